@@ -1,0 +1,15 @@
+#pragma once
+
+#include <nanobind/nanobind.h>
+
+namespace diffcloth::bind {
+
+namespace nb = nanobind;
+
+/// Contact kernels one by one, for tests against independent references.
+void contact_kernels(nb::module_& m);
+
+/// Rest shape and elastic potentials one by one, for tests against independent references.
+void elastic_kernels(nb::module_& m);
+
+}  // namespace diffcloth::bind

@@ -1,0 +1,27 @@
+#pragma once
+
+#include <cstdint>
+
+#include <Eigen/Core>
+
+namespace diffcloth {
+
+/// Index of a vertex, edge, face or contact in the kernels; int64 only at the Python boundary.
+using Index = std::int32_t;
+
+using Vec2 = Eigen::Vector2d;
+using Vec3 = Eigen::Vector3d;
+using Vec4 = Eigen::Vector4d;
+using Mat2 = Eigen::Matrix2d;
+using Mat3 = Eigen::Matrix3d;
+using Vec12 = Eigen::Matrix<double, 12, 1>;
+using Mat12 = Eigen::Matrix<double, 12, 12>;
+
+/// Positions, forces, ... of n vertices, one a row; the layout of the arrays that Python owns.
+using Rows3 = Eigen::Matrix<double, Eigen::Dynamic, 3, Eigen::RowMajor>;
+using ConstRows3 = Eigen::Map<const Rows3>;
+
+/// Vertex i of an array of rows, as a column vector.
+inline Vec3 row(const double* rows, Index i) { return Eigen::Map<const Vec3>(rows + 3 * i); }
+
+}  // namespace diffcloth

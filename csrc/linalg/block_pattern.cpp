@@ -1,0 +1,57 @@
+#include "linalg/block_pattern.h"
+
+#include <algorithm>
+
+namespace diffcloth::linalg {
+
+BlockPattern::BlockPattern(Index vertex_count, const std::vector<std::vector<Index>>& cliques) {
+  std::vector<std::pair<Index, Index>> pairs;
+  for (const std::vector<Index>& clique : cliques) {
+    for (const Index a : clique) {
+      for (const Index b : clique) {
+        if (a > b) pairs.emplace_back(a, b);
+      }
+    }
+  }
+  *this = from_pairs(vertex_count, std::move(pairs));
+}
+
+BlockPattern BlockPattern::from_pairs(Index vertex_count,
+                                      std::vector<std::pair<Index, Index>> pairs) {
+  for (Index i = 0; i < vertex_count; ++i) pairs.emplace_back(i, i);
+  std::ranges::sort(pairs, [](const auto& a, const auto& b) {
+    return a.second != b.second ? a.second < b.second : a.first < b.first;
+  });
+  pairs.erase(std::unique(pairs.begin(), pairs.end()), pairs.end());
+
+  BlockPattern pattern;
+  pattern.column_start_.assign(static_cast<std::size_t>(vertex_count) + 1, 0);
+  pattern.row_.reserve(pairs.size());
+  for (const auto& [row, column] : pairs) {
+    ++pattern.column_start_[column + 1];
+    pattern.row_.push_back(row);
+  }
+  for (Index j = 0; j < vertex_count; ++j) {
+    pattern.column_start_[j + 1] += pattern.column_start_[j];
+  }
+  return pattern;
+}
+
+Index BlockPattern::slot(Index i, Index j) const {
+  const auto begin = row_.begin() + column_start_[j];
+  const auto end = row_.begin() + column_start_[j + 1];
+  return static_cast<Index>(std::lower_bound(begin, end, i) - row_.begin());
+}
+
+std::vector<Index> BlockPattern::slots(std::span<const Index> clique) const {
+  std::vector<Index> result;
+  result.reserve(clique.size() * (clique.size() + 1) / 2);
+  for (std::size_t p = 0; p < clique.size(); ++p) {
+    for (std::size_t q = 0; q <= p; ++q) {
+      result.push_back(slot(std::max(clique[p], clique[q]), std::min(clique[p], clique[q])));
+    }
+  }
+  return result;
+}
+
+}  // namespace diffcloth::linalg
