@@ -6,6 +6,9 @@ namespace diffcloth::bind {
 
 namespace nb = nanobind;
 
+/// The simulator's handle: forward and backward of a step.
+void simulator(nb::module_& m);
+
 /// Contact kernels one by one, for tests against independent references.
 void contact_kernels(nb::module_& m);
 
