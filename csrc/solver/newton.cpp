@@ -43,8 +43,11 @@ constexpr double kWolfeSlope = 0.8;
 /// Relative size of an energy change that rounding can fake.
 constexpr double kEnergyNoise = 1e-11;
 constexpr int kBacktracks = 40;
+/// A step below this share of the coordinates is lost in their rounding.
+constexpr double kResolution = 1e-15;
 /// Iterations without progress after which the float64 floor is considered reached.
 constexpr int kStagnation = 5;
+constexpr double kNearFloor = 1e-4;  // [m/s]
 /// A prescribed motion is stuck when this many iterations move it by less than this fraction.
 constexpr int kStuckIterations = 20;
 constexpr double kStuckProgress = 1e-3;
@@ -80,6 +83,9 @@ class Minimizer {
   bool joint_step(const std::vector<double>& ends, double& remaining);
   void descend();
 
+  /// How far a search went: the whole step, a part of it, as far as rounding can tell, not at all.
+  enum class Move : std::uint8_t { kWhole, kPart, kRounded, kNone };
+
   bool take_direction();
   bool factor(Hessian& hessian, double shift);
   void solve(const linalg::CholeskyFactor& factor);
@@ -87,7 +93,7 @@ class Minimizer {
   bool exact_direction();
   void positive_direction();
   void shifted_direction();
-  bool search();
+  Move search();
   bool escape_saddle();
 
   void detect(const std::vector<double>& to);
@@ -319,11 +325,11 @@ bool Minimizer::take_direction() {
   if (chord()) return true;
   if (skip_exact_ > 0) {
     --skip_exact_;
-  } else if (exact_direction()) {
-    return true;
+  } else {
+    if (exact_direction()) return true;
+    skip_exact_ = indefinite_ <= kProjections ? 1 : 0;
   }
   if (indefinite_ <= kProjections) {
-    if (skip_exact_ == 0) skip_exact_ = 1;
     positive_direction();
   } else {
     shifted_direction();
@@ -333,9 +339,8 @@ bool Minimizer::take_direction() {
   return exact_direction();
 }
 
-/// Move along p_ by the largest collision-free fraction that decreases the objective. False when
-/// rounding leaves nothing to gain.
-bool Minimizer::search() {
+/// Move along p_ by the largest collision-free fraction that decreases the objective.
+Minimizer::Move Minimizer::search() {
   std::vector<double> to = moved(1.0);
   detect(to);
   const double safe = safe_fraction(to);
@@ -344,15 +349,19 @@ bool Minimizer::search() {
   if (f_.contact != nullptr) f_.contact->energies(candidates_, x_.data(), energies_);
   const double noise = kEnergyNoise * std::abs(f_.energy(x_.data(), energies_));
 
+  bool rounding = true;  // nothing but rounding has stood in the way
   double alpha = safe;
+  chord_allowed_ = false;
   for (int backtrack = 0; backtrack < kBacktracks; ++backtrack, alpha *= 0.5) {
     context_.checkpoint->check();
     if (alpha < 1.0) to = moved(alpha);
     if (f_.contact != nullptr) f_.contact->energies(candidates_, to.data(), trial_energies_);
     const double change = f_.energy_change(x_.data(), energies_, to.data(), trial_energies_);
     const bool decreased = change <= kArmijo * alpha * slope;
-    if (!decreased && !(std::abs(change) <= noise)) continue;
-
+    if (!decreased && !(std::abs(change) <= noise)) {
+      rounding = false;
+      continue;
+    }
     x_.swap(to);
     std::vector<double> g_before = g_;
     refresh();
@@ -364,10 +373,10 @@ bool Minimizer::search() {
     }
     record();
     chord_allowed_ = mode_ == Mode::kExact && alpha == 1.0;
-    return true;
+    if (alpha == 1.0) return Move::kWhole;
+    return safe == 1.0 && rounding ? Move::kRounded : Move::kPart;
   }
-  chord_allowed_ = false;
-  return false;
+  return safe == 1.0 && rounding ? Move::kRounded : Move::kNone;
 }
 
 /// Leave a saddle along the most negative direction of the Hessian, found by inverse iteration on
@@ -436,30 +445,20 @@ void Minimizer::descend() {
     }
     const double step = largest(p_);
     if (mode_ == Mode::kExact) out_.residual = step / f_.h;
-    const bool small = mode_ == Mode::kExact && step < f_.h * tolerance;
-
-    const std::vector<double> before = small ? x_ : std::vector<double>();
-    const bool moved_on = search();
-    if (small) {
-      // The last step is taken whole, or not at all where rounding hides its gain.
-      const bool whole = chord_allowed_;
-      if (whole || !moved_on) {
-        out_.status = Status::kConverged;
-        return;
-      }
+    const Move move = step <= kResolution * largest(x_) ? Move::kRounded : search();
+    if (mode_ == Mode::kExact && step < f_.h * tolerance &&
+        (move == Move::kWhole || move == Move::kRounded)) {
+      out_.status = Status::kConverged;
+      return;
     }
-    if (!moved_on) {
-      if (mode_ == Mode::kExact && !chord_allowed_ && last_step_ != step) {
-        last_step_ = step;
-        // A chord step may fail where a fresh factor succeeds.
-        if (out_.factored_at != x_) continue;
-      }
-      if (mode_ != Mode::kExact) {
-        skip_exact_ = 0;
-        if (indefinite_ <= kProjections) {
-          indefinite_ = kProjections + 1;
-          continue;
-        }
+    if (move == Move::kNone || move == Move::kRounded) {
+      // A chord step may fail where a fresh factor succeeds, a projection where a shift does.
+      last_step_ = 0.0;
+      if (mode_ == Mode::kExact && out_.factored_at != x_) continue;
+      skip_exact_ = 0;
+      if (mode_ != Mode::kExact && indefinite_ <= kProjections) {
+        indefinite_ = kProjections + 1;
+        continue;
       }
       return;
     }
@@ -468,7 +467,7 @@ void Minimizer::descend() {
       stagnant = step < 0.9 * best ? 0 : stagnant + 1;
       best = std::min(best, step);
       // Only near the floor: far from it, a growing step is ordinary.
-      if (stagnant >= kStagnation && step / f_.h < 1e-4) return;
+      if (stagnant >= kStagnation && step / f_.h < kNearFloor) return;
     }
   }
 }
