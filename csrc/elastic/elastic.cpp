@@ -2,6 +2,7 @@
 
 #include <array>
 #include <span>
+#include <stdexcept>
 
 #include "elastic/bending.h"
 #include "elastic/damping.h"
@@ -222,6 +223,9 @@ void prepare(Model& model, const Slots& slots) {
   prepared.bends = false;
   prepared.damped = false;
   for (Index f = 0; f < face_count(model); ++f) prepared.damped |= is_damped(model, f);
+  if (prepared.damped && (model.x_n == nullptr || !(model.h > 0.0))) {
+    throw std::invalid_argument("elastic: damping needs the start of the step and a time step > 0");
+  }
 
   for (Index e = 0; e < element_count; ++e) {
     prepared.bending[e] = element_mean(model, e, model.bending) * model.rest->bending_area[e];
