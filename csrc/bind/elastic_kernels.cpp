@@ -1,7 +1,9 @@
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <memory>
 #include <span>
 #include <stdexcept>
 #include <string>
@@ -31,12 +33,18 @@ using IndexArray = nb::ndarray<nb::numpy, std::int32_t>;
 
 /// A numpy array that owns a copy of the values.
 template <class Scalar>
-nb::ndarray<nb::numpy, Scalar> owned(const Scalar* values, std::initializer_list<std::size_t> shape) {
+nb::ndarray<nb::numpy, Scalar> owned(const Scalar* values,
+                                     std::initializer_list<std::size_t> shape) {
+  using Buffer = std::vector<Scalar>;
   std::size_t size = 1;
   for (const std::size_t extent : shape) size *= extent;
-  auto* copy = new std::vector<Scalar>(values, values + size);
-  const nb::capsule owner(copy, [](void* p) noexcept { delete static_cast<std::vector<Scalar>*>(p); });
-  return nb::ndarray<nb::numpy, Scalar>(copy->data(), shape, owner);
+  auto buffer = std::make_unique<Buffer>(values, values + size);
+  Scalar* data = buffer->data();
+  const nb::capsule owner(buffer.get(), [](void* p) noexcept {
+    std::unique_ptr<Buffer>(static_cast<Buffer*>(p)).reset();
+  });
+  buffer.release();  // the capsule owns it now
+  return nb::ndarray<nb::numpy, Scalar>(data, shape, owner);
 }
 
 Array vector_array(const std::vector<double>& values) {
@@ -254,7 +262,9 @@ class Elastic {
   std::vector<double> x_n_;
 };
 
-elastic::Anchors anchors_view(const Indices& vertex, const Values& stiffness, const Positions& target) {
+elastic::Anchors anchors_view(const Indices& vertex,
+                              const Values& stiffness,
+                              const Positions& target) {
   check_rows("stiffness", stiffness.shape(0), vertex.shape(0));
   check_rows("target", target.shape(0), vertex.shape(0));
   return {.vertex = {vertex.data(), vertex.size()},
@@ -318,11 +328,11 @@ void elastic_kernels(nb::module_& m) {
       .def("mixed", &Elastic::mixed, "x"_a.noconvert(), "z"_a.noconvert(), "with_rest"_a)
       .def("rest", &Elastic::rest)
       .def("rest_vjp", &Elastic::rest_vjp)
-      .def_prop_ro("stencil_start", &Elastic::stencil_start)
-      .def_prop_ro("stencil_vertices", &Elastic::stencil_vertices)
-      .def_prop_ro("edges", &Elastic::edges)
-      .def_prop_ro("edge_faces", &Elastic::edge_faces)
-      .def_prop_ro("face_edges", &Elastic::face_edges);
+      .def_prop_ro("stencil_start", &Elastic::stencil_start, nb::rv_policy::automatic)
+      .def_prop_ro("stencil_vertices", &Elastic::stencil_vertices, nb::rv_policy::automatic)
+      .def_prop_ro("edges", &Elastic::edges, nb::rv_policy::automatic)
+      .def_prop_ro("edge_faces", &Elastic::edge_faces, nb::rv_policy::automatic)
+      .def_prop_ro("face_edges", &Elastic::face_edges, nb::rv_policy::automatic);
   m.def("anchors",
         &anchors,
         "vertex"_a.noconvert(),
