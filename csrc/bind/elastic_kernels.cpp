@@ -4,12 +4,14 @@
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <optional>
 #include <span>
 #include <stdexcept>
 #include <string>
 #include <vector>
 
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
 #include "bind/bind.h"
@@ -107,7 +109,7 @@ class Elastic {
                       const Values& poisson,
                       const Values& damping,
                       double h,
-                      const Positions& x_n) {
+                      const std::optional<Positions>& x_n) {
     const auto fill = [this](const char* name, const Values& values) {
       check_rows(name, values.shape(0), topology_.faces.size());
       return std::vector<double>(values.data(), values.data() + values.size());
@@ -117,8 +119,11 @@ class Elastic {
     model_.poisson = fill("poisson", poisson);
     model_.damping = fill("damping", damping);
     model_.h = h;
-    x_n_ = positions("x_n", x_n);
-    model_.x_n = x_n_.data();
+    model_.x_n = nullptr;
+    if (x_n) {
+      x_n_ = positions("x_n", *x_n);
+      model_.x_n = x_n_.data();
+    }
     elastic::prepare(model_, slots_);
   }
 
@@ -318,7 +323,7 @@ void elastic_kernels(nb::module_& m) {
            "poisson"_a.noconvert(),
            "damping"_a.noconvert(),
            "h"_a,
-           "x_n"_a.noconvert())
+           "x_n"_a.noconvert().none())
       .def("energy", &Elastic::energy, "x"_a.noconvert())
       .def("energy_change", &Elastic::energy_change, "x0"_a.noconvert(), "x1"_a.noconvert())
       .def("gradient", &Elastic::gradient, "x"_a.noconvert())

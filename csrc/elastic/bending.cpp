@@ -301,6 +301,13 @@ ScalarBars mixed(const Element& element,
                  const double* x_n,
                  const double* z,
                  const GeometryBars& bars) {
+  const bool with_rest = bars.c != nullptr;
+  if (element.flat && x_n == nullptr && !with_rest) {
+    const Mat3 Y = second_derivatives(element, x);
+    const Mat3 dY = second_derivatives(element, z);
+    return {.weight = (Y * form(element.poisson)).cwiseProduct(dY).sum(),
+            .poisson = element.weight * (Y * form_derivative()).cwiseProduct(dY).sum()};
+  }
   const BodyState state = body_state(element, x);
   const BodyChange change = body_change(element, state, z);
   const Mat3& R = state.frame.R;
@@ -322,7 +329,6 @@ ScalarBars mixed(const Element& element,
     result.damping = element.weight * work_n;
   }
 
-  const bool with_rest = bars.c != nullptr;
   if (with_rest) {
     *bars.b += cross_columns(change.w, state.q) - change.dq;
     scatter_geometry(element, R * change.dq_total(), R * change.V, x, bars);

@@ -53,6 +53,8 @@ struct Model {
 };
 
 /// Fill model.prepared. To be called whenever anything in the model has changed.
+///
+/// @throws std::invalid_argument where damping has no start of the step or no time step
 void prepare(Model& model, const Slots& slots);
 
 /// Stretch and bending energy, without damping [J].
@@ -90,6 +92,9 @@ struct Bar {
 };
 
 /// bar += d/d theta (z . grad_x E(x; theta)) for each theta of the model, damping included.
+///
+/// The cotangents of damping and of x_n are left out where model.x_n is null; k_d has one also where
+/// it is zero.
 ///
 /// @param with_rest  whether the cotangents of the rest shape are wanted
 void add_mixed(const Model& model, const double* x, const double* z, bool with_rest, Bar& bar);

@@ -111,7 +111,7 @@ def model(
 
 
 def set_parameters(
-    elastic: Elastic, face_count: int, *, x_n: np.ndarray, **parameters: float | np.ndarray
+    elastic: Elastic, face_count: int, *, x_n: np.ndarray | None, **parameters: float | np.ndarray
 ) -> None:
     one = np.ones(face_count)
     elastic.set_parameters(
@@ -120,7 +120,7 @@ def set_parameters(
         parameters["poisson"] * one,
         parameters["damping"] * one,
         STEP,
-        np.ascontiguousarray(x_n),
+        None if x_n is None else np.ascontiguousarray(x_n),
     )
 
 

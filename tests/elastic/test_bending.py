@@ -55,6 +55,32 @@ def test_saddle_and_sphere_differ_by_poisson():
         assert elastic.energy(x) == pytest.approx(D * area * c**2 * (1 + sign * poisson), rel=1e-3)
 
 
+# Frequencies omega a^2 sqrt(rho / D) of a free square plate of side a with nu = 0.3: twist, saddle
+# and dome. A. W. Leissa, The free vibration of rectangular plates, J. Sound Vib. 31, 1973.
+FREE_PLATE = np.array([13.49, 19.79, 24.43])
+
+
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [
+        pytest.param("right", 0.95, 1.005, id="one diagonal: converges, 4 % below at 12 cells"),
+        pytest.param("delaunay", 0.85, 1.005, id="unstructured: relaxes a little"),
+        pytest.param("alternating", 0.70, 1.005, id="alternating: relaxes, the known limit"),
+    ],
+)
+def test_modes_of_a_free_plate(name, low, high):
+    X, faces = MESHES[name](13, 13)
+    X /= 12
+    elastic = model(X, faces, bending=1.0, poisson=0.3)
+    scale = 1 / np.sqrt(elastic.rest()["vertex_area"])
+    H = elastic.hessian(X, False)[2::3, 2::3]
+    values = np.linalg.eigvalsh(scale[:, None] * H * scale)
+    assert np.abs(values[:3]).max() < 1e-8  # affine maps and nothing else
+    ratio = np.sqrt(values[3:6]) / FREE_PLATE
+    assert (ratio > low).all()
+    assert (ratio < high).all()
+
+
 @pytest.mark.parametrize("bending_model", ["patch", "hinge"])
 @pytest.mark.parametrize("name", MESHES)
 def test_affine_maps_cost_nothing(name, bending_model):

@@ -81,3 +81,16 @@ def test_without_rest_the_other_cotangents_are_the_same():
     for name in parameters:
         np.testing.assert_array_equal(part[name], full[name])
     np.testing.assert_array_equal(part["X"], 0.0)
+
+
+@pytest.mark.parametrize("rest", ["flat", "cylinder"])
+def test_without_a_start_of_the_step_only_damping_is_left_out(rest):
+    elastic, _, faces, parameters, x, z = problem(rest, "patch", 0.0)
+    set_parameters(elastic, len(faces), **parameters)
+    full = elastic.mixed(x, z, False)
+    set_parameters(elastic, len(faces), **parameters | {"x_n": None})
+    part = elastic.mixed(x, z, False)
+    for name in ("stretch", "bending", "poisson"):
+        np.testing.assert_allclose(part[name], full[name], rtol=1e-10)
+    assert np.abs(full["damping"]).max() > 0
+    np.testing.assert_array_equal(part["damping"], 0.0)
