@@ -132,9 +132,9 @@ def index_array(name: str, value: object, count: int) -> IndexArray:
         raise InvalidInput(f"{name} must be a rectangular array of indices: {error}") from error
     if array.size and array.dtype.kind not in "iu":
         raise TypeError(f"{name} must hold integers, got dtype {array.dtype}")
-    outside = np.argwhere((array < 0) | (array >= count))
-    if outside.size:
-        at = tuple(int(i) for i in outside[0])
+    outside = (array < 0) | (array >= count)
+    if outside.any():
+        at = tuple(int(i) for i in np.argwhere(outside)[0])
         raise InvalidInput(
             f"{name} must be indices between 0 and {count - 1}, got {array[at]} at {list(at)}"
         )

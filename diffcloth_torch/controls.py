@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 import torch
@@ -86,8 +86,8 @@ class Parameters:
 
 
 def tensors_of(record: Any) -> Iterator[Tensor]:
-    """Go through the tensors of a State, Control or Parameters; None has none."""
-    if record is None:
+    """Go through the tensors of a State, Control or Parameters; anything else has none."""
+    if not is_dataclass(record):
         return
     for entry in fields(record):
         value = getattr(record, entry.name)

@@ -315,7 +315,7 @@ def _environments(
 
 
 def _texts(shapes: Sequence[Shape]) -> str:
-    return ", ".join(str(list(shape)) for shape in shapes)
+    return " or ".join(str(list(shape)) for shape in shapes)
 
 
 def _numbers(tensor: Tensor) -> FloatArray:

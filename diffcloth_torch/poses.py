@@ -18,9 +18,9 @@ _SHORTEST_QUATERNION = 1e-6
 def check_quaternions(name: str, poses: FloatArray) -> None:
     """Require quaternions [..., 3:7] that can be normalized."""
     norms = np.linalg.norm(poses[..., 3:], axis=-1)
-    wrong = np.argwhere(norms < _SHORTEST_QUATERNION)
-    if wrong.size:
-        at = [int(i) for i in wrong[0]]
+    wrong = norms < _SHORTEST_QUATERNION
+    if wrong.any():
+        at = [int(i) for i in np.argwhere(wrong)[0]]
         where = f" at {at}" if at else ""
         raise InvalidInput(
             f"{name} must hold a quaternion (w, x, y, z) of non-zero length in its last four "

@@ -49,16 +49,21 @@ class Report:
         present = [report for report in reports if report is not None]
         if len(present) < len(reports) or len({tuple(r.seconds) for r in present}) > 1:
             return None
-        return _combine(lambda *values: torch.as_tensor(values), present)
+        return _combine(lambda *values: torch.stack([_tensor(v) for v in values]), present)
 
     @staticmethod
     def where(mask: Tensor, a: Report | None, b: Report | None) -> Report | None:
         """Report that takes the environments of `a` where `mask` is true; None if one has none."""
         if a is None or b is None or tuple(a.seconds) != tuple(b.seconds):
             return None
-        return _combine(
-            lambda x, y: torch.where(mask, torch.as_tensor(x), torch.as_tensor(y)), [a, b]
-        )
+        return _combine(lambda x, y: torch.where(mask, _tensor(x), _tensor(y)), [a, b])
+
+
+def _tensor(value: Any) -> Tensor:
+    # A Python float would become a float32 tensor.
+    return (
+        torch.tensor(value, dtype=torch.float64) if type(value) is float else torch.as_tensor(value)
+    )
 
 
 def _combine(function: Callable[..., Any], reports: Sequence[Report]) -> Report:

@@ -140,7 +140,7 @@ class Simulator:
         }
         environments = () if batch_size is None else (batch_size,)
         copies = {
-            name: tensor.expand(*environments, *tensor.shape).clone(
+            name: tensor.expand((*environments, *tensor.shape)).clone(
                 memory_format=torch.contiguous_format
             )
             for name, tensor in tensors.items()

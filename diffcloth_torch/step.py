@@ -104,6 +104,11 @@ def as_array(tensor: Tensor) -> NDArray[np.float64]:
     return np.ascontiguousarray(tensor.detach().numpy())
 
 
+def _is_batched_by_vmap(tensor: Tensor) -> bool:
+    functorch = torch._C._functorch  # vectorized Jacobians still use the older of the two
+    return functorch.is_batchedtensor(tensor) or functorch.is_legacy_batchedtensor(tensor)
+
+
 def _forward(core: _core.Simulator, arrays: dict[str, Any], *, tape: bool) -> dict[str, Any]:
     try:
         return core.forward(arrays, tape, torch.get_num_threads())
@@ -137,7 +142,7 @@ class _Step(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *cotangents):
         saved = ctx.saved_tensors  # first: raises torch's own error if the tape was freed
-        if any(torch._C._functorch.is_batchedtensor(c) for c in cotangents):
+        if any(map(_is_batched_by_vmap, cotangents)):
             raise NotImplementedError(_TRANSFORMS)
         if ctx.unconverged:
             raise NotConverged(
