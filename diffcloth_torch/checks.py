@@ -200,11 +200,11 @@ def check_choice(name: str, value: object, accepted: Sequence[str]) -> str:
 
 
 def check_name(name: str, value: object) -> str | None:
-    """Require a non-empty name without a slash, which separates cloth and pin names, or None."""
+    """Require a printable name without a slash, which separates cloth and pin names, or None."""
     if value is None:
         return None
     if not isinstance(value, str):
         raise TypeError(f"{name} must be a string, got {type(value).__name__}")
-    if not value or "/" in value:
-        raise InvalidInput(f"{name} must be non-empty and without '/', got {value!r}")
+    if not value or "/" in value or not value.isprintable():
+        raise InvalidInput(f"{name} must be non-empty, printable and without '/', got {value!r}")
     return value

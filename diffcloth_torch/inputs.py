@@ -35,6 +35,7 @@ __all__ = [
     "PARAMETER_NAMES",
     "Inputs",
     "check_control",
+    "check_parameters",
     "control_inputs",
     "parameter_inputs",
     "state_inputs",
@@ -238,6 +239,18 @@ def _check_static(assembly: Assembly, targets: Tensor, poses: Tensor) -> None:
         )
 
 
+def check_parameters(parameters: Parameters) -> Parameters:
+    """Promote parameters to tensors; their values are checked in each step."""
+    if not isinstance(parameters, Parameters):
+        raise TypeError(f"step: `parameters` must be Parameters, got {type(parameters).__name__}")
+    given = {name: getattr(parameters, name) for name in PARAMETER_NAMES}
+    tensors = {
+        name: None if value is None else float_tensor(f"parameters: `{name}`", value)
+        for name, value in given.items()
+    }
+    return Parameters(**tensors, _unbatched=parameters._unbatched)
+
+
 class _ParameterShapes(NamedTuple):
     shared: list[Shape]  # accepted shapes without a batch axis
     core: Shape  # axes of the core's tensor behind that of the environments
@@ -267,11 +280,10 @@ def parameter_inputs(
     batch: int | None,
 ) -> Inputs:
     """Check parameters; a field that is None takes the default, `defaults` has all there are."""
-    if not isinstance(parameters, Parameters):
-        raise TypeError(f"step: `parameters` must be Parameters, got {type(parameters).__name__}")
+    checked = check_parameters(parameters)
     inputs = {}
     for name, accepted in _RANGES.items():
-        given = getattr(parameters, name)
+        given = getattr(checked, name)
         if name not in defaults:
             if given is not None:
                 raise InvalidInput(
@@ -279,8 +291,9 @@ def parameter_inputs(
                 )
             continue
         label = f"parameters: `{name}`"
-        tensor = defaults[name] if given is None else float_tensor(label, given)
-        check_range(label, _numbers(tensor), accepted)
+        tensor = defaults[name] if given is None else given
+        if given is not None:
+            check_range(label, _numbers(tensor), accepted)
         shapes = _parameter_shapes(assembly, name)
         unbatched = given is None or name in parameters._unbatched
         rows = _environments(label, tuple(tensor.shape), shapes.shared, batch, unbatched)

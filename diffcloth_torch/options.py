@@ -39,8 +39,12 @@ class ContactOptions:
             instead = f"differentiate with respect to Parameters.{field}"
             number = check_number(f"ContactOptions: `{field}`", value, POSITIVE, instead=instead)
             object.__setattr__(self, field, number)
-        check_count("ContactOptions: `friction_iterations`", self.friction_iterations, 1)
-        check_bool("ContactOptions: `self_contact`", self.self_contact)
+        iterations = check_count(
+            "ContactOptions: `friction_iterations`", self.friction_iterations, 1
+        )
+        object.__setattr__(self, "friction_iterations", iterations)
+        self_contact = check_bool("ContactOptions: `self_contact`", self.self_contact)
+        object.__setattr__(self, "self_contact", self_contact)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +69,7 @@ class SolverOptions:
             "SolverOptions: `tolerance`", self.tolerance, POSITIVE, instead="pass a plain number"
         )
         object.__setattr__(self, "tolerance", tolerance)
-        check_count("SolverOptions: `max_iterations`", self.max_iterations, 1)
-        check_bool("SolverOptions: `throw`", self.throw)
+        iterations = check_count("SolverOptions: `max_iterations`", self.max_iterations, 1)
+        object.__setattr__(self, "max_iterations", iterations)
+        object.__setattr__(self, "throw", check_bool("SolverOptions: `throw`", self.throw))
         check_choice("SolverOptions: `metric`", self.metric, METRICS)

@@ -24,6 +24,7 @@ from diffcloth_torch.errors import IntersectingState, InvalidInput
 from diffcloth_torch.inputs import (
     Inputs,
     check_control,
+    check_parameters,
     control_inputs,
     parameter_inputs,
     state_inputs,
@@ -211,7 +212,7 @@ class Simulator:
             body_poses=_own_copy(inputs["body_targets"], batch),
             soft_pin_targets=_own_copy(inputs["soft_pin_targets"], batch),
             body_forces=outcome.body_forces,
-            time=state.time + self.dt,
+            time=_own_copy((state.time + self.dt).reshape(-1), batch),
             report=report,
             _surfaces=self._surfaces,
         )
@@ -240,6 +241,11 @@ class Simulator:
         Returns:
             The states after each step.
         """
+        # Copies of NumPy arrays and lists: edits before backward must not reach what is repeated.
+        if isinstance(controls, Sequence):
+            controls = [c if c is None else check_control(self._assembly, c) for c in controls]
+        if parameters is not None:
+            parameters = check_parameters(parameters)
         return roll_out(
             lambda before, control: self.step(before, control, parameters),
             state,

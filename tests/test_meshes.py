@@ -229,6 +229,7 @@ def changed(array, index, value):
         ({"material": 5}, TypeError, "Material"),
         ({"material": dc.Material(stretch=[1.0, 2.0, 3.0])}, dc.InvalidInput, r"\[2\], got \[3\]"),
         ({"name": ""}, dc.InvalidInput, "non-empty"),
+        ({"name": "a\nb"}, dc.InvalidInput, "printable"),
     ],
 )
 def test_a_bad_cloth_is_refused(changes, error, message):
