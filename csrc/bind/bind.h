@@ -6,6 +6,9 @@ namespace diffcloth::bind {
 
 namespace nb = nanobind;
 
+/// `build_info()`: what this core was built with.
+void build_info(nb::module_& m);
+
 /// Contact kernels one by one, for tests against independent references.
 void contact_kernels(nb::module_& m);
 
