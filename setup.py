@@ -17,17 +17,20 @@ class CMakeBuild(build_ext):
 
     def build_extension(self, ext: Extension) -> None:
         package = Path(self.get_ext_fullpath(ext.name)).resolve().parent
-        # Outside setuptools' temporary folders, so that a second build only compiles what changed.
+        # Outside setuptools' temporary folders, so that a second build compiles only what changed;
+        # but not from the last one's settings, nor from the paths of its build environment.
         build = ROOT / "build" / sys.implementation.cache_tag
+        (build / "CMakeCache.txt").unlink(missing_ok=True)
         configure = [
-            # --fresh: in a build environment of pip, the cached paths of the last one are gone.
-            *("cmake", "--fresh", "-S", str(ROOT / "csrc"), "-B", str(build), "-G", "Ninja"),
+            *("cmake", "-S", str(ROOT / "csrc"), "-B", str(build), "-G", "Ninja"),
             f"-DPython_EXECUTABLE={sys.executable}",
             *shlex.split(os.environ.get("CMAKE_ARGS", "")),
         ]
         subprocess.run(configure, check=True)
         subprocess.run(["cmake", "--build", str(build)], check=True)
-        subprocess.run(["cmake", "--install", str(build), "--prefix", str(package.parent)], check=True)
+        subprocess.run(
+            ["cmake", "--install", str(build), "--prefix", str(package.parent)], check=True
+        )
 
 
 setup(

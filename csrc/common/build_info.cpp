@@ -3,11 +3,10 @@
 #include <Eigen/Core>
 
 #ifdef DIFFCLOTH_HAS_CHOLMOD
-#include <dlfcn.h>
-
 #include <array>
 
 #include <cholmod.h>
+#include <dlfcn.h>
 #endif
 
 namespace diffcloth {
