@@ -3,6 +3,7 @@
 NB_MODULE(_core, m) {
   namespace nb = nanobind;
   m.doc() = "C++ core of diffcloth_torch. The public interface is the Python package.";
+  diffcloth::bind::build_info(m);
 
   diffcloth::bind::simulator(m);
 
