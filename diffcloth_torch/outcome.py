@@ -15,7 +15,7 @@ from diffcloth_torch.errors import (
     SimulationError,
 )
 from diffcloth_torch.report import Report
-from diffcloth_torch.step import INFEASIBLE, INTERSECTING, UNCONVERGED
+from diffcloth_torch.step import CONVERGED, INFEASIBLE, INTERSECTING, UNCONVERGED
 
 __all__ = ["make_report", "raise_on_failure"]
 
@@ -27,7 +27,7 @@ def make_report(diagnostics: dict[str, Any], phases: Sequence[str], *, batched: 
         return torch.from_numpy(np.array(array)) if batched else array[0].item()
 
     return Report(
-        converged=value(diagnostics["converged"].astype(bool)),
+        converged=value(diagnostics["status"] == CONVERGED),
         iterations=value(diagnostics["iterations"]),
         residual=value(diagnostics["residual"]),
         minimum_distance=value(diagnostics["minimum_distance"]),
