@@ -1,9 +1,10 @@
 """Meshes, scenes and judges shared by the tests of the laws of physics."""
 
-import numpy as np
-import torch
+import itertools
 
-import diffcloth_torch as dc
+import numpy as np
+import pytest
+import torch
 
 F64 = torch.float64
 WEIGHTLESS = (0.0, 0.0, 0.0)
@@ -68,3 +69,47 @@ def rotation(axis, angle):
 def quaternion(axis, angle):
     axis = np.asarray(axis) / np.linalg.norm(axis)
     return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])
+
+
+class Judge:
+    """The IPC Toolkit's verdict on states and on motions between them."""
+
+    def __init__(self, sim):
+        ipctk = pytest.importorskip("ipctk")
+        self._ipctk = ipctk
+        self._bodies = sim.scene.bodies
+        start = sim.initial_state()
+        faces, first, surface = [], 0, []
+        for item in [*sim.scene.cloths, *sim.scene.bodies]:
+            faces.append(item.faces + first)
+            first += len(item.vertices)
+            surface += [len(faces)] * len(item.vertices)
+        faces = np.concatenate(faces).astype(np.int32)
+        points = self.points(start)
+        self.mesh = ipctk.CollisionMesh(points, ipctk.edges(faces), faces)
+        cloth_count = len(start.positions)
+        # Bodies may overlap each other; nothing else may.
+        self.mesh.can_collide = ipctk.make_static_obstacle_filter(cloth_count)
+
+    def points(self, state):
+        """Cloth and body vertices of a state."""
+        parts = [state.positions.detach().numpy()]
+        for body, pose in zip(self._bodies, state.body_poses.numpy(), strict=True):
+            parts.append(body.vertices @ matrix(pose[3:]).T + pose[:3])
+        return np.concatenate(parts)
+
+    def is_free(self, state):
+        return not self._ipctk.has_intersections(self.mesh, self.points(state))
+
+    def is_free_path(self, path):
+        """Whether the straight motions between the configurations of a path are collision-free."""
+        return all(
+            self._ipctk.is_step_collision_free(self.mesh, a, b) for a, b in itertools.pairwise(path)
+        )
+
+
+def matrix(q):
+    """Rotation matrix of a quaternion wxyz."""
+    w, u = q[0] / np.linalg.norm(q), np.asarray(q[1:]) / np.linalg.norm(q)
+    k = np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])
+    return np.eye(3) + 2 * w * k + 2 * k @ k
