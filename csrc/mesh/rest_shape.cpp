@@ -240,7 +240,8 @@ void chart_vjp(std::span<const Index> vertices,
     bar.u[a] += u_bar - edge_bar;
     bar.u[b] += edge_bar;
 
-    const Foot<Dual9> foot = unfold(variables<9>(corners(X, vertices[a], vertices[b], vertices[j])));
+    const Foot<Dual9> foot =
+        unfold(variables<9>(corners(X, vertices[a], vertices[b], vertices[j])));
     const std::array<Dual9, 2> outputs{foot.along, foot.off};
     add_corner_bar(outputs, foot_bar, vertices[a], vertices[b], vertices[j], X_bar);
   }
@@ -353,7 +354,8 @@ RestShape rest_shape(const Topology& topology, const BendingStencils& stencils, 
   for (Index e = 0; e < stencils.size(); ++e) {
     const Chart local = element_chart(stencils, e, X);
     const Operator c = element_operator(stencils, e, local);
-    std::copy(c.data(), c.data() + c.size(), rest.curvature_operator.data() + 3 * stencils.start[e]);
+    std::copy(
+        c.data(), c.data() + c.size(), rest.curvature_operator.begin() + 3 * stencils.start[e]);
     const bool patch = stencils.model[e] == BendingModel::kPatch;
     rest.bending_area[e] = patch ? local.area() : 1.0;
     rest.curvature[e] = local.frame().transpose() *
