@@ -61,7 +61,8 @@ void fit_operator_vjp(const BendingStencils& stencils,
 /// derivative at the middle of the side is sum_i (k . c_i + [i < 3] g_i) x_i, and N is the side's
 /// share in the second derivatives of the triangle,
 ///
-///   A (x,uu ; x,uv ; x,vv) = boundary integral of n (x) grad x:   N = |side| / A (n1^2, n1 n2, n2^2).
+///   A (x,uu ; x,uv ; x,vv) = boundary integral of n (x) grad x,
+///   N = |side| / A (n1^2, n1 n2, n2^2).
 template <class Scalar>
 struct Side {
   std::array<Scalar, 3> k, g, N;

@@ -50,9 +50,9 @@ std::array<std::array<Index, 2>, 2> sides(const Kink& kink) {
 //
 //   c_T <- c_T - 1/2 sum_sides N (d_T + d_T')
 //
-// with d the outward derivatives at the middle of the side. The sum of A c over all triangles is then
-// a boundary term: a constant curvature leaves no force on an interior vertex, and the mesh cannot
-// relax below the energy of a quadratic by moving single vertices. Quadratics have no kink.
+// with d the outward derivatives at the middle of the side. The sum of A c over all triangles is
+// then a boundary term: a constant curvature leaves no force on an interior vertex, and the mesh
+// cannot relax below the energy of a quadratic by moving single vertices. Quadratics have no kink.
 std::vector<double> curvature_operator(const BendingStencils& stencils, const Fits& fits) {
   std::vector<double> result(3 * stencils.vertices.size(), 0.0);
   const auto columns = [&](Index e) {

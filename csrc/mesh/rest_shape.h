@@ -34,8 +34,8 @@ struct Kink {
 ///
 /// The first three vertices of an element are the corners of its base face; then come the other
 /// points of its quadratic, which are laid into the plane of the base face by unfolding the mesh,
-/// then those of its neighbors' quadratics. The choice is made once, from the scene's rest mesh, and
-/// then kept, so that everything is smooth in the rest positions.
+/// then those of its neighbors' quadratics. The choice is made once, from the scene's rest mesh,
+/// and then kept, so that everything is smooth in the rest positions.
 struct BendingStencils {
   std::vector<Index> start{0};                   ///< [B + 1] into `vertices`
   std::vector<Index> vertices;                   ///< [start.back()]
