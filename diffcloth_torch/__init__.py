@@ -9,6 +9,7 @@
 Units are SI, z is up, quaternions are (w, x, y, z), and everything is float64 on the CPU.
 """
 
+from importlib.metadata import version
 from typing import Any
 
 from diffcloth_torch import _core
@@ -55,3 +56,10 @@ __all__ = [
 def build_info() -> dict[str, Any]:
     """Say what the C++ core was built with: libraries, compiler and options."""
     return dict(_core.build_info())
+
+
+def __getattr__(name: str) -> str:
+    # The version stands in the package's metadata alone, which is read when it is asked for.
+    if name == "__version__":
+        return version("diffcloth-torch")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

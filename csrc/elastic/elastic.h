@@ -93,8 +93,8 @@ struct Bar {
 
 /// bar += d/d theta (z . grad_x E(x; theta)) for each theta of the model, damping included.
 ///
-/// The cotangents of damping and of x_n are left out where model.x_n is null; k_d has one also where
-/// it is zero.
+/// The cotangents of damping and of x_n are left out where model.x_n is null; k_d has one also
+/// where it is zero.
 ///
 /// @param with_rest  whether the cotangents of the rest shape are wanted
 void add_mixed(const Model& model, const double* x, const double* z, bool with_rest, Bar& bar);

@@ -28,7 +28,8 @@ double energy_change(double weight, const Mat32& F0, const Mat32& F1, const Mat3
 
 /// The Hessian's 3x3 blocks of the lower-triangle pairs (0,0), (1,0), (1,1), (2,0), (2,1), (2,2):
 ///
-///   H_pq = k_s A [ (g_p.g_q) I - (1/t) e_p e_q^T - (g_p^T S^-1 g_q) n n^T ],  e_p = g_p0 r2 - g_p1 r1.
+///   H_pq = k_s A [ (g_p.g_q) I - (1/t) e_p e_q^T - (g_p^T S^-1 g_q) n n^T ],
+///   e_p = g_p0 r2 - g_p1 r1.
 ///
 /// The projected one clamps 1/t to 1/2 and the eigenvalues of S^-1 to 1.
 std::array<Mat3, 6> hessian(double weight,

@@ -5,7 +5,9 @@
 namespace diffcloth::mesh {
 namespace {
 
-using Svd = Eigen::JacobiSVD<FitMatrix>;
+// Thin singular vectors need a dynamic number of columns.
+using SvdMatrix = Eigen::Matrix<double, Eigen::Dynamic, Eigen::Dynamic, 0, kMaxExtra, 3>;
+using Svd = Eigen::JacobiSVD<SvdMatrix>;
 
 Svd decompose(const FitMatrix& M) { return Svd(M, Eigen::ComputeThinU | Eigen::ComputeThinV); }
 

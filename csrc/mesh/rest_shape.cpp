@@ -5,180 +5,125 @@
 #include <limits>
 
 #include "common/dual.h"
-#include "mesh/curvature_fit.h"
+#include "mesh/fit_operator.h"
 #include "mesh/local_chart.h"
 #include "mesh/unfolding.h"
 
 namespace diffcloth::mesh {
 namespace {
 
-using Dual5 = Dual<5>;
-using Dual8 = Dual<8>;
+using Dual3 = Dual<3>;
 using Dual9 = Dual<9>;
+using OperatorMap = Eigen::Map<Eigen::Matrix<double, 3, Eigen::Dynamic>>;
+using ConstOperatorMap = Eigen::Map<const Eigen::Matrix<double, 3, Eigen::Dynamic>>;
 
-/// Weights (c_uu, c_uv, c_vv) of each vertex of an element, one vertex a column.
-using Operator = Eigen::Matrix<double, 3, Eigen::Dynamic, 0, 3, kMaxPatch>;
+/// Charts and operators of the quadratics of all elements.
+struct Fits {
+  std::vector<Chart> chart;
+  std::vector<Operator> c;
 
-/// The unknown of the fit is (x,uu ; sqrt2 x,uv ; x,vv), whose norm does not depend on the frame.
-const Vec3 kUnknownScale(1.0, std::sqrt(0.5), 1.0);
+  Fits(const BendingStencils& stencils, const double* X) {
+    for (Index e = 0; e < stencils.size(); ++e) {
+      chart.push_back(element_chart(stencils, e, X));
+      c.push_back(fit_operator(stencils, e, chart.back()));
+    }
+  }
+};
 
-template <int n>
-std::array<Dual<n>, n> variables(const std::array<double, n>& values) {
-  std::array<Dual<n>, n> result;
-  for (int i = 0; i < n; ++i) result[i] = Dual<n>::variable(values[i], i);
+/// Place of each point of the fit of element `from` among the vertices of element e.
+std::vector<Index> places(const BendingStencils& stencils, Index e, Index from) {
+  const std::span<const Index> vertices = stencils.element(e);
+  std::vector<Index> result;
+  for (const Index v : stencils.fit(from)) {
+    result.push_back(static_cast<Index>(std::ranges::find(vertices, v) - vertices.begin()));
+  }
   return result;
 }
 
-Chart element_chart(const BendingStencils& stencils, Index e, const double* X) {
-  const std::span<const Index> vertices = stencils.element(e);
-  return chart(vertices, {stencils.unfold_edge.data() + stencils.start[e], vertices.size()}, X);
+/// The two sides of a kink: the element's own and its neighbor's.
+std::array<std::array<Index, 2>, 2> sides(const Kink& kink) {
+  return {{{kink.element, kink.corner}, {kink.other, kink.other_corner}}};
 }
 
-/// Shape gradients of the triangle (0, 0), (length, 0), (a, b).
-template <class Scalar>
-std::array<Scalar, 6> shape_gradient(const Scalar& length, const Scalar& a, const Scalar& b) {
-  const Scalar g1u = Scalar(1.0) / length;
-  const Scalar g1v = -a / (length * b);
-  const Scalar g2v = Scalar(1.0) / b;
-  return {-g1u, -(g1v + g2v), g1u, g1v, Scalar(0.0), g2v};
-}
-
-// ---- the curvature operator of a patch ----
-
-Operator patch_operator(const Chart& chart) {
-  const FitInverse inverse = fit_inverse(fit_matrix(chart)) / chart.area();
-  Operator c = Operator::Zero(3, chart.size);
-  for (int j = 3; j < chart.size; ++j) {
-    const Vec3 weight = kUnknownScale.cwiseProduct(inverse.col(j - 3));
-    const FitRow<double> row = fit_row(fit_parameters(chart, j));
-    c.col(j) = weight;
-    for (int i = 0; i < 3; ++i) c.col(i) -= row.lambda[i] * weight;
+// The quadratics of two neighbors disagree about the derivative across their side; with the mean of
+// both, the second derivatives of a triangle become
+//
+//   c_T <- c_T - 1/2 sum_sides N (d_T + d_T')
+//
+// with d the outward derivatives at the middle of the side. The sum of A c over all triangles is
+// then a boundary term: a constant curvature leaves no force on an interior vertex, and the mesh
+// cannot relax below the energy of a quadratic by moving single vertices. Quadratics have no kink.
+std::vector<double> curvature_operator(const BendingStencils& stencils, const Fits& fits) {
+  std::vector<double> result(3 * stencils.vertices.size(), 0.0);
+  const auto columns = [&](Index e) {
+    return OperatorMap(
+        result.data() + 3 * stencils.start[e], 3, stencils.start[e + 1] - stencils.start[e]);
+  };
+  for (Index e = 0; e < stencils.size(); ++e) columns(e).leftCols(fits.c[e].cols()) = fits.c[e];
+  for (const Kink& kink : stencils.kinks) {
+    OperatorMap c = columns(kink.element);
+    const Side<double> own = side(base_parameters(fits.chart[kink.element]), kink.corner);
+    for (const auto& [e, corner] : sides(kink)) {
+      const SideWeights d =
+          side_weights(side(base_parameters(fits.chart[e]), corner), fits.c[e]);
+      const std::vector<Index> place = places(stencils, kink.element, e);
+      for (std::size_t i = 0; i < place.size(); ++i) {
+        c.col(place[i]) -= 0.5 * d(i) * Eigen::Map<const Vec3>(own.N.data());
+      }
+    }
   }
-  return c;
+  return result;
 }
 
-/// Cotangents of the chart: base triangle and local coordinates.
-struct ChartBar {
-  double length = 0.0, a = 0.0, b = 0.0;
-  std::array<double, 9> frame{};
-  std::array<Vec2, kMaxPatch> u;
+/// Cotangents of the quadratics of all elements.
+struct FitsBar {
+  std::vector<Operator> c;
+  std::vector<Vec3> base;  ///< length, a, b of the base triangles
 
-  ChartBar() { u.fill(Vec2::Zero()); }
+  explicit FitsBar(const Fits& fits) : base(fits.c.size(), Vec3::Zero()) {
+    for (const Operator& operator_e : fits.c) c.push_back(Operator::Zero(3, operator_e.cols()));
+  }
 };
 
-void add_area_bar(const Chart& chart, double area_bar, ChartBar& bar) {
-  bar.length += 0.5 * chart.base.b * area_bar;
-  bar.b += 0.5 * chart.base.length * area_bar;
+/// Add the gradient of sum_j bars_j . values_j with respect to the base triangle.
+void add_base_bar(const std::array<Dual3, 3>& values, const Vec3& bars, Vec3& base_bar) {
+  for (int j = 0; j < 3; ++j) base_bar += bars(j) * values[j].derivative;
 }
 
-void patch_operator_vjp(const Chart& chart, const Operator& c_bar, ChartBar& bar) {
-  const FitMatrix M = fit_matrix(chart);
-  const double area = chart.area();
-  const FitInverse inverse = fit_inverse(M) / area;
-  FitInverse inverse_bar = FitInverse::Zero(3, M.rows());
-  std::array<Vec3, kMaxPatch> lambda_bar;
-  for (int j = 3; j < chart.size; ++j) {
-    const FitRow<double> row = fit_row(fit_parameters(chart, j));
-    const Vec3 weight = kUnknownScale.cwiseProduct(inverse.col(j - 3));
-    Vec3 weight_bar = c_bar.col(j);
-    for (int i = 0; i < 3; ++i) {
-      weight_bar -= row.lambda[i] * c_bar.col(i);
-      lambda_bar[j](i) = -weight.dot(c_bar.col(i));
+void kink_vjp(const BendingStencils& stencils,
+              const Fits& fits,
+              const Kink& kink,
+              const ConstOperatorMap& c_bar,
+              FitsBar& bar) {
+  const Side<Dual3> own =
+      side(variables<3>(base_parameters(fits.chart[kink.element])), kink.corner);
+  const Vec3 N(own.N[0].value, own.N[1].value, own.N[2].value);
+  Vec3 N_bar = Vec3::Zero();
+  for (const auto& [e, corner] : sides(kink)) {
+    const std::array<double, 3> base = base_parameters(fits.chart[e]);
+    const Side<double> value = side(base, corner);
+    const SideWeights d = side_weights(value, fits.c[e]);
+    const std::vector<Index> place = places(stencils, kink.element, e);
+    Vec3 k_bar = Vec3::Zero();
+    Vec3 g_bar = Vec3::Zero();
+    for (std::size_t i = 0; i < place.size(); ++i) {
+      N_bar -= 0.5 * d(i) * c_bar.col(place[i]);
+      const double d_bar = -0.5 * N.dot(c_bar.col(place[i]));
+      bar.c[e].col(i) += d_bar * Eigen::Map<const Vec3>(value.k.data());
+      k_bar += d_bar * fits.c[e].col(i);
+      if (i < 3) g_bar(i) = d_bar;
     }
-    inverse_bar.col(j - 3) = kUnknownScale.cwiseProduct(weight_bar);
+    const Side<Dual3> dual = side(variables<3>(base), corner);
+    add_base_bar(dual.k, k_bar, bar.base[e]);
+    add_base_bar(dual.g, g_bar, bar.base[e]);
   }
-  add_area_bar(chart, -inverse.cwiseProduct(inverse_bar).sum() / area, bar);
-  const FitMatrix M_bar = fit_inverse_vjp(M, inverse_bar / area);
-
-  for (int j = 3; j < chart.size; ++j) {
-    const FitRow<Dual5> row = fit_row(variables<5>(fit_parameters(chart, j)));
-    Eigen::Matrix<double, 5, 1> p_bar = Eigen::Matrix<double, 5, 1>::Zero();
-    for (int k = 0; k < 3; ++k) {
-      p_bar += lambda_bar[j](k) * row.lambda[k].derivative + M_bar(j - 3, k) * row.m[k].derivative;
-    }
-    bar.length += p_bar(0);
-    bar.a += p_bar(1);
-    bar.b += p_bar(2);
-    bar.u[j] += p_bar.tail<2>();
-  }
-}
-
-// ---- the operator of a hinge ----
-
-/// Weights of Bergou's hinge, sqrt(3 / (A0 + A1)) sum_i w_i x_i with cotangent weights w, about the
-/// edge a -> b with c to its left and d to its right.
-///
-/// @param u  coordinates of a, b, c, d
-template <class Scalar>
-std::array<Scalar, 4> hinge_weights(const std::array<Scalar, 8>& u) {
-  using std::sqrt;
-  const auto dot = [&u](int o, int p, int q) {
-    return (u[2 * p] - u[2 * o]) * (u[2 * q] - u[2 * o]) +
-           (u[2 * p + 1] - u[2 * o + 1]) * (u[2 * q + 1] - u[2 * o + 1]);
-  };
-  const auto cross = [&u](int o, int p, int q) {
-    return (u[2 * p] - u[2 * o]) * (u[2 * q + 1] - u[2 * o + 1]) -
-           (u[2 * p + 1] - u[2 * o + 1]) * (u[2 * q] - u[2 * o]);
-  };
-  const Scalar area_c = cross(0, 1, 2);  // twice the areas
-  const Scalar area_d = cross(1, 0, 3);
-  const Scalar cot_ac = dot(0, 1, 2) / area_c;
-  const Scalar cot_bc = dot(1, 0, 2) / area_c;
-  const Scalar cot_ad = dot(0, 1, 3) / area_d;
-  const Scalar cot_bd = dot(1, 0, 3) / area_d;
-  const Scalar scale = sqrt(Scalar(6.0) / (area_c + area_d));
-  return {scale * (cot_bc + cot_bd),
-          scale * (cot_ac + cot_ad),
-          -(scale * (cot_ac + cot_bc)),
-          -(scale * (cot_ad + cot_bd))};
-}
-
-/// Local vertices a, b, c, d of a hinge.
-std::array<int, 4> hinge_corners(const BendingStencils& stencils, Index e) {
-  const auto [a, b] = stencils.unfold_edge[stencils.start[e] + 3];
-  return {a, b, 3 - a - b, 3};
-}
-
-std::array<double, 8> hinge_coordinates(const Chart& chart, const std::array<int, 4>& corner) {
-  std::array<double, 8> u;
-  for (int i = 0; i < 4; ++i) {
-    u[2 * i] = chart.u[corner[i]].x();
-    u[2 * i + 1] = chart.u[corner[i]].y();
-  }
-  return u;
-}
-
-Operator hinge_operator(const Chart& chart, const std::array<int, 4>& corner) {
-  const std::array<double, 4> w = hinge_weights(hinge_coordinates(chart, corner));
-  Operator c = Operator::Zero(3, 4);
-  for (int i = 0; i < 4; ++i) c(0, corner[i]) = w[i];
-  return c;
-}
-
-void hinge_operator_vjp(const Chart& chart,
-                        const std::array<int, 4>& corner,
-                        const Operator& c_bar,
-                        ChartBar& bar) {
-  const std::array<Dual8, 4> w = hinge_weights(variables<8>(hinge_coordinates(chart, corner)));
-  for (int i = 0; i < 4; ++i) {
-    for (int k = 0; k < 4; ++k) {
-      bar.u[corner[k]] += c_bar(0, corner[i]) * w[i].derivative.segment<2>(2 * k);
-    }
-  }
-}
-
-Operator element_operator(const BendingStencils& stencils, Index e, const Chart& chart) {
-  switch (stencils.model[e]) {
-    case BendingModel::kPatch:
-      return patch_operator(chart);
-    case BendingModel::kHinge:
-      return hinge_operator(chart, hinge_corners(stencils, e));
-  }
-  return {};
+  add_base_bar(own.N, N_bar, bar.base[kink.element]);
 }
 
 /// Second derivatives sum_i c_ab,i X_i, one a column.
-Mat3 second_derivatives(std::span<const Index> vertices, const Operator& c, const double* X) {
+Mat3 second_derivatives(std::span<const Index> vertices,
+                        const ConstOperatorMap& c,
+                        const double* X) {
   const Vec3 origin = row(X, vertices[0]);
   Mat3 result = Mat3::Zero();
   for (std::size_t i = 1; i < vertices.size(); ++i) {
@@ -240,7 +185,8 @@ void chart_vjp(std::span<const Index> vertices,
     bar.u[a] += u_bar - edge_bar;
     bar.u[b] += edge_bar;
 
-    const Foot<Dual9> foot = unfold(variables<9>(corners(X, vertices[a], vertices[b], vertices[j])));
+    const Foot<Dual9> foot =
+        unfold(variables<9>(corners(X, vertices[a], vertices[b], vertices[j])));
     const std::array<Dual9, 2> outputs{foot.along, foot.off};
     add_corner_bar(outputs, foot_bar, vertices[a], vertices[b], vertices[j], X_bar);
   }
@@ -250,46 +196,71 @@ void chart_vjp(std::span<const Index> vertices,
   base_triangle_vjp({vertices[0], vertices[1], vertices[2]}, X, bar, X_bar);
 }
 
-void element_vjp(const BendingStencils& stencils,
-                 Index e,
-                 const double* X,
-                 const RestShapeBar& bar,
-                 double* X_bar) {
-  const std::span<const Index> vertices = stencils.element(e);
-  const Chart local = element_chart(stencils, e, X);
-  const Operator c = element_operator(stencils, e, local);
-  ChartBar local_bar;
-  if (stencils.model[e] == BendingModel::kPatch) {
-    add_area_bar(local, bar.bending_area[e], local_bar);
-  }
-
-  // b = R^T sum_i (X_i - X_0) c_i^T
-  const Mat3& b_bar = bar.curvature[e];
-  const Mat3 Y_bar = local.frame() * b_bar;
-  const Mat3 frame_bar = second_derivatives(vertices, c, X) * b_bar.transpose();
-  Eigen::Map<Mat3>(local_bar.frame.data()) = frame_bar;
-  Operator c_bar = Eigen::Map<const Eigen::Matrix<double, 3, Eigen::Dynamic>>(
-      bar.curvature_operator.data() + 3 * stencils.start[e], 3, local.size);
+/// From b = R^T sum_i (X_i - X_0) c_i^T to X, to the frame R and to c.
+void curvature_vjp(std::span<const Index> vertices,
+                   const ConstOperatorMap& c,
+                   const double* X,
+                   const Mat3& b_bar,
+                   const Mat3& frame,
+                   Mat3& frame_bar,
+                   OperatorMap c_bar,
+                   double* X_bar) {
+  const Mat3 Y_bar = frame * b_bar;
+  frame_bar = second_derivatives(vertices, c, X) * b_bar.transpose();
   const Vec3 origin = row(X, vertices[0]);
-  for (int i = 0; i < local.size; ++i) {
+  for (std::size_t i = 0; i < vertices.size(); ++i) {
     c_bar.col(i) += Y_bar.transpose() * (row(X, vertices[i]) - origin);
     Eigen::Map<Vec3>(X_bar + 3 * vertices[i]) += Y_bar * c.col(i);
   }
+}
 
-  switch (stencils.model[e]) {
-    case BendingModel::kPatch:
-      patch_operator_vjp(local, c_bar, local_bar);
-      break;
-    case BendingModel::kHinge:
-      hinge_operator_vjp(local, hinge_corners(stencils, e), c_bar, local_bar);
-      break;
+void bending_vjp(const BendingStencils& stencils,
+                 const double* X,
+                 const RestShapeBar& bar,
+                 double* X_bar) {
+  const Fits fits(stencils, X);
+  const std::vector<double> c = curvature_operator(stencils, fits);
+  std::vector<double> c_bar = bar.curvature_operator;
+  FitsBar fits_bar(fits);
+  std::vector<ChartBar> chart_bar(fits.chart.size());
+  for (Index e = 0; e < stencils.size(); ++e) {
+    const std::span<const Index> vertices = stencils.element(e);
+    const Index size = static_cast<Index>(vertices.size());
+    const std::ptrdiff_t offset = 3 * static_cast<std::ptrdiff_t>(stencils.start[e]);
+    OperatorMap element_bar(c_bar.data() + offset, 3, size);
+    Mat3 frame_bar;
+    curvature_vjp(vertices,
+                  ConstOperatorMap(c.data() + offset, 3, size),
+                  X,
+                  bar.curvature[e],
+                  fits.chart[e].frame(),
+                  frame_bar,
+                  element_bar,
+                  X_bar);
+    Eigen::Map<Mat3>(chart_bar[e].frame.data()) = frame_bar;
+    fits_bar.c[e] += element_bar.leftCols(fits.c[e].cols());
   }
-  chart_vjp(vertices,
-            {stencils.unfold_edge.data() + stencils.start[e], vertices.size()},
-            local,
-            X,
-            local_bar,
-            X_bar);
+  for (const Kink& kink : stencils.kinks) {
+    const Index e = kink.element;
+    kink_vjp(stencils,
+             fits,
+             kink,
+             ConstOperatorMap(c_bar.data() + 3 * static_cast<std::ptrdiff_t>(stencils.start[e]),
+                              3,
+                              stencils.start[e + 1] - stencils.start[e]),
+             fits_bar);
+  }
+  for (Index e = 0; e < stencils.size(); ++e) {
+    const Chart& local = fits.chart[e];
+    if (stencils.model[e] == BendingModel::kPatch) {
+      add_area_bar(local, bar.bending_area[e], chart_bar[e]);
+    }
+    chart_bar[e].length += fits_bar.base[e](0);
+    chart_bar[e].a += fits_bar.base[e](1);
+    chart_bar[e].b += fits_bar.base[e](2);
+    fit_operator_vjp(stencils, e, local, fits_bar.c[e], chart_bar[e]);
+    chart_vjp(stencils.fit(e), stencils.unfolding(e), local, X, chart_bar[e], X_bar);
+  }
 }
 
 void face_vjp(const Topology& topology,
@@ -306,9 +277,9 @@ void face_vjp(const Topology& topology,
   ChartBar local_bar;
   add_area_bar(local, area_bar, local_bar);
 
-  const std::array<Dual<3>, 3> base =
+  const std::array<Dual3, 3> base =
       variables<3>({local.base.length, local.base.a, local.base.b});
-  const std::array<Dual<3>, 6> g = shape_gradient(base[0], base[1], base[2]);
+  const std::array<Dual3, 6> g = shape_gradient(base[0], base[1], base[2]);
   Vec3 base_bar = Vec3::Zero();
   for (int k = 0; k < 6; ++k) base_bar += bar.shape_gradient[f](k / 2, k % 2) * g[k].derivative;
   local_bar.length += base_bar(0);
@@ -347,17 +318,20 @@ void fill_faces(const Topology& topology, const double* X, RestShape& rest) {
 RestShape rest_shape(const Topology& topology, const BendingStencils& stencils, const double* X) {
   RestShape rest;
   fill_faces(topology, X, rest);
-  rest.curvature_operator.resize(3 * stencils.vertices.size());
+  const Fits fits(stencils, X);
+  rest.curvature_operator = curvature_operator(stencils, fits);
   rest.curvature.resize(stencils.size());
   rest.bending_area.resize(stencils.size());
   for (Index e = 0; e < stencils.size(); ++e) {
-    const Chart local = element_chart(stencils, e, X);
-    const Operator c = element_operator(stencils, e, local);
-    std::copy(c.data(), c.data() + c.size(), rest.curvature_operator.data() + 3 * stencils.start[e]);
+    const std::span<const Index> vertices = stencils.element(e);
+    const ConstOperatorMap c(
+        rest.curvature_operator.data() + 3 * static_cast<std::ptrdiff_t>(stencils.start[e]),
+        3,
+        static_cast<Index>(vertices.size()));
     const bool patch = stencils.model[e] == BendingModel::kPatch;
-    rest.bending_area[e] = patch ? local.area() : 1.0;
-    rest.curvature[e] = local.frame().transpose() *
-                        second_derivatives(stencils.element(e), c, X);
+    rest.bending_area[e] = patch ? fits.chart[e].area() : 1.0;
+    rest.curvature[e] =
+        fits.chart[e].frame().transpose() * second_derivatives(vertices, c, X);
   }
   if (rest.area.empty()) return rest;
 
@@ -394,7 +368,7 @@ void rest_shape_vjp(const Topology& topology,
   for (Index f = 0; f < static_cast<Index>(topology.faces.size()); ++f) {
     face_vjp(topology, f, X, bar, X_bar);
   }
-  for (Index e = 0; e < stencils.size(); ++e) element_vjp(stencils, e, X, bar, X_bar);
+  bending_vjp(stencils, X, bar, X_bar);
   for (std::size_t e = 0; e < topology.edges.size(); ++e) {
     const auto [v0, v1] = topology.edges[e];
     const Vec3 bar_v1 = 2.0 * bar.edge_length_sq[e] * (row(X, v1) - row(X, v0));

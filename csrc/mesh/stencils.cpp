@@ -1,7 +1,9 @@
 #include <algorithm>
+#include <cmath>
 #include <stdexcept>
 
 #include "mesh/curvature_fit.h"
+#include "mesh/fit_operator.h"
 #include "mesh/local_chart.h"
 #include "mesh/rest_shape.h"
 
@@ -79,12 +81,89 @@ void append(const Patch& patch,
             std::array<Index, 2> faces,
             BendingModel model,
             BendingStencils& stencils) {
-  stencils.vertices.insert(stencils.vertices.end(), patch.vertices.begin(), patch.vertices.end());
+  stencils.fit_points.insert(
+      stencils.fit_points.end(), patch.vertices.begin(), patch.vertices.end());
   stencils.unfold_edge.insert(
       stencils.unfold_edge.end(), patch.unfold_edge.begin(), patch.unfold_edge.end());
-  stencils.start.push_back(static_cast<Index>(stencils.vertices.size()));
+  stencils.fit_start.push_back(static_cast<Index>(stencils.fit_points.size()));
   stencils.faces.push_back(faces);
   stencils.model.push_back(model);
+}
+
+/// Largest weight of the sum of two outward derivatives, relative to that of one of them, below
+/// which two quadratics agree across their side. Lower values change no mode of a plate in the
+/// fourth digit.
+constexpr double kAgreement = 0.1;
+
+/// The derivative across a side as one of its patches sees it.
+struct Outward {
+  std::span<const Index> points;
+  SideWeights weights;
+};
+
+Outward outward(const BendingStencils& stencils, Index e, Index corner, const double* X) {
+  const Chart local = element_chart(stencils, e, X);
+  return {.points = stencils.fit(e),
+          .weights = side_weights(side(base_parameters(local), corner),
+                                  fit_operator(stencils, e, local))};
+}
+
+bool agree(const Outward& s0, const Outward& s1) {
+  double largest = 0.0;
+  for (std::size_t i = 0; i < s0.points.size(); ++i) {
+    double sum = s0.weights(i);
+    for (std::size_t j = 0; j < s1.points.size(); ++j) {
+      if (s1.points[j] == s0.points[i]) sum += s1.weights(j);
+    }
+    largest = std::max(largest, std::abs(sum));
+  }
+  for (std::size_t j = 0; j < s1.points.size(); ++j) {
+    if (std::ranges::find(s0.points, s1.points[j]) == s0.points.end()) {
+      largest = std::max(largest, std::abs(s1.weights(j)));
+    }
+  }
+  return largest < kAgreement * s0.weights.cwiseAbs().maxCoeff();
+}
+
+Index corner_opposite(const Topology& topology, Index face, Index edge) {
+  const std::array<Index, 3>& edges = topology.face_edges[face];
+  return static_cast<Index>(std::ranges::find(edges, edge) - edges.begin());
+}
+
+void find_kinks(const Topology& topology, const double* X, BendingStencils& stencils) {
+  std::vector<Index> patch_of_face(topology.faces.size(), -1);
+  for (Index e = 0; e < stencils.size(); ++e) {
+    if (stencils.model[e] == BendingModel::kPatch) patch_of_face[stencils.faces[e][0]] = e;
+  }
+  for (Index edge = 0; edge < static_cast<Index>(topology.edges.size()); ++edge) {
+    const auto [f0, f1] = topology.edge_faces[edge];
+    if (f1 < 0 || patch_of_face[f0] < 0 || patch_of_face[f1] < 0) continue;
+    const Index e0 = patch_of_face[f0], e1 = patch_of_face[f1];
+    const Index p0 = corner_opposite(topology, f0, edge);
+    const Index p1 = corner_opposite(topology, f1, edge);
+    if (agree(outward(stencils, e0, p0, X), outward(stencils, e1, p1, X))) continue;
+    stencils.kinks.push_back({.element = e0, .corner = p0, .other = e1, .other_corner = p1});
+    stencils.kinks.push_back({.element = e1, .corner = p1, .other = e0, .other_corner = p0});
+  }
+}
+
+/// Each element couples the points of its own quadratic and of those across its kinks.
+void gather_vertices(BendingStencils& stencils) {
+  std::vector<std::vector<Index>> elements(stencils.size());
+  for (Index e = 0; e < stencils.size(); ++e) {
+    const std::span<const Index> points = stencils.fit(e);
+    elements[e].assign(points.begin(), points.end());
+  }
+  for (const Kink& kink : stencils.kinks) {
+    std::vector<Index>& element = elements[kink.element];
+    for (const Index v : stencils.fit(kink.other)) {
+      if (std::ranges::find(element, v) == element.end()) element.push_back(v);
+    }
+  }
+  for (const std::vector<Index>& element : elements) {
+    stencils.vertices.insert(stencils.vertices.end(), element.begin(), element.end());
+    stencils.start.push_back(static_cast<Index>(stencils.vertices.size()));
+  }
 }
 
 }  // namespace
@@ -114,6 +193,8 @@ BendingStencils choose_stencils(const Topology& topology,
     // Two faces on the same three vertices have no hinge.
     if (patch.vertices.size() == 4) append(patch, {f0, f1}, BendingModel::kHinge, stencils);
   }
+  find_kinks(topology, X, stencils);
+  gather_vertices(stencils);
   return stencils;
 }
 

@@ -60,15 +60,9 @@ def test_saddle_and_sphere_differ_by_poisson():
 FREE_PLATE = np.array([13.49, 19.79, 24.43])
 
 
-@pytest.mark.parametrize(
-    ("name", "low", "high"),
-    [
-        pytest.param("right", 0.95, 1.005, id="one diagonal: converges, 4 % below at 12 cells"),
-        pytest.param("delaunay", 0.85, 1.005, id="unstructured: relaxes a little"),
-        pytest.param("alternating", 0.70, 1.005, id="alternating: relaxes, the known limit"),
-    ],
-)
-def test_modes_of_a_free_plate(name, low, high):
+@pytest.mark.parametrize("name", ["right", "left", "alternating", "delaunay"])
+def test_modes_of_a_free_plate(name):
+    """The stiffness after relaxation: single quadratics alone lose up to 45 % of it here."""
     X, faces = MESHES[name](13, 13)
     X /= 12
     elastic = model(X, faces, bending=1.0, poisson=0.3)
@@ -77,8 +71,24 @@ def test_modes_of_a_free_plate(name, low, high):
     values = np.linalg.eigvalsh(scale[:, None] * H * scale)
     assert np.abs(values[:3]).max() < 1e-8  # affine maps and nothing else
     ratio = np.sqrt(values[3:6]) / FREE_PLATE
-    assert (ratio > low).all()
-    assert (ratio < high).all()
+    # 12 cells: 4 % of discretization error in the frequency of the saddle, a quarter of it at 24.
+    assert (ratio > 0.95).all()
+    assert (ratio < 1.005).all()
+
+
+@pytest.mark.parametrize("name", ["right", "alternating", "equilateral"])
+def test_constant_curvature_leaves_no_force_inside(name):
+    X, faces = MESHES[name](9, 9)
+    elastic = model(X, faces, bending=D, poisson=0.3)
+    x = X.copy()
+    x[:, 2] = 0.01 * (X[:, 0] ** 2 - 0.7 * X[:, 1] ** 2 + 0.4 * X[:, 0] * X[:, 1])
+    depth = np.minimum(X[:, 1], X[:, 1].max() - X[:, 1])
+    depth = np.minimum(depth, np.minimum(*(np.abs(X[:, 0] - end) for end in X[[0, -1], 0])))
+    side = X[:, 0] - 0.5 * X[:, 1] if name == "equilateral" else X[:, 0]
+    inside = (depth > 2.5) & (side > 2.5) & (side < 5.5)
+    assert inside.any()
+    g = elastic.gradient(x)
+    assert np.abs(g[inside]).max() < 1e-10 * np.abs(g).max()
 
 
 @pytest.mark.parametrize("bending_model", ["patch", "hinge"])
