@@ -106,6 +106,7 @@ class Simulator {
                     const std::vector<std::string>& needs,
                     int threads);
   nb::object energy(const nb::dict& inputs) const;
+  nb::object path(const nb::dict& inputs);
   double smallest_nonadjacent_distance() const;
   double default_barrier_stiffness(const nb::dict& inputs, double barrier_distance) const {
     const Arrays arrays(inputs);
@@ -198,6 +199,30 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   }
   out["message"] = messages;
   return out;
+}
+
+/// The polyline of accepted iterates of a single environment's step, for an independent judge.
+nb::object Simulator::path(const nb::dict& inputs) {
+  const Arrays arrays(inputs);
+  const auto n = 3 * static_cast<std::size_t>(scene_.cloth_vertex_count());
+  const auto all = 3 * static_cast<std::size_t>(scene_.vertex_count());
+  std::vector<double> positions(n), velocities(n), body_forces(all - n);
+  std::vector<std::vector<double>> iterates;
+  for_environments(1, 1, [&](Index, const Checkpoint& checkpoint) {
+    step::forward(scene_,
+                  arrays.environment(0),
+                  checkpoint,
+                  {.positions = positions.data(),
+                   .velocities = velocities.data(),
+                   .body_forces = body_forces.data(),
+                   .tape = {},
+                   .path = &iterates},
+                  &factors_);
+  });
+  Owned<double> out = make_array<double>({iterates.size(), all / 3, 3});
+  double* end = out.data;
+  for (const std::vector<double>& x : iterates) end = std::ranges::copy(x, end).out;
+  return out.array;
 }
 
 nb::dict Simulator::backward(const nb::dict& inputs,
@@ -388,6 +413,11 @@ void simulator(nb::module_& m) {
            "needs"_a,
            "threads"_a)
       .def("energy", &Simulator::energy, "inputs"_a)
+      .def("path",
+           &Simulator::path,
+           "inputs"_a,
+           "Iterates of the first environment's step, bodies included: no segment of this polyline "
+           "has a collision.")
       .def("smallest_nonadjacent_distance", &Simulator::smallest_nonadjacent_distance)
       .def("default_barrier_stiffness",
            &Simulator::default_barrier_stiffness,

@@ -38,6 +38,9 @@ struct Outputs {
   double* velocities;   ///< [N, 3]
   double* body_forces;  ///< [V, 3]
   Tape tape;            ///< pointers are null where no tape is wanted
+  /// Accepted iterates of all surfaces, each [3 (N + V)], first the start; null where not wanted.
+  /// Straight motion between them is free of collisions.
+  std::vector<std::vector<double>>* path = nullptr;
 };
 
 /// One step: x_{n+1}, v_{n+1}, the contact forces on the bodies' vertices, and the tape.
