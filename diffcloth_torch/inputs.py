@@ -30,6 +30,7 @@ from diffcloth_torch.materials import FACE_RANGES
 from diffcloth_torch.poses import check_quaternions
 from diffcloth_torch.scene import Assembly
 from diffcloth_torch.state import State
+from diffcloth_torch.surfaces import check_areas
 
 __all__ = [
     "PARAMETER_NAMES",
@@ -298,6 +299,13 @@ def parameter_inputs(
         unbatched = given is None or name in parameters._unbatched
         rows = _environments(label, tuple(tensor.shape), shapes.shared, batch, unbatched)
         inputs[name] = tensor.reshape(rows, *shapes.core)
+        if (
+            name == "rest_positions"
+            and given is not None
+            and not torch.equal(tensor, defaults[name])
+        ):
+            for shape in _numbers(inputs[name]):
+                check_areas("parameters", name, shape, assembly.faces)
     return inputs
 
 

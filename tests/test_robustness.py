@@ -28,7 +28,7 @@ def tent(cells=6, **keywords):
         cells,
         cells,
         size=0.4,
-        pose=[0.013, 0.007, 0.108, 0.99, 0.01, 0.02, 0.1],
+        pose=[0.013, 0.007, 0.115, 0.99, 0.01, 0.02, 0.1],
         pins={"corner": [0]},
         material=dc.Material(stretch=100.0),
     )
@@ -47,7 +47,7 @@ def contact(sim):
     state = sim.initial_state()
     for _ in range(10):
         state = sim.step(state)
-    assert state.report.contact_count > 3
+    assert state.report.contact_count > 1
     return state
 
 

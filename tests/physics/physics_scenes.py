@@ -113,7 +113,10 @@ class Judge:
         ipctk = self._ipctk
         if any(
             ipctk.is_step_collision_free(self.mesh, a, b, narrow_phase_ccd=ccd)
-            for ccd in (ipctk.TightInclusionCCD(), ipctk.AdditiveCCD(conservative_rescaling=0.99))
+            for ccd in (
+                ipctk.AdditiveCCD(max_iterations=1_000, conservative_rescaling=0.99),
+                ipctk.TightInclusionCCD(max_iterations=1_000),
+            )
         ):
             return True
         if depth == 0 or ipctk.has_intersections(self.mesh, b):

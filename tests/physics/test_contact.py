@@ -58,7 +58,8 @@ def test_a_cloth_drapes_over_a_ball_without_intersections(scheme, thickness):
     for _ in range(25):
         state = sim.step(state)
         assert judge.is_free(state)
-        assert state.report.minimum_distance > 0
+        if state.report.contact_count:
+            assert 0 < state.report.minimum_distance < sim.parameters().barrier_distance
         contacts = max(contacts, state.report.contact_count)
     assert contacts > 20
     assert state.positions[:, 2].min() < 0.1  # it hangs around the ball

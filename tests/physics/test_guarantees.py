@@ -18,7 +18,6 @@ from physics_scenes import (
 import diffcloth_torch as dc
 
 DT = 0.01
-SCHEMES = ["coupled", "split"]
 
 
 def curtain(pins):
@@ -70,7 +69,7 @@ def attempt(sim, judge, state, control):
 @pytest.mark.parametrize("speed", [10.0, 100.0])
 @pytest.mark.parametrize("body", ["plate", "rod", "ball"])
 @pytest.mark.parametrize("pins", ["top", "all"])
-@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("scheme", ["coupled", pytest.param("split", marks=pytest.mark.slow)])
 def test_a_fast_body_never_passes_through(speed, body, pins, scheme):
     sim = dc.Simulator(dc.Scene([curtain(pins)], [bodies()[body]]), DT, scheme=scheme)
     judge = Judge(sim)
@@ -89,20 +88,19 @@ def test_a_fast_body_never_passes_through(speed, body, pins, scheme):
 @pytest.mark.parametrize("degrees", [60.0, 179.0])
 @pytest.mark.parametrize("pins", ["top", "all"])
 def test_a_fast_turning_body_never_passes_through(degrees, pins):
-    # A plate beside the curtain that turns through it.
-    # It swings about its near edge, away from the cloth.
-    plate = dc.RigidBody.box([0.3, 0.2, 0.01])
-    hinged = plate.vertices + np.array([0.15, 0, 0])
-    start = quaternion([0, 0, 1], 0.5 * np.pi)
-    body = dc.RigidBody(hinged, plate.faces, motion="kinematic", pose=[-0.1, 0.01, -0.03, *start])
+    # A wing hinged beside the curtain that starts to point away from it and turns through it.
+    wing = dc.RigidBody.box([0.3, 0.2, 0.01])
+    hinged = wing.vertices + np.array([0.15, 0, 0])
+    start = quaternion([0, 1, 0], np.pi - 0.6)
+    body = dc.RigidBody(hinged, wing.faces, motion="kinematic", pose=[-0.05, 0.01, -0.1, *start])
     sim = dc.Simulator(dc.Scene([curtain(pins)], [body]), DT)
     judge = Judge(sim)
     state = sim.initial_state()
     poses = state.body_poses.clone()
-    angle, moved = 0.5 * np.pi, 0
-    for _ in range(2):
-        angle -= np.radians(degrees)
-        poses[0, 3:] = tensor(quaternion([0, 0, 1], angle))
+    angle, moved = np.pi - 0.6, 0
+    for _ in range(3):
+        angle += np.radians(degrees)
+        poses[0, 3:] = tensor(quaternion([0, 1, 0], angle))
         after = attempt(sim, judge, state, dc.Control(body_poses=poses))
         if after is None:
             break
@@ -117,8 +115,8 @@ def test_a_body_driven_far_into_a_pinned_cloth_stretches_it_or_is_refused():
     judge = Judge(sim)
     state = sim.initial_state()
     poses = state.body_poses.clone()
-    for _ in range(6):
-        poses[0, 0] += 0.1
+    for _ in range(3):
+        poses[0, 0] += 0.15
         after = attempt(sim, judge, state, dc.Control(body_poses=poses))
         if after is None:
             break
