@@ -114,6 +114,11 @@ class Simulator {
   nb::object find_overlap(const Doubles& positions,
                           const Doubles& body_poses,
                           const Doubles& thickness) const;
+  double reference_factorization_seconds(const nb::dict& inputs, int repeats) const {
+    const Arrays arrays(inputs);
+    const nb::gil_scoped_release nogil;
+    return step::reference_factorization_seconds(scene_, arrays.environment(0), repeats);
+  }
   void forget_factors() { factors_.clear(); }
 
  private:
@@ -393,6 +398,11 @@ void simulator(nb::module_& m) {
            &Simulator::default_barrier_stiffness,
            "inputs"_a,
            "barrier_distance"_a)
+      .def("reference_factorization_seconds",
+           &Simulator::reference_factorization_seconds,
+           "inputs"_a,
+           "repeats"_a,
+           "Seconds of one factorization of the contact-free Hessian by Eigen, for benchmarks.")
       .def("find_overlap",
            &Simulator::find_overlap,
            "positions"_a,

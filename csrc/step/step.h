@@ -73,6 +73,11 @@ void backward(const Scene& scene,
 /// Elastic energy + gravity + soft pins + barrier at the positions of the inputs [J].
 double potential_energy(const Scene& scene, const Inputs& inputs);
 
+/// The unit EF that speeds are stated in: seconds of one numeric factorization of the contact-free
+/// Hessian at the inputs' positions by Eigen's SimplicialLDLT, minimum degree order, no BLAS; the
+/// median of several.
+double reference_factorization_seconds(const Scene& scene, const Inputs& inputs, int repeats);
+
 /// kappa that balances the barrier with the contact-free Hessian at rest (3-contact, 3.3) [Pa].
 double default_barrier_stiffness(const Scene& scene, const Inputs& inputs, double barrier_distance);
 
