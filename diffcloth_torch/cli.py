@@ -153,7 +153,7 @@ def _write_optimization(task: Task, found: Optimization, out: Path) -> None:
     }
     write_metrics(out / "metrics.json", metrics)
     torch.save({"best": found.best.actions, "initial": found.first.actions}, out / "actions.pt")
-    arrays = {name: tensor.numpy() for name, tensor in found.best.actions.items()}
+    arrays: dict[str, Any] = {name: a.numpy() for name, a in found.best.actions.items()}
     np.savez(out / "actions.npz", **arrays)
 
 
