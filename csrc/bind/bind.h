@@ -6,6 +6,12 @@ namespace diffcloth::bind {
 
 namespace nb = nanobind;
 
+/// `build_info()`: what this core was built with.
+void build_info(nb::module_& m);
+
+/// The simulator's handle: forward and backward of a step.
+void simulator(nb::module_& m);
+
 /// Contact kernels one by one, for tests against independent references.
 void contact_kernels(nb::module_& m);
 

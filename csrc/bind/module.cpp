@@ -3,6 +3,9 @@
 NB_MODULE(_core, m) {
   namespace nb = nanobind;
   m.doc() = "C++ core of diffcloth_torch. The public interface is the Python package.";
+  diffcloth::bind::build_info(m);
+
+  diffcloth::bind::simulator(m);
 
   nb::module_ kernels = m.def_submodule("kernels", "Single kernels, exposed for tests.");
   diffcloth::bind::contact_kernels(kernels);

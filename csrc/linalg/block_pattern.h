@@ -1,6 +1,7 @@
 #pragma once
 
 #include <span>
+#include <utility>
 #include <vector>
 
 #include "common/types.h"
@@ -18,6 +19,10 @@ class BlockPattern {
 
   /// Pattern in which the vertices of each clique are coupled with each other.
   BlockPattern(Index vertex_count, const std::vector<std::vector<Index>>& cliques);
+
+  /// Pattern from finished columns: see column_start() and row().
+  BlockPattern(std::vector<Index> column_start, std::vector<Index> row)
+      : column_start_(std::move(column_start)), row_(std::move(row)) {}
 
   /// Pattern from lower-triangle (row, column) pairs with row >= column, in any order, repeated or
   /// not. The diagonal is added.

@@ -1,0 +1,27 @@
+#include "common/build_info.h"
+
+#include <nanobind/stl/string.h>
+
+#include "bind/bind.h"
+
+namespace diffcloth::bind {
+
+void build_info(nb::module_& m) {
+  m.def(
+      "build_info",
+      [] {
+        const BuildInfo info = diffcloth::build_info();
+        nb::dict result;
+        result["compiler"] = info.compiler;
+        result["build_type"] = info.build_type;
+        result["flags"] = info.flags;
+        result["processor"] = info.processor;
+        result["eigen"] = info.eigen;
+        result["factorization"] = info.factorization;
+        result["blas"] = info.blas;
+        return result;
+      },
+      "What this core was built with, and the BLAS it found in this process.");
+}
+
+}  // namespace diffcloth::bind

@@ -1,0 +1,409 @@
+#include <map>
+#include <memory>
+#include <stdexcept>
+#include <string>
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include "bind/bind.h"
+#include "common/parallel_for.h"
+#include "step/step.h"
+
+namespace diffcloth::bind {
+namespace {
+
+using namespace nb::literals;  // NOLINT: the literal suffix of nanobind
+using step::Input;
+using step::kInputCount;
+
+using Doubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
+using Integers = nb::ndarray<const std::int64_t, nb::c_contig, nb::device::cpu>;
+using Indices = nb::ndarray<const std::int32_t, nb::c_contig, nb::device::cpu>;
+
+/// A NumPy array that owns its memory.
+template <class T>
+struct Owned {
+  T* data;
+  nb::object array;
+};
+
+template <class T>
+Owned<T> make_array(const std::vector<std::size_t>& shape) {
+  std::size_t size = 1;
+  for (const std::size_t n : shape) size *= n;
+  auto memory = std::make_unique<T[]>(std::max<std::size_t>(size, 1));
+  T* data = memory.get();
+  nb::capsule owner(memory.release(), [](void* p) noexcept { delete[] static_cast<T*>(p); });
+  return {data, nb::cast(nb::ndarray<nb::numpy, T>(data, shape.size(), shape.data(), owner))};
+}
+
+template <class T>
+std::vector<T> to_vector(const nb::ndarray<const T, nb::c_contig, nb::device::cpu>& array) {
+  return {array.data(), array.data() + array.size()};
+}
+
+std::vector<std::array<Index, 3>> to_faces(const Indices& array) {
+  std::vector<std::array<Index, 3>> faces(array.size() / 3);
+  std::copy_n(array.data(), array.size(), faces.empty() ? nullptr : faces.front().data());
+  return faces;
+}
+
+/// The arrays of a call, and what one environment sees of them.
+struct Arrays {
+  std::array<Doubles, kInputCount> array;
+  std::array<bool, kInputCount> present{};
+  std::size_t environments = 1;
+
+  explicit Arrays(const nb::dict& inputs) {
+    for (std::size_t k = 0; k < kInputCount; ++k) {
+      const nb::str name(step::kInputNames[k]);
+      if (!inputs.contains(name)) continue;
+      array[k] = nb::cast<Doubles>(inputs[name]);
+      present[k] = true;
+    }
+    environments = array[static_cast<std::size_t>(Input::kPositions)].shape(0);
+  }
+
+  step::Inputs environment(std::size_t b) const {
+    step::Inputs inputs;
+    for (std::size_t k = 0; k < kInputCount; ++k) {
+      if (!present[k]) continue;
+      const std::size_t copies = array[k].shape(0);
+      const std::size_t count = copies == 0 ? 0 : array[k].size() / copies;
+      inputs.views[k] = {.data = array[k].data() + (copies > 1 ? b * count : 0), .count = count};
+    }
+    return inputs;
+  }
+};
+
+/// Runs body for every environment without the GIL, letting Ctrl-C through.
+void for_environments(std::size_t count,
+                      int threads,
+                      const std::function<void(Index, const Checkpoint&)>& body) {
+  Interrupt interrupt([] {
+    const nb::gil_scoped_acquire gil;
+    return PyErr_CheckSignals() != 0;
+  });
+  try {
+    const nb::gil_scoped_release nogil;
+    parallel_for(static_cast<Index>(count), threads, interrupt, body);
+  } catch (const Interrupted&) {
+    throw nb::python_error();  // the error that the signal handler has set
+  }
+}
+
+class Simulator {
+ public:
+  explicit Simulator(step::Description description) : scene_(std::move(description)) {}
+
+  nb::dict forward(const nb::dict& inputs, bool tape, int threads);
+  nb::dict backward(const nb::dict& inputs,
+                    const nb::dict& tape,
+                    const nb::dict& cotangents,
+                    const std::vector<std::string>& needs,
+                    int threads);
+  nb::object energy(const nb::dict& inputs) const;
+  double smallest_nonadjacent_distance() const;
+  double default_barrier_stiffness(const nb::dict& inputs, double barrier_distance) const {
+    const Arrays arrays(inputs);
+    return step::default_barrier_stiffness(scene_, arrays.environment(0), barrier_distance);
+  }
+  nb::object find_overlap(const Doubles& positions,
+                          const Doubles& body_poses,
+                          const Doubles& thickness) const;
+  void forget_factors() { factors_.clear(); }
+
+ private:
+  step::Scene scene_;
+  step::FactorCache factors_;
+};
+
+nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
+  const Arrays arrays(inputs);
+  const std::size_t b = arrays.environments;
+  const auto n = static_cast<std::size_t>(scene_.cloth_vertex_count());
+  const std::size_t v = static_cast<std::size_t>(scene_.vertex_count()) - n;
+  const auto k = static_cast<std::size_t>(scene_.given.friction_iterations);
+  const bool split = scene_.given.scheme == step::Scheme::kSplit;
+
+  nb::dict out;
+  const auto doubles = [&](const char* name, std::vector<std::size_t> shape) {
+    Owned<double> owned = make_array<double>(shape);
+    std::size_t size = 1;
+    for (const std::size_t extent : shape) size *= extent;
+    std::fill_n(owned.data, size, 0.0);
+    out[name] = owned.array;
+    return owned.data;
+  };
+  const auto integers = [&](const char* name) {
+    Owned<std::int64_t> owned = make_array<std::int64_t>({b});
+    std::fill_n(owned.data, b, 0);
+    out[name] = owned.array;
+    return owned.data;
+  };
+
+  double* positions = doubles("positions", {b, n, 3});
+  double* velocities = doubles("velocities", {b, n, 3});
+  double* body_forces = doubles("body_forces", {b, v, 3});
+  step::Tape tapes;
+  if (tape) {
+    tapes = {.iterates = doubles("tape_iterates", {b, k, n, 3}),
+             .factored = doubles("tape_factored", {b, k, n, 3}),
+             .elastic = split ? doubles("tape_elastic", {b, 2, n, 3}) : nullptr,
+             .solves = integers("tape_solves"),
+             .key = integers("tape_key")};
+  }
+  std::vector<step::Report> reports(b);
+  for_environments(b, threads, [&](Index i, const Checkpoint& checkpoint) {
+    const auto e = static_cast<std::size_t>(i);
+    step::Tape own;
+    if (tape) {
+      own = {.iterates = tapes.iterates + e * k * n * 3,
+             .factored = tapes.factored + e * k * n * 3,
+             .elastic = split ? tapes.elastic + e * 2 * n * 3 : nullptr,
+             .solves = tapes.solves + e,
+             .key = tapes.key + e};
+    }
+    reports[e] = step::forward(scene_,
+                               arrays.environment(e),
+                               checkpoint,
+                               {.positions = positions + e * n * 3,
+                                .velocities = velocities + e * n * 3,
+                                .body_forces = body_forces + e * v * 3,
+                                .tape = own},
+                               &factors_);
+  });
+
+  std::int64_t* status = integers("status");
+  std::int64_t* iterations = integers("iterations");
+  std::int64_t* contact_count = integers("contact_count");
+  double* residual = doubles("residual", {b});
+  double* minimum_distance = doubles("minimum_distance", {b});
+  double* motion_fraction = doubles("motion_fraction", {b});
+  double* seconds = doubles("seconds", {b, solver::kPhaseCount});
+  nb::list messages;
+  for (std::size_t e = 0; e < b; ++e) {
+    const step::Report& report = reports[e];
+    status[e] = static_cast<std::int64_t>(report.result);
+    iterations[e] = report.iterations;
+    contact_count[e] = report.contact_count;
+    residual[e] = report.residual;
+    minimum_distance[e] = report.minimum_distance;
+    motion_fraction[e] = report.motion_fraction;
+    std::ranges::copy(report.seconds, seconds + e * solver::kPhaseCount);
+    messages.append(report.message);
+  }
+  out["message"] = messages;
+  return out;
+}
+
+nb::dict Simulator::backward(const nb::dict& inputs,
+                             const nb::dict& tape,
+                             const nb::dict& cotangents,
+                             const std::vector<std::string>& needs,
+                             int threads) {
+  const Arrays arrays(inputs);
+  const std::size_t b = arrays.environments;
+  const auto n = static_cast<std::size_t>(scene_.cloth_vertex_count());
+  const std::size_t v = static_cast<std::size_t>(scene_.vertex_count()) - n;
+  const auto k = static_cast<std::size_t>(scene_.given.friction_iterations);
+
+  const auto positions_bar = nb::cast<Doubles>(cotangents["positions"]);
+  const auto velocities_bar = nb::cast<Doubles>(cotangents["velocities"]);
+  const auto forces_bar = nb::cast<Doubles>(cotangents["body_forces"]);
+  const auto iterates = nb::cast<Doubles>(tape["tape_iterates"]);
+  const auto factored = nb::cast<Doubles>(tape["tape_factored"]);
+  const bool split = tape.contains("tape_elastic");
+  const Doubles elastic = split ? nb::cast<Doubles>(tape["tape_elastic"]) : Doubles();
+  const auto solves = nb::cast<Integers>(tape["tape_solves"]);
+  const auto key = nb::cast<Integers>(tape["tape_key"]);
+
+  // Each environment writes into its own copy; shared inputs are then summed in index order.
+  struct Wanted {
+    std::size_t input, count, copies;
+    double* out;
+    std::vector<double> own;
+  };
+  nb::dict out;
+  std::vector<Wanted> wanted;
+  for (const std::string& name : needs) {
+    const auto* found = std::ranges::find(step::kInputNames, name);
+    const auto input = static_cast<std::size_t>(found - step::kInputNames.begin());
+    if (input == kInputCount || !arrays.present[input]) {
+      throw nb::value_error(("backward: `needs` has an unknown input " + name).c_str());
+    }
+    const Doubles& array = arrays.array[input];
+    std::vector<std::size_t> shape;
+    for (std::size_t d = 0; d < array.ndim(); ++d) shape.push_back(array.shape(d));
+    Owned<double> owned = make_array<double>(shape);
+    std::fill_n(owned.data, array.size(), 0.0);
+    out[name.c_str()] = owned.array;
+    const std::size_t copies = shape.empty() ? 1 : shape[0];
+    const std::size_t count = copies == 0 ? 0 : array.size() / copies;
+    wanted.push_back({.input = input,
+                      .count = count,
+                      .copies = copies,
+                      .out = owned.data,
+                      .own = std::vector<double>(b * count, 0.0)});
+  }
+
+  for_environments(b, threads, [&](Index i, const Checkpoint& checkpoint) {
+    const auto e = static_cast<std::size_t>(i);
+    step::Gradients gradients;
+    for (Wanted& w : wanted) gradients.data[w.input] = w.own.data() + e * w.count;
+    step::backward(scene_,
+                   arrays.environment(e),
+                   {.iterates = iterates.data() + e * k * n * 3,
+                    .factored = factored.data() + e * k * n * 3,
+                    .elastic = split ? elastic.data() + e * 2 * n * 3 : nullptr,
+                    .solves = solves.data() + e,
+                    .key = key.data() + e},
+                   {.positions = positions_bar.data() + e * n * 3,
+                    .velocities = velocities_bar.data() + e * n * 3,
+                    .body_forces = forces_bar.data() + e * v * 3},
+                   checkpoint,
+                   gradients,
+                   factors_);
+  });
+  for (const Wanted& w : wanted) {
+    for (std::size_t e = 0; e < b; ++e) {
+      double* target = w.out + (w.copies > 1 ? e * w.count : 0);
+      for (std::size_t a = 0; a < w.count; ++a) target[a] += w.own[e * w.count + a];
+    }
+  }
+  return out;
+}
+
+nb::object Simulator::energy(const nb::dict& inputs) const {
+  const Arrays arrays(inputs);
+  Owned<double> result = make_array<double>({arrays.environments});
+  for (std::size_t e = 0; e < arrays.environments; ++e) {
+    result.data[e] = step::potential_energy(scene_, arrays.environment(e));
+  }
+  return result.array;
+}
+
+double Simulator::smallest_nonadjacent_distance() const {
+  // Bodies do not count; their place does not matter.
+  std::vector<double> x = scene_.given.rest_vertices;
+  x.resize(3 * static_cast<std::size_t>(scene_.vertex_count()), 0.0);
+  return contact::smallest_nonadjacent_distance(scene_.collision_mesh, x.data());
+}
+
+nb::object Simulator::find_overlap(const Doubles& positions,
+                                   const Doubles& body_poses,
+                                   const Doubles& thickness) const {
+  std::vector<double> x = to_vector(positions);
+  const std::size_t cloth = x.size();
+  x.resize(3 * static_cast<std::size_t>(scene_.vertex_count()));
+  if (scene_.given.bodies.count() > 0) {
+    scene_.given.bodies.place(body_poses.data(), x.data() + cloth);
+  }
+  contact::BroadPhase::Scratch scratch;
+  const std::string text = step::find_overlap(scene_, x.data(), to_vector(thickness), scratch);
+  return text.empty() ? nb::none() : nb::cast(text);
+}
+
+step::Description describe(const Doubles& vertices,
+                           const Doubles& rest_vertices,
+                           const Indices& faces,
+                           const Indices& cloth_vertex_start,
+                           const Indices& cloth_face_start,
+                           const std::vector<std::string>& bending_models,
+                           const Indices& pins,
+                           const Indices& soft_pins,
+                           const Doubles& body_vertices,
+                           const Indices& body_faces,
+                           const Indices& body_vertex_start,
+                           bool self_contact,
+                           double dt,
+                           const std::string& scheme,
+                           const std::string& metric,
+                           int friction_iterations,
+                           double tolerance,
+                           int max_iterations) {
+  step::Description d;
+  d.vertices = to_vector(vertices);
+  d.rest_vertices = to_vector(rest_vertices);
+  d.faces = to_faces(faces);
+  d.cloth_vertex_start = to_vector(cloth_vertex_start);
+  d.cloth_face_start = to_vector(cloth_face_start);
+  for (const std::string& model : bending_models) {
+    d.bending_models.push_back(model == "hinge" ? mesh::BendingModel::kHinge
+                                                : mesh::BendingModel::kPatch);
+  }
+  d.pins = to_vector(pins);
+  d.soft_pins = to_vector(soft_pins);
+  d.bodies = {.vertices = to_vector(body_vertices), .vertex_start = to_vector(body_vertex_start)};
+  d.body_faces = to_faces(body_faces);
+  d.self_contact = self_contact;
+  d.dt = dt;
+  d.scheme = scheme == "split" ? step::Scheme::kSplit : step::Scheme::kCoupled;
+  d.metric = metric == "identity" ? step::Metric::kIdentity : step::Metric::kMass;
+  d.friction_iterations = friction_iterations;
+  d.options = {.tolerance = tolerance, .max_iterations = max_iterations};
+  return d;
+}
+
+}  // namespace
+
+void simulator(nb::module_& m) {
+  static nb::object simulation_error =
+      nb::exception<std::domain_error>(m, "SimulationError", PyExc_RuntimeError);
+
+  nb::class_<Simulator>(m, "Simulator")
+      .def(
+          "__init__",
+          [](Simulator* self, nb::kwargs k) {
+            const auto doubles = [&](const char* name) { return nb::cast<Doubles>(k[name]); };
+            const auto indices = [&](const char* name) { return nb::cast<Indices>(k[name]); };
+            new (self) Simulator(describe(doubles("vertices"),
+                                          doubles("rest_vertices"),
+                                          indices("faces"),
+                                          indices("cloth_vertex_start"),
+                                          indices("cloth_face_start"),
+                                          nb::cast<std::vector<std::string>>(k["bending_models"]),
+                                          indices("pins"),
+                                          indices("soft_pins"),
+                                          doubles("body_vertices"),
+                                          indices("body_faces"),
+                                          indices("body_vertex_start"),
+                                          nb::cast<bool>(k["self_contact"]),
+                                          nb::cast<double>(k["dt"]),
+                                          nb::cast<std::string>(k["scheme"]),
+                                          nb::cast<std::string>(k["metric"]),
+                                          nb::cast<int>(k["friction_iterations"]),
+                                          nb::cast<double>(k["tolerance"]),
+                                          nb::cast<int>(k["max_iterations"])));
+          })
+      .def("forward", &Simulator::forward, "inputs"_a, "tape"_a, "threads"_a)
+      .def("backward",
+           &Simulator::backward,
+           "inputs"_a,
+           "tape"_a,
+           "cotangents"_a,
+           "needs"_a,
+           "threads"_a)
+      .def("energy", &Simulator::energy, "inputs"_a)
+      .def("smallest_nonadjacent_distance", &Simulator::smallest_nonadjacent_distance)
+      .def("default_barrier_stiffness",
+           &Simulator::default_barrier_stiffness,
+           "inputs"_a,
+           "barrier_distance"_a)
+      .def("find_overlap",
+           &Simulator::find_overlap,
+           "positions"_a,
+           "body_poses"_a,
+           "thickness"_a)
+      .def("forget_factors",
+           &Simulator::forget_factors,
+           "Drop the factors kept for backward; they are made again when needed.")
+      .def_prop_ro_static("phases", [](nb::handle) {
+        return std::vector<std::string>(solver::kPhaseNames.begin(), solver::kPhaseNames.end());
+      });
+}
+
+}  // namespace diffcloth::bind

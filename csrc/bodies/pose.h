@@ -1,0 +1,42 @@
+#pragma once
+
+#include <vector>
+
+#include "common/types.h"
+
+namespace diffcloth::bodies {
+
+/// Pose of a body in the world: position [m] and quaternion wxyz, of any length but zero; 7 doubles.
+using Pose = Eigen::Matrix<double, 7, 1>;
+
+/// Rotation matrix of the normalized quaternion of a pose.
+Mat3 rotation(const Pose& pose);
+
+/// World positions p + R(q / |q|) y of body-frame points y.
+void transform(const Pose& pose, const double* points, Index count, double* out);
+
+/// Pull cotangents of the world positions back to the pose's seven numbers, normalization included.
+Pose transform_vjp(const Pose& pose, const double* points, Index count, const double* out_bar);
+
+/// Point at fraction s of the way between two poses: straight line and great arc (slerp).
+Pose interpolate(const Pose& from, const Pose& to, double s);
+
+/// Angle between two poses' rotations, in [0, pi] [rad].
+double angle(const Pose& from, const Pose& to);
+
+/// Vertices of all bodies, body by body.
+struct BodySet {
+  std::vector<double> vertices;     ///< [3 V] body frame
+  std::vector<Index> vertex_start;  ///< [K + 1]
+
+  Index count() const { return static_cast<Index>(vertex_start.size()) - 1; }
+  Index vertex_count() const { return vertex_start.back(); }
+
+  /// World positions for poses [7 K].
+  void place(const double* poses, double* out) const;
+
+  /// poses_bar [7 K] += pulled back out_bar [3 V].
+  void place_vjp(const double* poses, const double* out_bar, double* poses_bar) const;
+};
+
+}  // namespace diffcloth::bodies

@@ -1,0 +1,58 @@
+#include "common/build_info.h"
+
+#include <Eigen/Core>
+
+#ifdef DIFFCLOTH_HAS_CHOLMOD
+#include <array>
+
+#include <cholmod.h>
+#include <dlfcn.h>
+#endif
+
+namespace diffcloth {
+namespace {
+
+#ifdef DIFFCLOTH_HAS_CHOLMOD
+
+std::string factorization() {
+  std::array<int, 3> version{};
+  cholmod_version(version.data());
+  return "cholmod " + std::to_string(version[0]) + "." + std::to_string(version[1]) + "." +
+         std::to_string(version[2]);
+}
+
+/// The library that dgemm resolves to in this process, with OpenBLAS' own description of itself.
+/// It is the loader's choice, not the build's: an alternative of the system, or a copy that
+/// another package loaded before.
+std::string blas() {
+  void* const dgemm = dlsym(RTLD_DEFAULT, "dgemm_");
+  Dl_info library{};
+  if (dgemm == nullptr || dladdr(dgemm, &library) == 0) return "unknown";
+  std::string result = library.dli_fname;
+  using Describe = char* (*)();
+  const auto describe = reinterpret_cast<Describe>(dlsym(RTLD_DEFAULT, "openblas_get_config"));
+  if (describe != nullptr) result.append(" (").append(describe()).append(")");
+  return result;
+}
+
+#else
+
+std::string factorization() { return "eigen"; }
+std::string blas() { return "none"; }
+
+#endif
+
+}  // namespace
+
+BuildInfo build_info() {
+  return {.compiler = DIFFCLOTH_COMPILER,
+          .build_type = DIFFCLOTH_BUILD_TYPE,
+          .flags = DIFFCLOTH_FLAGS,
+          .processor = DIFFCLOTH_PROCESSOR,
+          .eigen = std::to_string(EIGEN_WORLD_VERSION) + "." + std::to_string(EIGEN_MAJOR_VERSION) +
+                   "." + std::to_string(EIGEN_MINOR_VERSION),
+          .factorization = factorization(),
+          .blas = blas()};
+}
+
+}  // namespace diffcloth

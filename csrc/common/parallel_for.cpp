@@ -1,0 +1,65 @@
+#include "common/parallel_for.h"
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <condition_variable>
+#include <exception>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+namespace diffcloth {
+
+void parallel_for(Index count,
+                  int threads,
+                  Interrupt& interrupt,
+                  const std::function<void(Index, const Checkpoint&)>& body) {
+  const int workers = std::clamp(threads, 1, std::max<int>(count, 1));
+  std::vector<std::exception_ptr> errors(static_cast<std::size_t>(count));
+  std::atomic<Index> next{0};
+  std::atomic<int> running{workers - 1};
+  std::mutex mutex;
+  std::condition_variable finished;
+
+  const auto work = [&](bool is_caller) {
+    const Checkpoint checkpoint(interrupt, is_caller);
+    for (Index i = next.fetch_add(1); i < count; i = next.fetch_add(1)) {
+      try {
+        checkpoint.check();
+        body(i, checkpoint);
+      } catch (...) {
+        errors[i] = std::current_exception();
+      }
+    }
+  };
+
+  std::vector<std::thread> pool;
+  for (int k = 1; k < workers; ++k) {
+    pool.emplace_back([&] {
+      work(false);
+      const std::lock_guard lock(mutex);
+      --running;
+      finished.notify_one();
+    });
+  }
+  work(true);
+  {
+    // The caller alone can see an interrupt, so it keeps looking while others work.
+    std::unique_lock lock(mutex);
+    while (running.load() > 0) {
+      finished.wait_for(lock, std::chrono::milliseconds(50));
+      lock.unlock();
+      interrupt.poll();
+      lock.lock();
+    }
+  }
+  for (std::thread& thread : pool) thread.join();
+
+  if (interrupt.stopped()) throw Interrupted{};
+  for (const std::exception_ptr& error : errors) {
+    if (error) std::rethrow_exception(error);
+  }
+}
+
+}  // namespace diffcloth

@@ -1,0 +1,350 @@
+#include "elastic/bending.h"
+
+#include <array>
+
+#include "linalg/block_pattern.h"
+
+namespace diffcloth::elastic::bending {
+namespace {
+
+/// Y_ab = sum_i c_ab,i x_i, one a column. The weights sum to zero: the common offset cancels first.
+Mat3 second_derivatives(const Element& element, const double* x) {
+  const Vec3 origin = row(x, element.vertices[0]);
+  Mat3 Y = Mat3::Zero();
+  for (Index i = 1; i < element.size(); ++i) {
+    Y += (row(x, element.vertices[i]) - origin) * element.weights(i).transpose();
+  }
+  return Y;
+}
+
+/// The same of x1 - x0.
+Mat3 second_derivatives_change(const Element& element, const double* x0, const double* x1) {
+  const Index v0 = element.vertices[0];
+  const Vec3 origin = row(x1, v0) - row(x0, v0);
+  Mat3 Y = Mat3::Zero();
+  for (Index i = 1; i < element.size(); ++i) {
+    const Index v = element.vertices[i];
+    Y += (row(x1, v) - row(x0, v) - origin) * element.weights(i).transpose();
+  }
+  return Y;
+}
+
+Mat32 base_gradient(const Element& element, const double* x) {
+  return deformation_gradient(*element.g,
+                              row(x, element.vertices[0]),
+                              row(x, element.vertices[1]),
+                              row(x, element.vertices[2]));
+}
+
+/// Element in its body frame at x: s and s_n, their work conjugates q = weight s Q, and the
+/// generalized torque tau with dE = <q_total, R^T dY> - tau . w.
+struct BodyState {
+  Frame frame;
+  Mat3 Q;                   ///< weight times the quadratic form
+  Mat3 curvature;           ///< R^T Y
+  Mat3 q, q_n;              ///< q_n includes the damping factor
+  Vec3 tau;
+
+  Mat3 q_total() const { return q + q_n; }
+};
+
+BodyState body_state(const Element& element, const double* x) {
+  BodyState state;
+  state.frame = frame(base_gradient(element, x));
+  state.Q = element.weight * form(element.poisson);
+  state.curvature = state.frame.R.transpose() * second_derivatives(element, x);
+  state.q = (state.curvature - *element.b) * state.Q;
+  state.tau = sum_of_crosses(*element.b, state.q);
+  state.q_n.setZero();
+  if (element.damping != 0.0) {
+    state.q_n = element.damping * (state.curvature - *element.b_n) * state.Q;
+    state.tau += sum_of_crosses(*element.b_n, state.q_n);
+  }
+  return state;
+}
+
+/// Force on the frame: dE/dF = R V with V this 3x2 matrix.
+Mat32 frame_stress(const BodyState& state) { return -rotation_adjoint(state.frame, state.tau); }
+
+/// T - tr T I with T = sum_ab q_ab b_ab^T: -w_z^T (.) w_v is part of the second derivative.
+Mat3 geometric_torque(const Element& element, const BodyState& state) {
+  Mat3 T = state.q * element.b->transpose();
+  if (element.damping != 0.0) T += state.q_n * element.b_n->transpose();
+  T.diagonal().array() -= T.trace();
+  return T;
+}
+
+/// Change of frame_stress() (in the fixed frame R) along K_v, less what the change of q does.
+Mat32 frame_stress_geometric(const BodyState& state,
+                             const Mat3& torque,
+                             const Mat32& K_v,
+                             const Vec3& w_v) {
+  return -rotation_adjoint(state.frame, torque * w_v) -
+         rotation_change_adjoint(state.frame, state.tau, K_v, w_v);
+}
+
+/// The derivative of an element's gradient along z.
+struct BodyChange {
+  Vec3 w;          ///< rotation of the frame
+  Mat3 ds, ds_n;   ///< changes of s and s_n in the frame
+  Mat3 dq, dq_n;
+  Mat32 V;         ///< change of the force on the frame
+
+  Mat3 dq_total() const { return dq + dq_n; }
+};
+
+BodyChange body_change(const Element& element, const BodyState& state, const double* z) {
+  BodyChange change;
+  const Mat3 Rt = state.frame.R.transpose();
+  const Mat32 K = Rt * base_gradient(element, z);
+  const Mat3 RtY = Rt * second_derivatives(element, z);
+  change.w = rotation(state.frame, K);
+  change.ds = RtY - cross_columns(change.w, *element.b);
+  change.dq = change.ds * state.Q;
+  Vec3 dtau = sum_of_crosses(*element.b, change.dq);
+  change.ds_n.setZero();
+  change.dq_n.setZero();
+  if (element.damping != 0.0) {
+    change.ds_n = RtY - cross_columns(change.w, *element.b_n);
+    change.dq_n = element.damping * change.ds_n * state.Q;
+    dtau += sum_of_crosses(*element.b_n, change.dq_n);
+  }
+  change.V = -rotation_adjoint(state.frame, dtau) +
+             frame_stress_geometric(state, geometric_torque(element, state), K, change.w);
+  return change;
+}
+
+/// y_i += Y_bar c_i over the element, y_p += F_bar g_p over its base triangle.
+void scatter(const Element& element, const Mat3& Y_bar, const Mat32& F_bar, double* y) {
+  for (Index i = 0; i < element.size(); ++i) {
+    Eigen::Map<Vec3>(y + 3 * element.vertices[i]) += Y_bar * element.weights(i);
+  }
+  for (Index p = 0; p < 3; ++p) {
+    Eigen::Map<Vec3>(y + 3 * element.vertices[p]) += F_bar * element.g->row(p).transpose();
+  }
+}
+
+/// c_i += Y_bar^T x_i, g_p += F_bar^T x_p, with x relative to the first vertex (the weights and the
+/// gradients sum to zero, so that an offset has no effect).
+void scatter_geometry(const Element& element,
+                      const Mat3& Y_bar,
+                      const Mat32& F_bar,
+                      const double* x,
+                      const GeometryBars& bars) {
+  const Vec3 origin = row(x, element.vertices[0]);
+  for (Index i = 0; i < element.size(); ++i) {
+    const Vec3 side = row(x, element.vertices[i]) - origin;
+    Eigen::Map<Vec3>(bars.c + 3 * i) += Y_bar.transpose() * side;
+    if (i < 3) bars.g->row(i) += (F_bar.transpose() * side).transpose();
+  }
+}
+
+/// The 3x3 matrix W_p with w = sum_p W_p R^T dx_p.
+Mat3 rotation_block(const Frame& frame, const mesh::ShapeGradient& g, Index p) {
+  const Vec2 h = frame.S_inv * g.row(p).transpose();
+  Mat3 W;
+  W << 0.0, 0.0, h(1), 0.0, 0.0, -h(0), -g(p, 1) / frame.t, g(p, 0) / frame.t, 0.0;
+  return W;
+}
+
+using BaseBlocks = std::array<std::array<Mat3, 3>, 3>;
+
+/// Blocks [p][q] among the base triangle, in the body frame, of the part that the second derivative
+/// of the frame contributes.
+BaseBlocks geometric_blocks(const Element& element, const BodyState& state) {
+  const Mat3 torque = geometric_torque(element, state);
+  BaseBlocks blocks;
+  for (Index q = 0; q < 3; ++q) {
+    const Mat3 W = rotation_block(state.frame, *element.g, q);
+    for (int k = 0; k < 3; ++k) {
+      Mat32 K = Mat32::Zero();
+      K.row(k) = element.g->row(q);
+      const Mat32 V = frame_stress_geometric(state, torque, K, W.col(k));
+      for (Index p = 0; p < 3; ++p) blocks[p][q].col(k) = V * element.g->row(p).transpose();
+    }
+  }
+  return blocks;
+}
+
+}  // namespace
+
+Mat3 form(double poisson) {
+  Mat3 Q;
+  Q << 1.0, 0.0, poisson, 0.0, 2.0 * (1.0 - poisson), 0.0, poisson, 0.0, 1.0;
+  return Q;
+}
+
+Mat3 form_derivative() {
+  Mat3 Q;
+  Q << 0.0, 0.0, 1.0, 0.0, -2.0, 0.0, 1.0, 0.0, 0.0;
+  return Q;
+}
+
+Mat3 body_curvature(const Element& element, const double* x) {
+  return frame(base_gradient(element, x)).R.transpose() * second_derivatives(element, x);
+}
+
+double energy(const Element& element, const double* x) {
+  const Mat3 s = element.flat ? second_derivatives(element, x)
+                              : Mat3(body_curvature(element, x) - *element.b);
+  return 0.5 * element.weight * (s * form(element.poisson)).cwiseProduct(s).sum();
+}
+
+double energy_change(const Element& element, const double* x0, const double* x1) {
+  const Mat3 Y0 = second_derivatives(element, x0);
+  const Mat3 dY = second_derivatives_change(element, x0, x1);
+  const Mat3 Q = element.weight * form(element.poisson);
+  if (element.flat) return 0.5 * ((2.0 * Y0 + dY) * Q).cwiseProduct(dY).sum();
+
+  const Mat3 R0 = frame(base_gradient(element, x0)).R;
+  const Mat3 R1 = frame(base_gradient(element, x1)).R;
+  const auto term = [&](const Mat3& b) {
+    const Mat3 s0 = Y0 - R0 * b;
+    const Mat3 ds = dY - (R1 - R0) * b;
+    return 0.5 * ((2.0 * s0 + ds) * Q).cwiseProduct(ds).sum();
+  };
+  double change = term(*element.b);
+  if (element.damping != 0.0) change += element.damping * term(*element.b_n);
+  return change;
+}
+
+void add_gradient(const Element& element, const double* x, double* g) {
+  if (element.flat) {
+    const Mat3 q =
+        second_derivatives(element, x) * (element.weight * form(element.poisson));
+    for (Index i = 0; i < element.size(); ++i) {
+      Eigen::Map<Vec3>(g + 3 * element.vertices[i]) += q * element.weights(i);
+    }
+    return;
+  }
+  const BodyState state = body_state(element, x);
+  const Mat3& R = state.frame.R;
+  scatter(element, R * state.q_total(), R * frame_stress(state), g);
+}
+
+// With J_i(ab) = c_ab,i I + [b_ab]x W_i the derivative of s_ab, Gauss-Newton's block in the body
+// frame is, for each of the two terms of the energy,
+//
+//   sum Q_ab,cd J_i(ab)^T J_j(cd) = (c_i^T Q c_j) I + [m_i]x W_j - W_i^T [m_j]x + W_i^T B W_j,
+//   m_i = b Q c_i,   B = tr(b Q b^T) I - b Q b^T.
+void add_hessian(const Element& element,
+                 std::span<const Index> slots,
+                 const double* x,
+                 bool positive,
+                 double* blocks) {
+  const BodyState state = body_state(element, x);
+  const Mat3& R = state.frame.R;
+  const Mat3& b = *element.b;
+  Mat3 bQ = b * state.Q;
+  Mat3 B = -bQ * b.transpose();
+  if (element.damping != 0.0) {
+    const Mat3 bQ_n = element.damping * *element.b_n * state.Q;
+    B -= bQ_n * element.b_n->transpose();
+    bQ += bQ_n;
+  }
+  B.diagonal().array() -= B.trace();
+
+  std::array<Mat3, 3> W;
+  for (Index p = 0; p < 3; ++p) W[p] = rotation_block(state.frame, *element.g, p);
+  BaseBlocks geometric;
+  if (!positive) geometric = geometric_blocks(element, state);
+
+  for (Index i = 0; i < element.size(); ++i) {
+    const Vec3 Qc = (1.0 + element.damping) * (state.Q * element.weights(i));
+    const Mat3 m_i = cross_matrix(bQ * element.weights(i));
+    for (Index j = 0; j <= i; ++j) {
+      Mat3 block = Qc.dot(element.weights(j)) * Mat3::Identity();
+      if (j < 3) {
+        block += m_i * W[j];
+        if (i < 3) {
+          const Mat3 m_j = cross_matrix(bQ * element.weights(j));
+          block += W[i].transpose() * (B * W[j] - m_j);
+          if (!positive) block += geometric[i][j];
+        }
+        block = R * block * R.transpose();
+      }
+      linalg::add_block(blocks,
+                        slots[linalg::lower(i, j)],
+                        element.vertices[i] < element.vertices[j],
+                        block);
+    }
+  }
+}
+
+void add_constant(const Element& element, std::span<const Index> slots, double* constant) {
+  const Mat3 Q = element.weight * form(element.poisson);
+  for (Index i = 0; i < element.size(); ++i) {
+    const Vec3 Qc = Q * element.weights(i);
+    for (Index j = 0; j <= i; ++j) {
+      constant[slots[linalg::lower(i, j)]] += Qc.dot(element.weights(j));
+    }
+  }
+}
+
+void add_hessian_product(const Element& element, const double* x, const double* z, double* y) {
+  if (element.flat) {
+    add_gradient(element, z, y);  // linear
+    return;
+  }
+  const BodyState state = body_state(element, x);
+  const BodyChange change = body_change(element, state, z);
+  const Mat3& R = state.frame.R;
+  scatter(element, R * change.dq_total(), R * change.V, y);
+}
+
+// phi = z . grad E = weight [ <s Q, ds> + damping <s_n Q, ds_n> ] with ds the change of s along z:
+// ds = R^T Y(z) - w x b. By symmetry of second derivatives, the gradient of phi with respect to
+// (Y, F) is the change of (dE/dY, dE/dF) along z, and that with respect to (Y(z), F(z)) is
+// (dE/dY, dE/dF). What depends on b: db -> -dq . db + (w x q) . db.
+ScalarBars mixed(const Element& element,
+                 const double* x,
+                 const double* x_n,
+                 const double* z,
+                 const GeometryBars& bars) {
+  const bool with_rest = bars.c != nullptr;
+  if (element.flat && x_n == nullptr && !with_rest) {
+    const Mat3 Y = second_derivatives(element, x);
+    const Mat3 dY = second_derivatives(element, z);
+    return {.weight = (Y * form(element.poisson)).cwiseProduct(dY).sum(),
+            .poisson = element.weight * (Y * form_derivative()).cwiseProduct(dY).sum()};
+  }
+  const BodyState state = body_state(element, x);
+  const BodyChange change = body_change(element, state, z);
+  const Mat3& R = state.frame.R;
+
+  const Mat3 Q = form(element.poisson);
+  const Mat3 dQ = form_derivative();
+  const Mat3 s = state.curvature - *element.b;
+  ScalarBars result;
+  result.weight = (s * Q).cwiseProduct(change.ds).sum();
+  result.poisson = element.weight * (s * dQ).cwiseProduct(change.ds).sum();
+  if (x_n != nullptr) {
+    // Also where the damping is zero, whose derivative is not.
+    const Mat3 s_n = state.curvature - *element.b_n;
+    const Mat3 ds_n = change.ds + cross_columns(change.w, *element.b - *element.b_n);
+    const double work_n = (s_n * Q).cwiseProduct(ds_n).sum();
+    result.weight += element.damping * work_n;
+    result.poisson +=
+        element.weight * element.damping * (s_n * dQ).cwiseProduct(ds_n).sum();
+    result.damping = element.weight * work_n;
+  }
+
+  if (with_rest) {
+    *bars.b += cross_columns(change.w, state.q) - change.dq;
+    scatter_geometry(element, R * change.dq_total(), R * change.V, x, bars);
+    scatter_geometry(element, R * state.q_total(), R * frame_stress(state), z, bars);
+  }
+  if (element.damping != 0.0 && x_n != nullptr) {
+    // b_n = R(x_n)^T Y(x_n)
+    const Mat3 b_bar = cross_columns(change.w, state.q_n) - change.dq_n;
+    const Frame frame_n = frame(base_gradient(element, x_n));
+    const Mat3 Y_bar = frame_n.R * b_bar;
+    const Mat32 F_bar =
+        -frame_n.R * rotation_adjoint(frame_n, sum_of_crosses(*element.b_n, b_bar));
+    scatter(element, Y_bar, F_bar, bars.x_n);
+    if (with_rest) scatter_geometry(element, Y_bar, F_bar, x_n, bars);
+  }
+  return result;
+}
+
+}  // namespace diffcloth::elastic::bending

@@ -1,0 +1,87 @@
+#pragma once
+
+#include <span>
+
+#include "common/types.h"
+#include "elastic/frame.h"
+
+namespace diffcloth::elastic::bending {
+
+/// One bending element. With the second derivatives Y_ab = sum_i c_ab,i x_i and the frame R(x) of
+/// the base triangle, its curvature in the frame it carries along is R^T Y, and
+///
+///   E = weight / 2 [ <s Q, s> + damping <s_n Q, s_n> ],   s = R^T Y - b,  s_n = R^T Y - b_n,
+///   <s Q, s> = |s_uu + s_vv|^2 - 2 (1 - nu) (s_uu . s_vv - |s_uv|^2),
+///
+/// b the rest curvature and b_n the curvature at the start of the step: both terms are exactly
+/// invariant under rigid motion. Where b = 0 and damping = 0 the energy is quadratic in x. In a
+/// hinge only the row uu is not zero, and nu has no effect.
+struct Element {
+  std::span<const Index> vertices;  ///< the base triangle first
+  const double* c;                  ///< 3 a vertex: c_uu, c_uv, c_vv [1/m^2]
+  const mesh::ShapeGradient* g;     ///< of the base triangle
+  double weight;                    ///< D A [N m^3]
+  double poisson;                   ///< nu [-]
+  double damping;                   ///< k_d / h [-]
+  const Mat3* b;                    ///< rest curvature [1/m]
+  const Mat3* b_n;                  ///< curvature at the start of the step [1/m]
+  bool flat;                        ///< b = 0 and damping = 0
+
+  Eigen::Map<const Vec3> weights(Index i) const { return Eigen::Map<const Vec3>(c + 3 * i); }
+  Index size() const { return static_cast<Index>(vertices.size()); }
+};
+
+/// The quadratic form Q on (uu, uv, vv), and its derivative with respect to nu.
+Mat3 form(double poisson);
+Mat3 form_derivative();
+
+/// Curvature R^T Y in the frame that the base triangle carries along.
+Mat3 body_curvature(const Element& element, const double* x);
+
+/// Energy without damping.
+double energy(const Element& element, const double* x);
+
+/// Energy at x1 minus energy at x0, damping included, from differences of positions.
+double energy_change(const Element& element, const double* x0, const double* x1);
+
+/// g += the gradient.
+void add_gradient(const Element& element, const double* x, double* g);
+
+/// blocks += the Hessian of an element that is not flat. The projected one is Gauss-Newton's.
+///
+/// @param slots  of the lower-triangle pairs of the element's vertices
+void add_hessian(const Element& element,
+                 std::span<const Index> slots,
+                 const double* x,
+                 bool positive,
+                 double* blocks);
+
+/// constant[slot] += weight c_i^T Q c_j: the Hessian of a flat element is this times I.
+void add_constant(const Element& element, std::span<const Index> slots, double* constant);
+
+/// y += H z.
+void add_hessian_product(const Element& element, const double* x, const double* z, double* y);
+
+/// Cotangents of the parameters of an element for phi = z . grad E.
+struct ScalarBars {
+  double weight = 0.0;
+  double poisson = 0.0;
+  double damping = 0.0;
+};
+
+/// Where the cotangents of the geometry of an element are added. Null pointers are skipped.
+struct GeometryBars {
+  double* c = nullptr;                ///< 3 a vertex
+  mesh::ShapeGradient* g = nullptr;   ///< of the base triangle
+  Mat3* b = nullptr;
+  double* x_n = nullptr;              ///< [N, 3]
+};
+
+/// @param x_n  start of the step, or null where there is none (then element.b_n is not read)
+ScalarBars mixed(const Element& element,
+                 const double* x,
+                 const double* x_n,
+                 const double* z,
+                 const GeometryBars& bars);
+
+}  // namespace diffcloth::elastic::bending

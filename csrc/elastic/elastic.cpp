@@ -1,0 +1,367 @@
+#include "elastic/elastic.h"
+
+#include <array>
+#include <span>
+#include <stdexcept>
+
+#include "elastic/bending.h"
+#include "elastic/damping.h"
+#include "elastic/frame.h"
+#include "elastic/stretch.h"
+
+namespace diffcloth::elastic {
+namespace {
+
+Index face_count(const Model& model) { return static_cast<Index>(model.topology->faces.size()); }
+
+Mat32 face_gradient(const Model& model, Index f, const double* x) {
+  const std::array<Index, 3>& face = model.topology->faces[f];
+  return deformation_gradient(
+      model.rest->shape_gradient[f], row(x, face[0]), row(x, face[1]), row(x, face[2]));
+}
+
+double stretch_weight(const Model& model, Index f) {
+  return model.stretch[f] * model.rest->area[f];
+}
+
+double damping_weight(const Model& model, Index f) {
+  return model.damping[f] / model.h * stretch_weight(model, f);
+}
+
+bool is_damped(const Model& model, Index f) { return model.damping[f] != 0.0; }
+
+/// The mean over the faces of a bending element.
+double element_mean(const Model& model, Index e, const std::vector<double>& face_values) {
+  const auto [f0, f1] = model.stencils->faces[e];
+  return f1 < 0 ? face_values[f0] : 0.5 * (face_values[f0] + face_values[f1]);
+}
+
+/// The transpose of element_mean().
+void add_to_faces(const Model& model, Index e, double bar, std::vector<double>& face_bars) {
+  const auto [f0, f1] = model.stencils->faces[e];
+  if (f1 < 0) {
+    face_bars[f0] += bar;
+  } else {
+    face_bars[f0] += 0.5 * bar;
+    face_bars[f1] += 0.5 * bar;
+  }
+}
+
+bending::Element bending_element(const Model& model, Index e) {
+  const mesh::BendingStencils& stencils = *model.stencils;
+  const Prepared& prepared = model.prepared;
+  return {.vertices = stencils.element(e),
+          .c = model.rest->curvature_operator.data() + 3 * stencils.start[e],
+          .g = &model.rest->shape_gradient[stencils.faces[e][0]],
+          .weight = prepared.bending[e],
+          .poisson = prepared.poisson[e],
+          .damping = prepared.damping[e],
+          .b = &model.rest->curvature[e],
+          .b_n = &prepared.curvature_n[e],
+          .flat = prepared.flat[e] != 0};
+}
+
+std::span<const Index> bending_slots(const Slots& slots, Index e) {
+  return {slots.bending.data() + slots.bending_start[e],
+          static_cast<std::size_t>(slots.bending_start[e + 1] - slots.bending_start[e])};
+}
+
+/// y_p += P g_p over the corners of a face.
+void scatter(const Model& model, Index f, const Mat32& P, double* y) {
+  for (int p = 0; p < 3; ++p) {
+    Eigen::Map<Vec3>(y + 3 * model.topology->faces[f][p]) +=
+        P * model.rest->shape_gradient[f].row(p).transpose();
+  }
+}
+
+/// g_p += F_bar^T x_p, with x relative to the first corner (the gradients sum to zero).
+void scatter_gradient_bar(const Model& model,
+                          Index f,
+                          const Mat32& F_bar,
+                          const double* x,
+                          mesh::ShapeGradient& g_bar) {
+  const std::array<Index, 3>& face = model.topology->faces[f];
+  for (int p = 1; p < 3; ++p) {
+    g_bar.row(p) += (row(x, face[p]) - row(x, face[0])).transpose() * F_bar;
+  }
+}
+
+void add_face_blocks(const std::array<Index, 3>& face,
+                     const Index* slots,
+                     const std::array<Mat3, 6>& element,
+                     double* blocks) {
+  int k = 0;
+  for (int p = 0; p < 3; ++p) {
+    for (int q = 0; q <= p; ++q, ++k) {
+      linalg::add_block(blocks, slots[k], face[p] < face[q], element[k]);
+    }
+  }
+}
+
+void add_face_mixed(const Model& model,
+                    Index f,
+                    const double* x,
+                    const double* z,
+                    bool with_rest,
+                    Bar& bar) {
+  const double k_s = model.stretch[f];
+  const double area = model.rest->area[f];
+  const Mat32 F = face_gradient(model, f, x);
+  const Mat32 G = face_gradient(model, f, z);
+  const Mat32 unit = stretch::stress(1.0, F);
+  const double work = unit.cwiseProduct(G).sum();
+  bar.stretch[f] += area * work;
+  if (with_rest) {
+    bar.rest.area[f] += k_s * work;
+    mesh::ShapeGradient& g_bar = bar.rest.shape_gradient[f];
+    scatter_gradient_bar(model, f, stretch::stress_change(k_s * area, F, G), x, g_bar);
+    scatter_gradient_bar(model, f, k_s * area * unit, z, g_bar);
+  }
+}
+
+void add_face_damping_mixed(const Model& model,
+                            Index f,
+                            const double* x,
+                            const double* z,
+                            bool with_rest,
+                            Bar& bar) {
+  const double k_s = model.stretch[f];
+  const double area = model.rest->area[f];
+  const double rate = model.damping[f] / model.h;
+  const Mat32 F = face_gradient(model, f, x);
+  const Mat32 F_n = face_gradient(model, f, model.x_n);
+  const Mat32 G = face_gradient(model, f, z);
+  const Mat32 unit = damping::stress(1.0, F, F_n);
+  const double work = unit.cwiseProduct(G).sum();
+  bar.damping[f] += k_s * area * work / model.h;
+  if (rate == 0.0) return;
+
+  const double weight = rate * k_s * area;
+  bar.stretch[f] += rate * area * work;
+  const Mat32 F_n_bar = damping::start_bar(weight, F, F_n, G);
+  scatter(model, f, F_n_bar, bar.x_n.data());
+  if (with_rest) {
+    bar.rest.area[f] += rate * k_s * work;
+    mesh::ShapeGradient& g_bar = bar.rest.shape_gradient[f];
+    scatter_gradient_bar(model, f, damping::stress_change(weight, F, F_n, G), x, g_bar);
+    scatter_gradient_bar(model, f, weight * unit, z, g_bar);
+    scatter_gradient_bar(model, f, F_n_bar, model.x_n, g_bar);
+  }
+}
+
+void add_bending_mixed(const Model& model,
+                       Index e,
+                       const double* x,
+                       const double* z,
+                       bool with_rest,
+                       Bar& bar) {
+  bending::Element element = bending_element(model, e);
+  Mat3 curvature_n;
+  if (model.x_n != nullptr) {
+    curvature_n = bending::body_curvature(element, model.x_n);
+    element.b_n = &curvature_n;
+  }
+  bending::GeometryBars geometry;
+  geometry.x_n = bar.x_n.data();
+  if (with_rest) {
+    geometry.c = bar.rest.curvature_operator.data() + 3 * model.stencils->start[e];
+    geometry.g = &bar.rest.shape_gradient[model.stencils->faces[e][0]];
+    geometry.b = &bar.rest.curvature[e];
+  }
+  const bending::ScalarBars scalar = bending::mixed(element, x, model.x_n, z, geometry);
+  add_to_faces(model, e, scalar.weight * model.rest->bending_area[e], bar.bending);
+  add_to_faces(model, e, scalar.poisson, bar.poisson);
+  if (model.x_n != nullptr) add_to_faces(model, e, scalar.damping / model.h, bar.damping);
+  if (with_rest) {
+    bar.rest.bending_area[e] += scalar.weight * element_mean(model, e, model.bending);
+  }
+}
+
+}  // namespace
+
+std::vector<std::vector<Index>> cliques(const mesh::Topology& topology,
+                                        const mesh::BendingStencils& stencils) {
+  std::vector<std::vector<Index>> result;
+  result.reserve(topology.faces.size() + stencils.faces.size());
+  for (const std::array<Index, 3>& face : topology.faces) {
+    result.emplace_back(face.begin(), face.end());
+  }
+  for (Index e = 0; e < stencils.size(); ++e) {
+    const std::span<const Index> vertices = stencils.element(e);
+    result.emplace_back(vertices.begin(), vertices.end());
+  }
+  return result;
+}
+
+Slots slots(const mesh::Topology& topology,
+            const mesh::BendingStencils& stencils,
+            const linalg::BlockPattern& pattern) {
+  Slots result;
+  result.block_count = pattern.block_count();
+  for (const std::array<Index, 3>& face : topology.faces) {
+    const std::vector<Index> element = pattern.slots(face);
+    result.stretch.insert(result.stretch.end(), element.begin(), element.end());
+  }
+  result.bending_start.push_back(0);
+  for (Index e = 0; e < stencils.size(); ++e) {
+    const std::vector<Index> element = pattern.slots(stencils.element(e));
+    result.bending.insert(result.bending.end(), element.begin(), element.end());
+    result.bending_start.push_back(static_cast<Index>(result.bending.size()));
+  }
+  return result;
+}
+
+void prepare(Model& model, const Slots& slots) {
+  const Index element_count = model.stencils->size();
+  Prepared& prepared = model.prepared;
+  prepared.bending.resize(element_count);
+  prepared.poisson.resize(element_count);
+  prepared.damping.resize(element_count);
+  prepared.flat.resize(element_count);
+  prepared.curvature_n.resize(element_count);
+  prepared.constant.assign(slots.block_count, 0.0);
+  prepared.bends = false;
+  prepared.damped = false;
+  for (Index f = 0; f < face_count(model); ++f) prepared.damped |= is_damped(model, f);
+  if (prepared.damped && (model.x_n == nullptr || !(model.h > 0.0))) {
+    throw std::invalid_argument("elastic: damping needs the start of the step and a time step > 0");
+  }
+
+  for (Index e = 0; e < element_count; ++e) {
+    prepared.bending[e] = element_mean(model, e, model.bending) * model.rest->bending_area[e];
+    prepared.poisson[e] = element_mean(model, e, model.poisson);
+    const double damping = element_mean(model, e, model.damping);
+    prepared.damping[e] = damping == 0.0 ? 0.0 : damping / model.h;
+    prepared.flat[e] = damping == 0.0 && model.rest->curvature[e].isZero(0.0);
+    const bending::Element element = bending_element(model, e);
+    if (element.flat) {
+      bending::add_constant(element, bending_slots(slots, e), prepared.constant.data());
+    } else {
+      prepared.bends = true;
+    }
+    if (damping != 0.0) {
+      prepared.curvature_n[e] = bending::body_curvature(element, model.x_n);
+    }
+  }
+}
+
+double energy(const Model& model, const double* x) {
+  double total = 0.0;
+  for (Index f = 0; f < face_count(model); ++f) {
+    total += stretch::energy(stretch_weight(model, f), face_gradient(model, f, x));
+  }
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    total += bending::energy(bending_element(model, e), x);
+  }
+  return total;
+}
+
+double energy_change(const Model& model, const double* x0, const double* x1) {
+  double total = 0.0;
+  for (Index f = 0; f < face_count(model); ++f) {
+    const std::array<Index, 3>& face = model.topology->faces[f];
+    const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
+    const Mat32 F0 = face_gradient(model, f, x0);
+    const Mat32 F1 = face_gradient(model, f, x1);
+    const Mat32 dF = deformation_gradient(g,
+                                          row(x1, face[0]) - row(x0, face[0]),
+                                          row(x1, face[1]) - row(x0, face[1]),
+                                          row(x1, face[2]) - row(x0, face[2]));
+    total += stretch::energy_change(stretch_weight(model, f), F0, F1, dF);
+    if (is_damped(model, f)) {
+      total += damping::energy_change(
+          damping_weight(model, f), F0, F1, dF, face_gradient(model, f, model.x_n));
+    }
+  }
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    total += bending::energy_change(bending_element(model, e), x0, x1);
+  }
+  return total;
+}
+
+void add_gradient(const Model& model, const double* x, double* g) {
+  for (Index f = 0; f < face_count(model); ++f) {
+    const Mat32 F = face_gradient(model, f, x);
+    Mat32 P = stretch::stress(stretch_weight(model, f), F);
+    if (is_damped(model, f)) {
+      P += damping::stress(damping_weight(model, f), F, face_gradient(model, f, model.x_n));
+    }
+    scatter(model, f, P, g);
+  }
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    bending::add_gradient(bending_element(model, e), x, g);
+  }
+}
+
+void add_hessian(const Model& model,
+                 const Slots& slots,
+                 const double* x,
+                 Projection projection,
+                 double* blocks) {
+  const bool positive = projection == Projection::kPositive;
+  for (Index f = 0; f < face_count(model); ++f) {
+    const std::array<Index, 3>& face = model.topology->faces[f];
+    const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
+    const Index* face_slots = slots.stretch.data() + 6 * static_cast<std::ptrdiff_t>(f);
+    const Mat32 F = face_gradient(model, f, x);
+    add_face_blocks(
+        face, face_slots, stretch::hessian(stretch_weight(model, f), g, F, positive), blocks);
+    if (is_damped(model, f)) {
+      const Mat32 F_n = face_gradient(model, f, model.x_n);
+      add_face_blocks(face,
+                      face_slots,
+                      damping::hessian(damping_weight(model, f), g, F, F_n, positive),
+                      blocks);
+    }
+  }
+  for (Index slot = 0; slot < slots.block_count; ++slot) {
+    double* block = blocks + 9 * static_cast<std::ptrdiff_t>(slot);
+    const double value = model.prepared.constant[slot];
+    block[0] += value;
+    block[4] += value;
+    block[8] += value;
+  }
+  if (!model.prepared.bends) return;
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    const bending::Element element = bending_element(model, e);
+    if (!element.flat) {
+      bending::add_hessian(element, bending_slots(slots, e), x, positive, blocks);
+    }
+  }
+}
+
+void add_hessian_product(const Model& model, const double* x, const double* z, double* y) {
+  for (Index f = 0; f < face_count(model); ++f) {
+    const Mat32 F = face_gradient(model, f, x);
+    const Mat32 G = face_gradient(model, f, z);
+    Mat32 P = stretch::stress_change(stretch_weight(model, f), F, G);
+    if (is_damped(model, f)) {
+      P += damping::stress_change(
+          damping_weight(model, f), F, face_gradient(model, f, model.x_n), G);
+    }
+    scatter(model, f, P, y);
+  }
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    bending::add_hessian_product(bending_element(model, e), x, z, y);
+  }
+}
+
+Bar::Bar(const mesh::Topology& topology, const mesh::BendingStencils& stencils)
+    : stretch(topology.faces.size(), 0.0),
+      bending(topology.faces.size(), 0.0),
+      poisson(topology.faces.size(), 0.0),
+      damping(topology.faces.size(), 0.0),
+      rest(topology, stencils),
+      x_n(3 * static_cast<std::size_t>(topology.vertex_count), 0.0) {}
+
+void add_mixed(const Model& model, const double* x, const double* z, bool with_rest, Bar& bar) {
+  for (Index f = 0; f < face_count(model); ++f) {
+    add_face_mixed(model, f, x, z, with_rest, bar);
+    if (model.x_n != nullptr) add_face_damping_mixed(model, f, x, z, with_rest, bar);
+  }
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    add_bending_mixed(model, e, x, z, with_rest, bar);
+  }
+}
+
+}  // namespace diffcloth::elastic

@@ -1,0 +1,102 @@
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "common/types.h"
+#include "linalg/block_pattern.h"
+#include "mesh/rest_shape.h"
+#include "mesh/topology.h"
+
+namespace diffcloth::elastic {
+
+/// Slots of the blocks of every element in a BlockPattern.
+struct Slots {
+  Index block_count = 0;              ///< of the pattern
+  std::vector<Index> stretch;         ///< [F, 6] lower-triangle pairs of a face
+  std::vector<Index> bending_start;   ///< [B + 1] into `bending`
+  std::vector<Index> bending;         ///< lower-triangle pairs of each bending element
+};
+
+/// Vertices that an element couples, for every element: what the pattern of the Hessian is made of.
+std::vector<std::vector<Index>> cliques(const mesh::Topology& topology,
+                                        const mesh::BendingStencils& stencils);
+
+Slots slots(const mesh::Topology& topology,
+            const mesh::BendingStencils& stencils,
+            const linalg::BlockPattern& pattern);
+
+/// What prepare() derives from a Model: constant during one step.
+struct Prepared {
+  std::vector<double> bending;       ///< [B] D of an element times its area
+  std::vector<double> poisson;       ///< [B]
+  std::vector<double> damping;       ///< [B] k_d / h [-]
+  std::vector<std::uint8_t> flat;    ///< [B] no rest curvature and no damping: a constant Hessian
+  std::vector<Mat3> curvature_n;     ///< [B] body-frame curvature at x_n, where damped
+  std::vector<double> constant;      ///< [slots] sum of the flat elements' Hessians, times I
+  bool damped = false;               ///< some face has damping
+  bool bends = false;                ///< some element is not flat
+};
+
+/// The elastic energy of all cloths and its damping over one step.
+struct Model {
+  const mesh::Topology* topology = nullptr;
+  const mesh::BendingStencils* stencils = nullptr;
+  const mesh::RestShape* rest = nullptr;
+  std::vector<double> stretch;   ///< [F] k_s [N/m]
+  std::vector<double> bending;   ///< [F] D [N m]
+  std::vector<double> poisson;   ///< [F] nu [-]
+  std::vector<double> damping;   ///< [F] k_d [s]
+  double h = 0.0;                ///< time step [s]; only damping needs it
+  const double* x_n = nullptr;   ///< [N, 3] start of the step [m]; only damping needs it
+  Prepared prepared;             ///< filled by prepare()
+};
+
+/// Fill model.prepared. To be called whenever anything in the model has changed.
+///
+/// @throws std::invalid_argument where damping has no start of the step or no time step
+void prepare(Model& model, const Slots& slots);
+
+/// Stretch and bending energy, without damping [J].
+double energy(const Model& model, const double* x);
+
+/// Energy at x1 minus energy at x0, damping included, as a sum of differences of the elements that
+/// do not cancel [J].
+double energy_change(const Model& model, const double* x0, const double* x1);
+
+/// g += grad E(x), damping included, [N, 3] [N].
+void add_gradient(const Model& model, const double* x, double* g);
+
+/// The exact Hessian, or one made of positive semi-definite element matrices.
+enum class Projection : std::uint8_t { kExact, kPositive };
+
+/// blocks += the Hessian at x, damping included, 9 doubles a slot [N/m].
+void add_hessian(const Model& model,
+                 const Slots& slots,
+                 const double* x,
+                 Projection projection,
+                 double* blocks);
+
+/// y += H(x) z over all vertices, with the exact Hessian and without a matrix.
+void add_hessian_product(const Model& model, const double* x, const double* z, double* y);
+
+/// Cotangents of what a Model depends on.
+struct Bar {
+  std::vector<double> stretch, bending, poisson, damping;  ///< [F]
+  mesh::RestShapeBar rest;
+  std::vector<double> x_n;  ///< [3 N] through damping
+
+  Bar() = default;
+  /// All zero.
+  Bar(const mesh::Topology& topology, const mesh::BendingStencils& stencils);
+};
+
+/// bar += d/d theta (z . grad_x E(x; theta)) for each theta of the model, damping included.
+///
+/// The cotangents of damping and of x_n are left out where model.x_n is null; k_d has one also where
+/// it is zero.
+///
+/// @param with_rest  whether the cotangents of the rest shape are wanted
+void add_mixed(const Model& model, const double* x, const double* z, bool with_rest, Bar& bar);
+
+}  // namespace diffcloth::elastic

@@ -1,0 +1,25 @@
+#pragma once
+
+#include <vector>
+
+#include "linalg/block_pattern.h"
+#include "linalg/cholesky.h"
+
+namespace diffcloth::linalg {
+
+/// Solve A x = b at the vertices that are not fixed, preconditioned by a factor of a nearby matrix.
+///
+/// @param fixed      [pattern.size()] vertices left out: x is zero there
+/// @param tolerance  on the residual in the preconditioner's norm, relative to b's
+/// @return true when the tolerance was reached; false on a direction of negative curvature or
+///         after max_iterations
+[[nodiscard]] bool conjugate_gradient(const BlockPattern& pattern,
+                                      const double* blocks,
+                                      const std::vector<char>& fixed,
+                                      const CholeskyFactor& preconditioner,
+                                      const std::vector<double>& b,
+                                      double tolerance,
+                                      int max_iterations,
+                                      std::vector<double>& x);
+
+}  // namespace diffcloth::linalg

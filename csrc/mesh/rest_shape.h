@@ -1,0 +1,104 @@
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <span>
+#include <vector>
+
+#include "common/types.h"
+#include "mesh/topology.h"
+
+namespace diffcloth::mesh {
+
+/// Shape gradients of a triangle, one corner a row.
+using ShapeGradient = Eigen::Matrix<double, 3, 2>;
+
+/// How a face resists bending.
+///
+/// A patch is the quadratic through its triangle and the three opposite vertices. It gives every
+/// quadratic map its exact energy on every mesh, boundaries included. Where the mesh is not
+/// translation invariant, the mesh can also relax below that energy by moving single vertices: the
+/// modes of a free plate come out right on grids with one diagonal and on equilateral meshes, up to
+/// a tenth too low in frequency on unstructured ones, and a quarter on grids of alternating
+/// diagonals.
+///
+/// A hinge is that of Bergou and DiffCloth: three to nine times too stiff, for comparisons.
+enum class BendingModel : std::uint8_t { kPatch, kHinge };
+
+/// Which vertices each bending element couples.
+///
+/// The first three vertices of an element are the corners of its base face; the others are laid
+/// into the plane of the base face by unfolding the mesh. The choice is made once, from the
+/// scene's rest mesh, and then kept, so that everything is smooth in the rest positions.
+struct BendingStencils {
+  std::vector<Index> start{0};                   ///< [B + 1] into `vertices`
+  std::vector<Index> vertices;                   ///< [start.back()]
+  std::vector<std::array<Index, 2>> faces;       ///< [B] base face; other face of a hinge or -1
+  std::vector<BendingModel> model;               ///< [B]
+  /// [start.back()] Local edge a -> b that an extra vertex is unfolded about; it lies to the right
+  /// of it. Corners of the base face hold {-1, -1}.
+  std::vector<std::array<Index, 2>> unfold_edge;
+
+  Index size() const { return static_cast<Index>(faces.size()); }
+  std::span<const Index> element(Index e) const {
+    return {vertices.data() + start[e], static_cast<std::size_t>(start[e + 1] - start[e])};
+  }
+};
+
+/// One patch for each face that asks for it and has a neighbor; one hinge for each interior edge
+/// both of whose faces ask for it.
+///
+/// @param X           rest positions, [N, 3] [m]
+/// @param face_model  one a face
+BendingStencils choose_stencils(const Topology& topology,
+                                const double* X,
+                                std::span<const BendingModel> face_model);
+
+/// Everything that the potentials need of the rest positions X.
+///
+/// Each face has the orthonormal rest frame r1 = (X1 - X0) / |.|, r2 = n x r1 and coordinates
+/// (u, v) in it.
+struct RestShape {
+  std::vector<double> area;                   ///< [F] [m^2]
+  std::vector<ShapeGradient> shape_gradient;  ///< [F] rows g_p: F = sum_p x_p g_p^T [1/m]
+  /// [start.back()] x 3: the weights (c_uu, c_uv, c_vv) of each stencil vertex,
+  /// x,ab = sum_i c_ab,i x_i [1/m^2].
+  std::vector<double> curvature_operator;
+  /// [B] columns b_uu, b_uv, b_vv: second derivatives X,ab in the rest frame (r1, r2, n) [1/m].
+  std::vector<Mat3> curvature;
+  std::vector<double> bending_area;    ///< [B] weight of an element: A of a patch, 1 of a hinge
+  std::vector<double> vertex_area;     ///< [N] a third of the adjacent faces [m^2]
+  std::vector<double> edge_area;       ///< [E] a third of the adjacent faces [m^2]
+  std::vector<double> edge_length_sq;  ///< [E] [m^2]
+  bool curved = false;                 ///< some curvature is above rounding; the rest are exactly 0
+};
+
+RestShape rest_shape(const Topology& topology, const BendingStencils& stencils, const double* X);
+
+/// Cotangents of the fields of RestShape, in the same layout.
+struct RestShapeBar {
+  std::vector<double> area;
+  std::vector<ShapeGradient> shape_gradient;
+  std::vector<double> curvature_operator;
+  std::vector<Mat3> curvature;
+  std::vector<double> bending_area;
+  std::vector<double> vertex_area;
+  std::vector<double> edge_area;
+  std::vector<double> edge_length_sq;
+
+  RestShapeBar() = default;
+  /// All zero.
+  RestShapeBar(const Topology& topology, const BendingStencils& stencils);
+};
+
+/// X_bar += (d rest_shape / dX)^T bar.
+///
+/// A curvature that rest_shape() rounds to zero is differentiated as it is before rounding: a flat
+/// rest shape has a first-order effect on a bent sheet.
+void rest_shape_vjp(const Topology& topology,
+                    const BendingStencils& stencils,
+                    const double* X,
+                    const RestShapeBar& bar,
+                    double* X_bar);
+
+}  // namespace diffcloth::mesh

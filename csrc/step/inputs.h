@@ -1,0 +1,60 @@
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+
+#include "common/types.h"
+
+namespace diffcloth::step {
+
+/// Every continuous input of a step. All but dt are differentiable.
+enum class Input : std::uint8_t {
+  kPositions,         ///< x_n [N, 3] m
+  kVelocities,        ///< v_n [N, 3] m/s
+  kBodyPoses,         ///< at the start of the step [K, 7]
+  kBodyTargets,       ///< at its end [K, 7]
+  kPinTargets,        ///< [P, 3] m
+  kSoftPinTargets,    ///< [Q, 3] m
+  kForces,            ///< [N, 3] N
+  kGravity,           ///< [3] m/s^2
+  kStretch,           ///< k_s, one value, one a cloth or one a face [N/m]
+  kBending,           ///< D, likewise [N m]
+  kPoisson,           ///< nu, likewise [-]
+  kDensity,           ///< rho, likewise [kg/m^2]
+  kDamping,           ///< k_d, likewise [s]
+  kFriction,          ///< mu, one value or [S, S] [-]
+  kThickness,         ///< [S] m
+  kBarrierStiffness,  ///< kappa [Pa]
+  kBarrierDistance,   ///< d_hat [m]
+  kSlipVelocity,      ///< eps_v [m/s]
+  kPinStiffness,      ///< k_a, one value or one a cloth [N/m]
+  kRestPositions,     ///< X [N, 3] m
+};
+inline constexpr std::size_t kInputCount = 20;
+inline constexpr std::array<const char*, kInputCount> kInputNames{
+    "positions",         "velocities",       "body_poses",       "body_targets",
+    "pin_targets",       "soft_pin_targets", "forces",           "gravity",
+    "stretch",           "bending",          "poisson",          "density",
+    "damping",           "friction",         "thickness",        "barrier_stiffness",
+    "barrier_distance",  "slip_velocity",    "pin_stiffness",    "rest_positions"};
+
+/// One environment's input: a flat array, absent where data is null.
+struct View {
+  const double* data = nullptr;
+  std::size_t count = 0;
+};
+
+struct Inputs {
+  std::array<View, kInputCount> views;
+  const View& operator[](Input input) const { return views[static_cast<std::size_t>(input)]; }
+  const double* data(Input input) const { return (*this)[input].data; }
+};
+
+/// Where one environment's gradients go: arrays like the inputs, zeroed; null where not wanted.
+struct Gradients {
+  std::array<double*, kInputCount> data{};
+  double* operator[](Input input) const { return data[static_cast<std::size_t>(input)]; }
+};
+
+}  // namespace diffcloth::step

@@ -1,0 +1,175 @@
+#include "step/scene.h"
+
+#include <algorithm>
+#include <cmath>
+
+namespace diffcloth::step {
+namespace {
+
+contact::CollisionMesh make_collision_mesh(const Description& d) {
+  const auto cloth_vertices = static_cast<Index>(d.vertices.size() / 3);
+  const auto cloths = static_cast<Index>(d.bending_models.size());
+  std::vector<std::array<Index, 3>> faces = d.faces;
+  for (const auto& face : d.body_faces) {
+    faces.push_back(
+        {face[0] + cloth_vertices, face[1] + cloth_vertices, face[2] + cloth_vertices});
+  }
+  std::vector<Index> surface(static_cast<std::size_t>(cloth_vertices + d.bodies.vertex_count()));
+  for (Index c = 0; c < cloths; ++c) {
+    std::fill(surface.begin() + d.cloth_vertex_start[c],
+              surface.begin() + d.cloth_vertex_start[c + 1],
+              c);
+  }
+  for (Index k = 0; k < d.bodies.count(); ++k) {
+    std::fill(surface.begin() + cloth_vertices + d.bodies.vertex_start[k],
+              surface.begin() + cloth_vertices + d.bodies.vertex_start[k + 1],
+              cloths + k);
+  }
+  const auto vertices = static_cast<Index>(surface.size());
+  return {vertices, cloth_vertices, cloths, std::move(faces), std::move(surface), d.self_contact};
+}
+
+/// All surfaces as given: the reference that the collision trees are built from.
+std::vector<double> reference_positions(const Description& d) {
+  std::vector<double> x = d.vertices;
+  x.insert(x.end(), d.bodies.vertices.begin(), d.bodies.vertices.end());
+  return x;
+}
+
+contact::RestMeasures make_body_measures(const Description& d,
+                                         const contact::CollisionMesh& mesh) {
+  contact::RestMeasures m;
+  m.vertex_area.assign(static_cast<std::size_t>(mesh.vertex_count), 0.0);
+  m.edge_area.assign(mesh.edges.size(), 0.0);
+  m.edge_length_sq.assign(mesh.edges.size(), 0.0);
+  m.face_area.assign(static_cast<std::size_t>(mesh.cloth_face_count), 0.0);
+  const double* y = d.bodies.vertices.data() - 3 * static_cast<std::ptrdiff_t>(mesh.cloth_vertex_count);
+  std::vector<double> area(mesh.faces.size(), 0.0);
+  for (std::size_t f = mesh.cloth_face_count; f < mesh.faces.size(); ++f) {
+    const auto& v = mesh.faces[f];
+    area[f] = 0.5 * (row(y, v[1]) - row(y, v[0])).cross(row(y, v[2]) - row(y, v[0])).norm();
+    for (const Index i : v) m.vertex_area[i] += area[f] / 3.0;
+  }
+  for (std::size_t e = mesh.cloth_edge_count; e < mesh.edges.size(); ++e) {
+    for (const Index f : mesh.edge_faces[e]) {
+      if (f >= 0) m.edge_area[e] += area[f] / 3.0;
+    }
+    m.edge_length_sq[e] = (row(y, mesh.edges[e][0]) - row(y, mesh.edges[e][1])).squaredNorm();
+  }
+  return m;
+}
+
+std::vector<Index> owners(const std::vector<Index>& start) {
+  std::vector<Index> owner(static_cast<std::size_t>(start.back()));
+  for (std::size_t c = 0; c + 1 < start.size(); ++c) {
+    std::fill(owner.begin() + start[c], owner.begin() + start[c + 1], static_cast<Index>(c));
+  }
+  return owner;
+}
+
+std::vector<mesh::BendingModel> face_models(const Description& d) {
+  std::vector<mesh::BendingModel> model;
+  for (std::size_t c = 0; c < d.bending_models.size(); ++c) {
+    model.insert(model.end(),
+                 static_cast<std::size_t>(d.cloth_face_start[c + 1] - d.cloth_face_start[c]),
+                 d.bending_models[c]);
+  }
+  return model;
+}
+
+std::vector<char> make_prescribed(const Description& d, Index vertex_count) {
+  std::vector<char> prescribed(static_cast<std::size_t>(vertex_count), 0);
+  for (const Index i : d.pins) prescribed[i] = 1;
+  for (std::size_t i = d.vertices.size() / 3; i < prescribed.size(); ++i) prescribed[i] = 1;
+  return prescribed;
+}
+
+}  // namespace
+
+Scene::Scene(Description description)
+    : given(std::move(description)),
+      topology(static_cast<Index>(given.vertices.size() / 3), given.faces),
+      face_cloth(owners(given.cloth_face_start)),
+      vertex_cloth(owners(given.cloth_vertex_start)),
+      stencils(mesh::choose_stencils(topology, given.rest_vertices.data(), face_models(given))),
+      rest(mesh::rest_shape(topology, stencils, given.rest_vertices.data())),
+      collision_mesh(make_collision_mesh(given)),
+      body_measures(make_body_measures(given, collision_mesh)),
+      broad_phase(collision_mesh, reference_positions(given).data()),
+      prescribed(make_prescribed(given, collision_mesh.vertex_count)),
+      elastic_assemblies(
+          linalg::BlockPattern(topology.vertex_count, elastic::cliques(topology, stencils)),
+          {prescribed.begin(), prescribed.begin() + topology.vertex_count}),
+      diagonal_assemblies(linalg::BlockPattern(topology.vertex_count, {}),
+                          {prescribed.begin(), prescribed.begin() + topology.vertex_count}) {
+  slots = elastic::slots(topology, stencils, elastic_assemblies.base());
+}
+
+contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& rest) {
+  contact::RestMeasures m = scene.body_measures;
+  std::ranges::copy(rest.vertex_area, m.vertex_area.begin());
+  std::ranges::copy(rest.edge_area, m.edge_area.begin());
+  std::ranges::copy(rest.edge_length_sq, m.edge_length_sq.begin());
+  std::ranges::copy(rest.area, m.face_area.begin());
+  return m;
+}
+
+namespace {
+
+/// "cloth 0 edge (3, 8)": a primitive by its surface and that surface's own vertex numbers.
+std::string describe(const Scene& scene, const char* kind, std::initializer_list<Index> vertices) {
+  const Index surface = scene.collision_mesh.vertex_surface[*vertices.begin()];
+  const bool is_cloth = surface < scene.cloth_count();
+  const Index first =
+      is_cloth ? scene.given.cloth_vertex_start[surface]
+               : scene.cloth_vertex_count() +
+                     scene.given.bodies.vertex_start[surface - scene.cloth_count()];
+  std::string text = (is_cloth ? "cloth " : "body ") +
+                     std::to_string(is_cloth ? surface : surface - scene.cloth_count()) + " " +
+                     kind + " (";
+  const char* separator = "";
+  for (const Index v : vertices) {
+    text += separator + std::to_string(v - first);
+    separator = ", ";
+  }
+  return text + ")";
+}
+
+}  // namespace
+
+std::string find_overlap(const Scene& scene,
+                         const double* x,
+                         const std::vector<double>& thickness,
+                         contact::BroadPhase::Scratch& scratch) {
+  const contact::CollisionMesh& mesh = scene.collision_mesh;
+  if (const auto pair = scene.broad_phase.find_intersection(x, scratch)) {
+    const auto& e = mesh.edges[pair->first];
+    const auto& f = mesh.faces[pair->second];
+    return describe(scene, "edge", {e[0], e[1]}) + " intersects " +
+           describe(scene, "face", {f[0], f[1], f[2]});
+  }
+  const double thickest =
+      thickness.empty() ? 0.0 : *std::max_element(thickness.begin(), thickness.end());
+  std::vector<contact::Candidate> candidates;
+  scene.broad_phase.find(x, x, thickest, scratch, candidates);
+  for (const contact::Candidate& pair : candidates) {
+    const auto& v = pair.vertices;
+    const double xi =
+        thickness.empty()
+            ? 0.0
+            : 0.5 * (thickness[mesh.vertex_surface[v[0]]] + thickness[mesh.vertex_surface[v[3]]]);
+    const double d = std::sqrt(contact::distance_sq(pair.kind, contact::corners(v, x)));
+    if (d > xi) continue;
+    const std::string gap = " are " + std::to_string(d) + " m apart, closer than their thickness " +
+                            std::to_string(xi) + " m";
+    if (pair.kind == contact::PairKind::kPointTriangle) {
+      return describe(scene, "vertex", {v[0]}) + " and " +
+             describe(scene, "face", {v[1], v[2], v[3]}) + gap;
+    }
+    return describe(scene, "edge", {v[0], v[1]}) + " and " + describe(scene, "edge", {v[2], v[3]}) +
+           gap;
+  }
+  return {};
+}
+
+}  // namespace diffcloth::step

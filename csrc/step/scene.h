@@ -1,0 +1,76 @@
+#pragma once
+
+#include <cstdint>
+#include <string>
+#include <vector>
+
+#include "bodies/pose.h"
+#include "contact/broad_phase.h"
+#include "contact/collision_mesh.h"
+#include "contact/contact_set.h"
+#include "elastic/elastic.h"
+#include "mesh/rest_shape.h"
+#include "mesh/topology.h"
+#include "solver/newton.h"
+#include "solver/objective.h"
+
+namespace diffcloth::step {
+
+enum class Scheme : std::uint8_t { kCoupled, kSplit };
+enum class Metric : std::uint8_t { kMass, kIdentity };
+
+/// What a simulator is made from.
+struct Description {
+  std::vector<double> vertices;       ///< [3 N] initial positions [m]
+  std::vector<double> rest_vertices;  ///< [3 N] rest positions [m]
+  std::vector<std::array<Index, 3>> faces;
+  std::vector<Index> cloth_vertex_start;  ///< [C + 1]
+  std::vector<Index> cloth_face_start;    ///< [C + 1]
+  std::vector<mesh::BendingModel> bending_models;  ///< [C]
+  std::vector<Index> pins;                         ///< [P]
+  std::vector<Index> soft_pins;                    ///< [Q]
+  bodies::BodySet bodies;
+  std::vector<std::array<Index, 3>> body_faces;  ///< indices into the bodies' vertices
+  bool self_contact = true;
+  double dt = 0.01;
+  Scheme scheme = Scheme::kCoupled;
+  Metric metric = Metric::kMass;
+  int friction_iterations = 2;
+  solver::Options options{};
+};
+
+/// Everything of a scene that no step changes. Immutable, but for caches that only remember.
+struct Scene {
+  explicit Scene(Description description);
+
+  Index cloth_vertex_count() const { return topology.vertex_count; }
+  Index vertex_count() const { return collision_mesh.vertex_count; }
+  Index cloth_count() const { return static_cast<Index>(given.bending_models.size()); }
+  Index surface_count() const { return cloth_count() + given.bodies.count(); }
+
+  Description given;
+  mesh::Topology topology;
+  std::vector<Index> face_cloth;    ///< [F]
+  std::vector<Index> vertex_cloth;  ///< [N]
+  mesh::BendingStencils stencils;
+  mesh::RestShape rest;             ///< of given.rest_vertices
+  contact::CollisionMesh collision_mesh;
+  contact::RestMeasures body_measures;  ///< the bodies' part; cloth entries are zero
+  contact::BroadPhase broad_phase;
+  std::vector<char> prescribed;  ///< [vertices] pins and bodies
+  elastic::Slots slots;
+
+  mutable solver::AssemblyCache elastic_assemblies;   ///< over the elastic pattern
+  mutable solver::AssemblyCache diagonal_assemblies;  ///< over isolated vertices
+};
+
+/// Face weights of contacts for a rest shape of the cloths.
+contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& rest);
+
+/// Where two surfaces overlap or are closer than their thickness; empty where they are not.
+std::string find_overlap(const Scene& scene,
+                         const double* x,
+                         const std::vector<double>& thickness,
+                         contact::BroadPhase::Scratch& scratch);
+
+}  // namespace diffcloth::step

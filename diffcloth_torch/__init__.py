@@ -1,0 +1,57 @@
+"""Cloth in intersection-free frictional contact, as one differentiable step in PyTorch.
+
+    import diffcloth_torch as dc
+
+    scene = dc.Scene(cloths=[dc.Cloth.grid(24, 24, pins={"edge": range(24)})])
+    sim = dc.Simulator(scene, dt=0.01)
+    state = sim.step(sim.initial_state())
+
+Units are SI, z is up, quaternions are (w, x, y, z), and everything is float64 on the CPU.
+"""
+
+from typing import Any
+
+from diffcloth_torch import _core
+from diffcloth_torch.controls import Control, Parameters
+from diffcloth_torch.errors import (
+    InfeasibleMotion,
+    IntersectingState,
+    InvalidInput,
+    NotConverged,
+    SimulationError,
+)
+from diffcloth_torch.materials import Material
+from diffcloth_torch.mesh import Cloth
+from diffcloth_torch.options import ContactOptions, SolverOptions
+from diffcloth_torch.report import Report
+from diffcloth_torch.rigid_body import RigidBody
+from diffcloth_torch.scene import Scene
+from diffcloth_torch.simulator import Simulator
+from diffcloth_torch.state import State, stack, where
+
+__all__ = [
+    "Cloth",
+    "ContactOptions",
+    "Control",
+    "InfeasibleMotion",
+    "IntersectingState",
+    "InvalidInput",
+    "Material",
+    "NotConverged",
+    "Parameters",
+    "Report",
+    "RigidBody",
+    "Scene",
+    "SimulationError",
+    "Simulator",
+    "SolverOptions",
+    "State",
+    "build_info",
+    "stack",
+    "where",
+]
+
+
+def build_info() -> dict[str, Any]:
+    """Say what the C++ core was built with: libraries, compiler and options."""
+    return dict(_core.build_info())

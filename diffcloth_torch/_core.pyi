@@ -1,0 +1,53 @@
+# The C++ extension. What the package uses is typed here; the kernels exposed to tests are not.
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Arrays = dict[str, NDArray[Any]]
+
+kernels: Any
+
+class SimulationError(RuntimeError): ...
+
+def build_info() -> dict[str, Any]: ...
+
+class Simulator:
+    phases: list[str]
+    def __init__(
+        self,
+        *,
+        vertices: NDArray[np.float64],
+        rest_vertices: NDArray[np.float64],
+        faces: NDArray[np.int32],
+        cloth_vertex_start: NDArray[np.int32],
+        cloth_face_start: NDArray[np.int32],
+        bending_models: list[str],
+        pins: NDArray[np.int32],
+        soft_pins: NDArray[np.int32],
+        body_vertices: NDArray[np.float64],
+        body_faces: NDArray[np.int32],
+        body_vertex_start: NDArray[np.int32],
+        body_face_start: NDArray[np.int32],
+        self_contact: bool,
+        dt: float,
+        scheme: str,
+        metric: str,
+        friction_iterations: int,
+        tolerance: float,
+        max_iterations: int,
+    ) -> None: ...
+    def smallest_nonadjacent_distance(self) -> float: ...
+    def default_barrier_stiffness(self, inputs: Arrays, barrier_distance: float) -> float: ...
+    def find_overlap(
+        self,
+        positions: NDArray[np.float64],
+        body_poses: NDArray[np.float64],
+        thickness: NDArray[np.float64],
+    ) -> str | None: ...
+    def energy(self, inputs: Arrays) -> NDArray[np.float64]: ...
+    def forward(self, inputs: Arrays, tape: bool, threads: int) -> dict[str, Any]: ...
+    def backward(
+        self, inputs: Arrays, tape: Arrays, cotangents: Arrays, needs: list[str], threads: int
+    ) -> Arrays: ...

@@ -1,0 +1,210 @@
+"""Validation of arguments: each helper returns the checked value or says what is wrong with it.
+
+`name` is the text that opens the message, for example "Material: `stretch`".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloth_torch.errors import InvalidInput
+
+__all__ = [
+    "ANY_NUMBER",
+    "NON_NEGATIVE",
+    "POISSON",
+    "POSITIVE",
+    "FloatArray",
+    "IndexArray",
+    "Range",
+    "check_bool",
+    "check_choice",
+    "check_count",
+    "check_finite",
+    "check_name",
+    "check_number",
+    "check_range",
+    "check_shape",
+    "float_array",
+    "float_tensor",
+    "frozen",
+    "index_array",
+    "refuse_gradient",
+]
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int32]
+
+_FLOAT64_BYTES = 8
+# Integers are accepted where a float is meant; float16, bfloat16 and float32 widen without loss.
+_PROMOTABLE = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
+_INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
+
+
+class Range(NamedTuple):
+    """An interval of accepted numbers; `closed` includes its finite ends."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    closed: bool = False
+
+    def outside(self, values: FloatArray) -> NDArray[np.bool_]:
+        """Tell which values lie outside; NaN does."""
+        if self.closed:
+            inside = (values >= self.low) & (values <= self.high)
+        else:
+            inside = (values > self.low) & (values < self.high)
+        return ~inside
+
+    def __str__(self) -> str:
+        """Say the range in words, to follow "must be"."""
+        if math.isinf(self.low) and math.isinf(self.high):
+            return "finite"
+        if math.isinf(self.high):
+            return f"finite and {'>=' if self.closed else '>'} {self.low:g}"
+        ends = "inclusive" if self.closed else "exclusive"
+        return f"between {self.low:g} and {self.high:g} ({ends})"
+
+
+ANY_NUMBER = Range()
+POSITIVE = Range(0.0)
+NON_NEGATIVE = Range(0.0, closed=True)
+POISSON = Range(-1.0, 0.5)
+
+
+def frozen(array: NDArray[Any]) -> NDArray[Any]:
+    """Mark an array of our own as read-only."""
+    array.setflags(write=False)
+    return array
+
+
+def refuse_gradient(name: str, value: object, instead: str) -> None:
+    """Refuse a tensor that requires a gradient where none can flow."""
+    if isinstance(value, Tensor) and value.requires_grad:
+        raise InvalidInput(
+            f"{name} must not require a gradient: none flows there; {instead} instead"
+        )
+
+
+def float_array(name: str, value: object, *, instead: str = "pass a detached tensor") -> FloatArray:
+    """Copy numbers into a new float64 array; promotes without loss and refuses everything else."""
+    refuse_gradient(name, value, instead)
+    if isinstance(value, Tensor):
+        return np.array(float_tensor(name, value).numpy(), dtype=np.float64, order="C")
+    try:
+        array = np.asarray(value)
+    except ValueError as error:  # ragged nested lists
+        raise InvalidInput(f"{name} must be a rectangular array of numbers: {error}") from error
+    if array.dtype.kind not in "fiu" or array.dtype.itemsize > _FLOAT64_BYTES:
+        raise TypeError(
+            f"{name} must hold real numbers of at most 64 bits, got dtype {array.dtype}"
+        )
+    return np.array(array, dtype=np.float64, order="C")
+
+
+def float_tensor(name: str, value: object) -> Tensor:
+    """Promote to a float64 tensor on the CPU; a tensor keeps its graph, other values are copied."""
+    if not isinstance(value, Tensor):
+        return torch.from_numpy(float_array(name, value))
+    if value.layout != torch.strided:
+        raise TypeError(
+            f"{name} must be a dense tensor, got {value.layout}; call .to_dense() first"
+        )
+    if value.device.type != "cpu":
+        raise TypeError(f"{name} must be on the CPU, got {value.device}; call .cpu() first")
+    if value.dtype not in _PROMOTABLE + _INTEGERS:
+        raise TypeError(f"{name} must be a tensor of real numbers, got {value.dtype}")
+    return value.to(torch.float64)
+
+
+def index_array(name: str, value: object, count: int) -> IndexArray:
+    """Copy vertex indices into a new int32 array, each in 0 .. count - 1."""
+    try:
+        array = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+    except ValueError as error:  # ragged nested lists
+        raise InvalidInput(f"{name} must be a rectangular array of indices: {error}") from error
+    if array.size and array.dtype.kind not in "iu":
+        raise TypeError(f"{name} must hold integers, got dtype {array.dtype}")
+    outside = (array < 0) | (array >= count)
+    if outside.any():
+        at = tuple(int(i) for i in np.argwhere(outside)[0])
+        raise InvalidInput(
+            f"{name} must be indices between 0 and {count - 1}, got {array[at]} at {list(at)}"
+        )
+    return np.array(array, dtype=np.int32, order="C")
+
+
+def check_shape(
+    name: str, got: Sequence[int], accepted: Iterable[Sequence[int | str]], hint: str = ""
+) -> None:
+    """Require one of the accepted shapes; a letter in a shape stands for any length."""
+    shapes = [list(shape) for shape in accepted]
+    for shape in shapes:
+        pairs = zip(shape, got, strict=False)
+        if len(shape) == len(got) and all(isinstance(n, str) or n == m for n, m in pairs):
+            return
+    texts = ["[" + ", ".join(str(n) for n in shape) + "]" for shape in shapes]
+    raise InvalidInput(f"{name} must have shape {' or '.join(texts)}, got {list(got)}{hint}")
+
+
+def check_finite(name: str, values: FloatArray) -> None:
+    """Require finite numbers."""
+    check_range(name, values, ANY_NUMBER)
+
+
+def check_range(name: str, values: FloatArray, accepted: Range) -> None:
+    """Require finite numbers in a range; the message holds the first offending index."""
+    wrong = accepted.outside(values) | ~np.isfinite(values)
+    if wrong.any():
+        at = [int(i) for i in np.argwhere(wrong)[0]]
+        where = f" at {at}" if at else ""
+        raise InvalidInput(f"{name} must be {accepted}, got {values[tuple(at)]:g}{where}")
+
+
+def check_number(name: str, value: object, accepted: Range, *, instead: str) -> float:
+    """Require one number in a range."""
+    array = float_array(name, value, instead=instead)
+    check_shape(name, array.shape, [()])
+    check_range(name, array, accepted)
+    return float(array)
+
+
+def check_count(name: str, value: object, minimum: int) -> int:
+    """Require an integer of at least `minimum`."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"{name} must be an integer, got {type(value).__name__}")
+    if value < minimum:
+        raise InvalidInput(f"{name} must be at least {minimum}, got {value}")
+    return int(value)
+
+
+def check_bool(name: str, value: object) -> bool:
+    """Require True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be True or False, got {type(value).__name__}")
+    return bool(value)
+
+
+def check_choice(name: str, value: object, accepted: Sequence[str]) -> str:
+    """Require one of the accepted words."""
+    if value not in accepted:
+        raise InvalidInput(f"{name} must be one of {', '.join(map(repr, accepted))}, got {value!r}")
+    return str(value)
+
+
+def check_name(name: str, value: object) -> str | None:
+    """Require a printable name without a slash, which separates cloth and pin names, or None."""
+    if value is None:
+        return None
+    if not isinstance(value, str):
+        raise TypeError(f"{name} must be a string, got {type(value).__name__}")
+    if not value or "/" in value or not value.isprintable():
+        raise InvalidInput(f"{name} must be non-empty, printable and without '/', got {value!r}")
+    return value

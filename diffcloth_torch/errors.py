@@ -1,0 +1,46 @@
+"""The exceptions of the package. A wrong dtype or device is a plain `TypeError`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+__all__ = [
+    "InfeasibleMotion",
+    "IntersectingState",
+    "InvalidInput",
+    "NotConverged",
+    "SimulationError",
+]
+
+
+class InvalidInput(ValueError):  # noqa: N818 - names of the public contract
+    """An argument has a wrong shape, value or name; the message says which and what is accepted."""
+
+
+class SimulationError(RuntimeError):
+    """The simulation itself failed; the state that it was given is untouched.
+
+    Attributes:
+        report: Report of the failed step, or None where no step was taken.
+        environments: Indices of the environments that failed; (0,) without a batch axis.
+    """
+
+    def __init__(
+        self, message: str, *, report: Any = None, environments: Sequence[int] = ()
+    ) -> None:
+        super().__init__(message)
+        self.report = report
+        self.environments = tuple(environments)
+
+
+class IntersectingState(SimulationError):  # noqa: N818
+    """Two surfaces already intersect, or are closer than their thickness, at the start."""
+
+
+class InfeasibleMotion(SimulationError):  # noqa: N818
+    """The prescribed motion of bodies and pins cannot be completed without an intersection."""
+
+
+class NotConverged(SimulationError):  # noqa: N818
+    """The iteration limit was reached before the residual fell below the tolerance."""

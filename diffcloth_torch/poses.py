@@ -1,0 +1,55 @@
+"""Poses `[px, py, pz, qw, qx, qy, qz]`: a position [m] and a quaternion, normalized when used."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffcloth_torch.checks import FloatArray, check_finite, check_shape, float_array
+from diffcloth_torch.errors import InvalidInput
+
+__all__ = ["IDENTITY", "check_quaternions", "pose_array", "rotation_matrix", "transform"]
+
+IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+# A quaternion shorter than this is taken for an uninitialized row, not for a rotation.
+_SHORTEST_QUATERNION = 1e-6
+
+
+def check_quaternions(name: str, poses: FloatArray) -> None:
+    """Require quaternions [..., 3:7] that can be normalized."""
+    norms = np.linalg.norm(poses[..., 3:], axis=-1)
+    wrong = norms < _SHORTEST_QUATERNION
+    if wrong.any():
+        at = [int(i) for i in np.argwhere(wrong)[0]]
+        where = f" at {at}" if at else ""
+        raise InvalidInput(
+            f"{name} must hold a quaternion (w, x, y, z) of non-zero length in its last four "
+            f"entries, got length {norms[tuple(at)]:g}{where}"
+        )
+
+
+def pose_array(name: str, pose: object, *, instead: str) -> FloatArray:
+    """Check one pose [7]; None is the identity."""
+    array = float_array(name, IDENTITY if pose is None else pose, instead=instead)
+    check_shape(name, array.shape, [(7,)])
+    check_finite(name, array)
+    check_quaternions(name, array)
+    return array
+
+
+def rotation_matrix(quaternion: FloatArray) -> FloatArray:
+    """Rotation [3, 3] of a quaternion (w, x, y, z) of any length."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def transform(vertices: FloatArray, pose: FloatArray) -> FloatArray:
+    """Map points [n, 3] of a body frame to the world."""
+    moved: FloatArray = vertices @ rotation_matrix(pose[3:]).T + pose[:3]
+    return moved

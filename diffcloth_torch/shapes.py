@@ -1,0 +1,116 @@
+"""Vertices and outward-facing triangles of simple shapes, centered at the origin."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloth_torch.checks import FloatArray
+
+__all__ = ["box", "capsule", "grid", "plane", "sphere"]
+
+Mesh = tuple[FloatArray, NDArray[np.int64]]
+
+# Segments around a capsule and rings on each of its caps: 5 degrees off a true circle at most.
+_CAPSULE_SEGMENTS = 32
+_CAPSULE_RINGS = 8
+
+
+def grid(rows: int, columns: int, size: FloatArray) -> Mesh:
+    """Sheet of rows x columns vertices in the xy-plane, row by row; columns run along x."""
+    x = (np.arange(columns) / (columns - 1) - 0.5) * size[0]
+    y = (np.arange(rows) / (rows - 1) - 0.5) * size[1]
+    xx, yy = np.meshgrid(x, y)
+    vertices = np.stack([xx, yy, np.zeros_like(xx)], axis=-1).reshape(-1, 3)
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
+    lower = np.stack([corner, corner + 1, corner + columns + 1], axis=-1)
+    upper = np.stack([corner, corner + columns + 1, corner + columns], axis=-1)
+    return vertices, np.stack([lower, upper], axis=1).reshape(-1, 3)
+
+
+def plane(size: FloatArray) -> Mesh:
+    """Rectangle of two triangles at z = 0 that faces up."""
+    return grid(2, 2, size)
+
+
+def box(size: FloatArray) -> Mesh:
+    """Cuboid of 8 vertices and 12 triangles."""
+    corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+    quads = [
+        (0, 1, 3, 2),  # -x
+        (4, 6, 7, 5),  # +x
+        (0, 4, 5, 1),  # -y
+        (2, 3, 7, 6),  # +y
+        (0, 2, 6, 4),  # -z
+        (1, 5, 7, 3),  # +z
+    ]
+    faces = [triangle for a, b, c, d in quads for triangle in ((a, b, c), (a, c, d))]
+    return corners * size, np.array(faces)
+
+
+def sphere(radius: float, subdivisions: int) -> Mesh:
+    """Icosahedron whose faces are split in four `subdivisions` times; vertices on the sphere."""
+    golden = (1 + 5**0.5) / 2
+    points = [
+        vertex
+        for s, g in itertools.product((-1.0, 1.0), (-golden, golden))
+        for vertex in ((0.0, s, g), (s, g, 0.0), (g, 0.0, s))
+    ]
+    vertices = np.array(points)
+    faces = _convex_faces(vertices)
+    for _ in range(subdivisions):
+        vertices, faces = _split_in_four(vertices, faces)
+    return radius * vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
+
+
+def _convex_faces(vertices: FloatArray) -> NDArray[np.int64]:
+    """Triples of vertices at the shortest distance from each other, oriented outward."""
+    distance = np.linalg.norm(vertices[:, None] - vertices[None], axis=-1)
+    near = np.isclose(distance, distance[distance > 0].min())
+    faces = []
+    for a, b, c in itertools.combinations(range(len(vertices)), 3):
+        if near[a, b] and near[b, c] and near[a, c]:
+            outward = np.linalg.det(vertices[[a, b, c]]) > 0
+            faces.append((a, b, c) if outward else (a, c, b))
+    return np.array(faces)
+
+
+def _split_in_four(vertices: FloatArray, faces: NDArray[np.int64]) -> Mesh:
+    ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, inverse = np.unique(ends, axis=0, return_inverse=True)
+    middle = len(vertices) + inverse.reshape(-1, 3)
+    a, b, c = faces.T
+    ab, bc, ca = middle.T
+    parts = [(a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca)]
+    split = np.stack([np.stack(part, axis=-1) for part in parts], axis=1).reshape(-1, 3)
+    points = np.concatenate([vertices, vertices[edges].mean(axis=1)])
+    return points / np.linalg.norm(points, axis=1, keepdims=True), split
+
+
+def capsule(radius: float, length: float) -> Mesh:
+    """Cylinder of a length along z between two half spheres around its ends."""
+    polar = np.linspace(0, np.pi / 2, _CAPSULE_RINGS + 1)[1:]
+    upper = [(radius * np.sin(t), length / 2 + radius * np.cos(t)) for t in polar]
+    profile = np.array(upper + [(r, -z) for r, z in reversed(upper)])  # radius and z of each ring
+    around = 2 * np.pi * np.arange(_CAPSULE_SEGMENTS) / _CAPSULE_SEGMENTS
+    circle = np.stack([np.cos(around), np.sin(around)], axis=-1)
+    rings = [np.column_stack([r * circle, np.full(_CAPSULE_SEGMENTS, z)]) for r, z in profile]
+    tip = length / 2 + radius
+    vertices = np.concatenate([*rings, [[0.0, 0.0, tip], [0.0, 0.0, -tip]]])
+    return vertices, _lathe_faces(len(profile))
+
+
+def _lathe_faces(ring_count: int) -> NDArray[np.int64]:
+    here = np.arange(_CAPSULE_SEGMENTS)
+    there = (here + 1) % _CAPSULE_SEGMENTS
+    top = ring_count * _CAPSULE_SEGMENTS
+    faces = [np.stack([here, there, np.full_like(here, top)], axis=-1)]
+    for ring in range(ring_count - 1):
+        up, down = ring * _CAPSULE_SEGMENTS, (ring + 1) * _CAPSULE_SEGMENTS
+        faces.append(np.stack([down + here, down + there, up + there], axis=-1))
+        faces.append(np.stack([down + here, up + there, up + here], axis=-1))
+    last = top - _CAPSULE_SEGMENTS
+    faces.append(np.stack([last + there, last + here, np.full_like(here, top + 1)], axis=-1))
+    return np.concatenate(faces)

@@ -1,0 +1,100 @@
+"""Checks that a triangle mesh must pass to become a cloth or a body."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from diffcloth_torch.checks import (
+    FloatArray,
+    IndexArray,
+    check_finite,
+    check_shape,
+    float_array,
+    frozen,
+    index_array,
+)
+from diffcloth_torch.errors import InvalidInput
+
+__all__ = ["check_areas", "check_manifold", "surface_arrays", "unique_edges"]
+
+# Twice the area of a face over its longest edge squared. Below this, rounding decides which way
+# the normal points.
+_FLATTEST_FACE = 1e-12
+
+
+def surface_arrays(
+    owner: str, vertices: object, faces: object, *, instead: str
+) -> tuple[FloatArray, IndexArray]:
+    """Check vertices [n, 3] and triangles [f, 3]; returns read-only copies."""
+    points = float_array(f"{owner}: `vertices`", vertices, instead=instead)
+    check_shape(f"{owner}: `vertices`", points.shape, [("n", 3)])
+    check_finite(f"{owner}: `vertices`", points)
+    triangles = index_array(f"{owner}: `faces`", faces, len(points))
+    hint = "; only triangles are supported: triangulate the mesh before"
+    check_shape(f"{owner}: `faces`", triangles.shape, [("f", 3)], hint)
+    if len(triangles) == 0:
+        raise InvalidInput(f"{owner}: `faces` must hold at least one triangle")
+    _check_distinct(owner, triangles)
+    check_areas(owner, "vertices", points, triangles)
+    return frozen(points), frozen(triangles)
+
+
+def _check_distinct(owner: str, faces: IndexArray) -> None:
+    corners = np.sort(faces, axis=1)
+    repeated = np.flatnonzero((corners[:, 0] == corners[:, 1]) | (corners[:, 1] == corners[:, 2]))
+    if repeated.size:
+        face = int(repeated[0])
+        raise InvalidInput(
+            f"{owner}: `faces` must have three different vertices each, "
+            f"got {faces[face].tolist()} at [{face}]"
+        )
+    _, first, inverse = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    original = first[inverse.reshape(-1)]
+    duplicate = np.flatnonzero(original != np.arange(len(faces)))
+    if duplicate.size:
+        face = int(duplicate[0])
+        raise InvalidInput(
+            f"{owner}: `faces` must be different from each other: faces {int(original[face])} "
+            f"and {face} have the same vertices {faces[face].tolist()}"
+        )
+
+
+def check_areas(owner: str, field: str, vertices: FloatArray, faces: IndexArray) -> None:
+    """Refuse faces of zero area."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    double_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    longest_sq = np.max([((q - p) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    flat = np.flatnonzero(double_area <= _FLATTEST_FACE * longest_sq)
+    if flat.size:
+        face = int(flat[0])
+        raise InvalidInput(
+            f"{owner}: `faces` must have an area > 0 in `{field}`, got a face without area "
+            f"at [{face}], vertices {faces[face].tolist()}"
+        )
+
+
+def check_manifold(owner: str, vertex_count: int, faces: IndexArray) -> None:
+    """Require that every vertex belongs to a face and every edge to at most two faces."""
+    used = np.zeros(vertex_count, dtype=bool)
+    used[faces] = True
+    if not used.all():
+        unused = int(np.flatnonzero(~used)[0])
+        raise InvalidInput(
+            f"{owner}: `vertices` must each belong to a face, or they have no mass: vertex "
+            f"{unused} does not ({int((~used).sum())} in all); remove them from the mesh"
+        )
+    edges, counts = unique_edges(faces)
+    crowded = np.flatnonzero(counts > 2)
+    if crowded.size:
+        edge = int(crowded[0])
+        raise InvalidInput(
+            f"{owner}: `faces` must share an edge between at most two of them, "
+            f"got {int(counts[edge])} on the edge of vertices {edges[edge].tolist()}"
+        )
+
+
+def unique_edges(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
+    """Edges [e, 2] of a mesh, smaller index first, and the number of faces on each [e]."""
+    ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, counts = np.unique(ends, axis=0, return_counts=True)
+    return edges, counts.astype(np.int32)

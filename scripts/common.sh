@@ -1,0 +1,117 @@
+# Set-up that scripts/demo, scripts/test and .ci/run share; source it.
+
+root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+venv=$root/.venv
+cd "$root"
+
+say() { printf '\n==> %s\n' "$*"; }
+
+# set_up EXTRA...: system packages, virtual environment, and the package with these extras.
+set_up() {
+  install_system_packages
+  make_virtual_environment
+  install_package "$@"
+}
+
+# The first Python that is new enough, or nothing.
+find_python() {
+  local name
+  for name in python3 python3.14 python3.13 python3.12 python3.11 python3.10; do
+    if command -v "$name" >/dev/null &&
+      "$name" -c 'import sys; sys.exit(sys.version_info < (3, 10))' 2>/dev/null; then
+      echo "$name"
+      return
+    fi
+  done
+}
+
+has_library() { { ldconfig -p || /sbin/ldconfig -p; } 2>/dev/null | grep -q "$1"; }
+
+# Debian's names of what pip cannot bring and this machine lacks, with what each is for.
+missing_system_packages() {
+  local python
+  python=$(find_python)
+  command -v c++ >/dev/null || echo "g++                  # compiles the core"
+  [[ -n $python ]] || echo "python3              # 3.10 or newer"
+  [[ -n $python ]] && "$python" -c 'import ensurepip, venv' 2>/dev/null ||
+    echo "python3-venv         # makes the virtual environment"
+  [[ -n $python ]] && "$python" -c '
+import pathlib, sys, sysconfig
+sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())' ||
+    echo "python3-dev          # compiles the core"
+  if [[ ! -e /usr/include/suitesparse/cholmod.h && ! -e /usr/include/cholmod.h ]]; then
+    echo "libsuitesparse-dev   # CHOLMOD, the faster factorization; else Eigen's"
+    # Its dense kernels must not start threads of their own.
+    echo "libopenblas0-serial  # dense kernels of CHOLMOD"
+  fi
+  # Found by hiding one library after the other: without a display, VTK draws through EGL on
+  # Mesa's software renderer, and it crashes without libX11.
+  has_library libEGL.so.1 || echo "libegl1              # pictures without a display"
+  compgen -G '/usr/lib/*/dri/swrast_dri.so' >/dev/null ||
+    echo "libgl1-mesa-dri      # pictures without a display"
+  has_library libX11.so.6 || echo "libx11-6             # pictures"
+  has_library libXcursor.so.1 || echo "libxcursor1          # pictures"
+}
+
+# Install what is missing where that needs no question: as root, or with sudo without password.
+install_system_packages() {
+  local missing names sudo=()
+  missing=$(missing_system_packages)
+  [[ -n $missing ]] || return 0
+  mapfile -t names < <(sed 's/ *#.*//' <<<"$missing")
+  if ((EUID != 0)); then sudo=(sudo -n); fi
+  if ! command -v apt-get >/dev/null || ! "${sudo[@]}" true 2>/dev/null; then
+    say "Skipped: system packages, for want of apt-get or the right to use it. Missing are"
+    echo "$missing"
+    return 0
+  fi
+  say "Installing system packages: ${names[*]}"
+  "${sudo[@]}" apt-get update -qq
+  "${sudo[@]}" env DEBIAN_FRONTEND=noninteractive \
+    apt-get install -qq -y --no-install-recommends "${names[@]}" >/dev/null
+}
+
+make_virtual_environment() {
+  local python
+  if [[ -x $venv/bin/pip ]]; then return 0; fi
+  python=$(find_python)
+  if [[ -z $python ]]; then
+    echo "Python 3.10 or newer is needed (Debian: python3 python3-venv python3-dev)." >&2
+    return 1
+  fi
+  say "Making the virtual environment .venv with $("$python" --version)"
+  "$python" -m venv "$venv"
+}
+
+pip_install() { "$venv/bin/pip" install --quiet --disable-pip-version-check -c constraints.txt "$@"; }
+
+# What decides whether an installed package is still the one in this folder. The Python files do
+# not: the install is editable.
+fingerprint() {
+  {
+    find csrc setup.py pyproject.toml constraints.txt -type f -print0 | LC_ALL=C sort -z |
+      xargs -0 sha256sum
+    "$venv/bin/python" -VV
+    echo "${CMAKE_ARGS:-} ${CXX:-} ${CXXFLAGS:-}"
+  } | sha256sum
+}
+
+# install_package EXTRA...: the package, editable, unless it is there and nothing has changed.
+install_package() {
+  local extra now stale=
+  now=$(fingerprint)
+  compgen -G 'diffcloth_torch/_core*.so' >/dev/null || stale=yes
+  for extra in "$@"; do
+    [[ $(cat "$venv/installed-$extra" 2>/dev/null) == "$now" ]] || stale=yes
+  done
+  [[ -n $stale ]] || return 0
+
+  say "Building the package and installing what it needs ($*): a few minutes the first time"
+  # The build's own requirements go into .venv, so that a second build compiles only what changed.
+  pip_install setuptools cmake ninja nanobind cmeel-eigen
+  PATH=$venv/bin:$PATH pip_install --no-build-isolation --editable ".[$(
+    IFS=,
+    echo "$*"
+  )]"
+  for extra in "$@"; do echo "$now" >"$venv/installed-$extra"; done
+}

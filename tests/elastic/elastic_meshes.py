@@ -1,0 +1,137 @@
+"""Meshes, deformations and difference quotients shared by the tests of the elastic potentials."""
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.spatial
+
+from diffcloth_torch import _core
+
+Elastic = _core.kernels.Elastic
+
+STEP = 0.01  # time step [s]
+
+
+def grid(nu: int, nv: int, diagonal: str = "right") -> tuple[np.ndarray, np.ndarray]:
+    """Unit cells split along one diagonal, the other, or in turns."""
+    i, j = np.meshgrid(np.arange(nu), np.arange(nv), indexing="ij")
+    X = np.stack([i.ravel(), j.ravel(), 0 * i.ravel()], 1).astype(float)
+    faces = []
+    for u in range(nu - 1):
+        for v in range(nv - 1):
+            a, b, c, d = u * nv + v, (u + 1) * nv + v, (u + 1) * nv + v + 1, u * nv + v + 1
+            left = diagonal == "left" or (diagonal == "alternating" and (u + v) % 2 == 1)
+            faces += [[a, b, d], [b, c, d]] if left else [[a, b, c], [a, c, d]]
+    return X, np.array(faces, np.int32)
+
+
+def equilateral(nu: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
+    X, faces = grid(nu, nv, "left")
+    X[:, 0] += 0.5 * X[:, 1]
+    X[:, 1] *= np.sqrt(0.75)
+    return X, faces
+
+
+def jittered(nu: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
+    X, faces = grid(nu, nv, "alternating")
+    X[:, :2] += np.random.default_rng(1).uniform(-0.25, 0.25, (len(X), 2))
+    return X, faces
+
+
+def delaunay(nu: int, nv: int) -> tuple[np.ndarray, np.ndarray]:
+    """Unstructured: interior points moved freely, then triangulated again."""
+    X, _ = grid(nu, nv)
+    inside = (X[:, 0] % (nu - 1) != 0) & (X[:, 1] % (nv - 1) != 0)
+    shift = np.random.default_rng(2).uniform(-0.35, 0.35, (len(X), 2))
+    X[inside, :2] += shift[inside]
+    faces = scipy.spatial.Delaunay(X[:, :2]).simplices
+    side = X[faces[:, 1:], :2] - X[faces[:, :1], :2]
+    area = side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0]
+    faces[area < 0] = faces[area < 0][:, ::-1]
+    return X, faces[np.abs(area) > 1e-9].astype(np.int32)
+
+
+MESHES: dict[str, Callable[[int, int], tuple[np.ndarray, np.ndarray]]] = {
+    "right": lambda nu, nv: grid(nu, nv, "right"),
+    "left": lambda nu, nv: grid(nu, nv, "left"),
+    "alternating": lambda nu, nv: grid(nu, nv, "alternating"),
+    "equilateral": equilateral,
+    "jittered": jittered,
+    "delaunay": delaunay,
+}
+
+
+def on_cylinder(X: np.ndarray, curvature: float, angle: float) -> np.ndarray:
+    """Roll a flat sheet onto a cylinder; `angle` is that of the bent direction."""
+    along = np.array([np.cos(angle), np.sin(angle)])
+    across = np.array([-along[1], along[0]])
+    s, t = X[:, :2] @ along, X[:, :2] @ across
+    x = np.outer(np.sin(curvature * s) / curvature, [*along, 0.0])
+    x += np.outer(t, [*across, 0.0])
+    x[:, 2] = (1 - np.cos(curvature * s)) / curvature
+    return x
+
+
+def on_sphere(X: np.ndarray, radius: float) -> np.ndarray:
+    x = X - X.mean(0)
+    x[:, 2] = np.sqrt(radius**2 - (x[:, :2] ** 2).sum(1))
+    return x
+
+
+def rigid(x: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Turn and move by amounts of order one."""
+    rng = np.random.default_rng(seed)
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    rotation *= np.sign(np.linalg.det(rotation))
+    return np.ascontiguousarray(x @ rotation.T + rng.normal(size=3))
+
+
+def model(
+    X: np.ndarray,
+    faces: np.ndarray,
+    bending_model: str = "patch",
+    *,
+    stretch: float | np.ndarray = 0.0,
+    bending: float | np.ndarray = 0.0,
+    poisson: float | np.ndarray = 0.0,
+    damping: float | np.ndarray = 0.0,
+    x_n: np.ndarray | None = None,
+) -> Elastic:
+    elastic = Elastic(X, faces, bending_model)
+    set_parameters(
+        elastic,
+        len(faces),
+        stretch=stretch,
+        bending=bending,
+        poisson=poisson,
+        damping=damping,
+        x_n=X if x_n is None else x_n,
+    )
+    return elastic
+
+
+def set_parameters(
+    elastic: Elastic, face_count: int, *, x_n: np.ndarray | None, **parameters: float | np.ndarray
+) -> None:
+    one = np.ones(face_count)
+    elastic.set_parameters(
+        parameters["stretch"] * one,
+        parameters["bending"] * one,
+        parameters["poisson"] * one,
+        parameters["damping"] * one,
+        STEP,
+        None if x_n is None else np.ascontiguousarray(x_n),
+    )
+
+
+def differences(f: Callable[[np.ndarray], float | np.ndarray], x: np.ndarray, eps: float):
+    """Derivative of f along every entry of x, by fourth-order central differences."""
+    columns = []
+    for k in range(x.size):
+        e = np.zeros(x.size)
+        e[k] = eps
+        e = e.reshape(x.shape)
+        near = np.asarray(f(x + e)) - np.asarray(f(x - e))
+        far = np.asarray(f(x + 2 * e)) - np.asarray(f(x - 2 * e))
+        columns.append((8 * near - far) / (12 * eps))
+    return np.stack(columns, -1)

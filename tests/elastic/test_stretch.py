@@ -1,0 +1,133 @@
+"""The stretch energy: what costs nothing, its traction law, its derivatives."""
+
+import numpy as np
+import pytest
+from elastic_meshes import MESHES, differences, grid, model, rigid
+
+K_S = 100.0  # [N/m]
+RNG = np.random.default_rng(3)
+
+TRIANGLE = (np.array([[0.0, 0, 0], [1, 0.1, 0], [0.3, 0.8, 0]]), np.array([[0, 1, 2]], np.int32))
+
+# In-plane maps of the triangle, with a bit of noise out of plane: tension, compression in one and
+# in both directions, an inversion.
+STATES = [
+    pytest.param(np.diag([1.3, 1.2, 1.0]), id="tension"),
+    pytest.param(np.diag([1.2, 0.7, 1.0]), id="compressed in one direction"),
+    pytest.param(np.diag([0.6, 0.5, 1.0]), id="compressed"),
+    pytest.param(np.array([[1.0, 0.8, 0], [0, 1, 0], [0.4, 0, 1]]), id="sheared"),
+    pytest.param(np.diag([-1.1, 0.9, 1.0]), id="turned over"),
+]
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_rigid_motion_costs_nothing(name):
+    X, faces = MESHES[name](5, 4)
+    elastic = model(X, faces, stretch=K_S)
+    x = rigid(X)
+    # The acceptance bound 1e-12 k_s A, A of order one; forces in k_s times lengths of order one.
+    assert abs(elastic.energy(x)) < 1e-12 * K_S
+    assert np.abs(elastic.gradient(x)).max() < 1e-12 * K_S * 10
+
+
+def test_isometric_fold_costs_nothing():
+    X, faces = grid(5, 4)
+    folded = X.copy()
+    beyond = X[:, 0] > 2
+    angle = 2.0
+    folded[beyond, 0] = 2 + (X[beyond, 0] - 2) * np.cos(angle)
+    folded[beyond, 2] = (X[beyond, 0] - 2) * np.sin(angle)
+    elastic = model(X, faces, stretch=K_S)
+    assert abs(elastic.energy(folded)) < 1e-12 * K_S
+    assert np.abs(elastic.gradient(folded)).max() < 1e-12 * K_S * 10
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_affine_map_has_constant_traction(name):
+    """Traction k_s (s1 - 1) along the stretched direction, none across: lateral contraction 0."""
+    X, faces = MESHES[name](5, 4)
+    s1 = 1.2
+    elastic = model(X, faces, stretch=K_S)
+    g = elastic.gradient(np.ascontiguousarray(X * [s1, 1.0, 1.0]))
+
+    # The weak form of a constant stress P: force on vertex i = sum over faces A P grad phi_i.
+    expected = np.zeros_like(X)
+    for a, b, c in faces:
+        for i, j, k in ((a, b, c), (b, c, a), (c, a, b)):
+            edge = X[k] - X[j]
+            expected[i, 0] += K_S * (s1 - 1) * 0.5 * -edge[1]
+    np.testing.assert_allclose(g, expected, atol=1e-10 * K_S)
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_gradient_and_hessian_match_differences(state):
+    X, faces = TRIANGLE
+    x = X @ state.T + 0.02 * RNG.normal(size=X.shape)
+    elastic = model(X, faces, stretch=K_S)
+    g = differences(elastic.energy, x, 1e-3).reshape(x.shape)
+    H = differences(lambda x: elastic.gradient(x).ravel(), x, 1e-3)
+    np.testing.assert_allclose(elastic.gradient(x), g, atol=1e-7 * K_S)
+    np.testing.assert_allclose(elastic.hessian(x, False), H, atol=1e-7 * K_S)
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_projected_hessian_clamps_the_eigenvalues_of_an_element(state):
+    X, faces = TRIANGLE
+    x = X @ state.T
+    elastic = model(X, faces, stretch=K_S)
+    exact = elastic.hessian(x, False)
+    positive = elastic.hessian(x, True)
+    floor = -1e-12 * K_S
+    assert np.linalg.eigvalsh(positive)[0] > floor * 10
+    if np.linalg.eigvalsh(exact)[0] > floor:
+        np.testing.assert_allclose(positive, exact, atol=1e-12 * K_S)
+    else:
+        assert np.linalg.eigvalsh(positive - exact)[0] > floor * 10
+        assert np.abs(positive - exact).max() > 1e-3 * K_S
+
+
+@pytest.mark.parametrize(
+    "x",
+    [
+        pytest.param(np.zeros((3, 3)), id="a point"),
+        pytest.param(np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 0, 0]]), id="a segment"),
+        pytest.param(np.array([[0.0, 0, 0], [1, 0, 0], [0.5, 1e-12, 0]]), id="nearly a segment"),
+    ],
+)
+def test_degenerate_triangles_stay_finite(x):
+    elastic = model(*TRIANGLE, stretch=K_S)
+    assert np.isfinite(elastic.energy(x))
+    assert np.isfinite(elastic.gradient(x)).all()
+    for positive in (False, True):
+        assert np.isfinite(elastic.hessian(x, positive)).all()
+    assert np.linalg.eigvalsh(elastic.hessian(x, True))[0] > -1e-9 * K_S
+
+
+def extended_energy(X, faces, x):
+    """The stretch energy in extended precision."""
+    X, x = X.astype(np.longdouble), x.astype(np.longdouble)
+    total = np.longdouble(0)
+    for a, b, c in faces:
+        e1, e2 = X[b] - X[a], X[c] - X[a]
+        u = np.sqrt(e1 @ e1)
+        a2 = e1 @ e2 / u
+        b2 = np.sqrt(e2 @ e2 - a2 * a2)
+        f1 = (x[b] - x[a]) / u
+        f2 = (x[c] - x[a] - a2 * f1) / b2
+        c11, c12, c22 = f1 @ f1, f1 @ f2, f2 @ f2
+        t = np.sqrt(c11 + c22 + 2 * np.sqrt(c11 * c22 - c12 * c12))
+        total += K_S * u * b2 / 4 * (c11 + c22 - 2 * t + 2)
+    return total
+
+
+@pytest.mark.parametrize("size", [1e-1, 1e-4, 1e-7])
+def test_energy_change_does_not_cancel(size):
+    X, faces = grid(4, 4)
+    rng = np.random.default_rng(4)
+    x0 = X * [1.01, 0.995, 1.0] + 1e-3 * rng.normal(size=X.shape)
+    x1 = x0 + size * rng.normal(size=X.shape)
+    elastic = model(X, faces, stretch=K_S)
+    expected = extended_energy(X, faces, x1) - extended_energy(X, faces, x0)
+    # Rounding of the forces times the step; extended precision itself limits the reference.
+    allowed = 1e-13 * K_S * size * len(faces) + 1e-17 * K_S * len(faces)
+    assert abs(elastic.energy_change(x0, x1) - float(expected)) < allowed

@@ -1,0 +1,82 @@
+"""What is installed: versions, the C++ core on its own, the command, the typing marker."""
+
+import importlib.metadata
+import importlib.resources
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import diffcloth_torch
+from diffcloth_torch import _core
+
+ROOT = Path(__file__).resolve().parent.parent
+PYPROJECT = (ROOT / "pyproject.toml").read_text()
+
+
+def run_python(code: str) -> str:
+    # Not from ROOT, where an import would find the sources instead of what is installed.
+    folder = Path(__file__).parent
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    return result.stdout.strip()
+
+
+def test_the_version_stands_in_one_place():
+    (version,) = re.findall(r'^version = "(.+)"$', PYPROJECT, re.MULTILINE)
+    assert importlib.metadata.version("diffcloth-torch") == version
+    assert diffcloth_torch.__version__ == version
+
+
+def test_the_build_needs_no_torch():
+    (requires,) = re.findall(r"^requires = (\[.*\])$", PYPROJECT, re.MULTILINE)
+    assert "nanobind" in requires
+    assert "torch" not in requires
+
+
+def test_the_core_loads_without_torch_and_numpy():
+    code = f"""
+import importlib.util, sys
+spec = importlib.util.spec_from_file_location("_core", {_core.__file__!r})
+spec.loader.exec_module(importlib.util.module_from_spec(spec))
+print(sorted({{"torch", "numpy"}} & set(sys.modules)))
+"""
+    assert run_python(code) == "[]"
+
+
+def test_build_info_names_every_part():
+    info = _core.build_info()
+    assert set(info) == {
+        "compiler",
+        "build_type",
+        "flags",
+        "processor",
+        "eigen",
+        "factorization",
+        "blas",
+    }
+    assert all(info.values())
+    assert re.fullmatch(r"3\.4\.\d+", info["eigen"])
+    assert re.fullmatch(r"eigen|cholmod \d+\.\d+\.\d+", info["factorization"])
+    assert (info["blas"] == "none") == (info["factorization"] == "eigen")
+    # The same bits on every machine of one architecture.
+    assert "-ffp-contract=off" in info["flags"]
+    assert "-ffast-math" not in info["flags"]
+
+
+@pytest.mark.parametrize("module", ["matplotlib", "pyvista", "trimesh"])
+def test_importing_the_package_leaves_out(module):
+    code = f"import sys, diffcloth_torch; print({module!r} in sys.modules)"
+    assert run_python(code) == "False"
+
+
+def test_the_command_is_installed():
+    (command,) = importlib.metadata.entry_points(group="console_scripts", name="diffcloth")
+    assert command.value == "diffcloth_torch.cli:main"
+    assert callable(command.load())
+
+
+def test_the_package_is_typed():
+    assert importlib.resources.files("diffcloth_torch").joinpath("py.typed").is_file()
