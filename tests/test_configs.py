@@ -79,37 +79,72 @@ def test_a_minimal_configuration_takes_the_defaults(write):
 
 
 REFUSED = [
-    pytest.param("simulation.stps=3", r"`simulation` has no key `stps` \(did you mean `steps`\?\)"
-                 r"; its keys are dt, steps, scheme", id="unknown-key"),
+    pytest.param(
+        "simulation.stps=3",
+        r"`simulation` has no key `stps` \(did you mean `steps`\?\)"
+        r"; its keys are dt, steps, scheme",
+        id="unknown-key",
+    ),
     pytest.param("sceen={}", r"the file has no key `sceen`.*`scene`", id="unknown-top"),
-    pytest.param("simulation.dt=0", r"`simulation\.dt` must be greater than 0, got 0", id="zero-dt"),
+    pytest.param(
+        "simulation.dt=0", r"`simulation\.dt` must be greater than 0, got 0", id="zero-dt"
+    ),
     pytest.param("simulation.dt=.nan", r"`simulation\.dt` must be a finite number", id="nan"),
-    pytest.param("simulation.dt=soon", r"`simulation\.dt` must be a valid number, got 'soon'",
-                 id="text-for-number"),
-    pytest.param("simulation.steps=1.5", r"`simulation\.steps` must be a valid integer",
-                 id="fraction"),
-    pytest.param("simulation.steps=true", r"`simulation\.steps` must be a valid integer", id="bool"),
-    pytest.param("simulation.scheme=implicit",
-                 r"`simulation\.scheme` must be 'coupled' or 'split', got 'implicit'", id="scheme"),
-    pytest.param("scene.cloths.sheet.shape.kind=square",
-                 r"`scene\.cloths\[0\]\.shape` must have as `kind` one of 'grid', 'disk', 'load'",
-                 id="shape"),
-    pytest.param("scene.cloths.sheet.shape.rows=1",
-                 r"`scene\.cloths\[0\]\.shape\.rows` must be greater than or equal to 2, got 1",
-                 id="rows"),
-    pytest.param("scene.cloths.sheet.shape={kind: grid, rows: 3}",
-                 r"`scene\.cloths\[0\]\.shape\.columns` is missing", id="missing"),
-    pytest.param("scene.cloths.sheet.material.poisson=0.5",
-                 r"`scene\.cloths\[0\]\.material\.poisson` must be less than 0\.5", id="poisson"),
-    pytest.param("scene.cloths.sheet.pose={axis: [0, 0, 1]}",
-                 r"`scene\.cloths\[0\]\.pose` must give `axis` and `degrees` together", id="axis"),
-    pytest.param("scene.cloths.sheet.pins={a: {vertices: [0], nearest: [[0, 0, 0]]}}",
-                 r"pins\.a` must have exactly one of vertices, box, nearest", id="two-selections"),
-    pytest.param("scene.cloths=[]", r"`scene\.cloths` is not accepted|`scene\.cloths` must",
-                 id="no-cloth"),
+    pytest.param(
+        "simulation.dt=soon",
+        r"`simulation\.dt` must be a valid number, got 'soon'",
+        id="text-for-number",
+    ),
+    pytest.param(
+        "simulation.steps=1.5", r"`simulation\.steps` must be a valid integer", id="fraction"
+    ),
+    pytest.param(
+        "simulation.steps=true", r"`simulation\.steps` must be a valid integer", id="bool"
+    ),
+    pytest.param(
+        "simulation.scheme=implicit",
+        r"`simulation\.scheme` must be 'coupled' or 'split', got 'implicit'",
+        id="scheme",
+    ),
+    pytest.param(
+        "scene.cloths.sheet.shape.kind=square",
+        r"`scene\.cloths\[0\]\.shape` must have as `kind` one of 'grid', 'disk', 'load'",
+        id="shape",
+    ),
+    pytest.param(
+        "scene.cloths.sheet.shape.rows=1",
+        r"`scene\.cloths\[0\]\.shape\.rows` must be greater than or equal to 2, got 1",
+        id="rows",
+    ),
+    pytest.param(
+        "scene.cloths.sheet.shape={kind: grid, rows: 3}",
+        r"`scene\.cloths\[0\]\.shape\.columns` is missing",
+        id="missing",
+    ),
+    pytest.param(
+        "scene.cloths.sheet.material.poisson=0.5",
+        r"`scene\.cloths\[0\]\.material\.poisson` must be less than 0\.5",
+        id="poisson",
+    ),
+    pytest.param(
+        "scene.cloths.sheet.pose={axis: [0, 0, 1]}",
+        r"`scene\.cloths\[0\]\.pose` must give `axis` and `degrees` together",
+        id="axis",
+    ),
+    pytest.param(
+        "scene.cloths.sheet.pins={a: {vertices: [0], nearest: [[0, 0, 0]]}}",
+        r"pins\.a` must have exactly one of vertices, box, nearest",
+        id="two-selections",
+    ),
+    pytest.param(
+        "scene.cloths=[]", r"`scene\.cloths` is not accepted|`scene\.cloths` must", id="no-cloth"
+    ),
     pytest.param("scene.gravity=[0, 0]", r"`scene\.gravity`.*3", id="short-vector"),
-    pytest.param("output.pictures.ground=low",
-                 r"`output\.pictures\.ground` must be a valid number or must be 'auto'", id="union"),
+    pytest.param(
+        "output.pictures.ground=low",
+        r"`output\.pictures\.ground` must be a valid number or must be 'auto'",
+        id="union",
+    ),
     pytest.param("task=dance", r"`task` must be one of drape, hit_cloth; got 'dance'", id="task"),
 ]
 
@@ -165,8 +200,11 @@ def test_set_leaves_the_document_alone():
         pytest.param("simulation.dt", "must be key=value", id="no-value"),
         pytest.param("=3", "must be key=value", id="no-key"),
         pytest.param("simulation.dt=[", "not YAML", id="broken-yaml"),
-        pytest.param("scene.cloths.shirt.name=x", "items of the list are 0 .. 0, sheet; got `shirt`",
-                     id="unknown-item"),
+        pytest.param(
+            "scene.cloths.shirt.name=x",
+            "items of the list are 0 .. 0, sheet; got `shirt`",
+            id="unknown-item",
+        ),
         pytest.param("task.name=x", "below a plain value", id="below-a-value"),
     ],
 )
