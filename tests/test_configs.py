@@ -230,7 +230,7 @@ class TestRoot:
     @pytest.mark.parametrize("given", ["../../secret.obj", "../meshes/../../secret.obj"])
     def test_a_file_elsewhere_is_refused(self, files, given):
         config = files / "project/configs/a.yaml"
-        with pytest.raises(InvalidInput, match="must lie under the root.*`root`"):
+        with pytest.raises(InvalidInput, match=r"must lie under the root.*`root`"):
             resolve_path(config, "..", given)
 
     def test_a_link_does_not_lead_out(self, files):

@@ -323,6 +323,8 @@ def test_actions_become_poses_of_the_body():
     dt = task.simulator.dt
     expected = torch.tensor([0.0, -0.04 + 3 * dt, 0.95 + 3 * 2 * dt], dtype=torch.float64)
     torch.testing.assert_close(poses[-1, :3].detach(), expected)
+    first_interval = torch.tensor([0.0, -0.04 + 3 * dt, 0.95], dtype=torch.float64)
+    torch.testing.assert_close(poses[2, :3].detach(), first_interval)
     half = torch.tensor(6 * dt / 2, dtype=torch.float64)
     torch.testing.assert_close(poses[-1, 3].detach(), half.cos())
     torch.testing.assert_close(poses[-1, 4].detach(), half.sin())

@@ -159,19 +159,23 @@ class TestRecord:
             lightness[ground] = image[gray].min()
         assert lightness["-0.5"] < lightness["null"] - 40
 
-    def test_a_failed_simulation_is_drawn_up_to_the_failure(self, make_task, tmp_path):
+    @pytest.mark.parametrize(
+        ("error", "drawn"),
+        [
+            pytest.param(dc.InfeasibleMotion("no way"), True, id="failed-step"),
+            pytest.param(KeyboardInterrupt(), False, id="interrupt"),
+        ],
+    )
+    def test_what_led_to_a_failed_step_is_drawn(self, make_task, tmp_path, error, drawn):
         task = make_task("output.pictures.video=none")
-        with pytest.raises(dc.InfeasibleMotion), Record(tmp_path, task, fps=10) as viewer:
-            viewer.show(task.initial_state())
-            raise dc.InfeasibleMotion("no way")
-        assert (tmp_path / "animation.png").exists()
 
-    def test_another_error_draws_nothing(self, make_task, tmp_path):
-        task = make_task()
-        with pytest.raises(KeyboardInterrupt), Record(tmp_path, task, fps=10) as viewer:
-            viewer.show(task.initial_state())
-            raise KeyboardInterrupt
-        assert not (tmp_path / "animation.png").exists()
+        def failing():
+            yield task.initial_state()
+            raise error
+
+        with pytest.raises(type(error)):
+            record(task, tmp_path, failing())
+        assert (tmp_path / "animation.png").exists() == drawn
 
 
 def test_a_missing_package_is_named_before_anything_runs(make_task, tmp_path, monkeypatch):
