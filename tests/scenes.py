@@ -228,6 +228,34 @@ def pinned(held=False, **options):
     return case
 
 
+def poking(**options):
+    """A corner of a box turns into a pinned sheet, by several portions of its motion."""
+    vertices, faces = grid(6, 6, seed=17)
+    up = [0.0, 0.0, 0.0, 0.87, 0.28, -0.36, 0.05]  # a corner on top
+    box = dc.RigidBody.box(0.2, motion="kinematic", pose=up, friction=0.5)
+    top = transform(np.array(box.vertices), np.array(up))
+    corner = top[np.argmax(top[:, 2])]
+    cloth = dc.Cloth(
+        vertices + corner + [0.013, 0.017, 0.007],
+        faces,
+        rest_vertices=vertices,
+        material=material(faces, friction=0.5),
+        pins={"rim": [0, 5, 30, 35]},
+        soft_pins={"free": [14]},
+        pin_stiffness=2.0,
+    )
+    sim = simulator([cloth], [box], **options)
+    state = settled(sim, sim.initial_state(), 3)
+    poses = state.body_poses.clone()
+    half = np.radians(25.0) / 2
+    w, x, y, z = up[3:]
+    about_z = [np.cos(half) * w - np.sin(half) * z, np.cos(half) * x - np.sin(half) * y,
+               np.cos(half) * y + np.sin(half) * x, np.cos(half) * z + np.sin(half) * w]
+    poses[0, 3:] = -1.4 * torch.tensor(about_z, dtype=F64)  # the other sign is the same rotation
+    poses[0, 2] += 4e-3
+    return Case(sim, state, {"body_poses": poses})
+
+
 # --- Cloth against cloth ---------------------------------------------------------------------------
 
 
@@ -265,7 +293,7 @@ def stacked(**options):
     """One cloth slides on another, softly pinned one; densities and thicknesses differ."""
     lower, faces = grid(6, 6, seed=11)
     upper, upper_faces = grid(5, 5, edge=0.09, seed=12)
-    upper = turned(turned(upper, (0, 0, 1), 0.4), (1, 0.5, 0), 0.006)
+    upper = turned(turned(upper, (0, 0, 1), 0.03), (1, 0.5, 0), 0.006)
     cloths = [
         dc.Cloth(
             lower,
@@ -322,6 +350,7 @@ REGIMES = {
     "folded_thick": lambda **o: folded(thickness=0.003, **o),
     "stacked": stacked,
     "sphere": on_sphere,
+    "poking": poking,
 }
 
 
