@@ -35,15 +35,29 @@ def directions(tensor: torch.Tensor, generator: torch.Generator) -> Iterator[tor
         yield noise * mask
 
 
-def difference(f: Callable[[torch.Tensor], float], x: torch.Tensor, d: torch.Tensor, step: float,
-               *, forward: bool = False) -> float:
+def difference(
+    f: Callable[[torch.Tensor], float],
+    x: torch.Tensor,
+    d: torch.Tensor,
+    step: float,
+    *,
+    forward: bool = False,
+) -> float:
     """Derivative of f at x along d."""
     stencil = _FORWARD if forward else _CENTRAL
     return sum(w * f(x + (k * step) * d) for k, w in stencil) / step
 
 
-def mismatch(f: Callable[[torch.Tensor], float], x: torch.Tensor, gradient: torch.Tensor,
-             d: torch.Tensor, step: float, rtol: float, *, forward: bool = False) -> float:
+def mismatch(
+    f: Callable[[torch.Tensor], float],
+    x: torch.Tensor,
+    gradient: torch.Tensor,
+    d: torch.Tensor,
+    step: float,
+    rtol: float,
+    *,
+    forward: bool = False,
+) -> float:
     """Smallest relative error over a sweep of steps, ended where it is below rtol.
 
     Relative to the root of the sum of squares of the terms of gradient . d: their sum may cancel.

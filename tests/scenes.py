@@ -8,7 +8,7 @@ friction, which lags one step behind, acts in the step at hand; what makes a reg
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -104,15 +104,30 @@ def material(faces, seed=0, *, friction=0.5, thickness=0.0, damping=0.002, stret
     )
 
 
-def simulator(cloths, bodies=(), *, scheme="coupled", metric="mass", gravity=(0.4, -0.3, -9.81),
-              tolerance=TOLERANCE, **contact):
-    options = {"barrier_distance": 0.01, "barrier_stiffness": 20.0, "slip_velocity": 0.02, **contact}
+def simulator(
+    cloths,
+    bodies=(),
+    *,
+    scheme="coupled",
+    metric="mass",
+    gravity=(0.4, -0.3, -9.81),
+    tolerance=TOLERANCE,
+    **contact,
+):
+    if scheme != "split":
+        metric = "mass"
+    options = {
+        "barrier_distance": 0.01,
+        "barrier_stiffness": 20.0,
+        "slip_velocity": 0.02,
+        **contact,
+    }
     return dc.Simulator(
         dc.Scene(cloths, bodies, gravity=gravity),
         DT,
         scheme=scheme,
         contact=dc.ContactOptions(**options),
-        solver=dc.SolverOptions(tolerance=tolerance, metric=metric if scheme == "split" else "mass"),
+        solver=dc.SolverOptions(tolerance=tolerance, metric=metric),
     )
 
 
@@ -127,7 +142,7 @@ def settled(sim, state, steps, control=None, *, velocity=None, hold=None):
     return state.detach()
 
 
-# --- Free flight -----------------------------------------------------------------------------------
+# --- Free flight ---------------------------------------------------------------------------------
 
 
 def hanging(curved=False, model="patch", **options):
@@ -160,15 +175,16 @@ def hanging(curved=False, model="patch", **options):
     return Case(sim, state, control)
 
 
-# --- A sheet on a box ------------------------------------------------------------------------------
+# --- A sheet on a box ----------------------------------------------------------------------------
 
 
-def on_box(friction, velocity, *, thickness=0.0, pins=None, steps=6, kick=None, moving=False,
-           **options):
+def on_box(
+    friction, velocity, *, thickness=0.0, pins=None, steps=6, kick=None, moving=False, **options
+):
     """A sheet that lies on a box, slightly tilted, with its rim in the air."""
     vertices, faces = grid(6, 6, seed=3)
     pose = [0.01, -0.02, 0.0, 1.3, 0.02, 0.03, 0.2]  # the quaternion is not normalized
-    above = vertices + [0.0, 0.0, 0.208 + 1.2 * thickness]
+    above = vertices + np.array([0.0, 0.0, 0.208 + 1.2 * thickness])
     placed = transform(above, np.array(pose))
     box = dc.RigidBody.box(
         (0.34, 0.29, 0.4),
@@ -249,14 +265,18 @@ def poking(**options):
     poses = state.body_poses.clone()
     half = np.radians(25.0) / 2
     w, x, y, z = up[3:]
-    about_z = [np.cos(half) * w - np.sin(half) * z, np.cos(half) * x - np.sin(half) * y,
-               np.cos(half) * y + np.sin(half) * x, np.cos(half) * z + np.sin(half) * w]
+    about_z = [
+        np.cos(half) * w - np.sin(half) * z,
+        np.cos(half) * x - np.sin(half) * y,
+        np.cos(half) * y + np.sin(half) * x,
+        np.cos(half) * z + np.sin(half) * w,
+    ]
     poses[0, 3:] = -1.4 * torch.tensor(about_z, dtype=F64)  # the other sign is the same rotation
     poses[0, 2] += 4e-3
     return Case(sim, state, {"body_poses": poses})
 
 
-# --- Cloth against cloth ---------------------------------------------------------------------------
+# --- Cloth against cloth -------------------------------------------------------------------------
 
 
 def folded(thickness=0.0, **options):
@@ -303,10 +323,14 @@ def stacked(**options):
             pin_stiffness=100.0,
         ),
         dc.Cloth(
-            upper + [0.02, 0.01, 0.013],
+            upper + np.array([0.02, 0.01, 0.013]),
             upper_faces,
             material=dc.Material(
-                stretch=250.0, bending=2e-3, density=0.5, damping=0.001, friction=0.6,
+                stretch=250.0,
+                bending=2e-3,
+                density=0.5,
+                damping=0.001,
+                friction=0.6,
                 thickness=0.006,
             ),
             soft_pins={"one": [12]},
@@ -323,9 +347,11 @@ def stacked(**options):
 def on_sphere(friction=0.4, rows=6, body_friction=None, **options):
     """A sheet over a sphere, which slides off to one side."""
     vertices, faces = grid(rows, rows, edge=0.5 / (rows - 1), seed=13)
-    ball = dc.RigidBody.sphere(0.2, motion="kinematic", friction=friction, pose=[0, 0, 0, 1, 0.2, 0.1, 0.3])
+    ball = dc.RigidBody.sphere(
+        0.2, motion="kinematic", friction=friction, pose=[0, 0, 0, 1, 0.2, 0.1, 0.3]
+    )
     cloth = dc.Cloth(
-        turned(vertices, (0.2, 1, 0), 0.05) + [0.05, 0.02, 0.207],
+        turned(vertices, (0.2, 1, 0), 0.05) + np.array([0.05, 0.02, 0.207]),
         faces,
         rest_vertices=vertices,
         material=material(faces, friction=friction),
@@ -354,7 +380,7 @@ REGIMES = {
 }
 
 
-@lru_cache(maxsize=None)
+@cache
 def regime(name, scheme="coupled", metric="mass", friction_iterations=2):
     """A scene by name; made once."""
     return REGIMES[name](scheme=scheme, metric=metric, friction_iterations=friction_iterations)

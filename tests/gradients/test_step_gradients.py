@@ -74,9 +74,7 @@ def make_loss(case, seed=0, weights=(1.0, scenes.DT, 0.01)):
 
     def loss(state):
         after = [getattr(state, name) for name in names]
-        return sum(
-            ((a - b) * c).sum() for a, b, c in zip(after, before, cotangents, strict=True)
-        )
+        return sum(((a - b) * c).sum() for a, b, c in zip(after, before, cotangents, strict=True))
 
     return loss
 
@@ -120,7 +118,7 @@ def check(case, rtol, *, zero=(), weights=(1.0, scenes.DT, 0.01), only=None):
     assert not problems, "\n".join(problems)
 
 
-# --- The regimes are what they say -----------------------------------------------------------------
+# --- The regimes are what they say ---------------------------------------------------------------
 
 
 def contact_slip(case, after):
@@ -220,7 +218,7 @@ def test_some_edges_in_contact_are_nearly_parallel(name):
     assert found
 
 
-# --- Gradients -------------------------------------------------------------------------------------
+# --- Gradients -----------------------------------------------------------------------------------
 
 
 COUPLED, MASS, IDENTITY = ("coupled", "mass"), ("split", "mass"), ("split", "identity")
@@ -330,9 +328,9 @@ def test_coarser_parameters_get_the_sums_of_finer_ones():
         torch.testing.assert_close(cloth[key], sums, rtol=1e-9, atol=0)
         torch.testing.assert_close(scalar[key], sums.sum(), rtol=1e-9, atol=1e-16)
 
-    pair = gradients(
-        case.where(parameters={"friction": torch.full((2, 2), 0.5, dtype=F64)}), loss
-    )["parameters.friction"]
+    pair = gradients(case.where(parameters={"friction": torch.full((2, 2), 0.5, dtype=F64)}), loss)[
+        "parameters.friction"
+    ]
     one = gradients(case.where(parameters={"friction": torch.tensor(0.5, dtype=F64)}), loss)
     torch.testing.assert_close(one["parameters.friction"], pair.sum(), rtol=1e-9, atol=1e-16)
     assert pair[0, 1] == pair[1, 0] != 0
@@ -413,7 +411,7 @@ def test_friction_iterations_change_the_step():
     assert 1e-7 < (x2 - x3).abs().max() < (x1 - x2).abs().max()
 
 
-def test_scenes_are_differentiable_in_everything(subtests=None):
+def test_scenes_are_differentiable_in_everything():
     """No input is forgotten by these tests."""
     sim = scenes.regime("pushing").sim
     parameters = {k for k, v in vars(sim.parameters()).items() if isinstance(v, torch.Tensor)}
