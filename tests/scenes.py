@@ -114,8 +114,6 @@ def simulator(
     tolerance=TOLERANCE,
     **contact,
 ):
-    if scheme != "split":
-        metric = "mass"
     options = {
         "barrier_distance": 0.01,
         "barrier_stiffness": 20.0,
@@ -179,13 +177,13 @@ def hanging(curved=False, model="patch", **options):
 
 
 def on_box(
-    friction, velocity, *, thickness=0.0, pins=None, steps=6, kick=None, moving=False, **options
+    friction, velocity, *, thickness=0.0, pins=None, steps=6, above=0.008, moving=False, **options
 ):
     """A sheet that lies on a box, slightly tilted, with its rim in the air."""
     vertices, faces = grid(6, 6, seed=3)
     pose = [0.01, -0.02, 0.0, 1.3, 0.02, 0.03, 0.2]  # the quaternion is not normalized
-    above = vertices + np.array([0.0, 0.0, 0.208 + 1.2 * thickness])
-    placed = transform(above, np.array(pose))
+    lifted = vertices + np.array([0.0, 0.0, 0.2 + above + 1.2 * thickness])
+    placed = transform(lifted, np.array(pose))
     box = dc.RigidBody.box(
         (0.34, 0.29, 0.4),
         motion="kinematic",
@@ -225,6 +223,16 @@ def sliding(**options):
 
 def separating(**options):
     return on_box(0.5, (0.3, 0.1, 0.12), **options)
+
+
+def landing(**options):
+    """No contact before the step, contact after it: friction begins in its second iteration."""
+    return on_box(0.5, (0.5, 0.2, -0.5), steps=0, above=0.011, **options)
+
+
+def leaving(**options):
+    """Contact before the step, none after it."""
+    return on_box(0.5, (0.3, 0.1, 1.5), **options)
 
 
 def thick(**options):
@@ -368,6 +376,8 @@ REGIMES = {
     "sticking": sticking,
     "sliding": sliding,
     "separating": separating,
+    "landing": landing,
+    "leaving": leaving,
     "thick": thick,
     "pushing": pushing,
     "pinned": pinned,

@@ -258,6 +258,26 @@ def test_a_batch_has_the_bits_of_its_environments_and_sums_what_they_share(case)
         assert torch.equal(value, found[name]), name
 
 
+def test_batched_controls_and_parameters_have_the_bits_of_their_environments(case):
+    g = torch.Generator().manual_seed(0)
+    inputs = {k: t for k, t in case.inputs().items() if not k.startswith("state.")}
+    batched = {
+        k: torch.stack([t, t * (1 + 1e-3 * torch.rand(t.shape, dtype=F64, generator=g))])
+        for k, t in inputs.items()
+        if k != "control.body_poses"  # one motion for all
+    }
+    batched = {k: t.requires_grad_() for k, t in batched.items()}
+    stacked = dc.stack([case.state, case.state])
+    states = {f"state.{k}": getattr(stacked, k) for k in scenes.STATE}
+    after = case.where(state=stacked).step({**states, **batched})
+    found = torch.autograd.grad(total(after), list(batched.values()))
+    for i in range(2):
+        values = {k: t[i].detach().clone().requires_grad_() for k, t in batched.items()}
+        single = gradients(case, values)
+        assert torch.equal(case.step(values).positions, after.positions[i])
+        assert_same(single, {k: bar[i] for k, bar in zip(batched, found, strict=True)})
+
+
 def test_the_number_of_threads_changes_no_bit(case, threads):
     threads(1)
     one, one_bars = batch_gradients(case)
