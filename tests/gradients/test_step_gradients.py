@@ -45,7 +45,7 @@ CONTACT_PARAMETERS = (
     "parameters.slip_velocity",
 )
 # Where a gradient vanishes; everywhere else it must not.
-ZERO = {name: CONTACT_PARAMETERS for name in ("hanging", "curved", "hinge")}
+ZERO = dict.fromkeys(("hanging", "curved", "hinge"), CONTACT_PARAMETERS)
 
 
 def make_loss(case, seed=0, weights=(1.0, scenes.DT, 0.01)):
@@ -185,6 +185,16 @@ def test_landing_and_leaving_have_contact_at_one_end_only():
         assert (case.step().report.contact_count > 0) == after
 
 
+def test_a_pinned_vertex_is_in_contact():
+    case = scenes.regime("pinned")
+    after = case.step()
+    frame = np.linalg.inv(_matrix(after.body_poses[0].numpy()))
+    pin = frame[:3, :3] @ after.positions[14].numpy() + frame[:3, 3]
+    half = np.array(case.sim.scene.bodies[0].vertices).max(axis=0)
+    assert (np.abs(pin[:2]) < half[:2]).all()
+    assert 0 < pin[2] - half[2] < 0.95 * case.sim.parameters().barrier_distance.item()
+
+
 def test_free_flight_is_free():
     for name in ("hanging", "curved", "hinge"):
         assert scenes.regime(name).step().report.contact_count == 0
@@ -234,7 +244,7 @@ QUICK = [
     ("sliding", IDENTITY, 2),
     ("separating", MASS, 1),
     ("landing", COUPLED, 2),
-    ("leaving", COUPLED, 2),
+    ("leaving", COUPLED, 1),
     ("thick", COUPLED, 2),
     ("pushing", COUPLED, 3),
     ("pinned", MASS, 2),
@@ -249,8 +259,8 @@ ALL = [
     for name in scenes.REGIMES
     for scheme in (COUPLED, MASS, IDENTITY)
     for iterations in (1, 2)
-    # Where nothing touches at the end, `split` has hardly a contact left to differentiate.
-    if name != "leaving" or scheme == COUPLED
+    # Where nothing touches at the end, only the friction of the first solve is left.
+    if name != "leaving" or (scheme, iterations) == (COUPLED, 1)
 ]
 SLOW = [case for case in ALL if case not in QUICK]
 
