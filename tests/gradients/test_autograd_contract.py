@@ -350,3 +350,13 @@ def test_one_unconverged_environment_refuses_for_its_batch():
     with pytest.raises(dc.NotConverged, match=r"environments \[1\]") as caught:
         after.positions.sum().backward()
     assert caught.value.environments == (1,)
+
+
+@pytest.mark.parametrize("name", ["pinned", "hanging"])
+def test_a_loss_of_nothing_has_a_gradient_of_exact_zeros(name):
+    case = scenes.regime(name)
+    values = leaves(case)
+    loss = 0.0 * total(case.step(values))
+    for gradient in torch.autograd.grad(loss, list(values.values())):
+        assert not gradient.isnan().any()
+        assert not gradient.any()

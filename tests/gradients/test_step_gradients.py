@@ -1,5 +1,6 @@
 """The gradient of one step, with respect to every input, against central differences."""
 
+import ipctk
 import numpy as np
 import pytest
 import scenes
@@ -10,7 +11,6 @@ import diffcloth_torch as dc
 from diffcloth_torch.poses import transform
 
 F64 = torch.float64
-ipctk = pytest.importorskip("ipctk")
 
 FREE, CONTACT = 1e-6, 1e-5  # relative error
 
