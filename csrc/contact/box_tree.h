@@ -1,0 +1,68 @@
+#pragma once
+
+#include <span>
+#include <vector>
+
+#include "common/types.h"
+
+namespace diffcloth::contact {
+
+/// Axis-aligned box.
+struct Box {
+  double lo[3];
+  double hi[3];
+};
+
+/// Whether two closed boxes have a point in common.
+inline bool overlap(const Box& a, const Box& b) {
+  return (a.lo[0] <= b.hi[0]) & (b.lo[0] <= a.hi[0]) & (a.lo[1] <= b.hi[1]) &
+         (b.lo[1] <= a.hi[1]) & (a.lo[2] <= b.hi[2]) & (b.lo[2] <= a.hi[2]);
+}
+
+/// Smallest box around two boxes.
+inline Box united(const Box& a, const Box& b) {
+  Box box;
+  for (int k = 0; k < 3; ++k) {
+    box.lo[k] = a.lo[k] < b.lo[k] ? a.lo[k] : b.lo[k];
+    box.hi[k] = a.hi[k] > b.hi[k] ? a.hi[k] : b.hi[k];
+  }
+  return box;
+}
+
+/// Binary tree over boxes whose shape is fixed once: only the boxes are refitted afterwards, so that
+/// what a search visits, and in which order, does not depend on earlier searches.
+class BoxTree {
+ public:
+  /// A node holds the items first .. last - 1 of items(); a leaf has no children (left = 0).
+  /// Its children are the nodes left and left + 1, behind the node itself.
+  struct Node {
+    Index first;
+    Index last;
+    Index left;
+  };
+
+  /// Boxes of a tree at one moment, in the order of items() and of nodes().
+  struct Boxes {
+    std::vector<Box> items;
+    std::vector<Box> nodes;
+  };
+
+  BoxTree() = default;
+
+  /// Tree over items with the given centers (centers[i] belongs to ids[i]), split at the median of
+  /// the longest axis.
+  BoxTree(std::vector<Index> ids, std::span<const Vec3> centers);
+
+  bool empty() const { return items_.empty(); }
+  const std::vector<Index>& items() const { return items_; }
+  const std::vector<Node>& nodes() const { return nodes_; }
+
+  /// Recompute the nodes' boxes from boxes.items.
+  void refit(Boxes& boxes) const;
+
+ private:
+  std::vector<Index> items_;
+  std::vector<Node> nodes_;
+};
+
+}  // namespace diffcloth::contact

@@ -1,0 +1,96 @@
+#pragma once
+
+#include <array>
+#include <compare>
+#include <cstdint>
+#include <optional>
+#include <utility>
+#include <vector>
+
+#include "common/types.h"
+#include "contact/box_tree.h"
+#include "contact/collision_mesh.h"
+#include "contact/pair.h"
+
+namespace diffcloth::contact {
+
+/// A pair that may come into contact. a: vertex or edge, b: face or edge of the collision mesh.
+struct Candidate {
+  PairKind kind;
+  std::array<Index, 4> vertices;
+  Index a;
+  Index b;
+
+  friend bool operator==(const Candidate& p, const Candidate& q) {
+    return p.kind == q.kind && p.a == q.a && p.b == q.b;
+  }
+  friend std::strong_ordering operator<=>(const Candidate& p, const Candidate& q) {
+    if (const auto order = p.kind <=> q.kind; order != 0) return order;
+    if (const auto order = p.a <=> q.a; order != 0) return order;
+    return p.b <=> q.b;
+  }
+};
+
+/// Which pairs can come close at all, by swept boxes.
+///
+/// Immutable after construction, and safe to share between threads that each have a Scratch. Pairs
+/// are: vertex and face, edge and edge, of different cloths, of a cloth and a body, and of one cloth
+/// if the mesh has self_contact. Pairs within a body, of two bodies, and pairs that share a vertex
+/// are left out, as are vertices that belong to no face.
+class BroadPhase {
+ public:
+  /// @param x_reference  positions that shape the search trees, 3 * vertex_count
+  BroadPhase(const CollisionMesh& mesh, const double* x_reference);
+
+  /// Boxes and lists that a search fills; reuse one to search without allocation.
+  struct Scratch {
+    struct Surface {
+      BoxTree::Boxes vertices;
+      BoxTree::Boxes edges;
+      BoxTree::Boxes faces;
+      Box box;      ///< Around the whole surface.
+      bool fitted;  ///< Whether the trees' boxes belong to the present search.
+    };
+    std::vector<Box> vertex_boxes;
+    std::vector<Surface> surfaces;
+    std::vector<std::array<Index, 2>> pairs;
+    std::vector<std::array<Index, 2>> sorted;
+    std::vector<Index> bucket;
+    std::vector<std::array<Index, 2>> stack;
+  };
+
+  /// All pairs whose boxes overlap, each box swept from x_t0 to x_t1 and inflated by radius / 2
+  /// (d_hat + the largest xi), rounded outward. Sorted; every pair that comes within radius at any
+  /// time of the straight motion is among them.
+  void find(const double* x_t0,
+            const double* x_t1,
+            double radius,
+            Scratch& scratch,
+            std::vector<Candidate>& out) const;
+
+  /// The lowest (edge, face) that intersect at x, among the pairs of surfaces that may touch.
+  ///
+  /// An edge that pierces a face is always found (exact arithmetic decides close calls); an edge
+  /// that merely touches a face may be reported.
+  std::optional<std::pair<Index, Index>> find_intersection(const double* x, Scratch& scratch) const;
+
+ private:
+  struct SurfaceTrees {
+    BoxTree vertices;
+    BoxTree edges;
+    BoxTree faces;
+  };
+
+  void sweep(const double* x_t0, const double* x_t1, double radius, Scratch& scratch) const;
+  void fit(Index surface, Scratch& scratch) const;
+  bool may_touch(Index surface_a, Index surface_b) const;
+
+  CollisionMesh mesh_;
+  std::vector<SurfaceTrees> trees_;
+};
+
+/// Smallest distance between non-adjacent elements of the same cloth at x (vertex and face, edge and
+/// edge) [m]; +infinity if there are none. Exact.
+double smallest_nonadjacent_distance(const CollisionMesh& mesh, const double* x);
+
+}  // namespace diffcloth::contact

@@ -1,0 +1,47 @@
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <vector>
+
+#include "common/types.h"
+
+namespace diffcloth::contact {
+
+/// Surfaces that may touch: the cloths' vertices first, then the bodies'.
+///
+/// A surface is a cloth (0 .. cloth_count - 1) or a body (from cloth_count on). Faces and edges are
+/// grouped by surface in the same order.
+struct CollisionMesh {
+  using Face = std::array<Index, 3>;
+  using Edge = std::array<Index, 2>;
+
+  Index vertex_count = 0;
+  Index cloth_vertex_count = 0;
+  Index cloth_count = 0;
+  std::vector<Face> faces;
+  std::vector<Edge> edges;  ///< v0 < v1, each once, lexicographic within a surface.
+  Index cloth_face_count = 0;
+  Index cloth_edge_count = 0;
+  std::vector<Index> vertex_surface;
+  std::vector<Index> face_surface;
+  std::vector<Index> edge_surface;
+  std::vector<std::array<Index, 2>> edge_faces;  ///< -1 where missing; the first two of several.
+  bool self_contact = true;                      ///< Whether a cloth touches itself.
+
+  CollisionMesh() = default;
+
+  /// @param faces           corners of every face, grouped by surface in ascending order
+  /// @param vertex_surface  surface of every vertex, ascending
+  /// @throws std::invalid_argument naming the first face or vertex that breaks this.
+  CollisionMesh(std::vector<Face> faces,
+                std::vector<Index> vertex_surface,
+                Index cloth_count,
+                bool self_contact);
+
+  Index surface_count() const {
+    return vertex_surface.empty() ? cloth_count : std::max(cloth_count, vertex_surface.back() + 1);
+  }
+};
+
+}  // namespace diffcloth::contact
