@@ -83,14 +83,14 @@ class BroadPhase {
 
   void sweep(const double* x_t0, const double* x_t1, double radius, Scratch& scratch) const;
   void fit(Index surface, Scratch& scratch) const;
-  bool may_touch(Index surface_a, Index surface_b) const;
+
+  /// Visit the pairs of surfaces that may touch and whose boxes overlap, the cloth first (a cloth
+  /// with itself included); their trees are fitted by then.
+  template <class Visit>
+  void visit_surface_pairs(Scratch& scratch, Visit&& visit) const;
 
   CollisionMesh mesh_;
   std::vector<SurfaceTrees> trees_;
 };
-
-/// Smallest distance between non-adjacent elements of the same cloth at x (vertex and face, edge and
-/// edge) [m]; +infinity if there are none. Exact.
-double smallest_nonadjacent_distance(const CollisionMesh& mesh, const double* x);
 
 }  // namespace diffcloth::contact

@@ -1,0 +1,93 @@
+#include "contact/ccd.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+
+#include "common/types.h"
+#include "contact/distance/separation.h"
+
+namespace diffcloth::contact {
+namespace {
+
+/// Share of the initial gap at which the search stops, and of the present gap that a step leaves.
+constexpr double kGapLeft = 0.1;
+
+/// Rounding of positions, relative to the largest coordinate, that counts as contact.
+constexpr double kRounding = 1e-12;
+
+/// A search that has not ended by then returns the safe time it has reached.
+constexpr int kMaxIterations = 1000;
+
+using Differences = std::array<Vec3, 4>;
+
+/// Vectors from the corners of the second primitive to those of the first: four for two edges,
+/// three for a point and a triangle (the fourth repeats the third).
+Differences between(PairKind kind, const Corners& x) {
+  switch (kind) {
+    case PairKind::kPointTriangle: return {x[0] - x[1], x[0] - x[2], x[0] - x[3], x[0] - x[3]};
+    case PairKind::kEdgeEdge: return {x[0] - x[2], x[0] - x[3], x[1] - x[2], x[1] - x[3]};
+  }
+  __builtin_unreachable();
+}
+
+/// Latest time up to which n . (start + time motion) >= bound holds from t on, for all differences;
+/// -infinity where it does not hold at t.
+double certified_time(const Vec3& n,
+                      const Differences& start,
+                      const Differences& motion,
+                      double t,
+                      double bound) {
+  double time = std::numeric_limits<double>::infinity();
+  for (int k = 0; k < 4; ++k) {
+    const double speed = n.dot(motion[k]);
+    const double gap = n.dot(start[k]) - bound;
+    if (speed < 0) {
+      time = std::min(time, -gap / speed);
+    } else if (!(gap + speed * t >= 0)) {
+      return -std::numeric_limits<double>::infinity();
+    }
+  }
+  return time;
+}
+
+}  // namespace
+
+double safe_step(PairKind kind, const Corners& x_t0, const Corners& x_t1, double xi) {
+  Vec3 d_vector = separation(kind, x_t0);
+  double d = d_vector.norm();
+  double largest = 0;
+  for (int i = 0; i < 4; ++i) {
+    largest = std::max({largest, x_t0[i].cwiseAbs().maxCoeff(), x_t1[i].cwiseAbs().maxCoeff()});
+  }
+  if (!(d > xi + kRounding * largest)) return 0;
+
+  Corners U;
+  for (int i = 0; i < 4; ++i) U[i] = x_t1[i] - x_t0[i];
+  const Differences start = between(kind, x_t0);
+  const Differences motion = between(kind, U);
+  double lp_sq = 0;
+  for (const Vec3& m : motion) {
+    if (!std::isfinite(m.squaredNorm())) return 0;  // nothing can be certified
+    lp_sq = std::max(lp_sq, m.squaredNorm());
+  }
+  const double lp = std::sqrt(lp_sq);
+
+  const double g = kGapLeft * (d - xi);
+  double t = 0;
+  for (int iteration = 0; iteration < kMaxIterations; ++iteration) {
+    const double reach = std::max(t + (1 - kGapLeft) * (d - xi) / lp,
+                                  certified_time(d_vector / d, start, motion, t, xi + g));
+    if (reach >= 1) return 1;
+    t = reach;
+    Corners x;
+    for (int i = 0; i < 4; ++i) x[i] = x_t0[i] + t * U[i];
+    d_vector = separation(kind, x);
+    d = d_vector.norm();
+    if (!(d - xi >= g)) break;
+  }
+  return t;
+}
+
+}  // namespace diffcloth::contact
