@@ -204,8 +204,8 @@ void collision_kernels(nb::module_& m) {
 
   nb::class_<Search>(m, "BroadPhase")
       .def(nb::init<const Faces&, const Surfaces&, Index, bool, const Positions&>(),
-           "faces"_a.noconvert(), "vertex_surface"_a.noconvert(), "cloth_count"_a,
-           "self_contact"_a, "x_reference"_a.noconvert())
+           "faces"_a.noconvert(), "vertex_surface"_a.noconvert(), "cloth_count"_a, "self_contact"_a,
+           "x_reference"_a.noconvert())
       .def("find", &Search::find, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "radius"_a)
       .def("find_intersection", &Search::find_intersection, "x"_a.noconvert())
       .def("smallest_nonadjacent_distance", &Search::smallest_nonadjacent_distance,

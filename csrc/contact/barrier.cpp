@@ -12,8 +12,8 @@ double barrier(double D, double xi, double d_hat) {
   const double s = 2 * xi * d_hat + d_hat * d_hat;
   if (sigma >= s) return 0;
   if (sigma <= 0) return std::numeric_limits<double>::infinity();
-  const double r = sigma / s;
-  return -d_hat * (r - 1) * (r - 1) * std::log(r);
+  const double below = sigma / s - 1;
+  return d_hat * (-below * below * std::log(sigma / s));
 }
 
 Barrier barrier_derivatives(double D, double xi, double d_hat) {
@@ -22,8 +22,13 @@ Barrier barrier_derivatives(double D, double xi, double d_hat) {
   if (sigma >= s) return {};
   if (sigma <= 0) {
     constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
-    return {.b = std::numeric_limits<double>::infinity(), .b1 = kNan, .b2 = kNan, .b_d_hat = kNan,
-            .b1_d_hat = kNan, .b_xi = kNan, .b1_xi = kNan};
+    return {.b = std::numeric_limits<double>::infinity(),
+            .b1 = kNan,
+            .b2 = kNan,
+            .b_d_hat = kNan,
+            .b1_d_hat = kNan,
+            .b_xi = kNan,
+            .b1_xi = kNan};
   }
   const double r = sigma / s;
   const double below = r - 1;

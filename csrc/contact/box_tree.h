@@ -15,8 +15,8 @@ struct Box {
 
 /// Whether two closed boxes have a point in common.
 inline bool overlap(const Box& a, const Box& b) {
-  return (a.lo[0] <= b.hi[0]) & (b.lo[0] <= a.hi[0]) & (a.lo[1] <= b.hi[1]) &
-         (b.lo[1] <= a.hi[1]) & (a.lo[2] <= b.hi[2]) & (b.lo[2] <= a.hi[2]);
+  return (a.lo[0] <= b.hi[0]) & (b.lo[0] <= a.hi[0]) & (a.lo[1] <= b.hi[1]) & (b.lo[1] <= a.hi[1]) &
+         (a.lo[2] <= b.hi[2]) & (b.lo[2] <= a.hi[2]);
 }
 
 /// Smallest box around two boxes.
@@ -29,8 +29,8 @@ inline Box united(const Box& a, const Box& b) {
   return box;
 }
 
-/// Binary tree over boxes whose shape is fixed once: only the boxes are refitted afterwards, so that
-/// what a search visits, and in which order, does not depend on earlier searches.
+/// Binary tree over boxes whose shape is fixed once: only the boxes are refitted afterwards, so
+/// that what a search visits, and in which order, does not depend on earlier searches.
 class BoxTree {
  public:
   /// A node holds the items first .. last - 1 of items(); a leaf has no children (left = 0).

@@ -13,64 +13,62 @@ namespace {
 
 using IndexPair = std::array<Index, 2>;
 using Stack = std::vector<IndexPair>;
+using PairList = BroadPhase::Scratch::PairList;
 
-/// Outward rounding of a box, relative to its coordinates: covers the rounding of the box itself and
-/// of positions interpolated between the ends of the motion.
+/// Outward rounding of a box, relative to its coordinates: covers the rounding of the box itself
+/// and of positions interpolated between the ends of the motion.
 constexpr double kOutward = 1e-15;
 
 bool share_vertex(const CollisionMesh::Edge& e, const CollisionMesh::Edge& f) {
-  return e[0] == f[0] || e[0] == f[1] || e[1] == f[0] || e[1] == f[1];
+  return (e[0] == f[0]) | (e[0] == f[1]) | (e[1] == f[0]) | (e[1] == f[1]);
 }
 
 bool has_vertex(const CollisionMesh::Face& face, Index v) {
-  return face[0] == v || face[1] == v || face[2] == v;
+  return (face[0] == v) | (face[1] == v) | (face[2] == v);
 }
 
-/// Visit all items of two trees whose boxes overlap.
-template <class Visit>
-void visit_overlaps(const BoxTree& tree_a,
-                    const BoxTree::Boxes& a,
-                    const BoxTree& tree_b,
-                    const BoxTree::Boxes& b,
-                    Stack& stack,
-                    Visit&& visit) {
+/// Append all (item of a, item of b) whose boxes overlap. Which items of two leaves do is as good
+/// as random: every pair is written, and kept by counting on, which spares the processor the guess.
+void append_overlaps(const BoxTree& tree_a,
+                     const BoxTree::Boxes& a,
+                     const BoxTree& tree_b,
+                     const BoxTree::Boxes& b,
+                     Stack& stack,
+                     PairList& pairs) {
   if (tree_a.empty() || tree_b.empty() || !overlap(a.nodes[0], b.nodes[0])) return;
   stack.clear();
   stack.push_back({0, 0});
   while (!stack.empty()) {
     const auto [i, j] = stack.back();
     stack.pop_back();
-    const BoxTree::Node& node_a = tree_a.nodes()[i];
-    const BoxTree::Node& node_b = tree_b.nodes()[j];
-    if (node_a.left == 0 && node_b.left == 0) {
-      for (Index k = node_a.first; k < node_a.last; ++k) {
-        for (Index l = node_b.first; l < node_b.last; ++l) {
-          if (overlap(a.items[k], b.items[l])) visit(tree_a.items()[k], tree_b.items()[l]);
+    const BoxTree::Node& p = tree_a.nodes()[i];
+    const BoxTree::Node& q = tree_b.nodes()[j];
+    if (p.left == 0 && q.left == 0) {
+      IndexPair* end = pairs.room((p.last - p.first) * (q.last - q.first));
+      for (Index k = p.first; k < p.last; ++k) {
+        for (Index l = q.first; l < q.last; ++l) {
+          *end = {tree_a.items()[k], tree_b.items()[l]};
+          end += overlap(a.items[k], b.items[l]);
         }
       }
+      pairs.end_at(end);
       continue;
     }
-    const bool split_a =
-        node_b.left == 0 ||
-        (node_a.left != 0 && node_a.last - node_a.first >= node_b.last - node_b.first);
+    const bool split_a = q.left == 0 || (p.left != 0 && p.last - p.first >= q.last - q.first);
     for (Index child = 0; child < 2; ++child) {
-      const Index next_i = split_a ? node_a.left + child : i;
-      const Index next_j = split_a ? j : node_b.left + child;
+      const Index next_i = split_a ? p.left + child : i;
+      const Index next_j = split_a ? j : q.left + child;
       if (overlap(a.nodes[next_i], b.nodes[next_j])) stack.push_back({next_i, next_j});
     }
   }
 }
 
-/// Visit all unordered pairs of different items of one tree whose boxes overlap.
-template <class Visit>
-void visit_self_overlaps(const BoxTree& tree,
-                         const BoxTree::Boxes& boxes,
-                         Stack& stack,
-                         Visit&& visit) {
+/// Append all unordered pairs of different items of one tree whose boxes overlap.
+void append_self_overlaps(const BoxTree& tree,
+                          const BoxTree::Boxes& boxes,
+                          Stack& stack,
+                          PairList& pairs) {
   if (tree.empty()) return;
-  const auto visit_items = [&](Index k, Index l) {
-    if (overlap(boxes.items[k], boxes.items[l])) visit(tree.items()[k], tree.items()[l]);
-  };
   stack.clear();
   stack.push_back({0, 0});
   while (!stack.empty()) {
@@ -78,19 +76,20 @@ void visit_self_overlaps(const BoxTree& tree,
     stack.pop_back();
     const BoxTree::Node& p = tree.nodes()[i];
     const BoxTree::Node& q = tree.nodes()[j];
-    if (i == j && p.left == 0) {
+    if (p.left == 0 && q.left == 0) {
+      IndexPair* end = pairs.room((p.last - p.first) * (q.last - q.first));
       for (Index k = p.first; k < p.last; ++k) {
-        for (Index l = k + 1; l < p.last; ++l) visit_items(k, l);
+        for (Index l = i == j ? k + 1 : q.first; l < q.last; ++l) {
+          *end = {tree.items()[k], tree.items()[l]};
+          end += overlap(boxes.items[k], boxes.items[l]);
+        }
       }
+      pairs.end_at(end);
     } else if (i == j) {
       stack.push_back({p.left, p.left});
       stack.push_back({p.left + 1, p.left + 1});
       if (overlap(boxes.nodes[p.left], boxes.nodes[p.left + 1])) {
         stack.push_back({p.left, p.left + 1});
-      }
-    } else if (p.left == 0 && q.left == 0) {
-      for (Index k = p.first; k < p.last; ++k) {
-        for (Index l = q.first; l < q.last; ++l) visit_items(k, l);
       }
     } else {
       const bool split_p = q.left == 0 || (p.left != 0 && p.last - p.first >= q.last - q.first);
@@ -101,6 +100,17 @@ void visit_self_overlaps(const BoxTree& tree,
       }
     }
   }
+}
+
+/// Drop the pairs that do not satisfy `keep`.
+template <class Keep>
+void filter(PairList& pairs, Keep&& keep) {
+  IndexPair* end = pairs.begin();
+  for (const IndexPair& pair : pairs) {
+    *end = pair;
+    end += keep(pair);
+  }
+  pairs.end_at(end);
 }
 
 /// Sort scratch.pairs into scratch.sorted: counted by the first index (below `count`), then by the
@@ -128,7 +138,8 @@ BroadPhase::BroadPhase(const CollisionMesh& mesh, const double* x_reference) : m
     for (const Index v : corners) sum += row(x_reference, v);
     return sum / static_cast<double>(corners.size());
   };
-  const auto tree_of = [&](const auto& elements, const std::vector<Index>& surface_of, Index surface) {
+  const auto tree_of = [&](const auto& elements, const std::vector<Index>& surface_of,
+                           Index surface) {
     std::vector<Index> ids;
     std::vector<Vec3> centers;
     for (std::size_t k = 0; k < elements.size(); ++k) {
@@ -223,18 +234,16 @@ void BroadPhase::find(const double* x_t0,
   sweep(x_t0, x_t1, radius, scratch);
 
   scratch.pairs.clear();
-  const auto keep_vertex_face = [&](Index v, Index f) {
-    if (!has_vertex(mesh_.faces[f], v)) scratch.pairs.push_back({v, f});
-  };
   visit_surface_pairs(scratch, [&](Index s, Index r) {
     const Scratch::Surface& a = scratch.surfaces[s];
     const Scratch::Surface& b = scratch.surfaces[r];
-    visit_overlaps(trees_[s].vertices, a.vertices, trees_[r].faces, b.faces, scratch.stack,
-                   keep_vertex_face);
+    append_overlaps(trees_[s].vertices, a.vertices, trees_[r].faces, b.faces, scratch.stack,
+                    scratch.pairs);
     if (s == r) return;
-    visit_overlaps(trees_[r].vertices, b.vertices, trees_[s].faces, a.faces, scratch.stack,
-                   keep_vertex_face);
+    append_overlaps(trees_[r].vertices, b.vertices, trees_[s].faces, a.faces, scratch.stack,
+                    scratch.pairs);
   });
+  filter(scratch.pairs, [&](const IndexPair& p) { return !has_vertex(mesh_.faces[p[1]], p[0]); });
   sort_pairs(mesh_.vertex_count, scratch);
   for (const auto& [v, f] : scratch.sorted) {
     const auto& [i, j, k] = mesh_.faces[f];
@@ -242,20 +251,19 @@ void BroadPhase::find(const double* x_t0,
   }
 
   scratch.pairs.clear();
-  const auto keep_edges = [&](Index e, Index f) {
-    if (!share_vertex(mesh_.edges[e], mesh_.edges[f])) {
-      scratch.pairs.push_back({std::min(e, f), std::max(e, f)});
-    }
-  };
   visit_surface_pairs(scratch, [&](Index s, Index r) {
     const BoxTree::Boxes& a = scratch.surfaces[s].edges;
     const BoxTree::Boxes& b = scratch.surfaces[r].edges;
     if (s == r) {
-      visit_self_overlaps(trees_[s].edges, a, scratch.stack, keep_edges);
+      append_self_overlaps(trees_[s].edges, a, scratch.stack, scratch.pairs);
     } else {
-      visit_overlaps(trees_[s].edges, a, trees_[r].edges, b, scratch.stack, keep_edges);
+      append_overlaps(trees_[s].edges, a, trees_[r].edges, b, scratch.stack, scratch.pairs);
     }
   });
+  filter(scratch.pairs,
+         [&](const IndexPair& p) { return !share_vertex(mesh_.edges[p[0]], mesh_.edges[p[1]]); });
+  for (IndexPair& pair : scratch.pairs)
+    pair = {std::min(pair[0], pair[1]), std::max(pair[0], pair[1])};
   sort_pairs(mesh_.cloth_edge_count, scratch);  // the lower edge belongs to a cloth
   for (const auto& [e, f] : scratch.sorted) {
     const auto& [i, j] = mesh_.edges[e];
@@ -267,24 +275,26 @@ void BroadPhase::find(const double* x_t0,
 std::optional<std::pair<Index, Index>> BroadPhase::find_intersection(const double* x,
                                                                      Scratch& scratch) const {
   sweep(x, x, 0, scratch);
-  std::optional<std::pair<Index, Index>> lowest;
-  const auto test = [&](Index e, Index f) {
-    const CollisionMesh::Edge& edge = mesh_.edges[e];
-    const CollisionMesh::Face& face = mesh_.faces[f];
-    if (lowest && *lowest < std::pair(e, f)) return;
-    if (has_vertex(face, edge[0]) || has_vertex(face, edge[1])) return;
-    if (pierces(row(x, edge[0]), row(x, edge[1]), row(x, face[0]), row(x, face[1]),
-                row(x, face[2]))) {
-      lowest = {e, f};
-    }
-  };
+  scratch.pairs.clear();
   visit_surface_pairs(scratch, [&](Index s, Index r) {
     const Scratch::Surface& a = scratch.surfaces[s];
     const Scratch::Surface& b = scratch.surfaces[r];
-    visit_overlaps(trees_[s].edges, a.edges, trees_[r].faces, b.faces, scratch.stack, test);
+    append_overlaps(trees_[s].edges, a.edges, trees_[r].faces, b.faces, scratch.stack,
+                    scratch.pairs);
     if (s == r) return;
-    visit_overlaps(trees_[r].edges, b.edges, trees_[s].faces, a.faces, scratch.stack, test);
+    append_overlaps(trees_[r].edges, b.edges, trees_[s].faces, a.faces, scratch.stack,
+                    scratch.pairs);
   });
+  std::optional<std::pair<Index, Index>> lowest;
+  for (const auto& [e, f] : scratch.pairs) {
+    const auto& [i, j] = mesh_.edges[e];
+    const CollisionMesh::Face& face = mesh_.faces[f];
+    if (lowest && *lowest < std::pair(e, f)) continue;
+    if (has_vertex(face, i) || has_vertex(face, j)) continue;
+    if (pierces(row(x, i), row(x, j), row(x, face[0]), row(x, face[1]), row(x, face[2]))) {
+      lowest = {e, f};
+    }
+  }
   return lowest;
 }
 

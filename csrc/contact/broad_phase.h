@@ -2,6 +2,7 @@
 
 #include <array>
 #include <compare>
+#include <cstddef>
 #include <cstdint>
 #include <optional>
 #include <utility>
@@ -34,9 +35,9 @@ struct Candidate {
 /// Which pairs can come close at all, by swept boxes.
 ///
 /// Immutable after construction, and safe to share between threads that each have a Scratch. Pairs
-/// are: vertex and face, edge and edge, of different cloths, of a cloth and a body, and of one cloth
-/// if the mesh has self_contact. Pairs within a body, of two bodies, and pairs that share a vertex
-/// are left out, as are vertices that belong to no face.
+/// are: vertex and face, edge and edge, of different cloths, of a cloth and a body, and of one
+/// cloth if the mesh has self_contact. Pairs within a body, of two bodies, and pairs that share a
+/// vertex are left out, as are vertices that belong to no face.
 class BroadPhase {
  public:
   /// @param x_reference  positions that shape the search trees, 3 * vertex_count
@@ -51,9 +52,28 @@ class BroadPhase {
       Box box;      ///< Around the whole surface.
       bool fitted;  ///< Whether the trees' boxes belong to the present search.
     };
+    /// Growing list that is written through a pointer.
+    class PairList {
+     public:
+      void clear() { size_ = 0; }
+      std::size_t size() const { return size_; }
+      std::array<Index, 2>* begin() { return pairs_.data(); }
+      std::array<Index, 2>* end() { return pairs_.data() + size_; }
+
+      /// Pointer behind the last pair, with room for `count` more.
+      std::array<Index, 2>* room(std::size_t count) {
+        if (size_ + count > pairs_.size()) pairs_.resize(2 * (size_ + count));
+        return end();
+      }
+      void end_at(const std::array<Index, 2>* end) { size_ = end - pairs_.data(); }
+
+     private:
+      std::vector<std::array<Index, 2>> pairs_;
+      std::size_t size_ = 0;
+    };
     std::vector<Box> vertex_boxes;
     std::vector<Surface> surfaces;
-    std::vector<std::array<Index, 2>> pairs;
+    PairList pairs;
     std::vector<std::array<Index, 2>> sorted;
     std::vector<Index> bucket;
     std::vector<std::array<Index, 2>> stack;

@@ -26,19 +26,18 @@ using Differences = std::array<Vec3, 4>;
 /// three for a point and a triangle (the fourth repeats the third).
 Differences between(PairKind kind, const Corners& x) {
   switch (kind) {
-    case PairKind::kPointTriangle: return {x[0] - x[1], x[0] - x[2], x[0] - x[3], x[0] - x[3]};
-    case PairKind::kEdgeEdge: return {x[0] - x[2], x[0] - x[3], x[1] - x[2], x[1] - x[3]};
+    case PairKind::kPointTriangle:
+      return {x[0] - x[1], x[0] - x[2], x[0] - x[3], x[0] - x[3]};
+    case PairKind::kEdgeEdge:
+      return {x[0] - x[2], x[0] - x[3], x[1] - x[2], x[1] - x[3]};
   }
   __builtin_unreachable();
 }
 
 /// Latest time up to which n . (start + time motion) >= bound holds from t on, for all differences;
 /// -infinity where it does not hold at t.
-double certified_time(const Vec3& n,
-                      const Differences& start,
-                      const Differences& motion,
-                      double t,
-                      double bound) {
+double certified_time(
+    const Vec3& n, const Differences& start, const Differences& motion, double t, double bound) {
   double time = std::numeric_limits<double>::infinity();
   for (int k = 0; k < 4; ++k) {
     const double speed = n.dot(motion[k]);

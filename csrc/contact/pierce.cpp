@@ -88,10 +88,9 @@ int quick_orientation(const Vec3& a, const Vec3& b, const Vec3& c, const Vec3& d
   const Vec3 v = c - a;
   const Vec3 w = d - a;
   const double determinant = u.cross(v).dot(w);
-  const Vec3 permanent =
-      Vec3(std::abs(u[1] * v[2]) + std::abs(u[2] * v[1]),
-           std::abs(u[2] * v[0]) + std::abs(u[0] * v[2]),
-           std::abs(u[0] * v[1]) + std::abs(u[1] * v[0]));
+  const Vec3 permanent = Vec3(std::abs(u[1] * v[2]) + std::abs(u[2] * v[1]),
+                              std::abs(u[2] * v[0]) + std::abs(u[0] * v[2]),
+                              std::abs(u[0] * v[1]) + std::abs(u[1] * v[0]));
   const double error = kOrientationError * permanent.dot(w.cwiseAbs());
   if (determinant > error) return 1;
   if (determinant < -error) return -1;
@@ -130,8 +129,8 @@ bool pierces(const Vec3& e0, const Vec3& e1, const Vec3& t0, const Vec3& t1, con
   const int above = quick_orientation(t0, t1, t2, e0);
   const int below = quick_orientation(t0, t1, t2, e1);
   if (above * below > 0) return false;
-  // Nearly coplanar pairs are common (a flat sheet) and mostly far apart: exact signs only for those
-  // that no plane separates.
+  // Nearly coplanar pairs are common (a flat sheet) and mostly far apart: exact signs only for
+  // those that no plane separates.
   if ((above == 0 || below == 0) && certainly_apart({e0, e1}, {t0, t1, t2})) return false;
 
   const int side_0 = orientation(t0, t1, t2, e0);

@@ -13,9 +13,9 @@ constexpr double kParallel = 2.5e-16;
 
 /// Distance from a vertex to an edge, as found while classifying.
 struct Nearest {
-  int vertex;   ///< corner of the point (its sign is that of the primitive it belongs to)
-  int e0, e1;   ///< corners of the edge
-  double a;     ///< parameter on the edge, clamped to [0, 1]
+  int vertex;  ///< corner of the point (its sign is that of the primitive it belongs to)
+  int e0, e1;  ///< corners of the edge
+  double a;    ///< parameter on the edge, clamped to [0, 1]
   double d_sq = std::numeric_limits<double>::infinity();
 };
 
@@ -149,8 +149,10 @@ Eigen::Matrix<double, 12, 2> parameter_coupling(const Closest& pair) {
 
 Closest closest(PairKind kind, const Corners& x) {
   switch (kind) {
-    case PairKind::kPointTriangle: return point_triangle(x);
-    case PairKind::kEdgeEdge: return edge_edge(x);
+    case PairKind::kPointTriangle:
+      return point_triangle(x);
+    case PairKind::kEdgeEdge:
+      return edge_edge(x);
   }
   __builtin_unreachable();
 }

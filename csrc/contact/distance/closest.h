@@ -12,11 +12,11 @@ namespace diffcloth::contact {
 ///
 /// With parameters beta where the closest points are free to slide (c' = dc/dbeta):
 ///
-///   type          c (over the corners that take part)   beta     c'_a                         s_a
-///   point-point   (1, -1)                               -        -                            -
-///   point-edge    (1, -(1 - a), -a)                     a        (0, 1, -1)                   -e
-///   point-plane   (1, -(1 - b0 - b1), -b0, -b1)         b0, b1   (0, 1, -1, 0), (0, 1, 0, -1) -e0, -e1
-///   line-line     (1 - s, s, -(1 - t), -t)              s, t     (-1, 1, 0, 0), (0, 0, 1, -1) u, -v
+///   type         c (of the corners that take part)  beta    c'_a                          s_a
+///   point-point  (1, -1)                            -       -                             -
+///   point-edge   (1, -(1 - a), -a)                  a       (0, 1, -1)                    -e
+///   point-plane  (1, -(1 - b0 - b1), -b0, -b1)      b0, b1  (0, 1, -1, 0), (0, 1, 0, -1)  -e0, -e1
+///   line-line    (1 - s, s, -(1 - t), -t)           s, t    (-1, 1, 0, 0), (0, 0, 1, -1)  u, -v
 ///
 ///   D = |t|^2,   s_a = dt/dbeta_a,   M_ab = s_a . s_b,   G_(i),a = c_i s_a + c'_(a,i) t
 ///   grad D = 2 c (x) t,   hess D = 2 c c^T (x) I - 2 G M^-1 G^T,   dbeta = -M^-1 G^T dx

@@ -9,9 +9,7 @@ namespace {
 /// angle of 1.8 degrees at rest length.
 constexpr double kThreshold = 1e-3;
 
-double cross_sq(const Corners& x) {
-  return Vec3(x[1] - x[0]).cross(x[3] - x[2]).squaredNorm();
-}
+double cross_sq(const Corners& x) { return Vec3(x[1] - x[0]).cross(x[3] - x[2]).squaredNorm(); }
 
 }  // namespace
 
@@ -32,7 +30,10 @@ Mollifier mollifier_derivatives(const Corners& x, double eps) {
   const Vec3 w = u.cross(v);
   const double q = w.squaredNorm();
   if (!(q < eps)) {
-    return {.m = 1, .gradient = Vec12::Zero(), .hessian = Mat12::Zero(), .m_eps = 0,
+    return {.m = 1,
+            .gradient = Vec12::Zero(),
+            .hessian = Mat12::Zero(),
+            .m_eps = 0,
             .gradient_eps = Vec12::Zero()};
   }
   const double y = q / eps;
@@ -48,8 +49,7 @@ Mollifier mollifier_derivatives(const Corners& x, double eps) {
 
   const Mat3 q_uu = 2 * (v.squaredNorm() * Mat3::Identity() - v * v.transpose());
   const Mat3 q_vv = 2 * (u.squaredNorm() * Mat3::Identity() - u * u.transpose());
-  const Mat3 q_uv =
-      2 * (2 * u * v.transpose() - u.dot(v) * Mat3::Identity() - v * u.transpose());
+  const Mat3 q_uv = 2 * (2 * u * v.transpose() - u.dot(v) * Mat3::Identity() - v * u.transpose());
 
   Mat12 hessian;
   for (int i = 0; i < 2; ++i) {

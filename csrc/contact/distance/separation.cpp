@@ -7,6 +7,10 @@
 namespace diffcloth::contact {
 namespace {
 
+/// Squared sine of the angle below which the interior of a pair is only one candidate of several:
+/// above it, the region that the closest points lie in is certain up to rounding.
+constexpr double kThin = 1e-6;
+
 double clamp01(double a) { return std::min(std::max(a, 0.0), 1.0); }
 
 /// The parameter in [0, 1] nearest to numerator / denominator; 0 on an edge of no length.
@@ -40,26 +44,22 @@ Vec3 point_triangle(const Vec3& p, const Vec3& t0, const Vec3& t1, const Vec3& t
   const Vec3 n = e0.cross(e1);
   const double n_sq = n.squaredNorm();
 
-  // On the interior first. The barycentric coordinates carry an error of rounding / sin(angle), which
-  // matters in a sliver: improve them once with what is left of w.
+  Shortest best{w, w.squaredNorm()};
   if (n_sq > 0) {
     double b0 = w.cross(e1).dot(n) / n_sq;
     double b1 = e0.cross(w).dot(n) / n_sq;
-    if (n_sq < 1e-6 * e0.squaredNorm() * e1.squaredNorm()) {
+    const bool sliver = n_sq < kThin * e0.squaredNorm() * e1.squaredNorm();
+    if (sliver) {
+      // b0 and b1 carry an error of rounding / sin(angle): improve them with what is left of w.
       const Vec3 rest = w - b0 * e0 - b1 * e1;
       b0 += rest.cross(e1).dot(n) / n_sq;
       b1 += e0.cross(rest).dot(n) / n_sq;
-    } else if (b0 > 0 && b1 > 0 && b0 + b1 < 1) {
-      return w - b0 * e0 - b1 * e1;
     }
-    Shortest best{w, w.squaredNorm()};
-    if (b0 >= 0 && b1 >= 0 && b0 + b1 <= 1) best.offer(w - b0 * e0 - b1 * e1);
-    best.offer(from_segment(w, e0));
-    best.offer(from_segment(w, e1));
-    best.offer(from_segment(p - t1, t2 - t1));
-    return best.t;
+    if (b0 >= 0 && b1 >= 0 && b0 + b1 <= 1) {
+      best.offer(w - b0 * e0 - b1 * e1);
+      if (!sliver) return best.t;
+    }
   }
-  Shortest best{w, w.squaredNorm()};
   best.offer(from_segment(w, e0));
   best.offer(from_segment(w, e1));
   best.offer(from_segment(p - t1, t2 - t1));
@@ -84,13 +84,10 @@ Vec3 edge_edge(const Vec3& a0, const Vec3& a1, const Vec3& b0, const Vec3& b1) {
   Shortest best{w, w.squaredNorm()};
   if (n_sq > 0) {
     const double s = v.cross(w).dot(n) / n_sq;
-    if (s >= 0 && s <= 1) {
-      const double t = (vw + s * uv) / vv;
-      if (t >= 0 && t <= 1) {
-        const Vec3 inner = at(s, t);
-        if (n_sq > 1e-6 * uu * vv && s > 0 && s < 1 && t > 0 && t < 1) return inner;
-        best.offer(inner);
-      }
+    const double t = (vw + s * uv) / vv;
+    if (s >= 0 && s <= 1 && t >= 0 && t <= 1) {
+      best.offer(at(s, t));
+      if (n_sq > kThin * uu * vv) return best.t;
     }
   }
   best.offer(at(0, clamped_ratio(vw, vv)));
@@ -104,8 +101,10 @@ Vec3 edge_edge(const Vec3& a0, const Vec3& a1, const Vec3& b0, const Vec3& b1) {
 
 Vec3 separation(PairKind kind, const Corners& x) {
   switch (kind) {
-    case PairKind::kPointTriangle: return point_triangle(x[0], x[1], x[2], x[3]);
-    case PairKind::kEdgeEdge: return edge_edge(x[0], x[1], x[2], x[3]);
+    case PairKind::kPointTriangle:
+      return point_triangle(x[0], x[1], x[2], x[3]);
+    case PairKind::kEdgeEdge:
+      return edge_edge(x[0], x[1], x[2], x[3]);
   }
   __builtin_unreachable();
 }
