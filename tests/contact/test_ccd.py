@@ -44,20 +44,31 @@ def test_no_exact_collision_is_missed(edge_edge):
     assert (t >= 0).all()
 
 
-def meeting_motions(edge_edge, count, rng):
-    """Random motions in which a point of either primitive meet at a known time."""
-    x_t0 = rng.normal(size=(count, 4, 3))
-    motion = 10 ** rng.uniform(-2, 2, size=(count, 1, 1)) * rng.normal(size=(count, 4, 3))
-    time = rng.uniform(0.01, 1, size=(count, 1))
-    if edge_edge:
-        s, t = rng.uniform(size=(2, count))
-        weights = np.stack([1 - s, s, t - 1, -t], axis=-1)
-    else:
-        weights = np.column_stack([np.ones(count), -rng.dirichlet([1, 1, 1], size=count)])
+def meeting_motions(edge_edge, count, rng, gap=None):
+    """Random motions in which a point of either primitive meet at a known time.
+
+    With `gap` [Q], random points of the primitives are that far apart at the start.
+    """
+
+    def between_random_points(x):
+        """Vector from a random point of the second primitive to one of the first."""
+        if edge_edge:
+            s, t = rng.uniform(size=(2, count))
+            weights = np.stack([1 - s, s, t - 1, -t], axis=-1)
+        else:
+            weights = np.column_stack([np.ones(count), -rng.dirichlet([1, 1, 1], size=count)])
+        return np.einsum("qi,qik->qk", weights, x)[:, None]
+
     first = slice(0, 2 if edge_edge else 1)
-    apart = np.einsum("qi,qik->qk", weights, x_t0 + time[:, :, None] * motion)
-    motion[:, first] -= (apart / time)[:, None]
-    return x_t0, x_t0 + motion, time[:, 0]
+    x_t0 = rng.normal(size=(count, 4, 3))
+    if gap is not None:
+        direction = rng.normal(size=(count, 1, 3))
+        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+        x_t0[:, first] += gap[:, None, None] * direction - between_random_points(x_t0)
+    motion = 10 ** rng.uniform(-2, 2, size=(count, 1, 1)) * rng.normal(size=(count, 4, 3))
+    time = rng.uniform(0.01, 1, size=(count, 1, 1))
+    motion[:, first] -= between_random_points(x_t0 + time * motion) / time
+    return x_t0, x_t0 + motion, time[:, 0, 0]
 
 
 @pytest.mark.parametrize("xi", [0.0, 0.02])
@@ -71,6 +82,17 @@ def test_motions_that_meet_are_stopped_before_they_do(edge_edge, xi):
     assert (t[~apart] == 0).all()
     assert (t[apart] > 0).all()
     assert (smallest_distance(edge_edge, x_t0, x_t1, t)[apart] > xi).all()
+
+
+@pytest.mark.parametrize("edge_edge", KINDS)
+def test_motions_that_meet_after_a_near_miss_are_stopped_before_they_do(edge_edge):
+    """Gaps down to the rounding of the positions, where the direction of the gap is uncertain."""
+    rng = np.random.default_rng(10)
+    gap = 10 ** rng.uniform(-11, -3, size=5000)
+    x_t0, x_t1, meeting = meeting_motions(edge_edge, 5000, rng, gap)
+    t = kernels.safe_step(edge_edge, x_t0, x_t1, 0.0)
+    assert (t < meeting).all()
+    assert (smallest_distance(edge_edge, x_t0, x_t1, t, samples=100)[t > 0] > 0).all()
 
 
 @pytest.mark.parametrize("edge_edge", KINDS)
@@ -107,6 +129,14 @@ def test_a_pair_in_contact_cannot_move_even_apart():
     assert one(POINT_TRIANGLE, touching, away, xi=0.1) == 0
     assert one(POINT_TRIANGLE, touching, touching, xi=0.1) == 0
     assert one(POINT_TRIANGLE, touching, away, xi=0.099) == 1
+
+
+def test_a_gap_within_the_rounding_of_the_positions_is_contact():
+    x = np.array([[0.2, 0.2, 3e-13], *TRIANGLE])
+    away = x + [[0, 0, 1], [0, 0, 0], [0, 0, 0], [0, 0, 0]]
+    assert one(POINT_TRIANGLE, x, away) == 0
+    x[0, 2] = 3e-12
+    assert one(POINT_TRIANGLE, x, away) == 1
 
 
 def test_pairs_that_move_alike_are_free():

@@ -7,9 +7,9 @@
 namespace diffcloth::contact {
 namespace {
 
-/// Squared sine of the angle below which the interior of a pair is only one candidate of several:
-/// above it, the region that the closest points lie in is certain up to rounding.
-constexpr double kThin = 1e-6;
+/// Squared sine of an angle below which a triangle is a sliver: its interior is only one candidate
+/// of several there, because it is uncertain which region the closest point lies in.
+constexpr double kSliver = 1e-6;
 
 double clamp01(double a) { return std::min(std::max(a, 0.0), 1.0); }
 
@@ -48,7 +48,7 @@ Vec3 point_triangle(const Vec3& p, const Vec3& t0, const Vec3& t1, const Vec3& t
   if (n_sq > 0) {
     double b0 = w.cross(e1).dot(n) / n_sq;
     double b1 = e0.cross(w).dot(n) / n_sq;
-    const bool sliver = n_sq < kThin * e0.squaredNorm() * e1.squaredNorm();
+    const bool sliver = n_sq < kSliver * e0.squaredNorm() * e1.squaredNorm();
     if (sliver) {
       // b0 and b1 carry an error of rounding / sin(angle): improve them with what is left of w.
       const Vec3 rest = w - b0 * e0 - b1 * e1;
@@ -81,15 +81,12 @@ Vec3 edge_edge(const Vec3& a0, const Vec3& a1, const Vec3& b0, const Vec3& b1) {
 
   // Between the lines. An error of s, rounding / sin(angle), moves the point of a along u; with t
   // projected anew it changes the distance only by that times sin(angle), however parallel u and v.
-  Shortest best{w, w.squaredNorm()};
   if (n_sq > 0) {
     const double s = v.cross(w).dot(n) / n_sq;
     const double t = (vw + s * uv) / vv;
-    if (s >= 0 && s <= 1 && t >= 0 && t <= 1) {
-      best.offer(at(s, t));
-      if (n_sq > kThin * uu * vv) return best.t;
-    }
+    if (s >= 0 && s <= 1 && t >= 0 && t <= 1) return at(s, t);
   }
+  Shortest best{w, w.squaredNorm()};
   best.offer(at(0, clamped_ratio(vw, vv)));
   best.offer(at(1, clamped_ratio(vw + uv, vv)));
   best.offer(at(clamped_ratio(-uw, uu), 0));
