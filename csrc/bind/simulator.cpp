@@ -10,6 +10,7 @@
 
 #include "bind/bind.h"
 #include "common/parallel_for.h"
+#include "contact/nonadjacent_distance.h"
 #include "step/step.h"
 
 namespace diffcloth::bind {
@@ -106,6 +107,7 @@ class Simulator {
                     const std::vector<std::string>& needs,
                     int threads);
   nb::object energy(const nb::dict& inputs) const;
+  nb::object path(const nb::dict& inputs);
   double smallest_nonadjacent_distance() const;
   double default_barrier_stiffness(const nb::dict& inputs, double barrier_distance) const {
     const Arrays arrays(inputs);
@@ -282,6 +284,32 @@ nb::dict Simulator::backward(const nb::dict& inputs,
   return out;
 }
 
+nb::object Simulator::path(const nb::dict& inputs) {
+  const Arrays arrays(inputs);
+  const auto n = static_cast<std::size_t>(scene_.cloth_vertex_count());
+  const auto all = static_cast<std::size_t>(scene_.vertex_count());
+  std::vector<double> positions(3 * n);
+  std::vector<double> velocities(3 * n);
+  std::vector<double> body_forces(3 * (all - n));
+  std::vector<std::vector<double>> path;
+  for_environments(1, 1, [&](Index, const Checkpoint& checkpoint) {
+    step::forward(scene_,
+                  arrays.environment(0),
+                  checkpoint,
+                  {.positions = positions.data(),
+                   .velocities = velocities.data(),
+                   .body_forces = body_forces.data(),
+                   .tape = {},
+                   .path = &path},
+                  nullptr);
+  });
+  Owned<double> result = make_array<double>({path.size(), all, 3});
+  for (std::size_t k = 0; k < path.size(); ++k) {
+    std::ranges::copy(path[k], result.data + 3 * all * k);
+  }
+  return result.array;
+}
+
 nb::object Simulator::energy(const nb::dict& inputs) const {
   const Arrays arrays(inputs);
   Owned<double> result = make_array<double>({arrays.environments});
@@ -393,6 +421,10 @@ void simulator(nb::module_& m) {
            "needs"_a,
            "threads"_a)
       .def("energy", &Simulator::energy, "inputs"_a)
+      .def("path",
+           &Simulator::path,
+           "inputs"_a,
+           "Accepted iterates of the first environment's step [M, N + V, 3].")
       .def("smallest_nonadjacent_distance", &Simulator::smallest_nonadjacent_distance)
       .def("default_barrier_stiffness",
            &Simulator::default_barrier_stiffness,

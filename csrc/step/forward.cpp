@@ -151,7 +151,8 @@ Report forward(const Scene& scene,
                           .scratch = &scratch,
                           .checkpoint = &checkpoint,
                           .options = scene.given.options,
-                          .seconds = &report.seconds};
+                          .seconds = &report.seconds,
+                          .path = outputs.path};
 
   std::copy_n(problem.start.begin(), cloth, outputs.positions);
   if (problem.contact) {

@@ -32,12 +32,14 @@ struct Report {
   std::string message;
 };
 
-/// Where the results of one environment go.
+/// Where the results of one environment go. With a path, the accepted iterates (all vertices) are
+/// appended to it.
 struct Outputs {
   double* positions;    ///< [N, 3]
   double* velocities;   ///< [N, 3]
   double* body_forces;  ///< [V, 3]
   Tape tape;            ///< pointers are null where no tape is wanted
+  std::vector<std::vector<double>>* path = nullptr;
 };
 
 /// One step: x_{n+1}, v_{n+1}, the contact forces on the bodies' vertices, and the tape.
