@@ -13,7 +13,8 @@ struct Box {
   double hi[3];
 };
 
-/// Whether two closed boxes have a point in common.
+/// Whether two closed boxes have a point in common; in full, because the outcome of each comparison
+/// is as good as random.
 inline bool overlap(const Box& a, const Box& b) {
   return (a.lo[0] <= b.hi[0]) & (b.lo[0] <= a.hi[0]) & (a.lo[1] <= b.hi[1]) & (b.lo[1] <= a.hi[1]) &
          (a.lo[2] <= b.hi[2]) & (b.lo[2] <= a.hi[2]);

@@ -12,7 +12,6 @@ namespace diffcloth::contact {
 namespace {
 
 using IndexPair = std::array<Index, 2>;
-using Stack = std::vector<IndexPair>;
 using PairList = BroadPhase::Scratch::PairList;
 
 /// Outward rounding of a box, relative to its coordinates: covers the rounding of the box itself
@@ -33,14 +32,13 @@ void append_overlaps(const BoxTree& tree_a,
                      const BoxTree::Boxes& a,
                      const BoxTree& tree_b,
                      const BoxTree::Boxes& b,
-                     Stack& stack,
+                     PairList& stack,
                      PairList& pairs) {
   if (tree_a.empty() || tree_b.empty() || !overlap(a.nodes[0], b.nodes[0])) return;
   stack.clear();
-  stack.push_back({0, 0});
-  while (!stack.empty()) {
-    const auto [i, j] = stack.back();
-    stack.pop_back();
+  stack.push({0, 0});
+  while (stack.size() > 0) {
+    const auto [i, j] = stack.pop();
     const BoxTree::Node& p = tree_a.nodes()[i];
     const BoxTree::Node& q = tree_b.nodes()[j];
     if (p.left == 0 && q.left == 0) {
@@ -55,25 +53,27 @@ void append_overlaps(const BoxTree& tree_a,
       continue;
     }
     const bool split_a = q.left == 0 || (p.left != 0 && p.last - p.first >= q.last - q.first);
+    IndexPair* end = stack.room(2);
     for (Index child = 0; child < 2; ++child) {
       const Index next_i = split_a ? p.left + child : i;
       const Index next_j = split_a ? j : q.left + child;
-      if (overlap(a.nodes[next_i], b.nodes[next_j])) stack.push_back({next_i, next_j});
+      *end = {next_i, next_j};
+      end += overlap(a.nodes[next_i], b.nodes[next_j]);
     }
+    stack.end_at(end);
   }
 }
 
 /// Append all unordered pairs of different items of one tree whose boxes overlap.
 void append_self_overlaps(const BoxTree& tree,
                           const BoxTree::Boxes& boxes,
-                          Stack& stack,
+                          PairList& stack,
                           PairList& pairs) {
   if (tree.empty()) return;
   stack.clear();
-  stack.push_back({0, 0});
-  while (!stack.empty()) {
-    const auto [i, j] = stack.back();
-    stack.pop_back();
+  stack.push({0, 0});
+  while (stack.size() > 0) {
+    const auto [i, j] = stack.pop();
     const BoxTree::Node& p = tree.nodes()[i];
     const BoxTree::Node& q = tree.nodes()[j];
     if (p.left == 0 && q.left == 0) {
@@ -86,18 +86,21 @@ void append_self_overlaps(const BoxTree& tree,
       }
       pairs.end_at(end);
     } else if (i == j) {
-      stack.push_back({p.left, p.left});
-      stack.push_back({p.left + 1, p.left + 1});
+      stack.push({p.left, p.left});
+      stack.push({p.left + 1, p.left + 1});
       if (overlap(boxes.nodes[p.left], boxes.nodes[p.left + 1])) {
-        stack.push_back({p.left, p.left + 1});
+        stack.push({p.left, p.left + 1});
       }
     } else {
       const bool split_p = q.left == 0 || (p.left != 0 && p.last - p.first >= q.last - q.first);
+      IndexPair* end = stack.room(2);
       for (Index child = 0; child < 2; ++child) {
         const Index next_i = split_p ? p.left + child : i;
         const Index next_j = split_p ? j : q.left + child;
-        if (overlap(boxes.nodes[next_i], boxes.nodes[next_j])) stack.push_back({next_i, next_j});
+        *end = {next_i, next_j};
+        end += overlap(boxes.nodes[next_i], boxes.nodes[next_j]);
       }
+      stack.end_at(end);
     }
   }
 }

@@ -65,6 +65,11 @@ class BroadPhase {
         if (size_ + count > pairs_.size()) pairs_.resize(2 * (size_ + count));
         return end();
       }
+      void push(const std::array<Index, 2>& pair) {
+        *room(1) = pair;
+        ++size_;
+      }
+      std::array<Index, 2> pop() { return pairs_[--size_]; }
       void end_at(const std::array<Index, 2>* end) { size_ = end - pairs_.data(); }
 
      private:
@@ -76,7 +81,7 @@ class BroadPhase {
     PairList pairs;
     std::vector<std::array<Index, 2>> sorted;
     std::vector<Index> bucket;
-    std::vector<std::array<Index, 2>> stack;
+    PairList stack;
   };
 
   /// All pairs whose boxes overlap, each box swept from x_t0 to x_t1 and inflated by radius / 2

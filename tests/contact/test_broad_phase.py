@@ -317,7 +317,7 @@ def test_the_smallest_distance_may_lie_beyond_pairs_whose_boxes_overlap():
     """Two large triangles, aslant and 5.7 apart, come up before two small ones that are closer."""
     large = np.array([[0.0, 0, 0], [10, 10, 0], [10, 10, 0.1]])
     small = np.array([[100.0, 0, 0], [100.5, 0, 0], [100, 0.5, 0]])
-    x = np.concatenate([large, large + [4, -4, 0], small, small + [3, 0, 0]])
+    x = np.concatenate([large, large + np.array([4, -4, 0]), small, small + np.array([3, 0, 0])])
     faces = np.arange(12, dtype=np.int32).reshape(4, 3)
     mesh = kernels.BroadPhase(faces, np.zeros(12, np.int32), 1, True, x)
     assert mesh.smallest_nonadjacent_distance(x) == 2.5

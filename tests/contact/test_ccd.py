@@ -133,7 +133,7 @@ def test_a_pair_in_contact_cannot_move_even_apart():
 
 def test_a_gap_within_the_rounding_of_the_positions_is_contact():
     x = np.array([[0.2, 0.2, 3e-13], *TRIANGLE])
-    away = x + [[0, 0, 1], [0, 0, 0], [0, 0, 0], [0, 0, 0]]
+    away = x + np.array([[0, 0, 1], [0, 0, 0], [0, 0, 0], [0, 0, 0]])
     assert one(POINT_TRIANGLE, x, away) == 0
     x[0, 2] = 3e-12
     assert one(POINT_TRIANGLE, x, away) == 1

@@ -168,7 +168,7 @@ Mat12 distance_sq_hessian(const Closest& pair) {
   if (pair.parameter_count > 0) {
     const Eigen::Matrix<double, 12, 2> G = parameter_coupling(pair);
     const Eigen::Matrix<double, 12, 2> GM = -2 * G * pair.M_inv;
-    hessian.noalias() = GM * G.transpose();
+    hessian = GM.lazyProduct(G.transpose());  // unrolled, where a product would call gemm
   }
   for (int i = 0; i < 4; ++i) {
     for (int j = 0; j < 4; ++j) {
