@@ -207,30 +207,6 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   return out;
 }
 
-/// The polyline of accepted iterates of a single environment's step, for an independent judge.
-nb::object Simulator::path(const nb::dict& inputs) {
-  const Arrays arrays(inputs);
-  const auto n = 3 * static_cast<std::size_t>(scene_.cloth_vertex_count());
-  const auto all = 3 * static_cast<std::size_t>(scene_.vertex_count());
-  std::vector<double> positions(n), velocities(n), body_forces(all - n);
-  std::vector<std::vector<double>> iterates;
-  for_environments(1, 1, [&](Index, const Checkpoint& checkpoint) {
-    step::forward(scene_,
-                  arrays.environment(0),
-                  checkpoint,
-                  {.positions = positions.data(),
-                   .velocities = velocities.data(),
-                   .body_forces = body_forces.data(),
-                   .tape = {},
-                   .path = &iterates},
-                  &factors_);
-  });
-  Owned<double> out = make_array<double>({iterates.size(), all / 3, 3});
-  double* end = out.data;
-  for (const std::vector<double>& x : iterates) end = std::ranges::copy(x, end).out;
-  return out.array;
-}
-
 nb::dict Simulator::backward(const nb::dict& inputs,
                              const nb::dict& tape,
                              const nb::dict& cotangents,

@@ -51,34 +51,6 @@ double certified_time(
   return time;
 }
 
-/// Unit vector from the second primitive toward the first.
-///
-/// At a gap of 1e-11 the closest vector t has lost five digits to rounding, as a direction too.
-/// Inside two primitives their normal is the same direction, accurate at any gap.
-Vec3 separation(const Closest& k) {
-  if (k.parameter_count == 2) {
-    const Vec3 normal = k.s.col(0).cross(k.s.col(1)).normalized();
-    return normal.dot(k.t) < 0.0 ? Vec3(-normal) : normal;
-  }
-  return k.t.normalized();
-}
-
-/// Largest step for which the plane across n keeps the primitives apart by `margin`: then
-/// n . (x_i - x_j) >= margin for all vertices i of one and j of the other, at its start and end.
-/// This holds for any n, but where n does not separate them to begin with, it is 0.
-double certified_step(const Vec3& n, const Corners& x, const Corners& u, int split, double margin) {
-  double step = 2.0;
-  for (int i = 0; i < split; ++i) {
-    for (int j = split; j < 4; ++j) {
-      const double slack = n.dot(x[i] - x[j]) - margin;
-      if (!(slack >= 0.0)) return 0.0;
-      const double closing = n.dot(u[i] - u[j]);
-      if (closing < 0.0) step = std::min(step, slack / -closing);
-    }
-  }
-  return step;
-}
-
 }  // namespace
 
 double safe_step(PairKind kind, const Corners& x_t0, const Corners& x_t1, double xi) {
