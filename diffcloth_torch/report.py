@@ -20,8 +20,8 @@ class Report:
         converged: Whether the residual fell below the tolerance.
         iterations: Newton iterations.
         residual: Largest Newton step at the end, as a velocity [m/s].
-        minimum_distance: Smallest gap between surfaces that may touch, beyond their thickness [m];
-            infinite where none is near.
+        minimum_distance: Smallest distance between mid-surfaces in contact [m], which is above half
+            the sum of their thicknesses; infinite where nothing is within the barrier's reach.
         contact_count: Pairs of primitives closer than the barrier distance.
         motion_fraction: Part of the prescribed motion that was reached, 1 for all of it.
         seconds: Phase of the solve -> time [s].

@@ -276,6 +276,32 @@ class Simulator:
         energies = torch.from_numpy(self._core.energy(_arrays(inputs)))
         return energies if batch is not None else energies[0]
 
+    def path(
+        self,
+        state: State,
+        control: Control | None = None,
+        parameters: Parameters | None = None,
+    ) -> Tensor:
+        """Polyline along which the solver takes a step, for an independent judge.
+
+        Every straight segment between successive rows is certified free of collisions, while the
+        chord from the first to the last may cross an obstacle. A step that fails gives the path up
+        to its failure.
+
+        Args:
+            state: Where things are, one environment.
+            control: Where they shall be; None holds pins and bodies.
+            parameters: Physical parameters; None takes those of the scene.
+
+        Returns:
+            Accepted iterates, shape [M, N + V, 3] [m]: cloth vertices, then body vertices.
+        """
+        with torch.no_grad():
+            inputs, batch = self._inputs(state, control, parameters)
+        if batch is not None:
+            raise InvalidInput("path: `state` must be one environment, got a batch; use state[i]")
+        return torch.from_numpy(self._core.path(_arrays(inputs)))
+
     def _inputs(
         self, state: State, control: Control | None, parameters: Parameters | None
     ) -> tuple[Inputs, int | None]:

@@ -10,6 +10,7 @@
 
 #include "bind/bind.h"
 #include "common/parallel_for.h"
+#include "contact/nonadjacent_distance.h"
 #include "step/step.h"
 
 namespace diffcloth::bind {
@@ -115,6 +116,11 @@ class Simulator {
   nb::object find_overlap(const Doubles& positions,
                           const Doubles& body_poses,
                           const Doubles& thickness) const;
+  double reference_factorization_seconds(const nb::dict& inputs, int repeats) const {
+    const Arrays arrays(inputs);
+    const nb::gil_scoped_release nogil;
+    return step::reference_factorization_seconds(scene_, arrays.environment(0), repeats);
+  }
   void forget_factors() { factors_.clear(); }
 
  private:
@@ -201,30 +207,6 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   return out;
 }
 
-/// The polyline of accepted iterates of a single environment's step, for an independent judge.
-nb::object Simulator::path(const nb::dict& inputs) {
-  const Arrays arrays(inputs);
-  const auto n = 3 * static_cast<std::size_t>(scene_.cloth_vertex_count());
-  const auto all = 3 * static_cast<std::size_t>(scene_.vertex_count());
-  std::vector<double> positions(n), velocities(n), body_forces(all - n);
-  std::vector<std::vector<double>> iterates;
-  for_environments(1, 1, [&](Index, const Checkpoint& checkpoint) {
-    step::forward(scene_,
-                  arrays.environment(0),
-                  checkpoint,
-                  {.positions = positions.data(),
-                   .velocities = velocities.data(),
-                   .body_forces = body_forces.data(),
-                   .tape = {},
-                   .path = &iterates},
-                  &factors_);
-  });
-  Owned<double> out = make_array<double>({iterates.size(), all / 3, 3});
-  double* end = out.data;
-  for (const std::vector<double>& x : iterates) end = std::ranges::copy(x, end).out;
-  return out.array;
-}
-
 nb::dict Simulator::backward(const nb::dict& inputs,
                              const nb::dict& tape,
                              const nb::dict& cotangents,
@@ -300,6 +282,32 @@ nb::dict Simulator::backward(const nb::dict& inputs,
     }
   }
   return out;
+}
+
+nb::object Simulator::path(const nb::dict& inputs) {
+  const Arrays arrays(inputs);
+  const auto n = static_cast<std::size_t>(scene_.cloth_vertex_count());
+  const auto all = static_cast<std::size_t>(scene_.vertex_count());
+  std::vector<double> positions(3 * n);
+  std::vector<double> velocities(3 * n);
+  std::vector<double> body_forces(3 * (all - n));
+  std::vector<std::vector<double>> path;
+  for_environments(1, 1, [&](Index, const Checkpoint& checkpoint) {
+    step::forward(scene_,
+                  arrays.environment(0),
+                  checkpoint,
+                  {.positions = positions.data(),
+                   .velocities = velocities.data(),
+                   .body_forces = body_forces.data(),
+                   .tape = {},
+                   .path = &path},
+                  nullptr);
+  });
+  Owned<double> result = make_array<double>({path.size(), all, 3});
+  for (std::size_t k = 0; k < path.size(); ++k) {
+    std::ranges::copy(path[k], result.data + 3 * all * k);
+  }
+  return result.array;
 }
 
 nb::object Simulator::energy(const nb::dict& inputs) const {
@@ -416,13 +424,17 @@ void simulator(nb::module_& m) {
       .def("path",
            &Simulator::path,
            "inputs"_a,
-           "Iterates of the first environment's step, bodies included: no segment of this polyline "
-           "has a collision.")
+           "Accepted iterates of the first environment's step [M, N + V, 3].")
       .def("smallest_nonadjacent_distance", &Simulator::smallest_nonadjacent_distance)
       .def("default_barrier_stiffness",
            &Simulator::default_barrier_stiffness,
            "inputs"_a,
            "barrier_distance"_a)
+      .def("reference_factorization_seconds",
+           &Simulator::reference_factorization_seconds,
+           "inputs"_a,
+           "repeats"_a,
+           "Seconds of one factorization of the contact-free Hessian by Eigen, for benchmarks.")
       .def("find_overlap",
            &Simulator::find_overlap,
            "positions"_a,

@@ -5,40 +5,50 @@
 
 namespace diffcloth::contact {
 
-double barrier(double d_sq, double xi, double d_hat) {
-  const double sigma = d_sq - xi * xi;
-  const double s = d_hat * (2.0 * xi + d_hat);
-  if (sigma >= s) return 0.0;
-  if (!(sigma > 0.0)) return std::numeric_limits<double>::infinity();
-  const double r = sigma - s;
-  return -d_hat / (s * s) * r * r * std::log(sigma / s);
+// With r = sigma / s the barrier is b = d_hat phi(r), phi = -(r - 1)^2 ln r.
+
+double barrier(double D, double xi, double d_hat) {
+  const double sigma = D - xi * xi;
+  const double s = 2 * xi * d_hat + d_hat * d_hat;
+  if (sigma >= s) return 0;
+  if (sigma <= 0) return std::numeric_limits<double>::infinity();
+  const double below = sigma / s - 1;
+  return d_hat * (-below * below * std::log(sigma / s));
 }
 
-Barrier barrier_derivatives(double d_sq, double xi, double d_hat) {
-  const double sigma = d_sq - xi * xi;
-  const double s = d_hat * (2.0 * xi + d_hat);
+Barrier barrier_derivatives(double D, double xi, double d_hat) {
+  const double sigma = D - xi * xi;
+  const double s = 2 * xi * d_hat + d_hat * d_hat;
   if (sigma >= s) return {};
-  const double a = d_hat / (s * s);
-  const double r = sigma - s;
-  const double log = std::log(sigma / s);
+  if (sigma <= 0) {
+    constexpr double kNan = std::numeric_limits<double>::quiet_NaN();
+    return {.b = std::numeric_limits<double>::infinity(),
+            .b1 = kNan,
+            .b2 = kNan,
+            .b_d_hat = kNan,
+            .b1_d_hat = kNan,
+            .b_xi = kNan,
+            .b1_xi = kNan};
+  }
+  const double r = sigma / s;
+  const double below = r - 1;
+  const double ln_r = std::log(r);
+  const double phi = -below * below * ln_r;
+  const double phi1 = -2 * below * ln_r - below * below / r;
+  const double phi2 = -2 * ln_r - 4 * below / r + below * below / (r * r);
 
-  const double b = -a * r * r * log;
-  const double b1 = -a * (2.0 * r * log + r * r / sigma);
-  const double b2 = -a * (2.0 * log + 4.0 * r / sigma - r * r / (sigma * sigma));
+  const double s_d_hat = 2 * (xi + d_hat);
+  const double s_xi = 2 * d_hat;
+  const double r_d_hat = -r * s_d_hat / s;
+  const double r_xi = (-2 * xi - r * s_xi) / s;
 
-  // At fixed sigma, with respect to s (through a = d_hat/s^2, too).
-  const double b_s = -2.0 / s * b + a * (2.0 * r * log + r * r / s);
-  const double b1_s = -2.0 / s * b1 + a * (2.0 * log + 2.0 * r / s + 2.0 * r / sigma);
-  const double s_d_hat = 2.0 * (xi + d_hat);
-  const double s_xi = 2.0 * d_hat;
-  const double sigma_xi = -2.0 * xi;
-  return {.b = b,
-          .b1 = b1,
-          .b2 = b2,
-          .b_d_hat = b / d_hat + b_s * s_d_hat,
-          .b1_d_hat = b1 / d_hat + b1_s * s_d_hat,
-          .b_xi = b1 * sigma_xi + b_s * s_xi,
-          .b1_xi = b2 * sigma_xi + b1_s * s_xi};
+  return {.b = d_hat * phi,
+          .b1 = d_hat * phi1 / s,
+          .b2 = d_hat * phi2 / (s * s),
+          .b_d_hat = phi + d_hat * phi1 * r_d_hat,
+          .b1_d_hat = (phi1 + d_hat * (phi2 * r_d_hat - phi1 * s_d_hat / s)) / s,
+          .b_xi = d_hat * phi1 * r_xi,
+          .b1_xi = d_hat * (phi2 * r_xi - phi1 * s_xi / s) / s};
 }
 
 }  // namespace diffcloth::contact

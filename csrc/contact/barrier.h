@@ -2,22 +2,27 @@
 
 namespace diffcloth::contact {
 
-/// Physically normalized barrier of the squared distance D [m]:
+/// Barrier of the squared distance D between surfaces of thickness xi, active up to xi + d_hat [m].
 ///
-///   b = -(d_hat / s^2) (sigma - s)^2 ln(sigma / s),  sigma = D - xi^2,  s = 2 xi d_hat + d_hat^2
+///   sigma = D - xi^2,   s = 2 xi d_hat + d_hat^2
+///   b = -(d_hat / s^2) (sigma - s)^2 ln(sigma / s)   for 0 < sigma < s,
+///   b = 0 for sigma >= s,   b = +infinity for sigma <= 0.
 ///
-/// for 0 < sigma < s; 0 above; +infinity at and below sigma = 0. It is C2 at sigma = s.
-///
-/// [Li et al. 2020; 2021 for the thickness xi]
-double barrier(double d_sq, double xi, double d_hat);
-
-/// b and its derivatives. b1 and b2 are with respect to D; those with respect to d_hat and xi are
-/// total, at fixed D.
+/// b is a length: times a stiffness [Pa] and an area it is an energy. b1 and b2 are derivatives by
+/// D; those by d_hat and xi hold D fixed and include the dependence of sigma and s.
 struct Barrier {
-  double b, b1, b2;
-  double b_d_hat, b1_d_hat;
-  double b_xi, b1_xi;
+  double b;
+  double b1;
+  double b2;
+  double b_d_hat;
+  double b1_d_hat;
+  double b_xi;
+  double b1_xi;
 };
-Barrier barrier_derivatives(double d_sq, double xi, double d_hat);
+
+double barrier(double D, double xi, double d_hat);
+
+/// Value and derivatives. For sigma <= 0 only b is defined; the rest is NaN.
+Barrier barrier_derivatives(double D, double xi, double d_hat);
 
 }  // namespace diffcloth::contact

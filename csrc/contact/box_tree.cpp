@@ -2,62 +2,61 @@
 
 #include <algorithm>
 #include <numeric>
+#include <utility>
+
+#include <Eigen/Geometry>
 
 namespace diffcloth::contact {
+namespace {
 
-BoxTree::BoxTree(const std::vector<Vec3>& centers) {
-  if (centers.empty()) return;
-  std::vector<Index> order(centers.size());
+/// Items a leaf may hold: few enough that two leaves are compared outright.
+constexpr Index kLeafSize = 4;
+
+}  // namespace
+
+BoxTree::BoxTree(std::vector<Index> ids, std::span<const Vec3> centers) {
+  if (ids.empty()) return;
+  const Index count = static_cast<Index>(ids.size());
+  std::vector<Index> order(count);
   std::iota(order.begin(), order.end(), 0);
-  struct Range {
-    Index node, first, last;
-  };
-  std::vector<Range> pending{{0, 0, static_cast<Index>(order.size())}};
-  nodes_.emplace_back();
-  while (!pending.empty()) {
-    const Range range = pending.back();
-    pending.pop_back();
-    const Index count = range.last - range.first;
-    nodes_[range.node].size = count;
-    if (count == 1) {
-      nodes_[range.node].primitive = order[range.first];
-      continue;
-    }
-    Vec3 lower = centers[order[range.first]];
-    Vec3 upper = lower;
-    for (Index k = range.first; k < range.last; ++k) {
-      lower = lower.cwiseMin(centers[order[k]]);
-      upper = upper.cwiseMax(centers[order[k]]);
-    }
-    Index axis = 0;
-    (upper - lower).maxCoeff(&axis);
-    const Index middle = range.first + count / 2;
-    std::nth_element(order.begin() + range.first,
-                     order.begin() + middle,
-                     order.begin() + range.last,
-                     [&](Index p, Index q) {
-                       return centers[p][axis] != centers[q][axis]
-                                  ? centers[p][axis] < centers[q][axis]
-                                  : p < q;
+
+  nodes_.push_back({0, count, 0});
+  for (std::size_t k = 0; k < nodes_.size(); ++k) {
+    const auto [first, last, left] = nodes_[k];
+    if (last - first <= kLeafSize) continue;
+    Eigen::AlignedBox3d extent;
+    for (Index i = first; i < last; ++i) extent.extend(centers[order[i]]);
+    int axis = 0;
+    extent.sizes().maxCoeff(&axis);
+
+    // Half of the leaves on either side, so that leaves are full.
+    const Index leaf_count = (last - first + kLeafSize - 1) / kLeafSize;
+    const Index middle = first + (leaf_count + 1) / 2 * kLeafSize;
+    std::nth_element(order.begin() + first, order.begin() + middle, order.begin() + last,
+                     [&](Index i, Index j) {
+                       const double x_i = centers[i][axis];
+                       const double x_j = centers[j][axis];
+                       return x_i < x_j || (x_i == x_j && i < j);
                      });
-    const auto left = static_cast<Index>(nodes_.size());
-    nodes_[range.node].left = left;
-    nodes_.emplace_back();
-    nodes_.emplace_back();
-    pending.push_back({left, range.first, middle});
-    pending.push_back({left + 1, middle, range.last});
+    nodes_[k].left = static_cast<Index>(nodes_.size());
+    nodes_.push_back({first, middle, 0});
+    nodes_.push_back({middle, last, 0});
   }
+  items_.reserve(count);
+  for (const Index i : order) items_.push_back(ids[i]);
 }
 
-void BoxTree::refit(const std::vector<Box>& primitives, std::vector<Box>& nodes) const {
-  nodes.resize(nodes_.size());
+void BoxTree::refit(Boxes& boxes) const {
+  boxes.nodes.resize(nodes_.size());
   for (std::size_t k = nodes_.size(); k-- > 0;) {
     const Node& node = nodes_[k];
-    if (node.left < 0) {
-      nodes[k] = primitives[node.primitive];
+    if (node.left > 0) {
+      boxes.nodes[k] = united(boxes.nodes[node.left], boxes.nodes[node.left + 1]);
     } else {
-      nodes[k] = nodes[node.left];
-      nodes[k].include(nodes[node.left + 1]);
+      boxes.nodes[k] = boxes.items[node.first];
+      for (Index i = node.first + 1; i < node.last; ++i) {
+        boxes.nodes[k] = united(boxes.nodes[k], boxes.items[i]);
+      }
     }
   }
 }

@@ -1,6 +1,6 @@
 #pragma once
 
-#include <utility>
+#include <span>
 #include <vector>
 
 #include "common/types.h"
@@ -9,116 +9,61 @@ namespace diffcloth::contact {
 
 /// Axis-aligned box.
 struct Box {
-  Vec3 lower;
-  Vec3 upper;
-
-  bool overlaps(const Box& other) const {
-    return (lower.array() <= other.upper.array()).all() &&
-           (other.lower.array() <= upper.array()).all();
-  }
-  void include(const Box& other) {
-    lower = lower.cwiseMin(other.lower);
-    upper = upper.cwiseMax(other.upper);
-  }
+  double lo[3];
+  double hi[3];
 };
 
-/// Binary tree over primitives with a fixed topology: only the boxes change, so results depend on
-/// the boxes alone and not on what the tree saw before.
+/// Whether two closed boxes have a point in common; in full, because the outcome of each comparison
+/// is as good as random.
+inline bool overlap(const Box& a, const Box& b) {
+  return (a.lo[0] <= b.hi[0]) & (b.lo[0] <= a.hi[0]) & (a.lo[1] <= b.hi[1]) & (b.lo[1] <= a.hi[1]) &
+         (a.lo[2] <= b.hi[2]) & (b.lo[2] <= a.hi[2]);
+}
+
+/// Smallest box around two boxes.
+inline Box united(const Box& a, const Box& b) {
+  Box box;
+  for (int k = 0; k < 3; ++k) {
+    box.lo[k] = a.lo[k] < b.lo[k] ? a.lo[k] : b.lo[k];
+    box.hi[k] = a.hi[k] > b.hi[k] ? a.hi[k] : b.hi[k];
+  }
+  return box;
+}
+
+/// Binary tree over boxes whose shape is fixed once: only the boxes are refitted afterwards, so
+/// that what a search visits, and in which order, does not depend on earlier searches.
 class BoxTree {
  public:
+  /// A node holds the items first .. last - 1 of items(); a leaf has no children (left = 0).
+  /// Its children are the nodes left and left + 1, behind the node itself.
+  struct Node {
+    Index first;
+    Index last;
+    Index left;
+  };
+
+  /// Boxes of a tree at one moment, in the order of items() and of nodes().
+  struct Boxes {
+    std::vector<Box> items;
+    std::vector<Box> nodes;
+  };
+
   BoxTree() = default;
 
-  /// Split by the median of the centers along the longest extent.
-  explicit BoxTree(const std::vector<Vec3>& centers);
+  /// Tree over items with the given centers (centers[i] belongs to ids[i]), split at the median of
+  /// the longest axis.
+  BoxTree(std::vector<Index> ids, std::span<const Vec3> centers);
 
-  bool empty() const { return nodes_.empty(); }
+  bool empty() const { return items_.empty(); }
+  const std::vector<Index>& items() const { return items_; }
+  const std::vector<Node>& nodes() const { return nodes_; }
 
-  /// Boxes of all nodes, children after parents, from those of the primitives.
-  void refit(const std::vector<Box>& primitives, std::vector<Box>& nodes) const;
-
-  /// visit(a, b) for all pairs of primitives of two trees whose boxes overlap.
-  template <class Visit>
-  static void overlaps(const BoxTree& a,
-                       const std::vector<Box>& boxes_a,
-                       const BoxTree& b,
-                       const std::vector<Box>& boxes_b,
-                       std::vector<std::pair<Index, Index>>& stack,
-                       const Visit& visit);
-
-  /// visit(p, q), p < q, for all pairs of primitives of one tree whose boxes overlap.
-  template <class Visit>
-  void self_overlaps(const std::vector<Box>& boxes,
-                     std::vector<std::pair<Index, Index>>& stack,
-                     const Visit& visit) const;
+  /// Recompute the nodes' boxes from boxes.items.
+  void refit(Boxes& boxes) const;
 
  private:
-  /// Children are neighbors in the array: left, left + 1. A leaf has left = -1 and a primitive.
-  struct Node {
-    Index left = -1;
-    Index primitive = -1;
-    Index size = 1;  ///< primitives below
-  };
+  std::vector<Index> items_;
   std::vector<Node> nodes_;
 };
-
-template <class Visit>
-void BoxTree::overlaps(const BoxTree& a,
-                       const std::vector<Box>& boxes_a,
-                       const BoxTree& b,
-                       const std::vector<Box>& boxes_b,
-                       std::vector<std::pair<Index, Index>>& stack,
-                       const Visit& visit) {
-  if (a.empty() || b.empty()) return;
-  stack.clear();
-  stack.emplace_back(0, 0);
-  while (!stack.empty()) {
-    const auto [i, j] = stack.back();
-    stack.pop_back();
-    if (!boxes_a[i].overlaps(boxes_b[j])) continue;
-    const Node& p = a.nodes_[i];
-    const Node& q = b.nodes_[j];
-    if (p.left < 0 && q.left < 0) {
-      visit(p.primitive, q.primitive);
-    } else if (q.left < 0 || (p.left >= 0 && p.size >= q.size)) {
-      stack.emplace_back(p.left, j);
-      stack.emplace_back(p.left + 1, j);
-    } else {
-      stack.emplace_back(i, q.left);
-      stack.emplace_back(i, q.left + 1);
-    }
-  }
-}
-
-template <class Visit>
-void BoxTree::self_overlaps(const std::vector<Box>& boxes,
-                            std::vector<std::pair<Index, Index>>& stack,
-                            const Visit& visit) const {
-  if (empty()) return;
-  stack.clear();
-  stack.emplace_back(0, 0);
-  while (!stack.empty()) {
-    const auto [i, j] = stack.back();
-    stack.pop_back();
-    const Node& p = nodes_[i];
-    const Node& q = nodes_[j];
-    if (i == j) {
-      if (p.left < 0) continue;
-      stack.emplace_back(p.left, p.left);
-      stack.emplace_back(p.left + 1, p.left + 1);
-      stack.emplace_back(p.left, p.left + 1);
-      continue;
-    }
-    if (!boxes[i].overlaps(boxes[j])) continue;
-    if (p.left < 0 && q.left < 0) {
-      visit(std::min(p.primitive, q.primitive), std::max(p.primitive, q.primitive));
-    } else if (q.left < 0 || (p.left >= 0 && p.size >= q.size)) {
-      stack.emplace_back(p.left, j);
-      stack.emplace_back(p.left + 1, j);
-    } else {
-      stack.emplace_back(i, q.left);
-      stack.emplace_back(i, q.left + 1);
-    }
-  }
-}
 
 }  // namespace diffcloth::contact

@@ -3,122 +3,228 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numeric>
+#include <span>
+
+#include "contact/pierce.h"
 
 namespace diffcloth::contact {
 namespace {
 
-bool share_vertex(const std::array<Index, 2>& a, const std::array<Index, 2>& b) {
-  return a[0] == b[0] || a[0] == b[1] || a[1] == b[0] || a[1] == b[1];
+using IndexPair = std::array<Index, 2>;
+using PairList = BroadPhase::Scratch::PairList;
+
+/// Outward rounding of a box, relative to its coordinates: covers the rounding of the box itself
+/// and of positions interpolated between the ends of the motion.
+constexpr double kOutward = 1e-15;
+
+bool share_vertex(const CollisionMesh::Edge& e, const CollisionMesh::Edge& f) {
+  return (e[0] == f[0]) | (e[0] == f[1]) | (e[1] == f[0]) | (e[1] == f[1]);
 }
 
-bool contains(const std::array<Index, 3>& face, Index vertex) {
-  return face[0] == vertex || face[1] == vertex || face[2] == vertex;
+bool has_vertex(const CollisionMesh::Face& face, Index v) {
+  return (face[0] == v) | (face[1] == v) | (face[2] == v);
 }
 
-/// Six times the signed volume of a tetrahedron.
-double volume(const Vec3& a, const Vec3& b, const Vec3& c, const Vec3& d) {
-  return (b - a).dot((c - a).cross(d - a));
+/// Append all (item of a, item of b) whose boxes overlap. Which items of two leaves do is as good
+/// as random: every pair is written, and kept by counting on, which spares the processor the guess.
+void append_overlaps(const BoxTree& tree_a,
+                     const BoxTree::Boxes& a,
+                     const BoxTree& tree_b,
+                     const BoxTree::Boxes& b,
+                     PairList& stack,
+                     PairList& pairs) {
+  if (tree_a.empty() || tree_b.empty() || !overlap(a.nodes[0], b.nodes[0])) return;
+  stack.clear();
+  stack.push({0, 0});
+  while (stack.size() > 0) {
+    const auto [i, j] = stack.pop();
+    const BoxTree::Node& p = tree_a.nodes()[i];
+    const BoxTree::Node& q = tree_b.nodes()[j];
+    if (p.left == 0 && q.left == 0) {
+      IndexPair* end = pairs.room((p.last - p.first) * (q.last - q.first));
+      for (Index k = p.first; k < p.last; ++k) {
+        for (Index l = q.first; l < q.last; ++l) {
+          *end = {tree_a.items()[k], tree_b.items()[l]};
+          end += overlap(a.items[k], b.items[l]);
+        }
+      }
+      pairs.end_at(end);
+      continue;
+    }
+    const bool split_a = q.left == 0 || (p.left != 0 && p.last - p.first >= q.last - q.first);
+    IndexPair* end = stack.room(2);
+    for (Index child = 0; child < 2; ++child) {
+      const Index next_i = split_a ? p.left + child : i;
+      const Index next_j = split_a ? j : q.left + child;
+      *end = {next_i, next_j};
+      end += overlap(a.nodes[next_i], b.nodes[next_j]);
+    }
+    stack.end_at(end);
+  }
 }
 
-bool pierces(const Vec3& e0, const Vec3& e1, const Vec3& t0, const Vec3& t1, const Vec3& t2) {
-  if (!(volume(e0, t0, t1, t2) * volume(e1, t0, t1, t2) < 0.0)) return false;
-  const double v0 = volume(e0, e1, t0, t1);
-  const double v1 = volume(e0, e1, t1, t2);
-  const double v2 = volume(e0, e1, t2, t0);
-  return (v0 > 0.0 && v1 > 0.0 && v2 > 0.0) || (v0 < 0.0 && v1 < 0.0 && v2 < 0.0);
+/// Append all unordered pairs of different items of one tree whose boxes overlap.
+void append_self_overlaps(const BoxTree& tree,
+                          const BoxTree::Boxes& boxes,
+                          PairList& stack,
+                          PairList& pairs) {
+  if (tree.empty()) return;
+  stack.clear();
+  stack.push({0, 0});
+  while (stack.size() > 0) {
+    const auto [i, j] = stack.pop();
+    const BoxTree::Node& p = tree.nodes()[i];
+    const BoxTree::Node& q = tree.nodes()[j];
+    if (p.left == 0 && q.left == 0) {
+      IndexPair* end = pairs.room((p.last - p.first) * (q.last - q.first));
+      for (Index k = p.first; k < p.last; ++k) {
+        for (Index l = i == j ? k + 1 : q.first; l < q.last; ++l) {
+          *end = {tree.items()[k], tree.items()[l]};
+          end += overlap(boxes.items[k], boxes.items[l]);
+        }
+      }
+      pairs.end_at(end);
+    } else if (i == j) {
+      stack.push({p.left, p.left});
+      stack.push({p.left + 1, p.left + 1});
+      if (overlap(boxes.nodes[p.left], boxes.nodes[p.left + 1])) {
+        stack.push({p.left, p.left + 1});
+      }
+    } else {
+      const bool split_p = q.left == 0 || (p.left != 0 && p.last - p.first >= q.last - q.first);
+      IndexPair* end = stack.room(2);
+      for (Index child = 0; child < 2; ++child) {
+        const Index next_i = split_p ? p.left + child : i;
+        const Index next_j = split_p ? j : q.left + child;
+        *end = {next_i, next_j};
+        end += overlap(boxes.nodes[next_i], boxes.nodes[next_j]);
+      }
+      stack.end_at(end);
+    }
+  }
+}
+
+/// Drop the pairs that do not satisfy `keep`.
+template <class Keep>
+void filter(PairList& pairs, Keep&& keep) {
+  IndexPair* end = pairs.begin();
+  for (const IndexPair& pair : pairs) {
+    *end = pair;
+    end += keep(pair);
+  }
+  pairs.end_at(end);
+}
+
+/// Sort scratch.pairs into scratch.sorted: counted by the first index (below `count`), then by the
+/// second within each of these short runs.
+void sort_pairs(Index count, BroadPhase::Scratch& scratch) {
+  std::vector<Index>& bucket = scratch.bucket;
+  bucket.assign(count + 1, 0);
+  for (const IndexPair& pair : scratch.pairs) ++bucket[pair[0] + 1];
+  std::partial_sum(bucket.begin(), bucket.end(), bucket.begin());
+  scratch.sorted.resize(scratch.pairs.size());
+  for (const IndexPair& pair : scratch.pairs) scratch.sorted[bucket[pair[0]]++] = pair;
+  Index first = 0;
+  for (Index a = 0; a < count; ++a) {
+    const Index last = bucket[a];  // moved on to the end of its run by the loop above
+    std::sort(scratch.sorted.begin() + first, scratch.sorted.begin() + last);
+    first = last;
+  }
 }
 
 }  // namespace
 
-Index BroadPhase::first(Group group) const {
-  switch (group) {
-    case kBodyVertices:
-      return mesh_.cloth_vertex_count;
-    case kBodyEdges:
-      return mesh_.cloth_edge_count;
-    case kBodyFaces:
-      return mesh_.cloth_face_count;
-    case kClothVertices:
-    case kClothEdges:
-    case kClothFaces:
-      return 0;
-  }
-  return 0;
-}
-
-Index BroadPhase::count(Group group) const {
-  switch (group) {
-    case kClothVertices:
-      return mesh_.cloth_vertex_count;
-    case kClothEdges:
-      return mesh_.cloth_edge_count;
-    case kClothFaces:
-      return mesh_.cloth_face_count;
-    case kBodyVertices:
-      return mesh_.vertex_count - mesh_.cloth_vertex_count;
-    case kBodyEdges:
-      return static_cast<Index>(mesh_.edges.size()) - mesh_.cloth_edge_count;
-    case kBodyFaces:
-      return static_cast<Index>(mesh_.faces.size()) - mesh_.cloth_face_count;
-  }
-  return 0;
-}
-
-/// Boxes of a group's primitives from those of their vertices, then of its tree.
-template <class VertexBox>
-void BroadPhase::refit(Group group, const VertexBox& box, Scratch& scratch) const {
-  scratch.primitives.resize(static_cast<std::size_t>(count(group)));
-  const Index begin = first(group);
-  for (Index k = 0; k < count(group); ++k) {
-    Box& target = scratch.primitives[k];
-    if (group == kClothVertices || group == kBodyVertices) {
-      target = box(begin + k);
-    } else if (group == kClothEdges || group == kBodyEdges) {
-      const auto& e = mesh_.edges[begin + k];
-      target = box(e[0]);
-      target.include(box(e[1]));
-    } else {
-      const auto& f = mesh_.faces[begin + k];
-      target = box(f[0]);
-      target.include(box(f[1]));
-      target.include(box(f[2]));
+BroadPhase::BroadPhase(const CollisionMesh& mesh, const double* x_reference) : mesh_(mesh) {
+  const auto center = [&](std::span<const Index> corners) -> Vec3 {
+    Vec3 sum = Vec3::Zero();
+    for (const Index v : corners) sum += row(x_reference, v);
+    return sum / static_cast<double>(corners.size());
+  };
+  const auto tree_of = [&](const auto& elements, const std::vector<Index>& surface_of,
+                           Index surface) {
+    std::vector<Index> ids;
+    std::vector<Vec3> centers;
+    for (std::size_t k = 0; k < elements.size(); ++k) {
+      if (surface_of[k] != surface) continue;
+      ids.push_back(static_cast<Index>(k));
+      centers.push_back(center(elements[k]));
     }
+    return BoxTree(std::move(ids), centers);
+  };
+  // Vertices without a face bound nothing: they belong to no surface here.
+  std::vector<Index> used_surface(mesh_.vertex_count, -1);
+  std::vector<std::array<Index, 1>> vertices(mesh_.vertex_count);
+  for (Index v = 0; v < mesh_.vertex_count; ++v) vertices[v] = {v};
+  for (const CollisionMesh::Face& face : mesh_.faces) {
+    for (const Index v : face) used_surface[v] = mesh_.vertex_surface[v];
   }
-  trees_[group].refit(scratch.primitives, scratch.boxes[group]);
+  for (Index surface = 0; surface < mesh_.surface_count(); ++surface) {
+    trees_.push_back({.vertices = tree_of(vertices, used_surface, surface),
+                      .edges = tree_of(mesh_.edges, mesh_.edge_surface, surface),
+                      .faces = tree_of(mesh_.faces, mesh_.face_surface, surface)});
+  }
 }
 
-template <class VertexBox>
-void BroadPhase::refit_all(const VertexBox& box, Scratch& scratch) const {
-  for (const Group group :
-       {kClothVertices, kClothEdges, kClothFaces, kBodyVertices, kBodyEdges, kBodyFaces}) {
-    refit(group, box, scratch);
+void BroadPhase::sweep(const double* x_t0,
+                       const double* x_t1,
+                       double radius,
+                       Scratch& scratch) const {
+  constexpr double kInfinity = std::numeric_limits<double>::infinity();
+  scratch.vertex_boxes.resize(mesh_.vertex_count);
+  scratch.surfaces.resize(trees_.size());
+  for (Scratch::Surface& surface : scratch.surfaces) {
+    surface.fitted = false;
+    surface.box = {.lo = {kInfinity, kInfinity, kInfinity},
+                   .hi = {-kInfinity, -kInfinity, -kInfinity}};
   }
+  const double half = 0.5 * radius;
+  for (Index v = 0; v < mesh_.vertex_count; ++v) {
+    Box& box = scratch.vertex_boxes[v];
+    for (int k = 0; k < 3; ++k) {
+      const double p = x_t0[3 * v + k];
+      const double q = x_t1[3 * v + k];
+      const double margin = half + kOutward * (half + std::max(std::abs(p), std::abs(q)));
+      box.lo[k] = std::min(p, q) - margin;
+      box.hi[k] = std::max(p, q) + margin;
+    }
+    Box& around = scratch.surfaces[mesh_.vertex_surface[v]].box;
+    around = united(around, box);
+  }
+}
+
+void BroadPhase::fit(Index surface, Scratch& scratch) const {
+  Scratch::Surface& boxes = scratch.surfaces[surface];
+  if (boxes.fitted) return;
+  const SurfaceTrees& trees = trees_[surface];
+  const auto fit_tree = [&](const BoxTree& tree, BoxTree::Boxes& target, auto&& box_of) {
+    target.items.resize(tree.items().size());
+    for (std::size_t k = 0; k < target.items.size(); ++k) target.items[k] = box_of(tree.items()[k]);
+    tree.refit(target);
+  };
+  const std::vector<Box>& of_vertex = scratch.vertex_boxes;
+  fit_tree(trees.vertices, boxes.vertices, [&](Index v) { return of_vertex[v]; });
+  fit_tree(trees.edges, boxes.edges, [&](Index e) {
+    const auto& [i, j] = mesh_.edges[e];
+    return united(of_vertex[i], of_vertex[j]);
+  });
+  fit_tree(trees.faces, boxes.faces, [&](Index f) {
+    const auto& [i, j, k] = mesh_.faces[f];
+    return united(united(of_vertex[i], of_vertex[j]), of_vertex[k]);
+  });
+  boxes.fitted = true;
 }
 
 template <class Visit>
-void BroadPhase::overlaps(Group a, Group b, Scratch& scratch, const Visit& visit) const {
-  const Index first_a = first(a);
-  const Index first_b = first(b);
-  BoxTree::overlaps(trees_[a],
-                    scratch.boxes[a],
-                    trees_[b],
-                    scratch.boxes[b],
-                    scratch.stack,
-                    [&](Index p, Index q) { visit(first_a + p, first_b + q); });
-}
-
-BroadPhase::BroadPhase(const CollisionMesh& mesh, const double* x) : mesh_(mesh) {
-  Scratch scratch;
-  const auto point = [&](Index i) {
-    const Vec3 p = row(x, i);
-    return Box{.lower = p, .upper = p};
-  };
-  for (const Group group :
-       {kClothVertices, kClothEdges, kClothFaces, kBodyVertices, kBodyEdges, kBodyFaces}) {
-    refit(group, point, scratch);
-    std::vector<Vec3> centers;
-    for (const Box& box : scratch.primitives) centers.push_back(0.5 * (box.lower + box.upper));
-    trees_[group] = BoxTree(centers);
+void BroadPhase::visit_surface_pairs(Scratch& scratch, Visit&& visit) const {
+  const Index surface_count = static_cast<Index>(trees_.size());
+  for (Index s = 0; s < mesh_.cloth_count; ++s) {
+    for (Index r = mesh_.self_contact ? s : s + 1; r < surface_count; ++r) {
+      if (!overlap(scratch.surfaces[s].box, scratch.surfaces[r].box)) continue;
+      fit(s, scratch);
+      fit(r, scratch);
+      visit(s, r);
+    }
   }
 }
 
@@ -128,119 +234,71 @@ void BroadPhase::find(const double* x_t0,
                       Scratch& scratch,
                       std::vector<Candidate>& out) const {
   out.clear();
-  refit_all(
-      [&](Index i) {
-        const Vec3 a = row(x_t0, i);
-        const Vec3 b = row(x_t1, i);
-        // Outward by more than the rounding of the sums below and of the distances compared later.
-        const double inflation =
-            0.5 * radius +
-            1e-12 * std::max(a.cwiseAbs().maxCoeff(), b.cwiseAbs().maxCoeff());
-        return Box{.lower = (a.cwiseMin(b).array() - inflation).matrix(),
-                   .upper = (a.cwiseMax(b).array() + inflation).matrix()};
-      },
-      scratch);
+  sweep(x_t0, x_t1, radius, scratch);
 
-  const auto point_triangle = [&](Index v, Index f) {
-    const auto& face = mesh_.faces[f];
-    if (!mesh_.may_touch(mesh_.vertex_surface[v], mesh_.face_surface[f]) || contains(face, v)) {
-      return;
-    }
-    out.push_back({.kind = PairKind::kPointTriangle,
-                   .a = v,
-                   .b = f,
-                   .vertices = {v, face[0], face[1], face[2]}});
-  };
-  const auto edge_edge = [&](Index a, Index b) {
-    const auto& e = mesh_.edges[a];
-    const auto& f = mesh_.edges[b];
-    if (!mesh_.may_touch(mesh_.edge_surface[a], mesh_.edge_surface[b]) || share_vertex(e, f)) {
-      return;
-    }
-    out.push_back(
-        {.kind = PairKind::kEdgeEdge, .a = a, .b = b, .vertices = {e[0], e[1], f[0], f[1]}});
-  };
-  if (mesh_.self_contact || mesh_.cloth_count > 1) {
-    overlaps(kClothVertices, kClothFaces, scratch, point_triangle);
-    trees_[kClothEdges].self_overlaps(scratch.boxes[kClothEdges], scratch.stack, edge_edge);
+  scratch.pairs.clear();
+  visit_surface_pairs(scratch, [&](Index s, Index r) {
+    const Scratch::Surface& a = scratch.surfaces[s];
+    const Scratch::Surface& b = scratch.surfaces[r];
+    append_overlaps(trees_[s].vertices, a.vertices, trees_[r].faces, b.faces, scratch.stack,
+                    scratch.pairs);
+    if (s == r) return;
+    append_overlaps(trees_[r].vertices, b.vertices, trees_[s].faces, a.faces, scratch.stack,
+                    scratch.pairs);
+  });
+  filter(scratch.pairs, [&](const IndexPair& p) { return !has_vertex(mesh_.faces[p[1]], p[0]); });
+  sort_pairs(mesh_.vertex_count, scratch);
+  for (const auto& [v, f] : scratch.sorted) {
+    const auto& [i, j, k] = mesh_.faces[f];
+    out.push_back({.kind = PairKind::kPointTriangle, .vertices = {v, i, j, k}, .a = v, .b = f});
   }
-  overlaps(kClothVertices, kBodyFaces, scratch, point_triangle);
-  overlaps(kBodyVertices, kClothFaces, scratch, point_triangle);
-  overlaps(kClothEdges, kBodyEdges, scratch, edge_edge);
-  std::ranges::sort(out);
+
+  scratch.pairs.clear();
+  visit_surface_pairs(scratch, [&](Index s, Index r) {
+    const BoxTree::Boxes& a = scratch.surfaces[s].edges;
+    const BoxTree::Boxes& b = scratch.surfaces[r].edges;
+    if (s == r) {
+      append_self_overlaps(trees_[s].edges, a, scratch.stack, scratch.pairs);
+    } else {
+      append_overlaps(trees_[s].edges, a, trees_[r].edges, b, scratch.stack, scratch.pairs);
+    }
+  });
+  filter(scratch.pairs,
+         [&](const IndexPair& p) { return !share_vertex(mesh_.edges[p[0]], mesh_.edges[p[1]]); });
+  for (IndexPair& pair : scratch.pairs)
+    pair = {std::min(pair[0], pair[1]), std::max(pair[0], pair[1])};
+  sort_pairs(mesh_.cloth_edge_count, scratch);  // the lower edge belongs to a cloth
+  for (const auto& [e, f] : scratch.sorted) {
+    const auto& [i, j] = mesh_.edges[e];
+    const auto& [k, l] = mesh_.edges[f];
+    out.push_back({.kind = PairKind::kEdgeEdge, .vertices = {i, j, k, l}, .a = e, .b = f});
+  }
 }
 
 std::optional<std::pair<Index, Index>> BroadPhase::find_intersection(const double* x,
                                                                      Scratch& scratch) const {
-  refit_all(
-      [&](Index i) {
-        const Vec3 p = row(x, i);
-        return Box{.lower = p, .upper = p};
-      },
-      scratch);
+  sweep(x, x, 0, scratch);
+  scratch.pairs.clear();
+  visit_surface_pairs(scratch, [&](Index s, Index r) {
+    const Scratch::Surface& a = scratch.surfaces[s];
+    const Scratch::Surface& b = scratch.surfaces[r];
+    append_overlaps(trees_[s].edges, a.edges, trees_[r].faces, b.faces, scratch.stack,
+                    scratch.pairs);
+    if (s == r) return;
+    append_overlaps(trees_[r].edges, b.edges, trees_[s].faces, a.faces, scratch.stack,
+                    scratch.pairs);
+  });
   std::optional<std::pair<Index, Index>> lowest;
-  const auto test = [&](Index e, Index f) {
-    const auto& edge = mesh_.edges[e];
-    const auto& face = mesh_.faces[f];
-    if (!mesh_.may_touch(mesh_.edge_surface[e], mesh_.face_surface[f]) ||
-        contains(face, edge[0]) || contains(face, edge[1])) {
-      return;
-    }
-    if (lowest && std::pair(e, f) >= *lowest) return;
-    if (pierces(row(x, edge[0]),
-                row(x, edge[1]),
-                row(x, face[0]),
-                row(x, face[1]),
-                row(x, face[2]))) {
+  for (const auto& [e, f] : scratch.pairs) {
+    const auto& [i, j] = mesh_.edges[e];
+    const CollisionMesh::Face& face = mesh_.faces[f];
+    if (lowest && *lowest < std::pair(e, f)) continue;
+    if (has_vertex(face, i) || has_vertex(face, j)) continue;
+    if (pierces(row(x, i), row(x, j), row(x, face[0]), row(x, face[1]), row(x, face[2]))) {
       lowest = {e, f};
     }
-  };
-  if (mesh_.self_contact || mesh_.cloth_count > 1) {
-    overlaps(kClothEdges, kClothFaces, scratch, test);
   }
-  overlaps(kClothEdges, kBodyFaces, scratch, test);
-  overlaps(kBodyEdges, kClothFaces, scratch, test);
   return lowest;
-}
-
-double smallest_nonadjacent_distance(const CollisionMesh& mesh, const double* x) {
-  const CollisionMesh cloths(
-      mesh.cloth_vertex_count,
-      mesh.cloth_vertex_count,
-      mesh.cloth_count,
-      {mesh.faces.begin(), mesh.faces.begin() + mesh.cloth_face_count},
-      {mesh.vertex_surface.begin(), mesh.vertex_surface.begin() + mesh.cloth_vertex_count},
-      true);
-  const BroadPhase broad_phase(cloths, x);
-  double shortest = std::numeric_limits<double>::infinity();
-  for (const auto& e : cloths.edges) {
-    shortest = std::min(shortest, (row(x, e[0]) - row(x, e[1])).norm());
-  }
-  Vec3 lower = row(x, 0);
-  Vec3 upper = lower;
-  for (Index i = 0; i < cloths.vertex_count; ++i) {
-    lower = lower.cwiseMin(row(x, i));
-    upper = upper.cwiseMax(row(x, i));
-  }
-
-  // A pair closer than the search radius is in the list, so the first radius that exceeds the
-  // smallest distance found settles it.
-  BroadPhase::Scratch scratch;
-  std::vector<Candidate> pairs;
-  const double largest_radius = 2.0 * (upper - lower).norm() + shortest;
-  for (double radius = 0.5 * shortest;; radius *= 2.0) {
-    broad_phase.find(x, x, radius, scratch, pairs);
-    double smallest = std::numeric_limits<double>::infinity();
-    for (const Candidate& pair : pairs) {
-      const auto& v = pair.vertices;
-      if (cloths.vertex_surface[v[0]] != cloths.vertex_surface[v[3]]) continue;
-      smallest = std::min(
-          smallest,
-          distance_sq(pair.kind, {row(x, v[0]), row(x, v[1]), row(x, v[2]), row(x, v[3])}));
-    }
-    smallest = std::sqrt(smallest);
-    if (smallest <= radius || radius > largest_radius) return smallest;
-  }
 }
 
 }  // namespace diffcloth::contact

@@ -1,70 +1,121 @@
 #pragma once
 
+#include <array>
+#include <compare>
+#include <cstddef>
+#include <cstdint>
 #include <optional>
 #include <utility>
 #include <vector>
 
+#include "common/types.h"
 #include "contact/box_tree.h"
 #include "contact/collision_mesh.h"
+#include "contact/pair.h"
 
 namespace diffcloth::contact {
 
-/// Finds the pairs of primitives that come near each other while vertices move on straight lines.
+/// A pair that may come into contact. a: vertex or edge, b: face or edge of the collision mesh.
+struct Candidate {
+  PairKind kind;
+  std::array<Index, 4> vertices;
+  Index a;
+  Index b;
+
+  friend bool operator==(const Candidate& p, const Candidate& q) {
+    return p.kind == q.kind && p.a == q.a && p.b == q.b;
+  }
+  friend std::strong_ordering operator<=>(const Candidate& p, const Candidate& q) {
+    if (const auto order = p.kind <=> q.kind; order != 0) return order;
+    if (const auto order = p.a <=> q.a; order != 0) return order;
+    return p.b <=> q.b;
+  }
+};
+
+/// Which pairs can come close at all, by swept boxes.
 ///
-/// Immutable once built; the topology of its trees comes from reference positions, so that a result
-/// depends on the queried motion alone. The mesh must outlive it.
+/// Immutable after construction, and safe to share between threads that each have a Scratch. Pairs
+/// are: vertex and face, edge and edge, of different cloths, of a cloth and a body, and of one
+/// cloth if the mesh has self_contact. Pairs within a body, of two bodies, and pairs that share a
+/// vertex are left out, as are vertices that belong to no face.
 class BroadPhase {
  public:
+  /// @param x_reference  positions that shape the search trees, 3 * vertex_count
   BroadPhase(const CollisionMesh& mesh, const double* x_reference);
 
-  /// Boxes and lists that are used again from call to call; one a thread.
+  /// Boxes and lists that a search fills; reuse one to search without allocation.
   struct Scratch {
-    std::vector<Box> primitives;
-    std::vector<Box> boxes[6];
-    std::vector<std::pair<Index, Index>> stack;
+    struct Surface {
+      BoxTree::Boxes vertices;
+      BoxTree::Boxes edges;
+      BoxTree::Boxes faces;
+      Box box;      ///< Around the whole surface.
+      bool fitted;  ///< Whether the trees' boxes belong to the present search.
+    };
+    /// Growing list that is written through a pointer.
+    class PairList {
+     public:
+      void clear() { size_ = 0; }
+      std::size_t size() const { return size_; }
+      std::array<Index, 2>* begin() { return pairs_.data(); }
+      std::array<Index, 2>* end() { return pairs_.data() + size_; }
+
+      /// Pointer behind the last pair, with room for `count` more.
+      std::array<Index, 2>* room(std::size_t count) {
+        if (size_ + count > pairs_.size()) pairs_.resize(2 * (size_ + count));
+        return end();
+      }
+      void push(const std::array<Index, 2>& pair) {
+        *room(1) = pair;
+        ++size_;
+      }
+      std::array<Index, 2> pop() { return pairs_[--size_]; }
+      void end_at(const std::array<Index, 2>* end) { size_ = end - pairs_.data(); }
+
+     private:
+      std::vector<std::array<Index, 2>> pairs_;
+      std::size_t size_ = 0;
+    };
+    std::vector<Box> vertex_boxes;
+    std::vector<Surface> surfaces;
+    PairList pairs;
+    std::vector<std::array<Index, 2>> sorted;
+    std::vector<Index> bucket;
+    PairList stack;
   };
 
-  /// All pairs whose swept boxes, each inflated by radius/2 and rounded outward, overlap. Sorted.
-  ///
-  /// Skipped: pairs within one body, of two bodies, of elements that share a vertex, and of one
-  /// cloth with itself where self contact is off.
+  /// All pairs whose boxes overlap, each box swept from x_t0 to x_t1 and inflated by radius / 2
+  /// (d_hat + the largest xi), rounded outward. Sorted; every pair that comes within radius at any
+  /// time of the straight motion is among them.
   void find(const double* x_t0,
             const double* x_t1,
             double radius,
             Scratch& scratch,
             std::vector<Candidate>& out) const;
 
-  /// The lowest pair (edge, face) that pierces each other, if any. Touching is not piercing.
+  /// The lowest (edge, face) that intersect at x, among the pairs of surfaces that may touch.
+  ///
+  /// An edge that pierces a face is always found (exact arithmetic decides close calls); an edge
+  /// that merely touches a face may be reported.
   std::optional<std::pair<Index, Index>> find_intersection(const double* x, Scratch& scratch) const;
 
  private:
-  /// The primitives of the cloths, then those of the bodies.
-  enum Group : std::uint8_t {
-    kClothVertices,
-    kClothEdges,
-    kClothFaces,
-    kBodyVertices,
-    kBodyEdges,
-    kBodyFaces
+  struct SurfaceTrees {
+    BoxTree vertices;
+    BoxTree edges;
+    BoxTree faces;
   };
 
-  template <class VertexBox>
-  void refit(Group group, const VertexBox& box, Scratch& scratch) const;
-  template <class VertexBox>
-  void refit_all(const VertexBox& box, Scratch& scratch) const;
+  void sweep(const double* x_t0, const double* x_t1, double radius, Scratch& scratch) const;
+  void fit(Index surface, Scratch& scratch) const;
+
+  /// Visit the pairs of surfaces that may touch and whose boxes overlap, the cloth first (a cloth
+  /// with itself included); their trees are fitted by then.
   template <class Visit>
-  void overlaps(Group a, Group b, Scratch& scratch, const Visit& visit) const;
+  void visit_surface_pairs(Scratch& scratch, Visit&& visit) const;
 
-  /// First vertex, edge or face of a group.
-  Index first(Group group) const;
-  Index count(Group group) const;
-
-  const CollisionMesh& mesh_;
-  BoxTree trees_[6];
+  CollisionMesh mesh_;
+  std::vector<SurfaceTrees> trees_;
 };
-
-/// Smallest distance between two elements of one cloth that share no vertex; infinite where there
-/// are none. Bodies do not count.
-double smallest_nonadjacent_distance(const CollisionMesh& mesh, const double* x);
 
 }  // namespace diffcloth::contact

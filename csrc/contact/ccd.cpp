@@ -1,78 +1,90 @@
 #include "contact/ccd.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
+#include <limits>
+
+#include "common/types.h"
+#include "contact/distance/separation.h"
 
 namespace diffcloth::contact {
 namespace {
 
-constexpr double kRounding = 1e-12;   ///< of the coordinates, relative
-constexpr double kTargetGap = 0.1;    ///< of the initial gap, at which the motion is stopped
-constexpr double kStepShare = 0.9;    ///< of the gap, spent by a distance step
-constexpr int kIterations = 10000;    ///< beyond it the safe fraction reached so far is returned
+/// Share of the initial gap at which the search stops, and of the present gap that a step leaves.
+constexpr double kGapLeft = 0.1;
 
-/// Unit vector from the second primitive toward the first.
-///
-/// At a gap of 1e-11 the closest vector t has lost five digits to rounding, as a direction too.
-/// Inside two primitives their normal is the same direction, accurate at any gap.
-Vec3 separation(const Closest& k) {
-  if (k.parameter_count == 2) {
-    const Vec3 normal = k.s.col(0).cross(k.s.col(1)).normalized();
-    return normal.dot(k.t) < 0.0 ? Vec3(-normal) : normal;
+/// Rounding of positions, relative to the largest coordinate, that counts as contact.
+constexpr double kRounding = 1e-12;
+
+/// A search that has not ended by then returns the safe time it has reached.
+constexpr int kMaxIterations = 1000;
+
+using Differences = std::array<Vec3, 4>;
+
+/// Vectors from the corners of the second primitive to those of the first: four for two edges,
+/// three for a point and a triangle (the fourth repeats the third).
+Differences between(PairKind kind, const Corners& x) {
+  switch (kind) {
+    case PairKind::kPointTriangle:
+      return {x[0] - x[1], x[0] - x[2], x[0] - x[3], x[0] - x[3]};
+    case PairKind::kEdgeEdge:
+      return {x[0] - x[2], x[0] - x[3], x[1] - x[2], x[1] - x[3]};
   }
-  return k.t.normalized();
+  __builtin_unreachable();
 }
 
-/// Largest step for which the plane across n keeps the primitives apart by `margin`: then
-/// n . (x_i - x_j) >= margin for all vertices i of one and j of the other, at its start and end.
-/// This holds for any n, but where n does not separate them to begin with, it is 0.
-double certified_step(const Vec3& n, const Corners& x, const Corners& u, int split, double margin) {
-  double step = 2.0;
-  for (int i = 0; i < split; ++i) {
-    for (int j = split; j < 4; ++j) {
-      const double slack = n.dot(x[i] - x[j]) - margin;
-      if (!(slack >= 0.0)) return 0.0;
-      const double closing = n.dot(u[i] - u[j]);
-      if (closing < 0.0) step = std::min(step, slack / -closing);
+/// Latest time up to which n . (start + time motion) >= bound holds from t on, for all differences;
+/// -infinity where it does not hold at t.
+double certified_time(
+    const Vec3& n, const Differences& start, const Differences& motion, double t, double bound) {
+  double time = std::numeric_limits<double>::infinity();
+  for (int k = 0; k < 4; ++k) {
+    const double speed = n.dot(motion[k]);
+    const double gap = n.dot(start[k]) - bound;
+    if (speed < 0) {
+      time = std::min(time, -gap / speed);
+    } else if (!(gap + speed * t >= 0)) {
+      return -std::numeric_limits<double>::infinity();
     }
   }
-  return step;
+  return time;
 }
 
 }  // namespace
 
 double safe_step(PairKind kind, const Corners& x_t0, const Corners& x_t1, double xi) {
-  const int split = kind == PairKind::kPointTriangle ? 1 : 2;
-  Corners u;
-  double magnitude = 0.0;
+  Vec3 d_vector = separation(kind, x_t0);
+  double d = d_vector.norm();
+  double largest = 0;
   for (int i = 0; i < 4; ++i) {
-    u[i] = x_t1[i] - x_t0[i];
-    magnitude = std::max({magnitude, x_t0[i].cwiseAbs().maxCoeff(), x_t1[i].cwiseAbs().maxCoeff()});
+    largest = std::max({largest, x_t0[i].cwiseAbs().maxCoeff(), x_t1[i].cwiseAbs().maxCoeff()});
   }
-  // The distance below which rounding could hide a contact.
-  const double xi_safe = xi + kRounding * magnitude;
+  if (!(d > xi + kRounding * largest)) return 0;
 
-  Closest k = closest(kind, x_t0);
-  double d = std::sqrt(k.d_sq);
-  if (!(d > xi_safe)) return 0.0;
-  double fastest = 0.0;
-  for (int i = 0; i < split; ++i) {
-    for (int j = split; j < 4; ++j) fastest = std::max(fastest, (u[i] - u[j]).norm());
+  Corners U;
+  for (int i = 0; i < 4; ++i) U[i] = x_t1[i] - x_t0[i];
+  const Differences start = between(kind, x_t0);
+  const Differences motion = between(kind, U);
+  double lp_sq = 0;
+  for (const Vec3& m : motion) {
+    if (!std::isfinite(m.squaredNorm())) return 0;  // nothing can be certified
+    lp_sq = std::max(lp_sq, m.squaredNorm());
   }
-  if (fastest == 0.0) return 1.0;
+  const double lp = std::sqrt(lp_sq);
 
-  const double gap = kTargetGap * (d - xi_safe);
-  double t = 0.0;
-  Corners x = x_t0;
-  for (int iteration = 0; iteration < kIterations; ++iteration) {
-    const double step = std::max(kStepShare * (d - xi_safe) / fastest,
-                                 certified_step(separation(k), x, u, split, xi_safe + gap));
-    if (t + step >= 1.0) return 1.0;
-    t += step;
-    for (int i = 0; i < 4; ++i) x[i] = x_t0[i] + t * u[i];
-    k = closest(kind, x);
-    d = std::sqrt(k.d_sq);
-    if (d - xi_safe <= gap) return t;
+  const double g = kGapLeft * (d - xi);
+  double t = 0;
+  for (int iteration = 0; iteration < kMaxIterations; ++iteration) {
+    const double reach = std::max(t + (1 - kGapLeft) * (d - xi) / lp,
+                                  certified_time(d_vector / d, start, motion, t, xi + g));
+    if (reach >= 1) return 1;
+    t = reach;
+    Corners x;
+    for (int i = 0; i < 4; ++i) x[i] = x_t0[i] + t * U[i];
+    d_vector = separation(kind, x);
+    d = d_vector.norm();
+    if (!(d - xi >= g)) break;
   }
   return t;
 }

@@ -1,47 +1,91 @@
 #include "contact/collision_mesh.h"
 
-#include <algorithm>
+#include <stdexcept>
+#include <string>
+#include <tuple>
+#include <utility>
 
 namespace diffcloth::contact {
+namespace {
 
-CollisionMesh::CollisionMesh(Index vertex_count_in,
-                             Index cloth_vertex_count_in,
-                             Index cloth_count_in,
-                             std::vector<std::array<Index, 3>> faces_in,
+void check(const CollisionMesh& mesh) {
+  for (Index i = 0; i < mesh.vertex_count; ++i) {
+    if (mesh.vertex_surface[i] < (i == 0 ? 0 : mesh.vertex_surface[i - 1])) {
+      throw std::invalid_argument("collision mesh: `vertex_surface` must ascend from 0, got " +
+                                  std::to_string(mesh.vertex_surface[i]) + " at vertex " +
+                                  std::to_string(i));
+    }
+  }
+  Index previous = 0;
+  for (std::size_t f = 0; f < mesh.faces.size(); ++f) {
+    const auto& [i, j, k] = mesh.faces[f];
+    const auto refuse = [&](const std::string& rule) {
+      throw std::invalid_argument("collision mesh: `faces` must " + rule + ", got (" +
+                                  std::to_string(i) + ", " + std::to_string(j) + ", " +
+                                  std::to_string(k) + ") at face " + std::to_string(f));
+    };
+    for (const Index v : mesh.faces[f]) {
+      if (v < 0 || v >= mesh.vertex_count) refuse("refer to vertices of the mesh");
+    }
+    if (i == j || j == k || k == i) refuse("have three different corners");
+    const Index surface = mesh.vertex_surface[i];
+    if (mesh.vertex_surface[j] != surface || mesh.vertex_surface[k] != surface) {
+      refuse("lie on one surface");
+    }
+    if (surface < previous) refuse("be grouped by surface in ascending order");
+    previous = surface;
+  }
+}
+
+/// An edge of a face, to be sorted and made unique.
+struct HalfEdge {
+  Index surface;
+  CollisionMesh::Edge edge;
+  Index face;
+};
+
+std::vector<HalfEdge> sorted_half_edges(const CollisionMesh& mesh) {
+  std::vector<HalfEdge> half_edges;
+  half_edges.reserve(3 * mesh.faces.size());
+  for (std::size_t f = 0; f < mesh.faces.size(); ++f) {
+    for (int k = 0; k < 3; ++k) {
+      const auto [v0, v1] = std::minmax(mesh.faces[f][k], mesh.faces[f][(k + 1) % 3]);
+      half_edges.push_back({mesh.face_surface[f], {v0, v1}, static_cast<Index>(f)});
+    }
+  }
+  std::sort(half_edges.begin(), half_edges.end(), [](const HalfEdge& p, const HalfEdge& q) {
+    return std::tie(p.surface, p.edge, p.face) < std::tie(q.surface, q.edge, q.face);
+  });
+  return half_edges;
+}
+
+}  // namespace
+
+CollisionMesh::CollisionMesh(std::vector<Face> faces_in,
                              std::vector<Index> vertex_surface_in,
+                             Index cloth_count_in,
                              bool self_contact_in)
-    : vertex_count(vertex_count_in),
-      cloth_vertex_count(cloth_vertex_count_in),
+    : vertex_count(static_cast<Index>(vertex_surface_in.size())),
       cloth_count(cloth_count_in),
       faces(std::move(faces_in)),
-      cloth_face_count(0),
-      cloth_edge_count(0),
       vertex_surface(std::move(vertex_surface_in)),
       self_contact(self_contact_in) {
-  struct Side {
-    std::array<Index, 2> edge;
-    Index face;
-  };
-  std::vector<Side> sides;
-  sides.reserve(3 * faces.size());
-  for (std::size_t f = 0; f < faces.size(); ++f) {
-    for (int k = 0; k < 3; ++k) {
-      const Index v = faces[f][k];
-      const Index w = faces[f][(k + 1) % 3];
-      sides.push_back({.edge = {std::min(v, w), std::max(v, w)}, .face = static_cast<Index>(f)});
-    }
-    face_surface.push_back(vertex_surface[faces[f][0]]);
-    if (faces[f][0] < cloth_vertex_count) ++cloth_face_count;
+  check(*this);
+  for (const Index surface : vertex_surface) cloth_vertex_count += surface < cloth_count;
+  face_surface.reserve(faces.size());
+  for (const Face& face : faces) {
+    face_surface.push_back(vertex_surface[face[0]]);
+    cloth_face_count += face_surface.back() < cloth_count;
   }
-  std::ranges::stable_sort(sides, {}, &Side::edge);
-  for (const Side& side : sides) {
-    if (edges.empty() || edges.back() != side.edge) {
-      edges.push_back(side.edge);
-      edge_surface.push_back(vertex_surface[side.edge[0]]);
-      edge_faces.emplace_back();
-      if (side.edge[0] < cloth_vertex_count) ++cloth_edge_count;
+  for (const HalfEdge& half_edge : sorted_half_edges(*this)) {
+    if (edges.empty() || edges.back() != half_edge.edge) {
+      edges.push_back(half_edge.edge);
+      edge_surface.push_back(half_edge.surface);
+      edge_faces.push_back({half_edge.face, -1});
+      cloth_edge_count += half_edge.surface < cloth_count;
+    } else if (edge_faces.back()[1] < 0) {
+      edge_faces.back()[1] = half_edge.face;
     }
-    edge_faces.back().push_back(side.face);
   }
 }
 

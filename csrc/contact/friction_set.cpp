@@ -59,12 +59,16 @@ void FrictionSet::add_gradient(const double* x_start, const double* x, double* g
   }
 }
 
-Mat12 FrictionSet::hessian(const Entry& k, const double* x_start, const double* x) const {
+Mat12 FrictionSet::hessian(const Entry& k,
+                           const double* x_start,
+                           const double* x,
+                           Curvature curvature) const {
   const Vec3 w = tangential(displacement(k, x_start, x), k.n);
   const FrictionLaw law = friction_law(w.norm(), model_->parameters().slip);
   const Mat3 projector = Mat3::Identity() - k.n * k.n.transpose();
+  const double along = curvature == Curvature::kExact ? law.f2 : 0.0;
   const Mat3 core =
-      (k.mu * k.lambda) * (law.f1_over_y * projector + law.f2 * w * w.transpose());
+      (k.mu * k.lambda) * (law.f1_over_y * projector + along * w * w.transpose());
   Mat12 h;
   for (int i = 0; i < 4; ++i) {
     for (int j = 0; j < 4; ++j) {
@@ -79,7 +83,7 @@ void FrictionSet::add_hessian_product(const double* x_start,
                                       const double* z,
                                       double* y) const {
   for (const Entry& k : entries_) {
-    const Vec12 product = hessian(k, x_start, x) * stacked(k.lag.pair.vertices, z);
+    const Vec12 product = hessian(k, x_start, x, Curvature::kExact) * stacked(k.lag.pair.vertices, z);
     for (int i = 0; i < 4; ++i) {
       Eigen::Map<Vec3>(y + 3 * k.lag.pair.vertices[i]) += product.segment<3>(3 * i);
     }

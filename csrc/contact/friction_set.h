@@ -32,8 +32,12 @@ class FrictionSet {
   double energy_change(const double* x_start, const double* x0, const double* x1) const;
   void add_gradient(const double* x_start, const double* x, double* g) const;
 
-  /// 12x12 Hessian of one entry: positive semi-definite.
-  Mat12 hessian(const Entry& entry, const double* x_start, const double* x) const;
+  /// 12x12 Hessian of one entry, positive semi-definite. kPositive is the quadratic majorant
+  /// (f1/|w|) P, which does not lose its curvature where a sliding contact would come to rest.
+  Mat12 hessian(const Entry& entry,
+                const double* x_start,
+                const double* x,
+                Curvature curvature) const;
 
   /// y += H z over all vertices.
   void add_hessian_product(const double* x_start,

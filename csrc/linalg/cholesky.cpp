@@ -12,9 +12,12 @@
 #ifdef DIFFCLOTH_HAS_CHOLMOD
 #include <cholmod.h>
 
-// Threads inside one small factorization cost more than they bring, and would make results depend
-// on their number. Present only where the BLAS that CHOLMOD is linked to is OpenBLAS.
+// Threads inside one small factorization cost more than they bring (most of the time went into
+// waiting for them), and would make results depend on their number. Present only where CHOLMOD is
+// linked to OpenBLAS, and to an OpenMP runtime.
 extern "C" void openblas_set_num_threads(int) __attribute__((weak));
+extern "C" int omp_get_max_active_levels() __attribute__((weak));
+extern "C" void omp_set_max_active_levels(int) __attribute__((weak));
 #endif
 
 namespace diffcloth::linalg {
@@ -56,6 +59,24 @@ std::vector<Index> minimum_degree_order(const BlockPattern& pattern,
 #ifdef DIFFCLOTH_HAS_CHOLMOD
 
 namespace {
+
+/// Keeps CHOLMOD's OpenMP loops on the calling thread while it lives.
+class SingleThread {
+ public:
+  SingleThread() {
+    if (omp_set_max_active_levels == nullptr) return;
+    levels_ = omp_get_max_active_levels();
+    omp_set_max_active_levels(0);
+  }
+  ~SingleThread() {
+    if (omp_set_max_active_levels != nullptr) omp_set_max_active_levels(levels_);
+  }
+  SingleThread(const SingleThread&) = delete;
+  SingleThread& operator=(const SingleThread&) = delete;
+
+ private:
+  int levels_ = 1;
+};
 
 /// One cholmod_common with our settings; freed with its owner.
 struct Common {
@@ -103,6 +124,7 @@ struct CholeskyAnalysis::Backend {
   cholmod_factor* symbolic = nullptr;
 
   explicit Backend(const CholeskyAnalysis& a) {
+    const SingleThread single_thread;
     cholmod_sparse matrix = view(a, nullptr);
     symbolic = cholmod_analyze(&matrix, &common.c);
     if (symbolic == nullptr) throw std::runtime_error("CHOLMOD: analysis failed");
@@ -135,6 +157,7 @@ struct CholeskyFactor::Backend {
   Backend& operator=(const Backend&) = delete;
 
   bool compute(const CholeskyAnalysis& a, const double* values) {
+    const SingleThread single_thread;
     cholmod_sparse matrix = view(a, values);
     cholmod_factorize(&matrix, factor, &common.c);
     if (common.c.status < CHOLMOD_OK) throw std::runtime_error("CHOLMOD: factorization failed");
@@ -142,6 +165,7 @@ struct CholeskyFactor::Backend {
   }
 
   void solve(std::vector<double>& b) const {
+    const SingleThread single_thread;
     cholmod_dense rhs{};
     rhs.nrow = rhs.nzmax = rhs.d = b.size();
     rhs.ncol = 1;

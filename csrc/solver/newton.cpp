@@ -374,6 +374,7 @@ Minimizer::Move Minimizer::search() {
     record();
     chord_allowed_ = mode_ == Mode::kExact && alpha == 1.0;
     if (alpha == 1.0) return Move::kWhole;
+    if (mode_ == Mode::kExact && !contacts_.empty()) skip_exact_ = 1;
     return safe == 1.0 && rounding ? Move::kRounded : Move::kPart;
   }
   return safe == 1.0 && rounding ? Move::kRounded : Move::kNone;

@@ -206,7 +206,7 @@ Hessian assemble(const Objective& f,
     add_pair(f,
              merged.pattern,
              k.lag.pair.vertices,
-             f.friction.hessian(k, f.x_start, x),
+             f.friction.hessian(k, f.x_start, x, curvature),
              result.blocks);
   }
   return result;
@@ -246,7 +246,7 @@ void add_prescribed_product(const Objective& f,
   }
   for (const contact::FrictionSet::Entry& k : f.friction.entries()) {
     if (std::ranges::all_of(k.lag.pair.vertices, [&](Index v) { return f.is_free(v); })) continue;
-    add_pair_product(f, k.lag.pair.vertices, f.friction.hessian(k, f.x_start, x), d, out);
+    add_pair_product(f, k.lag.pair.vertices, f.friction.hessian(k, f.x_start, x, curvature), d, out);
   }
 }
 

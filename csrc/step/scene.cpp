@@ -25,8 +25,7 @@ contact::CollisionMesh make_collision_mesh(const Description& d) {
               surface.begin() + cloth_vertices + d.bodies.vertex_start[k + 1],
               cloths + k);
   }
-  const auto vertices = static_cast<Index>(surface.size());
-  return {vertices, cloth_vertices, cloths, std::move(faces), std::move(surface), d.self_contact};
+  return {std::move(faces), std::move(surface), cloths, d.self_contact};
 }
 
 /// All surfaces as given: the reference that the collision trees are built from.

@@ -32,14 +32,13 @@ struct Report {
   std::string message;
 };
 
-/// Where the results of one environment go.
+/// Where the results of one environment go. With a path, the accepted iterates (all vertices) are
+/// appended to it.
 struct Outputs {
   double* positions;    ///< [N, 3]
   double* velocities;   ///< [N, 3]
   double* body_forces;  ///< [V, 3]
   Tape tape;            ///< pointers are null where no tape is wanted
-  /// Accepted iterates of all surfaces, each [3 (N + V)], first the start; null where not wanted.
-  /// Straight motion between them is free of collisions.
   std::vector<std::vector<double>>* path = nullptr;
 };
 
@@ -75,6 +74,11 @@ void backward(const Scene& scene,
 
 /// Elastic energy + gravity + soft pins + barrier at the positions of the inputs [J].
 double potential_energy(const Scene& scene, const Inputs& inputs);
+
+/// The unit EF that speeds are stated in: seconds of one numeric factorization of the contact-free
+/// Hessian at the inputs' positions by Eigen's SimplicialLDLT, minimum degree order, no BLAS; the
+/// median of several.
+double reference_factorization_seconds(const Scene& scene, const Inputs& inputs, int repeats);
 
 /// kappa that balances the barrier with the contact-free Hessian at rest (3-contact, 3.3) [Pa].
 double default_barrier_stiffness(const Scene& scene, const Inputs& inputs, double barrier_distance);

@@ -2,127 +2,184 @@
 
 #include <limits>
 
-#include "contact/distance/point_edge.h"
+#include <Eigen/Geometry>
 
 namespace diffcloth::contact {
 namespace {
 
-/// Below this squared sine two directions count as parallel, and a triangle as degenerate.
+/// Relative |u x v|^2 below which directions count as parallel: the square of 1.6e-8, where the
+/// cross product of double coordinates still has half of its digits.
 constexpr double kParallel = 2.5e-16;
 
-/// Write the interior closest features of a pair, whose beta solves M beta = rhs.
-bool solve_interior(const Eigen::Matrix<double, 3, 2>& s, const Vec3& t0, Vec2& beta, Mat2& M_inv) {
-  // t = t0 + s beta is shortest where s^T (t0 + s beta) = 0.
-  const double m00 = s.col(0).squaredNorm();
-  const double m11 = s.col(1).squaredNorm();
-  const double m01 = s.col(0).dot(s.col(1));
-  const double determinant = s.col(0).cross(s.col(1)).squaredNorm();
-  if (!(determinant >= kParallel * m00 * m11) || determinant == 0.0) return false;
-  M_inv << m11, -m01, -m01, m00;
-  M_inv /= determinant;
-  beta = -M_inv * (s.transpose() * t0);
-  return true;
+/// Distance from a vertex to an edge, as found while classifying.
+struct Nearest {
+  int vertex;  ///< corner of the point (its sign is that of the primitive it belongs to)
+  int e0, e1;  ///< corners of the edge
+  double a;    ///< parameter on the edge, clamped to [0, 1]
+  double d_sq = std::numeric_limits<double>::infinity();
+};
+
+Nearest point_edge(const Corners& x, int vertex, int e0, int e1) {
+  const Vec3 e = x[e1] - x[e0];
+  const Vec3 w = x[vertex] - x[e0];
+  const double ee = e.squaredNorm();
+  const double we = w.dot(e);
+  // An edge of no length is its first vertex.
+  const double a = we <= 0 || ee == 0 ? 0.0 : (we >= ee ? 1.0 : we / ee);
+  const double d_sq = a == 1 ? (x[vertex] - x[e1]).squaredNorm() : (w - a * e).squaredNorm();
+  return {.vertex = vertex, .e0 = e0, .e1 = e1, .a = a, .d_sq = d_sq};
 }
 
-Closest farthest() {
-  Closest k;
-  k.d_sq = std::numeric_limits<double>::infinity();
-  k.c.setZero();
-  k.t.setZero();
-  k.parameter_count = 0;
-  return k;
+Closest empty() {
+  return {.c = Vec4::Zero(),
+          .parameter_count = 0,
+          .c_beta = Eigen::Matrix<double, 4, 2>::Zero(),
+          .s = Eigen::Matrix<double, 3, 2>::Zero(),
+          .M_inv = Mat2::Zero(),
+          .t = Vec3::Zero(),
+          .d_sq = 0};
 }
+
+/// Point-edge and point-point. `sign` is +1 if the vertex belongs to the first primitive.
+Closest from_point_edge(const Corners& x, const Nearest& nearest, double sign) {
+  Closest out = empty();
+  const auto& [vertex, e0, e1, a, d_sq] = nearest;
+  out.c[vertex] = sign;
+  if (a == 0 || a == 1) {
+    const int other = a == 0 ? e0 : e1;
+    out.c[other] = -sign;
+    out.t = sign * (x[vertex] - x[other]);
+  } else {
+    const Vec3 e = x[e1] - x[e0];
+    out.c[e0] = -sign * (1 - a);
+    out.c[e1] = -sign * a;
+    out.parameter_count = 1;
+    out.c_beta(e0, 0) = sign;
+    out.c_beta(e1, 0) = -sign;
+    out.s.col(0) = -sign * e;
+    out.M_inv(0, 0) = 1 / e.squaredNorm();
+    out.t = sign * ((x[vertex] - x[e0]) - a * e);
+  }
+  out.d_sq = out.t.squaredNorm();
+  return out;
+}
+
+/// Inverse of M = [s0.s0, s0.s1; s0.s1, s1.s1], whose determinant is |s0 x s1|^2.
+Mat2 inverse_metric(const Vec3& s0, const Vec3& s1, double determinant) {
+  const double off = -s0.dot(s1);
+  Mat2 M_inv;
+  M_inv << s1.squaredNorm(), off, off, s0.squaredNorm();
+  return M_inv / determinant;
+}
+
+const Nearest& nearer(const Nearest& p, const Nearest& q) { return q.d_sq < p.d_sq ? q : p; }
 
 Closest point_triangle(const Corners& x) {
-  Closest k = farthest();
-  k.s.col(0) = x[1] - x[2];
-  k.s.col(1) = x[1] - x[3];
-  const Vec3 t0 = x[0] - x[1];
-  Vec2 beta;
-  if (solve_interior(k.s, t0, beta, k.M_inv) && beta[0] >= 0.0 && beta[1] >= 0.0 &&
-      beta[0] + beta[1] <= 1.0) {
-    k.c << 1.0, -(1.0 - beta[0] - beta[1]), -beta[0], -beta[1];
-    k.c_beta << 0, 0, 1, 1, -1, 0, 0, -1;
-    k.parameter_count = 2;
-    k.t = t0 + k.s * beta;
-    k.d_sq = k.t.squaredNorm();
-    return k;
+  const Vec3 e0 = x[2] - x[1];
+  const Vec3 e1 = x[3] - x[1];
+  const Vec3 w = x[0] - x[1];
+  const Vec3 n = e0.cross(e1);
+  const double n_sq = n.squaredNorm();
+  if (n_sq > kParallel * e0.squaredNorm() * e1.squaredNorm()) {
+    const double b0 = w.cross(e1).dot(n) / n_sq;
+    const double b1 = e0.cross(w).dot(n) / n_sq;
+    if (b0 > 0 && b1 > 0 && b0 + b1 < 1) {
+      Closest out = empty();
+      out.c << 1, -(1 - b0 - b1), -b0, -b1;
+      out.parameter_count = 2;
+      out.c_beta.col(0) << 0, 1, -1, 0;
+      out.c_beta.col(1) << 0, 1, 0, -1;
+      out.s.col(0) = -e0;
+      out.s.col(1) = -e1;
+      out.M_inv = inverse_metric(e0, e1, n_sq);
+      out.t = w - b0 * e0 - b1 * e1;
+      out.d_sq = out.t.squaredNorm();
+      return out;
+    }
   }
-  consider_point_edge(x, 0, 1, 2, 1.0, k);
-  consider_point_edge(x, 0, 2, 3, 1.0, k);
-  consider_point_edge(x, 0, 3, 1, 1.0, k);
-  return k;
+  const Nearest e01 = point_edge(x, 0, 1, 2);
+  const Nearest e12 = point_edge(x, 0, 2, 3);
+  const Nearest e20 = point_edge(x, 0, 3, 1);
+  return from_point_edge(x, nearer(nearer(e01, e12), e20), 1);
 }
 
 Closest edge_edge(const Corners& x) {
-  Closest k = farthest();
-  k.s.col(0) = x[1] - x[0];
-  k.s.col(1) = x[2] - x[3];
-  const Vec3 t0 = x[0] - x[2];
-  Vec2 beta;
-  if (solve_interior(k.s, t0, beta, k.M_inv) && beta[0] > 0.0 && beta[0] < 1.0 && beta[1] > 0.0 &&
-      beta[1] < 1.0) {
-    k.c << 1.0 - beta[0], beta[0], -(1.0 - beta[1]), -beta[1];
-    k.c_beta << -1, 0, 1, 0, 0, 1, 0, -1;
-    k.parameter_count = 2;
-    k.t = t0 + k.s * beta;
-    k.d_sq = k.t.squaredNorm();
-    return k;
-  }
-  consider_point_edge(x, 0, 2, 3, 1.0, k);
-  consider_point_edge(x, 1, 2, 3, 1.0, k);
-  consider_point_edge(x, 2, 0, 1, -1.0, k);
-  consider_point_edge(x, 3, 0, 1, -1.0, k);
-  return k;
-}
-
-/// G of the header, 12x2.
-Eigen::Matrix<double, 12, 2> coupling(const Closest& k) {
-  Eigen::Matrix<double, 12, 2> g = Eigen::Matrix<double, 12, 2>::Zero();
-  for (int a = 0; a < k.parameter_count; ++a) {
-    for (int i = 0; i < 4; ++i) {
-      g.block<3, 1>(3 * i, a) = k.c[i] * k.s.col(a) + k.c_beta(i, a) * k.t;
+  const Vec3 u = x[1] - x[0];
+  const Vec3 v = x[3] - x[2];
+  const Vec3 w = x[0] - x[2];
+  const Vec3 n = u.cross(v);
+  const double n_sq = n.squaredNorm();
+  if (n_sq >= kParallel * u.squaredNorm() * v.squaredNorm() && n_sq > 0) {
+    const double s = v.cross(w).dot(n) / n_sq;
+    const double t = u.cross(w).dot(n) / n_sq;
+    if (s > 0 && s < 1 && t > 0 && t < 1) {
+      Closest out = empty();
+      out.c << 1 - s, s, -(1 - t), -t;
+      out.parameter_count = 2;
+      out.c_beta.col(0) << -1, 1, 0, 0;
+      out.c_beta.col(1) << 0, 0, 1, -1;
+      out.s.col(0) = u;
+      out.s.col(1) = -v;
+      out.M_inv = inverse_metric(u, -v, n_sq);
+      out.t = w + s * u - t * v;
+      out.d_sq = out.t.squaredNorm();
+      return out;
     }
   }
-  return g;
+  const Nearest a0 = point_edge(x, 0, 2, 3);
+  const Nearest a1 = point_edge(x, 1, 2, 3);
+  const Nearest b0 = point_edge(x, 2, 0, 1);
+  const Nearest b1 = point_edge(x, 3, 0, 1);
+  const Nearest nearest = nearer(nearer(a0, a1), nearer(b0, b1));
+  return from_point_edge(x, nearest, nearest.vertex < 2 ? 1 : -1);
+}
+
+/// G = d(s . t)/dx: rows (3 i .. 3 i + 2) of column a are c_i s_a + c'_(a,i) t.
+Eigen::Matrix<double, 12, 2> parameter_coupling(const Closest& pair) {
+  Eigen::Matrix<double, 12, 2> G;
+  for (int a = 0; a < 2; ++a) {
+    for (int i = 0; i < 4; ++i) {
+      G.block<3, 1>(3 * i, a) = pair.c[i] * pair.s.col(a) + pair.c_beta(i, a) * pair.t;
+    }
+  }
+  return G;
 }
 
 }  // namespace
 
 Closest closest(PairKind kind, const Corners& x) {
-  return kind == PairKind::kPointTriangle ? point_triangle(x) : edge_edge(x);
+  switch (kind) {
+    case PairKind::kPointTriangle:
+      return point_triangle(x);
+    case PairKind::kEdgeEdge:
+      return edge_edge(x);
+  }
+  __builtin_unreachable();
 }
 
-Vec12 distance_sq_gradient(const Closest& k) {
-  Vec12 g;
-  for (int i = 0; i < 4; ++i) g.segment<3>(3 * i) = (2.0 * k.c[i]) * k.t;
-  return g;
+Vec12 distance_sq_gradient(const Closest& pair) {
+  Vec12 gradient;
+  for (int i = 0; i < 4; ++i) gradient.segment<3>(3 * i) = 2 * pair.c[i] * pair.t;
+  return gradient;
 }
 
-Mat12 distance_sq_hessian(const Closest& k) {
-  Mat12 h = Mat12::Zero();
+Mat12 distance_sq_hessian(const Closest& pair) {
+  Mat12 hessian = Mat12::Zero();
+  if (pair.parameter_count > 0) {
+    const Eigen::Matrix<double, 12, 2> G = parameter_coupling(pair);
+    const Eigen::Matrix<double, 12, 2> GM = -2 * G * pair.M_inv;
+    hessian = GM.lazyProduct(G.transpose());  // unrolled, where a product would call gemm
+  }
   for (int i = 0; i < 4; ++i) {
     for (int j = 0; j < 4; ++j) {
-      h.block<3, 3>(3 * i, 3 * j).diagonal().setConstant(2.0 * k.c[i] * k.c[j]);
+      hessian.block<3, 3>(3 * i, 3 * j).diagonal().array() += 2 * pair.c[i] * pair.c[j];
     }
   }
-  if (k.parameter_count == 0) return h;
-  const Eigen::Matrix<double, 12, 2> g = coupling(k);
-  if (k.parameter_count == 1) {
-    h.noalias() -= (2.0 * k.M_inv(0, 0)) * g.col(0) * g.col(0).transpose();
-  } else {
-    h.noalias() -= 2.0 * g * k.M_inv * g.transpose();
-  }
-  return h;
+  return hessian;
 }
 
-Eigen::Matrix<double, 2, 12> beta_jacobian(const Closest& k) {
-  if (k.parameter_count == 0) return Eigen::Matrix<double, 2, 12>::Zero();
-  Mat2 M_inv = k.M_inv;
-  if (k.parameter_count == 1) M_inv(0, 1) = M_inv(1, 0) = M_inv(1, 1) = 0.0;
-  return -M_inv * coupling(k).transpose();
+Eigen::Matrix<double, 2, 12> beta_jacobian(const Closest& pair) {
+  return -pair.M_inv * parameter_coupling(pair).transpose();
 }
-
-double distance_sq(PairKind kind, const Corners& x) { return closest(kind, x).d_sq; }
 
 }  // namespace diffcloth::contact

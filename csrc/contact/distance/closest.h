@@ -1,47 +1,51 @@
 #pragma once
 
-#include <array>
+#include <Eigen/Core>
 
 #include "common/types.h"
+#include "contact/distance/separation.h"
+#include "contact/pair.h"
 
 namespace diffcloth::contact {
 
-enum class PairKind : std::uint8_t { kPointTriangle, kEdgeEdge };
-
-/// Corners of a pair: point, t0, t1, t2; or a0, a1, b0, b1.
-using Corners = std::array<Vec3, 4>;
-
-/// Closest vector of a pair of primitives, from the second to the first:
+/// Closest vector t = sum_i c_i(beta) x_i of a pair.
 ///
-///   t = sum_i c_i(beta) x_i,   D = |t|^2,   s_a = dt/d(beta_a),   M_ab = s_a . s_b
+/// With parameters beta where the closest points are free to slide (c' = dc/dbeta):
 ///
-/// for the closest features: point-point (no beta), point-edge (one), point-triangle and edge-edge
-/// (two). Corners that take no part have c_i = 0 and zero rows in c_beta.
+///   type         c (of the corners that take part)  beta    c'_a                          s_a
+///   point-point  (1, -1)                            -       -                             -
+///   point-edge   (1, -(1 - a), -a)                  a       (0, 1, -1)                    -e
+///   point-plane  (1, -(1 - b0 - b1), -b0, -b1)      b0, b1  (0, 1, -1, 0), (0, 1, 0, -1)  -e0, -e1
+///   line-line    (1 - s, s, -(1 - t), -t)           s, t    (-1, 1, 0, 0), (0, 0, 1, -1)  u, -v
+///
+///   D = |t|^2,   s_a = dt/dbeta_a,   M_ab = s_a . s_b,   G_(i),a = c_i s_a + c'_(a,i) t
+///   grad D = 2 c (x) t,   hess D = 2 c c^T (x) I - 2 G M^-1 G^T,   dbeta = -M^-1 G^T dx
+///
+/// Corners that do not take part have c_i = 0 and zero rows in c_beta; parameters that do not exist
+/// have zero columns in c_beta, s and M_inv.
 struct Closest {
   Vec4 c;
   int parameter_count;
-  Eigen::Matrix<double, 4, 2> c_beta;  ///< dc_i/d(beta_a)
+  Eigen::Matrix<double, 4, 2> c_beta;
   Eigen::Matrix<double, 3, 2> s;
   Mat2 M_inv;
-  Vec3 t;
-  double d_sq;
+  Vec3 t;       ///< From the second primitive to the first [m].
+  double d_sq;  ///< |t|^2 [m^2].
 };
 
-/// Closest vector between point and triangle, or between two edges.
+/// Classify a pair by the region that its closest points lie in, and describe its closest vector.
+///
+/// Degenerate triangles take the nearest of their edges. Edges with |u x v|^2 below 2.5e-16
+/// |u|^2 |v|^2 are parallel and never of type line-line.
 Closest closest(PairKind kind, const Corners& x);
 
-/// grad D = 2 c (x) t.
-Vec12 distance_sq_gradient(const Closest& k);
+/// Gradient of the squared distance, corner by corner [m].
+Vec12 distance_sq_gradient(const Closest& pair);
 
-/// hess D = 2 (c c^T (x) I) - 2 G M^-1 G^T,   G_(i),a = c_i s_a + c'_(a,i) t.
-Mat12 distance_sq_hessian(const Closest& k);
+/// Hessian of the squared distance [-]; exact, hence indefinite.
+Mat12 distance_sq_hessian(const Closest& pair);
 
-/// d(beta)/dx = -M^-1 G^T; unused rows are zero.
-Eigen::Matrix<double, 2, 12> beta_jacobian(const Closest& k);
-
-/// Squared distance for collision detection: interior features only where they are well
-/// conditioned, else the nearest of the clamped point-edge distances, which exceeds the true one by
-/// rounding at most.
-double distance_sq(PairKind kind, const Corners& x);
+/// Change of the parameters with the corners, dbeta/dx [1/m]; rows beyond parameter_count are zero.
+Eigen::Matrix<double, 2, 12> beta_jacobian(const Closest& pair);
 
 }  // namespace diffcloth::contact

@@ -1,29 +1,31 @@
 #pragma once
 
-#include "contact/distance/closest.h"
+#include "common/types.h"
+#include "contact/pair.h"
 
 namespace diffcloth::contact {
 
-/// Edge-edge mollifier: the energy of nearly parallel edges fades, so that it stays smooth.
-///
-///   q = |u x v|^2,   m = (q/eps) (2 - q/eps)  for q < eps,  else 1
-///
-/// with edges u = a1 - a0, v = b1 - b0 and eps = 1e-3 |U|^2 |V|^2 of the rest edges.
-///
-/// [Li et al. 2020]
+/// Below which |u x v|^2 an edge-edge pair is mollified: 1e-3 |U|^2 |V|^2 of the rest edges [m^4].
 double mollifier_threshold(double rest_length_sq_a, double rest_length_sq_b);
 
-bool mollified(const Corners& x, double eps);
-
+/// Factor that makes the force of two edges continuous where they become parallel:
+///
+///   q = |u x v|^2,   m = (q / eps) (2 - q / eps) for q < eps, else 1.
 double mollifier(const Corners& x, double eps);
 
+/// Whether m(q) is below its plateau, that is q < eps.
+bool mollified(const Corners& x, double eps);
+
+/// m with its derivatives by the corners, and by eps at fixed corners.
 struct Mollifier {
   double m;
   Vec12 gradient;
   Mat12 hessian;
-  double m_eps;         ///< dm/d(eps)
-  Vec12 gradient_eps;   ///< d(gradient)/d(eps)
+  double m_eps;
+  Vec12 gradient_eps;  ///< d gradient / d eps
 };
+
+/// Value and derivatives; on the plateau m = 1 and all of them vanish.
 Mollifier mollifier_derivatives(const Corners& x, double eps);
 
 }  // namespace diffcloth::contact

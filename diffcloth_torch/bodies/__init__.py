@@ -1,0 +1,1 @@
+"""How rigid bodies move."""

@@ -1,0 +1,134 @@
+"""Rotations as quaternions (w, x, y, z), and poses [px, py, pz, qw, qx, qy, qz], in torch.
+
+A rotation vector w turns by |w| radians about w / |w|. Everything is differentiable, at zero too.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "integrate_poses",
+    "interpolate_poses",
+    "quaternion_exp",
+    "quaternion_log",
+    "quaternion_multiply",
+    "rotate",
+]
+
+# Below this angle [rad] the exponential is summed as a series; its first neglected terms are
+# 0.1^10 / (2^10 10!) = 3e-20 for the cosine and less for the sine.
+_SERIES_ANGLE = 0.1
+
+# sin(a / 2) below which a logarithm takes a / sin(a / 2) = 2, right to rounding.
+_SMALLEST_SINE = 1e-9
+
+
+def quaternion_exp(rotation_vector: Tensor) -> Tensor:
+    """Unit quaternions of rotation vectors.
+
+    With a = |w|, q = (cos(a/2), sin(a/2)/a w). The series in a^2 near zero keeps both the value
+    and the gradient, where sin(a/2)/a would be 0/0.
+
+    Args:
+        rotation_vector: w [rad], shape [..., 3].
+
+    Returns:
+        Quaternions, shape [..., 4].
+    """
+    angle_sq = (rotation_vector * rotation_vector).sum(-1, keepdim=True)
+    near_zero = angle_sq < _SERIES_ANGLE**2
+    # Both branches are evaluated: each gets an argument at which it and its gradient are finite.
+    angle = torch.where(near_zero, torch.ones_like(angle_sq), angle_sq).sqrt()
+    s = torch.where(near_zero, angle_sq, torch.zeros_like(angle_sq)) / 4  # (a/2)^2
+    cosine_series = 1 - s / 2 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56)))
+    sine_series = (1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72)))) / 2
+    cosine = torch.where(near_zero, cosine_series, torch.cos(angle / 2))
+    sine_over_angle = torch.where(near_zero, sine_series, torch.sin(angle / 2) / angle)
+    return torch.cat([cosine, sine_over_angle * rotation_vector], dim=-1)
+
+
+def quaternion_log(quaternion: Tensor) -> Tensor:
+    """Rotation vectors of unit quaternions, of at most pi radians.
+
+    Args:
+        quaternion: Unit quaternions, shape [..., 4].
+
+    Returns:
+        Rotation vectors [rad], shape [..., 3].
+    """
+    # q and -q are the same rotation; the one with w >= 0 turns by pi or less.
+    sign = torch.where(quaternion[..., :1] < 0, -1.0, 1.0)
+    w, v = sign * quaternion[..., :1], sign * quaternion[..., 1:]
+    sine_sq = (v * v).sum(-1, keepdim=True)
+    near_zero = sine_sq < _SMALLEST_SINE**2
+    sine = torch.where(near_zero, torch.ones_like(sine_sq), sine_sq).sqrt()
+    factor = torch.where(near_zero, torch.full_like(sine, 2.0), 2 * torch.atan2(sine, w) / sine)
+    vector: Tensor = factor * v
+    return vector
+
+
+def quaternion_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """Quaternion of the rotation `b` followed by `a`; shapes [..., 4]."""
+    aw, av = a[..., :1], a[..., 1:]
+    bw, bv = b[..., :1], b[..., 1:]
+    w = aw * bw - (av * bv).sum(-1, keepdim=True)
+    v = aw * bv + bw * av + torch.linalg.cross(av, bv)
+    return torch.cat([w, v], dim=-1)
+
+
+def rotate(quaternion: Tensor, points: Tensor) -> Tensor:
+    """Turn points [..., 3] by unit quaternions [..., 4]."""
+    w, v = quaternion[..., :1], quaternion[..., 1:]
+    v = v.expand_as(points)
+    twice = 2 * torch.linalg.cross(v, points)
+    turned: Tensor = points + w * twice + torch.linalg.cross(v, twice)
+    return turned
+
+
+def integrate_poses(pose: Tensor, twists: Tensor, dt: float) -> Tensor:
+    """Poses along a sequence of velocities.
+
+    Over each step p <- p + dt v and q <- exp(dt w) q, exact for a w that is constant over it.
+
+    Args:
+        pose: Pose before the first step, its quaternion of unit length; shape [7].
+        twists: Linear velocity v [m/s] and angular velocity w [rad/s] in world axes,
+            shape [n, 6].
+        dt: Time step [s].
+
+    Returns:
+        Poses after each step, shape [n, 7].
+    """
+    positions = pose[:3] + dt * torch.cumsum(twists[:, :3], dim=0)
+    turns = quaternion_exp(dt * twists[:, 3:])
+    quaternion = pose[3:]
+    quaternions = []
+    for turn in turns:
+        quaternion = quaternion_multiply(turn, quaternion)
+        quaternions.append(quaternion)
+    return torch.cat([positions, torch.stack(quaternions)], dim=-1)
+
+
+def interpolate_poses(times: Tensor, poses: Tensor, at: Tensor) -> Tensor:
+    """Poses between keyframes: straight paths, turns about one axis at constant speed.
+
+    Args:
+        times: Increasing times of the keyframes [s], shape [k].
+        poses: Their poses, shape [k, 7].
+        at: Times [s], shape [n]; before the first and after the last keyframe the pose is theirs.
+
+    Returns:
+        Poses, shape [n, 7].
+    """
+    if len(times) == 1:
+        return poses.expand(len(at), 7).clone()
+    after = torch.searchsorted(times, at.contiguous()).clamp(1, len(times) - 1)
+    a, b = poses[after - 1], poses[after]
+    span = times[after] - times[after - 1]
+    part = ((at - times[after - 1]) / span).clamp(0, 1)[:, None]
+    conjugate = a[:, 3:] * torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=a.dtype)
+    turn = quaternion_log(quaternion_multiply(b[:, 3:], conjugate))
+    quaternions = quaternion_multiply(quaternion_exp(part * turn), a[:, 3:])
+    return torch.cat([torch.lerp(a[:, :3], b[:, :3], part), quaternions], dim=-1)

@@ -1,0 +1,1 @@
+"""Tasks: a scene, what moves in it, and what is to be achieved; one file per task."""

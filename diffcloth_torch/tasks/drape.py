@@ -1,0 +1,44 @@
+"""Drape: simulate any scene that a configuration describes, with the motion that it prescribes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from torch import Tensor
+
+from diffcloth_torch.controls import Control
+from diffcloth_torch.io.configs import RunConfig
+from diffcloth_torch.state import State
+from diffcloth_torch.tasks.scenes import build_scene, build_simulator, prescribed_controls
+from diffcloth_torch.tasks.task import Goal
+
+__all__ = ["Drape"]
+
+
+class Drape:
+    """A scene, and bodies and pins that follow keyframes. Nothing is optimized."""
+
+    Config = RunConfig
+
+    def __init__(self, config: RunConfig, source: Path) -> None:
+        """Build the scene of a configuration that was read from the file `source`."""
+        self.config = config
+        self.scene = build_scene(config, source)
+        self.simulator = build_simulator(self.scene, config.simulation)
+
+    def initial_state(self) -> State:
+        """Make the state that the scene describes."""
+        return self.simulator.initial_state()
+
+    def actions(self) -> dict[str, Tensor]:
+        """Have none."""
+        return {}
+
+    def controls(self, actions: Mapping[str, Tensor]) -> list[Control]:
+        """Follow the keyframes."""
+        return prescribed_controls(self.config, self.scene, self.config.simulation.steps)
+
+    def goals(self) -> list[Goal]:
+        """Have none."""
+        return []

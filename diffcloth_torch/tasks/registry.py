@@ -1,0 +1,49 @@
+"""Tasks by the name that a configuration gives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.io.configs import RunConfig, read_document, set_values, validate
+from diffcloth_torch.tasks.drape import Drape
+from diffcloth_torch.tasks.hit_cloth import HitCloth
+from diffcloth_torch.tasks.task import Task
+
+__all__ = ["TASKS", "load_config", "load_task", "make_task"]
+
+TASKS: dict[str, Any] = {"drape": Drape, "hit_cloth": HitCloth}
+"""Name -> class with a `Config` and a constructor that takes one and the path it was read from."""
+
+
+def load_config(path: str | Path, assignments: Iterable[str] = ()) -> RunConfig:
+    """Read a configuration, change values and check it against the schema of its task.
+
+    Args:
+        path: YAML file.
+        assignments: "key=value" each, see `set_values`.
+
+    Raises:
+        InvalidInput: If the file, a key or a value is not accepted.
+    """
+    document = set_values(read_document(path), assignments)
+    name = document.get("task")
+    if name not in TASKS:
+        accepted = ", ".join(TASKS)
+        got = "it is missing" if name is None else f"got {name!r}"
+        raise InvalidInput(f"{path}: `task` must be one of {accepted}; {got}")
+    config: RunConfig = validate(TASKS[name].Config, document, path)
+    return config
+
+
+def make_task(config: RunConfig, path: str | Path) -> Task:
+    """Build what a configuration describes; `path` is where it was read from."""
+    constructor: Callable[[RunConfig, Path], Task] = TASKS[config.task]
+    return constructor(config, Path(path))
+
+
+def load_task(path: str | Path, assignments: Iterable[str] = ()) -> Task:
+    """Read a configuration and build what it describes."""
+    return make_task(load_config(path, assignments), path)

@@ -1,0 +1,30 @@
+"""Simulate a task, one state after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from tqdm import tqdm
+
+from diffcloth_torch.state import State
+from diffcloth_torch.tasks.task import Task
+
+__all__ = ["simulate"]
+
+
+def simulate(task: Task) -> Iterator[State]:
+    """Yield the initial state and the state after each step, with the task's initial actions.
+
+    Raises:
+        SimulationError: If a step fails.
+    """
+    with torch.no_grad():
+        controls = task.controls(task.actions())
+        state = task.initial_state()
+    yield state
+    # disable=None: quiet where the output is no terminal.
+    for control in tqdm(controls, desc="simulate", unit="step", disable=None):
+        with torch.no_grad():
+            state = task.simulator.step(state, control)
+        yield state

@@ -1,0 +1,43 @@
+"""A mesh sequence: one OBJ file per state, cloths and bodies in one file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+
+from diffcloth_torch.state import State
+
+__all__ = ["MeshSequence"]
+
+
+class MeshSequence:
+    """Writes `frame_0000.obj`, `frame_0001.obj` .. into a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        """Make the folder; files of an earlier sequence in it are removed.
+
+        Args:
+            folder: Where the files go.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        for old in folder.glob("frame_*.obj"):
+            old.unlink()
+        self._folder = folder
+        self._count = 0
+
+    def show(self, state: State) -> None:
+        """Write one file."""
+        state.export(self._folder / f"frame_{self._count:04d}.obj", bodies=True)
+        self._count += 1
+
+    def __enter__(self) -> MeshSequence:
+        """Have nothing more to open."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Have nothing to finish: each file is complete."""

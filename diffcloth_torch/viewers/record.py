@@ -1,0 +1,203 @@
+"""Pictures of a simulation: an animation, an overview of its moments, and single frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.io.configs import BodySection, PictureSection
+from diffcloth_torch.poses import transform
+from diffcloth_torch.state import State
+from diffcloth_torch.tasks.task import Task
+from diffcloth_torch.viewers.stage import Bounds, Skin, Stage, require_pyvista
+
+__all__ = ["Record"]
+
+Image = NDArray[np.uint8]
+
+_GAP_BELOW = 0.04  # of the size of the scene, between the lowest point and a floor of ours
+_SHEET_MARGIN = 8  # pixels between the pictures of an overview
+_GIF_STEP = 2  # every so many pixels of a picture are kept in a GIF
+
+
+class Record:
+    """Keeps the states that it is shown and draws them at the end, when all of the motion is known.
+
+    Files: `NAME.mp4` or `NAME.gif`, `NAME.png` (an overview of some moments), and
+    `NAME_frames/0000.png` .. if asked for.
+    """
+
+    def __init__(self, folder: Path, task: Task, *, fps: float, name: str = "animation") -> None:
+        """Check that pictures can be made, before a long simulation.
+
+        Args:
+            folder: Where the files go; it must exist.
+            task: What is shown, with its goals and the options in its configuration.
+            fps: Pictures per second, where the configuration does not say.
+            name: Name of the files.
+
+        Raises:
+            InvalidInput: If a package is missing; the message says how to install it.
+        """
+        require_pyvista()
+        self._options: PictureSection = task.config.output.pictures
+        _require_writer(self._options.video)
+        self._folder, self._task, self._name = folder, task, name
+        self._fps = fps if self._options.fps is None else self._options.fps
+        self._positions: list[NDArray[np.float64]] = []
+        self._poses: list[NDArray[np.float64]] = []
+
+    def show(self, state: State) -> None:
+        """Keep one state."""
+        self._positions.append(state.positions.detach().numpy().copy())
+        self._poses.append(state.body_poses.detach().numpy().copy())
+
+    def __enter__(self) -> Record:
+        """Have nothing more to open."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Draw what there is; after a failed step too, to see what led to it."""
+        if self._positions and (kind is None or issubclass(kind, SimulationError)):
+            self._draw_all()
+
+    def _draw_all(self) -> None:
+        count = len(self._positions)
+        moments = sorted({round(i) for i in np.linspace(0, count - 1, self._options.sheet)})
+        sheet = []
+        with self._stage() as stage, self._writer() as writer:
+            for k in tqdm(range(count), desc="draw", unit="frame", disable=None):
+                image = stage.draw(self._positions[k], self._poses[k][self._shown_bodies()])
+                writer(k, image)
+                if k in moments:
+                    sheet.append(image)
+        _write_image(self._folder / f"{self._name}.png", _side_by_side(sheet))
+
+    def _stage(self) -> Stage:
+        scene, sections = self._task.scene, self._task.config.scene
+        low, high = self._bounds()
+        stage = Stage(
+            [
+                Skin(cloth.faces + start, section.color, section.back_color)
+                for cloth, section, start in zip(
+                    scene.cloths, sections.cloths, self._cloth_starts(), strict=True
+                )
+            ],
+            [
+                (scene.bodies[k].vertices, Skin(scene.bodies[k].faces, sections.bodies[k].color))
+                for k in self._shown_bodies()
+            ],
+            size=self._options.size,
+            bounds=(low, high),
+            ground=self._ground(low, high),
+            camera=self._options.camera,
+        )
+        for goal in self._task.goals():
+            stage.add_goal(goal.vertices, goal.faces)
+        return stage
+
+    def _cloth_starts(self) -> list[int]:
+        counts = [len(cloth.vertices) for cloth in self._task.scene.cloths]
+        return [0, *np.cumsum(counts[:-1]).tolist()]
+
+    def _shown_bodies(self) -> list[int]:
+        """Bodies that are drawn: the floor of the stage stands for a level plane."""
+        sections = self._task.config.scene.bodies
+        return [k for k, section in enumerate(sections) if not _is_floor(section)]
+
+    def _bounds(self) -> Bounds:
+        points = [*self._positions, *(goal.vertices for goal in self._task.goals())]
+        for k in self._shown_bodies():
+            vertices = self._task.scene.bodies[k].vertices
+            poses = np.unique([pose[k] for pose in self._poses], axis=0)
+            points += [transform(vertices, pose) for pose in poses]
+        lows = [cloud.min(axis=0) for cloud in points]
+        highs = [cloud.max(axis=0) for cloud in points]
+        return np.min(lows, axis=0), np.max(highs, axis=0)
+
+    def _ground(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> float | None:
+        if self._options.ground != "auto":
+            return self._options.ground
+        floors = [body for body in self._task.config.scene.bodies if _is_floor(body)]
+        if floors:
+            return max(body.pose.position[2] for body in floors)
+        return float(low[2] - _GAP_BELOW * np.linalg.norm(high - low))
+
+    @contextmanager
+    def _writer(self) -> Iterator[Any]:
+        """Give a function (index, image) that adds a picture to the files."""
+        import imageio.v2 as imageio
+
+        frames = self._folder / f"{self._name}_frames"
+        if self._options.frames:
+            frames.mkdir(exist_ok=True)
+            for old in frames.glob("*.png"):
+                old.unlink()
+        video: Any = None
+        if self._options.video == "mp4":
+            video = imageio.get_writer(
+                self._folder / f"{self._name}.mp4",
+                fps=self._fps,
+                codec="libx264",
+                quality=8,
+                macro_block_size=2,
+            )
+        elif self._options.video == "gif":
+            video = imageio.get_writer(
+                self._folder / f"{self._name}.gif", duration=1000 / self._fps, loop=0
+            )
+        step = _GIF_STEP if self._options.video == "gif" else 1
+
+        def add(index: int, image: Image) -> None:
+            if self._options.frames:
+                _write_image(frames / f"{index:04d}.png", image)
+            if video is not None:
+                video.append_data(image[::step, ::step])
+
+        try:
+            yield add
+        finally:
+            if video is not None:
+                video.close()
+
+
+def _require_writer(video: str) -> None:
+    needed = ["imageio", *(["imageio_ffmpeg"] if video == "mp4" else [])]
+    for module in needed:
+        if find_spec(module) is None:
+            raise InvalidInput(
+                f"the animation needs {module.replace('_', '-')}: run  pip install "
+                "'diffcloth-torch[viewer]'  or change it with  --set output.pictures.video=gif  "
+                "or  --set output.pictures.video=none"
+            )
+
+
+def _is_floor(body: BodySection) -> bool:
+    turned = body.pose.axis is not None or body.pose.quaternion is not None
+    return body.shape.kind == "plane" and body.motion == "static" and not turned
+
+
+def _write_image(path: Path, image: Image) -> None:
+    import imageio.v2 as imageio
+
+    imageio.imwrite(path, image)
+
+
+def _side_by_side(images: list[Image]) -> Image:
+    margin = np.full((images[0].shape[0], _SHEET_MARGIN, 3), 255, dtype=np.uint8)
+    parts = [part for image in images for part in (margin, image)][1:]
+    return np.concatenate(parts, axis=1)

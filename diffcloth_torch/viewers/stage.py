@@ -1,0 +1,250 @@
+"""The stage that pictures are taken of: light, floor, cloth of two colors, bodies, targets.
+
+Everything is drawn off screen. On a machine without a display VTK draws through EGL.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.io.configs import CameraSection
+from diffcloth_torch.poses import transform
+from diffcloth_torch.viewers.floor import BACKGROUND, Floor, Shadow
+
+__all__ = ["Bounds", "Skin", "Stage", "require_pyvista"]
+
+Points = NDArray[np.float64]
+Triangles = NDArray[np.integer[Any]]
+Image = NDArray[np.uint8]
+Bounds = tuple[Points, Points]
+"""Lowest and highest coordinates [m], each of shape [3]."""
+
+_FRONT_COLORS = ("#2a6f97", "#c8553d", "#5b7f4b", "#7d5a8c")
+_BACK_COLORS = ("#f2c078", "#f3dcc0", "#e3dcae", "#e0cfe8")
+_BODY_COLORS = ("#8d99ae", "#a39b8b", "#7f9183")
+_GOAL_COLOR = "#2f9e78"
+
+# Directions to the lights, for a camera that looks along +y: they turn with it, so that what is
+# seen is lit. The key light also casts the shadow.
+_SUN = np.array([-0.45, -0.55, 1.0])
+# Direction, intensity and color of the other lights: cool ones across and from behind.
+_FILL = (np.array([1.0, -0.7, 0.3]), 0.45, "#e4eeff")
+_RIM = (np.array([-0.4, 1.0, 0.5]), 0.4, "#fff8f0")
+
+_CLOTH_SHINE = {"ambient": 0.36, "diffuse": 0.78, "specular": 0.1, "specular_power": 10}
+_BODY_SHINE = {"ambient": 0.4, "diffuse": 0.7, "specular": 0.25, "specular_power": 25}
+
+_VIEW_ANGLE = 26.0  # vertical, in degrees: long enough a lens that nothing looks bent
+_CREASE_ANGLE = 35.0  # degrees between faces of a body above which an edge is drawn sharp
+
+_INSTALL = (
+    "pictures need pyvista: run  pip install 'diffcloth-torch[viewer]'  or leave them out with  "
+    "--set 'output.viewers=[meshes]'"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """A surface and how it is painted.
+
+    Attributes:
+        faces: Vertex indices, shape [f, 3].
+        color: "#rrggbb" of the front; None takes one of the palette.
+        back_color: Likewise of the back.
+    """
+
+    faces: Triangles
+    color: str | None = None
+    back_color: str | None = None
+
+
+def require_pyvista() -> Any:
+    """Import pyvista for drawing off screen.
+
+    Raises:
+        InvalidInput: If it is not installed; the message says how to install it.
+    """
+    if not os.environ.get("DISPLAY"):
+        # Otherwise VTK tries an X server first, and complains about it.
+        os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+    try:
+        import pyvista
+    except ImportError as error:
+        raise InvalidInput(f"{_INSTALL} ({error})") from error
+    return pyvista
+
+
+class _Surface:
+    """A mesh on the stage whose vertices move."""
+
+    def __init__(self, polydata: Any, crease: float | None) -> None:
+        self.polydata = polydata
+        self._crease = crease
+        self.shown = self._with_normals()
+
+    def move(self, vertices: Points) -> None:
+        self.polydata.points = vertices
+        self.shown.copy_from(self._with_normals())
+
+    def _with_normals(self) -> Any:
+        return self.polydata.compute_normals(
+            cell_normals=False,
+            consistent_normals=False,
+            auto_orient_normals=False,
+            split_vertices=self._crease is not None,
+            feature_angle=self._crease or 180.0,
+        )
+
+
+class Stage:
+    """Draws a scene whose surfaces move. A context manager: the window is freed at the end."""
+
+    def __init__(
+        self,
+        cloths: Sequence[Skin],
+        bodies: Sequence[tuple[Points, Skin]],
+        *,
+        size: Sequence[int],
+        bounds: Bounds,
+        ground: float | None,
+        camera: CameraSection,
+    ) -> None:
+        """Set the stage.
+
+        Args:
+            cloths: Cloths; their faces index the positions that `draw` gets.
+            bodies: Vertices in the body frame [m], shape [v, 3], and skin of each body.
+            size: Width and height [pixels].
+            bounds: Of all that will be drawn.
+            ground: Height of the floor [m]; None leaves it out.
+            camera: Where pictures are taken from.
+        """
+        self._pv = require_pyvista()
+        self._bounds = bounds
+        self._plotter = self._pv.Plotter(off_screen=True, window_size=list(size), lighting="none")
+        self._plotter.set_background(BACKGROUND)
+        self._plotter.enable_anti_aliasing("msaa", multi_samples=8)
+        sun = self._light(camera.azimuth)
+        self._cloths = [(skin.faces, self._add_cloth(i, skin)) for i, skin in enumerate(cloths)]
+        self._bodies = [
+            (vertices, skin.faces, self._add_body(i, vertices, skin))
+            for i, (vertices, skin) in enumerate(bodies)
+        ]
+        self._poses: Points | None = None
+        self._floor = None
+        if ground is not None:
+            self._floor = Floor(self._pv, self._plotter, bounds, ground)
+            self._shadow = Shadow(self._floor, sun)
+        self._aim(camera)
+
+    def __enter__(self) -> Stage:
+        """Be open already."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Free the window."""
+        self._plotter.close()
+
+    def add_goal(self, vertices: Points, faces: Triangles) -> None:
+        """Show a shape to reach: translucent, with its border."""
+        shape = self._pv.PolyData.from_regular_faces(vertices, faces)
+        self._plotter.add_mesh(shape, color=_GOAL_COLOR, opacity=0.25, lighting=False)
+        border = shape.extract_feature_edges(
+            boundary_edges=True, feature_edges=False, manifold_edges=False, non_manifold_edges=False
+        )
+        if border.n_cells:
+            width = 0.0012 * float(np.linalg.norm(self._bounds[1] - self._bounds[0]))
+            tube = border.strip(join=True).tube(radius=width)
+            self._plotter.add_mesh(tube, color=_GOAL_COLOR, ambient=0.5)
+
+    def draw(self, positions: Points, poses: Points) -> Image:
+        """Take one picture.
+
+        Args:
+            positions: Cloth vertices [m], shape [N, 3].
+            poses: Poses of the bodies, shape [K, 7].
+
+        Returns:
+            Colors, shape [height, width, 3].
+        """
+        casters = []
+        for faces, surface in self._cloths:
+            surface.move(positions)
+            casters.append((positions, faces))
+        for k, (rest, faces, surface) in enumerate(self._bodies):
+            vertices = transform(rest, poses[k])
+            if self._poses is None or (poses[k] != self._poses[k]).any():
+                surface.move(vertices)
+            casters.append((vertices, faces))
+        self._poses = poses.copy()
+        if self._floor is not None:
+            self._shadow.cast(casters)
+        self._plotter.render()  # a screenshot alone would show the last picture again
+        image = self._plotter.screenshot(return_img=True)
+        return np.ascontiguousarray(image[..., :3])
+
+    def _light(self, azimuth: float) -> Points:
+        """Add the lights; returns the direction to the one that casts the shadow."""
+        low, high = self._bounds
+        center, size = (low + high) / 2, float(np.linalg.norm(high - low))
+        cosine, sine = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
+        turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        for direction, intensity, color in ((_SUN, 0.8, "#fff4e6"), _FILL, _RIM):
+            light = self._pv.Light(
+                position=tuple(center + 3 * size * (turn @ direction)),
+                focal_point=tuple(center),
+                intensity=intensity,
+                color=color,
+                light_type="scene light",
+            )
+            self._plotter.add_light(light)
+        sun: Points = turn @ _SUN
+        return sun
+
+    def _add_cloth(self, index: int, skin: Skin) -> _Surface:
+        vertices = np.zeros((int(skin.faces.max()) + 1, 3))
+        surface = _Surface(self._pv.PolyData.from_regular_faces(vertices, skin.faces), None)
+        back = skin.back_color or _BACK_COLORS[index % len(_BACK_COLORS)]
+        self._plotter.add_mesh(
+            surface.shown,
+            color=skin.color or _FRONT_COLORS[index % len(_FRONT_COLORS)],
+            smooth_shading=True,
+            backface_params={"color": back, **_CLOTH_SHINE},
+            **_CLOTH_SHINE,
+        )
+        return surface
+
+    def _add_body(self, index: int, vertices: Points, skin: Skin) -> _Surface:
+        polydata = self._pv.PolyData.from_regular_faces(vertices, skin.faces)
+        surface = _Surface(polydata, _CREASE_ANGLE)
+        color = skin.color or _BODY_COLORS[index % len(_BODY_COLORS)]
+        self._plotter.add_mesh(surface.shown, color=color, smooth_shading=True, **_BODY_SHINE)
+        return surface
+
+    def _aim(self, camera: CameraSection) -> None:
+        low, high = self._bounds
+        target = (low + high) / 2 if camera.target is None else np.array(camera.target)
+        radius = float(np.linalg.norm(high - low)) / 2
+        fitting = radius / np.sin(np.radians(_VIEW_ANGLE / 2))
+        distance = (fitting if camera.distance is None else camera.distance) / camera.zoom
+        azimuth, elevation = np.radians(camera.azimuth), np.radians(camera.elevation)
+        towards = np.array(
+            [
+                np.sin(azimuth) * np.cos(elevation),
+                -np.cos(azimuth) * np.cos(elevation),
+                np.sin(elevation),
+            ]
+        )
+        view = self._plotter.camera
+        view.position = tuple(target + distance * towards)
+        view.focal_point = tuple(target)
+        view.up = (0.0, 0.0, 1.0)
+        view.view_angle = _VIEW_ANGLE
+        self._plotter.reset_camera_clipping_range()

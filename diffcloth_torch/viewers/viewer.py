@@ -1,0 +1,46 @@
+"""What a viewer is, and the one that shows nothing."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Protocol
+
+from diffcloth_torch.state import State
+
+__all__ = ["NullViewer", "Viewer"]
+
+
+class Viewer(Protocol):
+    """Takes states in the order of time; a context manager that finishes its files at the end."""
+
+    def show(self, state: State) -> None:
+        """Take one state, without a batch axis."""
+        ...
+
+    def __enter__(self) -> Viewer: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None: ...
+
+
+class NullViewer:
+    """Shows nothing: for measurements."""
+
+    def show(self, state: State) -> None:
+        """Do nothing."""
+
+    def __enter__(self) -> NullViewer:
+        """Have nothing to open."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Have nothing to finish."""

@@ -1,0 +1,330 @@
+"""Candidates, intersections and the smallest distance of a mesh: against brute force and ipctk."""
+
+import itertools
+import os
+from pathlib import Path
+
+import ipctk
+import numpy as np
+import pytest
+import trimesh
+
+from diffcloth_torch import _core
+
+kernels = _core.kernels
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+needs_data = pytest.mark.skipif(
+    not DATA.exists() and "CI" not in os.environ, reason="the public meshes are not here"
+)
+
+
+def grid(n, rng, height=0.0):
+    """A jittered n x n sheet of unit size at some height."""
+    u, v = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    x = np.stack([u, v, np.zeros_like(u)], axis=-1).reshape(-1, 3) / (n - 1)
+    x = x + rng.uniform(-0.2, 0.2, size=x.shape) / n + [0, 0, height]
+    corner = (u * n + v)[:-1, :-1].ravel()
+    faces = [[corner, corner + n, corner + 1], [corner + 1, corner + n, corner + n + 1]]
+    return x, np.concatenate([np.stack(f, axis=-1) for f in faces])
+
+
+def merged(meshes):
+    """Stack meshes into positions, faces and the surface of every vertex."""
+    counts = [len(x) for x, _ in meshes]
+    starts = np.cumsum([0, *counts[:-1]])
+    x = np.concatenate([x for x, _ in meshes]).astype(float)
+    faces = np.concatenate([f + start for (_, f), start in zip(meshes, starts, strict=True)])
+    return x, faces.astype(np.int32), np.repeat(np.arange(len(meshes), dtype=np.int32), counts)
+
+
+def plane(size, height):
+    x = size * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) + [0.1, 0.2, height]
+    return x, np.array([[0, 1, 2], [0, 2, 3]])
+
+
+def scene(seed=0):
+    """Two cloths, a small body between them and a huge plane below."""
+    rng = np.random.default_rng(seed)
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.2)
+    body = ball.vertices + np.array([0.5, 0.5, 0.25]), ball.faces
+    return merged([grid(7, rng), grid(6, rng, 0.12), body, plane(10.0, -0.05)])
+
+
+def boxes(x_t0, x_t1, elements, radius):
+    corners = np.concatenate([x_t0[elements], x_t1[elements]], axis=1)
+    return corners.min(axis=1) - radius / 2, corners.max(axis=1) + radius / 2
+
+
+def may_touch(surface_a, surface_b, cloth_count, self_contact):
+    if surface_a == surface_b:
+        return self_contact and surface_a < cloth_count
+    return min(surface_a, surface_b) < cloth_count
+
+
+def brute_force(mesh, x_t0, x_t1, radius, faces, surface, cloth_count, self_contact):
+    """All candidates (kind, v0..v3, a, b), by comparing every two boxes."""
+    vertices = np.arange(len(x_t0))[:, None]
+    found = []
+    pairs = [(0, vertices, faces), (1, mesh.edges, mesh.edges)]
+    for kind, first, second in pairs:
+        lo_a, hi_a = boxes(x_t0, x_t1, first, radius)
+        lo_b, hi_b = boxes(x_t0, x_t1, second, radius)
+        overlap = ((lo_a[:, None] <= hi_b) & (lo_b <= hi_a[:, None])).all(-1)
+        for a, b in np.argwhere(overlap):
+            if kind == 1 and a >= b:
+                continue
+            corners = (*first[a], *second[b])
+            if len(set(corners)) < 4:
+                continue
+            if may_touch(surface[first[a][0]], surface[second[b][0]], cloth_count, self_contact):
+                found.append((kind, *corners, a, b))
+    return np.array(sorted(found, key=lambda c: (c[0], c[5], c[6])))
+
+
+@pytest.mark.parametrize("self_contact", [True, False], ids=["self-contact", "no-self-contact"])
+@pytest.mark.parametrize("speed", [0.0, 0.05, 0.5], ids=["rest", "slow", "fast"])
+def test_candidates_are_those_of_brute_force(self_contact, speed):
+    x, faces, surface = scene()
+    mesh = kernels.BroadPhase(faces, surface, 2, self_contact, x)
+    rng = np.random.default_rng(1)
+    x_t0 = x + 0.02 * rng.normal(size=x.shape)
+    x_t1 = x_t0 + speed * rng.normal(size=x.shape)
+    found = mesh.find(x_t0, x_t1, 0.03)
+    expected = brute_force(mesh, x_t0, x_t1, 0.03, faces, surface, 2, self_contact)
+    np.testing.assert_array_equal(found, expected)
+    assert {0, 1, 2, 3} <= set(surface[found[:, 1:5]].ravel())
+
+
+def test_pairs_that_come_within_the_radius_during_the_motion_are_candidates():
+    x, faces, surface = scene()
+    mesh = kernels.BroadPhase(faces, surface, 2, True, x)
+    rng = np.random.default_rng(2)
+    x_t1 = x + 0.2 * rng.normal(size=x.shape)
+    radius = 0.02
+    found = {tuple(c) for c in mesh.find(x, x_t1, radius)}
+    everything = mesh.find(x, x_t1, 100.0)
+    for share in (0.0, 0.3, 0.7, 1.0):
+        at = x + share * (x_t1 - x)
+        for kind in (0, 1):
+            pairs = everything[everything[:, 0] == kind]
+            d_sq = kernels.distance_sq(bool(kind), np.ascontiguousarray(at[pairs[:, 1:5]]))
+            close = pairs[d_sq <= radius**2]
+            assert len(close) > 3
+            assert {tuple(c) for c in close} <= found
+
+
+def test_results_do_not_depend_on_earlier_searches():
+    x, faces, surface = scene()
+    mesh = kernels.BroadPhase(faces, surface, 2, True, x)
+    rng = np.random.default_rng(3)
+    first = mesh.find(x, x, 0.03)
+    mesh.find(x + 5 * rng.normal(size=x.shape), x + rng.normal(size=x.shape), 0.5)
+    mesh.find(x + [0, 0, 100.0] * (surface == 1)[:, None], x, 0.01)
+    np.testing.assert_array_equal(mesh.find(x, x, 0.03), first)
+
+
+def test_the_shape_of_the_trees_does_not_matter():
+    x, faces, surface = scene()
+    shuffled = np.random.default_rng(4).permutation(x)
+    found = [kernels.BroadPhase(faces, surface, 2, True, r).find(x, x, 0.05) for r in (x, shuffled)]
+    np.testing.assert_array_equal(*found)
+
+
+def test_a_body_far_away_adds_nothing():
+    x, faces, surface = scene()
+    near = kernels.BroadPhase(faces, surface, 2, True, x)
+    far_x = x + [0, 0, 50.0] * (surface >= 2)[:, None]
+    found = near.find(far_x, far_x, 0.03)
+    assert len(found) > 100
+    assert (surface[found[:, 1:5]] < 2).all()
+
+
+def test_edges_are_unique_grouped_and_know_their_faces():
+    x, faces, surface = scene()
+    mesh = kernels.BroadPhase(faces, surface, 2, True, x)
+    edges = {(surface[f[0]], *sorted((f[k], f[(k + 1) % 3]))) for f in faces for k in range(3)}
+    listed = [(s, *e) for s, e in zip(mesh.edge_surface, mesh.edges, strict=True)]
+    assert listed == sorted(edges)
+    for edge, of_edge in zip(mesh.edges, mesh.edge_faces, strict=True):
+        expected = [f for f in range(len(faces)) if set(edge) <= set(faces[f])]
+        assert [f for f in of_edge if f >= 0] == expected
+    np.testing.assert_array_equal(mesh.face_surface, surface[faces[:, 0]])
+    assert mesh.cloth_counts == ((surface < 2).sum(), (mesh.edge_surface < 2).sum(), 72 + 50)
+
+
+@pytest.mark.parametrize(
+    ("faces", "surface", "message"),
+    [
+        pytest.param([[0, 1, 3]], [0, 0, 0], "refer to vertices of the mesh", id="range"),
+        pytest.param([[0, 1, 1]], [0, 0, 0], "three different corners", id="repeated"),
+        pytest.param([[0, 1, 2]], [0, 0, 1], "lie on one surface", id="two-surfaces"),
+        pytest.param([[3, 4, 5], [0, 1, 2]], [0, 0, 0, 1, 1, 1], "grouped by surface", id="order"),
+        pytest.param([[0, 1, 2]], [0, 1, 0], "must ascend", id="vertices"),
+    ],
+)
+def test_a_mesh_out_of_order_is_refused(faces, surface, message):
+    with pytest.raises(ValueError, match=message):
+        kernels.BroadPhase(
+            np.array(faces, np.int32),
+            np.array(surface, np.int32),
+            1,
+            True,
+            np.zeros((len(surface), 3)),
+        )
+
+
+def ipctk_intersects(x, faces):
+    mesh = ipctk.CollisionMesh(x, ipctk.edges(faces), faces)
+    return ipctk.has_intersections(mesh, x)
+
+
+def self_intersects(x, faces):
+    mesh = kernels.BroadPhase(faces, np.zeros(len(x), np.int32), 1, True, x)
+    return mesh.find_intersection(x) is not None
+
+
+def test_intersections_of_random_cloths_agree_with_ipctk():
+    rng = np.random.default_rng(7)
+    answers = []
+    for k in range(40):
+        x, faces = grid(6, rng)
+        x = x + (0.02 + 0.005 * k) * rng.normal(size=x.shape)
+        faces = faces.astype(np.int32)
+        answers.append(self_intersects(x, faces))
+        assert answers[-1] == ipctk_intersects(x, faces)
+    assert 5 < sum(answers) < 35
+
+
+def pierces(x, edge, face):
+    """Whether an edge crosses a triangle, in general position."""
+    a, b = x[edge]
+    t0, t1, t2 = x[face]
+
+    def volume(p, q, r, s):
+        return np.linalg.det([q - p, r - p, s - p])
+
+    side = volume(t0, t1, t2, a) * volume(t0, t1, t2, b) < 0
+    around = [volume(a, b, *pair) > 0 for pair in ((t0, t1), (t1, t2), (t2, t0))]
+    return side and (all(around) or not any(around))
+
+
+@pytest.mark.parametrize("self_contact", [True, False], ids=["self-contact", "no-self-contact"])
+def test_the_lowest_intersection_is_that_of_brute_force(self_contact):
+    x, faces, surface = scene()
+    mesh = kernels.BroadPhase(faces, surface, 2, self_contact, x)
+    rng = np.random.default_rng(8)
+    answers = set()
+    for k in range(12):
+        at = x + (0.003 + 0.01 * k) * rng.normal(size=x.shape)
+        lowest = next(
+            (
+                (e, f)
+                for e, f in itertools.product(range(len(mesh.edges)), range(len(faces)))
+                if np.all(at[mesh.edges[e]].min(0) <= at[faces[f]].max(0))
+                and np.all(at[faces[f]].min(0) <= at[mesh.edges[e]].max(0))
+                and not set(mesh.edges[e]) & set(faces[f])
+                and may_touch(mesh.edge_surface[e], mesh.face_surface[f], 2, self_contact)
+                and pierces(at, mesh.edges[e], faces[f])
+            ),
+            None,
+        )
+        assert mesh.find_intersection(at) == lowest
+        answers.add(lowest)
+    assert len(answers) > 2
+
+
+def rotation(seed):
+    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return q
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_flat_sheet_does_not_intersect_itself(seed):
+    """Coplanar neighbors are the rest state: rounding must not turn them into intersections."""
+    x, faces = grid(12, np.random.default_rng(seed))
+    x[:, 2] = 0
+    faces = faces.astype(np.int32)
+    assert not self_intersects(x, faces)
+    assert not self_intersects(np.ascontiguousarray(x @ rotation(seed) + 3.0), faces)
+
+
+@pytest.mark.parametrize("depth", [1e-3, 1e-9, 1e-15])
+def test_an_edge_that_pierces_ever_so_little_is_found(depth):
+    """The tip of an edge behind a tilted triangle by less than rounding of the determinant."""
+    q = rotation(11)
+    cloth = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]])
+    spike = np.array([[0.3, 0.3, -depth], [0.3, 0.3, 1], [0.4, 0.3, 1]]), np.array([[0, 1, 2]])
+    x, faces, surface = merged([cloth, spike])
+    x = np.ascontiguousarray(x @ q)
+    # Rounding of the rotated corners is 1e-16: at a depth of 1e-15 it cannot hide the tip.
+    assert kernels.BroadPhase(faces, surface, 2, True, x).find_intersection(x) is not None
+    x = np.ascontiguousarray(x + 2 * depth * q[2] * (surface == 1)[:, None])
+    assert kernels.BroadPhase(faces, surface, 2, True, x).find_intersection(x) is None
+
+
+@needs_data
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        pytest.param("two-cubes-far", False, id="far"),
+        pytest.param("two-cubes-close", False, id="close"),
+        pytest.param("two-cubes-intersecting", True, id="intersecting"),
+        pytest.param("thick-cloth_t0", False, id="thick-cloth"),
+    ],
+)
+def test_public_pairs_are_judged_as_labeled(name, expected):
+    mesh = trimesh.load(DATA / "pairs" / f"{name}.ply", process=False)
+    x, faces = np.array(mesh.vertices, float), np.array(mesh.faces, np.int32)
+    assert self_intersects(x, faces) == expected
+    assert ipctk_intersects(x, faces) == expected
+
+
+@needs_data
+def test_a_closing_thick_cloth_must_not_arrive():
+    """Two layers that pass through each other: the safe step over the candidates is below one."""
+    meshes = [trimesh.load(DATA / "pairs" / f"thick-cloth_t{k}.ply", process=False) for k in (0, 1)]
+    x_t0, x_t1 = (np.array(mesh.vertices, float) for mesh in meshes)
+    faces = np.array(meshes[0].faces, np.int32)
+    mesh = kernels.BroadPhase(faces, np.zeros(len(x_t0), np.int32), 1, True, x_t0)
+    candidates = mesh.find(x_t0, x_t1, 0.0)
+    alpha = 1.0
+    for kind in (0, 1):
+        v = candidates[candidates[:, 0] == kind, 1:5]
+        t0, t1 = (np.ascontiguousarray(x[v]) for x in (x_t0, x_t1))
+        alpha = min(alpha, kernels.safe_step(bool(kind), t0, t1, 0.0).min())
+    assert 0 < alpha < 1
+    assert not self_intersects(np.ascontiguousarray(x_t0 + alpha * (x_t1 - x_t0)), faces)
+
+
+def test_the_smallest_distance_is_that_of_brute_force():
+    rng = np.random.default_rng(9)
+    for noise in (0.0, 0.05, 0.3):
+        x, faces, surface = merged([grid(6, rng), grid(5, rng, 0.01), plane(10.0, -0.01)])
+        x = x + noise * rng.normal(size=x.shape)
+        mesh = kernels.BroadPhase(faces, surface, 2, False, x)
+        everything = kernels.BroadPhase(faces, surface, 2, True, x).find(x, x, 100.0)
+        same = surface[everything[:, 1]] == surface[everything[:, 4]]
+        expected = np.inf
+        for kind in (0, 1):
+            v = everything[same & (everything[:, 0] == kind), 1:5]
+            d_sq = kernels.distance_sq(bool(kind), np.ascontiguousarray(x[v]))
+            expected = min(expected, np.sqrt(d_sq.min()))
+        assert mesh.smallest_nonadjacent_distance(x) == expected
+
+
+def test_the_smallest_distance_may_lie_beyond_pairs_whose_boxes_overlap():
+    """Two large triangles, aslant and 5.7 apart, come up before two small ones that are closer."""
+    large = np.array([[0.0, 0, 0], [10, 10, 0], [10, 10, 0.1]])
+    small = np.array([[100.0, 0, 0], [100.5, 0, 0], [100, 0.5, 0]])
+    x = np.concatenate([large, large + np.array([4, -4, 0]), small, small + np.array([3, 0, 0])])
+    faces = np.arange(12, dtype=np.int32).reshape(4, 3)
+    mesh = kernels.BroadPhase(faces, np.zeros(12, np.int32), 1, True, x)
+    assert mesh.smallest_nonadjacent_distance(x) == 2.5
+
+
+def test_a_single_triangle_has_no_elements_apart():
+    x = np.eye(3)
+    mesh = kernels.BroadPhase(np.array([[0, 1, 2]], np.int32), np.zeros(3, np.int32), 1, True, x)
+    assert mesh.smallest_nonadjacent_distance(x) == np.inf
+    assert len(mesh.find(x, x, 1.0)) == 0

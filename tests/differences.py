@@ -1,0 +1,76 @@
+"""Gradients of a step or a rollout against finite differences, in given directions.
+
+A directional derivative along dense and sparse random directions sees every entry of a gradient, at
+a few evaluations instead of one for each entry.
+"""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+
+F64 = torch.float64
+
+# Stencils of order four: offsets in steps, and weights.
+_CENTRAL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
+_FORWARD = ((0, -25 / 12), (1, 4), (2, -3), (3, 4 / 3), (4, -1 / 4))
+
+# Where a difference misses, other steps are tried: rounding wants larger, kinks want smaller ones.
+_SWEEP = (1.0, 0.25, 4.0, 0.0625, 16.0, 1 / 64, 1 / 256)
+
+
+def directions(tensor: torch.Tensor, generator: torch.Generator) -> Iterator[torch.Tensor]:
+    """One unit direction per entry of a small tensor; a dense and two sparse ones of a large."""
+    if tensor.numel() <= 3:
+        for k in range(tensor.numel()):
+            unit = torch.zeros(tensor.numel(), dtype=F64)
+            unit[k] = 1.0
+            yield unit.reshape(tensor.shape)
+        return
+    for share in (1.0, 0.2, 0.05):
+        noise = torch.randn(tensor.shape, dtype=F64, generator=generator)
+        mask = torch.rand(tensor.shape, generator=generator) < share
+        if not mask.any():
+            mask.view(-1)[0] = True
+        yield noise * mask
+
+
+def difference(
+    f: Callable[[torch.Tensor], float],
+    x: torch.Tensor,
+    d: torch.Tensor,
+    step: float,
+    *,
+    forward: bool = False,
+) -> float:
+    """Derivative of f at x along d."""
+    stencil = _FORWARD if forward else _CENTRAL
+    return sum(w * f(x + (k * step) * d) for k, w in stencil) / step
+
+
+def mismatch(
+    f: Callable[[torch.Tensor], float],
+    x: torch.Tensor,
+    gradient: torch.Tensor,
+    d: torch.Tensor,
+    step: float,
+    rtol: float,
+    *,
+    forward: bool = False,
+) -> float:
+    """Smallest relative error over a sweep of steps, ended where it is below rtol.
+
+    Relative to the root of the sum of squares of the terms of gradient . d: their sum may cancel.
+    """
+    expected = float((gradient * d).sum())
+    scale = float((gradient * d).norm())
+    best = np.inf
+    for factor in _SWEEP:
+        try:
+            found = difference(f, x, d, factor * step, forward=forward)
+        except ValueError:  # a step so long that it leaves the accepted range
+            continue
+        best = min(best, abs(found - expected) / scale if scale else abs(found))
+        if best <= rtol:
+            break
+    return best

@@ -1,0 +1,442 @@
+"""The gradient of one step, with respect to every input, against central differences."""
+
+import ipctk
+import numpy as np
+import pytest
+import scenes
+import torch
+from differences import directions, mismatch
+
+import diffcloth_torch as dc
+from diffcloth_torch.poses import transform
+
+F64 = torch.float64
+
+FREE, CONTACT = 1e-6, 1e-5  # relative error
+
+# Steps of the differences: far above rounding, far below what the contacts' geometry resolves.
+STEPS = {
+    "state.positions": 2e-5,
+    "state.velocities": 2e-3,
+    "state.body_poses": 1e-5,
+    "state.soft_pin_targets": 1e-4,
+    "control.pins": 2e-5,
+    "control.soft_pins": 1e-4,
+    "control.body_poses": 1e-5,
+    "control.forces": 1e-4,
+    "parameters.gravity": 1e-1,
+    "parameters.rest_positions": 1e-5,
+    "parameters.thickness": 1e-5,
+    "parameters.slip_velocity": 1e-4,
+    "parameters.barrier_distance": 1e-5,
+    "parameters.poisson": 1e-3,
+    "parameters.damping": 1e-5,
+    "parameters.friction": 1e-3,
+}
+RELATIVE_STEP = 2e-3  # of the others
+# Not to be stepped below zero.
+NON_NEGATIVE = ("parameters.thickness", "parameters.damping", "parameters.friction")
+
+CONTACT_PARAMETERS = (
+    "parameters.friction",
+    "parameters.thickness",
+    "parameters.barrier_stiffness",
+    "parameters.barrier_distance",
+    "parameters.slip_velocity",
+)
+# Where a gradient vanishes; everywhere else it must not.
+ZERO = dict.fromkeys(("hanging", "curved", "hinge"), CONTACT_PARAMETERS)
+
+
+def make_loss(case, seed=0, weights=(1.0, scenes.DT, 0.01)):
+    """Random cotangents of all outputs, weighted so that none drowns the others.
+
+    The loss is that of the change of the outputs, so that differences do not cancel digits.
+    """
+    with torch.no_grad():
+        reference = case.step()
+    g = torch.Generator().manual_seed(seed)
+    names = ("positions", "velocities", "body_forces")
+    before = [getattr(reference, name) for name in names]
+    cotangents = [
+        w * torch.randn(t.shape, dtype=F64, generator=g)
+        for w, t in zip(weights, before, strict=True)
+    ]
+
+    def loss(state):
+        after = [getattr(state, name) for name in names]
+        return sum(((a - b) * c).sum() for a, b, c in zip(after, before, cotangents, strict=True))
+
+    return loss
+
+
+def gradients(case, loss):
+    leaves = {name: t.clone().requires_grad_() for name, t in case.inputs().items()}
+    found = torch.autograd.grad(loss(case.step(leaves)), list(leaves.values()), allow_unused=True)
+    return dict(zip(leaves, found, strict=True))
+
+
+def check(case, rtol, *, zero=(), weights=(1.0, scenes.DT, 0.01), only=None):
+    """Compare the gradient with respect to every input of a case with differences."""
+    loss = make_loss(case, weights=weights)
+    found = gradients(case, loss)
+    generator = torch.Generator().manual_seed(1)
+    problems = []
+    for name, tensor in case.inputs().items():
+        gradient = found[name]
+        if only is not None and name not in only:
+            continue
+        if gradient is None:
+            # What a control replaces is no input of the step.
+            assert name == "state.soft_pin_targets"
+            assert "soft_pins" in case.control
+            continue
+        if (name in zero) != (not gradient.any()):
+            problems.append(f"{name}: gradient {'not ' if name in zero else ''}zero")
+        step = STEPS.get(name, RELATIVE_STEP * tensor.abs().max().item())
+        forward = name in NON_NEGATIVE and tensor.min().item() < 10 * step
+
+        def f(value, name=name):
+            with torch.no_grad():
+                return loss(case.step({name: value})).item()
+
+        for d in directions(tensor, generator):
+            error = mismatch(
+                f, tensor, gradient, d.abs() if forward else d, step, rtol, forward=forward
+            )
+            if not error <= rtol:
+                problems.append(f"{name}: relative error {error:.1e}")
+    assert not problems, "\n".join(problems)
+
+
+# --- The regimes are what they say ---------------------------------------------------------------
+
+
+def contact_slip(case, after):
+    """Tangential displacement over the step of the vertices above the box, relative to it [m]."""
+    box = case.sim.scene.bodies[0]
+    start, end = case.state.body_poses[0].numpy(), after.body_poses[0].numpy()
+    half = np.array(box.vertices).max(axis=0)
+    inverse = [np.linalg.inv(_matrix(pose)) for pose in (start, end)]
+    local = [
+        x.numpy() @ m[:3, :3].T + m[:3, 3]
+        for x, m in zip((case.state.positions, after.positions), inverse, strict=True)
+    ]
+    reach = 0.01 + case.sim.parameters().thickness.max().item()
+    touching = (np.abs(local[1][:, :2]) < half[:2]).all(axis=1)
+    touching &= local[1][:, 2] < half[2] + reach
+    return np.linalg.norm((local[1] - local[0])[touching, :2], axis=1)
+
+
+def _matrix(pose):
+    columns = transform(np.vstack([np.eye(3), np.zeros(3)]), pose)
+    result = np.eye(4)
+    result[:3, :3] = (columns[:3] - columns[3]).T
+    result[:3, 3] = columns[3]
+    return result
+
+
+def test_sticking_and_sliding_are_what_they_say():
+    case = scenes.regime("sticking")
+    after = case.step()
+    slip = contact_slip(case, after)
+    limit = case.sim.parameters().slip_velocity.item() * scenes.DT
+    assert len(slip) >= 4
+    assert 1e-5 < slip.max() < limit
+    for name in ("sliding", "separating", "thick"):
+        case = scenes.regime(name)
+        slip = contact_slip(case, case.step())
+        assert len(slip) >= 4
+        assert slip.min() > case.sim.parameters().slip_velocity.item() * scenes.DT
+
+
+@pytest.mark.parametrize("name", [n for n in scenes.REGIMES if n not in (*ZERO, "leaving")])
+def test_contact_acts(name):
+    """On bodies, or where there is none, between cloths; before the step, so that friction does."""
+    case = scenes.regime(name)
+    after = case.step()
+    assert after.report.converged
+    assert after.report.contact_count >= (1 if name == "poking" else 20)
+    if len(after.body_forces):
+        assert after.body_forces.abs().max() > 1e-2
+        tangential = after.body_forces.sum(dim=0)[:2].norm()
+        assert tangential > 1e-3
+    frozen = case.where(parameters={"friction": torch.zeros((), dtype=F64)}).step()
+    assert (frozen.positions - after.positions).abs().max() > 1e-6  # [m]
+
+
+def test_separating_contacts_leave():
+    case = scenes.regime("separating")
+    after = case.step()
+    v = case.state.velocities
+    still = case.where(state=case.state.replace(velocities=torch.zeros_like(v))).step()
+    assert 0 < after.report.contact_count < still.report.contact_count
+
+
+def test_landing_and_leaving_have_contact_at_one_end_only():
+    for name, before, after in (("landing", False, True), ("leaving", True, False)):
+        case = scenes.regime(name)
+        still = torch.zeros_like(case.state.velocities)
+        weightless = {"gravity": torch.zeros(3, dtype=F64)}
+        start = case.where(
+            state=case.state.replace(velocities=still), control={}, parameters=weightless
+        ).step()
+        assert (start.body_forces.abs().max() > 0) == before
+        assert (case.step().report.contact_count > 0) == after
+
+
+def test_a_pinned_vertex_is_in_contact():
+    case = scenes.regime("pinned")
+    after = case.step()
+    frame = np.linalg.inv(_matrix(after.body_poses[0].numpy()))
+    pin = frame[:3, :3] @ after.positions[14].numpy() + frame[:3, 3]
+    half = np.array(case.sim.scene.bodies[0].vertices).max(axis=0)
+    assert (np.abs(pin[:2]) < half[:2]).all()
+    assert 0 < pin[2] - half[2] < 0.95 * case.sim.parameters().barrier_distance.item()
+
+
+def test_free_flight_is_free():
+    for name in ("hanging", "curved", "hinge"):
+        assert scenes.regime(name).step().report.contact_count == 0
+
+
+@pytest.mark.parametrize("name", ["pushing", "stacked"])
+def test_some_edges_in_contact_are_nearly_parallel(name):
+    """There the mollifier of edge-edge contacts acts."""
+    case = scenes.regime(name)
+    after = case.step()
+    assembly = case.sim._assembly
+    bodies = [
+        transform(np.array(b.vertices), pose)
+        for b, pose in zip(case.sim.scene.bodies, after.body_poses.numpy(), strict=True)
+    ]
+    x = np.concatenate([after.positions.numpy(), *bodies])
+    rest = np.concatenate([assembly.rest_vertices, assembly.body_vertices])
+    faces = np.concatenate([assembly.faces, assembly.body_faces + len(assembly.vertices)])
+    ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges = np.unique(ends, axis=0)
+    u = x[edges[:, 1]] - x[edges[:, 0]]
+    length_sq = ((rest[edges[:, 1]] - rest[edges[:, 0]]) ** 2).sum(axis=1)
+    q = (np.cross(u[:, None], u[None]) ** 2).sum(axis=-1) / (length_sq[:, None] * length_sq)
+    parameters = case.sim.parameters()
+    reach = parameters.barrier_distance.item() + parameters.thickness.mean().item()
+    found = [
+        (i, j)
+        for i, j in np.argwhere((q < 1e-3) & (q > 1e-6))
+        if i < j
+        and not set(edges[i]) & set(edges[j])
+        and edges[i, 0] < len(assembly.vertices)
+        and ipctk.edge_edge_distance(*x[edges[i]], *x[edges[j]]) < (0.95 * reach) ** 2
+    ]
+    assert found
+
+
+# --- Gradients -----------------------------------------------------------------------------------
+
+
+COUPLED, MASS, IDENTITY = ("coupled", "mass"), ("split", "mass"), ("split", "identity")
+QUICK = [
+    ("hanging", COUPLED, 2),
+    ("curved", MASS, 2),
+    ("hinge", IDENTITY, 2),
+    ("sticking", COUPLED, 2),
+    ("sliding", COUPLED, 1),
+    ("sliding", IDENTITY, 2),
+    ("separating", MASS, 1),
+    ("landing", COUPLED, 2),
+    ("leaving", COUPLED, 1),
+    ("thick", COUPLED, 2),
+    ("pushing", COUPLED, 3),
+    ("pinned", MASS, 2),
+    ("held", COUPLED, 2),
+    ("folded", MASS, 2),
+    ("folded_thick", COUPLED, 2),
+    ("stacked", COUPLED, 2),
+    ("poking", COUPLED, 2),
+]
+ALL = [
+    (name, scheme, iterations)
+    for name in scenes.REGIMES
+    for scheme in (COUPLED, MASS, IDENTITY)
+    for iterations in (1, 2)
+    # Where nothing touches at the end, only the friction of the first solve is left.
+    if name != "leaving" or (scheme, iterations) == (COUPLED, 1)
+]
+SLOW = [case for case in ALL if case not in QUICK]
+
+
+def identify(value):
+    return "-".join(value) if isinstance(value, tuple) else str(value)
+
+
+@pytest.mark.parametrize(
+    ("name", "scheme", "iterations"),
+    [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],
+    ids=identify,
+)
+def test_every_gradient_is_that_of_the_step(name, scheme, iterations):
+    case = scenes.regime(name, *scheme, iterations)
+    free = name in ZERO
+    zero = ZERO.get(name, ())
+    if name == "landing" and iterations == 1:
+        zero = ("parameters.friction",)  # no contact to take friction from
+    if not free and name != "sticking":
+        # The law of sliding does not know where sliding begins; who slides differs by scheme.
+        slip = gradients(case, make_loss(case))["parameters.slip_velocity"]
+        zero += () if slip.any() else ("parameters.slip_velocity",)
+    check(case, FREE if free else CONTACT, zero=zero)
+
+
+@pytest.mark.parametrize("output", range(3), ids=["positions", "velocities", "body_forces"])
+def test_each_output_alone_has_its_gradient(output):
+    """So that the error of a small output cannot hide behind a large one."""
+    case = scenes.regime("pinned", "coupled", "mass", 2)
+    weights = [0.0, 0.0, 0.0]
+    weights[output] = 1.0
+    check(
+        case,
+        CONTACT,
+        weights=weights,
+        only=(
+            "state.positions",
+            "state.body_poses",
+            "control.pins",
+            "control.body_poses",
+            "parameters.friction",
+            "parameters.barrier_stiffness",
+            "parameters.thickness",
+            "parameters.density",
+        ),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["hanging", "sticking", "pushing", "folded"])
+def test_every_entry_passes_gradcheck(name):
+    case = scenes.regime(name)
+    names = ("state.positions", "state.velocities", "state.body_poses", "control.forces")
+    inputs = {k: t.clone().requires_grad_() for k, t in case.inputs().items() if k in names}
+
+    def outputs(*tensors):
+        after = case.step(dict(zip(inputs, tensors, strict=True)))
+        return after.positions, scenes.DT * after.velocities, 0.01 * after.body_forces
+
+    assert torch.autograd.gradcheck(outputs, list(inputs.values()), eps=1e-6, atol=1e-7, rtol=1e-5)
+
+
+def test_coarser_parameters_get_the_sums_of_finer_ones():
+    """[] and [C] of every material against [F], pair friction against one value."""
+    case = scenes.regime("stacked")
+    sim, loss = case.sim, make_loss(case)
+    faces = [len(cloth.faces) for cloth in sim.scene.cloths]
+    uniform = {
+        "stretch": 280.0, "bending": 1e-3, "poisson": 0.2, "density": 0.3, "damping": 0.001,
+    }  # fmt: skip
+    groups = torch.cat([torch.full((n,), c) for c, n in enumerate(faces)])
+
+    def found(shape):
+        values = {k: torch.full(shape, v, dtype=F64) for k, v in uniform.items()}
+        return gradients(case.where(parameters=values), loss)
+
+    scalar, cloth, face = found(()), found((2,)), found((sum(faces),))
+    for name in uniform:
+        key = f"parameters.{name}"
+        sums = torch.stack([face[key][groups == c].sum() for c in range(2)])
+        assert (sums != 0).all()
+        torch.testing.assert_close(cloth[key], sums, rtol=1e-9, atol=0)
+        torch.testing.assert_close(scalar[key], sums.sum(), rtol=1e-9, atol=1e-16)
+
+    pair = gradients(case.where(parameters={"friction": torch.full((2, 2), 0.5, dtype=F64)}), loss)[
+        "parameters.friction"
+    ]
+    one = gradients(case.where(parameters={"friction": torch.tensor(0.5, dtype=F64)}), loss)
+    torch.testing.assert_close(one["parameters.friction"], pair.sum(), rtol=1e-9, atol=1e-16)
+    assert pair[0, 1] == pair[1, 0] != 0
+
+    both = gradients(
+        case.where(parameters={"pin_stiffness": torch.tensor([50.0, 50.0], dtype=F64)}), loss
+    )["parameters.pin_stiffness"]
+    one = gradients(case.where(parameters={"pin_stiffness": torch.tensor(50.0, dtype=F64)}), loss)
+    torch.testing.assert_close(one["parameters.pin_stiffness"], both.sum(), rtol=1e-9, atol=1e-16)
+    assert both.all()
+
+
+def test_a_parameter_of_zero_has_its_gradient():
+    """No damping, no bending, no friction: the gradient with respect to them is one-sided."""
+    case = scenes.regime("pushing", "coupled", "mass", 2)
+    zero = {name: torch.zeros((), dtype=F64) for name in ("damping", "bending", "friction")}
+    check(
+        case.where(parameters=zero),
+        CONTACT,
+        only=("parameters.damping", "parameters.friction"),
+    )
+
+
+def test_the_length_and_sign_of_a_quaternion_do_not_matter():
+    case = scenes.regime("pushing")
+    poses = case.control["body_poses"]
+    other = poses.clone()
+    other[:, 3:] *= -2.0
+    loss = make_loss(case)
+    name = "control.body_poses"
+    gradient = gradients(case, loss)[name]
+    scaled = gradients(case.where(control={**case.control, "body_poses": other}), loss)[name]
+    torch.testing.assert_close(scaled[:, :3], gradient[:, :3], rtol=1e-8, atol=1e-10)
+    torch.testing.assert_close(-2.0 * scaled[:, 3:], gradient[:, 3:], rtol=1e-8, atol=1e-9)
+    assert abs(float((gradient[0, 3:] * poses[0, 3:]).sum())) < 1e-12 * float(gradient.norm())
+
+
+@pytest.mark.parametrize(("name", "largest"), [("curved", 1e-2), ("sticking", 3e-2)])
+def test_taylor_remainder_is_of_second_order(name, largest):
+    """Over four decades, along a direction in all inputs at once."""
+    case = scenes.regime(name)
+    loss = make_loss(case)
+    inputs = case.inputs()
+    g = torch.Generator().manual_seed(3)
+    # One unit of each input, in which the solution moves comparably.
+    unit = {k: STEPS.get(k, RELATIVE_STEP * t.abs().max().item()) for k, t in inputs.items()}
+    d = {
+        k: 20.0 * unit[k] * torch.randn(t.shape, dtype=F64, generator=g) for k, t in inputs.items()
+    }
+    d["parameters.thickness"] = d["parameters.thickness"].abs()
+    d["parameters.damping"] = d["parameters.damping"].abs()
+    found = gradients(case, loss)
+    slope = sum(float((found[k] * d[k]).sum()) for k in d if found[k] is not None)
+    sizes = largest * 100 ** -np.linspace(0.0, 2.0, 9)
+    remainders = []
+    for size in sizes:
+        with torch.no_grad():
+            change = loss(case.step({k: t + size * d[k] for k, t in inputs.items()})).item()
+        remainders.append(abs(change - size * slope))
+    order = np.polyfit(np.log(sizes), np.log(remainders), 1)[0]
+    assert order == pytest.approx(2.0, abs=0.1), remainders
+
+
+def test_a_body_that_only_turns_has_a_gradient_beyond_one_portion():
+    """The path is cut in portions of ten degrees; the gradient knows only its ends."""
+    case = scenes.regime("poking")
+    a, b = case.state.body_poses[0, 3:], case.control["body_poses"][0, 3:]
+    cosine = float((a @ b).abs() / (a.norm() * b.norm()))
+    assert np.degrees(2 * np.arccos(cosine)) > 20
+
+
+def test_friction_iterations_change_the_step():
+    """Otherwise a chain through them would prove nothing."""
+    one, two, three = (scenes.regime("pushing", "coupled", "mass", k) for k in (1, 2, 3))
+    values = one.inputs()
+    x1, x2, x3 = (case.step(values).positions for case in (one, two, three))
+    assert (x1 - x2).abs().max() > 1e-5
+    assert 1e-7 < (x2 - x3).abs().max() < (x1 - x2).abs().max()
+
+
+def test_scenes_are_differentiable_in_everything():
+    """No input is forgotten by these tests."""
+    sim = scenes.regime("pushing").sim
+    parameters = {k for k, v in vars(sim.parameters()).items() if isinstance(v, torch.Tensor)}
+    seen = {name for regime in scenes.REGIMES for name in scenes.regime(regime).inputs()}
+    assert seen == {
+        *(f"state.{name}" for name in scenes.STATE),
+        *(f"control.{name}" for name in scenes.CONTROL),
+        *(f"parameters.{name}" for name in parameters),
+    }
+    assert parameters == {n for n in vars(dc.Parameters()) if not n.startswith("_")}

@@ -1,0 +1,257 @@
+"""Configurations: what is read, what is refused, and how the message says so."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.io.configs import read_document, resolve_path, set_values
+from diffcloth_torch.tasks.registry import load_config
+
+MINIMAL = """
+task: drape
+simulation: {dt: 1e-2, steps: 3}
+scene:
+  cloths:
+    - {name: sheet, shape: {kind: grid, rows: 3, columns: 3}}
+"""
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write_config(text: str) -> Path:
+        path = tmp_path / "config.yaml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write_config
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        pytest.param("1e-3", 1e-3, id="no-dot"),
+        pytest.param("1.5e3", 1.5e3, id="unsigned-exponent"),
+        pytest.param("-2E+4", -2e4, id="capital"),
+        pytest.param(".5e-1", 0.05, id="no-leading-digit"),
+        pytest.param("1.", 1.0, id="trailing-dot"),
+        pytest.param("7", 7, id="integer"),
+        pytest.param("'1e-3'", "1e-3", id="quoted-stays-text"),
+        pytest.param("1e", "1e", id="no-number"),
+        pytest.param("e3", "e3", id="no-digits"),
+    ],
+)
+def test_scientific_notation_is_a_number(write, text, value):
+    read = read_document(write(f"x: {text}"))["x"]
+    assert read == value
+    assert type(read) is type(value)
+
+
+def test_a_duplicate_key_is_refused_with_its_line(write):
+    with pytest.raises(InvalidInput, match=r"`steps` occurs twice.*line 2"):
+        read_document(write("a: {steps: 1,\n  steps: 2}"))
+
+
+def test_a_tag_that_builds_objects_is_refused(write):
+    with pytest.raises(InvalidInput, match="not readable as YAML"):
+        read_document(write("x: !!python/object/apply:os.getcwd []"))
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2]", "just text"])
+def test_a_file_without_a_mapping_is_refused(write, text):
+    with pytest.raises(InvalidInput, match="must be a mapping"):
+        read_document(write(text))
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    with pytest.raises(InvalidInput, match=r"nowhere\.yaml: there is no such file"):
+        read_document(tmp_path / "nowhere.yaml")
+
+
+def test_a_minimal_configuration_takes_the_defaults(write):
+    config = load_config(write(MINIMAL))
+    assert config.simulation.dt == 0.01
+    assert config.simulation.scheme == "coupled"
+    assert config.scene.cloths[0].material.stretch is None
+
+
+REFUSED = [
+    pytest.param(
+        "simulation.stps=3",
+        r"`simulation` has no key `stps` \(did you mean `steps`\?\)"
+        r"; its keys are dt, steps, scheme",
+        id="unknown-key",
+    ),
+    pytest.param("sceen={}", r"the file has no key `sceen`.*`scene`", id="unknown-top"),
+    pytest.param(
+        "simulation.dt=0", r"`simulation\.dt` must be greater than 0, got 0", id="zero-dt"
+    ),
+    pytest.param("simulation.dt=.nan", r"`simulation\.dt` must be a finite number", id="nan"),
+    pytest.param(
+        "simulation.dt=soon",
+        r"`simulation\.dt` must be a valid number, got 'soon'",
+        id="text-for-number",
+    ),
+    pytest.param(
+        "simulation.steps=1.5", r"`simulation\.steps` must be a valid integer", id="fraction"
+    ),
+    pytest.param(
+        "simulation.steps=true", r"`simulation\.steps` must be a valid integer", id="bool"
+    ),
+    pytest.param(
+        "simulation.scheme=implicit",
+        r"`simulation\.scheme` must be 'coupled' or 'split', got 'implicit'",
+        id="scheme",
+    ),
+    pytest.param(
+        "scene.cloths.sheet.shape.kind=square",
+        r"`scene\.cloths\[0\]\.shape` must have as `kind` one of 'grid', 'disk', 'load'",
+        id="shape",
+    ),
+    pytest.param(
+        "scene.cloths.sheet.shape.rows=1",
+        r"`scene\.cloths\[0\]\.shape\.rows` must be greater than or equal to 2, got 1",
+        id="rows",
+    ),
+    pytest.param(
+        "scene.cloths.sheet.shape={kind: grid, rows: 3}",
+        r"`scene\.cloths\[0\]\.shape\.columns` is missing",
+        id="missing",
+    ),
+    pytest.param(
+        "scene.cloths.sheet.material.poisson=0.5",
+        r"`scene\.cloths\[0\]\.material\.poisson` must be less than 0\.5",
+        id="poisson",
+    ),
+    pytest.param(
+        "scene.cloths.sheet.pose={axis: [0, 0, 1]}",
+        r"`scene\.cloths\[0\]\.pose` must give `axis` and `degrees` together",
+        id="axis",
+    ),
+    pytest.param(
+        "scene.cloths.sheet.pins={a: {vertices: [0], nearest: [[0, 0, 0]]}}",
+        r"pins\.a` must have exactly one of vertices, box, nearest",
+        id="two-selections",
+    ),
+    pytest.param(
+        "scene.cloths=[]", r"`scene\.cloths` is not accepted|`scene\.cloths` must", id="no-cloth"
+    ),
+    pytest.param("scene.gravity=[0, 0]", r"`scene\.gravity`.*3", id="short-vector"),
+    pytest.param(
+        "output.pictures.ground=low",
+        r"`output\.pictures\.ground` must be a valid number or must be 'auto'",
+        id="union",
+    ),
+    pytest.param("task=dance", r"`task` must be one of drape, hit_cloth; got 'dance'", id="task"),
+]
+
+
+@pytest.mark.parametrize(("assignment", "message"), REFUSED)
+def test_a_bad_value_is_refused_by_name(write, assignment, message):
+    with pytest.raises(InvalidInput, match=message) as caught:
+        load_config(write(MINIMAL), [assignment])
+    assert str(caught.value).startswith(str(write(MINIMAL)))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_body_with_a_trajectory_must_be_kinematic(write):
+    body = "{name: b, shape: {kind: box, size: 1}, trajectory: [{time: 1}]}"
+    with pytest.raises(InvalidInput, match=r"`scene\.bodies\[0\]` has a `trajectory` and must"):
+        load_config(write(MINIMAL), [f"scene.bodies=[{body}]"])
+
+
+def test_keyframes_must_come_in_order(write):
+    body = (
+        "{name: b, shape: {kind: box, size: 1}, motion: kinematic, "
+        "trajectory: [{time: 2}, {time: 1}]}"
+    )
+    with pytest.raises(InvalidInput, match=r"increasing times in `trajectory`, got \[2"):
+        load_config(write(MINIMAL), [f"scene.bodies=[{body}]"])
+
+
+def test_set_changes_values_by_name_and_by_index(write):
+    config = load_config(
+        write(MINIMAL),
+        [
+            "simulation.dt=1e-3",
+            "scene.cloths.sheet.shape.rows=5",
+            "scene.cloths.0.material.stretch=1e3",
+            "output.viewers=[meshes]",
+        ],
+    )
+    assert config.simulation.dt == 1e-3
+    assert config.scene.cloths[0].shape.rows == 5
+    assert config.scene.cloths[0].material.stretch == 1e3
+    assert config.output.viewers == ["meshes"]
+
+
+def test_set_leaves_the_document_alone():
+    document = {"a": {"b": [1, 2]}}
+    assert set_values(document, ["a.b.1=5", "a.c.d=6"]) == {"a": {"b": [1, 5], "c": {"d": 6}}}
+    assert document == {"a": {"b": [1, 2]}}
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        pytest.param("simulation.dt", "must be key=value", id="no-value"),
+        pytest.param("=3", "must be key=value", id="no-key"),
+        pytest.param("simulation.dt=[", "not YAML", id="broken-yaml"),
+        pytest.param(
+            "scene.cloths.shirt.name=x",
+            "items of the list are 0 .. 0, sheet; got `shirt`",
+            id="unknown-item",
+        ),
+        pytest.param("task.name=x", "below a plain value", id="below-a-value"),
+    ],
+)
+def test_a_bad_assignment_is_refused(write, assignment, message):
+    with pytest.raises(InvalidInput, match=message):
+        load_config(write(MINIMAL), [assignment])
+
+
+class TestRoot:
+    @pytest.fixture
+    def files(self, tmp_path):
+        for name in ("project/configs/a.yaml", "project/meshes/m.obj", "secret.obj"):
+            path = tmp_path / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text("", encoding="utf-8")
+        return tmp_path
+
+    def test_a_file_under_the_root_is_found(self, files):
+        config = files / "project/configs/a.yaml"
+        found = resolve_path(config, "..", "../meshes/m.obj")
+        assert found == (files / "project/meshes/m.obj").resolve()
+
+    @pytest.mark.parametrize("given", ["../../secret.obj", "../meshes/../../secret.obj"])
+    def test_a_file_elsewhere_is_refused(self, files, given):
+        config = files / "project/configs/a.yaml"
+        with pytest.raises(InvalidInput, match=r"must lie under the root.*`root`"):
+            resolve_path(config, "..", given)
+
+    def test_a_link_does_not_lead_out(self, files):
+        link = files / "project/meshes/link.obj"
+        link.symlink_to(files / "secret.obj")
+        with pytest.raises(InvalidInput, match="must lie under the root"):
+            resolve_path(files / "project/configs/a.yaml", "..", "../meshes/link.obj")
+
+    def test_an_absolute_path_elsewhere_is_refused(self, files):
+        with pytest.raises(InvalidInput, match="must lie under the root"):
+            resolve_path(files / "project/configs/a.yaml", "..", str(files / "secret.obj"))
+
+    def test_a_missing_file_is_named(self, files):
+        with pytest.raises(InvalidInput, match=r"there is no file 'x\.obj'"):
+            resolve_path(files / "project/configs/a.yaml", ".", "x.obj")
+
+
+SHIPPED = Path(__file__).parent.parent / "configs"
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_shipped_configurations_fit_the_schema(path):
+    config = load_config(path)
+    assert math.isfinite(config.simulation.dt)

@@ -1,0 +1,513 @@
+"""Tasks: generated meshes, scenes from configurations, prescribed motion, the optimization loop."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+import diffcloth_torch as dc
+from diffcloth_torch.bodies.rotation import (
+    integrate_poses,
+    interpolate_poses,
+    quaternion_exp,
+    quaternion_log,
+    quaternion_multiply,
+    rotate,
+)
+from diffcloth_torch.tasks import shapes
+from diffcloth_torch.tasks.hit_cloth import shape_distance
+from diffcloth_torch.tasks.optimization import OptimizerSection, evaluate, optimize
+from diffcloth_torch.tasks.registry import load_task
+from diffcloth_torch.tasks.simulation import simulate
+
+CONFIGS = Path(__file__).parent.parent / "configs"
+SHARED_DATA = Path(__file__).parent.parent.parent / "shared" / "data"
+
+
+@pytest.fixture
+def rng():
+    return torch.Generator().manual_seed(0)
+
+
+def random(rng, *shape):
+    return torch.randn(*shape, dtype=torch.float64, generator=rng)
+
+
+# --- rotations ----------------------------------------------------------------------------------
+
+
+def matrix_of(rotation_vector):
+    """Rotation by the exponential of a matrix: a reference without quaternions."""
+    x, y, z = rotation_vector.tolist()
+    return torch.linalg.matrix_exp(
+        torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
+    )
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-4, 0.0999999, 0.1000001, 1.0, 3.1, 5.0])
+def test_the_exponential_is_that_of_the_rotation_matrix(rng, angle):
+    axis = torch.nn.functional.normalize(random(rng, 3), dim=0)
+    point = random(rng, 3)
+    got = rotate(quaternion_exp(angle * axis), point)
+    torch.testing.assert_close(got, matrix_of(angle * axis) @ point, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-5, 0.05, 0.0999, 0.1001, 2.0])
+def test_the_exponential_has_the_right_gradient(rng, angle):
+    w = angle * torch.nn.functional.normalize(random(rng, 3), dim=0)
+    assert torch.autograd.gradcheck(quaternion_exp, w.requires_grad_(), rtol=1e-8, atol=1e-9)
+
+
+def test_the_exponential_is_smooth_where_its_branches_meet():
+    axis = torch.tensor([0.6, -0.48, 0.64], dtype=torch.float64)
+    below, above = quaternion_exp(axis * torch.tensor([[0.1 - 1e-15], [0.1 + 1e-15]]))
+    torch.testing.assert_close(below, above, rtol=0, atol=3e-15)
+
+
+def test_products_compose_rotations(rng):
+    a, b, point = random(rng, 3), random(rng, 3), random(rng, 3)
+    product = quaternion_multiply(quaternion_exp(a), quaternion_exp(b))
+    expected = matrix_of(a) @ matrix_of(b) @ point
+    torch.testing.assert_close(rotate(product, point), expected, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-10, 0.3, 3.0])
+def test_the_logarithm_undoes_the_exponential(rng, angle):
+    w = angle * torch.nn.functional.normalize(random(rng, 3), dim=0)
+    q = quaternion_exp(w)
+    for same in (q, -q):
+        torch.testing.assert_close(quaternion_log(same), w, rtol=0, atol=1e-14)
+
+
+def test_a_constant_twist_moves_along_a_screw():
+    pose = torch.tensor([1.0, 2, 3, 1, 0, 0, 0], dtype=torch.float64)
+    twist = torch.tensor([0.1, -0.2, 0.3, 0, 0, math.pi], dtype=torch.float64)
+    poses = integrate_poses(pose, twist.expand(50, 6), dt=0.01)
+    # After half a second: half the displacement of a second, and a quarter of a turn about z.
+    expected = [1.05, 1.9, 3.15, math.cos(math.pi / 4), 0, 0, math.sin(math.pi / 4)]
+    torch.testing.assert_close(poses[-1], torch.tensor(expected, dtype=torch.float64))
+    torch.testing.assert_close(poses[:, 3:].norm(dim=1), torch.ones(50, dtype=torch.float64))
+
+
+def test_integrated_poses_have_the_right_gradient(rng):
+    pose = torch.tensor([0.0, 0, 0, 0.6, 0, 0.8, 0], dtype=torch.float64)
+    twists = random(rng, 4, 6).requires_grad_()
+    assert torch.autograd.gradcheck(lambda t: integrate_poses(pose, t, 0.1), twists)
+
+
+def test_keyframes_are_met_and_held_outside():
+    identity, turned = [0.0, 0, 0, 1, 0, 0, 0], [1.0, 0, 0, math.sqrt(0.5), 0, 0, math.sqrt(0.5)]
+    poses = torch.tensor([identity, turned], dtype=torch.float64)
+    times = torch.tensor([1.0, 3.0], dtype=torch.float64)
+    got = interpolate_poses(times, poses, torch.tensor([0.0, 1, 2, 3, 9], dtype=torch.float64))
+    torch.testing.assert_close(got[[0, 1, 3, 4]], poses[[0, 0, 1, 1]])
+    halfway = [0.5, 0, 0, math.cos(math.pi / 8), 0, 0, math.sin(math.pi / 8)]
+    torch.testing.assert_close(got[2], torch.tensor(halfway, dtype=torch.float64))
+
+
+# --- meshes -------------------------------------------------------------------------------------
+
+
+def edges_of(faces):
+    ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    return np.unique(ends, axis=0, return_counts=True)
+
+
+def test_a_disk_is_one_sheet_of_good_triangles():
+    vertices, faces = shapes.disk(0.6, 0.06)
+    edges, counts = edges_of(faces)
+    border = edges[counts == 1]
+    np.testing.assert_allclose(np.linalg.norm(vertices[border].reshape(-1, 3), axis=1), 0.6)
+    assert len(vertices) - len(edges) + len(faces) == 1  # Euler: a disk
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    assert (normals[:, 2] > 0).all()
+    polygon = len(border) / 2 * 0.6**2 * math.sin(2 * math.pi / len(border))
+    assert normals[:, 2].sum() / 2 == pytest.approx(polygon)
+    longest = np.max([np.linalg.norm(q - p, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    height = normals[:, 2] / longest
+    assert (height / longest).min() > 0.3  # 0.87 for equal sides
+    degrees = np.bincount(edges[counts == 2].ravel(), minlength=len(vertices))
+    assert len(np.unique(degrees)) > 3  # unstructured
+
+
+def test_a_disk_is_the_same_every_time():
+    for a, b in zip(shapes.disk(0.5, 0.08), shapes.disk(0.5, 0.08), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_chair_is_closed_and_has_the_volume_of_its_parts():
+    w, d, h, back, t = 0.5, 0.4, 0.45, 0.5, 0.05
+    vertices, faces = shapes.chair(w, d, h, back, t, 0.1)
+    directed = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    forward = {tuple(edge) for edge in directed.tolist()}
+    assert len(forward) == len(directed)
+    assert forward == {(b, a) for a, b in forward}  # closed, consistently oriented
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+    assert volume == pytest.approx(w * d * t + w * t * back + 4 * t * t * (h - t))
+    assert vertices.min(axis=0) == pytest.approx([-w / 2, -d / 2, 0])
+    assert vertices.max(axis=0) == pytest.approx([w / 2, d / 2, h + back])
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        pytest.param("{kind: disk, radius: 1, edge_length: 3}", "edge_length", id="coarse"),
+        pytest.param("{kind: disk, radius: 1, edge_length: 1e-5}", "edge_length", id="fine"),
+    ],
+)
+def test_a_shape_that_cannot_be_made_is_refused(tmp_path, shape, message):
+    config = write_config(tmp_path, SHEET)
+    with pytest.raises(dc.InvalidInput, match=message):
+        load_task(config, [f"scene.cloths.sheet.shape={shape}"])
+
+
+# --- scenes -------------------------------------------------------------------------------------
+
+SHEET = """
+task: drape
+simulation: {dt: 0.01, steps: 4}
+scene:
+  cloths:
+    - name: sheet
+      shape: {kind: grid, rows: 3, columns: 4, size: [3, 2]}
+      pose: {position: [0, 0, 1], axis: [1, 0, 0], degrees: 90}
+      pins: {top: {box: {lower: [-9, -0.1, 1.9], upper: [9, 0.1, 2.1]}}}
+"""
+
+
+def write_config(folder, text):
+    path = folder / "config.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_cloth_is_posed_and_pinned_by_place(tmp_path):
+    task = load_task(write_config(tmp_path, SHEET))
+    (cloth,) = task.scene.cloths
+    np.testing.assert_allclose(cloth.vertices[:, 1], 0, atol=1e-15)
+    assert cloth.pins["top"].tolist() == [8, 9, 10, 11]
+    np.testing.assert_allclose(cloth.vertices[8:, 2], 2.0)
+    np.testing.assert_allclose(cloth.rest_vertices[:, 2], 0.0)
+
+
+def test_nearest_vertices_can_be_pinned(tmp_path):
+    pins = "scene.cloths.sheet.pins={ends: {nearest: [[-9, 0, 9], [9, 0, 9]]}}"
+    task = load_task(write_config(tmp_path, SHEET), [pins])
+    assert task.scene.cloths[0].pins["ends"].tolist() == [8, 11]
+
+
+def test_an_empty_box_of_pins_is_refused(tmp_path):
+    pins = "scene.cloths.sheet.pins={top: {box: {lower: [5, 5, 5], upper: [6, 6, 6]}}}"
+    with pytest.raises(dc.InvalidInput, match=r"box of sheet\.pins\.top must hold a vertex"):
+        load_task(write_config(tmp_path, SHEET), [pins])
+
+
+def test_two_surfaces_of_one_name_are_refused(tmp_path):
+    body = "scene.bodies=[{name: sheet, shape: {kind: sphere, radius: 0.1}}]"
+    with pytest.raises(dc.InvalidInput, match="'sheet' must be given once"):
+        load_task(write_config(tmp_path, SHEET), [body])
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        "{kind: box, size: [1, 2, 3]}",
+        "{kind: sphere, radius: 0.5}",
+        "{kind: capsule, radius: 0.2, length: 1}",
+        "{kind: plane, size: 2}",
+        "{kind: chair}",
+    ],
+)
+def test_every_kind_of_body_can_be_made(tmp_path, shape):
+    body = f"scene.bodies=[{{name: it, shape: {shape}, pose: {{position: [9, 9, 9]}}}}]"
+    task = load_task(write_config(tmp_path, SHEET), [body])
+    assert task.scene.body_names == ("it",)
+    assert task.scene.bodies[0].pose[:3].tolist() == [9, 9, 9]
+
+
+def test_own_meshes_keep_their_order_and_scale(tmp_path):
+    (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 3 1 2\nf 2 4 3\n")
+    shape = "scene.cloths.sheet.shape={kind: load, path: m.obj, scale: 0.5}"
+    task = load_task(
+        write_config(tmp_path, SHEET),
+        [shape, "scene.cloths.sheet.pins={}", "scene.cloths.sheet.pose={position: [0, 0, 1]}"],
+    )
+    (cloth,) = task.scene.cloths
+    assert cloth.faces.tolist() == [[2, 0, 1], [1, 3, 2]]
+    assert cloth.vertices.tolist() == [[0, 0, 1], [0.5, 0, 1], [0, 0.5, 1], [0.5, 0.5, 1]]
+
+
+def test_pins_follow_their_keyframes(tmp_path):
+    frames = "{top: [{time: 0.02, displacement: [0, 0.1, 0], axis: [0, 0, 1], degrees: 180}]}"
+    task = load_task(
+        write_config(tmp_path, SHEET), [f"scene.cloths.sheet.pin_trajectories={frames}"]
+    )
+    controls = task.controls({})
+    start = torch.tensor(task.scene.cloths[0].vertices[8:])
+    # Half a turn about the vertical through the middle of the row swaps its ends.
+    end = start.flip(0) + torch.tensor([0.0, 0.1, 0.0])
+    for control, expected in ((controls[1], end), (controls[3], end)):
+        torch.testing.assert_close(control.pins["sheet/top"], expected.double())
+    first = controls[0].pins["sheet/top"]
+    torch.testing.assert_close(first.mean(dim=0)[1], torch.tensor(0.05, dtype=torch.float64))
+
+
+def test_bodies_follow_their_keyframes_and_static_ones_stay(tmp_path):
+    bodies = (
+        "scene.bodies=[{name: still, shape: {kind: box, size: 1}, "
+        "pose: {position: [9, 0, 0], axis: [0, 1, 0], degrees: 33}}, "
+        "{name: mover, shape: {kind: box, size: 1}, motion: kinematic, "
+        "pose: {position: [-9, 0, 0]}, trajectory: [{time: 0.04, position: [-9, 0, 1]}]}]"
+    )
+    task = load_task(write_config(tmp_path, SHEET), [bodies])
+    poses = torch.stack([control.body_poses for control in task.controls({})])
+    assert torch.equal(poses[:, 0], torch.tensor(task.scene.bodies[0].pose).expand(4, 7))
+    heights = torch.tensor([0.25, 0.5, 0.75, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(poses[:, 1, 2], heights)
+
+
+def test_a_simulated_sheet_hangs_from_its_pins(tmp_path):
+    states = list(simulate(load_task(write_config(tmp_path, SHEET))))
+    assert len(states) == 5
+    moved = states[-1].positions - states[0].positions
+    assert moved[8:].abs().max() == 0
+    assert (moved[:4, 2] < 0).all()
+    assert not states[-1].positions.requires_grad
+
+
+# --- hit cloth ----------------------------------------------------------------------------------
+
+SMALL = [
+    "scene.cloths.sheet.shape={kind: grid, rows: 5, columns: 5}",
+    "simulation.steps=6",
+    "actions.interval=3",
+    "loss.steps=2",
+    # Closer than in the shipped configuration, so that a short push makes contact.
+    "scene.bodies.cuboid.pose={position: [0, -0.04, 0.95]}",
+]
+
+
+def small_hit(*assignments):
+    return load_task(CONFIGS / "hit_cloth.yaml", [*SMALL, *assignments])
+
+
+def test_the_shipped_task_is_the_one_of_the_paper():
+    task = load_task(CONFIGS / "hit_cloth.yaml")
+    (sheet,) = task.scene.cloths
+    assert sheet.vertices.size == 1728  # degrees of freedom
+    assert len(sheet.pins["top"]) == 24
+    np.testing.assert_allclose(sheet.vertices[:, 1], 0, atol=1e-15)  # hangs vertically
+    (goal,) = task.goals()
+    np.testing.assert_allclose(goal.vertices[:, 2], 1.5)  # and shall lie flat
+    pinned = sheet.pins["top"]
+    np.testing.assert_allclose(goal.vertices[pinned], sheet.vertices[pinned], atol=1e-12)
+
+
+def test_actions_become_poses_of_the_body():
+    task = small_hit("actions.linear=[[0, 1, 0], [0, 0, 2]]", "actions.angular=[[1, 0, 0]]")
+    actions = task.actions()
+    assert {name: tuple(t.shape) for name, t in actions.items()} == {
+        "linear": (2, 3),
+        "angular": (2, 3),
+    }
+    poses = torch.stack([control.body_poses[0] for control in task.controls(actions)])
+    dt = task.simulator.dt
+    expected = torch.tensor([0.0, -0.04 + 3 * dt, 0.95 + 3 * 2 * dt], dtype=torch.float64)
+    torch.testing.assert_close(poses[-1, :3].detach(), expected)
+    first_interval = torch.tensor([0.0, -0.04 + 3 * dt, 0.95], dtype=torch.float64)
+    torch.testing.assert_close(poses[2, :3].detach(), first_interval)
+    half = torch.tensor(6 * dt / 2, dtype=torch.float64)
+    torch.testing.assert_close(poses[-1, 3].detach(), half.cos())
+    torch.testing.assert_close(poses[-1, 4].detach(), half.sin())
+
+
+def test_the_wrong_number_of_action_rows_is_refused():
+    with pytest.raises(dc.InvalidInput, match="must have 1 row or one for each of the 2 control"):
+        small_hit("actions.linear=[[0, 1, 0], [0, 1, 0], [0, 1, 0]]").actions()
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        pytest.param("actions.body=tray", "'tray' in `actions.body`", id="body"),
+        pytest.param("target.cloth=towel", "'towel' in `target`", id="cloth"),
+        pytest.param("loss.steps=7", "`loss.steps`", id="steps"),
+        pytest.param("scene.bodies.cuboid.motion=static", "motion: kinematic", id="static"),
+    ],
+)
+def test_references_must_fit_the_scene(assignment, message):
+    with pytest.raises(dc.InvalidInput, match=message):
+        small_hit(assignment)
+
+
+def test_the_distance_of_shapes_is_the_root_mean_square():
+    target = torch.zeros(2, 3, dtype=torch.float64)
+    vertices = torch.tensor([[3.0, 4, 0], [0, 0, 0]], dtype=torch.float64)
+    assert shape_distance(vertices, target).item() == pytest.approx(math.sqrt(25 / 2))
+    assert shape_distance(vertices, target, "squared").item() == pytest.approx(25 / 2)
+
+
+def test_the_gradient_of_the_actions_is_that_of_finite_differences():
+    task = small_hit("simulation.solver={tolerance: 1e-10}", "optimizer.checkpoint_every=2")
+    actions = task.actions()
+    evaluation = evaluate(task, actions)
+    assert evaluation.statistics["largest_contact_count"] > 0
+    # One entry with an effect through contact: the push of the first interval.
+    eps = 1e-5
+    losses = []
+    for sign in (1, -1):
+        moved = {name: tensor.detach().clone() for name, tensor in actions.items()}
+        moved["linear"][0, 1] += sign * eps
+        with torch.no_grad():
+            states = task.simulator.rollout(task.initial_state(), task.controls(moved))
+            losses.append(task.loss(states).item())
+    difference = (losses[0] - losses[1]) / (2 * eps)
+    assert difference != 0
+    assert actions["linear"].grad[0, 1].item() == pytest.approx(difference, rel=1e-3)
+
+
+def test_a_few_iterations_lower_the_loss():
+    found = optimize(small_hit("optimizer.iterations=4"))
+    assert found.best.loss < found.first.loss
+    metrics = found.metrics()
+    assert metrics["iterations"] == 4
+    assert metrics["converged_steps"] == metrics["steps"] == 4 * 6
+    assert metrics["minimum_distance"] > 0
+
+
+# --- the loop, on a task without a simulation ---------------------------------------------------
+
+
+@dataclass
+class Bowl:
+    """Minimize |a|^2; rollouts of |a| beyond `reach` fail."""
+
+    optimizer: OptimizerSection
+    start: float = 1.0
+    reach: float = math.inf
+    error: type[Exception] = dc.InfeasibleMotion
+
+    def __post_init__(self):
+        self.simulator = SimpleNamespace(rollout=self.rollout)
+
+    def initial_state(self):
+        return None
+
+    def actions(self):
+        return {"a": torch.tensor([self.start], dtype=torch.float64, requires_grad=True)}
+
+    def controls(self, actions):
+        return [actions["a"]]
+
+    def rollout(self, state, control_at, *, steps, checkpoint_every):
+        value = control_at(0, state)
+        if value.abs().item() > self.reach:
+            raise self.error("too far")
+        report = dc.Report(
+            converged=True,
+            iterations=1,
+            residual=0.0,
+            minimum_distance=math.inf,
+            contact_count=0,
+            motion_fraction=1.0,
+            seconds={"all": 0.0},
+        )
+        return [dc.State(*[value] * 6, report=report)]
+
+    def loss(self, states):
+        return states[-1].positions.square().sum()
+
+
+def descend(rate=0.25, **options):
+    return OptimizerSection(iterations=5, learning_rates={"a": rate}, **options)
+
+
+def test_the_loop_is_gradient_descent():
+    # a <- a - 0.25 * 2 a halves a each time.
+    found = optimize(Bowl(descend()))
+    assert found.metrics()["losses"] == pytest.approx([0.25**k for k in range(5)])
+    assert found.best.actions["a"].item() == pytest.approx(0.5**4)
+    assert found.metrics()["minimum_distance"] is None
+
+
+def test_momentum_and_clipping_are_those_of_torch():
+    losses = optimize(Bowl(descend(momentum=0.5, clip=0.1))).metrics()["losses"]
+    a, velocity, expected = 1.0, 0.0, []
+    for _ in range(5):
+        expected.append(a * a)
+        velocity = 0.5 * velocity + math.copysign(min(abs(2 * a), 0.1), a)
+        a -= 0.25 * velocity
+    assert losses == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_loop_stops_below_a_loss():
+    assert len(optimize(Bowl(descend(stop_below=0.1))).history) == 3
+
+
+@pytest.mark.parametrize("error", [dc.InfeasibleMotion, dc.NotConverged])
+def test_a_failed_attempt_goes_back_half_way(error):
+    # The first step leads from 1 to -9, beyond the reach of 2: -4 fails as well, -1.5 is tried.
+    found = optimize(Bowl(descend(rate=5.0), reach=2.0, error=error))
+    assert found.metrics()["losses"][:2] == pytest.approx([1.0, 1.5**2])
+    assert found.metrics()["failed_attempts"] >= 2
+    assert found.failures[0] == {"iteration": 1, "error": f"{error.__name__}: too far"}
+
+
+def test_the_loop_gives_up_after_too_many_failures():
+    with pytest.raises(dc.InfeasibleMotion, match="too far"):
+        optimize(Bowl(descend(rate=50.0, failures=2), reach=1.0))
+
+
+def test_initial_actions_that_fail_end_the_loop():
+    with pytest.raises(dc.InfeasibleMotion, match="too far"):
+        optimize(Bowl(descend(), start=3.0, reach=2.0))
+
+
+def test_another_error_is_not_swallowed():
+    with pytest.raises(ZeroDivisionError):
+        optimize(Bowl(descend(rate=5.0), reach=2.0, error=ZeroDivisionError))
+
+
+def test_an_infinite_loss_is_an_error():
+    with pytest.raises(dc.SimulationError, match="the loss is inf"):
+        optimize(Bowl(descend(), start=1e200))
+
+
+def test_learning_rates_must_name_the_actions():
+    options = OptimizerSection(iterations=1, learning_rates={"b": 1.0})
+    with pytest.raises(dc.InvalidInput, match="must have the keys a, got b"):
+        optimize(Bowl(options))
+
+
+# --- shipped drapes -----------------------------------------------------------------------------
+
+
+def require_shared_data():
+    if not SHARED_DATA.is_dir():
+        if os.environ.get("CI"):
+            pytest.fail(f"the test data is absent: {SHARED_DATA}")
+        pytest.skip("the test data is absent: ../shared/data")
+
+
+def test_the_tablecloth_starts_above_the_chair():
+    task = load_task(CONFIGS / "drape.yaml")
+    chair = task.scene.bodies[0]
+    assert task.scene.cloths[0].vertices[:, 2].min() > chair.vertices[:, 2].max()
+
+
+def test_own_meshes_are_draped_by_the_shipped_configuration():
+    require_shared_data()
+    task = load_task(CONFIGS / "drape_own.yaml", ["simulation.steps=2"])
+    assert len(task.scene.cloths[0].vertices) == 482
+    assert len(task.scene.bodies[0].vertices) == 2930
+    states = list(simulate(task))
+    assert states[-1].report.converged

@@ -1,0 +1,199 @@
+"""Viewers: which files they leave, and what the pictures show."""
+
+from __future__ import annotations
+
+import builtins
+
+import numpy as np
+import pytest
+
+import diffcloth_torch as dc
+from diffcloth_torch.io.meshes import read_mesh
+from diffcloth_torch.tasks.registry import load_task
+from diffcloth_torch.tasks.simulation import simulate
+from diffcloth_torch.viewers.curves import draw_loss_curve
+from diffcloth_torch.viewers.meshes import MeshSequence
+from diffcloth_torch.viewers.record import Record
+from diffcloth_torch.viewers.registry import Viewers, open_viewers
+from diffcloth_torch.viewers.viewer import NullViewer
+
+CONFIG = """
+task: drape
+simulation: {dt: 0.01, steps: 4}
+scene:
+  cloths:
+    - name: sheet
+      shape: {kind: grid, rows: 4, columns: 4}
+      pose: {position: [0, 0, 1]}
+      color: "#ff0000"
+      back_color: "#0000ff"
+      pins: {all: {box: {lower: [-9, -9, -9], upper: [9, 9, 9]}}}
+  bodies:
+    - {name: ball, shape: {kind: sphere, radius: 0.2, subdivisions: 1}, color: "#00ff00"}
+output:
+  pictures: {size: [160, 120]}
+"""
+
+
+@pytest.fixture
+def make_task(tmp_path):
+    def make(*assignments):
+        path = tmp_path / "config.yaml"
+        path.write_text(CONFIG, encoding="utf-8")
+        return load_task(path, assignments)
+
+    return make
+
+
+@pytest.fixture
+def pictures():
+    pytest.importorskip("pyvista")
+    pytest.importorskip("imageio")
+
+
+class Counter(NullViewer):
+    def __init__(self):
+        self.times = []
+
+    def show(self, state):
+        self.times.append(round(float(state.time), 6))
+
+
+def test_every_so_many_states_are_shown(make_task):
+    counter = Counter()
+    with Viewers([counter], every=2) as viewers:
+        for state in simulate(make_task()):
+            viewers.show(state)
+    assert counter.times == [0.0, 0.02, 0.04]
+
+
+def test_a_mesh_sequence_has_one_file_per_state(make_task, tmp_path):
+    task = make_task()
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    (folder / "frame_0099.obj").write_text("of an earlier run")
+    (folder / "notes.txt").write_text("not ours")
+    states = list(simulate(task))
+    with MeshSequence(folder) as viewer:
+        for state in states:
+            viewer.show(state)
+    names = sorted(path.name for path in folder.iterdir())
+    assert names == [f"frame_{k:04d}.obj" for k in range(5)] + ["notes.txt"]
+    vertices, faces = read_mesh(folder / "frame_0004.obj")
+    np.testing.assert_array_equal(vertices[:16], states[-1].positions.numpy())
+    assert len(faces) == 18 + len(task.scene.bodies[0].faces)
+
+
+def record(task, folder, states=None):
+    with Record(folder, task, fps=10) as viewer:
+        for state in states or list(simulate(task)):
+            viewer.show(state)
+
+
+def read_image(path):
+    from matplotlib.image import imread
+
+    return (imread(path)[..., :3] * 255).astype(int)
+
+
+def has_hue(image, channel):
+    """Whether many pixels have one channel well above the others."""
+    others = [c for c in range(3) if c != channel]
+    strong = image[..., channel] > 1.6 * np.maximum(*(image[..., c] for c in others)) + 10
+    return strong.mean() > 0.003
+
+
+@pytest.mark.usefixtures("pictures")
+class TestRecord:
+    def test_the_files_are_there(self, make_task, tmp_path):
+        task = make_task("output.pictures.frames=true", "output.pictures.sheet=2")
+        record(task, tmp_path)
+        assert (tmp_path / "animation.mp4").stat().st_size > 500
+        frames = sorted(path.name for path in (tmp_path / "animation_frames").iterdir())
+        assert frames == [f"{k:04d}.png" for k in range(5)]
+        assert read_image(tmp_path / "animation.png").shape == (120, 2 * 160 + 8, 3)
+
+    def test_a_gif_can_be_had(self, make_task, tmp_path):
+        record(make_task("output.pictures.video=gif"), tmp_path)
+        assert (tmp_path / "animation.gif").read_bytes().startswith(b"GIF89a")
+        assert not (tmp_path / "animation.mp4").exists()
+
+    @pytest.mark.parametrize(
+        ("elevation", "seen", "hidden"),
+        [pytest.param(50, 0, 2, id="from-above"), pytest.param(-50, 2, 0, id="from-below")],
+    )
+    def test_the_sides_of_the_cloth_have_their_colors(
+        self, make_task, tmp_path, elevation, seen, hidden
+    ):
+        task = make_task(
+            f"output.pictures.camera.elevation={elevation}",
+            "output.pictures.ground=null",
+            "output.pictures.sheet=1",
+            "output.pictures.video=none",
+        )
+        record(task, tmp_path, [task.initial_state()])
+        image = read_image(tmp_path / "animation.png")
+        assert has_hue(image, seen)
+        assert not has_hue(image, hidden)
+        assert has_hue(image, 1)  # the ball
+
+    def test_pictures_follow_the_motion(self, make_task, tmp_path):
+        task = make_task("output.pictures.sheet=2", "output.pictures.video=none")
+        state = task.initial_state()
+        moved = state.replace(positions=state.positions + 0.5)
+        record(task, tmp_path, [state, moved])
+        image = read_image(tmp_path / "animation.png")
+        assert np.abs(image[:, :160] - image[:, -160:]).max() > 50
+
+    def test_a_floor_takes_a_shadow(self, make_task, tmp_path):
+        lightness = {}
+        for ground in ("null", "-0.5"):
+            task = make_task(
+                f"output.pictures.ground={ground}",
+                "output.pictures.sheet=1",
+                "output.pictures.video=none",
+            )
+            record(task, tmp_path, [task.initial_state()])
+            image = read_image(tmp_path / "animation.png")
+            gray = np.ptp(image, axis=-1) < 16
+            lightness[ground] = image[gray].min()
+        assert lightness["-0.5"] < lightness["null"] - 40
+
+    @pytest.mark.parametrize(
+        ("error", "drawn"),
+        [
+            pytest.param(dc.InfeasibleMotion("no way"), True, id="failed-step"),
+            pytest.param(KeyboardInterrupt(), False, id="interrupt"),
+        ],
+    )
+    def test_what_led_to_a_failed_step_is_drawn(self, make_task, tmp_path, error, drawn):
+        task = make_task("output.pictures.video=none")
+
+        def failing():
+            yield task.initial_state()
+            raise error
+
+        with pytest.raises(type(error)):
+            record(task, tmp_path, failing())
+        assert (tmp_path / "animation.png").exists() == drawn
+
+
+def test_a_missing_package_is_named_before_anything_runs(make_task, tmp_path, monkeypatch):
+    real = builtins.__import__
+
+    def without_pyvista(name, *args, **kwargs):
+        if name.partition(".")[0] == "pyvista":
+            raise ImportError("No module named 'pyvista'")
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without_pyvista)
+    with pytest.raises(dc.InvalidInput, match=r"pip install 'diffcloth-torch\[viewer\]'"):
+        open_viewers(make_task(), tmp_path)
+    open_viewers(make_task("output.viewers=[meshes]"), tmp_path)
+
+
+def test_a_loss_curve_is_a_picture(tmp_path):
+    draw_loss_curve(tmp_path / "loss.png", [0.5, 0.2, 0.3, 0.1])
+    image = read_image(tmp_path / "loss.png")
+    assert (image < 128).any()
+    assert image.shape == (600, 960, 3)
