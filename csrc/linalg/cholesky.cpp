@@ -78,6 +78,31 @@ class SingleThread {
   int levels_ = 1;
 };
 
+/// While it lives, OpenMP regions of this thread run on it alone. CHOLMOD names a number of threads
+/// in its own, so that only this limit binds it.
+class SerialOpenMp {
+ public:
+  SerialOpenMp() {
+    if (available()) omp_set_max_active_levels(0);
+  }
+  ~SerialOpenMp() {
+    if (available()) omp_set_max_active_levels(levels());
+  }
+  SerialOpenMp(const SerialOpenMp&) = delete;
+  SerialOpenMp& operator=(const SerialOpenMp&) = delete;
+
+ private:
+  static bool available() {
+    return omp_get_max_active_levels != nullptr && omp_set_max_active_levels != nullptr &&
+           levels() >= 0;
+  }
+  // Read once, before the first change: some OpenMP libraries share the limit between threads.
+  static int levels() {
+    static const int before = omp_get_max_active_levels();
+    return before;
+  }
+};
+
 /// One cholmod_common with our settings; freed with its owner.
 struct Common {
   cholmod_common c;
@@ -159,6 +184,7 @@ struct CholeskyFactor::Backend {
   bool compute(const CholeskyAnalysis& a, const double* values) {
     const SingleThread single_thread;
     cholmod_sparse matrix = view(a, values);
+    const SerialOpenMp serial;
     cholmod_factorize(&matrix, factor, &common.c);
     if (common.c.status < CHOLMOD_OK) throw std::runtime_error("CHOLMOD: factorization failed");
     return common.c.status == CHOLMOD_OK && factor->minor == factor->n;
@@ -172,6 +198,7 @@ struct CholeskyFactor::Backend {
     rhs.x = b.data();
     rhs.xtype = CHOLMOD_REAL;
     rhs.dtype = CHOLMOD_DOUBLE;
+    const SerialOpenMp serial;
     if (!cholmod_solve2(
             CHOLMOD_A, factor, &rhs, nullptr, &x, nullptr, &y, &e, &common.c)) {
       throw std::runtime_error("CHOLMOD: solve failed");
