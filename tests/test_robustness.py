@@ -115,7 +115,7 @@ def test_a_collapsed_rest_shape_is_refused(sim):
     parameters = sim.parameters()
     rest = parameters.rest_positions.clone()
     rest[1] = rest[0]
-    with pytest.raises(dc.InvalidInput, match=r"`rest_positions` .*area"):
+    with pytest.raises(dc.InvalidInput, match=r"area > 0 in `rest_positions`.* \[0\]"):
         sim.step(sim.initial_state(), None, parameters.replace(rest_positions=rest))
     assert still_works(sim)
 
@@ -268,10 +268,10 @@ def resident_bytes():
 def test_memory_does_not_grow_over_many_steps_with_backward(contact):
     sim = tent()
     state = contact.detach()
+    # The bounded cache of factors fills at first; afterwards 2,000 steps must leave nothing.
     sizes = []
-    for k in range(2000):
+    for k in range(5000):
         gradient(sim, state)
-        if k % 500 == 499:
+        if k in (2999, 4999):
             sizes.append(resident_bytes())
-    # The cache of factors fills at first; afterwards nothing stays.
-    assert sizes[-1] - sizes[0] < 5e6
+    assert sizes[1] - sizes[0] < 5e6

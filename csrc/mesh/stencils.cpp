@@ -90,7 +90,7 @@ void append(const Patch& patch,
   stencils.model.push_back(model);
 }
 
-/// Largest weight of the sum of two outward derivatives, relative to that of one of them, below
+/// Largest weight of the sum of two outward derivatives, relative to that in either of them, below
 /// which two quadratics agree across their side. Lower values change no mode of a plate in the
 /// fourth digit.
 constexpr double kAgreement = 0.1;
@@ -122,7 +122,10 @@ bool agree(const Outward& s0, const Outward& s1) {
       largest = std::max(largest, std::abs(s1.weights(j)));
     }
   }
-  return largest < kAgreement * s0.weights.cwiseAbs().maxCoeff();
+  // Of both, so that the order of the faces does not matter.
+  const double scale =
+      std::max(s0.weights.cwiseAbs().maxCoeff(), s1.weights.cwiseAbs().maxCoeff());
+  return largest < kAgreement * scale;
 }
 
 Index corner_opposite(const Topology& topology, Index face, Index edge) {
