@@ -1,6 +1,7 @@
 #include "contact/contact_set.h"
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 
 #include "contact/distance/mollifier.h"
@@ -188,15 +189,61 @@ void ContactModel::add_gradient(const std::vector<Contact>& contacts,
   }
 }
 
+namespace {
+
+// Positive part of b'' grad D grad D^T + b' hess D. With n = t/d and orthonormal tangents s_k (and
+// c'_k with respect to them), and b' <= 0,
+//
+//   (b'' + b'/(2D)) grad D grad D^T                                       along the normal
+//   + 2 |b'| d sum_k (p_k q_k^T + q_k p_k^T + d q_k q_k^T)                as the normal turns
+//   - 2 |b'| c c^T (x) (other tangents)                                   negative: left out
+//
+// with p_k = c (x) s_k orthogonal to q_k = c'_k (x) n. Each k is a 2x2 form with one positive
+// eigenvalue. Without the second line a contact pressed hard slides until it is blocked.
+Mat12 positive_hessian(const Closest& k, double b1, double b2) {
+  const Vec12 gradient = distance_sq_gradient(k);
+  Mat12 h = std::max(b2 + b1 / (2.0 * k.d_sq), 0.0) * gradient * gradient.transpose();
+  const double d = std::sqrt(k.d_sq);
+  const Vec3 n = k.t / d;
+  const double p_sq = k.c.squaredNorm();
+  Eigen::Matrix<double, 3, 2> s = k.s;
+  Eigen::Matrix<double, 4, 2> c = k.c_beta;
+  for (int a = 0; a < k.parameter_count; ++a) {
+    if (a == 1) {  // Gram-Schmidt
+      const double along = s.col(0).dot(s.col(1));
+      s.col(1) -= along * s.col(0);
+      c.col(1) -= along * c.col(0);
+    }
+    const double length = s.col(a).norm();
+    s.col(a) /= length;
+    c.col(a) /= length;
+    const double q_sq = c.col(a).squaredNorm();
+    // In the orthonormal basis p/|p|, q/|q|: [[0, |p||q|], [|p||q|, d |q|^2]].
+    const double off = std::sqrt(p_sq * q_sq);
+    const double corner = d * q_sq;
+    const double eigenvalue = 0.5 * (corner + std::sqrt(corner * corner + 4.0 * off * off));
+    const double norm = std::sqrt(off * off + eigenvalue * eigenvalue);
+    const double along_p = off / (norm * std::sqrt(p_sq));
+    const double along_q = eigenvalue / (norm * std::sqrt(q_sq));
+    Vec12 v;
+    for (int i = 0; i < 4; ++i) {
+      v.segment<3>(3 * i) = along_p * k.c[i] * s.col(a) + along_q * c(i, a) * n;
+    }
+    h.noalias() += (2.0 * std::abs(b1) * d * eigenvalue) * v * v.transpose();
+  }
+  return h;
+}
+
+}  // namespace
+
 Mat12 ContactModel::hessian(const Contact& k, const double* x, Curvature curvature) const {
   const double scale = parameters_.kappa * k.weight;
-  const Vec12 d_gradient = distance_sq_gradient(k.closest);
   const double b1 = k.barrier.b1;
   const double b2 = k.barrier.b2;
   if (curvature == Curvature::kPositive) {
-    const double coefficient = scale * k.mollifier * (b2 + b1 / (2.0 * k.closest.d_sq));
-    return std::max(coefficient, 0.0) * d_gradient * d_gradient.transpose();
+    return scale * k.mollifier * positive_hessian(k.closest, b1, b2);
   }
+  const Vec12 d_gradient = distance_sq_gradient(k.closest);
   Mat12 h = (k.mollifier * b2) * d_gradient * d_gradient.transpose() +
             (k.mollifier * b1) * distance_sq_hessian(k.closest);
   if (k.mollified) {

@@ -35,8 +35,10 @@ constexpr double kChordContraction = 0.1;
 constexpr double kFirstShift = 0.1;
 constexpr double kShiftGrowth = 4.0;
 constexpr double kShiftDecay = 0.3;
-/// Element-wise projection is tried this often after indefinite Hessians; then the shift.
+/// After an indefinite Hessian the elements are projected: this often, and as long as steps are
+/// larger than kFar [m/s]. Then the Hessian is shifted, which converges where projection crawls.
 constexpr int kProjections = 3;
+constexpr double kFar = 0.1;
 /// Sufficient decrease, and the slope that replaces it where the change drowns in rounding.
 constexpr double kArmijo = 1e-4;
 constexpr double kWolfeSlope = 0.8;
@@ -51,6 +53,8 @@ constexpr double kNearFloor = 1e-4;  // [m/s]
 /// A prescribed motion is stuck when this many iterations move it by less than this fraction.
 constexpr int kStuckIterations = 20;
 constexpr double kStuckProgress = 1e-3;
+/// A joint step that leaves more than this share of the motion is followed by a relaxation.
+constexpr double kStopped = 0.5;
 
 double dot(const std::vector<double>& a, const std::vector<double>& b) {
   double sum = 0.0;
@@ -80,6 +84,7 @@ class Minimizer {
  private:
   bool start_from(const std::vector<double>& guess);
   bool arrive();
+  void relax();
   bool joint_step(const std::vector<double>& ends, double& remaining);
   void descend();
 
@@ -232,6 +237,13 @@ bool Minimizer::joint_step(const std::vector<double>& ends, double& remaining) {
   return true;
 }
 
+/// One step of the free vertices alone: reopens gaps that a blocked joint step has closed.
+void Minimizer::relax() {
+  refresh();
+  positive_direction();
+  search();
+}
+
 /// Move the prescribed vertices to their ends. False when the motion is infeasible.
 bool Minimizer::arrive() {
   const int portions = motion_.portions();
@@ -255,10 +267,12 @@ bool Minimizer::arrive() {
         checked = remaining;
       }
       ++out_.iterations;
+      const double before = remaining;
       if (!joint_step(ends, remaining)) {
         out_.motion_fraction = (k + 1.0 - remaining) / portions;
         return false;
       }
+      if (remaining > kStopped * before) relax();
     }
   }
   return true;
@@ -323,13 +337,14 @@ void Minimizer::shifted_direction() {
 /// vanishes: a saddle.
 bool Minimizer::take_direction() {
   if (chord()) return true;
+  const bool far = indefinite_ <= kProjections || last_step_ > kFar * f_.h;
   if (skip_exact_ > 0) {
     --skip_exact_;
   } else {
     if (exact_direction()) return true;
-    skip_exact_ = indefinite_ <= kProjections ? 1 : 0;
+    skip_exact_ = far ? 1 : 0;
   }
-  if (indefinite_ <= kProjections) {
+  if (far) {
     positive_direction();
   } else {
     shifted_direction();
