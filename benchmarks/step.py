@@ -134,8 +134,8 @@ def _line(t: Timing) -> str:
     return (
         f"{t.scene:<13}{t.size:>4}^2{t.batch or 1:>6}{t.threads:>8}  {_spread(t.forward):>22}"
         f"{t.forward_in_ef:>7.2f}  {_spread(t.backward):>20}{t.backward_in_ef:>7.2f}"
-        f"  {_number(t.reference.median):>8}{t.iterations:>8.1f}{t.residual:>10.1e}{t.contacts:>9.0f}"
-        f"{t.contact_share:>9.1%}"
+        f"  {_number(t.reference.median):>8}{t.iterations:>8.1f}{t.residual:>10.1e}"
+        f"{t.contacts:>9.0f}{t.contact_share:>9.1%}"
     )
 
 
