@@ -9,6 +9,11 @@ factorization of the contact-free Hessian of the same state by `Eigen::Simplicia
 between the steps. Machines differ by more than the code does; EF divides most of that out. One core
 is used but where `threads` says otherwise: `torch.set_num_threads(1)`, as `--threads` sets it, and
 a BLAS that does not start threads (`OPENBLAS_NUM_THREADS=1`; `diffcloth info` names the BLAS).
+
+Each step is differentiated: its backward takes cotangents of positions and velocities to those
+before the step and to the targets of the bodies. Solves are at the default tolerance. `touching`
+is the share of the cloth's vertices in a pair within the barrier distance, found by ipctk (of the
+extra `test`). The core tells phases for forward only; backward is one number.
 """
 
 from __future__ import annotations
