@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import diffcloth_torch as dc
 
@@ -65,3 +66,19 @@ def test_optimize_push(capsys):
     names = runpy.run_path(str(ROOT / "examples/optimize_push.py"))
     assert abs(names["error"].item()) < 1e-3  # [m], from 44 mm
     assert capsys.readouterr().out.count("speed") == 8
+
+
+def test_drape_own_mesh(own_mesh, tmp_path):
+    body, out = tmp_path / "ball.obj", tmp_path / "draped.obj"
+    # The sheet hangs low at its corners, 2 cm at most: the ball below is clear of it.
+    ball = dc.RigidBody.sphere(0.1, subdivisions=2)
+    lines = [f"v {a} {b} {c - 0.14}\n" for a, b, c in ball.vertices]
+    lines += [f"f {a} {b} {c}\n" for a, b, c in ball.faces + 1]
+    body.write_text("".join(lines))
+    arguments = [str(own_mesh), str(body), "--height", "0.01", "--steps", "15", "--out", str(out)]
+    main = runpy.run_path(str(ROOT / "examples/drape_own_mesh.py"), run_name="example")["main"]
+    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert result.exit_code == 0
+    contacts = int(re.search(r"(\d+) contacts", result.output)[1])
+    assert contacts > 0
+    assert len(dc.Cloth.load(out).vertices) == 7 * 8
