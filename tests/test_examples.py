@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 
@@ -45,6 +47,14 @@ def test_own_mesh(own_mesh, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["own_mesh.py", str(own_mesh)])
     check_throw(runpy.run_path(str(ROOT / "examples/own_mesh.py")))
     assert "gradient: throw" in capsys.readouterr().out
+
+
+def test_script_says_no_more_than_it_prints(own_mesh):
+    """At the end of a script objects of the core still live; nanobind used to call them leaked."""
+    command = [sys.executable, str(ROOT / "examples/own_mesh.py"), str(own_mesh)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert result.stderr == ""
 
 
 def test_example_of_the_readme(own_mesh, monkeypatch):
