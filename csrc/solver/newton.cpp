@@ -129,6 +129,7 @@ class Minimizer {
 
   Mode mode_ = Mode::kExact;
   bool chord_allowed_ = false;
+  bool limited_ = false;    // whether collision detection cut the last step short
   double last_step_ = std::numeric_limits<double>::infinity();
   int indefinite_ = 0;      // exact Hessians that were not positive definite
   int skip_exact_ = 0;      // iterations for which the exact Hessian is not tried
@@ -359,6 +360,7 @@ Minimizer::Move Minimizer::search() {
   std::vector<double> to = moved(1.0);
   detect(to);
   const double safe = safe_fraction(to);
+  limited_ = safe < 1.0;
   const Timer timer(*context_.seconds, Phase::kLineSearch);
   const double slope = dot(g_, p_);
   if (f_.contact != nullptr) f_.contact->energies(candidates_, x_.data(), energies_);
@@ -461,9 +463,10 @@ void Minimizer::descend() {
     }
     const double step = largest(p_);
     if (mode_ == Mode::kExact) out_.residual = step / f_.h;
+    limited_ = false;
     const Move move = step <= kResolution * largest(x_) ? Move::kRounded : search();
-    if (mode_ == Mode::kExact && step < f_.h * tolerance &&
-        (move == Move::kWhole || move == Move::kRounded)) {
+    // Such a step descends unless rounding is in the way, and then it has nowhere better to go.
+    if (mode_ == Mode::kExact && step < f_.h * tolerance && !limited_) {
       out_.status = Status::kConverged;
       return;
     }
