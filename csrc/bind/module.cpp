@@ -6,8 +6,6 @@ NB_MODULE(_core, m) {
   // nothing that its user should read about.
   nb::set_leak_warnings(false);
   m.doc() = "C++ core of diffcloth_torch. The public interface is the Python package.";
-  // An autograd graph that is alive when the interpreter exits keeps its simulator: no leak.
-  nb::set_leak_warnings(false);
 
   diffcloth::bind::build_info(m);
   diffcloth::bind::simulator(m);

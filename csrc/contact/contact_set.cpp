@@ -44,8 +44,7 @@ double ContactModel::mu(const Candidate& pair) const {
   const auto surfaces = static_cast<Index>(parameters_.thickness.size());
   const Index a = surface_a(pair);
   const Index b = surface_b(pair);
-  return 0.5 *
-         (parameters_.friction[a * surfaces + b] + parameters_.friction[b * surfaces + a]);
+  return 0.5 * (parameters_.friction[a * surfaces + b] + parameters_.friction[b * surfaces + a]);
 }
 
 bool ContactModel::inert(const Candidate& pair) const {
@@ -71,11 +70,8 @@ double ContactModel::threshold(const Candidate& pair) const {
   return mollifier_threshold(rest_.edge_length_sq[pair.a], rest_.edge_length_sq[pair.b]);
 }
 
-void ContactModel::pull_back(const Candidate& pair,
-                             double weight_bar,
-                             double threshold_bar,
-                             double xi_bar,
-                             Bar& bar) const {
+void ContactModel::pull_back(
+    const Candidate& pair, double weight_bar, double threshold_bar, double xi_bar, Bar& bar) const {
   bar.thickness[surface_a(pair)] += 0.5 * xi_bar;
   bar.thickness[surface_b(pair)] += 0.5 * xi_bar;
   RestMeasures& rest = bar.rest;
@@ -160,12 +156,11 @@ void ContactModel::energies(const std::vector<Candidate>& candidates,
     const double xi_pair = xi(pair);
     const double range = parameters_.d_hat + xi_pair;
     if (!(d_sq < range * range)) continue;
-    const double m =
-        pair.kind == PairKind::kEdgeEdge ? mollifier(corner, threshold(pair)) : 1.0;
+    const double m = pair.kind == PairKind::kEdgeEdge ? mollifier(corner, threshold(pair)) : 1.0;
     const double b = barrier(d_sq, xi_pair, parameters_.d_hat);
     // 0 * infinity for exactly parallel edges that touch: still infeasible.
-    out[k] = b == std::numeric_limits<double>::infinity() ? b
-                                                          : parameters_.kappa * weight(pair) * m * b;
+    out[k] =
+        b == std::numeric_limits<double>::infinity() ? b : parameters_.kappa * weight(pair) * m * b;
   }
 }
 
@@ -176,8 +171,8 @@ void ContactModel::add_gradient(const std::vector<Contact>& contacts,
     const double scale = parameters_.kappa * k.weight;
     if (k.mollified) {
       const Mollifier m = mollifier_derivatives(corners(k.pair.vertices, x), k.threshold);
-      const Vec12 gradient = scale * (k.barrier.b * m.gradient +
-                                      m.m * k.barrier.b1 * distance_sq_gradient(k.closest));
+      const Vec12 gradient =
+          scale * (k.barrier.b * m.gradient + m.m * k.barrier.b1 * distance_sq_gradient(k.closest));
       scatter(k.pair.vertices, gradient, g);
       continue;
     }
@@ -259,9 +254,7 @@ void ContactModel::add_hessian_product(const std::vector<Contact>& contacts,
                                        const double* z,
                                        double* y) const {
   for (const Contact& k : contacts) {
-    scatter(k.pair.vertices,
-            hessian(k, x, Curvature::kExact) * stacked(k.pair.vertices, z),
-            y);
+    scatter(k.pair.vertices, hessian(k, x, Curvature::kExact) * stacked(k.pair.vertices, z), y);
   }
 }
 
@@ -288,8 +281,7 @@ void ContactModel::add_mixed(const std::vector<Contact>& contacts,
     bar.kappa += scale * k.weight * per_weight;
     bar.d_hat +=
         scale * kappa * k.weight * (k.barrier.b_d_hat * m_z + m * k.barrier.b1_d_hat * d_z);
-    const double xi_bar =
-        kappa * k.weight * (k.barrier.b_xi * m_z + m * k.barrier.b1_xi * d_z);
+    const double xi_bar = kappa * k.weight * (k.barrier.b_xi * m_z + m * k.barrier.b1_xi * d_z);
     pull_back(k.pair, scale * kappa * per_weight, scale * threshold_bar, scale * xi_bar, bar);
   }
 }

@@ -172,8 +172,7 @@ struct CholeskyFactor::Backend {
     rhs.x = b.data();
     rhs.xtype = CHOLMOD_REAL;
     rhs.dtype = CHOLMOD_DOUBLE;
-    if (!cholmod_solve2(
-            CHOLMOD_A, factor, &rhs, nullptr, &x, nullptr, &y, &e, &common.c)) {
+    if (!cholmod_solve2(CHOLMOD_A, factor, &rhs, nullptr, &x, nullptr, &y, &e, &common.c)) {
       throw std::runtime_error("CHOLMOD: solve failed");
     }
     const double* solution = static_cast<const double*>(x->x);
@@ -200,12 +199,8 @@ using Sparse = Eigen::SparseMatrix<double, Eigen::ColMajor, Index>;
 using EigenFactor = Eigen::SimplicialLLT<Sparse, Eigen::Lower, Eigen::NaturalOrdering<Index>>;
 
 Eigen::Map<const Sparse> view(const CholeskyAnalysis& a, const double* values) {
-  return {a.dimension(),
-          a.dimension(),
-          static_cast<Index>(a.row.size()),
-          a.column_start.data(),
-          a.row.data(),
-          values};
+  return {a.dimension(),         a.dimension(), static_cast<Index>(a.row.size()),
+          a.column_start.data(), a.row.data(),  values};
 }
 
 }  // namespace
