@@ -85,8 +85,8 @@ class Elastic {
   Elastic(const Positions& X, const Faces& faces, const std::string& bending_model)
       : X_(X.data(), X.data() + X.size()),
         topology_(static_cast<Index>(X.shape(0)), face_list(faces)),
-        stencils_(mesh::choose_stencils(
-            topology_, X_.data(), model_list(bending_model, faces.shape(0)))),
+        stencils_(
+            mesh::choose_stencils(topology_, X_.data(), model_list(bending_model, faces.shape(0)))),
         pattern_(topology_.vertex_count, elastic::cliques(topology_, stencils_)),
         slots_(elastic::slots(topology_, stencils_, pattern_)) {
     model_.topology = &topology_;
@@ -132,8 +132,7 @@ class Elastic {
   }
 
   double energy_change(const Positions& x0, const Positions& x1) const {
-    return elastic::energy_change(
-        model_, positions("x0", x0).data(), positions("x1", x1).data());
+    return elastic::energy_change(model_, positions("x0", x0).data(), positions("x1", x1).data());
   }
 
   Array gradient(const Positions& x) const {
@@ -144,8 +143,7 @@ class Elastic {
 
   Array hessian_blocks(const Positions& x, bool positive) const {
     std::vector<double> blocks(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
-    const auto projection =
-        positive ? elastic::Projection::kPositive : elastic::Projection::kExact;
+    const auto projection = positive ? elastic::Projection::kPositive : elastic::Projection::kExact;
     elastic::add_hessian(model_, slots_, positions("x", x).data(), projection, blocks.data());
     return owned(blocks.data(), {blocks.size() / 9, 9});
   }
@@ -168,15 +166,14 @@ class Elastic {
 
   Array hessian_product(const Positions& x, const Positions& z) const {
     std::vector<double> y(x.size(), 0.0);
-    elastic::add_hessian_product(
-        model_, positions("x", x).data(), positions("z", z).data(), y.data());
+    elastic::add_hessian_product(model_, positions("x", x).data(), positions("z", z).data(),
+                                 y.data());
     return rows_array(y);
   }
 
   nb::dict mixed(const Positions& x, const Positions& z, bool with_rest) const {
     elastic::Bar bar(topology_, stencils_);
-    elastic::add_mixed(
-        model_, positions("x", x).data(), positions("z", z).data(), with_rest, bar);
+    elastic::add_mixed(model_, positions("x", x).data(), positions("z", z).data(), with_rest, bar);
     std::vector<double> X_bar(X_.size(), 0.0);
     if (with_rest) {
       mesh::rest_shape_vjp(topology_, stencils_, X_.data(), bar.rest, X_bar.data());
@@ -311,18 +308,11 @@ nb::dict anchors(const Indices& vertex,
 
 void elastic_kernels(nb::module_& m) {
   nb::class_<Elastic>(m, "Elastic", "An elastic model on one rest mesh.")
-      .def(nb::init<const Positions&, const Faces&, const std::string&>(),
-           "X"_a.noconvert(),
-           "faces"_a.noconvert(),
-           "bending_model"_a)
+      .def(nb::init<const Positions&, const Faces&, const std::string&>(), "X"_a.noconvert(),
+           "faces"_a.noconvert(), "bending_model"_a)
       .def("set_rest", &Elastic::set_rest, "X"_a.noconvert())
-      .def("set_parameters",
-           &Elastic::set_parameters,
-           "stretch"_a.noconvert(),
-           "bending"_a.noconvert(),
-           "poisson"_a.noconvert(),
-           "damping"_a.noconvert(),
-           "h"_a,
+      .def("set_parameters", &Elastic::set_parameters, "stretch"_a.noconvert(),
+           "bending"_a.noconvert(), "poisson"_a.noconvert(), "damping"_a.noconvert(), "h"_a,
            "x_n"_a.noconvert().none())
       .def("energy", &Elastic::energy, "x"_a.noconvert())
       .def("energy_change", &Elastic::energy_change, "x0"_a.noconvert(), "x1"_a.noconvert())
@@ -338,14 +328,8 @@ void elastic_kernels(nb::module_& m) {
       .def_prop_ro("edges", &Elastic::edges, nb::rv_policy::automatic)
       .def_prop_ro("edge_faces", &Elastic::edge_faces, nb::rv_policy::automatic)
       .def_prop_ro("face_edges", &Elastic::face_edges, nb::rv_policy::automatic);
-  m.def("anchors",
-        &anchors,
-        "vertex"_a.noconvert(),
-        "stiffness"_a.noconvert(),
-        "target"_a.noconvert(),
-        "x0"_a.noconvert(),
-        "x1"_a.noconvert(),
-        "z"_a.noconvert());
+  m.def("anchors", &anchors, "vertex"_a.noconvert(), "stiffness"_a.noconvert(),
+        "target"_a.noconvert(), "x0"_a.noconvert(), "x1"_a.noconvert(), "z"_a.noconvert());
 }
 
 }  // namespace diffcloth::bind

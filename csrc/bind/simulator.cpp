@@ -174,9 +174,7 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
              .solves = tapes.solves + e,
              .key = tapes.key + e};
     }
-    reports[e] = step::forward(scene_,
-                               arrays.environment(e),
-                               checkpoint,
+    reports[e] = step::forward(scene_, arrays.environment(e), checkpoint,
                                {.positions = positions + e * n * 3,
                                 .velocities = velocities + e * n * 3,
                                 .body_forces = body_forces + e * v * 3,
@@ -261,8 +259,7 @@ nb::dict Simulator::backward(const nb::dict& inputs,
     const auto e = static_cast<std::size_t>(i);
     step::Gradients gradients;
     for (Wanted& w : wanted) gradients.data[w.input] = w.own.data() + e * w.count;
-    step::backward(scene_,
-                   arrays.environment(e),
+    step::backward(scene_, arrays.environment(e),
                    {.iterates = iterates.data() + e * k * n * 3,
                     .factored = factored.data() + e * k * n * 3,
                     .elastic = split ? elastic.data() + e * 2 * n * 3 : nullptr,
@@ -271,9 +268,7 @@ nb::dict Simulator::backward(const nb::dict& inputs,
                    {.positions = positions_bar.data() + e * n * 3,
                     .velocities = velocities_bar.data() + e * n * 3,
                     .body_forces = forces_bar.data() + e * v * 3},
-                   checkpoint,
-                   gradients,
-                   factors_);
+                   checkpoint, gradients, factors_);
   });
   for (const Wanted& w : wanted) {
     for (std::size_t e = 0; e < b; ++e) {
@@ -293,9 +288,7 @@ nb::object Simulator::path(const nb::dict& inputs) {
   std::vector<double> body_forces(3 * (all - n));
   std::vector<std::vector<double>> path;
   for_environments(1, 1, [&](Index, const Checkpoint& checkpoint) {
-    step::forward(scene_,
-                  arrays.environment(0),
-                  checkpoint,
+    step::forward(scene_, arrays.environment(0), checkpoint,
                   {.positions = positions.data(),
                    .velocities = velocities.data(),
                    .body_forces = body_forces.data(),
@@ -388,60 +381,34 @@ void simulator(nb::module_& m) {
       nb::exception<std::domain_error>(m, "SimulationError", PyExc_RuntimeError);
 
   nb::class_<Simulator>(m, "Simulator")
-      .def(
-          "__init__",
-          [](Simulator* self, nb::kwargs k) {
-            const auto doubles = [&](const char* name) { return nb::cast<Doubles>(k[name]); };
-            const auto indices = [&](const char* name) { return nb::cast<Indices>(k[name]); };
-            new (self) Simulator(describe(doubles("vertices"),
-                                          doubles("rest_vertices"),
-                                          indices("faces"),
-                                          indices("cloth_vertex_start"),
-                                          indices("cloth_face_start"),
-                                          nb::cast<std::vector<std::string>>(k["bending_models"]),
-                                          indices("pins"),
-                                          indices("soft_pins"),
-                                          doubles("body_vertices"),
-                                          indices("body_faces"),
-                                          indices("body_vertex_start"),
-                                          nb::cast<bool>(k["self_contact"]),
-                                          nb::cast<double>(k["dt"]),
-                                          nb::cast<std::string>(k["scheme"]),
-                                          nb::cast<std::string>(k["metric"]),
-                                          nb::cast<int>(k["friction_iterations"]),
-                                          nb::cast<double>(k["tolerance"]),
-                                          nb::cast<int>(k["max_iterations"])));
-          })
+      .def("__init__",
+           [](Simulator* self, nb::kwargs k) {
+             const auto doubles = [&](const char* name) { return nb::cast<Doubles>(k[name]); };
+             const auto indices = [&](const char* name) { return nb::cast<Indices>(k[name]); };
+             new (self) Simulator(describe(
+                 doubles("vertices"), doubles("rest_vertices"), indices("faces"),
+                 indices("cloth_vertex_start"), indices("cloth_face_start"),
+                 nb::cast<std::vector<std::string>>(k["bending_models"]), indices("pins"),
+                 indices("soft_pins"), doubles("body_vertices"), indices("body_faces"),
+                 indices("body_vertex_start"), nb::cast<bool>(k["self_contact"]),
+                 nb::cast<double>(k["dt"]), nb::cast<std::string>(k["scheme"]),
+                 nb::cast<std::string>(k["metric"]), nb::cast<int>(k["friction_iterations"]),
+                 nb::cast<double>(k["tolerance"]), nb::cast<int>(k["max_iterations"])));
+           })
       .def("forward", &Simulator::forward, "inputs"_a, "tape"_a, "threads"_a)
-      .def("backward",
-           &Simulator::backward,
-           "inputs"_a,
-           "tape"_a,
-           "cotangents"_a,
-           "needs"_a,
+      .def("backward", &Simulator::backward, "inputs"_a, "tape"_a, "cotangents"_a, "needs"_a,
            "threads"_a)
       .def("energy", &Simulator::energy, "inputs"_a)
-      .def("path",
-           &Simulator::path,
-           "inputs"_a,
+      .def("path", &Simulator::path, "inputs"_a,
            "Accepted iterates of the first environment's step [M, N + V, 3].")
       .def("smallest_nonadjacent_distance", &Simulator::smallest_nonadjacent_distance)
-      .def("default_barrier_stiffness",
-           &Simulator::default_barrier_stiffness,
-           "inputs"_a,
+      .def("default_barrier_stiffness", &Simulator::default_barrier_stiffness, "inputs"_a,
            "barrier_distance"_a)
-      .def("reference_factorization_seconds",
-           &Simulator::reference_factorization_seconds,
-           "inputs"_a,
-           "repeats"_a,
+      .def("reference_factorization_seconds", &Simulator::reference_factorization_seconds,
+           "inputs"_a, "repeats"_a,
            "Seconds of one factorization of the contact-free Hessian by Eigen, for benchmarks.")
-      .def("find_overlap",
-           &Simulator::find_overlap,
-           "positions"_a,
-           "body_poses"_a,
-           "thickness"_a)
-      .def("forget_factors",
-           &Simulator::forget_factors,
+      .def("find_overlap", &Simulator::find_overlap, "positions"_a, "body_poses"_a, "thickness"_a)
+      .def("forget_factors", &Simulator::forget_factors,
            "Drop the factors kept for backward; they are made again when needed.")
       .def_prop_ro_static("phases", [](nb::handle) {
         return std::vector<std::string>(solver::kPhaseNames.begin(), solver::kPhaseNames.end());

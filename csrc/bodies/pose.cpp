@@ -10,9 +10,7 @@ namespace {
 
 Vec4 unit_quaternion(const Pose& pose) { return pose.tail<4>().normalized(); }
 
-Mat3 matrix(const Vec4& q) {
-  return Eigen::Quaterniond(q[0], q[1], q[2], q[3]).toRotationMatrix();
-}
+Mat3 matrix(const Vec4& q) { return Eigen::Quaterniond(q[0], q[1], q[2], q[3]).toRotationMatrix(); }
 
 }  // namespace
 
@@ -68,10 +66,8 @@ double angle(const Pose& from, const Pose& to) {
 void BodySet::place(const double* poses, double* out) const {
   for (Index k = 0; k < count(); ++k) {
     const Index first = vertex_start[k];
-    transform(Eigen::Map<const Pose>(poses + 7 * k),
-              vertices.data() + 3 * first,
-              vertex_start[k + 1] - first,
-              out + 3 * first);
+    transform(Eigen::Map<const Pose>(poses + 7 * k), vertices.data() + 3 * first,
+              vertex_start[k + 1] - first, out + 3 * first);
   }
 }
 
@@ -79,10 +75,8 @@ void BodySet::place_vjp(const double* poses, const double* out_bar, double* pose
   for (Index k = 0; k < count(); ++k) {
     const Index first = vertex_start[k];
     Eigen::Map<Pose>(poses_bar + 7 * k) +=
-        transform_vjp(Eigen::Map<const Pose>(poses + 7 * k),
-                      vertices.data() + 3 * first,
-                      vertex_start[k + 1] - first,
-                      out_bar + 3 * first);
+        transform_vjp(Eigen::Map<const Pose>(poses + 7 * k), vertices.data() + 3 * first,
+                      vertex_start[k + 1] - first, out_bar + 3 * first);
   }
 }
 

@@ -1,6 +1,7 @@
 #include "contact/contact_set.h"
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
 
 #include "contact/distance/mollifier.h"
@@ -43,8 +44,7 @@ double ContactModel::mu(const Candidate& pair) const {
   const auto surfaces = static_cast<Index>(parameters_.thickness.size());
   const Index a = surface_a(pair);
   const Index b = surface_b(pair);
-  return 0.5 *
-         (parameters_.friction[a * surfaces + b] + parameters_.friction[b * surfaces + a]);
+  return 0.5 * (parameters_.friction[a * surfaces + b] + parameters_.friction[b * surfaces + a]);
 }
 
 bool ContactModel::inert(const Candidate& pair) const {
@@ -70,11 +70,8 @@ double ContactModel::threshold(const Candidate& pair) const {
   return mollifier_threshold(rest_.edge_length_sq[pair.a], rest_.edge_length_sq[pair.b]);
 }
 
-void ContactModel::pull_back(const Candidate& pair,
-                             double weight_bar,
-                             double threshold_bar,
-                             double xi_bar,
-                             Bar& bar) const {
+void ContactModel::pull_back(
+    const Candidate& pair, double weight_bar, double threshold_bar, double xi_bar, Bar& bar) const {
   bar.thickness[surface_a(pair)] += 0.5 * xi_bar;
   bar.thickness[surface_b(pair)] += 0.5 * xi_bar;
   RestMeasures& rest = bar.rest;
@@ -159,12 +156,11 @@ void ContactModel::energies(const std::vector<Candidate>& candidates,
     const double xi_pair = xi(pair);
     const double range = parameters_.d_hat + xi_pair;
     if (!(d_sq < range * range)) continue;
-    const double m =
-        pair.kind == PairKind::kEdgeEdge ? mollifier(corner, threshold(pair)) : 1.0;
+    const double m = pair.kind == PairKind::kEdgeEdge ? mollifier(corner, threshold(pair)) : 1.0;
     const double b = barrier(d_sq, xi_pair, parameters_.d_hat);
     // 0 * infinity for exactly parallel edges that touch: still infeasible.
-    out[k] = b == std::numeric_limits<double>::infinity() ? b
-                                                          : parameters_.kappa * weight(pair) * m * b;
+    out[k] =
+        b == std::numeric_limits<double>::infinity() ? b : parameters_.kappa * weight(pair) * m * b;
   }
 }
 
@@ -175,8 +171,8 @@ void ContactModel::add_gradient(const std::vector<Contact>& contacts,
     const double scale = parameters_.kappa * k.weight;
     if (k.mollified) {
       const Mollifier m = mollifier_derivatives(corners(k.pair.vertices, x), k.threshold);
-      const Vec12 gradient = scale * (k.barrier.b * m.gradient +
-                                      m.m * k.barrier.b1 * distance_sq_gradient(k.closest));
+      const Vec12 gradient =
+          scale * (k.barrier.b * m.gradient + m.m * k.barrier.b1 * distance_sq_gradient(k.closest));
       scatter(k.pair.vertices, gradient, g);
       continue;
     }
@@ -188,15 +184,61 @@ void ContactModel::add_gradient(const std::vector<Contact>& contacts,
   }
 }
 
+namespace {
+
+// Positive part of b'' grad D grad D^T + b' hess D. With n = t/d and orthonormal tangents s_k (and
+// c'_k with respect to them), and b' <= 0,
+//
+//   (b'' + b'/(2D)) grad D grad D^T                                       along the normal
+//   + 2 |b'| d sum_k (p_k q_k^T + q_k p_k^T + d q_k q_k^T)                as the normal turns
+//   - 2 |b'| c c^T (x) (other tangents)                                   negative: left out
+//
+// with p_k = c (x) s_k orthogonal to q_k = c'_k (x) n. Each k is a 2x2 form with one positive
+// eigenvalue. Without the second line a contact pressed hard slides until it is blocked.
+Mat12 positive_hessian(const Closest& k, double b1, double b2) {
+  const Vec12 gradient = distance_sq_gradient(k);
+  Mat12 h = std::max(b2 + b1 / (2.0 * k.d_sq), 0.0) * gradient * gradient.transpose();
+  const double d = std::sqrt(k.d_sq);
+  const Vec3 n = k.t / d;
+  const double p_sq = k.c.squaredNorm();
+  Eigen::Matrix<double, 3, 2> s = k.s;
+  Eigen::Matrix<double, 4, 2> c = k.c_beta;
+  for (int a = 0; a < k.parameter_count; ++a) {
+    if (a == 1) {  // Gram-Schmidt
+      const double along = s.col(0).dot(s.col(1));
+      s.col(1) -= along * s.col(0);
+      c.col(1) -= along * c.col(0);
+    }
+    const double length = s.col(a).norm();
+    s.col(a) /= length;
+    c.col(a) /= length;
+    const double q_sq = c.col(a).squaredNorm();
+    // In the orthonormal basis p/|p|, q/|q|: [[0, |p||q|], [|p||q|, d |q|^2]].
+    const double off = std::sqrt(p_sq * q_sq);
+    const double corner = d * q_sq;
+    const double eigenvalue = 0.5 * (corner + std::sqrt(corner * corner + 4.0 * off * off));
+    const double norm = std::sqrt(off * off + eigenvalue * eigenvalue);
+    const double along_p = off / (norm * std::sqrt(p_sq));
+    const double along_q = eigenvalue / (norm * std::sqrt(q_sq));
+    Vec12 v;
+    for (int i = 0; i < 4; ++i) {
+      v.segment<3>(3 * i) = along_p * k.c[i] * s.col(a) + along_q * c(i, a) * n;
+    }
+    h.noalias() += (2.0 * std::abs(b1) * d * eigenvalue) * v * v.transpose();
+  }
+  return h;
+}
+
+}  // namespace
+
 Mat12 ContactModel::hessian(const Contact& k, const double* x, Curvature curvature) const {
   const double scale = parameters_.kappa * k.weight;
-  const Vec12 d_gradient = distance_sq_gradient(k.closest);
   const double b1 = k.barrier.b1;
   const double b2 = k.barrier.b2;
   if (curvature == Curvature::kPositive) {
-    const double coefficient = scale * k.mollifier * (b2 + b1 / (2.0 * k.closest.d_sq));
-    return std::max(coefficient, 0.0) * d_gradient * d_gradient.transpose();
+    return scale * k.mollifier * positive_hessian(k.closest, b1, b2);
   }
+  const Vec12 d_gradient = distance_sq_gradient(k.closest);
   Mat12 h = (k.mollifier * b2) * d_gradient * d_gradient.transpose() +
             (k.mollifier * b1) * distance_sq_hessian(k.closest);
   if (k.mollified) {
@@ -212,9 +254,7 @@ void ContactModel::add_hessian_product(const std::vector<Contact>& contacts,
                                        const double* z,
                                        double* y) const {
   for (const Contact& k : contacts) {
-    scatter(k.pair.vertices,
-            hessian(k, x, Curvature::kExact) * stacked(k.pair.vertices, z),
-            y);
+    scatter(k.pair.vertices, hessian(k, x, Curvature::kExact) * stacked(k.pair.vertices, z), y);
   }
 }
 
@@ -241,8 +281,7 @@ void ContactModel::add_mixed(const std::vector<Contact>& contacts,
     bar.kappa += scale * k.weight * per_weight;
     bar.d_hat +=
         scale * kappa * k.weight * (k.barrier.b_d_hat * m_z + m * k.barrier.b1_d_hat * d_z);
-    const double xi_bar =
-        kappa * k.weight * (k.barrier.b_xi * m_z + m * k.barrier.b1_xi * d_z);
+    const double xi_bar = kappa * k.weight * (k.barrier.b_xi * m_z + m * k.barrier.b1_xi * d_z);
     pull_back(k.pair, scale * kappa * per_weight, scale * threshold_bar, scale * xi_bar, bar);
   }
 }

@@ -82,7 +82,7 @@ class ContactModel {
   /// g += grad B.
   void add_gradient(const std::vector<Contact>& contacts, const double* x, double* g) const;
 
-  /// 12x12 Hessian of one contact; kPositive is a rank-one majorant (Gauss-Newton).
+  /// 12x12 Hessian of one contact; kPositive is its positive part, up to the mollifier's terms.
   Mat12 hessian(const Contact& contact, const double* x, Curvature curvature) const;
 
   /// y += H z over all vertices, exact.

@@ -35,9 +35,7 @@ Vec3 tangential(const Vec3& u, const Vec3& n) { return u - n.dot(u) * n; }
 
 }  // namespace
 
-double FrictionSet::energy_change(const double* x_start,
-                                  const double* x0,
-                                  const double* x1) const {
+double FrictionSet::energy_change(const double* x_start, const double* x0, const double* x1) const {
   const double e = entries_.empty() ? 1.0 : model_->parameters().slip;
   double change = 0.0;
   for (const Entry& k : entries_) {
@@ -67,8 +65,7 @@ Mat12 FrictionSet::hessian(const Entry& k,
   const FrictionLaw law = friction_law(w.norm(), model_->parameters().slip);
   const Mat3 projector = Mat3::Identity() - k.n * k.n.transpose();
   const double along = curvature == Curvature::kExact ? law.f2 : 0.0;
-  const Mat3 core =
-      (k.mu * k.lambda) * (law.f1_over_y * projector + along * w * w.transpose());
+  const Mat3 core = (k.mu * k.lambda) * (law.f1_over_y * projector + along * w * w.transpose());
   Mat12 h;
   for (int i = 0; i < 4; ++i) {
     for (int j = 0; j < 4; ++j) {
@@ -83,7 +80,8 @@ void FrictionSet::add_hessian_product(const double* x_start,
                                       const double* z,
                                       double* y) const {
   for (const Entry& k : entries_) {
-    const Vec12 product = hessian(k, x_start, x, Curvature::kExact) * stacked(k.lag.pair.vertices, z);
+    const Vec12 product =
+        hessian(k, x_start, x, Curvature::kExact) * stacked(k.lag.pair.vertices, z);
     for (int i = 0; i < 4; ++i) {
       Eigen::Map<Vec3>(y + 3 * k.lag.pair.vertices[i]) += product.segment<3>(3 * i);
     }
@@ -142,11 +140,8 @@ void FrictionSet::add_mixed(const double* x_start,
       threshold_bar = per_lambda * kappa * area * mol.m_eps * b1;
       x_bar += (per_lambda * kappa * area * b1) * mol.gradient;
     }
-    model_->pull_back(lag.pair,
-                      scale * per_lambda * kappa * m * b1,
-                      scale * threshold_bar,
-                      scale * xi_bar,
-                      bar);
+    model_->pull_back(lag.pair, scale * per_lambda * kappa * m * b1, scale * threshold_bar,
+                      scale * xi_bar, bar);
 
     // c and n.
     const double strength = k.mu * k.lambda;

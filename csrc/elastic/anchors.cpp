@@ -31,8 +31,7 @@ double energy_change(const Anchors& anchors, const double* x0, const double* x1)
 
 void add_gradient(const Anchors& anchors, const double* x, double* g) {
   for (std::size_t a = 0; a < anchors.vertex.size(); ++a) {
-    Eigen::Map<Vec3>(g + 3 * anchors.vertex[a]) +=
-        anchors.stiffness[a] * extension(anchors, a, x);
+    Eigen::Map<Vec3>(g + 3 * anchors.vertex[a]) += anchors.stiffness[a] * extension(anchors, a, x);
   }
 }
 

@@ -30,9 +30,7 @@ Mat3 second_derivatives_change(const Element& element, const double* x0, const d
 }
 
 Mat32 base_gradient(const Element& element, const double* x) {
-  return deformation_gradient(*element.g,
-                              row(x, element.vertices[0]),
-                              row(x, element.vertices[1]),
+  return deformation_gradient(*element.g, row(x, element.vertices[0]), row(x, element.vertices[1]),
                               row(x, element.vertices[2]));
 }
 
@@ -40,9 +38,9 @@ Mat32 base_gradient(const Element& element, const double* x) {
 /// generalized torque tau with dE = <q_total, R^T dY> - tau . w.
 struct BodyState {
   Frame frame;
-  Mat3 Q;                   ///< weight times the quadratic form
-  Mat3 curvature;           ///< R^T Y
-  Mat3 q, q_n;              ///< q_n includes the damping factor
+  Mat3 Q;          ///< weight times the quadratic form
+  Mat3 curvature;  ///< R^T Y
+  Mat3 q, q_n;     ///< q_n includes the damping factor
   Vec3 tau;
 
   Mat3 q_total() const { return q + q_n; }
@@ -85,10 +83,10 @@ Mat32 frame_stress_geometric(const BodyState& state,
 
 /// The derivative of an element's gradient along z.
 struct BodyChange {
-  Vec3 w;          ///< rotation of the frame
-  Mat3 ds, ds_n;   ///< changes of s and s_n in the frame
+  Vec3 w;         ///< rotation of the frame
+  Mat3 ds, ds_n;  ///< changes of s and s_n in the frame
   Mat3 dq, dq_n;
-  Mat32 V;         ///< change of the force on the frame
+  Mat32 V;  ///< change of the force on the frame
 
   Mat3 dq_total() const { return dq + dq_n; }
 };
@@ -185,8 +183,8 @@ Mat3 body_curvature(const Element& element, const double* x) {
 }
 
 double energy(const Element& element, const double* x) {
-  const Mat3 s = element.flat ? second_derivatives(element, x)
-                              : Mat3(body_curvature(element, x) - *element.b);
+  const Mat3 s =
+      element.flat ? second_derivatives(element, x) : Mat3(body_curvature(element, x) - *element.b);
   return 0.5 * element.weight * (s * form(element.poisson)).cwiseProduct(s).sum();
 }
 
@@ -210,8 +208,7 @@ double energy_change(const Element& element, const double* x0, const double* x1)
 
 void add_gradient(const Element& element, const double* x, double* g) {
   if (element.flat) {
-    const Mat3 q =
-        second_derivatives(element, x) * (element.weight * form(element.poisson));
+    const Mat3 q = second_derivatives(element, x) * (element.weight * form(element.poisson));
     for (Index i = 0; i < element.size(); ++i) {
       Eigen::Map<Vec3>(g + 3 * element.vertices[i]) += q * element.weights(i);
     }
@@ -263,10 +260,8 @@ void add_hessian(const Element& element,
         }
         block = R * block * R.transpose();
       }
-      linalg::add_block(blocks,
-                        slots[linalg::lower(i, j)],
-                        element.vertices[i] < element.vertices[j],
-                        block);
+      linalg::add_block(blocks, slots[linalg::lower(i, j)],
+                        element.vertices[i] < element.vertices[j], block);
     }
   }
 }
@@ -324,8 +319,7 @@ ScalarBars mixed(const Element& element,
     const Mat3 ds_n = change.ds + cross_columns(change.w, *element.b - *element.b_n);
     const double work_n = (s_n * Q).cwiseProduct(ds_n).sum();
     result.weight += element.damping * work_n;
-    result.poisson +=
-        element.weight * element.damping * (s_n * dQ).cwiseProduct(ds_n).sum();
+    result.poisson += element.weight * element.damping * (s_n * dQ).cwiseProduct(ds_n).sum();
     result.damping = element.weight * work_n;
   }
 
@@ -339,8 +333,7 @@ ScalarBars mixed(const Element& element,
     const Mat3 b_bar = cross_columns(change.w, state.q_n) - change.dq_n;
     const Frame frame_n = frame(base_gradient(element, x_n));
     const Mat3 Y_bar = frame_n.R * b_bar;
-    const Mat32 F_bar =
-        -frame_n.R * rotation_adjoint(frame_n, sum_of_crosses(*element.b_n, b_bar));
+    const Mat32 F_bar = -frame_n.R * rotation_adjoint(frame_n, sum_of_crosses(*element.b_n, b_bar));
     scatter(element, Y_bar, F_bar, bars.x_n);
     if (with_rest) scatter_geometry(element, Y_bar, F_bar, x_n, bars);
   }

@@ -71,10 +71,10 @@ struct ScalarBars {
 
 /// Where the cotangents of the geometry of an element are added. Null pointers are skipped.
 struct GeometryBars {
-  double* c = nullptr;                ///< 3 a vertex
-  mesh::ShapeGradient* g = nullptr;   ///< of the base triangle
+  double* c = nullptr;               ///< 3 a vertex
+  mesh::ShapeGradient* g = nullptr;  ///< of the base triangle
   Mat3* b = nullptr;
-  double* x_n = nullptr;              ///< [N, 3]
+  double* x_n = nullptr;  ///< [N, 3]
 };
 
 /// @param x_n  start of the step, or null where there is none (then element.b_n is not read)

@@ -26,11 +26,8 @@ double energy_change(
   return weight / 8.0 * (strain(F0, F_n) + strain(F1, F_n)).cwiseProduct(dC).sum();
 }
 
-std::array<Mat3, 6> hessian(double weight,
-                            const mesh::ShapeGradient& g,
-                            const Mat32& F,
-                            const Mat32& F_n,
-                            bool positive) {
+std::array<Mat3, 6> hessian(
+    double weight, const mesh::ShapeGradient& g, const Mat32& F, const Mat32& F_n, bool positive) {
   const Mat2 E = positive ? positive_part(strain(F, F_n)) : strain(F, F_n);
   const Mat3 FF = F * F.transpose();
   const double half = 0.5 * weight;

@@ -34,11 +34,8 @@ double energy_change(
 ///   H_pq = weight / 2 [ (g_p^T (C - C_n) g_q) I + (F g_q)(F g_p)^T + (g_p.g_q) F F^T ].
 ///
 /// The projected one keeps the positive part of C - C_n.
-std::array<Mat3, 6> hessian(double weight,
-                            const mesh::ShapeGradient& g,
-                            const Mat32& F,
-                            const Mat32& F_n,
-                            bool positive);
+std::array<Mat3, 6> hessian(
+    double weight, const mesh::ShapeGradient& g, const Mat32& F, const Mat32& F_n, bool positive);
 
 /// Change of the stress along a change G of F.
 Mat32 stress_change(double weight, const Mat32& F, const Mat32& F_n, const Mat32& G);

@@ -16,8 +16,8 @@ Index face_count(const Model& model) { return static_cast<Index>(model.topology-
 
 Mat32 face_gradient(const Model& model, Index f, const double* x) {
   const std::array<Index, 3>& face = model.topology->faces[f];
-  return deformation_gradient(
-      model.rest->shape_gradient[f], row(x, face[0]), row(x, face[1]), row(x, face[2]));
+  return deformation_gradient(model.rest->shape_gradient[f], row(x, face[0]), row(x, face[1]),
+                              row(x, face[2]));
 }
 
 double stretch_weight(const Model& model, Index f) {
@@ -75,11 +75,8 @@ void scatter(const Model& model, Index f, const Mat32& P, double* y) {
 }
 
 /// g_p += F_bar^T x_p, with x relative to the first corner (the gradients sum to zero).
-void scatter_gradient_bar(const Model& model,
-                          Index f,
-                          const Mat32& F_bar,
-                          const double* x,
-                          mesh::ShapeGradient& g_bar) {
+void scatter_gradient_bar(
+    const Model& model, Index f, const Mat32& F_bar, const double* x, mesh::ShapeGradient& g_bar) {
   const std::array<Index, 3>& face = model.topology->faces[f];
   for (int p = 1; p < 3; ++p) {
     g_bar.row(p) += (row(x, face[p]) - row(x, face[0])).transpose() * F_bar;
@@ -98,12 +95,8 @@ void add_face_blocks(const std::array<Index, 3>& face,
   }
 }
 
-void add_face_mixed(const Model& model,
-                    Index f,
-                    const double* x,
-                    const double* z,
-                    bool with_rest,
-                    Bar& bar) {
+void add_face_mixed(
+    const Model& model, Index f, const double* x, const double* z, bool with_rest, Bar& bar) {
   const double k_s = model.stretch[f];
   const double area = model.rest->area[f];
   const Mat32 F = face_gradient(model, f, x);
@@ -119,12 +112,8 @@ void add_face_mixed(const Model& model,
   }
 }
 
-void add_face_damping_mixed(const Model& model,
-                            Index f,
-                            const double* x,
-                            const double* z,
-                            bool with_rest,
-                            Bar& bar) {
+void add_face_damping_mixed(
+    const Model& model, Index f, const double* x, const double* z, bool with_rest, Bar& bar) {
   const double k_s = model.stretch[f];
   const double area = model.rest->area[f];
   const double rate = model.damping[f] / model.h;
@@ -149,12 +138,8 @@ void add_face_damping_mixed(const Model& model,
   }
 }
 
-void add_bending_mixed(const Model& model,
-                       Index e,
-                       const double* x,
-                       const double* z,
-                       bool with_rest,
-                       Bar& bar) {
+void add_bending_mixed(
+    const Model& model, Index e, const double* x, const double* z, bool with_rest, Bar& bar) {
   bending::Element element = bending_element(model, e);
   Mat3 curvature_n;
   if (model.x_n != nullptr) {
@@ -263,14 +248,13 @@ double energy_change(const Model& model, const double* x0, const double* x1) {
     const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
     const Mat32 F0 = face_gradient(model, f, x0);
     const Mat32 F1 = face_gradient(model, f, x1);
-    const Mat32 dF = deformation_gradient(g,
-                                          row(x1, face[0]) - row(x0, face[0]),
+    const Mat32 dF = deformation_gradient(g, row(x1, face[0]) - row(x0, face[0]),
                                           row(x1, face[1]) - row(x0, face[1]),
                                           row(x1, face[2]) - row(x0, face[2]));
     total += stretch::energy_change(stretch_weight(model, f), F0, F1, dF);
     if (is_damped(model, f)) {
-      total += damping::energy_change(
-          damping_weight(model, f), F0, F1, dF, face_gradient(model, f, model.x_n));
+      total += damping::energy_change(damping_weight(model, f), F0, F1, dF,
+                                      face_gradient(model, f, model.x_n));
     }
   }
   for (Index e = 0; e < model.stencils->size(); ++e) {
@@ -304,14 +288,12 @@ void add_hessian(const Model& model,
     const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
     const Index* face_slots = slots.stretch.data() + 6 * static_cast<std::ptrdiff_t>(f);
     const Mat32 F = face_gradient(model, f, x);
-    add_face_blocks(
-        face, face_slots, stretch::hessian(stretch_weight(model, f), g, F, positive), blocks);
+    add_face_blocks(face, face_slots, stretch::hessian(stretch_weight(model, f), g, F, positive),
+                    blocks);
     if (is_damped(model, f)) {
       const Mat32 F_n = face_gradient(model, f, model.x_n);
-      add_face_blocks(face,
-                      face_slots,
-                      damping::hessian(damping_weight(model, f), g, F, F_n, positive),
-                      blocks);
+      add_face_blocks(face, face_slots,
+                      damping::hessian(damping_weight(model, f), g, F, F_n, positive), blocks);
     }
   }
   for (Index slot = 0; slot < slots.block_count; ++slot) {
@@ -336,8 +318,8 @@ void add_hessian_product(const Model& model, const double* x, const double* z, d
     const Mat32 G = face_gradient(model, f, z);
     Mat32 P = stretch::stress_change(stretch_weight(model, f), F, G);
     if (is_damped(model, f)) {
-      P += damping::stress_change(
-          damping_weight(model, f), F, face_gradient(model, f, model.x_n), G);
+      P += damping::stress_change(damping_weight(model, f), F, face_gradient(model, f, model.x_n),
+                                  G);
     }
     scatter(model, f, P, y);
   }

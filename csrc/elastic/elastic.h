@@ -12,10 +12,10 @@ namespace diffcloth::elastic {
 
 /// Slots of the blocks of every element in a BlockPattern.
 struct Slots {
-  Index block_count = 0;              ///< of the pattern
-  std::vector<Index> stretch;         ///< [F, 6] lower-triangle pairs of a face
-  std::vector<Index> bending_start;   ///< [B + 1] into `bending`
-  std::vector<Index> bending;         ///< lower-triangle pairs of each bending element
+  Index block_count = 0;             ///< of the pattern
+  std::vector<Index> stretch;        ///< [F, 6] lower-triangle pairs of a face
+  std::vector<Index> bending_start;  ///< [B + 1] into `bending`
+  std::vector<Index> bending;        ///< lower-triangle pairs of each bending element
 };
 
 /// Vertices that an element couples, for every element: what the pattern of the Hessian is made of.
@@ -28,14 +28,14 @@ Slots slots(const mesh::Topology& topology,
 
 /// What prepare() derives from a Model: constant during one step.
 struct Prepared {
-  std::vector<double> bending;       ///< [B] D of an element times its area
-  std::vector<double> poisson;       ///< [B]
-  std::vector<double> damping;       ///< [B] k_d / h [-]
-  std::vector<std::uint8_t> flat;    ///< [B] no rest curvature and no damping: a constant Hessian
-  std::vector<Mat3> curvature_n;     ///< [B] body-frame curvature at x_n, where damped
-  std::vector<double> constant;      ///< [slots] sum of the flat elements' Hessians, times I
-  bool damped = false;               ///< some face has damping
-  bool bends = false;                ///< some element is not flat
+  std::vector<double> bending;     ///< [B] D of an element times its area
+  std::vector<double> poisson;     ///< [B]
+  std::vector<double> damping;     ///< [B] k_d / h [-]
+  std::vector<std::uint8_t> flat;  ///< [B] no rest curvature and no damping: a constant Hessian
+  std::vector<Mat3> curvature_n;   ///< [B] body-frame curvature at x_n, where damped
+  std::vector<double> constant;    ///< [slots] sum of the flat elements' Hessians, times I
+  bool damped = false;             ///< some face has damping
+  bool bends = false;              ///< some element is not flat
 };
 
 /// The elastic energy of all cloths and its damping over one step.
@@ -43,13 +43,13 @@ struct Model {
   const mesh::Topology* topology = nullptr;
   const mesh::BendingStencils* stencils = nullptr;
   const mesh::RestShape* rest = nullptr;
-  std::vector<double> stretch;   ///< [F] k_s [N/m]
-  std::vector<double> bending;   ///< [F] D [N m]
-  std::vector<double> poisson;   ///< [F] nu [-]
-  std::vector<double> damping;   ///< [F] k_d [s]
-  double h = 0.0;                ///< time step [s]; only damping needs it
-  const double* x_n = nullptr;   ///< [N, 3] start of the step [m]; only damping needs it
-  Prepared prepared;             ///< filled by prepare()
+  std::vector<double> stretch;  ///< [F] k_s [N/m]
+  std::vector<double> bending;  ///< [F] D [N m]
+  std::vector<double> poisson;  ///< [F] nu [-]
+  std::vector<double> damping;  ///< [F] k_d [s]
+  double h = 0.0;               ///< time step [s]; only damping needs it
+  const double* x_n = nullptr;  ///< [N, 3] start of the step [m]; only damping needs it
+  Prepared prepared;            ///< filled by prepare()
 };
 
 /// Fill model.prepared. To be called whenever anything in the model has changed.
@@ -71,11 +71,8 @@ void add_gradient(const Model& model, const double* x, double* g);
 enum class Projection : std::uint8_t { kExact, kPositive };
 
 /// blocks += the Hessian at x, damping included, 9 doubles a slot [N/m].
-void add_hessian(const Model& model,
-                 const Slots& slots,
-                 const double* x,
-                 Projection projection,
-                 double* blocks);
+void add_hessian(
+    const Model& model, const Slots& slots, const double* x, Projection projection, double* blocks);
 
 /// y += H(x) z over all vertices, with the exact Hessian and without a matrix.
 void add_hessian_product(const Model& model, const double* x, const double* z, double* y);

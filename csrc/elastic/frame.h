@@ -30,10 +30,10 @@ inline Mat32 deformation_gradient(const mesh::ShapeGradient& g,
 ///
 ///   S^-1 = [[c22 + d, -c12], [-c12, c11 + d]] / (d t),   R = F S^-1,   n = r1 x r2.
 struct Frame {
-  Mat3 R;      ///< columns r1, r2, n
+  Mat3 R;  ///< columns r1, r2, n
   Mat2 S_inv;
-  double t;    ///< tr S
-  double d;    ///< area ratio, not floored
+  double t;  ///< tr S
+  double d;  ///< area ratio, not floored
 };
 
 inline Frame frame(const Mat32& F) {

@@ -199,8 +199,7 @@ struct CholeskyFactor::Backend {
     rhs.xtype = CHOLMOD_REAL;
     rhs.dtype = CHOLMOD_DOUBLE;
     const SerialOpenMp serial;
-    if (!cholmod_solve2(
-            CHOLMOD_A, factor, &rhs, nullptr, &x, nullptr, &y, &e, &common.c)) {
+    if (!cholmod_solve2(CHOLMOD_A, factor, &rhs, nullptr, &x, nullptr, &y, &e, &common.c)) {
       throw std::runtime_error("CHOLMOD: solve failed");
     }
     const double* solution = static_cast<const double*>(x->x);
@@ -227,12 +226,8 @@ using Sparse = Eigen::SparseMatrix<double, Eigen::ColMajor, Index>;
 using EigenFactor = Eigen::SimplicialLLT<Sparse, Eigen::Lower, Eigen::NaturalOrdering<Index>>;
 
 Eigen::Map<const Sparse> view(const CholeskyAnalysis& a, const double* values) {
-  return {a.dimension(),
-          a.dimension(),
-          static_cast<Index>(a.row.size()),
-          a.column_start.data(),
-          a.row.data(),
-          values};
+  return {a.dimension(),         a.dimension(), static_cast<Index>(a.row.size()),
+          a.column_start.data(), a.row.data(),  values};
 }
 
 }  // namespace

@@ -32,8 +32,7 @@ FitRow<Scalar> fit_row(const std::array<Scalar, 5>& p) {
   const Scalar sqrt2(1.4142135623730951);
   return {.lambda = {Scalar(1.0) - lambda1 - lambda2, lambda1, lambda2},
           .m = {scale * (u * u - lambda1 * length * length - lambda2 * a * a),
-                scale * (sqrt2 * (u * v - lambda2 * a * b)),
-                scale * (v * v - lambda2 * b * b)}};
+                scale * (sqrt2 * (u * v - lambda2 * a * b)), scale * (v * v - lambda2 * b * b)}};
 }
 
 /// Rows of the fit, one an extra point; at least three (rows of zeros change nothing).

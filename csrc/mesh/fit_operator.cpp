@@ -81,9 +81,7 @@ std::array<Scalar, 4> hinge_weights(const std::array<Scalar, 8>& u) {
   const Scalar cot_ad = dot(0, 1, 3) / area_d;
   const Scalar cot_bd = dot(1, 0, 3) / area_d;
   const Scalar scale = sqrt(Scalar(6.0) / (area_c + area_d));
-  return {scale * (cot_bc + cot_bd),
-          scale * (cot_ac + cot_ad),
-          -(scale * (cot_ac + cot_bc)),
+  return {scale * (cot_bc + cot_bd), scale * (cot_ac + cot_ad), -(scale * (cot_ac + cot_bc)),
           -(scale * (cot_ad + cot_bd))};
 }
 

@@ -14,7 +14,7 @@ namespace diffcloth::mesh {
 struct Chart {
   BaseTriangle<double> base;
   int size = 0;
-  std::array<Vec2, kMaxPatch> u;            ///< of each stencil vertex
+  std::array<Vec2, kMaxPatch> u;             ///< of each stencil vertex
   std::array<Foot<double>, kMaxPatch> foot;  ///< of each extra vertex, on its edge
 
   Mat3 frame() const { return Eigen::Map<const Mat3>(base.frame.data()); }

@@ -56,16 +56,15 @@ std::array<std::array<Index, 2>, 2> sides(const Kink& kink) {
 std::vector<double> curvature_operator(const BendingStencils& stencils, const Fits& fits) {
   std::vector<double> result(3 * stencils.vertices.size(), 0.0);
   const auto columns = [&](Index e) {
-    return OperatorMap(
-        result.data() + 3 * stencils.start[e], 3, stencils.start[e + 1] - stencils.start[e]);
+    return OperatorMap(result.data() + 3 * stencils.start[e], 3,
+                       stencils.start[e + 1] - stencils.start[e]);
   };
   for (Index e = 0; e < stencils.size(); ++e) columns(e).leftCols(fits.c[e].cols()) = fits.c[e];
   for (const Kink& kink : stencils.kinks) {
     OperatorMap c = columns(kink.element);
     const Side<double> own = side(base_parameters(fits.chart[kink.element]), kink.corner);
     for (const auto& [e, corner] : sides(kink)) {
-      const SideWeights d =
-          side_weights(side(base_parameters(fits.chart[e]), corner), fits.c[e]);
+      const SideWeights d = side_weights(side(base_parameters(fits.chart[e]), corner), fits.c[e]);
       const std::vector<Index> place = places(stencils, kink.element, e);
       for (std::size_t i = 0; i < place.size(); ++i) {
         c.col(place[i]) -= 0.5 * d(i) * Eigen::Map<const Vec3>(own.N.data());
@@ -229,24 +228,15 @@ void bending_vjp(const BendingStencils& stencils,
     const std::ptrdiff_t offset = 3 * static_cast<std::ptrdiff_t>(stencils.start[e]);
     OperatorMap element_bar(c_bar.data() + offset, 3, size);
     Mat3 frame_bar;
-    curvature_vjp(vertices,
-                  ConstOperatorMap(c.data() + offset, 3, size),
-                  X,
-                  bar.curvature[e],
-                  fits.chart[e].frame(),
-                  frame_bar,
-                  element_bar,
-                  X_bar);
+    curvature_vjp(vertices, ConstOperatorMap(c.data() + offset, 3, size), X, bar.curvature[e],
+                  fits.chart[e].frame(), frame_bar, element_bar, X_bar);
     Eigen::Map<Mat3>(chart_bar[e].frame.data()) = frame_bar;
     fits_bar.c[e] += element_bar.leftCols(fits.c[e].cols());
   }
   for (const Kink& kink : stencils.kinks) {
     const Index e = kink.element;
-    kink_vjp(stencils,
-             fits,
-             kink,
-             ConstOperatorMap(c_bar.data() + 3 * static_cast<std::ptrdiff_t>(stencils.start[e]),
-                              3,
+    kink_vjp(stencils, fits, kink,
+             ConstOperatorMap(c_bar.data() + 3 * static_cast<std::ptrdiff_t>(stencils.start[e]), 3,
                               stencils.start[e + 1] - stencils.start[e]),
              fits_bar);
   }
@@ -263,11 +253,8 @@ void bending_vjp(const BendingStencils& stencils,
   }
 }
 
-void face_vjp(const Topology& topology,
-              Index f,
-              const double* X,
-              const RestShapeBar& bar,
-              double* X_bar) {
+void face_vjp(
+    const Topology& topology, Index f, const double* X, const RestShapeBar& bar, double* X_bar) {
   const std::array<Index, 3>& face = topology.faces[f];
   const Chart local = chart(face, {}, X);
   double area_bar = bar.area[f];
@@ -277,8 +264,7 @@ void face_vjp(const Topology& topology,
   ChartBar local_bar;
   add_area_bar(local, area_bar, local_bar);
 
-  const std::array<Dual3, 3> base =
-      variables<3>({local.base.length, local.base.a, local.base.b});
+  const std::array<Dual3, 3> base = variables<3>({local.base.length, local.base.a, local.base.b});
   const std::array<Dual3, 6> g = shape_gradient(base[0], base[1], base[2]);
   Vec3 base_bar = Vec3::Zero();
   for (int k = 0; k < 6; ++k) base_bar += bar.shape_gradient[f](k / 2, k % 2) * g[k].derivative;
@@ -298,8 +284,7 @@ void fill_faces(const Topology& topology, const double* X, RestShape& rest) {
   for (Index f = 0; f < face_count; ++f) {
     const std::array<Index, 3>& face = topology.faces[f];
     const Chart local = chart(face, {}, X);
-    const std::array<double, 6> g =
-        shape_gradient(local.base.length, local.base.a, local.base.b);
+    const std::array<double, 6> g = shape_gradient(local.base.length, local.base.a, local.base.b);
     for (int k = 0; k < 6; ++k) rest.shape_gradient[f](k / 2, k % 2) = g[k];
     rest.area[f] = local.area();
     for (int p = 0; p < 3; ++p) {
@@ -325,13 +310,11 @@ RestShape rest_shape(const Topology& topology, const BendingStencils& stencils, 
   for (Index e = 0; e < stencils.size(); ++e) {
     const std::span<const Index> vertices = stencils.element(e);
     const ConstOperatorMap c(
-        rest.curvature_operator.data() + 3 * static_cast<std::ptrdiff_t>(stencils.start[e]),
-        3,
+        rest.curvature_operator.data() + 3 * static_cast<std::ptrdiff_t>(stencils.start[e]), 3,
         static_cast<Index>(vertices.size()));
     const bool patch = stencils.model[e] == BendingModel::kPatch;
     rest.bending_area[e] = patch ? fits.chart[e].area() : 1.0;
-    rest.curvature[e] =
-        fits.chart[e].frame().transpose() * second_derivatives(vertices, c, X);
+    rest.curvature[e] = fits.chart[e].frame().transpose() * second_derivatives(vertices, c, X);
   }
   if (rest.area.empty()) return rest;
 

@@ -26,8 +26,8 @@ enum class BendingModel : std::uint8_t { kPatch, kHinge };
 /// derivatives there, so that it also couples the points of its neighbor's quadratic. On grids with
 /// one diagonal and on equilateral meshes there are none away from the boundary.
 struct Kink {
-  Index element, corner;       ///< the side opposite the corner of the base triangle
-  Index other, other_corner;   ///< the same side, as its neighbor sees it
+  Index element, corner;      ///< the side opposite the corner of the base triangle
+  Index other, other_corner;  ///< the same side, as its neighbor sees it
 };
 
 /// Which vertices each bending element couples.
@@ -37,13 +37,13 @@ struct Kink {
 /// then those of its neighbors' quadratics. The choice is made once, from the scene's rest mesh,
 /// and then kept, so that everything is smooth in the rest positions.
 struct BendingStencils {
-  std::vector<Index> start{0};                   ///< [B + 1] into `vertices`
-  std::vector<Index> vertices;                   ///< [start.back()]
-  std::vector<std::array<Index, 2>> faces;       ///< [B] base face; other face of a hinge or -1
-  std::vector<BendingModel> model;               ///< [B]
+  std::vector<Index> start{0};              ///< [B + 1] into `vertices`
+  std::vector<Index> vertices;              ///< [start.back()]
+  std::vector<std::array<Index, 2>> faces;  ///< [B] base face; other face of a hinge or -1
+  std::vector<BendingModel> model;          ///< [B]
   std::vector<Kink> kinks;
-  std::vector<Index> fit_start{0};               ///< [B + 1] into `fit_points`
-  std::vector<Index> fit_points;                 ///< the points of each element's own quadratic
+  std::vector<Index> fit_start{0};  ///< [B + 1] into `fit_points`
+  std::vector<Index> fit_points;    ///< the points of each element's own quadratic
   /// [fit_start.back()] Local edge a -> b that an extra point is unfolded about; it lies to the
   /// right of it. Corners of the base face hold {-1, -1}.
   std::vector<std::array<Index, 2>> unfold_edge;

@@ -81,10 +81,10 @@ void append(const Patch& patch,
             std::array<Index, 2> faces,
             BendingModel model,
             BendingStencils& stencils) {
-  stencils.fit_points.insert(
-      stencils.fit_points.end(), patch.vertices.begin(), patch.vertices.end());
-  stencils.unfold_edge.insert(
-      stencils.unfold_edge.end(), patch.unfold_edge.begin(), patch.unfold_edge.end());
+  stencils.fit_points.insert(stencils.fit_points.end(), patch.vertices.begin(),
+                             patch.vertices.end());
+  stencils.unfold_edge.insert(stencils.unfold_edge.end(), patch.unfold_edge.begin(),
+                              patch.unfold_edge.end());
   stencils.fit_start.push_back(static_cast<Index>(stencils.fit_points.size()));
   stencils.faces.push_back(faces);
   stencils.model.push_back(model);
@@ -104,8 +104,8 @@ struct Outward {
 Outward outward(const BendingStencils& stencils, Index e, Index corner, const double* X) {
   const Chart local = element_chart(stencils, e, X);
   return {.points = stencils.fit(e),
-          .weights = side_weights(side(base_parameters(local), corner),
-                                  fit_operator(stencils, e, local))};
+          .weights =
+              side_weights(side(base_parameters(local), corner), fit_operator(stencils, e, local))};
 }
 
 bool agree(const Outward& s0, const Outward& s1) {
@@ -123,8 +123,7 @@ bool agree(const Outward& s0, const Outward& s1) {
     }
   }
   // Of both, so that the order of the faces does not matter.
-  const double scale =
-      std::max(s0.weights.cwiseAbs().maxCoeff(), s1.weights.cwiseAbs().maxCoeff());
+  const double scale = std::max(s0.weights.cwiseAbs().maxCoeff(), s1.weights.cwiseAbs().maxCoeff());
   return largest < kAgreement * scale;
 }
 

@@ -21,14 +21,8 @@ bool solve_adjoint(const Objective& f,
   const Hessian hessian = assemble(f, x, contacts, contact::Curvature::kExact);
   const linalg::BlockPattern& pattern = hessian.assembly->merged.pattern;
   const auto polish = [&](const linalg::CholeskyFactor& preconditioner) {
-    return linalg::conjugate_gradient(pattern,
-                                      hessian.blocks.data(),
-                                      *f.prescribed,
-                                      preconditioner,
-                                      b,
-                                      kTolerance,
-                                      kIterations,
-                                      z);
+    return linalg::conjugate_gradient(pattern, hessian.blocks.data(), *f.prescribed, preconditioner,
+                                      b, kTolerance, kIterations, z);
   };
   if (!polish(factor)) {
     linalg::CholeskyFactor fresh(hessian.assembly->analysis);

@@ -35,8 +35,10 @@ constexpr double kChordContraction = 0.1;
 constexpr double kFirstShift = 0.1;
 constexpr double kShiftGrowth = 4.0;
 constexpr double kShiftDecay = 0.3;
-/// Element-wise projection is tried this often after indefinite Hessians; then the shift.
+/// After an indefinite Hessian the elements are projected: this often, and as long as steps are
+/// larger than kFar [m/s]. Then the Hessian is shifted, which converges where projection crawls.
 constexpr int kProjections = 3;
+constexpr double kFar = 0.1;
 /// Sufficient decrease, and the slope that replaces it where the change drowns in rounding.
 constexpr double kArmijo = 1e-4;
 constexpr double kWolfeSlope = 0.8;
@@ -51,6 +53,8 @@ constexpr double kNearFloor = 1e-4;  // [m/s]
 /// A prescribed motion is stuck when this many iterations move it by less than this fraction.
 constexpr int kStuckIterations = 20;
 constexpr double kStuckProgress = 1e-3;
+/// A joint step that leaves more than this share of the motion is followed by a relaxation.
+constexpr double kStopped = 0.5;
 
 double dot(const std::vector<double>& a, const std::vector<double>& b) {
   double sum = 0.0;
@@ -80,11 +84,9 @@ class Minimizer {
  private:
   bool start_from(const std::vector<double>& guess);
   bool arrive();
+  void relax();
   bool joint_step(const std::vector<double>& ends, double& remaining);
   void descend();
-
-  /// How far a search went: the whole step, a part of it, as far as rounding can tell, not at all.
-  enum class Move : std::uint8_t { kWhole, kPart, kRounded, kNone };
 
   bool take_direction();
   bool factor(Hessian& hessian, double shift);
@@ -93,7 +95,8 @@ class Minimizer {
   bool exact_direction();
   void positive_direction();
   void shifted_direction();
-  Move search();
+  double change(const std::vector<double>& to);
+  bool search();
   bool escape_saddle();
 
   void detect(const std::vector<double>& to);
@@ -124,9 +127,10 @@ class Minimizer {
 
   Mode mode_ = Mode::kExact;
   bool chord_allowed_ = false;
+  bool limited_ = false;  // whether collision detection cut the last step short
   double last_step_ = std::numeric_limits<double>::infinity();
-  int indefinite_ = 0;      // exact Hessians that were not positive definite
-  int skip_exact_ = 0;      // iterations for which the exact Hessian is not tried
+  int indefinite_ = 0;  // exact Hessians that were not positive definite
+  int skip_exact_ = 0;  // iterations for which the exact Hessian is not tried
   double shift_ = kFirstShift;
   std::shared_ptr<linalg::CholeskyFactor> shifted_factor_;
 };
@@ -134,8 +138,8 @@ class Minimizer {
 void Minimizer::detect(const std::vector<double>& to) {
   if (context_.broad_phase == nullptr) return;
   const Timer timer(*context_.seconds, Phase::kDetection);
-  context_.broad_phase->find(
-      x_.data(), to.data(), f_.contact->reach(), *context_.scratch, candidates_);
+  context_.broad_phase->find(x_.data(), to.data(), f_.contact->reach(), *context_.scratch,
+                             candidates_);
 }
 
 double Minimizer::safe_fraction(const std::vector<double>& to) const {
@@ -143,11 +147,9 @@ double Minimizer::safe_fraction(const std::vector<double>& to) const {
   const Timer timer(*context_.seconds, Phase::kDetection);
   double alpha = 1.0;
   for (const Candidate& pair : candidates_) {
-    alpha = std::min(alpha,
-                     contact::safe_step(pair.kind,
-                                        contact::corners(pair.vertices, x_.data()),
-                                        contact::corners(pair.vertices, to.data()),
-                                        f_.contact->xi(pair)));
+    alpha = std::min(alpha, contact::safe_step(
+                                pair.kind, contact::corners(pair.vertices, x_.data()),
+                                contact::corners(pair.vertices, to.data()), f_.contact->xi(pair)));
     if (alpha == 0.0) break;
   }
   return alpha;
@@ -209,8 +211,8 @@ bool Minimizer::joint_step(const std::vector<double>& ends, double& remaining) {
   {
     const Timer timer(*context_.seconds, Phase::kAssembly);
     hessian = assemble(f_, x_.data(), contacts_, Curvature::kPositive);
-    add_prescribed_product(
-        f_, hessian, x_.data(), contacts_, Curvature::kPositive, d.data(), g_.data());
+    add_prescribed_product(f_, hessian, x_.data(), contacts_, Curvature::kPositive, d.data(),
+                           g_.data());
   }
   // Positive by construction: M/h^2 plus positive semi-definite parts.
   if (!factor(hessian, 0.0)) return false;
@@ -230,6 +232,13 @@ bool Minimizer::joint_step(const std::vector<double>& ends, double& remaining) {
   record();
   remaining *= 1.0 - alpha;
   return true;
+}
+
+/// One step of the free vertices alone: reopens gaps that a blocked joint step has closed.
+void Minimizer::relax() {
+  refresh();
+  positive_direction();
+  search();
 }
 
 /// Move the prescribed vertices to their ends. False when the motion is infeasible.
@@ -255,10 +264,12 @@ bool Minimizer::arrive() {
         checked = remaining;
       }
       ++out_.iterations;
+      const double before = remaining;
       if (!joint_step(ends, remaining)) {
         out_.motion_fraction = (k + 1.0 - remaining) / portions;
         return false;
       }
+      if (remaining > kStopped * before) relax();
     }
   }
   return true;
@@ -323,13 +334,14 @@ void Minimizer::shifted_direction() {
 /// vanishes: a saddle.
 bool Minimizer::take_direction() {
   if (chord()) return true;
+  const bool far = indefinite_ <= kProjections || last_step_ > kFar * f_.h;
   if (skip_exact_ > 0) {
     --skip_exact_;
   } else {
     if (exact_direction()) return true;
-    skip_exact_ = indefinite_ <= kProjections ? 1 : 0;
+    skip_exact_ = far ? 1 : 0;
   }
-  if (indefinite_ <= kProjections) {
+  if (far) {
     positive_direction();
   } else {
     shifted_direction();
@@ -339,29 +351,33 @@ bool Minimizer::take_direction() {
   return exact_direction();
 }
 
-/// Move along p_ by the largest collision-free fraction that decreases the objective.
-Minimizer::Move Minimizer::search() {
+/// Objective at `to` minus that at x_, from the current candidates.
+double Minimizer::change(const std::vector<double>& to) {
+  const Timer timer(*context_.seconds, Phase::kLineSearch);
+  if (f_.contact != nullptr) f_.contact->energies(candidates_, to.data(), trial_energies_);
+  return f_.energy_change(x_.data(), energies_, to.data(), trial_energies_);
+}
+
+/// Move along p_ by the largest collision-free fraction that decreases the objective. False when
+/// rounding leaves nothing to gain.
+bool Minimizer::search() {
   std::vector<double> to = moved(1.0);
   detect(to);
   const double safe = safe_fraction(to);
-  const Timer timer(*context_.seconds, Phase::kLineSearch);
+  limited_ = safe < 1.0;
   const double slope = dot(g_, p_);
   if (f_.contact != nullptr) f_.contact->energies(candidates_, x_.data(), energies_);
   const double noise = kEnergyNoise * std::abs(f_.energy(x_.data(), energies_));
 
-  bool rounding = true;  // nothing but rounding has stood in the way
   double alpha = safe;
   chord_allowed_ = false;
   for (int backtrack = 0; backtrack < kBacktracks; ++backtrack, alpha *= 0.5) {
     context_.checkpoint->check();
     if (alpha < 1.0) to = moved(alpha);
-    if (f_.contact != nullptr) f_.contact->energies(candidates_, to.data(), trial_energies_);
-    const double change = f_.energy_change(x_.data(), energies_, to.data(), trial_energies_);
-    const bool decreased = change <= kArmijo * alpha * slope;
-    if (!decreased && !(std::abs(change) <= noise)) {
-      rounding = false;
-      continue;
-    }
+    const double gain = change(to);
+    const bool decreased = gain <= kArmijo * alpha * slope;
+    if (!decreased && !(std::abs(gain) <= noise)) continue;
+
     x_.swap(to);
     std::vector<double> g_before = g_;
     refresh();
@@ -373,11 +389,9 @@ Minimizer::Move Minimizer::search() {
     }
     record();
     chord_allowed_ = mode_ == Mode::kExact && alpha == 1.0;
-    if (alpha == 1.0) return Move::kWhole;
-    if (mode_ == Mode::kExact && !contacts_.empty()) skip_exact_ = 1;
-    return safe == 1.0 && rounding ? Move::kRounded : Move::kPart;
+    return true;
   }
-  return safe == 1.0 && rounding ? Move::kRounded : Move::kNone;
+  return false;
 }
 
 /// Leave a saddle along the most negative direction of the Hessian, found by inverse iteration on
@@ -407,8 +421,7 @@ bool Minimizer::escape_saddle() {
   f_.hessian_product(x_.data(), contacts_, d.data(), product);
   if (!(dot(d, product) < 0.0)) return false;
   // The largest component decides the sign; ties go to the first.
-  const auto top = std::ranges::max_element(
-      d, {}, [](double value) { return std::abs(value); });
+  const auto top = std::ranges::max_element(d, {}, [](double value) { return std::abs(value); });
   // The distance that a speed of 1 m/s covers in a step: the search shortens it where needed.
   const double length = f_.h * 1.0 * (*top < 0.0 ? -1.0 : 1.0);
   for (std::size_t i = 0; i < d.size(); ++i) p_[i] = length * d[i];
@@ -419,8 +432,7 @@ bool Minimizer::escape_saddle() {
   if (f_.contact != nullptr) f_.contact->energies(candidates_, x_.data(), energies_);
   for (int backtrack = 0; backtrack < kBacktracks; ++backtrack, alpha *= 0.5) {
     to = moved(alpha);
-    if (f_.contact != nullptr) f_.contact->energies(candidates_, to.data(), trial_energies_);
-    if (f_.energy_change(x_.data(), energies_, to.data(), trial_energies_) < 0.0) {
+    if (change(to) < 0.0) {
       x_ = to;
       record();
       refresh();
@@ -446,13 +458,14 @@ void Minimizer::descend() {
     }
     const double step = largest(p_);
     if (mode_ == Mode::kExact) out_.residual = step / f_.h;
-    const Move move = step <= kResolution * largest(x_) ? Move::kRounded : search();
-    if (mode_ == Mode::kExact && step < f_.h * tolerance &&
-        (move == Move::kWhole || move == Move::kRounded)) {
+    limited_ = false;
+    const bool moved_on = step > kResolution * largest(x_) && search();
+    // Such a step descends unless rounding is in the way, and then it has nowhere better to go.
+    if (mode_ == Mode::kExact && step < f_.h * tolerance && !limited_) {
       out_.status = Status::kConverged;
       return;
     }
-    if (move == Move::kNone || move == Move::kRounded) {
+    if (!moved_on) {
       // A chord step may fail where a fresh factor succeeds, a projection where a shift does.
       last_step_ = 0.0;
       if (mode_ == Mode::kExact && out_.factored_at != x_) continue;

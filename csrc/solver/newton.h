@@ -49,8 +49,8 @@ struct Context {
 struct Outcome {
   Status status = Status::kNotConverged;
   int iterations = 0;
-  double residual = 0.0;         ///< |p|_inf / h of the last full Newton step [m/s]
-  double motion_fraction = 1.0;  ///< of the prescribed motion that was reached
+  double residual = 0.0;                   ///< |p|_inf / h of the last full Newton step [m/s]
+  double motion_fraction = 1.0;            ///< of the prescribed motion that was reached
   std::vector<contact::Contact> contacts;  ///< at the solution
   std::vector<double> factored_at;         ///< where the last exact Hessian was factored
   std::shared_ptr<const linalg::CholeskyFactor> factor;
@@ -74,9 +74,7 @@ Outcome minimize(const Objective& objective,
 
 /// The exact Hessian at `x` factored as minimize() does it; null when it is not positive definite.
 std::shared_ptr<const linalg::CholeskyFactor> factor_exact(
-    const Objective& objective,
-    const double* x,
-    const std::vector<contact::Contact>& contacts);
+    const Objective& objective, const double* x, const std::vector<contact::Contact>& contacts);
 
 /// Contacts at x, found from scratch.
 std::vector<contact::Contact> contacts_at(const Objective& objective,

@@ -27,8 +27,7 @@ std::shared_ptr<const Assembly> AssemblyCache::find(const Key& pairs) {
   }
   auto assembly = std::make_shared<Assembly>();
   assembly->merged = linalg::merge(base_, pairs);
-  assembly->analysis =
-      std::make_shared<linalg::CholeskyAnalysis>(assembly->merged.pattern, fixed_);
+  assembly->analysis = std::make_shared<linalg::CholeskyAnalysis>(assembly->merged.pattern, fixed_);
   const std::lock_guard lock(mutex_);
   entries_.emplace_front(pairs, assembly);
   if (entries_.size() > kCapacity) entries_.pop_back();
@@ -74,8 +73,7 @@ void Objective::gradient(const double* x,
   g.assign(3 * static_cast<std::size_t>(vertex_count), 0.0);
   const double inv_h_sq = 1.0 / (h * h);
   for (Index i = 0; i < cloth_vertex_count; ++i) {
-    Eigen::Map<Vec3>(g.data() + 3 * i) =
-        metric[i] * inv_h_sq * (row(x, i) - row(target.data(), i));
+    Eigen::Map<Vec3>(g.data() + 3 * i) = metric[i] * inv_h_sq * (row(x, i) - row(target.data(), i));
   }
   if (elastic != nullptr) elastic::add_gradient(*elastic, x, g.data());
   if (anchors != nullptr) elastic::add_gradient(*anchors, x, g.data());
@@ -177,9 +175,7 @@ Hessian assemble(const Objective& f,
         .array() += f.metric[i] * inv_h_sq;
   }
   if (f.elastic != nullptr) {
-    elastic::add_hessian(*f.elastic,
-                         *f.slots,
-                         x,
+    elastic::add_hessian(*f.elastic, *f.slots, x,
                          curvature == Curvature::kExact ? elastic::Projection::kExact
                                                         : elastic::Projection::kPositive,
                          base_blocks.data());
@@ -194,19 +190,16 @@ Hessian assemble(const Objective& f,
   } else {
     result.blocks.assign(9 * static_cast<std::size_t>(merged.pattern.block_count()), 0.0);
     for (Index k = 0; k < base.block_count(); ++k) {
-      std::copy_n(base_blocks.data() + 9 * static_cast<std::ptrdiff_t>(k),
-                  9,
+      std::copy_n(base_blocks.data() + 9 * static_cast<std::ptrdiff_t>(k), 9,
                   result.blocks.data() + 9 * static_cast<std::ptrdiff_t>(merged.slot_of_base[k]));
     }
   }
   for (const Contact& k : contacts) {
-    add_pair(f, merged.pattern, k.pair.vertices, f.contact->hessian(k, x, curvature), result.blocks);
+    add_pair(f, merged.pattern, k.pair.vertices, f.contact->hessian(k, x, curvature),
+             result.blocks);
   }
   for (const contact::FrictionSet::Entry& k : f.friction.entries()) {
-    add_pair(f,
-             merged.pattern,
-             k.lag.pair.vertices,
-             f.friction.hessian(k, f.x_start, x, curvature),
+    add_pair(f, merged.pattern, k.lag.pair.vertices, f.friction.hessian(k, f.x_start, x, curvature),
              result.blocks);
   }
   return result;
@@ -233,8 +226,8 @@ void add_prescribed_product(const Objective& f,
     }
   }
   if (moves) {
-    linalg::add_product(
-        hessian.assembly->merged.pattern, hessian.blocks.data(), pins.data(), product.data());
+    linalg::add_product(hessian.assembly->merged.pattern, hessian.blocks.data(), pins.data(),
+                        product.data());
     for (Index i = 0; i < f.cloth_vertex_count; ++i) {
       if (!f.is_free(i)) continue;
       for (Index a = 3 * i; a < 3 * i + 3; ++a) out[a] += product[a];
@@ -246,7 +239,8 @@ void add_prescribed_product(const Objective& f,
   }
   for (const contact::FrictionSet::Entry& k : f.friction.entries()) {
     if (std::ranges::all_of(k.lag.pair.vertices, [&](Index v) { return f.is_free(v); })) continue;
-    add_pair_product(f, k.lag.pair.vertices, f.friction.hessian(k, f.x_start, x, curvature), d, out);
+    add_pair_product(f, k.lag.pair.vertices, f.friction.hessian(k, f.x_start, x, curvature), d,
+                     out);
   }
 }
 

@@ -64,9 +64,7 @@ struct Bars {
 };
 
 /// Which inputs want a gradient beyond the state's.
-bool wants_rest(const Gradients& gradients) {
-  return gradients[Input::kRestPositions] != nullptr;
-}
+bool wants_rest(const Gradients& gradients) { return gradients[Input::kRestPositions] != nullptr; }
 
 class Adjoint {
  public:
@@ -119,8 +117,8 @@ std::shared_ptr<const linalg::CholeskyFactor> Adjoint::factor(const solver::Obje
                                                               const double* factored_at) {
   if (index < factors_.size() && factors_[index]) return factors_[index];
   const Array x = p_.with_bodies_at_end(factored_at);
-  auto result = solver::factor_exact(
-      f, x.data(), solver::contacts_at(f, x.data(), p_.broad_phase(), &scratch_));
+  auto result = solver::factor_exact(f, x.data(),
+                                     solver::contacts_at(f, x.data(), p_.broad_phase(), &scratch_));
   if (!result) throw std::domain_error("the Hessian is not positive definite at the solution");
   return result;
 }
@@ -136,8 +134,7 @@ Array Adjoint::solve(const solver::Objective& f,
   std::copy(g.begin(), g.end(), b.begin());
   Array forces(bars_.all, 0.0);
   if (force_bar != nullptr) {
-    std::copy(force_bar->begin(),
-              force_bar->end(),
+    std::copy(force_bar->begin(), force_bar->end(),
               forces.begin() + static_cast<std::ptrdiff_t>(bars_.cloth));
     Array coupling;
     f.hessian_product(x.data(), contacts, forces.data(), coupling);
@@ -175,10 +172,7 @@ void Adjoint::accumulate(const solver::Objective& f,
     elastic::add_mixed(*f.elastic, x.data(), zhat.data(), wants_rest(gradients_), bars_.elastic);
   }
   if (f.anchors != nullptr) {
-    elastic::add_mixed(*f.anchors,
-                       x.data(),
-                       zhat.data(),
-                       bars_.anchor_stiffness.data(),
+    elastic::add_mixed(*f.anchors, x.data(), zhat.data(), bars_.anchor_stiffness.data(),
                        bars_.anchor_target.data());
   }
   if (f.contact != nullptr) {
@@ -204,15 +198,14 @@ void Adjoint::sweep_contact(Array g, const Array& force_bar, const Checkpoint& c
     }
     const std::vector<Contact> contacts =
         solver::contacts_at(f, x.data(), p_.broad_phase(), &scratch_);
-    const auto preconditioner =
-        factor(f, first_factor + k, tape_.factored + k * bars_.cloth);
-    const Array zhat = solve(
-        f, x, contacts, *preconditioner, g, k + 1 == solves ? &force_bar : nullptr);
+    const auto preconditioner = factor(f, first_factor + k, tape_.factored + k * bars_.cloth);
+    const Array zhat =
+        solve(f, x, contacts, *preconditioner, g, k + 1 == solves ? &force_bar : nullptr);
     accumulate(f, x, contacts, g, zhat);
 
     Array lag_bar(bars_.all, 0.0);
-    f.friction.add_mixed(
-        f.x_start, x.data(), zhat.data(), x_lag.data(), -1.0, bars_.contact, lag_bar.data());
+    f.friction.add_mixed(f.x_start, x.data(), zhat.data(), x_lag.data(), -1.0, bars_.contact,
+                         lag_bar.data());
     if (k == 0) {
       for (std::size_t a = 0; a < bars_.all; ++a) bars_.start[a] += lag_bar[a];
     } else {
@@ -269,8 +262,7 @@ void Adjoint::run(const Cotangents& cotangents, const Checkpoint& checkpoint) {
     g[a] = cotangents.positions[a] + cotangents.velocities[a] / p_.h;
     bars_.start[a] -= cotangents.velocities[a] / p_.h;
   }
-  const Array force_bar(cotangents.body_forces,
-                        cotangents.body_forces + (bars_.all - bars_.cloth));
+  const Array force_bar(cotangents.body_forces, cotangents.body_forces + (bars_.all - bars_.cloth));
   sweep_contact(std::move(g), force_bar, checkpoint);
   if (p_.split()) sweep_elastic_stage();
   for (std::size_t i = 0; i < bars_.masses.size(); ++i) bars_.masses[i] += bars_.metric[i];
@@ -377,11 +369,8 @@ void Adjoint::write_rest() {
     rest.edge_length_sq[e] += bars_.contact.rest.edge_length_sq[e];
   }
   const double* X = p_.inputs.data(Input::kRestPositions);
-  mesh::rest_shape_vjp(p_.scene.topology,
-                       p_.scene.stencils,
-                       X != nullptr ? X : p_.scene.given.rest_vertices.data(),
-                       rest,
-                       out);
+  mesh::rest_shape_vjp(p_.scene.topology, p_.scene.stencils,
+                       X != nullptr ? X : p_.scene.given.rest_vertices.data(), rest, out);
 }
 
 }  // namespace

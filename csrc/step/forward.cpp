@@ -19,9 +19,8 @@ class Motion : public solver::PrescribedMotion {
     const double* to = problem.inputs.data(Input::kBodyTargets);
     double turn = 0.0;
     for (Index k = 0; k < problem.scene.given.bodies.count(); ++k) {
-      turn = std::max(turn,
-                      bodies::angle(Eigen::Map<const bodies::Pose>(from + 7 * k),
-                                    Eigen::Map<const bodies::Pose>(to + 7 * k)));
+      turn = std::max(turn, bodies::angle(Eigen::Map<const bodies::Pose>(from + 7 * k),
+                                          Eigen::Map<const bodies::Pose>(to + 7 * k)));
     }
     portions_ = std::max(1, static_cast<int>(std::ceil(turn / kLargestTurn)));
   }
@@ -39,8 +38,7 @@ class Motion : public solver::PrescribedMotion {
       Eigen::Map<Vec3>(x + 3 * i) = last ? to : Vec3(from + s * (to - from));
     }
     if (last) {
-      std::copy(problem_.ends.begin() + static_cast<std::ptrdiff_t>(cloth),
-                problem_.ends.end(),
+      std::copy(problem_.ends.begin() + static_cast<std::ptrdiff_t>(cloth), problem_.ends.end(),
                 x + cloth);
       return;
     }
@@ -50,8 +48,7 @@ class Motion : public solver::PrescribedMotion {
     for (Index b = 0; b < scene.given.bodies.count(); ++b) {
       Eigen::Map<bodies::Pose>(poses.data() + 7 * b) =
           bodies::interpolate(Eigen::Map<const bodies::Pose>(from + 7 * b),
-                              Eigen::Map<const bodies::Pose>(to + 7 * b),
-                              s);
+                              Eigen::Map<const bodies::Pose>(to + 7 * b), s);
     }
     scene.given.bodies.place(poses.data(), x + cloth);
   }
@@ -116,8 +113,7 @@ void finish_report(const Scene& scene, const solver::Outcome& outcome, Report& r
   report.contact_count = static_cast<Index>(outcome.contacts.size());
   report.minimum_distance = std::numeric_limits<double>::infinity();
   for (const contact::Contact& k : outcome.contacts) {
-    report.minimum_distance =
-        std::min(report.minimum_distance, std::sqrt(k.closest.d_sq) - k.xi);
+    report.minimum_distance = std::min(report.minimum_distance, std::sqrt(k.closest.d_sq) - k.xi);
   }
   if (report.result == Result::kInfeasibleMotion) {
     report.message = "in contact: " + blockers(scene, outcome.contacts);
@@ -157,8 +153,8 @@ Report forward(const Scene& scene,
 
   std::copy_n(problem.start.begin(), cloth, outputs.positions);
   if (problem.contact) {
-    report.message = find_overlap(
-        scene, problem.start.data(), problem.contact->parameters().thickness, scratch);
+    report.message =
+        find_overlap(scene, problem.start.data(), problem.contact->parameters().thickness, scratch);
     if (!report.message.empty()) {
       report.result = Result::kIntersectingStart;
       return report;

@@ -33,11 +33,10 @@ enum class Input : std::uint8_t {
 };
 inline constexpr std::size_t kInputCount = 20;
 inline constexpr std::array<const char*, kInputCount> kInputNames{
-    "positions",         "velocities",       "body_poses",       "body_targets",
-    "pin_targets",       "soft_pin_targets", "forces",           "gravity",
-    "stretch",           "bending",          "poisson",          "density",
-    "damping",           "friction",         "thickness",        "barrier_stiffness",
-    "barrier_distance",  "slip_velocity",    "pin_stiffness",    "rest_positions"};
+    "positions",         "velocities",       "body_poses",    "body_targets",  "pin_targets",
+    "soft_pin_targets",  "forces",           "gravity",       "stretch",       "bending",
+    "poisson",           "density",          "damping",       "friction",      "thickness",
+    "barrier_stiffness", "barrier_distance", "slip_velocity", "pin_stiffness", "rest_positions"};
 
 /// One environment's input: a flat array, absent where data is null.
 struct View {

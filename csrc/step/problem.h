@@ -22,13 +22,13 @@ class Problem {
   const Inputs& inputs;
   double h;
 
-  const mesh::RestShape* rest;         ///< the scene's, or that of the rest_positions input
+  const mesh::RestShape* rest;  ///< the scene's, or that of the rest_positions input
   contact::RestMeasures measures;
-  std::vector<double> density;         ///< [F]
-  std::vector<double> masses;          ///< [N] lumped [kg]
-  std::vector<double> predicted;       ///< xhat = x_n + h v_n + h^2 M^-1 f_ext [3 N]
-  std::vector<double> start;           ///< x_n and o_n: all vertices at the start of the step
-  std::vector<double> ends;            ///< like start, prescribed vertices at their targets
+  std::vector<double> density;    ///< [F]
+  std::vector<double> masses;     ///< [N] lumped [kg]
+  std::vector<double> predicted;  ///< xhat = x_n + h v_n + h^2 M^-1 f_ext [3 N]
+  std::vector<double> start;      ///< x_n and o_n: all vertices at the start of the step
+  std::vector<double> ends;       ///< like start, prescribed vertices at their targets
   elastic::Model elastic;
   std::vector<double> anchor_stiffness;  ///< [Q]
   elastic::Anchors anchors;
@@ -45,9 +45,7 @@ class Problem {
   std::vector<double> stage_metric() const;
 
   bool split() const { return scene.given.scheme == Scheme::kSplit; }
-  const contact::BroadPhase* broad_phase() const {
-    return contact ? &scene.broad_phase : nullptr;
-  }
+  const contact::BroadPhase* broad_phase() const { return contact ? &scene.broad_phase : nullptr; }
 
   /// All vertices, with these cloth positions and the bodies at their targets.
   std::vector<double> with_bodies_at_end(const double* cloth_positions) const;
@@ -62,6 +60,9 @@ class Problem {
 std::vector<double> spread(const View& view, const std::vector<Index>& owner);
 
 /// Adjoint of spread(): out += the sums, in order.
-void gather(const std::vector<double>& bar, const std::vector<Index>& owner, View view, double* out);
+void gather(const std::vector<double>& bar,
+            const std::vector<Index>& owner,
+            View view,
+            double* out);
 
 }  // namespace diffcloth::step

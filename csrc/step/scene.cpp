@@ -11,19 +11,16 @@ contact::CollisionMesh make_collision_mesh(const Description& d) {
   const auto cloths = static_cast<Index>(d.bending_models.size());
   std::vector<std::array<Index, 3>> faces = d.faces;
   for (const auto& face : d.body_faces) {
-    faces.push_back(
-        {face[0] + cloth_vertices, face[1] + cloth_vertices, face[2] + cloth_vertices});
+    faces.push_back({face[0] + cloth_vertices, face[1] + cloth_vertices, face[2] + cloth_vertices});
   }
   std::vector<Index> surface(static_cast<std::size_t>(cloth_vertices + d.bodies.vertex_count()));
   for (Index c = 0; c < cloths; ++c) {
     std::fill(surface.begin() + d.cloth_vertex_start[c],
-              surface.begin() + d.cloth_vertex_start[c + 1],
-              c);
+              surface.begin() + d.cloth_vertex_start[c + 1], c);
   }
   for (Index k = 0; k < d.bodies.count(); ++k) {
     std::fill(surface.begin() + cloth_vertices + d.bodies.vertex_start[k],
-              surface.begin() + cloth_vertices + d.bodies.vertex_start[k + 1],
-              cloths + k);
+              surface.begin() + cloth_vertices + d.bodies.vertex_start[k + 1], cloths + k);
   }
   return {std::move(faces), std::move(surface), cloths, d.self_contact};
 }
@@ -35,14 +32,14 @@ std::vector<double> reference_positions(const Description& d) {
   return x;
 }
 
-contact::RestMeasures make_body_measures(const Description& d,
-                                         const contact::CollisionMesh& mesh) {
+contact::RestMeasures make_body_measures(const Description& d, const contact::CollisionMesh& mesh) {
   contact::RestMeasures m;
   m.vertex_area.assign(static_cast<std::size_t>(mesh.vertex_count), 0.0);
   m.edge_area.assign(mesh.edges.size(), 0.0);
   m.edge_length_sq.assign(mesh.edges.size(), 0.0);
   m.face_area.assign(static_cast<std::size_t>(mesh.cloth_face_count), 0.0);
-  const double* y = d.bodies.vertices.data() - 3 * static_cast<std::ptrdiff_t>(mesh.cloth_vertex_count);
+  const double* y =
+      d.bodies.vertices.data() - 3 * static_cast<std::ptrdiff_t>(mesh.cloth_vertex_count);
   std::vector<double> area(mesh.faces.size(), 0.0);
   for (std::size_t f = mesh.cloth_face_count; f < mesh.faces.size(); ++f) {
     const auto& v = mesh.faces[f];
@@ -119,10 +116,9 @@ namespace {
 std::string describe(const Scene& scene, const char* kind, std::initializer_list<Index> vertices) {
   const Index surface = scene.collision_mesh.vertex_surface[*vertices.begin()];
   const bool is_cloth = surface < scene.cloth_count();
-  const Index first =
-      is_cloth ? scene.given.cloth_vertex_start[surface]
-               : scene.cloth_vertex_count() +
-                     scene.given.bodies.vertex_start[surface - scene.cloth_count()];
+  const Index first = is_cloth ? scene.given.cloth_vertex_start[surface]
+                               : scene.cloth_vertex_count() +
+                                     scene.given.bodies.vertex_start[surface - scene.cloth_count()];
   std::string text = (is_cloth ? "cloth " : "body ") +
                      std::to_string(is_cloth ? surface : surface - scene.cloth_count()) + " " +
                      kind + " (";

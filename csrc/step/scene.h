@@ -24,8 +24,8 @@ struct Description {
   std::vector<double> vertices;       ///< [3 N] initial positions [m]
   std::vector<double> rest_vertices;  ///< [3 N] rest positions [m]
   std::vector<std::array<Index, 3>> faces;
-  std::vector<Index> cloth_vertex_start;  ///< [C + 1]
-  std::vector<Index> cloth_face_start;    ///< [C + 1]
+  std::vector<Index> cloth_vertex_start;           ///< [C + 1]
+  std::vector<Index> cloth_face_start;             ///< [C + 1]
   std::vector<mesh::BendingModel> bending_models;  ///< [C]
   std::vector<Index> pins;                         ///< [P]
   std::vector<Index> soft_pins;                    ///< [Q]
@@ -53,7 +53,7 @@ struct Scene {
   std::vector<Index> face_cloth;    ///< [F]
   std::vector<Index> vertex_cloth;  ///< [N]
   mesh::BendingStencils stencils;
-  mesh::RestShape rest;             ///< of given.rest_vertices
+  mesh::RestShape rest;  ///< of given.rest_vertices
   contact::CollisionMesh collision_mesh;
   contact::RestMeasures body_measures;  ///< the bodies' part; cloth entries are zero
   contact::BroadPhase broad_phase;

@@ -15,9 +15,9 @@ namespace diffcloth::step {
 /// them, and a factor is found in the cache or made again where it was made: the same bits.
 template <class T, class Integer>
 struct BasicTape {
-  T* iterates = nullptr;    ///< [K, N, 3] the solution of each friction iteration
-  T* factored = nullptr;    ///< [K, N, 3] where its last Hessian was factored
-  T* elastic = nullptr;     ///< [2, N, 3] `split`: x^D, and where the elastic Hessian was factored
+  T* iterates = nullptr;  ///< [K, N, 3] the solution of each friction iteration
+  T* factored = nullptr;  ///< [K, N, 3] where its last Hessian was factored
+  T* elastic = nullptr;   ///< [2, N, 3] `split`: x^D, and where the elastic Hessian was factored
   Integer* solves = nullptr;  ///< [1] friction iterations that were made
   Integer* key = nullptr;     ///< [1] of the factors in the cache
 };

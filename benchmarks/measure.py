@@ -1,0 +1,210 @@
+"""Times of steps, forward and backward, and of the reference factorization beside them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from statistics import median
+from typing import Any
+
+import ipctk
+import numpy as np
+import torch
+
+import diffcloth_torch as dc
+from benchmarks.scenes import DT, Scene
+from diffcloth_torch.poses import transform
+from diffcloth_torch.step import as_array
+
+BLOCK = 5  # steps between two reference factorizations
+WARM_UP = 2  # steps with backward whose times are dropped: caches fill
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median and quartiles."""
+
+    median: float
+    lower: float
+    upper: float
+
+    @staticmethod
+    def of(values: list[float]) -> Spread:
+        lower, middle, upper = np.quantile(values, [0.25, 0.5, 0.75]).tolist()
+        return Spread(middle, lower, upper)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """One row of the table; times are per environment.
+
+    Attributes:
+        scene: Its name.
+        size: Vertices along a side.
+        batch: Environments, 0 for a state without a batch axis.
+        threads: Of torch.
+        steps: Timed steps.
+        forward: Of one step [ms].
+        backward: Of one step [ms].
+        reference: One Eigen LDL^T factorization of the contact-free Hessian, EF [ms].
+        phases: Medians of the phases that the report of a step gives [ms].
+        iterations: Median Newton iterations of a step.
+        residual: Largest of all steps [m/s].
+        contacts: Median number of pairs in contact.
+        contact_share: Median share of the vertices that are in contact [-].
+    """
+
+    scene: str
+    size: int
+    batch: int
+    threads: int
+    steps: int
+    forward: Spread
+    backward: Spread
+    reference: Spread
+    phases: dict[str, float]
+    iterations: float
+    residual: float
+    contacts: float
+    contact_share: float
+
+    @property
+    def forward_in_ef(self) -> float:
+        return self.forward.median / self.reference.median
+
+    @property
+    def backward_in_ef(self) -> float:
+        return self.backward.median / self.reference.median
+
+    def record(self) -> dict[str, Any]:
+        """Everything, as plain numbers."""
+        in_ef = {"forward_in_ef": self.forward_in_ef, "backward_in_ef": self.backward_in_ef}
+        return {**asdict(self), **in_ef}
+
+
+def time_steps(name: str, size: int, batch: int, threads: int, steps: int, scene: Scene) -> Timing:
+    """Bring a scene into its regime and time steps from there on, each with its backward.
+
+    The gradient is that of positions and velocities, with respect to those before the step and to
+    the targets of the bodies.
+    """
+    simulator = dc.Simulator(scene.scene, DT)
+    repeats = 3 if size <= 24 else 1
+    torch.set_num_threads(threads)
+    state = _start(simulator, scene, batch)
+    samples: list[dict[str, Any]] = []
+    references: list[float] = []
+    for k in range(WARM_UP + steps):
+        if (k - WARM_UP) % BLOCK == 0 and k >= WARM_UP:
+            references.append(reference_seconds(simulator, state, repeats))
+        state, sample = _timed_step(simulator, state, scene.control(state))
+        if k >= WARM_UP:
+            samples.append(sample)
+    references.append(reference_seconds(simulator, state, repeats))
+
+    def all_of(key: str, factor: float = 1.0) -> list[float]:
+        return [factor * sample[key] for sample in samples]
+
+    return Timing(
+        scene=name,
+        size=size,
+        batch=batch,
+        threads=threads,
+        steps=steps,
+        forward=Spread.of(all_of("forward", 1e3)),
+        backward=Spread.of(all_of("backward", 1e3)),
+        reference=Spread.of([1e3 * seconds for seconds in references]),
+        phases={
+            phase: 1e3 * median(sample["phases"][phase] for sample in samples)
+            for phase in samples[0]["phases"]
+        },
+        iterations=median(all_of("iterations")),
+        residual=max(all_of("residual")),
+        contacts=median(all_of("contacts")),
+        contact_share=median(all_of("contact_share")),
+    )
+
+
+def reference_seconds(simulator: dc.Simulator, state: dc.State, repeats: int) -> float:
+    """Seconds of one EF: Eigen's factorization of the contact-free Hessian at this state."""
+    inputs, _ = simulator._inputs(state, None, None)
+    arrays = {name: as_array(tensor) for name, tensor in inputs.items()}
+    return simulator._core.reference_factorization_seconds(arrays, repeats)
+
+
+def _start(simulator: dc.Simulator, scene: Scene, batch: int) -> dc.State:
+    """The scene in its regime; the environments of a batch differ a little from each other."""
+    state = simulator.initial_state(batch or None)
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(state.positions.shape, generator=generator, dtype=torch.float64)
+    speed = torch.tensor(scene.speed, dtype=torch.float64)
+    state = state.replace(velocities=speed + 0.003 * noise)
+    with torch.no_grad():
+        for _ in range(scene.approach):
+            state = simulator.step(state, scene.control(state))
+    return state
+
+
+def _timed_step(
+    simulator: dc.Simulator, state: dc.State, control: dc.Control
+) -> tuple[dc.State, dict[str, Any]]:
+    before = state.detach()
+    leaves = [before.positions, before.velocities]
+    if isinstance(control.body_poses, torch.Tensor):
+        leaves.append(control.body_poses)
+    for leaf in leaves:
+        leaf.requires_grad_()
+
+    start = time.perf_counter()
+    after = simulator.step(before, control)
+    forward = time.perf_counter() - start
+
+    outputs = [after.positions, after.velocities]
+    generator = torch.Generator().manual_seed(1)
+    cotangents = [torch.randn(x.shape, generator=generator, dtype=x.dtype) for x in outputs]
+    start = time.perf_counter()
+    torch.autograd.backward(outputs, cotangents)
+    backward = time.perf_counter() - start
+
+    after = after.detach()
+    environments = list(after) if after.batch_size else [after]
+    reports = [environment.report for environment in environments]
+    count = len(environments)
+    phases = {
+        phase: sum(report.seconds[phase] for report in reports) / count
+        for phase in reports[0].seconds
+    }
+    return after, {
+        "forward": forward / count,
+        "backward": backward / count,
+        "phases": phases,
+        "iterations": sum(report.iterations for report in reports) / count,
+        "residual": max(report.residual for report in reports),
+        "contacts": sum(report.contact_count for report in reports) / count,
+        "contact_share": sum(contact_share(simulator, e) for e in environments) / count,
+    }
+
+
+def contact_share(simulator: dc.Simulator, state: dc.State) -> float:
+    """Share of the cloth's vertices that belong to a pair in contact, as ipctk finds them [-]."""
+    faces, vertices = [], [state.positions.numpy()]
+    start = 0
+    for cloth in simulator.scene.cloths:
+        faces.append(cloth.faces + start)
+        start += len(cloth.vertices)
+    cloth_vertices = start
+    for body, pose in zip(simulator.scene.bodies, state.body_poses.numpy(), strict=True):
+        faces.append(body.faces + start)
+        vertices.append(transform(body.vertices, pose))
+        start += len(body.vertices)
+    all_vertices, all_faces = np.concatenate(vertices), np.concatenate(faces)
+    mesh = ipctk.CollisionMesh(all_vertices, ipctk.edges(all_faces), all_faces)
+    collisions = ipctk.NormalCollisions()
+    distance = simulator.parameters().barrier_distance
+    collisions.build(mesh, all_vertices, distance.item())
+    touched = {
+        int(vertex)
+        for k in range(len(collisions))
+        for vertex in collisions[k].vertex_ids(mesh.edges, mesh.faces)
+    }
+    return sum(0 <= vertex < cloth_vertices for vertex in touched) / cloth_vertices

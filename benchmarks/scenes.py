@@ -1,0 +1,116 @@
+"""The scenes that are timed: a square sheet of 1 m, and what it meets.
+
+Sheets are jittered in their plane, as exact grids sit on kinks of the contact energy. Each scene
+takes steps that bring it into its regime before anything is timed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+import diffcloth_torch as dc
+
+DT = 0.01  # [s]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is timed.
+
+    Attributes:
+        scene: Cloth and bodies.
+        approach: Steps until the regime is reached.
+        speed: Of the cloth at the start [m/s].
+        body_speed: Of the bodies, throughout [m/s].
+    """
+
+    scene: dc.Scene
+    approach: int
+    speed: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    body_speed: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def control(self, state: dc.State) -> dc.Control:
+        """Move the bodies on by one step; new leaves, so that gradients stop there."""
+        if state.body_poses.shape[-2] == 0:
+            return dc.Control()
+        shift = torch.tensor([*self.body_speed, 0, 0, 0, 0], dtype=torch.float64)
+        return dc.Control(body_poses=state.body_poses.detach() + DT * shift)
+
+
+def _sheet(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [n * n, 3] of a jittered sheet in the xy-plane, and faces; row by row along y."""
+    grid = dc.Cloth.grid(n, n)
+    vertices = np.array(grid.vertices)
+    jitter = np.random.default_rng(n).uniform(-0.1, 0.1, (n, n, 2)) / (n - 1)
+    jitter[[0, -1], :, 1] = 0.0
+    jitter[:, [0, -1], 0] = 0.0
+    vertices[:, :2] += jitter.reshape(-1, 2)
+    return vertices, np.array(grid.faces)
+
+
+def _gap(n: int) -> float:
+    """Distance at which the default barrier begins, about [m]."""
+    return 0.1 / (n - 1)
+
+
+def _upright(n: int, **keywords: object) -> dc.Cloth:
+    vertices, faces = _sheet(n)
+    placed = np.stack([vertices[:, 0], np.zeros(n * n), 1.0 + vertices[:, 1]], axis=-1)
+    return dc.Cloth(placed, faces, rest_vertices=vertices, **keywords)
+
+
+def hanging(n: int) -> Scene:
+    """Swing down from the horizontal, held by two corners: free of contact."""
+    vertices, faces = _sheet(n)
+    pins = {"corners": [n * (n - 1), n * n - 1]}
+    return Scene(dc.Scene([dc.Cloth(vertices, faces, pins=pins)]), approach=10)
+
+
+def plane(n: int) -> Scene:
+    """Slide on a floor: every vertex in contact."""
+    vertices, faces = _sheet(n)
+    vertices[:, 2] = _gap(n)
+    floor = dc.RigidBody.plane(4.0)
+    scene = dc.Scene([dc.Cloth(vertices, faces)], [floor])
+    return Scene(scene, approach=12, speed=(0.8, 0.3, 0.0))
+
+
+def sphere(n: int) -> Scene:
+    """Drape over a sphere: a part of the vertices in contact, folds between them."""
+    vertices, faces = _sheet(n)
+    vertices += (0.02, 0.03, _gap(n))
+    ball = dc.RigidBody.sphere(0.2, pose=[0, 0, -0.2, 1, 0, 0, 0])
+    return Scene(dc.Scene([dc.Cloth(vertices, faces)], [ball]), approach=20)
+
+
+def self_contact(n: int) -> Scene:
+    """Lay one half of a folded sheet on the other, which hangs between two pinned rows."""
+    vertices, faces = _sheet(n)
+    gap = 0.5 / (n - 1)
+    s = vertices[:, 1]  # along the fold; the upper half comes back over the lower one
+    lower = s < 0.0
+    folded = np.stack([vertices[:, 0], np.where(lower, s, -s), np.where(lower, 0.0, gap)], axis=-1)
+    last = int(lower.reshape(n, n)[:, 0].sum()) - 1
+    pins = {"edge": range(n), "fold": range(last * n, (last + 1) * n)}
+    cloth = dc.Cloth(folded, faces, rest_vertices=vertices, pins=pins)
+    return Scene(dc.Scene([cloth]), approach=14)
+
+
+def moving_body(n: int) -> Scene:
+    """Push a box into a sheet that hangs by its upper edge."""
+    cloth = _upright(n, pins={"edge": range(n * (n - 1), n * n)})
+    box = dc.RigidBody.box(0.4, motion="kinematic", pose=[0.03, -0.22, 0.95, 1, 0, 0, 0])
+    return Scene(dc.Scene([cloth], [box]), approach=22, body_speed=(0.0, 0.5, 0.1))
+
+
+SCENES: dict[str, Callable[[int], Scene]] = {
+    "hanging": hanging,
+    "plane": plane,
+    "sphere": sphere,
+    "self-contact": self_contact,
+    "moving-body": moving_body,
+}

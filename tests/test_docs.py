@@ -1,0 +1,83 @@
+"""The documentation points at what exists, and its formulas are those of the code."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import diffcloth_torch as dc
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if not target.startswith(("http://", "https://", "#")):
+            assert (page.parent / target.partition("#")[0]).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_that_are_named_exist(page):
+    for path in re.findall(
+        r"`((?:\.ci|configs|docs|examples|scripts|tests)/[\w./-]*\w)`", page.read_text()
+    ):
+        if path != "tests/oracles":  # where such references go
+            assert (ROOT / path).exists(), path
+
+
+@pytest.mark.parametrize("record", [dc.Parameters, dc.Control, dc.ContactOptions])
+def test_notation_has_every_name(record):
+    rows = "\n".join(
+        line for line in (ROOT / "docs/notation.md").read_text().splitlines() if line[:1] == "|"
+    )
+    for field in dataclasses.fields(record):
+        if field.name not in ("_unbatched", "self_contact"):  # neither is a quantity
+            assert re.search(rf"`(\w+\.)?{field.name}`", rows), field.name
+
+
+def test_resting_gap_is_that_of_the_guide():
+    """A sheet at rest on a floor: its weight is kappa A / 4 phi(gap / barrier distance)."""
+    grid = dc.Cloth.grid(7, 7, 0.3)
+    rest = np.array(grid.vertices)
+    rest[:, :2] += np.random.default_rng(0).uniform(-0.005, 0.005, (49, 2))
+    above = rest + np.array([0, 0, 0.004])
+    cloth = dc.Cloth(above, grid.faces, rest_vertices=rest, material=dc.Material(bending=1e-2))
+    contact = dc.ContactOptions(barrier_distance=0.005, barrier_stiffness=20.0)
+    # Off its diagonal, whose contacts with edges of the sheet would carry a part.
+    floor = dc.RigidBody.plane(50.0, pose=[9, 0, 0, 1, 0, 0, 0])
+    simulator = dc.Simulator(dc.Scene([cloth], [floor]), 0.02, contact=contact)
+    with torch.no_grad():
+        end = simulator.rollout(simulator.initial_state(), steps=60)[-1]
+
+    r = end.positions[:, 2].numpy() / 0.005
+    assert (r > 0.5).all()
+    assert (r < 1).all()
+    phi = 2 * r * (2 * (r**2 - 1) * np.log(r**2) + (1 - r**2) ** 2 / r**2)
+    pressure = 20.0 / 4 * phi.mean()
+    # 5 %: vertices at different heights carry different areas.
+    assert pressure == pytest.approx(0.124 * 9.81, rel=0.05)
+
+
+@pytest.mark.parametrize("load", [0.0, 0.5, 0.9])
+def test_creep_is_that_of_the_guide(load):
+    """A sheet on a floor, pulled sideways by a share of what friction can bear."""
+    friction, slip = 0.5, 1e-3
+    cloth = dc.Cloth.grid(3, 3, 0.1, pose=[0, 0, 0.003, 1, 0, 0, 0])
+    contact = dc.ContactOptions(barrier_distance=0.004, slip_velocity=slip)
+    scene = dc.Scene([cloth], [dc.RigidBody.plane(50.0)])
+    simulator = dc.Simulator(scene, 0.01, contact=contact)
+    parameters = simulator.parameters().replace(
+        friction=friction,
+        gravity=torch.tensor([load * friction * 9.81, 0.0, -9.81], dtype=torch.float64),
+    )
+    with torch.no_grad():
+        end = simulator.rollout(simulator.initial_state(), parameters=parameters, steps=100)[-1]
+    v = slip * (1 - np.sqrt(1 - load))
+    assert end.velocities[:, 0].mean().item() == pytest.approx(v, rel=0.02, abs=1e-8)
