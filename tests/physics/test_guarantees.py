@@ -67,10 +67,15 @@ def attempt(sim, judge, state, control):
     return None
 
 
-@pytest.mark.parametrize("speed", [10.0, 100.0])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    ("pins", "speed"),
+    [("top", 10.0), ("all", 10.0), ("top", 100.0), pytest.param("all", 100.0, marks=SLOW)],
+)
 @pytest.mark.parametrize("body", ["plate", "rod", "ball"])
-@pytest.mark.parametrize("pins", ["top", "all"])
-@pytest.mark.parametrize("scheme", ["coupled", pytest.param("split", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("scheme", ["coupled", pytest.param("split", marks=SLOW)])
 def test_a_fast_body_never_passes_through(speed, body, pins, scheme):
     sim = dc.Simulator(dc.Scene([curtain(pins)], [bodies()[body]]), DT, scheme=scheme)
     judge = Judge(sim)
