@@ -60,24 +60,6 @@ std::vector<Index> minimum_degree_order(const BlockPattern& pattern,
 
 namespace {
 
-/// Keeps CHOLMOD's OpenMP loops on the calling thread while it lives.
-class SingleThread {
- public:
-  SingleThread() {
-    if (omp_set_max_active_levels == nullptr) return;
-    levels_ = omp_get_max_active_levels();
-    omp_set_max_active_levels(0);
-  }
-  ~SingleThread() {
-    if (omp_set_max_active_levels != nullptr) omp_set_max_active_levels(levels_);
-  }
-  SingleThread(const SingleThread&) = delete;
-  SingleThread& operator=(const SingleThread&) = delete;
-
- private:
-  int levels_ = 1;
-};
-
 /// While it lives, OpenMP regions of this thread run on it alone. CHOLMOD names a number of threads
 /// in its own, so that only this limit binds it.
 class SerialOpenMp {
@@ -149,7 +131,7 @@ struct CholeskyAnalysis::Backend {
   cholmod_factor* symbolic = nullptr;
 
   explicit Backend(const CholeskyAnalysis& a) {
-    const SingleThread single_thread;
+    const SerialOpenMp serial;
     cholmod_sparse matrix = view(a, nullptr);
     symbolic = cholmod_analyze(&matrix, &common.c);
     if (symbolic == nullptr) throw std::runtime_error("CHOLMOD: analysis failed");
@@ -182,16 +164,14 @@ struct CholeskyFactor::Backend {
   Backend& operator=(const Backend&) = delete;
 
   bool compute(const CholeskyAnalysis& a, const double* values) {
-    const SingleThread single_thread;
-    cholmod_sparse matrix = view(a, values);
     const SerialOpenMp serial;
+    cholmod_sparse matrix = view(a, values);
     cholmod_factorize(&matrix, factor, &common.c);
     if (common.c.status < CHOLMOD_OK) throw std::runtime_error("CHOLMOD: factorization failed");
     return common.c.status == CHOLMOD_OK && factor->minor == factor->n;
   }
 
   void solve(std::vector<double>& b) const {
-    const SingleThread single_thread;
     cholmod_dense rhs{};
     rhs.nrow = rhs.nzmax = rhs.d = b.size();
     rhs.ncol = 1;

@@ -113,7 +113,7 @@ void finish_report(const Scene& scene, const solver::Outcome& outcome, Report& r
   report.contact_count = static_cast<Index>(outcome.contacts.size());
   report.minimum_distance = std::numeric_limits<double>::infinity();
   for (const contact::Contact& k : outcome.contacts) {
-    report.minimum_distance = std::min(report.minimum_distance, std::sqrt(k.closest.d_sq) - k.xi);
+    report.minimum_distance = std::min(report.minimum_distance, std::sqrt(k.closest.d_sq));
   }
   if (report.result == Result::kInfeasibleMotion) {
     report.message = "in contact: " + blockers(scene, outcome.contacts);
