@@ -16,11 +16,11 @@ constexpr Index kLeafSize = 4;
 
 BoxTree::BoxTree(std::vector<Index> ids, std::span<const Vec3> centers) {
   if (ids.empty()) return;
-  const Index count = static_cast<Index>(ids.size());
+  const auto count = static_cast<Index>(ids.size());
   std::vector<Index> order(count);
   std::iota(order.begin(), order.end(), 0);
 
-  nodes_.push_back({0, count, 0});
+  nodes_.push_back({.first = 0, .last = count, .left = 0});
   for (std::size_t k = 0; k < nodes_.size(); ++k) {
     const auto [first, last, left] = nodes_[k];
     if (last - first <= kLeafSize) continue;
@@ -39,8 +39,8 @@ BoxTree::BoxTree(std::vector<Index> ids, std::span<const Vec3> centers) {
                        return x_i < x_j || (x_i == x_j && i < j);
                      });
     nodes_[k].left = static_cast<Index>(nodes_.size());
-    nodes_.push_back({first, middle, 0});
-    nodes_.push_back({middle, last, 0});
+    nodes_.push_back({.first = first, .last = middle, .left = 0});
+    nodes_.push_back({.first = middle, .last = last, .left = 0});
   }
   items_.reserve(count);
   for (const Index i : order) items_.push_back(ids[i]);

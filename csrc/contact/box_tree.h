@@ -1,5 +1,6 @@
 #pragma once
 
+#include <array>
 #include <span>
 #include <vector>
 
@@ -9,8 +10,8 @@ namespace diffcloth::contact {
 
 /// Axis-aligned box.
 struct Box {
-  double lo[3];
-  double hi[3];
+  std::array<double, 3> lo;
+  std::array<double, 3> hi;
 };
 
 /// Whether two closed boxes have a point in common; in full, because the outcome of each comparison

@@ -5,6 +5,7 @@
 #include <limits>
 #include <numeric>
 #include <span>
+#include <utility>
 
 #include "contact/pierce.h"
 
@@ -135,7 +136,7 @@ void sort_pairs(Index count, BroadPhase::Scratch& scratch) {
 
 }  // namespace
 
-BroadPhase::BroadPhase(const CollisionMesh& mesh, const double* x_reference) : mesh_(mesh) {
+BroadPhase::BroadPhase(CollisionMesh mesh, const double* x_reference) : mesh_(std::move(mesh)) {
   const auto center = [&](std::span<const Index> corners) -> Vec3 {
     Vec3 sum = Vec3::Zero();
     for (const Index v : corners) sum += row(x_reference, v);
@@ -217,7 +218,7 @@ void BroadPhase::fit(Index surface, Scratch& scratch) const {
 
 template <class Visit>
 void BroadPhase::visit_surface_pairs(Scratch& scratch, Visit&& visit) const {
-  const Index surface_count = static_cast<Index>(trees_.size());
+  const auto surface_count = static_cast<Index>(trees_.size());
   for (Index s = 0; s < mesh_.cloth_count; ++s) {
     for (Index r = mesh_.self_contact ? s : s + 1; r < surface_count; ++r) {
       if (!overlap(scratch.surfaces[s].box, scratch.surfaces[r].box)) continue;

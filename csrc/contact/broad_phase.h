@@ -41,7 +41,7 @@ struct Candidate {
 class BroadPhase {
  public:
   /// @param x_reference  positions that shape the search trees, 3 * vertex_count
-  BroadPhase(const CollisionMesh& mesh, const double* x_reference);
+  BroadPhase(CollisionMesh mesh, const double* x_reference);
 
   /// Boxes and lists that a search fills; reuse one to search without allocation.
   struct Scratch {

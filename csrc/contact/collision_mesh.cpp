@@ -50,7 +50,8 @@ std::vector<HalfEdge> sorted_half_edges(const CollisionMesh& mesh) {
   for (std::size_t f = 0; f < mesh.faces.size(); ++f) {
     for (int k = 0; k < 3; ++k) {
       const auto [v0, v1] = std::minmax(mesh.faces[f][k], mesh.faces[f][(k + 1) % 3]);
-      half_edges.push_back({mesh.face_surface[f], {v0, v1}, static_cast<Index>(f)});
+      half_edges.push_back(
+          {.surface = mesh.face_surface[f], .edge = {v0, v1}, .face = static_cast<Index>(f)});
     }
   }
   std::sort(half_edges.begin(), half_edges.end(), [](const HalfEdge& p, const HalfEdge& q) {

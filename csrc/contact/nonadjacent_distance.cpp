@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numbers>
 #include <utility>
 #include <vector>
 
@@ -44,7 +45,7 @@ double mean_edge_length(const Cloth& cloth) {
 
 double diameter_bound(const Cloth& cloth) {
   const auto [lo, hi] = std::minmax_element(cloth.x.begin(), cloth.x.end());
-  return std::sqrt(3.0) * (*hi - *lo);
+  return std::numbers::sqrt3 * (*hi - *lo);
 }
 
 /// Grow the search radius until it finds a pair; the distance of that pair is then the radius that

@@ -182,7 +182,7 @@ struct CholeskyFactor::Backend {
     if (!cholmod_solve2(CHOLMOD_A, factor, &rhs, nullptr, &x, nullptr, &y, &e, &common.c)) {
       throw std::runtime_error("CHOLMOD: solve failed");
     }
-    const double* solution = static_cast<const double*>(x->x);
+    const auto* solution = static_cast<const double*>(x->x);
     std::copy(solution, solution + b.size(), b.begin());
   }
 

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <array>
+#include <numbers>
 
 #include <Eigen/Core>
 
@@ -29,7 +30,7 @@ FitRow<Scalar> fit_row(const std::array<Scalar, 5>& p) {
   const Scalar lambda2 = v / b;
   const Scalar lambda1 = (u - a * lambda2) / length;
   const Scalar scale = Scalar(1.0) / (length * b);  // 1 / (2 A)
-  const Scalar sqrt2(1.4142135623730951);
+  const Scalar sqrt2(std::numbers::sqrt2);
   return {.lambda = {Scalar(1.0) - lambda1 - lambda2, lambda1, lambda2},
           .m = {scale * (u * u - lambda1 * length * length - lambda2 * a * a),
                 scale * (sqrt2 * (u * v - lambda2 * a * b)), scale * (v * v - lambda2 * b * b)}};

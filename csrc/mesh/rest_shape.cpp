@@ -80,7 +80,7 @@ struct FitsBar {
   std::vector<Vec3> base;  ///< length, a, b of the base triangles
 
   explicit FitsBar(const Fits& fits) : base(fits.c.size(), Vec3::Zero()) {
-    for (const Operator& operator_e : fits.c) c.push_back(Operator::Zero(3, operator_e.cols()));
+    for (const Operator& operator_e : fits.c) c.emplace_back(Operator::Zero(3, operator_e.cols()));
   }
 };
 
@@ -224,7 +224,7 @@ void bending_vjp(const BendingStencils& stencils,
   std::vector<ChartBar> chart_bar(fits.chart.size());
   for (Index e = 0; e < stencils.size(); ++e) {
     const std::span<const Index> vertices = stencils.element(e);
-    const Index size = static_cast<Index>(vertices.size());
+    const auto size = static_cast<Index>(vertices.size());
     const std::ptrdiff_t offset = 3 * static_cast<std::ptrdiff_t>(stencils.start[e]);
     OperatorMap element_bar(c_bar.data() + offset, 3, size);
     Mat3 frame_bar;
@@ -275,7 +275,7 @@ void face_vjp(
 }
 
 void fill_faces(const Topology& topology, const double* X, RestShape& rest) {
-  const Index face_count = static_cast<Index>(topology.faces.size());
+  const auto face_count = static_cast<Index>(topology.faces.size());
   rest.area.resize(face_count);
   rest.shape_gradient.resize(face_count);
   rest.vertex_area.assign(topology.vertex_count, 0.0);

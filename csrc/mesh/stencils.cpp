@@ -63,7 +63,7 @@ void add_first_ring(const Topology& topology, Patch& patch) {
 
 /// The vertices beyond the two other edges of each neighbor that brought a vertex.
 void add_second_ring(const Topology& topology, Patch& patch) {
-  const Index first_end = static_cast<Index>(patch.vertices.size());
+  const auto first_end = static_cast<Index>(patch.vertices.size());
   for (Index j = 3; j < first_end; ++j) {
     const auto [a, b] = patch.unfold_edge[j];  // the neighbor is (b, a, j), counterclockwise
     extend(topology, patch.reached_face[j], a, j, patch);

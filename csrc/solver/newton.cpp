@@ -4,6 +4,7 @@
 #include <chrono>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 #include "contact/ccd.h"
 
@@ -433,7 +434,7 @@ bool Minimizer::escape_saddle() {
   for (int backtrack = 0; backtrack < kBacktracks; ++backtrack, alpha *= 0.5) {
     to = moved(alpha);
     if (change(to) < 0.0) {
-      x_ = to;
+      x_ = std::move(to);
       record();
       refresh();
       chord_allowed_ = false;

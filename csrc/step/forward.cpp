@@ -1,6 +1,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <numbers>
 
 #include "step/problem.h"
 #include "step/step.h"
@@ -10,7 +11,7 @@ namespace {
 
 /// A body turns along its geodesic in portions of at most this angle [rad]; straight motion of its
 /// vertices through a larger one would collapse it.
-constexpr double kLargestTurn = 10.0 * 3.14159265358979323846 / 180.0;
+constexpr double kLargestTurn = 10.0 * std::numbers::pi / 180.0;
 
 class Motion : public solver::PrescribedMotion {
  public:

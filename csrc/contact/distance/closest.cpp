@@ -72,7 +72,7 @@ Mat2 inverse_metric(const Vec3& s0, const Vec3& s1, double determinant) {
   return M_inv / determinant;
 }
 
-const Nearest& nearer(const Nearest& p, const Nearest& q) { return q.d_sq < p.d_sq ? q : p; }
+Nearest nearer(const Nearest& p, const Nearest& q) { return q.d_sq < p.d_sq ? q : p; }
 
 Closest point_triangle(const Corners& x) {
   const Vec3 e0 = x[2] - x[1];

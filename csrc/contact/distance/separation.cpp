@@ -44,7 +44,7 @@ Vec3 point_triangle(const Vec3& p, const Vec3& t0, const Vec3& t1, const Vec3& t
   const Vec3 n = e0.cross(e1);
   const double n_sq = n.squaredNorm();
 
-  Shortest best{w, w.squaredNorm()};
+  Shortest best{.t = w, .d_sq = w.squaredNorm()};
   if (n_sq > 0) {
     double b0 = w.cross(e1).dot(n) / n_sq;
     double b1 = e0.cross(w).dot(n) / n_sq;
@@ -86,7 +86,7 @@ Vec3 edge_edge(const Vec3& a0, const Vec3& a1, const Vec3& b0, const Vec3& b1) {
     const double t = (vw + s * uv) / vv;
     if (s >= 0 && s <= 1 && t >= 0 && t <= 1) return at(s, t);
   }
-  Shortest best{w, w.squaredNorm()};
+  Shortest best{.t = w, .d_sq = w.squaredNorm()};
   best.offer(at(0, clamped_ratio(vw, vv)));
   best.offer(at(1, clamped_ratio(vw + uv, vv)));
   best.offer(at(clamped_ratio(-uw, uu), 0));
