@@ -130,12 +130,25 @@ struct CholeskyAnalysis::Backend {
   mutable Common common;
   cholmod_factor* symbolic = nullptr;
 
-  explicit Backend(const CholeskyAnalysis& a) {
+  Backend(const CholeskyAnalysis& a, bool reorder) {
     const SerialOpenMp serial;
+    common.c.postorder = reorder ? 1 : 0;
     cholmod_sparse matrix = view(a, nullptr);
     symbolic = cholmod_analyze(&matrix, &common.c);
     if (symbolic == nullptr) throw std::runtime_error("CHOLMOD: analysis failed");
   }
+
+  /// The vertices in the order that CHOLMOD would rather have.
+  std::vector<Index> vertex_order(const CholeskyAnalysis& a) const {
+    const auto* order = static_cast<const Index*>(symbolic->Perm);
+    std::vector<Index> result;
+    for (Index k = 0; k < a.dimension(); ++k) {
+      // The three coordinates of a vertex form a chain of the elimination tree: the first leads.
+      if (order[k] % 3 == 0) result.push_back(a.unknown[order[k]] / 3);
+    }
+    return result;
+  }
+
   ~Backend() { cholmod_free_factor(&symbolic, &common.c); }
   Backend(const Backend&) = delete;
   Backend& operator=(const Backend&) = delete;
@@ -213,7 +226,8 @@ Eigen::Map<const Sparse> view(const CholeskyAnalysis& a, const double* values) {
 }  // namespace
 
 struct CholeskyAnalysis::Backend {
-  explicit Backend(const CholeskyAnalysis& /*analysis*/) {}
+  Backend(const CholeskyAnalysis& /*analysis*/, bool /*reorder*/) {}
+  static std::vector<Index> vertex_order(const CholeskyAnalysis& /*analysis*/) { return {}; }
 };
 
 struct CholeskyFactor::Backend {
@@ -243,7 +257,19 @@ const char* factorization_name() { return "eigen"; }
 #endif
 
 CholeskyAnalysis::CholeskyAnalysis(const BlockPattern& pattern, const std::vector<char>& fixed) {
-  const std::vector<Index> order = minimum_degree_order(pattern, fixed);
+  permute(pattern, minimum_degree_order(pattern, fixed));
+  if (dimension() == 0) return;
+  // In postorder the factorization takes the matrix as it stands, without two transposes each time.
+  const std::vector<Index> postorder = Backend(*this, true).vertex_order(*this);
+  if (!postorder.empty()) permute(pattern, postorder);
+  backend = std::make_unique<Backend>(*this, false);
+}
+
+void CholeskyAnalysis::permute(const BlockPattern& pattern, const std::vector<Index>& order) {
+  unknown.clear();
+  row.clear();
+  source.clear();
+  column_start.clear();
   std::vector<Index> rank(pattern.size(), -1);
   for (std::size_t k = 0; k < order.size(); ++k) rank[order[k]] = static_cast<Index>(k);
   for (const Index vertex : order) {
@@ -280,14 +306,13 @@ CholeskyAnalysis::CholeskyAnalysis(const BlockPattern& pattern, const std::vecto
       column_start.push_back(static_cast<Index>(row.size()));
     }
   }
-  backend = std::make_unique<Backend>(*this);
 }
 
 CholeskyAnalysis::~CholeskyAnalysis() = default;
 
 CholeskyFactor::CholeskyFactor(std::shared_ptr<const CholeskyAnalysis> analysis)
     : analysis_(std::move(analysis)),
-      backend_(std::make_unique<Backend>(*analysis_)),
+      backend_(analysis_->dimension() > 0 ? std::make_unique<Backend>(*analysis_) : nullptr),
       values_(analysis_->row.size()) {}
 
 CholeskyFactor::~CholeskyFactor() = default;
@@ -309,7 +334,7 @@ void CholeskyFactor::solve(const double* b, double* x) const {
 }
 
 std::size_t CholeskyFactor::bytes() const {
-  return backend_->bytes() + sizeof(double) * values_.size();
+  return backend_ ? backend_->bytes() + sizeof(double) * values_.size() : 0;
 }
 
 }  // namespace diffcloth::linalg

@@ -33,6 +33,10 @@ class CholeskyAnalysis {
   ~CholeskyAnalysis();
   CholeskyAnalysis(const CholeskyAnalysis&) = delete;
   CholeskyAnalysis& operator=(const CholeskyAnalysis&) = delete;
+
+ private:
+  /// Lay the matrix out with the vertices in this order.
+  void permute(const BlockPattern& pattern, const std::vector<Index>& order);
 };
 
 /// A = L L^T: CHOLMOD's supernodal factorization where the build has it, Eigen's otherwise.
