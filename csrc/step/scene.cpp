@@ -38,19 +38,20 @@ contact::RestMeasures make_body_measures(const Description& d, const contact::Co
   m.edge_area.assign(mesh.edges.size(), 0.0);
   m.edge_length_sq.assign(mesh.edges.size(), 0.0);
   m.face_area.assign(static_cast<std::size_t>(mesh.cloth_face_count), 0.0);
-  const double* y =
-      d.bodies.vertices.data() - 3 * static_cast<std::ptrdiff_t>(mesh.cloth_vertex_count);
+  const auto at = [&](Index vertex) -> Vec3 {
+    return row(d.bodies.vertices.data(), vertex - mesh.cloth_vertex_count);
+  };
   std::vector<double> area(mesh.faces.size(), 0.0);
   for (std::size_t f = mesh.cloth_face_count; f < mesh.faces.size(); ++f) {
     const auto& v = mesh.faces[f];
-    area[f] = 0.5 * (row(y, v[1]) - row(y, v[0])).cross(row(y, v[2]) - row(y, v[0])).norm();
+    area[f] = 0.5 * (at(v[1]) - at(v[0])).cross(at(v[2]) - at(v[0])).norm();
     for (const Index i : v) m.vertex_area[i] += area[f] / 3.0;
   }
   for (std::size_t e = mesh.cloth_edge_count; e < mesh.edges.size(); ++e) {
     for (const Index f : mesh.edge_faces[e]) {
       if (f >= 0) m.edge_area[e] += area[f] / 3.0;
     }
-    m.edge_length_sq[e] = (row(y, mesh.edges[e][0]) - row(y, mesh.edges[e][1])).squaredNorm();
+    m.edge_length_sq[e] = (at(mesh.edges[e][0]) - at(mesh.edges[e][1])).squaredNorm();
   }
   return m;
 }
