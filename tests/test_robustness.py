@@ -210,10 +210,12 @@ def test_a_forked_worker_steps_after_a_parallel_region(sim, contact):
 
 
 INTERRUPTED = """
-    import sys, time
+    import signal
     import torch
     import diffcloth_torch as dc
 
+    # A test run in the background of a shell ignores SIGINT, and so would its children.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     sheet = dc.Cloth.grid(24, 24, size=1.0, material=dc.Material(stretch=1e4))
     sim = dc.Simulator(dc.Scene([sheet]), 0.01, solver=dc.SolverOptions(throw=False))
     noise = torch.randn(
