@@ -165,6 +165,13 @@ void Minimizer::refresh() {
 
 bool Minimizer::start_from(const std::vector<double>& guess) {
   if (motion_.portions() > 1) return false;
+  // Where inertia alone would collapse the cloth (long steps, forces on light vertices), the start
+  // of the step with pins at their ends is the better place to begin.
+  std::vector<double> held = guess;
+  for (Index i = 0; i < f_.cloth_vertex_count; ++i) {
+    if (f_.is_free(i)) Eigen::Map<Vec3>(held.data() + 3 * i) = row(x_.data(), i);
+  }
+  if (f_.energy(guess.data(), {}) > f_.energy(held.data(), {})) return false;
   detect(guess);
   if (safe_fraction(guess) < 1.0) return false;
   if (f_.contact != nullptr) {
