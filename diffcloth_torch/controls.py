@@ -77,12 +77,13 @@ class Parameters:
     gravity: Tensor | None = None
     rest_positions: Tensor | None = None
     # Fields that a simulator made without a batch axis: their [C] or [F] is never taken for [B].
-    _unbatched: frozenset[str] = field(default=frozenset(), repr=False)
+    _unbatched: tuple[str, ...] = field(default=(), repr=False)
 
     def replace(self, **changes: Any) -> Parameters:
         """Copy with some fields replaced."""
         check_field_names("Parameters.replace", self, changes)
-        return replace(self, **changes, _unbatched=self._unbatched - changes.keys())
+        unbatched = tuple(name for name in self._unbatched if name not in changes)
+        return replace(self, **changes, _unbatched=unbatched)
 
 
 def tensors_of(record: Any) -> Iterator[Tensor]:

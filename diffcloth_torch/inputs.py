@@ -87,6 +87,8 @@ def state_inputs(assembly: Assembly, state: State) -> tuple[Inputs, int | None]:
     if batch == 0:
         raise InvalidInput("step: `state` must hold at least one environment, got a batch of 0")
     check_quaternions("step: `state.body_poses`", _numbers(state.body_poses))
+    _check_state_tensor("time", state.time)
+    check_shape("step: `state.time`", state.time.shape, [() if batch is None else (batch,)])
     return inputs, batch
 
 
@@ -176,7 +178,7 @@ def control_inputs(
     body_targets = state["body_poses"]
     if targets is not None:
         body_targets = _with_batch("control: `body_poses`", targets, 2, batch)
-        _check_static(assembly, body_targets, state["body_poses"])
+        body_targets = _keep_static(assembly, body_targets, state["body_poses"])
     forces = torch.zeros(1, len(assembly.vertices), 3, dtype=torch.float64)
     if checked.forces is not None:
         forces = _with_batch("control: `forces`", checked.forces, 2, batch)
@@ -229,15 +231,23 @@ def _with_batch(name: str, tensor: Tensor, dimensions: int, batch: int | None) -
     return tensor
 
 
-def _check_static(assembly: Assembly, targets: Tensor, poses: Tensor) -> None:
+def _keep_static(assembly: Assembly, targets: Tensor, poses: Tensor) -> Tensor:
+    """Refuse targets that move a static body; a row rounded to float32 stands for the state's."""
     static = list(assembly.static_bodies)
-    moved = (_numbers(targets)[:, static] != _numbers(poses)[:, static]).any(axis=-1)
+    given, kept = _numbers(targets)[:, static], _numbers(poses)[:, static]
+    rounded = kept.astype(np.float32).astype(np.float64)
+    moved = ((given != kept) & (given != rounded)).any(axis=-1)
     if moved.any():
         body = static[int(np.argwhere(moved)[0][1])]
         raise InvalidInput(
             f"control: `body_poses` must keep the row [{body}] of the state: that body is static; "
             'make it motion="kinematic" to move it'
         )
+    if (given == kept).all():
+        return targets
+    mask = torch.zeros(targets.shape[-2], 1, dtype=torch.bool)
+    mask[static] = True
+    return torch.where(mask, poses, targets)
 
 
 def check_parameters(parameters: Parameters) -> Parameters:

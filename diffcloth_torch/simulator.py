@@ -174,7 +174,7 @@ class Simulator:
     def parameters(self) -> Parameters:
         """Make the parameters of the scene, in new tensors; change them with `.replace(...)`."""
         copies = {name: tensor.clone() for name, tensor in self._defaults.items()}
-        return Parameters(**copies, _unbatched=frozenset(copies))
+        return Parameters(**copies, _unbatched=tuple(copies))
 
     def step(
         self,

@@ -147,7 +147,7 @@ class _Step(torch.autograd.Function):
         if ctx.unconverged:
             raise NotConverged(
                 "backward: a step that did not converge has no gradient; raise max_iterations, or "
-                f"leave environments {ctx.unconverged} out of the loss's batch",
+                f"step without environments {ctx.unconverged}",
                 environments=ctx.unconverged,
             )
         tensors = saved[: len(ctx.names)]

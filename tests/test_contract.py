@@ -887,3 +887,41 @@ def test_eight_threads_share_a_simulator(sim):
     for (after, x_bar), (after_again, x_bar_again) in zip(expected, results, strict=True):
         assert same(after, after_again)
         assert torch.equal(x_bar, x_bar_again)
+
+
+def test_parameters_survive_torch_save(tmp_path):
+    torch.save(dc.Parameters(stretch=torch.tensor(1.0)), tmp_path / "p.pt")
+    assert torch.load(tmp_path / "p.pt").stretch == 1
+
+
+def test_float32_poses_keep_a_static_body_where_it_is():
+    floor = dc.RigidBody.plane(2, pose=[0, 0, -0.1, 1, 0, 0, 0])
+    box = dc.RigidBody.box(0.1, motion="kinematic", pose=[0, 0, 1.1, 1, 0, 0, 0])
+    sim = dc.Simulator(dc.Scene([dc.Cloth.grid(3, 3)], [floor, box]), 0.01)
+    state = sim.initial_state()
+    after = sim.step(state, sim.control(body_poses=state.body_poses.float()))
+    assert torch.equal(after.body_poses[0], state.body_poses[0])
+    with pytest.raises(dc.InvalidInput, match="static"):
+        sim.step(state, sim.control(body_poses=state.body_poses + 1e-3))
+
+
+@pytest.mark.parametrize(
+    ("time", "error"),
+    [
+        pytest.param(0.5, TypeError, id="number"),
+        pytest.param(torch.tensor(1.0), TypeError, id="float32"),
+        pytest.param(torch.zeros(5, dtype=torch.float64), dc.InvalidInput, id="shape"),
+    ],
+)
+def test_the_time_of_a_state_is_checked(time, error):
+    sim = dc.Simulator(dc.Scene([dc.Cloth.grid(3, 3)]), 0.01)
+    with pytest.raises(error, match="time"):
+        sim.step(sim.initial_state().replace(time=time))
+
+
+@pytest.mark.parametrize("content", [b"solid a\nendsolid a\n", bytes(84)], ids=["ascii", "binary"])
+def test_an_stl_file_without_triangles_is_refused(content, tmp_path):
+    path = tmp_path / "empty.stl"
+    path.write_bytes(content)
+    with pytest.raises(dc.InvalidInput, match="not a readable STL"):
+        dc.RigidBody.load(path)

@@ -113,6 +113,8 @@ def _read_stl(path: Path) -> tuple[FloatArray, Indices]:
             soup = load_stl(file)
         except Exception as error:
             raise InvalidInput(f"{path}: not a readable STL file: {error}") from error
+    if "vertices" not in soup or "faces" not in soup:
+        raise InvalidInput(f"{path}: not a readable STL file: it holds no triangles")
     corners = np.asarray(soup["vertices"], dtype=np.float64)[np.asarray(soup["faces"])]
     points = corners.reshape(-1, 3)
     _, first, inverse = np.unique(points, axis=0, return_index=True, return_inverse=True)
