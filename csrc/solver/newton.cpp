@@ -32,6 +32,8 @@ class Timer {
 
 /// A chord step (an old factor) is taken while it shrinks the step by this much.
 constexpr double kChordContraction = 0.1;
+/// A factor vouches for the Hessian's sign at points nearer than this [m/s].
+constexpr double kNearFactor = 1e-4;
 /// First shift of an indefinite Hessian, as a share of M/h^2, and how it grows and shrinks.
 constexpr double kFirstShift = 0.1;
 constexpr double kShiftGrowth = 4.0;
@@ -93,6 +95,7 @@ class Minimizer {
   bool factor(Hessian& hessian, double shift);
   void solve(const linalg::CholeskyFactor& factor);
   bool chord();
+  bool near_factor() const;
   bool exact_direction();
   void positive_direction();
   void shifted_direction();
@@ -291,6 +294,16 @@ bool Minimizer::chord() {
   return true;
 }
 
+/// Whether the last exact factor was made so close by that the Hessian here is as definite: chord
+/// steps may have come far from it, into a saddle.
+bool Minimizer::near_factor() const {
+  double drift = 0.0;
+  for (std::size_t i = 0; i < x_.size(); ++i) {
+    drift = std::max(drift, std::abs(x_[i] - out_.factored_at[i]));
+  }
+  return drift < kNearFactor * f_.h;
+}
+
 /// Newton direction with the exact Hessian. False when it is not positive definite.
 bool Minimizer::exact_direction() {
   Hessian hessian;
@@ -470,8 +483,13 @@ void Minimizer::descend() {
     const bool moved_on = step > kResolution * largest(x_) && search();
     // Such a step descends unless rounding is in the way, and then it has nowhere better to go.
     if (mode_ == Mode::kExact && step < f_.h * tolerance && !limited_) {
-      out_.status = Status::kConverged;
-      return;
+      if (near_factor() || exact_direction()) {
+        out_.status = Status::kConverged;
+        return;
+      }
+      if (!escape_saddle()) return;
+      best = std::numeric_limits<double>::infinity();
+      continue;
     }
     if (!moved_on) {
       // A chord step may fail where a fresh factor succeeds, a projection where a shift does.
