@@ -25,7 +25,6 @@ class Interrupt {
     if (poll_ && poll_()) stopped_.store(true);
   }
 
-  void stop() { stopped_.store(true); }
   bool stopped() const { return stopped_.load(); }
 
  private:

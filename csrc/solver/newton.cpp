@@ -444,7 +444,7 @@ bool Minimizer::escape_saddle() {
   // The largest component decides the sign; ties go to the first.
   const auto top = std::ranges::max_element(d, {}, [](double value) { return std::abs(value); });
   // The distance that a speed of 1 m/s covers in a step: the search shortens it where needed.
-  const double length = f_.h * 1.0 * (*top < 0.0 ? -1.0 : 1.0);
+  const double length = f_.h * (*top < 0.0 ? -1.0 : 1.0);
   for (std::size_t i = 0; i < d.size(); ++i) p_[i] = length * d[i];
 
   std::vector<double> to = moved(1.0);
