@@ -19,6 +19,8 @@ from diffcloth_torch.step import CONVERGED, INFEASIBLE, INTERSECTING, UNCONVERGE
 
 __all__ = ["make_report", "raise_on_failure"]
 
+_COUNT = "count_"  # opens the names of the core's counters
+
 
 def make_report(diagnostics: dict[str, Any], phases: Sequence[str], *, batched: bool) -> Report:
     """Put the core's arrays [B] into a report."""
@@ -34,6 +36,11 @@ def make_report(diagnostics: dict[str, Any], phases: Sequence[str], *, batched: 
         contact_count=value(diagnostics["contact_count"]),
         motion_fraction=value(diagnostics["motion_fraction"]),
         seconds={phase: value(diagnostics["seconds"][:, i]) for i, phase in enumerate(phases)},
+        counts={
+            name.removeprefix(_COUNT): value(array)
+            for name, array in diagnostics.items()
+            if name.startswith(_COUNT)
+        },
     )
 
 
@@ -61,8 +68,8 @@ def raise_on_failure(
         (
             NotConverged,
             (status == UNCONVERGED) & throw,
-            "the solver stopped above its tolerance; raise SolverOptions.max_iterations or "
-            "tolerance, or lower dt",
+            "the solver stopped before its tolerance was reached; raise "
+            "SolverOptions.max_iterations or tolerance, or lower dt",
         ),
     ]
     for error, failed, sentence in failures:

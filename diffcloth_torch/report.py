@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import torch
@@ -18,13 +18,16 @@ class Report:
 
     Attributes:
         converged: Whether the residual fell below the tolerance.
-        iterations: Newton iterations.
-        residual: Largest Newton step at the end, as a velocity [m/s].
+        iterations: Newton iterations of all solves of the step.
+        residual: Largest displacement of the last Newton step, as a velocity [m/s].
         minimum_distance: Smallest distance between mid-surfaces in contact [m], which is above half
             the sum of their thicknesses; infinite where nothing is within the barrier's reach.
         contact_count: Pairs of primitives closer than the barrier distance.
         motion_fraction: Part of the prescribed motion that was reached, 1 for all of it.
-        seconds: Phase of the solve -> time [s].
+        seconds: Phase of the step -> time [s]; the phases add up to the time in the core.
+        counts: What was done -> how often: steps with the `exact` Hessian, `chord` steps with an
+            older factor, steps with a `projected` Hessian, Hessians of `negative_curvature`,
+            numeric `factorizations`, and symbolic `analyses`.
     """
 
     converged: bool | Tensor
@@ -34,6 +37,7 @@ class Report:
     contact_count: int | Tensor
     motion_fraction: float | Tensor
     seconds: dict[str, float | Tensor]
+    counts: dict[str, int | Tensor] = field(default_factory=dict)
 
     def select(self, index: int | slice) -> Report:
         """Report of one environment, or of some."""
@@ -47,14 +51,14 @@ class Report:
     def stack(reports: Sequence[Report | None]) -> Report | None:
         """Report of a batch from those of its environments; None if one has none."""
         present = [report for report in reports if report is not None]
-        if len(present) < len(reports) or len({tuple(r.seconds) for r in present}) > 1:
+        if len(present) < len(reports) or len({_names(r) for r in present}) > 1:
             return None
         return _combine(lambda *values: torch.stack([_tensor(v) for v in values]), present)
 
     @staticmethod
     def where(mask: Tensor, a: Report | None, b: Report | None) -> Report | None:
         """Report that takes the environments of `a` where `mask` is true; None if one has none."""
-        if a is None or b is None or tuple(a.seconds) != tuple(b.seconds):
+        if a is None or b is None or _names(a) != _names(b):
             return None
         return _combine(lambda x, y: torch.where(mask, _tensor(x), _tensor(y)), [a, b])
 
@@ -66,16 +70,29 @@ def _tensor(value: Any) -> Tensor:
     )
 
 
+# Fields that hold several numbers by name.
+_TABLES = ("seconds", "counts")
+
+
+def _names(report: Report) -> tuple[tuple[str, ...], ...]:
+    return tuple(tuple(getattr(report, table)) for table in _TABLES)
+
+
 def _combine(function: Callable[..., Any], reports: Sequence[Report]) -> Report:
-    """Apply a function to each field of some reports."""
+    """Apply a function to each number of some reports."""
     plain = {
-        field.name: function(*(getattr(report, field.name) for report in reports))
-        for field in fields(Report)
-        if field.name != "seconds"
+        entry.name: function(*(getattr(report, entry.name) for report in reports))
+        for entry in fields(Report)
+        if entry.name not in _TABLES
     }
-    phases = reports[0].seconds
-    seconds = {phase: function(*(report.seconds[phase] for report in reports)) for phase in phases}
-    return Report(**plain, seconds=seconds)
+    tables = {
+        table: {
+            name: function(*(getattr(report, table)[name] for report in reports))
+            for name in getattr(reports[0], table)
+        }
+        for table in _TABLES
+    }
+    return Report(**plain, **tables)
 
 
 torch.serialization.add_safe_globals([Report])

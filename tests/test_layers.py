@@ -14,6 +14,7 @@ CPP_LAYERS = [
     {"common"},
     {"linalg"},
     {"mesh"},
+    {"potential"},
     {"elastic", "contact", "bodies"},
     {"solver", "projective"},
     {"step"},

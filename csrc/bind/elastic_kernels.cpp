@@ -143,8 +143,8 @@ class Elastic {
 
   Array hessian_blocks(const Positions& x, bool positive) const {
     std::vector<double> blocks(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
-    const auto projection = positive ? elastic::Projection::kPositive : elastic::Projection::kExact;
-    elastic::add_hessian(model_, slots_, positions("x", x).data(), projection, blocks.data());
+    const auto curvature = positive ? Curvature::kPositive : Curvature::kExact;
+    elastic::add_hessian(model_, slots_, positions("x", x).data(), curvature, blocks.data());
     return owned(blocks.data(), {blocks.size() / 9, 9});
   }
 

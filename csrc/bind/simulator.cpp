@@ -2,6 +2,7 @@
 #include <memory>
 #include <stdexcept>
 #include <string>
+#include <type_traits>
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -11,6 +12,7 @@
 #include "bind/bind.h"
 #include "common/parallel_for.h"
 #include "contact/nonadjacent_distance.h"
+#include "step/scheme.h"
 #include "step/step.h"
 
 namespace diffcloth::bind {
@@ -128,80 +130,119 @@ class Simulator {
   step::FactorCache factors_;
 };
 
+/// Arrays of all environments by name, and what one environment sees of them.
+class Outputs {
+ public:
+  /// Zeroed arrays [environments, ...] for these fields, put into `out` under prefix + name.
+  Outputs(const std::vector<step::Field>& fields,
+          std::size_t environments,
+          const std::string& prefix,
+          nb::dict& out) {
+    for (const step::Field& field : fields) {
+      std::vector<std::size_t> shape{environments};
+      shape.insert(shape.end(), field.shape.begin(), field.shape.end());
+      Owned<double> owned = make_array<double>(shape);
+      std::fill_n(owned.data, environments * field.size(), 0.0);
+      out[(prefix + field.name).c_str()] = owned.array;
+      entries_.push_back({.name = field.name, .data = owned.data, .size = field.size()});
+    }
+  }
+
+  step::Arrays<double> environment(std::size_t e) const {
+    step::Arrays<double> arrays;
+    for (const Entry& entry : entries_) arrays.set(entry.name, entry.data + e * entry.size);
+    return arrays;
+  }
+
+ private:
+  struct Entry {
+    std::string name;
+    double* data;
+    std::size_t size;
+  };
+  std::vector<Entry> entries_;
+};
+
+/// Arrays that came back from Python under prefix + name; their shapes are checked, as hooks on saved
+/// tensors may return anything.
+class Saved {
+ public:
+  Saved(const std::vector<step::Field>& fields,
+        std::size_t environments,
+        const std::string& prefix,
+        const nb::dict& from) {
+    for (const step::Field& field : fields) {
+      const std::string name = prefix + field.name;
+      auto array = nb::cast<Doubles>(from[name.c_str()]);
+      if (array.size() != environments * field.size()) {
+        throw nb::value_error(("backward: `" + name + "` must have " +
+                               std::to_string(environments * field.size()) + " numbers, got " +
+                               std::to_string(array.size()))
+                                  .c_str());
+      }
+      entries_.push_back({.name = field.name, .array = array, .size = field.size()});
+    }
+  }
+
+  step::Arrays<const double> environment(std::size_t e) const {
+    step::Arrays<const double> arrays;
+    for (const Entry& entry : entries_) arrays.set(entry.name, entry.array.data() + e * entry.size);
+    return arrays;
+  }
+
+ private:
+  struct Entry {
+    std::string name;
+    Doubles array;
+    std::size_t size;
+  };
+  std::vector<Entry> entries_;
+};
+
+/// The reports of all environments, one array [environments] a number.
+void add_reports(const std::vector<step::Report>& reports, nb::dict& out) {
+  const std::size_t b = reports.size();
+  std::map<std::string, double*> numbers;
+  std::map<std::string, std::int64_t*> integers;
+  const auto slot = [&]<class T>(std::map<std::string, T*>& arrays, const char* name) {
+    if (!arrays.contains(name)) {
+      Owned<T> owned = make_array<T>({b});
+      out[name] = owned.array;
+      arrays[name] = owned.data;
+    }
+    return arrays[name];
+  };
+  Owned<double> seconds = make_array<double>({b, kPhaseCount});
+  nb::list messages;
+  for (std::size_t e = 0; e < b; ++e) {
+    reports[e].for_each([&](const char* name, auto value) {
+      if constexpr (std::is_same_v<decltype(value), double>) {
+        slot(numbers, name)[e] = value;
+      } else {
+        slot(integers, name)[e] = value;
+      }
+    });
+    std::ranges::copy(reports[e].seconds, seconds.data + e * kPhaseCount);
+    messages.append(reports[e].message);
+  }
+  out["seconds"] = seconds.array;
+  out["message"] = messages;
+}
+
 nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   const Arrays arrays(inputs);
   const std::size_t b = arrays.environments;
-  const auto n = static_cast<std::size_t>(scene_.cloth_vertex_count());
-  const std::size_t v = static_cast<std::size_t>(scene_.vertex_count()) - n;
-  const auto k = static_cast<std::size_t>(scene_.given.friction_iterations);
-  const bool split = scene_.given.scheme == step::Scheme::kSplit;
-
   nb::dict out;
-  const auto doubles = [&](const char* name, std::vector<std::size_t> shape) {
-    Owned<double> owned = make_array<double>(shape);
-    std::size_t size = 1;
-    for (const std::size_t extent : shape) size *= extent;
-    std::fill_n(owned.data, size, 0.0);
-    out[name] = owned.array;
-    return owned.data;
-  };
-  const auto integers = [&](const char* name) {
-    Owned<std::int64_t> owned = make_array<std::int64_t>({b});
-    std::fill_n(owned.data, b, 0);
-    out[name] = owned.array;
-    return owned.data;
-  };
-
-  double* positions = doubles("positions", {b, n, 3});
-  double* velocities = doubles("velocities", {b, n, 3});
-  double* body_forces = doubles("body_forces", {b, v, 3});
-  step::Tape tapes;
-  if (tape) {
-    tapes = {.iterates = doubles("tape_iterates", {b, k, n, 3}),
-             .factored = doubles("tape_factored", {b, k, n, 3}),
-             .elastic = split ? doubles("tape_elastic", {b, 2, n, 3}) : nullptr,
-             .solves = integers("tape_solves"),
-             .key = integers("tape_key")};
-  }
+  const Outputs outputs(step::output_fields(scene_), b, "", out);
+  const Outputs tapes(tape ? step::tape_fields(scene_) : std::vector<step::Field>(), b, "tape_",
+                      out);
   std::vector<step::Report> reports(b);
   for_environments(b, threads, [&](Index i, const Checkpoint& checkpoint) {
     const auto e = static_cast<std::size_t>(i);
-    step::Tape own;
-    if (tape) {
-      own = {.iterates = tapes.iterates + e * k * n * 3,
-             .factored = tapes.factored + e * k * n * 3,
-             .elastic = split ? tapes.elastic + e * 2 * n * 3 : nullptr,
-             .solves = tapes.solves + e,
-             .key = tapes.key + e};
-    }
-    reports[e] = step::forward(scene_, arrays.environment(e), checkpoint,
-                               {.positions = positions + e * n * 3,
-                                .velocities = velocities + e * n * 3,
-                                .body_forces = body_forces + e * v * 3,
-                                .tape = own},
-                               &factors_);
+    reports[e] = step::forward(scene_, arrays.environment(e), checkpoint, outputs.environment(e),
+                               tapes.environment(e), &factors_, nullptr);
   });
-
-  std::int64_t* status = integers("status");
-  std::int64_t* iterations = integers("iterations");
-  std::int64_t* contact_count = integers("contact_count");
-  double* residual = doubles("residual", {b});
-  double* minimum_distance = doubles("minimum_distance", {b});
-  double* motion_fraction = doubles("motion_fraction", {b});
-  double* seconds = doubles("seconds", {b, solver::kPhaseCount});
-  nb::list messages;
-  for (std::size_t e = 0; e < b; ++e) {
-    const step::Report& report = reports[e];
-    status[e] = static_cast<std::int64_t>(report.result);
-    iterations[e] = report.iterations;
-    contact_count[e] = report.contact_count;
-    residual[e] = report.residual;
-    minimum_distance[e] = report.minimum_distance;
-    motion_fraction[e] = report.motion_fraction;
-    std::ranges::copy(report.seconds, seconds + e * solver::kPhaseCount);
-    messages.append(report.message);
-  }
-  out["message"] = messages;
+  add_reports(reports, out);
   return out;
 }
 
@@ -212,19 +253,8 @@ nb::dict Simulator::backward(const nb::dict& inputs,
                              int threads) {
   const Arrays arrays(inputs);
   const std::size_t b = arrays.environments;
-  const auto n = static_cast<std::size_t>(scene_.cloth_vertex_count());
-  const std::size_t v = static_cast<std::size_t>(scene_.vertex_count()) - n;
-  const auto k = static_cast<std::size_t>(scene_.given.friction_iterations);
-
-  const auto positions_bar = nb::cast<Doubles>(cotangents["positions"]);
-  const auto velocities_bar = nb::cast<Doubles>(cotangents["velocities"]);
-  const auto forces_bar = nb::cast<Doubles>(cotangents["body_forces"]);
-  const auto iterates = nb::cast<Doubles>(tape["tape_iterates"]);
-  const auto factored = nb::cast<Doubles>(tape["tape_factored"]);
-  const bool split = tape.contains("tape_elastic");
-  const Doubles elastic = split ? nb::cast<Doubles>(tape["tape_elastic"]) : Doubles();
-  const auto solves = nb::cast<Integers>(tape["tape_solves"]);
-  const auto key = nb::cast<Integers>(tape["tape_key"]);
+  const Saved tapes(step::tape_fields(scene_), b, "tape_", tape);
+  const Saved bars(step::output_fields(scene_), b, "", cotangents);
 
   // Each environment writes into its own copy; shared inputs are then summed in index order.
   struct Wanted {
@@ -259,15 +289,7 @@ nb::dict Simulator::backward(const nb::dict& inputs,
     const auto e = static_cast<std::size_t>(i);
     step::Gradients gradients;
     for (Wanted& w : wanted) gradients.data[w.input] = w.own.data() + e * w.count;
-    step::backward(scene_, arrays.environment(e),
-                   {.iterates = iterates.data() + e * k * n * 3,
-                    .factored = factored.data() + e * k * n * 3,
-                    .elastic = split ? elastic.data() + e * 2 * n * 3 : nullptr,
-                    .solves = solves.data() + e,
-                    .key = key.data() + e},
-                   {.positions = positions_bar.data() + e * n * 3,
-                    .velocities = velocities_bar.data() + e * n * 3,
-                    .body_forces = forces_bar.data() + e * v * 3},
+    step::backward(scene_, arrays.environment(e), tapes.environment(e), bars.environment(e),
                    checkpoint, gradients, factors_);
   });
   for (const Wanted& w : wanted) {
@@ -281,21 +303,14 @@ nb::dict Simulator::backward(const nb::dict& inputs,
 
 nb::object Simulator::path(const nb::dict& inputs) {
   const Arrays arrays(inputs);
-  const auto n = static_cast<std::size_t>(scene_.cloth_vertex_count());
-  const auto all = static_cast<std::size_t>(scene_.vertex_count());
-  std::vector<double> positions(3 * n);
-  std::vector<double> velocities(3 * n);
-  std::vector<double> body_forces(3 * (all - n));
+  nb::dict unused;
+  const Outputs outputs(step::output_fields(scene_), 1, "", unused);
   std::vector<std::vector<double>> path;
   for_environments(1, 1, [&](Index, const Checkpoint& checkpoint) {
-    step::forward(scene_, arrays.environment(0), checkpoint,
-                  {.positions = positions.data(),
-                   .velocities = velocities.data(),
-                   .body_forces = body_forces.data(),
-                   .tape = {},
-                   .path = &path},
-                  nullptr);
+    step::forward(scene_, arrays.environment(0), checkpoint, outputs.environment(0), {}, nullptr,
+                  &path);
   });
+  const auto all = static_cast<std::size_t>(scene_.vertex_count());
   Owned<double> result = make_array<double>({path.size(), all, 3});
   for (std::size_t k = 0; k < path.size(); ++k) {
     std::ranges::copy(path[k], result.data + 3 * all * k);
@@ -333,6 +348,12 @@ nb::object Simulator::find_overlap(const Doubles& positions,
   return text.empty() ? nb::none() : nb::cast(text);
 }
 
+step::Metric to_metric(const std::string& name) {
+  if (name == "mass") return step::Metric::kMass;
+  if (name == "identity") return step::Metric::kIdentity;
+  throw nb::value_error(("metric must be one of 'mass', 'identity', got '" + name + "'").c_str());
+}
+
 step::Description describe(const Doubles& vertices,
                            const Doubles& rest_vertices,
                            const Indices& faces,
@@ -367,8 +388,8 @@ step::Description describe(const Doubles& vertices,
   d.body_faces = to_faces(body_faces);
   d.self_contact = self_contact;
   d.dt = dt;
-  d.scheme = scheme == "split" ? step::Scheme::kSplit : step::Scheme::kCoupled;
-  d.metric = metric == "identity" ? step::Metric::kIdentity : step::Metric::kMass;
+  d.scheme = scheme;
+  d.metric = to_metric(metric);
   d.friction_iterations = friction_iterations;
   d.options = {.tolerance = tolerance, .max_iterations = max_iterations};
   return d;
@@ -411,7 +432,7 @@ void simulator(nb::module_& m) {
       .def("forget_factors", &Simulator::forget_factors,
            "Drop the factors kept for backward; they are made again when needed.")
       .def_prop_ro_static("phases", [](nb::handle) {
-        return std::vector<std::string>(solver::kPhaseNames.begin(), solver::kPhaseNames.end());
+        return std::vector<std::string>(kPhaseNames.begin(), kPhaseNames.end());
       });
 }
 

@@ -51,6 +51,10 @@ bool ContactModel::inert(const Candidate& pair) const {
   return std::ranges::all_of(pair.vertices, [&](Index v) { return prescribed_[v] != 0; });
 }
 
+bool ContactModel::has_prescribed(const std::array<Index, 4>& vertices) const {
+  return std::ranges::any_of(vertices, [&](Index v) { return prescribed_[v] != 0; });
+}
+
 // Weights (3-contact, 3.3): point-triangle A_p/4, edge-edge (A_a + A_b)/4. A body's coarse areas
 // must not dominate: edge-edge takes the cloth edge's half, a body vertex on a cloth face the
 // smaller of the two.

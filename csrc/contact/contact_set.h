@@ -8,6 +8,7 @@
 #include "contact/broad_phase.h"
 #include "contact/collision_mesh.h"
 #include "contact/distance/closest.h"
+#include "potential/potential.h"
 
 namespace diffcloth::contact {
 
@@ -29,9 +30,6 @@ struct Parameters {
   std::vector<double> thickness;  ///< [S] full thickness of each surface [m]
   std::vector<double> friction;   ///< [S * S]; a pair uses the mean of its two entries
 };
-
-/// The exact Hessian, or a positive semi-definite stand-in for it far from the minimum.
-enum class Curvature : std::uint8_t { kExact, kPositive };
 
 /// A pair of primitives within reach, with everything its barrier needs.
 struct Contact {
@@ -120,6 +118,9 @@ class ContactModel {
 
   /// Vertices of both primitives prescribed.
   bool inert(const Candidate& pair) const;
+
+  /// Whether some of these vertices are prescribed.
+  bool has_prescribed(const std::array<Index, 4>& vertices) const;
 
  private:
   double weight(const Candidate& pair) const;

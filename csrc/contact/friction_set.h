@@ -19,6 +19,7 @@ class FrictionSet {
   /// @param contacts  the contacts of the lag configuration
   FrictionSet(const ContactModel& model, const std::vector<Contact>& contacts);
 
+  const ContactModel& model() const { return *model_; }
   bool empty() const { return entries_.empty(); }
 
   struct Entry {

@@ -277,12 +277,9 @@ void add_gradient(const Model& model, const double* x, double* g) {
   }
 }
 
-void add_hessian(const Model& model,
-                 const Slots& slots,
-                 const double* x,
-                 Projection projection,
-                 double* blocks) {
-  const bool positive = projection == Projection::kPositive;
+void add_hessian(
+    const Model& model, const Slots& slots, const double* x, Curvature curvature, double* blocks) {
+  const bool positive = curvature == Curvature::kPositive;
   for (Index f = 0; f < face_count(model); ++f) {
     const std::array<Index, 3>& face = model.topology->faces[f];
     const mesh::ShapeGradient& g = model.rest->shape_gradient[f];

@@ -7,6 +7,7 @@
 #include "linalg/block_pattern.h"
 #include "mesh/rest_shape.h"
 #include "mesh/topology.h"
+#include "potential/potential.h"
 
 namespace diffcloth::elastic {
 
@@ -67,12 +68,9 @@ double energy_change(const Model& model, const double* x0, const double* x1);
 /// g += grad E(x), damping included, [N, 3] [N].
 void add_gradient(const Model& model, const double* x, double* g);
 
-/// The exact Hessian, or one made of positive semi-definite element matrices.
-enum class Projection : std::uint8_t { kExact, kPositive };
-
 /// blocks += the Hessian at x, damping included, 9 doubles a slot [N/m].
 void add_hessian(
-    const Model& model, const Slots& slots, const double* x, Projection projection, double* blocks);
+    const Model& model, const Slots& slots, const double* x, Curvature curvature, double* blocks);
 
 /// y += H(x) z over all vertices, with the exact Hessian and without a matrix.
 void add_hessian_product(const Model& model, const double* x, const double* z, double* y);

@@ -4,13 +4,14 @@
 
 namespace diffcloth::linalg {
 
-MergedPattern merge(const BlockPattern& base, std::vector<std::pair<Index, Index>> pairs) {
-  const auto by_column = [](const auto& a, const auto& b) {
+void sort_couplings(Couplings& pairs) {
+  std::ranges::sort(pairs, [](const auto& a, const auto& b) {
     return a.second != b.second ? a.second < b.second : a.first < b.first;
-  };
-  std::ranges::sort(pairs, by_column);
+  });
   pairs.erase(std::unique(pairs.begin(), pairs.end()), pairs.end());
+}
 
+MergedPattern merge(const BlockPattern& base, const Couplings& pairs) {
   const std::vector<Index>& start = base.column_start();
   const std::vector<Index>& row = base.row();
   std::vector<Index> merged_start(start.size(), 0);
@@ -37,6 +38,47 @@ MergedPattern merge(const BlockPattern& base, std::vector<std::pair<Index, Index
   }
   return {.pattern = BlockPattern(std::move(merged_start), std::move(merged_row)),
           .slot_of_base = std::move(slot_of_base)};
+}
+
+BlockMatrix::BlockMatrix(std::shared_ptr<const MergedPattern> merged,
+                         const std::vector<char>& fixed)
+    : merged_(std::move(merged)),
+      fixed_(&fixed),
+      blocks_(9 * static_cast<std::size_t>(merged_->pattern.block_count()), 0.0) {}
+
+void BlockMatrix::add_base(const std::vector<double>& base_blocks) {
+  const double* from = base_blocks.data();
+  for (const Index slot : merged_->slot_of_base) {
+    double* to = blocks_.data() + 9 * static_cast<std::ptrdiff_t>(slot);
+    for (int a = 0; a < 9; ++a) to[a] += from[a];
+    from += 9;
+  }
+}
+
+void BlockMatrix::add_stencil(const std::array<Index, 4>& vertices, const Mat12& h) {
+  for (int p = 0; p < 4; ++p) {
+    const Index i = vertices[p];
+    if (!has(i)) continue;
+    for (int q = 0; q < 4; ++q) {
+      const Index j = vertices[q];
+      if (i < j || !has(j)) continue;
+      const Index slot = merged_->pattern.slot(i, j);
+      Eigen::Map<Mat3>(blocks_.data() + 9 * static_cast<std::ptrdiff_t>(slot)) +=
+          h.block<3, 3>(3 * p, 3 * q);
+    }
+  }
+}
+
+void BlockMatrix::blend(const BlockMatrix& other, double s) {
+  const double own = 1.0 / (1.0 + s);
+  const double others = s / (1.0 + s);
+  for (std::size_t k = 0; k < blocks_.size(); ++k) {
+    blocks_[k] = own * blocks_[k] + others * other.blocks_[k];
+  }
+}
+
+void BlockMatrix::add_product(const double* x, double* y) const {
+  linalg::add_product(merged_->pattern, blocks_.data(), x, y);
 }
 
 void add_product(const BlockPattern& pattern, const double* blocks, const double* x, double* y) {

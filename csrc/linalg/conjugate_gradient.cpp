@@ -13,14 +13,14 @@ double dot(const std::vector<double>& a, const std::vector<double>& b) {
 
 }  // namespace
 
-bool conjugate_gradient(const BlockPattern& pattern,
-                        const double* blocks,
-                        const std::vector<char>& fixed,
-                        const CholeskyFactor& preconditioner,
-                        const std::vector<double>& b,
-                        double tolerance,
-                        int max_iterations,
-                        std::vector<double>& x) {
+Convergence conjugate_gradient(const BlockPattern& pattern,
+                               const double* blocks,
+                               const std::vector<char>& fixed,
+                               const CholeskyFactor& preconditioner,
+                               const std::vector<double>& b,
+                               double tolerance,
+                               int max_iterations,
+                               std::vector<double>& x) {
   const std::size_t size = 3 * static_cast<std::size_t>(pattern.size());
   x.assign(size, 0.0);
   std::vector<double> r(b.begin(), b.begin() + static_cast<std::ptrdiff_t>(size));
@@ -33,7 +33,7 @@ bool conjugate_gradient(const BlockPattern& pattern,
   std::vector<double> q(size);
   double rz = dot(r, z);
   const double goal = tolerance * tolerance * rz;
-  if (rz == 0.0) return true;
+  if (rz == 0.0) return Convergence::kConverged;
 
   for (int iteration = 0; iteration < max_iterations; ++iteration) {
     std::fill(q.begin(), q.end(), 0.0);
@@ -42,7 +42,7 @@ bool conjugate_gradient(const BlockPattern& pattern,
       if (fixed[i]) q[3 * i] = q[3 * i + 1] = q[3 * i + 2] = 0.0;
     }
     const double curvature = dot(p, q);
-    if (!(curvature > 0.0)) return false;
+    if (!(curvature > 0.0)) return Convergence::kNegativeCurvature;
     const double alpha = rz / curvature;
     for (std::size_t k = 0; k < size; ++k) {
       x[k] += alpha * p[k];
@@ -50,12 +50,12 @@ bool conjugate_gradient(const BlockPattern& pattern,
     }
     preconditioner.solve(r.data(), z.data());
     const double next = dot(r, z);
-    if (next <= goal) return true;
+    if (next <= goal) return Convergence::kConverged;
     const double beta = next / rz;
     rz = next;
     for (std::size_t k = 0; k < size; ++k) p[k] = z[k] + beta * p[k];
   }
-  return false;
+  return Convergence::kIterationLimit;
 }
 
 }  // namespace diffcloth::linalg

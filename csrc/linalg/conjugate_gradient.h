@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cstdint>
 #include <vector>
 
 #include "linalg/block_pattern.h"
@@ -7,19 +8,20 @@
 
 namespace diffcloth::linalg {
 
+enum class Convergence : std::uint8_t { kConverged, kIterationLimit, kNegativeCurvature };
+
 /// Solve A x = b at the vertices that are not fixed, preconditioned by a factor of a nearby matrix.
 ///
 /// @param fixed      [pattern.size()] vertices left out: x is zero there
 /// @param tolerance  on the residual in the preconditioner's norm, relative to b's
-/// @return true when the tolerance was reached; false on a direction of negative curvature or
-///         after max_iterations
-[[nodiscard]] bool conjugate_gradient(const BlockPattern& pattern,
-                                      const double* blocks,
-                                      const std::vector<char>& fixed,
-                                      const CholeskyFactor& preconditioner,
-                                      const std::vector<double>& b,
-                                      double tolerance,
-                                      int max_iterations,
-                                      std::vector<double>& x);
+/// @return how it ended; x is the best iterate so far in any case
+[[nodiscard]] Convergence conjugate_gradient(const BlockPattern& pattern,
+                                             const double* blocks,
+                                             const std::vector<char>& fixed,
+                                             const CholeskyFactor& preconditioner,
+                                             const std::vector<double>& b,
+                                             double tolerance,
+                                             int max_iterations,
+                                             std::vector<double>& x);
 
 }  // namespace diffcloth::linalg

@@ -1,118 +1,72 @@
 #pragma once
 
-#include <list>
-#include <memory>
-#include <mutex>
-#include <utility>
 #include <vector>
 
-#include "common/types.h"
-#include "contact/contact_set.h"
-#include "contact/friction_set.h"
-#include "elastic/anchors.h"
-#include "elastic/elastic.h"
-#include "linalg/block_matrix.h"
-#include "linalg/cholesky.h"
+#include "contact/contact_potential.h"
+#include "potential/potential.h"
+#include "potential/proximity.h"
+#include "solver/assembly_cache.h"
+#include "solver/coordinates.h"
 
 namespace diffcloth::solver {
 
-/// A matrix pattern with contacts in it, and its symbolic factorization.
-struct Assembly {
-  linalg::MergedPattern merged;
-  std::shared_ptr<const linalg::CholeskyAnalysis> analysis;
-};
-
-/// Symbolic factorizations seen before, by the couplings that contact adds to the base pattern.
+/// What a solve minimizes: a sum of potentials over the positions of all vertices  [J].
 ///
-/// Only a memory: an entry is a function of its key, so results do not depend on what is in it.
-class AssemblyCache {
- public:
-  AssemblyCache(linalg::BlockPattern base, std::vector<char> fixed);
-
-  /// @param pairs  lower-triangle couplings (row > column), sorted by (column, row), unique
-  std::shared_ptr<const Assembly> find(const std::vector<std::pair<Index, Index>>& pairs);
-
-  const linalg::BlockPattern& base() const { return base_; }
-
- private:
-  using Key = std::vector<std::pair<Index, Index>>;
-  static constexpr std::size_t kCapacity = 64;
-
-  linalg::BlockPattern base_;
-  std::vector<char> fixed_;
-  std::shared_ptr<const Assembly> plain_;
-  std::mutex mutex_;
-  std::list<std::pair<Key, std::shared_ptr<const Assembly>>> entries_;  // most recent first
-};
-
-/// A sum of potentials over the positions of all vertices, cloth first, then bodies:
-///
-///   P(x) = 1/(2 h^2) (x - y)^T G (x - y) + W(x) + anchors + kappa B(x) + D(x - x_start)   [J]
-///
-/// Parts that are absent are null. Prescribed vertices (pins, bodies) are given; the others are the
-/// unknowns. Positions and gradients are arrays of 3 doubles a vertex.
+/// The potentials are the caller's. Two of them have a further role: the inertia, whose metric is
+/// the scale of shifts and speeds, and contact, which watches motions.
 struct Objective {
-  Index cloth_vertex_count;
-  Index vertex_count;
-  double h;
-  const std::vector<char>* prescribed;  ///< [vertex_count]
-
-  std::vector<double> metric;  ///< G_i [kg], [cloth_vertex_count]
-  std::vector<double> target;  ///< y [3 cloth_vertex_count]
-
-  const elastic::Model* elastic = nullptr;
-  const elastic::Slots* slots = nullptr;
-  const elastic::Anchors* anchors = nullptr;
-  const contact::ContactModel* contact = nullptr;
-  contact::FrictionSet friction;
-  const double* x_start = nullptr;  ///< start-of-step positions, for friction
-
+  const Coordinates* coordinates;
+  double h;       ///< time step [s]
+  double length;  ///< mean edge of the cloths [m]
+  Proximity* inertia;
+  std::vector<Potential*> others;                ///< everything but inertia and contact
+  contact::ContactPotential* contact = nullptr;  ///< null where nothing can touch
   AssemblyCache* assemblies;
 
-  bool is_free(Index vertex) const { return (*prescribed)[vertex] == 0; }
+  /// Every potential in a fixed order.
+  template <class Visit>
+  void for_each(Visit&& visit) const {
+    visit(static_cast<Potential&>(*inertia));
+    for (Potential* potential : others) visit(*potential);
+    if (contact != nullptr) visit(static_cast<Potential&>(*contact));
+  }
 
-  /// P(x), without friction, which only differences of are used.
-  double energy(const double* x, const std::vector<double>& contact_energies) const;
+  void stand_at(const double* x) const {
+    for_each([&](Potential& p) { p.stand_at(x); });
+  }
 
-  /// P(x1) - P(x0), element by element so that little cancels. The contact energies are those of
-  /// one candidate list at x0 and at x1.
-  double energy_change(const double* x0,
-                       const std::vector<double>& contact_energies0,
-                       const double* x1,
-                       const std::vector<double>& contact_energies1) const;
+  double energy(const double* x) const {
+    double e = 0.0;
+    for_each([&](const Potential& p) { e += p.energy(x); });
+    return e;
+  }
+
+  double energy_without_contact(const double* x) const {
+    double e = inertia->energy(x);
+    for (const Potential* p : others) e += p->energy(x);
+    return e;
+  }
+
+  double energy_change(const double* x, const double* to) const {
+    double change = 0.0;
+    for_each([&](const Potential& p) { change += p.energy_change(x, to); });
+    return change;
+  }
 
   /// grad P at all vertices, prescribed ones included.
-  void gradient(const double* x,
-                const std::vector<contact::Contact>& contacts,
-                std::vector<double>& g) const;
+  void gradient(const double* x, std::vector<double>& g) const {
+    g.assign(3 * static_cast<std::size_t>(coordinates->vertex_count()), 0.0);
+    for_each([&](const Potential& p) { p.add_gradient(x, g.data()); });
+  }
 
   /// y = (d^2 P) z over all vertices, exact.
-  void hessian_product(const double* x,
-                       const std::vector<contact::Contact>& contacts,
-                       const double* z,
-                       std::vector<double>& y) const;
+  void hessian_product(const double* x, const double* z, std::vector<double>& y) const {
+    y.assign(3 * static_cast<std::size_t>(coordinates->vertex_count()), 0.0);
+    for_each([&](const Potential& p) { p.add_hessian_product(x, z, y.data()); });
+  }
+
+  /// Couplings beyond the base pattern, sorted.
+  linalg::Couplings couplings() const;
 };
-
-/// Hessian of an objective at one point, on the blocks of the cloth's vertices.
-struct Hessian {
-  std::shared_ptr<const Assembly> assembly;
-  std::vector<double> blocks;
-};
-
-/// Assemble the Hessian at x; kPositive replaces each element's by a positive semi-definite one.
-Hessian assemble(const Objective& objective,
-                 const double* x,
-                 const std::vector<contact::Contact>& contacts,
-                 contact::Curvature curvature);
-
-/// out += H_xo d at the free vertices, for a motion d of the prescribed ones (zero elsewhere), with
-/// the same curvature as the assembled Hessian.
-void add_prescribed_product(const Objective& objective,
-                            const Hessian& hessian,
-                            const double* x,
-                            const std::vector<contact::Contact>& contacts,
-                            contact::Curvature curvature,
-                            const double* d,
-                            double* out);
 
 }  // namespace diffcloth::solver

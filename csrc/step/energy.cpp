@@ -6,10 +6,10 @@
 namespace diffcloth::step {
 
 double potential_energy(const Scene& scene, const Inputs& inputs) {
-  const Problem p(scene, inputs);
+  Problem p(scene, inputs);
   const double* x = p.start.data();
-  double energy = elastic::energy(p.elastic, x);
-  if (!scene.given.soft_pins.empty()) energy += elastic::energy(p.anchors, x);
+  double energy = 0.0;
+  for (const Potential* potential : p.elastic_potentials()) energy += potential->energy(x);
   const Vec3 gravity = row(inputs.data(Input::kGravity), 0);
   for (std::size_t i = 0; i < p.masses.size(); ++i) {
     energy -= p.masses[i] * gravity.dot(row(x, static_cast<Index>(i)));
@@ -34,16 +34,13 @@ double default_barrier_stiffness(const Scene& scene,
   Inputs at_rest = inputs;
   at_rest.views[static_cast<std::size_t>(Input::kPositions)].data =
       scene.given.rest_vertices.data();
-  const Problem p(scene, at_rest);
-  solver::Objective f = p.elastic_objective();
-  f.contact = nullptr;
-  f.assemblies = &scene.elastic_assemblies;
-  const solver::Hessian hessian =
-      solver::assemble(f, scene.given.rest_vertices.data(), {}, contact::Curvature::kExact);
-  const linalg::BlockPattern& pattern = hessian.assembly->merged.pattern;
+  Problem p(scene, at_rest);
+  const linalg::BlockMatrix hessian =
+      contact_free_hessian(p, scene.given.rest_vertices.data(), Curvature::kExact);
+  const linalg::BlockPattern& pattern = hessian.pattern();
   double trace = 0.0;
   for (Index i = 0; i < pattern.size(); ++i) {
-    trace += Eigen::Map<const Mat3>(hessian.blocks.data() +
+    trace += Eigen::Map<const Mat3>(hessian.blocks() +
                                     9 * static_cast<std::ptrdiff_t>(pattern.column_start()[i]))
                  .trace();
   }

@@ -1,6 +1,9 @@
 #include "step/problem.h"
 
 #include <algorithm>
+#include <utility>
+
+#include "solver/linear_system.h"
 
 namespace diffcloth::step {
 
@@ -39,67 +42,106 @@ contact::Parameters contact_parameters(const Scene& scene, const Inputs& in) {
   return p;
 }
 
-}  // namespace
+/// Of the rest_positions input; empty where the scene's own holds.
+mesh::RestShape own_rest_shape(const Scene& scene, const Inputs& in) {
+  const double* X = in.data(Input::kRestPositions);
+  return X == nullptr ? mesh::RestShape() : mesh::rest_shape(scene.topology, scene.stencils, X);
+}
 
-Problem::Problem(const Scene& scene_in, const Inputs& inputs_in)
-    : scene(scene_in), inputs(inputs_in), h(scene_in.given.dt), rest(&scene_in.rest) {
-  const Index n = scene.cloth_vertex_count();
-  if (const double* X = inputs.data(Input::kRestPositions)) {
-    own_rest_ = mesh::rest_shape(scene.topology, scene.stencils, X);
-    rest = &own_rest_;
-  }
-  measures = rest_measures(scene, *rest);
-
-  density = spread(inputs[Input::kDensity], scene.face_cloth);
-  masses.assign(static_cast<std::size_t>(n), 0.0);
+std::vector<double> lumped_masses(const Scene& scene,
+                                  const mesh::RestShape& rest,
+                                  const std::vector<double>& density) {
+  std::vector<double> masses(static_cast<std::size_t>(scene.cloth_vertex_count()), 0.0);
   for (std::size_t f = 0; f < density.size(); ++f) {
-    for (const Index i : scene.topology.faces[f]) masses[i] += density[f] * rest->area[f] / 3.0;
+    for (const Index i : scene.topology.faces[f]) masses[i] += density[f] * rest.area[f] / 3.0;
   }
+  return masses;
+}
 
-  const double* x_n = inputs.data(Input::kPositions);
-  start.assign(x_n, x_n + 3 * static_cast<std::ptrdiff_t>(n));
-  start.resize(3 * static_cast<std::size_t>(scene.vertex_count()));
-  ends = start;
-  const std::size_t bodies = 3 * static_cast<std::size_t>(n);
+std::vector<double> start_positions(const Scene& scene, const Inputs& in) {
+  const double* x_n = in.data(Input::kPositions);
+  const std::ptrdiff_t cloth = 3 * static_cast<std::ptrdiff_t>(scene.cloth_vertex_count());
+  std::vector<double> x(x_n, x_n + cloth);
+  x.resize(3 * static_cast<std::size_t>(scene.vertex_count()));
   if (scene.given.bodies.count() > 0) {
-    scene.given.bodies.place(inputs.data(Input::kBodyPoses), start.data() + bodies);
-    scene.given.bodies.place(inputs.data(Input::kBodyTargets), ends.data() + bodies);
+    scene.given.bodies.place(in.data(Input::kBodyPoses), x.data() + cloth);
+  }
+  return x;
+}
+
+std::vector<double> end_positions(const Scene& scene, const Inputs& in, std::vector<double> x) {
+  if (scene.given.bodies.count() > 0) {
+    scene.given.bodies.place(in.data(Input::kBodyTargets),
+                             x.data() + 3 * static_cast<std::size_t>(scene.cloth_vertex_count()));
   }
   for (std::size_t k = 0; k < scene.given.pins.size(); ++k) {
-    Eigen::Map<Vec3>(ends.data() + 3 * scene.given.pins[k]) =
-        row(inputs.data(Input::kPinTargets), static_cast<Index>(k));
+    Eigen::Map<Vec3>(x.data() + 3 * scene.given.pins[k]) =
+        row(in.data(Input::kPinTargets), static_cast<Index>(k));
   }
+  return x;
+}
 
-  const Vec3 gravity = row(inputs.data(Input::kGravity), 0);
-  predicted.resize(3 * static_cast<std::size_t>(n));
-  for (Index i = 0; i < n; ++i) {
-    Eigen::Map<Vec3>(predicted.data() + 3 * i) =
-        row(x_n, i) + h * row(inputs.data(Input::kVelocities), i) +
-        (h * h) * (gravity + row(inputs.data(Input::kForces), i) / masses[i]);
+std::vector<double> predicted_positions(const Inputs& in,
+                                        const std::vector<double>& masses,
+                                        double h) {
+  const Vec3 gravity = row(in.data(Input::kGravity), 0);
+  std::vector<double> xhat(3 * masses.size());
+  for (std::size_t i = 0; i < masses.size(); ++i) {
+    const auto v = static_cast<Index>(i);
+    Eigen::Map<Vec3>(xhat.data() + 3 * i) =
+        row(in.data(Input::kPositions), v) + h * row(in.data(Input::kVelocities), v) +
+        (h * h) * (gravity + row(in.data(Input::kForces), v) / masses[i]);
   }
+  return xhat;
+}
 
-  elastic.topology = &scene.topology;
-  elastic.stencils = &scene.stencils;
-  elastic.rest = rest;
-  elastic.stretch = spread(inputs[Input::kStretch], scene.face_cloth);
-  elastic.bending = spread(inputs[Input::kBending], scene.face_cloth);
-  elastic.poisson = inputs.data(Input::kPoisson) != nullptr
-                        ? spread(inputs[Input::kPoisson], scene.face_cloth)
-                        : std::vector<double>(scene.face_cloth.size(), 0.0);
-  elastic.damping = spread(inputs[Input::kDamping], scene.face_cloth);
-  elastic.h = h;
-  elastic.x_n = x_n;
-  elastic::prepare(elastic, scene.slots);
+elastic::Model elastic_model(const Scene& scene,
+                             const Inputs& in,
+                             const mesh::RestShape& rest,
+                             double h) {
+  elastic::Model model;
+  model.topology = &scene.topology;
+  model.stencils = &scene.stencils;
+  model.rest = &rest;
+  model.stretch = spread(in[Input::kStretch], scene.face_cloth);
+  model.bending = spread(in[Input::kBending], scene.face_cloth);
+  model.poisson = in.data(Input::kPoisson) != nullptr
+                      ? spread(in[Input::kPoisson], scene.face_cloth)
+                      : std::vector<double>(scene.face_cloth.size(), 0.0);
+  model.damping = spread(in[Input::kDamping], scene.face_cloth);
+  model.h = h;
+  model.x_n = in.data(Input::kPositions);
+  elastic::prepare(model, scene.slots);
+  return model;
+}
 
+}  // namespace
+
+Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, bool with_rest)
+    : scene(scene_in),
+      inputs(inputs_in),
+      h(scene_in.given.dt),
+      coordinates(scene_in.cloth_vertex_count(), scene_in.prescribed),
+      own_rest_(own_rest_shape(scene, inputs)),
+      rest(own_rest_.area.empty() ? &scene.rest : &own_rest_),
+      measures(rest_measures(scene, *rest)),
+      density(spread(inputs[Input::kDensity], scene.face_cloth)),
+      masses(lumped_masses(scene, *rest, density)),
+      start(start_positions(scene, inputs)),
+      ends(end_positions(scene, inputs, start)),
+      inertia(masses, predicted_positions(inputs, masses, h), h),
+      model(elastic_model(scene, inputs, *rest, h)),
+      elasticity(model, scene.slots, with_rest) {
   const std::vector<Index>& soft = scene.given.soft_pins;
   if (!soft.empty()) {
     const View stiffness = inputs[Input::kPinStiffness];
     for (const Index i : soft) {
       anchor_stiffness.push_back(stiffness.data[stiffness.count == 1 ? 0 : scene.vertex_cloth[i]]);
     }
-    anchors = {.vertex = soft,
-               .stiffness = anchor_stiffness,
-               .target = {inputs.data(Input::kSoftPinTargets), 3 * soft.size()}};
+    anchors.emplace(
+        elastic::Anchors{.vertex = soft,
+                         .stiffness = anchor_stiffness,
+                         .target = {inputs.data(Input::kSoftPinTargets), 3 * soft.size()}});
   }
   if (inputs.data(Input::kBarrierStiffness) != nullptr) {
     contact.emplace(scene.collision_mesh, measures, contact_parameters(scene, inputs),
@@ -107,50 +149,29 @@ Problem::Problem(const Scene& scene_in, const Inputs& inputs_in)
   }
 }
 
-solver::Objective Problem::bare_objective() const {
-  return {.cloth_vertex_count = scene.cloth_vertex_count(),
-          .vertex_count = scene.vertex_count(),
+std::vector<Potential*> Problem::elastic_potentials() {
+  std::vector<Potential*> result{&elasticity};
+  if (anchors) result.push_back(&*anchors);
+  return result;
+}
+
+solver::Objective Problem::objective(Proximity& inertia_or_nearness,
+                                     std::vector<Potential*> others,
+                                     solver::AssemblyCache& assemblies) const {
+  return {.coordinates = &coordinates,
           .h = h,
-          .prescribed = &scene.prescribed,
-          .metric = {},
-          .target = {},
-          .friction = {},
-          .x_start = start.data(),
-          .assemblies = nullptr};
+          .length = scene.mean_edge,
+          .inertia = &inertia_or_nearness,
+          .others = std::move(others),
+          .assemblies = &assemblies};
 }
 
-solver::Objective Problem::elastic_objective() const {
-  solver::Objective f = bare_objective();
-  f.metric = masses;
-  f.target = predicted;
-  f.elastic = &elastic;
-  f.slots = &scene.slots;
-  if (!scene.given.soft_pins.empty()) f.anchors = &anchors;
-  if (contact && !split()) f.contact = &*contact;
-  f.assemblies = &scene.elastic_assemblies;
-  return f;
-}
-
-std::vector<double> Problem::stage_metric() const {
-  if (scene.given.metric == Metric::kMass) return masses;
-  // The literal metric weighs all vertices alike; the mean mass keeps the energy in joules.
-  double mean = 0.0;
-  for (const double m : masses) mean += m;
-  mean /= static_cast<double>(masses.size());
-  return std::vector<double>(masses.size(), mean);
-}
-
-solver::Objective Problem::contact_objective(const double* x_d) const {
-  solver::Objective f = bare_objective();
-  f.metric = stage_metric();
-  f.target.assign(x_d, x_d + 3 * masses.size());
-  if (contact) f.contact = &*contact;
-  f.assemblies = &scene.diagonal_assemblies;
-  return f;
-}
-
-solver::Objective Problem::main_objective(const double* x_d) const {
-  return split() ? contact_objective(x_d) : elastic_objective();
+linalg::BlockMatrix contact_free_hessian(Problem& p, const double* x, Curvature curvature) {
+  const solver::Objective f =
+      p.objective(p.inertia, p.elastic_potentials(), p.scene.elastic_assemblies);
+  Stopwatch watch;
+  solver::Counts counts;
+  return solver::LinearSystem(f, watch, counts).assemble(x, curvature);
 }
 
 std::vector<double> Problem::with_bodies_at_end(const double* cloth_positions) const {

@@ -9,20 +9,15 @@
 namespace diffcloth::step {
 
 double reference_factorization_seconds(const Scene& scene, const Inputs& inputs, int repeats) {
-  const Problem p(scene, inputs);
-  solver::Objective f = p.elastic_objective();
-  f.contact = nullptr;
-  f.assemblies = &scene.elastic_assemblies;
-  const solver::Hessian hessian =
-      solver::assemble(f, p.start.data(), {}, contact::Curvature::kPositive);
-  const linalg::BlockPattern& pattern = hessian.assembly->merged.pattern;
+  Problem p(scene, inputs);
+  const linalg::BlockMatrix hessian = contact_free_hessian(p, p.start.data(), Curvature::kPositive);
+  const linalg::BlockPattern& pattern = hessian.pattern();
 
   std::vector<Eigen::Triplet<double>> entries;
   for (Index j = 0; j < pattern.size(); ++j) {
     for (Index k = pattern.column_start()[j]; k < pattern.column_start()[j + 1]; ++k) {
       const Index i = pattern.row()[k];
-      const Eigen::Map<const Mat3> block(hessian.blocks.data() +
-                                         9 * static_cast<std::ptrdiff_t>(k));
+      const Eigen::Map<const Mat3> block(hessian.blocks() + 9 * static_cast<std::ptrdiff_t>(k));
       for (Index a = 0; a < 3; ++a) {
         for (Index b = 0; b < 3; ++b) {
           if (3 * i + a >= 3 * j + b) entries.emplace_back(3 * i + a, 3 * j + b, block(a, b));

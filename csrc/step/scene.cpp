@@ -3,6 +3,8 @@
 #include <algorithm>
 #include <cmath>
 
+#include "step/scheme.h"
+
 namespace diffcloth::step {
 namespace {
 
@@ -74,6 +76,12 @@ std::vector<mesh::BendingModel> face_models(const Description& d) {
   return model;
 }
 
+double mean_length(const mesh::RestShape& rest) {
+  double sum = 0.0;
+  for (const double length_sq : rest.edge_length_sq) sum += std::sqrt(length_sq);
+  return sum / static_cast<double>(rest.edge_length_sq.size());
+}
+
 std::vector<char> make_prescribed(const Description& d, Index vertex_count) {
   std::vector<char> prescribed(static_cast<std::size_t>(vertex_count), 0);
   for (const Index i : d.pins) prescribed[i] = 1;
@@ -85,11 +93,13 @@ std::vector<char> make_prescribed(const Description& d, Index vertex_count) {
 
 Scene::Scene(Description description)
     : given(std::move(description)),
+      scheme(&find_scheme(given.scheme)),
       topology(static_cast<Index>(given.vertices.size() / 3), given.faces),
       face_cloth(owners(given.cloth_face_start)),
       vertex_cloth(owners(given.cloth_vertex_start)),
       stencils(mesh::choose_stencils(topology, given.rest_vertices.data(), face_models(given))),
       rest(mesh::rest_shape(topology, stencils, given.rest_vertices.data())),
+      mean_edge(mean_length(rest)),
       collision_mesh(make_collision_mesh(given)),
       body_measures(make_body_measures(given, collision_mesh)),
       broad_phase(collision_mesh, reference_positions(given).data()),

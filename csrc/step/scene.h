@@ -11,12 +11,14 @@
 #include "elastic/elastic.h"
 #include "mesh/rest_shape.h"
 #include "mesh/topology.h"
-#include "solver/newton.h"
-#include "solver/objective.h"
+#include "solver/assembly_cache.h"
+#include "solver/walk.h"
 
 namespace diffcloth::step {
 
-enum class Scheme : std::uint8_t { kCoupled, kSplit };
+class Scheme;
+
+/// Norm of the contact stage of `split`.
 enum class Metric : std::uint8_t { kMass, kIdentity };
 
 /// What a simulator is made from.
@@ -33,7 +35,7 @@ struct Description {
   std::vector<std::array<Index, 3>> body_faces;  ///< indices into the bodies' vertices
   bool self_contact = true;
   double dt = 0.01;
-  Scheme scheme = Scheme::kCoupled;
+  std::string scheme = "coupled";
   Metric metric = Metric::kMass;
   int friction_iterations = 2;
   solver::Options options{};
@@ -49,11 +51,13 @@ struct Scene {
   Index surface_count() const { return cloth_count() + given.bodies.count(); }
 
   Description given;
+  const Scheme* scheme;
   mesh::Topology topology;
   std::vector<Index> face_cloth;    ///< [F]
   std::vector<Index> vertex_cloth;  ///< [N]
   mesh::BendingStencils stencils;
   mesh::RestShape rest;  ///< of given.rest_vertices
+  double mean_edge;      ///< of the cloths at rest [m]
   contact::CollisionMesh collision_mesh;
   contact::RestMeasures body_measures;  ///< the bodies' part; cloth entries are zero
   contact::BroadPhase broad_phase;

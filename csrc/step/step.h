@@ -1,73 +1,44 @@
 #pragma once
 
-#include <memory>
-#include <string>
-#include <utility>
 #include <vector>
 
 #include "common/interrupt.h"
-#include "linalg/cholesky.h"
+#include "step/factor_cache.h"
+#include "step/fields.h"
 #include "step/inputs.h"
+#include "step/report.h"
 #include "step/scene.h"
-#include "step/tape.h"
 
 namespace diffcloth::step {
 
-/// Outcome of an environment's step, as the report states it.
-enum class Result : std::int32_t {
-  kConverged = 0,
-  kNotConverged = 1,
-  kInfeasibleMotion = 2,
-  kIntersectingStart = 3,
-};
+/// What a step gives back: "positions" and "velocities" [N, 3], "body_forces" [V, 3].
+std::vector<Field> output_fields(const Scene& scene);
 
-struct Report {
-  Result result = Result::kConverged;
-  Index iterations = 0;
-  double residual = 0.0;          ///< |p|_inf / h [m/s]
-  double minimum_distance = 0.0;  ///< of the pairs in contact; infinite without contact [m]
-  Index contact_count = 0;
-  double motion_fraction = 1.0;
-  solver::Seconds seconds{};
-  std::string message;
-};
+/// What backward needs of forward: the fields of the scheme, and "key", of factors in the cache.
+std::vector<Field> tape_fields(const Scene& scene);
 
-/// Where the results of one environment go. With a path, the accepted iterates (all vertices) are
-/// appended to it.
-struct Outputs {
-  double* positions;    ///< [N, 3]
-  double* velocities;   ///< [N, 3]
-  double* body_forces;  ///< [V, 3]
-  Tape tape;            ///< pointers are null where no tape is wanted
-  std::vector<std::vector<double>>* path = nullptr;
-};
-
-/// One step: x_{n+1}, v_{n+1}, the contact forces on the bodies' vertices, and the tape.
+/// One step of the scene's scheme.
 ///
-/// `coupled` minimizes inertia + elasticity + anchors + barrier + friction together. `split` (the
-/// paper's Eqs. 21-23) first inertia + elasticity + anchors, which gives x^D, then
-/// 1/(2h^2) (x - x^D)^T G (x - x^D) + barrier + friction. Either solves once for each friction
-/// iteration, with friction lagged at the solution before.
+/// @param outputs  named like output_fields(), zeroed
+/// @param tape     named like tape_fields(), zeroed; empty where no tape is wanted
+/// @param factors  where the factors for backward are kept; null without a tape
+/// @param path     where the accepted iterates (all vertices) are appended, or null
 Report forward(const Scene& scene,
                const Inputs& inputs,
                const Checkpoint& checkpoint,
-               Outputs outputs,
-               FactorCache* factors);
+               const Arrays<double>& outputs,
+               const Arrays<double>& tape,
+               FactorCache* factors,
+               std::vector<std::vector<double>>* path);
 
-/// Cotangents of the outputs of a step.
-struct Cotangents {
-  const double* positions;
-  const double* velocities;
-  const double* body_forces;
-};
-
-/// Gradients of a step that forward() took: see backward.cpp for the derivation.
+/// Gradients of a step that forward() took: see contact_stage.cpp for the derivation.
 ///
+/// @param cotangents  of the outputs, by their names
 /// @throws std::domain_error when the solution is not a local minimum.
 void backward(const Scene& scene,
               const Inputs& inputs,
-              const ConstTape& tape,
-              const Cotangents& cotangents,
+              const Arrays<const double>& tape,
+              const Arrays<const double>& cotangents,
               const Checkpoint& checkpoint,
               const Gradients& gradients,
               FactorCache& factors);

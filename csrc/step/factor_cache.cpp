@@ -1,4 +1,4 @@
-#include "step/tape.h"
+#include "step/factor_cache.h"
 
 namespace diffcloth::step {
 
@@ -24,6 +24,11 @@ FactorCache::Factors FactorCache::find(std::int64_t key) const {
     if (entry.key == key) return entry.factors;
   }
   return {};
+}
+
+std::size_t FactorCache::bytes() const {
+  const std::lock_guard lock(mutex_);
+  return bytes_;
 }
 
 void FactorCache::clear() {

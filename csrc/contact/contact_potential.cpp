@@ -1,0 +1,126 @@
+#include "contact/contact_potential.h"
+
+#include <algorithm>
+#include <numeric>
+
+#include "contact/ccd.h"
+
+namespace diffcloth::contact {
+namespace {
+
+using Stencil = std::array<Index, 4>;
+
+void add_stencil_couplings(const Stencil& v, linalg::Couplings& pairs) {
+  for (const Index i : v) {
+    for (const Index j : v) {
+      if (i > j) pairs.emplace_back(i, j);
+    }
+  }
+}
+
+void add_stencil_product(const Stencil& v, const Mat12& h, const double* d, double* y) {
+  const Vec12 product = h * stacked(v, d);
+  for (int i = 0; i < 4; ++i) Eigen::Map<Vec3>(y + 3 * v[i]) += product.segment<3>(3 * i);
+}
+
+}  // namespace
+
+double ContactPotential::safe_fraction(const double* x, const double* to) const {
+  double alpha = 1.0;
+  for (const Candidate& pair : candidates_) {
+    alpha = std::min(alpha, safe_step(pair.kind, corners(pair.vertices, x),
+                                      corners(pair.vertices, to), model_.xi(pair)));
+    if (alpha == 0.0) break;
+  }
+  return alpha;
+}
+
+void ContactPotential::stand_at(const double* x) {
+  model_.find(candidates_, x, contacts_);
+  has_energies_ = false;
+}
+
+double ContactPotential::energy(const double* x) const {
+  std::vector<double> energies;
+  model_.energies(candidates_, x, energies);
+  return std::accumulate(energies.begin(), energies.end(), 0.0);
+}
+
+double ContactPotential::energy_change(const double* x, const double* to) const {
+  if (!has_energies_) {
+    model_.energies(candidates_, x, energies_);
+    has_energies_ = true;
+  }
+  model_.energies(candidates_, to, trial_energies_);
+  double change = 0.0;
+  for (std::size_t k = 0; k < energies_.size(); ++k) change += trial_energies_[k] - energies_[k];
+  return change;
+}
+
+void ContactPotential::add_gradient(const double* x, double* g) const {
+  model_.add_gradient(contacts_, x, g);
+}
+
+void ContactPotential::add_couplings(linalg::Couplings& pairs) const {
+  for (const Contact& k : contacts_) add_stencil_couplings(k.pair.vertices, pairs);
+}
+
+void ContactPotential::add_hessian(const double* x,
+                                   Curvature curvature,
+                                   linalg::BlockMatrix& A) const {
+  for (const Contact& k : contacts_) {
+    A.add_stencil(k.pair.vertices, model_.hessian(k, x, curvature));
+  }
+}
+
+void ContactPotential::add_hessian_product(const double* x, const double* z, double* y) const {
+  model_.add_hessian_product(contacts_, x, z, y);
+}
+
+void ContactPotential::add_left_out_product(const double* x,
+                                            Curvature curvature,
+                                            const double* d,
+                                            double* y) const {
+  for (const Contact& k : contacts_) {
+    if (!model_.has_prescribed(k.pair.vertices)) continue;
+    add_stencil_product(k.pair.vertices, model_.hessian(k, x, curvature), d, y);
+  }
+}
+
+void ContactPotential::accumulate(const double* x, const double* z) {
+  model_.add_mixed(contacts_, x, z, -1.0, *bar_);
+}
+
+void FrictionPotential::add_couplings(linalg::Couplings& pairs) const {
+  for (const FrictionSet::Entry& k : set_.entries()) {
+    add_stencil_couplings(k.lag.pair.vertices, pairs);
+  }
+}
+
+void FrictionPotential::add_hessian(const double* x,
+                                    Curvature curvature,
+                                    linalg::BlockMatrix& A) const {
+  for (const FrictionSet::Entry& k : set_.entries()) {
+    A.add_stencil(k.lag.pair.vertices, set_.hessian(k, x_start_, x, curvature));
+  }
+}
+
+void FrictionPotential::add_left_out_product(const double* x,
+                                             Curvature curvature,
+                                             const double* d,
+                                             double* y) const {
+  for (const FrictionSet::Entry& k : set_.entries()) {
+    if (!set_.model().has_prescribed(k.lag.pair.vertices)) continue;
+    add_stencil_product(k.lag.pair.vertices, set_.hessian(k, x_start_, x, curvature), d, y);
+  }
+}
+
+void FrictionPotential::accumulate(const double* x, const double* z) {
+  const std::size_t size = 3 * static_cast<std::size_t>(set_.model().mesh().vertex_count);
+  start_bar.resize(size, 0.0);
+  lag_bar.resize(size, 0.0);
+  set_.add_hessian_product(x_start_, x, z, start_bar.data());
+  set_.add_mixed(x_start_, x, z, x_lag_, -1.0, *bar_, lag_bar.data());
+}
+
+}  // namespace diffcloth::contact

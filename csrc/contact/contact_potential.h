@@ -1,0 +1,106 @@
+#pragma once
+
+#include <vector>
+
+#include "contact/broad_phase.h"
+#include "contact/contact_set.h"
+#include "contact/friction_set.h"
+#include "potential/potential.h"
+
+namespace diffcloth::contact {
+
+/// The barrier of all contacts as a potential, and the detection of what may come into contact.
+///
+/// It acts on the pairs that the last watch() has found: a motion must be watched before the
+/// potential is asked about any point of it.
+class ContactPotential final : public Potential {
+ public:
+  /// @param scratch  reused by all potentials of one thread
+  /// @param bar      where accumulate() adds; null where it is never called
+  ContactPotential(const ContactModel& model,
+                   const BroadPhase& broad_phase,
+                   BroadPhase::Scratch& scratch,
+                   ContactModel::Bar* bar)
+      : model_(model), broad_phase_(broad_phase), scratch_(scratch), bar_(bar) {}
+
+  /// Find every pair that comes within reach on the straight motion x -> to.
+  void watch(const double* x, const double* to) {
+    broad_phase_.find(x, to, model_.reach(), scratch_, candidates_);
+    has_energies_ = false;
+  }
+
+  /// Fraction of the watched motion x -> to that is certified free of collisions.
+  double safe_fraction(const double* x, const double* to) const;
+
+  const ContactModel& model() const { return model_; }
+  const std::vector<Contact>& contacts() const { return contacts_; }
+
+  void stand_at(const double* x) override;
+  double energy(const double* x) const override;
+  double energy_change(const double* x, const double* to) const override;
+  void add_gradient(const double* x, double* g) const override;
+  void add_couplings(linalg::Couplings& pairs) const override;
+  void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
+  void add_hessian_product(const double* x, const double* z, double* y) const override;
+  void add_left_out_product(const double* x,
+                            Curvature curvature,
+                            const double* d,
+                            double* y) const override;
+  void accumulate(const double* x, const double* z) override;
+
+ private:
+  const ContactModel& model_;
+  const BroadPhase& broad_phase_;
+  BroadPhase::Scratch& scratch_;
+  ContactModel::Bar* bar_;
+  std::vector<Candidate> candidates_;
+  std::vector<Contact> contacts_;
+  mutable std::vector<double> energies_;  ///< of the candidates where the potential stands
+  mutable bool has_energies_ = false;
+  mutable std::vector<double> trial_energies_;
+};
+
+/// Lagged friction as a potential of the displacement over the step. See friction_set.h.
+class FrictionPotential final : public Potential {
+ public:
+  /// @param contacts  of the lag configuration
+  /// @param x_start   positions at the start of the step
+  /// @param bar       where accumulate() adds; null where it is never called
+  FrictionPotential(const ContactModel& model,
+                    const std::vector<Contact>& contacts,
+                    const double* x_start,
+                    ContactModel::Bar* bar)
+      : set_(model, contacts), x_start_(x_start), bar_(bar) {}
+
+  double energy(const double* /*x*/) const override { return 0.0; }
+  double energy_change(const double* x, const double* to) const override {
+    return set_.energy_change(x_start_, x, to);
+  }
+  void add_gradient(const double* x, double* g) const override {
+    set_.add_gradient(x_start_, x, g);
+  }
+  void add_couplings(linalg::Couplings& pairs) const override;
+  void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
+  void add_hessian_product(const double* x, const double* z, double* y) const override {
+    set_.add_hessian_product(x_start_, x, z, y);
+  }
+  void add_left_out_product(const double* x,
+                            Curvature curvature,
+                            const double* d,
+                            double* y) const override;
+  void accumulate(const double* x, const double* z) override;
+
+  /// Where the lag configuration lies: accumulate() needs it.
+  void set_lag(const double* x_lag) { x_lag_ = x_lag; }
+
+  std::vector<double> start_bar;  ///< of x_start, all vertices; empty until accumulate()
+  std::vector<double> lag_bar;    ///< of x_lag, likewise
+
+ private:
+  FrictionSet set_;
+  const double* x_start_;
+  const double* x_lag_ = nullptr;
+  ContactModel::Bar* bar_;
+};
+
+}  // namespace diffcloth::contact

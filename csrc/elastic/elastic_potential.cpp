@@ -1,0 +1,52 @@
+#include "elastic/elastic_potential.h"
+
+namespace diffcloth::elastic {
+namespace {
+
+std::vector<double> negated(const double* z, Index vertex_count) {
+  std::vector<double> result(z, z + 3 * static_cast<std::ptrdiff_t>(vertex_count));
+  for (double& value : result) value = -value;
+  return result;
+}
+
+}  // namespace
+
+ElasticPotential::ElasticPotential(const Model& model, const Slots& slots, bool with_rest)
+    : model_(model), slots_(slots), with_rest_(with_rest) {}
+
+void ElasticPotential::add_hessian(const double* x,
+                                   Curvature curvature,
+                                   linalg::BlockMatrix& A) const {
+  std::vector<double> blocks(9 * static_cast<std::size_t>(slots_.block_count), 0.0);
+  elastic::add_hessian(model_, slots_, x, curvature, blocks.data());
+  A.add_base(blocks);
+}
+
+void ElasticPotential::accumulate(const double* x, const double* z) {
+  if (bar_.stretch.empty()) bar_ = Bar(*model_.topology, *model_.stencils);
+  add_mixed(model_, x, negated(z, model_.topology->vertex_count).data(), with_rest_, bar_);
+}
+
+AnchorPotential::AnchorPotential(Anchors anchors)
+    : stiffness_bar(anchors.vertex.size(), 0.0),
+      target_bar(3 * anchors.vertex.size(), 0.0),
+      anchors_(anchors) {}
+
+void AnchorPotential::add_hessian(const double* /*x*/,
+                                  Curvature /*curvature*/,
+                                  linalg::BlockMatrix& A) const {
+  for (std::size_t a = 0; a < anchors_.vertex.size(); ++a) {
+    A.add_to_diagonal(anchors_.vertex[a], anchors_.stiffness[a]);
+  }
+}
+
+void AnchorPotential::accumulate(const double* x, const double* z) {
+  // Few of the vertices have a soft pin: turn the sign of what is added instead.
+  std::vector<double> stiffness(stiffness_bar.size(), 0.0);
+  std::vector<double> target(target_bar.size(), 0.0);
+  add_mixed(anchors_, x, z, stiffness.data(), target.data());
+  for (std::size_t a = 0; a < stiffness.size(); ++a) stiffness_bar[a] -= stiffness[a];
+  for (std::size_t a = 0; a < target.size(); ++a) target_bar[a] -= target[a];
+}
+
+}  // namespace diffcloth::elastic

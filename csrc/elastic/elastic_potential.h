@@ -1,0 +1,64 @@
+#pragma once
+
+#include "elastic/anchors.h"
+#include "elastic/elastic.h"
+#include "potential/potential.h"
+
+namespace diffcloth::elastic {
+
+/// Stretch, bending and damping of all cloths as a potential. See elastic.h.
+class ElasticPotential final : public Potential {
+ public:
+  /// @param model      prepared; outlives the potential
+  /// @param slots      of its elements in the base pattern
+  /// @param with_rest  whether the cotangents of the rest shape are wanted
+  ElasticPotential(const Model& model, const Slots& slots, bool with_rest);
+
+  double energy(const double* x) const override { return elastic::energy(model_, x); }
+  double energy_change(const double* x, const double* to) const override {
+    return elastic::energy_change(model_, x, to);
+  }
+  void add_gradient(const double* x, double* g) const override {
+    elastic::add_gradient(model_, x, g);
+  }
+  void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
+  void add_hessian_product(const double* x, const double* z, double* y) const override {
+    elastic::add_hessian_product(model_, x, z, y);
+  }
+
+  void accumulate(const double* x, const double* z) override;
+  Bar& bar() { return bar_; }
+
+ private:
+  const Model& model_;
+  const Slots& slots_;
+  bool with_rest_;
+  Bar bar_;
+};
+
+/// Soft pins as a potential. See anchors.h.
+class AnchorPotential final : public Potential {
+ public:
+  explicit AnchorPotential(Anchors anchors);
+
+  double energy(const double* x) const override { return elastic::energy(anchors_, x); }
+  double energy_change(const double* x, const double* to) const override {
+    return elastic::energy_change(anchors_, x, to);
+  }
+  void add_gradient(const double* x, double* g) const override {
+    elastic::add_gradient(anchors_, x, g);
+  }
+  void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
+  void add_hessian_product(const double* /*x*/, const double* z, double* y) const override {
+    elastic::add_hessian_product(anchors_, z, y);
+  }
+  void accumulate(const double* x, const double* z) override;
+
+  std::vector<double> stiffness_bar;  ///< [A]
+  std::vector<double> target_bar;     ///< [3 A]
+
+ private:
+  Anchors anchors_;
+};
+
+}  // namespace diffcloth::elastic

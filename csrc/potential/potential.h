@@ -1,0 +1,58 @@
+#pragma once
+
+#include <cstdint>
+#include <utility>
+#include <vector>
+
+#include "common/types.h"
+#include "linalg/block_matrix.h"
+
+namespace diffcloth {
+
+/// The exact Hessian, or a positive semi-definite stand-in for it far from the minimum.
+enum class Curvature : std::uint8_t { kExact, kPositive };
+
+/// One term of what a step minimizes: an energy of the positions of all vertices, cloth first, then
+/// bodies, 3 doubles a vertex.
+///
+/// A potential stands at one point at a time. stand_at(x) finds what belongs to that point (the
+/// contacts in reach); the functions below that take `x` are asked for that point.
+class Potential {
+ public:
+  Potential() = default;
+  virtual ~Potential() = default;
+  Potential(const Potential&) = delete;
+  Potential& operator=(const Potential&) = delete;
+
+  virtual void stand_at(const double* /*x*/) {}
+
+  /// P(x) [J]; 0 for a potential of which only differences have a meaning.
+  virtual double energy(const double* x) const = 0;
+
+  /// P(to) - P(x) [J], element by element so that little cancels. NaN or +infinity: not feasible.
+  virtual double energy_change(const double* x, const double* to) const = 0;
+
+  /// g += grad P over all vertices [N].
+  virtual void add_gradient(const double* x, double* g) const = 0;
+
+  /// Append the couplings (row > column) of vertices that the potential has here and that the base
+  /// pattern of the linear system need not have. Any order, repeated or not.
+  virtual void add_couplings(std::vector<std::pair<Index, Index>>& /*pairs*/) const {}
+
+  /// A += the Hessian; A leaves out the rows that are not its own.
+  virtual void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const = 0;
+
+  /// y += H z over all vertices, exact.
+  virtual void add_hessian_product(const double* x, const double* z, double* y) const = 0;
+
+  /// y += H d over the pairs with vertices that add_hessian() leaves out.
+  virtual void add_left_out_product(const double* /*x*/,
+                                    Curvature /*curvature*/,
+                                    const double* /*d*/,
+                                    double* /*y*/) const {}
+
+  /// Add -d/d(theta) (z . grad P) to the cotangents that the potential keeps for its inputs theta.
+  virtual void accumulate(const double* x, const double* z) = 0;
+};
+
+}  // namespace diffcloth

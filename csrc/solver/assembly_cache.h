@@ -1,0 +1,70 @@
+#pragma once
+
+#include <cstddef>
+#include <list>
+#include <memory>
+#include <mutex>
+#include <vector>
+
+#include "linalg/block_matrix.h"
+#include "linalg/cholesky.h"
+
+namespace diffcloth::solver {
+
+/// A matrix pattern with contacts in it, and its symbolic factorization, made when first asked for.
+class Assembly {
+ public:
+  Assembly(const linalg::BlockPattern& base,
+           const std::vector<char>& fixed,
+           const linalg::Couplings& pairs)
+      : merged(linalg::merge(base, pairs)), fixed_(fixed) {}
+
+  const linalg::MergedPattern merged;
+
+  struct Found {
+    std::shared_ptr<const linalg::CholeskyAnalysis> analysis;
+    bool is_new;  ///< made by this call
+  };
+  Found analysis() const;
+
+ private:
+  const std::vector<char>& fixed_;
+  mutable std::once_flag once_;
+  mutable std::shared_ptr<const linalg::CholeskyAnalysis> analysis_;
+};
+
+/// Patterns and symbolic factorizations seen before, by the couplings that contact adds to the base
+/// pattern.
+///
+/// Only a memory, bounded in bytes: an entry is a function of its key, so results do not depend on
+/// what is in it.
+class AssemblyCache {
+ public:
+  AssemblyCache(linalg::BlockPattern base, std::vector<char> fixed);
+
+  AssemblyCache(const AssemblyCache&) = delete;
+  AssemblyCache& operator=(const AssemblyCache&) = delete;
+
+  /// @param pairs  sorted couplings of vertices that are not fixed, none of them in the base
+  std::shared_ptr<const Assembly> find(const linalg::Couplings& pairs);
+
+  const linalg::BlockPattern& base() const { return base_; }
+  const std::vector<char>& fixed() const { return fixed_; }
+
+ private:
+  struct Entry {
+    linalg::Couplings key;
+    std::shared_ptr<const Assembly> assembly;
+    std::size_t bytes;
+  };
+  static constexpr std::size_t kCapacity = std::size_t{32} << 20;  // [bytes]
+
+  linalg::BlockPattern base_;
+  std::vector<char> fixed_;
+  std::shared_ptr<const Assembly> plain_;
+  std::mutex mutex_;
+  std::list<Entry> entries_;  // most recent first
+  std::size_t bytes_ = 0;
+};
+
+}  // namespace diffcloth::solver

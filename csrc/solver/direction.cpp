@@ -1,0 +1,149 @@
+#include "solver/direction.h"
+
+#include <algorithm>
+#include <stdexcept>
+
+namespace diffcloth::solver {
+namespace {
+
+/// A chord step is taken while it shrinks the step by this much.
+constexpr double kChordContraction = 0.1;
+/// An old factor is not asked for more conjugate gradient iterations, to this relative residual: a
+/// new factor would be cheaper.
+constexpr int kIterations = 8;
+constexpr double kForcing = 0.03;
+/// Share s of the projection after an indefinite Hessian; its growth while the blend is indefinite;
+/// its fall and growth with what steps gain; below which it counts as none; beyond which a blend is
+/// nothing but the projection.
+constexpr double kFirstShare = 1.0;
+constexpr double kFailureGrowth = 4.0;
+constexpr double kDecay = 0.25;
+constexpr double kGrowth = 2.0;
+constexpr double kNoShare = 0.05;
+constexpr double kLargestShare = 1e8;
+/// A step is good that gains this share of what its quadratic model promises, at once; after this
+/// many backtracks the model is poor.
+constexpr double kGoodGain = 0.25;
+constexpr int kManyBacktracks = 3;
+/// Damped steps are lengthened to where the exact curvature along them puts the minimum.
+constexpr double kWorthGrowing = 1.5;
+constexpr double kLargestGrowth = 4.0;
+
+}  // namespace
+
+bool Directions::chord() {
+  if (!chord_allowed_ || !factor_ || s_ > 0.0) return false;
+  walk_.system.solve(*factor_, walk_.g(), p_);
+  if (!(largest(p_) <= kChordContraction * last_step_)) return false;
+  ++walk_.context.counts->chord;
+  return true;
+}
+
+bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
+  if (!factor_ || s_ > 0.0) return false;
+  const linalg::Convergence result =
+      walk_.system.solve(H, *factor_, walk_.g(), kForcing, kIterations, p_);
+  indefinite = result == linalg::Convergence::kNegativeCurvature;
+  if (result != linalg::Convergence::kConverged) return false;
+  ++walk_.context.counts->exact;
+  return true;
+}
+
+bool Directions::certify() {
+  factor_ = walk_.system.certify(walk_.x().data());
+  if (!factor_) {
+    ++walk_.context.counts->negative_curvature;
+    return false;
+  }
+  ++walk_.context.counts->exact;
+  walk_.system.solve(*factor_, walk_.g(), p_);
+  return true;
+}
+
+Directions::Direction Directions::next() {
+  if (chord()) return {.kind = Kind::kChord, .first = 1.0};
+  const linalg::BlockMatrix H = walk_.system.assemble(walk_.x().data(), Curvature::kExact);
+  if (s_ == 0.0) {
+    bool indefinite = false;
+    if (iterate(H, indefinite)) return {.kind = Kind::kIterated, .first = 1.0};
+    if (!indefinite) {
+      if (Factor factor = walk_.system.factor(H)) {
+        factor_ = std::move(factor);
+        ++walk_.context.counts->exact;
+        walk_.system.solve(*factor_, walk_.g(), p_);
+        return {.kind = Kind::kFactored, .first = 1.0};
+      }
+    }
+    ++walk_.context.counts->negative_curvature;
+    s_ = kFirstShare;
+  }
+  return damp(H);
+}
+
+Directions::Direction Directions::damp(const linalg::BlockMatrix& H) {
+  const linalg::BlockMatrix P = walk_.system.assemble(walk_.x().data(), Curvature::kPositive);
+  Factor factor;
+  for (;; s_ = std::max(kFirstShare, kFailureGrowth * s_)) {
+    walk_.context.checkpoint->check();
+    linalg::BlockMatrix A = H;
+    A.blend(P, s_);
+    factor = walk_.system.factor(A);
+    if (factor) break;
+    if (s_ > kLargestShare) {
+      throw std::domain_error(
+          "the projected Hessian is not positive definite: the stiffnesses of "
+          "the scene differ by more than float64 can hold");
+    }
+  }
+  ++walk_.context.counts->projected;
+  walk_.system.solve(*factor, walk_.g(), p_);
+  slope_ = dot(walk_.g(), p_);
+
+  // The minimum of the exact quadratic along p; beyond any bound where its curvature is negative.
+  std::vector<double> Hp(walk_.f.coordinates->size(), 0.0);
+  H.add_product(p_.data(), Hp.data());
+  double curvature = 0.0;
+  for (std::size_t a = 0; a < Hp.size(); ++a) curvature += p_[a] * Hp[a];
+  const double best = curvature > 0.0 ? -slope_ / curvature : kLargestGrowth;
+  return {.kind = Kind::kDamped,
+          .first = best > kWorthGrowing ? std::min(best, kLargestGrowth) : 1.0};
+}
+
+void Directions::learn(const Direction& direction, const Search& search) {
+  last_step_ = largest(p_);
+  chord_allowed_ = direction.kind != Kind::kDamped && search.alpha == 1.0;
+  if (direction.kind != Kind::kDamped) return;
+  const double promised = slope_ * search.alpha * (1.0 - 0.5 * std::min(search.alpha, 1.0));
+  if (search.backtracks == 0 && search.gain <= kGoodGain * promised) {
+    s_ *= kDecay;
+    if (s_ < kNoShare) s_ = 0.0;
+  } else if (search.backtracks >= kManyBacktracks) {
+    s_ *= kGrowth;
+  }
+}
+
+bool Directions::retry(Kind kind) {
+  last_step_ = 0.0;
+  chord_allowed_ = false;
+  switch (kind) {
+    case Kind::kChord:
+    case Kind::kIterated:
+      factor_ = nullptr;
+      return true;
+    case Kind::kFactored:
+      s_ = kFirstShare;
+      return true;
+    case Kind::kDamped:
+      s_ *= kFailureGrowth;
+      return s_ <= kLargestShare;
+  }
+  __builtin_unreachable();
+}
+
+void Directions::restart() {
+  last_step_ = std::numeric_limits<double>::infinity();
+  chord_allowed_ = false;
+  s_ = 0.0;
+}
+
+}  // namespace diffcloth::solver

@@ -1,0 +1,69 @@
+#pragma once
+
+#include <cstdint>
+#include <limits>
+#include <utility>
+#include <vector>
+
+#include "solver/line_search.h"
+#include "solver/walk.h"
+
+namespace diffcloth::solver {
+
+/// What a direction was computed with.
+enum class Kind : std::uint8_t {
+  kFactored,  ///< the exact Hessian, factored here: where it succeeds, the certificate of a minimum
+  kIterated,  ///< the exact Hessian, by conjugate gradients
+  kChord,     ///< a factor of the exact Hessian at an earlier point
+  kDamped,    ///< the exact Hessian blended with its projection
+};
+
+/// The next direction of a minimization, as cheap as what the last ones have shown allows.
+///
+/// In this order: a chord step with the last exact factor while that contracts; conjugate gradients
+/// on the exact Hessian with that factor; a new factor. Where the exact Hessian H is not positive
+/// definite, A(s) = (H + s P) / (1 + s) with its projection P; s falls while steps gain what they
+/// promise. All constants are free of units.
+class Directions {
+ public:
+  /// @param nearby  factor of an exact Hessian that may be close; may be null
+  Directions(Walk& walk, Factor nearby) : walk_(walk), factor_(std::move(nearby)) {}
+
+  struct Direction {
+    Kind kind;
+    double first;  ///< fraction to try first: above 1 where a damped step should be longer
+  };
+
+  /// Compute the next direction into p().
+  Direction next();
+
+  /// Compute the direction of the exact Hessian, factored here. False where it is indefinite.
+  bool certify();
+
+  const std::vector<double>& p() const { return p_; }
+  const Factor& factor() const { return factor_; }
+
+  /// Learn from how the last direction was walked.
+  void learn(const Direction& direction, const Search& search);
+
+  /// Turn to the next kind of direction, as the last one led nowhere. False when none is left.
+  bool retry(Kind kind);
+
+  /// Forget the way here, after a jump.
+  void restart();
+
+ private:
+  bool chord();
+  bool iterate(const linalg::BlockMatrix& H, bool& indefinite);
+  Direction damp(const linalg::BlockMatrix& H);
+
+  Walk& walk_;
+  Factor factor_;
+  std::vector<double> p_;
+  double slope_ = 0.0;
+  double last_step_ = std::numeric_limits<double>::infinity();
+  bool chord_allowed_ = false;  // the last step was a full one with an exact Hessian
+  double s_ = 0.0;
+};
+
+}  // namespace diffcloth::solver

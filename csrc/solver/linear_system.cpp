@@ -1,0 +1,49 @@
+#include "solver/linear_system.h"
+
+namespace diffcloth::solver {
+
+linalg::BlockMatrix LinearSystem::assemble(const double* x, Curvature curvature) {
+  const Stopwatch::Scope scope(watch_, Phase::kAssembly);
+  assembly_ = f_.assemblies->find(f_.couplings());
+  linalg::BlockMatrix matrix({assembly_, &assembly_->merged}, f_.assemblies->fixed());
+  f_.for_each([&](const Potential& p) { p.add_hessian(x, curvature, matrix); });
+  return matrix;
+}
+
+Factor LinearSystem::factor(const linalg::BlockMatrix& matrix) {
+  const Stopwatch::Scope analysis_scope(watch_, Phase::kAnalysis);
+  const Assembly::Found found = assembly_->analysis();
+  counts_.analyses += found.is_new ? 1 : 0;
+  const Stopwatch::Scope scope(watch_, Phase::kFactorization);
+  ++counts_.factorizations;
+  auto factor = std::make_shared<linalg::CholeskyFactor>(found.analysis);
+  if (!factor->compute(matrix.blocks())) return nullptr;
+  return factor;
+}
+
+void LinearSystem::solve(const linalg::CholeskyFactor& factor,
+                         const std::vector<double>& b,
+                         std::vector<double>& p) {
+  const Stopwatch::Scope scope(watch_, Phase::kSolve);
+  z_.assign(f_.coordinates->size(), 0.0);
+  factor.solve(b.data(), z_.data());
+  for (double& value : z_) value = -value;
+  f_.coordinates->push_forward(z_, p);
+}
+
+linalg::Convergence LinearSystem::solve(const linalg::BlockMatrix& matrix,
+                                        const linalg::CholeskyFactor& nearby,
+                                        const std::vector<double>& b,
+                                        double tolerance,
+                                        int max_iterations,
+                                        std::vector<double>& p) {
+  const Stopwatch::Scope scope(watch_, Phase::kSolve);
+  const linalg::Convergence result =
+      linalg::conjugate_gradient(matrix.pattern(), matrix.blocks(), f_.assemblies->fixed(), nearby,
+                                 b, tolerance, max_iterations, z_);
+  for (double& value : z_) value = -value;
+  f_.coordinates->push_forward(z_, p);
+  return result;
+}
+
+}  // namespace diffcloth::solver

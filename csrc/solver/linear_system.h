@@ -1,0 +1,65 @@
+#pragma once
+
+#include <memory>
+#include <vector>
+
+#include "common/stopwatch.h"
+#include "linalg/block_matrix.h"
+#include "linalg/cholesky.h"
+#include "linalg/conjugate_gradient.h"
+#include "solver/objective.h"
+
+namespace diffcloth::solver {
+
+using Factor = std::shared_ptr<const linalg::CholeskyFactor>;
+
+/// What a step did, for the report.
+struct Counts {
+  int exact = 0;               ///< Newton steps with the exact Hessian, factored or by CG
+  int chord = 0;               ///< steps with an older factor
+  int projected = 0;           ///< steps with a Hessian blended with its projection
+  int negative_curvature = 0;  ///< Hessians that were found indefinite
+  int factorizations = 0;      ///< numeric ones, those that failed included
+  int analyses = 0;            ///< symbolic ones
+};
+
+/// The Newton system H p = -g of an objective, at the point where it stands: assembled, factored,
+/// solved and certified. Matrices live on the cloths' vertices.
+class LinearSystem {
+ public:
+  LinearSystem(const Objective& objective, Stopwatch& watch, Counts& counts)
+      : f_(objective), watch_(watch), counts_(counts) {}
+
+  /// The Hessian at x, on the couplings of this point alone: a function of x, not of the way there.
+  linalg::BlockMatrix assemble(const double* x, Curvature curvature);
+
+  /// L L^T of a matrix that assemble() has made at the last point; null where it is not positive
+  /// definite.
+  Factor factor(const linalg::BlockMatrix& matrix);
+
+  /// Change p = -factor^-1 b of all vertices, zero at prescribed ones.
+  void solve(const linalg::CholeskyFactor& factor,
+             const std::vector<double>& b,
+             std::vector<double>& p);
+
+  /// The same for a matrix, by conjugate gradients with a factor of a nearby one.
+  linalg::Convergence solve(const linalg::BlockMatrix& matrix,
+                            const linalg::CholeskyFactor& nearby,
+                            const std::vector<double>& b,
+                            double tolerance,
+                            int max_iterations,
+                            std::vector<double>& p);
+
+  /// Factor of the exact Hessian at x: the certificate that a point where the gradient vanishes is a
+  /// minimum. Null where it is none.
+  Factor certify(const double* x) { return factor(assemble(x, Curvature::kExact)); }
+
+ private:
+  const Objective& f_;
+  Stopwatch& watch_;
+  Counts& counts_;
+  std::shared_ptr<const Assembly> assembly_;
+  std::vector<double> z_;
+};
+
+}  // namespace diffcloth::solver

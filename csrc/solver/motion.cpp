@@ -1,0 +1,107 @@
+#include "solver/motion.h"
+
+#include "solver/line_search.h"
+
+namespace diffcloth::solver {
+namespace {
+
+/// A motion is stuck when this many iterations move it by less than this fraction.
+constexpr int kStuckIterations = 20;
+constexpr double kStuckProgress = 1e-3;
+/// A joint step that leaves more than this share of the motion is followed by a relaxation.
+constexpr double kStopped = 0.5;
+
+/// Change of the prescribed vertices to their ends, zero elsewhere.
+std::vector<double> prescribed_change(const Walk& walk, const std::vector<double>& ends) {
+  std::vector<double> d(ends.size(), 0.0);
+  for (Index i = 0; i < walk.f.coordinates->vertex_count(); ++i) {
+    if (walk.f.coordinates->is_free(i)) continue;
+    for (Index a = 3 * i; a < 3 * i + 3; ++a) d[a] = ends[a] - walk.x()[a];
+  }
+  return d;
+}
+
+/// g += H_xo d.
+void add_coupling(const Objective& f,
+                  const linalg::BlockMatrix& matrix,
+                  const std::vector<double>& x,
+                  const std::vector<double>& d,
+                  std::vector<double>& g) {
+  // The matrix holds the couplings with pins that the base pattern has.
+  matrix.add_product(d.data(), g.data());
+  f.for_each([&](const Potential& p) {
+    p.add_left_out_product(x.data(), Curvature::kPositive, d.data(), g.data());
+  });
+}
+
+/// One joint step towards the ends. Returns the fraction of the remaining motion that it covers.
+double joint_step(Walk& walk, const std::vector<double>& ends) {
+  const std::vector<double> d = prescribed_change(walk, ends);
+  const linalg::BlockMatrix matrix = walk.system.assemble(walk.x().data(), Curvature::kPositive);
+  std::vector<double> b = walk.g();
+  add_coupling(walk.f, matrix, walk.x(), d, b);
+  // Positive by construction, M/h^2 plus positive semi-definite parts, but for rounding.
+  const Factor factor = walk.system.factor(matrix);
+  if (!factor) return 0.0;
+  ++walk.context.counts->projected;
+  std::vector<double> p;
+  walk.system.solve(*factor, b, p);
+  for (std::size_t a = 0; a < p.size(); ++a) p[a] += d[a];
+
+  std::vector<double> to;
+  Coordinates::retract(walk.x(), p, 1.0, to);
+  const double alpha = walk.watch(to);
+  Coordinates::retract(walk.x(), p, alpha, to);
+  if (alpha == 1.0) {
+    for (std::size_t a = 0; a < to.size(); ++a) {
+      if (!walk.f.coordinates->is_free(static_cast<Index>(a / 3))) to[a] = ends[a];
+    }
+  }
+  walk.go(to);
+  walk.refresh();
+  return alpha;
+}
+
+void relax(Walk& walk) {
+  const linalg::BlockMatrix matrix = walk.system.assemble(walk.x().data(), Curvature::kPositive);
+  const Factor factor = walk.system.factor(matrix);
+  if (!factor) return;
+  std::vector<double> p;
+  walk.system.solve(*factor, walk.g(), p);
+  search(walk, p, 1.0);
+}
+
+bool has_arrived(const Walk& walk, const std::vector<double>& ends) {
+  for (Index i = 0; i < walk.f.coordinates->vertex_count(); ++i) {
+    if (walk.f.coordinates->is_free(i)) continue;
+    if (row(walk.x().data(), i) != row(ends.data(), i)) return false;
+  }
+  return true;
+}
+
+}  // namespace
+
+double arrive(Walk& walk, const PrescribedMotion& motion) {
+  const int portions = motion.portions();
+  std::vector<double> ends(walk.x());
+  for (int k = 0; k < portions; ++k) {
+    motion.end_of_portion(k, ends.data());
+    if (has_arrived(walk, ends)) continue;
+    double remaining = 1.0;
+    double checked = 1.0;
+    for (int iteration = 1; remaining > 0.0; ++iteration) {
+      const double reached = (k + 1.0 - remaining) / portions;
+      if (!walk.spend()) return reached;
+      const double alpha = joint_step(walk, ends);
+      remaining *= 1.0 - alpha;
+      if (iteration % kStuckIterations == 0) {
+        if (checked - remaining < kStuckProgress) return reached;
+        checked = remaining;
+      }
+      if (alpha < kStopped) relax(walk);
+    }
+  }
+  return 1.0;
+}
+
+}  // namespace diffcloth::solver

@@ -1,0 +1,29 @@
+#pragma once
+
+#include <vector>
+
+#include "solver/walk.h"
+
+namespace diffcloth::solver {
+
+/// How the prescribed vertices (pins and bodies) move over the step: in portions, each short enough
+/// that straight motion between its ends does not distort a turning body.
+class PrescribedMotion {
+ public:
+  virtual ~PrescribedMotion() = default;
+  virtual int portions() const = 0;
+
+  /// Write the positions of the prescribed vertices at the end of portion k into x.
+  virtual void end_of_portion(int k, double* x) const = 0;
+};
+
+/// Walk the prescribed vertices to their ends, the free ones along with them.
+///
+/// Joint Newton: H_xx p = -(g + H_xo do), both moved by the same collision-free fraction. No energy
+/// is compared on the way, as the prescribed motion does work; a blocked step is followed by a
+/// relaxation of the free vertices, which reopens the gaps that it has closed.
+///
+/// @return the fraction of the motion that was reached: 1 for all of it
+double arrive(Walk& walk, const PrescribedMotion& motion);
+
+}  // namespace diffcloth::solver

@@ -1,0 +1,104 @@
+#include "solver/saddle.h"
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+
+namespace diffcloth::solver {
+namespace {
+
+/// First shift that makes the Hessian definite, as a share of M/h^2, and its growth.
+constexpr double kFirstShift = 0.1;
+constexpr double kShiftGrowth = 4.0;
+constexpr double kLargestShift = 1e12;
+constexpr int kInverseIterations = 30;
+/// Share of the mean edge that the first trial moves a vertex by, and its halvings.
+constexpr double kFirstMove = 0.25;
+constexpr int kBacktracks = 40;
+
+/// A fixed start without symmetry.
+std::vector<double> start_vector(const Coordinates& coordinates) {
+  std::vector<double> d(coordinates.size(), 0.0);
+  std::uint32_t seed = 1;
+  for (Index i = 0; i < coordinates.cloth_vertex_count(); ++i) {
+    if (!coordinates.is_free(i)) continue;
+    for (Index a = 3 * i; a < 3 * i + 3; ++a) {
+      seed = seed * 1664525U + 1013904223U;
+      d[a] = static_cast<double>(seed >> 8) / (1U << 24) - 0.5;
+    }
+  }
+  return d;
+}
+
+Factor shifted_factor(Walk& walk) {
+  linalg::BlockMatrix H = walk.system.assemble(walk.x().data(), Curvature::kExact);
+  const std::vector<double>& metric = walk.f.inertia->metric();
+  const double h = walk.f.h;
+  double added = 0.0;
+  for (double shift = kFirstShift; shift < kLargestShift; shift *= kShiftGrowth) {
+    walk.context.checkpoint->check();
+    for (std::size_t i = 0; i < metric.size(); ++i) {
+      H.add_to_diagonal(static_cast<Index>(i), (shift - added) * metric[i] / (h * h));
+    }
+    added = shift;
+    if (Factor factor = walk.system.factor(H)) return factor;
+  }
+  return nullptr;
+}
+
+/// Direction of the smallest eigenvalue of H relative to the metric, its largest entry 1.
+std::vector<double> most_negative(Walk& walk, const linalg::CholeskyFactor& shifted) {
+  const std::vector<double>& metric = walk.f.inertia->metric();
+  std::vector<double> d = start_vector(*walk.f.coordinates);
+  std::vector<double> b(d.size(), 0.0);
+  for (int k = 0; k < kInverseIterations; ++k) {
+    walk.context.checkpoint->check();
+    for (std::size_t a = 0; a < d.size(); ++a) b[a] = metric[a / 3] * d[a];
+    shifted.solve(b.data(), d.data());
+    const double size = largest(d);
+    for (double& value : d) value /= size;
+  }
+  // The largest entry decides the sign; of equal ones the first.
+  const auto top = std::ranges::max_element(d, {}, [](double value) { return std::abs(value); });
+  if (*top < 0.0) {
+    for (double& value : d) value = -value;
+  }
+  return d;
+}
+
+}  // namespace
+
+bool leave_saddle(Walk& walk) {
+  const Factor shifted = shifted_factor(walk);
+  if (!shifted) return false;
+  std::vector<double> p;
+  walk.f.coordinates->push_forward(most_negative(walk, *shifted), p);
+  std::vector<double> product;
+  walk.f.hessian_product(walk.x().data(), p.data(), product);
+  if (!(dot(p, product) < 0.0)) return false;
+
+  // From far to near: the first point that is lower, and on while the next is lower still.
+  const double length = kFirstMove * walk.f.length;
+  std::vector<double> to;
+  Coordinates::retract(walk.x(), p, length, to);
+  double alpha = length * walk.watch(to);
+  double best = 0.0;
+  double best_alpha = 0.0;
+  for (int k = 0; k < kBacktracks; ++k, alpha *= 0.5) {
+    Coordinates::retract(walk.x(), p, alpha, to);
+    const double change = walk.change(to);
+    if (change < best) {
+      best = change;
+      best_alpha = alpha;
+    } else if (best_alpha > 0.0) {
+      break;
+    }
+  }
+  if (best_alpha == 0.0) return false;
+  Coordinates::retract(walk.x(), p, best_alpha, to);
+  walk.go(to);
+  walk.refresh();
+  return true;
+}
+
+}  // namespace diffcloth::solver

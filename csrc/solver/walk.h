@@ -1,0 +1,122 @@
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <vector>
+
+#include "common/interrupt.h"
+#include "common/stopwatch.h"
+#include "solver/linear_system.h"
+#include "solver/objective.h"
+
+namespace diffcloth::solver {
+
+inline double dot(const std::vector<double>& a, const std::vector<double>& b) {
+  double sum = 0.0;
+  for (std::size_t i = 0; i < a.size(); ++i) sum += a[i] * b[i];
+  return sum;
+}
+
+/// Largest change of a coordinate; NaN counts as infinite.
+inline double largest(const std::vector<double>& p) {
+  double result = 0.0;
+  for (const double value : p) {
+    if (!(std::abs(value) <= result)) result = std::abs(value);
+  }
+  return std::isnan(result) ? std::numeric_limits<double>::infinity() : result;
+}
+
+struct Options {
+  double tolerance;    ///< on |p|_inf / h, p the full Newton step [m/s]
+  int max_iterations;  ///< of a step, over all its solves
+};
+
+/// What the solves of one step share.
+struct Context {
+  const Checkpoint* checkpoint;
+  Options options;
+  Stopwatch* watch;
+  Counts* counts;
+  int iterations = 0;                                ///< taken by all solves so far
+  std::vector<std::vector<double>>* path = nullptr;  ///< accepted iterates, where wanted
+};
+
+/// A walk from one feasible point to the next: the positions, the gradient there, and which motions
+/// from there are free of collisions. Every segment walked is certified.
+class Walk {
+ public:
+  /// @param x  in: a feasible start; moves along
+  Walk(const Objective& f, std::vector<double>& x, Context& context)
+      : f(f), context(context), system(f, *context.watch, *context.counts), x_(x) {
+    record();
+  }
+
+  const Objective& f;
+  Context& context;
+  LinearSystem system;
+
+  const std::vector<double>& x() const { return x_; }
+  const std::vector<double>& g() const { return g_; }
+
+  /// Find contacts and gradient where the walk stands, among the watched pairs.
+  void refresh() {
+    const Stopwatch::Scope scope(*context.watch, Phase::kAssembly);
+    f.stand_at(x_.data());
+    f.gradient(x_.data(), g_);
+  }
+
+  /// Watch the straight motion to a point; returns its fraction that is free of collisions.
+  double watch(const std::vector<double>& to) {
+    if (f.contact == nullptr) return 1.0;
+    const Stopwatch::Scope scope(*context.watch, Phase::kDetection);
+    f.contact->watch(x_.data(), to.data());
+    return f.contact->safe_fraction(x_.data(), to.data());
+  }
+
+  /// Change of the objective on the way to a point of the watched motion.
+  double change(const std::vector<double>& to) const {
+    const Stopwatch::Scope scope(*context.watch, Phase::kLineSearch);
+    return f.energy_change(x_.data(), to.data());
+  }
+
+  /// Go to a point of the watched motion; the gradient there is still to be refreshed.
+  void go(const std::vector<double>& to) {
+    x_ = to;
+    record();
+  }
+
+  /// Go to a point of the watched motion unless the slope along p there is above a bound.
+  bool go_if_flat(const std::vector<double>& to, const std::vector<double>& p, double bound) {
+    std::vector<double> x_before = to;
+    x_before.swap(x_);
+    std::vector<double> g_before = g_;
+    refresh();
+    if (dot(g_, p) <= bound) {
+      record();
+      return true;
+    }
+    x_.swap(x_before);
+    g_.swap(g_before);
+    f.stand_at(x_.data());
+    return false;
+  }
+
+  /// Take one iteration from the budget of the step. False when it is used up.
+  bool spend() {
+    context.checkpoint->check();
+    if (context.iterations >= context.options.max_iterations) return false;
+    ++context.iterations;
+    return true;
+  }
+
+ private:
+  void record() {
+    if (context.path != nullptr) context.path->push_back(x_);
+  }
+
+  std::vector<double>& x_;
+  std::vector<double> g_;
+};
+
+}  // namespace diffcloth::solver

@@ -1,0 +1,273 @@
+// The adjoint of a step.
+//
+// Let E_k be the objective of friction iteration k = 1..K, x_k its minimizer over the free vertices,
+// and grad the gradient over *all* vertices: free, pinned and bodies'. The outputs are x_K,
+// v = (x_K - x_n)/h and the forces f_o = -grad_o E_K at fixed x_K (bodies' rows). For cotangents
+// x_bar, v_bar, f_bar:
+//
+//   g_K   = x_bar + v_bar / h
+//   z_k   = H_k^-1 (g_k - H_xo f_bar [k = K])      at the free vertices
+//   zhat  = (z_k, 0 at pins, f_bar at bodies [k = K, else 0])
+//
+// Then every input theta that E_k depends on, whether through the solution or through the forces,
+// gets the same expression,
+//
+//   theta_bar -= d/d(theta) ( zhat . grad E_k ),
+//
+// which each potential adds up for its own inputs; in particular prescribed positions (pins c, bodies
+// o) get  -(H zhat) at their rows, and pins also the direct g_k. Friction's displacement x - x_start
+// gives  x_start_bar += H_D zhat. The lag configuration of k is x_{k-1} (x_n for k = 1): its
+// cotangent becomes g_{k-1}, and the sweep goes on from K to 1.
+
+#include "step/contact_stage.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <optional>
+#include <stdexcept>
+#include <string>
+
+#include "solver/adjoint.h"
+#include "solver/newton.h"
+#include "step/motion.h"
+
+namespace diffcloth::step {
+namespace {
+
+using contact::Contact;
+using contact::ContactPotential;
+using contact::FrictionPotential;
+using Array = std::vector<double>;
+
+/// The potentials of one friction iteration.
+class Sum {
+ public:
+  Sum(ContactStage& stage,
+      Problem& problem,
+      contact::BroadPhase::Scratch& scratch,
+      contact::ContactModel::Bar* bar)
+      : stage_(stage), problem_(problem), bar_(bar) {
+    if (problem.contact) {
+      contact_.emplace(*problem.contact, problem.scene.broad_phase, scratch, bar);
+    }
+    objective = problem.objective(stage.inertia, stage.others, stage.assemblies);
+    objective.contact = contact_ ? &*contact_ : nullptr;
+  }
+
+  /// Contacts at a point, found from scratch; the contact potential stands there.
+  const std::vector<Contact>& contacts_at(const Array& x) {
+    static const std::vector<Contact> none;
+    if (!contact_) return none;
+    contact_->watch(x.data(), x.data());
+    contact_->stand_at(x.data());
+    return contact_->contacts();
+  }
+
+  /// Take friction from the contacts of a configuration.
+  void lag(const std::vector<Contact>& contacts) {
+    objective.others = stage_.others;
+    friction.reset();
+    if (contacts.empty()) return;
+    friction.emplace(*problem_.contact, contacts, problem_.start.data(), bar_);
+    objective.others.push_back(&*friction);
+  }
+
+  solver::Objective objective;
+  std::optional<FrictionPotential> friction;
+
+ private:
+  ContactStage& stage_;
+  Problem& problem_;
+  contact::ContactModel::Bar* bar_;
+  std::optional<ContactPotential> contact_;
+};
+
+/// The bodies and cloths in contact, which block a motion.
+std::string blockers(const Scene& scene, const std::vector<Contact>& contacts) {
+  std::vector<char> involved(static_cast<std::size_t>(scene.surface_count()), 0);
+  for (const Contact& k : contacts) {
+    for (const Index v : k.pair.vertices) involved[scene.collision_mesh.vertex_surface[v]] = 1;
+  }
+  std::string text;
+  for (Index s = 0; s < scene.surface_count(); ++s) {
+    if (!involved[s]) continue;
+    const bool is_cloth = s < scene.cloth_count();
+    text += (text.empty() ? "" : ", ") + std::string(is_cloth ? "cloth " : "body ") +
+            std::to_string(is_cloth ? s : s - scene.cloth_count());
+  }
+  return text;
+}
+
+void report_contacts(const Scene& scene, const std::vector<Contact>& contacts, Report& report) {
+  report.contact_count = static_cast<Index>(contacts.size());
+  report.minimum_distance = std::numeric_limits<double>::infinity();
+  for (const Contact& k : contacts) {
+    report.minimum_distance = std::min(report.minimum_distance, std::sqrt(k.closest.d_sq));
+  }
+  if (report.result == Result::kInfeasibleMotion) {
+    report.message = "in contact: " + blockers(scene, contacts);
+  }
+}
+
+/// Contact forces on the bodies' vertices: minus the partial derivative of the contact energy.
+void write_body_forces(const Sum& sum, const Array& x, std::size_t cloth, double* out) {
+  Array g(x.size(), 0.0);
+  if (sum.objective.contact != nullptr) sum.objective.contact->add_gradient(x.data(), g.data());
+  if (sum.friction) sum.friction->add_gradient(x.data(), g.data());
+  for (std::size_t a = cloth; a < g.size(); ++a) out[a - cloth] = -g[a];
+}
+
+/// Everything at its end, free vertices where inertia alone (or x^D) would put them.
+Array guess(const Problem& problem, const Proximity& inertia) {
+  Array x = problem.with_bodies_at_end(inertia.target().data());
+  for (const Index i : problem.scene.given.pins) {
+    Eigen::Map<Vec3>(x.data() + 3 * i) = row(problem.ends.data(), i);
+  }
+  return x;
+}
+
+std::string words(solver::Status status) {
+  switch (status) {
+    case solver::Status::kConverged:
+    case solver::Status::kInfeasibleMotion:
+      return {};
+    case solver::Status::kIterationLimit:
+      return "the iterations of the step are used up";
+    case solver::Status::kRoundingFloor:
+      return "rounding hides any further decrease: the floor of float64 for this scene";
+    case solver::Status::kBlocked:
+      return "surfaces are so close that rounding lets none of them move";
+    case solver::Status::kSaddle:
+      return "at a saddle that no lower point was found from";
+  }
+  __builtin_unreachable();
+}
+
+}  // namespace
+
+void merge(const solver::Outcome& outcome, Report& report) {
+  report.residual = std::max(report.residual, outcome.residual);
+  report.motion_fraction = std::min(report.motion_fraction, outcome.motion_fraction);
+  if (outcome.status == solver::Status::kInfeasibleMotion) {
+    report.result = Result::kInfeasibleMotion;
+  } else if (outcome.status != solver::Status::kConverged) {
+    report.result = Result::kNotConverged;
+    report.message = words(outcome.status);
+  }
+}
+
+std::vector<Field> ContactStage::tape(const Scene& scene) {
+  const auto n = static_cast<std::size_t>(scene.cloth_vertex_count());
+  const auto k = static_cast<std::size_t>(scene.given.friction_iterations);
+  return {{.name = "iterates", .shape = {k, n, 3}}, {.name = "solves", .shape = {1}}};
+}
+
+void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
+  Problem& problem = step.problem;
+  const std::size_t cloth = problem.coordinates.size();
+  const int friction_iterations = problem.scene.given.friction_iterations;
+  Sum sum(*this, problem, step.scratch, nullptr);
+  const Motion motion(problem);
+  sum.lag(sum.contacts_at(x));
+  const Array first_guess = guess(problem, inertia);
+  solver::Factor factor;
+  int solves = 0;
+  while (solves < friction_iterations) {
+    const solver::Outcome outcome =
+        solver::minimize(sum.objective, x, motion, solves == 0 ? &first_guess : nullptr,
+                         std::move(factor), step.context);
+    merge(outcome, step.report);
+    step.factors.push_back(outcome.factor);
+    factor = outcome.factor;
+    if (!step.tape.empty()) {
+      std::copy_n(x.begin(), cloth, step.tape["iterates"] + solves * cloth);
+    }
+    ++solves;
+    if (step.report.result != Result::kConverged) break;
+    const std::vector<Contact>& contacts =
+        sum.objective.contact != nullptr ? sum.objective.contact->contacts() : sum.contacts_at(x);
+    // Without contact before and after, another solve would be the same one.
+    if (!sum.friction && contacts.empty()) break;
+    if (solves < friction_iterations) sum.lag(contacts);
+  }
+  report_contacts(
+      problem.scene,
+      sum.objective.contact != nullptr ? sum.objective.contact->contacts() : sum.contacts_at(x),
+      step.report);
+  if (!step.tape.empty()) *step.tape["solves"] = solves;
+  write_body_forces(sum, x, cloth, body_forces);
+}
+
+void pull_back_solve(const Backward& step,
+                     const solver::Objective& f,
+                     const Array& x,
+                     solver::Factor factor,
+                     const Array& g,
+                     const Array* force_bar) {
+  Cotangents& bars = step.cotangents;
+  const std::size_t cloth = step.problem.coordinates.size();
+  solver::LinearSystem system(f, *step.context.watch, *step.context.counts);
+  if (!factor) factor = system.certify(x.data());
+  if (!factor) throw std::domain_error("the Hessian is not positive definite at the solution");
+
+  Array b(x.size(), 0.0);
+  std::ranges::copy(g, b.begin());
+  Array forces(x.size(), 0.0);
+  Array product;
+  if (force_bar != nullptr) {
+    std::ranges::copy(*force_bar, forces.begin() + static_cast<std::ptrdiff_t>(cloth));
+    f.hessian_product(x.data(), forces.data(), product);
+    for (std::size_t a = 0; a < cloth; ++a) b[a] -= product[a];
+  }
+  Array zhat;
+  solver::solve_adjoint(system, x.data(), *factor, b, zhat);
+  for (std::size_t a = cloth; a < zhat.size(); ++a) zhat[a] = forces[a];
+
+  f.hessian_product(x.data(), zhat.data(), product);
+  for (const Index i : step.problem.scene.given.pins) {
+    for (Index a = 3 * i; a < 3 * i + 3; ++a) bars.ends[a] += g[a] - product[a];
+  }
+  for (std::size_t a = cloth; a < zhat.size(); ++a) bars.ends[a] -= product[a];
+  f.for_each([&](Potential& p) { p.accumulate(x.data(), zhat.data()); });
+}
+
+void ContactStage::backward(const Backward& step, Array g) {
+  Problem& problem = step.problem;
+  Cotangents& bars = step.cotangents;
+  const std::size_t cloth = problem.coordinates.size();
+  const auto solves = static_cast<std::size_t>(*step.tape["solves"]);
+  Sum sum(*this, problem, step.scratch, &bars.contact);
+  const auto at = [&](std::size_t k) {
+    return problem.with_bodies_at_end(step.tape["iterates"] + k * cloth);
+  };
+  for (std::size_t k = solves; k-- > 0;) {
+    step.context.checkpoint->check();
+    const Array x = at(k);
+    const Array x_lag = k == 0 ? problem.start : at(k - 1);
+    sum.lag(sum.contacts_at(x_lag));
+    if (sum.friction) sum.friction->set_lag(x_lag.data());
+    sum.contacts_at(x);
+    sum.objective.stand_at(x.data());
+    const std::size_t place = first_factor + k;
+    pull_back_solve(step, sum.objective, x,
+                    place < step.factors.size() ? step.factors[place] : nullptr, g,
+                    k + 1 == solves ? &bars.body_forces : nullptr);
+
+    std::ranges::fill(g, 0.0);
+    if (!sum.friction) continue;
+    const Array& lag_bar = sum.friction->lag_bar;
+    const Array& start_bar = sum.friction->start_bar;
+    Array& rest = k == 0 ? bars.start : bars.ends;
+    for (std::size_t a = 0; a < x.size(); ++a) {
+      bars.start[a] += start_bar[a];
+      if (k == 0 || a >= cloth) {
+        rest[a] += lag_bar[a];
+      } else {
+        g[a] = lag_bar[a];
+      }
+    }
+  }
+}
+
+}  // namespace diffcloth::step

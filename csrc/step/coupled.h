@@ -1,0 +1,17 @@
+#pragma once
+
+#include "step/scheme.h"
+
+namespace diffcloth::step {
+
+/// Inertia + elasticity + anchors + barrier + friction, minimized together: one exact implicit Euler
+/// step in contact.
+class Coupled final : public Scheme {
+ public:
+  std::string_view name() const override { return "coupled"; }
+  std::vector<Field> tape(const Scene& scene) const override;
+  void forward(const Forward& step, double* positions, double* body_forces) const override;
+  void backward(const Backward& step) const override;
+};
+
+}  // namespace diffcloth::step

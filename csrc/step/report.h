@@ -1,0 +1,49 @@
+#pragma once
+
+#include <cstdint>
+#include <string>
+
+#include "common/stopwatch.h"
+#include "common/types.h"
+#include "solver/linear_system.h"
+
+namespace diffcloth::step {
+
+/// Outcome of an environment's step, as the report states it.
+enum class Result : std::int32_t {
+  kConverged = 0,
+  kNotConverged = 1,
+  kInfeasibleMotion = 2,
+  kIntersectingStart = 3,
+};
+
+struct Report {
+  Result result = Result::kConverged;
+  Index iterations = 0;
+  double residual = 0.0;          ///< |p|_inf / h [m/s]
+  double minimum_distance = 0.0;  ///< of the pairs in contact; infinite without contact [m]
+  Index contact_count = 0;
+  double motion_fraction = 1.0;
+  solver::Counts counts;
+  Seconds seconds{};
+  std::string message;
+
+  /// Call visit(name, value) for every number but the seconds.
+  template <class Visit>
+  void for_each(Visit&& visit) const {
+    visit("status", static_cast<std::int64_t>(result));
+    visit("iterations", static_cast<std::int64_t>(iterations));
+    visit("residual", residual);
+    visit("minimum_distance", minimum_distance);
+    visit("contact_count", static_cast<std::int64_t>(contact_count));
+    visit("motion_fraction", motion_fraction);
+    visit("count_exact", static_cast<std::int64_t>(counts.exact));
+    visit("count_chord", static_cast<std::int64_t>(counts.chord));
+    visit("count_projected", static_cast<std::int64_t>(counts.projected));
+    visit("count_negative_curvature", static_cast<std::int64_t>(counts.negative_curvature));
+    visit("count_factorizations", static_cast<std::int64_t>(counts.factorizations));
+    visit("count_analyses", static_cast<std::int64_t>(counts.analyses));
+  }
+};
+
+}  // namespace diffcloth::step

@@ -1,0 +1,63 @@
+#pragma once
+
+#include <string_view>
+#include <vector>
+
+#include "step/cotangents.h"
+#include "step/factor_cache.h"
+#include "step/fields.h"
+#include "step/problem.h"
+#include "step/report.h"
+
+namespace diffcloth::step {
+
+struct Scene;
+
+/// What a scheme works with going forward.
+struct Forward {
+  Problem& problem;
+  contact::BroadPhase::Scratch& scratch;
+  solver::Context& context;
+  const Arrays<double>& tape;     ///< empty where no tape is wanted
+  FactorCache::Factors& factors;  ///< kept for backward, in the scheme's own order
+  Report& report;
+};
+
+/// What it works with going back.
+struct Backward {
+  Problem& problem;
+  contact::BroadPhase::Scratch& scratch;
+  solver::Context& context;
+  const Arrays<const double>& tape;
+  const FactorCache::Factors& factors;  ///< empty where they are gone
+  Cotangents& cotangents;
+};
+
+/// A way to take a step: what is minimized, in which order, and the adjoint of that.
+class Scheme {
+ public:
+  Scheme() = default;
+  virtual ~Scheme() = default;
+  Scheme(const Scheme&) = delete;
+  Scheme& operator=(const Scheme&) = delete;
+
+  virtual std::string_view name() const = 0;
+
+  /// What backward needs of forward beyond the inputs: positions, no contacts and no matrices.
+  virtual std::vector<Field> tape(const Scene& scene) const = 0;
+
+  /// Find the positions at the end of the step, and the contact forces on the bodies' vertices.
+  virtual void forward(const Forward& step, double* positions, double* body_forces) const = 0;
+
+  /// From the cotangents of the end to those of all that the potentials depend on.
+  virtual void backward(const Backward& step) const = 0;
+};
+
+/// The scheme of a name.
+/// @throws std::invalid_argument with the names that there are
+const Scheme& find_scheme(std::string_view name);
+
+/// Names of all schemes, the default first.
+std::vector<std::string_view> scheme_names();
+
+}  // namespace diffcloth::step

@@ -1,0 +1,100 @@
+// The adjoint of `split` is that of its contact stage (contact_stage.cpp), whose target is x^D; the
+// cotangent of x^D is the g of one more adjoint of the same form, that of the elastic stage: the
+// paper's Eqs. 8 and 29 with all explicit terms.
+
+#include "step/split.h"
+
+#include <algorithm>
+
+#include "solver/newton.h"
+#include "step/contact_stage.h"
+#include "step/motion.h"
+
+namespace diffcloth::step {
+namespace {
+
+using Array = std::vector<double>;
+
+/// G_i of the contact stage [kg].
+Array stage_metric(const Problem& p) {
+  if (p.scene.given.metric == Metric::kMass) return p.masses;
+  // The literal metric weighs all vertices alike; the mean mass keeps the energy in joules.
+  double mean = 0.0;
+  for (const double m : p.masses) mean += m;
+  return Array(p.masses.size(), mean / static_cast<double>(p.masses.size()));
+}
+
+/// Its adjoint: into the masses.
+void add_stage_metric(const Problem& p, const Array& bar, Array& masses_bar) {
+  double mean = 0.0;
+  for (const double value : bar) mean += value;
+  mean /= static_cast<double>(bar.size());
+  for (std::size_t i = 0; i < bar.size(); ++i) {
+    masses_bar[i] += p.scene.given.metric == Metric::kMass ? bar[i] : mean;
+  }
+}
+
+ContactStage stage(Problem& problem, Proximity& nearness) {
+  return {.inertia = nearness,
+          .others = {},
+          .assemblies = problem.scene.diagonal_assemblies,
+          .first_factor = 1};
+}
+
+/// x^D: pins are at their targets, and so are the bodies, which nothing here looks at.
+Array solve_elastic_stage(const Forward& step) {
+  Problem& problem = step.problem;
+  const solver::Objective f = problem.objective(problem.inertia, problem.elastic_potentials(),
+                                                problem.scene.elastic_assemblies);
+  Array x = problem.with_bodies_at_end(problem.inertia.target().data());
+  for (const Index i : problem.scene.given.pins) {
+    Eigen::Map<Vec3>(x.data() + 3 * i) = row(problem.ends.data(), i);
+  }
+  // Its way is no motion of the cloth.
+  auto* const path = std::exchange(step.context.path, nullptr);
+  const solver::Outcome outcome =
+      solver::minimize(f, x, Motion(problem), nullptr, nullptr, step.context);
+  step.context.path = path;
+  merge(outcome, step.report);
+  step.factors.push_back(outcome.factor);
+  return x;
+}
+
+}  // namespace
+
+std::vector<Field> Split::tape(const Scene& scene) const {
+  std::vector<Field> fields = ContactStage::tape(scene);
+  fields.push_back(
+      {.name = "elastic", .shape = {static_cast<std::size_t>(scene.cloth_vertex_count()), 3}});
+  return fields;
+}
+
+void Split::forward(const Forward& step, double* positions, double* body_forces) const {
+  Problem& problem = step.problem;
+  const std::size_t cloth = problem.coordinates.size();
+  Array x_d = solve_elastic_stage(step);
+  x_d.resize(cloth);
+  if (!step.tape.empty()) std::ranges::copy(x_d, step.tape["elastic"]);
+
+  Proximity nearness(stage_metric(problem), std::move(x_d), problem.h);
+  Array x = problem.start;
+  stage(problem, nearness).forward(step, x, body_forces);
+  std::copy_n(x.begin(), cloth, positions);
+}
+
+void Split::backward(const Backward& step) const {
+  Problem& problem = step.problem;
+  const double* x_d = step.tape["elastic"];
+  Proximity nearness(stage_metric(problem), Array(x_d, x_d + problem.coordinates.size()),
+                     problem.h);
+  stage(problem, nearness).backward(step, step.cotangents.positions);
+  add_stage_metric(problem, nearness.metric_bar, step.cotangents.masses);
+
+  const solver::Objective f = problem.objective(problem.inertia, problem.elastic_potentials(),
+                                                problem.scene.elastic_assemblies);
+  pull_back_solve(step, f, problem.with_bodies_at_end(x_d),
+                  step.factors.empty() ? nullptr : step.factors.front(), nearness.target_bar,
+                  nullptr);
+}
+
+}  // namespace diffcloth::step

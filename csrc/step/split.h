@@ -1,0 +1,17 @@
+#pragma once
+
+#include "step/scheme.h"
+
+namespace diffcloth::step {
+
+/// The paper's scheme (Eqs. 21-29): first inertia + elasticity + anchors without contact, which gives
+/// x^D; then 1/(2h^2) (x - x^D)^T G (x - x^D) + barrier + friction.
+class Split final : public Scheme {
+ public:
+  std::string_view name() const override { return "split"; }
+  std::vector<Field> tape(const Scene& scene) const override;
+  void forward(const Forward& step, double* positions, double* body_forces) const override;
+  void backward(const Backward& step) const override;
+};
+
+}  // namespace diffcloth::step
