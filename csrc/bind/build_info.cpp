@@ -3,6 +3,7 @@
 #include <nanobind/stl/string.h>
 
 #include "bind/bind.h"
+#include "linalg/cholesky.h"
 
 namespace diffcloth::bind {
 
@@ -17,7 +18,7 @@ void build_info(nb::module_& m) {
         result["flags"] = info.flags;
         result["processor"] = info.processor;
         result["eigen"] = info.eigen;
-        result["factorization"] = info.factorization;
+        result["factorization"] = linalg::factorization_name();
         result["blas"] = info.blas;
         return result;
       },

@@ -13,4 +13,5 @@ NB_MODULE(_core, m) {
   nb::module_ kernels = m.def_submodule("kernels", "Single kernels, exposed for tests.");
   diffcloth::bind::contact_kernels(kernels);
   diffcloth::bind::elastic_kernels(kernels);
+  diffcloth::bind::linalg_kernels(kernels);
 }

@@ -3,9 +3,6 @@
 #include <Eigen/Core>
 
 #ifdef DIFFCLOTH_HAS_CHOLMOD
-#include <array>
-
-#include <cholmod.h>
 #include <dlfcn.h>
 #endif
 
@@ -13,13 +10,6 @@ namespace diffcloth {
 namespace {
 
 #ifdef DIFFCLOTH_HAS_CHOLMOD
-
-std::string factorization() {
-  std::array<int, 3> version{};
-  cholmod_version(version.data());
-  return "cholmod " + std::to_string(version[0]) + "." + std::to_string(version[1]) + "." +
-         std::to_string(version[2]);
-}
 
 /// The library that dgemm resolves to in this process, with OpenBLAS' own description of itself.
 /// It is the loader's choice, not the build's: an alternative of the system, or a copy that
@@ -37,7 +27,6 @@ std::string blas() {
 
 #else
 
-std::string factorization() { return "eigen"; }
 std::string blas() { return "none"; }
 
 #endif
@@ -51,7 +40,6 @@ BuildInfo build_info() {
           .processor = DIFFCLOTH_PROCESSOR,
           .eigen = std::to_string(EIGEN_WORLD_VERSION) + "." + std::to_string(EIGEN_MAJOR_VERSION) +
                    "." + std::to_string(EIGEN_MINOR_VERSION),
-          .factorization = factorization(),
           .blas = blas()};
 }
 

@@ -1,47 +1,92 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 #include <memory>
+#include <span>
+#include <string>
 #include <vector>
 
+#include "linalg/aligned_buffer.h"
 #include "linalg/block_pattern.h"
+#include "linalg/dense_kernels.h"
 
 namespace diffcloth::linalg {
 
-/// Symbolic part of A = L L^T for a block pattern with some vertices eliminated.
+/// What factors a matrix.
+enum class Backend : std::uint8_t {
+  kMultifrontal,  ///< our own, without a BLAS
+  kEigen,         ///< Eigen's SimplicialLLT
+  kCholmod,       ///< CHOLMOD's supernodal factorization; where the build has it
+};
+
+const char* name(Backend backend);
+
+/// The backends of this build.
+const std::vector<Backend>& available_backends();
+
+/// What the default backend is in this process: "multifrontal (avx512)".
+std::string factorization_name();
+
+class AnalysisBackend;
+class FactorBackend;
+
+/// Memory that factorizations need while they run. Keep one for each thread and pass it to every
+/// compute(): it grows to what the largest needs and stays so.
+class CholeskyWorkspace {
+ public:
+  /// At least `size` doubles, of any values.
+  double* reserve(std::size_t size);
+
+  std::size_t bytes() const { return buffer_.bytes(); }
+
+ private:
+  AlignedBuffer buffer_;
+};
+
+/// Where the time of multifrontal factorizations went [s].
+struct CholeskySeconds {
+  double assembly = 0.0;    ///< the matrix into panels
+  double extend_add = 0.0;  ///< update matrices of children into their parents
+  double panel = 0.0;       ///< columns of L
+  double update = 0.0;      ///< update matrices
+};
+
+/// Symbolic part of A = L L^T for a block pattern with some vertices left out.
 ///
-/// Holds the fill-reducing order (approximate minimum degree on the vertex graph, so nine times
-/// cheaper than on the scalar one) and where each scalar of the permuted lower triangle comes from.
-/// Immutable; shared by any number of factors and threads.
+/// Everything is done on the graph of the vertices, which is nine times smaller than that of the
+/// scalars. Immutable; shared by any number of factors and threads.
 class CholeskyAnalysis {
  public:
   /// @param fixed  [pattern.size()] vertices left out of the matrix
-  CholeskyAnalysis(const BlockPattern& pattern, const std::vector<char>& fixed);
-
-  Index dimension() const { return static_cast<Index>(column_start.size()) - 1; }
-
-  // The permuted lower triangle in compressed columns; source[k] is the place of scalar k among the
-  // pattern's block values; unknown[k] is the coordinate (3 vertex + axis) of permuted unknown k.
-  std::vector<Index> column_start;
-  std::vector<Index> row;
-  std::vector<Index> source;
-  std::vector<Index> unknown;
-
-  struct Backend;
-  std::unique_ptr<Backend> backend;
-
+  /// @param level  instructions of the multifrontal kernels; others ignore it
+  CholeskyAnalysis(const BlockPattern& pattern,
+                   const std::vector<char>& fixed,
+                   Backend backend = Backend::kMultifrontal,
+                   KernelLevel level = best_level());
   ~CholeskyAnalysis();
   CholeskyAnalysis(const CholeskyAnalysis&) = delete;
   CholeskyAnalysis& operator=(const CholeskyAnalysis&) = delete;
 
+  /// Unknown scalars.
+  Index dimension() const;
+
+  /// Memory of the analysis.
+  std::size_t bytes() const;
+
+  /// Entries of L, stored zeros included.
+  std::size_t nonzeros() const;
+
+  /// Operations of one factorization.
+  double flops() const;
+
+  const AnalysisBackend& backend() const { return *backend_; }
+
  private:
-  /// Lay the matrix out with the vertices in this order.
-  void permute(const BlockPattern& pattern, const std::vector<Index>& order);
+  std::unique_ptr<const AnalysisBackend> backend_;
 };
 
-/// A = L L^T: CHOLMOD's supernodal factorization where the build has it, Eigen's otherwise.
-///
-/// L L^T and not L D L^T: only the former reports an indefinite matrix.
+/// A = L L^T, and not L D L^T: only the former reports an indefinite matrix.
 class CholeskyFactor {
  public:
   explicit CholeskyFactor(std::shared_ptr<const CholeskyAnalysis> analysis);
@@ -49,24 +94,32 @@ class CholeskyFactor {
   CholeskyFactor(const CholeskyFactor&) = delete;
   CholeskyFactor& operator=(const CholeskyFactor&) = delete;
 
-  /// Factor the matrix with these block values. False when it is not positive definite.
+  /// Factor the matrix with these block values, of whose diagonal blocks the lower triangles count.
+  /// False, at once, where it turns out not to be positive definite or not finite; the factor must
+  /// then not be used before another compute() has succeeded.
+  ///
+  /// @param seconds  if given, times are added to it; backends other than ours leave it alone
+  [[nodiscard]] bool compute(const double* blocks,
+                             CholeskyWorkspace& workspace,
+                             CholeskySeconds* seconds = nullptr);
+
+  /// The same with memory of its own for this call.
   [[nodiscard]] bool compute(const double* blocks);
 
-  /// x = A^-1 b over 3 * vertex_count coordinates; rows of eliminated vertices are left as they are.
-  /// Thread-safe.
+  /// x = A^-1 b over 3 * vertex_count coordinates; rows of vertices left out stay as they are. May
+  /// be called from any number of threads at once.
   void solve(const double* b, double* x) const;
 
-  /// Memory of the factor [bytes].
+  /// x[r] = A^-1 b[r] for several right-hand sides, with the bits of one at a time.
+  void solve(std::span<const double* const> b, std::span<double* const> x) const;
+
+  /// Memory of the factor, without that of the analysis.
   std::size_t bytes() const;
 
  private:
   std::shared_ptr<const CholeskyAnalysis> analysis_;
-  struct Backend;
-  std::unique_ptr<Backend> backend_;
-  std::vector<double> values_;
+  std::unique_ptr<FactorBackend> backend_;
+  bool positive_ = false;
 };
-
-/// "cholmod 3.0.14" or "eigen".
-const char* factorization_name();
 
 }  // namespace diffcloth::linalg

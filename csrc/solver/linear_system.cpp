@@ -17,7 +17,7 @@ Factor LinearSystem::factor(const linalg::BlockMatrix& matrix) {
   const Stopwatch::Scope scope(watch_, Phase::kFactorization);
   ++counts_.factorizations;
   auto factor = std::make_shared<linalg::CholeskyFactor>(found.analysis);
-  if (!factor->compute(matrix.blocks())) return nullptr;
+  if (!factor->compute(matrix.blocks(), workspace_)) return nullptr;
   return factor;
 }
 

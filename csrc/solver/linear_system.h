@@ -27,8 +27,12 @@ struct Counts {
 /// solved and certified. Matrices live on the cloths' vertices.
 class LinearSystem {
  public:
-  LinearSystem(const Objective& objective, Stopwatch& watch, Counts& counts)
-      : f_(objective), watch_(watch), counts_(counts) {}
+  /// @param workspace  of the factorizations; kept by the thread from one system to the next
+  LinearSystem(const Objective& objective,
+               linalg::CholeskyWorkspace& workspace,
+               Stopwatch& watch,
+               Counts& counts)
+      : f_(objective), workspace_(workspace), watch_(watch), counts_(counts) {}
 
   /// The Hessian at x, on the couplings of this point alone: a function of x, not of the way there.
   linalg::BlockMatrix assemble(const double* x, Curvature curvature);
@@ -56,6 +60,7 @@ class LinearSystem {
 
  private:
   const Objective& f_;
+  linalg::CholeskyWorkspace& workspace_;
   Stopwatch& watch_;
   Counts& counts_;
   std::shared_ptr<const Assembly> assembly_;

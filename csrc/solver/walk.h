@@ -36,6 +36,7 @@ struct Options {
 struct Context {
   const Checkpoint* checkpoint;
   Options options;
+  linalg::CholeskyWorkspace* workspace;
   Stopwatch* watch;
   Counts* counts;
   int iterations = 0;                                ///< taken by all solves so far
@@ -48,7 +49,7 @@ class Walk {
  public:
   /// @param x  in: a feasible start; moves along
   Walk(const Objective& f, std::vector<double>& x, Context& context)
-      : f(f), context(context), system(f, *context.watch, *context.counts), x_(x) {
+      : f(f), context(context), system(f, *context.workspace, *context.watch, *context.counts), x_(x) {
     record();
   }
 

@@ -171,7 +171,8 @@ linalg::BlockMatrix contact_free_hessian(Problem& p, const double* x, Curvature 
       p.objective(p.inertia, p.elastic_potentials(), p.scene.elastic_assemblies);
   Stopwatch watch;
   solver::Counts counts;
-  return solver::LinearSystem(f, watch, counts).assemble(x, curvature);
+  linalg::CholeskyWorkspace workspace;
+  return solver::LinearSystem(f, workspace, watch, counts).assemble(x, curvature);
 }
 
 std::vector<double> Problem::with_bodies_at_end(const double* cloth_positions) const {

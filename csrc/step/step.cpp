@@ -51,8 +51,10 @@ Report forward(const Scene& scene,
     }
   }
 
+  linalg::CholeskyWorkspace workspace;
   solver::Context context{.checkpoint = &checkpoint,
                           .options = scene.given.options,
+                          .workspace = &workspace,
                           .watch = &watch,
                           .counts = &report.counts,
                           .path = path};
@@ -98,8 +100,10 @@ void backward(const Scene& scene,
   }
   bars.body_forces.assign(f_bar, f_bar + (problem.start.size() - cloth));
 
+  linalg::CholeskyWorkspace workspace;
   solver::Context context{.checkpoint = &checkpoint,
                           .options = scene.given.options,
+                          .workspace = &workspace,
                           .watch = &watch,
                           .counts = &counts};
   scene.scheme->backward({.problem = problem,

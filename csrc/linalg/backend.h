@@ -1,0 +1,63 @@
+#pragma once
+
+#include <cstddef>
+#include <memory>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "linalg/block_pattern.h"
+#include "linalg/dense_kernels.h"
+#include "linalg/elimination_tree.h"
+#include "linalg/graph.h"
+
+namespace diffcloth::linalg {
+
+class CholeskyWorkspace;
+struct CholeskySeconds;
+
+/// Values of a factorization: what CholeskyFactor stands before.
+class FactorBackend {
+ public:
+  FactorBackend() = default;
+  virtual ~FactorBackend() = default;
+  FactorBackend(const FactorBackend&) = delete;
+  FactorBackend& operator=(const FactorBackend&) = delete;
+
+  virtual bool compute(const double* blocks,
+                       CholeskyWorkspace& workspace,
+                       CholeskySeconds* seconds) = 0;
+  virtual void solve(std::span<const double* const> b, std::span<double* const> x) const = 0;
+  virtual std::size_t bytes() const = 0;
+};
+
+/// Structure of a factorization: what CholeskyAnalysis stands before. It outlives its factors.
+class AnalysisBackend {
+ public:
+  AnalysisBackend() = default;
+  virtual ~AnalysisBackend() = default;
+  AnalysisBackend(const AnalysisBackend&) = delete;
+  AnalysisBackend& operator=(const AnalysisBackend&) = delete;
+
+  virtual std::unique_ptr<FactorBackend> make_factor() const = 0;
+  virtual Index dimension() const = 0;
+  virtual std::size_t nonzeros() const = 0;
+  virtual double flops() const = 0;
+  virtual std::size_t bytes() const = 0;
+};
+
+/// A pattern and the order in which its vertices are eliminated.
+struct Elimination {
+  const BlockPattern& pattern;
+  const Graph& graph;
+  const EliminationTree& tree;
+};
+
+std::unique_ptr<const AnalysisBackend> analyze_multifrontal(const Elimination& elimination,
+                                                            KernelLevel level);
+std::unique_ptr<const AnalysisBackend> analyze_eigen(const Elimination& elimination);
+#ifdef DIFFCLOTH_HAS_CHOLMOD
+std::unique_ptr<const AnalysisBackend> analyze_cholmod(const Elimination& elimination);
+#endif
+
+}  // namespace diffcloth::linalg

@@ -1,0 +1,89 @@
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+namespace diffcloth::linalg {
+
+/// Instructions that the dense kernels use.
+enum class KernelLevel : std::uint8_t { kPortable, kAvx2, kAvx512 };
+
+/// Shape of a supernode's dense matrices, in scalars. All are column-major.
+///
+/// The panel [ld, columns] holds the supernode's columns of L: the lower triangle of its own rows
+/// first, `top` of them with padding, then the rows below. The update matrix [update_ld, rows] is
+/// what it subtracts from its ancestors; only its lower triangle means anything, as only that of
+/// the panel's first rows does. `top`, ld and update_ld are multiples of 8, and padding in the
+/// panel is zero.
+struct Front {
+  std::int32_t columns;
+  std::int32_t rows;
+  std::int32_t top;
+  std::int32_t ld;
+  std::int32_t update_ld;
+};
+
+/// Consecutive rows of a child's update matrix that are consecutive in its parent, too.
+struct Run {
+  std::int32_t from;   ///< first row in the child's update matrix
+  std::int32_t to;     ///< first column of the parent, or row of its update matrix
+  std::int32_t count;  ///< how many
+};
+
+/// Where the rows of a child's update matrix belong in its parent: runs, ascending. The first ones
+/// go to the parent's columns, the others to the rows below them.
+struct ChildMap {
+  const Run* runs;
+  std::int32_t column_runs;
+  std::int32_t run_count;
+};
+
+/// The dense arithmetic of the multifrontal factorization.
+///
+/// Every entry is summed in one order, whatever the level: c_ij -= a_ik b_jk for k = 0, 1, ... with
+/// one rounding each. Levels with fused multiply-add (all but kPortable on x86-64) therefore agree
+/// in every bit.
+struct DenseKernels {
+  /// L of the panel in place, left-looking, 1 / l_jj on the diagonal. False, at once, at a pivot
+  /// that is not positive and finite.
+  bool (*factor)(const Front& front, double* panel);
+
+  /// U = -L_2 L_2^T, where L_2 are the panel's rows below its triangle.
+  void (*update)(const Front& front, const double* panel, double* u);
+
+  /// Add the columns of a child's update matrix that are columns of the parent.
+  void (*add_to_panel)(
+      const Front& child, const double* u, const ChildMap& map, const Front& front, double* panel);
+
+  /// Add the other columns of a child's update matrix.
+  void (*add_to_update)(const Front& child,
+                        const double* u,
+                        const ChildMap& map,
+                        const Front& front,
+                        double* parent_u);
+
+  /// c_1 := L_1^-1 c_1, c_2 := c_2 - L_2 c_1 for up to four vectors c, `stride` apart; c_2 begins at
+  /// `top`, entries of padding are zero.
+  void (*forward)(
+      const Front& front, const double* panel, double* c, std::ptrdiff_t stride, int count);
+
+  /// c_1 := L_1^-T (c_1 - L_2^T c_2), in the same layout.
+  void (*backward)(
+      const Front& front, const double* panel, double* c, std::ptrdiff_t stride, int count);
+};
+
+/// Most vectors that one call of forward() or backward() takes.
+constexpr int kMaxVectors = 4;
+
+const char* name(KernelLevel level);
+
+/// Whether this build and this processor have the instructions.
+bool supported(KernelLevel level);
+
+/// The fastest level that is supported.
+KernelLevel best_level();
+
+/// The kernels of a supported level.
+const DenseKernels& dense_kernels(KernelLevel level);
+
+}  // namespace diffcloth::linalg

@@ -1,0 +1,233 @@
+#include "linalg/symbolic.h"
+
+#include <algorithm>
+#include <utility>
+
+#include "linalg/supernodes.h"
+
+namespace diffcloth::linalg {
+namespace {
+
+constexpr Index kLanes = 8;
+
+Index padded(Index n) { return (n + kLanes - 1) / kLanes * kLanes; }
+
+/// Columns an odd number of cache lines apart lie in different sets of the cache.
+Index leading_dimension(Index n) { return n >= 128 && n % 16 == 0 ? n + kLanes : n; }
+
+std::size_t product(Index a, Index b) {
+  return static_cast<std::size_t>(a) * static_cast<std::size_t>(b);
+}
+
+/// Builds a Symbolic, one aspect after the other.
+class Analyzer {
+ public:
+  Analyzer(const BlockPattern& pattern, const Graph& graph, const EliminationTree& tree)
+      : pattern_(pattern), graph_(graph), tree_(tree), gathered_(gather_supernodes(tree)) {}
+
+  Symbolic run() {
+    place_columns();
+    find_children();
+    find_rows();
+    lay_out_panels();
+    place_blocks();
+    map_children();
+    lay_out_arena();
+    return std::move(s_);
+  }
+
+ private:
+  void place_columns() {
+    const Index n = graph_.size();
+    s_.vertex.resize(n);
+    rank_.assign(pattern_.size(), -1);
+    for (Index k = 0; k < n; ++k) {
+      s_.vertex[k] = graph_.vertex[tree_.order[gathered_.column[k]]];
+      rank_[s_.vertex[k]] = k;
+    }
+    s_.supernodes.resize(gathered_.size());
+    owner_.resize(n);
+    for (Index s = 0; s < gathered_.size(); ++s) {
+      Supernode& node = s_.supernodes[s];
+      node.first = gathered_.start[s];
+      node.columns = gathered_.start[s + 1] - node.first;
+      std::fill_n(owner_.begin() + node.first, node.columns, s);
+    }
+  }
+
+  void find_children() {
+    const Index count = gathered_.size();
+    std::vector<Index> start(count + 1, 0);
+    for (Index s = 0; s < count; ++s) {
+      if (gathered_.parent[s] != -1) ++start[gathered_.parent[s] + 1];
+    }
+    for (Index s = 0; s < count; ++s) start[s + 1] += start[s];
+    for (Index s = 0; s < count; ++s) {
+      s_.supernodes[s].children_begin = start[s];
+      s_.supernodes[s].children_end = start[s + 1];
+    }
+    s_.children.resize(start.back());
+    for (Index s = 0; s < count; ++s) {
+      if (gathered_.parent[s] != -1) s_.children[start[gathered_.parent[s]]++].supernode = s;
+    }
+  }
+
+  /// Rows below a supernode: those of A's columns and of its children.
+  void find_rows() {
+    std::vector<Index> seen(graph_.size(), -1);
+    for (Index s = 0; s < gathered_.size(); ++s) {
+      Supernode& node = s_.supernodes[s];
+      const Index end = node.first + node.columns;
+      node.rows_begin = s_.rows.size();
+      const auto take = [&](Index row) {
+        if (row < end || seen[row] == s) return;
+        seen[row] = s;
+        s_.rows.push_back(row);
+      };
+      for (Index k = node.first; k < end; ++k) {
+        const Index v = tree_.order[gathered_.column[k]];
+        for (Index e = graph_.start[v]; e < graph_.start[v + 1]; ++e) {
+          take(rank_[graph_.vertex[graph_.neighbor[e]]]);
+        }
+      }
+      for (Index c = node.children_begin; c < node.children_end; ++c) {
+        const Supernode& child = s_.supernodes[s_.children[c].supernode];
+        for (std::size_t r = child.rows_begin; r < child.rows_end; ++r) take(s_.rows[r]);
+      }
+      node.rows_end = s_.rows.size();
+      std::sort(s_.rows.begin() + static_cast<std::ptrdiff_t>(node.rows_begin), s_.rows.end());
+    }
+  }
+
+  void lay_out_panels() {
+    for (Supernode& node : s_.supernodes) {
+      Front& front = node.front;
+      front.columns = 3 * node.columns;
+      front.rows = 3 * static_cast<Index>(node.rows_end - node.rows_begin);
+      front.top = padded(front.columns);
+      front.ld = leading_dimension(front.top + padded(front.rows));
+      front.update_ld = leading_dimension(padded(front.rows));
+      node.panel = s_.factor_size;
+      s_.factor_size += product(front.ld, front.columns);
+      s_.longest = std::max(s_.longest, front.ld);
+      for (Index j = 0; j < front.columns; ++j) {
+        const double height = front.columns - j + front.rows;
+        s_.nonzeros += static_cast<std::size_t>(height);
+        s_.flops += height * height;
+      }
+    }
+  }
+
+  /// Row of the panel at which the vertex eliminated at `rank` begins.
+  Index panel_row(const Supernode& node, Index rank) const {
+    if (rank < node.first + node.columns) return 3 * (rank - node.first);
+    const auto begin = s_.rows.begin() + static_cast<std::ptrdiff_t>(node.rows_begin);
+    const auto end = s_.rows.begin() + static_cast<std::ptrdiff_t>(node.rows_end);
+    return node.front.top + 3 * static_cast<Index>(std::lower_bound(begin, end, rank) - begin);
+  }
+
+  void place_blocks() {
+    // Slots by supernode: counted, then filled in.
+    std::vector<std::size_t> start(s_.supernodes.size() + 1, 0);
+    const auto for_each_block = [&](auto visit) {
+      for (Index j = 0; j < pattern_.size(); ++j) {
+        if (rank_[j] < 0) continue;
+        for (Index k = pattern_.column_start()[j]; k < pattern_.column_start()[j + 1]; ++k) {
+          const Index i = pattern_.row()[k];
+          if (rank_[i] >= 0) visit(k, rank_[i], rank_[j]);
+        }
+      }
+    };
+    for_each_block([&](Index, Index i, Index j) { ++start[owner_[std::min(i, j)] + 1]; });
+    for (std::size_t s = 0; s < s_.supernodes.size(); ++s) {
+      start[s + 1] += start[s];
+      s_.supernodes[s].blocks_begin = start[s];
+      s_.supernodes[s].blocks_end = start[s + 1];
+    }
+    s_.blocks.resize(start.back());
+    for_each_block([&](Index slot, Index i, Index j) {
+      const Index column = std::min(i, j);
+      const Supernode& node = s_.supernodes[owner_[column]];
+      s_.blocks[start[owner_[column]]++] = {
+          .slot = slot,
+          .place = panel_row(node, std::max(i, j)) + 3 * (column - node.first) * node.front.ld,
+          .transposed = i < j};
+    });
+  }
+
+  void map_children() {
+    std::vector<Index> position(graph_.size());  // among the parent's columns, then its rows
+    for (const Supernode& node : s_.supernodes) {
+      for (Index k = 0; k < node.columns; ++k) position[node.first + k] = k;
+      for (std::size_t r = node.rows_begin; r < node.rows_end; ++r) {
+        position[s_.rows[r]] = node.columns + static_cast<Index>(r - node.rows_begin);
+      }
+      for (Index c = node.children_begin; c < node.children_end; ++c) {
+        map_child(node, position, s_.children[c]);
+      }
+    }
+  }
+
+  void map_child(const Supernode& parent, const std::vector<Index>& position, Child& child) {
+    const Supernode& node = s_.supernodes[child.supernode];
+    child.runs_begin = s_.runs.size();
+    child.column_runs = 0;
+    Index previous = -2;
+    for (std::size_t r = node.rows_begin; r < node.rows_end; ++r) {
+      const Index to = position[s_.rows[r]];
+      if (to != previous + 1 || to == parent.columns) {
+        const bool is_column = to < parent.columns;
+        if (is_column) ++child.column_runs;
+        s_.runs.push_back({.from = 3 * static_cast<Index>(r - node.rows_begin),
+                           .to = 3 * (is_column ? to : to - parent.columns),
+                           .count = 0});
+      }
+      s_.runs.back().count += 3;
+      previous = to;
+    }
+    child.run_count = static_cast<Index>(s_.runs.size() - child.runs_begin);
+  }
+
+  /// First fit at each supernode's turn, while the matrices of its children are alive.
+  void lay_out_arena() {
+    struct Extent {
+      std::size_t begin, end;
+      Index supernode;
+    };
+    std::vector<Extent> alive;  // ascending
+    for (Index s = 0; s < gathered_.size(); ++s) {
+      Supernode& node = s_.supernodes[s];
+      const std::size_t size = product(node.front.update_ld, node.front.rows);
+      std::size_t begin = 0;
+      auto gap = alive.begin();
+      for (; gap != alive.end() && gap->begin < begin + size; ++gap) begin = gap->end;
+      node.update = begin;
+      s_.arena_size = std::max(s_.arena_size, begin + size);
+      if (size > 0) alive.insert(gap, {.begin = begin, .end = begin + size, .supernode = s});
+      std::erase_if(alive, [&](const Extent& e) { return gathered_.parent[e.supernode] == s; });
+    }
+  }
+
+  const BlockPattern& pattern_;
+  const Graph& graph_;
+  const EliminationTree& tree_;
+  SupernodeTree gathered_;
+  std::vector<Index> rank_;   // [pattern.size()] place in the order of elimination, -1 if fixed
+  std::vector<Index> owner_;  // [n] supernode of a column
+  Symbolic s_;
+};
+
+}  // namespace
+
+Symbolic analyze(const BlockPattern& pattern, const Graph& graph, const EliminationTree& tree) {
+  return Analyzer(pattern, graph, tree).run();
+}
+
+std::size_t Symbolic::bytes() const {
+  return sizeof(Symbolic) + vertex.capacity() * sizeof(Index) +
+         supernodes.capacity() * sizeof(Supernode) + rows.capacity() * sizeof(Index) +
+         blocks.capacity() * sizeof(PlacedBlock) + children.capacity() * sizeof(Child) +
+         runs.capacity() * sizeof(Run);
+}
+
+}  // namespace diffcloth::linalg

@@ -1,0 +1,66 @@
+#pragma once
+
+#include <cstddef>
+#include <vector>
+
+#include "linalg/block_pattern.h"
+#include "linalg/dense_kernels.h"
+#include "linalg/elimination_tree.h"
+#include "linalg/graph.h"
+
+namespace diffcloth::linalg {
+
+/// Consecutive columns of L that are stored as one dense panel, and where everything of it lies.
+struct Supernode {
+  Front front;
+  Index first;               ///< its first column, in vertices
+  Index columns;             ///< vertices
+  std::size_t rows_begin;    ///< its rows below: Symbolic::rows[rows_begin .. rows_end - 1]
+  std::size_t rows_end;      ///<
+  std::size_t panel;         ///< offset in the factor [doubles]
+  std::size_t update;        ///< offset of its update matrix in the arena [doubles]
+  std::size_t blocks_begin;  ///< its blocks of A: Symbolic::blocks[blocks_begin .. blocks_end - 1]
+  std::size_t blocks_end;
+  Index children_begin;  ///< its children: Symbolic::children[children_begin .. children_end - 1]
+  Index children_end;
+};
+
+/// A block of the matrix: its slot, its place in the panel, and whether it stands transposed there.
+struct PlacedBlock {
+  Index slot;
+  Index place;
+  bool transposed;
+};
+
+/// A child of a supernode: how its update matrix falls into its parent's matrices, in scalars.
+struct Child {
+  Index supernode;
+  std::size_t runs_begin;
+  Index column_runs;
+  Index run_count;
+};
+
+/// All of A = L L^T that does not depend on values, for the multifrontal method.
+///
+/// Vertices are eliminated in a postorder of the tree of supernodes. A supernode adds the update
+/// matrices of its children to its own; these are alive until their parent has taken them, and share
+/// one arena at offsets that are found here, once.
+struct Symbolic {
+  std::vector<Index> vertex;  ///< [n] vertex eliminated k-th
+  std::vector<Supernode> supernodes;
+  std::vector<Index> rows;  ///< vertices in the order of elimination, ascending in each supernode
+  std::vector<PlacedBlock> blocks;
+  std::vector<Child> children;
+  std::vector<Run> runs;
+  std::size_t factor_size = 0;  ///< [doubles]
+  std::size_t arena_size = 0;   ///< [doubles]
+  std::size_t nonzeros = 0;     ///< of L, zeros that supernodes store included, padding not
+  double flops = 0.0;           ///< of one factorization, for those nonzeros
+  Index longest = 0;            ///< largest ld of a panel
+
+  std::size_t bytes() const;
+};
+
+Symbolic analyze(const BlockPattern& pattern, const Graph& graph, const EliminationTree& tree);
+
+}  // namespace diffcloth::linalg
