@@ -49,7 +49,7 @@ struct Bars {
         anchor_stiffness(p.anchor_stiffness.size(), 0.0),
         anchor_target(3 * p.anchor_stiffness.size(), 0.0),
         elastic(p.scene.topology, p.scene.stencils),
-        contact(p.scene.collision_mesh, p.measures) {}
+        contact(p.scene.collision_mesh) {}
 
   std::size_t all, cloth;
   Array start;       ///< x_n and o_n
@@ -359,7 +359,12 @@ void Adjoint::write_rest() {
   for (std::size_t f = 0; f < faces.size(); ++f) {
     double sum = 0.0;
     for (const Index i : faces[f]) sum += bars_.masses[i];
-    rest.area[f] += sum * p_.density[f] / 3.0 + bars_.contact.rest.face_area[f];
+    rest.area[f] += sum * p_.density[f] / 3.0;
+  }
+  const std::vector<Index>& start = p_.scene.given.cloth_face_start;
+  for (Index c = 0; c < p_.scene.cloth_count(); ++c) {
+    const double share = bars_.contact.rest.mean_face_area[c] / (start[c + 1] - start[c]);
+    for (Index f = start[c]; f < start[c + 1]; ++f) rest.area[f] += share;
   }
   for (std::size_t i = 0; i < rest.vertex_area.size(); ++i) {
     rest.vertex_area[i] += bars_.contact.rest.vertex_area[i];
