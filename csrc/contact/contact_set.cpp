@@ -36,9 +36,7 @@ ContactModel::ContactModel(const CollisionMesh& mesh,
       rest_(rest),
       parameters_(std::move(parameters)),
       prescribed_(prescribed) {
-  double thickest = 0.0;
-  for (const double t : parameters_.thickness) thickest = std::max(thickest, t);
-  reach_ = parameters_.d_hat + thickest;
+  for (const double t : parameters_.thickness) reach_.push_back(0.5 * (parameters_.d_hat + t));
 }
 
 double ContactModel::xi(const Candidate& pair) const {

@@ -66,8 +66,9 @@ class ContactModel {
   const Parameters& parameters() const { return parameters_; }
   const CollisionMesh& mesh() const { return mesh_; }
 
-  /// Largest distance at which a pair can interact: d_hat + max xi [m].
-  double reach() const { return reach_; }
+  /// Half the distance at which a surface can interact with one of its own thickness:
+  /// (d_hat + thickness) / 2 [m]. A pair can at the sum of both, d_hat + xi.
+  const std::vector<double>& reach() const { return reach_; }
 
   /// Half the sum of the thicknesses of a pair's surfaces [m].
   double xi(const Candidate& pair) const;
@@ -148,7 +149,7 @@ class ContactModel {
   const RestMeasures& rest_;
   Parameters parameters_;
   const std::vector<char>& prescribed_;
-  double reach_;
+  std::vector<double> reach_;  // [S]
 };
 
 /// The four corners of a pair.
