@@ -13,6 +13,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
 
 #include "bind/bind.h"
 #include "contact/barrier.h"
@@ -90,9 +91,12 @@ class Search {
       : mesh_(collision_mesh(faces, vertex_surface, cloth_count, self_contact)),
         broad_phase_(mesh_, checked("x_reference", x_reference)) {}
 
-  /// Kind (1: edge-edge), corners, a and b of every candidate, in order.
-  IndexRows find(const Positions& x_t0, const Positions& x_t1, double radius) {
-    broad_phase_.find(checked("x_t0", x_t0), checked("x_t1", x_t1), radius, scratch_, candidates_);
+  /// Kind (1: edge-edge), corners, a and b of every candidate, in order. One reach for each surface.
+  IndexRows find(const Positions& x_t0, const Positions& x_t1, const std::vector<double>& reach) {
+    if (reach.size() != static_cast<std::size_t>(mesh_.surface_count())) {
+      throw nb::value_error("broad phase: `reach` must have one value a surface");
+    }
+    broad_phase_.find(checked("x_t0", x_t0), checked("x_t1", x_t1), reach, scratch_, candidates_);
     IndexRows out(candidates_.size(), 7);
     for (std::size_t i = 0; i < candidates_.size(); ++i) {
       const auto& [kind, v, a, b] = candidates_[i];
@@ -206,7 +210,13 @@ void collision_kernels(nb::module_& m) {
       .def(nb::init<const Faces&, const Surfaces&, Index, bool, const Positions&>(),
            "faces"_a.noconvert(), "vertex_surface"_a.noconvert(), "cloth_count"_a, "self_contact"_a,
            "x_reference"_a.noconvert())
-      .def("find", &Search::find, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "radius"_a)
+      .def("find", &Search::find, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "reach"_a)
+      .def(
+          "find",
+          [](Search& s, const Positions& x_t0, const Positions& x_t1, double radius) {
+            return s.find(x_t0, x_t1, std::vector<double>(s.mesh().surface_count(), 0.5 * radius));
+          },
+          "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "radius"_a)
       .def("find_intersection", &Search::find_intersection, "x"_a.noconvert())
       .def("smallest_nonadjacent_distance", &Search::smallest_nonadjacent_distance,
            "x"_a.noconvert())

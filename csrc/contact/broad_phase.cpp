@@ -117,21 +117,45 @@ void filter(PairList& pairs, Keep&& keep) {
   pairs.end_at(end);
 }
 
-/// Sort scratch.pairs into scratch.sorted: counted by the first index (below `count`), then by the
-/// second within each of these short runs.
-void sort_pairs(Index count, BroadPhase::Scratch& scratch) {
+/// Sort pairs into scratch.sorted: counted by the first index (below `count`), then by the second
+/// within each of these short runs.
+void sort_pairs(PairList& pairs, Index count, BroadPhase::Scratch& scratch) {
   std::vector<Index>& bucket = scratch.bucket;
   bucket.assign(count + 1, 0);
-  for (const IndexPair& pair : scratch.pairs) ++bucket[pair[0] + 1];
+  for (const IndexPair& pair : pairs) ++bucket[pair[0] + 1];
   std::partial_sum(bucket.begin(), bucket.end(), bucket.begin());
-  scratch.sorted.resize(scratch.pairs.size());
-  for (const IndexPair& pair : scratch.pairs) scratch.sorted[bucket[pair[0]]++] = pair;
+  scratch.sorted.resize(pairs.size());
+  for (const IndexPair& pair : pairs) scratch.sorted[bucket[pair[0]]++] = pair;
   Index first = 0;
   for (Index a = 0; a < count; ++a) {
     const Index last = bucket[a];  // moved on to the end of its run by the loop above
     std::sort(scratch.sorted.begin() + first, scratch.sorted.begin() + last);
     first = last;
   }
+}
+
+constexpr double kInfinity = std::numeric_limits<double>::infinity();
+constexpr Box kEmptyBox{.lo = {kInfinity, kInfinity, kInfinity},
+                        .hi = {-kInfinity, -kInfinity, -kInfinity}};
+
+Box point_box(const double* x, Index v) {
+  const std::array<double, 3> p{x[3 * v], x[3 * v + 1], x[3 * v + 2]};
+  return {.lo = p, .hi = p};
+}
+
+/// Box of a motion as seen from a frame that moves by `frame` meanwhile.
+Box swept(const Box& t0, const Box& t1, const Vec3& frame, double reach) {
+  Box box;
+  for (int k = 0; k < 3; ++k) {
+    const double lo = std::min(t0.lo[k], t1.lo[k] - frame[k]);
+    const double hi = std::max(t0.hi[k], t1.hi[k] - frame[k]);
+    const double size =
+        std::max({std::abs(lo), std::abs(hi), std::abs(t1.lo[k]), std::abs(t1.hi[k])});
+    const double margin = reach + kOutward * (reach + size);
+    box.lo[k] = lo - margin;
+    box.hi[k] = hi + margin;
+  }
+  return box;
 }
 
 }  // namespace
@@ -167,37 +191,37 @@ BroadPhase::BroadPhase(CollisionMesh mesh, const double* x_reference) : mesh_(st
   }
 }
 
-void BroadPhase::sweep(const double* x_t0,
-                       const double* x_t1,
-                       double radius,
-                       Scratch& scratch) const {
-  constexpr double kInfinity = std::numeric_limits<double>::infinity();
+/// Boxes around the surfaces at both ends, and their mean motions.
+void BroadPhase::measure_motion(const Sweep& sweep, Scratch& scratch) const {
   scratch.vertex_boxes.resize(mesh_.vertex_count);
   scratch.surfaces.resize(trees_.size());
-  for (Scratch::Surface& surface : scratch.surfaces) {
+  for (std::size_t s = 0; s < trees_.size(); ++s) {
+    Scratch::Surface& surface = scratch.surfaces[s];
     surface.fitted = false;
-    surface.box = {.lo = {kInfinity, kInfinity, kInfinity},
-                   .hi = {-kInfinity, -kInfinity, -kInfinity}};
-  }
-  const double half = 0.5 * radius;
-  for (Index v = 0; v < mesh_.vertex_count; ++v) {
-    Box& box = scratch.vertex_boxes[v];
-    for (int k = 0; k < 3; ++k) {
-      const double p = x_t0[3 * v + k];
-      const double q = x_t1[3 * v + k];
-      const double margin = half + kOutward * (half + std::max(std::abs(p), std::abs(q)));
-      box.lo[k] = std::min(p, q) - margin;
-      box.hi[k] = std::max(p, q) + margin;
+    surface.box_t0 = surface.box_t1 = kEmptyBox;
+    Vec3 sum = Vec3::Zero();
+    for (const Index v : trees_[s].vertices.items()) {
+      surface.box_t0 = united(surface.box_t0, point_box(sweep.x_t0, v));
+      surface.box_t1 = united(surface.box_t1, point_box(sweep.x_t1, v));
+      sum += row(sweep.x_t1, v) - row(sweep.x_t0, v);
     }
-    Box& around = scratch.surfaces[mesh_.vertex_surface[v]].box;
-    around = united(around, box);
+    const auto count = static_cast<double>(trees_[s].vertices.items().size());
+    const Vec3 mean = count > 0 ? Vec3(sum / count) : Vec3::Zero();
+    // Within the reach a frame saves little, and costs the boxes of one more frame. Written so that
+    // a motion that is not finite has none.
+    surface.motion =
+        mean.allFinite() && mean.cwiseAbs().maxCoeff() > sweep.reach[s] ? mean : Vec3::Zero();
   }
 }
 
-void BroadPhase::fit(Index surface, Scratch& scratch) const {
+void BroadPhase::fit(const Sweep& sweep, Index surface, const Vec3& frame, Scratch& scratch) const {
   Scratch::Surface& boxes = scratch.surfaces[surface];
-  if (boxes.fitted) return;
+  if (boxes.fitted && boxes.frame == frame) return;
   const SurfaceTrees& trees = trees_[surface];
+  for (const Index v : trees.vertices.items()) {
+    scratch.vertex_boxes[v] =
+        swept(point_box(sweep.x_t0, v), point_box(sweep.x_t1, v), frame, sweep.reach[surface]);
+  }
   const auto fit_tree = [&](const BoxTree& tree, BoxTree::Boxes& target, auto&& box_of) {
     target.items.resize(tree.items().size());
     for (std::size_t k = 0; k < target.items.size(); ++k) target.items[k] = box_of(tree.items()[k]);
@@ -213,17 +237,25 @@ void BroadPhase::fit(Index surface, Scratch& scratch) const {
     const auto& [i, j, k] = mesh_.faces[f];
     return united(united(of_vertex[i], of_vertex[j]), of_vertex[k]);
   });
+  boxes.frame = frame;
   boxes.fitted = true;
 }
 
 template <class Visit>
-void BroadPhase::visit_surface_pairs(Scratch& scratch, Visit&& visit) const {
+void BroadPhase::visit_surface_pairs(const Sweep& sweep, Scratch& scratch, Visit&& visit) const {
+  measure_motion(sweep, scratch);
   const auto surface_count = static_cast<Index>(trees_.size());
   for (Index s = 0; s < mesh_.cloth_count; ++s) {
     for (Index r = mesh_.self_contact ? s : s + 1; r < surface_count; ++r) {
-      if (!overlap(scratch.surfaces[s].box, scratch.surfaces[r].box)) continue;
-      fit(s, scratch);
-      fit(r, scratch);
+      const Scratch::Surface& a = scratch.surfaces[s];
+      const Scratch::Surface& b = scratch.surfaces[r];
+      const Vec3 frame = r < mesh_.cloth_count ? a.motion : b.motion;
+      if (!overlap(swept(a.box_t0, a.box_t1, frame, sweep.reach[s]),
+                   swept(b.box_t0, b.box_t1, frame, sweep.reach[r]))) {
+        continue;
+      }
+      fit(sweep, s, frame, scratch);
+      fit(sweep, r, frame, scratch);
       visit(s, r);
     }
   }
@@ -231,44 +263,40 @@ void BroadPhase::visit_surface_pairs(Scratch& scratch, Visit&& visit) const {
 
 void BroadPhase::find(const double* x_t0,
                       const double* x_t1,
-                      double radius,
+                      std::span<const double> reach,
                       Scratch& scratch,
                       std::vector<Candidate>& out) const {
   out.clear();
-  sweep(x_t0, x_t1, radius, scratch);
-
-  scratch.pairs.clear();
-  visit_surface_pairs(scratch, [&](Index s, Index r) {
+  PairList& vertex_faces = scratch.vertex_face_pairs;
+  PairList& edges = scratch.edge_pairs;
+  vertex_faces.clear();
+  edges.clear();
+  const Sweep sweep{.x_t0 = x_t0, .x_t1 = x_t1, .reach = reach};
+  visit_surface_pairs(sweep, scratch, [&](Index s, Index r) {
     const Scratch::Surface& a = scratch.surfaces[s];
     const Scratch::Surface& b = scratch.surfaces[r];
     append_overlaps(trees_[s].vertices, a.vertices, trees_[r].faces, b.faces, scratch.stack,
-                    scratch.pairs);
-    if (s == r) return;
+                    vertex_faces);
+    if (s == r) {
+      append_self_overlaps(trees_[s].edges, a.edges, scratch.stack, edges);
+      return;
+    }
     append_overlaps(trees_[r].vertices, b.vertices, trees_[s].faces, a.faces, scratch.stack,
-                    scratch.pairs);
+                    vertex_faces);
+    append_overlaps(trees_[s].edges, a.edges, trees_[r].edges, b.edges, scratch.stack, edges);
   });
-  filter(scratch.pairs, [&](const IndexPair& p) { return !has_vertex(mesh_.faces[p[1]], p[0]); });
-  sort_pairs(mesh_.vertex_count, scratch);
+
+  filter(vertex_faces, [&](const IndexPair& p) { return !has_vertex(mesh_.faces[p[1]], p[0]); });
+  sort_pairs(vertex_faces, mesh_.vertex_count, scratch);
   for (const auto& [v, f] : scratch.sorted) {
     const auto& [i, j, k] = mesh_.faces[f];
     out.push_back({.kind = PairKind::kPointTriangle, .vertices = {v, i, j, k}, .a = v, .b = f});
   }
 
-  scratch.pairs.clear();
-  visit_surface_pairs(scratch, [&](Index s, Index r) {
-    const BoxTree::Boxes& a = scratch.surfaces[s].edges;
-    const BoxTree::Boxes& b = scratch.surfaces[r].edges;
-    if (s == r) {
-      append_self_overlaps(trees_[s].edges, a, scratch.stack, scratch.pairs);
-    } else {
-      append_overlaps(trees_[s].edges, a, trees_[r].edges, b, scratch.stack, scratch.pairs);
-    }
-  });
-  filter(scratch.pairs,
+  filter(edges,
          [&](const IndexPair& p) { return !share_vertex(mesh_.edges[p[0]], mesh_.edges[p[1]]); });
-  for (IndexPair& pair : scratch.pairs)
-    pair = {std::min(pair[0], pair[1]), std::max(pair[0], pair[1])};
-  sort_pairs(mesh_.cloth_edge_count, scratch);  // the lower edge belongs to a cloth
+  for (IndexPair& pair : edges) pair = {std::min(pair[0], pair[1]), std::max(pair[0], pair[1])};
+  sort_pairs(edges, mesh_.cloth_edge_count, scratch);  // the lower edge belongs to a cloth
   for (const auto& [e, f] : scratch.sorted) {
     const auto& [i, j] = mesh_.edges[e];
     const auto& [k, l] = mesh_.edges[f];
@@ -278,19 +306,18 @@ void BroadPhase::find(const double* x_t0,
 
 std::optional<std::pair<Index, Index>> BroadPhase::find_intersection(const double* x,
                                                                      Scratch& scratch) const {
-  sweep(x, x, 0, scratch);
-  scratch.pairs.clear();
-  visit_surface_pairs(scratch, [&](Index s, Index r) {
+  const std::vector<double> reach(trees_.size(), 0.0);
+  PairList& pairs = scratch.edge_pairs;  // here of an edge and a face
+  pairs.clear();
+  visit_surface_pairs({.x_t0 = x, .x_t1 = x, .reach = reach}, scratch, [&](Index s, Index r) {
     const Scratch::Surface& a = scratch.surfaces[s];
     const Scratch::Surface& b = scratch.surfaces[r];
-    append_overlaps(trees_[s].edges, a.edges, trees_[r].faces, b.faces, scratch.stack,
-                    scratch.pairs);
+    append_overlaps(trees_[s].edges, a.edges, trees_[r].faces, b.faces, scratch.stack, pairs);
     if (s == r) return;
-    append_overlaps(trees_[r].edges, b.edges, trees_[s].faces, a.faces, scratch.stack,
-                    scratch.pairs);
+    append_overlaps(trees_[r].edges, b.edges, trees_[s].faces, a.faces, scratch.stack, pairs);
   });
   std::optional<std::pair<Index, Index>> lowest;
-  for (const auto& [e, f] : scratch.pairs) {
+  for (const auto& [e, f] : pairs) {
     const auto& [i, j] = mesh_.edges[e];
     const CollisionMesh::Face& face = mesh_.faces[f];
     if (lowest && *lowest < std::pair(e, f)) continue;

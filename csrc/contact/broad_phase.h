@@ -5,6 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <optional>
+#include <span>
 #include <utility>
 #include <vector>
 
@@ -49,7 +50,10 @@ class BroadPhase {
       BoxTree::Boxes vertices;
       BoxTree::Boxes edges;
       BoxTree::Boxes faces;
-      Box box;      ///< Around the whole surface.
+      Box box_t0;   ///< Around the whole surface at the start, without margin.
+      Box box_t1;   ///< Likewise at the end.
+      Vec3 motion;  ///< Mean motion of its vertices; zero where it is not worth a frame.
+      Vec3 frame;   ///< Motion of the frame that the trees' boxes are in.
       bool fitted;  ///< Whether the trees' boxes belong to the present search.
     };
     /// Growing list that is written through a pointer.
@@ -78,18 +82,25 @@ class BroadPhase {
     };
     std::vector<Box> vertex_boxes;
     std::vector<Surface> surfaces;
-    PairList pairs;
+    PairList vertex_face_pairs;
+    PairList edge_pairs;
     std::vector<std::array<Index, 2>> sorted;
     std::vector<Index> bucket;
     PairList stack;
   };
 
-  /// All pairs whose boxes overlap, each box swept from x_t0 to x_t1 and inflated by radius / 2
-  /// (d_hat + the largest xi), rounded outward. Sorted; every pair that comes within radius at any
-  /// time of the straight motion is among them.
+  /// All pairs whose boxes overlap, each box swept from x_t0 to x_t1, inflated by the reach of its
+  /// surface and rounded outward. Boxes are swept in a frame that moves as a surface does on
+  /// average: a body for pairs with it, else the first cloth of a pair. A cloth that flies as a
+  /// whole thus meets itself as if it were at rest.
+  ///
+  /// Sorted; every pair that comes within the sum of the two reaches at any time of the straight
+  /// motion is among them.
+  ///
+  /// @param reach  [surfaces] [m]
   void find(const double* x_t0,
             const double* x_t1,
-            double radius,
+            std::span<const double> reach,
             Scratch& scratch,
             std::vector<Candidate>& out) const;
 
@@ -106,13 +117,20 @@ class BroadPhase {
     BoxTree faces;
   };
 
-  void sweep(const double* x_t0, const double* x_t1, double radius, Scratch& scratch) const;
-  void fit(Index surface, Scratch& scratch) const;
+  /// What a search is about.
+  struct Sweep {
+    const double* x_t0;
+    const double* x_t1;
+    std::span<const double> reach;
+  };
+
+  void measure_motion(const Sweep& sweep, Scratch& scratch) const;
+  void fit(const Sweep& sweep, Index surface, const Vec3& frame, Scratch& scratch) const;
 
   /// Visit the pairs of surfaces that may touch and whose boxes overlap, the cloth first (a cloth
   /// with itself included); their trees are fitted by then.
   template <class Visit>
-  void visit_surface_pairs(Scratch& scratch, Visit&& visit) const;
+  void visit_surface_pairs(const Sweep& sweep, Scratch& scratch, Visit&& visit) const;
 
   CollisionMesh mesh_;
   std::vector<SurfaceTrees> trees_;

@@ -42,6 +42,7 @@ struct HalfEdge {
   Index surface;
   CollisionMesh::Edge edge;
   Index face;
+  int side;  ///< It joins the corners side and side + 1.
 };
 
 std::vector<HalfEdge> sorted_half_edges(const CollisionMesh& mesh) {
@@ -50,8 +51,10 @@ std::vector<HalfEdge> sorted_half_edges(const CollisionMesh& mesh) {
   for (std::size_t f = 0; f < mesh.faces.size(); ++f) {
     for (int k = 0; k < 3; ++k) {
       const auto [v0, v1] = std::minmax(mesh.faces[f][k], mesh.faces[f][(k + 1) % 3]);
-      half_edges.push_back(
-          {.surface = mesh.face_surface[f], .edge = {v0, v1}, .face = static_cast<Index>(f)});
+      half_edges.push_back({.surface = mesh.face_surface[f],
+                            .edge = {v0, v1},
+                            .face = static_cast<Index>(f),
+                            .side = k});
     }
   }
   std::sort(half_edges.begin(), half_edges.end(), [](const HalfEdge& p, const HalfEdge& q) {
@@ -78,6 +81,7 @@ CollisionMesh::CollisionMesh(std::vector<Face> faces_in,
     face_surface.push_back(vertex_surface[face[0]]);
     cloth_face_count += face_surface.back() < cloth_count;
   }
+  face_edges.resize(faces.size());
   for (const HalfEdge& half_edge : sorted_half_edges(*this)) {
     if (edges.empty() || edges.back() != half_edge.edge) {
       edges.push_back(half_edge.edge);
@@ -87,6 +91,7 @@ CollisionMesh::CollisionMesh(std::vector<Face> faces_in,
     } else if (edge_faces.back()[1] < 0) {
       edge_faces.back()[1] = half_edge.face;
     }
+    face_edges[half_edge.face][half_edge.side] = static_cast<Index>(edges.size()) - 1;
   }
 }
 

@@ -27,6 +27,7 @@ struct CollisionMesh {
   std::vector<Index> face_surface;
   std::vector<Index> edge_surface;
   std::vector<std::array<Index, 2>> edge_faces;  ///< -1 where missing; the first two of several.
+  std::vector<std::array<Index, 3>> face_edges;  ///< Edge k joins the corners k and k + 1.
   bool self_contact = true;                      ///< Whether a cloth touches itself.
 
   CollisionMesh() = default;

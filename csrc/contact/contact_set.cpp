@@ -27,13 +27,16 @@ void scatter(const std::array<Index, 4>& v, const Vec12& g, double* out) {
 }  // namespace
 
 ContactModel::ContactModel(const CollisionMesh& mesh,
+                           const FeatureWeights& weights,
                            const RestMeasures& rest,
                            Parameters parameters,
                            const std::vector<char>& prescribed)
-    : mesh_(mesh), rest_(rest), parameters_(std::move(parameters)), prescribed_(prescribed) {
-  double thickest = 0.0;
-  for (const double t : parameters_.thickness) thickest = std::max(thickest, t);
-  reach_ = parameters_.d_hat + thickest;
+    : mesh_(mesh),
+      weights_(weights),
+      rest_(rest),
+      parameters_(std::move(parameters)),
+      prescribed_(prescribed) {
+  for (const double t : parameters_.thickness) reach_.push_back(0.5 * (parameters_.d_hat + t));
 }
 
 double ContactModel::xi(const Candidate& pair) const {
@@ -47,59 +50,52 @@ double ContactModel::mu(const Candidate& pair) const {
   return 0.5 * (parameters_.friction[a * surfaces + b] + parameters_.friction[b * surfaces + a]);
 }
 
-bool ContactModel::inert(const Candidate& pair) const {
-  return std::ranges::all_of(pair.vertices, [&](Index v) { return prescribed_[v] != 0; });
+bool ContactModel::between_cloths(const Candidate& pair) const {
+  return surface_a(pair) < mesh_.cloth_count && surface_b(pair) < mesh_.cloth_count;
 }
 
 bool ContactModel::has_prescribed(const std::array<Index, 4>& vertices) const {
   return std::ranges::any_of(vertices, [&](Index v) { return prescribed_[v] != 0; });
 }
 
-// Weights (3-contact, 3.3): point-triangle A_p/4, edge-edge (A_a + A_b)/4. A body's coarse areas
-// must not dominate: edge-edge takes the cloth edge's half, a body vertex on a cloth face the
-// smaller of the two.
-double ContactModel::weight(const Candidate& pair) const {
+// What multiplies a contact's coefficient to make its weight.
+double ContactModel::area(const Candidate& pair) const {
   if (pair.kind == PairKind::kPointTriangle) {
     const Index p = pair.vertices[0];
-    if (p < mesh_.cloth_vertex_count) return 0.25 * rest_.vertex_area[p];
-    return 0.25 * std::min(rest_.vertex_area[p], rest_.face_area[pair.b]);
+    return p < mesh_.cloth_vertex_count ? rest_.vertex_area[p]
+                                        : rest_.mean_face_area[surface_b(pair)];
   }
-  if (pair.a >= mesh_.cloth_edge_count) return 0.5 * rest_.edge_area[pair.b];
-  if (pair.b >= mesh_.cloth_edge_count) return 0.5 * rest_.edge_area[pair.a];
-  return 0.25 * (rest_.edge_area[pair.a] + rest_.edge_area[pair.b]);
+  if (!between_cloths(pair)) return rest_.edge_area[pair.a];
+  return rest_.edge_area[pair.a] + rest_.edge_area[pair.b];
 }
 
 double ContactModel::threshold(const Candidate& pair) const {
-  if (pair.kind == PairKind::kPointTriangle) return 0.0;
+  if (pair.kind == PairKind::kPointTriangle || pair.b < 0) return 0.0;
   return mollifier_threshold(rest_.edge_length_sq[pair.a], rest_.edge_length_sq[pair.b]);
 }
 
 void ContactModel::pull_back(
-    const Candidate& pair, double weight_bar, double threshold_bar, double xi_bar, Bar& bar) const {
+    const Contact& k, double weight_bar, double threshold_bar, double xi_bar, Bar& bar) const {
+  const Candidate& pair = k.pair;
   bar.thickness[surface_a(pair)] += 0.5 * xi_bar;
   bar.thickness[surface_b(pair)] += 0.5 * xi_bar;
+  const double area_bar = k.coefficient * weight_bar;
   RestMeasures& rest = bar.rest;
   if (pair.kind == PairKind::kPointTriangle) {
     const Index p = pair.vertices[0];
-    if (p < mesh_.cloth_vertex_count || rest_.vertex_area[p] <= rest_.face_area[pair.b]) {
-      rest.vertex_area[p] += 0.25 * weight_bar;
+    if (p < mesh_.cloth_vertex_count) {
+      rest.vertex_area[p] += area_bar;
     } else {
-      rest.face_area[pair.b] += 0.25 * weight_bar;
+      rest.mean_face_area[surface_b(pair)] += area_bar;
     }
     return;
   }
-  if (pair.a >= mesh_.cloth_edge_count) {
-    rest.edge_area[pair.b] += 0.5 * weight_bar;
-  } else if (pair.b >= mesh_.cloth_edge_count) {
-    rest.edge_area[pair.a] += 0.5 * weight_bar;
-  } else {
-    rest.edge_area[pair.a] += 0.25 * weight_bar;
-    rest.edge_area[pair.b] += 0.25 * weight_bar;
-  }
+  rest.edge_area[pair.a] += area_bar;
+  if (between_cloths(pair)) rest.edge_area[pair.b] += area_bar;
+  if (!k.mollified) return;
   // The threshold is 1e-3 |U|^2 |V|^2.
-  const double eps = threshold(pair);
-  rest.edge_length_sq[pair.a] += threshold_bar * eps / rest_.edge_length_sq[pair.a];
-  rest.edge_length_sq[pair.b] += threshold_bar * eps / rest_.edge_length_sq[pair.b];
+  rest.edge_length_sq[pair.a] += threshold_bar * k.threshold / rest_.edge_length_sq[pair.a];
+  rest.edge_length_sq[pair.b] += threshold_bar * k.threshold / rest_.edge_length_sq[pair.b];
 }
 
 void ContactModel::pull_back_mu(const Candidate& pair, double mu_bar, Bar& bar) const {
@@ -110,61 +106,147 @@ void ContactModel::pull_back_mu(const Candidate& pair, double mu_bar, Bar& bar) 
   bar.friction[b * surfaces + a] += 0.5 * mu_bar;
 }
 
-ContactModel::Bar::Bar(const CollisionMesh& mesh, const RestMeasures& like) {
-  const auto surfaces =
-      static_cast<std::size_t>(mesh.vertex_surface.empty() ? 0 : mesh.vertex_surface.back() + 1);
+ContactModel::Bar::Bar(const CollisionMesh& mesh) : rest(RestMeasures::zero(mesh)) {
+  const auto surfaces = static_cast<std::size_t>(mesh.surface_count());
   thickness.assign(surfaces, 0.0);
   friction.assign(surfaces * surfaces, 0.0);
-  rest.vertex_area.assign(like.vertex_area.size(), 0.0);
-  rest.edge_area.assign(like.edge_area.size(), 0.0);
-  rest.edge_length_sq.assign(like.edge_length_sq.size(), 0.0);
-  rest.face_area.assign(like.face_area.size(), 0.0);
+}
+
+std::size_t ContactModel::group_end(const std::vector<Candidate>& candidates,
+                                    std::size_t first) const {
+  const Candidate& head = candidates[first];
+  std::size_t end = first + 1;
+  if (between_cloths(head)) return end;
+  while (end < candidates.size() && candidates[end].kind == head.kind &&
+         candidates[end].a == head.a && surface_b(candidates[end]) == surface_b(head)) {
+    ++end;
+  }
+  return end;
+}
+
+namespace {
+
+/// Whether two primitives are farther apart than `range` along an axis.
+bool is_beyond(PairKind kind, const Corners& x, double range) {
+  const int first_of_b = kind == PairKind::kPointTriangle ? 1 : 2;
+  for (int k = 0; k < 3; ++k) {
+    const double a0 = x[0][k];
+    const double a1 = x[first_of_b - 1][k];
+    const double b0 = std::min({x[first_of_b][k], x[2][k], x[3][k]});
+    const double b1 = std::max({x[first_of_b][k], x[2][k], x[3][k]});
+    if (std::min(a0, a1) > b1 + range || b0 > std::max(a0, a1) + range) return true;
+  }
+  return false;
+}
+
+}  // namespace
+
+void ContactModel::add_cloth_term(const Candidate& pair,
+                                  const double* x,
+                                  std::vector<Term>& out) const {
+  if (std::ranges::all_of(pair.vertices, [&](Index v) { return prescribed_[v] != 0; })) return;
+  const Corners corner = corners(pair.vertices, x);
+  const double range = parameters_.d_hat + xi(pair);
+  if (is_beyond(pair.kind, corner, range)) return;
+  const double d_sq = closest(pair.kind, corner).d_sq;
+  if (d_sq < range * range) out.push_back({.pair = pair, .coefficient = 0.25, .d_sq = d_sq});
+}
+
+/// Terms of a group of candidates.
+void ContactModel::find_terms(std::span<const Candidate> group,
+                              const double* x,
+                              MergeScratch& scratch,
+                              std::vector<Term>& out) const {
+  const Candidate& head = group.front();
+  if (between_cloths(head)) {
+    add_cloth_term(head, x, out);
+    return;
+  }
+  const double range = parameters_.d_hat + xi(head);
+  const Index a = head.vertices[0];
+  if (head.kind == PairKind::kEdgeEdge) {
+    if (prescribed_[a] != 0 && prescribed_[head.vertices[1]] != 0) return;
+    add_edge_terms(mesh_, weights_, group, rest_.edge_length_sq, x, range, 0.5, scratch, out);
+  } else if (a < mesh_.cloth_vertex_count) {
+    if (prescribed_[a] != 0) return;
+    add_point_terms(mesh_, weights_, group, x, range, 0.25, scratch, out);
+  } else {
+    const double s = weights_.vertex_sharpness(surface_b(head), a);
+    if (s == 0.0) return;
+    add_point_terms(mesh_, weights_, group, x, range, 0.25 * s, scratch, out);
+  }
+}
+
+Contact ContactModel::contact(const Term& term, const double* x) const {
+  const Candidate& pair = term.pair;
+  Corners corner = corners(pair.vertices, x);
+  const double xi_pair = xi(pair);
+  Contact k{.pair = pair,
+            .coefficient = term.coefficient,
+            .weight = term.coefficient * area(pair),
+            .threshold = threshold(pair),
+            .xi = xi_pair,
+            .closest = {},
+            .barrier = {},
+            .mollifier = 1.0,
+            .mollified = false};
+  if (pair.kind == PairKind::kEdgeEdge && mollified(corner, k.threshold)) {
+    k.mollified = true;
+    k.mollifier = mollifier(corner, k.threshold);
+  }
+  if (term.end >= 0) {
+    // The distance of one end of edge b: the other one does not take part.
+    corner[3 - term.end] = corner[2 + term.end];
+    k.closest = closest(pair.kind, corner);
+    if (term.end == 1) {
+      k.closest.c.tail<2>().reverseInPlace();
+      k.closest.c_beta.bottomRows<2>().colwise().reverseInPlace();
+    }
+  } else {
+    k.closest = closest(pair.kind, corner);
+  }
+  k.barrier = barrier_derivatives(k.closest.d_sq, xi_pair, parameters_.d_hat);
+  return k;
 }
 
 void ContactModel::find(const std::vector<Candidate>& candidates,
                         const double* x,
                         std::vector<Contact>& out) const {
   out.clear();
-  for (const Candidate& pair : candidates) {
-    if (inert(pair)) continue;
-    const Corners corner = corners(pair.vertices, x);
-    const Closest geometry = closest(pair.kind, corner);
-    const double xi_pair = xi(pair);
-    const double range = parameters_.d_hat + xi_pair;
-    if (!(geometry.d_sq < range * range)) continue;
-    Contact contact{.pair = pair,
-                    .weight = weight(pair),
-                    .threshold = threshold(pair),
-                    .xi = xi_pair,
-                    .closest = geometry,
-                    .barrier = barrier_derivatives(geometry.d_sq, xi_pair, parameters_.d_hat),
-                    .mollifier = 1.0,
-                    .mollified = false};
-    if (pair.kind == PairKind::kEdgeEdge && mollified(corner, contact.threshold)) {
-      contact.mollified = true;
-      contact.mollifier = mollifier(corner, contact.threshold);
-    }
-    out.push_back(contact);
+  MergeScratch scratch;
+  std::vector<Term> terms;
+  for (std::size_t first = 0, last = 0; first < candidates.size(); first = last) {
+    last = group_end(candidates, first);
+    find_terms({candidates.data() + first, last - first}, x, scratch, terms);
   }
+  out.reserve(terms.size());
+  for (const Term& term : terms) out.push_back(contact(term, x));
 }
 
 void ContactModel::energies(const std::vector<Candidate>& candidates,
                             const double* x,
                             std::vector<double>& out) const {
+  constexpr double kInfinity = std::numeric_limits<double>::infinity();
   out.assign(candidates.size(), 0.0);
-  for (std::size_t k = 0; k < candidates.size(); ++k) {
-    const Candidate& pair = candidates[k];
-    if (inert(pair)) continue;
-    const Corners corner = corners(pair.vertices, x);
-    const double d_sq = closest(pair.kind, corner).d_sq;
-    const double xi_pair = xi(pair);
-    const double range = parameters_.d_hat + xi_pair;
-    if (!(d_sq < range * range)) continue;
-    const double m = pair.kind == PairKind::kEdgeEdge ? mollifier(corner, threshold(pair)) : 1.0;
-    const double b = barrier(d_sq, xi_pair, parameters_.d_hat);
-    // 0 * infinity for exactly parallel edges that touch: still infeasible.
-    out[k] =
-        b == std::numeric_limits<double>::infinity() ? b : parameters_.kappa * weight(pair) * m * b;
+  MergeScratch scratch;
+  std::vector<Term> terms;
+  for (std::size_t first = 0, last = 0; first < candidates.size(); first = last) {
+    last = group_end(candidates, first);
+    terms.clear();
+    find_terms({candidates.data() + first, last - first}, x, scratch, terms);
+    double sum = 0.0;
+    for (const Term& term : terms) {
+      const double b = barrier(term.d_sq, xi(term.pair), parameters_.d_hat);
+      if (b == kInfinity) {
+        // Whatever multiplies it, be it zero for exactly parallel edges, or negative.
+        sum = b;
+        break;
+      }
+      const double eps = threshold(term.pair);
+      const double m = eps > 0.0 ? mollifier(corners(term.pair.vertices, x), eps) : 1.0;
+      sum += parameters_.kappa * (term.coefficient * area(term.pair)) * m * b;
+    }
+    out[first] = sum;
   }
 }
 
@@ -240,6 +322,7 @@ Mat12 ContactModel::hessian(const Contact& k, const double* x, Curvature curvatu
   const double b1 = k.barrier.b1;
   const double b2 = k.barrier.b2;
   if (curvature == Curvature::kPositive) {
+    if (scale <= 0.0) return Mat12::Zero();
     return scale * k.mollifier * positive_hessian(k.closest, b1, b2);
   }
   const Vec12 d_gradient = distance_sq_gradient(k.closest);
@@ -286,7 +369,7 @@ void ContactModel::add_mixed(const std::vector<Contact>& contacts,
     bar.d_hat +=
         scale * kappa * k.weight * (k.barrier.b_d_hat * m_z + m * k.barrier.b1_d_hat * d_z);
     const double xi_bar = kappa * k.weight * (k.barrier.b_xi * m_z + m * k.barrier.b1_xi * d_z);
-    pull_back(k.pair, scale * kappa * per_weight, scale * threshold_bar, scale * xi_bar, bar);
+    pull_back(k, scale * kappa * per_weight, scale * threshold_bar, scale * xi_bar, bar);
   }
 }
 

@@ -1,6 +1,6 @@
 #pragma once
 
-#include <utility>
+#include <span>
 #include <vector>
 
 #include "common/types.h"
@@ -8,19 +8,12 @@
 #include "contact/broad_phase.h"
 #include "contact/collision_mesh.h"
 #include "contact/distance/closest.h"
+#include "contact/feature_weights.h"
+#include "contact/merge.h"
+#include "contact/rest_measures.h"
 #include "potential/potential.h"
 
 namespace diffcloth::contact {
-
-/// Rest quantities that weigh contacts, for every vertex and edge of the collision mesh.
-///
-/// A vertex' or an edge's area is a third of its adjacent rest faces; a body's come from its mesh.
-struct RestMeasures {
-  std::vector<double> vertex_area;     ///< [vertices] m^2
-  std::vector<double> edge_area;       ///< [edges] m^2
-  std::vector<double> edge_length_sq;  ///< [edges] m^2
-  std::vector<double> face_area;       ///< [cloth faces] m^2
-};
 
 /// What a contact's energy depends on besides positions and rest shape.
 struct Parameters {
@@ -33,24 +26,37 @@ struct Parameters {
 
 /// A pair of primitives within reach, with everything its barrier needs.
 struct Contact {
-  Candidate pair;
-  double weight;     ///< w [m^2]
-  double threshold;  ///< eps of the edge-edge mollifier [m^4]; 0 for point-triangle
-  double xi;         ///< half the sum of the two thicknesses [m]
+  Candidate pair;      ///< against bodies, its nearest features: see Term
+  double coefficient;  ///< share of the area; may be negative
+  double weight;       ///< w: coefficient times area [m^2]
+  double threshold;    ///< eps of the edge-edge mollifier [m^4]; 0 where there is none
+  double xi;           ///< half the sum of the two thicknesses [m]
   Closest closest;
   Barrier barrier;
   double mollifier;  ///< m
   bool mollified;    ///< m < 1: its derivatives count
 };
 
-/// Barrier contacts of one configuration: sum over pairs of kappa w m b(D; xi, d_hat)  [J].
+/// Barrier contacts of one configuration: sum of kappa w m b(D; xi, d_hat)  [J].
+///
+/// Between cloths the sum is over all pairs of a vertex p and a face, w = A_p / 4, and of two edges,
+/// w = (A_a + A_b) / 4. Between a cloth and a body it is over features (see FeatureWeights), so that
+/// it does not know how the body is cut into triangles:
+///
+///   cloth vertex p:  w = A_p / 4            times the sum over the body's features,
+///   cloth edge c:    w = A_c / 2            times the sum over the body's sharp edges,
+///   body vertex v:   w = s_v mean(A_f) / 4  times the sum over the cloth's features, with the mean
+///                                           area of the cloth's faces.
+///
+/// Terms that share their nearest features are one contact, whose coefficient is the sum of theirs.
 ///
 /// Positions are those of the whole collision mesh, cloth first, then bodies: 3 doubles a vertex.
-/// `prescribed` marks vertices whose motion is given (pins, bodies): pairs made of them alone carry
-/// no energy.
+/// `prescribed` marks vertices whose motion is given (pins, bodies): features made of them alone
+/// carry no energy.
 class ContactModel {
  public:
   ContactModel(const CollisionMesh& mesh,
+               const FeatureWeights& weights,
                const RestMeasures& rest,
                Parameters parameters,
                const std::vector<char>& prescribed);
@@ -58,8 +64,9 @@ class ContactModel {
   const Parameters& parameters() const { return parameters_; }
   const CollisionMesh& mesh() const { return mesh_; }
 
-  /// Largest distance at which a pair can interact: d_hat + max xi [m].
-  double reach() const { return reach_; }
+  /// Half the distance at which a surface can interact with one of its own thickness:
+  /// (d_hat + thickness) / 2 [m]. A pair can at the sum of both, d_hat + xi.
+  const std::vector<double>& reach() const { return reach_; }
 
   /// Half the sum of the thicknesses of a pair's surfaces [m].
   double xi(const Candidate& pair) const;
@@ -67,12 +74,14 @@ class ContactModel {
   /// Friction coefficient of a pair.
   double mu(const Candidate& pair) const;
 
-  /// The candidates that are within range at x, in their order.
+  /// The contacts among the candidates at x, in their order.
   void find(const std::vector<Candidate>& candidates,
             const double* x,
             std::vector<Contact>& out) const;
 
-  /// Energy of each candidate at x [J]; +infinity where d <= xi.
+  /// Energies at x [J], whose sum is that of the contacts; +infinity where d <= xi. Each entry is
+  /// that of one candidate, or of a point or an edge against a body, in the place of its first
+  /// candidate: entries of one list are comparable between positions.
   void energies(const std::vector<Candidate>& candidates,
                 const double* x,
                 std::vector<double>& out) const;
@@ -80,7 +89,8 @@ class ContactModel {
   /// g += grad B.
   void add_gradient(const std::vector<Contact>& contacts, const double* x, double* g) const;
 
-  /// 12x12 Hessian of one contact; kPositive is its positive part, up to the mollifier's terms.
+  /// 12x12 Hessian of one contact; kPositive is its positive part, up to the mollifier's terms, and
+  /// zero if its weight is negative.
   Mat12 hessian(const Contact& contact, const double* x, Curvature curvature) const;
 
   /// y += H z over all vertices, exact.
@@ -98,7 +108,7 @@ class ContactModel {
     std::vector<double> friction;   ///< [S * S]
     RestMeasures rest;
 
-    Bar(const CollisionMesh& mesh, const RestMeasures& like);
+    explicit Bar(const CollisionMesh& mesh);
   };
 
   /// bar += scale * d/d(theta) of z . grad B, for every theta of Bar.
@@ -108,31 +118,39 @@ class ContactModel {
                  double scale,
                  Bar& bar) const;
 
-  /// Pull cotangents of a pair's weight, mollifier threshold and xi back to rest and thickness.
-  void pull_back(const Candidate& pair,
+  /// Pull cotangents of a contact's weight, mollifier threshold and xi back to rest and thickness.
+  void pull_back(const Contact& contact,
                  double weight_bar,
                  double threshold_bar,
                  double xi_bar,
                  Bar& bar) const;
   void pull_back_mu(const Candidate& pair, double mu_bar, Bar& bar) const;
 
-  /// Vertices of both primitives prescribed.
-  bool inert(const Candidate& pair) const;
-
   /// Whether some of these vertices are prescribed.
   bool has_prescribed(const std::array<Index, 4>& vertices) const;
 
  private:
-  double weight(const Candidate& pair) const;
+  /// Candidates that act together: one, or those of a point or an edge and a body.
+  std::size_t group_end(const std::vector<Candidate>& candidates, std::size_t first) const;
+  bool between_cloths(const Candidate& pair) const;
+  void find_terms(std::span<const Candidate> group,
+                  const double* x,
+                  MergeScratch& scratch,
+                  std::vector<Term>& out) const;
+  void add_cloth_term(const Candidate& pair, const double* x, std::vector<Term>& out) const;
+  double area(const Candidate& pair) const;
   double threshold(const Candidate& pair) const;
+  Contact contact(const Term& term, const double* x) const;
+
   Index surface_a(const Candidate& pair) const { return mesh_.vertex_surface[pair.vertices[0]]; }
   Index surface_b(const Candidate& pair) const { return mesh_.vertex_surface[pair.vertices[3]]; }
 
   const CollisionMesh& mesh_;
+  const FeatureWeights& weights_;
   const RestMeasures& rest_;
   Parameters parameters_;
   const std::vector<char>& prescribed_;
-  double reach_;
+  std::vector<double> reach_;  // [S]
 };
 
 /// The four corners of a pair.

@@ -61,6 +61,7 @@ Mat12 FrictionSet::hessian(const Entry& k,
                            const double* x_start,
                            const double* x,
                            Curvature curvature) const {
+  if (curvature == Curvature::kPositive && k.lambda < 0.0) return Mat12::Zero();
   const Vec3 w = tangential(displacement(k, x_start, x), k.n);
   const FrictionLaw law = friction_law(w.norm(), model_->parameters().slip);
   const Mat3 projector = Mat3::Identity() - k.n * k.n.transpose();
@@ -140,7 +141,7 @@ void FrictionSet::add_mixed(const double* x_start,
       threshold_bar = per_lambda * kappa * area * mol.m_eps * b1;
       x_bar += (per_lambda * kappa * area * b1) * mol.gradient;
     }
-    model_->pull_back(lag.pair, scale * per_lambda * kappa * m * b1, scale * threshold_bar,
+    model_->pull_back(lag, scale * per_lambda * kappa * m * b1, scale * threshold_bar,
                       scale * xi_bar, bar);
 
     // c and n.

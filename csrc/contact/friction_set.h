@@ -33,8 +33,9 @@ class FrictionSet {
   double energy_change(const double* x_start, const double* x0, const double* x1) const;
   void add_gradient(const double* x_start, const double* x, double* g) const;
 
-  /// 12x12 Hessian of one entry, positive semi-definite. kPositive is the quadratic majorant
-  /// (f1/|w|) P, which does not lose its curvature where a sliding contact would come to rest.
+  /// 12x12 Hessian of one entry, of the sign of lambda. kPositive is the quadratic majorant
+  /// (f1/|w|) P, which does not lose its curvature where a sliding contact would come to rest, and
+  /// zero where lambda is negative.
   Mat12 hessian(const Entry& entry,
                 const double* x_start,
                 const double* x,

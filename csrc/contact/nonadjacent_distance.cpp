@@ -1,6 +1,7 @@
 #include "contact/nonadjacent_distance.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 #include <numbers>
@@ -58,7 +59,8 @@ double smallest_distance(const Cloth& cloth) {
   const double largest = diameter_bound(cloth);
   double radius = std::max(0.25 * mean_edge_length(cloth), 1e-3 * largest);
   while (true) {
-    broad_phase.find(cloth.x.data(), cloth.x.data(), radius, scratch, candidates);
+    const std::array<double, 1> reach{0.5 * radius};
+    broad_phase.find(cloth.x.data(), cloth.x.data(), reach, scratch, candidates);
     double smallest_sq = kInfinity;
     for (const Candidate& candidate : candidates) {
       Corners corners;

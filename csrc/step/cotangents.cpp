@@ -77,7 +77,12 @@ void write_rest(Problem& p, const Cotangents& bars, const Gradients& gradients) 
   mesh::RestShapeBar& rest = p.elasticity.bar().rest;
   const Array sums = face_sums(p, bars.masses);
   for (std::size_t f = 0; f < sums.size(); ++f) {
-    rest.area[f] += sums[f] * p.density[f] / 3.0 + bars.contact.rest.face_area[f];
+    rest.area[f] += sums[f] * p.density[f] / 3.0;
+  }
+  const std::vector<Index>& start = p.scene.given.cloth_face_start;
+  for (Index c = 0; c < p.scene.cloth_count(); ++c) {
+    const double share = bars.contact.rest.mean_face_area[c] / (start[c + 1] - start[c]);
+    for (Index f = start[c]; f < start[c + 1]; ++f) rest.area[f] += share;
   }
   for (std::size_t i = 0; i < rest.vertex_area.size(); ++i) {
     rest.vertex_area[i] += bars.contact.rest.vertex_area[i];
@@ -98,7 +103,7 @@ Cotangents::Cotangents(const Problem& p)
       ends(p.start.size(), 0.0),
       velocities(p.coordinates.size(), 0.0),
       masses(p.masses.size(), 0.0),
-      contact(p.scene.collision_mesh, p.measures) {}
+      contact(p.scene.collision_mesh) {}
 
 void Cotangents::add_predicted(Problem& p, const Gradients& gradients) {
   const double h = p.h;

@@ -144,8 +144,8 @@ Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, bool with_rest)
                          .target = {inputs.data(Input::kSoftPinTargets), 3 * soft.size()}});
   }
   if (inputs.data(Input::kBarrierStiffness) != nullptr) {
-    contact.emplace(scene.collision_mesh, measures, contact_parameters(scene, inputs),
-                    scene.prescribed);
+    contact.emplace(scene.collision_mesh, scene.feature_weights, measures,
+                    contact_parameters(scene, inputs), scene.prescribed);
   }
 }
 

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numeric>
 
 #include "step/scheme.h"
 
@@ -34,28 +35,11 @@ std::vector<double> reference_positions(const Description& d) {
   return x;
 }
 
-contact::RestMeasures make_body_measures(const Description& d, const contact::CollisionMesh& mesh) {
-  contact::RestMeasures m;
-  m.vertex_area.assign(static_cast<std::size_t>(mesh.vertex_count), 0.0);
-  m.edge_area.assign(mesh.edges.size(), 0.0);
-  m.edge_length_sq.assign(mesh.edges.size(), 0.0);
-  m.face_area.assign(static_cast<std::size_t>(mesh.cloth_face_count), 0.0);
-  const auto at = [&](Index vertex) -> Vec3 {
-    return row(d.bodies.vertices.data(), vertex - mesh.cloth_vertex_count);
-  };
-  std::vector<double> area(mesh.faces.size(), 0.0);
-  for (std::size_t f = mesh.cloth_face_count; f < mesh.faces.size(); ++f) {
-    const auto& v = mesh.faces[f];
-    area[f] = 0.5 * (at(v[1]) - at(v[0])).cross(at(v[2]) - at(v[0])).norm();
-    for (const Index i : v) m.vertex_area[i] += area[f] / 3.0;
-  }
-  for (std::size_t e = mesh.cloth_edge_count; e < mesh.edges.size(); ++e) {
-    for (const Index f : mesh.edge_faces[e]) {
-      if (f >= 0) m.edge_area[e] += area[f] / 3.0;
-    }
-    m.edge_length_sq[e] = (at(mesh.edges[e][0]) - at(mesh.edges[e][1])).squaredNorm();
-  }
-  return m;
+/// All surfaces at rest, bodies in their own frames.
+std::vector<double> all_rest_positions(const Description& d) {
+  std::vector<double> x = d.rest_vertices;
+  x.insert(x.end(), d.bodies.vertices.begin(), d.bodies.vertices.end());
+  return x;
 }
 
 std::vector<Index> owners(const std::vector<Index>& start) {
@@ -101,9 +85,10 @@ Scene::Scene(Description description)
       rest(mesh::rest_shape(topology, stencils, given.rest_vertices.data())),
       mean_edge(mean_length(rest)),
       collision_mesh(make_collision_mesh(given)),
-      body_measures(make_body_measures(given, collision_mesh)),
-      broad_phase(collision_mesh, reference_positions(given).data()),
       prescribed(make_prescribed(given, collision_mesh.vertex_count)),
+      measures(contact::measure(collision_mesh, all_rest_positions(given).data())),
+      feature_weights(collision_mesh, all_rest_positions(given).data(), prescribed),
+      broad_phase(collision_mesh, reference_positions(given).data()),
       elastic_assemblies(
           linalg::BlockPattern(topology.vertex_count, elastic::cliques(topology, stencils)),
           {prescribed.begin(), prescribed.begin() + topology.vertex_count}),
@@ -113,11 +98,16 @@ Scene::Scene(Description description)
 }
 
 contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& rest) {
-  contact::RestMeasures m = scene.body_measures;
+  contact::RestMeasures m = scene.measures;
   std::ranges::copy(rest.vertex_area, m.vertex_area.begin());
   std::ranges::copy(rest.edge_area, m.edge_area.begin());
   std::ranges::copy(rest.edge_length_sq, m.edge_length_sq.begin());
-  std::ranges::copy(rest.area, m.face_area.begin());
+  const std::vector<Index>& start = scene.given.cloth_face_start;
+  for (Index c = 0; c < scene.cloth_count(); ++c) {
+    const double sum =
+        std::accumulate(rest.area.begin() + start[c], rest.area.begin() + start[c + 1], 0.0);
+    m.mean_face_area[c] = sum / (start[c + 1] - start[c]);
+  }
   return m;
 }
 
@@ -154,16 +144,14 @@ std::string find_overlap(const Scene& scene,
     return describe(scene, "edge", {e[0], e[1]}) + " intersects " +
            describe(scene, "face", {f[0], f[1], f[2]});
   }
-  const double thickest =
-      thickness.empty() ? 0.0 : *std::max_element(thickness.begin(), thickness.end());
+  std::vector<double> half(thickness);
+  half.resize(static_cast<std::size_t>(mesh.surface_count()), 0.0);
+  for (double& value : half) value *= 0.5;
   std::vector<contact::Candidate> candidates;
-  scene.broad_phase.find(x, x, thickest, scratch, candidates);
+  scene.broad_phase.find(x, x, half, scratch, candidates);
   for (const contact::Candidate& pair : candidates) {
     const auto& v = pair.vertices;
-    const double xi =
-        thickness.empty()
-            ? 0.0
-            : 0.5 * (thickness[mesh.vertex_surface[v[0]]] + thickness[mesh.vertex_surface[v[3]]]);
+    const double xi = half[mesh.vertex_surface[v[0]]] + half[mesh.vertex_surface[v[3]]];
     const double d = std::sqrt(contact::distance_sq(pair.kind, contact::corners(v, x)));
     if (d > xi) continue;
     const std::string gap = " are " + std::to_string(d) + " m apart, closer than their thickness " +

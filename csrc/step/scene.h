@@ -8,6 +8,8 @@
 #include "contact/broad_phase.h"
 #include "contact/collision_mesh.h"
 #include "contact/contact_set.h"
+#include "contact/feature_weights.h"
+#include "contact/rest_measures.h"
 #include "elastic/elastic.h"
 #include "mesh/rest_shape.h"
 #include "mesh/topology.h"
@@ -59,16 +61,17 @@ struct Scene {
   mesh::RestShape rest;  ///< of given.rest_vertices
   double mean_edge;      ///< of the cloths at rest [m]
   contact::CollisionMesh collision_mesh;
-  contact::RestMeasures body_measures;  ///< the bodies' part; cloth entries are zero
+  std::vector<char> prescribed;             ///< [vertices] pins and bodies
+  contact::RestMeasures measures;           ///< of given.rest_vertices and the bodies
+  contact::FeatureWeights feature_weights;  ///< likewise
   contact::BroadPhase broad_phase;
-  std::vector<char> prescribed;  ///< [vertices] pins and bodies
   elastic::Slots slots;
 
   mutable solver::AssemblyCache elastic_assemblies;   ///< over the elastic pattern
   mutable solver::AssemblyCache diagonal_assemblies;  ///< over isolated vertices
 };
 
-/// Face weights of contacts for a rest shape of the cloths.
+/// Rest quantities that weigh contacts, for a rest shape of the cloths.
 contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& rest);
 
 /// Where two surfaces overlap or are closer than their thickness; empty where they are not.

@@ -51,9 +51,16 @@ def scene(seed=0):
     return merged([grid(7, rng), grid(6, rng, 0.12), body, plane(10.0, -0.05)])
 
 
-def boxes(x_t0, x_t1, elements, radius):
+def boxes(x_t0, x_t1, elements, reach):
     corners = np.concatenate([x_t0[elements], x_t1[elements]], axis=1)
-    return corners.min(axis=1) - radius / 2, corners.max(axis=1) + radius / 2
+    return corners.min(axis=1) - reach, corners.max(axis=1) + reach
+
+
+def frame_of(a, b, x_t0, x_t1, surface, cloth_count, reach):
+    """Motion of the frame that a pair of surfaces meets in: of the body, or of the first cloth."""
+    of = max(a, b) if max(a, b) >= cloth_count else min(a, b)
+    motion = (x_t1 - x_t0)[surface == of].mean(axis=0)
+    return motion if np.abs(motion).max() > reach[of] else np.zeros(3)
 
 
 def may_touch(surface_a, surface_b, cloth_count, self_contact):
@@ -62,23 +69,25 @@ def may_touch(surface_a, surface_b, cloth_count, self_contact):
     return min(surface_a, surface_b) < cloth_count
 
 
-def brute_force(mesh, x_t0, x_t1, radius, faces, surface, cloth_count, self_contact):
+def brute_force(mesh, x_t0, x_t1, reach, faces, surface, cloth_count, self_contact):
     """All candidates (kind, v0..v3, a, b), by comparing every two boxes."""
     vertices = np.arange(len(x_t0))[:, None]
     found = []
-    pairs = [(0, vertices, faces), (1, mesh.edges, mesh.edges)]
-    for kind, first, second in pairs:
-        lo_a, hi_a = boxes(x_t0, x_t1, first, radius)
-        lo_b, hi_b = boxes(x_t0, x_t1, second, radius)
-        overlap = ((lo_a[:, None] <= hi_b) & (lo_b <= hi_a[:, None])).all(-1)
-        for a, b in np.argwhere(overlap):
-            if kind == 1 and a >= b:
+    for kind, first, second in [(0, vertices, faces), (1, mesh.edges, mesh.edges)]:
+        of_first, of_second = surface[first[:, 0]], surface[second[:, 0]]
+        for s, r in itertools.product(range(len(reach)), repeat=2):
+            if not may_touch(s, r, cloth_count, self_contact):
                 continue
-            corners = (*first[a], *second[b])
-            if len(set(corners)) < 4:
-                continue
-            if may_touch(surface[first[a][0]], surface[second[b][0]], cloth_count, self_contact):
-                found.append((kind, *corners, a, b))
+            seen_t1 = x_t1 - frame_of(s, r, x_t0, x_t1, surface, cloth_count, reach)
+            ids_a, ids_b = np.flatnonzero(of_first == s), np.flatnonzero(of_second == r)
+            lo_a, hi_a = boxes(x_t0, seen_t1, first[ids_a], reach[s])
+            lo_b, hi_b = boxes(x_t0, seen_t1, second[ids_b], reach[r])
+            overlap = ((lo_a[:, None] <= hi_b) & (lo_b <= hi_a[:, None])).all(-1)
+            for k, l in np.argwhere(overlap):
+                a, b = ids_a[k], ids_b[l]
+                corners = (*first[a], *second[b])
+                if len(set(corners)) == 4 and (kind == 0 or a < b):
+                    found.append((kind, *corners, a, b))
     return np.array(sorted(found, key=lambda c: (c[0], c[5], c[6])))
 
 
@@ -89,9 +98,10 @@ def test_candidates_are_those_of_brute_force(self_contact, speed):
     mesh = kernels.BroadPhase(faces, surface, 2, self_contact, x)
     rng = np.random.default_rng(1)
     x_t0 = x + 0.02 * rng.normal(size=x.shape)
-    x_t1 = x_t0 + speed * rng.normal(size=x.shape)
-    found = mesh.find(x_t0, x_t1, 0.03)
-    expected = brute_force(mesh, x_t0, x_t1, 0.03, faces, surface, 2, self_contact)
+    x_t1 = x_t0 + speed * rng.normal(size=x.shape) + 3 * speed * surface[:, None]
+    reach = [0.01, 0.02, 0.04, 0.0]
+    found = mesh.find(x_t0, x_t1, reach)
+    expected = brute_force(mesh, x_t0, x_t1, reach, faces, surface, 2, self_contact)
     np.testing.assert_array_equal(found, expected)
     assert {0, 1, 2, 3} <= set(surface[found[:, 1:5]].ravel())
 
@@ -112,6 +122,36 @@ def test_pairs_that_come_within_the_radius_during_the_motion_are_candidates():
             close = pairs[d_sq <= radius**2]
             assert len(close) > 3
             assert {tuple(c) for c in close} <= found
+
+
+def test_a_reach_is_that_of_its_surface():
+    """What is thick does not bring other surfaces together."""
+    x, faces, surface = scene()
+    mesh = kernels.BroadPhase(faces, surface, 2, True, x)
+    thin = mesh.find(x, x, [0.01, 0.01, 0.01, 0.01])
+    thick = mesh.find(x, x, [0.01, 0.01, 0.01, 0.2])
+
+    def between_others(found):
+        return found[(surface[found[:, 1:5]] < 3).all(axis=1)]
+
+    np.testing.assert_array_equal(between_others(thick), between_others(thin))
+    assert len(thick) > len(thin)
+
+
+def test_flying_together_is_like_standing_still():
+    """The candidates within a cloth, and between cloths, do not depend on a common motion."""
+    x, faces, surface = merged(
+        [grid(12, np.random.default_rng(5)), grid(9, np.random.default_rng(6), 0.01)]
+    )
+    mesh = kernels.BroadPhase(faces, surface, 2, True, x)
+    rng = np.random.default_rng(7)
+    x_t1 = x + 0.01 * rng.normal(size=x.shape)
+    still = mesh.find(x, x_t1, 0.02)
+    flying = mesh.find(x, x_t1 + np.array([60.0, -30.0, 15.0]), 0.02)
+    # Not the same to the pair: the rest is seen from the first cloth's mean motion.
+    assert 0.9 < len(flying) / len(still) < 1.1
+    kinds = np.bincount(flying[:, 0])
+    assert (kinds > 100).all()
 
 
 def test_results_do_not_depend_on_earlier_searches():

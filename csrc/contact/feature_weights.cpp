@@ -1,0 +1,117 @@
+#include "contact/feature_weights.h"
+
+#include <algorithm>
+#include <cmath>
+#include <numbers>
+
+#include "contact/rest_measures.h"
+#include "contact/sharpness.h"
+
+namespace diffcloth::contact {
+namespace {
+
+double smoothstep(double t) {
+  const double u = std::clamp(t, 0.0, 1.0);
+  return u * u * (3.0 - 2.0 * u);
+}
+
+/// @param angle  where a surface begins to count as sharp: radians
+/// @param share  of the sharpest
+/// @param ratio  the cloth's edge length over the width of the feature
+float sharpness(double angle, double share, double ratio) {
+  if (angle == 0.0) return 0.0F;
+  return static_cast<float>(std::clamp(share, 0.0, 1.0) * smoothstep(angle * std::max(1.0, ratio)));
+}
+
+/// [cloths] mean length of the edges.
+std::vector<double> mean_edge_length(const CollisionMesh& mesh, const RestMeasures& rest) {
+  std::vector<double> length(mesh.cloth_count, 0.0);
+  std::vector<Index> count(mesh.cloth_count, 0);
+  for (Index e = 0; e < mesh.cloth_edge_count; ++e) {
+    length[mesh.edge_surface[e]] += std::sqrt(rest.edge_length_sq[e]);
+    ++count[mesh.edge_surface[e]];
+  }
+  for (Index s = 0; s < mesh.cloth_count; ++s) length[s] /= std::max(count[s], 1);
+  return length;
+}
+
+/// For both ends of every body edge, how much another sharp edge continues it there.
+std::vector<std::array<float, 2>> continuations(const CollisionMesh& mesh,
+                                                const double* X,
+                                                const std::vector<double>& edge_angle) {
+  struct End {
+    Index edge;
+    int end;
+    Vec3 away;
+  };
+  std::vector<std::vector<End>> ends(mesh.vertex_count - mesh.cloth_vertex_count);
+  for (auto e = mesh.cloth_edge_count; e < static_cast<Index>(mesh.edges.size()); ++e) {
+    if (edge_angle[e] == 0.0) continue;
+    const auto& [i, j] = mesh.edges[e];
+    const Vec3 along = (row(X, j) - row(X, i)).normalized();
+    ends[i - mesh.cloth_vertex_count].push_back({.edge = e, .end = 0, .away = along});
+    ends[j - mesh.cloth_vertex_count].push_back({.edge = e, .end = 1, .away = -along});
+  }
+  std::vector<std::array<float, 2>> result(mesh.edges.size() - mesh.cloth_edge_count, {0.0F, 0.0F});
+  for (const std::vector<End>& at_vertex : ends) {
+    for (const End& p : at_vertex) {
+      double straightest = -1.0;
+      for (const End& q : at_vertex) {
+        if (q.edge != p.edge) straightest = std::max(straightest, -p.away.dot(q.away));
+      }
+      result[p.edge - mesh.cloth_edge_count][p.end] =
+          static_cast<float>(smoothstep((straightest - 0.5) / 0.4));
+    }
+  }
+  return result;
+}
+
+}  // namespace
+
+FeatureWeights::FeatureWeights(const CollisionMesh& mesh,
+                               const double* X,
+                               const std::vector<char>& prescribed)
+    : cloth_edge_count_(mesh.cloth_edge_count),
+      cloth_vertex_count_(mesh.cloth_vertex_count),
+      body_edge_count_(static_cast<Index>(mesh.edges.size()) - mesh.cloth_edge_count),
+      body_vertex_count_(mesh.vertex_count - mesh.cloth_vertex_count) {
+  count_faces(mesh, prescribed);
+  const RestMeasures rest = measure(mesh, X);
+  const Bulge angles = bulge(mesh, X);
+  continuation_ = continuations(mesh, X, angles.edge);
+  for (const double length : mean_edge_length(mesh, rest)) {
+    for (auto e = mesh.cloth_edge_count; e < static_cast<Index>(mesh.edges.size()); ++e) {
+      const double width = 2.0 * rest.edge_area[e] / std::sqrt(rest.edge_length_sq[e]);
+      const double theta = angles.edge[e];
+      edge_sharpness_.push_back(sharpness(theta, 2.0 * theta / std::numbers::pi, length / width));
+    }
+    for (Index v = mesh.cloth_vertex_count; v < mesh.vertex_count; ++v) {
+      const double omega = angles.vertex[v];
+      vertex_sharpness_.push_back(sharpness(std::sqrt(omega), 2.0 * omega / std::numbers::pi,
+                                            length / std::sqrt(rest.vertex_area[v])));
+    }
+  }
+}
+
+void FeatureWeights::count_faces(const CollisionMesh& mesh, const std::vector<char>& prescribed) {
+  face_counts_.assign(mesh.faces.size(), 1);
+  edge_.assign(mesh.edges.size(), 1);
+  vertex_.assign(mesh.vertex_count, 1);
+  for (std::size_t f = 0; f < mesh.faces.size(); ++f) {
+    const CollisionMesh::Face& face = mesh.faces[f];
+    // Bodies are prescribed as a whole, and count.
+    if (static_cast<Index>(f) < mesh.cloth_face_count) {
+      face_counts_[f] = std::ranges::any_of(face, [&](Index v) { return prescribed[v] == 0; });
+    }
+    if (face_counts_[f] == 0) continue;
+    for (const Index e : mesh.face_edges[f]) --edge_[e];
+    for (const Index v : face) --vertex_[v];
+  }
+  // n_f - 1 of every edge that has faces is -edge_.
+  for (std::size_t e = 0; e < mesh.edges.size(); ++e) {
+    if (edge_[e] == 1) continue;
+    for (const Index v : mesh.edges[e]) vertex_[v] -= edge_[e];
+  }
+}
+
+}  // namespace diffcloth::contact

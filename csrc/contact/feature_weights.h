@@ -1,0 +1,73 @@
+#pragma once
+
+#include <array>
+#include <vector>
+
+#include "common/types.h"
+#include "contact/collision_mesh.h"
+
+namespace diffcloth::contact {
+
+/// Which share each feature of a surface has in what the surface does to a point or an edge.
+///
+/// A point sees every feature of the other surface (its closed faces, edges and vertices):
+///
+///   sum over features of w b(D(p, feature)),   w = 1                                 of a face,
+///                                                  1 - n_f                           of an edge,
+///                                                  1 - n_f + sum_e (n_f(e) - 1)      of a vertex,
+///
+/// with n_f the number of its faces. Features that share their nearest point then add up to one for
+/// the nearest feature of the surface, and to zero for all others above a flat or convex surface:
+/// the sum does not know how the surface is cut into triangles.
+///
+/// Edges and vertices of bodies act by themselves only where a cloth can rest on them, which
+/// `edge_sharpness` s_e and `vertex_sharpness` s_v measure between 0 (flat, hollow) and 1:
+///
+///   s_e = clip(2 theta / pi) smoothstep(theta max(1, L / h_e)),
+///   s_v = clip(2 Omega / pi) smoothstep(sqrt(Omega) max(1, L / sqrt(A_v))),
+///
+/// with the exterior dihedral angle theta (pi at a boundary), the width h_e of the faces at an edge,
+/// the solid angle Omega of the normals at a vertex, its area A_v, and the mean edge length L of the
+/// cloth. The sign of theta counts on closed parts whose faces are oriented outward; elsewhere
+/// (open, inward or inconsistently oriented parts) its size does.
+///
+/// All of these are constants, made once from the rest meshes. Sharpnesses are rounded to single
+/// precision, so that sums of a few of their products are exact, and cancel exactly.
+class FeatureWeights {
+ public:
+  /// @param X           rest positions, 3 * vertex_count; each surface may be in its own frame
+  /// @param prescribed  [vertices] cloth faces with prescribed corners only do not count
+  FeatureWeights(const CollisionMesh& mesh, const double* X, const std::vector<char>& prescribed);
+
+  bool counts(Index face) const { return face_counts_[face] != 0; }
+  Index edge(Index e) const { return edge_[e]; }
+  Index vertex(Index v) const { return vertex_[v]; }
+
+  /// s_e of a body's edge, as a cloth sees it.
+  double edge_sharpness(Index cloth, Index e) const {
+    return edge_sharpness_[cloth * body_edge_count_ + (e - cloth_edge_count_)];
+  }
+  /// s_v of a body's vertex, as a cloth sees it.
+  double vertex_sharpness(Index cloth, Index v) const {
+    return vertex_sharpness_[cloth * body_vertex_count_ + (v - cloth_vertex_count_)];
+  }
+  /// How much another sharp edge continues a body's edge at its end 0 or 1: smoothstep of
+  /// (-u1 . u2 - 1/2) / 0.4, with unit vectors u from the end. 0 to 1.
+  double continuation(Index e, int end) const { return continuation_[e - cloth_edge_count_][end]; }
+
+ private:
+  void count_faces(const CollisionMesh& mesh, const std::vector<char>& prescribed);
+
+  Index cloth_edge_count_;
+  Index cloth_vertex_count_;
+  Index body_edge_count_;
+  Index body_vertex_count_;
+  std::vector<char> face_counts_;                   // [faces]
+  std::vector<Index> edge_;                         // [edges]
+  std::vector<Index> vertex_;                       // [vertices]
+  std::vector<float> edge_sharpness_;               // [cloths * body edges]
+  std::vector<float> vertex_sharpness_;             // [cloths * body vertices]
+  std::vector<std::array<float, 2>> continuation_;  // [body edges]
+};
+
+}  // namespace diffcloth::contact

@@ -1,0 +1,237 @@
+#include "contact/merge.h"
+
+#include <algorithm>
+#include <tuple>
+
+#include "contact/distance/closest.h"
+#include "contact/distance/mollifier.h"
+
+namespace diffcloth::contact {
+namespace {
+
+using Part = MergeScratch::Part;
+using NearEdge = MergeScratch::NearEdge;
+
+/// Shares of a triangle or an edge within which a projection counts as on its border. Two faces at
+/// an edge, each with its own rounding, would else both claim the point above it. What the distance
+/// loses is the square of this, and drowns in rounding.
+constexpr double kBorder = 1e-12;
+
+enum Kind : std::int8_t { kVertex, kEdge, kFace, kMollified };
+
+NearEdge nearest_on_edge(const CollisionMesh& mesh, Index edge, const Vec3& p, const double* x) {
+  const auto& [i, j] = mesh.edges[edge];
+  const Vec3 e = row(x, j) - row(x, i);
+  const Vec3 w = p - row(x, i);
+  const double along = w.dot(e);
+  const double length_sq = e.squaredNorm();
+  if (along <= kBorder * length_sq) return {.edge = edge, .vertex = i, .d_sq = w.squaredNorm()};
+  if (along >= (1.0 - kBorder) * length_sq) {
+    return {.edge = edge, .vertex = j, .d_sq = (p - row(x, j)).squaredNorm()};
+  }
+  return {.edge = edge, .vertex = -1, .d_sq = (w - (along / length_sq) * e).squaredNorm()};
+}
+
+/// Whether a point's projection lies inside a triangle; then also its squared distance.
+bool projects_into(const Corners& x, double& d_sq) {
+  const Vec3 e0 = x[2] - x[1];
+  const Vec3 e1 = x[3] - x[1];
+  const Vec3 w = x[0] - x[1];
+  const Vec3 n = e0.cross(e1);
+  const double n_sq = n.squaredNorm();
+  const double b0 = w.cross(e1).dot(n);
+  const double b1 = e0.cross(w).dot(n);
+  const double least = kBorder * n_sq;
+  if (!(b0 > least && b1 > least && n_sq - b0 - b1 > least)) return false;
+  const Closest geometry = closest(PairKind::kPointTriangle, x);
+  d_sq = geometry.d_sq;
+  return geometry.parameter_count == 2;
+}
+
+bool is_beyond(const Vec3& p, const Vec3& a, const Vec3& b, const Vec3& c, double range) {
+  for (int k = 0; k < 3; ++k) {
+    if (p[k] < std::min({a[k], b[k], c[k]}) - range) return true;
+    if (p[k] > std::max({a[k], b[k], c[k]}) + range) return true;
+  }
+  return false;
+}
+
+bool is_beyond(const Corners& x, double range) {
+  for (int k = 0; k < 3; ++k) {
+    const auto [lo_a, hi_a] = std::minmax(x[0][k], x[1][k]);
+    const auto [lo_b, hi_b] = std::minmax(x[2][k], x[3][k]);
+    if (lo_a > hi_b + range || lo_b > hi_a + range) return true;
+  }
+  return false;
+}
+
+/// Add up the parts of each feature; those within range and not zero come first in the list.
+void merge(std::vector<Part>& parts, double range) {
+  const auto key = [](const Part& p) { return std::tuple(p.kind, p.id, p.end); };
+  std::erase_if(parts, [&](const Part& p) { return !(p.d_sq < range * range); });
+  // Sums of few integers or products of single-precision numbers: exact in any order.
+  std::ranges::sort(parts, {}, key);
+  std::size_t count = 0;
+  for (const Part& p : parts) {
+    if (count > 0 && key(parts[count - 1]) == key(p)) {
+      parts[count - 1].coefficient += p.coefficient;
+    } else {
+      parts[count++] = p;
+    }
+  }
+  parts.resize(count);
+  std::erase_if(parts, [](const Part& p) { return p.coefficient == 0.0; });
+}
+
+template <class Values>
+void sort_unique(Values& values) {
+  std::ranges::sort(values);
+  values.erase(std::unique(values.begin(), values.end()), values.end());
+}
+
+}  // namespace
+
+void add_point_terms(const CollisionMesh& mesh,
+                     const FeatureWeights& weights,
+                     std::span<const Candidate> group,
+                     const double* x,
+                     double range,
+                     double scale,
+                     MergeScratch& scratch,
+                     std::vector<Term>& out) {
+  const Index point = group.front().a;
+  const Vec3 p = row(x, point);
+  auto& [faces, edges, vertices, parts] = scratch;
+  faces.clear();
+  for (const Candidate& pair : group) {
+    const auto& [self, i, j, k] = pair.vertices;
+    if (!weights.counts(pair.b) || is_beyond(p, row(x, i), row(x, j), row(x, k), range)) continue;
+    faces.push_back(pair.b);
+  }
+  if (faces.empty()) return;
+
+  // What comes within range has all of its faces within range: their features are all.
+  vertices.clear();
+  for (const Index f : faces) {
+    vertices.insert(vertices.end(), mesh.face_edges[f].begin(), mesh.face_edges[f].end());
+  }
+  sort_unique(vertices);
+  edges.clear();
+  for (const Index e : vertices) edges.push_back(nearest_on_edge(mesh, e, p, x));
+  vertices.clear();
+  for (const Index f : faces) {
+    vertices.insert(vertices.end(), mesh.faces[f].begin(), mesh.faces[f].end());
+  }
+  sort_unique(vertices);
+
+  parts.clear();
+  const auto push_on_edge = [&parts](const NearEdge& near, Index weight) {
+    const bool inside = near.vertex < 0;
+    parts.push_back({.kind = inside ? kEdge : kVertex,
+                     .end = -1,
+                     .id = inside ? near.edge : near.vertex,
+                     .coefficient = static_cast<double>(weight),
+                     .d_sq = near.d_sq});
+  };
+  for (const Index f : faces) {
+    const auto& [i, j, k] = mesh.faces[f];
+    double d_sq = 0.0;
+    if (projects_into({p, row(x, i), row(x, j), row(x, k)}, d_sq)) {
+      parts.push_back({.kind = kFace, .end = -1, .id = f, .coefficient = 1.0, .d_sq = d_sq});
+      continue;
+    }
+    const NearEdge* nearest = nullptr;
+    for (const Index e : mesh.face_edges[f]) {
+      const auto at = std::ranges::lower_bound(edges, e, {}, &NearEdge::edge);
+      if (nearest == nullptr || at->d_sq < nearest->d_sq) nearest = &*at;
+    }
+    push_on_edge(*nearest, 1);
+  }
+  for (const NearEdge& near : edges) push_on_edge(near, weights.edge(near.edge));
+  for (const Index v : vertices) {
+    parts.push_back({.kind = kVertex,
+                     .end = -1,
+                     .id = v,
+                     .coefficient = static_cast<double>(weights.vertex(v)),
+                     .d_sq = (p - row(x, v)).squaredNorm()});
+  }
+  merge(parts, range);
+
+  for (const Part& part : parts) {
+    Candidate pair{.kind = PairKind::kPointTriangle,
+                   .vertices = {point, part.id, part.id, part.id},
+                   .a = point,
+                   .b = -1};
+    if (part.kind == kFace) {
+      const auto& [i, j, k] = mesh.faces[part.id];
+      pair.vertices = {point, i, j, k};
+      pair.b = part.id;
+    } else if (part.kind == kEdge) {
+      const auto& [i, j] = mesh.edges[part.id];
+      pair.vertices = {point, i, j, j};
+    }
+    out.push_back({.pair = pair, .coefficient = scale * part.coefficient, .d_sq = part.d_sq});
+  }
+}
+
+void add_edge_terms(const CollisionMesh& mesh,
+                    const FeatureWeights& weights,
+                    std::span<const Candidate> group,
+                    std::span<const double> edge_length_sq,
+                    const double* x,
+                    double range,
+                    double scale,
+                    MergeScratch& scratch,
+                    std::vector<Term>& out) {
+  const Index c = group.front().a;
+  const Index cloth = mesh.edge_surface[c];
+  std::vector<Part>& parts = scratch.parts;
+  parts.clear();
+  for (const Candidate& pair : group) {
+    const Index e = pair.b;
+    const double s = weights.edge_sharpness(cloth, e);
+    if (s == 0.0) continue;
+    const auto& v = pair.vertices;
+    const Corners corner{row(x, v[0]), row(x, v[1]), row(x, v[2]), row(x, v[3])};
+    if (is_beyond(corner, range)) continue;
+    const bool soft = mollified(corner, mollifier_threshold(edge_length_sq[c], edge_length_sq[e]));
+    const auto push = [&](std::int8_t end, double coefficient, double d_sq) {
+      const bool shared = end >= 0 && !soft;
+      parts.push_back({.kind = soft ? kMollified : (shared ? kVertex : kEdge),
+                       .end = shared ? std::int8_t{-1} : end,
+                       .id = shared ? v[2 + end] : e,
+                       .coefficient = coefficient,
+                       .d_sq = d_sq});
+    };
+    const Closest whole = closest(PairKind::kEdgeEdge, corner);
+    const bool at_0 = whole.c[3] == 0.0;
+    const bool at_1 = whole.c[2] == 0.0;
+    if (!at_0 && !at_1) push(-1, s, whole.d_sq);
+    for (const std::int8_t end : {std::int8_t{0}, std::int8_t{1}}) {
+      const bool nearest = end == 0 ? at_0 : at_1;
+      const double share = (nearest ? 1.0 : 0.0) - 0.5 * weights.continuation(e, end);
+      if (share == 0.0) continue;
+      const NearEdge near = nearest_on_edge(mesh, c, corner[2 + end], x);
+      push(end, s * share, near.d_sq);
+    }
+  }
+  merge(parts, range);
+
+  for (const Part& part : parts) {
+    Candidate pair{.kind = PairKind::kEdgeEdge,
+                   .vertices = {mesh.edges[c][0], mesh.edges[c][1], part.id, part.id},
+                   .a = c,
+                   .b = -1};
+    if (part.kind != kVertex) {
+      pair.vertices[2] = mesh.edges[part.id][0];
+      pair.vertices[3] = mesh.edges[part.id][1];
+      pair.b = part.id;
+    }
+    out.push_back({.pair = pair,
+                   .coefficient = scale * part.coefficient,
+                   .d_sq = part.d_sq,
+                   .end = part.end});
+  }
+}
+
+}  // namespace diffcloth::contact

@@ -1,0 +1,82 @@
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <span>
+#include <vector>
+
+#include "common/types.h"
+#include "contact/broad_phase.h"
+#include "contact/collision_mesh.h"
+#include "contact/feature_weights.h"
+
+namespace diffcloth::contact {
+
+/// One term of what a surface does to a point or an edge: a coefficient times m b(D).
+struct Term {
+  /// Where the nearest feature of a face is an edge or a vertex, corners repeat ({p, e0, e1, e1},
+  /// {p, v, v, v}, {c0, c1, v, v}), so that no corner takes part that does not matter, and b is -1.
+  Candidate pair;
+  double coefficient;
+  double d_sq;  ///< [m^2]
+  /// Of an edge-edge pair: 0 or 1 if D is the distance of that end of edge b, -1 if of all of it.
+  /// The mollifier is that of the two edges in any case.
+  std::int8_t end = -1;
+};
+
+/// Lists that the functions below fill and leave behind, to be reused without allocation.
+struct MergeScratch {
+  struct NearEdge {
+    Index edge;
+    Index vertex;  ///< The end that is nearest, -1 inside the edge.
+    double d_sq;
+  };
+  /// A share of a feature in the sum, before shares of one feature merge.
+  struct Part {
+    std::int8_t kind;  ///< with id and end, tells features apart
+    std::int8_t end;
+    Index id;
+    double coefficient;
+    double d_sq;
+  };
+  std::vector<Index> faces;
+  std::vector<NearEdge> edges;
+  std::vector<Index> vertices;
+  std::vector<Part> parts;
+};
+
+/// Terms of a point against a surface, those with the same nearest feature merged and those with
+/// coefficient zero dropped: see FeatureWeights.
+///
+/// @param group  the candidates of one point and one surface
+/// @param range  terms of a larger distance are left out [m]
+/// @param out    appended to, in the order of the features
+void add_point_terms(const CollisionMesh& mesh,
+                     const FeatureWeights& weights,
+                     std::span<const Candidate> group,
+                     const double* x,
+                     double range,
+                     double scale,
+                     MergeScratch& scratch,
+                     std::vector<Term>& out);
+
+/// Terms of a cloth's edge c against the sharp edges e of a body,
+///
+///   s_e m(c, e) [b(D(c, e)) - 1/2 sum over the ends v of e of gamma_ev b(D(c, v))],
+///
+/// so that an edge that is cut into pieces acts as the whole does: pieces that continue each other
+/// meet in a vertex, which each takes half of. Terms at one vertex that are not mollified merge.
+///
+/// @param group           the candidates of one edge and one body
+/// @param edge_length_sq  [edges] of the rest shapes [m^2], for the mollifier
+void add_edge_terms(const CollisionMesh& mesh,
+                    const FeatureWeights& weights,
+                    std::span<const Candidate> group,
+                    std::span<const double> edge_length_sq,
+                    const double* x,
+                    double range,
+                    double scale,
+                    MergeScratch& scratch,
+                    std::vector<Term>& out);
+
+}  // namespace diffcloth::contact

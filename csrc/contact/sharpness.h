@@ -1,0 +1,24 @@
+#pragma once
+
+#include <vector>
+
+#include "common/types.h"
+#include "contact/collision_mesh.h"
+
+namespace diffcloth::contact {
+
+/// How far the bodies of a mesh bulge at their edges and vertices, from their rest positions X.
+///
+/// A part (faces connected by edges) is solid if it is closed, consistently oriented and encloses a
+/// positive volume. There an edge or a vertex that is hollow as seen from outside has angle 0; other
+/// parts may be touched from both sides, and are taken to bulge everywhere.
+struct Bulge {
+  std::vector<double> edge;    ///< [edges] exterior dihedral angle, pi at boundaries [rad]
+  std::vector<double> vertex;  ///< [vertices] solid angle of the normals [sr]
+};
+
+/// Angles below 1e-4, the rounding of meshes in single precision, are flat, and 0. The cloth's
+/// entries are 0.
+Bulge bulge(const CollisionMesh& mesh, const double* X);
+
+}  // namespace diffcloth::contact
