@@ -67,3 +67,34 @@ def test_summaries(quick):
         assert len(records[summary]) == 5
         for row in records[summary].values():
             assert all(math.isfinite(number) for number in row.values())
+
+
+def test_two_packages_are_compared_on_the_same_steps(tmp_path):
+    out = tmp_path / "compare.json"
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.compare",
+        "--against",
+        str(ROOT),
+        "--json",
+        str(out),
+    ]
+    command += ["--scene", "plane", "--size", "6", "--steps", "2"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    rows = json.loads(out.read_text())
+    assert [(row["batch"], row["threads"]) for row in rows] == [(0, 1), (8, 1), (8, 2)]
+    for row in rows:
+        assert row["this"]["iterations"] == row["other"]["iterations"] >= 1
+        for side in ("this", "other"):
+            assert row[side]["forward"] > 0 < row[side]["backward"]
+            assert row[side]["unconverged"] == 0
+
+
+def test_a_folder_without_a_package_is_refused(tmp_path):
+    command = [sys.executable, "-m", "benchmarks.compare", "--against", str(tmp_path)]
+    command += ["--scene", "hanging", "--size", "6", "--no-batch"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert f"{tmp_path} has no diffcloth_torch" in result.stderr

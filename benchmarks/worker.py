@@ -1,0 +1,90 @@
+"""One side of a comparison: steps a scene with the package in a given folder, step by step.
+
+`benchmarks.compare` runs this file as a script, tells it a row as JSON in the first line of its
+input, and then asks for one timed step with each further line. Only the public interface of the
+package is used, so that versions can meet whose insides differ.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def main() -> None:
+    row = json.loads(sys.stdin.readline())
+    os.sched_setaffinity(0, row["cores"])
+    use_package(Path(row["package"]))
+    steps = timed_steps(row)
+    print(json.dumps(next(steps)), flush=True)  # ready: how the approach went
+    for _ in sys.stdin:
+        print(json.dumps(next(steps)), flush=True)
+
+
+def use_package(folder: Path) -> None:
+    """Import the package from `folder`, and the scenes from this checkout."""
+    sys.path[0] = str(folder)
+    import diffcloth_torch
+
+    found = Path(diffcloth_torch.__file__).resolve().parents[1]
+    if found != folder.resolve():
+        raise SystemExit(f"{folder} has no diffcloth_torch; Python found that of {found}")
+    sys.path[0] = str(ROOT)
+
+
+def timed_steps(row: dict[str, Any]) -> Any:
+    """Yield once when the scene is in its regime, then the times of each step."""
+    import torch
+
+    import diffcloth_torch as dc
+    from benchmarks.scenes import DT, SCENES
+
+    torch.set_num_threads(row["threads"])
+    scene = SCENES[row["scene"]](row["size"])
+    simulator = dc.Simulator(scene.scene, DT, solver=dc.SolverOptions(throw=False))
+    state = simulator.initial_state(row["batch"] or None)
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(state.positions.shape, generator=generator, dtype=torch.float64)
+    speed = torch.tensor(scene.speed, dtype=torch.float64)
+    state = state.replace(velocities=speed + 0.003 * noise)
+    with torch.no_grad():
+        for _ in range(scene.approach):
+            state = simulator.step(state, scene.control(state))
+    yield {"core": dc.build_info()["factorization"]}
+
+    count = row["batch"] or 1
+    clock = time.process_time if row["processor_time"] else time.perf_counter
+    while True:
+        before = state.detach()
+        leaves = [before.positions.requires_grad_(), before.velocities.requires_grad_()]
+        control = scene.control(state)
+        if isinstance(control.body_poses, torch.Tensor):
+            leaves.append(control.body_poses.requires_grad_())
+        start = clock()
+        after = simulator.step(before, control)
+        forward = clock() - start
+        converged = torch.as_tensor(after.report.converged).sum().item()
+        backward = None
+        if converged == count:
+            outputs = [after.positions, after.velocities]
+            cotangents = [torch.randn(x.shape, generator=generator, dtype=x.dtype) for x in outputs]
+            start = clock()
+            torch.autograd.backward(outputs, cotangents)
+            backward = (clock() - start) / count
+        yield {
+            "forward": forward / count,
+            "backward": backward,
+            "iterations": torch.as_tensor(after.report.iterations).double().mean().item(),
+            "unconverged": count - converged,
+        }
+        state = after.detach()
+
+
+if __name__ == "__main__":
+    main()

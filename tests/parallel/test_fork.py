@@ -1,0 +1,135 @@
+"""Forked processes step batches on threads of their own after the parent has done so."""
+
+import multiprocessing
+import os
+import signal
+import threading
+import traceback
+
+import pytest
+import torch
+from parallel_scenes import batch, differing, simulator, step
+from torch.utils.data import DataLoader, Dataset
+
+pytestmark = [
+    pytest.mark.skipif(not hasattr(os, "fork"), reason="forks"),
+    # Python 3.12 warns of every fork of a process with threads; that it works is tested here.
+    pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning"),
+]
+
+SIZES = (6, 12, 24)
+TIMEOUT = 300  # [s]: a child that hangs must not hang the tests
+
+
+@pytest.fixture(params=SIZES)
+def after_a_parallel_region(request):
+    """State, and the values of its step on two threads: they have run in this process."""
+    n = request.param
+    state = batch(n, 4)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        torch.randn(500, 500) @ torch.randn(500, 500)
+        yield n, state, step(simulator(n), state)[1]
+    finally:
+        torch.set_num_threads(before)
+
+
+def in_child(function):
+    """Run a function in a forked child; its exit status, negative for a signal."""
+    pid = os.fork()
+    if pid == 0:
+        signal.alarm(TIMEOUT)
+        try:
+            status = 0 if function() else 1
+        except BaseException:
+            traceback.print_exc()
+            status = 2
+        os._exit(status)
+    _, status = os.waitpid(pid, 0)
+    return os.waitstatus_to_exitcode(status)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_forked_child_steps_batches(after_a_parallel_region, count):
+    n, state, expected = after_a_parallel_region
+
+    def repeat():
+        torch.set_num_threads(count)
+        sim = simulator(n)
+        return all(differing(step(sim, state)[1], expected) == [] for _ in range(2))
+
+    assert in_child(repeat) == 0
+    # The parent goes on as before.
+    assert differing(step(simulator(n), state)[1], expected) == []
+
+
+def test_a_child_forked_while_another_thread_steps(after_a_parallel_region):
+    # The other thread does not exist in the child, and may have held any lock of the core.
+    n, state, expected = after_a_parallel_region
+    sim = simulator(n)
+    stop = threading.Event()
+
+    def keep_stepping():
+        while not stop.is_set():
+            sim.step(state)
+
+    thread = threading.Thread(target=keep_stepping)
+    thread.start()
+    try:
+        for _ in range(3):
+            status = in_child(lambda: differing(step(sim, state)[1], expected) == [])
+            assert status == 0
+    finally:
+        stop.set()
+        thread.join()
+
+
+def work(queue, n, state):
+    torch.set_num_threads(2)
+    _, values = step(simulator(n), state)
+    queue.put([value.numpy() for value in values])
+
+
+def test_a_process_of_multiprocessing_steps_batches(after_a_parallel_region):
+    n, state, expected = after_a_parallel_region
+    context = multiprocessing.get_context("fork")
+    queue = context.SimpleQueue()
+    process = context.Process(target=work, args=(queue, n, state))
+    process.start()
+    values = [torch.from_numpy(value) for value in queue.get()] if wait(process, queue) else None
+    process.join()
+    assert process.exitcode == 0
+    assert differing(values, expected) == []
+
+
+def wait(process, queue):
+    """Whether an answer came before the process ended."""
+    while queue.empty():
+        process.join(0.05)
+        if process.exitcode not in (None, 0):
+            return False
+    return True
+
+
+class Steps(Dataset):
+    def __init__(self, n, state):
+        self.n, self.state = n, state
+
+    def __len__(self):
+        return 2
+
+    def __getitem__(self, index):
+        torch.set_num_threads(2)  # a worker starts with one
+        return step(simulator(self.n), self.state)[1]
+
+
+def test_a_worker_of_a_data_loader_steps_batches(after_a_parallel_region):
+    n, state, expected = after_a_parallel_region
+    loader = DataLoader(
+        Steps(n, state), batch_size=None, num_workers=1, multiprocessing_context="fork"
+    )
+    rows = list(loader)
+    assert len(rows) == 2
+    for values in rows:
+        assert differing(values, expected) == []
