@@ -108,8 +108,10 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
   const double step = largest(directions_.p());
   residual_ = step / walk_.f.h;
   if (direction.kind == Kind::kDamped) {
-    // Nothing pulls, and yet the Hessian is indefinite.
-    if (step < kSettled * goal_) return escape();
+    if (step < kSettled * goal_) {
+      settling_ = true;
+      return Next::kGoOn;
+    }
   } else if (step < goal_) {
     if (direction.kind != Kind::kFactored) {
       settling_ = true;

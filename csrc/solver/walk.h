@@ -49,7 +49,10 @@ class Walk {
  public:
   /// @param x  in: a feasible start; moves along
   Walk(const Objective& f, std::vector<double>& x, Context& context)
-      : f(f), context(context), system(f, *context.workspace, *context.watch, *context.counts), x_(x) {
+      : f(f),
+        context(context),
+        system(f, *context.workspace, *context.watch, *context.counts),
+        x_(x) {
     record();
   }
 

@@ -207,7 +207,8 @@ void pull_back_solve(const Backward& step,
                      const Array* force_bar) {
   Cotangents& bars = step.cotangents;
   const std::size_t cloth = step.problem.coordinates.size();
-  solver::LinearSystem system(f, *step.context.workspace, *step.context.watch, *step.context.counts);
+  solver::LinearSystem system(f, *step.context.workspace, *step.context.watch,
+                              *step.context.counts);
   if (!factor) factor = system.certify(x.data());
   if (!factor) throw std::domain_error("the Hessian is not positive definite at the solution");
 
