@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <map>
 #include <memory>
 #include <stdexcept>
@@ -79,6 +80,10 @@ struct Arrays {
     return inputs;
   }
 };
+
+bool is_zero(const double* values, std::size_t count) {
+  return std::all_of(values, values + count, [](double value) { return value == 0.0; });
+}
 
 /// Runs body for every environment without the GIL, letting Ctrl-C through.
 void for_environments(std::size_t count,
@@ -257,6 +262,14 @@ nb::dict Simulator::backward(const nb::dict& inputs,
 
   for_environments(b, threads, [&](Index i, const Checkpoint& checkpoint) {
     const auto e = static_cast<std::size_t>(i);
+    const step::Cotangents own_bar{.positions = positions_bar.data() + e * n * 3,
+                                   .velocities = velocities_bar.data() + e * n * 3,
+                                   .body_forces = forces_bar.data() + e * v * 3};
+    // The loss does not depend on this environment. Its step may even have failed.
+    if (is_zero(own_bar.positions, n * 3) && is_zero(own_bar.velocities, n * 3) &&
+        is_zero(own_bar.body_forces, v * 3)) {
+      return;
+    }
     step::Gradients gradients;
     for (Wanted& w : wanted) gradients.data[w.input] = w.own.data() + e * w.count;
     step::backward(scene_, arrays.environment(e),
@@ -265,10 +278,7 @@ nb::dict Simulator::backward(const nb::dict& inputs,
                     .elastic = split ? elastic.data() + e * 2 * n * 3 : nullptr,
                     .solves = solves.data() + e,
                     .key = key.data() + e},
-                   {.positions = positions_bar.data() + e * n * 3,
-                    .velocities = velocities_bar.data() + e * n * 3,
-                    .body_forces = forces_bar.data() + e * v * 3},
-                   checkpoint, gradients, factors_);
+                   own_bar, checkpoint, gradients, factors_);
   });
   for (const Wanted& w : wanted) {
     for (std::size_t e = 0; e < b; ++e) {
