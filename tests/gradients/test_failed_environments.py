@@ -120,15 +120,16 @@ def test_a_single_failed_step_has_a_zero_gradient_of_a_loss_without_it():
 
 
 def test_an_environment_outside_the_loss_is_not_solved_for():
-    # One iteration takes the first to a saddle, where a solve would find an indefinite Hessian.
-    cloth = dc.Cloth.grid(10, 10, material=dc.Material(1e4, 1e-5), pins={"feet": [0, 9]})
+    # A flat sheet, compressed in its plane, and one iteration: a solve would have to factor a
+    # Hessian that is indefinite, and raise.
+    cloth = dc.Cloth.grid(10, 10, material=dc.Material(1e4, 1e-5))
     sim = dc.Simulator(
-        dc.Scene([cloth], gravity=(0, -9.81, 0)),
+        dc.Scene([cloth], gravity=(0, 0, 0)),
         0.05,
         contact=dc.ContactOptions(self_contact=False),
         solver=dc.SolverOptions(throw=False, max_iterations=1),
     )
-    x = sim.initial_state(1).positions.requires_grad_()
+    x = (0.9 * sim.initial_state(1).positions).requires_grad_()
     after = sim.step(sim.initial_state(1).replace(positions=x))
     assert not after.report.converged
     (gradient,) = torch.autograd.grad(after.positions, x, torch.zeros_like(x))
