@@ -10,7 +10,7 @@
 #include <nanobind/stl/vector.h>
 
 #include "bind/bind.h"
-#include "common/parallel_for.h"
+#include "bind/environments.h"
 #include "contact/nonadjacent_distance.h"
 #include "step/step.h"
 
@@ -85,22 +85,6 @@ bool is_zero(const double* values, std::size_t count) {
   return std::all_of(values, values + count, [](double value) { return value == 0.0; });
 }
 
-/// Runs body for every environment without the GIL, letting Ctrl-C through.
-void for_environments(std::size_t count,
-                      int threads,
-                      const std::function<void(Index, const Checkpoint&)>& body) {
-  Interrupt interrupt([] {
-    const nb::gil_scoped_acquire gil;
-    return PyErr_CheckSignals() != 0;
-  });
-  try {
-    const nb::gil_scoped_release nogil;
-    parallel_for(static_cast<Index>(count), threads, interrupt, body);
-  } catch (const Interrupted&) {
-    throw nb::python_error();  // the error that the signal handler has set
-  }
-}
-
 class Simulator {
  public:
   explicit Simulator(step::Description description) : scene_(std::move(description)) {}
@@ -127,6 +111,7 @@ class Simulator {
     return step::reference_factorization_seconds(scene_, arrays.environment(0), repeats);
   }
   void forget_factors() { factors_.clear(); }
+  std::size_t factor_bytes() const { return factors_.bytes(); }
 
  private:
   step::Scene scene_;
@@ -420,6 +405,10 @@ void simulator(nb::module_& m) {
       .def("find_overlap", &Simulator::find_overlap, "positions"_a, "body_poses"_a, "thickness"_a)
       .def("forget_factors", &Simulator::forget_factors,
            "Drop the factors kept for backward; they are made again when needed.")
+      .def_prop_ro("factor_bytes", &Simulator::factor_bytes,
+                   "What the factors kept for backward take up; at most `largest_factor_bytes`.")
+      .def_prop_ro_static("largest_factor_bytes",
+                          [](nb::handle) { return step::FactorCache::kBytes; })
       .def_prop_ro_static("phases", [](nb::handle) {
         return std::vector<std::string>(solver::kPhaseNames.begin(), solver::kPhaseNames.end());
       });

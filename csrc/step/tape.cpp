@@ -26,6 +26,11 @@ FactorCache::Factors FactorCache::find(std::int64_t key) const {
   return {};
 }
 
+std::size_t FactorCache::bytes() const {
+  const std::lock_guard lock(mutex_);
+  return bytes_;
+}
+
 void FactorCache::clear() {
   const std::lock_guard lock(mutex_);
   entries_.clear();

@@ -36,9 +36,12 @@ class FactorCache {
 
   void clear();
 
- private:
+  /// What the factors that are kept take up; at most kBytes.
+  std::size_t bytes() const;
+
   static constexpr std::size_t kBytes = std::size_t{256} << 20;
 
+ private:
   struct Entry {
     std::int64_t key;
     std::size_t bytes;
