@@ -15,6 +15,8 @@ def build_info() -> dict[str, Any]: ...
 
 class Simulator:
     phases: list[str]
+    largest_factor_bytes: int
+    factor_bytes: int
     def __init__(
         self,
         *,

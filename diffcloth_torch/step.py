@@ -144,12 +144,7 @@ class _Step(torch.autograd.Function):
         saved = ctx.saved_tensors  # first: raises torch's own error if the tape was freed
         if any(map(_is_batched_by_vmap, cotangents)):
             raise NotImplementedError(_TRANSFORMS)
-        if ctx.unconverged:
-            raise NotConverged(
-                "backward: a step that did not converge has no gradient; raise max_iterations, or "
-                f"step without environments {ctx.unconverged}",
-                environments=ctx.unconverged,
-            )
+        _refuse_unconverged(ctx, cotangents)
         tensors = saved[: len(ctx.names)]
         # The first four arguments of forward are not tensors.
         needs = dict(zip(ctx.names, ctx.needs_input_grad[4:], strict=True))
@@ -159,6 +154,21 @@ class _Step(torch.autograd.Function):
             anchors = (*tensors, *cotangents)
             rows = [None if row is None else _Once.apply(row, *anchors) for row in rows]
         return None, None, None, None, *rows
+
+
+def _refuse_unconverged(ctx, cotangents):
+    """Raise if the loss depends on an environment that has no gradient; others do without it."""
+    wanted = [
+        i
+        for i in ctx.unconverged
+        if any((c[i] if ctx.batched else c).count_nonzero() for c in cotangents)
+    ]
+    if wanted:
+        raise NotConverged(
+            "backward: a step that did not converge has no gradient; raise max_iterations, or "
+            f"leave environments {wanted} out of the loss with diffcloth_torch.where",
+            environments=wanted,
+        )
 
 
 def _backward(ctx, saved, cotangents, needs):

@@ -12,6 +12,9 @@ void build_info(nb::module_& m);
 /// The simulator's handle: forward and backward of a step.
 void simulator(nb::module_& m);
 
+/// Threads, for tests of what happens when they fail or are interrupted.
+void common_kernels(nb::module_& m);
+
 /// Contact kernels one by one, for tests against independent references.
 void contact_kernels(nb::module_& m);
 

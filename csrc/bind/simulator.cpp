@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <map>
 #include <memory>
 #include <stdexcept>
@@ -10,7 +11,7 @@
 #include <nanobind/stl/vector.h>
 
 #include "bind/bind.h"
-#include "common/parallel_for.h"
+#include "bind/environments.h"
 #include "contact/nonadjacent_distance.h"
 #include "step/scheme.h"
 #include "step/step.h"
@@ -82,22 +83,6 @@ struct Arrays {
   }
 };
 
-/// Runs body for every environment without the GIL, letting Ctrl-C through.
-void for_environments(std::size_t count,
-                      int threads,
-                      const std::function<void(Index, const Checkpoint&)>& body) {
-  Interrupt interrupt([] {
-    const nb::gil_scoped_acquire gil;
-    return PyErr_CheckSignals() != 0;
-  });
-  try {
-    const nb::gil_scoped_release nogil;
-    parallel_for(static_cast<Index>(count), threads, interrupt, body);
-  } catch (const Interrupted&) {
-    throw nb::python_error();  // the error that the signal handler has set
-  }
-}
-
 class Simulator {
  public:
   explicit Simulator(step::Description description) : scene_(std::move(description)) {}
@@ -124,6 +109,7 @@ class Simulator {
     return step::reference_factorization_seconds(scene_, arrays.environment(0), repeats);
   }
   void forget_factors() { factors_.clear(); }
+  std::size_t factor_bytes() const { return factors_.bytes(); }
 
  private:
   step::Scene scene_;
@@ -182,6 +168,14 @@ class Saved {
       }
       entries_.push_back({.name = field.name, .array = array, .size = field.size()});
     }
+  }
+
+  /// Whether an environment's arrays are zero throughout.
+  bool is_zero(std::size_t e) const {
+    return std::ranges::all_of(entries_, [&](const Entry& entry) {
+      const double* const first = entry.array.data() + e * entry.size;
+      return std::all_of(first, first + entry.size, [](double value) { return value == 0.0; });
+    });
   }
 
   step::Arrays<const double> environment(std::size_t e) const {
@@ -287,6 +281,8 @@ nb::dict Simulator::backward(const nb::dict& inputs,
 
   for_environments(b, threads, [&](Index i, const Checkpoint& checkpoint) {
     const auto e = static_cast<std::size_t>(i);
+    // The loss does not depend on this environment. Its step may even have failed.
+    if (bars.is_zero(e)) return;
     step::Gradients gradients;
     for (Wanted& w : wanted) gradients.data[w.input] = w.own.data() + e * w.count;
     step::backward(scene_, arrays.environment(e), tapes.environment(e), bars.environment(e),
@@ -431,6 +427,10 @@ void simulator(nb::module_& m) {
       .def("find_overlap", &Simulator::find_overlap, "positions"_a, "body_poses"_a, "thickness"_a)
       .def("forget_factors", &Simulator::forget_factors,
            "Drop the factors kept for backward; they are made again when needed.")
+      .def_prop_ro("factor_bytes", &Simulator::factor_bytes,
+                   "What the factors kept for backward take up; at most `largest_factor_bytes`.")
+      .def_prop_ro_static("largest_factor_bytes",
+                          [](nb::handle) { return step::FactorCache::kBytes; })
       .def_prop_ro_static("phases", [](nb::handle) {
         return std::vector<std::string>(kPhaseNames.begin(), kPhaseNames.end());
       });

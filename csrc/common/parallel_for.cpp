@@ -6,6 +6,7 @@
 #include <condition_variable>
 #include <exception>
 #include <mutex>
+#include <system_error>
 #include <thread>
 #include <vector>
 
@@ -18,9 +19,9 @@ void parallel_for(Index count,
   const int workers = std::clamp(threads, 1, std::max<int>(count, 1));
   std::vector<std::exception_ptr> errors(static_cast<std::size_t>(count));
   std::atomic<Index> next{0};
-  std::atomic<int> running{workers - 1};
   std::mutex mutex;
   std::condition_variable finished;
+  int running = 0;  // guarded by the mutex
 
   const auto work = [&](bool is_caller) {
     const Checkpoint checkpoint(interrupt, is_caller);
@@ -33,28 +34,41 @@ void parallel_for(Index count,
       }
     }
   };
+  const auto work_beside_caller = [&] {
+    work(false);
+    const std::lock_guard lock(mutex);
+    --running;
+    finished.notify_one();
+  };
 
-  std::vector<std::thread> pool;
-  for (int k = 1; k < workers; ++k) {
-    pool.emplace_back([&] {
-      work(false);
+  std::vector<std::jthread> pool;  // joined before anything above is gone, whatever happens
+  pool.reserve(static_cast<std::size_t>(workers - 1));
+  while (std::ssize(pool) + 1 < workers) {
+    {
+      const std::lock_guard lock(mutex);
+      ++running;
+    }
+    try {
+      pool.emplace_back(work_beside_caller);
+    } catch (const std::system_error&) {
+      // The system has no more threads to give: those that are there do the work.
       const std::lock_guard lock(mutex);
       --running;
-      finished.notify_one();
-    });
+      break;
+    }
   }
   work(true);
   {
     // The caller alone can see an interrupt, so it keeps looking while others work.
     std::unique_lock lock(mutex);
-    while (running.load() > 0) {
+    while (running > 0) {
       finished.wait_for(lock, std::chrono::milliseconds(50));
       lock.unlock();
       interrupt.poll();
       lock.lock();
     }
   }
-  for (std::thread& thread : pool) thread.join();
+  pool.clear();
 
   if (interrupt.stopped()) throw Interrupted{};
   for (const std::exception_ptr& error : errors) {

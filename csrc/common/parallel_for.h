@@ -10,7 +10,8 @@ namespace diffcloth {
 /// Run body(i, checkpoint) for i in [0, count) on up to `threads` threads, the caller's included.
 ///
 /// Each index is one environment and owns its outputs, so the result does not depend on the number
-/// of threads. Threads live only inside the call. The first exception (of the lowest index) is
+/// of threads. Threads live only inside the call; where the system refuses to make as many, fewer do
+/// the work. The first exception (of the lowest index) is
 /// rethrown once all have stopped; an interrupt stops all of them.
 void parallel_for(Index count,
                   int threads,

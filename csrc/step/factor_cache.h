@@ -24,11 +24,13 @@ class FactorCache {
   Factors find(std::int64_t key) const;
 
   void clear();
+
+  /// What the factors that are kept take up; at most kBytes.
   std::size_t bytes() const;
 
- private:
   static constexpr std::size_t kBytes = std::size_t{256} << 20;
 
+ private:
   struct Entry {
     std::int64_t key;
     std::size_t bytes;
