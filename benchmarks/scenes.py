@@ -41,7 +41,7 @@ class Scene:
         return dc.Control(body_poses=state.body_poses.detach() + DT * shift)
 
 
-def _sheet(n: int) -> tuple[np.ndarray, np.ndarray]:
+def sheet(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [n * n, 3] of a jittered sheet in the xy-plane, and faces; row by row along y."""
     grid = dc.Cloth.grid(n, n)
     vertices = np.array(grid.vertices)
@@ -58,21 +58,21 @@ def _gap(n: int) -> float:
 
 
 def _upright(n: int, **keywords: object) -> dc.Cloth:
-    vertices, faces = _sheet(n)
+    vertices, faces = sheet(n)
     placed = np.stack([vertices[:, 0], np.zeros(n * n), 1.0 + vertices[:, 1]], axis=-1)
     return dc.Cloth(placed, faces, rest_vertices=vertices, **keywords)
 
 
 def hanging(n: int) -> Scene:
     """Swing down from the horizontal, held by two corners: free of contact."""
-    vertices, faces = _sheet(n)
+    vertices, faces = sheet(n)
     pins = {"corners": [n * (n - 1), n * n - 1]}
     return Scene(dc.Scene([dc.Cloth(vertices, faces, pins=pins)]), approach=10)
 
 
 def plane(n: int) -> Scene:
     """Slide on a floor: every vertex in contact."""
-    vertices, faces = _sheet(n)
+    vertices, faces = sheet(n)
     vertices[:, 2] = _gap(n)
     floor = dc.RigidBody.plane(4.0)
     scene = dc.Scene([dc.Cloth(vertices, faces)], [floor])
@@ -81,7 +81,7 @@ def plane(n: int) -> Scene:
 
 def sphere(n: int) -> Scene:
     """Drape over a sphere: a part of the vertices in contact, folds between them."""
-    vertices, faces = _sheet(n)
+    vertices, faces = sheet(n)
     vertices += (0.02, 0.03, _gap(n))
     ball = dc.RigidBody.sphere(0.2, pose=[0, 0, -0.2, 1, 0, 0, 0])
     return Scene(dc.Scene([dc.Cloth(vertices, faces)], [ball]), approach=20)
@@ -89,7 +89,7 @@ def sphere(n: int) -> Scene:
 
 def self_contact(n: int) -> Scene:
     """Lay one half of a folded sheet on the other, which hangs between two pinned rows."""
-    vertices, faces = _sheet(n)
+    vertices, faces = sheet(n)
     gap = 0.5 / (n - 1)
     s = vertices[:, 1]  # along the fold; the upper half comes back over the lower one
     lower = s < 0.0

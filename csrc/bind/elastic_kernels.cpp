@@ -148,6 +148,18 @@ class Elastic {
     return owned(blocks.data(), {blocks.size() / 9, 9});
   }
 
+  /// (row, column) of every block, in the order of hessian_blocks().
+  IndexArray block_pairs() const {
+    std::vector<std::int32_t> pairs;
+    for (Index j = 0; j < pattern_.size(); ++j) {
+      for (Index k = pattern_.column_start()[j]; k < pattern_.column_start()[j + 1]; ++k) {
+        pairs.push_back(pattern_.row()[k]);
+        pairs.push_back(j);
+      }
+    }
+    return owned(pairs.data(), {pairs.size() / 2, 2});
+  }
+
   Array hessian(const Positions& x, bool positive) const {
     const Array blocks = hessian_blocks(x, positive);
     const Index n = topology_.vertex_count;
@@ -319,6 +331,7 @@ void elastic_kernels(nb::module_& m) {
       .def("gradient", &Elastic::gradient, "x"_a.noconvert())
       .def("hessian", &Elastic::hessian, "x"_a.noconvert(), "positive"_a)
       .def("hessian_blocks", &Elastic::hessian_blocks, "x"_a.noconvert(), "positive"_a)
+      .def("block_pairs", &Elastic::block_pairs)
       .def("hessian_product", &Elastic::hessian_product, "x"_a.noconvert(), "z"_a.noconvert())
       .def("mixed", &Elastic::mixed, "x"_a.noconvert(), "z"_a.noconvert(), "with_rest"_a)
       .def("rest", &Elastic::rest)

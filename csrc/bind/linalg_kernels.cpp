@@ -101,8 +101,7 @@ class Factor {
     nb::dict result;
     result["assembly"] = seconds.assembly / repeats;
     result["extend-add"] = seconds.extend_add / repeats;
-    result["panel"] = seconds.panel / repeats;
-    result["update"] = seconds.update / repeats;
+    result["dense"] = seconds.dense / repeats;
     return result;
   }
 

@@ -48,8 +48,7 @@ class CholeskyWorkspace {
 struct CholeskySeconds {
   double assembly = 0.0;    ///< the matrix into panels
   double extend_add = 0.0;  ///< update matrices of children into their parents
-  double panel = 0.0;       ///< columns of L
-  double update = 0.0;      ///< update matrices
+  double dense = 0.0;       ///< columns of L and update matrices
 };
 
 /// Symbolic part of A = L L^T for a block pattern with some vertices left out.

@@ -44,12 +44,12 @@ struct ChildMap {
 /// one rounding each. Levels with fused multiply-add (all but kPortable on x86-64) therefore agree
 /// in every bit.
 struct DenseKernels {
-  /// L of the panel in place, left-looking, 1 / l_jj on the diagonal. False, at once, at a pivot
-  /// that is not positive and finite.
-  bool (*factor)(const Front& front, double* panel);
-
-  /// U = -L_2 L_2^T, where L_2 are the panel's rows below its triangle.
-  void (*update)(const Front& front, const double* panel, double* u);
+  /// L of the panel in place, 1 / l_jj on the diagonal, and U = -L_2 L_2^T, where L_2 are the rows
+  /// below the triangle. False, at once, at a pivot that is not positive and finite.
+  ///
+  /// @param u        [update_ld, rows up to a multiple of 8], need not be initialized
+  /// @param scratch  [kColumnBlock ld]
+  bool (*factor)(const Front& front, double* panel, double* u, double* scratch);
 
   /// Add the columns of a child's update matrix that are columns of the parent.
   void (*add_to_panel)(
@@ -71,6 +71,9 @@ struct DenseKernels {
   void (*backward)(
       const Front& front, const double* panel, double* c, std::ptrdiff_t stride, int count);
 };
+
+/// Columns that are factored before later ones see them: what they need at a time stays in the cache.
+constexpr int kColumnBlock = 96;
 
 /// Most vectors that one call of forward() or backward() takes.
 constexpr int kMaxVectors = 4;

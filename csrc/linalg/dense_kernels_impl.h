@@ -2,7 +2,7 @@
 // instructions defines, in its anonymous namespace and before it includes this one, the type Pack
 // with the operations on it, and
 //
-//   kPacks  packs of rows in a register block of C (1 or 4),   kWidth  columns of it (3 or 6)
+//   kPacks  packs of rows in a block of registers,   kWidth  columns of it, a divisor of eight
 //
 // Such a file must hold nothing that another file could define, too: the linker would keep one copy,
 // perhaps of instructions that the machine lacks. So this one includes no Eigen and no standard
@@ -14,6 +14,8 @@
 
 #include "linalg/dense_kernels.h"
 
+#define DIFFCLOTH_INLINE inline __attribute__((always_inline))
+
 namespace diffcloth::linalg {
 namespace {
 
@@ -24,11 +26,14 @@ constexpr int up_to_pack(int n) { return (n + kLanes - 1) / kLanes * kLanes; }
 constexpr int down_to_pack(int n) { return n / kLanes * kLanes; }
 
 /// A block of 8 P rows and W columns in registers.
+///
+/// Its operands are in slabs: eight rows each, column after column, so that whatever a product reads
+/// is contiguous. Slabs are `stride` apart.
 template <int P, int W>
 struct Tile {
   Pack c[W][P];
 
-  inline __attribute__((always_inline)) void clear() {
+  DIFFCLOTH_INLINE void clear() {
 #pragma GCC unroll 8
     for (int j = 0; j < W; ++j) {
 #pragma GCC unroll 8
@@ -36,52 +41,64 @@ struct Tile {
     }
   }
 
-  inline __attribute__((always_inline)) void load_from(const double* from, std::ptrdiff_t ld) {
+  /// The first `columns` of them from a column-major matrix.
+  DIFFCLOTH_INLINE void load_from(const double* from, std::ptrdiff_t ld, int columns = W) {
 #pragma GCC unroll 8
     for (int j = 0; j < W; ++j) {
 #pragma GCC unroll 8
-      for (int p = 0; p < P; ++p) c[j][p] = load(from + j * ld + kLanes * p);
+      for (int p = 0; p < P; ++p) {
+        c[j][p] = j < columns ? load(from + j * ld + kLanes * p) : zero();
+      }
     }
   }
 
-  inline __attribute__((always_inline)) void store_to(double* to, std::ptrdiff_t ld) const {
+  DIFFCLOTH_INLINE void store_to(double* to, std::ptrdiff_t ld, int columns = W) const {
 #pragma GCC unroll 8
     for (int j = 0; j < W; ++j) {
+      if (j >= columns) break;
 #pragma GCC unroll 8
       for (int p = 0; p < P; ++p) store(to + j * ld + kLanes * p, c[j][p]);
     }
   }
 
-  /// C -= A B^T with A [8 P, depth] and B [W, depth] of one leading dimension.
-  inline __attribute__((always_inline)) void subtract_product(const double* a,
-                                                              const double* b,
-                                                              std::ptrdiff_t ld,
-                                                              int depth) {
+  DIFFCLOTH_INLINE void store_to_slabs(double* to, std::ptrdiff_t stride) const {
+#pragma GCC unroll 8
+    for (int j = 0; j < W; ++j) {
+#pragma GCC unroll 8
+      for (int p = 0; p < P; ++p) store(to + p * stride + kLanes * j, c[j][p]);
+    }
+  }
+
+  /// C -= A B^T over `depth` columns of the slabs a [P] and of W rows b of a slab.
+  DIFFCLOTH_INLINE void subtract_product(const double* a,
+                                         std::ptrdiff_t stride,
+                                         const double* b,
+                                         int depth) {
     for (int k = 0; k < depth; ++k) {
       Pack a_k[P];
 #pragma GCC unroll 8
-      for (int p = 0; p < P; ++p) a_k[p] = load(a + kLanes * p);
+      for (int p = 0; p < P; ++p) a_k[p] = load(a + p * stride);
 #pragma GCC unroll 8
       for (int j = 0; j < W; ++j) {
         const Pack b_k = broadcast(b[j]);
 #pragma GCC unroll 8
         for (int p = 0; p < P; ++p) c[j][p] = subtract_product_of(c[j][p], a_k[p], b_k);
       }
-      a += ld;
-      b += ld;
+      a += kLanes;
+      b += kLanes;
     }
   }
 
-  /// C := C L^-T for a lower triangle [W, W] with its diagonal inverted.
-  inline __attribute__((always_inline)) void solve(const double* l, std::ptrdiff_t ld) {
+  /// C := C L^-T for a lower triangle [W, W] in a slab, with its diagonal inverted.
+  DIFFCLOTH_INLINE void solve(const double* l) {
 #pragma GCC unroll 8
     for (int j = 0; j < W; ++j) {
-      const Pack inverse = broadcast(l[j + j * ld]);
+      const Pack inverse = broadcast(l[j + kLanes * j]);
 #pragma GCC unroll 8
       for (int p = 0; p < P; ++p) c[j][p] = c[j][p] * inverse;
 #pragma GCC unroll 8
       for (int i = j + 1; i < W; ++i) {
-        const Pack l_ij = broadcast(l[i + j * ld]);
+        const Pack l_ij = broadcast(l[i + kLanes * j]);
 #pragma GCC unroll 8
         for (int p = 0; p < P; ++p) c[i][p] = subtract_product_of(c[i][p], c[j][p], l_ij);
       }
@@ -89,144 +106,179 @@ struct Tile {
   }
 };
 
-/// Rows `row` .. row + 8 P - 1 of the block of W columns that begins at `column`.
-template <int P, int W>
-void panel_tile(double* panel, std::ptrdiff_t ld, int row, int column) {
-  Tile<P, W> tile;
-  double* const c = panel + row + column * ld;
-  tile.load_from(c, ld);
-  tile.subtract_product(panel + row, panel + column, ld, column);
-  tile.solve(panel + column + column * ld, ld);
-  tile.store_to(c, ld);
-}
-
-template <int W>
-void panel_tile(double* panel, std::ptrdiff_t ld, int row, int packs, int column) {
-  if constexpr (kPacks == 4) {
-    if (packs == 4) return panel_tile<4, W>(panel, ld, row, column);
-    if (packs == 3) return panel_tile<3, W>(panel, ld, row, column);
-    if (packs == 2) return panel_tile<2, W>(panel, ld, row, column);
+/// Call f<W>() for a width of 1 .. kWidth that is known only now.
+template <int W = kWidth, class Call>
+DIFFCLOTH_INLINE void with_width(int width, Call call) {
+  if constexpr (W == 1) {
+    call.template operator()<1>();
+  } else if (width == W) {
+    call.template operator()<W>();
+  } else {
+    with_width<W - 1>(width, call);
   }
-  panel_tile<1, W>(panel, ld, row, column);
 }
 
-/// Cholesky factor of the lower triangle [W, W] at l, 1 / l_jj on its diagonal.
-template <int W>
-bool factor_corner(double* l, std::ptrdiff_t ld) {
-  for (int j = 0; j < W; ++j) {
-    const double pivot = l[j + j * ld];
+/// The same for a number of packs, 1 .. kPacks.
+template <int P = kPacks, class Call>
+DIFFCLOTH_INLINE void with_packs(int packs, Call call) {
+  if constexpr (P == 1) {
+    call.template operator()<1>();
+  } else if (packs == P) {
+    call.template operator()<P>();
+  } else {
+    with_packs<P - 1>(packs, call);
+  }
+}
+
+/// Some columns of a panel, at most kColumnBlock: the triangle on the diagonal and all rows below.
+/// `slabs` takes what is finished.
+struct Block {
+  double* panel;  ///< where the triangle begins, with leading dimension ld
+  std::ptrdiff_t ld;
+  double* slabs;
+  std::ptrdiff_t stride;
+  int columns;
+};
+
+/// Finish columns begin .. end - 1 in 8 P rows below the triangle.
+template <int P>
+void solve_rows(const Block& block, int row, int begin, int end) {
+  double* const a = block.slabs + row / kLanes * block.stride;
+  for (int c = begin; c < end; c += kWidth) {
+    const double* const strip = block.slabs + c / kLanes * block.stride + c % kLanes;
+    with_width(end - c < kWidth ? end - c : kWidth, [&]<int W>() {
+      Tile<P, W> tile;
+      double* const l = block.panel + row + c * block.ld;
+      tile.load_from(l, block.ld);
+      tile.subtract_product(a, block.stride, strip, c);
+      tile.solve(strip + kLanes * c);
+      tile.store_to_slabs(a + kLanes * c, block.stride);
+      tile.store_to(l, block.ld);
+    });
+  }
+}
+
+void solve_rows(const Block& block, int row, int packs, int begin, int end) {
+  with_packs(packs, [&]<int P>() { solve_rows<P>(block, row, begin, end); });
+}
+
+/// Cholesky factor of the first rows and columns of a slab's block, 1 / l_jj on the diagonal. What
+/// it leaves above the diagonal means nothing.
+bool factor_corner(double* l, int columns) {
+  for (int j = 0; j < columns; ++j) {
+    double* const l_j = l + kLanes * j;
+    const double pivot = l_j[j];
     if (!(pivot > 0.0 && pivot <= kLargest)) return false;
     const double inverse = 1.0 / __builtin_sqrt(pivot);
-    l[j + j * ld] = inverse;
-    for (int i = j + 1; i < W; ++i) l[i + j * ld] *= inverse;
-    for (int k = j + 1; k < W; ++k) {
-      for (int i = k; i < W; ++i) {
-        l[i + k * ld] = subtract_product_of(l[i + k * ld], l[i + j * ld], l[k + j * ld]);
-      }
+    const Pack column = load(l_j) * broadcast(inverse);
+    store(l_j, column);
+    for (int k = j + 1; k < columns; ++k) {
+      double* const l_k = l + kLanes * k;
+      store(l_k, subtract_product_of(load(l_k), column, broadcast(l_j[k])));
     }
+    l_j[j] = inverse;
   }
   return true;
 }
 
-/// Finish W columns of the triangle, whose earlier columns are done. Packs may begin above it; what
-/// they then change means nothing.
-template <int W>
-bool factor_columns(double* panel, std::ptrdiff_t ld, int top, int column) {
-  const int end = up_to_pack(column + W);
-  for (int row = down_to_pack(column); row < end; row += kLanes) {
-    Tile<1, W> tile;
-    double* const c = panel + row + column * ld;
-    tile.load_from(c, ld);
-    tile.subtract_product(panel + row, panel + column, ld, column);
-    tile.store_to(c, ld);
-  }
-  double* const corner = panel + column + column * ld;
-  if (!factor_corner<W>(corner, ld)) return false;
-  if (column + W < end) {  // the last pack goes on below the corner, which has to stay
-    double kept[W][W];
-    for (int j = 0; j < W; ++j) {
-      for (int i = 0; i < W; ++i) kept[j][i] = corner[i + j * ld];
+/// The triangle of a block, eight columns at a time.
+bool factor_triangle(const Block& block) {
+  const int columns = block.columns;
+  const int end = up_to_pack(columns);
+  for (int c = 0; c < columns; c += kLanes) {
+    const int width = columns - c < kLanes ? columns - c : kLanes;
+    double* const slab = block.slabs + c / kLanes * block.stride;
+    double* const l = block.panel + c + c * block.ld;
+    for (int j = 0; j < width; j += kWidth) {
+      with_width(width - j < kWidth ? width - j : kWidth, [&]<int W>() {
+        Tile<1, W> tile;
+        tile.load_from(l + j * block.ld, block.ld);
+        tile.subtract_product(slab, block.stride, slab + j, c);
+        tile.store_to_slabs(slab + kLanes * (c + j), block.stride);
+      });
     }
-    Tile<1, W> tile;
-    double* const c = panel + end - kLanes + column * ld;
-    tile.load_from(c, ld);
-    tile.solve(corner, ld);
-    tile.store_to(c, ld);
-    for (int j = 0; j < W; ++j) {
-      for (int i = 0; i < W; ++i) corner[i + j * ld] = kept[j][i];
-    }
-  }
-  for (int row = end; row < top; row += kLanes * kPacks) {
-    const int packs = (top - row) / kLanes;
-    panel_tile<W>(panel, ld, row, packs < kPacks ? packs : kPacks, column);
-  }
-  return true;
-}
-
-bool factor(const Front& front, double* panel) {
-  const int columns = front.columns;
-  const int whole = columns / kWidth * kWidth;
-  for (int j = 0; j < whole; j += kWidth) {
-    if (!factor_columns<kWidth>(panel, front.ld, front.top, j)) return false;
-  }
-  if (whole < columns && !factor_columns<3>(panel, front.ld, front.top, whole)) return false;
-
-  // Below the triangle, rows by rows: a strip of them stays in the cache over all columns.
-  for (int row = front.top; row < front.ld; row += kLanes * kPacks) {
-    const int left = (front.ld - row) / kLanes;
-    const int packs = left < kPacks ? left : kPacks;
-    for (int j = 0; j < whole; j += kWidth) panel_tile<kWidth>(panel, front.ld, row, packs, j);
-    if (whole < columns) panel_tile<3>(panel, front.ld, row, packs, whole);
-  }
-  return true;
-}
-
-template <int P, int W>
-void update_tile(
-    const double* a, const double* b, std::ptrdiff_t ld, int depth, double* u, std::ptrdiff_t ldu) {
-  Tile<P, W> tile;
-  tile.clear();
-  tile.subtract_product(a, b, ld, depth);
-  tile.store_to(u, ldu);
-}
-
-template <int W>
-void update_tile(const double* a,
-                 const double* b,
-                 std::ptrdiff_t ld,
-                 int depth,
-                 double* u,
-                 std::ptrdiff_t ldu,
-                 int packs) {
-  if constexpr (kPacks == 4) {
-    if (packs == 4) return update_tile<4, W>(a, b, ld, depth, u, ldu);
-    if (packs == 3) return update_tile<3, W>(a, b, ld, depth, u, ldu);
-    if (packs == 2) return update_tile<2, W>(a, b, ld, depth, u, ldu);
-  }
-  update_tile<1, W>(a, b, ld, depth, u, ldu);
-}
-
-void update(const Front& front, const double* panel, double* u) {
-  const double* const l = panel + front.top;
-  const std::ptrdiff_t ld = front.ld;
-  const std::ptrdiff_t ldu = front.update_ld;
-  const int padded = up_to_pack(front.rows);
-  for (int strip = 0; strip < padded; strip += kLanes * kPacks) {
-    const int end = strip + kLanes * kPacks < padded ? strip + kLanes * kPacks : padded;
-    for (int j = 0; j < front.rows && j < end; j += kWidth) {
-      const int row = j < strip ? strip : down_to_pack(j);  // above are only entries of no meaning
+    double* const corner = slab + kLanes * c;
+    if (!factor_corner(corner, width)) return false;
+    for (int j = 0; j < width; ++j) store(l + j * block.ld, load(corner + kLanes * j));
+    for (int row = c + kLanes; row < end; row += kLanes * kPacks) {
       const int packs = (end - row) / kLanes;
-      double* const c = u + row + j * ldu;
-      if (j + kWidth <= front.rows) {
-        update_tile<kWidth>(l + row, l + j, ld, front.columns, c, ldu, packs);
-      } else {
-        update_tile<3>(l + row, l + j, ld, front.columns, c, ldu, packs);
-      }
+      solve_rows(block, row, packs < kPacks ? packs : kPacks, c, c + width);
     }
+  }
+  return true;
+}
+
+/// C -= A B^T for 8 P rows and the columns that belong to one slab b, as far as they exist; C itself
+/// counts as zero where nothing has been added to it.
+template <int P>
+void subtract_from(double* to,
+                   std::ptrdiff_t ld,
+                   int columns,
+                   bool is_zero,
+                   const double* a,
+                   const double* b,
+                   const Block& block) {
+  for (int j = 0; j < columns; j += kWidth) {
+    Tile<P, kWidth> tile;
+    double* const c = to + j * ld;
+    if (is_zero) {
+      tile.clear();
+    } else {
+      tile.load_from(c, ld, columns - j);
+    }
+    tile.subtract_product(a, block.stride, b + j, block.columns);
+    tile.store_to(c, ld, columns - j);
   }
 }
 
-inline __attribute__((always_inline)) void add(const double* from, int count, double* to) {
+/// What a finished block subtracts from rows `row` .. row + 8 packs - 1 of later columns, those of
+/// the panel and those of the update matrix.
+void update_rows(const Block& block, const Front& front, int first, int row, int packs, double* u) {
+  const int end = row + kLanes * packs;
+  for (int strip = up_to_pack(block.columns); strip < end; strip += kLanes) {
+    const int from = strip < row ? row : strip;  // above are only entries of no meaning
+    const double* const a = block.slabs + from / kLanes * block.stride;
+    const double* const b = block.slabs + strip / kLanes * block.stride;
+    const int column = first + strip;
+    with_packs((end - from) / kLanes, [&]<int P>() {
+      if (column < front.top) {
+        const int left = front.columns - column;
+        subtract_from<P>(block.panel + from + strip * block.ld, block.ld,
+                         left < kLanes ? left : kLanes, false, a, b, block);
+      } else {
+        subtract_from<P>(u + (first + from - front.top) +
+                             static_cast<std::ptrdiff_t>(column - front.top) * front.update_ld,
+                         front.update_ld, kLanes, first == 0, a, b, block);
+      }
+    });
+  }
+}
+
+bool factor(const Front& front, double* panel, double* u, double* scratch) {
+  const int end = front.top + up_to_pack(front.rows);
+  for (int first = 0; first < front.columns; first += kColumnBlock) {
+    const int left = front.columns - first;
+    const int columns = left < kColumnBlock ? left : kColumnBlock;
+    const Block block{.panel = panel + first + static_cast<std::ptrdiff_t>(first) * front.ld,
+                      .ld = front.ld,
+                      .slabs = scratch,
+                      .stride = static_cast<std::ptrdiff_t>(kLanes) * columns,
+                      .columns = columns};
+    if (!factor_triangle(block)) return false;
+    // A few rows at a time, which stay in the cache: first those of later columns, then the others.
+    for (int row = up_to_pack(columns); first + row < end;) {
+      const int bound = first + row < front.top ? front.top : end;
+      const int rest = (bound - first - row) / kLanes;
+      const int packs = rest < kPacks ? rest : kPacks;
+      solve_rows(block, row, packs, 0, columns);
+      update_rows(block, front, first, row, packs, u);
+      row += kLanes * packs;
+    }
+  }
+  return true;
+}
+
+DIFFCLOTH_INLINE void add(const double* from, int count, double* to) {
   int i = 0;
   for (; i + kLanes <= count; i += kLanes) store(to + i, load(to + i) + load(from + i));
   if (i < count) add_some(from + i, count - i, to + i);
@@ -376,7 +428,6 @@ void backward(
 }
 
 constexpr DenseKernels kKernels{.factor = factor,
-                                .update = update,
                                 .add_to_panel = add_to_panel,
                                 .add_to_update = add_to_update,
                                 .forward = forward,
@@ -384,3 +435,5 @@ constexpr DenseKernels kKernels{.factor = factor,
 
 }  // namespace
 }  // namespace diffcloth::linalg
+
+#undef DIFFCLOTH_INLINE

@@ -52,8 +52,8 @@ inline void add_some(const double* from, int count, double* to) {
   for (; i < count; ++i) to[i] += from[i];
 }
 
-constexpr int kPacks = 1;  // 12 of 16 registers
-constexpr int kWidth = 6;
+constexpr int kPacks = 1;  // 8 of 16 registers
+constexpr int kWidth = 4;
 
 }  // namespace
 }  // namespace diffcloth::linalg

@@ -39,8 +39,8 @@ inline void add_some(const double* from, int count, double* to) {
   _mm512_mask_storeu_pd(to, lanes, sum);
 }
 
-constexpr int kPacks = 4;  // 24 of 32 registers
-constexpr int kWidth = 6;
+constexpr int kPacks = 3;  // 24 of 32 registers
+constexpr int kWidth = 8;
 
 }  // namespace
 }  // namespace diffcloth::linalg

@@ -64,8 +64,8 @@ inline void add_some(const double* from, int count, double* to) {
   for (int i = 0; i < count; ++i) to[i] += from[i];
 }
 
-constexpr int kPacks = 1;
-constexpr int kWidth = 3;  // 12 of 16 registers
+constexpr int kPacks = 1;  // 8 of 16 registers
+constexpr int kWidth = 2;
 
 }  // namespace
 }  // namespace diffcloth::linalg

@@ -39,7 +39,8 @@ class MultifrontalFactor final : public FactorBackend {
   bool compute(const double* blocks,
                CholeskyWorkspace& workspace,
                CholeskySeconds* seconds) override {
-    double* const arena = workspace.reserve(s_.arena_size);
+    double* const arena =
+        workspace.reserve(s_.arena_size + static_cast<std::size_t>(s_.longest) * kColumnBlock);
     Stopwatch watch(seconds);
     return std::ranges::all_of(s_.supernodes, [&](const Supernode& node) {
       return eliminate(node, blocks, arena, watch);
@@ -65,14 +66,11 @@ class MultifrontalFactor final : public FactorBackend {
       kernels_.add_to_panel(child.front, arena + child.update, map, node.front, panel);
     });
     watch.lap(&CholeskySeconds::extend_add);
-    if (!kernels_.factor(node.front, panel)) return false;
-    watch.lap(&CholeskySeconds::panel);
-    if (node.front.rows == 0) return true;
-
-    // Written before anything is added to it, so that it need not be cleared.
+    // The update matrix is written before anything is added to it: it need not be cleared.
     double* const u = arena + node.update;
-    kernels_.update(node.front, panel, u);
-    watch.lap(&CholeskySeconds::update);
+    if (!kernels_.factor(node.front, panel, u, arena + s_.arena_size)) return false;
+    watch.lap(&CholeskySeconds::dense);
+    if (node.front.rows == 0) return true;
     for_each_child(node, [&](const Supernode& child, const ChildMap& map) {
       kernels_.add_to_update(child.front, arena + child.update, map, node.front, u);
     });

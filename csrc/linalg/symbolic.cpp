@@ -197,7 +197,7 @@ class Analyzer {
     std::vector<Extent> alive;  // ascending
     for (Index s = 0; s < gathered_.size(); ++s) {
       Supernode& node = s_.supernodes[s];
-      const std::size_t size = product(node.front.update_ld, node.front.rows);
+      const std::size_t size = product(node.front.update_ld, padded(node.front.rows));
       std::size_t begin = 0;
       auto gap = alive.begin();
       for (; gap != alive.end() && gap->begin < begin + size; ++gap) begin = gap->end;

@@ -1,0 +1,154 @@
+"""Symmetric matrices of 3x3 blocks: patterns, values, the dense matrix, and factors of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffcloth_torch import _core
+
+kernels = _core.kernels
+
+STEP = 0.01  # of the cloth's Hessians [s]
+
+
+@dataclass(frozen=True)
+class BlockMatrix:
+    """Lower blocks by column, then by row.
+
+    Attributes:
+        size: Vertices.
+        pairs: [k, 2] (row, column), every diagonal block among them.
+        blocks: [k, 9] column-major.
+        fixed: [size] vertices left out.
+    """
+
+    size: int
+    pairs: np.ndarray
+    blocks: np.ndarray
+    fixed: np.ndarray
+
+    @property
+    def unknowns(self) -> np.ndarray:
+        """Coordinates that are in the matrix."""
+        return np.flatnonzero(np.repeat(~self.fixed, 3))
+
+    def dense(self) -> np.ndarray:
+        """The matrix without the fixed vertices; diagonal blocks by their lower triangles."""
+        full = np.zeros((3 * self.size, 3 * self.size))
+        for (i, j), block in zip(self.pairs, self.blocks.reshape(-1, 3, 3), strict=True):
+            full[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = block.T
+        full = np.tril(full) + np.tril(full, -1).T
+        return full[np.ix_(self.unknowns, self.unknowns)]
+
+    def shifted(self, shift: float) -> BlockMatrix:
+        """With a multiple of the identity added."""
+        blocks = self.blocks.copy()
+        blocks[np.ix_(self.pairs[:, 0] == self.pairs[:, 1], [0, 4, 8])] += shift
+        return BlockMatrix(self.size, self.pairs, blocks, self.fixed)
+
+    def with_fixed(self, vertices: list[int]) -> BlockMatrix:
+        fixed = self.fixed.copy()
+        fixed[vertices] = True
+        return BlockMatrix(self.size, self.pairs, self.blocks, fixed)
+
+    def analysis(self, backend: str = "multifrontal", level: str = ""):
+        return kernels.CholeskyAnalysis(self.size, self.pairs, self.fixed, backend, level)
+
+    def factor(self, backend: str = "multifrontal", level: str = ""):
+        """A factor, which must come out positive definite."""
+        factor = kernels.CholeskyFactor(self.analysis(backend, level))
+        assert factor.compute(self.blocks, kernels.CholeskyWorkspace())
+        return factor
+
+    def is_positive(self, backend: str = "multifrontal", level: str = "") -> bool:
+        factor = kernels.CholeskyFactor(self.analysis(backend, level))
+        return factor.compute(self.blocks, kernels.CholeskyWorkspace())
+
+
+def solve(factor, b: np.ndarray, fill: float = 0.0) -> np.ndarray:
+    """Solutions for b [count, vertices, 3]; entries of fixed vertices stay as filled."""
+    x = np.full_like(b, fill)
+    factor.solve(np.ascontiguousarray(b), x)
+    return x
+
+
+def sorted_pairs(size: int, pairs: list[tuple[int, int]] | np.ndarray) -> np.ndarray:
+    """Lower-triangle pairs with the diagonal, in the order of slots."""
+    pairs = np.array(pairs, dtype=np.int32).reshape(-1, 2)
+    lower = np.stack([pairs.max(1), pairs.min(1)], 1)
+    diagonal = np.repeat(np.arange(size, dtype=np.int32)[:, None], 2, axis=1)
+    unique = np.unique(np.concatenate([lower, diagonal])[:, ::-1], axis=0)
+    return np.ascontiguousarray(unique[:, ::-1], dtype=np.int32)
+
+
+def random_matrix(
+    size: int, pairs: list[tuple[int, int]] | np.ndarray, seed: int = 0
+) -> BlockMatrix:
+    """Positive definite by diagonal dominance, blocks neither symmetric nor of one scale."""
+    rng = np.random.default_rng(seed)
+    pairs = sorted_pairs(size, pairs)
+    blocks = rng.uniform(-1.0, 1.0, (len(pairs), 9))
+    scale = 10.0 ** rng.uniform(-3, 3, size)  # D A D is as definite as A
+    couplings = np.bincount(pairs.ravel(), minlength=size)
+    diagonal = pairs[:, 0] == pairs[:, 1]
+    blocks[np.ix_(diagonal, [0, 4, 8])] += 3.0 * couplings[:, None]
+    blocks *= (scale[pairs[:, 0]] * scale[pairs[:, 1]])[:, None]
+    return BlockMatrix(size, pairs, blocks, np.zeros(size, dtype=bool))
+
+
+def grid_pairs(rows: int, columns: int, reach: int) -> list[tuple[int, int]]:
+    """Vertices of a grid, coupled where they are up to `reach` apart."""
+    pairs = []
+    for i in range(rows):
+        for j in range(columns):
+            for di in range(reach + 1):
+                for dj in range(-reach, reach + 1):
+                    if di + abs(dj) <= reach and i + di < rows and 0 <= j + dj < columns:
+                        pairs.append((i * columns + j, (i + di) * columns + j + dj))
+    return pairs
+
+
+def cloth_matrix(n: int, contacts: int = 0, seed: int = 0) -> BlockMatrix:
+    """M / h^2 and the projected Hessian of a crumpled sheet with contacts between its vertices."""
+    rng = np.random.default_rng(seed)
+    u, v = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij")
+    X = np.stack([u.ravel(), v.ravel(), 0 * u.ravel()], 1)
+    corner = np.array([i * n + j for i in range(n - 1) for j in range(n - 1)])
+    first = np.stack([corner, corner + n, corner + n + 1], 1)
+    second = np.stack([corner, corner + n + 1, corner + 1], 1)
+    faces = np.concatenate([first, second]).astype(np.int32)
+    one = np.ones(len(faces))
+    x = np.ascontiguousarray(X + rng.normal(0.0, 0.1 / n, X.shape))
+    elastic = kernels.Elastic(X, faces, "patch")
+    elastic.set_parameters(300.0 * one, 1e-3 * one, 0.3 * one, 0.0 * one, STEP, None)
+    mass = 0.2 * elastic.rest()["vertex_area"]
+
+    pairs = sorted_pairs(n * n, elastic.block_pairs())
+    blocks = elastic.hessian_blocks(x, True)
+    diagonal = pairs[:, 0] == pairs[:, 1]
+    blocks[np.ix_(diagonal, [0, 4, 8])] += mass[:, None] / STEP**2
+    matrix = BlockMatrix(n * n, pairs, blocks, np.zeros(n * n, dtype=bool))
+    stencils = [rng.choice(n * n, 4, replace=False) for _ in range(contacts)]
+    return with_contacts(matrix, stencils, rng) if contacts else matrix
+
+
+def with_contacts(
+    matrix: BlockMatrix, stencils: list[np.ndarray], rng: np.random.Generator
+) -> BlockMatrix:
+    """Add k (w n)(w n)^T over four vertices each, as a stiff barrier does."""
+    added = [(a, b) for stencil in stencils for a in stencil for b in stencil]
+    pairs = sorted_pairs(matrix.size, np.concatenate([matrix.pairs, added]))
+    slot = {(int(i), int(j)): k for k, (i, j) in enumerate(pairs)}
+    blocks = np.zeros((len(pairs), 9))
+    for (i, j), block in zip(matrix.pairs, matrix.blocks, strict=True):
+        blocks[slot[int(i), int(j)]] = block
+    for stencil in stencils:
+        w = np.outer([1.0, *-rng.dirichlet([1.0, 1.0, 1.0])], rng.normal(size=3))
+        for a in range(4):
+            for b in range(4):
+                i, j = int(stencil[a]), int(stencil[b])
+                if i >= j:
+                    blocks[slot[i, j]] += 1e4 * np.outer(w[b], w[a]).ravel()  # column-major
+    return BlockMatrix(matrix.size, pairs, blocks, matrix.fixed)
