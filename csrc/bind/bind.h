@@ -15,6 +15,9 @@ void simulator(nb::module_& m);
 /// Contact kernels one by one, for tests against independent references.
 void contact_kernels(nb::module_& m);
 
+/// Barrier and friction of a whole mesh, for tests of their derivatives and weights.
+void contact_potentials(nb::module_& m);
+
 /// Rest shape and elastic potentials one by one, for tests against independent references.
 void elastic_kernels(nb::module_& m);
 

@@ -12,5 +12,6 @@ NB_MODULE(_core, m) {
 
   nb::module_ kernels = m.def_submodule("kernels", "Single kernels, exposed for tests.");
   diffcloth::bind::contact_kernels(kernels);
+  diffcloth::bind::contact_potentials(kernels);
   diffcloth::bind::elastic_kernels(kernels);
 }
