@@ -20,6 +20,8 @@ void contact_kernels(nb::module_& m);
 
 /// Sparse Cholesky factorizations, for tests against independent references and for benchmarks.
 void linalg_kernels(nb::module_& m);
+/// Barrier and friction of a whole mesh, for tests of their derivatives and weights.
+void contact_potentials(nb::module_& m);
 
 /// Rest shape and elastic potentials one by one, for tests against independent references.
 void elastic_kernels(nb::module_& m);
