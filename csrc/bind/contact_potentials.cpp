@@ -22,7 +22,6 @@ using namespace nb::literals;
 using Positions = Eigen::Ref<const Rows3>;
 using FaceRows = Eigen::Ref<const Eigen::Matrix<Index, Eigen::Dynamic, 3, Eigen::RowMajor>>;
 using Values = Eigen::VectorXd;
-using contact::Curvature;
 
 std::vector<contact::CollisionMesh::Face> face_list(const FaceRows& faces) {
   std::vector<contact::CollisionMesh::Face> rows(faces.rows());
