@@ -142,8 +142,8 @@ class Minimizer {
 void Minimizer::detect(const std::vector<double>& to) {
   if (context_.broad_phase == nullptr) return;
   const Timer timer(*context_.seconds, Phase::kDetection);
-  context_.broad_phase->find(x_.data(), to.data(), f_.contact->reach(), *context_.scratch,
-                             candidates_);
+  context_.candidates->find(x_.data(), to.data(), f_.contact->reach(), *context_.scratch,
+                            candidates_);
 }
 
 double Minimizer::safe_fraction(const std::vector<double>& to) const {

@@ -7,6 +7,7 @@
 
 #include "common/interrupt.h"
 #include "contact/broad_phase.h"
+#include "contact/candidate_list.h"
 #include "solver/objective.h"
 
 namespace diffcloth::solver {
@@ -39,6 +40,7 @@ class PrescribedMotion {
 /// What a minimization needs besides the objective.
 struct Context {
   const contact::BroadPhase* broad_phase;  ///< null: no collision detection at all
+  contact::CandidateList* candidates;      ///< kept over the solves of a step
   contact::BroadPhase::Scratch* scratch;
   const Checkpoint* checkpoint;
   Options options;

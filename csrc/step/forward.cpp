@@ -145,7 +145,9 @@ Report forward(const Scene& scene,
   contact::BroadPhase::Scratch scratch;
   const Problem problem(scene, inputs);
   const std::size_t cloth = 3 * problem.masses.size();
+  contact::CandidateList candidates(scene.broad_phase);
   solver::Context context{.broad_phase = problem.broad_phase(),
+                          .candidates = &candidates,
                           .scratch = &scratch,
                           .checkpoint = &checkpoint,
                           .options = scene.given.options,
