@@ -44,6 +44,8 @@ class BroadPhase {
   /// @param x_reference  positions that shape the search trees, 3 * vertex_count
   BroadPhase(CollisionMesh mesh, const double* x_reference);
 
+  const CollisionMesh& mesh() const { return mesh_; }
+
   /// Boxes and lists that a search fills; reuse one to search without allocation.
   struct Scratch {
     struct Surface {
