@@ -67,3 +67,13 @@ def test_summaries(quick):
         assert len(records[summary]) == 5
         for row in records[summary].values():
             assert all(math.isfinite(number) for number in row.values())
+
+
+def test_every_factorization_is_timed():
+    command = [sys.executable, "-m", "benchmarks.factorization", "--quick"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    for name in ("hanging", "self-contact"):
+        assert result.stdout.count(f"\n{name}, ") == 2
+    for method in ("multifrontal (portable)", "eigen"):
+        assert result.stdout.count(method) >= 4
