@@ -26,7 +26,7 @@ import numpy as np
 
 import diffcloth_torch as dc
 from benchmarks.hessians import HESSIANS, Hessian
-from diffcloth_torch import _core
+from diffcloth_torch import _kernels
 
 SIZES = (24, 48, 96, 200)
 LARGEST_ELSEWHERE = 96  # beyond it only our own factorization is timed
@@ -45,9 +45,8 @@ class Method:
 
 def methods() -> list[Method]:
     """The slowest level of ours first."""
-    kernels = _core.kernels
-    ours = [Method("multifrontal", level) for level in kernels.kernel_levels()]
-    return ours + [Method(b) for b in kernels.cholesky_backends() if b != "multifrontal"]
+    ours = [Method("multifrontal", level) for level in _kernels.kernel_levels()]
+    return ours + [Method(b) for b in _kernels.cholesky_backends() if b != "multifrontal"]
 
 
 class Trial:
@@ -57,8 +56,8 @@ class Trial:
         self.method = method
         self.matrix = matrix
         self.analysis = self._analyze()
-        self.factor = _core.kernels.CholeskyFactor(self.analysis)
-        self.workspace = _core.kernels.CholeskyWorkspace()
+        self.factor = _kernels.CholeskyFactor(self.analysis)
+        self.workspace = _kernels.CholeskyWorkspace()
         self.b = np.random.default_rng(0).normal(size=(1, matrix.size, 3))
         self.x = np.zeros_like(self.b)
         self.seconds: dict[str, list[float]] = {"analysis": [], "factor": [], "solve": []}
@@ -76,7 +75,7 @@ class Trial:
 
     def _analyze(self):
         m = self.matrix
-        return _core.kernels.CholeskyAnalysis(
+        return _kernels.CholeskyAnalysis(
             m.size, m.pairs, m.fixed, self.method.backend, self.method.level
         )
 

@@ -1,4 +1,4 @@
-# The C++ extension. What the package uses is typed here; the kernels exposed to tests are not.
+# The C++ extension. What the package uses is typed here.
 
 from typing import Any
 
@@ -6,8 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Arrays = dict[str, NDArray[Any]]
-
-kernels: Any
 
 class SimulationError(RuntimeError): ...
 

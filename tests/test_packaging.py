@@ -46,6 +46,15 @@ print(sorted({{"torch", "numpy"}} & set(sys.modules)))
     assert run_python(code) == "[]"
 
 
+def test_only_tests_have_the_single_kernels():
+    assert not hasattr(_core, "kernels")
+    folder = Path(_core.__file__).parent
+    if folder == ROOT / "diffcloth_torch":
+        pytest.skip("about wheels: an editable install with the extra `test` has them")
+    assert list(folder.glob("_core*.so"))
+    assert not list(folder.glob("_kernels*"))
+
+
 def test_build_info_names_every_part():
     info = _core.build_info()
     assert set(info) == {

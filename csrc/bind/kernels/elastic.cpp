@@ -1,3 +1,5 @@
+#include "elastic/elastic.h"
+
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -14,9 +16,8 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
-#include "bind/bind.h"
+#include "bind/kernels/kernels.h"
 #include "elastic/anchors.h"
-#include "elastic/elastic.h"
 #include "linalg/block_pattern.h"
 #include "mesh/rest_shape.h"
 #include "mesh/topology.h"

@@ -15,7 +15,7 @@
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
-#include "bind/bind.h"
+#include "bind/kernels/kernels.h"
 #include "contact/barrier.h"
 #include "contact/broad_phase.h"
 #include "contact/ccd.h"

@@ -8,8 +8,8 @@
 
 #include <nanobind/stl/vector.h>
 
-#include "bind/bind.h"
 #include "bind/environments.h"
+#include "bind/kernels/kernels.h"
 
 namespace diffcloth::bind {
 namespace {

@@ -11,7 +11,7 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
-#include "bind/bind.h"
+#include "bind/kernels/kernels.h"
 #include "linalg/cholesky.h"
 
 namespace diffcloth::bind {
