@@ -26,11 +26,11 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.controls import Control, Parameters
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry.poses import check_quaternions
+from diffcloth_torch.geometry.surfaces import check_areas
 from diffcloth_torch.materials import FACE_RANGES
-from diffcloth_torch.poses import check_quaternions
 from diffcloth_torch.scene import Assembly
 from diffcloth_torch.state import State
-from diffcloth_torch.surfaces import check_areas
 
 __all__ = [
     "PARAMETER_NAMES",

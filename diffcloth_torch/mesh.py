@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from diffcloth_torch import shapes
 from diffcloth_torch.checks import (
     POSITIVE,
     FloatArray,
@@ -26,10 +25,11 @@ from diffcloth_torch.checks import (
     index_array,
 )
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.io.meshes import read_mesh
+from diffcloth_torch.geometry import shapes
+from diffcloth_torch.geometry.meshes import read_mesh
+from diffcloth_torch.geometry.poses import pose_array, transform
+from diffcloth_torch.geometry.surfaces import check_areas, check_manifold, surface_arrays
 from diffcloth_torch.materials import FACE_RANGES, Material
-from diffcloth_torch.poses import pose_array, transform
-from diffcloth_torch.surfaces import check_areas, check_manifold, surface_arrays
 
 __all__ = ["BENDING_MODELS", "Cloth", "plane_size"]
 

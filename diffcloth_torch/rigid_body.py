@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from diffcloth_torch import shapes
 from diffcloth_torch.checks import (
     NON_NEGATIVE,
     POSITIVE,
@@ -22,10 +21,11 @@ from diffcloth_torch.checks import (
     float_array,
     frozen,
 )
-from diffcloth_torch.io.meshes import read_mesh
+from diffcloth_torch.geometry import shapes
+from diffcloth_torch.geometry.meshes import read_mesh
+from diffcloth_torch.geometry.poses import pose_array
+from diffcloth_torch.geometry.surfaces import surface_arrays
 from diffcloth_torch.mesh import plane_size
-from diffcloth_torch.poses import pose_array
-from diffcloth_torch.surfaces import surface_arrays
 
 __all__ = ["MOTIONS", "RigidBody"]
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.bodies.rotation import (
+from diffcloth_torch.geometry.rotation import (
     integrate_poses,
     interpolate_poses,
     quaternion_exp,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import diffcloth_torch as dc
-from diffcloth_torch.io.meshes import read_mesh
+from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.tasks.registry import load_task
 from diffcloth_torch.tasks.simulation import simulate
 from diffcloth_torch.viewers.curves import draw_loss_curve

@@ -11,9 +11,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloth_torch.bodies.rotation import interpolate_poses, rotate
 from diffcloth_torch.controls import Control
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry.meshes import read_mesh
+from diffcloth_torch.geometry.poses import transform
+from diffcloth_torch.geometry.rotation import interpolate_poses, rotate
 from diffcloth_torch.io.configs import (
     BodySection,
     ClothSection,
@@ -26,11 +28,9 @@ from diffcloth_torch.io.configs import (
     SimulationSection,
     resolve_path,
 )
-from diffcloth_torch.io.meshes import read_mesh
 from diffcloth_torch.materials import Material
 from diffcloth_torch.mesh import Cloth
 from diffcloth_torch.options import ContactOptions, SolverOptions
-from diffcloth_torch.poses import transform
 from diffcloth_torch.rigid_body import RigidBody
 from diffcloth_torch.scene import Scene
 from diffcloth_torch.simulator import Simulator

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.io.ply import read_ply, write_ply
+from diffcloth_torch.geometry.ply import read_ply, write_ply
 
 __all__ = ["MeshPart", "read_mesh", "write_mesh"]
 
