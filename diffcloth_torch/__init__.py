@@ -21,12 +21,12 @@ from diffcloth_torch.errors import (
     NotConverged,
     SimulationError,
 )
-from diffcloth_torch.materials import Material
-from diffcloth_torch.mesh import Cloth
-from diffcloth_torch.options import ContactOptions, SolverOptions
+from diffcloth_torch.model.cloth import Cloth
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.options import ContactOptions, SolverOptions
+from diffcloth_torch.model.rigid_body import RigidBody
+from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.report import Report
-from diffcloth_torch.rigid_body import RigidBody
-from diffcloth_torch.scene import Scene
 from diffcloth_torch.simulator import Simulator
 from diffcloth_torch.state import State, stack, where
 

@@ -28,8 +28,8 @@ from diffcloth_torch.controls import Control, Parameters
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.poses import check_quaternions
 from diffcloth_torch.geometry.surfaces import check_areas
-from diffcloth_torch.materials import FACE_RANGES
-from diffcloth_torch.scene import Assembly
+from diffcloth_torch.model.materials import FACE_RANGES
+from diffcloth_torch.model.scene import Assembly
 from diffcloth_torch.state import State
 
 __all__ = [

@@ -28,11 +28,11 @@ from diffcloth_torch.io.configs import (
     SimulationSection,
     resolve_path,
 )
-from diffcloth_torch.materials import Material
-from diffcloth_torch.mesh import Cloth
-from diffcloth_torch.options import ContactOptions, SolverOptions
-from diffcloth_torch.rigid_body import RigidBody
-from diffcloth_torch.scene import Scene
+from diffcloth_torch.model.cloth import Cloth
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.options import ContactOptions, SolverOptions
+from diffcloth_torch.model.rigid_body import RigidBody
+from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.simulator import Simulator
 from diffcloth_torch.tasks import shapes
 

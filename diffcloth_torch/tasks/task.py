@@ -12,7 +12,7 @@ from torch import Tensor
 
 from diffcloth_torch.controls import Control
 from diffcloth_torch.io.configs import RunConfig
-from diffcloth_torch.scene import Scene
+from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.simulator import Simulator
 from diffcloth_torch.state import State
 from diffcloth_torch.tasks.optimization import OptimizerSection

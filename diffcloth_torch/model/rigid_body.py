@@ -25,7 +25,7 @@ from diffcloth_torch.geometry import shapes
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import pose_array
 from diffcloth_torch.geometry.surfaces import surface_arrays
-from diffcloth_torch.mesh import plane_size
+from diffcloth_torch.model.cloth import plane_size
 
 __all__ = ["MOTIONS", "RigidBody"]
 

@@ -29,7 +29,7 @@ from diffcloth_torch.geometry import shapes
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import pose_array, transform
 from diffcloth_torch.geometry.surfaces import check_areas, check_manifold, surface_arrays
-from diffcloth_torch.materials import FACE_RANGES, Material
+from diffcloth_torch.model.materials import FACE_RANGES, Material
 
 __all__ = ["BENDING_MODELS", "Cloth", "plane_size"]
 

@@ -9,10 +9,10 @@ from torch import Tensor
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.surfaces import unique_edges
-from diffcloth_torch.materials import FACE_RANGES, Material
-from diffcloth_torch.options import ContactOptions
-from diffcloth_torch.rigid_body import RigidBody
-from diffcloth_torch.scene import Assembly, Scene
+from diffcloth_torch.model.materials import FACE_RANGES, Material
+from diffcloth_torch.model.options import ContactOptions
+from diffcloth_torch.model.rigid_body import RigidBody
+from diffcloth_torch.model.scene import Assembly, Scene
 
 __all__ = ["check_barrier", "choose_barrier_distance", "has_contact", "scene_parameters"]
 

@@ -17,8 +17,8 @@ from diffcloth_torch.checks import (
     frozen,
 )
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.mesh import Cloth
-from diffcloth_torch.rigid_body import RigidBody
+from diffcloth_torch.model.cloth import Cloth
+from diffcloth_torch.model.rigid_body import RigidBody
 
 __all__ = ["Assembly", "Scene", "assemble"]
 
