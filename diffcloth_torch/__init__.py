@@ -13,7 +13,6 @@ from importlib.metadata import version
 from typing import Any
 
 from diffcloth_torch import _core
-from diffcloth_torch.controls import Control, Parameters
 from diffcloth_torch.errors import (
     InfeasibleMotion,
     IntersectingState,
@@ -26,9 +25,10 @@ from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.report import Report
-from diffcloth_torch.simulator import Simulator
-from diffcloth_torch.state import State, stack, where
+from diffcloth_torch.sim.controls import Control, Parameters
+from diffcloth_torch.sim.report import Report
+from diffcloth_torch.sim.simulator import Simulator
+from diffcloth_torch.sim.state import State, stack, where
 
 __all__ = [
     "Cloth",

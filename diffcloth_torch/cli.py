@@ -17,7 +17,7 @@ import torch
 
 from diffcloth_torch import build_info
 from diffcloth_torch.errors import InvalidInput, SimulationError
-from diffcloth_torch.state import State
+from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.optimization import Optimization, optimize
 from diffcloth_torch.tasks.registry import TASKS, load_task
 from diffcloth_torch.tasks.simulation import simulate

@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloth_torch.controls import Control
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import transform
@@ -33,7 +32,8 @@ from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.simulator import Simulator
+from diffcloth_torch.sim.controls import Control
+from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.tasks import shapes
 
 __all__ = [

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from tqdm import tqdm
 
-from diffcloth_torch.state import State
+from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.task import Task
 
 __all__ = ["simulate"]

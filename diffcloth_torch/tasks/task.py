@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloth_torch.controls import Control
 from diffcloth_torch.io.configs import RunConfig
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.simulator import Simulator
-from diffcloth_torch.state import State
+from diffcloth_torch.sim.controls import Control
+from diffcloth_torch.sim.simulator import Simulator
+from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.optimization import OptimizerSection
 
 __all__ = ["Goal", "Optimizable", "Task"]

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.io.configs import BodySection, PictureSection
-from diffcloth_torch.state import State
+from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.task import Task
 from diffcloth_torch.viewers.stage import Bounds, Skin, Stage, require_pyvista
 

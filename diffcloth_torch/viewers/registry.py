@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 
-from diffcloth_torch.state import State
+from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.task import Task
 from diffcloth_torch.viewers.meshes import MeshSequence
 from diffcloth_torch.viewers.record import Record

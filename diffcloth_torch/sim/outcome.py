@@ -14,8 +14,8 @@ from diffcloth_torch.errors import (
     NotConverged,
     SimulationError,
 )
-from diffcloth_torch.report import Report
-from diffcloth_torch.step import CONVERGED, INFEASIBLE, INTERSECTING, UNCONVERGED
+from diffcloth_torch.sim.report import Report
+from diffcloth_torch.sim.step import CONVERGED, INFEASIBLE, INTERSECTING, UNCONVERGED
 
 __all__ = ["make_report", "raise_on_failure"]
 

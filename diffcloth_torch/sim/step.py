@@ -28,8 +28,8 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from diffcloth_torch import _core
-from diffcloth_torch.controls import tensors_of
 from diffcloth_torch.errors import NotConverged, SimulationError
+from diffcloth_torch.sim.controls import tensors_of
 
 __all__ = [
     "CONVERGED",

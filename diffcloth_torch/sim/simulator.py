@@ -13,16 +13,7 @@ from torch import Tensor
 
 from diffcloth_torch import _core
 from diffcloth_torch.checks import POSITIVE, check_choice, check_count, check_number
-from diffcloth_torch.controls import Control, Parameters
 from diffcloth_torch.errors import IntersectingState, InvalidInput
-from diffcloth_torch.inputs import (
-    Inputs,
-    check_control,
-    check_parameters,
-    control_inputs,
-    parameter_inputs,
-    state_inputs,
-)
 from diffcloth_torch.model.defaults import (
     check_barrier,
     choose_barrier_distance,
@@ -31,10 +22,19 @@ from diffcloth_torch.model.defaults import (
 )
 from diffcloth_torch.model.options import SCHEMES, ContactOptions, SolverOptions
 from diffcloth_torch.model.scene import Assembly, Scene, assemble
-from diffcloth_torch.outcome import make_report, raise_on_failure
-from diffcloth_torch.rollout import roll_out
-from diffcloth_torch.state import State, Surfaces
-from diffcloth_torch.step import as_array, refuse_transforms, take_step
+from diffcloth_torch.sim.controls import Control, Parameters
+from diffcloth_torch.sim.inputs import (
+    Inputs,
+    check_control,
+    check_parameters,
+    control_inputs,
+    parameter_inputs,
+    state_inputs,
+)
+from diffcloth_torch.sim.outcome import make_report, raise_on_failure
+from diffcloth_torch.sim.rollout import roll_out
+from diffcloth_torch.sim.state import State, Surfaces
+from diffcloth_torch.sim.step import as_array, refuse_transforms, take_step
 
 __all__ = ["Simulator"]
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import MeshPart, write_mesh
 from diffcloth_torch.geometry.poses import transform
-from diffcloth_torch.report import Report
+from diffcloth_torch.sim.report import Report
 
 __all__ = ["State", "Surfaces", "check_field_names", "stack", "where"]
 

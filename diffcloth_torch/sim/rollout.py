@@ -9,9 +9,9 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from diffcloth_torch.checks import check_count
-from diffcloth_torch.controls import Control, Parameters, tensors_of
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.state import State
+from diffcloth_torch.sim.controls import Control, Parameters, tensors_of
+from diffcloth_torch.sim.state import State
 
 __all__ = ["Controls", "roll_out"]
 

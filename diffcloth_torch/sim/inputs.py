@@ -24,13 +24,13 @@ from diffcloth_torch.checks import (
     check_shape,
     float_tensor,
 )
-from diffcloth_torch.controls import Control, Parameters
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.poses import check_quaternions
 from diffcloth_torch.geometry.surfaces import check_areas
 from diffcloth_torch.model.materials import FACE_RANGES
 from diffcloth_torch.model.scene import Assembly
-from diffcloth_torch.state import State
+from diffcloth_torch.sim.controls import Control, Parameters
+from diffcloth_torch.sim.state import State
 
 __all__ = [
     "PARAMETER_NAMES",

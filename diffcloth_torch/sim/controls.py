@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from diffcloth_torch.state import check_field_names
+from diffcloth_torch.sim.state import check_field_names
 
 __all__ = ["Control", "Parameters", "tensors_of"]
 
