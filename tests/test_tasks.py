@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
+from diffcloth_torch.config import shapes
 from diffcloth_torch.geometry.rotation import (
     integrate_poses,
     interpolate_poses,
@@ -21,7 +22,6 @@ from diffcloth_torch.geometry.rotation import (
     quaternion_multiply,
     rotate,
 )
-from diffcloth_torch.tasks import shapes
 from diffcloth_torch.tasks.hit_cloth import shape_distance
 from diffcloth_torch.tasks.optimization import OptimizerSection, evaluate, optimize
 from diffcloth_torch.tasks.registry import load_task

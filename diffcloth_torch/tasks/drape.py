@@ -7,10 +7,10 @@ from pathlib import Path
 
 from torch import Tensor
 
-from diffcloth_torch.io.configs import RunConfig
+from diffcloth_torch.config.scenes import build_scene, build_simulator, prescribed_controls
+from diffcloth_torch.config.schema import RunConfig
 from diffcloth_torch.sim.controls import Control
 from diffcloth_torch.sim.state import State
-from diffcloth_torch.tasks.scenes import build_scene, build_simulator, prescribed_controls
 from diffcloth_torch.tasks.task import Goal
 
 __all__ = ["Drape"]

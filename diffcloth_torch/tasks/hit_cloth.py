@@ -19,19 +19,19 @@ from annotated_types import Ge, Len
 from pydantic import model_validator
 from torch import Tensor
 
-from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.geometry.poses import transform
-from diffcloth_torch.geometry.rotation import integrate_poses
-from diffcloth_torch.io.configs import PoseSection, RunConfig, Section, Vector3
-from diffcloth_torch.sim.controls import Control
-from diffcloth_torch.sim.state import State
-from diffcloth_torch.tasks.optimization import OptimizerSection
-from diffcloth_torch.tasks.scenes import (
+from diffcloth_torch.config.scenes import (
     build_scene,
     build_simulator,
     pose_array,
     prescribed_controls,
 )
+from diffcloth_torch.config.schema import PoseSection, RunConfig, Section, Vector3
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry.poses import transform
+from diffcloth_torch.geometry.rotation import integrate_poses
+from diffcloth_torch.sim.controls import Control
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.tasks.optimization import OptimizerSection
 from diffcloth_torch.tasks.task import Goal
 
 __all__ = ["HitCloth", "HitClothConfig", "shape_distance"]

@@ -14,8 +14,8 @@ from annotated_types import Ge, Gt, Lt
 from torch import Tensor
 from tqdm import tqdm
 
+from diffcloth_torch.config.schema import Positive, Section
 from diffcloth_torch.errors import InfeasibleMotion, InvalidInput, NotConverged, SimulationError
-from diffcloth_torch.io.configs import Positive, Section
 from diffcloth_torch.sim.controls import Control
 from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State

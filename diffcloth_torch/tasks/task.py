@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloth_torch.io.configs import RunConfig
+from diffcloth_torch.config.schema import RunConfig
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.controls import Control
 from diffcloth_torch.sim.simulator import Simulator

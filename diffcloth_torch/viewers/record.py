@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from diffcloth_torch.config.schema import BodySection, PictureSection
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.geometry.poses import transform
-from diffcloth_torch.io.configs import BodySection, PictureSection
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.task import Task
 from diffcloth_torch.viewers.stage import Bounds, Skin, Stage, require_pyvista

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diffcloth_torch.config.schema import CameraSection
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.poses import transform
-from diffcloth_torch.io.configs import CameraSection
 from diffcloth_torch.viewers.floor import BACKGROUND, Floor, Shadow
 
 __all__ = ["Bounds", "Skin", "Stage", "require_pyvista"]

@@ -11,11 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.geometry.meshes import read_mesh
-from diffcloth_torch.geometry.poses import transform
-from diffcloth_torch.geometry.rotation import interpolate_poses, rotate
-from diffcloth_torch.io.configs import (
+from diffcloth_torch.config import shapes
+from diffcloth_torch.config.schema import (
     BodySection,
     ClothSection,
     PinKeyframe,
@@ -27,6 +24,10 @@ from diffcloth_torch.io.configs import (
     SimulationSection,
     resolve_path,
 )
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry.meshes import read_mesh
+from diffcloth_torch.geometry.poses import transform
+from diffcloth_torch.geometry.rotation import interpolate_poses, rotate
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
@@ -34,7 +35,6 @@ from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.controls import Control
 from diffcloth_torch.sim.simulator import Simulator
-from diffcloth_torch.tasks import shapes
 
 __all__ = [
     "build_scene",
