@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-import torch
 from torch import Tensor
 
+from diffcloth_torch._moved import allow_loading
 from diffcloth_torch.sim.state import check_field_names
 
 __all__ = ["Control", "Parameters", "tensors_of"]
@@ -96,4 +96,4 @@ def tensors_of(record: Any) -> Iterator[Tensor]:
         yield from (tensor for tensor in values if isinstance(tensor, Tensor))
 
 
-torch.serialization.add_safe_globals([Control, Parameters])
+allow_loading(Control, Parameters)

@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffcloth_torch._moved import allow_loading
+
 __all__ = ["Report"]
 
 
@@ -38,6 +40,10 @@ class Report:
     motion_fraction: float | Tensor
     seconds: dict[str, float | Tensor]
     counts: dict[str, int | Tensor] = field(default_factory=dict)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # Reports that the first version saved count nothing.
+        self.__dict__.update({"counts": {}} | state)
 
     def select(self, index: int | slice) -> Report:
         """Report of one environment, or of some."""
@@ -85,7 +91,7 @@ def _combine(function: Callable[..., Any], reports: Sequence[Report]) -> Report:
         for entry in fields(Report)
         if entry.name not in _TABLES
     }
-    tables = {
+    tables: dict[str, Any] = {
         table: {
             name: function(*(getattr(report, table)[name] for report in reports))
             for name in getattr(reports[0], table)
@@ -95,4 +101,4 @@ def _combine(function: Callable[..., Any], reports: Sequence[Report]) -> Report:
     return Report(**plain, **tables)
 
 
-torch.serialization.add_safe_globals([Report])
+allow_loading(Report)

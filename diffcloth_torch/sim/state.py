@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch._moved import allow_loading
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import MeshPart, write_mesh
 from diffcloth_torch.geometry.poses import transform
@@ -218,4 +219,4 @@ def check_field_names(owner: str, instance: Any, changes: dict[str, Any]) -> Non
             raise InvalidInput(f"{owner}: the fields are {', '.join(accepted)}; got {name!r}")
 
 
-torch.serialization.add_safe_globals([State, Surfaces])
+allow_loading(State, Surfaces)
