@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import diffcloth_torch as dc
+from diffcloth_torch.config.viewers import open_viewers
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.tasks.registry import load_task
 from diffcloth_torch.tasks.simulation import simulate
 from diffcloth_torch.viewers.curves import draw_loss_curve
 from diffcloth_torch.viewers.meshes import MeshSequence
-from diffcloth_torch.viewers.record import Record
-from diffcloth_torch.viewers.registry import Viewers, open_viewers
+from diffcloth_torch.viewers.several import Viewers
 from diffcloth_torch.viewers.viewer import NullViewer
 
 CONFIG = """
@@ -84,8 +84,14 @@ def test_a_mesh_sequence_has_one_file_per_state(make_task, tmp_path):
     assert len(faces) == 18 + len(task.scene.bodies[0].faces)
 
 
+def open_task(task, folder):
+    return open_viewers(task.config, task.scene, folder, task.goals())
+
+
 def record(task, folder, states=None):
-    with Record(folder, task, fps=10) as viewer:
+    alone = task.config.output.model_copy(update={"viewers": ["record"]})
+    config = task.config.model_copy(update={"output": alone})
+    with open_viewers(config, task.scene, folder) as viewer:
         for state in states or list(simulate(task)):
             viewer.show(state)
 
@@ -188,8 +194,8 @@ def test_a_missing_package_is_named_before_anything_runs(make_task, tmp_path, mo
 
     monkeypatch.setattr(builtins, "__import__", without_pyvista)
     with pytest.raises(dc.InvalidInput, match=r"pip install 'diffcloth-torch\[viewer\]'"):
-        open_viewers(make_task(), tmp_path)
-    open_viewers(make_task("output.viewers=[meshes]"), tmp_path)
+        open_task(make_task(), tmp_path)
+    open_task(make_task("output.viewers=[meshes]"), tmp_path)
 
 
 def test_a_loss_curve_is_a_picture(tmp_path):

@@ -14,6 +14,7 @@ from annotated_types import Ge, Gt, Le, Len, Lt
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, ValidationError, model_validator
 
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.viewers.look import Camera, Pictures
 
 __all__ = [
     "BodySection",
@@ -318,34 +319,24 @@ class SimulationSection(Section):
 
 
 class CameraSection(Section):
-    """Where pictures are taken from; what is not given is chosen from the motion.
+    """Where pictures are taken from, as in `Camera`."""
 
-    `azimuth` and `elevation` are in degrees: azimuth 0 looks along +y, 90 along -x. `zoom` divides
-    the distance. What is drawn lies around `target`.
-    """
-
-    azimuth: float = 35.0
-    elevation: Annotated[float, Gt(-90), Lt(90)] = 18.0
-    zoom: Positive = 1.0
+    azimuth: float = Camera.azimuth
+    elevation: Annotated[float, Gt(-90), Lt(90)] = Camera.elevation
+    zoom: Positive = Camera.zoom
     target: Vector3 | None = None
     distance: Positive | None = None
 
 
 class PictureSection(Section):
-    """Pictures and the animation.
+    """Pictures and the animation, as in `Pictures`; `size` is divisible by 2 for the video."""
 
-    `size` is in pixels, divisible by 2 for the video; `fps` None plays in real time. `sheet` is how
-    many moments the overview picture has, from the first to the last. `frames` keeps every picture
-    of the animation. `ground` is the height of a floor that is only drawn: "auto" takes that of a
-    static level plane of the scene, or lies below everything; None leaves it out.
-    """
-
-    size: Annotated[list[Annotated[int, Ge(64), Le(4096)]], Len(2, 2)] = [960, 720]
+    size: Annotated[list[Annotated[int, Ge(64), Le(4096)]], Len(2, 2)] = list(Pictures.size)
     fps: Annotated[float, Gt(0), Le(240)] | None = None
-    video: Literal["mp4", "gif", "none"] = "mp4"
-    frames: bool = False
-    sheet: Annotated[int, Ge(1), Le(12)] = 3
-    ground: float | Literal["auto"] | None = "auto"
+    video: Literal["mp4", "gif", "none"] = Pictures.video
+    frames: bool = Pictures.frames
+    sheet: Annotated[int, Ge(1), Le(12)] = Pictures.sheet
+    ground: float | Literal["auto"] | None = Pictures.ground
     camera: CameraSection = CameraSection()
 
     @model_validator(mode="after")

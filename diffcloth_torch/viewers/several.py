@@ -1,19 +1,15 @@
-"""Viewers by the names that a configuration gives."""
+"""Several viewers as one."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import ExitStack
-from pathlib import Path
 from types import TracebackType
 
 from diffcloth_torch.sim.state import State
-from diffcloth_torch.tasks.task import Task
-from diffcloth_torch.viewers.meshes import MeshSequence
-from diffcloth_torch.viewers.record import Record
 from diffcloth_torch.viewers.viewer import Viewer
 
-__all__ = ["Viewers", "open_viewers"]
+__all__ = ["Viewers"]
 
 
 class Viewers:
@@ -52,15 +48,3 @@ class Viewers:
     ) -> None:
         """Finish all of them."""
         self._stack.__exit__(kind, error, trace)
-
-
-def open_viewers(task: Task, folder: Path) -> Viewers:
-    """Make the viewers of a task's configuration, whose files go to a folder that exists."""
-    output = task.config.output
-    made: list[Viewer] = []
-    if "record" in output.viewers:
-        fps = 1 / (task.simulator.dt * output.every)
-        made.append(Record(folder, task, fps=fps))
-    if "meshes" in output.viewers:
-        made.append(MeshSequence(folder / "meshes"))
-    return Viewers(made, output.every)
