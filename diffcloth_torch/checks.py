@@ -18,9 +18,11 @@ from diffcloth_torch.errors import InvalidInput
 
 __all__ = [
     "ANY_NUMBER",
+    "LARGEST",
     "NON_NEGATIVE",
     "POISSON",
     "POSITIVE",
+    "SMALLEST",
     "FloatArray",
     "IndexArray",
     "Range",
@@ -72,6 +74,12 @@ class Range(NamedTuple):
         ends = "inclusive" if self.closed else "exclusive"
         return f"between {self.low:g} and {self.high:g} ({ends})"
 
+
+# The core multiplies up to ten numbers of one size (squares of volumes and their derivatives in
+# distances, stiffness over squared time steps): within these bounds such products neither overflow
+# nor vanish. They are far outside every system of units.
+LARGEST = 1e30
+SMALLEST = 1e-30
 
 ANY_NUMBER = Range()
 POSITIVE = Range(0.0)
@@ -160,8 +168,21 @@ def check_finite(name: str, values: FloatArray) -> None:
 
 
 def check_range(name: str, values: FloatArray, accepted: Range) -> None:
-    """Require finite numbers in a range; the message holds the first offending index."""
-    wrong = accepted.outside(values) | ~np.isfinite(values)
+    """Require finite numbers in a range; the message holds the first offending index.
+
+    What is positive must not be so small, and nothing so large, that powers of it leave the range
+    of float64.
+    """
+    _refuse(name, values, accepted.outside(values) | ~np.isfinite(values), str(accepted))
+    size = np.abs(values)
+    too_large = f"at most {LARGEST:g} in size, as powers of it would overflow"
+    _refuse(name, values, size > LARGEST, too_large)
+    if accepted.low == 0.0 and not accepted.closed:
+        too_small = f"at least {SMALLEST:g}, as powers of it would vanish"
+        _refuse(name, values, size < SMALLEST, too_small)
+
+
+def _refuse(name: str, values: FloatArray, wrong: NDArray[np.bool_], accepted: str) -> None:
     if wrong.any():
         at = [int(i) for i in np.argwhere(wrong)[0]]
         where = f" at {at}" if at else ""

@@ -334,3 +334,15 @@ def test_a_plane_faces_up():
     a, b, c = body.vertices[body.faces[0]]
     assert np.cross(b - a, c - a)[2] > 0
     np.testing.assert_array_equal(np.abs(body.vertices), np.tile([1, 2, 0], (4, 1)))
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e3])
+def test_the_flattest_face_that_is_accepted(scale):
+    # Twice the area over the longest side squared; below 1e-12 rounding decides about its normal.
+    def triangle(height):
+        return [[0, 0, 0], [scale, 0, 0], [0.5 * scale, height * scale, 0]], [[0, 1, 2]]
+
+    for make in (dc.Cloth, dc.RigidBody):
+        assert make(*triangle(1.1e-12)).faces.shape == (1, 3)
+        with pytest.raises(dc.InvalidInput, match=r"without area at \[0\]"):
+            make(*triangle(0.9e-12))

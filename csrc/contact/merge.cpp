@@ -1,6 +1,7 @@
 #include "contact/merge.h"
 
 #include <algorithm>
+#include <cmath>
 #include <tuple>
 
 #include "contact/distance/closest.h"
@@ -12,9 +13,10 @@ namespace {
 using Part = MergeScratch::Part;
 using NearEdge = MergeScratch::NearEdge;
 
-/// Shares of a triangle or an edge within which a projection counts as on its border. Two faces at
-/// an edge, each with its own rounding, would else both claim the point above it. What the distance
-/// loses is the square of this, and drowns in rounding.
+/// How near to its border a projection counts as on it, as a share of a triangle or edge, or of the
+/// distance of the point where that is more. Two faces at an edge, each with its own rounding, would
+/// else both claim the point above it. What the distance loses is the square of this, and drowns in
+/// rounding.
 constexpr double kBorder = 1e-12;
 
 enum Kind : std::int8_t { kVertex, kEdge, kFace, kMollified };
@@ -25,11 +27,20 @@ NearEdge nearest_on_edge(const CollisionMesh& mesh, Index edge, const Vec3& p, c
   const Vec3 w = p - row(x, i);
   const double along = w.dot(e);
   const double length_sq = e.squaredNorm();
-  if (along <= kBorder * length_sq) return {.edge = edge, .vertex = i, .d_sq = w.squaredNorm()};
-  if (along >= (1.0 - kBorder) * length_sq) {
+  const double border = kBorder * std::sqrt(length_sq * std::max(length_sq, w.squaredNorm()));
+  if (along <= border) return {.edge = edge, .vertex = i, .d_sq = w.squaredNorm()};
+  if (along >= length_sq - border) {
     return {.edge = edge, .vertex = j, .d_sq = (p - row(x, j)).squaredNorm()};
   }
   return {.edge = edge, .vertex = -1, .d_sq = (w - (along / length_sq) * e).squaredNorm()};
+}
+
+/// Whether edge a of a triangle is nearer than edge b. The inside of an edge is nearer than its end,
+/// which another edge may find, even if rounding does not tell their distances apart.
+bool is_nearer(const NearEdge& a, const NearEdge& b) {
+  constexpr double kTie = 1e-15;
+  const double tie = static_cast<int>(a.vertex < 0) * kTie - static_cast<int>(b.vertex < 0) * kTie;
+  return a.d_sq < b.d_sq * (1.0 + tie);
 }
 
 /// Whether a point's projection lies inside a triangle; then also its squared distance.
@@ -41,7 +52,8 @@ bool projects_into(const Corners& x, double& d_sq) {
   const double n_sq = n.squaredNorm();
   const double b0 = w.cross(e1).dot(n);
   const double b1 = e0.cross(w).dot(n);
-  const double least = kBorder * n_sq;
+  const double longest_sq = std::max(e0.squaredNorm(), e1.squaredNorm());
+  const double least = kBorder * std::sqrt(n_sq * std::max(n_sq, longest_sq * w.squaredNorm()));
   if (!(b0 > least && b1 > least && n_sq - b0 - b1 > least)) return false;
   const Closest geometry = closest(PairKind::kPointTriangle, x);
   d_sq = geometry.d_sq;
@@ -143,7 +155,7 @@ void add_point_terms(const CollisionMesh& mesh,
     const NearEdge* nearest = nullptr;
     for (const Index e : mesh.face_edges[f]) {
       const auto at = std::ranges::lower_bound(edges, e, {}, &NearEdge::edge);
-      if (nearest == nullptr || at->d_sq < nearest->d_sq) nearest = &*at;
+      if (nearest == nullptr || is_nearer(*at, *nearest)) nearest = &*at;
     }
     push_on_edge(*nearest, 1);
   }

@@ -1,6 +1,7 @@
 #ifdef DIFFCLOTH_HAS_CHOLMOD
 
 #include <algorithm>
+#include <cmath>
 #include <mutex>
 #include <stdexcept>
 
@@ -105,6 +106,18 @@ void for_each_supernode(const cholmod_factor& factor, Visit visit) {
   }
 }
 
+double trace(const cholmod_factor& factor) {
+  const auto* const start = static_cast<const int*>(factor.px);
+  const auto* const values = static_cast<const double*>(factor.x);
+  double sum = 0.0;
+  std::size_t s = 0;
+  for_each_supernode(factor, [&](int columns, int rows) {
+    const double* const panel = values + start[s++];
+    for (std::ptrdiff_t j = 0; j < columns; ++j) sum += panel[j + j * rows];
+  });
+  return sum;
+}
+
 /// Symbolic factorization, and the matrix that it is of.
 struct Structure {
   ScalarMatrix matrix;
@@ -151,7 +164,9 @@ class CholmodFactor final : public FactorBackend {
     cholmod_sparse matrix = view(structure_.matrix, values_.data());
     cholmod_factorize(&matrix, factor_, &common_.c);
     if (common_.c.status < CHOLMOD_OK) throw std::runtime_error("CHOLMOD: factorization failed");
-    return common_.c.status == CHOLMOD_OK && factor_->minor == factor_->n;
+    // A BLAS may let NaN pass for a pivot; it then stands on the diagonal.
+    return common_.c.status == CHOLMOD_OK && factor_->minor == factor_->n &&
+           std::isfinite(trace(*factor_));
   }
 
   void solve(std::span<const double* const> b, std::span<double* const> x) const override {

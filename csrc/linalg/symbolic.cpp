@@ -30,8 +30,8 @@ class Analyzer {
     find_children();
     find_rows();
     lay_out_panels();
-    place_blocks();
-    map_children();
+    sort_blocks();
+    map_into_panels();
     lay_out_arena();
     return std::move(s_);
   }
@@ -118,16 +118,8 @@ class Analyzer {
     }
   }
 
-  /// Row of the panel at which the vertex eliminated at `rank` begins.
-  Index panel_row(const Supernode& node, Index rank) const {
-    if (rank < node.first + node.columns) return 3 * (rank - node.first);
-    const auto begin = s_.rows.begin() + static_cast<std::ptrdiff_t>(node.rows_begin);
-    const auto end = s_.rows.begin() + static_cast<std::ptrdiff_t>(node.rows_end);
-    return node.front.top + 3 * static_cast<Index>(std::lower_bound(begin, end, rank) - begin);
-  }
-
-  void place_blocks() {
-    // Slots by supernode: counted, then filled in.
+  /// Slots by supernode: counted, then filled in. The places are those of row and column so far.
+  void sort_blocks() {
     std::vector<std::size_t> start(s_.supernodes.size() + 1, 0);
     const auto for_each_block = [&](auto visit) {
       for (Index j = 0; j < pattern_.size(); ++j) {
@@ -145,22 +137,27 @@ class Analyzer {
       s_.supernodes[s].blocks_end = start[s + 1];
     }
     s_.blocks.resize(start.back());
+    block_column_.resize(start.back());
     for_each_block([&](Index slot, Index i, Index j) {
-      const Index column = std::min(i, j);
-      const Supernode& node = s_.supernodes[owner_[column]];
-      s_.blocks[start[owner_[column]]++] = {
-          .slot = slot,
-          .place = panel_row(node, std::max(i, j)) + 3 * (column - node.first) * node.front.ld,
-          .transposed = i < j};
+      const std::size_t k = start[owner_[std::min(i, j)]]++;
+      s_.blocks[k] = {.slot = slot, .place = std::max(i, j), .transposed = i < j};
+      block_column_[k] = std::min(i, j);
     });
   }
 
-  void map_children() {
-    std::vector<Index> position(graph_.size());  // among the parent's columns, then its rows
+  /// Where blocks of the matrix and update matrices of children fall in each supernode.
+  void map_into_panels() {
+    std::vector<Index> position(graph_.size());  // among a supernode's columns, then its rows
     for (const Supernode& node : s_.supernodes) {
       for (Index k = 0; k < node.columns; ++k) position[node.first + k] = k;
       for (std::size_t r = node.rows_begin; r < node.rows_end; ++r) {
         position[s_.rows[r]] = node.columns + static_cast<Index>(r - node.rows_begin);
+      }
+      const Index padding = node.front.top - node.front.columns;
+      for (std::size_t k = node.blocks_begin; k < node.blocks_end; ++k) {
+        const Index p = position[s_.blocks[k].place];
+        const Index row = p < node.columns ? 3 * p : 3 * p + padding;
+        s_.blocks[k].place = row + 3 * (block_column_[k] - node.first) * node.front.ld;
       }
       for (Index c = node.children_begin; c < node.children_end; ++c) {
         map_child(node, position, s_.children[c]);
@@ -214,6 +211,7 @@ class Analyzer {
   SupernodeTree gathered_;
   std::vector<Index> rank_;   // [pattern.size()] place in the order of elimination, -1 if fixed
   std::vector<Index> owner_;  // [n] supernode of a column
+  std::vector<Index> block_column_;  // [blocks] place of its column in the order of elimination
   Symbolic s_;
 };
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from diffcloth_torch.checks import (
+    SMALLEST,
     FloatArray,
     IndexArray,
     check_finite,
@@ -60,10 +61,17 @@ def _check_distinct(owner: str, faces: IndexArray) -> None:
 
 
 def check_areas(owner: str, field: str, vertices: FloatArray, faces: IndexArray) -> None:
-    """Refuse faces of zero area."""
+    """Refuse faces of zero area, and those whose area is lost in the range of float64."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     double_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     longest_sq = np.max([((q - p) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    tiny = np.flatnonzero((longest_sq > 0.0) & (longest_sq < SMALLEST**2))
+    if tiny.size:
+        face = int(tiny[0])
+        raise InvalidInput(
+            f"{owner}: `faces` must have sides of at least {SMALLEST:g} m in `{field}`, as powers "
+            f"of them would vanish, got {np.sqrt(longest_sq[face]):g} at [{face}]"
+        )
     flat = np.flatnonzero(double_area <= _FLATTEST_FACE * longest_sq)
     if flat.size:
         face = int(flat[0])

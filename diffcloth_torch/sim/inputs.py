@@ -89,6 +89,7 @@ def state_inputs(assembly: Assembly, state: State) -> tuple[Inputs, int | None]:
     check_quaternions("step: `state.body_poses`", _numbers(state.body_poses))
     _check_state_tensor("time", state.time)
     check_shape("step: `state.time`", state.time.shape, [() if batch is None else (batch,)])
+    check_finite("step: `state.time`", _numbers(state.time))
     return inputs, batch
 
 

@@ -24,7 +24,8 @@ class Report:
         residual: Largest displacement of the last Newton step, as a velocity [m/s].
         minimum_distance: Smallest distance between mid-surfaces in contact [m], which is above half
             the sum of their thicknesses; infinite where nothing is within the barrier's reach.
-        contact_count: Pairs of primitives closer than the barrier distance.
+        contact_count: Contacts within the barrier distance: pairs of primitives of cloths; of a
+            cloth and a body, features that are not hidden behind nearer ones.
         motion_fraction: Part of the prescribed motion that was reached, 1 for all of it.
         seconds: Phase of the step -> time [s]; the phases add up to the time in the core.
         counts: What was done -> how often: steps with the `exact` Hessian, `chord` steps with an

@@ -12,6 +12,9 @@ void common_kernels(nb::module_& m);
 /// Contact kernels one by one, for tests against independent references.
 void contact_kernels(nb::module_& m);
 
+/// Barrier and friction of a whole mesh, for tests of their derivatives and weights.
+void contact_potentials(nb::module_& m);
+
 /// Sparse Cholesky factorizations, for tests against independent references and for benchmarks.
 void linalg_kernels(nb::module_& m);
 

@@ -7,6 +7,7 @@ NB_MODULE(_kernels, m) {
 
   diffcloth::bind::common_kernels(m);
   diffcloth::bind::contact_kernels(m);
+  diffcloth::bind::contact_potentials(m);
   diffcloth::bind::elastic_kernels(m);
   diffcloth::bind::linalg_kernels(m);
 }

@@ -1,0 +1,130 @@
+"""Scenes of every kind of contact, all in general position."""
+
+import numpy as np
+import trimesh
+from oracles.feature_sum import stack
+
+
+def grid(n, size, rng, jitter=0.2):
+    """Jittered n x n sheet in the plane z = 0, centered."""
+    u, v = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    x = size * (np.stack([u, v, 0 * u], axis=-1).reshape(-1, 3) / (n - 1) - [0.5, 0.5, 0])
+    x[:, :2] += jitter * rng.uniform(-0.5, 0.5, (len(x), 2)) * size / n
+    corner = (u * n + v)[:-1, :-1].ravel()
+    faces = [[corner, corner + n, corner + 1], [corner + 1, corner + n, corner + n + 1]]
+    return x, np.concatenate([np.stack(f, axis=-1) for f in faces])
+
+
+def cloth(n, size, height, rng, noise):
+    """Rest shape, position and faces of a crumpled sheet at some height."""
+    X, faces = grid(n, size, rng)
+    return X, X + [0, 0, height] + noise * rng.normal(size=X.shape), faces
+
+
+def relief(n, size, rng, height):
+    """Open terrain of hills and hollows, finer than the cloth."""
+    x, faces = grid(n, size, rng)
+    x[:, 2] = rng.uniform(-height, height, len(x))
+    return x, faces
+
+
+def ball(rng, radius, noise, subdivisions=1):
+    """Closed body with some hollows."""
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    scale = 1 + noise * rng.uniform(-1, 1, (len(mesh.vertices), 1))
+    return mesh.vertices * scale - [0, 0, radius], mesh.faces
+
+
+def box(size):
+    mesh = trimesh.creation.box((size, size, size))
+    return mesh.vertices - [0, 0, size / 2], mesh.faces
+
+
+def rotated(body, rng):
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.linalg.det(q))
+    return body[0] @ q.T, body[1]
+
+
+def on_relief(rng):
+    return stack([cloth(5, 0.6, 0.07, rng, 0.02)], [relief(7, 0.7, rng, 0.05)])
+
+
+def on_a_ball(rng):
+    return stack([cloth(6, 0.6, 0.05, rng, 0.01)], [ball(rng, 0.5, 0.0, 2)])
+
+
+def on_a_lump(rng):
+    return stack([cloth(6, 0.6, 0.05, rng, 0.03)], [ball(rng, 0.3, 0.2)])
+
+
+def on_a_corner(rng):
+    """The corner of a box below the middle of the sheet, edges across it."""
+    x, faces = box(0.5)
+    turned = trimesh.geometry.align_vectors([-1, -1, 1], [0, 0, 1])[:3, :3]
+    x = (x + np.array([0.25, 0.25, 0])) @ turned.T
+    return stack([cloth(6, 0.4, 0.04, rng, 0.01)], [(x - [0, 0, x[:, 2].max()], faces)])
+
+
+def on_a_triangle(rng):
+    """An open body: one triangle, from above and below."""
+    x = np.array([[0.0, -0.02, 0], [0.21, 0.03, 0.01], [0.05, 0.22, -0.01]])
+    sheets = [cloth(6, 0.5, z, rng, 0.01) for z in (0.05, -0.05)]
+    return stack(sheets, [(x, np.array([[0, 1, 2]]))])
+
+
+def on_slivers(rng):
+    """A floor with slivers a ten-thousandth as wide as the other triangles."""
+    x, faces = grid(5, 0.6, rng, jitter=0.0)
+    x = x.reshape(5, 5, 3)
+    x[2, :, 0] = x[1, :, 0] + 1.5e-5
+    return stack(
+        [cloth(6, 0.4, 0.05, rng, 0.01)], [(x.reshape(-1, 3) + np.array([0.01, 0.02, 0]), faces)]
+    )
+
+
+def two_cloths(rng):
+    return stack([cloth(5, 0.6, 0.05, rng, 0.01), cloth(4, 0.5, 0.0, rng, 0.01)], [])
+
+
+def crumpled(rng):
+    """Self contact, and two bodies that the sheet is caught between."""
+    ground = relief(4, 0.7, rng, 0.02)
+    return stack([cloth(6, 0.5, 0.06, rng, 0.03)], [ground, (ground[0] + [0, 0, 0.13], ground[1])])
+
+
+def pinned(rng):
+    """Faces that are pinned as a whole, over a body's corner and in self contact."""
+    scene = on_a_corner(rng)
+    scene.prescribed[6:24] = True
+    return scene
+
+
+def thick(rng):
+    scene = stack(
+        [cloth(5, 0.6, 0.1, rng, 0.01), cloth(5, 0.6, 0.2, rng, 0.01)],
+        [relief(5, 0.7, rng, 0.02)],
+    )
+    scene.thickness = [0.05, 0.02, 0.08]
+    return scene
+
+
+SCENES = {
+    f.__name__: f
+    for f in (
+        on_relief,
+        on_a_ball,
+        on_a_lump,
+        on_a_corner,
+        on_a_triangle,
+        on_slivers,
+        two_cloths,
+        crumpled,
+        pinned,
+        thick,
+    )
+}
+
+
+def make(name, seed=0):
+    return SCENES[name](np.random.default_rng(seed))

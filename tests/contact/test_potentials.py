@@ -1,0 +1,199 @@
+"""The potentials of contact and friction: their sum over features, and every derivative."""
+
+import contact_scenes
+import numpy as np
+import pytest
+from oracles.feature_sum import FeatureSum
+
+NAMES = list(contact_scenes.SCENES)
+MEASURES = ("vertex_area", "edge_area", "edge_length_sq", "mean_face_area")
+
+
+def energy(potential, x):
+    return potential.energies(x, x)[0].sum()
+
+
+def difference(f, x, d, step):
+    """Central difference of fourth order along d."""
+    return (
+        sum(
+            w * f(x + k * step * d)
+            for k, w in ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
+        )
+        / step
+    )
+
+
+def directions(shape, count=4, seed=3):
+    return np.random.default_rng(seed).normal(size=(count, *shape))
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("name", NAMES)
+def test_the_energy_is_the_sum_over_all_features(name, seed):
+    scene = contact_scenes.make(name, seed)
+    expected = FeatureSum(scene).energy(scene.x)
+    assert expected > 1e-6
+    # Distances of ipctk agree to 1e-12; the sum has terms of both signs.
+    np.testing.assert_allclose(energy(scene.potential(), scene.x), expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_contacts_are_where_they_say(name):
+    scene = contact_scenes.make(name)
+    potential = scene.potential()
+    corners, c, weight, distance = potential.contacts(scene.x)
+    t = np.einsum("ki,kij->kj", c, scene.x[corners])
+    np.testing.assert_allclose(np.linalg.norm(t, axis=1), distance, rtol=1e-9)
+    assert (distance < 0.1 + max(scene.thickness, default=0.0)).all()
+    assert (weight != 0).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_gradient_is_that_of_the_energy(name):
+    scene = contact_scenes.make(name)
+    potential = scene.potential()
+    g = potential.gradient(scene.x)
+    assert np.abs(g).max() > 1e-4
+    for d in directions(scene.x.shape):
+        # Far below the width of the slivers, 1.5e-5.
+        found = difference(lambda x: energy(potential, x), scene.x, d, 1e-7)
+        assert found == pytest.approx(g @ d.ravel(), abs=1e-7 * np.linalg.norm(g))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_hessian_is_that_of_the_gradient(name):
+    scene = contact_scenes.make(name)
+    potential = scene.potential()
+    h = potential.hessian(scene.x)
+    np.testing.assert_allclose(h, h.T, atol=1e-12 * np.abs(h).max())
+    for d in directions(scene.x.shape):
+        found = difference(potential.gradient, scene.x, d, 1e-7)
+        product = potential.hessian_product(scene.x, d)
+        np.testing.assert_allclose(found, product, atol=2e-6 * np.abs(product).max())
+        np.testing.assert_allclose(h @ d.ravel(), product, atol=1e-11 * np.abs(product).max())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_projected_hessian_is_positive(name):
+    scene = contact_scenes.make(name)
+    for h in (
+        scene.potential().hessian(scene.x, positive=True),
+        scene.potential().friction(scene.x, scene.x, scene.x + 0.01, positive=True)[2],
+    ):
+        lowest, highest = np.linalg.eigvalsh(h)[[0, -1]]
+        assert highest > 0
+        assert lowest > -1e-12 * highest
+
+
+def parameter_of(scene, name):
+    count = int(scene.surface.max()) + 1
+    if name == "thickness":
+        return np.array(scene.thickness or [1e-3] * count)
+    if name == "friction":
+        return 0.1 + np.arange(count**2) / count**2
+    return np.array(getattr(scene, name))
+
+
+def with_measure(scene, name, values, **changes):
+    potential = scene.potential(**changes)
+    potential.set_measure(name, values.tolist())
+    return potential
+
+
+def check_parameters(scene, found, value):
+    """found: cotangents; value(potential): what they are the derivatives of."""
+    if not scene.thickness:
+        scene.thickness = parameter_of(scene, "thickness").tolist()
+    scale = max(np.abs(np.atleast_1d(v)).max() for k, v in found.items() if k != "x_lag")
+    assert scale > 0
+    for name in ("kappa", "d_hat", "slip", "thickness", "friction"):
+        at = parameter_of(scene, name)
+        for d in directions(at.shape, 2):
+            expected = np.sum(found[name] * d)
+            step = 1e-5 * np.abs(at).max()
+            slope = difference(
+                lambda v, name=name: value(scene.potential(**{name: v.tolist()})), at, d, step
+            )
+            assert slope == pytest.approx(expected, rel=2e-6, abs=1e-9 * scale), name
+    for name in MEASURES:
+        at = np.array(scene.potential().measure(name))
+        for d in directions(at.shape, 2):
+            d *= at > 0
+            expected = np.sum(found[name] * d)
+            slope = difference(
+                lambda v, name=name: value(with_measure(scene, name, v)), at, d, 1e-5 * at.max()
+            )
+            assert slope == pytest.approx(expected, rel=2e-6, abs=1e-9 * scale), name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_mixed_derivatives_are_those_of_the_gradient(name):
+    scene = contact_scenes.make(name)
+    if not scene.thickness:
+        scene.thickness = parameter_of(scene, "thickness").tolist()
+    for z in directions(scene.x.shape, 1, seed=8):
+        found = scene.potential().mixed(scene.x, z)
+        check_parameters(scene, found, lambda p, z=z: p.gradient(scene.x) @ z.ravel())
+
+
+def moved(scene, amount, seed=5):
+    return scene.x + amount * np.random.default_rng(seed).normal(size=scene.x.shape)
+
+
+# Displacements against the slip of 0.02: sticking, sliding.
+@pytest.mark.parametrize("amount", [0.003, 0.05])
+@pytest.mark.parametrize("name", NAMES)
+def test_friction_has_the_derivatives_of_its_energy(name, amount):
+    scene = contact_scenes.make(name)
+    potential = scene.potential()
+    start, x = moved(scene, amount), moved(scene, amount, 6)
+    _, g, h = potential.friction(scene.x, start, x)
+    for d in directions(x.shape, 2):
+        slope = difference(lambda at: potential.friction(scene.x, start, at)[0], x, d, 1e-7)
+        assert slope == pytest.approx(g @ d.ravel(), abs=1e-7 * np.linalg.norm(g))
+        curvature = difference(lambda at: potential.friction(scene.x, start, at)[1], x, d, 1e-7)
+        np.testing.assert_allclose(
+            curvature, h @ d.ravel(), atol=1e-5 * np.abs(h @ d.ravel()).max()
+        )
+
+
+@pytest.mark.parametrize("amount", [0.003, 0.05])
+@pytest.mark.parametrize("name", NAMES)
+def test_mixed_derivatives_of_friction(name, amount):
+    scene = contact_scenes.make(name)
+    if not scene.thickness:
+        scene.thickness = parameter_of(scene, "thickness").tolist()
+    start, x = moved(scene, amount), moved(scene, amount, 6)
+    z = directions(x.shape, 1, seed=8)[0]
+
+    def value(potential, lag=scene.x):
+        return potential.friction(lag, start, x)[1] @ z.ravel()
+
+    found = scene.potential().friction_mixed(scene.x, start, x, z)
+    check_parameters(scene, found, value)
+    for d in directions(x.shape, 3):
+        slope = difference(lambda lag: value(scene.potential(), lag), scene.x, d, 1e-7)
+        expected = found["x_lag"] @ d.ravel()
+        assert slope == pytest.approx(expected, abs=2e-6 * np.linalg.norm(found["x_lag"]))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_energies_are_comparable_between_positions(name):
+    """Entry by entry they change no more than the positions do."""
+    scene = contact_scenes.make(name)
+    potential = scene.potential()
+    rng = np.random.default_rng(9)
+    other = scene.x + 1e-9 * rng.normal(size=scene.x.shape)
+    a, b = potential.energies(scene.x, other)
+    assert np.abs(b - a).max() < 1e-5 * a.max()
+    assert energy(potential, other) == pytest.approx(b.sum(), rel=1e-12)
+
+
+def test_touching_is_infinite():
+    """Also where a weight at the same distance is negative."""
+    scene = contact_scenes.make("on_relief")
+    x = scene.x.copy()
+    body = scene.surface == 1
+    x[0] = x[body][20]
+    assert energy(scene.potential(), x) == np.inf

@@ -1,0 +1,196 @@
+"""The energy of contact as a plain sum over every feature of every surface, with ipctk's distances.
+
+No candidates, no merging, no classification: what the core's sums must add up to.
+"""
+
+import collections
+import itertools
+from dataclasses import dataclass, field
+
+import ipctk
+import numpy as np
+
+from diffcloth_torch import _kernels as kernels
+
+
+@dataclass
+class ContactScene:
+    """Surfaces in contact, and all that their energy depends on."""
+
+    X: np.ndarray  # rest positions
+    x: np.ndarray
+    faces: np.ndarray
+    surface: np.ndarray
+    cloth_count: int
+    prescribed: np.ndarray
+    d_hat: float = 0.1
+    kappa: float = 3.0
+    slip: float = 0.02
+    thickness: list = field(default_factory=list)
+    self_contact: bool = True
+
+    def potential(self, **changes):
+        count = int(self.surface.max()) + 1
+        friction = 0.1 + np.arange(count**2) / count**2
+        values = {
+            "kappa": self.kappa,
+            "d_hat": self.d_hat,
+            "slip": self.slip,
+            "thickness": self.thickness or [0.0] * count,
+            "friction": friction.tolist(),
+        } | changes
+        return kernels.ContactPotential(
+            self.faces.astype(np.int32),
+            self.surface.tolist(),
+            self.cloth_count,
+            self.self_contact,
+            self.X,
+            self.prescribed.tolist(),
+            **values,
+        )
+
+
+def stack(cloths, bodies, pins=(), **values):
+    """Scene of (X, x, faces) of every cloth and (x, faces) of every body."""
+    parts = [*cloths, *((x, x, f) for x, f in bodies)]
+    counts = [len(x) for _, x, _ in parts]
+    starts = np.cumsum([0, *counts[:-1]])
+    surface = np.repeat(np.arange(len(parts), dtype=np.int32), counts)
+    prescribed = surface >= len(cloths)
+    prescribed[list(pins)] = True
+    return ContactScene(
+        X=np.concatenate([X for X, _, _ in parts]).astype(float),
+        x=np.concatenate([x for _, x, _ in parts]).astype(float),
+        faces=np.concatenate([f + s for (_, _, f), s in zip(parts, starts, strict=True)]),
+        surface=surface,
+        cloth_count=len(cloths),
+        prescribed=prescribed,
+        **values,
+    )
+
+
+def edges_of(faces):
+    return sorted({tuple(sorted((f[k], f[(k + 1) % 3]))) for f in faces for k in range(3)})
+
+
+def area(a, b, c):
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a))
+
+
+class FeatureSum:
+    """Sum over features; the sharpness of a body's features is that of the core."""
+
+    def __init__(self, scene):
+        self.scene = scene
+        potential = scene.potential()
+        count = int(scene.surface.max()) + 1
+        self.thickness = scene.thickness or [0.0] * count
+        self.faces = [
+            [tuple(map(int, f)) for f in scene.faces if scene.surface[f[0]] == s]
+            for s in range(count)
+        ]
+        self.vertex_area = collections.Counter()
+        self.edge_area = collections.Counter()
+        for f in scene.faces:
+            third = area(*scene.X[f]) / 3
+            for k in range(3):
+                self.vertex_area[f[k]] += third
+                self.edge_area[tuple(sorted((f[k], f[(k + 1) % 3])))] += third
+        edges = [tuple(map(int, e)) for e in potential.edges()]
+        first = sum(scene.surface[e[0]] < scene.cloth_count for e in edges)
+        first_vertex = int((scene.surface < scene.cloth_count).sum())
+        self.edge_sharpness, self.vertex_sharpness = [], []
+        for cloth in range(scene.cloth_count):
+            of_edge, of_vertex = potential.sharpness(cloth)
+            self.edge_sharpness.append(dict(zip(edges[first:], of_edge, strict=True)))
+            self.vertex_sharpness.append(dict(enumerate(of_vertex, first_vertex)))
+        self.continuation = dict(zip(edges[first:], potential.continuation(), strict=True))
+
+    def barrier(self, d_sq, s, r):
+        xi = 0.5 * (self.thickness[s] + self.thickness[r])
+        return kernels.barrier(d_sq, xi, self.scene.d_hat)
+
+    def counted_faces(self, s):
+        """Those that a point sees: of a cloth, with a vertex that is free."""
+        if s >= self.scene.cloth_count:
+            return self.faces[s]
+        return [f for f in self.faces[s] if not self.scene.prescribed[list(f)].all()]
+
+    def point_against(self, x, p, s, r):
+        """Sum over the features of surface r of w b(D)."""
+        faces = self.counted_faces(r)
+        of_edge = collections.Counter(e for f in faces for e in edges_of([f]))
+        of_vertex = collections.Counter(v for f in faces for v in f)
+        total = sum(
+            self.barrier(ipctk.point_triangle_distance(x[p], *x[list(f)]), s, r) for f in faces
+        )
+        for e, n_f in of_edge.items():
+            if n_f != 1:
+                b = self.barrier(ipctk.point_edge_distance(x[p], *x[list(e)]), s, r)
+                total += (1 - n_f) * b
+        for v, n_f in of_vertex.items():
+            w = 1 - n_f + sum(n - 1 for e, n in of_edge.items() if v in e)
+            if w:
+                total += w * self.barrier(np.sum((x[p] - x[v]) ** 2), s, r)
+        return total
+
+    def mollifier(self, x, c, e):
+        rest = self.scene.X
+        length_sq = [np.sum((rest[i] - rest[j]) ** 2) for i, j in (c, e)]
+        return kernels.mollifier(x[[*c, *e]], kernels.mollifier_threshold(*length_sq))[0]
+
+    def edge_against(self, x, c, s, r):
+        """Sum over the sharp edges of body r."""
+        total = 0.0
+        for e in edges_of(self.faces[r]):
+            sharpness = self.edge_sharpness[s][e]
+            if not sharpness:
+                continue
+            inner = self.barrier(ipctk.edge_edge_distance(*x[list(c)], *x[list(e)]), s, r)
+            for v, gamma in zip(e, self.continuation[e], strict=True):
+                b = self.barrier(ipctk.point_edge_distance(x[v], *x[list(c)]), s, r)
+                inner -= 0.5 * gamma * b
+            total += sharpness * self.mollifier(x, c, e) * inner
+        return total
+
+    def energy(self, x):
+        scene = self.scene
+        total = 0.0
+        for s in range(scene.cloth_count):
+            points = np.unique(self.faces[s])
+            for r in range(scene.cloth_count, len(self.faces)):
+                for p in points:
+                    if not scene.prescribed[p]:
+                        total += 0.25 * self.vertex_area[p] * self.point_against(x, p, s, r)
+                for c in edges_of(self.faces[s]):
+                    if not scene.prescribed[list(c)].all():
+                        total += 0.5 * self.edge_area[c] * self.edge_against(x, c, s, r)
+                mean_area = np.mean([area(*scene.X[list(f)]) for f in self.faces[s]])
+                for v in np.unique(self.faces[r]):
+                    sharpness = self.vertex_sharpness[s][v]
+                    if sharpness:
+                        sum_over_cloth = self.point_against(x, v, r, s)
+                        total += 0.25 * sharpness * mean_area * sum_over_cloth
+            for r in range(s, scene.cloth_count):
+                total += self.between_cloths(x, s, r)
+        return scene.kappa * total
+
+    def between_cloths(self, x, s, r):
+        scene = self.scene
+        if s == r and not scene.self_contact:
+            return 0.0
+        total = 0.0
+        for a, b in {(s, r), (r, s)}:
+            for p, f in itertools.product(np.unique(self.faces[a]), self.faces[b]):
+                if p in f or scene.prescribed[[p, *f]].all():
+                    continue
+                d_sq = ipctk.point_triangle_distance(x[p], *x[list(f)])
+                total += 0.25 * self.vertex_area[p] * self.barrier(d_sq, s, r)
+        for c, e in itertools.product(edges_of(self.faces[s]), edges_of(self.faces[r])):
+            if (s == r and c >= e) or set(c) & set(e) or scene.prescribed[[*c, *e]].all():
+                continue
+            b = self.barrier(ipctk.edge_edge_distance(*x[list(c)], *x[list(e)]), s, r)
+            if b:
+                weight = 0.25 * (self.edge_area[c] + self.edge_area[e])
+                total += weight * self.mollifier(x, c, e) * b
+        return total

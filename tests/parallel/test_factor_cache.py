@@ -1,0 +1,36 @@
+"""Factors are kept for backward up to a number of bytes, and made again where they are gone."""
+
+import pytest
+import torch
+from parallel_scenes import batch, simulator
+
+import diffcloth_torch as dc
+from diffcloth_torch import _core
+
+
+def test_factors_are_kept_up_to_a_number_of_bytes():
+    sim = dc.Simulator(dc.Scene([dc.Cloth.grid(30, 30)], gravity=(0, 0, 0)), 0.01)
+    core, largest = sim._core, _core.Simulator.largest_factor_bytes
+    state = sim.initial_state().replace(positions=sim.initial_state().positions.requires_grad_())
+    kept, sizes = [], []
+    while len(sizes) < 2 or sizes[-1] > sizes[-2]:
+        kept.append(sim.step(state))
+        sizes.append(core.factor_bytes)
+        assert 0 < sizes[-1] <= largest
+        assert len(sizes) < 1000
+    # It was full, and held as many as there was room for.
+    assert sizes[-1] > largest - sizes[0] - 1
+    core.forget_factors()
+    assert core.factor_bytes == 0
+
+
+@pytest.mark.parametrize("scheme", ["coupled", "split"])
+def test_factors_that_are_gone_change_no_bit(scheme):
+    sim, state = simulator(12, scheme), batch(12, 2, scheme=scheme)
+    x = state.positions.clone().requires_grad_()
+    after = sim.step(state.replace(positions=x))
+    loss = (after.positions**2).sum() + after.body_forces.sum()
+    (kept,) = torch.autograd.grad(loss, x, retain_graph=True)
+    sim._core.forget_factors()
+    (made_again,) = torch.autograd.grad(loss, x)
+    assert torch.equal(kept, made_again)
