@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 Arrays = dict[str, NDArray[Any]]
 
+input_names: list[str]
+
 class SimulationError(RuntimeError): ...
 
 def build_info() -> dict[str, Any]: ...

@@ -4,16 +4,28 @@ from __future__ import annotations
 
 import difflib
 import itertools
+import math
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 import yaml
-from annotated_types import Ge, Gt, Le, Len, Lt
-from pydantic import BaseModel, ConfigDict, Discriminator, Field, ValidationError, model_validator
+from annotated_types import Ge, Gt, Interval, Le, Len, Lt
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    ValidationError,
+    create_model,
+    model_validator,
+)
 
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.viewers.look import Camera, Pictures
 
 __all__ = [
@@ -49,6 +61,16 @@ NonNegative = Annotated[float, Ge(0)]
 Vector3 = Annotated[list[float], Len(3, 3)]
 Lengths2 = Positive | Annotated[list[Positive], Len(2, 2)]
 Lengths3 = Positive | Annotated[list[Positive], Len(3, 3)]
+
+
+def _limits(parameter: str) -> Interval:
+    """Range of a parameter's values, as a configuration's schema has it."""
+    accepted = PARAMETERS[parameter].accepted
+    low = None if math.isinf(accepted.low) else accepted.low
+    high = None if math.isinf(accepted.high) else accepted.high
+    return Interval(ge=low, le=high) if accepted.closed else Interval(gt=low, lt=high)
+
+
 Color = Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]
 """A color as "#rrggbb"."""
 
@@ -215,16 +237,14 @@ class Selection(Section):
         return self
 
 
-class MaterialSection(Section):
-    """Properties of a cloth, in the units of `Material`; what is not given takes its default."""
+_LIMITED: dict[str, Any] = {
+    field.name: (Annotated[float, _limits(field.name)] | None, None) for field in fields(Material)
+}
+_MaterialFields: Any = create_model("_MaterialFields", __base__=Section, **_LIMITED)
 
-    stretch: Positive | None = None
-    bending: NonNegative | None = None
-    poisson: Annotated[float, Gt(-1), Lt(0.5)] | None = None
-    density: Positive | None = None
-    damping: NonNegative | None = None
-    friction: NonNegative | None = None
-    thickness: NonNegative | None = None
+
+class MaterialSection(_MaterialFields):  # type: ignore[misc]  # its fields are those of Material
+    """Properties of a cloth, in the units of `Material`; what is not given takes its default."""
 
 
 class ClothSection(Section):
@@ -236,7 +256,7 @@ class ClothSection(Section):
     material: MaterialSection = MaterialSection()
     pins: dict[str, Selection] = {}
     soft_pins: dict[str, Selection] = {}
-    pin_stiffness: Positive | None = None
+    pin_stiffness: Annotated[float, _limits("pin_stiffness")] | None = None
     pin_trajectories: dict[str, Annotated[list[PinKeyframe], Len(1)]] = {}
     bending_model: Literal["patch", "hinge"] | None = None
     color: Color | None = None
@@ -266,8 +286,8 @@ class BodySection(Section):
     pose: PoseSection = PoseSection()
     motion: Literal["static", "kinematic"] = "static"
     trajectory: list[PoseKeyframe] = []
-    friction: NonNegative | None = None
-    thickness: NonNegative | None = None
+    friction: Annotated[float, _limits("friction")] | None = None
+    thickness: Annotated[float, _limits("thickness")] | None = None
     color: Color | None = None
 
     @model_validator(mode="after")
@@ -292,10 +312,10 @@ class SceneSection(Section):
 class ContactSection(Section):
     """Options of contact, as in `ContactOptions`."""
 
-    barrier_distance: Positive | None = None
-    barrier_stiffness: Positive | None = None
+    barrier_distance: Annotated[float, _limits("barrier_distance")] | None = None
+    barrier_stiffness: Annotated[float, _limits("barrier_stiffness")] | None = None
     friction_iterations: Annotated[int, Ge(1)] | None = None
-    slip_velocity: Positive | None = None
+    slip_velocity: Annotated[float, _limits("slip_velocity")] | None = None
     self_contact: bool | None = None
 
 

@@ -29,7 +29,8 @@ from diffcloth_torch.geometry import shapes
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import pose_array, transform
 from diffcloth_torch.geometry.surfaces import check_areas, check_manifold, surface_arrays
-from diffcloth_torch.model.materials import FACE_RANGES, Material
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.quantities import FACE_QUANTITIES, check_parameter
 
 __all__ = ["BENDING_MODELS", "Cloth", "plane_size"]
 
@@ -101,10 +102,7 @@ class Cloth:
         self.rest_vertices = _rest(rest_vertices, points, triangles)
         self.material = _material(material, len(triangles))
         self.pins, self.soft_pins = _pin_groups(pins, soft_pins, len(points))
-        instead = "differentiate with respect to Parameters.pin_stiffness"
-        self.pin_stiffness = check_number(
-            "Cloth: `pin_stiffness`", pin_stiffness, POSITIVE, instead=instead
-        )
+        self.pin_stiffness = check_parameter("Cloth", "pin_stiffness", pin_stiffness)
         self.bending_model = check_choice("Cloth: `bending_model`", bending_model, BENDING_MODELS)
         self.name = check_name("Cloth: `name`", name)
 
@@ -203,7 +201,7 @@ def _rest(rest_vertices: object, vertices: FloatArray, faces: IndexArray) -> Flo
 def _material(material: object, face_count: int) -> Material:
     if not isinstance(material, Material):
         raise TypeError(f"Cloth: `material` must be a Material, got {type(material).__name__}")
-    for field in FACE_RANGES:
+    for field in FACE_QUANTITIES:
         value = np.asarray(getattr(material, field))
         check_shape(f"Cloth: `material.{field}`", value.shape, [(), (face_count,)])
     return material

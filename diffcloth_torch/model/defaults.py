@@ -9,8 +9,9 @@ from torch import Tensor
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.surfaces import unique_edges
-from diffcloth_torch.model.materials import FACE_RANGES, Material
+from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ContactOptions
+from diffcloth_torch.model.quantities import FACE_QUANTITIES
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Assembly, Scene
 
@@ -37,7 +38,7 @@ def scene_parameters(scene: Scene, assembly: Assembly, contact: bool) -> dict[st
         assembly: Its arrays.
         contact: Whether any two of its surfaces may touch.
     """
-    values = {field: _material_values(scene, field) for field in FACE_RANGES}
+    values = {field: _material_values(scene, field) for field in FACE_QUANTITIES}
     if all(cloth.bending_model == "hinge" for cloth in scene.cloths):
         del values["poisson"]  # hinges have no Poisson effect
     if contact:

@@ -6,27 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from diffcloth_torch.checks import (
-    NON_NEGATIVE,
-    POISSON,
-    POSITIVE,
     FloatArray,
-    check_number,
     check_range,
     check_shape,
     float_array,
     frozen,
 )
+from diffcloth_torch.model.quantities import FACE_QUANTITIES, PARAMETERS, check_parameter
 
-__all__ = ["FACE_RANGES", "Material"]
-
-FACE_RANGES = {
-    "stretch": POSITIVE,
-    "bending": NON_NEGATIVE,
-    "poisson": POISSON,
-    "density": POSITIVE,
-    "damping": NON_NEGATIVE,
-}
-"""Accepted values of the fields that may differ from face to face."""
+__all__ = ["Material"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,18 +40,15 @@ class Material:
     thickness: float = 0.0
 
     def __post_init__(self) -> None:
-        for field, accepted in FACE_RANGES.items():
+        for field in FACE_QUANTITIES:
             name = f"Material: `{field}`"
             instead = f"differentiate with respect to Parameters.{field}"
             values = float_array(name, getattr(self, field), instead=instead)
             check_shape(name, values.shape, [(), ("F",)])
-            check_range(name, values, accepted)
+            check_range(name, values, PARAMETERS[field].accepted)
             self._keep(field, frozen(values) if values.ndim else float(values))
         for field in ("friction", "thickness"):
-            instead = f"differentiate with respect to Parameters.{field}"
-            value = getattr(self, field)
-            name = f"Material: `{field}`"
-            self._keep(field, check_number(name, value, NON_NEGATIVE, instead=instead))
+            self._keep(field, check_parameter("Material", field, getattr(self, field)))
 
     def _keep(self, field: str, value: Any) -> None:
         object.__setattr__(self, field, value)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from diffcloth_torch.checks import POSITIVE, check_bool, check_choice, check_count, check_number
+from diffcloth_torch.model.quantities import check_parameter
 
 __all__ = ["METRICS", "SCHEMES", "ContactOptions", "SolverOptions"]
 
@@ -36,9 +37,7 @@ class ContactOptions:
             value = getattr(self, field)
             if value is None and field != "slip_velocity":
                 continue
-            instead = f"differentiate with respect to Parameters.{field}"
-            number = check_number(f"ContactOptions: `{field}`", value, POSITIVE, instead=instead)
-            object.__setattr__(self, field, number)
+            object.__setattr__(self, field, check_parameter("ContactOptions", field, value))
         iterations = check_count(
             "ContactOptions: `friction_iterations`", self.friction_iterations, 1
         )

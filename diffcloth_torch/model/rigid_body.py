@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from diffcloth_torch.checks import (
-    NON_NEGATIVE,
     POSITIVE,
     FloatArray,
     IndexArray,
@@ -26,6 +25,7 @@ from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import pose_array
 from diffcloth_torch.geometry.surfaces import surface_arrays
 from diffcloth_torch.model.cloth import plane_size
+from diffcloth_torch.model.quantities import check_parameter
 
 __all__ = ["MOTIONS", "RigidBody"]
 
@@ -84,14 +84,8 @@ class RigidBody:
         self.vertices, self.faces = surface_arrays("RigidBody", vertices, faces, instead=_POSES)
         self.motion = check_choice("RigidBody: `motion`", motion, MOTIONS)
         self.pose = frozen(pose_array("RigidBody: `pose`", pose, instead=_POSES))
-        instead = "differentiate with respect to Parameters.friction"
-        self.friction = check_number(
-            "RigidBody: `friction`", friction, NON_NEGATIVE, instead=instead
-        )
-        instead = "differentiate with respect to Parameters.thickness"
-        self.thickness = check_number(
-            "RigidBody: `thickness`", thickness, NON_NEGATIVE, instead=instead
-        )
+        self.friction = check_parameter("RigidBody", "friction", friction)
+        self.thickness = check_parameter("RigidBody", "thickness", thickness)
         self.name = check_name("RigidBody: `name`", name)
 
     @classmethod

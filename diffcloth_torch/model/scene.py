@@ -145,6 +145,20 @@ class Assembly:
     static_bodies: tuple[int, ...]
 
     @property
+    def sizes(self) -> dict[str, int]:
+        """Sizes by the letters that the tables of quantities have for them."""
+        return {
+            "N": len(self.vertices),
+            "F": len(self.faces),
+            "C": self.cloth_count,
+            "K": self.body_count,
+            "V": len(self.body_vertices),
+            "S": self.surface_count,
+            "P": len(self.pins),
+            "Q": len(self.soft_pins),
+        }
+
+    @property
     def cloth_count(self) -> int:
         """Number of cloths, C."""
         return len(self.cloth_vertex_start) - 1

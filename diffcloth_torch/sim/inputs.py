@@ -8,17 +8,13 @@ that gradients find their way back to what the caller passed, in its own dtype.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from diffcloth_torch.checks import (
-    NON_NEGATIVE,
-    POSITIVE,
     FloatArray,
-    Range,
     check_finite,
     check_range,
     check_shape,
@@ -27,13 +23,12 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.poses import check_quaternions
 from diffcloth_torch.geometry.surfaces import check_areas
-from diffcloth_torch.model.materials import FACE_RANGES
+from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Shape, shape_of
 from diffcloth_torch.model.scene import Assembly
 from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.state import State
 
 __all__ = [
-    "PARAMETER_NAMES",
     "Inputs",
     "check_control",
     "check_parameters",
@@ -44,33 +39,13 @@ __all__ = [
 
 Inputs = dict[str, Tensor]
 
-_RANGES: Mapping[str, Range] = {
-    **FACE_RANGES,
-    "friction": NON_NEGATIVE,
-    "thickness": NON_NEGATIVE,
-    "barrier_stiffness": POSITIVE,
-    "barrier_distance": POSITIVE,
-    "slip_velocity": POSITIVE,
-    "pin_stiffness": POSITIVE,
-    "gravity": Range(),
-    "rest_positions": Range(),
-}
-PARAMETER_NAMES = tuple(_RANGES)
-
-Shape = tuple[int, ...]
-
 
 def state_inputs(assembly: Assembly, state: State) -> tuple[Inputs, int | None]:
     """Check a state; returns its tensors and its batch size, None without a batch axis."""
     if not isinstance(state, State):
         raise TypeError(f"step: `state` must be a State, got {type(state).__name__}")
-    vertex_count = len(assembly.vertices)
-    shapes: dict[str, Shape] = {
-        "positions": (vertex_count, 3),
-        "velocities": (vertex_count, 3),
-        "body_poses": (assembly.body_count, 7),
-        "soft_pin_targets": (len(assembly.soft_pins), 3),
-    }
+    sizes = assembly.sizes
+    shapes = {name: shape_of(q.axes[0], sizes) for name, q in STATE.items() if q.core}
     for name in shapes:
         _check_state_tensor(name, getattr(state, name))
     batch = state.batch_size
@@ -115,19 +90,17 @@ def check_control(assembly: Assembly, control: Control) -> Control:
     """Promote a control to tensors and check everything that does not depend on a state."""
     if not isinstance(control, Control):
         raise TypeError(f"step: `control` must be a Control, got {type(control).__name__}")
-    counts = {"pins": len(assembly.pins), "soft_pins": len(assembly.soft_pins)}
+    sizes = assembly.sizes
     groups = {"pins": assembly.pin_groups, "soft_pins": assembly.soft_pin_groups}
     checked: dict[str, Tensor | dict[str, Tensor] | None] = {}
-    for field, count in counts.items():
+    for field, quantity in CONTROL.items():
         given = getattr(control, field)
-        if isinstance(given, Mapping):
+        if field in groups and isinstance(given, Mapping):
             checked[field] = _named_pins(field, given, groups[field])
         else:
-            checked[field] = _target(field, given, (count, 3))
-    checked["body_poses"] = _target("body_poses", control.body_poses, (assembly.body_count, 7))
+            checked[field] = _target(field, given, shape_of(quantity.axes[0], sizes))
     if checked["body_poses"] is not None:
         check_quaternions("control: `body_poses`", _numbers(checked["body_poses"]))  # type: ignore[arg-type]
-    checked["forces"] = _target("forces", control.forces, (len(assembly.vertices), 3))
     return Control(**checked)  # type: ignore[arg-type]
 
 
@@ -255,34 +228,12 @@ def check_parameters(parameters: Parameters) -> Parameters:
     """Promote parameters to tensors; their values are checked in each step."""
     if not isinstance(parameters, Parameters):
         raise TypeError(f"step: `parameters` must be Parameters, got {type(parameters).__name__}")
-    given = {name: getattr(parameters, name) for name in PARAMETER_NAMES}
+    given = {name: getattr(parameters, name) for name in PARAMETERS}
     tensors = {
         name: None if value is None else float_tensor(f"parameters: `{name}`", value)
         for name, value in given.items()
     }
     return Parameters(**tensors, _unbatched=parameters._unbatched)
-
-
-class _ParameterShapes(NamedTuple):
-    shared: list[Shape]  # accepted shapes without a batch axis
-    core: Shape  # axes of the core's tensor behind that of the environments
-
-
-def _parameter_shapes(assembly: Assembly, name: str) -> _ParameterShapes:
-    cloths, surfaces = assembly.cloth_count, assembly.surface_count
-    if name in FACE_RANGES:
-        return _ParameterShapes([(), (cloths,), (len(assembly.faces),)], (-1,))
-    if name == "friction":
-        return _ParameterShapes([(), (surfaces, surfaces)], (-1,))
-    if name == "pin_stiffness":
-        return _ParameterShapes([(), (cloths,)], (-1,))
-    if name == "thickness":
-        return _ParameterShapes([(surfaces,)], (-1,))
-    if name == "gravity":
-        return _ParameterShapes([(3,)], (3,))
-    if name == "rest_positions":
-        return _ParameterShapes([(len(assembly.vertices), 3)], (-1, 3))
-    return _ParameterShapes([()], (1,))
 
 
 def parameter_inputs(
@@ -294,7 +245,8 @@ def parameter_inputs(
     """Check parameters; a field that is None takes the default, `defaults` has all there are."""
     checked = check_parameters(parameters)
     inputs = {}
-    for name, accepted in _RANGES.items():
+    sizes = assembly.sizes
+    for name, quantity in PARAMETERS.items():
         given = getattr(checked, name)
         if name not in defaults:
             if given is not None:
@@ -305,11 +257,11 @@ def parameter_inputs(
         label = f"parameters: `{name}`"
         tensor = defaults[name] if given is None else given
         if given is not None:
-            check_range(label, _numbers(tensor), accepted)
-        shapes = _parameter_shapes(assembly, name)
+            check_range(label, _numbers(tensor), quantity.accepted)
+        shared = [shape_of(axes, sizes) for axes in quantity.axes]
         unbatched = given is None or name in parameters._unbatched
-        rows = _environments(label, tuple(tensor.shape), shapes.shared, batch, unbatched)
-        inputs[name] = tensor.reshape(rows, *shapes.core)
+        rows = _environments(label, tuple(tensor.shape), shared, batch, unbatched)
+        inputs[name] = tensor.reshape(rows, *quantity.core_axes)
         if (
             name == "rest_positions"
             and given is not None

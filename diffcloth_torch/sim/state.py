@@ -15,6 +15,7 @@ from diffcloth_torch._moved import allow_loading
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import MeshPart, write_mesh
 from diffcloth_torch.geometry.poses import transform
+from diffcloth_torch.model.quantities import STATE
 from diffcloth_torch.sim.report import Report
 
 __all__ = ["State", "Surfaces", "check_field_names", "stack", "where"]
@@ -148,7 +149,7 @@ class State:
         return State(**tensors, report=report, _surfaces=self._surfaces)
 
 
-_TENSORS = ("positions", "velocities", "body_poses", "soft_pin_targets", "body_forces", "time")
+_TENSORS = tuple(STATE)
 
 
 def stack(states: Sequence[State]) -> State:
