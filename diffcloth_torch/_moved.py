@@ -44,6 +44,7 @@ _NOW = {
     "surfaces": "geometry.surfaces",
     "tasks.scenes": "config.scenes",
     "tasks.shapes": "config.shapes",
+    "viewers.registry": "viewers.several",
 }
 MOVED = {_PACKAGE + old: _PACKAGE + new for old, new in _NOW.items()}
 """Old path -> new path."""

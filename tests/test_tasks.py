@@ -293,6 +293,22 @@ def test_a_simulated_sheet_hangs_from_its_pins(tmp_path):
     assert not states[-1].positions.requires_grad
 
 
+def test_a_controller_may_close_the_loop(tmp_path):
+    """It is asked before each step, with the state before that step."""
+    task = load_task(write_config(tmp_path, SHEET))
+    asked = []
+
+    def controller(k, state):
+        asked.append((k, round(float(state.time) / 0.01)))
+        return dc.Control(pins={"sheet/top": state.positions[8:12] + 1e-3})
+
+    task.controller = lambda actions: controller
+    states = list(simulate(task))
+    assert asked == [(0, 0), (1, 1), (2, 2), (3, 3)]
+    moved = states[-1].positions[8:12] - states[0].positions[8:12]
+    torch.testing.assert_close(moved, torch.full_like(moved, 4e-3))
+
+
 # --- hit cloth ----------------------------------------------------------------------------------
 
 SMALL = [

@@ -69,6 +69,7 @@ def _parameters(*quantities: Quantity) -> Mapping[str, Quantity]:
 
 
 _PER_FACE: tuple[Axes, ...] = ((), ("C",), ("F",))
+_PAIRS: tuple[Axes, ...] = ((), ("S", "S"))
 _ONE: tuple[Axes, ...] = ((),)
 
 STATE = _table(
@@ -91,9 +92,7 @@ PARAMETERS = _parameters(
     Quantity("poisson", "-", _PER_FACE, "Material.poisson", POISSON),
     Quantity("density", "kg/m^2", _PER_FACE, "Material.density", POSITIVE),
     Quantity("damping", "s", _PER_FACE, "Material.damping", NON_NEGATIVE),
-    Quantity(
-        "friction", "-", ((), ("S", "S")), "Material.friction, RigidBody.friction", NON_NEGATIVE
-    ),
+    Quantity("friction", "-", _PAIRS, "Material.friction, RigidBody.friction", NON_NEGATIVE),
     Quantity("thickness", "m", (("S",),), "Material.thickness, RigidBody.thickness", NON_NEGATIVE),
     Quantity("barrier_stiffness", "Pa", _ONE, "ContactOptions.barrier_stiffness", POSITIVE),
     Quantity("barrier_distance", "m", _ONE, "ContactOptions.barrier_distance", POSITIVE),
