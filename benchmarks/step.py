@@ -7,8 +7,7 @@
 Times are medians with quartiles, in milliseconds per environment, and medians in EF: one numeric
 factorization of the contact-free Hessian of the same state by `Eigen::SimplicialLDLT`, timed in
 between the steps. Machines differ by more than the code does; EF divides most of that out. One core
-is used but where `threads` says otherwise: `torch.set_num_threads(1)`, as `--threads` sets it, and
-a BLAS that does not start threads (`OPENBLAS_NUM_THREADS=1`; `diffcloth info` names the BLAS).
+is used but where `threads` says otherwise: `torch.set_num_threads(1)`, as `--threads` sets it.
 
 Each step is differentiated: its backward takes cotangents of positions and velocities to those
 before the step and to the targets of the bodies. Solves are at the default tolerance. `touching`
@@ -64,7 +63,7 @@ def main(
         rows += [(name, batch_size, 2 if quick else BATCH, n) for name in names for n in pools]
 
     core = dc.build_info()
-    print(f"{_processor()}; torch {torch.__version__}; {core['factorization']}; {core['blas']}")
+    print(f"{_processor()}; torch {torch.__version__}; {core['factorization']}")
     print(f"h = {DT:g} s, scheme coupled, tolerance {dc.SolverOptions().tolerance:g} m/s\n")
     print(_HEAD)
     timings = []

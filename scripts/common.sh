@@ -39,11 +39,6 @@ missing_system_packages() {
 import pathlib, sys, sysconfig
 sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())' ||
     echo "python3-dev          # compiles the core"
-  if [[ ! -e /usr/include/suitesparse/cholmod.h && ! -e /usr/include/cholmod.h ]]; then
-    echo "libsuitesparse-dev   # CHOLMOD, the faster factorization; else Eigen's"
-    # Its dense kernels must not start threads of their own.
-    echo "libopenblas0-serial  # dense kernels of CHOLMOD"
-  fi
   # Found by hiding one library after the other: without a display, VTK draws through EGL on
   # Mesa's software renderer, and it crashes without libX11.
   has_library libEGL.so.1 || echo "libegl1              # pictures without a display"
@@ -53,10 +48,12 @@ sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())' 
   has_library libXcursor.so.1 || echo "libxcursor1          # pictures"
 }
 
-# Install what is missing where that needs no question: as root, or with sudo without password.
-install_system_packages() {
-  local missing names sudo=()
-  missing=$(missing_system_packages)
+install_system_packages() { install_packages "$(missing_system_packages)"; }
+
+# install_packages LINES: what they name, "package  # what it is for", where that needs no question:
+# as root, or with sudo without password.
+install_packages() {
+  local missing=$1 names sudo=()
   [[ -n $missing ]] || return 0
   mapfile -t names < <(sed 's/ *#.*//' <<<"$missing")
   if ((EUID != 0)); then sudo=(sudo -n); fi

@@ -13,13 +13,13 @@ namespace {
 std::unique_ptr<const AnalysisBackend> analyze(const BlockPattern& pattern,
                                                const std::vector<char>& fixed,
                                                Backend backend,
-                                               KernelLevel level) {
+                                               const CholeskyOptions& options) {
   const Graph graph = unknown_graph(pattern, fixed);
-  const EliminationTree tree = eliminate(graph, fill_reducing_order(graph));
+  const EliminationTree tree = eliminate(graph, fill_reducing_order(graph, options.ordering));
   const Elimination elimination{.pattern = pattern, .graph = graph, .tree = tree};
   switch (backend) {
     case Backend::kMultifrontal:
-      return analyze_multifrontal(elimination, level);
+      return analyze_multifrontal(elimination, options.level);
     case Backend::kEigen:
       return analyze_eigen(elimination);
     case Backend::kCholmod:
@@ -72,8 +72,8 @@ double* CholeskyWorkspace::reserve(std::size_t size) {
 CholeskyAnalysis::CholeskyAnalysis(const BlockPattern& pattern,
                                    const std::vector<char>& fixed,
                                    Backend backend,
-                                   KernelLevel level)
-    : backend_(analyze(pattern, fixed, backend, level)) {}
+                                   const CholeskyOptions& options)
+    : backend_(analyze(pattern, fixed, backend, options)) {}
 
 CholeskyAnalysis::~CholeskyAnalysis() = default;
 

@@ -10,6 +10,7 @@
 #include "linalg/aligned_buffer.h"
 #include "linalg/block_pattern.h"
 #include "linalg/dense_kernels.h"
+#include "linalg/ordering.h"
 
 namespace diffcloth::linalg {
 
@@ -51,6 +52,12 @@ struct CholeskySeconds {
   double dense = 0.0;       ///< columns of L and update matrices
 };
 
+/// What only tests and benchmarks choose.
+struct CholeskyOptions {
+  KernelLevel level = best_level();  ///< of our own kernels
+  Ordering ordering = Ordering::kAutomatic;
+};
+
 /// Symbolic part of A = L L^T for a block pattern with some vertices left out.
 ///
 /// Everything is done on the graph of the vertices, which is nine times smaller than that of the
@@ -58,11 +65,10 @@ struct CholeskySeconds {
 class CholeskyAnalysis {
  public:
   /// @param fixed  [pattern.size()] vertices left out of the matrix
-  /// @param level  instructions of the multifrontal kernels; others ignore it
   CholeskyAnalysis(const BlockPattern& pattern,
                    const std::vector<char>& fixed,
                    Backend backend = Backend::kMultifrontal,
-                   KernelLevel level = best_level());
+                   const CholeskyOptions& options = {});
   ~CholeskyAnalysis();
   CholeskyAnalysis(const CholeskyAnalysis&) = delete;
   CholeskyAnalysis& operator=(const CholeskyAnalysis&) = delete;

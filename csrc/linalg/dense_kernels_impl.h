@@ -14,6 +14,9 @@
 
 #include "linalg/dense_kernels.h"
 
+// Plain arrays: those of the standard library are templates that the whole program would share.
+// NOLINTBEGIN(modernize-avoid-c-arrays)
+
 #define DIFFCLOTH_INLINE inline __attribute__((always_inline))
 
 namespace diffcloth::linalg {
@@ -146,7 +149,7 @@ void solve_rows(const Block& block, int row, int begin, int end) {
   double* const a = block.slabs + row / kLanes * block.stride;
   for (int c = begin; c < end; c += kWidth) {
     const double* const strip = block.slabs + c / kLanes * block.stride + c % kLanes;
-    with_width(end - c < kWidth ? end - c : kWidth, [&]<int W>() {
+    with_width(end - c < kWidth ? end - c : kWidth, [&]<int W> {
       Tile<P, W> tile;
       double* const l = block.panel + row + c * block.ld;
       tile.load_from(l, block.ld);
@@ -159,7 +162,7 @@ void solve_rows(const Block& block, int row, int begin, int end) {
 }
 
 void solve_rows(const Block& block, int row, int packs, int begin, int end) {
-  with_packs(packs, [&]<int P>() { solve_rows<P>(block, row, begin, end); });
+  with_packs(packs, [&]<int P> { solve_rows<P>(block, row, begin, end); });
 }
 
 /// Cholesky factor of the first rows and columns of a slab's block, 1 / l_jj on the diagonal. What
@@ -190,7 +193,7 @@ bool factor_triangle(const Block& block) {
     double* const slab = block.slabs + c / kLanes * block.stride;
     double* const l = block.panel + c + c * block.ld;
     for (int j = 0; j < width; j += kWidth) {
-      with_width(width - j < kWidth ? width - j : kWidth, [&]<int W>() {
+      with_width(width - j < kWidth ? width - j : kWidth, [&]<int W> {
         Tile<1, W> tile;
         tile.load_from(l + j * block.ld, block.ld);
         tile.subtract_product(slab, block.stride, slab + j, c);
@@ -240,7 +243,7 @@ void update_rows(const Block& block, const Front& front, int first, int row, int
     const double* const a = block.slabs + from / kLanes * block.stride;
     const double* const b = block.slabs + strip / kLanes * block.stride;
     const int column = first + strip;
-    with_packs((end - from) / kLanes, [&]<int P>() {
+    with_packs((end - from) / kLanes, [&]<int P> {
       if (column < front.top) {
         const int left = front.columns - column;
         subtract_from<P>(block.panel + from + strip * block.ld, block.ld,
@@ -437,3 +440,5 @@ constexpr DenseKernels kKernels{.factor = factor,
 }  // namespace diffcloth::linalg
 
 #undef DIFFCLOTH_INLINE
+
+// NOLINTEND(modernize-avoid-c-arrays)

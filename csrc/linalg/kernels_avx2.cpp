@@ -7,7 +7,7 @@ namespace diffcloth::linalg {
 namespace {
 
 struct Pack {
-  __m256d v[2];
+  __m256d v[2];  // NOLINT(modernize-avoid-c-arrays): see dense_kernels_impl.h
 };
 
 inline Pack zero() { return {{_mm256_setzero_pd(), _mm256_setzero_pd()}}; }

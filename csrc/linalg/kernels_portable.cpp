@@ -8,7 +8,7 @@ using Two = double __attribute__((vector_size(16)));
 using UnalignedTwo = double __attribute__((vector_size(16), aligned(8), may_alias));
 
 struct Pack {
-  Two v[4];
+  Two v[4];  // NOLINT(modernize-avoid-c-arrays): see dense_kernels_impl.h
 };
 
 inline Pack zero() { return {}; }

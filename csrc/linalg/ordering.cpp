@@ -1,11 +1,38 @@
 #include "linalg/ordering.h"
 
+#include <stdexcept>
+
 #include <Eigen/OrderingMethods>
 #include <Eigen/SparseCore>
 
+#include "linalg/nested_dissection.h"
+
 namespace diffcloth::linalg {
 
-std::vector<Index> fill_reducing_order(const Graph& graph) { return minimum_degree_order(graph); }
+namespace {
+
+/// From here on the work that nested dissection saves is more than it costs.
+constexpr Index kLargeGraph = 5000;
+
+}  // namespace
+
+const char* name(Ordering ordering) {
+  switch (ordering) {
+    case Ordering::kAutomatic:
+      return "automatic";
+    case Ordering::kMinimumDegree:
+      return "minimum degree";
+    case Ordering::kNestedDissection:
+      return "nested dissection";
+  }
+  throw std::invalid_argument("unknown ordering");
+}
+
+std::vector<Index> fill_reducing_order(const Graph& graph, Ordering ordering) {
+  const bool dissect = ordering == Ordering::kNestedDissection ||
+                       (ordering == Ordering::kAutomatic && graph.size() >= kLargeGraph);
+  return dissect ? nested_dissection_order(graph) : minimum_degree_order(graph);
+}
 
 std::vector<Index> minimum_degree_order(const Graph& graph) {
   const Index n = graph.size();

@@ -21,7 +21,6 @@ double panel_blocks(Index columns, Index rows) {
 /// Whether a panel of so many columns may have this share of zeros.
 bool few_zeros(Index columns, double share) {
   const Index scalars = 3 * columns;
-  if (scalars <= 4) return true;
   return (scalars <= 16 && share < 0.8) || (scalars <= 48 && share < 0.1) || share < 0.05;
 }
 

@@ -14,13 +14,15 @@ constexpr int kIterations = 8;
 constexpr double kForcing = 0.03;
 /// Share s of the projection after an indefinite Hessian; its growth while the blend is indefinite,
 /// and how often, before the projection stands alone for once; its fall and growth with what steps
-/// gain; below which it counts as none; beyond which nothing more is to be had from it.
+/// gain; below which it counts as none; above which it need not grow, as little else is left; beyond
+/// which nothing more is to be had from it.
 constexpr double kFirstShare = 1.0;
 constexpr double kFailureGrowth = 4.0;
 constexpr int kFailures = 3;
 constexpr double kDecay = 0.25;
 constexpr double kGrowth = 2.0;
 constexpr double kNoShare = 0.05;
+constexpr double kFullShare = 64.0;
 constexpr double kLargestShare = 1e8;
 /// A step is good that gains this share of what its quadratic model promises, at once; after this
 /// many backtracks the model is poor.
@@ -119,7 +121,7 @@ void Directions::learn(const Direction& direction, const Search& search) {
     s_ *= kDecay;
     if (s_ < kNoShare) s_ = 0.0;
   } else if (search.backtracks >= kManyBacktracks) {
-    s_ *= kGrowth;
+    s_ = std::min(kGrowth * s_, kFullShare);
   }
 }
 

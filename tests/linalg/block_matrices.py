@@ -51,18 +51,29 @@ class BlockMatrix:
         fixed[vertices] = True
         return BlockMatrix(self.size, self.pairs, self.blocks, fixed)
 
-    def analysis(self, backend: str = "multifrontal", level: str = ""):
-        return kernels.CholeskyAnalysis(self.size, self.pairs, self.fixed, backend, level)
+    def analysis(self, backend: str = "multifrontal", level: str = "", ordering: str = "automatic"):
+        return kernels.CholeskyAnalysis(self.size, self.pairs, self.fixed, backend, level, ordering)
 
-    def factor(self, backend: str = "multifrontal", level: str = ""):
+    def factor(self, backend: str = "multifrontal", level: str = "", ordering: str = "automatic"):
         """A factor, which must come out positive definite."""
-        factor = kernels.CholeskyFactor(self.analysis(backend, level))
+        factor = kernels.CholeskyFactor(self.analysis(backend, level, ordering))
         assert factor.compute(self.blocks, kernels.CholeskyWorkspace())
         return factor
 
     def is_positive(self, backend: str = "multifrontal", level: str = "") -> bool:
         factor = kernels.CholeskyFactor(self.analysis(backend, level))
         return factor.compute(self.blocks, kernels.CholeskyWorkspace())
+
+    def product(self, x: np.ndarray) -> np.ndarray:
+        """A x for x [vertices, 3], without forming A densely; no vertex may be fixed."""
+        y = np.zeros_like(x)
+        for (i, j), block in zip(self.pairs, self.blocks.reshape(-1, 3, 3), strict=True):
+            if i == j:
+                y[i] += (np.tril(block.T) + np.tril(block.T, -1).T) @ x[i]
+            else:
+                y[i] += block.T @ x[j]
+                y[j] += block @ x[i]
+        return y
 
 
 def solve(factor, b: np.ndarray, fill: float = 0.0) -> np.ndarray:

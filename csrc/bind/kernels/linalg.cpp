@@ -50,6 +50,14 @@ linalg::KernelLevel level_named(const std::string& name) {
                               "'");
 }
 
+linalg::Ordering ordering_named(const std::string& name) {
+  using enum linalg::Ordering;
+  for (const linalg::Ordering ordering : {kAutomatic, kMinimumDegree, kNestedDissection}) {
+    if (name == linalg::name(ordering)) return ordering;
+  }
+  throw std::invalid_argument("Cholesky: `ordering` is unknown: '" + name + "'");
+}
+
 /// A pattern and its analysis.
 struct Analysis {
   linalg::BlockPattern pattern;
@@ -59,7 +67,8 @@ struct Analysis {
            const Pairs& pairs,
            const Flags& fixed,
            const std::string& backend,
-           const std::string& level) {
+           const std::string& level,
+           const std::string& ordering) {
     if (fixed.shape(0) != static_cast<std::size_t>(vertex_count)) {
       throw std::invalid_argument("Cholesky: `fixed` must have one entry for each vertex");
     }
@@ -73,7 +82,9 @@ struct Analysis {
     pattern = linalg::BlockPattern::from_pairs(vertex_count, std::move(list));
     analysis = std::make_shared<linalg::CholeskyAnalysis>(
         pattern, std::vector<char>(fixed.data(), fixed.data() + fixed.shape(0)),
-        backend_named(backend), level.empty() ? linalg::best_level() : level_named(level));
+        backend_named(backend),
+        linalg::CholeskyOptions{.level = level.empty() ? linalg::best_level() : level_named(level),
+                                .ordering = ordering_named(ordering)});
   }
 };
 
@@ -151,9 +162,10 @@ void linalg_kernels(nb::module_& m) {
       .def(nb::init<>())
       .def("bytes", &linalg::CholeskyWorkspace::bytes);
   nb::class_<Analysis>(m, "CholeskyAnalysis")
-      .def(nb::init<Index, const Pairs&, const Flags&, const std::string&, const std::string&>(),
+      .def(nb::init<Index, const Pairs&, const Flags&, const std::string&, const std::string&,
+                    const std::string&>(),
            "vertex_count"_a, "pairs"_a.noconvert(), "fixed"_a.noconvert(),
-           "backend"_a = "multifrontal", "level"_a = "")
+           "backend"_a = "multifrontal", "level"_a = "", "ordering"_a = "automatic")
       .def("column_start", [](const Analysis& a) { return a.pattern.column_start(); })
       .def("row", [](const Analysis& a) { return a.pattern.row(); })
       .def("dimension", [](const Analysis& a) { return a.analysis->dimension(); })
