@@ -1,6 +1,7 @@
 """Build the C++ core with CMake; everything else is in pyproject.toml."""
 
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -10,30 +11,41 @@ from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
 ROOT = Path(__file__).resolve().parent
+CMAKE_ARGS = shlex.split(os.environ.get("CMAKE_ARGS", ""))
+
+# The core, and single kernels for tests where CMAKE_ARGS asks for them.
+KERNELS = re.compile(r"-DDIFFCLOTH_KERNELS(:BOOL)?=(ON|YES|TRUE|Y|1)", re.IGNORECASE)
+MODULES = ["_core", *(["_kernels"] if any(map(KERNELS.fullmatch, CMAKE_ARGS)) else [])]
 
 
 class CMakeBuild(build_ext):
     """Configure, build and install csrc/ into the package. CMAKE_ARGS adds arguments."""
 
-    def build_extension(self, ext: Extension) -> None:
-        package = Path(self.get_ext_fullpath(ext.name)).resolve().parent
+    def run(self) -> None:
         # Outside setuptools' temporary folders, so that a second build compiles only what changed;
         # but not from the last one's settings, nor from the paths of its build environment.
-        build = ROOT / "build" / sys.implementation.cache_tag
-        (build / "CMakeCache.txt").unlink(missing_ok=True)
+        self.cmake_folder = ROOT / "build" / sys.implementation.cache_tag
+        (self.cmake_folder / "CMakeCache.txt").unlink(missing_ok=True)
         configure = [
-            *("cmake", "-S", str(ROOT / "csrc"), "-B", str(build), "-G", "Ninja"),
+            *("cmake", "-S", str(ROOT / "csrc"), "-B", str(self.cmake_folder), "-G", "Ninja"),
             f"-DPython_EXECUTABLE={sys.executable}",
-            *shlex.split(os.environ.get("CMAKE_ARGS", "")),
+            *CMAKE_ARGS,
         ]
         subprocess.run(configure, check=True)
-        subprocess.run(["cmake", "--build", str(build)], check=True)
-        subprocess.run(
-            ["cmake", "--install", str(build), "--prefix", str(package.parent)], check=True
-        )
+        subprocess.run(["cmake", "--build", str(self.cmake_folder)], check=True)
+        # setuptools packs all that lies here, also what an earlier build with other switches left.
+        for old in Path(self.build_lib, "diffcloth_torch").glob("_kernels*.so"):
+            old.unlink()
+        super().run()
+
+    def build_extension(self, ext: Extension) -> None:
+        package = Path(self.get_ext_fullpath(ext.name)).resolve().parent
+        component = ext.name.rpartition(".")[2]
+        install = ["cmake", "--install", str(self.cmake_folder), "--component", component]
+        subprocess.run([*install, "--prefix", str(package.parent)], check=True)
 
 
 setup(
-    ext_modules=[Extension("diffcloth_torch._core", sources=[])],
+    ext_modules=[Extension(f"diffcloth_torch.{module}", sources=[]) for module in MODULES],
     cmdclass={"build_ext": CMakeBuild},
 )

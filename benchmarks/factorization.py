@@ -27,7 +27,7 @@ import numpy as np
 
 import diffcloth_torch as dc
 from benchmarks.hessians import HESSIANS, Hessian
-from diffcloth_torch import _core
+from diffcloth_torch import _kernels
 
 SIZES = (24, 48, 96, 200)
 BURST = 3  # calls in a row: the first one finds its memory in no cache
@@ -47,9 +47,8 @@ class Method:
 
 def methods() -> list[Method]:
     """The slowest level of ours first."""
-    kernels = _core.kernels
-    ours = [Method("multifrontal", level) for level in kernels.kernel_levels()]
-    return ours + [Method(b) for b in kernels.cholesky_backends() if b != "multifrontal"]
+    ours = [Method("multifrontal", level) for level in _kernels.kernel_levels()]
+    return ours + [Method(b) for b in _kernels.cholesky_backends() if b != "multifrontal"]
 
 
 class Trial:
@@ -59,8 +58,8 @@ class Trial:
         self.method = method
         self.matrix = matrix
         self.analysis = self._analyze()
-        self.factor = _core.kernels.CholeskyFactor(self.analysis)
-        self.workspace = _core.kernels.CholeskyWorkspace()
+        self.factor = _kernels.CholeskyFactor(self.analysis)
+        self.workspace = _kernels.CholeskyWorkspace()
         self.b = np.random.default_rng(0).normal(size=(1, matrix.size, 3))
         self.x = np.zeros_like(self.b)
         self.seconds: dict[str, list[float]] = {"analysis": [], "factor": [], "solve": []}
@@ -78,7 +77,7 @@ class Trial:
 
     def _analyze(self):
         m = self.matrix
-        return _core.kernels.CholeskyAnalysis(
+        return _kernels.CholeskyAnalysis(
             m.size, m.pairs, m.fixed, self.method.backend, self.method.level
         )
 

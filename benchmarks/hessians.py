@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from benchmarks.scenes import DT, sheet
-from diffcloth_torch import _core
+from diffcloth_torch import _kernels
 
 STRETCH, BENDING, POISSON, DENSITY = 300.0, 1e-4, 0.3, 0.2  # [N/m], [N m], [-], [kg/m^2]
 BARRIER = 1e4  # stiffness of a contact [N/m]
@@ -58,7 +58,7 @@ HESSIANS = {"hanging": hanging, "self-contact": self_contact}
 
 def _elastic(X: np.ndarray, faces: np.ndarray, x: np.ndarray, fixed: list[int]) -> Hessian:
     """M / h^2 and the projected Hessian of stretch and bending."""
-    elastic = _core.kernels.Elastic(X, faces.astype(np.int32), "patch")
+    elastic = _kernels.Elastic(X, faces.astype(np.int32), "patch")
     one = np.ones(len(faces))
     elastic.set_parameters(STRETCH * one, BENDING * one, POISSON * one, 0.0 * one, DT, None)
     pairs, blocks = elastic.block_pairs(), elastic.hessian_blocks(x, True)

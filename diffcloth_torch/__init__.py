@@ -9,11 +9,12 @@
 Units are SI, z is up, quaternions are (w, x, y, z), and everything is float64 on the CPU.
 """
 
+from importlib import import_module
 from importlib.metadata import version
 from typing import Any
 
 from diffcloth_torch import _core
-from diffcloth_torch.controls import Control, Parameters
+from diffcloth_torch._moved import MOVED, find_old_modules
 from diffcloth_torch.errors import (
     InfeasibleMotion,
     IntersectingState,
@@ -21,14 +22,15 @@ from diffcloth_torch.errors import (
     NotConverged,
     SimulationError,
 )
-from diffcloth_torch.materials import Material
-from diffcloth_torch.mesh import Cloth
-from diffcloth_torch.options import ContactOptions, SolverOptions
-from diffcloth_torch.report import Report
-from diffcloth_torch.rigid_body import RigidBody
-from diffcloth_torch.scene import Scene
-from diffcloth_torch.simulator import Simulator
-from diffcloth_torch.state import State, stack, where
+from diffcloth_torch.model.cloth import Cloth
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.options import ContactOptions, SolverOptions
+from diffcloth_torch.model.rigid_body import RigidBody
+from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.controls import Control, Parameters
+from diffcloth_torch.sim.report import Report
+from diffcloth_torch.sim.simulator import Simulator
+from diffcloth_torch.sim.state import State, stack, where
 
 __all__ = [
     "Cloth",
@@ -58,8 +60,13 @@ def build_info() -> dict[str, Any]:
     return dict(_core.build_info())
 
 
-def __getattr__(name: str) -> str:
+def __getattr__(name: str) -> Any:
     # The version stands in the package's metadata alone, which is read when it is asked for.
     if name == "__version__":
         return version("diffcloth-torch")
+    if f"{__name__}.{name}" in MOVED:
+        return import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+find_old_modules()

@@ -1,4 +1,4 @@
-# The C++ extension. What the package uses is typed here; the kernels exposed to tests are not.
+# The C++ extension. What the package uses is typed here.
 
 from typing import Any
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Arrays = dict[str, NDArray[Any]]
 
-kernels: Any
+input_names: list[str]
 
 class SimulationError(RuntimeError): ...
 

@@ -16,15 +16,15 @@ import numpy as np
 import torch
 
 from diffcloth_torch import build_info
+from diffcloth_torch.config.viewers import open_viewers
 from diffcloth_torch.errors import InvalidInput, SimulationError
-from diffcloth_torch.state import State
+from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.optimization import Optimization, optimize
 from diffcloth_torch.tasks.registry import TASKS, load_task
 from diffcloth_torch.tasks.simulation import simulate
 from diffcloth_torch.tasks.statistics import rollout_statistics, step_records, write_metrics
 from diffcloth_torch.tasks.task import Optimizable, Task
 from diffcloth_torch.viewers.curves import draw_loss_curve
-from diffcloth_torch.viewers.registry import open_viewers
 
 __all__ = ["main"]
 
@@ -92,7 +92,7 @@ def run(config: Path, assignments: Sequence[str], out: Path) -> None:
     states: list[State] = []
     start = time.perf_counter()
     try:
-        with open_viewers(task, out) as viewers:
+        with open_viewers(task.config, task.scene, out, task.goals()) as viewers:
             for state in simulate(task):
                 viewers.show(state)
                 states.append(state)
@@ -131,7 +131,8 @@ def optimize_command(config: Path, assignments: Sequence[str], out: Path) -> Non
             f"`diffcloth run`; tasks that have are {able}"
         )
     out.mkdir(parents=True, exist_ok=True)
-    viewers = open_viewers(task, out)  # before the long part: it may lack a package
+    # Before the long part: a package may be missing.
+    viewers = open_viewers(task.config, task.scene, out, task.goals())
     # After every iteration, so that an interrupted run leaves what it found.
     found = optimize(task, report=lambda sofar: _write_optimization(task, sofar, out))
     draw_loss_curve(out / "loss.png", found.metrics()["losses"])

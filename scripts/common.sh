@@ -95,9 +95,13 @@ fingerprint() {
 
 # install_package EXTRA...: the package, editable, unless it is there and nothing has changed.
 install_package() {
-  local extra now stale=
+  local extra now stale='' switches=${CMAKE_ARGS:-}
   now=$(fingerprint)
   compgen -G 'diffcloth_torch/_core*.so' >/dev/null || stale=yes
+  if [[ " $* " == *" test "* ]]; then # tests call single kernels
+    switches+=" -DDIFFCLOTH_KERNELS=ON"
+    compgen -G 'diffcloth_torch/_kernels*.so' >/dev/null || stale=yes
+  fi
   for extra in "$@"; do
     [[ $(cat "$venv/installed-$extra" 2>/dev/null) == "$now" ]] || stale=yes
   done
@@ -106,7 +110,7 @@ install_package() {
   say "Building the package and installing what it needs ($*): a few minutes the first time"
   # The build's own requirements go into .venv, so that a second build compiles only what changed.
   pip_install setuptools cmake ninja nanobind cmeel-eigen
-  PATH=$venv/bin:$PATH pip_install --no-build-isolation --editable ".[$(
+  CMAKE_ARGS=$switches PATH=$venv/bin:$PATH pip_install --no-build-isolation --editable ".[$(
     IFS=,
     echo "$*"
   )]"

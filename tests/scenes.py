@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.poses import transform
+from diffcloth_torch.geometry.poses import transform
 
 F64 = torch.float64
 DT = 0.01

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 
 import diffcloth_torch as dc
 from diffcloth_torch.cli import main
-from diffcloth_torch.simulator import Simulator
+from diffcloth_torch.sim.simulator import Simulator
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 

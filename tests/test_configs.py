@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from diffcloth_torch.config.schema import read_document, resolve_path, set_values
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.io.configs import read_document, resolve_path, set_values
 from diffcloth_torch.tasks.registry import load_config
 
 MINIMAL = """

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.io.meshes import read_mesh, write_mesh
+from diffcloth_torch.geometry.meshes import read_mesh, write_mesh
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 

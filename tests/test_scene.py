@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.scene import assemble
+from diffcloth_torch.model.scene import assemble
 
 
 def two_cloths():

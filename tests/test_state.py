@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.io.meshes import read_mesh
+from diffcloth_torch.geometry.meshes import read_mesh
 
 
 def make(seed=0, *, report=True, batch=()):

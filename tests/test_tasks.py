@@ -13,7 +13,8 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.bodies.rotation import (
+from diffcloth_torch.config import shapes
+from diffcloth_torch.geometry.rotation import (
     integrate_poses,
     interpolate_poses,
     quaternion_exp,
@@ -21,7 +22,6 @@ from diffcloth_torch.bodies.rotation import (
     quaternion_multiply,
     rotate,
 )
-from diffcloth_torch.tasks import shapes
 from diffcloth_torch.tasks.hit_cloth import shape_distance
 from diffcloth_torch.tasks.optimization import OptimizerSection, evaluate, optimize
 from diffcloth_torch.tasks.registry import load_task
@@ -190,6 +190,15 @@ def write_config(folder, text):
     return path
 
 
+def controls_of(task, actions):
+    controller, state = task.controller(actions), task.initial_state()
+    return [controller(k, state) for k in range(task.steps)]
+
+
+def prescribed(task):
+    return controls_of(task, task.actions())
+
+
 def test_a_cloth_is_posed_and_pinned_by_place(tmp_path):
     task = load_task(write_config(tmp_path, SHEET))
     (cloth,) = task.scene.cloths
@@ -251,7 +260,7 @@ def test_pins_follow_their_keyframes(tmp_path):
     task = load_task(
         write_config(tmp_path, SHEET), [f"scene.cloths.sheet.pin_trajectories={frames}"]
     )
-    controls = task.controls({})
+    controls = prescribed(task)
     start = torch.tensor(task.scene.cloths[0].vertices[8:])
     # Half a turn about the vertical through the middle of the row swaps its ends.
     end = start.flip(0) + torch.tensor([0.0, 0.1, 0.0])
@@ -269,7 +278,7 @@ def test_bodies_follow_their_keyframes_and_static_ones_stay(tmp_path):
         "pose: {position: [-9, 0, 0]}, trajectory: [{time: 0.04, position: [-9, 0, 1]}]}]"
     )
     task = load_task(write_config(tmp_path, SHEET), [bodies])
-    poses = torch.stack([control.body_poses for control in task.controls({})])
+    poses = torch.stack([control.body_poses for control in prescribed(task)])
     assert torch.equal(poses[:, 0], torch.tensor(task.scene.bodies[0].pose).expand(4, 7))
     heights = torch.tensor([0.25, 0.5, 0.75, 1.0], dtype=torch.float64)
     torch.testing.assert_close(poses[:, 1, 2], heights)
@@ -282,6 +291,22 @@ def test_a_simulated_sheet_hangs_from_its_pins(tmp_path):
     assert moved[8:].abs().max() == 0
     assert (moved[:4, 2] < 0).all()
     assert not states[-1].positions.requires_grad
+
+
+def test_a_controller_may_close_the_loop(tmp_path):
+    """It is asked before each step, with the state before that step."""
+    task = load_task(write_config(tmp_path, SHEET))
+    asked = []
+
+    def controller(k, state):
+        asked.append((k, round(float(state.time) / 0.01)))
+        return dc.Control(pins={"sheet/top": state.positions[8:12] + 1e-3})
+
+    task.controller = lambda actions: controller
+    states = list(simulate(task))
+    assert asked == [(0, 0), (1, 1), (2, 2), (3, 3)]
+    moved = states[-1].positions[8:12] - states[0].positions[8:12]
+    torch.testing.assert_close(moved, torch.full_like(moved, 4e-3))
 
 
 # --- hit cloth ----------------------------------------------------------------------------------
@@ -319,7 +344,7 @@ def test_actions_become_poses_of_the_body():
         "linear": (2, 3),
         "angular": (2, 3),
     }
-    poses = torch.stack([control.body_poses[0] for control in task.controls(actions)])
+    poses = torch.stack([control.body_poses[0] for control in controls_of(task, actions)])
     dt = task.simulator.dt
     expected = torch.tensor([0.0, -0.04 + 3 * dt, 0.95 + 3 * 2 * dt], dtype=torch.float64)
     torch.testing.assert_close(poses[-1, :3].detach(), expected)
@@ -368,7 +393,8 @@ def test_the_gradient_of_the_actions_is_that_of_finite_differences():
         moved = {name: tensor.detach().clone() for name, tensor in actions.items()}
         moved["linear"][0, 1] += sign * eps
         with torch.no_grad():
-            states = task.simulator.rollout(task.initial_state(), task.controls(moved))
+            controller = task.controller(moved)
+            states = task.simulator.rollout(task.initial_state(), controller, steps=6)
             losses.append(task.loss(states).item())
     difference = (losses[0] - losses[1]) / (2 * eps)
     assert difference != 0
@@ -392,6 +418,7 @@ class Bowl:
     """Minimize |a|^2; rollouts of |a| beyond `reach` fail."""
 
     optimizer: OptimizerSection
+    steps: int = 1
     start: float = 1.0
     reach: float = math.inf
     error: type[Exception] = dc.InfeasibleMotion
@@ -405,8 +432,8 @@ class Bowl:
     def actions(self):
         return {"a": torch.tensor([self.start], dtype=torch.float64, requires_grad=True)}
 
-    def controls(self, actions):
-        return [actions["a"]]
+    def controller(self, actions):
+        return lambda k, state: actions["a"]
 
     def rollout(self, state, control_at, *, steps, checkpoint_every):
         value = control_at(0, state)

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import builtins
+import typing
 
 import numpy as np
 import pytest
 
 import diffcloth_torch as dc
-from diffcloth_torch.io.meshes import read_mesh
+from diffcloth_torch.config import schema
+from diffcloth_torch.config.viewers import VIEWERS, open_viewers
+from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.tasks.registry import load_task
 from diffcloth_torch.tasks.simulation import simulate
 from diffcloth_torch.viewers.curves import draw_loss_curve
+from diffcloth_torch.viewers.look import Camera, Goal, Paint, Pictures
 from diffcloth_torch.viewers.meshes import MeshSequence
 from diffcloth_torch.viewers.record import Record
-from diffcloth_torch.viewers.registry import Viewers, open_viewers
+from diffcloth_torch.viewers.several import Viewers
 from diffcloth_torch.viewers.viewer import NullViewer
 
 CONFIG = """
@@ -67,6 +71,60 @@ def test_every_so_many_states_are_shown(make_task):
     assert counter.times == [0.0, 0.02, 0.04]
 
 
+def test_configurations_accept_every_viewer_that_can_be_opened():
+    (names,) = typing.get_args(schema.OutputSection.model_fields["viewers"].annotation)
+    assert typing.get_args(names) == tuple(name for name, _ in VIEWERS)
+
+
+def test_options_of_pictures_are_those_of_the_schema():
+    for options, section in (
+        (Pictures(), schema.PictureSection()),
+        (Camera(), schema.CameraSection()),
+    ):
+        given = section.model_dump(exclude={"camera"})
+        for name, value in given.items():
+            default = getattr(options, name)
+            assert (list(default) if name == "size" else default) == value
+        assert set(section.model_dump()) == set(vars(options))
+
+
+def test_a_scene_is_drawn_without_a_configuration(tmp_path):
+    pytest.importorskip("pyvista")
+    sheet = dc.Cloth.grid(4, 4, pose=[0, 0, 1, 1, 0, 0, 0], name="sheet")
+    floor = dc.RigidBody.plane(9.0, pose=[0, 0, 0.5, 1, 0, 0, 0])
+    simulator = dc.Simulator(dc.Scene([sheet], [floor]), 0.01)
+    pictures = Pictures(size=(160, 120), video="none", sheet=1, camera=Camera(elevation=50.0))
+    goal = Goal(sheet.vertices + np.array([0, 0, 0.5]), sheet.faces)
+    paints = {"sheet": Paint("#ff0000")}
+    with Record(
+        tmp_path, simulator.scene, fps=10, pictures=pictures, paints=paints, goals=[goal]
+    ) as viewer:
+        viewer.show(simulator.initial_state())
+    image = read_image(tmp_path / "animation.png")
+    assert has_hue(image, 0)
+    assert (image[..., 1] - image[..., 0] > 20).mean() > 0.01  # the goal, green and translucent
+
+
+@pytest.mark.parametrize(
+    ("body", "floor"),
+    [
+        pytest.param(dc.RigidBody.plane(2.0, pose=[0, 0, -1, 1, 0, 0, 0]), True, id="level"),
+        pytest.param(dc.RigidBody.plane(2.0, pose=[0, 0, -1, 3, 0, 0, 4]), True, id="turned"),
+        pytest.param(dc.RigidBody.plane(2.0, pose=[0, 0, -1, 9, 1, 0, 0]), False, id="inclined"),
+        pytest.param(
+            dc.RigidBody.plane(2.0, pose=[0, 0, -1, 1, 0, 0, 0], motion="kinematic"),
+            False,
+            id="moving",
+        ),
+        pytest.param(dc.RigidBody.box(2.0, pose=[0, 0, -2, 1, 0, 0, 0]), False, id="box"),
+    ],
+)
+def test_the_drawn_floor_stands_for_a_static_level_plane(tmp_path, body, floor):
+    pytest.importorskip("pyvista")
+    record = Record(tmp_path, dc.Scene([dc.Cloth.grid(3, 3)], [body]), fps=10)
+    assert record._shown_bodies() == ([] if floor else [0])
+
+
 def test_a_mesh_sequence_has_one_file_per_state(make_task, tmp_path):
     task = make_task()
     folder = tmp_path / "meshes"
@@ -84,8 +142,14 @@ def test_a_mesh_sequence_has_one_file_per_state(make_task, tmp_path):
     assert len(faces) == 18 + len(task.scene.bodies[0].faces)
 
 
+def open_task(task, folder):
+    return open_viewers(task.config, task.scene, folder, task.goals())
+
+
 def record(task, folder, states=None):
-    with Record(folder, task, fps=10) as viewer:
+    alone = task.config.output.model_copy(update={"viewers": ["record"]})
+    config = task.config.model_copy(update={"output": alone})
+    with open_viewers(config, task.scene, folder) as viewer:
         for state in states or list(simulate(task)):
             viewer.show(state)
 
@@ -188,8 +252,8 @@ def test_a_missing_package_is_named_before_anything_runs(make_task, tmp_path, mo
 
     monkeypatch.setattr(builtins, "__import__", without_pyvista)
     with pytest.raises(dc.InvalidInput, match=r"pip install 'diffcloth-torch\[viewer\]'"):
-        open_viewers(make_task(), tmp_path)
-    open_viewers(make_task("output.viewers=[meshes]"), tmp_path)
+        open_task(make_task(), tmp_path)
+    open_task(make_task("output.viewers=[meshes]"), tmp_path)
 
 
 def test_a_loss_curve_is_a_picture(tmp_path):

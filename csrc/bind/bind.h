@@ -12,18 +12,4 @@ void build_info(nb::module_& m);
 /// The simulator's handle: forward and backward of a step.
 void simulator(nb::module_& m);
 
-/// Threads, for tests of what happens when they fail or are interrupted.
-void common_kernels(nb::module_& m);
-
-/// Contact kernels one by one, for tests against independent references.
-void contact_kernels(nb::module_& m);
-
-/// Sparse Cholesky factorizations, for tests against independent references and for benchmarks.
-void linalg_kernels(nb::module_& m);
-/// Barrier and friction of a whole mesh, for tests of their derivatives and weights.
-void contact_potentials(nb::module_& m);
-
-/// Rest shape and elastic potentials one by one, for tests against independent references.
-void elastic_kernels(nb::module_& m);
-
 }  // namespace diffcloth::bind

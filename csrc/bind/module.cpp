@@ -9,11 +9,4 @@ NB_MODULE(_core, m) {
 
   diffcloth::bind::build_info(m);
   diffcloth::bind::simulator(m);
-
-  nb::module_ kernels = m.def_submodule("kernels", "Single kernels, exposed for tests.");
-  diffcloth::bind::common_kernels(kernels);
-  diffcloth::bind::contact_kernels(kernels);
-  diffcloth::bind::contact_potentials(kernels);
-  diffcloth::bind::elastic_kernels(kernels);
-  diffcloth::bind::linalg_kernels(kernels);
 }

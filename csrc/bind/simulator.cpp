@@ -434,6 +434,8 @@ void simulator(nb::module_& m) {
       .def_prop_ro_static("phases", [](nb::handle) {
         return std::vector<std::string>(kPhaseNames.begin(), kPhaseNames.end());
       });
+  m.attr("input_names") =
+      std::vector<std::string>(step::kInputNames.begin(), step::kInputNames.end());
 }
 
 }  // namespace diffcloth::bind

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from torch import Tensor
 
-from diffcloth_torch.controls import Control
-from diffcloth_torch.io.configs import RunConfig
-from diffcloth_torch.state import State
-from diffcloth_torch.tasks.scenes import build_scene, build_simulator, prescribed_controls
-from diffcloth_torch.tasks.task import Goal
+from diffcloth_torch.config.scenes import build_scene, build_simulator, prescribed_controls
+from diffcloth_torch.config.schema import RunConfig
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.tasks.optimization import Controller
+from diffcloth_torch.viewers.look import Goal
 
 __all__ = ["Drape"]
 
@@ -26,6 +26,8 @@ class Drape:
         self.config = config
         self.scene = build_scene(config, source)
         self.simulator = build_simulator(self.scene, config.simulation)
+        self.steps = config.simulation.steps
+        self._prescribed = prescribed_controls(config, self.scene, self.steps)
 
     def initial_state(self) -> State:
         """Make the state that the scene describes."""
@@ -35,9 +37,9 @@ class Drape:
         """Have none."""
         return {}
 
-    def controls(self, actions: Mapping[str, Tensor]) -> list[Control]:
-        """Follow the keyframes."""
-        return prescribed_controls(self.config, self.scene, self.config.simulation.steps)
+    def controller(self, actions: Mapping[str, Tensor]) -> Controller:
+        """Follow the keyframes, whatever the state."""
+        return lambda k, _state: self._prescribed[k]
 
     def goals(self) -> list[Goal]:
         """Have none."""

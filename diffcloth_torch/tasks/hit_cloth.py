@@ -19,20 +19,19 @@ from annotated_types import Ge, Len
 from pydantic import model_validator
 from torch import Tensor
 
-from diffcloth_torch.bodies.rotation import integrate_poses
-from diffcloth_torch.controls import Control
-from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.io.configs import PoseSection, RunConfig, Section, Vector3
-from diffcloth_torch.poses import transform
-from diffcloth_torch.state import State
-from diffcloth_torch.tasks.optimization import OptimizerSection
-from diffcloth_torch.tasks.scenes import (
+from diffcloth_torch.config.scenes import (
     build_scene,
     build_simulator,
     pose_array,
     prescribed_controls,
 )
-from diffcloth_torch.tasks.task import Goal
+from diffcloth_torch.config.schema import PoseSection, RunConfig, Section, Vector3
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry.poses import transform
+from diffcloth_torch.geometry.rotation import integrate_poses
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.tasks.optimization import Controller, OptimizerSection
+from diffcloth_torch.viewers.look import Goal
 
 __all__ = ["HitCloth", "HitClothConfig", "shape_distance"]
 
@@ -103,13 +102,14 @@ class HitCloth:
         self.config = config
         self.scene = build_scene(config, source)
         self.simulator = build_simulator(self.scene, config.simulation)
+        self.steps = config.simulation.steps
         self.optimizer = config.optimizer
         self._body = self.scene.body_names.index(config.actions.body)
         cloth = self.scene.cloths[self.scene.cloth_names.index(config.target.cloth)]
         target = transform(cloth.rest_vertices, pose_array(config.target.pose))
         self._target = torch.from_numpy(target)
         self._goal = Goal(target, cloth.faces)
-        self._prescribed = prescribed_controls(config, self.scene, config.simulation.steps)
+        self._prescribed = prescribed_controls(config, self.scene, self.steps)
 
     def initial_state(self) -> State:
         """Make the state that the scene describes."""
@@ -117,25 +117,27 @@ class HitCloth:
 
     def actions(self) -> dict[str, Tensor]:
         """Velocities of the initial actions, each of shape [T, 3] for T control intervals."""
-        steps, section = self.config.simulation.steps, self.config.actions
-        intervals = -(-steps // section.interval)
+        section = self.config.actions
+        intervals = -(-self.steps // section.interval)
         return {
             name: _rows(name, getattr(section, name), intervals).requires_grad_()
             for name in ("linear", "angular")
         }
 
-    def controls(self, actions: Mapping[str, Tensor]) -> list[Control]:
+    def controller(self, actions: Mapping[str, Tensor]) -> Controller:
         """Integrate the actions to poses of the body; the rest of the scene follows keyframes."""
         twists = torch.cat([actions["linear"], actions["angular"]], dim=-1)
-        steps, interval = self.config.simulation.steps, self.config.actions.interval
         start = torch.from_numpy(self.scene.bodies[self._body].pose.copy())
         poses = integrate_poses(
-            start, twists.repeat_interleave(interval, dim=0)[:steps], self.simulator.dt
+            start,
+            twists.repeat_interleave(self.config.actions.interval, dim=0)[: self.steps],
+            self.simulator.dt,
         )
-        return [
+        controls = [
             control.replace(body_poses=_with_row(control.body_poses, self._body, pose))
             for control, pose in zip(self._prescribed, poses, strict=True)
         ]
+        return lambda k, _state: controls[k]
 
     def loss(self, states: Sequence[State]) -> Tensor:
         """L2 distance between the cloth and its target, averaged over the last states."""

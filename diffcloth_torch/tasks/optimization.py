@@ -14,16 +14,18 @@ from annotated_types import Ge, Gt, Lt
 from torch import Tensor
 from tqdm import tqdm
 
-from diffcloth_torch.controls import Control
+from diffcloth_torch.config.schema import Positive, Section
 from diffcloth_torch.errors import InfeasibleMotion, InvalidInput, NotConverged, SimulationError
-from diffcloth_torch.io.configs import Positive, Section
-from diffcloth_torch.simulator import Simulator
-from diffcloth_torch.state import State
+from diffcloth_torch.sim.controls import Control
+from diffcloth_torch.sim.simulator import Simulator
+from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.statistics import rollout_statistics
 
-__all__ = ["Evaluation", "Optimization", "OptimizerSection", "evaluate", "optimize"]
+__all__ = ["Controller", "Evaluation", "Optimization", "OptimizerSection", "evaluate", "optimize"]
 
 Actions = dict[str, Tensor]
+Controller = Callable[[int, State], Control]
+"""From the index of a step and the state before it to its control."""
 
 
 class OptimizerSection(Section):
@@ -50,9 +52,11 @@ class _Optimizable(Protocol):
     def simulator(self) -> Simulator: ...
     @property
     def optimizer(self) -> OptimizerSection: ...
+    @property
+    def steps(self) -> int: ...
     def initial_state(self) -> State: ...
     def actions(self) -> Actions: ...
-    def controls(self, actions: Mapping[str, Tensor]) -> Sequence[Control]: ...
+    def controller(self, actions: Mapping[str, Tensor]) -> Controller: ...
     def loss(self, states: Sequence[State]) -> Tensor: ...
 
 
@@ -204,18 +208,18 @@ def evaluate(
     for tensor in actions.values():
         tensor.grad = None
     start = time.perf_counter()
-    controls = task.controls(actions)
+    controller = task.controller(actions)
     forward = True
 
-    def control_at(k: int, _: State) -> Control:
+    def control_at(k: int, state: State) -> Control:
         if forward:  # backward asks again for the steps that it repeats
             on_step(k)
-        return controls[k]
+        return controller(k, state)
 
     states = task.simulator.rollout(
         task.initial_state(),
         control_at,
-        steps=len(controls),
+        steps=task.steps,
         checkpoint_every=task.optimizer.checkpoint_every,
     )
     loss = task.loss(states)
@@ -299,8 +303,7 @@ class _Progress:
 
 @contextmanager
 def _progress(task: _Optimizable, options: OptimizerSection) -> Iterator[_Progress]:
-    steps = len(task.controls(task.actions()))
-    total = steps * options.iterations
+    total = task.steps * options.iterations
     # disable=None: quiet where the output is no terminal.
     with tqdm(total=total, desc="optimize", unit="step", disable=None) as bar:
-        yield _Progress(bar, steps)
+        yield _Progress(bar, task.steps)

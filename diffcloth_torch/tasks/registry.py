@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from diffcloth_torch.config.schema import RunConfig, read_document, set_values, validate
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.io.configs import RunConfig, read_document, set_values, validate
 from diffcloth_torch.tasks.drape import Drape
 from diffcloth_torch.tasks.hit_cloth import HitCloth
 from diffcloth_torch.tasks.task import Task

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from tqdm import tqdm
 
-from diffcloth_torch.state import State
+from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.task import Task
 
 __all__ = ["simulate"]
@@ -20,11 +20,11 @@ def simulate(task: Task) -> Iterator[State]:
         SimulationError: If a step fails.
     """
     with torch.no_grad():
-        controls = task.controls(task.actions())
+        controller = task.controller(task.actions())
         state = task.initial_state()
     yield state
     # disable=None: quiet where the output is no terminal.
-    for control in tqdm(controls, desc="simulate", unit="step", disable=None):
+    for k in tqdm(range(task.steps), desc="simulate", unit="step", disable=None):
         with torch.no_grad():
-            state = task.simulator.step(state, control)
+            state = task.simulator.step(state, controller(k, state))
         yield state

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from diffcloth_torch.report import Report
-from diffcloth_torch.state import State
+from diffcloth_torch.sim.report import Report
+from diffcloth_torch.sim.state import State
 
 __all__ = ["rollout_statistics", "step_records", "write_metrics"]
 

@@ -3,42 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloth_torch.controls import Control
-from diffcloth_torch.io.configs import RunConfig
-from diffcloth_torch.scene import Scene
-from diffcloth_torch.simulator import Simulator
-from diffcloth_torch.state import State
-from diffcloth_torch.tasks.optimization import OptimizerSection
+from diffcloth_torch.config.schema import RunConfig
+from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.simulator import Simulator
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.tasks.optimization import Controller, OptimizerSection
+from diffcloth_torch.viewers.look import Goal
 
-__all__ = ["Goal", "Optimizable", "Task"]
-
-
-@dataclass(frozen=True, eq=False)
-class Goal:
-    """A shape to reach, for pictures.
-
-    Attributes:
-        vertices: Positions [m], shape [n, 3].
-        faces: Vertex indices, shape [f, 3].
-    """
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int32]
+__all__ = ["Controller", "Optimizable", "Task"]
 
 
 class Task(Protocol):
-    """A scene, and controls for its steps."""
+    """A scene, and how it is controlled."""
 
     config: RunConfig
     scene: Scene
     simulator: Simulator
+    steps: int
 
     def initial_state(self) -> State:
         """Make the state before the first step."""
@@ -48,8 +33,12 @@ class Task(Protocol):
         """Make new leaf tensors of the initial actions; none where nothing is optimized."""
         ...
 
-    def controls(self, actions: Mapping[str, Tensor]) -> Sequence[Control]:
-        """Controls of all steps that follow from some actions."""
+    def controller(self, actions: Mapping[str, Tensor]) -> Controller:
+        """Make what controls each step by some actions.
+
+        It takes the index of a step and the state before it, and may look at that state. Asked
+        again for the same step, it gives the same: checkpointed rollouts repeat steps.
+        """
         ...
 
     def goals(self) -> Sequence[Goal]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import TracebackType
 
-from diffcloth_torch.state import State
+from diffcloth_torch.sim.state import State
 
 __all__ = ["MeshSequence"]
 

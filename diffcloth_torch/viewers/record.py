@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any
 
 import numpy as np
@@ -14,15 +14,18 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from diffcloth_torch.errors import InvalidInput, SimulationError
-from diffcloth_torch.io.configs import BodySection, PictureSection
-from diffcloth_torch.poses import transform
-from diffcloth_torch.state import State
-from diffcloth_torch.tasks.task import Task
+from diffcloth_torch.geometry.poses import transform
+from diffcloth_torch.model.rigid_body import RigidBody
+from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.viewers.look import Goal, Paint, Pictures
 from diffcloth_torch.viewers.stage import Bounds, Skin, Stage, require_pyvista
 
 __all__ = ["Record"]
 
 Image = NDArray[np.uint8]
+
+_DEFAULT_PICTURES = Pictures()
 
 _GAP_BELOW = 0.04  # of the size of the scene, between the lowest point and a floor of ours
 _SHEET_MARGIN = 8  # pixels between the pictures of an overview
@@ -36,22 +39,36 @@ class Record:
     `NAME_frames/0000.png` .. if asked for.
     """
 
-    def __init__(self, folder: Path, task: Task, *, fps: float, name: str = "animation") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        scene: Scene,
+        *,
+        fps: float,
+        pictures: Pictures = _DEFAULT_PICTURES,
+        paints: Mapping[str, Paint] = MappingProxyType({}),
+        goals: Sequence[Goal] = (),
+        name: str = "animation",
+    ) -> None:
         """Check that pictures can be made, before a long simulation.
 
         Args:
             folder: Where the files go; it must exist.
-            task: What is shown, with its goals and the options in its configuration.
-            fps: Pictures per second, where the configuration does not say.
+            scene: What is shown.
+            fps: Pictures per second, where `pictures` do not say.
+            pictures: How they are made.
+            paints: Name of a cloth or body -> its colors.
+            goals: Shapes that are shown beside it.
             name: Name of the files.
 
         Raises:
             InvalidInput: If a package is missing; the message says how to install it.
         """
         require_pyvista()
-        self._options: PictureSection = task.config.output.pictures
+        self._options = pictures
         _require_writer(self._options.video)
-        self._folder, self._task, self._name = folder, task, name
+        self._folder, self._scene, self._name = folder, scene, name
+        self._paints, self._goals = paints, goals
         self._fps = fps if self._options.fps is None else self._options.fps
         self._positions: list[NDArray[np.float64]] = []
         self._poses: list[NDArray[np.float64]] = []
@@ -88,17 +105,18 @@ class Record:
         _write_image(self._folder / f"{self._name}.png", _side_by_side(sheet))
 
     def _stage(self) -> Stage:
-        scene, sections = self._task.scene, self._task.config.scene
+        scene = self._scene
+        names = scene.body_names
         low, high = self._bounds()
         stage = Stage(
             [
-                Skin(cloth.faces + start, section.color, section.back_color)
-                for cloth, section, start in zip(
-                    scene.cloths, sections.cloths, self._cloth_starts(), strict=True
+                Skin(cloth.faces + start, self._paint(name))
+                for cloth, name, start in zip(
+                    scene.cloths, scene.cloth_names, self._cloth_starts(), strict=True
                 )
             ],
             [
-                (scene.bodies[k].vertices, Skin(scene.bodies[k].faces, sections.bodies[k].color))
+                (scene.bodies[k].vertices, Skin(scene.bodies[k].faces, self._paint(names[k])))
                 for k in self._shown_bodies()
             ],
             size=self._options.size,
@@ -106,23 +124,25 @@ class Record:
             ground=self._ground(low, high),
             camera=self._options.camera,
         )
-        for goal in self._task.goals():
-            stage.add_goal(goal.vertices, goal.faces)
+        for goal in self._goals:
+            stage.add_goal(goal)
         return stage
 
+    def _paint(self, name: str) -> Paint:
+        return self._paints.get(name, Paint())
+
     def _cloth_starts(self) -> list[int]:
-        counts = [len(cloth.vertices) for cloth in self._task.scene.cloths]
+        counts = [len(cloth.vertices) for cloth in self._scene.cloths]
         return [0, *np.cumsum(counts[:-1]).tolist()]
 
     def _shown_bodies(self) -> list[int]:
         """Bodies that are drawn: the floor of the stage stands for a level plane."""
-        sections = self._task.config.scene.bodies
-        return [k for k, section in enumerate(sections) if not _is_floor(section)]
+        return [k for k, body in enumerate(self._scene.bodies) if not _is_floor(body)]
 
     def _bounds(self) -> Bounds:
-        points = [*self._positions, *(goal.vertices for goal in self._task.goals())]
+        points = [*self._positions, *(goal.vertices for goal in self._goals)]
         for k in self._shown_bodies():
-            vertices = self._task.scene.bodies[k].vertices
+            vertices = self._scene.bodies[k].vertices
             poses = np.unique([pose[k] for pose in self._poses], axis=0)
             points += [transform(vertices, pose) for pose in poses]
         lows = [cloud.min(axis=0) for cloud in points]
@@ -132,9 +152,9 @@ class Record:
     def _ground(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> float | None:
         if self._options.ground != "auto":
             return self._options.ground
-        floors = [body for body in self._task.config.scene.bodies if _is_floor(body)]
+        floors = [body for body in self._scene.bodies if _is_floor(body)]
         if floors:
-            return max(body.pose.position[2] for body in floors)
+            return max(float(_placed(body)[0, 2]) for body in floors)
         return float(low[2] - _GAP_BELOW * np.linalg.norm(high - low))
 
     @contextmanager
@@ -186,9 +206,14 @@ def _require_writer(video: str) -> None:
             )
 
 
-def _is_floor(body: BodySection) -> bool:
-    turned = body.pose.axis is not None or body.pose.quaternion is not None
-    return body.shape.kind == "plane" and body.motion == "static" and not turned
+def _placed(body: RigidBody) -> NDArray[np.float64]:
+    return transform(body.vertices, body.pose)
+
+
+def _is_floor(body: RigidBody) -> bool:
+    """Whether a body is a static level plane, as `RigidBody.plane` makes them."""
+    is_plane = len(body.vertices) == 4 and len(body.faces) == 2
+    return is_plane and body.motion == "static" and not np.ptp(_placed(body)[:, 2])
 
 
 def _write_image(path: Path, image: Image) -> None:

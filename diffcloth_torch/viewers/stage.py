@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.io.configs import CameraSection
-from diffcloth_torch.poses import transform
+from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.viewers.floor import BACKGROUND, Floor, Shadow
+from diffcloth_torch.viewers.look import Camera, Goal, Paint
 
 __all__ = ["Bounds", "Skin", "Stage", "require_pyvista"]
 
@@ -56,13 +56,11 @@ class Skin:
 
     Attributes:
         faces: Vertex indices, shape [f, 3].
-        color: "#rrggbb" of the front; None takes one of the palette.
-        back_color: Likewise of the back.
+        paint: Its colors.
     """
 
     faces: Triangles
-    color: str | None = None
-    back_color: str | None = None
+    paint: Paint
 
 
 def require_pyvista() -> Any:
@@ -114,7 +112,7 @@ class Stage:
         size: Sequence[int],
         bounds: Bounds,
         ground: float | None,
-        camera: CameraSection,
+        camera: Camera,
     ) -> None:
         """Set the stage.
 
@@ -152,9 +150,9 @@ class Stage:
         """Free the window."""
         self._plotter.close()
 
-    def add_goal(self, vertices: Points, faces: Triangles) -> None:
+    def add_goal(self, goal: Goal) -> None:
         """Show a shape to reach: translucent, with its border."""
-        shape = self._pv.PolyData.from_regular_faces(vertices, faces)
+        shape = self._pv.PolyData.from_regular_faces(goal.vertices, goal.faces)
         self._plotter.add_mesh(shape, color=_GOAL_COLOR, opacity=0.25, lighting=False)
         border = shape.extract_feature_edges(
             boundary_edges=True, feature_edges=False, manifold_edges=False, non_manifold_edges=False
@@ -211,10 +209,10 @@ class Stage:
     def _add_cloth(self, index: int, skin: Skin) -> _Surface:
         vertices = np.zeros((int(skin.faces.max()) + 1, 3))
         surface = _Surface(self._pv.PolyData.from_regular_faces(vertices, skin.faces), None)
-        back = skin.back_color or _BACK_COLORS[index % len(_BACK_COLORS)]
+        back = skin.paint.back_color or _BACK_COLORS[index % len(_BACK_COLORS)]
         self._plotter.add_mesh(
             surface.shown,
-            color=skin.color or _FRONT_COLORS[index % len(_FRONT_COLORS)],
+            color=skin.paint.color or _FRONT_COLORS[index % len(_FRONT_COLORS)],
             smooth_shading=True,
             backface_params={"color": back, **_CLOTH_SHINE},
             **_CLOTH_SHINE,
@@ -224,11 +222,11 @@ class Stage:
     def _add_body(self, index: int, vertices: Points, skin: Skin) -> _Surface:
         polydata = self._pv.PolyData.from_regular_faces(vertices, skin.faces)
         surface = _Surface(polydata, _CREASE_ANGLE)
-        color = skin.color or _BODY_COLORS[index % len(_BODY_COLORS)]
+        color = skin.paint.color or _BODY_COLORS[index % len(_BODY_COLORS)]
         self._plotter.add_mesh(surface.shown, color=color, smooth_shading=True, **_BODY_SHINE)
         return surface
 
-    def _aim(self, camera: CameraSection) -> None:
+    def _aim(self, camera: Camera) -> None:
         low, high = self._bounds
         target = (low + high) / 2 if camera.target is None else np.array(camera.target)
         radius = float(np.linalg.norm(high - low)) / 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import TracebackType
 from typing import Protocol
 
-from diffcloth_torch.state import State
+from diffcloth_torch.sim.state import State
 
 __all__ = ["NullViewer", "Viewer"]
 

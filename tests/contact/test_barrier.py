@@ -4,9 +4,7 @@ import ipctk
 import numpy as np
 import pytest
 
-from diffcloth_torch import _core
-
-kernels = _core.kernels
+from diffcloth_torch import _kernels as kernels
 
 THICKNESSES = [pytest.param(0.0, id="no-thickness"), pytest.param(3e-3, id="thick")]
 D_HAT = 1e-3

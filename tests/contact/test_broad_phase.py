@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from diffcloth_torch import _core
-
-kernels = _core.kernels
+from diffcloth_torch import _kernels as kernels
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 needs_data = pytest.mark.skipif(

@@ -6,9 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from diffcloth_torch import _core
-
-kernels = _core.kernels
+from diffcloth_torch import _kernels as kernels
 
 QUERIES = Path(__file__).parents[3] / "shared" / "data" / "ccd_queries_unit.npz"
 POINT_TRIANGLE, EDGE_EDGE = False, True

@@ -7,9 +7,7 @@ import ipctk
 import numpy as np
 import pytest
 
-from diffcloth_torch import _core
-
-kernels = _core.kernels
+from diffcloth_torch import _kernels as kernels
 
 POINT_TRIANGLE, EDGE_EDGE = False, True
 KINDS = [

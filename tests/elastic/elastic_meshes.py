@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import scipy.spatial
 
-from diffcloth_torch import _core
+from diffcloth_torch import _kernels
 
-Elastic = _core.kernels.Elastic
+Elastic = _kernels.Elastic
 
 STEP = 0.01  # time step [s]
 

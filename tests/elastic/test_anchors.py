@@ -3,7 +3,7 @@
 import numpy as np
 from elastic_meshes import differences
 
-from diffcloth_torch import _core
+from diffcloth_torch import _kernels
 
 RNG = np.random.default_rng(9)
 VERTEX = np.array([4, 1, 1], np.int32)  # two springs on one vertex
@@ -13,7 +13,7 @@ X0, X1, Z = RNG.normal(size=(3, 6, 3))
 
 
 def anchors(x1=X1, stiffness=STIFFNESS, target=TARGET, x0=X0):
-    return _core.kernels.anchors(VERTEX, stiffness, target, x0, x1, Z)
+    return _kernels.anchors(VERTEX, stiffness, target, x0, x1, Z)
 
 
 def test_energy_is_that_of_springs():

@@ -8,6 +8,7 @@ import trimesh
 from test_step_gradients import CONTACT, check, gradients, make_loss
 
 import diffcloth_torch as dc
+from diffcloth_torch import _kernels
 
 F64 = torch.float64
 GAP = 0.006  # of the barrier's 0.01
@@ -126,7 +127,7 @@ def test_some_contacts_have_negative_weights():
     x = np.concatenate([case.step().positions.numpy(), case.sim.scene.bodies[0].vertices])
     cloth, body = case.sim.scene.cloths[0], case.sim.scene.bodies[0]
     count = len(cloth.vertices)
-    potential = dc._core.kernels.ContactPotential(
+    potential = _kernels.ContactPotential(
         np.concatenate([cloth.faces, body.faces + count]).astype(np.int32),
         [0] * count + [1] * len(body.vertices),
         1,

@@ -6,8 +6,8 @@ import scenes
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.outcome import raise_on_failure
-from diffcloth_torch.step import CONVERGED, UNCONVERGED
+from diffcloth_torch.sim.outcome import raise_on_failure
+from diffcloth_torch.sim.step import CONVERGED, UNCONVERGED
 
 F64 = torch.float64
 FAILED = 1  # of three environments

@@ -8,7 +8,7 @@ import torch
 from differences import directions, mismatch
 
 import diffcloth_torch as dc
-from diffcloth_torch.poses import transform
+from diffcloth_torch.geometry.poses import transform
 
 F64 = torch.float64
 

@@ -6,9 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from diffcloth_torch import _core
-
-kernels = _core.kernels
+from diffcloth_torch import _kernels as kernels
 
 STEP = 0.01  # of the cloth's Hessians [s]
 

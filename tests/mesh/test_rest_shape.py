@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from diffcloth_torch import _core
+from diffcloth_torch import _kernels
 
-Elastic = _core.kernels.Elastic
+Elastic = _kernels.Elastic
 RNG = np.random.default_rng(11)
 
 

@@ -10,9 +10,7 @@ from dataclasses import dataclass, field
 import ipctk
 import numpy as np
 
-from diffcloth_torch import _core
-
-kernels = _core.kernels
+from diffcloth_torch import _kernels as kernels
 
 
 @dataclass

@@ -11,9 +11,9 @@ import time
 
 import pytest
 
-from diffcloth_torch import _core
+from diffcloth_torch import _kernels
 
-run = _core.kernels.run_environments
+run = _kernels.run_environments
 
 
 @pytest.mark.parametrize("threads", [-1, 0, 1, 2, 3, 8])
@@ -41,16 +41,16 @@ WITHOUT_THREADS = """
     import threading
     import torch
     import diffcloth_torch as dc
-    from diffcloth_torch import _core, step
+    from diffcloth_torch import _kernels, step
 
     try:
         threading.Thread(target=int).start()
     except RuntimeError:
         print("no threads")
 
-    print(_core.kernels.run_environments(5, 4, 0.0))
+    print(_kernels.run_environments(5, 4, 0.0))
     try:
-        _core.kernels.run_environments(5, 4, 0.0, [3, 1])
+        _kernels.run_environments(5, 4, 0.0, [3, 1])
     except ValueError as error:
         print(error)
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch import _core
+from diffcloth_torch import _kernels
 
 G = 9.81
 DEFAULT = dc.Material()
@@ -52,7 +52,7 @@ class Sheet:
         faces = np.ascontiguousarray(self.cloth.faces, dtype=np.int32)
         one = np.ones(len(faces))
         m = self.material
-        elastic = _core.kernels.Elastic(X, faces, "patch")
+        elastic = _kernels.Elastic(X, faces, "patch")
         elastic.set_parameters(
             m.stretch * one, m.bending * one, m.poisson * one, 0 * one, self.h, None
         )

@@ -1,0 +1,70 @@
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <stdexcept>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include <nanobind/stl/vector.h>
+
+#include "bind/environments.h"
+#include "bind/kernels/kernels.h"
+
+namespace diffcloth::bind {
+namespace {
+
+using namespace nb::literals;  // NOLINT: the literal suffix of nanobind
+using Clock = std::chrono::steady_clock;
+
+void rest() { std::this_thread::sleep_for(std::chrono::milliseconds(1)); }
+
+/// Runs `count` bodies and returns how many of them each thread took, the caller's first.
+///
+/// Bodies on the caller's thread return once another thread has begun, those on others go on for
+/// `seconds`, unless they are interrupted; `failing` ones then throw.
+std::vector<int> run_environments(int count,
+                                  int threads,
+                                  double seconds,
+                                  const std::vector<int>& failing) {
+  const std::thread::id caller = std::this_thread::get_id();
+  std::vector<std::thread::id> taken_by(static_cast<std::size_t>(count));
+  std::atomic<int> others{0};
+  const auto end = Clock::now() + std::chrono::duration<double>(seconds);
+  for_environments(static_cast<std::size_t>(count), threads,
+                   [&](Index i, const Checkpoint& checkpoint) {
+                     const bool is_caller = std::this_thread::get_id() == caller;
+                     taken_by[i] = std::this_thread::get_id();
+                     if (!is_caller) ++others;
+                     while (Clock::now() < end && !(is_caller && others.load() > 0)) {
+                       checkpoint.check();
+                       rest();
+                     }
+                     if (std::ranges::find(failing, i) != failing.end()) {
+                       throw std::invalid_argument("environment " + std::to_string(i));
+                     }
+                   });
+
+  std::vector<std::thread::id> order{caller};
+  std::vector<int> counts{0};
+  for (const std::thread::id id : taken_by) {
+    const auto at = std::ranges::find(order, id);
+    const auto k = static_cast<std::size_t>(at - order.begin());
+    if (at == order.end()) {
+      order.push_back(id);
+      counts.push_back(0);
+    }
+    ++counts[k];
+  }
+  return counts;
+}
+
+}  // namespace
+
+void common_kernels(nb::module_& m) {
+  m.def("run_environments", &run_environments, "count"_a, "threads"_a, "seconds"_a,
+        "failing"_a = std::vector<int>{},
+        "Run bodies that wait; returns how many each thread took, the caller's first.");
+}
+
+}  // namespace diffcloth::bind

@@ -1,0 +1,268 @@
+#include <array>
+#include <cstddef>
+#include <optional>
+#include <string>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+#include <Eigen/Core>
+#include <nanobind/eigen/dense.h>
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/pair.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include "bind/kernels/kernels.h"
+#include "contact/barrier.h"
+#include "contact/broad_phase.h"
+#include "contact/candidate_list.h"
+#include "contact/ccd.h"
+#include "contact/collision_mesh.h"
+#include "contact/distance/closest.h"
+#include "contact/distance/mollifier.h"
+#include "contact/friction.h"
+#include "contact/nonadjacent_distance.h"
+
+namespace diffcloth::bind {
+namespace {
+
+using namespace nb::literals;
+using contact::Corners;
+using contact::PairKind;
+
+template <class Scalar, class Shape>
+using Array = nb::ndarray<const Scalar, Shape, nb::c_contig, nb::device::cpu>;
+using OnePair = Array<double, nb::shape<4, 3>>;
+using Pairs = Array<double, nb::shape<-1, 4, 3>>;
+using Positions = Array<double, nb::shape<-1, 3>>;
+using Faces = Array<Index, nb::shape<-1, 3>>;
+using Surfaces = Array<Index, nb::shape<-1>>;
+using IndexRows = Eigen::Matrix<Index, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+
+Corners corners(const double* x) { return {row(x, 0), row(x, 1), row(x, 2), row(x, 3)}; }
+
+PairKind kind_of(bool edge_edge) {
+  return edge_edge ? PairKind::kEdgeEdge : PairKind::kPointTriangle;
+}
+
+template <std::size_t kWidth>
+IndexRows index_rows(const std::vector<std::array<Index, kWidth>>& rows) {
+  IndexRows out(rows.size(), kWidth);
+  for (std::size_t i = 0; i < rows.size(); ++i) {
+    for (std::size_t k = 0; k < kWidth; ++k) out(i, k) = rows[i][k];
+  }
+  return out;
+}
+
+Eigen::VectorX<Index> index_vector(const std::vector<Index>& values) {
+  return Eigen::Map<const Eigen::VectorX<Index>>(values.data(), values.size());
+}
+
+contact::CollisionMesh collision_mesh(const Faces& faces,
+                                      const Surfaces& vertex_surface,
+                                      Index cloth_count,
+                                      bool self_contact) {
+  std::vector<contact::CollisionMesh::Face> rows(faces.shape(0));
+  for (std::size_t f = 0; f < rows.size(); ++f) rows[f] = {faces(f, 0), faces(f, 1), faces(f, 2)};
+  return {std::move(rows),
+          {vertex_surface.data(), vertex_surface.data() + vertex_surface.shape(0)},
+          cloth_count,
+          self_contact};
+}
+
+void check_rows(const char* name, const Positions& x, const contact::CollisionMesh& mesh) {
+  if (x.shape(0) == static_cast<std::size_t>(mesh.vertex_count)) return;
+  throw nb::value_error((std::string("broad phase: `") + name + "` must have " +
+                         std::to_string(mesh.vertex_count) + " rows, got " +
+                         std::to_string(x.shape(0)))
+                            .c_str());
+}
+
+/// A mesh, its search trees and the lists of earlier searches: what a solver keeps together.
+class Search {
+ public:
+  Search(const Faces& faces,
+         const Surfaces& vertex_surface,
+         Index cloth_count,
+         bool self_contact,
+         const Positions& x_reference)
+      : mesh_(collision_mesh(faces, vertex_surface, cloth_count, self_contact)),
+        broad_phase_(mesh_, checked("x_reference", x_reference)),
+        list_(broad_phase_) {}
+  Search(const Search&) = delete;
+  Search& operator=(const Search&) = delete;
+
+  /// Kind (1: edge-edge), corners, a and b of every candidate, in order. One reach for each surface.
+  IndexRows find(const Positions& x_t0, const Positions& x_t1, const std::vector<double>& reach) {
+    check_reach(reach);
+    broad_phase_.find(checked("x_t0", x_t0), checked("x_t1", x_t1), reach, scratch_, candidates_);
+    return rows();
+  }
+
+  /// Likewise, from the list that is kept between searches.
+  IndexRows find_kept(const Positions& x_t0,
+                      const Positions& x_t1,
+                      const std::vector<double>& reach) {
+    check_reach(reach);
+    list_.find(checked("x_t0", x_t0), checked("x_t1", x_t1), reach, scratch_, candidates_);
+    return rows();
+  }
+
+  Index builds() const { return list_.builds(); }
+
+  IndexRows rows() const {
+    IndexRows out(candidates_.size(), 7);
+    for (std::size_t i = 0; i < candidates_.size(); ++i) {
+      const auto& [kind, v, a, b] = candidates_[i];
+      out.row(i) << static_cast<Index>(kind), v[0], v[1], v[2], v[3], a, b;
+    }
+    return out;
+  }
+
+  std::optional<std::pair<Index, Index>> find_intersection(const Positions& x) {
+    return broad_phase_.find_intersection(checked("x", x), scratch_);
+  }
+
+  double smallest_nonadjacent_distance(const Positions& x) const {
+    return contact::smallest_nonadjacent_distance(mesh_, checked("x", x));
+  }
+
+  const contact::CollisionMesh& mesh() const { return mesh_; }
+
+ private:
+  void check_reach(const std::vector<double>& reach) const {
+    if (reach.size() == static_cast<std::size_t>(mesh_.surface_count())) return;
+    throw nb::value_error("broad phase: `reach` must have one value a surface");
+  }
+
+  const double* checked(const char* name, const Positions& x) const {
+    check_rows(name, x, mesh_);
+    return x.data();
+  }
+
+  contact::CollisionMesh mesh_;
+  contact::BroadPhase broad_phase_;
+  contact::CandidateList list_;
+  contact::BroadPhase::Scratch scratch_;
+  std::vector<contact::Candidate> candidates_;
+};
+
+void distance_kernels(nb::module_& m) {
+  m.def(
+      "closest",
+      [](bool edge_edge, const OnePair& x) {
+        const contact::Closest pair = contact::closest(kind_of(edge_edge), corners(x.data()));
+        return std::tuple(pair.c, pair.parameter_count, pair.c_beta, pair.s, pair.M_inv, pair.t,
+                          pair.d_sq);
+      },
+      "edge_edge"_a, "x"_a.noconvert());
+  m.def(
+      "distance_sq_derivatives",
+      [](bool edge_edge, const OnePair& x) {
+        const contact::Closest pair = contact::closest(kind_of(edge_edge), corners(x.data()));
+        return std::tuple(pair.d_sq, contact::distance_sq_gradient(pair),
+                          contact::distance_sq_hessian(pair), contact::beta_jacobian(pair));
+      },
+      "edge_edge"_a, "x"_a.noconvert());
+  m.def(
+      "distance_sq",
+      [](bool edge_edge, const Pairs& x) {
+        Eigen::VectorXd out(x.shape(0));
+        for (std::size_t i = 0; i < x.shape(0); ++i) {
+          out[i] = contact::distance_sq(kind_of(edge_edge), corners(x.data() + 12 * i));
+        }
+        return out;
+      },
+      "edge_edge"_a, "x"_a.noconvert());
+  m.def("mollifier_threshold", &contact::mollifier_threshold, "rest_length_sq_a"_a,
+        "rest_length_sq_b"_a);
+  m.def(
+      "mollifier",
+      [](const OnePair& x, double eps) {
+        return std::pair(contact::mollifier(corners(x.data()), eps),
+                         contact::mollified(corners(x.data()), eps));
+      },
+      "x"_a.noconvert(), "eps"_a);
+  m.def(
+      "mollifier_derivatives",
+      [](const OnePair& x, double eps) {
+        const contact::Mollifier m = contact::mollifier_derivatives(corners(x.data()), eps);
+        return std::tuple(m.m, m.gradient, m.hessian, m.m_eps, m.gradient_eps);
+      },
+      "x"_a.noconvert(), "eps"_a);
+}
+
+void law_kernels(nb::module_& m) {
+  m.def("barrier", &contact::barrier, "D"_a, "xi"_a, "d_hat"_a);
+  m.def(
+      "barrier_derivatives",
+      [](double D, double xi, double d_hat) {
+        const contact::Barrier b = contact::barrier_derivatives(D, xi, d_hat);
+        return std::tuple(b.b, b.b1, b.b2, b.b_d_hat, b.b1_d_hat, b.b_xi, b.b1_xi);
+      },
+      "D"_a, "xi"_a, "d_hat"_a);
+  m.def(
+      "friction_law",
+      [](double y, double e) {
+        const contact::FrictionLaw f = contact::friction_law(y, e);
+        return std::tuple(f.f0, f.f1_over_y, f.f2, f.f1_over_y_e, f.f0_e);
+      },
+      "y"_a, "e"_a);
+}
+
+void collision_kernels(nb::module_& m) {
+  m.def(
+      "safe_step",
+      [](bool edge_edge, const Pairs& x_t0, const Pairs& x_t1, double xi) {
+        if (x_t0.shape(0) != x_t1.shape(0)) {
+          throw nb::value_error("safe_step: `x_t0` and `x_t1` must have as many pairs");
+        }
+        Eigen::VectorXd out(x_t0.shape(0));
+        for (std::size_t i = 0; i < x_t0.shape(0); ++i) {
+          out[i] = contact::safe_step(kind_of(edge_edge), corners(x_t0.data() + 12 * i),
+                                      corners(x_t1.data() + 12 * i), xi);
+        }
+        return out;
+      },
+      "edge_edge"_a, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "xi"_a);
+
+  nb::class_<Search>(m, "BroadPhase")
+      .def(nb::init<const Faces&, const Surfaces&, Index, bool, const Positions&>(),
+           "faces"_a.noconvert(), "vertex_surface"_a.noconvert(), "cloth_count"_a, "self_contact"_a,
+           "x_reference"_a.noconvert())
+      .def("find", &Search::find, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "reach"_a)
+      .def(
+          "find",
+          [](Search& s, const Positions& x_t0, const Positions& x_t1, double radius) {
+            return s.find(x_t0, x_t1, std::vector<double>(s.mesh().surface_count(), 0.5 * radius));
+          },
+          "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "radius"_a)
+      .def("find_kept", &Search::find_kept, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "reach"_a)
+      .def_prop_ro("builds", &Search::builds)
+      .def("find_intersection", &Search::find_intersection, "x"_a.noconvert())
+      .def("smallest_nonadjacent_distance", &Search::smallest_nonadjacent_distance,
+           "x"_a.noconvert())
+      .def_prop_ro("edges", [](const Search& s) { return index_rows(s.mesh().edges); })
+      .def_prop_ro("edge_faces", [](const Search& s) { return index_rows(s.mesh().edge_faces); })
+      .def_prop_ro("edge_surface",
+                   [](const Search& s) { return index_vector(s.mesh().edge_surface); })
+      .def_prop_ro("face_surface",
+                   [](const Search& s) { return index_vector(s.mesh().face_surface); })
+      .def_prop_ro("cloth_counts", [](const Search& s) {
+        const contact::CollisionMesh& mesh = s.mesh();
+        return std::tuple(mesh.cloth_vertex_count, mesh.cloth_edge_count, mesh.cloth_face_count);
+      });
+}
+
+}  // namespace
+
+void contact_kernels(nb::module_& m) {
+  distance_kernels(m);
+  law_kernels(m);
+  collision_kernels(m);
+}
+
+}  // namespace diffcloth::bind

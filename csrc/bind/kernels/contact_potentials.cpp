@@ -1,0 +1,294 @@
+#include <string>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+#include <Eigen/Core>
+#include <nanobind/eigen/dense.h>
+#include <nanobind/nanobind.h>
+#include <nanobind/stl/pair.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/vector.h>
+
+#include "bind/kernels/kernels.h"
+#include "contact/contact_set.h"
+#include "contact/friction_set.h"
+
+namespace diffcloth::bind {
+namespace {
+
+using namespace nb::literals;
+using Positions = Eigen::Ref<const Rows3>;
+using FaceRows = Eigen::Ref<const Eigen::Matrix<Index, Eigen::Dynamic, 3, Eigen::RowMajor>>;
+using Values = Eigen::VectorXd;
+
+std::vector<contact::CollisionMesh::Face> face_list(const FaceRows& faces) {
+  std::vector<contact::CollisionMesh::Face> rows(faces.rows());
+  for (std::size_t f = 0; f < rows.size(); ++f) rows[f] = {faces(f, 0), faces(f, 1), faces(f, 2)};
+  return rows;
+}
+
+Values to_values(const std::vector<double>& v) {
+  return Eigen::Map<const Values>(v.data(), static_cast<Eigen::Index>(v.size()));
+}
+
+/// Barrier and lagged friction of a mesh, alone: for tests.
+class ContactPotential {
+ public:
+  ContactPotential(const FaceRows& faces,
+                   std::vector<Index> vertex_surface,
+                   Index cloth_count,
+                   bool self_contact,
+                   const Positions& X,
+                   const std::vector<bool>& prescribed,
+                   contact::Parameters parameters)
+      : mesh_(face_list(faces), std::move(vertex_surface), cloth_count, self_contact),
+        prescribed_(prescribed.begin(), prescribed.end()),
+        weights_(mesh_, X.data(), prescribed_),
+        rest_(contact::measure(mesh_, X.data())),
+        model_(mesh_, weights_, rest_, std::move(parameters), prescribed_),
+        broad_phase_(mesh_, X.data()) {}
+  ContactPotential(const ContactPotential&) = delete;
+  ContactPotential& operator=(const ContactPotential&) = delete;
+
+  Index candidate_count(const Positions& x) { return static_cast<Index>(candidates(x, x).size()); }
+
+  /// Entries that are comparable between x and another position.
+  std::pair<Values, Values> energies(const Positions& x, const Positions& other) {
+    const std::vector<contact::Candidate> pairs = candidates(x, other);
+    std::vector<double> a;
+    std::vector<double> b;
+    model_.energies(pairs, x.data(), a);
+    model_.energies(pairs, other.data(), b);
+    return {to_values(a), to_values(b)};
+  }
+
+  /// Corners, weight and distance of every contact.
+  nb::tuple contacts(const Positions& x) {
+    const std::vector<contact::Contact> found = find(x);
+    const auto count = static_cast<Eigen::Index>(found.size());
+    Eigen::Matrix<Index, Eigen::Dynamic, 4, Eigen::RowMajor> corners(count, 4);
+    Eigen::Matrix<double, Eigen::Dynamic, 4, Eigen::RowMajor> c(count, 4);
+    Values weight(count);
+    Values distance(count);
+    for (Eigen::Index k = 0; k < count; ++k) {
+      for (int i = 0; i < 4; ++i) corners(k, i) = found[k].pair.vertices[i];
+      c.row(k) = found[k].closest.c;
+      weight[k] = found[k].weight;
+      distance[k] = std::sqrt(found[k].closest.d_sq);
+    }
+    return nb::make_tuple(corners, c, weight, distance);
+  }
+
+  Values gradient(const Positions& x) {
+    Values g = Values::Zero(x.size());
+    model_.add_gradient(find(x), x.data(), g.data());
+    return g;
+  }
+
+  Eigen::MatrixXd hessian(const Positions& x, bool positive) {
+    Eigen::MatrixXd h = Eigen::MatrixXd::Zero(x.size(), x.size());
+    for (const contact::Contact& k : find(x)) {
+      add_block(k.pair.vertices,
+                model_.hessian(k, x.data(), positive ? Curvature::kPositive : Curvature::kExact),
+                h);
+    }
+    return h;
+  }
+
+  Values hessian_product(const Positions& x, const Positions& z) {
+    Values y = Values::Zero(x.size());
+    model_.add_hessian_product(find(x), x.data(), z.data(), y.data());
+    return y;
+  }
+
+  nb::dict mixed(const Positions& x, const Positions& z, double scale) {
+    contact::ContactModel::Bar bar(mesh_);
+    model_.add_mixed(find(x), x.data(), z.data(), scale, bar);
+    return to_dict(bar);
+  }
+
+  /// Change of friction's energy from x_start to x, its gradient and its Hessian.
+  std::tuple<double, Values, Eigen::MatrixXd> friction(const Positions& x_lag,
+                                                       const Positions& x_start,
+                                                       const Positions& x,
+                                                       bool positive) {
+    const contact::FrictionSet set(model_, find(x_lag));
+    Values g = Values::Zero(x.size());
+    set.add_gradient(x_start.data(), x.data(), g.data());
+    Eigen::MatrixXd h = Eigen::MatrixXd::Zero(x.size(), x.size());
+    for (const contact::FrictionSet::Entry& k : set.entries()) {
+      add_block(k.lag.pair.vertices,
+                set.hessian(k, x_start.data(), x.data(),
+                            positive ? Curvature::kPositive : Curvature::kExact),
+                h);
+    }
+    return {set.energy_change(x_start.data(), x_start.data(), x.data()), g, h};
+  }
+
+  nb::dict friction_mixed(const Positions& x_lag,
+                          const Positions& x_start,
+                          const Positions& x,
+                          const Positions& z,
+                          double scale) {
+    const contact::FrictionSet set(model_, find(x_lag));
+    contact::ContactModel::Bar bar(mesh_);
+    Values lag_bar = Values::Zero(x.size());
+    set.add_mixed(x_start.data(), x.data(), z.data(), x_lag.data(), scale, bar, lag_bar.data());
+    nb::dict result = to_dict(bar);
+    result["x_lag"] = lag_bar;
+    return result;
+  }
+
+  /// A rest measure by its name, to be changed by differences.
+  std::vector<double>& measure(const std::string& name) {
+    if (name == "vertex_area") return rest_.vertex_area;
+    if (name == "edge_area") return rest_.edge_area;
+    if (name == "edge_length_sq") return rest_.edge_length_sq;
+    if (name == "mean_face_area") return rest_.mean_face_area;
+    throw nb::value_error(("contact potential: no measure `" + name + "`").c_str());
+  }
+
+  /// s_e and s_v of the bodies' edges and vertices, as a cloth sees them.
+  std::pair<Values, Values> sharpness(Index cloth) const {
+    Values edge(mesh_.edges.size() - mesh_.cloth_edge_count);
+    Values vertex(mesh_.vertex_count - mesh_.cloth_vertex_count);
+    for (Index k = 0; k < edge.size(); ++k) {
+      edge[k] = weights_.edge_sharpness(cloth, mesh_.cloth_edge_count + k);
+    }
+    for (Index k = 0; k < vertex.size(); ++k) {
+      vertex[k] = weights_.vertex_sharpness(cloth, mesh_.cloth_vertex_count + k);
+    }
+    return {edge, vertex};
+  }
+
+  /// Continuation of a body's edges at both of their ends.
+  Eigen::MatrixXd continuation() const {
+    Eigen::MatrixXd result(mesh_.edges.size() - mesh_.cloth_edge_count, 2);
+    for (Index k = 0; k < result.rows(); ++k) {
+      for (int end = 0; end < 2; ++end) {
+        result(k, end) = weights_.continuation(mesh_.cloth_edge_count + k, end);
+      }
+    }
+    return result;
+  }
+
+  /// Weights of a sum over all features: of edges, of vertices, and whether a face counts.
+  std::tuple<std::vector<Index>, std::vector<Index>, std::vector<bool>> feature_weights() const {
+    std::vector<Index> edge;
+    std::vector<Index> vertex;
+    std::vector<bool> counts;
+    for (Index e = 0; e < static_cast<Index>(mesh_.edges.size()); ++e) {
+      edge.push_back(weights_.edge(e));
+    }
+    for (Index v = 0; v < mesh_.vertex_count; ++v) vertex.push_back(weights_.vertex(v));
+    for (Index f = 0; f < static_cast<Index>(mesh_.faces.size()); ++f) {
+      counts.push_back(weights_.counts(f));
+    }
+    return {edge, vertex, counts};
+  }
+
+  Eigen::Matrix<Index, Eigen::Dynamic, 2, Eigen::RowMajor> edges() const {
+    Eigen::Matrix<Index, Eigen::Dynamic, 2, Eigen::RowMajor> result(mesh_.edges.size(), 2);
+    for (std::size_t e = 0; e < mesh_.edges.size(); ++e) {
+      result.row(e) << mesh_.edges[e][0], mesh_.edges[e][1];
+    }
+    return result;
+  }
+
+ private:
+  std::vector<contact::Candidate> candidates(const Positions& x, const Positions& to) {
+    if (x.rows() != mesh_.vertex_count || to.rows() != mesh_.vertex_count) {
+      throw nb::value_error("contact potential: positions must have one row a vertex");
+    }
+    std::vector<contact::Candidate> pairs;
+    broad_phase_.find(x.data(), to.data(), model_.reach(), scratch_, pairs);
+    return pairs;
+  }
+
+  std::vector<contact::Contact> find(const Positions& x) {
+    std::vector<contact::Contact> found;
+    model_.find(candidates(x, x), x.data(), found);
+    return found;
+  }
+
+  static void add_block(const std::array<Index, 4>& v, const Mat12& h, Eigen::MatrixXd& out) {
+    for (int i = 0; i < 4; ++i) {
+      for (int j = 0; j < 4; ++j) {
+        out.block<3, 3>(3 * v[i], 3 * v[j]) += h.block<3, 3>(3 * i, 3 * j);
+      }
+    }
+  }
+
+  static nb::dict to_dict(const contact::ContactModel::Bar& bar) {
+    nb::dict result;
+    result["kappa"] = bar.kappa;
+    result["d_hat"] = bar.d_hat;
+    result["slip"] = bar.slip;
+    result["thickness"] = to_values(bar.thickness);
+    result["friction"] = to_values(bar.friction);
+    result["vertex_area"] = to_values(bar.rest.vertex_area);
+    result["edge_area"] = to_values(bar.rest.edge_area);
+    result["edge_length_sq"] = to_values(bar.rest.edge_length_sq);
+    result["mean_face_area"] = to_values(bar.rest.mean_face_area);
+    return result;
+  }
+
+  contact::CollisionMesh mesh_;
+  std::vector<char> prescribed_;
+  contact::FeatureWeights weights_;
+  contact::RestMeasures rest_;
+  contact::ContactModel model_;
+  contact::BroadPhase broad_phase_;
+  contact::BroadPhase::Scratch scratch_;
+};
+
+}  // namespace
+
+void contact_potentials(nb::module_& m) {
+  nb::class_<ContactPotential>(m, "ContactPotential")
+      .def(
+          "__init__",
+          [](ContactPotential* self, const FaceRows& faces, std::vector<Index> vertex_surface,
+             Index cloth_count, bool self_contact, const Positions& X,
+             const std::vector<bool>& prescribed, double kappa, double d_hat, double slip,
+             std::vector<double> thickness, std::vector<double> friction) {
+            new (self) ContactPotential(faces, std::move(vertex_surface), cloth_count, self_contact,
+                                        X, prescribed,
+                                        {.kappa = kappa,
+                                         .d_hat = d_hat,
+                                         .slip = slip,
+                                         .thickness = std::move(thickness),
+                                         .friction = std::move(friction)});
+          },
+          "faces"_a, "vertex_surface"_a, "cloth_count"_a, "self_contact"_a, "X"_a, "prescribed"_a,
+          "kappa"_a, "d_hat"_a, "slip"_a, "thickness"_a, "friction"_a)
+      .def("candidate_count", &ContactPotential::candidate_count, "x"_a)
+      .def("energies", &ContactPotential::energies, "x"_a, "other"_a)
+      .def("contacts", &ContactPotential::contacts, "x"_a)
+      .def("gradient", &ContactPotential::gradient, "x"_a)
+      .def("hessian", &ContactPotential::hessian, "x"_a, "positive"_a = false)
+      .def("hessian_product", &ContactPotential::hessian_product, "x"_a, "z"_a)
+      .def("mixed", &ContactPotential::mixed, "x"_a, "z"_a, "scale"_a = 1.0)
+      .def("friction", &ContactPotential::friction, "x_lag"_a, "x_start"_a, "x"_a,
+           "positive"_a = false)
+      .def("friction_mixed", &ContactPotential::friction_mixed, "x_lag"_a, "x_start"_a, "x"_a,
+           "z"_a, "scale"_a = 1.0)
+      .def("measure",
+           [](ContactPotential& self, const std::string& name) { return self.measure(name); })
+      .def("set_measure",
+           [](ContactPotential& self, const std::string& name, const std::vector<double>& values) {
+             std::vector<double>& measure = self.measure(name);
+             if (measure.size() != values.size()) {
+               throw nb::value_error("contact potential: a measure keeps its size");
+             }
+             measure = values;
+           })
+      .def("sharpness", &ContactPotential::sharpness, "cloth"_a = 0)
+      .def("continuation", &ContactPotential::continuation)
+      .def("feature_weights", &ContactPotential::feature_weights)
+      .def("edges", &ContactPotential::edges);
+}
+
+}  // namespace diffcloth::bind

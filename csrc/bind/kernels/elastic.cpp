@@ -1,0 +1,349 @@
+#include "elastic/elastic.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <optional>
+#include <span>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+
+#include "bind/kernels/kernels.h"
+#include "elastic/anchors.h"
+#include "linalg/block_pattern.h"
+#include "mesh/rest_shape.h"
+#include "mesh/topology.h"
+
+namespace diffcloth::bind {
+namespace {
+
+using namespace nb::literals;
+
+using Positions = nb::ndarray<const double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using Faces = nb::ndarray<const std::int32_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using Indices = nb::ndarray<const std::int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Values = nb::ndarray<const double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Array = nb::ndarray<nb::numpy, double>;
+using IndexArray = nb::ndarray<nb::numpy, std::int32_t>;
+
+/// A numpy array that owns a copy of the values.
+template <class Scalar>
+nb::ndarray<nb::numpy, Scalar> owned(const Scalar* values,
+                                     std::initializer_list<std::size_t> shape) {
+  using Buffer = std::vector<Scalar>;
+  std::size_t size = 1;
+  for (const std::size_t extent : shape) size *= extent;
+  auto buffer = std::make_unique<Buffer>(values, values + size);
+  Scalar* data = buffer->data();
+  const nb::capsule owner(buffer.get(), [](void* p) noexcept {
+    std::unique_ptr<Buffer>(static_cast<Buffer*>(p)).reset();
+  });
+  buffer.release();  // the capsule owns it now
+  return nb::ndarray<nb::numpy, Scalar>(data, shape, owner);
+}
+
+Array vector_array(const std::vector<double>& values) {
+  return owned(values.data(), {values.size()});
+}
+
+Array rows_array(const std::vector<double>& values) {
+  return owned(values.data(), {values.size() / 3, 3});
+}
+
+void check_rows(const char* name, std::size_t rows, std::size_t expected) {
+  if (rows != expected) {
+    throw std::invalid_argument("elastic: `" + std::string(name) + "` must have " +
+                                std::to_string(expected) + " rows, got " + std::to_string(rows));
+  }
+}
+
+std::vector<std::array<Index, 3>> face_list(const Faces& faces) {
+  std::vector<std::array<Index, 3>> result(faces.shape(0));
+  for (std::size_t f = 0; f < result.size(); ++f) {
+    result[f] = {faces(f, 0), faces(f, 1), faces(f, 2)};
+  }
+  return result;
+}
+
+std::vector<mesh::BendingModel> model_list(const std::string& name, std::size_t faces) {
+  if (name == "patch") return std::vector(faces, mesh::BendingModel::kPatch);
+  if (name == "hinge") return std::vector(faces, mesh::BendingModel::kHinge);
+  throw std::invalid_argument("elastic: `bending_model` must be 'patch' or 'hinge', got '" + name +
+                              "'");
+}
+
+/// A rest mesh with its stencils and one elastic model on it: all that a test varies, in one place.
+class Elastic {
+ public:
+  Elastic(const Positions& X, const Faces& faces, const std::string& bending_model)
+      : X_(X.data(), X.data() + X.size()),
+        topology_(static_cast<Index>(X.shape(0)), face_list(faces)),
+        stencils_(
+            mesh::choose_stencils(topology_, X_.data(), model_list(bending_model, faces.shape(0)))),
+        pattern_(topology_.vertex_count, elastic::cliques(topology_, stencils_)),
+        slots_(elastic::slots(topology_, stencils_, pattern_)) {
+    model_.topology = &topology_;
+    model_.stencils = &stencils_;
+    model_.rest = &rest_;
+    set_rest(X);
+  }
+  Elastic(const Elastic&) = delete;
+  Elastic& operator=(const Elastic&) = delete;
+
+  /// Move the rest positions; the stencils stay.
+  void set_rest(const Positions& X) {
+    check_rows("X", X.shape(0), topology_.vertex_count);
+    std::copy(X.data(), X.data() + X.size(), X_.begin());
+    rest_ = mesh::rest_shape(topology_, stencils_, X_.data());
+  }
+
+  void set_parameters(const Values& stretch,
+                      const Values& bending,
+                      const Values& poisson,
+                      const Values& damping,
+                      double h,
+                      const std::optional<Positions>& x_n) {
+    const auto fill = [this](const char* name, const Values& values) {
+      check_rows(name, values.shape(0), topology_.faces.size());
+      return std::vector<double>(values.data(), values.data() + values.size());
+    };
+    model_.stretch = fill("stretch", stretch);
+    model_.bending = fill("bending", bending);
+    model_.poisson = fill("poisson", poisson);
+    model_.damping = fill("damping", damping);
+    model_.h = h;
+    model_.x_n = nullptr;
+    if (x_n) {
+      x_n_ = positions("x_n", *x_n);
+      model_.x_n = x_n_.data();
+    }
+    elastic::prepare(model_, slots_);
+  }
+
+  double energy(const Positions& x) const {
+    return elastic::energy(model_, positions("x", x).data());
+  }
+
+  double energy_change(const Positions& x0, const Positions& x1) const {
+    return elastic::energy_change(model_, positions("x0", x0).data(), positions("x1", x1).data());
+  }
+
+  Array gradient(const Positions& x) const {
+    std::vector<double> g(x.size(), 0.0);
+    elastic::add_gradient(model_, positions("x", x).data(), g.data());
+    return rows_array(g);
+  }
+
+  Array hessian_blocks(const Positions& x, bool positive) const {
+    std::vector<double> blocks(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
+    const auto curvature = positive ? Curvature::kPositive : Curvature::kExact;
+    elastic::add_hessian(model_, slots_, positions("x", x).data(), curvature, blocks.data());
+    return owned(blocks.data(), {blocks.size() / 9, 9});
+  }
+
+  /// (row, column) of every block, in the order of hessian_blocks().
+  IndexArray block_pairs() const {
+    std::vector<std::int32_t> pairs;
+    for (Index j = 0; j < pattern_.size(); ++j) {
+      for (Index k = pattern_.column_start()[j]; k < pattern_.column_start()[j + 1]; ++k) {
+        pairs.push_back(pattern_.row()[k]);
+        pairs.push_back(j);
+      }
+    }
+    return owned(pairs.data(), {pairs.size() / 2, 2});
+  }
+
+  Array hessian(const Positions& x, bool positive) const {
+    const Array blocks = hessian_blocks(x, positive);
+    const Index n = topology_.vertex_count;
+    Eigen::MatrixXd dense = Eigen::MatrixXd::Zero(3 * n, 3 * n);
+    for (Index j = 0; j < n; ++j) {
+      for (Index s = pattern_.column_start()[j]; s < pattern_.column_start()[j + 1]; ++s) {
+        const Index i = pattern_.row()[s];
+        const Mat3 block = Eigen::Map<const Mat3>(blocks.data() + 9 * s);
+        dense.block<3, 3>(3 * i, 3 * j) = block;
+        dense.block<3, 3>(3 * j, 3 * i) = block.transpose();
+      }
+    }
+    const std::size_t size = 3 * static_cast<std::size_t>(n);
+    return owned(dense.data(), {size, size});
+  }
+
+  Array hessian_product(const Positions& x, const Positions& z) const {
+    std::vector<double> y(x.size(), 0.0);
+    elastic::add_hessian_product(model_, positions("x", x).data(), positions("z", z).data(),
+                                 y.data());
+    return rows_array(y);
+  }
+
+  nb::dict mixed(const Positions& x, const Positions& z, bool with_rest) const {
+    elastic::Bar bar(topology_, stencils_);
+    elastic::add_mixed(model_, positions("x", x).data(), positions("z", z).data(), with_rest, bar);
+    std::vector<double> X_bar(X_.size(), 0.0);
+    if (with_rest) {
+      mesh::rest_shape_vjp(topology_, stencils_, X_.data(), bar.rest, X_bar.data());
+    }
+    nb::dict result;
+    result["stretch"] = vector_array(bar.stretch);
+    result["bending"] = vector_array(bar.bending);
+    result["poisson"] = vector_array(bar.poisson);
+    result["damping"] = vector_array(bar.damping);
+    result["x_n"] = rows_array(bar.x_n);
+    result["X"] = rows_array(X_bar);
+    return result;
+  }
+
+  nb::dict rest() const {
+    std::vector<double> gradients;
+    for (const mesh::ShapeGradient& g : rest_.shape_gradient) {
+      for (int k = 0; k < 6; ++k) gradients.push_back(g(k / 2, k % 2));
+    }
+    std::vector<double> curvature;
+    for (const Mat3& b : rest_.curvature) curvature.insert(curvature.end(), b.data(), b.data() + 9);
+    nb::dict result;
+    result["area"] = vector_array(rest_.area);
+    result["shape_gradient"] = owned(gradients.data(), {rest_.area.size(), 3, 2});
+    result["curvature_operator"] = rows_array(rest_.curvature_operator);
+    result["curvature"] = owned(curvature.data(), {rest_.curvature.size(), 3, 3});
+    result["bending_area"] = vector_array(rest_.bending_area);
+    result["vertex_area"] = vector_array(rest_.vertex_area);
+    result["edge_area"] = vector_array(rest_.edge_area);
+    result["edge_length_sq"] = vector_array(rest_.edge_length_sq);
+    result["curved"] = rest_.curved;
+    return result;
+  }
+
+  /// Pull random cotangents of every field of the rest shape back to X. The cotangent of entry k
+  /// of a field is cos(k + 1): a test repeats it.
+  Array rest_vjp() const {
+    mesh::RestShapeBar bar(topology_, stencils_);
+    const auto fill = [](std::vector<double>& field) {
+      for (std::size_t k = 0; k < field.size(); ++k) field[k] = std::cos(k + 1.0);
+    };
+    fill(bar.area);
+    fill(bar.curvature_operator);
+    fill(bar.bending_area);
+    fill(bar.vertex_area);
+    fill(bar.edge_area);
+    fill(bar.edge_length_sq);
+    for (std::size_t k = 0; k < 6 * bar.shape_gradient.size(); ++k) {
+      bar.shape_gradient[k / 6](k % 6 / 2, k % 2) = std::cos(k + 1.0);
+    }
+    for (std::size_t k = 0; k < 9 * bar.curvature.size(); ++k) {
+      bar.curvature[k / 9].data()[k % 9] = std::cos(k + 1.0);
+    }
+    std::vector<double> X_bar(X_.size(), 0.0);
+    mesh::rest_shape_vjp(topology_, stencils_, X_.data(), bar, X_bar.data());
+    return rows_array(X_bar);
+  }
+
+  IndexArray stencil_start() const {
+    return owned(stencils_.start.data(), {stencils_.start.size()});
+  }
+  IndexArray stencil_vertices() const {
+    return owned(stencils_.vertices.data(), {stencils_.vertices.size()});
+  }
+  IndexArray edges() const {
+    return owned(topology_.edges.data()->data(), {topology_.edges.size(), 2});
+  }
+  IndexArray edge_faces() const {
+    return owned(topology_.edge_faces.data()->data(), {topology_.edges.size(), 2});
+  }
+  IndexArray face_edges() const {
+    return owned(topology_.face_edges.data()->data(), {topology_.faces.size(), 3});
+  }
+
+ private:
+  std::vector<double> positions(const char* name, const Positions& x) const {
+    check_rows(name, x.shape(0), topology_.vertex_count);
+    return {x.data(), x.data() + x.size()};
+  }
+
+  std::vector<double> X_;
+  mesh::Topology topology_;
+  mesh::BendingStencils stencils_;
+  mesh::RestShape rest_;
+  linalg::BlockPattern pattern_;
+  elastic::Slots slots_;
+  elastic::Model model_;
+  std::vector<double> x_n_;
+};
+
+elastic::Anchors anchors_view(const Indices& vertex,
+                              const Values& stiffness,
+                              const Positions& target) {
+  check_rows("stiffness", stiffness.shape(0), vertex.shape(0));
+  check_rows("target", target.shape(0), vertex.shape(0));
+  return {.vertex = {vertex.data(), vertex.size()},
+          .stiffness = {stiffness.data(), stiffness.size()},
+          .target = {target.data(), target.size()}};
+}
+
+/// Value, change, gradient, Hessian product and mixed derivatives of soft pins.
+nb::dict anchors(const Indices& vertex,
+                 const Values& stiffness,
+                 const Positions& target,
+                 const Positions& x0,
+                 const Positions& x1,
+                 const Positions& z) {
+  const elastic::Anchors pins = anchors_view(vertex, stiffness, target);
+  std::vector<double> gradient(x1.size(), 0.0);
+  std::vector<double> product(x1.size(), 0.0);
+  std::vector<double> blocks(3 * x1.size(), 0.0);
+  std::vector<Index> diagonal(x1.shape(0));
+  for (std::size_t i = 0; i < diagonal.size(); ++i) diagonal[i] = static_cast<Index>(i);
+  std::vector<double> stiffness_bar(vertex.size(), 0.0);
+  std::vector<double> target_bar(3 * vertex.size(), 0.0);
+  elastic::add_gradient(pins, x1.data(), gradient.data());
+  elastic::add_hessian_product(pins, z.data(), product.data());
+  elastic::add_hessian(pins, diagonal, blocks.data());
+  elastic::add_mixed(pins, x1.data(), z.data(), stiffness_bar.data(), target_bar.data());
+  nb::dict result;
+  result["energy"] = elastic::energy(pins, x1.data());
+  result["energy_change"] = elastic::energy_change(pins, x0.data(), x1.data());
+  result["gradient"] = rows_array(gradient);
+  result["hessian_product"] = rows_array(product);
+  result["hessian_blocks"] = owned(blocks.data(), {x1.shape(0), 3, 3});
+  result["stiffness_bar"] = vector_array(stiffness_bar);
+  result["target_bar"] = rows_array(target_bar);
+  return result;
+}
+
+}  // namespace
+
+void elastic_kernels(nb::module_& m) {
+  nb::class_<Elastic>(m, "Elastic", "An elastic model on one rest mesh.")
+      .def(nb::init<const Positions&, const Faces&, const std::string&>(), "X"_a.noconvert(),
+           "faces"_a.noconvert(), "bending_model"_a)
+      .def("set_rest", &Elastic::set_rest, "X"_a.noconvert())
+      .def("set_parameters", &Elastic::set_parameters, "stretch"_a.noconvert(),
+           "bending"_a.noconvert(), "poisson"_a.noconvert(), "damping"_a.noconvert(), "h"_a,
+           "x_n"_a.noconvert().none())
+      .def("energy", &Elastic::energy, "x"_a.noconvert())
+      .def("energy_change", &Elastic::energy_change, "x0"_a.noconvert(), "x1"_a.noconvert())
+      .def("gradient", &Elastic::gradient, "x"_a.noconvert())
+      .def("hessian", &Elastic::hessian, "x"_a.noconvert(), "positive"_a)
+      .def("hessian_blocks", &Elastic::hessian_blocks, "x"_a.noconvert(), "positive"_a)
+      .def("block_pairs", &Elastic::block_pairs)
+      .def("hessian_product", &Elastic::hessian_product, "x"_a.noconvert(), "z"_a.noconvert())
+      .def("mixed", &Elastic::mixed, "x"_a.noconvert(), "z"_a.noconvert(), "with_rest"_a)
+      .def("rest", &Elastic::rest)
+      .def("rest_vjp", &Elastic::rest_vjp)
+      .def_prop_ro("stencil_start", &Elastic::stencil_start, nb::rv_policy::automatic)
+      .def_prop_ro("stencil_vertices", &Elastic::stencil_vertices, nb::rv_policy::automatic)
+      .def_prop_ro("edges", &Elastic::edges, nb::rv_policy::automatic)
+      .def_prop_ro("edge_faces", &Elastic::edge_faces, nb::rv_policy::automatic)
+      .def_prop_ro("face_edges", &Elastic::face_edges, nb::rv_policy::automatic);
+  m.def("anchors", &anchors, "vertex"_a.noconvert(), "stiffness"_a.noconvert(),
+        "target"_a.noconvert(), "x0"_a.noconvert(), "x1"_a.noconvert(), "z"_a.noconvert());
+}
+
+}  // namespace diffcloth::bind

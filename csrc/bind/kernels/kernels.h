@@ -1,0 +1,24 @@
+#pragma once
+
+#include <nanobind/nanobind.h>
+
+namespace diffcloth::bind {
+
+namespace nb = nanobind;
+
+/// Threads, for tests of what happens when they fail or are interrupted.
+void common_kernels(nb::module_& m);
+
+/// Contact kernels one by one, for tests against independent references.
+void contact_kernels(nb::module_& m);
+
+/// Barrier and friction of a whole mesh, for tests of their derivatives and weights.
+void contact_potentials(nb::module_& m);
+
+/// Sparse Cholesky factorizations, for tests against independent references and for benchmarks.
+void linalg_kernels(nb::module_& m);
+
+/// Rest shape and elastic potentials one by one, for tests against independent references.
+void elastic_kernels(nb::module_& m);
+
+}  // namespace diffcloth::bind

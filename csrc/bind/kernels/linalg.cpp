@@ -1,0 +1,183 @@
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/shared_ptr.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include "bind/kernels/kernels.h"
+#include "linalg/cholesky.h"
+
+namespace diffcloth::bind {
+namespace {
+
+using namespace nb::literals;
+
+using Pairs = nb::ndarray<const std::int32_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+using Flags = nb::ndarray<const bool, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Blocks = nb::ndarray<const double, nb::shape<-1, 9>, nb::c_contig, nb::device::cpu>;
+using Vectors = nb::ndarray<const double, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using MutableVectors = nb::ndarray<double, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+
+linalg::Backend backend_named(const std::string& name) {
+  for (const linalg::Backend backend : linalg::available_backends()) {
+    if (name == linalg::name(backend)) return backend;
+  }
+  throw std::invalid_argument("Cholesky: `backend` must be one of this build's, got '" + name +
+                              "'");
+}
+
+std::vector<linalg::KernelLevel> supported_levels() {
+  using enum linalg::KernelLevel;
+  std::vector<linalg::KernelLevel> result;
+  for (const linalg::KernelLevel level : {kPortable, kAvx2, kAvx512}) {
+    if (linalg::supported(level)) result.push_back(level);
+  }
+  return result;
+}
+
+linalg::KernelLevel level_named(const std::string& name) {
+  for (const linalg::KernelLevel level : supported_levels()) {
+    if (name == linalg::name(level)) return level;
+  }
+  throw std::invalid_argument("Cholesky: `level` must be one of this machine's, got '" + name +
+                              "'");
+}
+
+linalg::Ordering ordering_named(const std::string& name) {
+  using enum linalg::Ordering;
+  for (const linalg::Ordering ordering : {kAutomatic, kMinimumDegree, kNestedDissection}) {
+    if (name == linalg::name(ordering)) return ordering;
+  }
+  throw std::invalid_argument("Cholesky: `ordering` is unknown: '" + name + "'");
+}
+
+/// A pattern and its analysis.
+struct Analysis {
+  linalg::BlockPattern pattern;
+  std::shared_ptr<const linalg::CholeskyAnalysis> analysis;
+
+  Analysis(Index vertex_count,
+           const Pairs& pairs,
+           const Flags& fixed,
+           const std::string& backend,
+           const std::string& level,
+           const std::string& ordering) {
+    if (fixed.shape(0) != static_cast<std::size_t>(vertex_count)) {
+      throw std::invalid_argument("Cholesky: `fixed` must have one entry for each vertex");
+    }
+    std::vector<std::pair<Index, Index>> list;
+    for (std::size_t k = 0; k < pairs.shape(0); ++k) {
+      if (pairs(k, 1) < 0 || pairs(k, 0) < pairs(k, 1) || pairs(k, 0) >= vertex_count) {
+        throw std::invalid_argument("Cholesky: `pairs` must be (row, column), row >= column");
+      }
+      list.emplace_back(pairs(k, 0), pairs(k, 1));
+    }
+    pattern = linalg::BlockPattern::from_pairs(vertex_count, std::move(list));
+    analysis = std::make_shared<linalg::CholeskyAnalysis>(
+        pattern, std::vector<char>(fixed.data(), fixed.data() + fixed.shape(0)),
+        backend_named(backend),
+        linalg::CholeskyOptions{.level = level.empty() ? linalg::best_level() : level_named(level),
+                                .ordering = ordering_named(ordering)});
+  }
+};
+
+class Factor {
+ public:
+  explicit Factor(const Analysis& analysis)
+      : blocks_(static_cast<std::size_t>(analysis.pattern.block_count())),
+        vertices_(static_cast<std::size_t>(analysis.pattern.size())),
+        factor_(analysis.analysis) {}
+
+  bool compute(const Blocks& blocks, linalg::CholeskyWorkspace& workspace) {
+    check(blocks);
+    const nb::gil_scoped_release nogil;
+    return factor_.compute(blocks.data(), workspace);
+  }
+
+  nb::dict profile(const Blocks& blocks, linalg::CholeskyWorkspace& workspace, int repeats) {
+    check(blocks);
+    linalg::CholeskySeconds seconds;
+    bool positive = true;
+    for (int k = 0; k < repeats; ++k) {
+      positive = factor_.compute(blocks.data(), workspace, &seconds) && positive;
+    }
+    if (!positive) throw std::invalid_argument("Factor: the matrix is not positive definite");
+    nb::dict result;
+    result["assembly"] = seconds.assembly / repeats;
+    result["extend-add"] = seconds.extend_add / repeats;
+    result["dense"] = seconds.dense / repeats;
+    return result;
+  }
+
+  void solve(const Vectors& b, const MutableVectors& x) const {
+    if (b.shape(0) != x.shape(0) || b.shape(1) != vertices_ || x.shape(1) != vertices_) {
+      throw std::invalid_argument("Factor: `b` and `x` must be [count, vertices, 3]");
+    }
+    std::vector<const double*> from;
+    std::vector<double*> to;
+    for (std::size_t r = 0; r < b.shape(0); ++r) {
+      from.push_back(b.data() + 3 * vertices_ * r);
+      to.push_back(x.data() + 3 * vertices_ * r);
+    }
+    const nb::gil_scoped_release nogil;
+    factor_.solve(from, to);
+  }
+
+  std::size_t bytes() const { return factor_.bytes(); }
+
+ private:
+  void check(const Blocks& blocks) const {
+    if (blocks.shape(0) != blocks_) {
+      throw std::invalid_argument("Factor: `blocks` must have one row for each block");
+    }
+  }
+
+  std::size_t blocks_;
+  std::size_t vertices_;
+  linalg::CholeskyFactor factor_;
+};
+
+}  // namespace
+
+void linalg_kernels(nb::module_& m) {
+  m.def("cholesky_backends", [] {
+    std::vector<std::string> names;
+    for (const linalg::Backend b : linalg::available_backends())
+      names.emplace_back(linalg::name(b));
+    return names;
+  });
+  m.def("kernel_levels", [] {
+    std::vector<std::string> names;
+    for (const linalg::KernelLevel l : supported_levels()) names.emplace_back(linalg::name(l));
+    return names;
+  });
+  nb::class_<linalg::CholeskyWorkspace>(m, "CholeskyWorkspace")
+      .def(nb::init<>())
+      .def("bytes", &linalg::CholeskyWorkspace::bytes);
+  nb::class_<Analysis>(m, "CholeskyAnalysis")
+      .def(nb::init<Index, const Pairs&, const Flags&, const std::string&, const std::string&,
+                    const std::string&>(),
+           "vertex_count"_a, "pairs"_a.noconvert(), "fixed"_a.noconvert(),
+           "backend"_a = "multifrontal", "level"_a = "", "ordering"_a = "automatic")
+      .def("column_start", [](const Analysis& a) { return a.pattern.column_start(); })
+      .def("row", [](const Analysis& a) { return a.pattern.row(); })
+      .def("dimension", [](const Analysis& a) { return a.analysis->dimension(); })
+      .def("bytes", [](const Analysis& a) { return a.analysis->bytes(); })
+      .def("nonzeros", [](const Analysis& a) { return a.analysis->nonzeros(); })
+      .def("flops", [](const Analysis& a) { return a.analysis->flops(); });
+  nb::class_<Factor>(m, "CholeskyFactor")
+      .def(nb::init<const Analysis&>(), "analysis"_a)
+      .def("compute", &Factor::compute, "blocks"_a.noconvert(), "workspace"_a)
+      .def("profile", &Factor::profile, "blocks"_a.noconvert(), "workspace"_a, "repeats"_a)
+      .def("solve", &Factor::solve, "b"_a.noconvert(), "x"_a.noconvert())
+      .def("bytes", &Factor::bytes);
+}
+
+}  // namespace diffcloth::bind

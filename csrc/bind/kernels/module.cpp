@@ -1,0 +1,13 @@
+#include "bind/kernels/kernels.h"
+
+// A module of its own, so that what is shipped holds nothing that only tests call.
+NB_MODULE(_kernels, m) {
+  diffcloth::bind::nb::set_leak_warnings(false);  // see bind/module.cpp
+  m.doc() = "Single kernels of the C++ core, exposed for tests and benchmarks.";
+
+  diffcloth::bind::common_kernels(m);
+  diffcloth::bind::contact_kernels(m);
+  diffcloth::bind::contact_potentials(m);
+  diffcloth::bind::elastic_kernels(m);
+  diffcloth::bind::linalg_kernels(m);
+}

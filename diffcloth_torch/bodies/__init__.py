@@ -1,1 +1,0 @@
-"""How rigid bodies move."""

@@ -1,0 +1,1 @@
+"""Configurations: the schema of YAML files, and what is built from them."""

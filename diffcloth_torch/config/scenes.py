@@ -1,0 +1,243 @@
+"""From a configuration to a scene, a simulator and the motion that the configuration prescribes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloth_torch.config import shapes
+from diffcloth_torch.config.schema import (
+    BodySection,
+    ClothSection,
+    PinKeyframe,
+    PoseSection,
+    RotationSection,
+    RunConfig,
+    Section,
+    Selection,
+    SimulationSection,
+    resolve_path,
+)
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry.meshes import read_mesh
+from diffcloth_torch.geometry.poses import transform
+from diffcloth_torch.geometry.rotation import interpolate_poses, rotate
+from diffcloth_torch.model.cloth import Cloth
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.options import ContactOptions, SolverOptions
+from diffcloth_torch.model.rigid_body import RigidBody
+from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.controls import Control
+from diffcloth_torch.sim.simulator import Simulator
+
+__all__ = [
+    "build_scene",
+    "build_simulator",
+    "pose_array",
+    "prescribed_controls",
+    "prescribed_poses",
+    "quaternion",
+]
+
+
+def build_scene(config: RunConfig, source: Path) -> Scene:
+    """Make the cloths and bodies of a configuration that was read from the file `source`."""
+    _require_unique_names(config)
+    cloths = [_cloth(section, config.root, source) for section in config.scene.cloths]
+    bodies = [_body(section, config.root, source) for section in config.scene.bodies]
+    gravity = config.scene.gravity
+    return Scene(cloths, bodies) if gravity is None else Scene(cloths, bodies, gravity=gravity)
+
+
+def build_simulator(scene: Scene, section: SimulationSection) -> Simulator:
+    """Make the simulator of a scene; what the configuration leaves out takes its default."""
+    return Simulator(
+        scene,
+        section.dt,
+        scheme=section.scheme,
+        contact=ContactOptions(**_given(section.contact)),
+        solver=SolverOptions(**_given(section.solver)),
+    )
+
+
+def _given(section: Section) -> dict[str, Any]:
+    return section.model_dump(exclude_none=True)
+
+
+def _require_unique_names(config: RunConfig) -> None:
+    names = [cloth.name for cloth in config.scene.cloths]
+    names += [body.name for body in config.scene.bodies]
+    for name in names:
+        if names.count(name) > 1:
+            raise InvalidInput(f"`scene`: the name {name!r} must be given once, got it twice")
+
+
+def quaternion(section: RotationSection) -> NDArray[np.float64]:
+    """Unit quaternion (w, x, y, z) of a rotation."""
+    if section.axis is not None and section.degrees is not None:
+        half = np.radians(section.degrees) / 2
+        axis = np.array(section.axis) / np.linalg.norm(section.axis)
+        return np.concatenate([[np.cos(half)], np.sin(half) * axis])
+    given = np.array(section.quaternion or [1.0, 0.0, 0.0, 0.0])
+    unit: NDArray[np.float64] = given / np.linalg.norm(given)
+    return unit
+
+
+def pose_array(section: PoseSection) -> NDArray[np.float64]:
+    """Pose [px, py, pz, qw, qx, qy, qz] of a section."""
+    return np.concatenate([section.position, quaternion(section)])
+
+
+def _cloth(section: ClothSection, root: str, source: Path) -> Cloth:
+    shape = section.shape
+    rest: NDArray[np.float64]
+    faces: NDArray[np.integer[Any]]
+    if shape.kind == "grid":
+        sheet = Cloth.grid(shape.rows, shape.columns, shape.size)
+        rest, faces = sheet.vertices, sheet.faces
+    elif shape.kind == "disk":
+        rest, faces = _generated(section.name, shapes.disk, _given(shape))
+    else:
+        rest, faces = read_mesh(resolve_path(source, root, shape.path))
+        rest = shape.scale * rest
+    vertices = transform(rest, pose_array(section.pose))
+    if shape.kind == "load" and shape.rest is not None:
+        rest = shape.scale * read_mesh(resolve_path(source, root, shape.rest))[0]
+    options: dict[str, Any] = section.model_dump(
+        include={"pin_stiffness", "bending_model"}, exclude_none=True
+    )
+    for kind in ("pins", "soft_pins"):
+        options[kind] = {
+            name: _selected(f"{section.name}.{kind}.{name}", selection, vertices)
+            for name, selection in getattr(section, kind).items()
+        }
+    return Cloth(
+        vertices,
+        faces,
+        material=Material(**_given(section.material)),
+        rest_vertices=rest,
+        name=section.name,
+        **options,
+    )
+
+
+def _generated(name: str, generate: Any, arguments: dict[str, Any]) -> Any:
+    del arguments["kind"]
+    try:
+        return generate(**arguments)
+    except ValueError as error:
+        raise InvalidInput(f"`scene`: the shape of {name!r} cannot be made: {error}") from error
+
+
+def _selected(name: str, selection: Selection, vertices: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Vertices that a selection names, in increasing order but for a list, which keeps its own."""
+    if selection.vertices is not None:
+        return np.array(selection.vertices)
+    if selection.nearest is not None:
+        points = np.array(selection.nearest)
+        distances = np.linalg.norm(vertices[None] - points[:, None], axis=-1)
+        return np.unique(distances.argmin(axis=1))
+    box = selection.box
+    assert box is not None  # the schema requires one of the three
+    inside = (vertices >= box.lower) & (vertices <= box.upper)
+    chosen = np.flatnonzero(inside.all(axis=1))
+    if chosen.size == 0:
+        low, high = vertices.min(axis=0).round(4), vertices.max(axis=0).round(4)
+        raise InvalidInput(
+            f"`scene`: the box of {name} must hold a vertex; the cloth lies between "
+            f"{low.tolist()} and {high.tolist()}"
+        )
+    return chosen
+
+
+def _body(section: BodySection, root: str, source: Path) -> RigidBody:
+    shape = section.shape
+    keywords = {
+        "motion": section.motion,
+        "pose": pose_array(section.pose),
+        "name": section.name,
+        **section.model_dump(include={"friction", "thickness"}, exclude_none=True),
+    }
+    if shape.kind == "load":
+        path = resolve_path(source, root, shape.path)
+        return RigidBody.load(path, scale=shape.scale, **keywords)
+    if shape.kind == "chair":
+        return RigidBody(*_generated(section.name, shapes.chair, _given(shape)), **keywords)
+    arguments = _given(shape)
+    del arguments["kind"]
+    return _MAKERS[shape.kind](**arguments, **keywords)
+
+
+_MAKERS: dict[str, Callable[..., RigidBody]] = {
+    "box": RigidBody.box,
+    "sphere": RigidBody.sphere,
+    "capsule": RigidBody.capsule,
+    "plane": RigidBody.plane,
+}
+
+
+# --- prescribed motion --------------------------------------------------------------------------
+
+
+def prescribed_poses(config: RunConfig, steps: int) -> Tensor:
+    """Poses of all bodies after each step, shape [steps, K, 7]; without keyframes they hold."""
+    times = _step_times(config.simulation.dt, steps)
+    poses = torch.empty(steps, len(config.scene.bodies), 7, dtype=torch.float64)
+    for k, body in enumerate(config.scene.bodies):
+        keyframes = [(0.0, pose_array(body.pose))]
+        if body.trajectory and body.trajectory[0].time == 0:
+            keyframes = []
+        keyframes += [(keyframe.time, pose_array(keyframe)) for keyframe in body.trajectory]
+        poses[:, k] = interpolate_poses(
+            torch.tensor([time for time, _ in keyframes], dtype=torch.float64),
+            torch.tensor(np.array([pose for _, pose in keyframes])),
+            times,
+        )
+    return poses
+
+
+def prescribed_controls(config: RunConfig, scene: Scene, steps: int) -> list[Control]:
+    """Controls of each step: the poses of the bodies and the positions of the moving pins."""
+    times = _step_times(config.simulation.dt, steps)
+    pins: dict[str, Tensor] = {}
+    soft_pins: dict[str, Tensor] = {}
+    for section, cloth in zip(config.scene.cloths, scene.cloths, strict=True):
+        for name, keyframes in section.pin_trajectories.items():
+            vertices = {**cloth.pins, **cloth.soft_pins}[name]
+            moved = _moved(torch.tensor(cloth.vertices[vertices]), keyframes, times)
+            (pins if name in cloth.pins else soft_pins)[f"{section.name}/{name}"] = moved
+    poses = prescribed_poses(config, steps) if scene.bodies else None
+    return [
+        Control(
+            pins={name: moved[k] for name, moved in pins.items()} or None,
+            soft_pins={name: moved[k] for name, moved in soft_pins.items()} or None,
+            body_poses=None if poses is None else poses[k],
+        )
+        for k in range(steps)
+    ]
+
+
+def _step_times(dt: float, steps: int) -> Tensor:
+    return dt * torch.arange(1, steps + 1, dtype=torch.float64)
+
+
+def _moved(start: Tensor, keyframes: Sequence[PinKeyframe], times: Tensor) -> Tensor:
+    """Positions [n, p, 3] of pins [p, 3] at some times: turned about their mean and displaced."""
+    frames = [(0.0, [0.0, 0.0, 0.0], np.array([1.0, 0.0, 0.0, 0.0]))]
+    if keyframes[0].time == 0:
+        frames = []
+    frames += [(frame.time, frame.displacement, quaternion(frame)) for frame in keyframes]
+    poses = interpolate_poses(
+        torch.tensor([time for time, _, _ in frames], dtype=torch.float64),
+        torch.tensor(np.array([[*move, *turn] for _, move, turn in frames])),
+        times,
+    )
+    center = start.mean(dim=0)
+    turned = rotate(poses[:, None, 3:], (start - center).expand(len(times), -1, 3))
+    return turned + center + poses[:, None, :3]

@@ -1,0 +1,601 @@
+"""Configurations: YAML files, read safely and checked against a schema before anything runs."""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
+
+import yaml
+from annotated_types import Ge, Gt, Interval, Le, Len, Lt
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    ValidationError,
+    create_model,
+    model_validator,
+)
+
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.quantities import PARAMETERS
+from diffcloth_torch.viewers.look import Camera, Pictures
+
+__all__ = [
+    "BodySection",
+    "BoxSelection",
+    "ClothSection",
+    "ContactSection",
+    "MaterialSection",
+    "MeshFile",
+    "OutputSection",
+    "PictureSection",
+    "PoseSection",
+    "Positive",
+    "RotationSection",
+    "RunConfig",
+    "SceneSection",
+    "Section",
+    "Selection",
+    "SimulationSection",
+    "SolverSection",
+    "Vector3",
+    "read_document",
+    "resolve_path",
+    "set_values",
+    "validate",
+]
+
+Document = dict[str, Any]
+S = TypeVar("S", bound="Section")
+
+Positive = Annotated[float, Gt(0)]
+NonNegative = Annotated[float, Ge(0)]
+Vector3 = Annotated[list[float], Len(3, 3)]
+Lengths2 = Positive | Annotated[list[Positive], Len(2, 2)]
+Lengths3 = Positive | Annotated[list[Positive], Len(3, 3)]
+
+
+def _limits(parameter: str) -> Interval:
+    """Range of a parameter's values, as a configuration's schema has it."""
+    accepted = PARAMETERS[parameter].accepted
+    low = None if math.isinf(accepted.low) else accepted.low
+    high = None if math.isinf(accepted.high) else accepted.high
+    return Interval(ge=low, le=high) if accepted.closed else Interval(gt=low, lt=high)
+
+
+Color = Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]
+"""A color as "#rrggbb"."""
+
+
+class Section(BaseModel):
+    """A mapping of a configuration; keys that it does not know are refused."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, protected_namespaces=()
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_keys(cls, given: Any) -> Any:
+        if not isinstance(given, Mapping):
+            return given
+        for key in given:
+            if key not in cls.model_fields:
+                close = difflib.get_close_matches(str(key), cls.model_fields, n=1)
+                hint = f" (did you mean `{close[0]}`?)" if close else ""
+                accepted = ", ".join(cls.model_fields)
+                raise ValueError(f"has no key `{key}`{hint}; its keys are {accepted}")
+        return given
+
+
+# --- shapes and poses ---------------------------------------------------------------------------
+
+
+class RotationSection(Section):
+    """A rotation: `degrees` about `axis`, or a `quaternion` (w, x, y, z); none by default."""
+
+    axis: Vector3 | None = None
+    degrees: float | None = None
+    quaternion: Annotated[list[float], Len(4, 4)] | None = None
+
+    @model_validator(mode="after")
+    def _check_rotation(self) -> RotationSection:
+        if (self.axis is None) != (self.degrees is None):
+            raise ValueError("must give `axis` and `degrees` together")
+        if self.axis is not None and self.quaternion is not None:
+            raise ValueError("must give `axis` and `degrees`, or `quaternion`, not both")
+        for name in ("axis", "quaternion"):
+            value = getattr(self, name)
+            if value is not None and not any(value):
+                raise ValueError(f"must have an `{name}` that is not zero")
+        return self
+
+
+class PoseSection(RotationSection):
+    """Where something is: turned about its origin, then moved to `position` [m]."""
+
+    position: Vector3 = [0.0, 0.0, 0.0]
+
+
+class PoseKeyframe(PoseSection):
+    """Pose of a body at a time [s]."""
+
+    time: NonNegative
+
+
+class PinKeyframe(RotationSection):
+    """How far pins are at a time [s] from where they start.
+
+    They are turned about the mean of their starting positions, then moved by `displacement` [m].
+    """
+
+    time: NonNegative
+    displacement: Vector3 = [0.0, 0.0, 0.0]
+
+
+class MeshFile(Section):
+    """A mesh file; `scale` is meters per unit of the file."""
+
+    kind: Literal["load"]
+    path: str
+    scale: Positive = 1.0
+
+
+class ClothFile(MeshFile):
+    """A mesh file of a cloth, and a second one of its stress-free shape if that differs."""
+
+    rest: str | None = None
+
+
+class Grid(Section):
+    """Rectangle in the xy-plane with `rows` x `columns` vertices; columns run along x."""
+
+    kind: Literal["grid"]
+    rows: Annotated[int, Ge(2)]
+    columns: Annotated[int, Ge(2)]
+    size: Lengths2 = 1.0
+
+
+class Disk(Section):
+    """Round sheet in the xy-plane on an unstructured mesh with edges of about `edge_length` [m]."""
+
+    kind: Literal["disk"]
+    radius: Positive
+    edge_length: Positive
+
+
+class Box(Section):
+    """Cuboid with sides of `size` [m]."""
+
+    kind: Literal["box"]
+    size: Lengths3
+
+
+class Sphere(Section):
+    """Sphere."""
+
+    kind: Literal["sphere"]
+    radius: Positive
+    subdivisions: Annotated[int, Ge(0), Le(6)] = 3
+
+
+class Capsule(Section):
+    """Cylinder along z of `length` [m] with half spheres on its ends."""
+
+    kind: Literal["capsule"]
+    radius: Positive
+    length: Positive
+
+
+class Plane(Section):
+    """Rectangle at z = 0 that faces up."""
+
+    kind: Literal["plane"]
+    size: Lengths2
+
+
+class Chair(Section):
+    """Chair that stands on z = 0 and faces -y; lengths in meters, `height` is that of the seat."""
+
+    kind: Literal["chair"]
+    width: Positive = 0.44
+    depth: Positive = 0.44
+    height: Positive = 0.46
+    back_height: Positive = 0.42
+    thickness: Positive = 0.04
+    edge_length: Positive = 0.12
+
+
+# --- the scene ----------------------------------------------------------------------------------
+
+
+class BoxSelection(Section):
+    """An axis-aligned box in world axes [m]."""
+
+    lower: Vector3
+    upper: Vector3
+
+
+class Selection(Section):
+    """Vertices by index, inside a box at the start, or nearest to points at the start."""
+
+    vertices: Annotated[list[Annotated[int, Ge(0)]], Len(1)] | None = None
+    box: BoxSelection | None = None
+    nearest: Annotated[list[Vector3], Len(1)] | None = None
+
+    @model_validator(mode="after")
+    def _check_one(self) -> Selection:
+        _require_one(self, ("vertices", "box", "nearest"))
+        return self
+
+
+_LIMITED: dict[str, Any] = {
+    field.name: (Annotated[float, _limits(field.name)] | None, None) for field in fields(Material)
+}
+_MaterialFields: Any = create_model("_MaterialFields", __base__=Section, **_LIMITED)
+
+
+class MaterialSection(_MaterialFields):  # type: ignore[misc]  # its fields are those of Material
+    """Properties of a cloth, in the units of `Material`; what is not given takes its default."""
+
+
+class ClothSection(Section):
+    """A cloth."""
+
+    name: str
+    shape: Annotated[Grid | Disk | ClothFile, Discriminator("kind")]
+    pose: PoseSection = PoseSection()
+    material: MaterialSection = MaterialSection()
+    pins: dict[str, Selection] = {}
+    soft_pins: dict[str, Selection] = {}
+    pin_stiffness: Annotated[float, _limits("pin_stiffness")] | None = None
+    pin_trajectories: dict[str, Annotated[list[PinKeyframe], Len(1)]] = {}
+    bending_model: Literal["patch", "hinge"] | None = None
+    color: Color | None = None
+    back_color: Color | None = None
+
+    @model_validator(mode="after")
+    def _check_trajectories(self) -> ClothSection:
+        names = [*self.pins, *self.soft_pins]
+        for name, keyframes in self.pin_trajectories.items():
+            if name not in names:
+                accepted = ", ".join(names) or "none"
+                raise ValueError(
+                    f"moves the pins `{name}` in `pin_trajectories`, but its pins are: {accepted}"
+                )
+            _require_increasing(f"pin_trajectories.{name}", keyframes)
+        return self
+
+
+class BodySection(Section):
+    """A rigid body. With a `trajectory` it is kinematic and starts at `pose` at time 0."""
+
+    name: str
+    shape: Annotated[
+        Box | Sphere | Capsule | Plane | Chair | MeshFile,
+        Discriminator("kind"),
+    ]
+    pose: PoseSection = PoseSection()
+    motion: Literal["static", "kinematic"] = "static"
+    trajectory: list[PoseKeyframe] = []
+    friction: Annotated[float, _limits("friction")] | None = None
+    thickness: Annotated[float, _limits("thickness")] | None = None
+    color: Color | None = None
+
+    @model_validator(mode="after")
+    def _check_trajectory(self) -> BodySection:
+        _require_increasing("trajectory", self.trajectory)
+        if self.trajectory and self.motion == "static":
+            raise ValueError("has a `trajectory` and must have `motion: kinematic` for it")
+        return self
+
+
+class SceneSection(Section):
+    """What is simulated."""
+
+    gravity: Vector3 | None = None
+    cloths: Annotated[list[ClothSection], Len(1)]
+    bodies: list[BodySection] = []
+
+
+# --- the run ------------------------------------------------------------------------------------
+
+
+class ContactSection(Section):
+    """Options of contact, as in `ContactOptions`."""
+
+    barrier_distance: Annotated[float, _limits("barrier_distance")] | None = None
+    barrier_stiffness: Annotated[float, _limits("barrier_stiffness")] | None = None
+    friction_iterations: Annotated[int, Ge(1)] | None = None
+    slip_velocity: Annotated[float, _limits("slip_velocity")] | None = None
+    self_contact: bool | None = None
+
+
+class SolverSection(Section):
+    """Options of the solver, as in `SolverOptions`."""
+
+    tolerance: Positive | None = None
+    max_iterations: Annotated[int, Ge(1)] | None = None
+    throw: bool | None = None
+    metric: Literal["mass", "identity"] | None = None
+
+
+class SimulationSection(Section):
+    """Time step [s], number of steps, scheme and options."""
+
+    dt: Positive
+    steps: Annotated[int, Ge(1)]
+    scheme: Literal["coupled", "split"] = "coupled"
+    contact: ContactSection = ContactSection()
+    solver: SolverSection = SolverSection()
+
+
+class CameraSection(Section):
+    """Where pictures are taken from, as in `Camera`."""
+
+    azimuth: float = Camera.azimuth
+    elevation: Annotated[float, Gt(-90), Lt(90)] = Camera.elevation
+    zoom: Positive = Camera.zoom
+    target: Vector3 | None = None
+    distance: Positive | None = None
+
+
+class PictureSection(Section):
+    """Pictures and the animation, as in `Pictures`; `size` is divisible by 2 for the video."""
+
+    size: Annotated[list[Annotated[int, Ge(64), Le(4096)]], Len(2, 2)] = list(Pictures.size)
+    fps: Annotated[float, Gt(0), Le(240)] | None = None
+    video: Literal["mp4", "gif", "none"] = Pictures.video
+    frames: bool = Pictures.frames
+    sheet: Annotated[int, Ge(1), Le(12)] = Pictures.sheet
+    ground: float | Literal["auto"] | None = Pictures.ground
+    camera: CameraSection = CameraSection()
+
+    @model_validator(mode="after")
+    def _check_even(self) -> PictureSection:
+        if any(length % 2 for length in self.size):
+            raise ValueError(f"must have a `size` of two even numbers, got {self.size}")
+        return self
+
+
+class OutputSection(Section):
+    """What a run leaves behind: `every` so many steps a frame, for each of the `viewers`."""
+
+    viewers: list[Literal["record", "meshes"]] = ["record", "meshes"]
+    every: Annotated[int, Ge(1)] = 1
+    pictures: PictureSection = PictureSection()
+
+
+class RunConfig(Section):
+    """The keys that every configuration has.
+
+    `root` is the folder, relative to the configuration, that mesh files must lie under; by
+    default the folder of the configuration. Tasks add keys of their own.
+    """
+
+    task: str
+    root: str = "."
+    simulation: SimulationSection
+    scene: SceneSection
+    output: OutputSection = OutputSection()
+
+
+def _require_one(section: Section, names: Iterable[str]) -> None:
+    given = [name for name in names if getattr(section, name) is not None]
+    if len(given) != 1:
+        raise ValueError(
+            f"must have exactly one of {', '.join(names)}, got {', '.join(given) or 'none'}"
+        )
+
+
+def _require_increasing(name: str, keyframes: Iterable[PoseKeyframe | PinKeyframe]) -> None:
+    times = [keyframe.time for keyframe in keyframes]
+    if any(b <= a for a, b in itertools.pairwise(times)):
+        raise ValueError(f"must have increasing times in `{name}`, got {times}")
+
+
+# --- reading ------------------------------------------------------------------------------------
+
+
+class _Loader(yaml.SafeLoader):
+    """The safe loader; it refuses a key that occurs twice and reads 1e-3 as a number."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, str):
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"a key must be text, got {key!r}", key_node.start_mark
+                )
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key `{key}` occurs twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+# YAML 1.1 demands a dot and a signed exponent: to PyYAML 1e-3 is text.
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(?:[0-9][0-9_]*(?:\.[0-9_]*)?|\.[0-9]+)[eE][-+]?[0-9]+$"),
+    list("-+0123456789."),
+)
+
+# A configuration is a page of text; a larger file is a mistake, refused before it is parsed.
+_LARGEST_CONFIG_BYTES = 1_000_000
+
+
+def read_document(path: str | Path) -> Document:
+    """Read a YAML mapping.
+
+    Raises:
+        InvalidInput: If the file is missing, too large, not YAML, not a mapping, or repeats a key.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InvalidInput(f"{path}: there is no such file")
+    if path.stat().st_size > _LARGEST_CONFIG_BYTES:
+        raise InvalidInput(f"{path}: a configuration has at most {_LARGEST_CONFIG_BYTES} bytes")
+    try:
+        document = _parse(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InvalidInput(f"{path}: not readable as YAML: {_one_line(error)}") from error
+    if not isinstance(document, dict):
+        raise InvalidInput(f"{path}: a configuration must be a mapping of keys to values")
+    return document
+
+
+def _parse(text: str) -> Any:
+    return yaml.load(text, Loader=_Loader)  # which derives from SafeLoader
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def set_values(document: Document, assignments: Iterable[str]) -> Document:
+    """Copy a document with values changed.
+
+    Args:
+        document: What a configuration file holds.
+        assignments: "key=value" each; the key is dotted, an item of a list is addressed by its
+            number or its `name`, and the value is YAML.
+
+    Raises:
+        InvalidInput: If an assignment is malformed or its key cannot exist.
+    """
+    changed: Document = _copy(document)
+    for assignment in assignments:
+        key, equals, text = assignment.partition("=")
+        if not equals or not key:
+            raise InvalidInput(f"--set: must be key=value, got {assignment!r}")
+        try:
+            value = _parse(text)
+        except yaml.YAMLError as error:
+            raise InvalidInput(f"--set {key}: the value is not YAML: {_one_line(error)}") from error
+        *parents, last = key.split(".")
+        place: Any = changed
+        for part in parents:
+            place = _descend(key, place, part)
+        if isinstance(place, list):
+            place[_item(key, place, last)] = value
+        elif isinstance(place, dict):
+            place[last] = value
+        else:
+            raise InvalidInput(f"--set {key}: `{last}` lies below a plain value")
+    return changed
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _copy(entry) for key, entry in value.items()}
+    return [_copy(entry) for entry in value] if isinstance(value, list) else value
+
+
+def _descend(key: str, place: Any, part: str) -> Any:
+    if isinstance(place, list):
+        return place[_item(key, place, part)]
+    if isinstance(place, dict):
+        return place.setdefault(part, {})  # a section that the file leaves to its defaults
+    raise InvalidInput(f"--set {key}: `{part}` lies below a plain value")
+
+
+def _item(key: str, items: list[Any], part: str) -> int:
+    names = [item.get("name") if isinstance(item, dict) else None for item in items]
+    if part in names:
+        return names.index(part)
+    if part.isdecimal() and int(part) < len(items):
+        return int(part)
+    named = [str(name) for name in names if name is not None]
+    accepted = ", ".join([f"0 .. {len(items) - 1}", *named]) if items else "none, it is empty"
+    raise InvalidInput(f"--set {key}: the items of the list are {accepted}; got `{part}`")
+
+
+def validate(model: type[S], document: Document, source: str | Path) -> S:
+    """Check a document against a schema.
+
+    Raises:
+        InvalidInput: If a key is unknown or missing, or a value is not accepted; the message
+            names the key, the value and what is accepted.
+    """
+    try:
+        return model.model_validate(document)
+    except ValidationError as error:
+        problems = _sentences(document, error.errors())
+        more = f" ({len(problems) - 1} more problems)" if len(problems) > 1 else ""
+        raise InvalidInput(f"{source}: {problems[0]}{more}") from error
+
+
+def _sentences(document: Document, problems: Iterable[Any]) -> list[str]:
+    """One sentence for each key that has a problem."""
+    messages: dict[str, list[str]] = {}
+    shown: dict[str, str] = {}
+    for problem in problems:
+        name = _key_text(document, problem["loc"], missing=problem["type"] == "missing")
+        messages.setdefault(name, []).append(_message(problem))
+        given = problem["input"]
+        plain = problem["type"] not in ("missing", "value_error") and not isinstance(given, dict)
+        shown[name] = f", got {given!r}" if plain else ""
+    # A value that may be of several types has a message for each type.
+    return [
+        f"`{name}` {' or '.join(dict.fromkeys(texts))}{shown[name]}".replace("``", "the file")
+        for name, texts in messages.items()
+    ]
+
+
+def _message(problem: Any) -> str:
+    kind, context = problem["type"], problem.get("ctx", {})
+    if kind == "missing":
+        return "is missing"
+    if kind == "value_error":
+        return str(context["error"])
+    if kind == "union_tag_not_found":
+        return "needs the key `kind`"
+    if kind == "union_tag_invalid":
+        return f"must have as `kind` one of {context['expected_tags']}; got {context['tag']!r}"
+    text = str(problem["msg"]).removeprefix("Input should ")
+    return f"must {text}" if text != problem["msg"] else f"is not accepted: {text}"
+
+
+def _key_text(document: Document, location: tuple[int | str, ...], *, missing: bool) -> str:
+    """Write a place as in the file: pydantic's also names the member of a union that was tried."""
+    text = ""
+    place: Any = document
+    for i, part in enumerate(location):
+        in_mapping = isinstance(place, dict) and part in place
+        in_list = isinstance(place, list) and isinstance(part, int) and part < len(place)
+        if in_mapping or in_list:
+            place = place[part]
+        elif not (missing and i == len(location) - 1):
+            continue
+        text += f"[{part}]" if isinstance(part, int) else f".{part}"
+    return text.removeprefix(".")
+
+
+def resolve_path(config: Path, root: str, given: str) -> Path:
+    """File that a configuration names, relative to the configuration and under its root.
+
+    Raises:
+        InvalidInput: If it lies elsewhere or does not exist.
+    """
+    folder = config.resolve().parent
+    allowed = (folder / root).resolve()
+    path = (folder / given).resolve()
+    if not path.is_relative_to(allowed):
+        raise InvalidInput(
+            f"{config}: the file {given!r} must lie under the root {str(allowed)!r}; declare a "
+            "higher one with the key `root`, relative to the configuration (for example `root: ..`)"
+        )
+    if not path.is_file():
+        raise InvalidInput(f"{config}: there is no file {given!r} (looked for {str(path)!r})")
+    return path

@@ -1,0 +1,1 @@
+"""Meshes without physics: their shapes, checks, poses and files."""

@@ -1,0 +1,145 @@
+"""Triangle meshes from and to files, with the order of vertices and faces kept.
+
+OBJ and PLY have readers of our own: common loaders triangulate polygons, reorder faces and drop
+unreferenced vertices without a word, after which a pin index means another vertex. STL holds no
+indices; its corners are merged where they are equal to the last bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry.ply import read_ply, write_ply
+
+__all__ = ["MeshPart", "read_mesh", "write_mesh"]
+
+Indices = NDArray[np.int64]
+MeshPart = tuple[str, FloatArray, NDArray[np.integer]]
+"""Name, vertices [n, 3] in meters and faces [f, 3] of one object of a file."""
+
+
+def read_mesh(path: str | Path) -> tuple[FloatArray, Indices]:
+    """Read vertices [n, 3] and triangles [f, 3] of an .obj, .ply or .stl file.
+
+    Raises:
+        InvalidInput: If the file is empty, malformed, of another format or has other polygons
+            than triangles. The message names the line or the face.
+        OSError: If the file cannot be read.
+    """
+    path = Path(path)
+    readers = {".obj": _read_obj, ".ply": read_ply, ".stl": _read_stl}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise InvalidInput(f"{path}: mesh files end in {', '.join(readers)}; got {path.suffix!r}")
+    vertices, faces = reader(path)
+    if len(vertices) == 0 or len(faces) == 0:
+        raise InvalidInput(
+            f"{path}: the mesh is empty: {len(vertices)} vertices, {len(faces)} triangles"
+        )
+    return vertices, faces
+
+
+def write_mesh(path: str | Path, parts: Sequence[MeshPart]) -> None:
+    """Write named surfaces, in their order, to an .obj or .ply file; numbers survive exactly."""
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix == ".obj":
+        _write_obj(path, parts)
+    elif suffix == ".ply":
+        write_ply(path, *_joined(parts))
+    else:
+        raise InvalidInput(f"export: `path` must end in .obj or .ply, got {str(path)!r}")
+
+
+def _read_obj(path: Path) -> tuple[FloatArray, Indices]:
+    vertices: list[list[float]] = []
+    faces: list[list[int]] = []
+    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    for number, line in enumerate(text.splitlines(), start=1):
+        keyword, *words = line.partition("#")[0].split() or [""]
+        try:
+            if keyword == "v":
+                vertices.append(_obj_vertex(words))
+            elif keyword == "f":
+                faces.append(_obj_triangle(words, len(vertices)))
+        except ValueError as error:
+            raise InvalidInput(f"{path}:{number}: {error}, in {line.strip()!r}") from error
+    return (
+        np.array(vertices, dtype=np.float64).reshape(-1, 3),
+        np.array(faces, dtype=np.int64).reshape(-1, 3),
+    )
+
+
+def _obj_vertex(words: Sequence[str]) -> list[float]:
+    # A fourth number is a weight; six or seven numbers carry a color.
+    if len(words) < 3:
+        raise ValueError(f"a vertex needs 3 coordinates, got {len(words)}")
+    return [float(word) for word in words[:3]]
+
+
+def _obj_triangle(words: Sequence[str], vertex_count: int) -> list[int]:
+    """Corners of `f a b c`, each `v`, `v/vt`, `v//vn` or `v/vt/vn`; negative: from the end."""
+    if len(words) != 3:
+        raise ValueError(
+            f"a face must be a triangle, got {len(words)} corners; "
+            "triangulate the mesh before loading it"
+        )
+    corners = []
+    for word in words:
+        index = int(word.partition("/")[0])
+        corner = index - 1 if index > 0 else vertex_count + index
+        if index == 0 or not 0 <= corner < vertex_count:
+            raise ValueError(
+                f"a face index must be in 1 .. {vertex_count} (the vertices read so far) "
+                f"or negative, got {index}"
+            )
+        corners.append(corner)
+    return corners
+
+
+def _read_stl(path: Path) -> tuple[FloatArray, Indices]:
+    from trimesh.exchange.stl import load_stl
+
+    if path.stat().st_size == 0:
+        raise InvalidInput(f"{path}: the file is empty")
+    with path.open("rb") as file:
+        try:
+            soup = load_stl(file)
+        except Exception as error:
+            raise InvalidInput(f"{path}: not a readable STL file: {error}") from error
+    if "vertices" not in soup or "faces" not in soup:
+        raise InvalidInput(f"{path}: not a readable STL file: it holds no triangles")
+    corners = np.asarray(soup["vertices"], dtype=np.float64)[np.asarray(soup["faces"])]
+    points = corners.reshape(-1, 3)
+    _, first, inverse = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    # np.unique sorts; restore the order of first appearance in the file.
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return points[first[order]], rank[inverse.reshape(-1)].reshape(-1, 3)
+
+
+def _write_obj(path: Path, parts: Sequence[MeshPart]) -> None:
+    lines = []
+    start = 1
+    for name, vertices, faces in parts:
+        lines.append(f"o {name}")
+        lines += [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+        lines += [f"f {a} {b} {c}" for a, b, c in (faces + start).tolist()]
+        start += len(vertices)
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _joined(parts: Sequence[MeshPart]) -> tuple[FloatArray, NDArray[np.int32]]:
+    starts = np.cumsum([0] + [len(vertices) for _, vertices, _ in parts])
+    vertices = np.concatenate([vertices for _, vertices, _ in parts])
+    faces = np.concatenate(
+        [faces + start for (_, _, faces), start in zip(parts, starts, strict=False)]
+    )
+    return vertices, faces.astype(np.int32)

@@ -1,0 +1,1 @@
+"""What is simulated: cloths, bodies and the scene of them, and the options of a simulator."""

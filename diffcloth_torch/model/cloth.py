@@ -1,0 +1,238 @@
+"""A piece of cloth: its mesh, its rest shape, its material and its pins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from diffcloth_torch.checks import (
+    POSITIVE,
+    FloatArray,
+    IndexArray,
+    check_choice,
+    check_count,
+    check_finite,
+    check_name,
+    check_number,
+    check_range,
+    check_shape,
+    float_array,
+    frozen,
+    index_array,
+)
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry import shapes
+from diffcloth_torch.geometry.meshes import read_mesh
+from diffcloth_torch.geometry.poses import pose_array, transform
+from diffcloth_torch.geometry.surfaces import check_areas, check_manifold, surface_arrays
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.quantities import FACE_QUANTITIES, check_parameter
+
+__all__ = ["BENDING_MODELS", "Cloth", "plane_size"]
+
+BENDING_MODELS = ("patch", "hinge")
+
+_DEFAULT_MATERIAL = Material()
+_POSITIONS = "differentiate with respect to State.positions"
+_REST = "differentiate with respect to Parameters.rest_positions"
+
+
+class Cloth:
+    """A triangulated sheet; immutable.
+
+    Attributes:
+        vertices: Initial positions [m], shape [n, 3].
+        faces: Vertex indices, shape [f, 3].
+        material: Material of the sheet.
+        pins: Name -> indices of vertices whose motion is prescribed.
+        soft_pins: Name -> indices of vertices that springs pull to targets.
+        pin_stiffness: Stiffness of each of these springs [N/m].
+        rest_vertices: Positions in which the cloth is free of stress [m], shape [n, 3].
+        bending_model: "patch" (six-point patches, isotropic on any mesh) or "hinge".
+        name: Name in the scene; None lets the scene choose one.
+    """
+
+    vertices: FloatArray
+    faces: IndexArray
+    material: Material
+    pins: Mapping[str, IndexArray]
+    soft_pins: Mapping[str, IndexArray]
+    pin_stiffness: float
+    rest_vertices: FloatArray
+    bending_model: str
+    name: str | None
+
+    def __init__(
+        self,
+        vertices: object,
+        faces: object,
+        *,
+        material: Material = _DEFAULT_MATERIAL,
+        pins: Mapping[str, object] | None = None,
+        soft_pins: Mapping[str, object] | None = None,
+        pin_stiffness: float = 1e4,
+        rest_vertices: object = None,
+        bending_model: str = "patch",
+        name: str | None = None,
+    ) -> None:
+        """Check and copy the arguments.
+
+        Args:
+            vertices: Initial positions [m], shape [n, 3]; each vertex belongs to a face.
+            faces: Vertex indices, shape [f, 3]; triangles, at most two on an edge.
+            material: Material; its arrays hold one value per face.
+            pins: Name -> indices of vertices whose motion is prescribed.
+            soft_pins: Name -> indices of vertices that springs pull to targets.
+            pin_stiffness: Stiffness of each of these springs [N/m], > 0.
+            rest_vertices: Stress-free positions [m], shape [n, 3]; `vertices` by default.
+            bending_model: "patch" or "hinge".
+            name: Name in the scene.
+
+        Raises:
+            InvalidInput: If a shape, an index or a value is not accepted.
+            TypeError: If something has a wrong type.
+        """
+        points, triangles = surface_arrays("Cloth", vertices, faces, instead=_POSITIONS)
+        check_manifold("Cloth", len(points), triangles)
+        self.vertices, self.faces = points, triangles
+        self.rest_vertices = _rest(rest_vertices, points, triangles)
+        self.material = _material(material, len(triangles))
+        self.pins, self.soft_pins = _pin_groups(pins, soft_pins, len(points))
+        self.pin_stiffness = check_parameter("Cloth", "pin_stiffness", pin_stiffness)
+        self.bending_model = check_choice("Cloth: `bending_model`", bending_model, BENDING_MODELS)
+        self.name = check_name("Cloth: `name`", name)
+
+    @classmethod
+    def load(
+        cls, path: str | Path, *, scale: float = 1.0, pose: object = None, **keywords: Any
+    ) -> Cloth:
+        """Read an .obj, .ply or .stl file; vertex `i` of the file is vertex `i` of the cloth.
+
+        Args:
+            path: Mesh file of triangles.
+            scale: Meters per unit of the file, > 0.
+            pose: Where to put it: [px, py, pz, qw, qx, qy, qz]; as in the file by default.
+            **keywords: As for `Cloth`; `rest_vertices` is in meters, `scale` and `pose` do not
+                apply to it.
+        """
+        vertices, faces = read_mesh(path)
+        factor = check_number("Cloth.load: `scale`", scale, POSITIVE, instead=_POSITIONS)
+        return cls._posed("Cloth.load", factor * vertices, faces, pose, keywords)
+
+    @classmethod
+    def grid(
+        cls,
+        rows: int,
+        columns: int,
+        size: object = (1.0, 1.0),
+        *,
+        pose: object = None,
+        **keywords: Any,
+    ) -> Cloth:
+        """Make a rectangular sheet in the xy-plane, centered at the origin.
+
+        Vertex `row * columns + column` lies at x = (column / (columns - 1) - 1/2) * size[0] and
+        y = (row / (rows - 1) - 1/2) * size[1]. The faces look up.
+
+        Args:
+            rows: Vertices along y, >= 2.
+            columns: Vertices along x, >= 2.
+            size: Lengths along x and y [m], or one length for both.
+            pose: Where to put it: [px, py, pz, qw, qx, qy, qz].
+            **keywords: As for `Cloth`.
+        """
+        check_count("Cloth.grid: `rows`", rows, 2)
+        check_count("Cloth.grid: `columns`", columns, 2)
+        vertices, faces = shapes.grid(rows, columns, plane_size("Cloth.grid: `size`", size))
+        return cls._posed("Cloth.grid", vertices, faces, pose, keywords)
+
+    @classmethod
+    def _posed(
+        cls,
+        owner: str,
+        vertices: FloatArray,
+        faces: object,
+        pose: object,
+        keywords: dict[str, Any],
+    ) -> Cloth:
+        if pose is None:
+            return cls(vertices, faces, **keywords)
+        placed = transform(vertices, pose_array(f"{owner}: `pose`", pose, instead=_POSITIONS))
+        # The rest shape does not depend on the pose, and unrotated coordinates are exact.
+        keywords.setdefault("rest_vertices", vertices)
+        return cls(placed, faces, **keywords)
+
+    def __repr__(self) -> str:
+        return f"Cloth({self.name!r}, {len(self.vertices)} vertices, {len(self.faces)} faces)"
+
+    def __getstate__(self) -> dict[str, Any]:
+        plain = {"pins": dict(self.pins), "soft_pins": dict(self.soft_pins)}
+        return {**vars(self), **plain}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for name, value in state.items():
+            setattr(self, name, value)
+        self.pins, self.soft_pins = MappingProxyType(self.pins), MappingProxyType(self.soft_pins)
+
+
+def plane_size(name: str, size: object) -> FloatArray:
+    """Lengths along x and y [m] from two numbers or one."""
+    lengths = float_array(name, size)
+    check_shape(name, lengths.shape, [(), (2,)])
+    check_range(name, lengths, POSITIVE)
+    return np.broadcast_to(lengths, 2)
+
+
+def _rest(rest_vertices: object, vertices: FloatArray, faces: IndexArray) -> FloatArray:
+    if rest_vertices is None:
+        return vertices
+    rest = float_array("Cloth: `rest_vertices`", rest_vertices, instead=_REST)
+    check_shape("Cloth: `rest_vertices`", rest.shape, [vertices.shape])
+    check_finite("Cloth: `rest_vertices`", rest)
+    check_areas("Cloth", "rest_vertices", rest, faces)
+    frozen(rest)
+    return rest
+
+
+def _material(material: object, face_count: int) -> Material:
+    if not isinstance(material, Material):
+        raise TypeError(f"Cloth: `material` must be a Material, got {type(material).__name__}")
+    for field in FACE_QUANTITIES:
+        value = np.asarray(getattr(material, field))
+        check_shape(f"Cloth: `material.{field}`", value.shape, [(), (face_count,)])
+    return material
+
+
+def _pin_groups(
+    pins: Mapping[str, object] | None, soft_pins: Mapping[str, object] | None, vertex_count: int
+) -> tuple[Mapping[str, IndexArray], Mapping[str, IndexArray]]:
+    """Check both kinds together: no vertex may be pinned twice."""
+    groups = []
+    holder: dict[int, str] = {}
+    for field, given in (("pins", pins), ("soft_pins", soft_pins)):
+        if given is not None and not isinstance(given, Mapping):
+            raise InvalidInput(
+                f"Cloth: `{field}` must be a dict of name -> vertex indices, "
+                f"got {type(given).__name__}"
+            )
+        group = {}
+        for pin, indices in (given or {}).items():
+            check_name(f"Cloth: a name in `{field}`", pin)
+            name = f"Cloth: `{field}[{pin!r}]`"
+            array = index_array(name, indices, vertex_count)
+            check_shape(name, array.shape, [("n",)])
+            if array.size == 0:
+                raise InvalidInput(f"{name} must hold at least one vertex")
+            for vertex in array.tolist():
+                if vertex in holder:
+                    raise InvalidInput(
+                        f"{name} must not pin vertex {vertex} again: `{holder[vertex]}` does"
+                    )
+                holder[vertex] = f"{field}[{pin!r}]"
+            group[str(pin)] = frozen(array)
+        groups.append(MappingProxyType(group))
+    return groups[0], groups[1]

@@ -1,0 +1,115 @@
+"""Values of the parameters that a scene and its options give."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry.surfaces import unique_edges
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.options import ContactOptions
+from diffcloth_torch.model.quantities import FACE_QUANTITIES
+from diffcloth_torch.model.rigid_body import RigidBody
+from diffcloth_torch.model.scene import Assembly, Scene
+
+__all__ = ["check_barrier", "choose_barrier_distance", "has_contact", "scene_parameters"]
+
+# The barrier distance, as parts of the median cloth edge and of the smallest distance between
+# elements of the rest mesh that are not neighbors. Beyond one half of the latter, the surface would
+# repel itself at rest.
+_PART_OF_EDGE = 0.1
+_PART_OF_NONADJACENT = 0.45
+_LARGEST_PART_OF_NONADJACENT = 0.5
+
+
+def has_contact(scene: Scene, contact: ContactOptions) -> bool:
+    """Whether any two surfaces of the scene may touch."""
+    return contact.self_contact or len(scene.cloths) + len(scene.bodies) > 1
+
+
+def scene_parameters(scene: Scene, assembly: Assembly, contact: bool) -> dict[str, Tensor]:
+    """All parameters that the scene has but those of the barrier, as small as they can be written.
+
+    Args:
+        scene: The scene.
+        assembly: Its arrays.
+        contact: Whether any two of its surfaces may touch.
+    """
+    values = {field: _material_values(scene, field) for field in FACE_QUANTITIES}
+    if all(cloth.bending_model == "hinge" for cloth in scene.cloths):
+        del values["poisson"]  # hinges have no Poisson effect
+    if contact:
+        surfaces: list[Material | RigidBody] = [cloth.material for cloth in scene.cloths]
+        surfaces += scene.bodies
+        friction = np.array([surface.friction for surface in surfaces])
+        values["friction"] = np.sqrt(friction[:, None] * friction)
+        values["thickness"] = np.array([surface.thickness for surface in surfaces])
+    if len(assembly.soft_pins):
+        values["pin_stiffness"] = _shortest([cloth.pin_stiffness for cloth in scene.cloths])
+    values["gravity"] = scene.gravity
+    values["rest_positions"] = assembly.rest_vertices
+    return {name: torch.from_numpy(np.array(value)) for name, value in values.items()}
+
+
+def _material_values(scene: Scene, field: str) -> FloatArray:
+    """One value where all cloths agree, one per cloth where each has one, else one per face."""
+    values = [getattr(cloth.material, field) for cloth in scene.cloths]
+    if all(isinstance(value, float) for value in values):
+        return _shortest(values)
+    counts = [len(cloth.faces) for cloth in scene.cloths]
+    parts = [np.broadcast_to(v, n) for v, n in zip(values, counts, strict=True)]
+    return np.concatenate(parts)
+
+
+def _shortest(values: list[float]) -> FloatArray:
+    return np.array(values if len(set(values)) > 1 else values[0], dtype=np.float64)
+
+
+def choose_barrier_distance(
+    scene: Scene, nonadjacent_distance: float, contact: ContactOptions
+) -> float:
+    """Barrier distance from the cloths alone, so that a far body changes nothing [m]."""
+    edges = [
+        np.linalg.norm(np.diff(cloth.rest_vertices[unique_edges(cloth.faces)[0]], axis=1), axis=-1)
+        for cloth in scene.cloths
+    ]
+    distance = _PART_OF_EDGE * float(np.median(np.concatenate(edges)))
+    if not contact.self_contact:
+        return distance
+    thickness = max(cloth.material.thickness for cloth in scene.cloths)
+    limit = _PART_OF_NONADJACENT * nonadjacent_distance - thickness
+    if limit <= 0:
+        raise InvalidInput(
+            f"Simulator: `material.thickness` of a cloth must be below {_PART_OF_NONADJACENT} of "
+            "the smallest distance between elements of its rest mesh that are not neighbors, "
+            f"{_PART_OF_NONADJACENT * nonadjacent_distance:g} m, got {thickness:g}"
+        )
+    return min(distance, limit)
+
+
+def check_barrier(
+    owner: str,
+    distance: FloatArray,
+    cloth_thickness: FloatArray,
+    nonadjacent_distance: float,
+) -> None:
+    """Require that a cloth at rest does not repel itself.
+
+    Args:
+        owner: Opens the message.
+        distance: Barrier distance [m], shape [nb, 1].
+        cloth_thickness: Thickness of the cloths [m], shape [nb, C].
+        nonadjacent_distance: Smallest distance between elements of a rest mesh that are not
+            neighbors [m].
+    """
+    reach = float((distance + cloth_thickness).max())
+    limit = _LARGEST_PART_OF_NONADJACENT * nonadjacent_distance
+    if reach >= limit:
+        raise InvalidInput(
+            f"{owner}: `barrier_distance` plus the thickness of a cloth must be below half the "
+            "smallest distance between elements of the rest mesh that are not neighbors, "
+            f"{limit:g} m, got {reach:g}"
+        )

@@ -1,0 +1,54 @@
+"""What a cloth is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from diffcloth_torch.checks import (
+    FloatArray,
+    check_range,
+    check_shape,
+    float_array,
+    frozen,
+)
+from diffcloth_torch.model.quantities import FACE_QUANTITIES, PARAMETERS, check_parameter
+
+__all__ = ["Material"]
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """Properties of a cloth; numbers, or one value per face for the first five.
+
+    Attributes:
+        stretch: Membrane stiffness [N/m], > 0.
+        bending: Bending stiffness [N m], >= 0.
+        poisson: Poisson ratio of bending [-], between -1 and 0.5.
+        density: Mass per rest area [kg/m^2], > 0.
+        damping: Time over which strain rates are damped [s], >= 0.
+        friction: Friction coefficient of the surface [-], >= 0.
+        thickness: Full thickness of the surface in contact [m], >= 0.
+    """
+
+    stretch: float | FloatArray = 550.0
+    bending: float | FloatArray = 1e-5
+    poisson: float | FloatArray = 0.3
+    density: float | FloatArray = 0.124
+    damping: float | FloatArray = 0.0
+    friction: float = 0.4
+    thickness: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in FACE_QUANTITIES:
+            name = f"Material: `{field}`"
+            instead = f"differentiate with respect to Parameters.{field}"
+            values = float_array(name, getattr(self, field), instead=instead)
+            check_shape(name, values.shape, [(), ("F",)])
+            check_range(name, values, PARAMETERS[field].accepted)
+            self._keep(field, frozen(values) if values.ndim else float(values))
+        for field in ("friction", "thickness"):
+            self._keep(field, check_parameter("Material", field, getattr(self, field)))
+
+    def _keep(self, field: str, value: Any) -> None:
+        object.__setattr__(self, field, value)

@@ -1,0 +1,74 @@
+"""How a simulator treats contact and how far it solves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from diffcloth_torch.checks import POSITIVE, check_bool, check_choice, check_count, check_number
+from diffcloth_torch.model.quantities import check_parameter
+
+__all__ = ["METRICS", "SCHEMES", "ContactOptions", "SolverOptions"]
+
+SCHEMES = ("coupled", "split")
+METRICS = ("mass", "identity")
+
+
+@dataclass(frozen=True, eq=False)
+class ContactOptions:
+    """Contact and friction.
+
+    Attributes:
+        barrier_distance: Gap below which surfaces repel each other [m], > 0; None chooses it from
+            the cloths when the simulator is made.
+        barrier_stiffness: Stiffness of the barrier [Pa], > 0; None chooses it likewise.
+        friction_iterations: Solves per step in which the friction force is updated, >= 1.
+        slip_velocity: Velocity at which sticking turns into sliding [m/s], > 0.
+        self_contact: Whether a cloth collides with itself.
+    """
+
+    barrier_distance: float | None = None
+    barrier_stiffness: float | None = None
+    friction_iterations: int = 2
+    slip_velocity: float = 1e-3
+    self_contact: bool = True
+
+    def __post_init__(self) -> None:
+        for field in ("barrier_distance", "barrier_stiffness", "slip_velocity"):
+            value = getattr(self, field)
+            if value is None and field != "slip_velocity":
+                continue
+            object.__setattr__(self, field, check_parameter("ContactOptions", field, value))
+        iterations = check_count(
+            "ContactOptions: `friction_iterations`", self.friction_iterations, 1
+        )
+        object.__setattr__(self, "friction_iterations", iterations)
+        self_contact = check_bool("ContactOptions: `self_contact`", self.self_contact)
+        object.__setattr__(self, "self_contact", self_contact)
+
+
+@dataclass(frozen=True, eq=False)
+class SolverOptions:
+    """The Newton solver.
+
+    Attributes:
+        tolerance: Largest Newton step that counts as converged, as a velocity [m/s], > 0.
+        max_iterations: Newton iterations a step may take, >= 1.
+        throw: Whether a step that does not converge raises `NotConverged`; otherwise the last
+            feasible iterate comes back with `report.converged` False.
+        metric: Norm of the contact stage of the "split" scheme: "mass" or "identity".
+    """
+
+    tolerance: float = 1e-6
+    max_iterations: int = 200
+    throw: bool = True
+    metric: str = "mass"
+
+    def __post_init__(self) -> None:
+        tolerance = check_number(
+            "SolverOptions: `tolerance`", self.tolerance, POSITIVE, instead="pass a plain number"
+        )
+        object.__setattr__(self, "tolerance", tolerance)
+        iterations = check_count("SolverOptions: `max_iterations`", self.max_iterations, 1)
+        object.__setattr__(self, "max_iterations", iterations)
+        object.__setattr__(self, "throw", check_bool("SolverOptions: `throw`", self.throw))
+        check_choice("SolverOptions: `metric`", self.metric, METRICS)

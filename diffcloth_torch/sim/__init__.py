@@ -1,0 +1,1 @@
+"""What moves: states and controls, the differentiable step between them, and the simulator."""

@@ -1,0 +1,99 @@
+"""What a caller sets in a step: where things shall be at its end, and physical parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any
+
+from torch import Tensor
+
+from diffcloth_torch._moved import allow_loading
+from diffcloth_torch.sim.state import check_field_names
+
+__all__ = ["Control", "Parameters", "tensors_of"]
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """Targets for the end of a step, and forces during it. None holds what the state has.
+
+    Every tensor may have a leading batch axis; without one it holds for all environments.
+
+    Attributes:
+        pins: Positions of the pinned vertices [m], shape [P, 3], or "cloth/pin" (or "pin" where
+            that is unique) -> positions; missing names stay where they are.
+        soft_pins: Positions to which the soft pins pull [m], shape [Q, 3], or likewise by name.
+        body_poses: [px, py, pz, qw, qx, qy, qz] of each body, shape [K, 7]; the row of a static
+            body must stay what it is.
+        forces: Forces on the cloth vertices [N], shape [N, 3]; none by default.
+    """
+
+    pins: Tensor | Mapping[str, Tensor] | None = None
+    soft_pins: Tensor | Mapping[str, Tensor] | None = None
+    body_poses: Tensor | None = None
+    forces: Tensor | None = None
+
+    def replace(self, **changes: Any) -> Control:
+        """Copy with some fields replaced."""
+        check_field_names("Control.replace", self, changes)
+        return replace(self, **changes)
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """Physical parameters, by default those of the scene. None where the scene has no such thing.
+
+    Each may have a leading batch axis [B]. With the friction of a pair of surfaces (i, j) the mean
+    of its two entries is meant.
+
+    Attributes:
+        stretch: Membrane stiffness [N/m], > 0; shape [], [C] or [F].
+        bending: Bending stiffness [N m], >= 0; shape [], [C] or [F].
+        poisson: Poisson ratio of bending [-], between -1 and 0.5; shape [], [C] or [F].
+        density: Mass per rest area [kg/m^2], > 0; shape [], [C] or [F].
+        damping: Time over which strain rates are damped [s], >= 0; shape [], [C] or [F].
+        friction: Friction coefficient [-], >= 0; shape [] or [S, S].
+        thickness: Full thickness of each surface [m], >= 0; shape [S].
+        barrier_stiffness: [Pa], > 0; shape [].
+        barrier_distance: [m], > 0; shape [].
+        slip_velocity: Where sticking turns into sliding [m/s], > 0; shape [].
+        pin_stiffness: Springs of the soft pins [N/m], > 0; shape [] or [C].
+        gravity: Acceleration [m/s^2], shape [3].
+        rest_positions: Stress-free positions of the cloth vertices [m], shape [N, 3].
+    """
+
+    stretch: Tensor | None = None
+    bending: Tensor | None = None
+    poisson: Tensor | None = None
+    density: Tensor | None = None
+    damping: Tensor | None = None
+    friction: Tensor | None = None
+    thickness: Tensor | None = None
+    barrier_stiffness: Tensor | None = None
+    barrier_distance: Tensor | None = None
+    slip_velocity: Tensor | None = None
+    pin_stiffness: Tensor | None = None
+    gravity: Tensor | None = None
+    rest_positions: Tensor | None = None
+    # Fields that a simulator made without a batch axis: their [C] or [F] is never taken for [B].
+    _unbatched: tuple[str, ...] = field(default=(), repr=False)
+
+    def replace(self, **changes: Any) -> Parameters:
+        """Copy with some fields replaced."""
+        check_field_names("Parameters.replace", self, changes)
+        unbatched = tuple(name for name in self._unbatched if name not in changes)
+        return replace(self, **changes, _unbatched=unbatched)
+
+
+def tensors_of(record: Any) -> Iterator[Tensor]:
+    """Go through the tensors of a State, Control or Parameters; anything else has none."""
+    if not is_dataclass(record):
+        return
+    for entry in fields(record):
+        value = getattr(record, entry.name)
+        values = value.values() if isinstance(value, Mapping) else (value,)
+        yield from (tensor for tensor in values if isinstance(tensor, Tensor))
+
+
+allow_loading(Control, Parameters)

@@ -1,0 +1,87 @@
+"""From the core's diagnostics to a report, or to the exception that a failed step raises."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from diffcloth_torch.errors import (
+    InfeasibleMotion,
+    IntersectingState,
+    NotConverged,
+    SimulationError,
+)
+from diffcloth_torch.sim.report import Report
+from diffcloth_torch.sim.step import CONVERGED, INFEASIBLE, INTERSECTING, UNCONVERGED
+
+__all__ = ["make_report", "raise_on_failure"]
+
+_COUNT = "count_"  # opens the names of the core's counters
+
+
+def make_report(diagnostics: dict[str, Any], phases: Sequence[str], *, batched: bool) -> Report:
+    """Put the core's arrays [B] into a report."""
+
+    def value(array: np.ndarray[Any, Any]) -> Any:
+        return torch.from_numpy(np.array(array)) if batched else array[0].item()
+
+    return Report(
+        converged=value(diagnostics["status"] == CONVERGED),
+        iterations=value(diagnostics["iterations"]),
+        residual=value(diagnostics["residual"]),
+        minimum_distance=value(diagnostics["minimum_distance"]),
+        contact_count=value(diagnostics["contact_count"]),
+        motion_fraction=value(diagnostics["motion_fraction"]),
+        seconds={phase: value(diagnostics["seconds"][:, i]) for i, phase in enumerate(phases)},
+        counts={
+            name.removeprefix(_COUNT): value(array)
+            for name, array in diagnostics.items()
+            if name.startswith(_COUNT)
+        },
+    )
+
+
+def raise_on_failure(
+    diagnostics: dict[str, Any], report: Report, *, throw: bool, batched: bool
+) -> None:
+    """Raise what is most wrong in any environment; `throw` says whether `NotConverged` is."""
+    status = diagnostics["status"]
+    if not status.any():
+        return
+    # Bodies stand at the targets in the new state, so that a motion cut short has no state.
+    unfinished = (status == UNCONVERGED) & (diagnostics["motion_fraction"] < 1)
+    failures: list[tuple[type[SimulationError], np.ndarray[Any, Any], str]] = [
+        (
+            IntersectingState,
+            status == INTERSECTING,
+            "surfaces intersect, or are closer than their thickness, in the given state",
+        ),
+        (
+            InfeasibleMotion,
+            (status == INFEASIBLE) | unfinished,
+            "the prescribed motion cannot be completed without an intersection; move bodies and "
+            "pins less far in a step, or make room for the cloth",
+        ),
+        (
+            NotConverged,
+            (status == UNCONVERGED) & throw,
+            "the solver stopped before its tolerance was reached; raise "
+            "SolverOptions.max_iterations or tolerance, or lower dt",
+        ),
+    ]
+    for error, failed, sentence in failures:
+        environments = np.flatnonzero(failed).tolist()
+        if environments:
+            first = environments[0]
+            place = f"environments {environments}: " if batched else ""
+            detail = diagnostics["message"][first]
+            numbers = (
+                f"iterations {diagnostics['iterations'][first]}, residual "
+                f"{diagnostics['residual'][first]:.3g} m/s, motion fraction "
+                f"{diagnostics['motion_fraction'][first]:.3g}"
+            )
+            text = f"step: {place}{sentence} ({detail + '; ' if detail else ''}{numbers})"
+            raise error(text, report=report, environments=environments)

@@ -1,0 +1,105 @@
+"""What a step says about itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffcloth_torch._moved import allow_loading
+
+__all__ = ["Report"]
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """How a step went; Python numbers, or tensors of shape [B] in a batch.
+
+    Attributes:
+        converged: Whether the residual fell below the tolerance.
+        iterations: Newton iterations of all solves of the step.
+        residual: Largest displacement of the last Newton step, as a velocity [m/s].
+        minimum_distance: Smallest distance between mid-surfaces in contact [m], which is above half
+            the sum of their thicknesses; infinite where nothing is within the barrier's reach.
+        contact_count: Contacts within the barrier distance: pairs of primitives of cloths; of a
+            cloth and a body, features that are not hidden behind nearer ones.
+        motion_fraction: Part of the prescribed motion that was reached, 1 for all of it.
+        seconds: Phase of the step -> time [s]; the phases add up to the time in the core.
+        counts: What was done -> how often: steps with the `exact` Hessian, `chord` steps with an
+            older factor, steps with a `projected` Hessian, Hessians of `negative_curvature`,
+            numeric `factorizations`, and symbolic `analyses`.
+    """
+
+    converged: bool | Tensor
+    iterations: int | Tensor
+    residual: float | Tensor
+    minimum_distance: float | Tensor
+    contact_count: int | Tensor
+    motion_fraction: float | Tensor
+    seconds: dict[str, float | Tensor]
+    counts: dict[str, int | Tensor] = field(default_factory=dict)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # Reports that the first version saved count nothing.
+        self.__dict__.update({"counts": {}} | state)
+
+    def select(self, index: int | slice) -> Report:
+        """Report of one environment, or of some."""
+
+        def pick(values: Any) -> Any:
+            return values[index].item() if isinstance(index, int) else values[index]
+
+        return _combine(pick, [self])
+
+    @staticmethod
+    def stack(reports: Sequence[Report | None]) -> Report | None:
+        """Report of a batch from those of its environments; None if one has none."""
+        present = [report for report in reports if report is not None]
+        if len(present) < len(reports) or len({_names(r) for r in present}) > 1:
+            return None
+        return _combine(lambda *values: torch.stack([_tensor(v) for v in values]), present)
+
+    @staticmethod
+    def where(mask: Tensor, a: Report | None, b: Report | None) -> Report | None:
+        """Report that takes the environments of `a` where `mask` is true; None if one has none."""
+        if a is None or b is None or _names(a) != _names(b):
+            return None
+        return _combine(lambda x, y: torch.where(mask, _tensor(x), _tensor(y)), [a, b])
+
+
+def _tensor(value: Any) -> Tensor:
+    # A Python float would become a float32 tensor.
+    return (
+        torch.tensor(value, dtype=torch.float64) if type(value) is float else torch.as_tensor(value)
+    )
+
+
+# Fields that hold several numbers by name.
+_TABLES = ("seconds", "counts")
+
+
+def _names(report: Report) -> tuple[tuple[str, ...], ...]:
+    return tuple(tuple(getattr(report, table)) for table in _TABLES)
+
+
+def _combine(function: Callable[..., Any], reports: Sequence[Report]) -> Report:
+    """Apply a function to each number of some reports."""
+    plain = {
+        entry.name: function(*(getattr(report, entry.name) for report in reports))
+        for entry in fields(Report)
+        if entry.name not in _TABLES
+    }
+    tables: dict[str, Any] = {
+        table: {
+            name: function(*(getattr(report, table)[name] for report in reports))
+            for name in getattr(reports[0], table)
+        }
+        for table in _TABLES
+    }
+    return Report(**plain, **tables)
+
+
+allow_loading(Report)

@@ -1,0 +1,410 @@
+"""The simulator: a scene, a time step and a solver, and the step that they define."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloth_torch import _core
+from diffcloth_torch.checks import POSITIVE, check_choice, check_count, check_number
+from diffcloth_torch.errors import IntersectingState, InvalidInput
+from diffcloth_torch.model.defaults import (
+    check_barrier,
+    choose_barrier_distance,
+    has_contact,
+    scene_parameters,
+)
+from diffcloth_torch.model.options import SCHEMES, ContactOptions, SolverOptions
+from diffcloth_torch.model.scene import Assembly, Scene, assemble
+from diffcloth_torch.sim.controls import Control, Parameters
+from diffcloth_torch.sim.inputs import (
+    Inputs,
+    check_control,
+    check_parameters,
+    control_inputs,
+    parameter_inputs,
+    state_inputs,
+)
+from diffcloth_torch.sim.outcome import make_report, raise_on_failure
+from diffcloth_torch.sim.rollout import roll_out
+from diffcloth_torch.sim.state import State, Surfaces
+from diffcloth_torch.sim.step import as_array, refuse_transforms, take_step
+
+__all__ = ["Simulator"]
+
+_DEFAULT_CONTACT = ContactOptions()
+_DEFAULT_SOLVER = SolverOptions()
+
+
+class Simulator:
+    """Steps a scene through time. Immutable, and safe to use from several threads.
+
+    Attributes:
+        scene: What is simulated.
+        dt: Time step [s].
+        scheme: "coupled" or "split".
+        contact: Contact options, as given.
+        solver: Solver options.
+        slices: Cloth name -> its rows in `positions`.
+    """
+
+    scene: Scene
+    dt: float
+    scheme: str
+    contact: ContactOptions
+    solver: SolverOptions
+    slices: dict[str, slice]
+
+    def __init__(
+        self,
+        scene: Scene,
+        dt: float,
+        *,
+        scheme: str = "coupled",
+        contact: ContactOptions = _DEFAULT_CONTACT,
+        solver: SolverOptions = _DEFAULT_SOLVER,
+    ) -> None:
+        """Prepare the solver and choose the barrier where it is not given.
+
+        Args:
+            scene: What is simulated.
+            dt: Time step [s], > 0.
+            scheme: "coupled" solves elasticity and contact together; "split" solves elasticity
+                first and then contact, near its result.
+            contact: Contact and friction.
+            solver: Tolerance and limits of the solver.
+
+        Raises:
+            IntersectingState: If surfaces of the scene intersect or are closer than their
+                thickness.
+            InvalidInput: If a value is not accepted, or the barrier is too wide for the meshes.
+            TypeError: If something has a wrong type.
+        """
+        for name, value, kind in (
+            ("scene", scene, Scene),
+            ("contact", contact, ContactOptions),
+            ("solver", solver, SolverOptions),
+        ):
+            if not isinstance(value, kind):
+                raise TypeError(
+                    f"Simulator: `{name}` must be a {kind.__name__}, got {type(value).__name__}"
+                )
+        self.scene, self.contact, self.solver = scene, contact, solver
+        instead = "pass a plain number; no gradient with respect to the time step exists: use one"
+        self.dt = check_number("Simulator: `dt`", dt, POSITIVE, instead=instead)
+        self.scheme = check_choice("Simulator: `scheme`", scheme, SCHEMES)
+        if scheme != "split" and solver.metric != _DEFAULT_SOLVER.metric:
+            raise InvalidInput(
+                f"Simulator: `solver.metric` {solver.metric!r} needs scheme 'split', got {scheme!r}"
+            )
+        self._assembly = assemble(scene)
+        starts = self._assembly.cloth_vertex_start.tolist()
+        rows = [slice(a, b) for a, b in pairwise(starts)]
+        self.slices = dict(zip(scene.cloth_names, rows, strict=True))
+        self._surfaces = _surfaces(scene, self._assembly)
+        self._core = _make_core(self)
+        self._nonadjacent_distance = self._core.smallest_nonadjacent_distance()
+        self._defaults = scene_parameters(scene, self._assembly, has_contact(scene, contact))
+        if has_contact(scene, contact):
+            self._choose_barrier()
+        self._check_overlap()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restore, (self.scene, self.dt, self.scheme, self.contact, self.solver)
+
+    def __repr__(self) -> str:
+        return f"Simulator({self.scene!r}, dt={self.dt:g}, scheme={self.scheme!r})"
+
+    def initial_state(self, batch_size: int | None = None) -> State:
+        """Make the state that the scene describes, at rest.
+
+        Args:
+            batch_size: Number of equal environments, >= 1; None makes a state without batch axis.
+        """
+        if batch_size is not None:
+            check_count("initial_state: `batch_size`", batch_size, 1)
+        assembly = self._assembly
+        positions = torch.from_numpy(assembly.vertices)
+        tensors = {
+            "positions": positions,
+            "velocities": torch.zeros_like(positions),
+            "body_poses": torch.from_numpy(assembly.body_poses),
+            "soft_pin_targets": positions[torch.from_numpy(assembly.soft_pins.astype(np.int64))],
+            "body_forces": torch.zeros(len(assembly.body_vertices), 3, dtype=torch.float64),
+            "time": torch.zeros((), dtype=torch.float64),
+        }
+        environments = () if batch_size is None else (batch_size,)
+        copies = {
+            name: tensor.expand((*environments, *tensor.shape)).clone(
+                memory_format=torch.contiguous_format
+            )
+            for name, tensor in tensors.items()
+        }
+        return State(**copies, report=None, _surfaces=self._surfaces)
+
+    def control(
+        self,
+        *,
+        pins: Any = None,
+        soft_pins: Any = None,
+        body_poses: Any = None,
+        forces: Any = None,
+    ) -> Control:
+        """Make a control and check it against the scene; what is None holds.
+
+        Args:
+            pins: Positions at the end of the step [m], shape [P, 3], or name -> positions.
+            soft_pins: Likewise, shape [Q, 3] or name -> positions.
+            body_poses: Poses at the end of the step, shape [K, 7].
+            forces: Forces on the cloth vertices [N], shape [N, 3].
+
+        Raises:
+            InvalidInput: If a name, shape or value is not accepted.
+            TypeError: If something is no array of numbers on the CPU.
+        """
+        control = Control(pins=pins, soft_pins=soft_pins, body_poses=body_poses, forces=forces)
+        return check_control(self._assembly, control)
+
+    def parameters(self) -> Parameters:
+        """Make the parameters of the scene, in new tensors; change them with `.replace(...)`."""
+        copies = {name: tensor.clone() for name, tensor in self._defaults.items()}
+        return Parameters(**copies, _unbatched=tuple(copies))
+
+    def step(
+        self,
+        state: State,
+        control: Control | None = None,
+        parameters: Parameters | None = None,
+    ) -> State:
+        """Advance by one time step. Pure, and differentiable in all three arguments.
+
+        Args:
+            state: Where things are.
+            control: Where they shall be; None holds pins and bodies.
+            parameters: Physical parameters; None takes those of the scene.
+
+        Returns:
+            The state after `dt`. Its `positions`, `velocities` and `body_forces` carry gradients.
+
+        Raises:
+            IntersectingState: If surfaces intersect in `state`.
+            InfeasibleMotion: If bodies or pins cannot reach their targets without an intersection.
+            NotConverged: If the solver stops early; with `SolverOptions(throw=False)` the last
+                feasible iterate is returned instead.
+            InvalidInput: If a shape or value is not accepted.
+            TypeError: If a tensor of the state is not float64 on the CPU.
+        """
+        inputs, batch = self._inputs(state, control, parameters)
+        outcome = take_step(self._core, inputs, batched=batch is not None)
+        report = make_report(outcome.diagnostics, self._core.phases, batched=batch is not None)
+        raise_on_failure(
+            outcome.diagnostics, report, throw=self.solver.throw, batched=batch is not None
+        )
+        return State(
+            positions=outcome.positions,
+            velocities=outcome.velocities,
+            body_poses=_own_copy(inputs["body_targets"], batch),
+            soft_pin_targets=_own_copy(inputs["soft_pin_targets"], batch),
+            body_forces=outcome.body_forces,
+            time=_own_copy((state.time + self.dt).reshape(-1), batch),
+            report=report,
+            _surfaces=self._surfaces,
+        )
+
+    def rollout(
+        self,
+        state: State,
+        controls: Sequence[Control | None] | Callable[[int, State], Control | None] | None = None,
+        parameters: Parameters | None = None,
+        *,
+        steps: int | None = None,
+        checkpoint_every: int | None = None,
+    ) -> list[State]:
+        """Take several steps.
+
+        Args:
+            state: Where to start.
+            controls: One control for each step (None holds), or a function of the index of a step
+                and the state before it; None holds throughout.
+            parameters: Physical parameters of all steps.
+            steps: Number of steps; needed unless `controls` is a sequence.
+            checkpoint_every: Keep tapes of this many steps at a time: backward repeats the steps
+                from the state before them. A function `controls` is then called again and must
+                return the same.
+
+        Returns:
+            The states after each step.
+        """
+        # Copies of NumPy arrays and lists: edits before backward must not reach what is repeated.
+        if isinstance(controls, Sequence):
+            controls = [c if c is None else check_control(self._assembly, c) for c in controls]
+        if parameters is not None:
+            parameters = check_parameters(parameters)
+        return roll_out(
+            lambda before, control: self.step(before, control, parameters),
+            state,
+            controls,
+            parameters,
+            steps,
+            checkpoint_every,
+        )
+
+    def energy(self, state: State, parameters: Parameters | None = None) -> Tensor:
+        """Elastic energy, gravity, soft pins and barrier at the positions of a state [J].
+
+        Args:
+            state: Where things are. It must not require a gradient: there is none.
+            parameters: Physical parameters; None takes those of the scene.
+
+        Returns:
+            Energy, shape [], or [B] in a batch.
+        """
+        inputs, batch = self._inputs(state, None, parameters)
+        if torch.is_grad_enabled():
+            for name, tensor in inputs.items():
+                if tensor.requires_grad:
+                    raise InvalidInput(
+                        f"energy: `{name}` must not require a gradient, energy has none; "
+                        "call it under torch.no_grad() or with a detached state"
+                    )
+        energies = torch.from_numpy(self._core.energy(_arrays(inputs)))
+        return energies if batch is not None else energies[0]
+
+    def path(
+        self,
+        state: State,
+        control: Control | None = None,
+        parameters: Parameters | None = None,
+    ) -> Tensor:
+        """Polyline along which the solver takes a step, for an independent judge.
+
+        Every straight segment between successive rows is certified free of collisions, while the
+        chord from the first to the last may cross an obstacle. A step that fails gives the path up
+        to its failure.
+
+        Args:
+            state: Where things are, one environment.
+            control: Where they shall be; None holds pins and bodies.
+            parameters: Physical parameters; None takes those of the scene.
+
+        Returns:
+            Accepted iterates, shape [M, N + V, 3] [m]: cloth vertices, then body vertices.
+        """
+        with torch.no_grad():
+            inputs, batch = self._inputs(state, control, parameters)
+        if batch is not None:
+            raise InvalidInput("path: `state` must be one environment, got a batch; use state[i]")
+        return torch.from_numpy(self._core.path(_arrays(inputs)))
+
+    def _inputs(
+        self, state: State, control: Control | None, parameters: Parameters | None
+    ) -> tuple[Inputs, int | None]:
+        """Check everything and give every tensor its leading axis of environments."""
+        refuse_transforms(state, control, parameters)
+        inputs, batch = state_inputs(self._assembly, state)
+        inputs.update(control_inputs(self._assembly, control, inputs, batch))
+        given = Parameters() if parameters is None else parameters
+        inputs.update(parameter_inputs(self._assembly, given, self._defaults, batch))
+        self._check_barrier("parameters", inputs)
+        rest = inputs["rest_positions"]
+        scene_rest = self._defaults["rest_positions"].unsqueeze(0)
+        if not rest.requires_grad and torch.equal(rest, scene_rest):
+            del inputs["rest_positions"]  # the core has prepared the rest shape of the scene
+        return inputs, batch
+
+    def _choose_barrier(self) -> None:
+        """Complete the defaults by what the contact options give or leave to the scene."""
+        distance = self.contact.barrier_distance
+        if distance is None:
+            distance = choose_barrier_distance(self.scene, self._nonadjacent_distance, self.contact)
+        self._defaults["slip_velocity"] = _scalar(self.contact.slip_velocity)
+        self._defaults["barrier_distance"] = _scalar(distance)
+        inputs = parameter_inputs(self._assembly, Parameters(), self._defaults, None)
+        self._check_barrier("Simulator", inputs)
+        stiffness = self.contact.barrier_stiffness
+        if stiffness is None:
+            inputs, _ = self._inputs(self.initial_state(), None, None)
+            stiffness = self._core.default_barrier_stiffness(_arrays(inputs), distance)
+        self._defaults["barrier_stiffness"] = _scalar(stiffness)
+
+    def _check_barrier(self, owner: str, inputs: Inputs) -> None:
+        if "barrier_distance" in inputs and self.contact.self_contact:
+            thickness = as_array(inputs["thickness"])[:, : self._assembly.cloth_count]
+            distance = as_array(inputs["barrier_distance"])
+            check_barrier(owner, distance, thickness, self._nonadjacent_distance)
+
+    def _check_overlap(self) -> None:
+        thickness = self._defaults.get("thickness")
+        overlap = self._core.find_overlap(
+            self._assembly.vertices,
+            self._assembly.body_poses,
+            np.zeros(self._assembly.surface_count) if thickness is None else as_array(thickness),
+        )
+        if overlap is not None:
+            raise IntersectingState(
+                "Simulator: surfaces of the scene intersect, or are closer than their thickness: "
+                f"{overlap}",
+                environments=(0,),
+            )
+
+
+def _restore(
+    scene: Scene, dt: float, scheme: str, contact: ContactOptions, solver: SolverOptions
+) -> Simulator:
+    return Simulator(scene, dt, scheme=scheme, contact=contact, solver=solver)
+
+
+def _make_core(simulator: Simulator) -> _core.Simulator:
+    assembly = simulator._assembly
+    return _core.Simulator(
+        vertices=assembly.vertices,
+        rest_vertices=assembly.rest_vertices,
+        faces=assembly.faces,
+        cloth_vertex_start=assembly.cloth_vertex_start,
+        cloth_face_start=assembly.cloth_face_start,
+        bending_models=[cloth.bending_model for cloth in simulator.scene.cloths],
+        pins=assembly.pins,
+        soft_pins=assembly.soft_pins,
+        body_vertices=assembly.body_vertices,
+        body_faces=assembly.body_faces,
+        body_vertex_start=assembly.body_vertex_start,
+        body_face_start=assembly.body_face_start,
+        self_contact=simulator.contact.self_contact,
+        dt=simulator.dt,
+        scheme=simulator.scheme,
+        metric=simulator.solver.metric,
+        friction_iterations=simulator.contact.friction_iterations,
+        tolerance=simulator.solver.tolerance,
+        max_iterations=simulator.solver.max_iterations,
+    )
+
+
+def _surfaces(scene: Scene, assembly: Assembly) -> Surfaces:
+    starts = zip(scene.cloths, assembly.cloth_vertex_start.tolist(), strict=False)
+    return Surfaces(
+        cloth_names=list(scene.cloth_names),
+        cloth_faces=[torch.from_numpy(cloth.faces + start) for cloth, start in starts],
+        body_names=list(scene.body_names),
+        body_vertices=[torch.from_numpy(np.array(body.vertices)) for body in scene.bodies],
+        body_faces=[torch.from_numpy(np.array(body.faces)) for body in scene.bodies],
+    )
+
+
+def _arrays(inputs: Inputs) -> dict[str, NDArray[np.float64]]:
+    return {name: as_array(tensor) for name, tensor in inputs.items()}
+
+
+def _scalar(value: float) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def _own_copy(tensor: Tensor, batch: int | None) -> Tensor:
+    """Copy rows [nb, ...] of the inputs, so that the new state shares no storage with them."""
+    rows = tensor[0] if batch is None else tensor.expand(batch, *tensor.shape[1:])
+    return rows.clone(memory_format=torch.contiguous_format)

@@ -1,0 +1,223 @@
+"""The state of a simulation: tensors that a step takes and returns, alone or in a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffcloth_torch._moved import allow_loading
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry.meshes import MeshPart, write_mesh
+from diffcloth_torch.geometry.poses import transform
+from diffcloth_torch.model.quantities import STATE
+from diffcloth_torch.sim.report import Report
+
+__all__ = ["State", "Surfaces", "check_field_names", "stack", "where"]
+
+_BATCHED_DIMENSIONS = 3  # positions [B, N, 3]
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """The meshes that a state moves, as plain tensors, so that a saved state can be exported.
+
+    Attributes:
+        cloth_names: Name of each cloth.
+        cloth_faces: Vertex indices of each cloth in `positions`, shape [f, 3].
+        body_names: Name of each body.
+        body_vertices: Vertices of each body in its frame [m], shape [v, 3].
+        body_faces: Vertex indices of each body in its own vertices, shape [g, 3].
+    """
+
+    cloth_names: list[str]
+    cloth_faces: list[Tensor]
+    body_names: list[str]
+    body_vertices: list[Tensor]
+    body_faces: list[Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Positions and velocities at one time. Every tensor may have a leading batch axis.
+
+    Attributes:
+        positions: Cloth vertices [m], shape [N, 3].
+        velocities: Cloth vertices [m/s], shape [N, 3].
+        body_poses: [px, py, pz, qw, qx, qy, qz] of each body, shape [K, 7].
+        soft_pin_targets: Where the soft pins pull [m], shape [Q, 3].
+        body_forces: Contact forces on the body vertices during the step that led here [N],
+            shape [V, 3].
+        time: Time since the initial state [s], shape [].
+        report: How the step that led here went; None in an initial state.
+    """
+
+    positions: Tensor
+    velocities: Tensor
+    body_poses: Tensor
+    soft_pin_targets: Tensor
+    body_forces: Tensor
+    time: Tensor
+    report: Report | None = None
+    _surfaces: Surfaces | None = field(default=None, repr=False)
+
+    @property
+    def batch_size(self) -> int | None:
+        """Number of environments, None without a batch axis."""
+        batched = self.positions.dim() == _BATCHED_DIMENSIONS
+        return self.positions.shape[0] if batched else None
+
+    def replace(self, **changes: Any) -> State:
+        """Copy with some fields replaced; the other tensors are shared."""
+        check_field_names("State.replace", self, changes)
+        return replace(self, **changes)
+
+    def detach(self) -> State:
+        """Copy whose tensors carry no graph."""
+        return self._map(lambda tensor: tensor.detach(), self.report)
+
+    def __getitem__(self, index: int | slice) -> State:
+        """Take one environment of a batch, without the batch axis, or a slice of the batch."""
+        size = self._require_batch("state[i]")
+        if not isinstance(index, slice):
+            if isinstance(index, bool) or not isinstance(index, int | np.integer):
+                raise TypeError(f"state[i]: `i` must be an integer, got {type(index).__name__}")
+            if not -size <= index < size:
+                raise InvalidInput(f"state[i]: `i` must be in 0 .. {size - 1}, got {index}")
+            index = int(index)
+        report = None if self.report is None else self.report.select(index)
+        return self._map(lambda tensor: tensor[index], report)
+
+    def __len__(self) -> int:
+        """Number of environments."""
+        return self._require_batch("len(state)")
+
+    def __iter__(self) -> Iterator[State]:
+        """Go through the environments."""
+        return (self[i] for i in range(len(self)))
+
+    def __bool__(self) -> bool:
+        """Be true: `len` counts environments."""
+        return True
+
+    def export(self, path: str | Path, *, bodies: bool = False) -> None:
+        """Write the cloths as a mesh, with the vertices in the order of `positions`.
+
+        Args:
+            path: File that ends in .obj (one object per surface) or .ply (all in one).
+            bodies: Whether the bodies, at their poses, follow the cloths.
+
+        Raises:
+            InvalidInput: If the state is a batch, was not made by a simulator, or the file ending
+                is another.
+        """
+        if self.batch_size is not None:
+            raise InvalidInput("export: the state must be a single one; use state[i].export(...)")
+        if self._surfaces is None:
+            raise InvalidInput(
+                "export: the state must come from a Simulator, which knows its faces"
+            )
+        write_mesh(path, self._parts(self._surfaces, bodies))
+
+    def _parts(self, surfaces: Surfaces, bodies: bool) -> list[MeshPart]:
+        positions = self.positions.detach().numpy()
+        parts: list[MeshPart] = []
+        start = 0
+        for name, faces in zip(surfaces.cloth_names, surfaces.cloth_faces, strict=True):
+            end = int(faces.max()) + 1  # every cloth vertex belongs to a face
+            parts.append((name, positions[start:end], faces.numpy() - start))
+            start = end
+        if bodies:
+            poses = self.body_poses.detach().numpy()
+            for k, name in enumerate(surfaces.body_names):
+                vertices = transform(surfaces.body_vertices[k].numpy(), poses[k])
+                parts.append((name, vertices, surfaces.body_faces[k].numpy()))
+        return parts
+
+    def _require_batch(self, what: str) -> int:
+        if self.batch_size is None:
+            raise InvalidInput(f"{what}: the state must have a batch axis")
+        return self.batch_size
+
+    def _map(self, function: Callable[[Tensor], Tensor], report: Report | None) -> State:
+        tensors = {name: function(getattr(self, name)) for name in _TENSORS}
+        return State(**tensors, report=report, _surfaces=self._surfaces)
+
+
+_TENSORS = tuple(STATE)
+
+
+def stack(states: Sequence[State]) -> State:
+    """Make a batch of states without a batch axis; gradients flow to each of them.
+
+    Raises:
+        InvalidInput: If there is none, one is a batch already, or their shapes differ.
+    """
+    if len(states) == 0:
+        raise InvalidInput("stack: `states` must hold at least one state")
+    for i, state in enumerate(states):
+        if state.batch_size is not None:
+            raise InvalidInput(f"stack: `states` must have no batch axis, got one at [{i}]")
+    tensors = {}
+    for name in _TENSORS:
+        parts = [getattr(state, name) for state in states]
+        for i, part in enumerate(parts):
+            if part.shape != parts[0].shape:
+                raise InvalidInput(
+                    f"stack: `{name}` must have the same shape in all states, "
+                    f"got {list(parts[0].shape)} at [0] and {list(part.shape)} at [{i}]"
+                )
+        tensors[name] = torch.stack(parts)
+    report = Report.stack([state.report for state in states])
+    return State(**tensors, report=report, _surfaces=states[0]._surfaces)
+
+
+def where(mask: Tensor, a: State, b: State) -> State:
+    """Take environment `i` from `a` where `mask[i]` is true, from `b` elsewhere.
+
+    Args:
+        mask: Booleans, shape [B].
+        a: A batch, or one state for all environments.
+        b: A batch, or one state for all environments.
+
+    Raises:
+        InvalidInput: If the batch sizes differ.
+        TypeError: If `mask` is not a boolean tensor.
+    """
+    _check_mask(mask)
+    for name, state in (("a", a), ("b", b)):
+        if state.batch_size not in (None, len(mask)):
+            raise InvalidInput(
+                f"where: `{name}` must have {len(mask)} environments, as `mask`, "
+                f"got {state.batch_size}"
+            )
+    tensors = {}
+    for name in _TENSORS:
+        x, y = getattr(a, name), getattr(b, name)
+        single = max(x.dim() - (a.batch_size is not None), y.dim() - (b.batch_size is not None))
+        tensors[name] = torch.where(mask.reshape(-1, *[1] * single), x, y)
+    report = Report.where(mask, a.report, b.report)
+    return State(**tensors, report=report, _surfaces=a._surfaces)
+
+
+def _check_mask(mask: object) -> None:
+    if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
+        raise TypeError("where: `mask` must be a boolean tensor")
+    if mask.dim() != 1:
+        raise InvalidInput(f"where: `mask` must have shape [B], got {list(mask.shape)}")
+
+
+def check_field_names(owner: str, instance: Any, changes: dict[str, Any]) -> None:
+    """Require that changes name public fields of a dataclass."""
+    accepted = [f.name for f in fields(instance) if not f.name.startswith("_")]
+    for name in changes:
+        if name not in accepted:
+            raise InvalidInput(f"{owner}: the fields are {', '.join(accepted)}; got {name!r}")
+
+
+allow_loading(State, Surfaces)

@@ -1,0 +1,50 @@
+"""Several viewers as one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import ExitStack
+from types import TracebackType
+
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.viewers.viewer import Viewer
+
+__all__ = ["Viewers"]
+
+
+class Viewers:
+    """Several viewers, of every so many states the first."""
+
+    def __init__(self, viewers: Iterable[Viewer], every: int = 1) -> None:
+        """Remember the viewers.
+
+        Args:
+            viewers: Each is shown the same states.
+            every: States from one that is shown to the next.
+        """
+        self._viewers = list(viewers)
+        self._every = every
+        self._count = 0
+        self._stack = ExitStack()
+
+    def show(self, state: State) -> None:
+        """Take the next state."""
+        if self._count % self._every == 0:
+            for viewer in self._viewers:
+                viewer.show(state)
+        self._count += 1
+
+    def __enter__(self) -> Viewers:
+        """Open all of them."""
+        for viewer in self._viewers:
+            self._stack.enter_context(viewer)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Finish all of them."""
+        self._stack.__exit__(kind, error, trace)
