@@ -1,6 +1,8 @@
 #include "linalg/cholesky.h"
 
+#include <algorithm>
 #include <stdexcept>
+#include <string_view>
 
 #include "linalg/backend.h"
 #include "linalg/elimination_tree.h"
@@ -57,8 +59,16 @@ const std::vector<Backend>& available_backends() {
   return backends;
 }
 
+Backend default_backend() {
+  static const Backend backend =
+      *std::ranges::find(available_backends(), std::string_view(DIFFCLOTH_FACTORIZATION),
+                         [](Backend b) { return std::string_view(name(b)); });
+  return backend;
+}
+
 std::string factorization_name() {
-  return std::string(name(Backend::kMultifrontal)) + " (" + name(best_level()) + ")";
+  const std::string own = name(default_backend());
+  return default_backend() == Backend::kMultifrontal ? own + " (" + name(best_level()) + ")" : own;
 }
 
 double* CholeskyWorkspace::reserve(std::size_t size) {

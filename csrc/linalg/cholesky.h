@@ -26,6 +26,9 @@ const char* name(Backend backend);
 /// The backends of this build.
 const std::vector<Backend>& available_backends();
 
+/// The backend that this build was told to use (DIFFCLOTH_FACTORIZATION): our own if nothing was said.
+Backend default_backend();
+
 /// What the default backend is in this process: "multifrontal (avx512)".
 std::string factorization_name();
 
@@ -67,7 +70,7 @@ class CholeskyAnalysis {
   /// @param fixed  [pattern.size()] vertices left out of the matrix
   CholeskyAnalysis(const BlockPattern& pattern,
                    const std::vector<char>& fixed,
-                   Backend backend = Backend::kMultifrontal,
+                   Backend backend = default_backend(),
                    const CholeskyOptions& options = {});
   ~CholeskyAnalysis();
   CholeskyAnalysis(const CholeskyAnalysis&) = delete;
