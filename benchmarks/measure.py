@@ -11,10 +11,12 @@ import ipctk
 import numpy as np
 import torch
 
-import diffcloth_torch as dc
-from benchmarks.scenes import DT, Scene
+# By the paths of the first version, with which this one is compared.
 from diffcloth_torch.poses import transform
 from diffcloth_torch.step import as_array
+
+import diffcloth_torch as dc
+from benchmarks.scenes import DT, Scene
 
 BLOCK = 5  # steps between two reference factorizations
 WARM_UP = 2  # steps with backward whose times are dropped: caches fill
