@@ -98,3 +98,13 @@ def test_a_folder_without_a_package_is_refused(tmp_path):
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 1
     assert f"{tmp_path} has no diffcloth_torch" in result.stderr
+
+
+def test_every_factorization_is_timed():
+    command = [sys.executable, "-m", "benchmarks.factorization", "--quick"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    for name in ("hanging", "self-contact"):
+        assert result.stdout.count(f"\n{name}, ") == 2
+    for method in ("multifrontal (portable)", "eigen"):
+        assert result.stdout.count(method) >= 4

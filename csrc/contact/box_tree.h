@@ -1,5 +1,6 @@
 #pragma once
 
+#include <algorithm>
 #include <array>
 #include <span>
 #include <vector>
@@ -19,6 +20,18 @@ struct Box {
 inline bool overlap(const Box& a, const Box& b) {
   return (a.lo[0] <= b.hi[0]) & (b.lo[0] <= a.hi[0]) & (a.lo[1] <= b.hi[1]) & (b.lo[1] <= a.hi[1]) &
          (a.lo[2] <= b.hi[2]) & (b.lo[2] <= a.hi[2]);
+}
+
+/// Whether two boxes, each with a margin of its own around it, are within the sum of the margins,
+/// `range`, as the crow flies without them. Boxes that overlap only where their margins have corners
+/// are not. Also branch-free; NaN is near.
+inline bool are_near(const Box& a, const Box& b, double range) {
+  double sum = 0.0;
+  for (int k = 0; k < 3; ++k) {
+    const double apart = std::max(a.lo[k] - b.hi[k], b.lo[k] - a.hi[k]) + range;
+    sum += apart > 0.0 ? apart * apart : 0.0;
+  }
+  return !(sum > range * range) & overlap(a, b);
 }
 
 /// Smallest box around two boxes.

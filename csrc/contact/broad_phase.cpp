@@ -27,12 +27,13 @@ bool has_vertex(const CollisionMesh::Face& face, Index v) {
   return (face[0] == v) | (face[1] == v) | (face[2] == v);
 }
 
-/// Append all (item of a, item of b) whose boxes overlap. Which items of two leaves do is as good
+/// Append all (item of a, item of b) whose boxes are within range. Which items of two leaves do is as good
 /// as random: every pair is written, and kept by counting on, which spares the processor the guess.
 void append_overlaps(const BoxTree& tree_a,
                      const BoxTree::Boxes& a,
                      const BoxTree& tree_b,
                      const BoxTree::Boxes& b,
+                     double range,
                      PairList& stack,
                      PairList& pairs) {
   if (tree_a.empty() || tree_b.empty() || !overlap(a.nodes[0], b.nodes[0])) return;
@@ -47,7 +48,7 @@ void append_overlaps(const BoxTree& tree_a,
       for (Index k = p.first; k < p.last; ++k) {
         for (Index l = q.first; l < q.last; ++l) {
           *end = {tree_a.items()[k], tree_b.items()[l]};
-          end += overlap(a.items[k], b.items[l]);
+          end += are_near(a.items[k], b.items[l], range);
         }
       }
       pairs.end_at(end);
@@ -59,15 +60,16 @@ void append_overlaps(const BoxTree& tree_a,
       const Index next_i = split_a ? p.left + child : i;
       const Index next_j = split_a ? j : q.left + child;
       *end = {next_i, next_j};
-      end += overlap(a.nodes[next_i], b.nodes[next_j]);
+      end += are_near(a.nodes[next_i], b.nodes[next_j], range);
     }
     stack.end_at(end);
   }
 }
 
-/// Append all unordered pairs of different items of one tree whose boxes overlap.
+/// Append all unordered pairs of different items of one tree whose boxes are within range.
 void append_self_overlaps(const BoxTree& tree,
                           const BoxTree::Boxes& boxes,
+                          double range,
                           PairList& stack,
                           PairList& pairs) {
   if (tree.empty()) return;
@@ -82,7 +84,7 @@ void append_self_overlaps(const BoxTree& tree,
       for (Index k = p.first; k < p.last; ++k) {
         for (Index l = i == j ? k + 1 : q.first; l < q.last; ++l) {
           *end = {tree.items()[k], tree.items()[l]};
-          end += overlap(boxes.items[k], boxes.items[l]);
+          end += are_near(boxes.items[k], boxes.items[l], range);
         }
       }
       pairs.end_at(end);
@@ -99,7 +101,7 @@ void append_self_overlaps(const BoxTree& tree,
         const Index next_i = split_p ? p.left + child : i;
         const Index next_j = split_p ? j : q.left + child;
         *end = {next_i, next_j};
-        end += overlap(boxes.nodes[next_i], boxes.nodes[next_j]);
+        end += are_near(boxes.nodes[next_i], boxes.nodes[next_j], range);
       }
       stack.end_at(end);
     }
@@ -275,15 +277,18 @@ void BroadPhase::find(const double* x_t0,
   visit_surface_pairs(sweep, scratch, [&](Index s, Index r) {
     const Scratch::Surface& a = scratch.surfaces[s];
     const Scratch::Surface& b = scratch.surfaces[r];
-    append_overlaps(trees_[s].vertices, a.vertices, trees_[r].faces, b.faces, scratch.stack,
+    // Rounded up, as the boxes are rounded outward.
+    const double range = (1.0 + kOutward) * (reach[s] + reach[r]);
+    append_overlaps(trees_[s].vertices, a.vertices, trees_[r].faces, b.faces, range, scratch.stack,
                     vertex_faces);
     if (s == r) {
-      append_self_overlaps(trees_[s].edges, a.edges, scratch.stack, edges);
+      append_self_overlaps(trees_[s].edges, a.edges, range, scratch.stack, edges);
       return;
     }
-    append_overlaps(trees_[r].vertices, b.vertices, trees_[s].faces, a.faces, scratch.stack,
+    append_overlaps(trees_[r].vertices, b.vertices, trees_[s].faces, a.faces, range, scratch.stack,
                     vertex_faces);
-    append_overlaps(trees_[s].edges, a.edges, trees_[r].edges, b.edges, scratch.stack, edges);
+    append_overlaps(trees_[s].edges, a.edges, trees_[r].edges, b.edges, range, scratch.stack,
+                    edges);
   });
 
   filter(vertex_faces, [&](const IndexPair& p) { return !has_vertex(mesh_.faces[p[1]], p[0]); });
@@ -312,9 +317,9 @@ std::optional<std::pair<Index, Index>> BroadPhase::find_intersection(const doubl
   visit_surface_pairs({.x_t0 = x, .x_t1 = x, .reach = reach}, scratch, [&](Index s, Index r) {
     const Scratch::Surface& a = scratch.surfaces[s];
     const Scratch::Surface& b = scratch.surfaces[r];
-    append_overlaps(trees_[s].edges, a.edges, trees_[r].faces, b.faces, scratch.stack, pairs);
+    append_overlaps(trees_[s].edges, a.edges, trees_[r].faces, b.faces, 0.0, scratch.stack, pairs);
     if (s == r) return;
-    append_overlaps(trees_[r].edges, b.edges, trees_[s].faces, a.faces, scratch.stack, pairs);
+    append_overlaps(trees_[r].edges, b.edges, trees_[s].faces, a.faces, 0.0, scratch.stack, pairs);
   });
   std::optional<std::pair<Index, Index>> lowest;
   for (const auto& [e, f] : pairs) {

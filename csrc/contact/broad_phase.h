@@ -44,6 +44,8 @@ class BroadPhase {
   /// @param x_reference  positions that shape the search trees, 3 * vertex_count
   BroadPhase(CollisionMesh mesh, const double* x_reference);
 
+  const CollisionMesh& mesh() const { return mesh_; }
+
   /// Boxes and lists that a search fills; reuse one to search without allocation.
   struct Scratch {
     struct Surface {
@@ -89,8 +91,8 @@ class BroadPhase {
     PairList stack;
   };
 
-  /// All pairs whose boxes overlap, each box swept from x_t0 to x_t1, inflated by the reach of its
-  /// surface and rounded outward. Boxes are swept in a frame that moves as a surface does on
+  /// All pairs whose boxes, each swept from x_t0 to x_t1 and rounded outward, are within the sum of
+  /// the two surfaces' reaches of each other. Boxes are swept in a frame that moves as a surface does on
   /// average: a body for pairs with it, else the first cloth of a pair. A cloth that flies as a
   /// whole thus meets itself as if it were at rest.
   ///

@@ -3,11 +3,20 @@
 #include <vector>
 
 #include "contact/broad_phase.h"
+#include "contact/candidate_list.h"
 #include "contact/contact_set.h"
 #include "contact/friction_set.h"
 #include "potential/potential.h"
 
 namespace diffcloth::contact {
+
+/// What one thread searches with: lists that are kept over the solves of a step.
+struct Detection {
+  explicit Detection(const BroadPhase& broad_phase) : candidates(broad_phase) {}
+
+  CandidateList candidates;
+  BroadPhase::Scratch scratch;
+};
 
 /// The barrier of all contacts as a potential, and the detection of what may come into contact.
 ///
@@ -15,17 +24,13 @@ namespace diffcloth::contact {
 /// potential is asked about any point of it.
 class ContactPotential final : public Potential {
  public:
-  /// @param scratch  reused by all potentials of one thread
-  /// @param bar      where accumulate() adds; null where it is never called
-  ContactPotential(const ContactModel& model,
-                   const BroadPhase& broad_phase,
-                   BroadPhase::Scratch& scratch,
-                   ContactModel::Bar* bar)
-      : model_(model), broad_phase_(broad_phase), scratch_(scratch), bar_(bar) {}
+  /// @param bar  where accumulate() adds; null where it is never called
+  ContactPotential(const ContactModel& model, Detection& detection, ContactModel::Bar* bar)
+      : model_(model), detection_(detection), bar_(bar) {}
 
   /// Find every pair that comes within reach on the straight motion x -> to.
   void watch(const double* x, const double* to) {
-    broad_phase_.find(x, to, model_.reach(), scratch_, candidates_);
+    detection_.candidates.find(x, to, model_.reach(), detection_.scratch, candidates_);
     has_energies_ = false;
   }
 
@@ -50,8 +55,7 @@ class ContactPotential final : public Potential {
 
  private:
   const ContactModel& model_;
-  const BroadPhase& broad_phase_;
-  BroadPhase::Scratch& scratch_;
+  Detection& detection_;
   ContactModel::Bar* bar_;
   std::vector<Candidate> candidates_;
   std::vector<Contact> contacts_;

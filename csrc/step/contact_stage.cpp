@@ -45,11 +45,11 @@ class Sum {
  public:
   Sum(ContactStage& stage,
       Problem& problem,
-      contact::BroadPhase::Scratch& scratch,
+      contact::Detection& detection,
       contact::ContactModel::Bar* bar)
       : stage_(stage), problem_(problem), bar_(bar) {
     if (problem.contact) {
-      contact_.emplace(*problem.contact, problem.scene.broad_phase, scratch, bar);
+      contact_.emplace(*problem.contact, detection, bar);
     }
     objective = problem.objective(stage.inertia, stage.others, stage.assemblies);
     objective.contact = contact_ ? &*contact_ : nullptr;
@@ -167,7 +167,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
   Problem& problem = step.problem;
   const std::size_t cloth = problem.coordinates.size();
   const int friction_iterations = problem.scene.given.friction_iterations;
-  Sum sum(*this, problem, step.scratch, nullptr);
+  Sum sum(*this, problem, step.detection, nullptr);
   const Motion motion(problem);
   sum.lag(sum.contacts_at(x));
   const Array first_guess = guess(problem, inertia);
@@ -238,7 +238,7 @@ void ContactStage::backward(const Backward& step, Array g) {
   Cotangents& bars = step.cotangents;
   const std::size_t cloth = problem.coordinates.size();
   const auto solves = static_cast<std::size_t>(*step.tape["solves"]);
-  Sum sum(*this, problem, step.scratch, &bars.contact);
+  Sum sum(*this, problem, step.detection, &bars.contact);
   const auto at = [&](std::size_t k) {
     return problem.with_bodies_at_end(step.tape["iterates"] + k * cloth);
   };

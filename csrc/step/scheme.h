@@ -16,7 +16,7 @@ struct Scene;
 /// What a scheme works with going forward.
 struct Forward {
   Problem& problem;
-  contact::BroadPhase::Scratch& scratch;
+  contact::Detection& detection;
   solver::Context& context;
   const Arrays<double>& tape;     ///< empty where no tape is wanted
   FactorCache::Factors& factors;  ///< kept for backward, in the scheme's own order
@@ -26,7 +26,7 @@ struct Forward {
 /// What it works with going back.
 struct Backward {
   Problem& problem;
-  contact::BroadPhase::Scratch& scratch;
+  contact::Detection& detection;
   solver::Context& context;
   const Arrays<const double>& tape;
   const FactorCache::Factors& factors;  ///< empty where they are gone

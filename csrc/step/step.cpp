@@ -37,14 +37,14 @@ Report forward(const Scene& scene,
                std::vector<std::vector<double>>* path) {
   Stopwatch watch;
   Report report;
-  contact::BroadPhase::Scratch scratch;
+  contact::Detection detection(scene.broad_phase);
   Problem problem(scene, inputs);
   double* const positions = outputs["positions"];
   std::copy_n(problem.start.begin(), cloth_size(scene), positions);
   if (problem.contact) {
     const Stopwatch::Scope scope(watch, Phase::kDetection);
-    report.message =
-        find_overlap(scene, problem.start.data(), problem.contact->parameters().thickness, scratch);
+    report.message = find_overlap(scene, problem.start.data(),
+                                  problem.contact->parameters().thickness, detection.scratch);
     if (!report.message.empty()) {
       report.result = Result::kIntersectingStart;
       return report;
@@ -60,7 +60,7 @@ Report forward(const Scene& scene,
                           .path = path};
   FactorCache::Factors kept;
   scene.scheme->forward({.problem = problem,
-                         .scratch = scratch,
+                         .detection = detection,
                          .context = context,
                          .tape = tape,
                          .factors = kept,
@@ -85,7 +85,7 @@ void backward(const Scene& scene,
               FactorCache& factors) {
   Stopwatch watch;
   solver::Counts counts;
-  contact::BroadPhase::Scratch scratch;
+  contact::Detection detection(scene.broad_phase);
   Problem problem(scene, inputs, gradients[Input::kRestPositions] != nullptr);
   Cotangents bars(problem);
 
@@ -107,7 +107,7 @@ void backward(const Scene& scene,
                           .watch = &watch,
                           .counts = &counts};
   scene.scheme->backward({.problem = problem,
-                          .scratch = scratch,
+                          .detection = detection,
                           .context = context,
                           .tape = tape,
                           .factors = factors.find(static_cast<std::int64_t>(*tape["key"])),

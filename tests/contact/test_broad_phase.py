@@ -49,9 +49,9 @@ def scene(seed=0):
     return merged([grid(7, rng), grid(6, rng, 0.12), body, plane(10.0, -0.05)])
 
 
-def boxes(x_t0, x_t1, elements, reach):
+def boxes(x_t0, x_t1, elements):
     corners = np.concatenate([x_t0[elements], x_t1[elements]], axis=1)
-    return corners.min(axis=1) - reach, corners.max(axis=1) + reach
+    return corners.min(axis=1), corners.max(axis=1)
 
 
 def frame_of(a, b, x_t0, x_t1, surface, cloth_count, reach):
@@ -78,10 +78,11 @@ def brute_force(mesh, x_t0, x_t1, reach, faces, surface, cloth_count, self_conta
                 continue
             seen_t1 = x_t1 - frame_of(s, r, x_t0, x_t1, surface, cloth_count, reach)
             ids_a, ids_b = np.flatnonzero(of_first == s), np.flatnonzero(of_second == r)
-            lo_a, hi_a = boxes(x_t0, seen_t1, first[ids_a], reach[s])
-            lo_b, hi_b = boxes(x_t0, seen_t1, second[ids_b], reach[r])
-            overlap = ((lo_a[:, None] <= hi_b) & (lo_b <= hi_a[:, None])).all(-1)
-            for k, l in np.argwhere(overlap):
+            lo_a, hi_a = boxes(x_t0, seen_t1, first[ids_a])
+            lo_b, hi_b = boxes(x_t0, seen_t1, second[ids_b])
+            apart = np.maximum(np.maximum(lo_b - hi_a[:, None], lo_a[:, None] - hi_b), 0)
+            near = (apart**2).sum(axis=-1) <= (reach[s] + reach[r]) ** 2
+            for k, l in np.argwhere(near):
                 a, b = ids_a[k], ids_b[l]
                 corners = (*first[a], *second[b])
                 if len(set(corners)) == 4 and (kind == 0 or a < b):

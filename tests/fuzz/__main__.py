@@ -99,6 +99,8 @@ def _step(
         return None
     except dc.NotConverged as error:
         reason = _reason(scene, error.report)
+        if reason.startswith("residual"):
+            tally.line("report", where, str(error))
         tally.counts["NotConverged"] += 1
         tally.failed_step(f"NotConverged: {reason}", where, str(error))
         return None
@@ -141,8 +143,10 @@ def _judge(
     if not judge.is_free(after):
         tally.line("intersection", where, "state")
     report = after.report
-    sane = report.converged and 0 <= report.residual <= scene.simulator.solver.tolerance
-    if not (sane and report.iterations >= 1 and report.motion_fraction == 1):
+    solver = scene.simulator.solver
+    sane = report.converged and 0 <= report.residual <= solver.tolerance
+    sane = sane and 1 <= report.iterations <= solver.max_iterations
+    if not (sane and report.motion_fraction == 1):
         tally.line("report", where, repr(report))
     if len(scene.simulator._assembly.pins) == 0:
         _check_momentum(scene, before, after, tally, where)

@@ -203,7 +203,9 @@ ROUNDED = [Units(m=1e-3), Units(m=1e3), Units(s=1e-2), Units(s=1e2, kg=1e-3)]
 
 
 def label(u):
-    return ",".join(f"{n}={getattr(u, n):g}" for n in ("m", "kg", "s") if getattr(u, n) != 1)
+    return (
+        ",".join(f"{n}={getattr(u, n):g}" for n in ("m", "kg", "s") if getattr(u, n) != 1) or "SI"
+    )
 
 
 @pytest.mark.parametrize("units", EXACT, ids=label)
@@ -229,6 +231,31 @@ def test_a_scene_in_units_of_powers_of_ten_behaves_the_same(name, units):
     assert (result.velocities - expected.velocities).abs().max() < 1e-6
     scale = expected.gradient.abs().max()
     assert (result.gradient - expected.gradient).abs().max() < 1e-5 * scale
+
+
+def strip_on_a_cylinder(u, stretch):
+    """A strip that is held at one end and falls over a cylinder, where it crumples."""
+    rows, cells, radius = 5, 40, 0.05
+    grid = dc.Cloth.grid(cells + 1, rows, size=(0.04, 0.4))
+    vertices = np.array(grid.vertices)
+    placed = vertices + np.array([0.0, 0.0, radius + 2e-3])
+    material = {"stretch": stretch, "bending": 1e-6, "friction": 0.4}
+    cloth = u.cloth(placed, grid.faces, vertices, material=material, pins={"end": range(rows)})
+    half = 0.5**0.5
+    pose = u.pose(0.0, 0.0, 0.0, q=(half, 0.0, half, 0.0))  # its axis along x
+    return u.simulator([cloth], [dc.RigidBody.capsule(radius * u.m, 0.2 * u.m, pose=pose)])
+
+
+@pytest.mark.parametrize("stretch", [550.0, 5e3])
+@pytest.mark.parametrize("units", [Units(), Units(m=2.0**-10), Units(m=2.0**10)], ids=label)
+def test_a_strip_falls_over_a_cylinder_in_any_unit(units, stretch):
+    sim = strip_on_a_cylinder(units, stretch)
+    state = sim.initial_state()
+    touched = 0
+    for _ in range(40):
+        state = sim.step(state)  # raises where it does not converge
+        touched = max(touched, state.report.contact_count)
+    assert touched > 10
 
 
 CONTACTS = {

@@ -18,6 +18,7 @@
 #include "bind/kernels/kernels.h"
 #include "contact/barrier.h"
 #include "contact/broad_phase.h"
+#include "contact/candidate_list.h"
 #include "contact/ccd.h"
 #include "contact/collision_mesh.h"
 #include "contact/distance/closest.h"
@@ -89,14 +90,30 @@ class Search {
          bool self_contact,
          const Positions& x_reference)
       : mesh_(collision_mesh(faces, vertex_surface, cloth_count, self_contact)),
-        broad_phase_(mesh_, checked("x_reference", x_reference)) {}
+        broad_phase_(mesh_, checked("x_reference", x_reference)),
+        list_(broad_phase_) {}
+  Search(const Search&) = delete;
+  Search& operator=(const Search&) = delete;
 
   /// Kind (1: edge-edge), corners, a and b of every candidate, in order. One reach for each surface.
   IndexRows find(const Positions& x_t0, const Positions& x_t1, const std::vector<double>& reach) {
-    if (reach.size() != static_cast<std::size_t>(mesh_.surface_count())) {
-      throw nb::value_error("broad phase: `reach` must have one value a surface");
-    }
+    check_reach(reach);
     broad_phase_.find(checked("x_t0", x_t0), checked("x_t1", x_t1), reach, scratch_, candidates_);
+    return rows();
+  }
+
+  /// Likewise, from the list that is kept between searches.
+  IndexRows find_kept(const Positions& x_t0,
+                      const Positions& x_t1,
+                      const std::vector<double>& reach) {
+    check_reach(reach);
+    list_.find(checked("x_t0", x_t0), checked("x_t1", x_t1), reach, scratch_, candidates_);
+    return rows();
+  }
+
+  Index builds() const { return list_.builds(); }
+
+  IndexRows rows() const {
     IndexRows out(candidates_.size(), 7);
     for (std::size_t i = 0; i < candidates_.size(); ++i) {
       const auto& [kind, v, a, b] = candidates_[i];
@@ -116,6 +133,11 @@ class Search {
   const contact::CollisionMesh& mesh() const { return mesh_; }
 
  private:
+  void check_reach(const std::vector<double>& reach) const {
+    if (reach.size() == static_cast<std::size_t>(mesh_.surface_count())) return;
+    throw nb::value_error("broad phase: `reach` must have one value a surface");
+  }
+
   const double* checked(const char* name, const Positions& x) const {
     check_rows(name, x, mesh_);
     return x.data();
@@ -123,6 +145,7 @@ class Search {
 
   contact::CollisionMesh mesh_;
   contact::BroadPhase broad_phase_;
+  contact::CandidateList list_;
   contact::BroadPhase::Scratch scratch_;
   std::vector<contact::Candidate> candidates_;
 };
@@ -217,6 +240,8 @@ void collision_kernels(nb::module_& m) {
             return s.find(x_t0, x_t1, std::vector<double>(s.mesh().surface_count(), 0.5 * radius));
           },
           "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "radius"_a)
+      .def("find_kept", &Search::find_kept, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "reach"_a)
+      .def_prop_ro("builds", &Search::builds)
       .def("find_intersection", &Search::find_intersection, "x"_a.noconvert())
       .def("smallest_nonadjacent_distance", &Search::smallest_nonadjacent_distance,
            "x"_a.noconvert())

@@ -1,0 +1,97 @@
+"""Candidates that are kept between searches miss nothing, and are few near the end of a solve."""
+
+import numpy as np
+import pytest
+from test_broad_phase import kernels, scene
+
+REACH = [0.01, 0.02, 0.015, 0.005]
+
+
+def close_pairs(mesh, everything, x_t0, x_t1, surface):
+    """Pairs within reach at some time of the motion, at least at these."""
+    found = set()
+    for share in np.linspace(0, 1, 5):
+        at = x_t0 + share * (x_t1 - x_t0)
+        for kind in (0, 1):
+            pairs = everything[everything[:, 0] == kind]
+            d_sq = kernels.distance_sq(bool(kind), np.ascontiguousarray(at[pairs[:, 1:5]]))
+            reach = np.take(REACH, surface[pairs[:, 1]]) + np.take(REACH, surface[pairs[:, 4]])
+            found |= {tuple(c) for c in pairs[d_sq <= reach**2]}
+    return found
+
+
+@pytest.fixture(scope="module")
+def search():
+    x, faces, surface = scene()
+    mesh = kernels.BroadPhase(faces, surface, 2, True, x)
+    return x, mesh, surface, mesh.find(x, x, 100.0)
+
+
+@pytest.mark.parametrize("common", [0.0, 5.0], ids=["still", "flying"])
+@pytest.mark.parametrize("scale", [1e-5, 1e-3, 1e-2, 1e-1])
+def test_no_pair_that_comes_within_reach_is_missed(search, scale, common):
+    """Over a walk of many motions, from lists made before it."""
+    x, mesh, surface, everything = search
+    rng = np.random.default_rng(int(1e6 * scale))
+    cloths = (surface < 2)[:, None]
+    at, builds = x + 0.003 * rng.normal(size=x.shape), mesh.builds
+    missed, close_count, found_count = 0, 0, 0
+    for _ in range(6):
+        # A body moves as one; the cloths also share a motion, which brings them to the bodies.
+        step = scale * rng.normal(size=x.shape) * cloths
+        step += scale * rng.normal(size=3) * (surface == 2)[:, None]
+        step += common * scale * rng.normal(size=3) * cloths
+        found = {tuple(c) for c in mesh.find_kept(at, at + step, REACH)}
+        close = close_pairs(mesh, everything, at, at + step, surface)
+        missed += len(close - found)
+        close_count += len(close)
+        found_count += len(found)
+        assert found <= {tuple(c) for c in everything}
+        at = at + step
+    assert missed == 0
+    assert close_count > 100
+    if scale == 1e-5:
+        assert mesh.builds - builds <= 2
+        assert found_count < 1.5 * close_count
+    if scale == 1e-1:
+        assert mesh.builds == builds  # too far for a skin: the swept boxes' own
+
+
+def test_what_is_found_is_sorted(search):
+    x, mesh, _, _ = search
+    step = 1e-3 * np.random.default_rng(1).normal(size=x.shape)
+    kept = mesh.find_kept(x, x + step, REACH)
+    order = np.lexsort((kept[:, 6], kept[:, 5], kept[:, 0]))
+    np.testing.assert_array_equal(order, np.arange(len(kept)))
+    assert len(kept) > 10
+
+
+def test_another_reach_makes_another_list(search):
+    x, mesh, _, _ = search
+    mesh.find_kept(x, x, REACH)
+    wide = [10 * r for r in REACH]
+    found = mesh.find_kept(x, x, wide)
+    assert len(found) > 2 * len(mesh.find_kept(x, x, REACH))
+    fresh = mesh.find(x, x, wide)
+    d_sq = {
+        kind: kernels.distance_sq(
+            bool(kind), np.ascontiguousarray(x[fresh[fresh[:, 0] == kind][:, 1:5]])
+        )
+        for kind in (0, 1)
+    }
+    surface = search[2]
+    for kind in (0, 1):
+        pairs = fresh[fresh[:, 0] == kind]
+        reach = np.take(wide, surface[pairs[:, 1]]) + np.take(wide, surface[pairs[:, 4]])
+        close = {tuple(c) for c in pairs[d_sq[kind] <= reach**2]}
+        assert close <= {tuple(c) for c in found}
+
+
+def test_motions_that_are_not_finite_are_searched_as_such(search):
+    """A solver may try them; they must not be answered from a list."""
+    x, mesh, _, _ = search
+    mesh.find_kept(x, x, REACH)
+    for value in (np.nan, np.inf):
+        to = x.copy()
+        to[5, 1] = value
+        np.testing.assert_array_equal(mesh.find_kept(x, to, REACH), mesh.find(x, to, REACH))

@@ -1,0 +1,77 @@
+"""How a step ends: the limit on iterations, the tolerance, and a motion that is blocked."""
+
+import numpy as np
+import pytest
+import torch
+
+import diffcloth_torch as dc
+
+F64 = torch.float64
+
+
+def pushed(**solver):
+    """A box that is pushed and turned far into a hanging sheet within one step, in portions."""
+    n = 8
+    sheet = dc.Cloth.grid(n, n, size=0.4)
+    vertices = np.array(sheet.vertices)
+    vertices[:, :2] += np.random.default_rng(0).uniform(-0.005, 0.005, (n * n, 2))
+    upright = vertices[:, [0, 2, 1]]
+    cloth = dc.Cloth(
+        upright, sheet.faces, rest_vertices=vertices, pins={"edge": range(n * n - n, n * n)}
+    )
+    box = dc.RigidBody.box(0.15, motion="kinematic", pose=[0.01, -0.085, 0.02, 1, 0, 0, 0])
+    sim = dc.Simulator(dc.Scene([cloth], [box]), 0.01, solver=dc.SolverOptions(**solver))
+    state = sim.initial_state()
+    poses = state.body_poses.clone()
+    poses[0, 1] += 0.12
+    poses[0, 3:] = torch.tensor([np.cos(0.3), 0.0, 0.0, np.sin(0.3)], dtype=F64)
+    return sim, state, dc.Control(body_poses=poses)
+
+
+@pytest.mark.parametrize("scheme", ["coupled", "split"])
+@pytest.mark.parametrize("limit", [1, 2, 5, 12, 25, 200])
+def test_the_limit_on_iterations_holds_for_all_portions_and_solves(limit, scheme):
+    sim, state, control = pushed(max_iterations=limit)
+    sim = dc.Simulator(sim.scene, sim.dt, scheme=scheme, solver=sim.solver)
+    try:
+        report = sim.step(state, control).report
+    except dc.InfeasibleMotion as error:
+        report = error.report
+        assert report.motion_fraction < 1
+    except dc.NotConverged as error:
+        report = error.report
+        assert sim.solver.tolerance < report.residual < np.inf
+    else:
+        assert report.converged
+        assert limit > 2  # the motion alone has four portions
+    assert 1 <= report.iterations <= limit
+
+
+@pytest.mark.parametrize("limit", [1, 2, 5, 12, 25])
+def test_a_step_that_is_cut_short_has_a_residual_above_the_tolerance(limit):
+    sim, state, _ = pushed(max_iterations=limit, throw=False)
+    velocities = torch.from_numpy(np.random.default_rng(1).normal(size=state.positions.shape))
+    report = sim.step(state.replace(velocities=velocities)).report
+    if not report.converged:
+        assert sim.solver.tolerance < report.residual < np.inf
+    assert report.converged or limit < 25
+
+
+def test_a_blocked_motion_lets_the_cloth_give_way_before_it_goes_on():
+    # Gaps that a blocked motion has closed would let each further step advance by next to nothing.
+    sim, state, control = pushed()
+    path = sim.path(state, control).numpy()
+    cloth, body = path[:, :64], path[:, 64:]
+    arrived = np.abs(body - body[-1]).max(axis=(1, 2)) == 0
+    stands = np.abs(np.diff(body, axis=0)).max(axis=(1, 2)) == 0
+    moves = np.abs(np.diff(cloth, axis=0)).max(axis=(1, 2)) > 0
+    assert (stands & moves & ~arrived[:-1]).any()
+
+
+@pytest.mark.parametrize("tolerance", [1e-9, 1e-7, 1e-5, 1e-3])
+def test_a_looser_tolerance_converges_where_a_tighter_one_does(tolerance):
+    sim, state, control = pushed(tolerance=tolerance)
+    for _ in range(3):
+        state = sim.step(state, control)
+        assert state.report.converged
+        assert state.report.residual <= tolerance

@@ -1,0 +1,69 @@
+"""What a step says about its time, and what it leaves in memory."""
+
+import os
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+import diffcloth_torch as dc
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_the_seconds_of_a_report_are_those_of_the_step():
+    ball = dc.RigidBody.sphere(0.2, pose=[0.01, 0.02, -0.205, 1, 0, 0, 0])
+    sim = dc.Simulator(dc.Scene([dc.Cloth.grid(20, 20)], [ball]), 0.01)
+    state = sim.initial_state()
+    told = wall = 0.0
+    with torch.no_grad():
+        for _ in range(8):
+            begin = time.perf_counter()
+            state = sim.step(state)
+            wall += time.perf_counter() - begin
+            told += sum(state.report.seconds.values())
+    # The rest is what Python does around the core, about a millisecond a step.
+    assert 0.92 * wall < told <= wall
+
+
+SELF_CONTACT = """
+    import os
+    import torch
+    from benchmarks.scenes import self_contact
+    import diffcloth_torch as dc
+
+    def resident():
+        with open("/proc/self/statm") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    torch.set_num_threads(1)
+    scene = self_contact(40)
+    sim = dc.Simulator(scene.scene, 0.01)
+    state = sim.initial_state()
+    sizes = []
+    with torch.no_grad():
+        for _ in range(14):
+            state = sim.step(state)
+            sizes.append(resident())
+    assert state.report.contact_count > 100
+    print(max(sizes) - sizes[0])
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="reads /proc")  # noqa: PTH110
+def test_contacts_that_come_and_go_leave_little_in_memory():
+    # Each new set of contacts is a new pattern of the matrix, whose analysis may be kept.
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(SELF_CONTACT)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    assert float(result.stdout) < 150  # [MB]
