@@ -11,12 +11,10 @@ import ipctk
 import numpy as np
 import torch
 
-# By the paths of the first version, with which this one is compared.
-from diffcloth_torch.poses import transform
-from diffcloth_torch.step import as_array
-
 import diffcloth_torch as dc
 from benchmarks.scenes import DT, Scene
+from diffcloth_torch.poses import transform  # paths that the first version has, too
+from diffcloth_torch.step import as_array
 
 BLOCK = 5  # steps between two reference factorizations
 WARM_UP = 2  # steps with backward whose times are dropped: caches fill
