@@ -13,7 +13,7 @@ import torch
 
 import diffcloth_torch as dc
 from benchmarks.scenes import DT, Scene
-from diffcloth_torch.poses import transform
+from diffcloth_torch.poses import transform  # paths that the first version has, too
 from diffcloth_torch.step import as_array
 
 BLOCK = 5  # steps between two reference factorizations
