@@ -12,13 +12,11 @@ constexpr double kChordContraction = 0.1;
 /// new factor would be cheaper.
 constexpr int kIterations = 8;
 constexpr double kForcing = 0.03;
-/// Share s of the projection after an indefinite Hessian; its growth while the blend is indefinite,
-/// and how often, before the projection stands alone for once; its fall and growth with what steps
-/// gain; below which it counts as none; above which it need not grow, as little else is left; beyond
-/// which nothing more is to be had from it.
+/// Share s of the projection after an indefinite Hessian; its growth while the blend is indefinite;
+/// its fall and growth with what steps gain; below which it counts as none; to which poor steps let
+/// it grow, as little else is left then; beyond which nothing more is to be had from it.
 constexpr double kFirstShare = 1.0;
 constexpr double kFailureGrowth = 4.0;
-constexpr int kFailures = 3;
 constexpr double kDecay = 0.25;
 constexpr double kGrowth = 2.0;
 constexpr double kNoShare = 0.05;
