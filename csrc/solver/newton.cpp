@@ -38,6 +38,7 @@ class Descent {
   enum class Next : std::uint8_t { kGoOn, kStop };
 
   Next settle();
+  Status look();
   Next take(const Directions::Direction& direction);
   Next stop(Status status) {
     status_ = status;
@@ -138,6 +139,16 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
   return Next::kGoOn;
 }
 
+/// What is here when the iterations are used up: the residual of this very point.
+Status Descent::look() {
+  const bool minimum = directions_.certify();
+  if (!minimum) directions_.next();
+  const double step = largest(directions_.p());
+  residual_ = step / walk_.f.h;
+  if (step >= goal_) return Status::kIterationLimit;
+  return minimum ? Status::kConverged : Status::kSaddle;
+}
+
 Status Descent::run() {
   for (;;) {
     if (settling_) {
@@ -145,7 +156,7 @@ Status Descent::run() {
       if (settle() == Next::kStop) return status_;
       continue;
     }
-    if (!walk_.spend()) return Status::kIterationLimit;
+    if (!walk_.spend()) return look();
     if (take(directions_.next()) == Next::kStop) return status_;
   }
 }

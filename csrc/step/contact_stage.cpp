@@ -139,7 +139,7 @@ std::string words(solver::Status status) {
     case solver::Status::kBlocked:
       return "surfaces are so close that rounding lets none of them move";
     case solver::Status::kSaddle:
-      return "at a saddle that no lower point was found from";
+      return "at a saddle, and no lower point was found from there";
   }
   __builtin_unreachable();
 }

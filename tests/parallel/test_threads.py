@@ -14,7 +14,7 @@ import torch
 from parallel_scenes import batch, differing, simulator, step
 
 SIZES = (12, 16, 24)
-REPEATS = {12: 6, 16: 4, 24: 2}
+REPEATS = {12: 4, 16: 2, 24: 1}
 SLOW = pytest.param(10, marks=pytest.mark.slow)  # times as often
 ENVIRONMENTS = 4
 
