@@ -96,7 +96,7 @@ def test_eight_python_threads_on_one_simulator(n, often):
     states = list(batch(n, 8, seed=1))
     with threads(1):
         expected = [step(sim, state)[1] for state in states]
-        for _ in range(often * REPEATS[n] // 2):
+        for _ in range(often * max(1, REPEATS[n] // 2)):
             with ThreadPoolExecutor(8) as pool:
                 results = list(pool.map(lambda state: step(sim, state)[1], states))
             assert [differing(a, b) for a, b in zip(results, expected, strict=True)] == [[]] * 8
