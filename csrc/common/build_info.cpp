@@ -27,7 +27,7 @@ std::string blas() {
 
 #else
 
-std::string blas() { return "none"; }
+const char* blas() { return "none"; }
 
 #endif
 

@@ -205,7 +205,7 @@ Bulge bulge(const CollisionMesh& mesh, const double* X) {
     const auto& [i, j] = mesh.edges[e];
     const Vec3 along = (row(X, j) - row(X, i)).normalized();
     stars[i].directions.push_back(along);
-    stars[j].directions.push_back(-along);
+    stars[j].directions.emplace_back(-along);
     for (const Index v : {i, j}) stars[v].lowest = std::min(stars[v].lowest, theta);
   }
   for (auto f = static_cast<std::size_t>(mesh.cloth_face_count); f < mesh.faces.size(); ++f) {

@@ -7,10 +7,11 @@
 namespace diffcloth::solver {
 namespace {
 
-/// First shift that makes the Hessian definite, as a share of M/h^2, and its growth.
+/// The first shift that is tried to make the Hessian definite, as a share of M/h^2, its growth, and
+/// how many are tried: up to 4e11.
 constexpr double kFirstShift = 0.1;
 constexpr double kShiftGrowth = 4.0;
-constexpr double kLargestShift = 1e12;
+constexpr int kShifts = 22;
 constexpr int kInverseIterations = 30;
 /// Share of the mean edge that the first trial moves a vertex by, and its halvings.
 constexpr double kFirstMove = 0.25;
@@ -35,7 +36,8 @@ Factor shifted_factor(Walk& walk) {
   const std::vector<double>& metric = walk.f.inertia->metric();
   const double h = walk.f.h;
   double added = 0.0;
-  for (double shift = kFirstShift; shift < kLargestShift; shift *= kShiftGrowth) {
+  double shift = kFirstShift;
+  for (int k = 0; k < kShifts; ++k, shift *= kShiftGrowth) {
     walk.context.checkpoint->check();
     for (std::size_t i = 0; i < metric.size(); ++i) {
       H.add_to_diagonal(static_cast<Index>(i), (shift - added) * metric[i] / (h * h));
