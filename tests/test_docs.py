@@ -81,3 +81,21 @@ def test_creep_is_that_of_the_guide(load):
         end = simulator.rollout(simulator.initial_state(), parameters=parameters, steps=100)[-1]
     v = slip * (1 - np.sqrt(1 - load))
     assert end.velocities[:, 0].mean().item() == pytest.approx(v, rel=0.02, abs=1e-8)
+
+
+def test_the_example_of_a_potential_fits_the_code():
+    """What it changes stands in the files that it names; it has what a potential must have."""
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    parts = re.split(
+        r"^--- (.+)\n", re.search(r"```diff\n(.*?)```", text, re.DOTALL)[1], flags=re.M
+    )
+    assert len(parts) > 2
+    for path, lines in zip(parts[1::2], parts[2::2], strict=True):
+        code = (ROOT / path).read_text()
+        for line in lines.splitlines():
+            assert line[0] == "+" or f"\n{line[1:]}" in code, (path, line)
+    required = re.findall(
+        r"(\w+)\([^)]*\)(?: const)? = 0;", (ROOT / "csrc/potential/potential.h").read_text()
+    )
+    overridden = re.findall(r"(\w+)\([^)]*\)(?: const)? override", text)
+    assert set(required) == set(overridden)

@@ -51,8 +51,9 @@ class SolverOptions:
     """The Newton solver.
 
     Attributes:
-        tolerance: Largest Newton step that counts as converged, as a velocity [m/s], > 0.
-        max_iterations: Newton iterations a step may take, >= 1.
+        tolerance: Largest step with the exact Hessian that counts as converged, as a velocity
+            [m/s], > 0.
+        max_iterations: Newton iterations that a step may take over all its solves, >= 1.
         throw: Whether a step that does not converge raises `NotConverged`; otherwise the last
             feasible iterate comes back with `report.converged` False.
         metric: Norm of the contact stage of the "split" scheme: "mass" or "identity".
