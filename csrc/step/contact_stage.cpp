@@ -27,6 +27,7 @@
 #include <optional>
 #include <stdexcept>
 #include <string>
+#include <string_view>
 
 #include "solver/adjoint.h"
 #include "solver/newton.h"
@@ -68,7 +69,8 @@ class Sum {
   void lag(const std::vector<Contact>& contacts) {
     objective.others = stage_.others;
     friction.reset();
-    if (contacts.empty()) return;
+    // Where nothing can touch there are no contacts either.
+    if (!problem_.contact || contacts.empty()) return;
     friction.emplace(*problem_.contact, contacts, problem_.start.data(), bar_);
     objective.others.push_back(&*friction);
   }
@@ -127,7 +129,7 @@ Array guess(const Problem& problem, const Proximity& inertia) {
   return x;
 }
 
-std::string words(solver::Status status) {
+std::string_view words(solver::Status status) {
   switch (status) {
     case solver::Status::kConverged:
     case solver::Status::kInfeasibleMotion:

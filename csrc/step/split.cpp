@@ -21,7 +21,9 @@ Array stage_metric(const Problem& p) {
   // The literal metric weighs all vertices alike; the mean mass keeps the energy in joules.
   double mean = 0.0;
   for (const double m : p.masses) mean += m;
-  return Array(p.masses.size(), mean / static_cast<double>(p.masses.size()));
+  mean /= static_cast<double>(p.masses.size());
+  Array metric(p.masses.size(), mean);
+  return metric;
 }
 
 /// Its adjoint: into the masses.
