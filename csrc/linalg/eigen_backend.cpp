@@ -9,7 +9,13 @@ namespace diffcloth::linalg {
 namespace {
 
 using Sparse = Eigen::SparseMatrix<double, Eigen::ColMajor, Index>;
-using Solver = Eigen::SimplicialLLT<Sparse, Eigen::Lower, Eigen::NaturalOrdering<Index>>;
+
+/// Shows L, whose pattern is known, and asked for, once it is analyzed; matrixL() wants its values.
+class Solver final
+    : public Eigen::SimplicialLLT<Sparse, Eigen::Lower, Eigen::NaturalOrdering<Index>> {
+ public:
+  const Sparse& lower() const { return m_matrix; }
+};
 
 Eigen::Map<const Sparse> view(const ScalarMatrix& matrix, const double* values) {
   return {matrix.dimension(),         matrix.dimension(), static_cast<Index>(matrix.row.size()),
@@ -52,12 +58,12 @@ class EigenFactor final : public FactorBackend {
 
   std::size_t nonzeros() const {
     if (matrix_.dimension() == 0) return 0;
-    return static_cast<std::size_t>(solver_.matrixL().nestedExpression().nonZeros());
+    return static_cast<std::size_t>(solver_.lower().nonZeros());
   }
 
   double flops() const {
     if (matrix_.dimension() == 0) return 0.0;
-    const Sparse& l = solver_.matrixL().nestedExpression();
+    const Sparse& l = solver_.lower();
     double sum = 0.0;
     for (Index j = 0; j < l.outerSize(); ++j) {
       const double height = l.outerIndexPtr()[j + 1] - l.outerIndexPtr()[j];
@@ -68,7 +74,7 @@ class EigenFactor final : public FactorBackend {
 
  private:
   double trace() const {
-    const Sparse& l = solver_.matrixL().nestedExpression();
+    const Sparse& l = solver_.lower();
     double sum = 0.0;
     for (Index j = 0; j < l.outerSize(); ++j) sum += l.valuePtr()[l.outerIndexPtr()[j]];
     return sum;
