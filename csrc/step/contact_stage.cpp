@@ -29,7 +29,6 @@
 #include <string>
 #include <string_view>
 
-#include "solver/adjoint.h"
 #include "solver/newton.h"
 #include "step/motion.h"
 
@@ -223,8 +222,10 @@ void pull_back_solve(const Backward& step,
     f.hessian_product(x.data(), forces.data(), product);
     for (std::size_t a = 0; a < cloth; ++a) b[a] -= product[a];
   }
+  // The factor is that of H itself: nothing is left to polish.
   Array zhat;
-  solver::solve_adjoint(system, x.data(), *factor, b, zhat);
+  system.solve(*factor, b, zhat);
+  for (double& value : zhat) value = -value;
   for (std::size_t a = cloth; a < zhat.size(); ++a) zhat[a] = forces[a];
 
   f.hessian_product(x.data(), zhat.data(), product);
