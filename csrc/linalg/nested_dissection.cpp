@@ -217,27 +217,41 @@ class Dissection {
   std::vector<Index> run() {
     std::vector<Index> all(graph_.size());
     for (Index k = 0; k < graph_.size(); ++k) all[k] = k;
-    dissect(all);
+    dissect(std::move(all));
     return std::move(order_);
   }
 
  private:
-  void dissect(const std::vector<Index>& nodes) {
-    const Graph part = induced(graph_, nodes, number_);
-    if (part.size() <= kSmallPart) {
-      order_part(nodes);
-      return;
+  void dissect(std::vector<Index> nodes) {
+    // One component after the other, in a loop: there may be as many as nodes, too deep to nest.
+    for (;;) {
+      const Graph part = induced(graph_, nodes, number_);
+      if (part.size() <= kSmallPart) {
+        order_part(nodes);
+        return;
+      }
+      const std::vector<Index> distance = distances(part, 0);
+      std::vector<Index> component;
+      std::vector<Index> others;
+      for (Index k = 0; k < part.size(); ++k) {
+        (distance[k] < 0 ? others : component).push_back(nodes[k]);
+      }
+      if (others.empty()) {
+        cut(part, nodes);
+        return;
+      }
+      dissect(std::move(component));
+      nodes = std::move(others);
     }
-    const std::vector<Index> distance = distances(part, 0);
+  }
+
+  /// For a connected part.
+  void cut(const Graph& part, const std::vector<Index>& nodes) {
     std::array<std::vector<Index>, 3> parts;
-    if (std::ranges::find(distance, -1) != distance.end()) {
-      for (Index k = 0; k < part.size(); ++k) parts[distance[k] < 0 ? 1 : 0].push_back(nodes[k]);
-    } else {
-      const std::vector<char> where = bisect(part);
-      for (Index k = 0; k < part.size(); ++k) parts[where[k]].push_back(nodes[k]);
-    }
-    dissect(parts[0]);
-    dissect(parts[1]);
+    const std::vector<char> where = bisect(part);
+    for (Index k = 0; k < part.size(); ++k) parts[where[k]].push_back(nodes[k]);
+    dissect(std::move(parts[0]));
+    dissect(std::move(parts[1]));
     order_.insert(order_.end(), parts[2].begin(), parts[2].end());
   }
 
