@@ -12,8 +12,10 @@ namespace diffcloth::contact {
 
 /// What one thread searches with: lists that are kept over the solves of a step.
 struct Detection {
-  explicit Detection(const BroadPhase& broad_phase) : candidates(broad_phase) {}
+  explicit Detection(const BroadPhase& broad_phase_in)
+      : broad_phase(broad_phase_in), candidates(broad_phase_in) {}
 
+  const BroadPhase& broad_phase;
   CandidateList candidates;
   BroadPhase::Scratch scratch;
 };
@@ -31,6 +33,19 @@ class ContactPotential final : public Potential {
   /// Find every pair that comes within reach on the straight motion x -> to.
   void watch(const double* x, const double* to) {
     detection_.candidates.find(x, to, model_.reach(), detection_.scratch, candidates_);
+    has_energies_ = false;
+  }
+
+  /// Stand at a point that no motion leads from: its pairs alone, without a list for later.
+  void look_at(const double* x) {
+    detection_.broad_phase.find(x, x, model_.reach(), detection_.scratch, candidates_);
+    stand_at(x);
+  }
+
+  /// Stand at a point that is known to have no contact.
+  void look_at_nothing() {
+    candidates_.clear();
+    contacts_.clear();
     has_energies_ = false;
   }
 

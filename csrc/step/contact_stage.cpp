@@ -56,11 +56,16 @@ class Sum {
   }
 
   /// Contacts at a point, found from scratch; the contact potential stands there.
-  const std::vector<Contact>& contacts_at(const Array& x) {
+  ///
+  /// @param any  false where it is known that there are none
+  const std::vector<Contact>& contacts_at(const Array& x, bool any = true) {
     static const std::vector<Contact> none;
     if (!contact_) return none;
-    contact_->watch(x.data(), x.data());
-    contact_->stand_at(x.data());
+    if (any) {
+      contact_->look_at(x.data());
+    } else {
+      contact_->look_at_nothing();
+    }
     return contact_->contacts();
   }
 
@@ -161,7 +166,10 @@ void merge(const solver::Outcome& outcome, Report& report) {
 std::vector<Field> ContactStage::tape(const Scene& scene) {
   const auto n = static_cast<std::size_t>(scene.cloth_vertex_count());
   const auto k = static_cast<std::size_t>(scene.given.friction_iterations);
-  return {{.name = "iterates", .shape = {k, n, 3}}, {.name = "solves", .shape = {1}}};
+  // Numbers of contacts, at the start and after each solve, spare backward the search for none.
+  return {{.name = "iterates", .shape = {k, n, 3}},
+          {.name = "solves", .shape = {1}},
+          {.name = "contacts", .shape = {k + 1}}};
 }
 
 void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
@@ -170,7 +178,12 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
   const int friction_iterations = problem.scene.given.friction_iterations;
   Sum sum(*this, problem, step.detection, nullptr);
   const Motion motion(problem);
-  sum.lag(sum.contacts_at(x));
+  const auto keep_count = [&](int k, std::size_t count) {
+    if (!step.tape.empty()) step.tape["contacts"][k] = static_cast<double>(count);
+  };
+  const std::vector<Contact>& at_start = sum.contacts_at(x);
+  keep_count(0, at_start.size());
+  sum.lag(at_start);
   const Array first_guess = guess(problem, inertia);
   solver::Factor factor;
   int solves = 0;
@@ -188,6 +201,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
     if (step.report.result != Result::kConverged) break;
     const std::vector<Contact>& contacts =
         sum.objective.contact != nullptr ? sum.objective.contact->contacts() : sum.contacts_at(x);
+    keep_count(solves, contacts.size());
     // Without contact before and after, another solve would be the same one.
     if (!sum.friction && contacts.empty()) break;
     if (solves < friction_iterations) sum.lag(contacts);
@@ -245,13 +259,14 @@ void ContactStage::backward(const Backward& step, Array g) {
   const auto at = [&](std::size_t k) {
     return problem.with_bodies_at_end(step.tape["iterates"] + k * cloth);
   };
+  const double* const counts = step.tape["contacts"];
   for (std::size_t k = solves; k-- > 0;) {
     step.context.checkpoint->check();
     const Array x = at(k);
     const Array x_lag = k == 0 ? problem.start : at(k - 1);
-    sum.lag(sum.contacts_at(x_lag));
+    sum.lag(sum.contacts_at(x_lag, counts[k] > 0.0));
     if (sum.friction) sum.friction->set_lag(x_lag.data());
-    sum.contacts_at(x);
+    sum.contacts_at(x, counts[k + 1] > 0.0);
     sum.objective.stand_at(x.data());
     const std::size_t place = first_factor + k;
     pull_back_solve(step, sum.objective, x,
