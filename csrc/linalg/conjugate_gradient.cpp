@@ -3,15 +3,6 @@
 #include "linalg/block_matrix.h"
 
 namespace diffcloth::linalg {
-namespace {
-
-double dot(const std::vector<double>& a, const std::vector<double>& b) {
-  double sum = 0.0;
-  for (std::size_t i = 0; i < a.size(); ++i) sum += a[i] * b[i];
-  return sum;
-}
-
-}  // namespace
 
 Convergence conjugate_gradient(const BlockPattern& pattern,
                                const double* blocks,

@@ -8,6 +8,13 @@
 
 namespace diffcloth::linalg {
 
+/// Sum in the order of the entries.
+inline double dot(const std::vector<double>& a, const std::vector<double>& b) {
+  double sum = 0.0;
+  for (std::size_t i = 0; i < a.size(); ++i) sum += a[i] * b[i];
+  return sum;
+}
+
 enum class Convergence : std::uint8_t { kConverged, kIterationLimit, kNegativeCurvature };
 
 /// Solve A x = b at the vertices that are not fixed, preconditioned by a factor of a nearby matrix.

@@ -19,8 +19,8 @@ Search search(Walk& walk, const std::vector<double>& p, double first) {
   Search result;
   std::vector<double> to;
   Coordinates::retract(walk.x(), p, first, to);
-  result.safe = first * walk.watch(to);
-  if (!(result.safe > 0.0)) {
+  double alpha = first * walk.watch(to);
+  if (!(alpha > 0.0)) {
     result.result = SearchResult::kBlocked;
     return result;
   }
@@ -28,7 +28,6 @@ Search search(Walk& walk, const std::vector<double>& p, double first) {
   const std::vector<double> start = walk.x();
   double noise = -1.0;  // not needed before a trial fails
 
-  double alpha = result.safe;
   for (; result.backtracks < kBacktracks; ++result.backtracks, alpha *= 0.5) {
     walk.context.checkpoint->check();
     Coordinates::retract(start, p, alpha, to);

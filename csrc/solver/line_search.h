@@ -16,7 +16,6 @@ enum class SearchResult : std::uint8_t {
 struct Search {
   SearchResult result = SearchResult::kNoGain;
   double alpha = 0.0;  ///< fraction of the direction that was walked
-  double safe = 1.0;   ///< fraction that is free of collisions, at most what was asked for
   double gain = 0.0;   ///< change of the objective [J]
   int backtracks = 0;
   bool measured = true;  ///< the decrease was larger than what rounding can fake

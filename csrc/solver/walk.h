@@ -12,11 +12,7 @@
 
 namespace diffcloth::solver {
 
-inline double dot(const std::vector<double>& a, const std::vector<double>& b) {
-  double sum = 0.0;
-  for (std::size_t i = 0; i < a.size(); ++i) sum += a[i] * b[i];
-  return sum;
-}
+using linalg::dot;
 
 /// Largest change of a coordinate; NaN counts as infinite.
 inline double largest(const std::vector<double>& p) {

@@ -59,14 +59,18 @@ class Sum {
   ///
   /// @param any  false where it is known that there are none
   const std::vector<Contact>& contacts_at(const Array& x, bool any = true) {
-    static const std::vector<Contact> none;
-    if (!contact_) return none;
-    if (any) {
+    if (contact_ && any) {
       contact_->look_at(x.data());
-    } else {
+    } else if (contact_) {
       contact_->look_at_nothing();
     }
-    return contact_->contacts();
+    return contacts();
+  }
+
+  /// Contacts where the contact potential stands.
+  const std::vector<Contact>& contacts() const {
+    static const std::vector<Contact> none;
+    return contact_ ? contact_->contacts() : none;
   }
 
   /// Take friction from the contacts of a configuration.
@@ -199,17 +203,13 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
     }
     ++solves;
     if (step.report.result != Result::kConverged) break;
-    const std::vector<Contact>& contacts =
-        sum.objective.contact != nullptr ? sum.objective.contact->contacts() : sum.contacts_at(x);
+    const std::vector<Contact>& contacts = sum.contacts();
     keep_count(solves, contacts.size());
     // Without contact before and after, another solve would be the same one.
     if (!sum.friction && contacts.empty()) break;
     if (solves < friction_iterations) sum.lag(contacts);
   }
-  report_contacts(
-      problem.scene,
-      sum.objective.contact != nullptr ? sum.objective.contact->contacts() : sum.contacts_at(x),
-      step.report);
+  report_contacts(problem.scene, sum.contacts(), step.report);
   if (!step.tape.empty()) *step.tape["solves"] = solves;
   write_body_forces(sum, x, cloth, body_forces);
 }
