@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 import diffcloth_torch as dc
-from benchmarks.scenes import DT, Scene
+from benchmarks.scenes import DT, Scene, in_regime
 from diffcloth_torch.poses import transform  # paths that the first version has, too
 from diffcloth_torch.step import as_array
 
@@ -91,7 +91,7 @@ def time_steps(name: str, size: int, batch: int, threads: int, steps: int, scene
     simulator = dc.Simulator(scene.scene, DT)
     repeats = 3 if size <= 24 else 1
     torch.set_num_threads(threads)
-    state = _start(simulator, scene, batch)
+    state = in_regime(simulator, scene, batch)
     samples: list[dict[str, Any]] = []
     references: list[float] = []
     for k in range(WARM_UP + steps):
@@ -130,19 +130,6 @@ def reference_seconds(simulator: dc.Simulator, state: dc.State, repeats: int) ->
     inputs, _ = simulator._inputs(state, None, None)
     arrays = {name: as_array(tensor) for name, tensor in inputs.items()}
     return simulator._core.reference_factorization_seconds(arrays, repeats)
-
-
-def _start(simulator: dc.Simulator, scene: Scene, batch: int) -> dc.State:
-    """The scene in its regime; the environments of a batch differ a little from each other."""
-    state = simulator.initial_state(batch or None)
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.randn(state.positions.shape, generator=generator, dtype=torch.float64)
-    speed = torch.tensor(scene.speed, dtype=torch.float64)
-    state = state.replace(velocities=speed + 0.003 * noise)
-    with torch.no_grad():
-        for _ in range(scene.approach):
-            state = simulator.step(state, scene.control(state))
-    return state
 
 
 def _timed_step(

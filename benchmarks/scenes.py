@@ -114,3 +114,16 @@ SCENES: dict[str, Callable[[int], Scene]] = {
     "self-contact": self_contact,
     "moving-body": moving_body,
 }
+
+
+def in_regime(simulator: dc.Simulator, scene: Scene, batch: int) -> dc.State:
+    """The scene in its regime; the environments of a batch differ a little from each other."""
+    state = simulator.initial_state(batch or None)
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(state.positions.shape, generator=generator, dtype=torch.float64)
+    speed = torch.tensor(scene.speed, dtype=torch.float64)
+    state = state.replace(velocities=speed + 0.003 * noise)
+    with torch.no_grad():
+        for _ in range(scene.approach):
+            state = simulator.step(state, scene.control(state))
+    return state

@@ -43,19 +43,13 @@ def timed_steps(row: dict[str, Any]) -> Any:
     import torch
 
     import diffcloth_torch as dc
-    from benchmarks.scenes import DT, SCENES
+    from benchmarks.scenes import DT, SCENES, in_regime
 
     torch.set_num_threads(row["threads"])
     scene = SCENES[row["scene"]](row["size"])
     simulator = dc.Simulator(scene.scene, DT, solver=dc.SolverOptions(throw=False))
-    state = simulator.initial_state(row["batch"] or None)
-    generator = torch.Generator().manual_seed(0)
-    noise = torch.randn(state.positions.shape, generator=generator, dtype=torch.float64)
-    speed = torch.tensor(scene.speed, dtype=torch.float64)
-    state = state.replace(velocities=speed + 0.003 * noise)
-    with torch.no_grad():
-        for _ in range(scene.approach):
-            state = simulator.step(state, scene.control(state))
+    state = in_regime(simulator, scene, row["batch"])
+    generator = torch.Generator().manual_seed(1)
     yield {"core": dc.build_info()["factorization"]}
 
     count = row["batch"] or 1
