@@ -1,0 +1,90 @@
+"""A tree of rigid links: what a robot, or a single rigid body, is to dynamics and to the core."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from diffcloth_torch.checks import FloatArray, IndexArray
+
+__all__ = ["Mechanism"]
+
+
+@dataclass(frozen=True, eq=False)
+class Mechanism:
+    """Links and joints, in float64. A rigid body is a mechanism of one link.
+
+    The pose of a link l follows from that of its parent p and its joint's value:
+
+        T_l = T_p offset_l motion(axis_l, multiplier_l q[dof_l] + constant_l),
+
+    where motion turns about, or shifts along, the axis. Links are in the order of the file, parents
+    not necessarily first.
+
+    Attributes:
+        name: Of the robot or body.
+        base: "fixed", "kinematic" (the root link moves on prescribed poses), or "floating".
+        link_names: Names of the L links.
+        parent: Index of each link's parent, -1 for the root; shape [L].
+        kind: Joint to the parent: "fixed" (the root's too), "revolute" or "prismatic"; length L.
+        offset: Frame of that joint in the parent's frame, shape [L, 4, 4].
+        axis: Unit axis in the joint's frame, zero where it is fixed; shape [L, 3].
+        dof: Which of the J joints moves it, -1 where it is fixed; shape [L].
+        multiplier: Of that joint's value, 1 where it does not mimic; shape [L].
+        constant: Added to it [rad or m], shape [L].
+        joint_names: Names of the J joints that move and do not mimic, in the order of the file.
+        lower: Lower limits [rad or m], -infinity where there are none; shape [J].
+        upper: Upper limits, likewise.
+        actuation: "position", "velocity", "torque" or "pd" of each joint; length J.
+        mass: Of each link [kg], shape [L].
+        center: Centers of mass in the links' frames [m], shape [L, 3].
+        inertia: About the centers, in the links' axes [kg m^2], shape [L, 3, 3].
+    """
+
+    name: str
+    base: str
+    link_names: tuple[str, ...]
+    parent: IndexArray
+    kind: tuple[str, ...]
+    offset: FloatArray
+    axis: FloatArray
+    dof: IndexArray
+    multiplier: FloatArray
+    constant: FloatArray
+    joint_names: tuple[str, ...]
+    lower: FloatArray
+    upper: FloatArray
+    actuation: tuple[str, ...]
+    mass: FloatArray
+    center: FloatArray
+    inertia: FloatArray
+
+    @property
+    def link_count(self) -> int:
+        """Number of links, L."""
+        return len(self.link_names)
+
+    @property
+    def joint_count(self) -> int:
+        """Number of joints that move and do not mimic, J."""
+        return len(self.joint_names)
+
+    @property
+    def root(self) -> int:
+        """Index of the root link."""
+        return int(np.flatnonzero(self.parent < 0)[0])
+
+    @property
+    def order(self) -> tuple[int, ...]:
+        """Indices of all links, parents before their children."""
+        order = [self.root]
+        for link in order:
+            order += np.flatnonzero(self.parent == link).tolist()
+        return tuple(order)
+
+    @property
+    def is_dynamic(self) -> bool:
+        """Whether anything here moves by forces."""
+        driven = any(mode in ("torque", "pd") for mode in self.actuation)
+        return self.base == "floating" or driven
