@@ -55,6 +55,17 @@ class State:
             shape [V, 3].
         time: Time since the initial state [s], shape [].
         report: How the step that led here went; None in an initial state.
+        body_velocities: Velocity of each body's center of mass, then its angular velocity, in world
+            axes [m/s, rad/s], shape [K, 6]; zero where the body is static, and ignored by a step
+            where it is not dynamic.
+        joint_positions: Values of the joints [rad or m], shape [J].
+        joint_velocities: Their rates [rad/s or m/s], shape [J].
+        joint_targets: What pd drives pull to until a control says otherwise [rad or m], shape [J].
+        joint_efforts: What the drive, or where the joint is prescribed the constraint, applied
+            during the step that led here [N m or N], shape [J].
+        base_poses: Frame of each robot's root link, as in `body_poses`, shape [R, 7].
+        base_velocities: Velocity of its center of mass, then its angular velocity, in world axes
+            [m/s, rad/s], shape [R, 6].
     """
 
     positions: Tensor
@@ -64,7 +75,29 @@ class State:
     body_forces: Tensor
     time: Tensor
     report: Report | None = None
+    # Never None: what is left out becomes rows of zeros.
+    body_velocities: Tensor = None  # type: ignore[assignment]
+    joint_positions: Tensor = None  # type: ignore[assignment]
+    joint_velocities: Tensor = None  # type: ignore[assignment]
+    joint_targets: Tensor = None  # type: ignore[assignment]
+    joint_efforts: Tensor = None  # type: ignore[assignment]
+    base_poses: Tensor = None  # type: ignore[assignment]
+    base_velocities: Tensor = None  # type: ignore[assignment]
     _surfaces: Surfaces | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        missing = [name for name in _ADDED if getattr(self, name) is None]
+        if missing:
+            *environments, bodies = np.shape(self.body_poses)[:-1]
+            for name in missing:
+                letter, *row = STATE[name].axes[0]
+                shape = (*environments, bodies if letter == "K" else 0, *row)
+                object.__setattr__(self, name, torch.zeros(shape, dtype=torch.float64))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # States that the first version saved have no robots, and bodies without velocities.
+        self.__dict__.update(state)
+        self.__post_init__()
 
     @property
     def batch_size(self) -> int | None:
@@ -150,6 +183,8 @@ class State:
 
 
 _TENSORS = tuple(STATE)
+# Fields that states of the first version lack.
+_ADDED = _TENSORS[_TENSORS.index("body_velocities") :]
 
 
 def stack(states: Sequence[State]) -> State:
