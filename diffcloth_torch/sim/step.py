@@ -45,7 +45,7 @@ __all__ = [
 # Values of the core's `status`, per environment.
 CONVERGED, UNCONVERGED, INFEASIBLE, INTERSECTING = 0, 1, 2, 3
 
-_OUTPUTS = ("positions", "velocities", "body_forces")
+_OUTPUTS = ("positions", "velocities", "body_forces", "coordinates")
 _TAPE = "tape_"
 _TRANSFORMS = (
     "step: torch.func transforms, forward-mode derivatives and vectorized Jacobians are not "
@@ -64,12 +64,14 @@ class Outcome(NamedTuple):
         positions: [B, N, 3], or [N, 3] without a batch axis.
         velocities: Likewise.
         body_forces: [B, V, 3] or [V, 3].
+        coordinates: Of bodies and robots at the end of the step, [B, n] or [n].
         diagnostics: Arrays [B] of the core: status, message and the entries of the report.
     """
 
     positions: Tensor
     velocities: Tensor
     body_forces: Tensor
+    coordinates: Tensor
     diagnostics: dict[str, Any]
 
 
@@ -87,8 +89,8 @@ def take_step(core: _core.Simulator, inputs: dict[str, Tensor], *, batched: bool
         result = _forward(core, {name: as_array(t) for name, t in inputs.items()}, tape=False)
         return Outcome(*_outputs(result, batched), _diagnostics(result))
     diagnostics: dict[str, Any] = {}
-    x, v, f = _Step.apply(core, tuple(inputs), batched, diagnostics, *inputs.values())
-    return Outcome(x, v, f, diagnostics)
+    outputs = _Step.apply(core, tuple(inputs), batched, diagnostics, *inputs.values())
+    return Outcome(*outputs, diagnostics)
 
 
 def refuse_transforms(*records: object) -> None:
@@ -116,10 +118,9 @@ def _forward(core: _core.Simulator, arrays: dict[str, Any], *, tape: bool) -> di
         raise SimulationError(f"step: {error}") from error
 
 
-def _outputs(result: dict[str, Any], batched: bool) -> tuple[Tensor, Tensor, Tensor]:
+def _outputs(result: dict[str, Any], batched: bool) -> tuple[Tensor, ...]:
     arrays = (result[name] for name in _OUTPUTS)
-    x, v, f = (torch.from_numpy(array if batched else array[0]) for array in arrays)
-    return x, v, f
+    return tuple(torch.from_numpy(array if batched else array[0]) for array in arrays)
 
 
 def _diagnostics(result: dict[str, Any]) -> dict[str, Any]:
