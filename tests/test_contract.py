@@ -131,8 +131,15 @@ def test_states_and_parameters_are_new_each_time(sim):
     assert sim.parameters().stretch.item() == dc.Material().stretch
 
 
-def test_slices_give_the_rows_of_each_cloth(sim):
-    assert sim.slices == {"sheet": slice(0, 16), "cloth1": slice(16, 25)}
+def test_slices_give_the_rows_of_each_surface(sim):
+    assert sim.surfaces == ("sheet", "cloth1", "floor", "box")
+    assert sim.slices == {
+        "sheet": slice(0, 16),
+        "cloth1": slice(16, 25),
+        "floor": slice(0, 4),  # rows in body_forces
+        "box": slice(4, 12),
+    }
+    assert sim.joint_slices == {}
 
 
 def test_parameters_are_as_small_as_the_scene_allows(sim):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray
@@ -32,6 +33,7 @@ class Layout:
         assembly: Arrays of the scene.
         bodies: Mechanism of each of the K bodies.
         robots: Mechanism of each of the R robots.
+        kinematic_bodies: Indices of the bodies on prescribed poses.
         is_dynamic: Whether forces move anything but the cloths.
         groups: Field of a control -> name -> rows.
         kept: "body_poses" or "base_poses" -> why each row must be the state's, "" where it need not.
@@ -48,6 +50,8 @@ class Layout:
         self.assembly = assembly
         self.bodies = assembly.mechanisms[: assembly.body_count]
         self.robots = assembly.mechanisms[assembly.body_count :]
+        kinematic = [k for k, body in enumerate(self.bodies) if body.base == "kinematic"]
+        self.kinematic_bodies = torch.tensor(kinematic, dtype=torch.int64)
         self.is_dynamic = any(mechanism.is_dynamic for mechanism in assembly.mechanisms)
         self.joint_names = tuple(f"{r.name}/{joint}" for r in self.robots for joint in r.joint_names)
         self.actuation = tuple(mode for robot in self.robots for mode in robot.actuation)

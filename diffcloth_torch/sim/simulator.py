@@ -34,6 +34,7 @@ from diffcloth_torch.sim.inputs import (
     state_fields,
 )
 from diffcloth_torch.sim.layout import Layout
+from diffcloth_torch.sim.motion import prescribed_motion
 from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.rollout import roll_out
 from diffcloth_torch.sim.state import State, Surfaces
@@ -251,19 +252,21 @@ class Simulator:
             InvalidInput: If a shape or value is not accepted.
             TypeError: If a tensor of the state is not float64 on the CPU.
         """
-        inputs, batch = self._inputs(state, control, parameters)
+        (before, wanted, physical), batch = self._fields(state, control, parameters)
+        inputs = self._core_inputs(before, wanted, physical)
         outcome = take_step(self._core, inputs, batched=batch is not None)
         report = make_report(outcome.diagnostics, self._core.phases, batched=batch is not None)
         raise_on_failure(
             outcome.diagnostics, report, throw=self.solver.throw, batched=batch is not None
         )
+        after = prescribed_motion(self._layout, before, wanted, self.dt)
+        after["soft_pin_targets"] = wanted["soft_pins"]
+        after["time"] = before["time"] + self.dt
         return State(
             positions=outcome.positions,
             velocities=outcome.velocities,
-            body_poses=_own_copy(inputs["body_targets"], batch),
-            soft_pin_targets=_own_copy(inputs["soft_pin_targets"], batch),
             body_forces=outcome.body_forces,
-            time=_own_copy((state.time + self.dt).reshape(-1), batch),
+            **{name: _own_copy(values, batch) for name, values in after.items()},
             report=report,
             _surfaces=self._surfaces,
         )
