@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.dynamics.kinematics import Tree
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.quantities import CONTROL, Shape
@@ -33,6 +35,8 @@ class Layout:
         assembly: Arrays of the scene.
         bodies: Mechanism of each of the K bodies.
         robots: Mechanism of each of the R robots.
+        trees: Kinematics of each robot.
+        rigid_vertices: Name of a body, or "robot/link" -> its rows among the V vertices.
         kinematic_bodies: Indices of the bodies on prescribed poses.
         is_dynamic: Whether forces move anything but the cloths.
         groups: Field of a control -> name -> rows.
@@ -50,6 +54,14 @@ class Layout:
         self.assembly = assembly
         self.bodies = assembly.mechanisms[: assembly.body_count]
         self.robots = assembly.mechanisms[assembly.body_count :]
+        self.trees = tuple(Tree(robot) for robot in self.robots)
+        starts = assembly.body_vertex_start.tolist()
+        self.rigid_vertices = {
+            name: slice(*ends)
+            for name, ends in zip(
+                assembly.surface_names[assembly.cloth_count :], pairwise(starts), strict=True
+            )
+        }
         kinematic = [k for k, body in enumerate(self.bodies) if body.base == "kinematic"]
         self.kinematic_bodies = torch.tensor(kinematic, dtype=torch.int64)
         self.is_dynamic = any(mechanism.is_dynamic for mechanism in assembly.mechanisms)

@@ -34,6 +34,7 @@ from diffcloth_torch.sim.inputs import (
     state_fields,
 )
 from diffcloth_torch.sim.layout import Layout
+from diffcloth_torch.sim.links import contact_wrenches, link_poses, link_velocities
 from diffcloth_torch.sim.motion import prescribed_motion
 from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.rollout import roll_out
@@ -126,9 +127,10 @@ class Simulator:
         self._layout = Layout(self._assembly)
         _check_motion(self)
         self.surfaces = self._assembly.surface_names
-        starts = (self._assembly.cloth_vertex_start, self._assembly.body_vertex_start)
-        rows = [slice(a, b) for start in starts for a, b in pairwise(start.tolist())]
-        self.slices = dict(zip(self.surfaces, rows, strict=True))
+        starts = self._assembly.cloth_vertex_start.tolist()
+        rows = [slice(a, b) for a, b in pairwise(starts)]
+        cloths = zip(scene.cloth_names, rows, strict=True)
+        self.slices = {**dict(cloths), **self._layout.rigid_vertices}
         self.joint_slices = dict(self._assembly.joint_slices)
         self._surfaces = _surfaces(scene, self._assembly)
         self._core = _make_core(self)
@@ -308,6 +310,65 @@ class Simulator:
             steps,
             checkpoint_every,
         )
+
+    def link_poses(self, state: State) -> dict[str, Tensor]:
+        """Frames of the links of all robots, differentiable in the state.
+
+        Args:
+            state: Where things are.
+
+        Returns:
+            "robot/link" -> homogeneous matrix from the link to the world, shape [4, 4], or
+            [B, 4, 4] in a batch.
+        """
+        fields, batch = state_fields(self._layout, state)
+        return _unbatched(link_poses(self._layout, fields), batch)
+
+    def link_velocities(
+        self, state: State, parameters: Parameters | None = None
+    ) -> dict[str, Tensor]:
+        """Velocities of the links of all robots, differentiable in both arguments.
+
+        Args:
+            state: How things move.
+            parameters: Physical parameters, of which the centers of mass count; None takes those
+                of the scene.
+
+        Returns:
+            "robot/link" -> velocity of the link's center of mass (of the origin of its frame where
+            the robot is not dynamic), then its angular velocity, in world axes [m/s, rad/s], shape
+            [6], or [B, 6] in a batch.
+        """
+        fields, batch = state_fields(self._layout, state)
+        centers = self._centers("link", parameters, batch)
+        return _unbatched(link_velocities(self._layout, fields, centers), batch)
+
+    def contact_wrenches(
+        self, state: State, parameters: Parameters | None = None
+    ) -> dict[str, Tensor]:
+        """What the contact forces of a state add up to, differentiable in both arguments.
+
+        Args:
+            state: Its `body_forces` are added up where its bodies and links are.
+            parameters: Physical parameters, of which the centers of mass count; None takes those
+                of the scene.
+
+        Returns:
+            Name of a body, or "robot/link" -> force, then torque about the center of mass (about
+            the origin of its frame where it is not dynamic), in world axes [N, N m], shape [6], or
+            [B, 6] in a batch.
+        """
+        fields, batch = state_fields(self._layout, state)
+        forces = state.body_forces if batch is not None else state.body_forces.unsqueeze(0)
+        centers = [self._centers(owner, parameters, batch) for owner in ("body", "link")]
+        return _unbatched(contact_wrenches(self._layout, fields, forces, *centers), batch)
+
+    def _centers(self, owner: str, parameters: Parameters | None, batch: int | None) -> Tensor:
+        """Centers of mass of bodies or links, zero where nothing is dynamic; [B or 1, rows, 3]."""
+        given = Parameters() if parameters is None else parameters
+        fields = parameter_fields(self._layout, given, self._defaults, batch)
+        rows = self._assembly.sizes["K" if owner == "body" else "L"]
+        return fields.get(f"{owner}_center", torch.zeros(1, rows, 3, dtype=torch.float64))
 
     def energy(self, state: State, parameters: Parameters | None = None) -> Tensor:
         """Elastic energy, gravity, soft pins and barrier at the positions of a state [J].
@@ -491,6 +552,10 @@ def _arrays(inputs: Inputs) -> dict[str, NDArray[np.float64]]:
 
 def _scalar(value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
+
+
+def _unbatched(named: dict[str, Tensor], batch: int | None) -> dict[str, Tensor]:
+    return named if batch is not None else {name: tensor[0] for name, tensor in named.items()}
 
 
 def _own_copy(tensor: Tensor, batch: int | None) -> Tensor:
