@@ -35,6 +35,9 @@ struct Description {
   std::vector<Index> soft_pins;                    ///< [Q]
   bodies::BodySet bodies;
   std::vector<std::array<Index, 3>> body_faces;  ///< indices into the bodies' vertices
+  /// [surfaces of bodies] whether dynamics moves them; empty: none is moved
+  std::vector<char> body_dynamic;
+  std::vector<std::array<Index, 2>> ignored_pairs;  ///< pairs of surfaces that never touch
   bool self_contact = true;
   double dt = 0.01;
   std::string scheme = "coupled";

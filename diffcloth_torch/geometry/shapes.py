@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray
 
-__all__ = ["box", "capsule", "cylinder", "grid", "plane", "sphere"]
+__all__ = ["Mesh", "box", "capsule", "cylinder", "grid", "plane", "sphere"]
 
 Mesh = tuple[FloatArray, NDArray[np.int64]]
 
