@@ -127,13 +127,12 @@ def pose_velocities(start: Tensor, end: Tensor, dt: float) -> Tensor:
     Returns:
         Linear velocities [m/s] and angular velocities [rad/s] in world axes, shape [..., 6].
     """
-    lengths = [
-        torch.linalg.vector_norm(q, dim=-1, keepdim=True) for q in (start[..., 3:], end[..., 3:])
-    ]
-    conjugate = (
-        start[..., 3:] / lengths[0] * torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=start.dtype)
+    before, after = (
+        pose[..., 3:] / torch.linalg.vector_norm(pose[..., 3:], dim=-1, keepdim=True)
+        for pose in (start, end)
     )
-    turn = quaternion_log(quaternion_multiply(end[..., 3:] / lengths[1], conjugate))
+    conjugate = before * torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=before.dtype)
+    turn = quaternion_log(quaternion_multiply(after, conjugate))
     return torch.cat([end[..., :3] - start[..., :3], turn], dim=-1) / dt
 
 

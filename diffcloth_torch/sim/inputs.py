@@ -195,7 +195,9 @@ def control_fields(
         driven = torch.tensor([mode == "pd" for mode in layout.actuation], dtype=torch.bool)
         unset |= {
             "body_wrenches": _zeros(len(layout.bodies), 6),
-            "joint_positions": torch.where(driven, state["joint_targets"], state["joint_positions"]),
+            "joint_positions": torch.where(
+                driven, state["joint_targets"], state["joint_positions"]
+            ),
             "joint_velocities": _zeros(len(layout.joint_names)),
             "joint_efforts": _zeros(len(layout.joint_names)),
             "base_poses": state["base_poses"],
@@ -349,9 +351,7 @@ def _check_values(layout: Layout, name: str, values: FloatArray, default: FloatA
 def _refuse_row(label: str, wrong: NDArray[np.bool_], accepted: str) -> None:
     if wrong.any():
         row = int(np.argwhere(wrong)[0][-1])
-        raise InvalidInput(
-            f"{label} must be {accepted} in the row [{row}], of what forces move"
-        )
+        raise InvalidInput(f"{label} must be {accepted} in the row [{row}], of what forces move")
 
 
 def _environments(

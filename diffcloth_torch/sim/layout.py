@@ -40,7 +40,7 @@ class Layout:
         kinematic_bodies: Indices of the bodies on prescribed poses.
         is_dynamic: Whether forces move anything but the cloths.
         groups: Field of a control -> name -> rows.
-        kept: "body_poses" or "base_poses" -> why each row must be the state's, "" where it need not.
+        kept: "body_poses" or "base_poses" -> why each row must be the state's, or "".
         unforced: "body_wrenches" or "base_wrenches" -> why each row must be zero, or "".
         joint_names: "robot/joint" of each of the J joints.
         actuation: Of each joint, length J.
@@ -65,7 +65,9 @@ class Layout:
         kinematic = [k for k, body in enumerate(self.bodies) if body.base == "kinematic"]
         self.kinematic_bodies = torch.tensor(kinematic, dtype=torch.int64)
         self.is_dynamic = any(mechanism.is_dynamic for mechanism in assembly.mechanisms)
-        self.joint_names = tuple(f"{r.name}/{joint}" for r in self.robots for joint in r.joint_names)
+        self.joint_names = tuple(
+            f"{r.name}/{joint}" for r in self.robots for joint in r.joint_names
+        )
         self.actuation = tuple(mode for robot in self.robots for mode in robot.actuation)
         self.lower = _joined([robot.lower for robot in self.robots])
         self.upper = _joined([robot.upper for robot in self.robots])

@@ -8,29 +8,23 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from diffcloth_torch.dynamics.kinematics import Tree, root_frame
-from diffcloth_torch.geometry.rotation import quaternion_matrix
+from diffcloth_torch.dynamics.kinematics import Tree
+from diffcloth_torch.model.kinematics import link_frames, pose_frame
 from diffcloth_torch.sim.inputs import Fields
 from diffcloth_torch.sim.layout import Layout
 
-__all__ = ["contact_wrenches", "link_poses", "link_velocities", "pose_frames"]
+__all__ = ["contact_wrenches", "link_poses", "link_velocities"]
 
 ByName = dict[str, Tensor]
 
 
-def pose_frames(poses: Tensor) -> Tensor:
-    """Frames [..., 4, 4] of poses [..., 7]."""
-    quaternions = poses[..., 3:] / torch.linalg.vector_norm(poses[..., 3:], dim=-1, keepdim=True)
-    origin = torch.zeros(3, dtype=poses.dtype)
-    return root_frame(poses[..., :3], quaternion_matrix(quaternions), origin)
-
-
 def link_poses(layout: Layout, state: Fields) -> ByName:
     """Frames of all links, "robot/link" -> [B, 4, 4]."""
-    bases = pose_frames(state["base_poses"])
-    named = {}
+    bases = pose_frame(state["base_poses"])
+    named: ByName = {}
     for r, (tree, joints) in enumerate(_trees(layout)):
-        frames = tree.poses(bases[:, r], state["joint_positions"][:, joints])
+        positions = state["joint_positions"][:, joints]
+        frames = link_frames(tree.mechanism, bases[:, r], positions)
         named |= _by_link(tree, frames)
     return named
 
@@ -43,14 +37,16 @@ def link_velocities(layout: Layout, state: Fields, link_centers: Tensor) -> ByNa
         state: Fields of a state.
         link_centers: In the links' frames [m], shape [B or 1, L, 3].
     """
-    bases = pose_frames(state["base_poses"])
-    named = {}
+    bases = pose_frame(state["base_poses"])
+    named: ByName = {}
     first = 0
     for r, (tree, joints) in enumerate(_trees(layout)):
         links = slice(first, first := first + tree.mechanism.link_count)
         positions = state["joint_positions"][:, joints]
         frames = tree.frames(bases[:, r], positions, link_centers[:, links])
-        rates = torch.cat([state["base_velocities"][:, r], state["joint_velocities"][:, joints]], -1)
+        rates = torch.cat(
+            [state["base_velocities"][:, r], state["joint_velocities"][:, joints]], -1
+        )
         twists = (tree.jacobian(frames) @ rates[:, None, :, None])[..., 0]
         named |= _by_link(tree, twists)
     return named
@@ -68,13 +64,13 @@ def contact_wrenches(
         body_centers: In the bodies' frames [m], shape [B or 1, K, 3].
         link_centers: In the links' frames [m], shape [B or 1, L, 3].
     """
-    bodies = pose_frames(state["body_poses"])
+    bodies = pose_frame(state["body_poses"])
     frames = {body.name: bodies[:, k] for k, body in enumerate(layout.bodies)}
     frames |= link_poses(layout, state)
     environments = max(len(body_centers), len(link_centers))
     of_all = [c.expand(environments, -1, -1) for c in (body_centers, link_centers)]
     centers = torch.cat(of_all, dim=1)
-    named = {}
+    named: ByName = {}
     for i, (name, frame) in enumerate(frames.items()):
         rows = layout.rigid_vertices.get(name, slice(0, 0))
         vertices = torch.from_numpy(layout.assembly.body_vertices[rows])
@@ -82,7 +78,6 @@ def contact_wrenches(
         torques = torch.linalg.cross(arms, forces[:, rows])
         named[name] = torch.cat([forces[:, rows].sum(1), torques.sum(1)], dim=-1)
     return named
-
 
 
 def _trees(layout: Layout) -> list[tuple[Tree, slice]]:

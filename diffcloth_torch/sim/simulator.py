@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch import _core
-from diffcloth_torch.checks import POSITIVE, check_choice, check_count, check_number
+from diffcloth_torch.checks import (
+    POSITIVE,
+    check_choice,
+    check_count,
+    check_number,
+    check_shape,
+)
 from diffcloth_torch.errors import IntersectingState, InvalidInput
 from diffcloth_torch.model.defaults import (
     check_barrier,
@@ -21,8 +27,8 @@ from diffcloth_torch.model.defaults import (
     scene_parameters,
 )
 from diffcloth_torch.model.options import COUPLINGS, SCHEMES, ContactOptions, SolverOptions
-from diffcloth_torch.model.scene import Assembly, Scene, assemble
 from diffcloth_torch.model.quantities import STATE, shape_of
+from diffcloth_torch.model.scene import Assembly, Scene, assemble
 from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.inputs import (
     Fields,
@@ -38,7 +44,7 @@ from diffcloth_torch.sim.links import contact_wrenches, link_poses, link_velocit
 from diffcloth_torch.sim.motion import prescribed_motion
 from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.rollout import roll_out
-from diffcloth_torch.sim.state import State, Surfaces
+from diffcloth_torch.sim.state import LinkSurfaces, State, Surfaces
 from diffcloth_torch.sim.step import as_array, refuse_transforms, take_step
 
 __all__ = ["Simulator"]
@@ -360,6 +366,8 @@ class Simulator:
         """
         fields, batch = state_fields(self._layout, state)
         forces = state.body_forces if batch is not None else state.body_forces.unsqueeze(0)
+        shape = (len(fields["positions"]), *self._assembly.body_vertices.shape)
+        check_shape("contact_wrenches: `state.body_forces`", forces.shape, [shape])
         centers = [self._centers(owner, parameters, batch) for owner in ("body", "link")]
         return _unbatched(contact_wrenches(self._layout, fields, forces, *centers), batch)
 
@@ -460,7 +468,7 @@ class Simulator:
             stiffness = self._core.default_barrier_stiffness(_arrays(inputs), distance)
         self._defaults["barrier_stiffness"] = _scalar(stiffness)
 
-    def _check_barrier(self, owner: str, inputs: Inputs) -> None:
+    def _check_barrier(self, owner: str, inputs: Fields) -> None:
         if "barrier_distance" in inputs and self.contact.self_contact:
             thickness = as_array(inputs["thickness"])[:, : self._assembly.cloth_count]
             distance = as_array(inputs["barrier_distance"])
@@ -543,10 +551,14 @@ def _surfaces(scene: Scene, assembly: Assembly) -> Surfaces:
         body_names=list(scene.body_names),
         body_vertices=[torch.from_numpy(np.array(body.vertices)) for body in scene.bodies],
         body_faces=[torch.from_numpy(np.array(body.faces)) for body in scene.bodies],
+        robots=tuple(
+            LinkSurfaces.of(name, robot)
+            for name, robot in zip(scene.robot_names, scene.robots, strict=True)
+        ),
     )
 
 
-def _arrays(inputs: Inputs) -> dict[str, NDArray[np.float64]]:
+def _arrays(inputs: Fields) -> dict[str, NDArray[np.float64]]:
     return {name: as_array(tensor) for name, tensor in inputs.items()}
 
 

@@ -24,7 +24,16 @@ def tree_arguments(assembly: Assembly, limit_stiffness: FloatArray) -> dict[str,
     """
     links: dict[str, list[Any]] = {
         name: []
-        for name in ("tree", "parent", "kind", "offset", "axis", "coordinate", "multiplier", "constant")
+        for name in (
+            "tree",
+            "parent",
+            "kind",
+            "offset",
+            "axis",
+            "coordinate",
+            "multiplier",
+            "constant",
+        )
     }
     prescribed: list[bool] = []
     lower: list[float] = []
