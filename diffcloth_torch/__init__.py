@@ -13,7 +13,7 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import Any
 
-from diffcloth_torch import _core
+from diffcloth_torch import _core, robots
 from diffcloth_torch._moved import MOVED, find_old_modules
 from diffcloth_torch.errors import (
     IgnoredLimitsWarning,
@@ -54,6 +54,7 @@ __all__ = [
     "SolverOptions",
     "State",
     "build_info",
+    "robots",
     "stack",
     "where",
 ]

@@ -22,6 +22,7 @@ PUBLIC = {
         "barrier_distance barrier_stiffness friction_iterations slip_velocity self_contact"
     ),
     "Control": "pins soft_pins body_poses forces replace",
+    "IgnoredLimitsWarning": "",
     "InfeasibleMotion": "",
     "IntersectingState": "",
     "InvalidInput": "",
@@ -32,13 +33,15 @@ PUBLIC = {
         "barrier_distance slip_velocity pin_stiffness gravity rest_positions replace"
     ),
     "Report": "select stack where",
-    "RigidBody": "load box sphere capsule plane",
+    "RigidBody": "load box sphere capsule cylinder plane",
+    "Robot": "load forward_kinematics joint_names link_names",
     "Scene": "",
     "SimulationError": "",
     "Simulator": "initial_state control parameters step rollout energy",
     "SolverOptions": "tolerance max_iterations throw metric",
     "State": "batch_size replace detach export",
     "build_info": "",
+    "robots": "GRIPPER panda",
     "stack": "",
     "where": "",
 }

@@ -365,19 +365,22 @@ def _link(link: Any) -> Link:
     )
 
 
+_SIZES = {
+    "box": ("size",),
+    "cylinder": ("radius", "length"),
+    "sphere": ("radius",),
+    "mesh": ("scale",),
+}
+
+
 def _shape(collision: Any) -> Shape:
     geometry = collision.geometry
     kind = type(geometry).__name__.lower()
-    sizes = {
-        "box": lambda: geometry.size,
-        "cylinder": lambda: (geometry.radius, geometry.length),
-        "sphere": lambda: (geometry.radius,),
-        "mesh": lambda: geometry.scale,
-    }
+    size = np.hstack([getattr(geometry, field) for field in _SIZES[kind]])
     return Shape(
         kind=kind,
         frame=_frame(collision.origin),
-        size=tuple(sizes[kind]()),
+        size=tuple(size.tolist()),
         filename=geometry.filename if kind == "mesh" else "",
     )
 
