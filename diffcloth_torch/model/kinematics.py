@@ -43,7 +43,7 @@ def link_frames(mechanism: Mechanism, root_frame: Tensor, joint_positions: Tenso
     """
     shape = np.broadcast_shapes(root_frame.shape[:-2], joint_positions.shape[:-1])
     frames: list[Tensor] = [root_frame] * mechanism.link_count
-    offset, axis = torch.from_numpy(mechanism.offset), torch.from_numpy(mechanism.axis)
+    offset, axis = (torch.from_numpy(np.array(a)) for a in (mechanism.offset, mechanism.axis))
     for link in mechanism.order:
         if link == mechanism.root:
             frames[link] = root_frame.expand(*shape, 4, 4)

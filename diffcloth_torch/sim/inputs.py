@@ -154,12 +154,14 @@ def _named_targets(layout: Layout, field: str, given: Mapping[str, object]) -> d
 
 def _check_rows(layout: Layout, field: str, values: FloatArray, first: int = 0) -> None:
     """Refuse wrenches on what forces do not move, and joint positions beyond a limit."""
-    for k, why in enumerate(layout.unforced.get(field, ())[first : first + values.shape[-2]]):
-        if why and values[..., k, :].any():
-            raise InvalidInput(
-                f"control: `{field}` must be zero in the row [{first + k}]: {why}, and no force "
-                "moves it"
-            )
+    if field in layout.unforced:
+        rows = slice(first, first + values.shape[-2])
+        for k, why in enumerate(layout.unforced[field][rows]):
+            if why and values[..., k, :].any():
+                raise InvalidInput(
+                    f"control: `{field}` must be zero in the row [{first + k}]: {why}, and no "
+                    "force moves it"
+                )
     if field == "joint_positions":
         rows = slice(first, first + values.shape[-1])
         lower, upper = layout.lower[rows], layout.upper[rows]
