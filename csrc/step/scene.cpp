@@ -25,7 +25,12 @@ contact::CollisionMesh make_collision_mesh(const Description& d) {
     std::fill(surface.begin() + cloth_vertices + d.bodies.vertex_start[k],
               surface.begin() + cloth_vertices + d.bodies.vertex_start[k + 1], cloths + k);
   }
-  return {std::move(faces), std::move(surface), cloths, d.self_contact};
+  return {std::move(faces), std::move(surface), cloths,
+          contact::touching_surfaces({.surface_count = cloths + d.bodies.count(),
+                                      .cloth_count = cloths,
+                                      .self_contact = d.self_contact,
+                                      .body_dynamic = d.body_dynamic,
+                                      .ignored = d.ignored_pairs})};
 }
 
 /// All surfaces as given: the reference that the collision trees are built from.

@@ -1,3 +1,4 @@
+#include <array>
 #include <string>
 #include <tuple>
 #include <utility>
@@ -6,6 +7,7 @@
 #include <Eigen/Core>
 #include <nanobind/eigen/dense.h>
 #include <nanobind/nanobind.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
@@ -39,11 +41,11 @@ class ContactPotential {
   ContactPotential(const FaceRows& faces,
                    std::vector<Index> vertex_surface,
                    Index cloth_count,
-                   bool self_contact,
+                   contact::SurfacePairs touching,
                    const Positions& X,
                    const std::vector<bool>& prescribed,
                    contact::Parameters parameters)
-      : mesh_(face_list(faces), std::move(vertex_surface), cloth_count, self_contact),
+      : mesh_(face_list(faces), std::move(vertex_surface), cloth_count, std::move(touching)),
         prescribed_(prescribed.begin(), prescribed.end()),
         weights_(mesh_, X.data(), prescribed_),
         rest_(contact::measure(mesh_, X.data())),
@@ -253,9 +255,13 @@ void contact_potentials(nb::module_& m) {
           [](ContactPotential* self, const FaceRows& faces, std::vector<Index> vertex_surface,
              Index cloth_count, bool self_contact, const Positions& X,
              const std::vector<bool>& prescribed, double kappa, double d_hat, double slip,
-             std::vector<double> thickness, std::vector<double> friction) {
-            new (self) ContactPotential(faces, std::move(vertex_surface), cloth_count, self_contact,
-                                        X, prescribed,
+             std::vector<double> thickness, std::vector<double> friction,
+             const std::vector<bool>& body_dynamic,
+             const std::vector<std::array<Index, 2>>& ignored_pairs) {
+            contact::SurfacePairs touching = touching_surfaces(
+                vertex_surface, cloth_count, self_contact, body_dynamic, ignored_pairs);
+            new (self) ContactPotential(faces, std::move(vertex_surface), cloth_count,
+                                        std::move(touching), X, prescribed,
                                         {.kappa = kappa,
                                          .d_hat = d_hat,
                                          .slip = slip,
@@ -263,7 +269,9 @@ void contact_potentials(nb::module_& m) {
                                          .friction = std::move(friction)});
           },
           "faces"_a, "vertex_surface"_a, "cloth_count"_a, "self_contact"_a, "X"_a, "prescribed"_a,
-          "kappa"_a, "d_hat"_a, "slip"_a, "thickness"_a, "friction"_a)
+          "kappa"_a, "d_hat"_a, "slip"_a, "thickness"_a, "friction"_a,
+          "body_dynamic"_a = std::vector<bool>{},
+          "ignored_pairs"_a = std::vector<std::array<Index, 2>>{})
       .def("candidate_count", &ContactPotential::candidate_count, "x"_a)
       .def("energies", &ContactPotential::energies, "x"_a, "other"_a)
       .def("contacts", &ContactPotential::contacts, "x"_a)
