@@ -471,6 +471,12 @@ void simulator(nb::module_& m) {
                  nb::cast<std::string>(k["metric"]), nb::cast<int>(k["friction_iterations"]),
                  nb::cast<double>(k["tolerance"]), nb::cast<int>(k["max_iterations"]));
              if (k.contains("tree_free")) description.mechanisms = describe_mechanisms(k);
+             if (k.contains("ignored_pairs")) {
+               const std::vector<Index> pairs = to_vector(indices("ignored_pairs"));
+               for (std::size_t p = 0; p + 1 < pairs.size(); p += 2) {
+                 description.ignored_pairs.push_back({pairs[p], pairs[p + 1]});
+               }
+             }
              new (self) Simulator(std::move(description));
            })
       .def("forward", &Simulator::forward, "inputs"_a, "tape"_a, "threads"_a)

@@ -9,7 +9,8 @@
 namespace diffcloth::step {
 namespace {
 
-contact::CollisionMesh make_collision_mesh(const Description& d) {
+contact::CollisionMesh make_collision_mesh(const Description& d,
+                                           const bodies::Mechanisms& mechanisms) {
   const auto cloth_vertices = static_cast<Index>(d.vertices.size() / 3);
   const auto cloths = static_cast<Index>(d.bending_models.size());
   std::vector<std::array<Index, 3>> faces = d.faces;
@@ -21,7 +22,9 @@ contact::CollisionMesh make_collision_mesh(const Description& d) {
     std::fill(surface.begin() + d.cloth_vertex_start[c],
               surface.begin() + d.cloth_vertex_start[c + 1], c);
   }
+  std::vector<char> dynamic;
   for (Index k = 0; k < d.bodies.count(); ++k) {
+    dynamic.push_back(mechanisms.is_dynamic(k) ? 1 : 0);
     std::fill(surface.begin() + cloth_vertices + d.bodies.vertex_start[k],
               surface.begin() + cloth_vertices + d.bodies.vertex_start[k + 1], cloths + k);
   }
@@ -29,7 +32,7 @@ contact::CollisionMesh make_collision_mesh(const Description& d) {
           contact::touching_surfaces({.surface_count = cloths + d.bodies.count(),
                                       .cloth_count = cloths,
                                       .self_contact = d.self_contact,
-                                      .body_dynamic = d.body_dynamic,
+                                      .body_dynamic = dynamic,
                                       .ignored = d.ignored_pairs})};
 }
 
@@ -157,7 +160,7 @@ Scene::Scene(Description description)
       stencils(mesh::choose_stencils(topology, given.rest_vertices.data(), face_models(given))),
       rest(mesh::rest_shape(topology, stencils, given.rest_vertices.data())),
       mechanisms(complete(given), given.bodies),
-      collision_mesh(make_collision_mesh(given)),
+      collision_mesh(make_collision_mesh(given, mechanisms)),
       mean_edge(mean_length(rest, collision_mesh, given.bodies)),
       prescribed(make_prescribed(given, mechanisms)),
       measures(contact::measure(collision_mesh, all_rest_positions(given).data())),

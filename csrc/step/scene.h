@@ -37,8 +37,6 @@ struct Description {
   bodies::BodySet bodies;
   bodies::MechanismsDescription mechanisms;      ///< empty: every body is a tree of one link
   std::vector<std::array<Index, 3>> body_faces;  ///< indices into the bodies' vertices
-  /// [surfaces of bodies] whether dynamics moves them; empty: none is moved
-  std::vector<char> body_dynamic;
   std::vector<std::array<Index, 2>> ignored_pairs;  ///< pairs of surfaces that never touch
   bool self_contact = true;
   double dt = 0.01;
