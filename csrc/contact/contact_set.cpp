@@ -54,10 +54,6 @@ bool ContactModel::between_cloths(const Candidate& pair) const {
   return surface_a(pair) < mesh_.cloth_count && surface_b(pair) < mesh_.cloth_count;
 }
 
-bool ContactModel::has_prescribed(const std::array<Index, 4>& vertices) const {
-  return std::ranges::any_of(vertices, [&](Index v) { return prescribed_[v] != 0; });
-}
-
 // What multiplies a contact's coefficient to make its weight.
 double ContactModel::area(const Candidate& pair) const {
   if (pair.kind == PairKind::kPointTriangle) {

@@ -126,8 +126,6 @@ class ContactModel {
                  Bar& bar) const;
   void pull_back_mu(const Candidate& pair, double mu_bar, Bar& bar) const;
 
-  /// Whether some of these vertices are prescribed.
-  bool has_prescribed(const std::array<Index, 4>& vertices) const;
 
  private:
   /// Candidates that act together: one, or those of a point or an edge and a body.

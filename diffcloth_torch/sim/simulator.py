@@ -475,12 +475,8 @@ class Simulator:
             check_barrier(owner, distance, thickness, self._nonadjacent_distance)
 
     def _check_overlap(self) -> None:
-        thickness = self._defaults.get("thickness")
-        overlap = self._core.find_overlap(
-            self._assembly.vertices,
-            self._assembly.body_poses,
-            np.zeros(self._assembly.surface_count) if thickness is None else as_array(thickness),
-        )
+        inputs, _ = self._inputs(self.initial_state(), None, None)
+        overlap = self._core.find_overlap(_arrays(inputs))
         if overlap is not None:
             raise IntersectingState(
                 "Simulator: surfaces of the scene intersect, or are closer than their thickness: "
