@@ -131,7 +131,7 @@ def test_a_batch_takes_shared_and_own_values(layout, scene):
     assert torch.equal(control["joint_positions"][:, SLIDE], own)
     assert control["joint_positions"][:, TURN].tolist() == [0.5] * 3
     assert torch.equal(control["joint_efforts"][:, SPIN], rows(3, 5)[:, SPIN])
-    with pytest.raises(dc.InvalidInput, match=r"`joint_positions\['slide'\]` has a batch axis"):
+    with pytest.raises(dc.InvalidInput, match=r"`joint_positions\['arm/slide'\]` has a batch axis"):
         complete(layout, scene, dc.Control(joint_positions={"slide": own}))
     with pytest.raises(dc.InvalidInput, match="must have 3 environments"):
         complete(layout, scene, dc.Control(joint_efforts=rows(2, 5)), batch=(3,))
