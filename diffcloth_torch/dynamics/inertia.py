@@ -30,7 +30,8 @@ __all__ = [
     "Motion",
     "generalized_force",
     "mass_matrix",
-    "momentum_and_slope",
+    "momentum",
+    "slope",
     "wrenches_of_forces",
 ]
 
@@ -82,39 +83,37 @@ def mass_matrix(motion: Motion, inertia: Inertia) -> Tensor:
     return matrix + torch.diag_embed(_at_joints(inertia.armature))
 
 
-def momentum_and_slope(
-    tree: Tree, motion: Motion, inertia: Inertia, velocity: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Momentum p and the slope dT/dq of the kinetic energy, shapes [B, 6 + J].
+def momentum(motion: Motion, inertia: Inertia, velocity: Tensor) -> Tensor:
+    """M nu of velocities nu [B, 6 + J], likewise."""
+    of_links = (motion.weighted @ velocity[..., None, :, None])[..., 0]
+    return generalized_force(motion, of_links) + _at_joints(inertia.armature) * velocity
+
+
+def slope(tree: Tree, motion: Motion, velocity: Tensor) -> Tensor:
+    """dT/dq of the kinetic energy at constant velocities nu [B, 6 + J], likewise.
 
     Args:
         tree: The mechanism.
         motion: Its links.
-        inertia: What they weigh.
-        velocity: nu, shape [B, 6 + J].
+        velocity: nu.
     """
     frames, nu = motion.frames, velocity[..., None, :, None]
-    twist = (motion.jacobian @ nu)[..., 0]  # [B, L, 6]
-    h = (motion.weighted @ nu)[..., 0]
-    p = generalized_force(motion, h) + _at_joints(inertia.armature) * velocity
-
-    linear, angular = h[..., :3], h[..., 3:]
+    twists = (motion.jacobian @ nu)[..., 0]  # [B, L, 6]
+    linear, angular = torch.split((motion.weighted @ nu)[..., 0], 3, dim=-1)
     carried = torch.cat([linear, angular + torch.linalg.cross(frames.centers, linear)], dim=-1)
-    sums = tree.reach.T @ carried  # of what hangs on each joint; about the world's origin
-    F = sums[..., :3]
-    N = sums[..., 3:] - torch.linalg.cross(frames.pivots, F)
-    of_links = twist[..., tree.moving, :]
-    omega = of_links[..., 3:]
+    # Of all that hangs on each joint, first about the origin, then about the pivot.
+    F, N = torch.split(tree.reach.T @ carried, 3, dim=-1)
+    N = N - torch.linalg.cross(frames.pivots, F)
+    rate, omega = torch.split(twists[..., tree.moving, :], 3, dim=-1)
     arms = frames.pivots - frames.centers[..., tree.moving, :]
-    pivot_rate = of_links[..., :3] + torch.linalg.cross(omega, arms)
+    pivot_rate = rate + torch.linalg.cross(omega, arms)
     axis_rate = torch.linalg.cross(omega, frames.axes)
     turning = (axis_rate * N + frames.axes * torch.linalg.cross(F, pivot_rate)).sum(-1)
     sliding = (axis_rate * F).sum(-1)
-    slope = torch.lerp(sliding, turning, tree.revolute[:, 0]) @ tree.leaders
-
+    joints = torch.lerp(sliding, turning, tree.revolute[:, 0]) @ tree.leaders
     root_rate = velocity[..., :3]
-    root_slope = torch.linalg.cross(linear.sum(-2), root_rate)
-    return p, torch.cat([torch.zeros_like(root_rate), root_slope, slope], dim=-1)
+    root = torch.linalg.cross(linear.sum(-2), root_rate)
+    return torch.cat([torch.zeros_like(root_rate), root, joints], dim=-1)
 
 
 def generalized_force(motion: Motion, wrenches: Tensor) -> Tensor:

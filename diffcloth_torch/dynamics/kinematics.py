@@ -78,15 +78,14 @@ class Tree:
         """Frames of the links, shape [B, L, 4, 4].
 
         Args:
-            root: Frame of the root link, shape [B, 4, 4].
+            root: Frame of the root link, shape [B or 1, 4, 4].
             joints: Values of the joints [rad or m], shape [B, J].
         """
         values = (joints @ self._values + self._constants)[..., None, None]
         motions = torch.sin(values) * self._cross + (1 - torch.cos(values)) * self._cross_sq
         steps = self._offsets + self._offsets @ (motions + values * self._shift)
         local = steps.unbind(-3)
-        batch = max(len(root), len(local[0]))
-        placed = {self.mechanism.root: root.expand(batch, 4, 4)}
+        placed = {self.mechanism.root: root.expand_as(local[0])}
         for link in self.mechanism.order[1:]:
             placed[link] = placed[int(self.mechanism.parent[link])] @ local[link]
         rows = [placed[link] for link in range(self.mechanism.link_count)]
@@ -126,10 +125,10 @@ class Tree:
 
 
 def root_frame(center: Tensor, rotation: Tensor, local_center: Tensor) -> Tensor:
-    """Frame [B, 4, 4] of a link at `rotation` [B, 3, 3], by its center in the world and in itself."""
+    """Frame [B, 4, 4] of a link at `rotation`, by its center in the world and in itself [B, 3]."""
     position = center - (rotation @ local_center[..., None])[..., 0]
-    upper = torch.cat([rotation.expand(len(position), 3, 3), position[..., None]], dim=-1)
-    return torch.cat([upper, _LAST_ROW.expand(len(position), 1, 4)], dim=-2)
+    upper = torch.cat([rotation.expand(*position.shape, 3), position[..., None]], dim=-1)
+    return torch.cat([upper, _LAST_ROW.expand(*upper.shape[:-2], 1, 4)], dim=-2)
 
 
 def _rigid(arms: Tensor) -> Tensor:

@@ -17,7 +17,8 @@ from diffcloth_torch.dynamics.inertia import (
     Motion,
     generalized_force,
     mass_matrix,
-    momentum_and_slope,
+    momentum,
+    slope,
     wrenches_of_forces,
 )
 from diffcloth_torch.dynamics.kinematics import Tree, root_frame
@@ -97,17 +98,16 @@ def bias(judge, pose, joints, nu):
     rotation = quaternion_matrix(pose[:, 3:])
     center = (rotation @ local[..., None])[..., 0] + pose[:, :3]
 
-    def momentum(t):
+    def momentum_at(t):
         turned = rotation_exp(t * nu[:, 3:6]) @ rotation
         root = root_frame(center + t * nu[:, :3], turned, local)
         motion = Motion.at(judge.tree, inertia, root, joints + t * nu[:, 6:])
-        return momentum_and_slope(judge.tree, motion, inertia, nu)[0]
+        return momentum(motion, inertia, nu)
 
-    rate = torch.autograd.functional.jacobian(momentum, torch.zeros((), dtype=torch.float64))
+    rate = torch.autograd.functional.jacobian(momentum_at, torch.zeros((), dtype=torch.float64))
     motion = motion_at(judge, pose, joints)
-    slope = momentum_and_slope(judge.tree, motion, inertia, nu)[1]
     weights = inertia.mass[..., None] * tensor(np.concatenate([G, np.zeros(3)]))
-    return rate - slope - generalized_force(motion, weights)
+    return rate - slope(judge.tree, motion, nu) - generalized_force(motion, weights)
 
 
 def test_bias(judge):
@@ -169,14 +169,14 @@ def test_second_derivatives():
     tree, inertia = Tree(mechanism), inertia_of(mechanism)
     pose, joints, nu = random_configuration(mechanism, np.random.default_rng(4))
 
-    def slope(joints, nu, mass, center):
+    def both(joints, nu, mass, center):
         own = inertia._replace(mass=mass, center=center)
         motion = Motion.at(tree, own, frame_of(pose), joints)
-        return momentum_and_slope(tree, motion, own, nu)
+        return momentum(motion, own, nu), slope(tree, motion, nu)
 
     inputs = [t.clone().requires_grad_() for t in (joints, nu, inertia.mass, inertia.center)]
-    assert torch.autograd.gradcheck(slope, inputs, rtol=1e-7, atol=1e-8)
-    assert torch.autograd.gradgradcheck(slope, inputs, rtol=1e-6, atol=1e-7)
+    assert torch.autograd.gradcheck(both, inputs, rtol=1e-7, atol=1e-8)
+    assert torch.autograd.gradgradcheck(both, inputs, rtol=1e-6, atol=1e-7)
 
 
 def test_the_slope_is_that_of_the_kinetic_energy(judge):
@@ -186,6 +186,7 @@ def test_the_slope_is_that_of_the_kinetic_energy(judge):
     inertia = inertia_of(judge.mechanism)
     joints.requires_grad_()
     motion = Motion.at(judge.tree, inertia, frame_of(pose), joints)
-    p, slope = momentum_and_slope(judge.tree, motion, inertia, nu)
-    (expected,) = torch.autograd.grad((p * nu).sum() / 2, joints)
-    torch.testing.assert_close(slope[:, 6:], expected, **CLOSE)
+    energy = (momentum(motion, inertia, nu) * nu).sum() / 2
+    (expected,) = torch.autograd.grad(energy, joints)
+    got = slope(judge.tree, motion, nu)[:, 6:]
+    torch.testing.assert_close(got, expected, **CLOSE)
