@@ -69,12 +69,14 @@ double stiffness_for_cloths(const Scene& scene, const Inputs& inputs, double bar
   return kFactor * barrier_distance * mean_diagonal / (eta * mean_weight);
 }
 
-/// kappa at which the heaviest free body, resting on one of six sides, stays d_hat / 2 away.
+/// kappa at which the heaviest free body, resting on one of six sides, stays d_hat / 2 away. Without
+/// gravity, where it crosses the gap from rest in a time step.
 double stiffness_for_bodies(const Scene& scene, const Inputs& inputs, double barrier_distance) {
   const bodies::MechanismsDescription& given = scene.mechanisms.given();
   const double* metric = inputs.data(Input::kCoordinateMetric);
   const double h = scene.given.dt;
   const double gravity = row(inputs.data(Input::kGravity), 0).norm();
+  const double acceleration = gravity > 0.0 ? gravity : barrier_distance / (h * h);
   double result = 0.0;
   std::size_t first = 0;
   for (std::size_t t = 0; t < given.tree_free.size(); ++t) {
@@ -95,7 +97,7 @@ double stiffness_for_bodies(const Scene& scene, const Inputs& inputs, double bar
       }
       const double weight = 0.25 * area / 6.0;
       const double slope = at_half_gap(xi, barrier_distance).slope;
-      if (weight > 0.0) result = std::max(result, mass * gravity / (weight * slope));
+      if (weight > 0.0) result = std::max(result, mass * acceleration / (weight * slope));
     }
     first += n * n;
   }
