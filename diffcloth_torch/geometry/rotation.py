@@ -11,10 +11,15 @@ from torch import Tensor
 __all__ = [
     "integrate_poses",
     "interpolate_poses",
+    "nearer_quaternion",
+    "pose_velocities",
     "quaternion_exp",
     "quaternion_log",
+    "quaternion_matrix",
     "quaternion_multiply",
     "rotate",
+    "rotation_exp",
+    "torque_from_moment",
 ]
 
 # Below this angle [rad] the exponential is summed as a series; its first neglected terms are
@@ -111,6 +116,26 @@ def integrate_poses(pose: Tensor, twists: Tensor, dt: float) -> Tensor:
     return torch.cat([positions, torch.stack(quaternions)], dim=-1)
 
 
+def pose_velocities(start: Tensor, end: Tensor, dt: float) -> Tensor:
+    """Constant velocities that lead from poses to others, as `integrate_poses` does.
+
+    Args:
+        start: Poses with quaternions of any length, shape [..., 7].
+        end: Poses that are turned by less than pi from them, likewise.
+        dt: Time between them [s].
+
+    Returns:
+        Linear velocities [m/s] and angular velocities [rad/s] in world axes, shape [..., 6].
+    """
+    before, after = (
+        pose[..., 3:] / torch.linalg.vector_norm(pose[..., 3:], dim=-1, keepdim=True)
+        for pose in (start, end)
+    )
+    conjugate = before * torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=before.dtype)
+    turn = quaternion_log(quaternion_multiply(after, conjugate))
+    return torch.cat([end[..., :3] - start[..., :3], turn], dim=-1) / dt
+
+
 def interpolate_poses(times: Tensor, poses: Tensor, at: Tensor) -> Tensor:
     """Poses between keyframes: straight paths, turns about one axis at constant speed.
 
@@ -132,3 +157,54 @@ def interpolate_poses(times: Tensor, poses: Tensor, at: Tensor) -> Tensor:
     turn = quaternion_log(quaternion_multiply(b[:, 3:], conjugate))
     quaternions = quaternion_multiply(quaternion_exp(part * turn), a[:, 3:])
     return torch.cat([torch.lerp(a[:, :3], b[:, :3], part), quaternions], dim=-1)
+
+
+def quaternion_matrix(quaternion: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
+    q = quaternion
+    # Twice the products of all pairs, of which the matrix is made.
+    p = 2 * q.unsqueeze(-1) * q.unsqueeze(-2)
+    ww, xx, yy, zz = p.diagonal(dim1=-2, dim2=-1).unbind(-1)
+    wx, wy, wz = p[..., 0, 1], p[..., 0, 2], p[..., 0, 3]
+    xy, xz, yz = p[..., 1, 2], p[..., 1, 3], p[..., 2, 3]
+    rows = [ww + xx - 1, xy - wz, xz + wy, xy + wz, ww + yy - 1, yz - wx, xz - wy, yz + wx]
+    return torch.stack([*rows, ww + zz - 1], dim=-1).reshape(*q.shape[:-1], 3, 3)
+
+
+def rotation_exp(rotation_vector: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] of rotation vectors [..., 3] [rad], smooth at zero too."""
+    return quaternion_matrix(quaternion_exp(rotation_vector))
+
+
+def torque_from_moment(rotation_vector: Tensor, moment: Tensor) -> Tensor:
+    """Torque that does the work of a generalized force on a rotation vector.
+
+    Where R = exp(w) R_0 changes by dw, it turns in the world by J(w) dw, J the left Jacobian of the
+    exponential. A force Q with the work Q . dw is thus the torque
+
+        J(w)^-T Q = Q + w x Q / 2 + b w x (w x Q),    b = (1 - (a/2) cot(a/2)) / a^2,  a = |w|.
+
+    Args:
+        rotation_vector: w [rad], shorter than 2 pi; shape [..., 3].
+        moment: Q [N m], shape [..., 3].
+
+    Returns:
+        Torques in world axes [N m], shape [..., 3].
+    """
+    w = rotation_vector
+    angle_sq = (w * w).sum(-1, keepdim=True)
+    near_zero = angle_sq < _SERIES_ANGLE**2
+    half = torch.where(near_zero, torch.ones_like(angle_sq), angle_sq / 4).sqrt()
+    s = torch.where(near_zero, angle_sq, torch.zeros_like(angle_sq))
+    # The first neglected term is 3e-9 0.1^10.
+    series = 1 / 12 + s * (1 / 720 + s * (1 / 30240 + s * (1 / 1209600 + s / 47900160)))
+    b = torch.where(near_zero, series, (1 - half / torch.tan(half)) / (4 * half * half))
+    turned = torch.linalg.cross(w, moment)
+    torque: Tensor = moment + turned / 2 + b * torch.linalg.cross(w, turned)
+    return torque
+
+
+def nearer_quaternion(quaternion: Tensor, other: Tensor) -> Tensor:
+    """Of q and -q, one rotation, the one nearer to `other`; shapes [..., 4]."""
+    opposite = (quaternion * other).sum(-1, keepdim=True) < 0
+    return torch.where(opposite, -quaternion, quaternion)

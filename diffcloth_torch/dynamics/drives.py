@@ -1,0 +1,76 @@
+"""What drives the joints, as quadratic terms of the sum that a step minimizes.
+
+A joint under `pd` adds, with q_n its value at the start of the step of length h,
+
+    1/2 kp (q - q_t)^2 + kd/(2h) (q - q_n - h qd_t)^2 + d/(2h) (q - q_n)^2,
+
+so that its drive acts at the end of the step: implicitly, and without a bound on the gains. Under
+`torque` only the last term, of the joint's own viscosity, is there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+__all__ = ["Drives", "fold"]
+
+
+class Drives(NamedTuple):
+    """Gains and targets, zero where they do not apply; [B or 1, J].
+
+    Attributes:
+        stiffness: kp [N m/rad or N/m].
+        damping: kd [N m s/rad or N s/m].
+        viscosity: d of the joint itself, likewise.
+        positions: q_t [rad or m].
+        velocities: qd_t [rad/s or m/s].
+        efforts: Applied over the whole step as they are [N m or N].
+    """
+
+    stiffness: Tensor
+    damping: Tensor
+    viscosity: Tensor
+    positions: Tensor
+    velocities: Tensor
+    efforts: Tensor
+
+    def applied_efforts(self, start: Tensor, end: Tensor, dt: float) -> Tensor:
+        """Efforts of the drives over a step between joint values `start` and `end` [B, J]."""
+        spring = self.stiffness * (self.positions - end)
+        return self.efforts + spring + self.damping * (self.velocities - (end - start) / dt)
+
+
+def fold(
+    drives: Drives, inertial: Tensor, predicted: Tensor, start: Tensor, dt: float, unknown: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Add drives and viscosity to 1/2 (q - q^)^T M/h^2 (q - q^); again 1/2 (q - t)^T A (q - t).
+
+    Args:
+        drives: Of the last J of n coordinates.
+        inertial: M/h^2, shape [B, n, n].
+        predicted: q^, shape [B, n].
+        start: q_n of the joints, shape [B, J].
+        dt: h [s].
+        unknown: Indices of the coordinates that are not prescribed; t is q^ in the others.
+
+    Returns:
+        A [B, n, n] and t [B, n].
+    """
+    n, joints = predicted.shape[-1], start.shape[-1]
+    if not (joints and len(unknown)):
+        return inertial, predicted
+    moved = predicted[..., n - joints :] - start
+    pull = (
+        drives.stiffness * (start + moved - drives.positions)
+        + drives.damping * (moved / dt - drives.velocities)
+        + drives.viscosity * moved / dt
+    )
+    gains = drives.stiffness + (drives.damping + drives.viscosity) / dt
+    metric = inertial + torch.diag_embed(torch.nn.functional.pad(gains, (n - joints, 0)))
+    force = torch.nn.functional.pad(pull, (n - joints, 0))[..., unknown]
+    solved = metric[..., unknown[:, None], unknown]
+    shift = torch.linalg.solve(solved, force[..., None])[..., 0]
+    return metric, predicted.index_add(-1, unknown, -shift)

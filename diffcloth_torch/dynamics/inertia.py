@@ -1,0 +1,147 @@
+"""Mass matrix, momentum and forces of a mechanism in its velocities nu = (dc/dt, omega, dq/dt).
+
+With the 6 velocities V_l = J_l nu of each link, those of its center and of rotation, and its mass
+and inertia in world axes W_l = diag(m 1, R I R^T):
+
+    M = sum_l J_l^T W_l J_l,   p = M nu = sum_l J_l^T h_l,   h_l = W_l V_l.
+
+Let joint j turn about the axis z through the point o, and let F and N be the momentum and the
+angular momentum about o of all links that hang on it. Then p_j = z . N (z . F where it slides), and
+since a turn of the joint carries all of these with it, but not what it hangs on, the kinetic energy
+T = p . nu / 2 grows with its value at constant rates by
+
+    dT/dq_j = dz/dt . N + z . (F x do/dt),   dz/dt = omega x z      (dz/dt . F where it slides).
+
+Lagrange's equations are dp/dt = dT/dq + forces. Those of the root's rotation, in world axes, have
+the same form if its slope is (P x dc/dt), with the momentum P of all.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffcloth_torch.dynamics.kinematics import Frames, Tree
+
+__all__ = [
+    "Inertia",
+    "Motion",
+    "generalized_force",
+    "mass_matrix",
+    "momentum",
+    "slope",
+    "wrenches_of_forces",
+]
+
+
+class Inertia(NamedTuple):
+    """What the links and joints weigh.
+
+    Attributes:
+        mass: [B or 1, L] kg.
+        center: In the links' frames, [B or 1, L, 3] m.
+        inertia: About the centers, in the links' axes, [B or 1, L, 3, 3] kg m^2.
+        armature: Inertia of the joints' drives, [B or 1, J] kg m^2, or kg where they slide.
+    """
+
+    mass: Tensor
+    center: Tensor
+    inertia: Tensor
+    armature: Tensor
+
+
+class Motion(NamedTuple):
+    """Links in a configuration, ready for any velocity.
+
+    Attributes:
+        frames: Where they are.
+        jacobian: J_l, shape [B, L, 6, 6 + J].
+        weighted: W_l J_l, likewise.
+    """
+
+    frames: Frames
+    jacobian: Tensor
+    weighted: Tensor
+
+    @staticmethod
+    def at(tree: Tree, inertia: Inertia, root: Tensor, joints: Tensor) -> Motion:
+        """Place the links; `root` is the frame [B, 4, 4] of the root link, `joints` [B, J]."""
+        frames = tree.frames(root, joints, inertia.center)
+        jacobian = tree.jacobian(frames)
+        rotation = frames.poses[..., :3, :3]
+        linear = inertia.mass[..., None, None] * jacobian[..., :3, :]
+        local = inertia.inertia @ (rotation.transpose(-1, -2) @ jacobian[..., 3:, :])
+        return Motion(frames, jacobian, torch.cat([linear, rotation @ local], dim=-2))
+
+
+def mass_matrix(motion: Motion, inertia: Inertia) -> Tensor:
+    """M with the armature on its diagonal, shape [B, 6 + J, 6 + J]."""
+    columns = motion.jacobian.flatten(-3, -2)
+    matrix = columns.transpose(-1, -2) @ motion.weighted.flatten(-3, -2)
+    return matrix + torch.diag_embed(_at_joints(inertia.armature))
+
+
+def momentum(motion: Motion, inertia: Inertia, velocity: Tensor) -> Tensor:
+    """M nu of velocities nu [B, 6 + J], likewise."""
+    of_links = (motion.weighted @ velocity[..., None, :, None])[..., 0]
+    return generalized_force(motion, of_links) + _at_joints(inertia.armature) * velocity
+
+
+def slope(tree: Tree, motion: Motion, velocity: Tensor) -> Tensor:
+    """dT/dq of the kinetic energy at constant velocities nu [B, 6 + J], likewise.
+
+    Args:
+        tree: The mechanism.
+        motion: Its links.
+        velocity: nu.
+    """
+    frames, nu = motion.frames, velocity[..., None, :, None]
+    twists = (motion.jacobian @ nu)[..., 0]  # [B, L, 6]
+    linear, angular = torch.split((motion.weighted @ nu)[..., 0], 3, dim=-1)
+    carried = torch.cat([linear, angular + torch.linalg.cross(frames.centers, linear)], dim=-1)
+    # Of all that hangs on each joint, first about the origin, then about the pivot.
+    F, N = torch.split(tree.reach.T @ carried, 3, dim=-1)
+    N = N - torch.linalg.cross(frames.pivots, F)
+    rate, omega = torch.split(twists[..., tree.moving, :], 3, dim=-1)
+    arms = frames.pivots - frames.centers[..., tree.moving, :]
+    pivot_rate = rate + torch.linalg.cross(omega, arms)
+    axis_rate = torch.linalg.cross(omega, frames.axes)
+    turning = (axis_rate * N + frames.axes * torch.linalg.cross(F, pivot_rate)).sum(-1)
+    sliding = (axis_rate * F).sum(-1)
+    joints = torch.lerp(sliding, turning, tree.revolute[:, 0]) @ tree.leaders
+    root_rate = velocity[..., :3]
+    root = torch.linalg.cross(linear.sum(-2), root_rate)
+    return torch.cat([torch.zeros_like(root_rate), root, joints], dim=-1)
+
+
+def generalized_force(motion: Motion, wrenches: Tensor) -> Tensor:
+    """sum_l J_l^T f_l of forces at the links' centers and torques, [B, L, 6] -> [B, 6 + J]."""
+    columns = motion.jacobian.flatten(-3, -2)
+    return (wrenches.flatten(-2).unsqueeze(-2) @ columns).squeeze(-2)
+
+
+def wrenches_of_forces(frames: Frames, links: Tensor, points: Tensor, forces: Tensor) -> Tensor:
+    """Force and torque about the center of each link, from forces at points on them.
+
+    Args:
+        frames: The links.
+        links: Of which link each point is, shape [V].
+        points: In the frames of their links [m], shape [V, 3].
+        forces: In the world [N], shape [B, V, 3].
+
+    Returns:
+        Shape [B, L, 6], N and N m.
+    """
+    poses = frames.poses[..., links, :, :]
+    placed = (poses[..., :3, :3] @ points[..., None])[..., 0] + poses[..., :3, 3]
+    arms = placed - frames.centers[..., links, :]
+    parts = torch.cat([forces, torch.linalg.cross(arms, forces)], dim=-1)
+    zeros = parts.new_zeros(*parts.shape[:-2], frames.centers.shape[-2], 6)
+    return zeros.index_add(-2, links, parts)
+
+
+def _at_joints(values: Tensor) -> Tensor:
+    """Zeros for the root before values [B, J] of the joints."""
+    return torch.nn.functional.pad(values, (6, 0))
