@@ -15,7 +15,9 @@
 
 #include "bind/kernels/kernels.h"
 #include "contact/contact_set.h"
+#include "contact/feature_areas.h"
 #include "contact/friction_set.h"
+#include "contact/sharpness.h"
 
 namespace diffcloth::bind {
 namespace {
@@ -50,7 +52,8 @@ class ContactPotential {
         weights_(mesh_, X.data(), prescribed_),
         rest_(contact::measure(mesh_, X.data())),
         model_(mesh_, weights_, rest_, std::move(parameters), prescribed_),
-        broad_phase_(mesh_, X.data()) {}
+        broad_phase_(mesh_, X.data()),
+        X_(X) {}
   ContactPotential(const ContactPotential&) = delete;
   ContactPotential& operator=(const ContactPotential&) = delete;
 
@@ -176,6 +179,14 @@ class ContactPotential {
     return result;
   }
 
+  /// Of the bodies: A_v of vertices, theta and A_e of edges, and the areas of surfaces.
+  std::tuple<Values, Values, Values, Values> body_areas() const {
+    const contact::Bulge bulge = contact::bulge(mesh_, X_.data());
+    const contact::FeatureAreas areas = contact::feature_areas(mesh_, X_.data(), bulge);
+    return {to_values(areas.vertex), to_values(bulge.edge), to_values(areas.edge),
+            to_values(areas.surface)};
+  }
+
   /// Weights of a sum over all features: of edges, of vertices, and whether a face counts.
   std::tuple<std::vector<Index>, std::vector<Index>, std::vector<bool>> feature_weights() const {
     std::vector<Index> edge;
@@ -244,6 +255,7 @@ class ContactPotential {
   contact::ContactModel model_;
   contact::BroadPhase broad_phase_;
   contact::BroadPhase::Scratch scratch_;
+  Rows3 X_;
 };
 
 }  // namespace
@@ -294,6 +306,7 @@ void contact_potentials(nb::module_& m) {
              measure = values;
            })
       .def("sharpness", &ContactPotential::sharpness, "cloth"_a = 0)
+      .def("body_areas", &ContactPotential::body_areas)
       .def("continuation", &ContactPotential::continuation)
       .def("feature_weights", &ContactPotential::feature_weights)
       .def("edges", &ContactPotential::edges);
