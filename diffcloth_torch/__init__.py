@@ -13,9 +13,10 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import Any
 
-from diffcloth_torch import _core
+from diffcloth_torch import _core, robots
 from diffcloth_torch._moved import MOVED, find_old_modules
 from diffcloth_torch.errors import (
+    IgnoredLimitsWarning,
     InfeasibleMotion,
     IntersectingState,
     InvalidInput,
@@ -26,6 +27,7 @@ from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
 from diffcloth_torch.model.rigid_body import RigidBody
+from diffcloth_torch.model.robot import Robot
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.report import Report
@@ -36,6 +38,7 @@ __all__ = [
     "Cloth",
     "ContactOptions",
     "Control",
+    "IgnoredLimitsWarning",
     "InfeasibleMotion",
     "IntersectingState",
     "InvalidInput",
@@ -44,12 +47,14 @@ __all__ = [
     "Parameters",
     "Report",
     "RigidBody",
+    "Robot",
     "Scene",
     "SimulationError",
     "Simulator",
     "SolverOptions",
     "State",
     "build_info",
+    "robots",
     "stack",
     "where",
 ]

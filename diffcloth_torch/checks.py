@@ -32,6 +32,7 @@ __all__ = [
     "check_finite",
     "check_name",
     "check_number",
+    "check_pairs",
     "check_range",
     "check_shape",
     "float_array",
@@ -39,6 +40,7 @@ __all__ = [
     "frozen",
     "index_array",
     "refuse_gradient",
+    "texts",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -216,7 +218,7 @@ def check_bool(name: str, value: object) -> bool:
 def check_choice(name: str, value: object, accepted: Sequence[str]) -> str:
     """Require one of the accepted words."""
     if value not in accepted:
-        raise InvalidInput(f"{name} must be one of {', '.join(map(repr, accepted))}, got {value!r}")
+        raise InvalidInput(f"{name} must be one of {texts(accepted)}, got {value!r}")
     return str(value)
 
 
@@ -229,3 +231,25 @@ def check_name(name: str, value: object) -> str | None:
     if not value or "/" in value or not value.isprintable():
         raise InvalidInput(f"{name} must be non-empty, printable and without '/', got {value!r}")
     return value
+
+
+def check_pairs(
+    name: str, value: Iterable[Sequence[str]], accepted: Sequence[str]
+) -> tuple[tuple[str, str], ...]:
+    """Require pairs of two different names of those that are accepted."""
+    pairs = []
+    for i, pair in enumerate(value):
+        if isinstance(pair, str) or len(pair) != 2 or pair[0] == pair[1]:
+            raise InvalidInput(f"{name} must hold pairs of two names, got {pair!r} at [{i}]")
+        for entry in pair:
+            if entry not in accepted:
+                raise InvalidInput(
+                    f"{name} has the names {texts(accepted)}; got {entry!r} at [{i}]"
+                )
+        pairs.append((pair[0], pair[1]))
+    return tuple(pairs)
+
+
+def texts(names: Iterable[object]) -> str:
+    """List names in a message."""
+    return ", ".join(map(repr, names)) or "none"

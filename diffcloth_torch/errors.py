@@ -1,4 +1,4 @@
-"""The exceptions of the package. A wrong dtype or device is a plain `TypeError`."""
+"""The exceptions and warnings of the package. A wrong dtype or device is a plain `TypeError`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 __all__ = [
+    "IgnoredLimitsWarning",
     "InfeasibleMotion",
     "IntersectingState",
     "InvalidInput",
@@ -44,3 +45,7 @@ class InfeasibleMotion(SimulationError):  # noqa: N818
 
 class NotConverged(SimulationError):  # noqa: N818
     """The iteration limit was reached before the residual fell below the tolerance."""
+
+
+class IgnoredLimitsWarning(UserWarning):
+    """A robot's file has effort or velocity limits, or dry joint friction: none is applied."""

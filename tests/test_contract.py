@@ -22,6 +22,7 @@ PUBLIC = {
         "barrier_distance barrier_stiffness friction_iterations slip_velocity self_contact"
     ),
     "Control": "pins soft_pins body_poses forces replace",
+    "IgnoredLimitsWarning": "",
     "InfeasibleMotion": "",
     "IntersectingState": "",
     "InvalidInput": "",
@@ -32,13 +33,15 @@ PUBLIC = {
         "barrier_distance slip_velocity pin_stiffness gravity rest_positions replace"
     ),
     "Report": "select stack where",
-    "RigidBody": "load box sphere capsule plane",
+    "RigidBody": "load box sphere capsule cylinder plane",
+    "Robot": "load forward_kinematics joint_names link_names",
     "Scene": "",
     "SimulationError": "",
     "Simulator": "initial_state control parameters step rollout energy",
     "SolverOptions": "tolerance max_iterations throw metric",
     "State": "batch_size replace detach export",
     "build_info": "",
+    "robots": "GRIPPER panda",
     "stack": "",
     "where": "",
 }
@@ -131,8 +134,15 @@ def test_states_and_parameters_are_new_each_time(sim):
     assert sim.parameters().stretch.item() == dc.Material().stretch
 
 
-def test_slices_give_the_rows_of_each_cloth(sim):
-    assert sim.slices == {"sheet": slice(0, 16), "cloth1": slice(16, 25)}
+def test_slices_give_the_rows_of_each_surface(sim):
+    assert sim.surfaces == ("sheet", "cloth1", "floor", "box")
+    assert sim.slices == {
+        "sheet": slice(0, 16),
+        "cloth1": slice(16, 25),
+        "floor": slice(0, 4),  # rows in body_forces
+        "box": slice(4, 12),
+    }
+    assert sim.joint_slices == {}
 
 
 def test_parameters_are_as_small_as_the_scene_allows(sim):

@@ -80,7 +80,7 @@ def test_a_blas_is_named_where_cholmod_calls_one():
     assert (blas == "none") == ("cholmod" not in kernels.cholesky_backends())
 
 
-@pytest.mark.parametrize("module", ["matplotlib", "pyvista", "trimesh"])
+@pytest.mark.parametrize("module", ["matplotlib", "pytorch_kinematics", "pyvista", "trimesh"])
 def test_importing_the_package_leaves_out(module):
     code = f"import sys, diffcloth_torch; print({module!r} in sys.modules)"
     assert run_python(code) == "False"
@@ -90,6 +90,10 @@ def test_the_command_is_installed():
     (command,) = importlib.metadata.entry_points(group="console_scripts", name="diffcloth")
     assert command.value == "diffcloth_torch.cli:main"
     assert callable(command.load())
+
+
+def test_the_gripper_comes_with_the_package():
+    assert importlib.resources.files("diffcloth_torch.robots").joinpath("gripper.urdf").is_file()
 
 
 def test_the_package_is_typed():

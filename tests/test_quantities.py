@@ -66,7 +66,8 @@ def test_the_core_gets_no_other_names(sim):
 
 def test_shapes_are_those_of_the_tables(sim):
     sizes = assemble(sim.scene).sizes
-    assert sizes == {"N": 16, "F": 14, "C": 2, "K": 1, "V": 8, "S": 3, "P": 1, "Q": 1}
+    cloth = {"N": 16, "F": 14, "C": 2, "P": 1, "Q": 1}
+    assert sizes == {**cloth, "K": 1, "V": 8, "S": 3, "J": 0, "L": 0, "R": 0}
     state, parameters = sim.initial_state(), sim.parameters()
     for record, table in ((state, STATE), (parameters, PARAMETERS)):
         for name, quantity in table.items():

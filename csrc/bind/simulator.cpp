@@ -100,9 +100,7 @@ class Simulator {
     const Arrays arrays(inputs);
     return step::default_barrier_stiffness(scene_, arrays.environment(0), barrier_distance);
   }
-  nb::object find_overlap(const Doubles& positions,
-                          const Doubles& body_poses,
-                          const Doubles& thickness) const;
+  nb::object find_overlap(const nb::dict& inputs) const;
   double reference_factorization_seconds(const nb::dict& inputs, int repeats) const {
     const Arrays arrays(inputs);
     const nb::gil_scoped_release nogil;
@@ -330,17 +328,9 @@ double Simulator::smallest_nonadjacent_distance() const {
   return contact::smallest_nonadjacent_distance(scene_.collision_mesh, x.data());
 }
 
-nb::object Simulator::find_overlap(const Doubles& positions,
-                                   const Doubles& body_poses,
-                                   const Doubles& thickness) const {
-  std::vector<double> x = to_vector(positions);
-  const std::size_t cloth = x.size();
-  x.resize(3 * static_cast<std::size_t>(scene_.vertex_count()));
-  if (scene_.given.bodies.count() > 0) {
-    scene_.given.bodies.place(body_poses.data(), x.data() + cloth);
-  }
-  contact::BroadPhase::Scratch scratch;
-  const std::string text = step::find_overlap(scene_, x.data(), to_vector(thickness), scratch);
+nb::object Simulator::find_overlap(const nb::dict& inputs) const {
+  const Arrays arrays(inputs);
+  const std::string text = step::find_overlap(scene_, arrays.environment(0));
   return text.empty() ? nb::none() : nb::cast(text);
 }
 
@@ -380,7 +370,9 @@ step::Description describe(const Doubles& vertices,
   }
   d.pins = to_vector(pins);
   d.soft_pins = to_vector(soft_pins);
-  d.bodies = {.vertices = to_vector(body_vertices), .vertex_start = to_vector(body_vertex_start)};
+  d.bodies = {.vertices = to_vector(body_vertices),
+              .vertex_start = to_vector(body_vertex_start),
+              .pose = {}};
   d.body_faces = to_faces(body_faces);
   d.self_contact = self_contact;
   d.dt = dt;
@@ -389,6 +381,73 @@ step::Description describe(const Doubles& vertices,
   d.friction_iterations = friction_iterations;
   d.options = {.tolerance = tolerance, .max_iterations = max_iterations};
   return d;
+}
+
+/// Trees of links, from the arrays that say what they are; see bodies::MechanismsDescription.
+bodies::MechanismsDescription describe_mechanisms(const nb::kwargs& k) {
+  const auto doubles = [&](const char* name) { return to_vector(nb::cast<Doubles>(k[name])); };
+  const auto indices = [&](const char* name) { return to_vector(nb::cast<Indices>(k[name])); };
+  bodies::MechanismsDescription m;
+  for (const Index free : indices("tree_free")) m.tree_free.push_back(free != 0 ? 1 : 0);
+  for (const Index given : indices("coordinate_prescribed")) {
+    m.prescribed.push_back(given != 0 ? 1 : 0);
+  }
+  m.lower = doubles("coordinate_lower");
+  m.upper = doubles("coordinate_upper");
+  m.limit_stiffness = doubles("limit_stiffness");
+  m.surface_link = indices("surface_link");
+  const std::vector<Index> tree = indices("link_tree");
+  const std::vector<Index> parent = indices("link_parent");
+  const std::vector<Index> kind = indices("link_kind");
+  const std::vector<Index> coordinate = indices("link_coordinate");
+  const std::vector<double> offset = doubles("link_offset");
+  const std::vector<double> axis = doubles("link_axis");
+  const std::vector<double> multiplier = doubles("link_multiplier");
+  const std::vector<double> constant = doubles("link_constant");
+  const std::size_t n = m.prescribed.size();
+  const std::size_t links = tree.size();
+  for (const std::size_t size : {parent.size(), kind.size(), coordinate.size(), offset.size() / 16,
+                                 axis.size() / 3, multiplier.size(), constant.size()}) {
+    if (size != links) throw nb::value_error("trees: arrays of links must have equal lengths");
+  }
+  for (const std::size_t size : {m.lower.size(), m.upper.size(), m.limit_stiffness.size()}) {
+    if (size != n) throw nb::value_error("trees: arrays of coordinates must have equal lengths");
+  }
+  m.coordinate_tree.assign(n, -1);
+  for (std::size_t l = 0; l < links; ++l) {
+    const Eigen::Matrix<double, 4, 4, Eigen::RowMajor> frame(offset.data() + 16 * l);
+    if (parent[l] >= static_cast<Index>(l) || coordinate[l] >= static_cast<Index>(n) ||
+        tree[l] < 0 || tree[l] >= static_cast<Index>(m.tree_free.size())) {
+      throw nb::value_error("trees: parents must precede links, and indices must be in range");
+    }
+    m.links.push_back({.tree = tree[l],
+                       .parent = parent[l],
+                       .kind = static_cast<bodies::JointKind>(kind[l]),
+                       .offset = frame.topRows<3>(),
+                       .axis = row(axis.data(), static_cast<Index>(l)),
+                       .coordinate = coordinate[l],
+                       .multiplier = multiplier[l],
+                       .constant = constant[l]});
+    if (coordinate[l] >= 0) m.coordinate_tree[coordinate[l]] = tree[l];
+  }
+  for (const Index l : m.surface_link) {
+    if (l < 0 || l >= static_cast<Index>(links)) {
+      throw nb::value_error("trees: `surface_link` must name links");
+    }
+  }
+  // What no joint has is the six of a free root, tree after tree.
+  std::size_t c = 0;
+  for (std::size_t t = 0; t < m.tree_free.size(); ++t) {
+    for (int i = 0; m.tree_free[t] != 0 && i < 6; ++i, ++c) {
+      if (c >= n || m.coordinate_tree[c] != -1) {
+        throw nb::value_error("trees: a free root must have six coordinates");
+      }
+      m.coordinate_tree[c] = static_cast<Index>(t);
+    }
+    while (c < n && m.coordinate_tree[c] == static_cast<Index>(t)) ++c;
+  }
+  if (c != n) throw nb::value_error("trees: coordinates must go tree after tree");
+  return m;
 }
 
 }  // namespace
@@ -402,7 +461,7 @@ void simulator(nb::module_& m) {
            [](Simulator* self, nb::kwargs k) {
              const auto doubles = [&](const char* name) { return nb::cast<Doubles>(k[name]); };
              const auto indices = [&](const char* name) { return nb::cast<Indices>(k[name]); };
-             new (self) Simulator(describe(
+             step::Description description = describe(
                  doubles("vertices"), doubles("rest_vertices"), indices("faces"),
                  indices("cloth_vertex_start"), indices("cloth_face_start"),
                  nb::cast<std::vector<std::string>>(k["bending_models"]), indices("pins"),
@@ -410,7 +469,15 @@ void simulator(nb::module_& m) {
                  indices("body_vertex_start"), nb::cast<bool>(k["self_contact"]),
                  nb::cast<double>(k["dt"]), nb::cast<std::string>(k["scheme"]),
                  nb::cast<std::string>(k["metric"]), nb::cast<int>(k["friction_iterations"]),
-                 nb::cast<double>(k["tolerance"]), nb::cast<int>(k["max_iterations"])));
+                 nb::cast<double>(k["tolerance"]), nb::cast<int>(k["max_iterations"]));
+             if (k.contains("tree_free")) description.mechanisms = describe_mechanisms(k);
+             if (k.contains("ignored_pairs")) {
+               const std::vector<Index> pairs = to_vector(indices("ignored_pairs"));
+               for (std::size_t p = 0; p + 1 < pairs.size(); p += 2) {
+                 description.ignored_pairs.push_back({pairs[p], pairs[p + 1]});
+               }
+             }
+             new (self) Simulator(std::move(description));
            })
       .def("forward", &Simulator::forward, "inputs"_a, "tape"_a, "threads"_a)
       .def("backward", &Simulator::backward, "inputs"_a, "tape"_a, "cotangents"_a, "needs"_a,
@@ -424,7 +491,8 @@ void simulator(nb::module_& m) {
       .def("reference_factorization_seconds", &Simulator::reference_factorization_seconds,
            "inputs"_a, "repeats"_a,
            "Seconds of one factorization of the contact-free Hessian by Eigen, for benchmarks.")
-      .def("find_overlap", &Simulator::find_overlap, "positions"_a, "body_poses"_a, "thickness"_a)
+      .def("find_overlap", &Simulator::find_overlap, "inputs"_a,
+           "Where surfaces overlap at the start of the first environment's step, or None.")
       .def("forget_factors", &Simulator::forget_factors,
            "Drop the factors kept for backward; they are made again when needed.")
       .def_prop_ro("factor_bytes", &Simulator::factor_bytes,

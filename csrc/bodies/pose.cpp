@@ -65,17 +65,19 @@ double angle(const Pose& from, const Pose& to) {
 
 void BodySet::place(const double* poses, double* out) const {
   for (Index k = 0; k < count(); ++k) {
+    if (pose[k] < 0) continue;
     const Index first = vertex_start[k];
-    transform(Eigen::Map<const Pose>(poses + 7 * k), vertices.data() + 3 * first,
+    transform(Eigen::Map<const Pose>(poses + 7 * pose[k]), vertices.data() + 3 * first,
               vertex_start[k + 1] - first, out + 3 * first);
   }
 }
 
 void BodySet::place_vjp(const double* poses, const double* out_bar, double* poses_bar) const {
   for (Index k = 0; k < count(); ++k) {
+    if (pose[k] < 0) continue;
     const Index first = vertex_start[k];
-    Eigen::Map<Pose>(poses_bar + 7 * k) +=
-        transform_vjp(Eigen::Map<const Pose>(poses + 7 * k), vertices.data() + 3 * first,
+    Eigen::Map<Pose>(poses_bar + 7 * pose[k]) +=
+        transform_vjp(Eigen::Map<const Pose>(poses + 7 * pose[k]), vertices.data() + 3 * first,
                       vertex_start[k + 1] - first, out_bar + 3 * first);
   }
 }

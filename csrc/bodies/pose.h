@@ -24,18 +24,19 @@ Pose interpolate(const Pose& from, const Pose& to, double s);
 /// Angle between two poses' rotations, in [0, pi] [rad].
 double angle(const Pose& from, const Pose& to);
 
-/// Vertices of all bodies, body by body.
+/// Vertices of the surfaces of all bodies and links, surface by surface.
 struct BodySet {
-  std::vector<double> vertices;     ///< [3 V] body frame
-  std::vector<Index> vertex_start;  ///< [K + 1]
+  std::vector<double> vertices;     ///< [3 V] in the frame of the body or link
+  std::vector<Index> vertex_start;  ///< [surfaces + 1]
+  std::vector<Index> pose;          ///< [surfaces] which pose moves it; -1: something else does
 
   Index count() const { return static_cast<Index>(vertex_start.size()) - 1; }
   Index vertex_count() const { return vertex_start.back(); }
 
-  /// World positions for poses [7 K].
+  /// World positions of the surfaces that move with a pose.
   void place(const double* poses, double* out) const;
 
-  /// poses_bar [7 K] += pulled back out_bar [3 V].
+  /// poses_bar += pulled back out_bar [3 V].
   void place_vjp(const double* poses, const double* out_bar, double* poses_bar) const;
 };
 

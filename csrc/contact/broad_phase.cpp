@@ -119,9 +119,11 @@ void filter(PairList& pairs, Keep&& keep) {
   pairs.end_at(end);
 }
 
-/// Sort pairs into scratch.sorted: counted by the first index (below `count`), then by the second
-/// within each of these short runs.
-void sort_pairs(PairList& pairs, Index count, BroadPhase::Scratch& scratch) {
+/// Sort pairs into scratch.sorted: counted by the first index, then by the second within each of
+/// these short runs.
+void sort_pairs(PairList& pairs, BroadPhase::Scratch& scratch) {
+  Index count = 0;
+  for (const IndexPair& pair : pairs) count = std::max(count, pair[0] + 1);
   std::vector<Index>& bucket = scratch.bucket;
   bucket.assign(count + 1, 0);
   for (const IndexPair& pair : pairs) ++bucket[pair[0] + 1];
@@ -247,8 +249,9 @@ template <class Visit>
 void BroadPhase::visit_surface_pairs(const Sweep& sweep, Scratch& scratch, Visit&& visit) const {
   measure_motion(sweep, scratch);
   const auto surface_count = static_cast<Index>(trees_.size());
-  for (Index s = 0; s < mesh_.cloth_count; ++s) {
-    for (Index r = mesh_.self_contact ? s : s + 1; r < surface_count; ++r) {
+  for (Index s = 0; s < surface_count; ++s) {
+    for (Index r = s; r < surface_count; ++r) {
+      if (!mesh_.touching.contains(s, r)) continue;
       const Scratch::Surface& a = scratch.surfaces[s];
       const Scratch::Surface& b = scratch.surfaces[r];
       const Vec3 frame = r < mesh_.cloth_count ? a.motion : b.motion;
@@ -292,7 +295,7 @@ void BroadPhase::find(const double* x_t0,
   });
 
   filter(vertex_faces, [&](const IndexPair& p) { return !has_vertex(mesh_.faces[p[1]], p[0]); });
-  sort_pairs(vertex_faces, mesh_.vertex_count, scratch);
+  sort_pairs(vertex_faces, scratch);
   for (const auto& [v, f] : scratch.sorted) {
     const auto& [i, j, k] = mesh_.faces[f];
     out.push_back({.kind = PairKind::kPointTriangle, .vertices = {v, i, j, k}, .a = v, .b = f});
@@ -301,7 +304,7 @@ void BroadPhase::find(const double* x_t0,
   filter(edges,
          [&](const IndexPair& p) { return !share_vertex(mesh_.edges[p[0]], mesh_.edges[p[1]]); });
   for (IndexPair& pair : edges) pair = {std::min(pair[0], pair[1]), std::max(pair[0], pair[1])};
-  sort_pairs(edges, mesh_.cloth_edge_count, scratch);  // the lower edge belongs to a cloth
+  sort_pairs(edges, scratch);
   for (const auto& [e, f] : scratch.sorted) {
     const auto& [i, j] = mesh_.edges[e];
     const auto& [k, l] = mesh_.edges[f];

@@ -36,9 +36,8 @@ struct Candidate {
 /// Which pairs can come close at all, by swept boxes.
 ///
 /// Immutable after construction, and safe to share between threads that each have a Scratch. Pairs
-/// are: vertex and face, edge and edge, of different cloths, of a cloth and a body, and of one
-/// cloth if the mesh has self_contact. Pairs within a body, of two bodies, and pairs that share a
-/// vertex are left out, as are vertices that belong to no face.
+/// are: vertex and face, edge and edge, of surfaces that may touch. Pairs that share a vertex are
+/// left out, as are vertices that belong to no face.
 class BroadPhase {
  public:
   /// @param x_reference  positions that shape the search trees, 3 * vertex_count
@@ -93,8 +92,8 @@ class BroadPhase {
 
   /// All pairs whose boxes, each swept from x_t0 to x_t1 and rounded outward, are within the sum of
   /// the two surfaces' reaches of each other. Boxes are swept in a frame that moves as a surface does on
-  /// average: a body for pairs with it, else the first cloth of a pair. A cloth that flies as a
-  /// whole thus meets itself as if it were at rest.
+  /// average: the second of a pair if it is a body, else the first. A cloth that flies as a whole
+  /// thus meets itself as if it were at rest.
   ///
   /// Sorted; every pair that comes within the sum of the two reaches at any time of the straight
   /// motion is among them.
@@ -129,7 +128,7 @@ class BroadPhase {
   void measure_motion(const Sweep& sweep, Scratch& scratch) const;
   void fit(const Sweep& sweep, Index surface, const Vec3& frame, Scratch& scratch) const;
 
-  /// Visit the pairs of surfaces that may touch and whose boxes overlap, the cloth first (a cloth
+  /// Visit the pairs of surfaces that may touch and whose boxes overlap, the lower first (a surface
   /// with itself included); their trees are fitted by then.
   template <class Visit>
   void visit_surface_pairs(const Sweep& sweep, Scratch& scratch, Visit&& visit) const;

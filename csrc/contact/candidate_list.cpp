@@ -58,6 +58,7 @@ void CandidateList::measure_approach(const double* x_t0,
     const std::vector<Motion> moved = motions(mesh, reference_.data(), x);
     for (std::size_t s = 0; s < count; ++s) {
       for (std::size_t r = 0; r < count; ++r) {
+        if (!mesh.touching.contains(static_cast<Index>(s), static_cast<Index>(r))) continue;
         const double common =
             moved[s].around_mean + moved[r].around_mean + (moved[s].mean - moved[r].mean).norm();
         raise(out[s * count + r], std::min(common, moved[s].largest + moved[r].largest));
@@ -71,8 +72,8 @@ bool CandidateList::covers(std::span<const double> approach, std::span<const dou
   if (!std::ranges::equal(reach, reach_)) return false;
   const CollisionMesh& mesh = broad_phase_->mesh();
   const auto count = static_cast<std::size_t>(mesh.surface_count());
-  for (std::size_t s = 0; s < static_cast<std::size_t>(mesh.cloth_count); ++s) {
-    for (std::size_t r = 0; r < count; ++r) {
+  for (std::size_t s = 0; s < count; ++s) {
+    for (std::size_t r = s; r < count; ++r) {
       if (!(approach[s * count + r] + rounding_ <= 2.0 * skin_)) return false;
     }
   }
@@ -95,9 +96,7 @@ bool CandidateList::build(const double* x_t0,
   const double largest_reach = reach.empty() ? 0.0 : *std::ranges::max_element(reach);
   measure_approach(x_t0, x_t1, approach_);
   double approach = 0.0;
-  for (std::size_t s = 0; s < static_cast<std::size_t>(mesh.cloth_count); ++s) {
-    for (std::size_t r = 0; r < count; ++r) raise(approach, approach_[s * count + r]);
-  }
+  for (const double value : approach_) raise(approach, value);
   skin_ = std::clamp(kAhead * 0.5 * approach, kThinnest * largest_reach, kThickest * largest_reach);
   if (!covers(approach_, reach)) {
     reference_.clear();

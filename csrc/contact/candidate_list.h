@@ -36,7 +36,8 @@ class CandidateList {
   Index builds() const { return builds_; }
 
  private:
-  /// [surfaces^2] by how much two surfaces can have come closer since the reference, at most.
+  /// [surfaces^2] by how much two surfaces can have come closer since the reference, at most; 0 of
+  /// those that never touch.
   void measure_approach(const double* x_t0, const double* x_t1, std::vector<double>& out) const;
   bool covers(std::span<const double> approach, std::span<const double> reach) const;
   bool build(const double* x_t0,

@@ -10,10 +10,12 @@ namespace {
 
 void check(const CollisionMesh& mesh) {
   for (Index i = 0; i < mesh.vertex_count; ++i) {
-    if (mesh.vertex_surface[i] < (i == 0 ? 0 : mesh.vertex_surface[i - 1])) {
-      throw std::invalid_argument("collision mesh: `vertex_surface` must ascend from 0, got " +
-                                  std::to_string(mesh.vertex_surface[i]) + " at vertex " +
-                                  std::to_string(i));
+    if (mesh.vertex_surface[i] < (i == 0 ? 0 : mesh.vertex_surface[i - 1]) ||
+        mesh.vertex_surface[i] >= mesh.surface_count()) {
+      throw std::invalid_argument(
+          "collision mesh: `vertex_surface` must ascend from 0 and stay below " +
+          std::to_string(mesh.surface_count()) + ", got " + std::to_string(mesh.vertex_surface[i]) +
+          " at vertex " + std::to_string(i));
     }
   }
   Index previous = 0;
@@ -68,12 +70,12 @@ std::vector<HalfEdge> sorted_half_edges(const CollisionMesh& mesh) {
 CollisionMesh::CollisionMesh(std::vector<Face> faces_in,
                              std::vector<Index> vertex_surface_in,
                              Index cloth_count_in,
-                             bool self_contact_in)
+                             SurfacePairs touching_in)
     : vertex_count(static_cast<Index>(vertex_surface_in.size())),
       cloth_count(cloth_count_in),
       faces(std::move(faces_in)),
       vertex_surface(std::move(vertex_surface_in)),
-      self_contact(self_contact_in) {
+      touching(std::move(touching_in)) {
   check(*this);
   for (const Index surface : vertex_surface) cloth_vertex_count += surface < cloth_count;
   face_surface.reserve(faces.size());

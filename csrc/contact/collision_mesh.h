@@ -1,10 +1,10 @@
 #pragma once
 
-#include <algorithm>
 #include <array>
 #include <vector>
 
 #include "common/types.h"
+#include "contact/surface_pairs.h"
 
 namespace diffcloth::contact {
 
@@ -28,21 +28,20 @@ struct CollisionMesh {
   std::vector<Index> edge_surface;
   std::vector<std::array<Index, 2>> edge_faces;  ///< -1 where missing; the first two of several.
   std::vector<std::array<Index, 3>> face_edges;  ///< Edge k joins the corners k and k + 1.
-  bool self_contact = true;                      ///< Whether a cloth touches itself.
+  SurfacePairs touching;
 
   CollisionMesh() = default;
 
   /// @param faces           corners of every face, grouped by surface in ascending order
   /// @param vertex_surface  surface of every vertex, ascending
+  /// @param touching        which of the surfaces may touch; it says how many there are
   /// @throws std::invalid_argument naming the first face or vertex that breaks this.
   CollisionMesh(std::vector<Face> faces,
                 std::vector<Index> vertex_surface,
                 Index cloth_count,
-                bool self_contact);
+                SurfacePairs touching);
 
-  Index surface_count() const {
-    return vertex_surface.empty() ? cloth_count : std::max(cloth_count, vertex_surface.back() + 1);
-  }
+  Index surface_count() const { return touching.surface_count(); }
 };
 
 }  // namespace diffcloth::contact

@@ -18,6 +18,10 @@ void add_stencil_couplings(const Stencil& v, linalg::Couplings& pairs) {
   }
 }
 
+bool moves(const Stencil& v, const double* d) {
+  return std::ranges::any_of(v, [&](Index i) { return !row(d, i).isZero(0.0); });
+}
+
 void add_stencil_product(const Stencil& v, const Mat12& h, const double* d, double* y) {
   const Vec12 product = h * stacked(v, d);
   for (int i = 0; i < 4; ++i) Eigen::Map<Vec3>(y + 3 * v[i]) += product.segment<3>(3 * i);
@@ -82,7 +86,7 @@ void ContactPotential::add_left_out_product(const double* x,
                                             const double* d,
                                             double* y) const {
   for (const Contact& k : contacts_) {
-    if (!model_.has_prescribed(k.pair.vertices)) continue;
+    if (!moves(k.pair.vertices, d)) continue;
     add_stencil_product(k.pair.vertices, model_.hessian(k, x, curvature), d, y);
   }
 }
@@ -110,7 +114,7 @@ void FrictionPotential::add_left_out_product(const double* x,
                                              const double* d,
                                              double* y) const {
   for (const FrictionSet::Entry& k : set_.entries()) {
-    if (!set_.model().has_prescribed(k.lag.pair.vertices)) continue;
+    if (!moves(k.lag.pair.vertices, d)) continue;
     add_stencil_product(k.lag.pair.vertices, set_.hessian(k, x_start_, x, curvature), d, y);
   }
 }

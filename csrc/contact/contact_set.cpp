@@ -54,12 +54,13 @@ bool ContactModel::between_cloths(const Candidate& pair) const {
   return surface_a(pair) < mesh_.cloth_count && surface_b(pair) < mesh_.cloth_count;
 }
 
-bool ContactModel::has_prescribed(const std::array<Index, 4>& vertices) const {
-  return std::ranges::any_of(vertices, [&](Index v) { return prescribed_[v] != 0; });
+bool ContactModel::between_bodies(const Candidate& pair) const {
+  return surface_a(pair) >= mesh_.cloth_count && surface_b(pair) >= mesh_.cloth_count;
 }
 
 // What multiplies a contact's coefficient to make its weight.
 double ContactModel::area(const Candidate& pair) const {
+  if (between_bodies(pair)) return 1.0;  // its coefficient is the weight
   if (pair.kind == PairKind::kPointTriangle) {
     const Index p = pair.vertices[0];
     return p < mesh_.cloth_vertex_count ? rest_.vertex_area[p]
@@ -74,26 +75,31 @@ double ContactModel::threshold(const Candidate& pair) const {
   return mollifier_threshold(rest_.edge_length_sq[pair.a], rest_.edge_length_sq[pair.b]);
 }
 
+void ContactModel::pull_back_area(const Contact& k, double area_bar, RestMeasures& rest) const {
+  const Candidate& pair = k.pair;
+  if (between_bodies(pair)) return;
+  if (pair.kind == PairKind::kEdgeEdge) {
+    rest.edge_area[pair.a] += area_bar;
+    if (between_cloths(pair)) rest.edge_area[pair.b] += area_bar;
+    return;
+  }
+  const Index p = pair.vertices[0];
+  if (p < mesh_.cloth_vertex_count) {
+    rest.vertex_area[p] += area_bar;
+  } else {
+    rest.mean_face_area[surface_b(pair)] += area_bar;
+  }
+}
+
 void ContactModel::pull_back(
     const Contact& k, double weight_bar, double threshold_bar, double xi_bar, Bar& bar) const {
   const Candidate& pair = k.pair;
   bar.thickness[surface_a(pair)] += 0.5 * xi_bar;
   bar.thickness[surface_b(pair)] += 0.5 * xi_bar;
-  const double area_bar = k.coefficient * weight_bar;
-  RestMeasures& rest = bar.rest;
-  if (pair.kind == PairKind::kPointTriangle) {
-    const Index p = pair.vertices[0];
-    if (p < mesh_.cloth_vertex_count) {
-      rest.vertex_area[p] += area_bar;
-    } else {
-      rest.mean_face_area[surface_b(pair)] += area_bar;
-    }
-    return;
-  }
-  rest.edge_area[pair.a] += area_bar;
-  if (between_cloths(pair)) rest.edge_area[pair.b] += area_bar;
+  pull_back_area(k, k.coefficient * weight_bar, bar.rest);
   if (!k.mollified) return;
   // The threshold is 1e-3 |U|^2 |V|^2.
+  RestMeasures& rest = bar.rest;
   rest.edge_length_sq[pair.a] += threshold_bar * k.threshold / rest_.edge_length_sq[pair.a];
   rest.edge_length_sq[pair.b] += threshold_bar * k.threshold / rest_.edge_length_sq[pair.b];
 }
@@ -164,16 +170,18 @@ void ContactModel::find_terms(std::span<const Candidate> group,
   }
   const double range = parameters_.d_hat + xi(head);
   const Index a = head.vertices[0];
+  if (between_bodies(head) && prescribed_[a] != 0 && prescribed_[head.vertices[3]] != 0) return;
   if (head.kind == PairKind::kEdgeEdge) {
-    if (prescribed_[a] != 0 && prescribed_[head.vertices[1]] != 0) return;
+    if (!between_bodies(head) && prescribed_[a] != 0 && prescribed_[head.vertices[1]] != 0) return;
     add_edge_terms(mesh_, weights_, group, rest_.edge_length_sq, x, range, 0.5, scratch, out);
   } else if (a < mesh_.cloth_vertex_count) {
     if (prescribed_[a] != 0) return;
     add_point_terms(mesh_, weights_, group, x, range, 0.25, scratch, out);
   } else {
-    const double s = weights_.vertex_sharpness(surface_b(head), a);
-    if (s == 0.0) return;
-    add_point_terms(mesh_, weights_, group, x, range, 0.25 * s, scratch, out);
+    const double w = between_bodies(head) ? weights_.vertex_area(a, surface_b(head))
+                                          : weights_.vertex_sharpness(surface_b(head), a);
+    if (w == 0.0) return;
+    add_point_terms(mesh_, weights_, group, x, range, 0.25 * w, scratch, out);
   }
 }
 
@@ -194,16 +202,17 @@ Contact ContactModel::contact(const Term& term, const double* x) const {
     k.mollified = true;
     k.mollifier = mollifier(corner, k.threshold);
   }
-  if (term.end >= 0) {
-    // The distance of one end of edge b: the other one does not take part.
-    corner[3 - term.end] = corner[2 + term.end];
-    k.closest = closest(pair.kind, corner);
-    if (term.end == 1) {
-      k.closest.c.tail<2>().reverseInPlace();
-      k.closest.c_beta.bottomRows<2>().colwise().reverseInPlace();
-    }
-  } else {
-    k.closest = closest(pair.kind, corner);
+  for (int side = 0; side < 2; ++side) {
+    // The distance of one end of an edge: the other one does not take part.
+    const int end = term.ends[side];
+    if (end >= 0) corner[2 * side + 1 - end] = corner[2 * side + end];
+  }
+  k.closest = closest(pair.kind, corner);
+  for (int side = 0; side < 2; ++side) {
+    // What repeats is taken for its first corner.
+    if (term.ends[side] != 1) continue;
+    k.closest.c.segment<2>(2 * side).reverseInPlace();
+    k.closest.c_beta.middleRows<2>(2 * side).colwise().reverseInPlace();
   }
   k.barrier = barrier_derivatives(k.closest.d_sq, xi_pair, parameters_.d_hat);
   return k;

@@ -27,7 +27,7 @@ struct Parameters {
 /// A pair of primitives within reach, with everything its barrier needs.
 struct Contact {
   Candidate pair;      ///< against bodies, its nearest features: see Term
-  double coefficient;  ///< share of the area; may be negative
+  double coefficient;  ///< share of the area, between bodies an area [m^2]; may be negative
   double weight;       ///< w: coefficient times area [m^2]
   double threshold;    ///< eps of the edge-edge mollifier [m^4]; 0 where there is none
   double xi;           ///< half the sum of the two thicknesses [m]
@@ -48,11 +48,14 @@ struct Contact {
 ///   body vertex v:   w = s_v mean(A_f) / 4  times the sum over the cloth's features, with the mean
 ///                                           area of the cloth's faces.
 ///
+/// Between two bodies it is over the features of each that a corner of the other meets, and over pairs
+/// of ridges; areas are those of FeatureWeights.
+///
 /// Terms that share their nearest features are one contact, whose coefficient is the sum of theirs.
 ///
 /// Positions are those of the whole collision mesh, cloth first, then bodies: 3 doubles a vertex.
-/// `prescribed` marks vertices whose motion is given (pins, bodies): features made of them alone
-/// carry no energy.
+/// `prescribed` marks vertices whose motion is given (pins, bodies that dynamics does not move):
+/// features made of them alone carry no energy.
 class ContactModel {
  public:
   ContactModel(const CollisionMesh& mesh,
@@ -126,19 +129,19 @@ class ContactModel {
                  Bar& bar) const;
   void pull_back_mu(const Candidate& pair, double mu_bar, Bar& bar) const;
 
-  /// Whether some of these vertices are prescribed.
-  bool has_prescribed(const std::array<Index, 4>& vertices) const;
 
  private:
   /// Candidates that act together: one, or those of a point or an edge and a body.
   std::size_t group_end(const std::vector<Candidate>& candidates, std::size_t first) const;
   bool between_cloths(const Candidate& pair) const;
+  bool between_bodies(const Candidate& pair) const;
   void find_terms(std::span<const Candidate> group,
                   const double* x,
                   MergeScratch& scratch,
                   std::vector<Term>& out) const;
   void add_cloth_term(const Candidate& pair, const double* x, std::vector<Term>& out) const;
   double area(const Candidate& pair) const;
+  void pull_back_area(const Contact& contact, double area_bar, RestMeasures& rest) const;
   double threshold(const Candidate& pair) const;
   Contact contact(const Term& term, const double* x) const;
 

@@ -4,6 +4,7 @@
 #include <cmath>
 #include <numbers>
 
+#include "contact/feature_areas.h"
 #include "contact/rest_measures.h"
 #include "contact/sharpness.h"
 
@@ -79,6 +80,14 @@ FeatureWeights::FeatureWeights(const CollisionMesh& mesh,
   const RestMeasures rest = measure(mesh, X);
   const Bulge angles = bulge(mesh, X);
   continuation_ = continuations(mesh, X, angles.edge);
+  const FeatureAreas areas = feature_areas(mesh, X, angles);
+  vertex_area_.assign(areas.vertex.begin() + mesh.cloth_vertex_count, areas.vertex.end());
+  surface_area_.assign(areas.surface.begin(), areas.surface.end());
+  for (auto e = static_cast<std::size_t>(mesh.cloth_edge_count); e < mesh.edges.size(); ++e) {
+    const double share = std::clamp(2.0 * angles.edge[e] / std::numbers::pi, 0.0, 1.0);
+    body_edges_.push_back(
+        {.sharpness = static_cast<float>(share), .area = static_cast<float>(areas.edge[e])});
+  }
   for (const double length : mean_edge_length(mesh, rest)) {
     for (auto e = mesh.cloth_edge_count; e < static_cast<Index>(mesh.edges.size()); ++e) {
       const double width = 2.0 * rest.edge_area[e] / std::sqrt(rest.edge_length_sq[e]);

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <algorithm>
 #include <array>
 #include <vector>
 
@@ -31,6 +32,14 @@ namespace diffcloth::contact {
 /// cloth. The sign of theta counts on closed parts whose faces are oriented outward; elsewhere
 /// (open, inward or inconsistently oriented parts) its size does.
 ///
+/// Between two bodies every corner and every ridge acts, with the area of A_v and A_e of FeatureAreas,
+/// but no more than the other has, and a ridge by its angle, s = clip(2 theta / pi):
+///
+///   corner v of body a against body b:    w = min(A_v, area of b) / 4,
+///   ridges c and e of two bodies:         w = s_c s_e min(A_c, A_e) / 2,
+///
+/// so that no cut of either body into triangles changes what holds them apart.
+///
 /// All of these are constants, made once from the rest meshes. Sharpnesses are rounded to single
 /// precision, so that sums of a few of their products are exact, and cancel exactly.
 class FeatureWeights {
@@ -52,10 +61,29 @@ class FeatureWeights {
     return vertex_sharpness_[cloth * body_vertex_count_ + (v - cloth_vertex_count_)];
   }
   /// How much another sharp edge continues a body's edge at its end 0 or 1: smoothstep of
-  /// (-u1 . u2 - 1/2) / 0.4, with unit vectors u from the end. 0 to 1.
-  double continuation(Index e, int end) const { return continuation_[e - cloth_edge_count_][end]; }
+  /// (-u1 . u2 - 1/2) / 0.4, with unit vectors u from the end. 0 to 1; 0 of a cloth's edge.
+  double continuation(Index e, int end) const {
+    return e < cloth_edge_count_ ? 0.0 : continuation_[e - cloth_edge_count_][end];
+  }
+
+  /// min(A_v, area of the surface) of a body's vertex against another body [m^2].
+  double vertex_area(Index v, Index surface) const {
+    return std::min(vertex_area_[v - cloth_vertex_count_], surface_area_[surface]);
+  }
+  /// s_c s_e min(A_c, A_e) of the edges of two bodies [m^2].
+  float edge_pair_area(Index c, Index e) const {
+    const Edge& p = body_edges_[c - cloth_edge_count_];
+    const Edge& q = body_edges_[e - cloth_edge_count_];
+    return static_cast<float>(double{p.sharpness} * q.sharpness * std::min(p.area, q.area));
+  }
 
  private:
+  /// A body's edge, as other bodies see it.
+  struct Edge {
+    float sharpness;
+    float area;  ///< [m^2]
+  };
+
   void count_faces(const CollisionMesh& mesh, const std::vector<char>& prescribed);
 
   Index cloth_edge_count_;
@@ -68,6 +96,9 @@ class FeatureWeights {
   std::vector<float> edge_sharpness_;               // [cloths * body edges]
   std::vector<float> vertex_sharpness_;             // [cloths * body vertices]
   std::vector<std::array<float, 2>> continuation_;  // [body edges]
+  std::vector<Edge> body_edges_;                    // [body edges]
+  std::vector<float> vertex_area_;                  // [body vertices]
+  std::vector<float> surface_area_;                 // [surfaces]
 };
 
 }  // namespace diffcloth::contact

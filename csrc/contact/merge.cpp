@@ -79,7 +79,7 @@ bool is_beyond(const Corners& x, double range) {
 
 /// Add up the parts of each feature; those within range and not zero come first in the list.
 void merge(std::vector<Part>& parts, double range) {
-  const auto key = [](const Part& p) { return std::tuple(p.kind, p.id, p.end); };
+  const auto key = [](const Part& p) { return std::tuple(p.kind, p.id, p.ends[1], p.ends[0]); };
   std::erase_if(parts, [&](const Part& p) { return !(p.d_sq < range * range); });
   // Sums of few integers or products of single-precision numbers: exact in any order.
   std::ranges::sort(parts, {}, key);
@@ -93,6 +93,19 @@ void merge(std::vector<Part>& parts, double range) {
   }
   parts.resize(count);
   std::erase_if(parts, [](const Part& p) { return p.coefficient == 0.0; });
+}
+
+/// Weight of edge c against a body's edge e.
+double weight(const CollisionMesh& mesh, const FeatureWeights& weights, Index c, Index e) {
+  const Index surface = mesh.edge_surface[c];
+  return surface < mesh.cloth_count ? weights.edge_sharpness(surface, e)
+                                    : weights.edge_pair_area(c, e);
+}
+
+/// The end of an edge that has all of its closest point's weight; -1 if each has a part.
+std::int8_t end_of(double c0, double c1) {
+  if (c1 == 0.0) return 0;
+  return c0 == 0.0 ? std::int8_t{1} : std::int8_t{-1};
 }
 
 template <class Values>
@@ -140,7 +153,7 @@ void add_point_terms(const CollisionMesh& mesh,
   const auto push_on_edge = [&parts](const NearEdge& near, Index weight) {
     const bool inside = near.vertex < 0;
     parts.push_back({.kind = inside ? kEdge : kVertex,
-                     .end = -1,
+                     .ends = {-1, -1},
                      .id = inside ? near.edge : near.vertex,
                      .coefficient = static_cast<double>(weight),
                      .d_sq = near.d_sq});
@@ -149,7 +162,7 @@ void add_point_terms(const CollisionMesh& mesh,
     const auto& [i, j, k] = mesh.faces[f];
     double d_sq = 0.0;
     if (projects_into({p, row(x, i), row(x, j), row(x, k)}, d_sq)) {
-      parts.push_back({.kind = kFace, .end = -1, .id = f, .coefficient = 1.0, .d_sq = d_sq});
+      parts.push_back({.kind = kFace, .ends = {-1, -1}, .id = f, .coefficient = 1.0, .d_sq = d_sq});
       continue;
     }
     const NearEdge* nearest = nullptr;
@@ -162,7 +175,7 @@ void add_point_terms(const CollisionMesh& mesh,
   for (const NearEdge& near : edges) push_on_edge(near, weights.edge(near.edge));
   for (const Index v : vertices) {
     parts.push_back({.kind = kVertex,
-                     .end = -1,
+                     .ends = {-1, -1},
                      .id = v,
                      .coefficient = static_cast<double>(weights.vertex(v)),
                      .d_sq = (p - row(x, v)).squaredNorm()});
@@ -196,53 +209,76 @@ void add_edge_terms(const CollisionMesh& mesh,
                     MergeScratch& scratch,
                     std::vector<Term>& out) {
   const Index c = group.front().a;
-  const Index cloth = mesh.edge_surface[c];
   std::vector<Part>& parts = scratch.parts;
   parts.clear();
   for (const Candidate& pair : group) {
     const Index e = pair.b;
-    const double s = weights.edge_sharpness(cloth, e);
-    if (s == 0.0) continue;
+    const double w = weight(mesh, weights, c, e);
+    if (w == 0.0) continue;
     const auto& v = pair.vertices;
     const Corners corner{row(x, v[0]), row(x, v[1]), row(x, v[2]), row(x, v[3])};
     if (is_beyond(corner, range)) continue;
     const bool soft = mollified(corner, mollifier_threshold(edge_length_sq[c], edge_length_sq[e]));
-    const auto push = [&](std::int8_t end, double coefficient, double d_sq) {
-      const bool shared = end >= 0 && !soft;
+    const auto push = [&](std::int8_t end_c, std::int8_t end_e, double coefficient, double d_sq) {
+      // An end that is not continued has nothing to merge with.
+      if (end_c >= 0 && weights.continuation(c, end_c) == 0.0) end_c = -1;
+      const bool shared = end_e >= 0 && !soft;
       parts.push_back({.kind = soft ? kMollified : (shared ? kVertex : kEdge),
-                       .end = shared ? std::int8_t{-1} : end,
-                       .id = shared ? v[2 + end] : e,
+                       .ends = {end_c, shared ? std::int8_t{-1} : end_e},
+                       .id = shared ? v[2 + end_e] : e,
                        .coefficient = coefficient,
                        .d_sq = d_sq});
     };
-    const Closest whole = closest(PairKind::kEdgeEdge, corner);
-    const bool at_0 = whole.c[3] == 0.0;
-    const bool at_1 = whole.c[2] == 0.0;
-    if (!at_0 && !at_1) push(-1, s, whole.d_sq);
+    // What c as a whole, or its end, does to e and to its ends.
+    const auto push_against_e = [&](std::int8_t end_c, double coefficient) {
+      Corners at = corner;
+      if (end_c >= 0) at[0] = at[1] = corner[end_c];
+      const Closest whole = closest(PairKind::kEdgeEdge, at);
+      const bool at_0 = whole.c[3] == 0.0;
+      const bool at_1 = whole.c[2] == 0.0;
+      if (!at_0 && !at_1) {
+        const std::int8_t nearest = end_c >= 0 ? end_c : end_of(whole.c[0], whole.c[1]);
+        push(nearest, -1, coefficient, whole.d_sq);
+      }
+      for (const std::int8_t end : {std::int8_t{0}, std::int8_t{1}}) {
+        const bool nearest = end == 0 ? at_0 : at_1;
+        const double share = (nearest ? 1.0 : 0.0) - 0.5 * weights.continuation(e, end);
+        if (share == 0.0) continue;
+        if (end_c >= 0) {
+          push(end_c, end, coefficient * share, (at[0] - corner[2 + end]).squaredNorm());
+          continue;
+        }
+        const NearEdge near = nearest_on_edge(mesh, c, corner[2 + end], x);
+        const bool inside = near.vertex < 0;
+        push(inside ? std::int8_t{-1} : std::int8_t{near.vertex == v[1]}, end, coefficient * share,
+             near.d_sq);
+      }
+    };
+    push_against_e(-1, w);
     for (const std::int8_t end : {std::int8_t{0}, std::int8_t{1}}) {
-      const bool nearest = end == 0 ? at_0 : at_1;
-      const double share = (nearest ? 1.0 : 0.0) - 0.5 * weights.continuation(e, end);
-      if (share == 0.0) continue;
-      const NearEdge near = nearest_on_edge(mesh, c, corner[2 + end], x);
-      push(end, s * share, near.d_sq);
+      const double share = 0.5 * weights.continuation(c, end);
+      if (share != 0.0) push_against_e(end, -share * w);
     }
   }
   merge(parts, range);
 
   for (const Part& part : parts) {
-    Candidate pair{.kind = PairKind::kEdgeEdge,
-                   .vertices = {mesh.edges[c][0], mesh.edges[c][1], part.id, part.id},
-                   .a = c,
-                   .b = -1};
+    const auto& [i, j] = mesh.edges[c];
+    Candidate pair{
+        .kind = PairKind::kEdgeEdge, .vertices = {i, j, part.id, part.id}, .a = c, .b = -1};
+    std::array<std::int8_t, 2> ends = part.ends;
     if (part.kind != kVertex) {
       pair.vertices[2] = mesh.edges[part.id][0];
       pair.vertices[3] = mesh.edges[part.id][1];
       pair.b = part.id;
     }
-    out.push_back({.pair = pair,
-                   .coefficient = scale * part.coefficient,
-                   .d_sq = part.d_sq,
-                   .end = part.end});
+    if (part.kind != kMollified && ends[0] >= 0) {
+      pair.vertices[0] = pair.vertices[1] = mesh.edges[c][ends[0]];
+      pair.b = -1;
+      ends[0] = -1;
+    }
+    out.push_back(
+        {.pair = pair, .coefficient = scale * part.coefficient, .d_sq = part.d_sq, .ends = ends});
   }
 }
 

@@ -14,14 +14,14 @@ namespace diffcloth::contact {
 
 /// One term of what a surface does to a point or an edge: a coefficient times m b(D).
 struct Term {
-  /// Where the nearest feature of a face is an edge or a vertex, corners repeat ({p, e0, e1, e1},
-  /// {p, v, v, v}, {c0, c1, v, v}), so that no corner takes part that does not matter, and b is -1.
+  /// Where the nearest feature is an edge or a vertex, corners repeat ({p, e0, e1, e1}, {p, v, v, v},
+  /// {c0, c1, v, v}, {u, u, e0, e1}), so that no corner takes part that does not matter, and b is -1.
   Candidate pair;
   double coefficient;
   double d_sq;  ///< [m^2]
-  /// Of an edge-edge pair: 0 or 1 if D is the distance of that end of edge b, -1 if of all of it.
-  /// The mollifier is that of the two edges in any case.
-  std::int8_t end = -1;
+  /// Of an edge-edge pair, for each of its edges: 0 or 1 if D is the distance of that end, -1 if of all
+  /// of the edge. The mollifier is that of the two edges in any case.
+  std::array<std::int8_t, 2> ends = {-1, -1};
 };
 
 /// Lists that the functions below fill and leave behind, to be reused without allocation.
@@ -33,8 +33,8 @@ struct MergeScratch {
   };
   /// A share of a feature in the sum, before shares of one feature merge.
   struct Part {
-    std::int8_t kind;  ///< with id and end, tells features apart
-    std::int8_t end;
+    std::int8_t kind;  ///< with id and ends, tells features apart
+    std::array<std::int8_t, 2> ends;
     Index id;
     double coefficient;
     double d_sq;
@@ -60,12 +60,14 @@ void add_point_terms(const CollisionMesh& mesh,
                      MergeScratch& scratch,
                      std::vector<Term>& out);
 
-/// Terms of a cloth's edge c against the sharp edges e of a body,
+/// Terms of an edge c against the sharp edges e of a body,
 ///
-///   s_e m(c, e) [b(D(c, e)) - 1/2 sum over the ends v of e of gamma_ev b(D(c, v))],
+///   w_ce m(c, e) [b(D(c, e)) - 1/2 sum over the ends v of e of gamma_ev b(D(c, v))],
 ///
 /// so that an edge that is cut into pieces acts as the whole does: pieces that continue each other
-/// meet in a vertex, which each takes half of. Terms at one vertex that are not mollified merge.
+/// meet in a vertex, which each takes half of. Terms at one vertex that are not mollified merge. If c is
+/// an edge of a body too, b(D(c, .)) is likewise b(D(c, .)) - 1/2 sum over its ends u of
+/// gamma_cu b(D(u, .)).
 ///
 /// @param group           the candidates of one edge and one body
 /// @param edge_length_sq  [edges] of the rest shapes [m^2], for the mollifier

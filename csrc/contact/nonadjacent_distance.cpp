@@ -32,7 +32,10 @@ Cloth one_cloth(const CollisionMesh& mesh, Index surface, const double* x) {
     faces.push_back(mesh.faces[f]);
     for (Index& v : faces.back()) v -= static_cast<Index>(first);
   }
-  return {.mesh = CollisionMesh(std::move(faces), std::vector<Index>(last - first, 0), 1, true),
+  SurfacePairs itself(1);
+  itself.set(0, 0, true);
+  return {.mesh = CollisionMesh(std::move(faces), std::vector<Index>(last - first, 0), 1,
+                                std::move(itself)),
           .x = std::vector<double>(x + 3 * first, x + 3 * last)};
 }
 

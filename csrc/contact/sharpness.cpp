@@ -4,11 +4,12 @@
 #include <array>
 #include <cmath>
 #include <numbers>
-#include <numeric>
 #include <optional>
 #include <utility>
 
 #include <Eigen/Geometry>
+
+#include "common/disjoint_sets.h"
 
 namespace diffcloth::contact {
 namespace {
@@ -26,24 +27,6 @@ bool runs_up(const CollisionMesh& mesh, Index f, Index e) {
   return mesh.faces[f][side] == mesh.edges[e][0];
 }
 
-/// Disjoint sets of faces.
-class Parts {
- public:
-  explicit Parts(std::size_t size) : parent_(size) { std::iota(parent_.begin(), parent_.end(), 0); }
-  Index find(Index i) {
-    while (parent_[i] != i) i = parent_[i] = parent_[parent_[i]];
-    return i;
-  }
-  void unite(Index i, Index j) {
-    const Index p = find(i);
-    const Index q = find(j);
-    parent_[std::max(p, q)] = std::min(p, q);
-  }
-
- private:
-  std::vector<Index> parent_;
-};
-
 /// What the angles of a body's features are measured with.
 struct Faces {
   std::vector<Vec3> normal;       ///< [faces] unit, or zero of a face without area
@@ -54,7 +37,7 @@ struct Faces {
 std::vector<char> find_solid(const CollisionMesh& mesh,
                              const double* X,
                              const std::vector<Index>& edge_count) {
-  Parts parts(mesh.faces.size());
+  DisjointSets parts(mesh.faces.size());
   for (std::size_t e = mesh.cloth_edge_count; e < mesh.edges.size(); ++e) {
     if (edge_count[e] > 1) parts.unite(mesh.edge_faces[e][0], mesh.edge_faces[e][1]);
   }
@@ -197,11 +180,13 @@ double normal_cone(const Star& star) {
 Bulge bulge(const CollisionMesh& mesh, const double* X) {
   const Faces faces = describe(mesh, X);
   Bulge result{.edge = std::vector<double>(mesh.edges.size(), 0.0),
-               .vertex = std::vector<double>(mesh.vertex_count, 0.0)};
+               .vertex = std::vector<double>(mesh.vertex_count, 0.0),
+               .flat = std::vector<char>(mesh.edges.size(), 0)};
   std::vector<Star> stars(mesh.vertex_count);
   for (auto e = static_cast<std::size_t>(mesh.cloth_edge_count); e < mesh.edges.size(); ++e) {
     const double theta = dihedral(mesh, X, faces, static_cast<Index>(e));
     result.edge[e] = std::max(theta, 0.0);
+    result.flat[e] = theta == 0.0;
     const auto& [i, j] = mesh.edges[e];
     const Vec3 along = (row(X, j) - row(X, i)).normalized();
     stars[i].directions.push_back(along);

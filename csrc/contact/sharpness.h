@@ -15,6 +15,7 @@ namespace diffcloth::contact {
 struct Bulge {
   std::vector<double> edge;    ///< [edges] exterior dihedral angle, pi at boundaries [rad]
   std::vector<double> vertex;  ///< [vertices] solid angle of the normals [sr]
+  std::vector<char> flat;      ///< [edges] whether it lies inside a plane
 };
 
 /// Angles below 1e-4, the rounding of meshes in single precision, are flat, and 0. The cloth's

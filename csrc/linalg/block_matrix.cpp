@@ -41,9 +41,11 @@ MergedPattern merge(const BlockPattern& base, const Couplings& pairs) {
 }
 
 BlockMatrix::BlockMatrix(std::shared_ptr<const MergedPattern> merged,
-                         const std::vector<char>& fixed)
+                         const std::vector<char>& fixed,
+                         const Attachments* attachments)
     : merged_(std::move(merged)),
       fixed_(&fixed),
+      attachments_(attachments),
       blocks_(9 * static_cast<std::size_t>(merged_->pattern.block_count()), 0.0) {}
 
 void BlockMatrix::add_base(const std::vector<double>& base_blocks) {
@@ -55,16 +57,49 @@ void BlockMatrix::add_base(const std::vector<double>& base_blocks) {
   }
 }
 
-void BlockMatrix::add_stencil(const std::array<Index, 4>& vertices, const Mat12& h) {
+void BlockMatrix::add_stencil(const std::array<Index, 4>& points, const Mat12& h) {
+  if (std::ranges::any_of(points, [&](Index v) { return is_attached(v); })) {
+    add_attached(points, h);
+    return;
+  }
   for (int p = 0; p < 4; ++p) {
-    const Index i = vertices[p];
+    const Index i = points[p];
     if (!has(i)) continue;
     for (int q = 0; q < 4; ++q) {
-      const Index j = vertices[q];
+      const Index j = points[q];
       if (i < j || !has(j)) continue;
-      const Index slot = merged_->pattern.slot(i, j);
-      Eigen::Map<Mat3>(blocks_.data() + 9 * static_cast<std::ptrdiff_t>(slot)) +=
-          h.block<3, 3>(3 * p, 3 * q);
+      add_block(i, j, h.block<3, 3>(3 * p, 3 * q));
+    }
+  }
+}
+
+void BlockMatrix::add_attached(const std::array<Index, 4>& points, const Mat12& h) {
+  // The four points move with a few rows: dx = sum of G_r dz_r.
+  struct Row {
+    Index row;
+    Eigen::Matrix<double, 12, 3> g;
+  };
+  std::vector<Row> rows;
+  const auto find = [&](Index r) -> Row& {
+    for (Row& known : rows) {
+      if (known.row == r) return known;
+    }
+    rows.push_back({.row = r, .g = Eigen::Matrix<double, 12, 3>::Zero()});
+    return rows.back();
+  };
+  for (int p = 0; p < 4; ++p) {
+    if (has(points[p])) {
+      find(points[p]).g.block<3, 3>(3 * p, 0) += Mat3::Identity();
+    } else if (is_attached(points[p])) {
+      for (const auto* e = attachments_->begin(points[p]); e != attachments_->end(points[p]); ++e) {
+        find(e->row).g.block<3, 3>(3 * p, 0) += e->jacobian;
+      }
+    }
+  }
+  for (const Row& s : rows) {
+    const Eigen::Matrix<double, 12, 3> hg = h * s.g;
+    for (const Row& r : rows) {
+      if (r.row >= s.row) add_block(r.row, s.row, r.g.transpose() * hg);
     }
   }
 }

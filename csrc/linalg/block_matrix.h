@@ -5,6 +5,7 @@
 #include <utility>
 #include <vector>
 
+#include "linalg/attachments.h"
 #include "linalg/block_pattern.h"
 
 namespace diffcloth::linalg {
@@ -24,14 +25,19 @@ struct MergedPattern {
 /// Enlarge a pattern by sorted couplings.
 MergedPattern merge(const BlockPattern& base, const Couplings& pairs);
 
-/// A symmetric matrix over the cloth's vertices on a merged pattern.
+/// A symmetric matrix on a merged pattern, whose rows are the cloth's vertices and, behind them, nodes
+/// of coordinates.
 ///
 /// Potentials with elements that never change add to the base pattern, whose slots they know; the
-/// others add blocks by their vertices. Rows of fixed vertices exist in the base pattern only.
+/// others add blocks by their points, of which those without rows may be attached to some. Rows of
+/// fixed points exist in the base pattern only.
 class BlockMatrix {
  public:
-  /// @param fixed  [pattern size] vertices whose rows further couplings leave out
-  BlockMatrix(std::shared_ptr<const MergedPattern> merged, const std::vector<char>& fixed);
+  /// @param fixed        [pattern size] rows that further couplings leave out
+  /// @param attachments  of the points that are no rows; null where every point is one
+  BlockMatrix(std::shared_ptr<const MergedPattern> merged,
+              const std::vector<char>& fixed,
+              const Attachments* attachments = nullptr);
 
   const BlockPattern& pattern() const { return merged_->pattern; }
   const double* blocks() const { return blocks_.data(); }
@@ -49,11 +55,21 @@ class BlockMatrix {
     block[8] += value;
   }
 
-  /// Whether vertex i has a row here that is not fixed.
-  bool has(Index i) const { return i < merged_->pattern.size() && (*fixed_)[i] == 0; }
+  /// Add a diagonal to the diagonal block of row i.
+  void add_to_diagonal(Index i, const Vec3& values) {
+    double* block =
+        blocks_.data() + 9 * static_cast<std::ptrdiff_t>(merged_->pattern.column_start()[i]);
+    for (int a = 0; a < 3; ++a) block[4 * a] += values[a];
+  }
 
-  /// Add the 12x12 matrix of four vertices, without the rows that are left out.
-  void add_stencil(const std::array<Index, 4>& vertices, const Mat12& h);
+  /// Add a block at rows i >= j, and its transpose at (j, i).
+  void add_block(Index i, Index j, const Mat3& block) {
+    Eigen::Map<Mat3>(blocks_.data() +
+                     9 * static_cast<std::ptrdiff_t>(merged_->pattern.slot(i, j))) += block;
+  }
+
+  /// Add the 12x12 matrix of four points, without the rows that are left out.
+  void add_stencil(const std::array<Index, 4>& points, const Mat12& h);
 
   /// this = (this + s other) / (1 + s); both on the same pattern.
   void blend(const BlockMatrix& other, double s);
@@ -62,8 +78,20 @@ class BlockMatrix {
   void add_product(const double* x, double* y) const;
 
  private:
+  /// Whether a point is a row here that is not fixed.
+  bool has(Index point) const {
+    const Index rows = attachments_ == nullptr ? merged_->pattern.size() : attachments_->first;
+    return point < rows && (*fixed_)[point] == 0;
+  }
+  bool is_attached(Index point) const {
+    return attachments_ != nullptr && !attachments_->empty() && point >= attachments_->first &&
+           attachments_->begin(point) != attachments_->end(point);
+  }
+  void add_attached(const std::array<Index, 4>& points, const Mat12& h);
+
   std::shared_ptr<const MergedPattern> merged_;
   const std::vector<char>* fixed_;
+  const Attachments* attachments_;
   std::vector<double> blocks_;
 };
 

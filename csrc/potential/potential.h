@@ -12,8 +12,8 @@ namespace diffcloth {
 /// The exact Hessian, or a positive semi-definite stand-in for it far from the minimum.
 enum class Curvature : std::uint8_t { kExact, kPositive };
 
-/// One term of what a step minimizes: an energy of the positions of all vertices, cloth first, then
-/// bodies, 3 doubles a vertex.
+/// One term of what a step minimizes: an energy of all points, 3 doubles each: vertices, cloth first,
+/// then bodies, and behind them the nodes of coordinates.
 ///
 /// A potential stands at one point at a time. stand_at(x) finds what belongs to that point (the
 /// contacts in reach); the functions below that take `x` are asked for that point.
@@ -45,7 +45,8 @@ class Potential {
   /// y += H z over all vertices, exact.
   virtual void add_hessian_product(const double* x, const double* z, double* y) const = 0;
 
-  /// y += H d over the pairs with vertices that add_hessian() leaves out.
+  /// y += H d, of the pairs with points that move in d, for a motion d of points whose rows
+  /// add_hessian() leaves out.
   virtual void add_left_out_product(const double* /*x*/,
                                     Curvature /*curvature*/,
                                     const double* /*d*/,

@@ -35,7 +35,7 @@ constexpr double kLargestGrowth = 4.0;
 bool Directions::chord() {
   if (!chord_allowed_ || !factor_ || s_ > 0.0) return false;
   walk_.system.solve(*factor_, walk_.g(), p_);
-  if (!(largest(p_) <= kChordContraction * last_step_)) return false;
+  if (!(walk_.displacement(p_) <= kChordContraction * last_step_)) return false;
   ++walk_.context.counts->chord;
   return true;
 }
@@ -101,17 +101,18 @@ Directions::Direction Directions::damp(const linalg::BlockMatrix& H) {
   slope_ = dot(walk_.g(), p_);
 
   // The minimum of the exact quadratic along p; beyond any bound where its curvature is negative.
-  std::vector<double> Hp(walk_.f.coordinates->size(), 0.0);
-  H.add_product(p_.data(), Hp.data());
-  double curvature = 0.0;
-  for (std::size_t a = 0; a < Hp.size(); ++a) curvature += p_[a] * Hp[a];
+  std::vector<double> z;
+  walk_.f.coordinates->take_rows(p_, z);
+  std::vector<double> Hz(z.size(), 0.0);
+  H.add_product(z.data(), Hz.data());
+  const double curvature = dot(z, Hz);
   const double best = curvature > 0.0 ? -slope_ / curvature : kLargestGrowth;
   return {.kind = Kind::kDamped,
           .first = best > kWorthGrowing ? std::min(best, kLargestGrowth) : 1.0};
 }
 
 void Directions::learn(const Direction& direction, const Search& search) {
-  last_step_ = largest(p_);
+  last_step_ = walk_.displacement(p_);
   chord_allowed_ = direction.kind != Kind::kDamped && search.alpha == 1.0;
   if (direction.kind != Kind::kDamped) return;
   const double promised = slope_ * search.alpha * (1.0 - 0.5 * std::min(search.alpha, 1.0));

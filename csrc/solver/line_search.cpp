@@ -1,5 +1,6 @@
 #include "solver/line_search.h"
 
+#include <algorithm>
 #include <cmath>
 
 namespace diffcloth::solver {
@@ -18,8 +19,7 @@ constexpr int kBacktracks = 40;
 Search search(Walk& walk, const std::vector<double>& p, double first) {
   Search result;
   std::vector<double> to;
-  Coordinates::retract(walk.x(), p, first, to);
-  double alpha = first * walk.watch(to);
+  double alpha = walk.watch(p, std::min(first, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
   if (!(alpha > 0.0)) {
     result.result = SearchResult::kBlocked;
     return result;
@@ -29,8 +29,15 @@ Search search(Walk& walk, const std::vector<double>& p, double first) {
   double noise = -1.0;  // not needed before a trial fails
 
   for (; result.backtracks < kBacktracks; ++result.backtracks, alpha *= 0.5) {
+    if (result.backtracks > 0) {
+      if (walk.f.coordinates->is_curved()) {
+        alpha = walk.watch(p, alpha, to);
+        if (!(alpha > 0.0)) break;
+      } else {
+        walk.f.coordinates->retract(start, p, alpha, to);
+      }
+    }
     walk.context.checkpoint->check();
-    Coordinates::retract(start, p, alpha, to);
     const double gain = walk.change(to);
     const bool decreased = gain <= kArmijo * alpha * slope;
     if (!decreased) {

@@ -5,8 +5,14 @@ namespace diffcloth::solver {
 linalg::BlockMatrix LinearSystem::assemble(const double* x, Curvature curvature) {
   const Stopwatch::Scope scope(watch_, Phase::kAssembly);
   assembly_ = f_.assemblies->find(f_.couplings());
-  linalg::BlockMatrix matrix({assembly_, &assembly_->merged}, f_.assemblies->fixed());
+  linalg::BlockMatrix matrix({assembly_, &assembly_->merged}, f_.assemblies->fixed(),
+                             &f_.coordinates->attachments());
   f_.for_each([&](const Potential& p) { p.add_hessian(x, curvature, matrix); });
+  if (f_.coordinates->is_curved() && curvature == Curvature::kExact) {
+    std::vector<double> g;
+    f_.gradient(x, g);
+    f_.coordinates->add_curvature(x, g, matrix);
+  }
   return matrix;
 }
 
@@ -25,8 +31,9 @@ void LinearSystem::solve(const linalg::CholeskyFactor& factor,
                          const std::vector<double>& b,
                          std::vector<double>& p) {
   const Stopwatch::Scope scope(watch_, Phase::kSolve);
-  z_.assign(f_.coordinates->size(), 0.0);
-  factor.solve(b.data(), z_.data());
+  f_.coordinates->pull_back(b, b_);
+  z_.assign(b_.size(), 0.0);
+  factor.solve(b_.data(), z_.data());
   for (double& value : z_) value = -value;
   f_.coordinates->push_forward(z_, p);
 }
@@ -38,9 +45,10 @@ linalg::Convergence LinearSystem::solve(const linalg::BlockMatrix& matrix,
                                         int max_iterations,
                                         std::vector<double>& p) {
   const Stopwatch::Scope scope(watch_, Phase::kSolve);
+  f_.coordinates->pull_back(b, b_);
   const linalg::Convergence result =
       linalg::conjugate_gradient(matrix.pattern(), matrix.blocks(), f_.assemblies->fixed(), nearby,
-                                 b, tolerance, max_iterations, z_);
+                                 b_, tolerance, max_iterations, z_);
   for (double& value : z_) value = -value;
   f_.coordinates->push_forward(z_, p);
   return result;

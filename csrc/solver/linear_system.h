@@ -24,7 +24,8 @@ struct Counts {
 };
 
 /// The Newton system H p = -g of an objective, at the point where it stands: assembled, factored,
-/// solved and certified. Matrices live on the cloths' vertices.
+/// solved and certified. Matrices live on the rows of the coordinates, which stand where the
+/// objective does.
 class LinearSystem {
  public:
   /// @param workspace  of the factorizations; kept by the thread from one system to the next
@@ -41,7 +42,9 @@ class LinearSystem {
   /// definite.
   Factor factor(const linalg::BlockMatrix& matrix);
 
-  /// Change p = -factor^-1 b of all vertices, zero at prescribed ones.
+  /// Change p = -factor^-1 (b pulled back to rows) of all points, zero at prescribed ones.
+  ///
+  /// @param b  at all points
   void solve(const linalg::CholeskyFactor& factor,
              const std::vector<double>& b,
              std::vector<double>& p);
@@ -64,6 +67,7 @@ class LinearSystem {
   Stopwatch& watch_;
   Counts& counts_;
   std::shared_ptr<const Assembly> assembly_;
+  std::vector<double> b_;
   std::vector<double> z_;
 };
 

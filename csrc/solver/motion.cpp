@@ -1,5 +1,7 @@
 #include "solver/motion.h"
 
+#include <algorithm>
+
 #include "solver/line_search.h"
 
 namespace diffcloth::solver {
@@ -11,24 +13,30 @@ constexpr double kStuckProgress = 1e-3;
 /// A joint step that leaves more than this share of the motion is followed by a relaxation.
 constexpr double kStopped = 0.5;
 
-/// Change of the prescribed vertices to their ends, zero elsewhere.
+/// Change of what is prescribed to its ends, and of what follows it; zero elsewhere.
 std::vector<double> prescribed_change(const Walk& walk, const std::vector<double>& ends) {
+  const Coordinates& coordinates = *walk.f.coordinates;
   std::vector<double> d(ends.size(), 0.0);
-  for (Index i = 0; i < walk.f.coordinates->vertex_count(); ++i) {
-    if (walk.f.coordinates->is_free(i)) continue;
+  for (Index i = 0; i < coordinates.point_count(); ++i) {
+    if (coordinates.prescribed()[i] == 0) continue;
     for (Index a = 3 * i; a < 3 * i + 3; ++a) d[a] = ends[a] - walk.x()[a];
   }
+  coordinates.follow(walk.x(), d);
   return d;
 }
 
-/// g += H_xo d.
+/// g += H d over the rows.
 void add_coupling(const Objective& f,
                   const linalg::BlockMatrix& matrix,
                   const std::vector<double>& x,
                   const std::vector<double>& d,
                   std::vector<double>& g) {
-  // The matrix holds the couplings with pins that the base pattern has.
-  matrix.add_product(d.data(), g.data());
+  // The matrix holds the couplings with pins and prescribed coordinates that the base pattern has.
+  std::vector<double> d_z;
+  f.coordinates->take_rows(d, d_z);
+  std::vector<double> product(d_z.size(), 0.0);
+  matrix.add_product(d_z.data(), product.data());
+  f.coordinates->add_rows(product, g);
   f.for_each([&](const Potential& p) {
     p.add_left_out_product(x.data(), Curvature::kPositive, d.data(), g.data());
   });
@@ -49,12 +57,13 @@ double joint_step(Walk& walk, const std::vector<double>& ends) {
   for (std::size_t a = 0; a < p.size(); ++a) p[a] += d[a];
 
   std::vector<double> to;
-  Coordinates::retract(walk.x(), p, 1.0, to);
-  const double alpha = walk.watch(to);
-  Coordinates::retract(walk.x(), p, alpha, to);
+  const double alpha = walk.watch(p, std::min(1.0, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
+  if (!(alpha > 0.0)) return 0.0;
   if (alpha == 1.0) {
-    for (std::size_t a = 0; a < to.size(); ++a) {
-      if (!walk.f.coordinates->is_free(static_cast<Index>(a / 3))) to[a] = ends[a];
+    // To the bit; what follows has been placed by nodes that differ from these by rounding.
+    for (Index i = 0; i < walk.f.coordinates->point_count(); ++i) {
+      if (walk.f.coordinates->prescribed()[i] == 0) continue;
+      for (Index a = 3 * i; a < 3 * i + 3; ++a) to[a] = ends[a];
     }
   }
   walk.go(to);
@@ -72,8 +81,8 @@ void relax(Walk& walk) {
 }
 
 bool has_arrived(const Walk& walk, const std::vector<double>& ends) {
-  for (Index i = 0; i < walk.f.coordinates->vertex_count(); ++i) {
-    if (walk.f.coordinates->is_free(i)) continue;
+  for (Index i = 0; i < walk.f.coordinates->point_count(); ++i) {
+    if (walk.f.coordinates->prescribed()[i] == 0) continue;
     if (row(walk.x().data(), i) != row(ends.data(), i)) return false;
   }
   return true;

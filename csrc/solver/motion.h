@@ -6,18 +6,18 @@
 
 namespace diffcloth::solver {
 
-/// How the prescribed vertices (pins and bodies) move over the step: in portions, each short enough
-/// that straight motion between its ends does not distort a turning body.
+/// How what is prescribed (pins, bodies, joints, frames) moves over the step: in portions, each short
+/// enough that straight motion between its ends does not distort a turning body.
 class PrescribedMotion {
  public:
   virtual ~PrescribedMotion() = default;
   virtual int portions() const = 0;
 
-  /// Write the positions of the prescribed vertices at the end of portion k into x.
+  /// Write the prescribed points at the end of portion k into x.
   virtual void end_of_portion(int k, double* x) const = 0;
 };
 
-/// Walk the prescribed vertices to their ends, the free ones along with them.
+/// Walk what is prescribed to its ends, the unknowns along with it.
 ///
 /// Joint Newton: H_xx p = -(g + H_xo do), both moved by the same collision-free fraction. No energy
 /// is compared on the way, as the prescribed motion does work; a blocked step is followed by a

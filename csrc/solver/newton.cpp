@@ -106,7 +106,7 @@ Descent::Next Descent::no_way(const Directions::Direction& direction,
 }
 
 Descent::Next Descent::take(const Directions::Direction& direction) {
-  const double step = largest(directions_.p());
+  const double step = walk_.displacement(directions_.p());
   residual_ = step / walk_.f.h;
   if (direction.kind == Kind::kDamped) {
     if (step < kSettled * goal_) {
@@ -123,7 +123,7 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
       settled_step_ = step;
     }
   }
-  if (!(step > kResolution * largest(walk_.x()))) {
+  if (!(step > kResolution * walk_.f.coordinates->extent(walk_.x()))) {
     return no_way(direction, step, SearchResult::kNoGain);
   }
   const Search search = solver::search(walk_, directions_.p(), direction.first);
@@ -143,7 +143,7 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
 Status Descent::look() {
   const bool minimum = directions_.certify();
   if (!minimum) directions_.next();
-  const double step = largest(directions_.p());
+  const double step = walk_.displacement(directions_.p());
   residual_ = step / walk_.f.h;
   if (step >= goal_) return Status::kIterationLimit;
   return minimum ? Status::kConverged : Status::kSaddle;
@@ -166,14 +166,19 @@ bool start_from(Walk& walk, const std::vector<double>& guess) {
   // Where inertia alone would collapse the cloth (long steps, forces on light vertices), the start
   // of the step with pins at their ends is the better place to begin.
   std::vector<double> held = guess;
-  for (Index i = 0; i < walk.f.coordinates->cloth_vertex_count(); ++i) {
-    if (!walk.f.coordinates->is_free(i)) continue;
-    Eigen::Map<Vec3>(held.data() + 3 * i) = row(walk.x().data(), i);
+  const Coordinates& coordinates = *walk.f.coordinates;
+  for (Index i = 0; i < coordinates.row_count(); ++i) {
+    if (!coordinates.is_free(i)) continue;
+    const Index point = coordinates.point(i);
+    Eigen::Map<Vec3>(held.data() + 3 * point) = row(walk.x().data(), point);
   }
+  coordinates.place(held);
   if (walk.f.energy_without_contact(guess.data()) > walk.f.energy_without_contact(held.data())) {
     return false;
   }
-  if (walk.watch(guess) < 1.0) return false;
+  std::vector<double> change(guess.size());
+  for (std::size_t a = 0; a < guess.size(); ++a) change[a] = guess[a] - walk.x()[a];
+  if (coordinates.largest_fraction(walk.x(), change) < 1.0 || walk.watch(guess) < 1.0) return false;
   if (walk.f.contact != nullptr) {
     walk.f.contact->stand_at(guess.data());
     if (!walk.f.contact->contacts().empty()) return false;

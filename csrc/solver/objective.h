@@ -2,6 +2,7 @@
 
 #include <vector>
 
+#include "bodies/coordinate_potential.h"
 #include "contact/contact_potential.h"
 #include "potential/potential.h"
 #include "potential/proximity.h"
@@ -10,28 +11,31 @@
 
 namespace diffcloth::solver {
 
-/// What a solve minimizes: a sum of potentials over the positions of all vertices  [J].
+/// What a solve minimizes: a sum of potentials over all points  [J].
 ///
-/// The potentials are the caller's. Two of them have a further role: the inertia, whose metric is
-/// the scale of shifts and speeds, and contact, which watches motions.
+/// The potentials are the caller's. Some of them have a further role: inertia and the coordinates'
+/// potential, whose metrics are the scale of shifts and speeds, and contact, which watches motions.
 struct Objective {
-  const Coordinates* coordinates;
+  Coordinates* coordinates;
   double h;       ///< time step [s]
   double length;  ///< mean edge of the cloths [m]
   Proximity* inertia;
   std::vector<Potential*> others;                ///< everything but inertia and contact
   contact::ContactPotential* contact = nullptr;  ///< null where nothing can touch
+  bodies::CoordinatePotential* chart = nullptr;  ///< of free coordinates; null where there are none
   AssemblyCache* assemblies;
 
   /// Every potential in a fixed order.
   template <class Visit>
   void for_each(Visit&& visit) const {
     visit(static_cast<Potential&>(*inertia));
+    if (chart != nullptr) visit(static_cast<Potential&>(*chart));
     for (Potential* potential : others) visit(*potential);
     if (contact != nullptr) visit(static_cast<Potential&>(*contact));
   }
 
   void stand_at(const double* x) const {
+    coordinates->stand_at(x);
     for_each([&](Potential& p) { p.stand_at(x); });
   }
 
@@ -43,6 +47,7 @@ struct Objective {
 
   double energy_without_contact(const double* x) const {
     double e = inertia->energy(x);
+    if (chart != nullptr) e += chart->energy(x);
     for (const Potential* p : others) e += p->energy(x);
     return e;
   }
@@ -53,19 +58,23 @@ struct Objective {
     return change;
   }
 
-  /// grad P at all vertices, prescribed ones included.
+  /// grad P at all points, prescribed ones included.
   void gradient(const double* x, std::vector<double>& g) const {
-    g.assign(3 * static_cast<std::size_t>(coordinates->vertex_count()), 0.0);
+    g.assign(3 * static_cast<std::size_t>(coordinates->point_count()), 0.0);
     for_each([&](const Potential& p) { p.add_gradient(x, g.data()); });
   }
 
-  /// y = (d^2 P) z over all vertices, exact.
+  /// y = (d^2 P) z over all points, exact.
   void hessian_product(const double* x, const double* z, std::vector<double>& y) const {
-    y.assign(3 * static_cast<std::size_t>(coordinates->vertex_count()), 0.0);
+    y.assign(3 * static_cast<std::size_t>(coordinates->point_count()), 0.0);
     for_each([&](const Potential& p) { p.add_hessian_product(x, z, y.data()); });
   }
 
-  /// Couplings beyond the base pattern, sorted.
+  /// What shifts of a Hessian are measured in, one for each number of a row: M / h^2 of vertices, the
+  /// diagonal of the metric of coordinates.
+  std::vector<double> metric() const;
+
+  /// Couplings of rows beyond the base pattern, sorted.
   linalg::Couplings couplings() const;
 };
 

@@ -21,7 +21,7 @@ constexpr int kBacktracks = 40;
 std::vector<double> start_vector(const Coordinates& coordinates) {
   std::vector<double> d(coordinates.size(), 0.0);
   std::uint32_t seed = 1;
-  for (Index i = 0; i < coordinates.cloth_vertex_count(); ++i) {
+  for (Index i = 0; i < coordinates.row_count(); ++i) {
     if (!coordinates.is_free(i)) continue;
     for (Index a = 3 * i; a < 3 * i + 3; ++a) {
       seed = seed * 1664525U + 1013904223U;
@@ -31,16 +31,15 @@ std::vector<double> start_vector(const Coordinates& coordinates) {
   return d;
 }
 
-Factor shifted_factor(Walk& walk) {
-  linalg::BlockMatrix H = walk.system.assemble(walk.x().data(), Curvature::kExact);
-  const std::vector<double>& metric = walk.f.inertia->metric();
-  const double h = walk.f.h;
+Factor shifted_factor(Walk& walk, const linalg::BlockMatrix& exact) {
+  const std::vector<double> metric = walk.f.metric();
+  linalg::BlockMatrix H = exact;
   double added = 0.0;
   double shift = kFirstShift;
   for (int k = 0; k < kShifts; ++k, shift *= kShiftGrowth) {
     walk.context.checkpoint->check();
-    for (std::size_t i = 0; i < metric.size(); ++i) {
-      H.add_to_diagonal(static_cast<Index>(i), (shift - added) * metric[i] / (h * h));
+    for (Index i = 0; i < H.pattern().size(); ++i) {
+      H.add_to_diagonal(i, (shift - added) * row(metric.data(), i));
     }
     added = shift;
     if (Factor factor = walk.system.factor(H)) return factor;
@@ -50,14 +49,16 @@ Factor shifted_factor(Walk& walk) {
 
 /// Direction of the smallest eigenvalue of H relative to the metric, its largest entry 1.
 std::vector<double> most_negative(Walk& walk, const linalg::CholeskyFactor& shifted) {
-  const std::vector<double>& metric = walk.f.inertia->metric();
+  const std::vector<double> metric = walk.f.metric();
   std::vector<double> d = start_vector(*walk.f.coordinates);
   std::vector<double> b(d.size(), 0.0);
+  std::vector<double> p;
   for (int k = 0; k < kInverseIterations; ++k) {
     walk.context.checkpoint->check();
-    for (std::size_t a = 0; a < d.size(); ++a) b[a] = metric[a / 3] * d[a];
+    for (std::size_t a = 0; a < d.size(); ++a) b[a] = metric[a] * d[a];
     shifted.solve(b.data(), d.data());
-    const double size = largest(d);
+    walk.f.coordinates->push_forward(d, p);
+    const double size = walk.displacement(p);
     for (double& value : d) value /= size;
   }
   // The largest entry decides the sign; of equal ones the first.
@@ -71,23 +72,24 @@ std::vector<double> most_negative(Walk& walk, const linalg::CholeskyFactor& shif
 }  // namespace
 
 bool leave_saddle(Walk& walk) {
-  const Factor shifted = shifted_factor(walk);
+  const linalg::BlockMatrix H = walk.system.assemble(walk.x().data(), Curvature::kExact);
+  const Factor shifted = shifted_factor(walk, H);
   if (!shifted) return false;
+  const std::vector<double> d = most_negative(walk, *shifted);
+  std::vector<double> product(d.size(), 0.0);
+  H.add_product(d.data(), product.data());
+  if (!(dot(d, product) < 0.0)) return false;
   std::vector<double> p;
-  walk.f.coordinates->push_forward(most_negative(walk, *shifted), p);
-  std::vector<double> product;
-  walk.f.hessian_product(walk.x().data(), p.data(), product);
-  if (!(dot(p, product) < 0.0)) return false;
+  walk.f.coordinates->push_forward(d, p);
 
   // From far to near: the first point that is lower, and on while the next is lower still.
   const double length = kFirstMove * walk.f.length;
   std::vector<double> to;
-  Coordinates::retract(walk.x(), p, length, to);
-  double alpha = length * walk.watch(to);
+  double alpha = walk.watch(p, std::min(length, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
   double best = 0.0;
   double best_alpha = 0.0;
-  for (int k = 0; k < kBacktracks; ++k, alpha *= 0.5) {
-    Coordinates::retract(walk.x(), p, alpha, to);
+  for (int k = 0; k < kBacktracks && alpha > 0.0; ++k, alpha *= 0.5) {
+    if (k > 0) alpha = walk.watch(p, alpha, to);
     const double change = walk.change(to);
     if (change < best) {
       best = change;
@@ -96,8 +98,7 @@ bool leave_saddle(Walk& walk) {
       break;
     }
   }
-  if (best_alpha == 0.0) return false;
-  Coordinates::retract(walk.x(), p, best_alpha, to);
+  if (best_alpha == 0.0 || !(walk.watch(p, best_alpha, to) > 0.0)) return false;
   walk.go(to);
   walk.refresh();
   return true;

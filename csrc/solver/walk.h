@@ -14,15 +14,6 @@ namespace diffcloth::solver {
 
 using linalg::dot;
 
-/// Largest change of a coordinate; NaN counts as infinite.
-inline double largest(const std::vector<double>& p) {
-  double result = 0.0;
-  for (const double value : p) {
-    if (!(std::abs(value) <= result)) result = std::abs(value);
-  }
-  return std::isnan(result) ? std::numeric_limits<double>::infinity() : result;
-}
-
 struct Options {
   double tolerance;    ///< on |p|_inf / h, p the full Newton step [m/s]
   int max_iterations;  ///< of a step, over all its solves
@@ -66,12 +57,43 @@ class Walk {
     f.gradient(x_.data(), g_);
   }
 
+  /// Size of a change of all points [m].
+  double displacement(const std::vector<double>& p) const { return f.coordinates->displacement(p); }
+
   /// Watch the straight motion to a point; returns its fraction that is free of collisions.
   double watch(const std::vector<double>& to) {
     if (f.contact == nullptr) return 1.0;
     const Stopwatch::Scope scope(*context.watch, Phase::kDetection);
     f.contact->watch(x_.data(), to.data());
     return f.contact->safe_fraction(x_.data(), to.data());
+  }
+
+  /// Go along a change of all points, by the fraction alpha or less, as far as the straight motion of
+  /// every point to where it ends is free of collisions; what is watched is that motion.
+  ///
+  /// @param to  out: the end
+  /// @return the fraction, 0 where there is no way
+  double watch(const std::vector<double>& p, double alpha, std::vector<double>& to) {
+    // On a curve each fraction has a chord of its own: the safe part of one says little more about the
+    // next than where to try.
+    constexpr double kShorter = 0.9;
+    constexpr int kTrials = 60;
+    f.coordinates->retract(x_, p, alpha, to);
+    double safe = watch(to);
+    if (!f.coordinates->is_curved()) {
+      if (safe < 1.0) {
+        alpha *= safe;
+        f.coordinates->retract(x_, p, alpha, to);
+      }
+      return alpha;
+    }
+    for (int k = 0; safe < 1.0; ++k) {
+      if (!(safe > 0.0) || k == kTrials) return 0.0;
+      alpha *= kShorter * safe;
+      f.coordinates->retract(x_, p, alpha, to);
+      safe = watch(to);
+    }
+    return alpha;
   }
 
   /// Change of the objective on the way to a point of the watched motion.

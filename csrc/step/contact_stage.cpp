@@ -18,6 +18,11 @@
 // o) get  -(H zhat) at their rows, and pins also the direct g_k. Friction's displacement x - x_start
 // gives  x_start_bar += H_D zhat. The lag configuration of k is x_{k-1} (x_n for k = 1): its
 // cotangent becomes g_{k-1}, and the sweep goes on from K to 1.
+//
+// Where vertices y(q, s) of links follow coordinates q and frames s, x stands for all of z = (cloth, q),
+// dy = J dz, H includes the second derivative of  y . grad_y E_k  by q, and zhat has J z_k at those
+// vertices besides f_bar. Prescribed joints and frames are like pins: of  zhat . grad E_k  they get
+// -J_s^T (H zhat) and, as J itself depends on them,  -d/ds (J z_k) . grad_y E_k.
 
 #include "step/contact_stage.h"
 
@@ -121,20 +126,12 @@ void report_contacts(const Scene& scene, const std::vector<Contact>& contacts, R
 }
 
 /// Contact forces on the bodies' vertices: minus the partial derivative of the contact energy.
-void write_body_forces(const Sum& sum, const Array& x, std::size_t cloth, double* out) {
+void write_body_forces(const Problem& problem, const Sum& sum, const Array& x, double* out) {
   Array g(x.size(), 0.0);
   if (sum.objective.contact != nullptr) sum.objective.contact->add_gradient(x.data(), g.data());
   if (sum.friction) sum.friction->add_gradient(x.data(), g.data());
-  for (std::size_t a = cloth; a < g.size(); ++a) out[a - cloth] = -g[a];
-}
-
-/// Everything at its end, free vertices where inertia alone (or x^D) would put them.
-Array guess(const Problem& problem, const Proximity& inertia) {
-  Array x = problem.with_bodies_at_end(inertia.target().data());
-  for (const Index i : problem.scene.given.pins) {
-    Eigen::Map<Vec3>(x.data() + 3 * i) = row(problem.ends.data(), i);
-  }
-  return x;
+  const std::size_t end = 3 * static_cast<std::size_t>(problem.scene.vertex_count());
+  for (std::size_t a = problem.cloth_size; a < end; ++a) out[a - problem.cloth_size] = -g[a];
 }
 
 std::string_view words(solver::Status status) {
@@ -168,7 +165,8 @@ void merge(const solver::Outcome& outcome, Report& report) {
 }
 
 std::vector<Field> ContactStage::tape(const Scene& scene) {
-  const auto n = static_cast<std::size_t>(scene.cloth_vertex_count());
+  const auto n =
+      static_cast<std::size_t>(scene.cloth_vertex_count() + scene.mechanisms.node_count());
   const auto k = static_cast<std::size_t>(scene.given.friction_iterations);
   // Numbers of contacts, at the start and after each solve, spare backward the search for none.
   return {{.name = "iterates", .shape = {k, n, 3}},
@@ -178,7 +176,7 @@ std::vector<Field> ContactStage::tape(const Scene& scene) {
 
 void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
   Problem& problem = step.problem;
-  const std::size_t cloth = problem.coordinates.size();
+  const std::size_t size = problem.coordinates.size();
   const int friction_iterations = problem.scene.given.friction_iterations;
   Sum sum(*this, problem, step.detection, nullptr);
   const Motion motion(problem);
@@ -188,7 +186,8 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
   const std::vector<Contact>& at_start = sum.contacts_at(x);
   keep_count(0, at_start.size());
   sum.lag(at_start);
-  const Array first_guess = guess(problem, inertia);
+  // Everything at its end, unknowns where inertia alone (or x^D) would put them.
+  const Array first_guess = problem.predicted(inertia.target().data());
   solver::Factor factor;
   int solves = 0;
   while (solves < friction_iterations) {
@@ -199,7 +198,9 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
     step.factors.push_back(outcome.factor);
     factor = outcome.factor;
     if (!step.tape.empty()) {
-      std::copy_n(x.begin(), cloth, step.tape["iterates"] + solves * cloth);
+      Array rows;
+      problem.coordinates.take_rows(x, rows);
+      std::ranges::copy(rows, step.tape["iterates"] + solves * size);
     }
     ++solves;
     if (step.report.result != Result::kConverged) break;
@@ -211,7 +212,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
   }
   report_contacts(problem.scene, sum.contacts(), step.report);
   if (!step.tape.empty()) *step.tape["solves"] = solves;
-  write_body_forces(sum, x, cloth, body_forces);
+  write_body_forces(problem, sum, x, body_forces);
 }
 
 void pull_back_solve(const Backward& step,
@@ -221,44 +222,50 @@ void pull_back_solve(const Backward& step,
                      const Array& g,
                      const Array* force_bar) {
   Cotangents& bars = step.cotangents;
-  const std::size_t cloth = step.problem.coordinates.size();
+  const solver::Coordinates& coordinates = *f.coordinates;
   solver::LinearSystem system(f, *step.context.workspace, *step.context.watch,
                               *step.context.counts);
   if (!factor) factor = system.certify(x.data());
   if (!factor) throw std::domain_error("the Hessian is not positive definite at the solution");
 
   Array b(x.size(), 0.0);
-  std::ranges::copy(g, b.begin());
+  coordinates.add_rows(g, b);
   Array forces(x.size(), 0.0);
   Array product;
   if (force_bar != nullptr) {
-    std::ranges::copy(*force_bar, forces.begin() + static_cast<std::ptrdiff_t>(cloth));
+    std::ranges::copy(*force_bar,
+                      forces.begin() + static_cast<std::ptrdiff_t>(step.problem.cloth_size));
     f.hessian_product(x.data(), forces.data(), product);
-    for (std::size_t a = 0; a < cloth; ++a) b[a] -= product[a];
+    for (std::size_t a = 0; a < b.size(); ++a) b[a] -= product[a];
   }
   // The factor is that of H itself: nothing is left to polish.
   Array zhat;
   system.solve(*factor, b, zhat);
-  for (double& value : zhat) value = -value;
-  for (std::size_t a = cloth; a < zhat.size(); ++a) zhat[a] = forces[a];
+  for (std::size_t a = 0; a < zhat.size(); ++a) zhat[a] = forces[a] - zhat[a];
 
   f.hessian_product(x.data(), zhat.data(), product);
-  for (const Index i : step.problem.scene.given.pins) {
-    for (Index a = 3 * i; a < 3 * i + 3; ++a) bars.ends[a] += g[a] - product[a];
+  for (double& value : product) value = -value;
+  coordinates.gather(x, product);
+  if (coordinates.is_curved()) {
+    Array gradient;
+    f.gradient(x.data(), gradient);
+    coordinates.subtract_change(x, zhat, gradient, product);
   }
-  for (std::size_t a = cloth; a < zhat.size(); ++a) bars.ends[a] -= product[a];
+  coordinates.add_rows(g, product);
+  for (Index i = 0; i < coordinates.point_count(); ++i) {
+    if (coordinates.prescribed()[i] == 0) continue;
+    for (Index a = 3 * i; a < 3 * i + 3; ++a) bars.ends[a] += product[a];
+  }
   f.for_each([&](Potential& p) { p.accumulate(x.data(), zhat.data()); });
 }
 
 void ContactStage::backward(const Backward& step, Array g) {
   Problem& problem = step.problem;
   Cotangents& bars = step.cotangents;
-  const std::size_t cloth = problem.coordinates.size();
+  const std::size_t size = problem.coordinates.size();
   const auto solves = static_cast<std::size_t>(*step.tape["solves"]);
   Sum sum(*this, problem, step.detection, &bars.contact);
-  const auto at = [&](std::size_t k) {
-    return problem.with_bodies_at_end(step.tape["iterates"] + k * cloth);
-  };
+  const auto at = [&](std::size_t k) { return problem.at(step.tape["iterates"] + k * size); };
   const double* const counts = step.tape["contacts"];
   for (std::size_t k = solves; k-- > 0;) {
     step.context.checkpoint->check();
@@ -275,17 +282,19 @@ void ContactStage::backward(const Backward& step, Array g) {
 
     std::ranges::fill(g, 0.0);
     if (!sum.friction) continue;
-    const Array& lag_bar = sum.friction->lag_bar;
+    Array& lag_bar = sum.friction->lag_bar;
     const Array& start_bar = sum.friction->start_bar;
-    Array& rest = k == 0 ? bars.start : bars.ends;
-    for (std::size_t a = 0; a < x.size(); ++a) {
-      bars.start[a] += start_bar[a];
-      if (k == 0 || a >= cloth) {
-        rest[a] += lag_bar[a];
-      } else {
-        g[a] = lag_bar[a];
-      }
+    for (std::size_t a = 0; a < start_bar.size(); ++a) bars.start[a] += start_bar[a];
+    if (k == 0) {
+      for (std::size_t a = 0; a < lag_bar.size(); ++a) bars.start[a] += lag_bar[a];
+      continue;
     }
+    lag_bar.resize(x.size(), 0.0);
+    problem.coordinates.gather(x_lag, lag_bar);
+    problem.coordinates.take_rows(lag_bar, g);
+    // What is prescribed and no row: bodies and frames.
+    problem.coordinates.clear_rows(lag_bar);
+    for (std::size_t a = 0; a < lag_bar.size(); ++a) bars.ends[a] += lag_bar[a];
   }
 }
 

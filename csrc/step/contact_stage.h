@@ -20,16 +20,16 @@ struct ContactStage {
   /// What it keeps on the tape.
   static std::vector<Field> tape(const Scene& scene);
 
-  /// @param x  in: all vertices at the start of the step; out: at its end
+  /// @param x  in: all points at the start of the step; out: at its end
   void forward(const Forward& step, std::vector<double>& x, double* body_forces);
 
-  /// @param g  cotangent of the cloths' positions at the end [3 N]
+  /// @param g  cotangent of the rows (cloth positions, coordinates) at the end
   void backward(const Backward& step, std::vector<double> g);
 };
 
 /// zhat of one solve, and everything it pulls back but the lag: see contact_stage.cpp.
 ///
-/// @param x          all vertices where the objective has been minimized; its potentials stand there
+/// @param x          all points where the objective has been minimized; its potentials stand there
 /// @param factor     of the exact Hessian there, or null to make it
 /// @param force_bar  cotangents of the forces on the bodies' vertices, or null
 void pull_back_solve(const Backward& step,

@@ -15,12 +15,30 @@ void add_to(double* out, const Array& bar) {
 
 void write_surfaces(const Problem& p, const Cotangents& bars, const Gradients& gradients) {
   const bodies::BodySet& bodies = p.scene.given.bodies;
-  const std::size_t cloth = p.coordinates.size();
+  const bodies::Mechanisms& mechanisms = p.scene.mechanisms;
+  Array start = bars.start;
+  p.coordinates.gather(p.start, start);
   if (double* out = gradients[Input::kBodyPoses]) {
-    bodies.place_vjp(p.inputs.data(Input::kBodyPoses), bars.start.data() + cloth, out);
+    const double* poses = p.inputs.data(Input::kBodyPoses);
+    bodies.place_vjp(poses, start.data() + p.cloth_size, out);
+    mechanisms.set_frames_vjp(poses, p.coordinates.nodes(start), out);
   }
   if (double* out = gradients[Input::kBodyTargets]) {
-    bodies.place_vjp(p.inputs.data(Input::kBodyTargets), bars.ends.data() + cloth, out);
+    const double* poses = p.inputs.data(Input::kBodyTargets);
+    bodies.place_vjp(poses, bars.ends.data() + p.cloth_size, out);
+    mechanisms.set_frames_vjp(poses, p.coordinates.nodes(bars.ends), out);
+  }
+  for (Index c = 0; c < mechanisms.coordinate_count(); ++c) {
+    const Index slot = mechanisms.slot(c);
+    if (double* out = gradients[Input::kCoordinates]) out[c] += p.coordinates.nodes(start)[slot];
+    double* const out = gradients[Input::kCoordinateEnds];
+    if (out != nullptr && mechanisms.given().prescribed[c] != 0) {
+      out[c] += p.coordinates.nodes(bars.ends)[slot];
+    }
+  }
+  if (p.chart) {
+    add_to(gradients[Input::kCoordinateTargets], p.chart->target_bar);
+    add_to(gradients[Input::kCoordinateMetric], p.chart->metric_bar);
   }
   if (double* out = gradients[Input::kBarrierStiffness]) *out += bars.contact.kappa;
   if (double* out = gradients[Input::kBarrierDistance]) *out += bars.contact.d_hat;
@@ -101,7 +119,7 @@ void write_rest(Problem& p, const Cotangents& bars, const Gradients& gradients) 
 Cotangents::Cotangents(const Problem& p)
     : start(p.start.size(), 0.0),
       ends(p.start.size(), 0.0),
-      velocities(p.coordinates.size(), 0.0),
+      velocities(p.cloth_size, 0.0),
       masses(p.masses.size(), 0.0),
       contact(p.scene.collision_mesh) {}
 

@@ -17,9 +17,9 @@ struct Cotangents {
   /// Write everything into the gradients of the inputs.
   void write(Problem& problem, const Gradients& gradients);
 
-  std::vector<double> positions;    ///< of the output x_{n+1}, v_{n+1} / h included [3 N]
-  std::vector<double> start;        ///< x_n and o_n
-  std::vector<double> ends;         ///< pins' targets and o_{n+1}
+  std::vector<double> rows;         ///< of the outputs x_{n+1}, v_{n+1} / h included, and q_{n+1}
+  std::vector<double> start;        ///< x_n and o_n: all points
+  std::vector<double> ends;         ///< what is prescribed, at its end: all points
   std::vector<double> velocities;   ///< v_n
   std::vector<double> masses;       ///< [N]
   std::vector<double> body_forces;  ///< of the output [3 V]

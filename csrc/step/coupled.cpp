@@ -1,7 +1,5 @@
 #include "step/coupled.h"
 
-#include <algorithm>
-
 #include "step/contact_stage.h"
 
 namespace diffcloth::step {
@@ -18,14 +16,12 @@ ContactStage stage(Problem& problem) {
 
 std::vector<Field> Coupled::tape(const Scene& scene) const { return ContactStage::tape(scene); }
 
-void Coupled::forward(const Forward& step, double* positions, double* body_forces) const {
-  std::vector<double> x = step.problem.start;
+void Coupled::forward(const Forward& step, std::vector<double>& x, double* body_forces) const {
   stage(step.problem).forward(step, x, body_forces);
-  std::copy_n(x.begin(), step.problem.coordinates.size(), positions);
 }
 
 void Coupled::backward(const Backward& step) const {
-  stage(step.problem).backward(step, step.cotangents.positions);
+  stage(step.problem).backward(step, step.cotangents.rows);
 }
 
 }  // namespace diffcloth::step

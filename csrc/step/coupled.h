@@ -10,7 +10,7 @@ class Coupled final : public Scheme {
  public:
   std::string_view name() const override { return "coupled"; }
   std::vector<Field> tape(const Scene& scene) const override;
-  void forward(const Forward& step, double* positions, double* body_forces) const override;
+  void forward(const Forward& step, std::vector<double>& x, double* body_forces) const override;
   void backward(const Backward& step) const override;
 };
 

@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <numeric>
 
 #include "step/problem.h"
@@ -25,11 +26,22 @@ double potential_energy(const Scene& scene, const Inputs& inputs) {
   return energy;
 }
 
-double default_barrier_stiffness(const Scene& scene,
-                                 const Inputs& inputs,
-                                 double barrier_distance) {
-  // kappa = c d_hat mean(H_ii) / (eta w_mean), c = 5; eta = d_hat b''(gap) at a gap of d_hat / 2,
-  // with derivatives with respect to the gap: b''_gap = 4 d^2 b'' + 2 b' at d = xi + gap.
+namespace {
+
+/// Slope -b' and stiffness b'' of the barrier of unit weight in the gap, half of d_hat wide.
+struct HalfGap {
+  double slope;
+  double stiffness;
+};
+
+HalfGap at_half_gap(double xi, double barrier_distance) {
+  const double d = xi + 0.5 * barrier_distance;
+  const contact::Barrier b = contact::barrier_derivatives(d * d, xi, barrier_distance);
+  return {.slope = -2.0 * d * b.b1, .stiffness = 4.0 * d * d * b.b2 + 2.0 * b.b1};
+}
+
+/// kappa = c d_hat mean(H_ii) / (eta w_mean), c = 5; eta = d_hat b''(gap) at a gap of d_hat / 2.
+double stiffness_for_cloths(const Scene& scene, const Inputs& inputs, double barrier_distance) {
   constexpr double kFactor = 5.0;
   Inputs at_rest = inputs;
   at_rest.views[static_cast<std::size_t>(Input::kPositions)].data =
@@ -38,13 +50,14 @@ double default_barrier_stiffness(const Scene& scene,
   const linalg::BlockMatrix hessian =
       contact_free_hessian(p, scene.given.rest_vertices.data(), Curvature::kExact);
   const linalg::BlockPattern& pattern = hessian.pattern();
+  const Index n = scene.cloth_vertex_count();
   double trace = 0.0;
-  for (Index i = 0; i < pattern.size(); ++i) {
+  for (Index i = 0; i < n; ++i) {
     trace += Eigen::Map<const Mat3>(hessian.blocks() +
                                     9 * static_cast<std::ptrdiff_t>(pattern.column_start()[i]))
                  .trace();
   }
-  const double mean_diagonal = trace / (3.0 * pattern.size());
+  const double mean_diagonal = trace / (3.0 * n);
   const std::vector<double>& area = p.rest->vertex_area;
   const double mean_weight =
       0.25 * std::accumulate(area.begin(), area.end(), 0.0) / static_cast<double>(area.size());
@@ -52,10 +65,56 @@ double default_barrier_stiffness(const Scene& scene,
   double xi = 0.0;
   const double* thickness = inputs.data(Input::kThickness);
   for (Index c = 0; c < scene.cloth_count(); ++c) xi = std::max(xi, thickness[c]);
-  const double d = xi + 0.5 * barrier_distance;
-  const contact::Barrier b = contact::barrier_derivatives(d * d, xi, barrier_distance);
-  const double eta = barrier_distance * (4.0 * d * d * b.b2 + 2.0 * b.b1);
+  const double eta = barrier_distance * at_half_gap(xi, barrier_distance).stiffness;
   return kFactor * barrier_distance * mean_diagonal / (eta * mean_weight);
+}
+
+/// kappa at which the heaviest free body, resting on one of six sides, stays d_hat / 2 away. Without
+/// gravity, where it crosses the gap from rest in a time step.
+double stiffness_for_bodies(const Scene& scene, const Inputs& inputs, double barrier_distance) {
+  const bodies::MechanismsDescription& given = scene.mechanisms.given();
+  const double* metric = inputs.data(Input::kCoordinateMetric);
+  const double h = scene.given.dt;
+  const double gravity = row(inputs.data(Input::kGravity), 0).norm();
+  const double acceleration = gravity > 0.0 ? gravity : barrier_distance / (h * h);
+  double result = 0.0;
+  std::size_t first = 0;
+  for (std::size_t t = 0; t < given.tree_free.size(); ++t) {
+    const auto n = static_cast<std::size_t>(
+        std::ranges::count(given.coordinate_tree, static_cast<Index>(t)));
+    if (given.tree_free[t] != 0) {
+      const double mass = metric[first] * h * h;
+      double area = 0.0;
+      double xi = 0.0;
+      for (Index v = scene.cloth_vertex_count(); v < scene.vertex_count(); ++v) {
+        const Index surface = scene.collision_mesh.vertex_surface[v];
+        if (given.links[given.surface_link[surface - scene.cloth_count()]].tree !=
+            static_cast<Index>(t)) {
+          continue;
+        }
+        area += scene.measures.vertex_area[v];
+        xi = std::max(xi, inputs.data(Input::kThickness)[surface]);
+      }
+      const double weight = 0.25 * area / 6.0;
+      const double slope = at_half_gap(xi, barrier_distance).slope;
+      if (weight > 0.0) result = std::max(result, mass * acceleration / (weight * slope));
+    }
+    first += n * n;
+  }
+  return result;
+}
+
+}  // namespace
+
+double default_barrier_stiffness(const Scene& scene,
+                                 const Inputs& inputs,
+                                 double barrier_distance) {
+  double kappa = 0.0;
+  if (scene.cloth_count() > 0) kappa = stiffness_for_cloths(scene, inputs, barrier_distance);
+  if (scene.mechanisms.has_free()) {
+    kappa = std::max(kappa, stiffness_for_bodies(scene, inputs, barrier_distance));
+  }
+  return kappa;
 }
 
 }  // namespace diffcloth::step

@@ -12,8 +12,8 @@ namespace diffcloth::step {
 enum class Input : std::uint8_t {
   kPositions,         ///< x_n [N, 3] m
   kVelocities,        ///< v_n [N, 3] m/s
-  kBodyPoses,         ///< at the start of the step [K, 7]
-  kBodyTargets,       ///< at its end [K, 7]
+  kBodyPoses,         ///< frames of the roots of all trees at the start of the step [T, 7]
+  kBodyTargets,       ///< at its end [T, 7]
   kPinTargets,        ///< [P, 3] m
   kSoftPinTargets,    ///< [Q, 3] m
   kForces,            ///< [N, 3] N
@@ -30,13 +30,18 @@ enum class Input : std::uint8_t {
   kSlipVelocity,      ///< eps_v [m/s]
   kPinStiffness,      ///< k_a, one value or one a cloth [N/m]
   kRestPositions,     ///< X [N, 3] m
+  kCoordinates,       ///< of mechanisms, at the start of the step [n]
+  kCoordinateEnds,    ///< at its end, where prescribed [n]
+  kCoordinateTargets, ///< t [n], see bodies::CoordinatePotential
+  kCoordinateMetric,  ///< A [sum n_t^2]
 };
-inline constexpr std::size_t kInputCount = 20;
+inline constexpr std::size_t kInputCount = 24;
 inline constexpr std::array<const char*, kInputCount> kInputNames{
     "positions",         "velocities",       "body_poses",    "body_targets",  "pin_targets",
     "soft_pin_targets",  "forces",           "gravity",       "stretch",       "bending",
     "poisson",           "density",          "damping",       "friction",      "thickness",
-    "barrier_stiffness", "barrier_distance", "slip_velocity", "pin_stiffness", "rest_positions"};
+    "barrier_stiffness", "barrier_distance", "slip_velocity", "pin_stiffness", "rest_positions",
+    "coordinates",       "coordinate_ends",  "coordinate_targets", "coordinate_metric"};
 
 /// One environment's input: a flat array, absent where data is null.
 struct View {

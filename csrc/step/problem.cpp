@@ -62,17 +62,34 @@ std::vector<double> start_positions(const Scene& scene, const Inputs& in) {
   const double* x_n = in.data(Input::kPositions);
   const std::ptrdiff_t cloth = 3 * static_cast<std::ptrdiff_t>(scene.cloth_vertex_count());
   std::vector<double> x(x_n, x_n + cloth);
-  x.resize(3 * static_cast<std::size_t>(scene.vertex_count()));
+  x.resize(3 * static_cast<std::size_t>(scene.point_count()), 0.0);
   if (scene.given.bodies.count() > 0) {
     scene.given.bodies.place(in.data(Input::kBodyPoses), x.data() + cloth);
+  }
+  double* const nodes = x.data() + 3 * static_cast<std::ptrdiff_t>(scene.vertex_count());
+  for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
+    nodes[scene.mechanisms.slot(c)] = in.data(Input::kCoordinates)[c];
+  }
+  if (!scene.mechanisms.empty()) {
+    scene.mechanisms.set_frames(in.data(Input::kBodyPoses), nodes);
+    scene.mechanisms.place(nodes, x.data() + cloth);
   }
   return x;
 }
 
 std::vector<double> end_positions(const Scene& scene, const Inputs& in, std::vector<double> x) {
+  double* const bodies = x.data() + 3 * static_cast<std::ptrdiff_t>(scene.cloth_vertex_count());
   if (scene.given.bodies.count() > 0) {
-    scene.given.bodies.place(in.data(Input::kBodyTargets),
-                             x.data() + 3 * static_cast<std::size_t>(scene.cloth_vertex_count()));
+    scene.given.bodies.place(in.data(Input::kBodyTargets), bodies);
+  }
+  double* const nodes = x.data() + 3 * static_cast<std::ptrdiff_t>(scene.vertex_count());
+  for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
+    if (scene.mechanisms.given().prescribed[c] == 0) continue;
+    nodes[scene.mechanisms.slot(c)] = in.data(Input::kCoordinateEnds)[c];
+  }
+  if (!scene.mechanisms.empty()) {
+    scene.mechanisms.set_frames(in.data(Input::kBodyTargets), nodes);
+    scene.mechanisms.place(nodes, bodies);
   }
   for (std::size_t k = 0; k < scene.given.pins.size(); ++k) {
     Eigen::Map<Vec3>(x.data() + 3 * scene.given.pins[k]) =
@@ -121,7 +138,11 @@ Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, bool with_rest)
     : scene(scene_in),
       inputs(inputs_in),
       h(scene_in.given.dt),
-      coordinates(scene_in.cloth_vertex_count(), scene_in.prescribed),
+      coordinates(scene_in.cloth_vertex_count(),
+                  scene_in.vertex_count(),
+                  scene_in.mechanisms,
+                  scene_in.prescribed),
+      cloth_size(3 * static_cast<std::size_t>(scene_in.cloth_vertex_count())),
       own_rest_(own_rest_shape(scene, inputs)),
       rest(own_rest_.area.empty() ? &scene.rest : &own_rest_),
       measures(rest_measures(scene, *rest)),
@@ -143,6 +164,10 @@ Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, bool with_rest)
                          .stiffness = anchor_stiffness,
                          .target = {inputs.data(Input::kSoftPinTargets), 3 * soft.size()}});
   }
+  if (scene.mechanisms.has_free()) {
+    chart.emplace(scene.mechanisms, scene.vertex_count(), scene.cloth_vertex_count(),
+                  inputs.data(Input::kCoordinateTargets), inputs.data(Input::kCoordinateMetric));
+  }
   if (inputs.data(Input::kBarrierStiffness) != nullptr) {
     contact.emplace(scene.collision_mesh, scene.feature_weights, measures,
                     contact_parameters(scene, inputs), scene.prescribed);
@@ -157,12 +182,13 @@ std::vector<Potential*> Problem::elastic_potentials() {
 
 solver::Objective Problem::objective(Proximity& inertia_or_nearness,
                                      std::vector<Potential*> others,
-                                     solver::AssemblyCache& assemblies) const {
+                                     solver::AssemblyCache& assemblies) {
   return {.coordinates = &coordinates,
           .h = h,
           .length = scene.mean_edge,
           .inertia = &inertia_or_nearness,
           .others = std::move(others),
+          .chart = chart ? &*chart : nullptr,
           .assemblies = &assemblies};
 }
 
@@ -175,9 +201,24 @@ linalg::BlockMatrix contact_free_hessian(Problem& p, const double* x, Curvature 
   return solver::LinearSystem(f, workspace, watch, counts).assemble(x, curvature);
 }
 
-std::vector<double> Problem::with_bodies_at_end(const double* cloth_positions) const {
+std::vector<double> Problem::at(const double* rows) const {
   std::vector<double> x = ends;
-  std::copy_n(cloth_positions, 3 * masses.size(), x.begin());
+  coordinates.put_rows(rows, x);
+  coordinates.place(x);
+  return x;
+}
+
+std::vector<double> Problem::predicted(const double* cloth_positions) const {
+  std::vector<double> x = ends;
+  std::copy_n(cloth_positions, cloth_size, x.begin());
+  for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
+    if (scene.mechanisms.given().prescribed[c] != 0) continue;
+    coordinates.nodes(x)[scene.mechanisms.slot(c)] = inputs.data(Input::kCoordinateTargets)[c];
+  }
+  coordinates.place(x);
+  for (const Index i : scene.given.pins) {
+    Eigen::Map<Vec3>(x.data() + 3 * i) = row(ends.data(), i);
+  }
   return x;
 }
 

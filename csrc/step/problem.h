@@ -25,6 +25,7 @@ class Problem {
   const Inputs& inputs;
   double h;
   solver::Coordinates coordinates;
+  std::size_t cloth_size;  ///< 3 N
 
  private:
   mesh::RestShape own_rest_;
@@ -34,15 +35,16 @@ class Problem {
   contact::RestMeasures measures;
   std::vector<double> density;  ///< [F]
   std::vector<double> masses;   ///< [N] lumped [kg]
-  std::vector<double> start;    ///< x_n and o_n: all vertices at the start of the step
-  std::vector<double> ends;     ///< like start, prescribed vertices at their targets
+  std::vector<double> start;    ///< x_n and o_n: all points at the start of the step
+  std::vector<double> ends;     ///< like start, what is prescribed at its targets
 
   Proximity inertia;  ///< metric M, target xhat = x_n + h v_n + h^2 (gravity + M^-1 f)
   elastic::Model model;
   elastic::ElasticPotential elasticity;
   std::vector<double> anchor_stiffness;  ///< [Q]
   std::optional<elastic::AnchorPotential> anchors;
-  std::optional<contact::ContactModel> contact;  ///< absent where nothing can touch
+  std::optional<bodies::CoordinatePotential> chart;  ///< absent without free coordinates
+  std::optional<contact::ContactModel> contact;      ///< absent where nothing can touch
 
   /// Elasticity and anchors.
   std::vector<Potential*> elastic_potentials();
@@ -50,10 +52,14 @@ class Problem {
   /// A sum of potentials over the cloths' vertices, without contact.
   solver::Objective objective(Proximity& inertia,
                               std::vector<Potential*> others,
-                              solver::AssemblyCache& assemblies) const;
+                              solver::AssemblyCache& assemblies);
 
-  /// All vertices, with these cloth positions and the bodies at their targets.
-  std::vector<double> with_bodies_at_end(const double* cloth_positions) const;
+  /// All points, with these rows and everything prescribed at its targets.
+  std::vector<double> at(const double* rows) const;
+
+  /// All points, with these cloth positions, free coordinates at their targets t, and everything
+  /// prescribed at its own.
+  std::vector<double> predicted(const double* cloth_positions) const;
 };
 
 /// Hessian of inertia, elasticity and anchors at x.

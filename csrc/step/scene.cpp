@@ -9,7 +9,8 @@
 namespace diffcloth::step {
 namespace {
 
-contact::CollisionMesh make_collision_mesh(const Description& d) {
+contact::CollisionMesh make_collision_mesh(const Description& d,
+                                           const bodies::Mechanisms& mechanisms) {
   const auto cloth_vertices = static_cast<Index>(d.vertices.size() / 3);
   const auto cloths = static_cast<Index>(d.bending_models.size());
   std::vector<std::array<Index, 3>> faces = d.faces;
@@ -21,11 +22,18 @@ contact::CollisionMesh make_collision_mesh(const Description& d) {
     std::fill(surface.begin() + d.cloth_vertex_start[c],
               surface.begin() + d.cloth_vertex_start[c + 1], c);
   }
+  std::vector<char> dynamic;
   for (Index k = 0; k < d.bodies.count(); ++k) {
+    dynamic.push_back(mechanisms.is_dynamic(k) ? 1 : 0);
     std::fill(surface.begin() + cloth_vertices + d.bodies.vertex_start[k],
               surface.begin() + cloth_vertices + d.bodies.vertex_start[k + 1], cloths + k);
   }
-  return {std::move(faces), std::move(surface), cloths, d.self_contact};
+  return {std::move(faces), std::move(surface), cloths,
+          contact::touching_surfaces({.surface_count = cloths + d.bodies.count(),
+                                      .cloth_count = cloths,
+                                      .self_contact = d.self_contact,
+                                      .body_dynamic = dynamic,
+                                      .ignored = d.ignored_pairs})};
 }
 
 /// All surfaces as given: the reference that the collision trees are built from.
@@ -60,17 +68,85 @@ std::vector<mesh::BendingModel> face_models(const Description& d) {
   return model;
 }
 
-double mean_length(const mesh::RestShape& rest) {
+double mean_length(const mesh::RestShape& rest,
+                   const contact::CollisionMesh& mesh,
+                   const bodies::BodySet& bodies) {
   double sum = 0.0;
-  for (const double length_sq : rest.edge_length_sq) sum += std::sqrt(length_sq);
-  return sum / static_cast<double>(rest.edge_length_sq.size());
+  if (!rest.edge_length_sq.empty()) {
+    for (const double length_sq : rest.edge_length_sq) sum += std::sqrt(length_sq);
+    return sum / static_cast<double>(rest.edge_length_sq.size());
+  }
+  for (const auto& [i, j] : mesh.edges) {
+    sum += (row(bodies.vertices.data(), j) - row(bodies.vertices.data(), i)).norm();
+  }
+  return sum / static_cast<double>(mesh.edges.size());
 }
 
-std::vector<char> make_prescribed(const Description& d, Index vertex_count) {
-  std::vector<char> prescribed(static_cast<std::size_t>(vertex_count), 0);
+/// Where nothing is said of trees: every body is one, of one link without coordinates.
+bodies::MechanismsDescription complete(const Description& d) {
+  bodies::MechanismsDescription m = d.mechanisms;
+  if (!m.tree_free.empty()) return m;
+  for (Index k = 0; k < d.bodies.count(); ++k) {
+    m.tree_free.push_back(0);
+    m.surface_link.push_back(k);
+    bodies::Link link{.tree = k,
+                      .parent = -1,
+                      .kind = bodies::JointKind::kFixed,
+                      .offset = bodies::Mat34::Identity(),
+                      .axis = Vec3::Zero(),
+                      .coordinate = -1,
+                      .multiplier = 0.0,
+                      .constant = 0.0};
+    m.links.push_back(link);
+  }
+  return m;
+}
+
+/// Which pose places a surface: the one of its tree, unless that is a mechanism.
+std::vector<Index> surface_poses(const bodies::Mechanisms& mechanisms) {
+  std::vector<Index> pose;
+  const bodies::MechanismsDescription& given = mechanisms.given();
+  for (std::size_t s = 0; s < given.surface_link.size(); ++s) {
+    const bool own = !mechanisms.has_surface(static_cast<Index>(s));
+    pose.push_back(own ? given.links[given.surface_link[s]].tree : -1);
+  }
+  return pose;
+}
+
+std::vector<char> make_prescribed(const Description& d, const bodies::Mechanisms& mechanisms) {
+  std::vector<char> prescribed(d.vertices.size() / 3, 0);
   for (const Index i : d.pins) prescribed[i] = 1;
-  for (std::size_t i = d.vertices.size() / 3; i < prescribed.size(); ++i) prescribed[i] = 1;
+  for (Index k = 0; k < d.bodies.count(); ++k) {
+    const Index count = d.bodies.vertex_start[k + 1] - d.bodies.vertex_start[k];
+    prescribed.insert(prescribed.end(), static_cast<std::size_t>(count),
+                      mechanisms.is_dynamic(k) ? 0 : 1);
+  }
+  for (Index k = 0; k < mechanisms.node_count(); ++k) {
+    prescribed.push_back(mechanisms.is_prescribed(k) ? 1 : 0);
+  }
+  prescribed.insert(prescribed.end(), static_cast<std::size_t>(4 * mechanisms.tree_count()), 1);
   return prescribed;
+}
+
+/// Those of rows: of the cloth's vertices and the nodes of coordinates.
+std::vector<char> fixed_rows(const std::vector<char>& prescribed,
+                             Index cloth_vertex_count,
+                             const bodies::Mechanisms& mechanisms) {
+  std::vector<char> fixed(prescribed.begin(), prescribed.begin() + cloth_vertex_count);
+  const auto frames = prescribed.end() - 4 * mechanisms.tree_count();
+  fixed.insert(fixed.end(), frames - mechanisms.node_count(), frames);
+  return fixed;
+}
+
+/// A pattern of the cloths with the nodes of coordinates behind it.
+linalg::BlockPattern with_nodes(Index cloth_vertex_count,
+                                std::vector<std::vector<Index>> cliques,
+                                const bodies::Mechanisms& mechanisms) {
+  for (std::vector<Index> clique : mechanisms.cliques()) {
+    for (Index& node : clique) node += cloth_vertex_count;
+    cliques.push_back(std::move(clique));
+  }
+  return {cloth_vertex_count + mechanisms.node_count(), cliques};
 }
 
 }  // namespace
@@ -83,17 +159,19 @@ Scene::Scene(Description description)
       vertex_cloth(owners(given.cloth_vertex_start)),
       stencils(mesh::choose_stencils(topology, given.rest_vertices.data(), face_models(given))),
       rest(mesh::rest_shape(topology, stencils, given.rest_vertices.data())),
-      mean_edge(mean_length(rest)),
-      collision_mesh(make_collision_mesh(given)),
-      prescribed(make_prescribed(given, collision_mesh.vertex_count)),
+      mechanisms(complete(given), given.bodies),
+      collision_mesh(make_collision_mesh(given, mechanisms)),
+      mean_edge(mean_length(rest, collision_mesh, given.bodies)),
+      prescribed(make_prescribed(given, mechanisms)),
       measures(contact::measure(collision_mesh, all_rest_positions(given).data())),
       feature_weights(collision_mesh, all_rest_positions(given).data(), prescribed),
       broad_phase(collision_mesh, reference_positions(given).data()),
       elastic_assemblies(
-          linalg::BlockPattern(topology.vertex_count, elastic::cliques(topology, stencils)),
-          {prescribed.begin(), prescribed.begin() + topology.vertex_count}),
-      diagonal_assemblies(linalg::BlockPattern(topology.vertex_count, {}),
-                          {prescribed.begin(), prescribed.begin() + topology.vertex_count}) {
+          with_nodes(topology.vertex_count, elastic::cliques(topology, stencils), mechanisms),
+          fixed_rows(prescribed, topology.vertex_count, mechanisms)),
+      diagonal_assemblies(with_nodes(topology.vertex_count, {}, mechanisms),
+                          fixed_rows(prescribed, topology.vertex_count, mechanisms)) {
+  given.bodies.pose = surface_poses(mechanisms);
   slots = elastic::slots(topology, stencils, elastic_assemblies.base());
 }
 

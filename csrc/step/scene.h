@@ -4,6 +4,7 @@
 #include <string>
 #include <vector>
 
+#include "bodies/mechanisms.h"
 #include "bodies/pose.h"
 #include "contact/broad_phase.h"
 #include "contact/collision_mesh.h"
@@ -34,7 +35,9 @@ struct Description {
   std::vector<Index> pins;                         ///< [P]
   std::vector<Index> soft_pins;                    ///< [Q]
   bodies::BodySet bodies;
+  bodies::MechanismsDescription mechanisms;      ///< empty: every body is a tree of one link
   std::vector<std::array<Index, 3>> body_faces;  ///< indices into the bodies' vertices
+  std::vector<std::array<Index, 2>> ignored_pairs;  ///< pairs of surfaces that never touch
   bool self_contact = true;
   double dt = 0.01;
   std::string scheme = "coupled";
@@ -51,6 +54,7 @@ struct Scene {
   Index vertex_count() const { return collision_mesh.vertex_count; }
   Index cloth_count() const { return static_cast<Index>(given.bending_models.size()); }
   Index surface_count() const { return cloth_count() + given.bodies.count(); }
+  Index point_count() const { return static_cast<Index>(prescribed.size()); }
 
   Description given;
   const Scheme* scheme;
@@ -59,9 +63,10 @@ struct Scene {
   std::vector<Index> vertex_cloth;  ///< [N]
   mesh::BendingStencils stencils;
   mesh::RestShape rest;  ///< of given.rest_vertices
-  double mean_edge;      ///< of the cloths at rest [m]
+  bodies::Mechanisms mechanisms;
   contact::CollisionMesh collision_mesh;
-  std::vector<char> prescribed;             ///< [vertices] pins and bodies
+  double mean_edge;                         ///< of the cloths at rest, else of the bodies [m]
+  std::vector<char> prescribed;             ///< [points] pins, bodies, ...: see solver::Coordinates
   contact::RestMeasures measures;           ///< of given.rest_vertices and the bodies
   contact::FeatureWeights feature_weights;  ///< likewise
   contact::BroadPhase broad_phase;

@@ -46,8 +46,12 @@ class Scheme {
   /// What backward needs of forward beyond the inputs: positions, no contacts and no matrices.
   virtual std::vector<Field> tape(const Scene& scene) const = 0;
 
-  /// Find the positions at the end of the step, and the contact forces on the bodies' vertices.
-  virtual void forward(const Forward& step, double* positions, double* body_forces) const = 0;
+  /// Find all points at the end of the step, and the contact forces on the bodies' vertices.
+  ///
+  /// @param x  in: at the start of the step
+  virtual void forward(const Forward& step,
+                       std::vector<double>& x,
+                       double* body_forces) const = 0;
 
   /// From the cotangents of the end to those of all that the potentials depend on.
   virtual void backward(const Backward& step) const = 0;

@@ -48,10 +48,7 @@ Array solve_elastic_stage(const Forward& step) {
   Problem& problem = step.problem;
   const solver::Objective f = problem.objective(problem.inertia, problem.elastic_potentials(),
                                                 problem.scene.elastic_assemblies);
-  Array x = problem.with_bodies_at_end(problem.inertia.target().data());
-  for (const Index i : problem.scene.given.pins) {
-    Eigen::Map<Vec3>(x.data() + 3 * i) = row(problem.ends.data(), i);
-  }
+  Array x = problem.predicted(problem.inertia.target().data());
   // Its way is no motion of the cloth.
   auto* const path = std::exchange(step.context.path, nullptr);
   const solver::Outcome outcome =
@@ -71,32 +68,30 @@ std::vector<Field> Split::tape(const Scene& scene) const {
   return fields;
 }
 
-void Split::forward(const Forward& step, double* positions, double* body_forces) const {
+void Split::forward(const Forward& step, Array& x, double* body_forces) const {
   Problem& problem = step.problem;
-  const std::size_t cloth = problem.coordinates.size();
   Array x_d = solve_elastic_stage(step);
-  x_d.resize(cloth);
+  x_d.resize(problem.cloth_size);
   if (!step.tape.empty()) std::ranges::copy(x_d, step.tape["elastic"]);
 
   Proximity nearness(stage_metric(problem), std::move(x_d), problem.h);
-  Array x = problem.start;
   stage(problem, nearness).forward(step, x, body_forces);
-  std::copy_n(x.begin(), cloth, positions);
 }
 
 void Split::backward(const Backward& step) const {
   Problem& problem = step.problem;
   const double* x_d = step.tape["elastic"];
-  Proximity nearness(stage_metric(problem), Array(x_d, x_d + problem.coordinates.size()),
-                     problem.h);
-  stage(problem, nearness).backward(step, step.cotangents.positions);
+  Proximity nearness(stage_metric(problem), Array(x_d, x_d + problem.cloth_size), problem.h);
+  stage(problem, nearness).backward(step, step.cotangents.rows);
   add_stage_metric(problem, nearness.metric_bar, step.cotangents.masses);
 
   const solver::Objective f = problem.objective(problem.inertia, problem.elastic_potentials(),
                                                 problem.scene.elastic_assemblies);
-  pull_back_solve(step, f, problem.with_bodies_at_end(x_d),
-                  step.factors.empty() ? nullptr : step.factors.front(), nearness.target_bar,
-                  nullptr);
+  Array g = nearness.target_bar;
+  g.resize(problem.coordinates.size(), 0.0);
+  const Array x = problem.predicted(x_d);
+  problem.coordinates.stand_at(x.data());
+  pull_back_solve(step, f, x, step.factors.empty() ? nullptr : step.factors.front(), g, nullptr);
 }
 
 }  // namespace diffcloth::step

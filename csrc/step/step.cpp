@@ -6,26 +6,30 @@
 #include "step/scheme.h"
 
 namespace diffcloth::step {
-namespace {
-
-std::size_t cloth_size(const Scene& scene) {
-  return 3 * static_cast<std::size_t>(scene.cloth_vertex_count());
-}
-
-}  // namespace
-
 std::vector<Field> output_fields(const Scene& scene) {
   const auto n = static_cast<std::size_t>(scene.cloth_vertex_count());
   const std::size_t v = static_cast<std::size_t>(scene.vertex_count()) - n;
-  return {{.name = "positions", .shape = {n, 3}},
-          {.name = "velocities", .shape = {n, 3}},
-          {.name = "body_forces", .shape = {v, 3}}};
+  const auto q = static_cast<std::size_t>(scene.mechanisms.coordinate_count());
+  std::vector<Field> fields{{.name = "positions", .shape = {n, 3}},
+                            {.name = "velocities", .shape = {n, 3}},
+                            {.name = "body_forces", .shape = {v, 3}}};
+  if (q > 0) fields.push_back({.name = "coordinates", .shape = {q}});
+  return fields;
 }
 
 std::vector<Field> tape_fields(const Scene& scene) {
   std::vector<Field> fields = scene.scheme->tape(scene);
   fields.push_back({.name = "key", .shape = {1}});
   return fields;
+}
+
+std::string find_overlap(const Scene& scene, const Inputs& inputs) {
+  std::vector<double> thickness(static_cast<std::size_t>(scene.surface_count()), 0.0);
+  if (const double* given = inputs.data(Input::kThickness)) {
+    std::copy_n(given, thickness.size(), thickness.begin());
+  }
+  contact::BroadPhase::Scratch scratch;
+  return find_overlap(scene, Problem(scene, inputs).start.data(), thickness, scratch);
 }
 
 Report forward(const Scene& scene,
@@ -40,7 +44,7 @@ Report forward(const Scene& scene,
   contact::Detection detection(scene.broad_phase);
   Problem problem(scene, inputs);
   double* const positions = outputs["positions"];
-  std::copy_n(problem.start.begin(), cloth_size(scene), positions);
+  std::copy_n(problem.start.begin(), problem.cloth_size, positions);
   if (problem.contact) {
     const Stopwatch::Scope scope(watch, Phase::kDetection);
     report.message = find_overlap(scene, problem.start.data(),
@@ -59,15 +63,20 @@ Report forward(const Scene& scene,
                           .counts = &report.counts,
                           .path = path};
   FactorCache::Factors kept;
+  std::vector<double> x = problem.start;
   scene.scheme->forward({.problem = problem,
                          .detection = detection,
                          .context = context,
                          .tape = tape,
                          .factors = kept,
                          .report = report},
-                        positions, outputs["body_forces"]);
+                        x, outputs["body_forces"]);
+  std::copy_n(x.begin(), problem.cloth_size, positions);
+  for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
+    outputs["coordinates"][c] = problem.coordinates.nodes(x)[scene.mechanisms.slot(c)];
+  }
   double* const velocities = outputs["velocities"];
-  for (std::size_t a = 0; a < cloth_size(scene); ++a) {
+  for (std::size_t a = 0; a < problem.cloth_size; ++a) {
     velocities[a] = (positions[a] - problem.start[a]) / problem.h;
   }
   if (!tape.empty()) *tape["key"] = static_cast<double>(factors->insert(std::move(kept)));
@@ -92,13 +101,16 @@ void backward(const Scene& scene,
   const double* const x_bar = cotangents["positions"];
   const double* const v_bar = cotangents["velocities"];
   const double* const f_bar = cotangents["body_forces"];
-  const std::size_t cloth = cloth_size(scene);
-  bars.positions.resize(cloth);
-  for (std::size_t a = 0; a < cloth; ++a) {
-    bars.positions[a] = x_bar[a] + v_bar[a] / problem.h;
+  bars.rows.assign(problem.coordinates.size(), 0.0);
+  for (std::size_t a = 0; a < problem.cloth_size; ++a) {
+    bars.rows[a] = x_bar[a] + v_bar[a] / problem.h;
     bars.start[a] -= v_bar[a] / problem.h;
   }
-  bars.body_forces.assign(f_bar, f_bar + (problem.start.size() - cloth));
+  for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
+    bars.rows[problem.cloth_size + scene.mechanisms.slot(c)] = cotangents["coordinates"][c];
+  }
+  bars.body_forces.assign(
+      f_bar, f_bar + (3 * static_cast<std::size_t>(scene.vertex_count()) - problem.cloth_size));
 
   linalg::CholeskyWorkspace workspace;
   solver::Context context{.checkpoint = &checkpoint,

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <string>
 #include <vector>
 
 #include "common/interrupt.h"
@@ -11,7 +12,8 @@
 
 namespace diffcloth::step {
 
-/// What a step gives back: "positions" and "velocities" [N, 3], "body_forces" [V, 3].
+/// What a step gives back: "positions" and "velocities" [N, 3], "body_forces" [V, 3], and, where there
+/// are any, "coordinates" [n].
 std::vector<Field> output_fields(const Scene& scene);
 
 /// What backward needs of forward: the fields of the scheme, and "key", of factors in the cache.
@@ -42,6 +44,9 @@ void backward(const Scene& scene,
               const Checkpoint& checkpoint,
               const Gradients& gradients,
               FactorCache& factors);
+
+/// Where surfaces overlap at the start of the step, or are closer than their thickness; else empty.
+std::string find_overlap(const Scene& scene, const Inputs& inputs);
 
 /// Elastic energy + gravity + soft pins + barrier at the positions of the inputs [J].
 double potential_energy(const Scene& scene, const Inputs& inputs);

@@ -139,7 +139,7 @@ def _rigid(arms: Tensor) -> Tensor:
 
 
 def _tensor(array: FloatArray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float64))
+    return torch.from_numpy(np.array(array, dtype=np.float64))
 
 
 _EYE = torch.eye(3, dtype=torch.float64)

@@ -12,6 +12,7 @@ __all__ = [
     "integrate_poses",
     "interpolate_poses",
     "nearer_quaternion",
+    "pose_velocities",
     "quaternion_exp",
     "quaternion_log",
     "quaternion_matrix",
@@ -135,6 +136,26 @@ def integrate_poses(pose: Tensor, twists: Tensor, dt: float) -> Tensor:
         quaternion = quaternion_multiply(turn, quaternion)
         quaternions.append(quaternion)
     return torch.cat([positions, torch.stack(quaternions)], dim=-1)
+
+
+def pose_velocities(start: Tensor, end: Tensor, dt: float) -> Tensor:
+    """Constant velocities that lead from poses to others, as `integrate_poses` does.
+
+    Args:
+        start: Poses with quaternions of any length, shape [..., 7].
+        end: Poses that are turned by less than pi from them, likewise.
+        dt: Time between them [s].
+
+    Returns:
+        Linear velocities [m/s] and angular velocities [rad/s] in world axes, shape [..., 6].
+    """
+    before, after = (
+        pose[..., 3:] / torch.linalg.vector_norm(pose[..., 3:], dim=-1, keepdim=True)
+        for pose in (start, end)
+    )
+    conjugate = before * torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=before.dtype)
+    turn = quaternion_log(quaternion_multiply(after, conjugate))
+    return torch.cat([end[..., :3] - start[..., :3], turn], dim=-1) / dt
 
 
 def interpolate_poses(times: Tensor, poses: Tensor, at: Tensor) -> Tensor:

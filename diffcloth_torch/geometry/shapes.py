@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray
 
-__all__ = ["box", "capsule", "grid", "plane", "sphere"]
+__all__ = ["Mesh", "box", "capsule", "cylinder", "grid", "plane", "sphere"]
 
 Mesh = tuple[FloatArray, NDArray[np.int64]]
 
 # Segments around a capsule and rings on each of its caps: 5 degrees off a true circle at most.
 _CAPSULE_SEGMENTS = 32
 _CAPSULE_RINGS = 8
+
+# Rings on an end of a cylinder: 6 vertices on the first, 6 more on each next, 30 on its rim.
+_CYLINDER_RINGS = 5
+_CYLINDER_ROWS = 32
 
 
 def grid(rows: int, columns: int, size: FloatArray) -> Mesh:
@@ -35,8 +40,8 @@ def plane(size: FloatArray) -> Mesh:
     return grid(2, 2, size)
 
 
-def box(size: FloatArray) -> Mesh:
-    """Cuboid of 8 vertices and 12 triangles."""
+def box(size: FloatArray, segments: Sequence[int] = (1, 1, 1)) -> Mesh:
+    """Cuboid, its edges along x, y and z cut into segments; 8 vertices and 12 triangles uncut."""
     corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
     quads = [
         (0, 1, 3, 2),  # -x
@@ -46,8 +51,35 @@ def box(size: FloatArray) -> Mesh:
         (0, 2, 6, 4),  # -z
         (1, 5, 7, 3),  # +z
     ]
+    if tuple(segments) != (1, 1, 1):
+        return _cut_box(corners, quads, segments, size)
     faces = [triangle for a, b, c, d in quads for triangle in ((a, b, c), (a, c, d))]
     return corners * size, np.array(faces)
+
+
+def _cut_box(
+    corners: FloatArray,
+    quads: Sequence[tuple[int, int, int, int]],
+    segments: Sequence[int],
+    size: FloatArray,
+) -> Mesh:
+    counts = np.array(segments)
+    nodes: dict[tuple[int, ...], int] = {}  # lattice point on the surface -> vertex
+    faces = []
+    lattice = np.rint((corners + 0.5) * counts).astype(np.int64)
+    for a, b, _, d in quads:
+        along, across = np.sign(lattice[b] - lattice[a]), np.sign(lattice[d] - lattice[a])
+        for i, j in itertools.product(
+            range(int(np.abs(counts @ along))), range(int(np.abs(counts @ across)))
+        ):
+            start = lattice[a] + i * along + j * across
+            quad = [
+                nodes.setdefault(tuple(point.tolist()), len(nodes))
+                for point in (start, start + along, start + along + across, start + across)
+            ]
+            faces += [(quad[0], quad[1], quad[2]), (quad[0], quad[2], quad[3])]
+    points = np.array(list(nodes)) / counts - 0.5
+    return points * size, np.array(faces)
 
 
 def sphere(radius: float, subdivisions: int) -> Mesh:
@@ -100,6 +132,56 @@ def capsule(radius: float, length: float) -> Mesh:
     tip = length / 2 + radius
     vertices = np.concatenate([*rings, [[0.0, 0.0, tip], [0.0, 0.0, -tip]]])
     return vertices, _lathe_faces(len(profile))
+
+
+def cylinder(radius: float, length: float, rings: int = _CYLINDER_RINGS, rows: int = 0) -> Mesh:
+    """Closed cylinder along z.
+
+    Args:
+        radius: Radius [m].
+        length: Length [m].
+        rings: Rings on each end, around its center; six times as many segments on its rim.
+        rows: Of quadrilaterals along its side; 0 makes them no longer than the radius, but not more
+            than 32 of them.
+    """
+    rows = rows or int(np.ceil(min(length / radius, _CYLINDER_ROWS)))
+    disk, disk_faces = _disk(rings)
+    disk *= radius
+    rim = 6 * rings
+    top = np.column_stack([disk, np.full(len(disk), length / 2)])
+    bottom = np.column_stack([disk, np.full(len(disk), -length / 2)])
+    heights = np.linspace(length / 2, -length / 2, rows + 1)[1:-1]
+    side = [np.column_stack([disk[-rim:], np.full(rim, z)]) for z in heights]
+    # First vertices of the rings along the side, from the rim of the top to that of the bottom.
+    n = len(disk)
+    starts = [n - rim, *(2 * n + rim * np.arange(rows - 1)).tolist(), 2 * n - rim]
+    here = np.arange(rim)
+    there = (here + 1) % rim
+    faces = [disk_faces, n + disk_faces[:, ::-1]]
+    for up, down in itertools.pairwise(starts):
+        faces.append(np.stack([down + here, down + there, up + there], axis=-1))
+        faces.append(np.stack([down + here, up + there, up + here], axis=-1))
+    return np.concatenate([top, bottom, *side]), np.concatenate(faces)
+
+
+def _disk(rings: int) -> Mesh:
+    """Disk of radius 1 in the xy-plane that faces up; ring k > 0 has 6 k vertices, rim last."""
+    points = [np.zeros((1, 2))]
+    faces = []
+    for k in range(1, rings + 1):
+        around = 2 * np.pi * np.arange(6 * k) / (6 * k)
+        points.append(k / rings * np.stack([np.cos(around), np.sin(around)], axis=-1))
+        outer, inner = 1 + 3 * k * (k - 1), 1 + 3 * (k - 1) * (k - 2) if k > 1 else 0
+        for sector, i in itertools.product(range(6), range(k)):
+            # Vertices i of the sector on both rings; the inner ring has one fewer in each sector.
+            a = outer + sector * k + i
+            b = outer + (sector * k + i + 1) % (6 * k)
+            c = inner + (sector * (k - 1) + i) % max(1, 6 * (k - 1))
+            faces.append((a, b, c))
+            if i < k - 1:
+                d = inner + (sector * (k - 1) + i + 1) % (6 * (k - 1))
+                faces.append((c, b, d))
+    return np.concatenate(points), np.array(faces)
 
 
 def _lathe_faces(ring_count: int) -> NDArray[np.int64]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from diffcloth_torch.checks import (
@@ -16,7 +18,15 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.errors import InvalidInput
 
-__all__ = ["check_areas", "check_manifold", "surface_arrays", "unique_edges"]
+__all__ = ["Surface", "check_areas", "check_manifold", "surface_arrays", "unique_edges"]
+
+
+class Surface(NamedTuple):
+    """Vertices [n, 3] in meters and triangles [f, 3]."""
+
+    vertices: FloatArray
+    faces: IndexArray
+
 
 # Twice the area of a face over its longest edge squared. Below this, rounding decides which way
 # the normal points.

@@ -27,7 +27,7 @@ _LARGEST_PART_OF_NONADJACENT = 0.5
 
 def has_contact(scene: Scene, contact: ContactOptions) -> bool:
     """Whether any two surfaces of the scene may touch."""
-    return contact.self_contact or len(scene.cloths) + len(scene.bodies) > 1
+    return len(scene.surface_names) > 1 or (contact.self_contact and len(scene.cloths) > 0)
 
 
 def scene_parameters(scene: Scene, assembly: Assembly, contact: bool) -> dict[str, Tensor]:
@@ -38,20 +38,50 @@ def scene_parameters(scene: Scene, assembly: Assembly, contact: bool) -> dict[st
         assembly: Its arrays.
         contact: Whether any two of its surfaces may touch.
     """
-    values = {field: _material_values(scene, field) for field in FACE_QUANTITIES}
-    if all(cloth.bending_model == "hinge" for cloth in scene.cloths):
-        del values["poisson"]  # hinges have no Poisson effect
+    values: dict[str, FloatArray] = {}
+    if scene.cloths:
+        values = {field: _material_values(scene, field) for field in FACE_QUANTITIES}
+        if all(cloth.bending_model == "hinge" for cloth in scene.cloths):
+            del values["poisson"]  # hinges have no Poisson effect
+        values["rest_positions"] = assembly.rest_vertices
     if contact:
-        surfaces: list[Material | RigidBody] = [cloth.material for cloth in scene.cloths]
-        surfaces += scene.bodies
-        friction = np.array([surface.friction for surface in surfaces])
+        friction = _surface_values(scene, "friction")
         values["friction"] = np.sqrt(friction[:, None] * friction)
-        values["thickness"] = np.array([surface.thickness for surface in surfaces])
+        values["thickness"] = _surface_values(scene, "thickness")
     if len(assembly.soft_pins):
         values["pin_stiffness"] = _shortest([cloth.pin_stiffness for cloth in scene.cloths])
     values["gravity"] = scene.gravity
-    values["rest_positions"] = assembly.rest_vertices
+    values |= _rigid_values(assembly)
     return {name: torch.from_numpy(np.array(value)) for name, value in values.items()}
+
+
+def _surface_values(scene: Scene, field: str) -> FloatArray:
+    """A property of every surface: of cloths, bodies, and links that have collision shapes."""
+    owners: list[Material | RigidBody] = [cloth.material for cloth in scene.cloths]
+    values = [getattr(owner, field) for owner in [*owners, *scene.bodies]]
+    for robot in scene.robots:
+        links = zip(robot.surfaces, getattr(robot, field), strict=True)
+        values += [value for surface, value in links if surface is not None]
+    return np.array(values)
+
+
+def _rigid_values(assembly: Assembly) -> dict[str, FloatArray]:
+    """Masses of bodies and links and properties of joints; rows of what is not dynamic are zero."""
+    bodies = assembly.mechanisms[: assembly.body_count]
+    robots = assembly.mechanisms[assembly.body_count :]
+    values: dict[str, FloatArray] = {}
+    for owner, mechanisms in (("body", bodies), ("link", robots)):
+        if any(mechanism.is_dynamic for mechanism in mechanisms):
+            for field in ("mass", "center", "inertia"):
+                rows = [m.is_dynamic * getattr(m, field) for m in mechanisms]
+                values[f"{owner}_{field}"] = np.concatenate(rows)
+    driven = np.array([mode in ("torque", "pd") for r in robots for mode in r.actuation])
+    if driven.any():
+        values["joint_stiffness"] = assembly.stiffness
+        values["joint_damping"] = assembly.damping
+        values["joint_viscosity"] = driven * assembly.joint_viscosity
+        values["joint_armature"] = driven * assembly.joint_armature
+    return values
 
 
 def _material_values(scene: Scene, field: str) -> FloatArray:
@@ -72,6 +102,10 @@ def choose_barrier_distance(
     scene: Scene, nonadjacent_distance: float, contact: ContactOptions
 ) -> float:
     """Barrier distance from the cloths alone, so that a far body changes nothing [m]."""
+    if not scene.cloths:
+        raise InvalidInput(
+            "Simulator: `contact.barrier_distance` must be given for a scene without cloths"
+        )
     edges = [
         np.linalg.norm(np.diff(cloth.rest_vertices[unique_edges(cloth.faces)[0]], axis=1), axis=-1)
         for cloth in scene.cloths

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -82,6 +83,27 @@ class Mechanism:
         for link in order:
             order += np.flatnonzero(self.parent == link).tolist()
         return tuple(order)
+
+    @property
+    def rigid_group(self) -> IndexArray:
+        """Of each link, the first link (nearest to the root) that fixed joints join it to; [L]."""
+        group = np.arange(self.link_count, dtype=np.int32)
+        for link in self.order[1:]:
+            if self.kind[link] == "fixed":
+                group[link] = group[self.parent[link]]
+        return group
+
+    @property
+    def adjacent_links(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of names of links that are rigidly joined, or joined by a single moving joint."""
+        group = self.rigid_group
+        # Of each group, that which its first link hangs on.
+        above = np.where(self.parent[group] >= 0, group[self.parent[group]], -1)
+        return tuple(
+            (self.link_names[a], self.link_names[b])
+            for a, b in combinations(range(self.link_count), 2)
+            if group[a] == group[b] or above[a] == group[b] or above[b] == group[a]
+        )
 
     @property
     def is_dynamic(self) -> bool:

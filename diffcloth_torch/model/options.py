@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from diffcloth_torch.checks import POSITIVE, check_bool, check_choice, check_count, check_number
 from diffcloth_torch.model.quantities import check_parameter
 
-__all__ = ["METRICS", "SCHEMES", "ContactOptions", "SolverOptions"]
+__all__ = ["COUPLINGS", "METRICS", "SCHEMES", "ContactOptions", "SolverOptions"]
 
 SCHEMES = ("coupled", "split")
 METRICS = ("mass", "identity")
+COUPLINGS = ("monolithic", "rigid_to_cloth", "cloth_to_rigid")
 
 
 @dataclass(frozen=True, eq=False)

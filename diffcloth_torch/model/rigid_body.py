@@ -1,4 +1,4 @@
-"""A rigid obstacle: a triangle mesh that stands still or moves on prescribed poses."""
+"""A rigid body: a triangle mesh that stands still, moves on prescribed poses, or by forces."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from diffcloth_torch.checks import (
     IndexArray,
     check_choice,
     check_count,
+    check_finite,
     check_name,
     check_number,
     check_range,
@@ -20,7 +21,9 @@ from diffcloth_torch.checks import (
     float_array,
     frozen,
 )
+from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry import shapes
+from diffcloth_torch.geometry.mass_properties import check_inertia, is_closed, mass_properties
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import pose_array
 from diffcloth_torch.geometry.surfaces import surface_arrays
@@ -29,9 +32,12 @@ from diffcloth_torch.model.quantities import check_parameter
 
 __all__ = ["MOTIONS", "RigidBody"]
 
-MOTIONS = ("static", "kinematic")
+MOTIONS = ("static", "kinematic", "dynamic")
 
 _POSES = "differentiate with respect to State.body_poses or Control.body_poses"
+_MASS = "differentiate with respect to Parameters.body_mass"
+_CENTER = "differentiate with respect to Parameters.body_center"
+_INERTIA = "differentiate with respect to Parameters.body_inertia"
 
 
 class RigidBody:
@@ -40,10 +46,13 @@ class RigidBody:
     Attributes:
         vertices: Positions in the body frame [m], shape [v, 3].
         faces: Vertex indices, shape [g, 3].
-        motion: "static", or "kinematic" (moves on prescribed poses).
+        motion: "static", "kinematic" (moves on prescribed poses) or "dynamic" (moves by forces).
         pose: Initial pose [px, py, pz, qw, qx, qy, qz], shape [7].
         friction: Friction coefficient of the surface [-].
         thickness: Full thickness of the surface in contact [m].
+        mass: Mass [kg]; it, center and inertia are zero where the body is not dynamic.
+        center: Center of mass in the body frame [m], shape [3].
+        inertia: About the center, in body axes [kg m^2], shape [3, 3].
         name: Name in the scene; None lets the scene choose one.
     """
 
@@ -53,6 +62,10 @@ class RigidBody:
     pose: FloatArray
     friction: float
     thickness: float
+    # Values of their own, for pickles that were made before bodies had a mass.
+    mass: float = 0.0
+    center: FloatArray = frozen(np.zeros(3))
+    inertia: FloatArray = frozen(np.zeros((3, 3)))
     name: str | None
 
     def __init__(
@@ -64,21 +77,36 @@ class RigidBody:
         pose: object = None,
         friction: float = 0.4,
         thickness: float = 0.0,
+        density: float | None = None,
+        mass: float | None = None,
+        center: object = None,
+        inertia: object = None,
         name: str | None = None,
     ) -> None:
         """Check and copy the arguments.
 
+        A dynamic body has exactly one of `density` and `mass`. Where its mesh is closed, it is
+        filled evenly: that gives `center` and `inertia` unless they are given.
+
         Args:
             vertices: Positions in the body frame [m], shape [v, 3].
-            faces: Vertex indices of triangles, shape [g, 3].
-            motion: "static" or "kinematic".
+            faces: Vertex indices of triangles, shape [g, 3]; those of a closed mesh that gives
+                mass properties face outward.
+            motion: "static", "kinematic" or "dynamic".
             pose: Initial pose [px, py, pz, qw, qx, qy, qz]; the identity by default.
             friction: Friction coefficient [-], >= 0.
             thickness: Full thickness [m], >= 0.
+            density: Of a dynamic body with a closed mesh [kg/m^3], > 0.
+            mass: Of a dynamic body [kg], > 0.
+            center: Center of mass in the body frame [m], shape [3].
+            inertia: About the center, in body axes [kg m^2], shape [3, 3]; symmetric, positive
+                definite, no principal moment above the sum of the others. It does not follow from
+                a `center` that is given: it is then still that of the evenly filled mesh.
             name: Name in the scene.
 
         Raises:
-            InvalidInput: If a shape, an index or a value is not accepted.
+            InvalidInput: If a shape, an index or a value is not accepted, or if a dynamic body
+                lacks what its open mesh cannot give.
             TypeError: If something has a wrong type.
         """
         self.vertices, self.faces = surface_arrays("RigidBody", vertices, faces, instead=_POSES)
@@ -86,7 +114,62 @@ class RigidBody:
         self.pose = frozen(pose_array("RigidBody: `pose`", pose, instead=_POSES))
         self.friction = check_parameter("RigidBody", "friction", friction)
         self.thickness = check_parameter("RigidBody", "thickness", thickness)
+        self._set_mass_properties(density=density, mass=mass, center=center, inertia=inertia)
         self.name = check_name("RigidBody: `name`", name)
+
+    def _set_mass_properties(
+        self, *, density: object, mass: object, center: object, inertia: object
+    ) -> None:
+        given = {"density": density, "mass": mass, "center": center, "inertia": inertia}
+        if self.motion != "dynamic":
+            for field, value in given.items():
+                if value is not None:
+                    raise InvalidInput(
+                        f'RigidBody: `{field}` needs motion="dynamic", got {self.motion!r}'
+                    )
+            return
+        if (density is None) == (mass is None):
+            got = "neither" if mass is None else "both"
+            raise InvalidInput(
+                f"RigidBody: a dynamic body must have `density` or `mass`, one of them, got {got}"
+            )
+        filled = None
+        if density is not None or center is None or inertia is None:
+            filled = self._filled_mesh()
+        if density is not None and filled is not None:
+            rho = check_number("RigidBody: `density`", density, POSITIVE, instead=_MASS)
+            self.mass = rho * filled[0]
+        else:
+            self.mass = check_number("RigidBody: `mass`", mass, POSITIVE, instead=_MASS)
+        if center is not None:
+            self.center = float_array("RigidBody: `center`", center, instead=_CENTER)
+            check_shape("RigidBody: `center`", self.center.shape, [(3,)])
+            check_finite("RigidBody: `center`", self.center)
+        elif filled is not None:
+            self.center = filled[1]
+        if inertia is not None:
+            moments = float_array("RigidBody: `inertia`", inertia, instead=_INERTIA)
+        elif filled is not None:
+            moments = self.mass / filled[0] * filled[2]
+        self.inertia = check_inertia("RigidBody: `inertia`", moments)
+        frozen(self.center)
+        frozen(self.inertia)
+
+    def _filled_mesh(self) -> tuple[float, FloatArray, FloatArray]:
+        """Volume, center and inertia for a density of one, of a mesh that must be closed."""
+        if not is_closed(self.faces):
+            raise InvalidInput(
+                "RigidBody: a dynamic body must have `mass`, `center` and `inertia` where its "
+                "mesh is not closed: some edge has no two faces of one orientation"
+            )
+        volume, center, inertia = mass_properties(self.vertices, self.faces)
+        if not volume > 0:
+            raise InvalidInput(
+                "RigidBody: `faces` of a closed mesh must face outward, so that it holds a "
+                f"volume > 0, got {volume:g} m^3; reverse them, or give `mass`, `center` and "
+                "`inertia`"
+            )
+        return volume, center, inertia
 
     @classmethod
     def load(cls, path: str | Path, *, scale: float = 1.0, **keywords: Any) -> RigidBody:
@@ -140,6 +223,20 @@ class RigidBody:
         r = check_number(name.format("radius"), radius, POSITIVE, instead=_POSES)
         h = check_number(name.format("length"), length, POSITIVE, instead=_POSES)
         return cls(*shapes.capsule(r, h), **keywords)
+
+    @classmethod
+    def cylinder(cls, radius: float, length: float, **keywords: Any) -> RigidBody:
+        """Make a closed cylinder along z, centered at the origin.
+
+        Args:
+            radius: Radius [m], > 0.
+            length: Length [m], > 0.
+            **keywords: As for `RigidBody`.
+        """
+        name = "RigidBody.cylinder: `{}`"
+        r = check_number(name.format("radius"), radius, POSITIVE, instead=_POSES)
+        h = check_number(name.format("length"), length, POSITIVE, instead=_POSES)
+        return cls(*shapes.cylinder(r, h), **keywords)
 
     @classmethod
     def plane(cls, size: object, **keywords: Any) -> RigidBody:

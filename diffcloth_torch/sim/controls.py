@@ -24,15 +24,35 @@ class Control:
         pins: Positions of the pinned vertices [m], shape [P, 3], or "cloth/pin" (or "pin" where
             that is unique) -> positions; missing names stay where they are.
         soft_pins: Positions to which the soft pins pull [m], shape [Q, 3], or likewise by name.
-        body_poses: [px, py, pz, qw, qx, qy, qz] of each body, shape [K, 7]; the row of a static
-            body must stay what it is.
+        body_poses: [px, py, pz, qw, qx, qy, qz] of each body, shape [K, 7], or body -> pose [7];
+            the row of a body that is not kinematic must stay what the state has.
         forces: Forces on the cloth vertices [N], shape [N, 3]; none by default.
+        body_wrenches: Force at the center of mass of each dynamic body, then torque, in world axes
+            [N, N m], shape [K, 6], or body -> wrench [6]; zero where the body is not dynamic.
+        joint_positions: Targets of position and pd joints [rad or m], shape [J], or "robot/joint"
+            (or "joint" where that is unique) -> number; rows of other joints are ignored, and
+            pd joints that are not named hold their last target.
+        joint_velocities: Targets of velocity and pd joints [rad/s or m/s], shape [J], or likewise
+            by name; zero by default.
+        joint_efforts: Efforts of torque joints, and those that pd joints add to their drive's
+            [N m or N], shape [J], or likewise by name; zero by default.
+        base_poses: Frames of the robots' root links, shape [R, 7], or robot -> pose [7]; the row of
+            a robot whose base is not kinematic must stay what the state has.
+        base_wrenches: Force at the center of mass of each floating root link, then torque, in world
+            axes [N, N m], shape [R, 6], or robot -> wrench [6]; zero where the base is not
+            floating.
     """
 
     pins: Tensor | Mapping[str, Tensor] | None = None
     soft_pins: Tensor | Mapping[str, Tensor] | None = None
-    body_poses: Tensor | None = None
+    body_poses: Tensor | Mapping[str, Tensor] | None = None
     forces: Tensor | None = None
+    body_wrenches: Tensor | Mapping[str, Tensor] | None = None
+    joint_positions: Tensor | Mapping[str, Tensor] | None = None
+    joint_velocities: Tensor | Mapping[str, Tensor] | None = None
+    joint_efforts: Tensor | Mapping[str, Tensor] | None = None
+    base_poses: Tensor | Mapping[str, Tensor] | None = None
+    base_wrenches: Tensor | Mapping[str, Tensor] | None = None
 
     def replace(self, **changes: Any) -> Control:
         """Copy with some fields replaced."""
@@ -61,6 +81,19 @@ class Parameters:
         pin_stiffness: Springs of the soft pins [N/m], > 0; shape [] or [C].
         gravity: Acceleration [m/s^2], shape [3].
         rest_positions: Stress-free positions of the cloth vertices [m], shape [N, 3].
+        body_mass: Mass of each body [kg], >= 0, > 0 where it is dynamic; shape [K]. This and the
+            next two are ignored where the body is not dynamic.
+        body_center: Its center of mass, in its frame [m], shape [K, 3].
+        body_inertia: Its inertia about that center, in the axes of its frame [kg m^2]; the
+            symmetric part is meant and must be positive definite; shape [K, 3, 3].
+        link_mass: Mass of each link [kg], >= 0, shape [L].
+        link_center: Its center of mass, in its frame [m], shape [L, 3].
+        link_inertia: Its inertia about that center, in the axes of its frame [kg m^2]; the
+            symmetric part is meant; shape [L, 3, 3].
+        joint_stiffness: Of pd drives [N m/rad or N/m], >= 0, shape [J].
+        joint_damping: Of pd drives [N m s/rad or N s/m], >= 0, shape [J].
+        joint_viscosity: Of the joints themselves [N m s/rad or N s/m], >= 0, shape [J].
+        joint_armature: Inertia of the drives, seen at the joints [kg m^2 or kg], >= 0, shape [J].
     """
 
     stretch: Tensor | None = None
@@ -76,6 +109,16 @@ class Parameters:
     pin_stiffness: Tensor | None = None
     gravity: Tensor | None = None
     rest_positions: Tensor | None = None
+    body_mass: Tensor | None = None
+    body_center: Tensor | None = None
+    body_inertia: Tensor | None = None
+    link_mass: Tensor | None = None
+    link_center: Tensor | None = None
+    link_inertia: Tensor | None = None
+    joint_stiffness: Tensor | None = None
+    joint_damping: Tensor | None = None
+    joint_viscosity: Tensor | None = None
+    joint_armature: Tensor | None = None
     # Fields that a simulator made without a batch axis: their [C] or [F] is never taken for [B].
     _unbatched: tuple[str, ...] = field(default=(), repr=False)
 

@@ -1,4 +1,4 @@
-"""From a state, a control and parameters to the tensors that the core takes.
+"""From a state, a control and parameters to fields that are checked and complete.
 
 Every tensor gets a leading axis of environments here: as many as the state has (one without a
 batch axis), or one where a value is shared by all. Everything is ordinary differentiable torch, so
@@ -7,10 +7,12 @@ that gradients find their way back to what the caller passed, in its own dtype.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch.checks import (
@@ -24,32 +26,47 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.poses import check_quaternions
 from diffcloth_torch.geometry.surfaces import check_areas
 from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Shape, shape_of
-from diffcloth_torch.model.scene import Assembly
 from diffcloth_torch.sim.controls import Control, Parameters
+from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.state import State
 
 __all__ = [
-    "Inputs",
+    "Fields",
     "check_control",
     "check_parameters",
-    "control_inputs",
-    "parameter_inputs",
-    "state_inputs",
+    "control_fields",
+    "core_inputs",
+    "parameter_fields",
+    "state_fields",
 ]
 
-Inputs = dict[str, Tensor]
+Fields = dict[str, Tensor]
+"""Values by name, with a leading axis of environments."""
+
+_PINS = ("pins", "soft_pins")
+_POSES = ("body_poses", "base_poses")
 
 
-def state_inputs(assembly: Assembly, state: State) -> tuple[Inputs, int | None]:
+def core_inputs(state: Fields, control: Fields, parameters: Fields) -> Fields:
+    """Fields under the names that the core has for them."""
+    return {
+        quantity.core: fields[name]
+        for table, fields in ((STATE, state), (CONTROL, control), (PARAMETERS, parameters))
+        for name, quantity in table.items()
+        if quantity.core is not None and name in fields
+    }
+
+
+def state_fields(layout: Layout, state: State) -> tuple[Fields, int | None]:
     """Check a state; returns its tensors and its batch size, None without a batch axis."""
     if not isinstance(state, State):
         raise TypeError(f"step: `state` must be a State, got {type(state).__name__}")
-    sizes = assembly.sizes
-    shapes = {name: shape_of(q.axes[0], sizes) for name, q in STATE.items() if q.core}
+    sizes = layout.assembly.sizes
+    shapes = {name: shape_of(q.axes[0], sizes) for name, q in STATE.items() if not q.ignored}
     for name in shapes:
         _check_state_tensor(name, getattr(state, name))
     batch = state.batch_size
-    inputs = {}
+    fields = {}
     for name, shape in shapes.items():
         tensor = getattr(state, name)
         label = f"step: `state.{name}`"
@@ -57,15 +74,14 @@ def state_inputs(assembly: Assembly, state: State) -> tuple[Inputs, int | None]:
             check_shape(label, tensor.shape, [shape, ("B", *shape)])
         else:
             check_shape(label, tensor.shape, [shape if batch is None else (batch, *shape)])
-        check_finite(label, _numbers(tensor))
-        inputs[name] = tensor.unsqueeze(0) if batch is None else tensor
+        if tensor.numel():
+            check_finite(label, _numbers(tensor))
+        fields[name] = tensor.unsqueeze(0) if batch is None else tensor
     if batch == 0:
         raise InvalidInput("step: `state` must hold at least one environment, got a batch of 0")
-    check_quaternions("step: `state.body_poses`", _numbers(state.body_poses))
-    _check_state_tensor("time", state.time)
-    check_shape("step: `state.time`", state.time.shape, [() if batch is None else (batch,)])
-    check_finite("step: `state.time`", _numbers(state.time))
-    return inputs, batch
+    for name in _POSES:
+        check_quaternions(f"step: `state.{name}`", _numbers(getattr(state, name)))
+    return fields, batch
 
 
 def _check_state_tensor(name: str, tensor: object) -> None:
@@ -86,107 +102,153 @@ def _check_state_tensor(name: str, tensor: object) -> None:
         )
 
 
-def check_control(assembly: Assembly, control: Control) -> Control:
+def check_control(layout: Layout, control: Control) -> Control:
     """Promote a control to tensors and check everything that does not depend on a state."""
     if not isinstance(control, Control):
         raise TypeError(f"step: `control` must be a Control, got {type(control).__name__}")
-    sizes = assembly.sizes
-    groups = {"pins": assembly.pin_groups, "soft_pins": assembly.soft_pin_groups}
-    checked: dict[str, Tensor | dict[str, Tensor] | None] = {}
+    sizes = layout.assembly.sizes
+    checked: dict[str, Tensor | dict[str, Tensor]] = {}
     for field, quantity in CONTROL.items():
         given = getattr(control, field)
-        if field in groups and isinstance(given, Mapping):
-            checked[field] = _named_pins(field, given, groups[field])
+        if given is None:
+            continue
+        if field in layout.groups and isinstance(given, Mapping):
+            checked[field] = _named_targets(layout, field, given)
         else:
-            checked[field] = _target(field, given, shape_of(quantity.axes[0], sizes))
-    if checked["body_poses"] is not None:
-        check_quaternions("control: `body_poses`", _numbers(checked["body_poses"]))  # type: ignore[arg-type]
+            tensor = _target(field, field, given, shape_of(quantity.axes[0], sizes))
+            _check_rows(layout, field, _numbers(tensor))
+            checked[field] = tensor
     return Control(**checked)  # type: ignore[arg-type]
 
 
-def _target(field: str, value: object, shape: Shape) -> Tensor | None:
-    if value is None:
-        return None
-    name = f"control: `{field}`"
+def _target(field: str, label: str, value: object, shape: Shape) -> Tensor:
+    name = f"control: `{label}`"
     tensor = float_tensor(name, value)
     check_shape(name, tensor.shape, [shape, ("B", *shape)])
     check_finite(name, _numbers(tensor))
+    if field in _POSES:
+        check_quaternions(name, _numbers(tensor))
     return tensor
 
 
-def _named_pins(
-    field: str, given: Mapping[str, object], groups: Mapping[str, slice]
-) -> dict[str, Tensor]:
-    """Resolve names to "cloth/pin" and check the shape of each entry."""
+def _named_targets(layout: Layout, field: str, given: Mapping[str, object]) -> dict[str, Tensor]:
+    """Resolve names to full ones and check each entry."""
     named: dict[str, Tensor] = {}
     for key, value in given.items():
-        full = [key] if key in groups else [g for g in groups if g.partition("/")[2] == key]
-        if len(full) != 1:
-            problem = "is the name of several" if full else "is none of them"
-            accepted = ", ".join(map(repr, groups)) or "none, the scene has no such pins"
+        name = layout.full_name(field, key)
+        if name in named:
+            raise InvalidInput(f"control: `{field}` must name {name!r} once, got it twice")
+        if value is None:
             raise InvalidInput(
-                f"control: `{field}` has the names {accepted} (or the part behind '/' where it is "
-                f"unique); {key!r} {problem}"
+                f"control: `{field}[{key!r}]` must hold numbers; leave the name out to hold it"
             )
-        if full[0] in named:
-            raise InvalidInput(f"control: `{field}` must name {full[0]!r} once, got it twice")
-        rows = groups[full[0]]
-        tensor = _target(f"{field}[{key!r}]", value, (rows.stop - rows.start, 3))
-        if tensor is None:
-            raise InvalidInput(
-                f"control: `{field}[{key!r}]` must hold positions; leave the name out to hold it"
-            )
-        named[full[0]] = tensor
+        shape = layout.entry_shape(field, name)
+        tensor = _target(field, f"{field}[{key!r}]", value, shape)
+        if field not in _PINS:
+            numbers = _numbers(tensor)
+            row = np.expand_dims(numbers, numbers.ndim - len(shape))
+            _check_rows(layout, field, row, first=layout.groups[field][name].start)
+        named[name] = tensor
     return named
 
 
-def control_inputs(
-    assembly: Assembly, control: Control | None, state: Inputs, batch: int | None
-) -> Inputs:
-    """Targets for the end of the step and forces; what is not set holds what the state has."""
-    checked = check_control(assembly, Control() if control is None else control)
+def _check_rows(layout: Layout, field: str, values: FloatArray, first: int = 0) -> None:
+    """Refuse wrenches on what forces do not move, and joint positions beyond a limit."""
+    if field in layout.unforced:
+        rows = slice(first, first + values.shape[-2])
+        for k, why in enumerate(layout.unforced[field][rows]):
+            if why and values[..., k, :].any():
+                raise InvalidInput(
+                    f"control: `{field}` must be zero in the row [{first + k}]: {why}, and no "
+                    "force moves it"
+                )
+    if field == "joint_positions":
+        rows = slice(first, first + values.shape[-1])
+        lower, upper = layout.lower[rows], layout.upper[rows]
+        # A limit that was rounded to float32 is meant to be the limit.
+        beyond = (values < np.minimum(lower, lower.astype(np.float32))) | (
+            values > np.maximum(upper, upper.astype(np.float32))
+        )
+        beyond &= layout.settable[field][rows]
+        if beyond.any():
+            at = tuple(int(i) for i in np.argwhere(beyond)[0])
+            joint = at[-1]
+            raise InvalidInput(
+                f"control: `{field}` must be between the limits {lower[joint]:g} and "
+                f"{upper[joint]:g} of {layout.joint_names[first + joint]!r}, "
+                f"got {values[at]:g} in the row [{first + joint}]"
+            )
+
+
+def control_fields(
+    layout: Layout, control: Control | None, state: Fields, batch: int | None
+) -> Fields:
+    """Complete a control: prescribed things and pd targets hold the state's, the rest is zero."""
+    checked = check_control(layout, Control() if control is None else control)
+    assembly = layout.assembly
     pins = torch.from_numpy(assembly.pins.astype(np.int64))
-    held_pins = state["positions"][:, pins]
-    held_soft_pins = state["soft_pin_targets"]
-    targets = checked.body_poses
-    body_targets = state["body_poses"]
-    if targets is not None:
-        body_targets = _with_batch("control: `body_poses`", targets, 2, batch)
-        body_targets = _keep_static(assembly, body_targets, state["body_poses"])
-    forces = torch.zeros(1, len(assembly.vertices), 3, dtype=torch.float64)
-    if checked.forces is not None:
-        forces = _with_batch("control: `forces`", checked.forces, 2, batch)
+    unset = {
+        "pins": state["positions"][:, pins],
+        "soft_pins": state["soft_pin_targets"],
+        "body_poses": state["body_poses"],
+        "forces": _zeros(len(assembly.vertices), 3),
+    }
+    if layout.has_coordinates:
+        driven = torch.tensor([mode == "pd" for mode in layout.actuation], dtype=torch.bool)
+        unset |= {
+            "body_wrenches": _zeros(len(layout.bodies), 6),
+            "joint_positions": torch.where(
+                driven, state["joint_targets"], state["joint_positions"]
+            ),
+            "joint_velocities": _zeros(len(layout.joint_names)),
+            "joint_efforts": _zeros(len(layout.joint_names)),
+            "base_poses": state["base_poses"],
+            "base_wrenches": _zeros(len(layout.robots), 6),
+        }
     return {
-        "pin_targets": _pin_targets("pins", checked.pins, assembly.pin_groups, held_pins, batch),
-        "soft_pin_targets": _pin_targets(
-            "soft_pins", checked.soft_pins, assembly.soft_pin_groups, held_soft_pins, batch
-        ),
-        "body_targets": body_targets,
-        "forces": forces,
+        field: _complete(layout, field, getattr(checked, field), values, batch)
+        for field, values in unset.items()
     }
 
 
-def _pin_targets(
+def _zeros(*shape: int) -> Tensor:
+    return torch.zeros(1, *shape, dtype=torch.float64)
+
+
+def _complete(
+    layout: Layout,
     field: str,
     given: Tensor | Mapping[str, Tensor] | None,
-    groups: Mapping[str, slice],
-    held: Tensor,
+    unset: Tensor,
     batch: int | None,
 ) -> Tensor:
+    """Fill what a control leaves out of a field."""
     if given is None:
-        return held
+        return unset
     if isinstance(given, Tensor):
-        return _with_batch(f"control: `{field}`", given, 2, batch)
-    parts = [
-        _with_batch(f"control: `{field}[{name!r}]`", given[name], 2, batch)
-        if name in given
-        else held[:, rows]
-        for name, rows in groups.items()
-    ]
-    if not parts:
-        return held
+        values = _with_batch(f"control: `{field}`", given, unset.dim() - 1, batch)
+        if field in layout.settable:
+            values = torch.where(torch.from_numpy(layout.settable[field]), values, unset)
+    else:
+        values = _complete_by_name(layout, field, given, unset, batch)
+    return _keep(layout, field, values, unset) if field in layout.kept else values
+
+
+def _complete_by_name(
+    layout: Layout, field: str, given: Mapping[str, Tensor], unset: Tensor, batch: int | None
+) -> Tensor:
+    if not given:
+        return unset
+    parts = []
+    for name, rows in layout.groups[field].items():
+        part = unset[:, rows]
+        if name in given:
+            dimensions = len(layout.entry_shape(field, name))
+            values = _with_batch(f"control: `{field}[{name!r}]`", given[name], dimensions, batch)
+            part = values.reshape(len(values), *part.shape[1:])
+        parts.append(part)
     environments = max(len(part) for part in parts)
-    return torch.cat([part.expand(environments, -1, -1) for part in parts], dim=1)
+    return torch.cat([part.expand(environments, *part.shape[1:]) for part in parts], dim=1)
 
 
 def _with_batch(name: str, tensor: Tensor, dimensions: int, batch: int | None) -> Tensor:
@@ -205,22 +267,24 @@ def _with_batch(name: str, tensor: Tensor, dimensions: int, batch: int | None) -
     return tensor
 
 
-def _keep_static(assembly: Assembly, targets: Tensor, poses: Tensor) -> Tensor:
-    """Refuse targets that move a static body; a row rounded to float32 stands for the state's."""
-    static = list(assembly.static_bodies)
-    given, kept = _numbers(targets)[:, static], _numbers(poses)[:, static]
+def _keep(layout: Layout, field: str, targets: Tensor, poses: Tensor) -> Tensor:
+    """Refuse targets of what is not kinematic; a row rounded to float32 stands for the state's."""
+    reasons = layout.kept[field]
+    still = [k for k, why in enumerate(reasons) if why]
+    given, kept = _numbers(targets)[:, still], _numbers(poses)[:, still]
     rounded = kept.astype(np.float32).astype(np.float64)
     moved = ((given != kept) & (given != rounded)).any(axis=-1)
     if moved.any():
-        body = static[int(np.argwhere(moved)[0][1])]
+        row = still[int(np.argwhere(moved)[0][1])]
+        remedy = 'motion="kinematic"' if field == "body_poses" else 'base="kinematic"'
         raise InvalidInput(
-            f"control: `body_poses` must keep the row [{body}] of the state: that body is static; "
-            'make it motion="kinematic" to move it'
+            f"control: `{field}` must keep the row [{row}] of the state: {reasons[row]}; "
+            f"make it {remedy} to move it"
         )
     if (given == kept).all():
         return targets
     mask = torch.zeros(targets.shape[-2], 1, dtype=torch.bool)
-    mask[static] = True
+    mask[still] = True
     return torch.where(mask, poses, targets)
 
 
@@ -236,16 +300,16 @@ def check_parameters(parameters: Parameters) -> Parameters:
     return Parameters(**tensors, _unbatched=parameters._unbatched)
 
 
-def parameter_inputs(
-    assembly: Assembly,
+def parameter_fields(
+    layout: Layout,
     parameters: Parameters,
     defaults: Mapping[str, Tensor],
     batch: int | None,
-) -> Inputs:
+) -> Fields:
     """Check parameters; a field that is None takes the default, `defaults` has all there are."""
     checked = check_parameters(parameters)
-    inputs = {}
-    sizes = assembly.sizes
+    fields = {}
+    sizes = layout.assembly.sizes
     for name, quantity in PARAMETERS.items():
         given = getattr(checked, name)
         if name not in defaults:
@@ -260,16 +324,36 @@ def parameter_inputs(
             check_range(label, _numbers(tensor), quantity.accepted)
         shared = [shape_of(axes, sizes) for axes in quantity.axes]
         unbatched = given is None or name in parameters._unbatched
-        rows = _environments(label, tuple(tensor.shape), shared, batch, unbatched)
-        inputs[name] = tensor.reshape(rows, *quantity.core_axes)
-        if (
-            name == "rest_positions"
-            and given is not None
-            and not torch.equal(tensor, defaults[name])
-        ):
-            for shape in _numbers(inputs[name]):
-                check_areas("parameters", name, shape, assembly.faces)
-    return inputs
+        environments = _environments(label, tuple(tensor.shape), shared, batch, unbatched)
+        row = quantity.row_shape
+        rows = tensor.numel() // (environments * math.prod(row))
+        fields[name] = tensor.reshape(environments, rows, *row)
+        if given is not None:
+            _check_values(layout, name, _numbers(fields[name]), _numbers(defaults[name]))
+    return fields
+
+
+def _check_values(layout: Layout, name: str, values: FloatArray, default: FloatArray) -> None:
+    """Refuse values [nb, rows, ..] that the range of a parameter does not say."""
+    if name == "rest_positions":
+        if not (values == default).all():
+            for shape in values:
+                check_areas("parameters", name, shape, layout.assembly.faces)
+        return
+    label = f"parameters: `{name}`"
+    if name in ("body_mass", "link_mass"):
+        wrong = (values == 0.0) & layout.massive[name[:4]]
+        _refuse_row(label, wrong, "> 0")
+    elif name in ("body_inertia", "link_inertia"):
+        symmetric = (values + np.swapaxes(values, -1, -2)) / 2
+        wrong = np.linalg.eigvalsh(symmetric)[..., 0] <= 0.0
+        _refuse_row(label, wrong & layout.massive[name[:4]], "positive definite")
+
+
+def _refuse_row(label: str, wrong: NDArray[np.bool_], accepted: str) -> None:
+    if wrong.any():
+        row = int(np.argwhere(wrong)[0][-1])
+        raise InvalidInput(f"{label} must be {accepted} in the row [{row}], of what forces move")
 
 
 def _environments(

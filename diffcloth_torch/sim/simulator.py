@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch import _core
-from diffcloth_torch.checks import POSITIVE, check_choice, check_count, check_number
+from diffcloth_torch.checks import (
+    POSITIVE,
+    check_choice,
+    check_count,
+    check_number,
+    check_shape,
+)
 from diffcloth_torch.errors import IntersectingState, InvalidInput
 from diffcloth_torch.model.defaults import (
     check_barrier,
@@ -20,20 +26,25 @@ from diffcloth_torch.model.defaults import (
     has_contact,
     scene_parameters,
 )
-from diffcloth_torch.model.options import SCHEMES, ContactOptions, SolverOptions
+from diffcloth_torch.model.options import COUPLINGS, SCHEMES, ContactOptions, SolverOptions
+from diffcloth_torch.model.quantities import STATE, shape_of
 from diffcloth_torch.model.scene import Assembly, Scene, assemble
 from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.inputs import (
-    Inputs,
+    Fields,
     check_control,
     check_parameters,
-    control_inputs,
-    parameter_inputs,
-    state_inputs,
+    control_fields,
+    core_inputs,
+    parameter_fields,
+    state_fields,
 )
+from diffcloth_torch.sim.layout import Layout
+from diffcloth_torch.sim.links import contact_wrenches, link_poses, link_velocities
+from diffcloth_torch.sim.motion import prescribed_motion
 from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.rollout import roll_out
-from diffcloth_torch.sim.state import State, Surfaces
+from diffcloth_torch.sim.state import LinkSurfaces, State, Surfaces
 from diffcloth_torch.sim.step import as_array, refuse_transforms, take_step
 
 __all__ = ["Simulator"]
@@ -49,17 +60,24 @@ class Simulator:
         scene: What is simulated.
         dt: Time step [s].
         scheme: "coupled" or "split".
+        coupling: "monolithic", "rigid_to_cloth" or "cloth_to_rigid".
         contact: Contact options, as given.
         solver: Solver options.
-        slices: Cloth name -> its rows in `positions`.
+        surfaces: Names of the S surfaces: cloths, bodies, then links that have a shape.
+        slices: Name of a surface -> its rows in `positions` for a cloth, in `body_forces` for a
+            body or a link.
+        joint_slices: Name of a robot -> its rows in `joint_positions` and the like.
     """
 
     scene: Scene
     dt: float
     scheme: str
+    coupling: str
     contact: ContactOptions
     solver: SolverOptions
+    surfaces: tuple[str, ...]
     slices: dict[str, slice]
+    joint_slices: dict[str, slice]
 
     def __init__(
         self,
@@ -67,6 +85,7 @@ class Simulator:
         dt: float,
         *,
         scheme: str = "coupled",
+        coupling: str = "monolithic",
         contact: ContactOptions = _DEFAULT_CONTACT,
         solver: SolverOptions = _DEFAULT_SOLVER,
     ) -> None:
@@ -76,14 +95,20 @@ class Simulator:
             scene: What is simulated.
             dt: Time step [s], > 0.
             scheme: "coupled" solves elasticity and contact together; "split" solves elasticity
-                first and then contact, near its result.
+                first and then contact, near its result. It takes what forces move only with the
+                staggered couplings.
+            coupling: How cloths and what forces move act on each other: "monolithic" solves for
+                both together; "rigid_to_cloth" moves bodies with their velocities, solves the
+                cloths against them, and changes those velocities by the contact impulses;
+                "cloth_to_rigid" solves the cloths against bodies at rest and then moves the bodies.
             contact: Contact and friction.
             solver: Tolerance and limits of the solver.
 
         Raises:
             IntersectingState: If surfaces of the scene intersect or are closer than their
                 thickness.
-            InvalidInput: If a value is not accepted, or the barrier is too wide for the meshes.
+            InvalidInput: If a value is not accepted, the barrier is too wide for the meshes, or a
+                pd joint has no gains.
             TypeError: If something has a wrong type.
         """
         for name, value, kind in (
@@ -99,14 +124,20 @@ class Simulator:
         instead = "pass a plain number; no gradient with respect to the time step exists: use one"
         self.dt = check_number("Simulator: `dt`", dt, POSITIVE, instead=instead)
         self.scheme = check_choice("Simulator: `scheme`", scheme, SCHEMES)
+        self.coupling = check_choice("Simulator: `coupling`", coupling, COUPLINGS)
         if scheme != "split" and solver.metric != _DEFAULT_SOLVER.metric:
             raise InvalidInput(
                 f"Simulator: `solver.metric` {solver.metric!r} needs scheme 'split', got {scheme!r}"
             )
         self._assembly = assemble(scene)
+        self._layout = Layout(self._assembly)
+        _check_motion(self)
+        self.surfaces = self._assembly.surface_names
         starts = self._assembly.cloth_vertex_start.tolist()
         rows = [slice(a, b) for a, b in pairwise(starts)]
-        self.slices = dict(zip(scene.cloth_names, rows, strict=True))
+        cloths = zip(scene.cloth_names, rows, strict=True)
+        self.slices = {**dict(cloths), **self._layout.rigid_vertices}
+        self.joint_slices = dict(self._assembly.joint_slices)
         self._surfaces = _surfaces(scene, self._assembly)
         self._core = _make_core(self)
         self._nonadjacent_distance = self._core.smallest_nonadjacent_distance()
@@ -116,7 +147,8 @@ class Simulator:
         self._check_overlap()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restore, (self.scene, self.dt, self.scheme, self.contact, self.solver)
+        arguments = (self.scene, self.dt, self.scheme, self.contact, self.solver, self.coupling)
+        return _restore, arguments
 
     def __repr__(self) -> str:
         return f"Simulator({self.scene!r}, dt={self.dt:g}, scheme={self.scheme!r})"
@@ -133,12 +165,15 @@ class Simulator:
         positions = torch.from_numpy(assembly.vertices)
         tensors = {
             "positions": positions,
-            "velocities": torch.zeros_like(positions),
             "body_poses": torch.from_numpy(assembly.body_poses),
             "soft_pin_targets": positions[torch.from_numpy(assembly.soft_pins.astype(np.int64))],
-            "body_forces": torch.zeros(len(assembly.body_vertices), 3, dtype=torch.float64),
-            "time": torch.zeros((), dtype=torch.float64),
+            "joint_positions": torch.from_numpy(assembly.joint_positions),
+            "joint_targets": torch.from_numpy(assembly.joint_positions),
+            "base_poses": torch.from_numpy(assembly.base_poses),
         }
+        for name, quantity in STATE.items():  # the rest is at rest
+            shape = shape_of(quantity.axes[0], assembly.sizes)
+            tensors.setdefault(name, torch.zeros(shape, dtype=torch.float64))
         environments = () if batch_size is None else (batch_size,)
         copies = {
             name: tensor.expand((*environments, *tensor.shape)).clone(
@@ -155,21 +190,46 @@ class Simulator:
         soft_pins: Any = None,
         body_poses: Any = None,
         forces: Any = None,
+        body_wrenches: Any = None,
+        joint_positions: Any = None,
+        joint_velocities: Any = None,
+        joint_efforts: Any = None,
+        base_poses: Any = None,
+        base_wrenches: Any = None,
     ) -> Control:
-        """Make a control and check it against the scene; what is None holds.
+        """Make a control and check it against the scene; what is None holds, or is zero.
+
+        Everything but `forces` may be given by name too, as in `Control`.
 
         Args:
-            pins: Positions at the end of the step [m], shape [P, 3], or name -> positions.
-            soft_pins: Likewise, shape [Q, 3] or name -> positions.
-            body_poses: Poses at the end of the step, shape [K, 7].
+            pins: Positions at the end of the step [m], shape [P, 3].
+            soft_pins: Likewise, shape [Q, 3].
+            body_poses: Poses of kinematic bodies at the end of the step, shape [K, 7].
             forces: Forces on the cloth vertices [N], shape [N, 3].
+            body_wrenches: Forces and torques on dynamic bodies [N, N m], shape [K, 6].
+            joint_positions: Targets of position and pd joints [rad or m], shape [J].
+            joint_velocities: Targets of velocity and pd joints [rad/s or m/s], shape [J].
+            joint_efforts: Efforts at torque and pd joints [N m or N], shape [J].
+            base_poses: Poses of kinematic bases at the end of the step, shape [R, 7].
+            base_wrenches: Forces and torques on floating bases [N, N m], shape [R, 6].
 
         Raises:
             InvalidInput: If a name, shape or value is not accepted.
             TypeError: If something is no array of numbers on the CPU.
         """
-        control = Control(pins=pins, soft_pins=soft_pins, body_poses=body_poses, forces=forces)
-        return check_control(self._assembly, control)
+        control = Control(
+            pins=pins,
+            soft_pins=soft_pins,
+            body_poses=body_poses,
+            forces=forces,
+            body_wrenches=body_wrenches,
+            joint_positions=joint_positions,
+            joint_velocities=joint_velocities,
+            joint_efforts=joint_efforts,
+            base_poses=base_poses,
+            base_wrenches=base_wrenches,
+        )
+        return check_control(self._layout, control)
 
     def parameters(self) -> Parameters:
         """Make the parameters of the scene, in new tensors; change them with `.replace(...)`."""
@@ -200,19 +260,21 @@ class Simulator:
             InvalidInput: If a shape or value is not accepted.
             TypeError: If a tensor of the state is not float64 on the CPU.
         """
-        inputs, batch = self._inputs(state, control, parameters)
+        (before, wanted, physical), batch = self._fields(state, control, parameters)
+        inputs = self._core_inputs(before, wanted, physical)
         outcome = take_step(self._core, inputs, batched=batch is not None)
         report = make_report(outcome.diagnostics, self._core.phases, batched=batch is not None)
         raise_on_failure(
             outcome.diagnostics, report, throw=self.solver.throw, batched=batch is not None
         )
+        after = prescribed_motion(self._layout, before, wanted, self.dt)
+        after["soft_pin_targets"] = wanted["soft_pins"]
+        after["time"] = before["time"] + self.dt
         return State(
             positions=outcome.positions,
             velocities=outcome.velocities,
-            body_poses=_own_copy(inputs["body_targets"], batch),
-            soft_pin_targets=_own_copy(inputs["soft_pin_targets"], batch),
             body_forces=outcome.body_forces,
-            time=_own_copy((state.time + self.dt).reshape(-1), batch),
+            **{name: _own_copy(values, batch) for name, values in after.items()},
             report=report,
             _surfaces=self._surfaces,
         )
@@ -243,7 +305,7 @@ class Simulator:
         """
         # Copies of NumPy arrays and lists: edits before backward must not reach what is repeated.
         if isinstance(controls, Sequence):
-            controls = [c if c is None else check_control(self._assembly, c) for c in controls]
+            controls = [c if c is None else check_control(self._layout, c) for c in controls]
         if parameters is not None:
             parameters = check_parameters(parameters)
         return roll_out(
@@ -254,6 +316,67 @@ class Simulator:
             steps,
             checkpoint_every,
         )
+
+    def link_poses(self, state: State) -> dict[str, Tensor]:
+        """Frames of the links of all robots, differentiable in the state.
+
+        Args:
+            state: Where things are.
+
+        Returns:
+            "robot/link" -> homogeneous matrix from the link to the world, shape [4, 4], or
+            [B, 4, 4] in a batch.
+        """
+        fields, batch = state_fields(self._layout, state)
+        return _unbatched(link_poses(self._layout, fields), batch)
+
+    def link_velocities(
+        self, state: State, parameters: Parameters | None = None
+    ) -> dict[str, Tensor]:
+        """Velocities of the links of all robots, differentiable in both arguments.
+
+        Args:
+            state: How things move.
+            parameters: Physical parameters, of which the centers of mass count; None takes those
+                of the scene.
+
+        Returns:
+            "robot/link" -> velocity of the link's center of mass (of the origin of its frame where
+            the robot is not dynamic), then its angular velocity, in world axes [m/s, rad/s], shape
+            [6], or [B, 6] in a batch.
+        """
+        fields, batch = state_fields(self._layout, state)
+        centers = self._centers("link", parameters, batch)
+        return _unbatched(link_velocities(self._layout, fields, centers), batch)
+
+    def contact_wrenches(
+        self, state: State, parameters: Parameters | None = None
+    ) -> dict[str, Tensor]:
+        """What the contact forces of a state add up to, differentiable in both arguments.
+
+        Args:
+            state: Its `body_forces` are added up where its bodies and links are.
+            parameters: Physical parameters, of which the centers of mass count; None takes those
+                of the scene.
+
+        Returns:
+            Name of a body, or "robot/link" -> force, then torque about the center of mass (about
+            the origin of its frame where it is not dynamic), in world axes [N, N m], shape [6], or
+            [B, 6] in a batch.
+        """
+        fields, batch = state_fields(self._layout, state)
+        forces = state.body_forces if batch is not None else state.body_forces.unsqueeze(0)
+        shape = (len(fields["positions"]), *self._assembly.body_vertices.shape)
+        check_shape("contact_wrenches: `state.body_forces`", forces.shape, [shape])
+        centers = [self._centers(owner, parameters, batch) for owner in ("body", "link")]
+        return _unbatched(contact_wrenches(self._layout, fields, forces, *centers), batch)
+
+    def _centers(self, owner: str, parameters: Parameters | None, batch: int | None) -> Tensor:
+        """Centers of mass of bodies or links, zero where nothing is dynamic; [B or 1, rows, 3]."""
+        given = Parameters() if parameters is None else parameters
+        fields = parameter_fields(self._layout, given, self._defaults, batch)
+        rows = self._assembly.sizes["K" if owner == "body" else "L"]
+        return fields.get(f"{owner}_center", torch.zeros(1, rows, 3, dtype=torch.float64))
 
     def energy(self, state: State, parameters: Parameters | None = None) -> Tensor:
         """Elastic energy, gravity, soft pins and barrier at the positions of a state [J].
@@ -304,19 +427,31 @@ class Simulator:
 
     def _inputs(
         self, state: State, control: Control | None, parameters: Parameters | None
-    ) -> tuple[Inputs, int | None]:
+    ) -> tuple[Fields, int | None]:
+        """Inputs of the core, and the batch size."""
+        fields, batch = self._fields(state, control, parameters)
+        return self._core_inputs(*fields), batch
+
+    def _fields(
+        self, state: State, control: Control | None, parameters: Parameters | None
+    ) -> tuple[tuple[Fields, Fields, Fields], int | None]:
         """Check everything and give every tensor its leading axis of environments."""
         refuse_transforms(state, control, parameters)
-        inputs, batch = state_inputs(self._assembly, state)
-        inputs.update(control_inputs(self._assembly, control, inputs, batch))
+        before, batch = state_fields(self._layout, state)
+        wanted = control_fields(self._layout, control, before, batch)
         given = Parameters() if parameters is None else parameters
-        inputs.update(parameter_inputs(self._assembly, given, self._defaults, batch))
-        self._check_barrier("parameters", inputs)
-        rest = inputs["rest_positions"]
-        scene_rest = self._defaults["rest_positions"].unsqueeze(0)
-        if not rest.requires_grad and torch.equal(rest, scene_rest):
-            del inputs["rest_positions"]  # the core has prepared the rest shape of the scene
-        return inputs, batch
+        physical = parameter_fields(self._layout, given, self._defaults, batch)
+        self._check_barrier("parameters", physical)
+        return (before, wanted, physical), batch
+
+    def _core_inputs(self, state: Fields, control: Fields, parameters: Fields) -> Fields:
+        inputs = core_inputs(state, control, parameters)
+        rest = inputs.get("rest_positions")
+        if rest is not None and not rest.requires_grad:
+            scene_rest = self._defaults["rest_positions"].unsqueeze(0)
+            if torch.equal(rest, scene_rest):
+                del inputs["rest_positions"]  # the core has prepared the rest shape of the scene
+        return inputs
 
     def _choose_barrier(self) -> None:
         """Complete the defaults by what the contact options give or leave to the scene."""
@@ -325,27 +460,23 @@ class Simulator:
             distance = choose_barrier_distance(self.scene, self._nonadjacent_distance, self.contact)
         self._defaults["slip_velocity"] = _scalar(self.contact.slip_velocity)
         self._defaults["barrier_distance"] = _scalar(distance)
-        inputs = parameter_inputs(self._assembly, Parameters(), self._defaults, None)
-        self._check_barrier("Simulator", inputs)
+        fields = parameter_fields(self._layout, Parameters(), self._defaults, None)
+        self._check_barrier("Simulator", fields)
         stiffness = self.contact.barrier_stiffness
         if stiffness is None:
             inputs, _ = self._inputs(self.initial_state(), None, None)
             stiffness = self._core.default_barrier_stiffness(_arrays(inputs), distance)
         self._defaults["barrier_stiffness"] = _scalar(stiffness)
 
-    def _check_barrier(self, owner: str, inputs: Inputs) -> None:
+    def _check_barrier(self, owner: str, inputs: Fields) -> None:
         if "barrier_distance" in inputs and self.contact.self_contact:
             thickness = as_array(inputs["thickness"])[:, : self._assembly.cloth_count]
             distance = as_array(inputs["barrier_distance"])
             check_barrier(owner, distance, thickness, self._nonadjacent_distance)
 
     def _check_overlap(self) -> None:
-        thickness = self._defaults.get("thickness")
-        overlap = self._core.find_overlap(
-            self._assembly.vertices,
-            self._assembly.body_poses,
-            np.zeros(self._assembly.surface_count) if thickness is None else as_array(thickness),
-        )
+        inputs, _ = self._inputs(self.initial_state(), None, None)
+        overlap = self._core.find_overlap(_arrays(inputs))
         if overlap is not None:
             raise IntersectingState(
                 "Simulator: surfaces of the scene intersect, or are closer than their thickness: "
@@ -355,9 +486,32 @@ class Simulator:
 
 
 def _restore(
-    scene: Scene, dt: float, scheme: str, contact: ContactOptions, solver: SolverOptions
+    scene: Scene,
+    dt: float,
+    scheme: str,
+    contact: ContactOptions,
+    solver: SolverOptions,
+    coupling: str = "monolithic",  # pickles of the first version end before it
 ) -> Simulator:
-    return Simulator(scene, dt, scheme=scheme, contact=contact, solver=solver)
+    return Simulator(scene, dt, scheme=scheme, coupling=coupling, contact=contact, solver=solver)
+
+
+def _check_motion(simulator: Simulator) -> None:
+    """Refuse what the scheme cannot move, and drives without gains."""
+    layout, assembly = simulator._layout, simulator._assembly
+    if simulator.scheme == "split" and simulator.coupling == "monolithic" and layout.is_dynamic:
+        raise InvalidInput(
+            "Simulator: scheme 'split' takes prescribed bodies and the staggered couplings "
+            "'rigid_to_cloth' and 'cloth_to_rigid'; the scene has something that forces move and "
+            "`coupling` is 'monolithic'"
+        )
+    gains = assembly.stiffness + assembly.damping
+    for name, mode, gain in zip(layout.joint_names, layout.actuation, gains, strict=True):
+        if mode == "pd" and gain == 0.0:
+            raise InvalidInput(
+                f"Simulator: the pd joint {name!r} must have gains: give `stiffness` or `damping` "
+                "to its Robot, or another `actuation`"
+            )
 
 
 def _make_core(simulator: Simulator) -> _core.Simulator:
@@ -393,15 +547,23 @@ def _surfaces(scene: Scene, assembly: Assembly) -> Surfaces:
         body_names=list(scene.body_names),
         body_vertices=[torch.from_numpy(np.array(body.vertices)) for body in scene.bodies],
         body_faces=[torch.from_numpy(np.array(body.faces)) for body in scene.bodies],
+        robots=tuple(
+            LinkSurfaces.of(name, robot)
+            for name, robot in zip(scene.robot_names, scene.robots, strict=True)
+        ),
     )
 
 
-def _arrays(inputs: Inputs) -> dict[str, NDArray[np.float64]]:
+def _arrays(inputs: Fields) -> dict[str, NDArray[np.float64]]:
     return {name: as_array(tensor) for name, tensor in inputs.items()}
 
 
 def _scalar(value: float) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
+
+
+def _unbatched(named: dict[str, Tensor], batch: int | None) -> dict[str, Tensor]:
+    return named if batch is not None else {name: tensor[0] for name, tensor in named.items()}
 
 
 def _own_copy(tensor: Tensor, batch: int | None) -> Tensor:

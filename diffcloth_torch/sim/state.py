@@ -15,12 +15,66 @@ from diffcloth_torch._moved import allow_loading
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import MeshPart, write_mesh
 from diffcloth_torch.geometry.poses import transform
-from diffcloth_torch.model.quantities import STATE
+from diffcloth_torch.model.kinematics import link_frames, pose_frame
+from diffcloth_torch.model.mechanism import Mechanism
+from diffcloth_torch.model.quantities import STATE, shape_of
+from diffcloth_torch.model.robot import Robot
 from diffcloth_torch.sim.report import Report
 
 __all__ = ["State", "Surfaces", "check_field_names", "stack", "where"]
 
 _BATCHED_DIMENSIONS = 3  # positions [B, N, 3]
+
+
+@dataclass(frozen=True, eq=False)
+class LinkSurfaces:
+    """The meshes of a robot's links, and what places them.
+
+    Attributes:
+        mechanism: Fields of the robot's `Mechanism`, arrays as tensors.
+        vertices: Vertices of each link in its frame [m], shape [v, 3]; None without a surface.
+        faces: Vertex indices of each link in its own vertices, shape [g, 3], or None.
+    """
+
+    mechanism: dict[str, Any]
+    vertices: list[Tensor | None]
+    faces: list[Tensor | None]
+
+    @staticmethod
+    def of(name: str, robot: Robot) -> LinkSurfaces:
+        """Take them from a robot with a name in its scene."""
+        plain = {
+            field: torch.from_numpy(np.array(value)) if isinstance(value, np.ndarray) else value
+            for field, value in vars(replace(robot.mechanism, name=name)).items()
+        }
+        meshes = robot.surfaces
+        return LinkSurfaces(
+            mechanism=plain,
+            vertices=[
+                None if m is None else torch.from_numpy(np.array(m.vertices)) for m in meshes
+            ],
+            faces=[None if m is None else torch.from_numpy(np.array(m.faces)) for m in meshes],
+        )
+
+    @property
+    def joint_count(self) -> int:
+        """Number of joints, J."""
+        return len(self.mechanism["joint_names"])
+
+    def parts(self, base_pose: Tensor, joint_positions: Tensor) -> list[MeshPart]:
+        """Place the meshes by a pose [7] of the root link and joint positions [J]."""
+        fields: dict[str, Any] = {
+            field: value.numpy() if isinstance(value, Tensor) else value
+            for field, value in self.mechanism.items()
+        }
+        mechanism = Mechanism(**fields)
+        frames = link_frames(mechanism, pose_frame(base_pose), joint_positions)
+        links = zip(mechanism.link_names, self.vertices, self.faces, frames, strict=True)
+        return [
+            (f"{mechanism.name}/{link}", (v @ frame[:3, :3].mT + frame[:3, 3]).numpy(), f.numpy())
+            for link, v, f, frame in links
+            if v is not None and f is not None
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +87,7 @@ class Surfaces:
         body_names: Name of each body.
         body_vertices: Vertices of each body in its frame [m], shape [v, 3].
         body_faces: Vertex indices of each body in its own vertices, shape [g, 3].
+        robots: The surfaces of each robot.
     """
 
     cloth_names: list[str]
@@ -40,6 +95,7 @@ class Surfaces:
     body_names: list[str]
     body_vertices: list[Tensor]
     body_faces: list[Tensor]
+    robots: tuple[LinkSurfaces, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +111,17 @@ class State:
             shape [V, 3].
         time: Time since the initial state [s], shape [].
         report: How the step that led here went; None in an initial state.
+        body_velocities: Velocity of each body's center of mass, then its angular velocity, in world
+            axes [m/s, rad/s], shape [K, 6]; zero where the body is static, and ignored by a step
+            where it is not dynamic.
+        joint_positions: Values of the joints [rad or m], shape [J].
+        joint_velocities: Their rates [rad/s or m/s], shape [J].
+        joint_targets: What pd drives pull to until a control says otherwise [rad or m], shape [J].
+        joint_efforts: What the drive, or where the joint is prescribed the constraint, applied
+            during the step that led here [N m or N], shape [J].
+        base_poses: Frame of each robot's root link, as in `body_poses`, shape [R, 7].
+        base_velocities: Velocity of its center of mass, then its angular velocity, in world axes
+            [m/s, rad/s], shape [R, 6].
     """
 
     positions: Tensor
@@ -64,7 +131,29 @@ class State:
     body_forces: Tensor
     time: Tensor
     report: Report | None = None
+    # Never None: what is left out becomes rows of zeros.
+    body_velocities: Tensor = None  # type: ignore[assignment]
+    joint_positions: Tensor = None  # type: ignore[assignment]
+    joint_velocities: Tensor = None  # type: ignore[assignment]
+    joint_targets: Tensor = None  # type: ignore[assignment]
+    joint_efforts: Tensor = None  # type: ignore[assignment]
+    base_poses: Tensor = None  # type: ignore[assignment]
+    base_velocities: Tensor = None  # type: ignore[assignment]
     _surfaces: Surfaces | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        missing = [name for name in _ADDED if getattr(self, name) is None]
+        if missing:
+            *environments, bodies = np.shape(self.body_poses)[:-1]
+            for name in missing:
+                shape = shape_of(STATE[name].axes[0], {"K": bodies, "J": 0, "R": 0})
+                zeros = torch.zeros(*environments, *shape, dtype=torch.float64)
+                object.__setattr__(self, name, zeros)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # States that the first version saved have no robots, and bodies without velocities.
+        self.__dict__.update(state)
+        self.__post_init__()
 
     @property
     def batch_size(self) -> int | None:
@@ -110,7 +199,7 @@ class State:
 
         Args:
             path: File that ends in .obj (one object per surface) or .ply (all in one).
-            bodies: Whether the bodies, at their poses, follow the cloths.
+            bodies: Whether the bodies and the links of robots, at their poses, follow the cloths.
 
         Raises:
             InvalidInput: If the state is a batch, was not made by a simulator, or the file ending
@@ -137,6 +226,11 @@ class State:
             for k, name in enumerate(surfaces.body_names):
                 vertices = transform(surfaces.body_vertices[k].numpy(), poses[k])
                 parts.append((name, vertices, surfaces.body_faces[k].numpy()))
+            first = 0
+            for r, robot in enumerate(surfaces.robots):
+                rows = slice(first, first := first + robot.joint_count)
+                joints = self.joint_positions.detach()[rows]
+                parts += robot.parts(self.base_poses.detach()[r], joints)
         return parts
 
     def _require_batch(self, what: str) -> int:
@@ -150,6 +244,8 @@ class State:
 
 
 _TENSORS = tuple(STATE)
+# Fields that states of the first version lack.
+_ADDED = _TENSORS[_TENSORS.index("body_velocities") :]
 
 
 def stack(states: Sequence[State]) -> State:
@@ -220,4 +316,4 @@ def check_field_names(owner: str, instance: Any, changes: dict[str, Any]) -> Non
             raise InvalidInput(f"{owner}: the fields are {', '.join(accepted)}; got {name!r}")
 
 
-allow_loading(State, Surfaces)
+allow_loading(State, Surfaces, LinkSurfaces)

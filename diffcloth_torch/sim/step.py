@@ -45,7 +45,8 @@ __all__ = [
 # Values of the core's `status`, per environment.
 CONVERGED, UNCONVERGED, INFEASIBLE, INTERSECTING = 0, 1, 2, 3
 
-_OUTPUTS = ("positions", "velocities", "body_forces")
+# The last one only of scenes that have coordinates.
+_OUTPUTS = ("positions", "velocities", "body_forces", "coordinates")
 _TAPE = "tape_"
 _TRANSFORMS = (
     "step: torch.func transforms, forward-mode derivatives and vectorized Jacobians are not "
@@ -65,12 +66,15 @@ class Outcome(NamedTuple):
         velocities: Likewise.
         body_forces: [B, V, 3] or [V, 3].
         diagnostics: Arrays [B] of the core: status, message and the entries of the report.
+        coordinates: Of bodies and robots at the end of the step, [B, n] or [n]; None where there
+            are none.
     """
 
     positions: Tensor
     velocities: Tensor
     body_forces: Tensor
     diagnostics: dict[str, Any]
+    coordinates: Tensor | None = None
 
 
 def take_step(core: _core.Simulator, inputs: dict[str, Tensor], *, batched: bool) -> Outcome:
@@ -85,10 +89,10 @@ def take_step(core: _core.Simulator, inputs: dict[str, Tensor], *, batched: bool
     needs_tape = torch.is_grad_enabled() and any(t.requires_grad for t in inputs.values())
     if not needs_tape:
         result = _forward(core, {name: as_array(t) for name, t in inputs.items()}, tape=False)
-        return Outcome(*_outputs(result, batched), _diagnostics(result))
+        return _outcome(_outputs(result, batched), _diagnostics(result))
     diagnostics: dict[str, Any] = {}
-    x, v, f = _Step.apply(core, tuple(inputs), batched, diagnostics, *inputs.values())
-    return Outcome(x, v, f, diagnostics)
+    outputs = _Step.apply(core, tuple(inputs), batched, diagnostics, *inputs.values())
+    return _outcome(outputs, diagnostics)
 
 
 def refuse_transforms(*records: object) -> None:
@@ -116,10 +120,14 @@ def _forward(core: _core.Simulator, arrays: dict[str, Any], *, tape: bool) -> di
         raise SimulationError(f"step: {error}") from error
 
 
-def _outputs(result: dict[str, Any], batched: bool) -> tuple[Tensor, Tensor, Tensor]:
-    arrays = (result[name] for name in _OUTPUTS)
-    x, v, f = (torch.from_numpy(array if batched else array[0]) for array in arrays)
-    return x, v, f
+def _outputs(result: dict[str, Any], batched: bool) -> tuple[Tensor, ...]:
+    arrays = (result[name] for name in _OUTPUTS if name in result)
+    return tuple(torch.from_numpy(array if batched else array[0]) for array in arrays)
+
+
+def _outcome(outputs: tuple[Tensor, ...], diagnostics: dict[str, Any]) -> Outcome:
+    positions, velocities, body_forces, *coordinates = outputs
+    return Outcome(positions, velocities, body_forces, diagnostics, *coordinates)
 
 
 def _diagnostics(result: dict[str, Any]) -> dict[str, Any]:
@@ -179,7 +187,7 @@ def _backward(ctx, saved, cotangents, needs):
         gradients = ctx.core.backward(
             dict(zip(ctx.names, arrays[:count], strict=True)),
             dict(zip(ctx.tape_names, arrays[count:], strict=True)),
-            {name: as_array(c) for name, c in zip(_OUTPUTS, seeds, strict=True)},
+            {name: as_array(c) for name, c in zip(_OUTPUTS, seeds, strict=False)},
             needs,
             torch.get_num_threads(),
         )

@@ -109,6 +109,80 @@ def thick(rng):
     return scene
 
 
+def two_lumps(rng):
+    """Closed bodies with hollows; both move."""
+    above = rotated(ball(rng, 0.3, 0.1), rng)
+    below = rotated(ball(rng, 0.25, 0.1), rng)
+    above = raised(above, -0.06)
+    return stack([], [above, lowered(below)], body_dynamic=[True, True])
+
+
+def raised(body, height):
+    return body[0] - [0, 0, body[0][:, 2].min() - height], body[1]
+
+
+def lowered(body):
+    return body[0] - [0, 0, body[0][:, 2].max()], body[1]
+
+
+def box_on_relief(rng):
+    """A box, finely cut, on terrain that stands still."""
+    mesh = trimesh.creation.box((0.3, 0.25, 0.2)).subdivide()
+    body = rotated((mesh.vertices, mesh.faces), rng)
+    ground = relief(6, 0.9, rng, 0.03)
+    return stack([], [raised(body, 0.06), ground], body_dynamic=[True, False])
+
+
+def boxes_aslant(rng):
+    """Boxes whose edges in pieces are nearly parallel: mollified, also where pieces meet."""
+    lower = trimesh.creation.box((0.4, 0.4, 0.2)).subdivide()
+    upper = trimesh.creation.box((0.4, 0.4, 0.2)).subdivide()
+    q = trimesh.transformations.euler_matrix(0.004, -0.006, 0.013)[:3, :3]
+    above = raised((upper.vertices @ q.T + [0.011, 0.007, 0], upper.faces), 0.05)
+    return stack([], [above, lowered((lower.vertices, lower.faces))], body_dynamic=[True, True])
+
+
+def ridges_across(rng):
+    """Ridges cut into pieces shorter than the reach, one above the other."""
+    pieces = [prism(7, rng), prism(5, rng)]
+    q = trimesh.transformations.euler_matrix(np.pi, 0.05, 0.9)[:3, :3]
+    above = raised((pieces[0][0] @ q.T, pieces[0][1]), 0.05)
+    return stack([], [above, lowered(pieces[1])], body_dynamic=[False, True])
+
+
+def prism(pieces, rng):
+    """Bar along x with its ridge up, bent a little; the ridge is cut into pieces."""
+    s = np.linspace(-0.2, 0.2, pieces + 1)
+    section = np.array([[0.0, 0.0], [0.2, -0.15], [-0.2, -0.15]])
+    x = np.array([[at, *p] for at in s for p in section])
+    x[:, 2] -= 0.3 * x[:, 0] ** 2
+    faces = [[0, 2, 1], [3 * pieces, 3 * pieces + 1, 3 * pieces + 2]]
+    for k in range(pieces):
+        for i in range(3):
+            a, b = 3 * k + i, 3 * k + (i + 1) % 3
+            faces += [[a, b, b + 3], [a, b + 3, a + 3]]
+    mesh = trimesh.Trimesh(x, faces, process=False)
+    return x + 1e-3 * rng.normal(size=x.shape), mesh.faces * 1 if mesh.volume > 0 else mesh.faces[
+        :, ::-1
+    ]
+
+
+def between_bodies(rng):
+    """A cloth between two thick bodies that also touch each other; a third is ignored by one."""
+    sheet = cloth(5, 0.4, 0.06, rng, 0.01)
+    lump = raised(rotated(ball(rng, 0.2, 0.1), rng), 0.14)
+    wall = rotated(box(0.3), rng)
+    wall = raised((wall[0] - [wall[0][:, 0].min() - 0.27, 0, 0], wall[1]), 0.05)
+    scene = stack(
+        [sheet],
+        [relief(5, 0.7, rng, 0.02), lump, wall],
+        body_dynamic=[False, True, True],
+        ignored_pairs=[[1, 3]],
+    )
+    scene.thickness = [0.01, 0.02, 0.03, 0.0]
+    return scene
+
+
 SCENES = {
     f.__name__: f
     for f in (
@@ -122,6 +196,11 @@ SCENES = {
         crumpled,
         pinned,
         thick,
+        two_lumps,
+        box_on_relief,
+        boxes_aslant,
+        ridges_across,
+        between_bodies,
     )
 }
 

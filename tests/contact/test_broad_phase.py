@@ -49,6 +49,26 @@ def scene(seed=0):
     return merged([grid(7, rng), grid(6, rng, 0.12), body, plane(10.0, -0.05)])
 
 
+def crowd(seed=0):
+    """A cloth over three bodies that nearly touch each other, above a plane."""
+    rng = np.random.default_rng(seed)
+    balls = [trimesh.creation.icosphere(subdivisions=1, radius=0.2) for _ in range(2)]
+    block = trimesh.creation.box((0.5, 0.2, 0.2)).subdivide()
+    bodies = [
+        (mesh.vertices + np.array(at), mesh.faces)
+        for mesh, at in [
+            (balls[0], [0.2, 0.2, 0.2]),
+            (balls[1], [0.62, 0.2, 0.2]),
+            (block, [0.41, 0.51, 0.12]),
+        ]
+    ]
+    return merged([grid(7, rng, 0.42), *bodies, plane(10.0, -0.01)])
+
+
+# Of the crowd: the plane stands still, and two bodies ignore each other; so do cloth and block.
+CROWD = {"body_dynamic": [True, True, False, False], "ignored_pairs": [[1, 2], [0, 3]]}
+
+
 def boxes(x_t0, x_t1, elements):
     corners = np.concatenate([x_t0[elements], x_t1[elements]], axis=1)
     return corners.min(axis=1), corners.max(axis=1)
@@ -61,20 +81,23 @@ def frame_of(a, b, x_t0, x_t1, surface, cloth_count, reach):
     return motion if np.abs(motion).max() > reach[of] else np.zeros(3)
 
 
-def may_touch(surface_a, surface_b, cloth_count, self_contact):
-    if surface_a == surface_b:
-        return self_contact and surface_a < cloth_count
-    return min(surface_a, surface_b) < cloth_count
+def may_touch(surface_a, surface_b, cloth_count, self_contact, body_dynamic=(), ignored_pairs=()):
+    a, b = sorted((surface_a, surface_b))
+    if [a, b] in list(ignored_pairs):
+        return False
+    if a == b:
+        return self_contact and a < cloth_count
+    return a < cloth_count or any(body_dynamic[s - cloth_count] for s in (a, b) if body_dynamic)
 
 
-def brute_force(mesh, x_t0, x_t1, reach, faces, surface, cloth_count, self_contact):
+def brute_force(mesh, x_t0, x_t1, reach, faces, surface, cloth_count, self_contact, **bodies):
     """All candidates (kind, v0..v3, a, b), by comparing every two boxes."""
     vertices = np.arange(len(x_t0))[:, None]
     found = []
     for kind, first, second in [(0, vertices, faces), (1, mesh.edges, mesh.edges)]:
         of_first, of_second = surface[first[:, 0]], surface[second[:, 0]]
         for s, r in itertools.product(range(len(reach)), repeat=2):
-            if not may_touch(s, r, cloth_count, self_contact):
+            if not may_touch(s, r, cloth_count, self_contact, **bodies):
                 continue
             seen_t1 = x_t1 - frame_of(s, r, x_t0, x_t1, surface, cloth_count, reach)
             ids_a, ids_b = np.flatnonzero(of_first == s), np.flatnonzero(of_second == r)
@@ -103,6 +126,44 @@ def test_candidates_are_those_of_brute_force(self_contact, speed):
     expected = brute_force(mesh, x_t0, x_t1, reach, faces, surface, 2, self_contact)
     np.testing.assert_array_equal(found, expected)
     assert {0, 1, 2, 3} <= set(surface[found[:, 1:5]].ravel())
+
+
+def pairs_of_surfaces(found, surface):
+    return {tuple(sorted(p)) for p in surface[found[:, [1, 4]]].tolist()}
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.05], ids=["rest", "slow"])
+def test_bodies_that_dynamics_moves_meet_each_other(speed):
+    x, faces, surface = crowd()
+    mesh = kernels.BroadPhase(faces, surface, 1, True, x, **CROWD)
+    rng = np.random.default_rng(1)
+    x_t0 = x + 0.01 * rng.normal(size=x.shape)
+    x_t1 = x_t0 + speed * rng.normal(size=x.shape) + speed * surface[:, None]
+    reach = [0.01, 0.02, 0.04, 0.03, 0.01]
+    found = mesh.find(x_t0, x_t1, reach)
+    expected = brute_force(mesh, x_t0, x_t1, reach, faces, surface, 1, True, **CROWD)
+    np.testing.assert_array_equal(found, expected)
+    touching = {(0, 1), (0, 2), (1, 3), (1, 4), (2, 3), (2, 4)}
+    assert pairs_of_surfaces(found, surface) - {(0, 0)} == touching
+    assert {tuple(p) for p in surface[found[found[:, 0] == 0][:, [1, 4]]].tolist()} >= {
+        (1, 3),
+        (3, 1),
+    }
+
+
+def test_bodies_that_nothing_moves_do_not_meet():
+    x, faces, surface = crowd()
+    everything = kernels.BroadPhase(faces, surface, 1, True, x).find(x, x, 100.0)
+    assert pairs_of_surfaces(everything, surface) == {(0, s) for s in range(5)}
+    still = kernels.BroadPhase(faces, surface, 1, True, x, body_dynamic=[False] * 4)
+    np.testing.assert_array_equal(still.find(x, x, 100.0), everything)
+
+
+@pytest.mark.parametrize("ignored", [[[0, 5]], [[-1, 2]]])
+def test_pairs_of_surfaces_that_are_not_there_are_refused(ignored):
+    x, faces, surface = crowd()
+    with pytest.raises(ValueError, match="ignored_pairs"):
+        kernels.BroadPhase(faces, surface, 1, True, x, ignored_pairs=ignored)
 
 
 def test_pairs_that_come_within_the_radius_during_the_motion_are_candidates():
@@ -271,6 +332,23 @@ def test_the_lowest_intersection_is_that_of_brute_force(self_contact):
         assert mesh.find_intersection(at) == lowest
         answers.add(lowest)
     assert len(answers) > 2
+
+
+def test_intersections_of_bodies_are_found():
+    """Of those that meet, and of no others."""
+    x, faces, surface = crowd()
+    mesh = kernels.BroadPhase(faces, surface, 1, True, x, **CROWD)
+    assert mesh.find_intersection(x) is None
+
+    def sunk(body, move):
+        return x + np.array(move) * (surface == body)[:, None]
+
+    edge, face = mesh.find_intersection(sunk(2, [0, 0, -0.05]))
+    assert (mesh.edge_surface[edge], mesh.face_surface[face]) == (2, 4)
+    edge, face = mesh.find_intersection(sunk(3, [0, -0.1, 0]))
+    assert {mesh.edge_surface[edge], mesh.face_surface[face]} == {1, 3}
+    assert mesh.find_intersection(sunk(2, [-0.05, 0, 0])) is None  # 1 and 2 ignore each other
+    assert mesh.find_intersection(sunk(3, [0, 0, -0.05])) is None  # neither 3 nor 4 moves
 
 
 def rotation(seed):

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from test_broad_phase import kernels, scene
+from test_broad_phase import CROWD, crowd, kernels, scene
 
 REACH = [0.01, 0.02, 0.015, 0.005]
 
 
-def close_pairs(mesh, everything, x_t0, x_t1, surface):
+def close_pairs(everything, x_t0, x_t1, surface, reach_of=REACH):
     """Pairs within reach at some time of the motion, at least at these."""
     found = set()
     for share in np.linspace(0, 1, 5):
@@ -15,7 +15,9 @@ def close_pairs(mesh, everything, x_t0, x_t1, surface):
         for kind in (0, 1):
             pairs = everything[everything[:, 0] == kind]
             d_sq = kernels.distance_sq(bool(kind), np.ascontiguousarray(at[pairs[:, 1:5]]))
-            reach = np.take(REACH, surface[pairs[:, 1]]) + np.take(REACH, surface[pairs[:, 4]])
+            reach = np.take(reach_of, surface[pairs[:, 1]]) + np.take(
+                reach_of, surface[pairs[:, 4]]
+            )
             found |= {tuple(c) for c in pairs[d_sq <= reach**2]}
     return found
 
@@ -42,7 +44,7 @@ def test_no_pair_that_comes_within_reach_is_missed(search, scale, common):
         step += scale * rng.normal(size=3) * (surface == 2)[:, None]
         step += common * scale * rng.normal(size=3) * cloths
         found = {tuple(c) for c in mesh.find_kept(at, at + step, REACH)}
-        close = close_pairs(mesh, everything, at, at + step, surface)
+        close = close_pairs(everything, at, at + step, surface)
         missed += len(close - found)
         close_count += len(close)
         found_count += len(found)
@@ -55,6 +57,33 @@ def test_no_pair_that_comes_within_reach_is_missed(search, scale, common):
         assert found_count < 1.5 * close_count
     if scale == 1e-1:
         assert mesh.builds == builds  # too far for a skin: the swept boxes' own
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e-2])
+def test_no_pair_of_bodies_is_missed(scale):
+    x, faces, surface = crowd()
+    mesh = kernels.BroadPhase(faces, surface, 1, True, x, **CROWD)
+    everything, reach = mesh.find(x, x, 100.0), [0.02, 0.03, 0.03, 0.02, 0.01]
+    rng = np.random.default_rng(3)
+    at, close_count = x, 0
+    for _ in range(8):
+        step = scale * rng.normal(size=(5, 3))[surface]
+        found = {tuple(c) for c in mesh.find_kept(at, at + step, reach)}
+        close = close_pairs(everything, at, at + step, surface, reach)
+        assert close <= found
+        close_count += sum(surface[c[1]] > 0 for c in close)
+        at = at + step
+    assert close_count > 100
+
+
+def test_surfaces_that_never_touch_cost_no_list():
+    x, faces, surface = crowd()
+    for ignored, builds in (([[0, 3]], 1), ([], 2)):
+        mesh = kernels.BroadPhase(faces, surface, 1, True, x, ignored_pairs=ignored)
+        mesh.find_kept(x, x, [0.01] * 5)
+        away = x + np.array([0, 5.0, 0]) * (surface == 3)[:, None]
+        mesh.find_kept(away, away, [0.01] * 5)
+        assert mesh.builds == builds
 
 
 def test_what_is_found_is_sorted(search):

@@ -105,7 +105,7 @@ def check_parameters(scene, found, value):
     """found: cotangents; value(potential): what they are the derivatives of."""
     if not scene.thickness:
         scene.thickness = parameter_of(scene, "thickness").tolist()
-    scale = max(np.abs(np.atleast_1d(v)).max() for k, v in found.items() if k != "x_lag")
+    scale = max(np.abs(v).max(initial=0) for k, v in found.items() if k != "x_lag")
     assert scale > 0
     for name in ("kappa", "d_hat", "slip", "thickness", "friction"):
         at = parameter_of(scene, name)
@@ -118,6 +118,8 @@ def check_parameters(scene, found, value):
             assert slope == pytest.approx(expected, rel=2e-6, abs=1e-9 * scale), name
     for name in MEASURES:
         at = np.array(scene.potential().measure(name))
+        if not at.size:
+            continue
         for d in directions(at.shape, 2):
             d *= at > 0
             expected = np.sum(found[name] * d)

@@ -28,6 +28,8 @@ class ContactScene:
     slip: float = 0.02
     thickness: list = field(default_factory=list)
     self_contact: bool = True
+    body_dynamic: list = field(default_factory=list)
+    ignored_pairs: list = field(default_factory=list)
 
     def potential(self, **changes):
         count = int(self.surface.max()) + 1
@@ -38,6 +40,8 @@ class ContactScene:
             "slip": self.slip,
             "thickness": self.thickness or [0.0] * count,
             "friction": friction.tolist(),
+            "body_dynamic": self.body_dynamic,
+            "ignored_pairs": self.ignored_pairs,
         } | changes
         return kernels.ContactPotential(
             self.faces.astype(np.int32),
@@ -50,13 +54,15 @@ class ContactScene:
         )
 
 
-def stack(cloths, bodies, pins=(), **values):
+def stack(cloths, bodies, pins=(), body_dynamic=(), **values):
     """Scene of (X, x, faces) of every cloth and (x, faces) of every body."""
     parts = [*cloths, *((x, x, f) for x, f in bodies)]
     counts = [len(x) for _, x, _ in parts]
     starts = np.cumsum([0, *counts[:-1]])
     surface = np.repeat(np.arange(len(parts), dtype=np.int32), counts)
-    prescribed = surface >= len(cloths)
+    dynamic = np.zeros(len(parts), bool)
+    dynamic[len(cloths) : len(cloths) + len(body_dynamic)] = body_dynamic
+    prescribed = (surface >= len(cloths)) & ~dynamic[surface]
     prescribed[list(pins)] = True
     return ContactScene(
         X=np.concatenate([X for X, _, _ in parts]).astype(float),
@@ -65,6 +71,7 @@ def stack(cloths, bodies, pins=(), **values):
         surface=surface,
         cloth_count=len(cloths),
         prescribed=prescribed,
+        body_dynamic=list(body_dynamic),
         **values,
     )
 
@@ -77,8 +84,17 @@ def area(a, b, c):
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a))
 
 
+def distance_sq(p, q):
+    """Of two edges or points."""
+    if len(p) == 2 and len(q) == 2:
+        return ipctk.edge_edge_distance(*p, *q)
+    if len(p) == len(q):
+        return np.sum((p[0] - q[0]) ** 2)
+    return ipctk.point_edge_distance(p[0], *q) if len(q) == 2 else distance_sq(q, p)
+
+
 class FeatureSum:
-    """Sum over features; the sharpness of a body's features is that of the core."""
+    """Sum over features; the sharpness and the areas of a body's features are those of the core."""
 
     def __init__(self, scene):
         self.scene = scene
@@ -105,6 +121,13 @@ class FeatureSum:
             self.edge_sharpness.append(dict(zip(edges[first:], of_edge, strict=True)))
             self.vertex_sharpness.append(dict(enumerate(of_vertex, first_vertex)))
         self.continuation = dict(zip(edges[first:], potential.continuation(), strict=True))
+        corner_area, theta, ridge_area, surface_area = potential.body_areas()
+        single = [corner_area, np.clip(2 * theta / np.pi, 0, 1), ridge_area, surface_area]
+        self.corner_area, share, ridge_area, self.surface_area = (
+            np.float32(values).astype(float) for values in single
+        )
+        self.ridge_share = dict(zip(edges, share, strict=True))
+        self.ridge_area = dict(zip(edges, ridge_area, strict=True))
 
     def barrier(self, d_sq, s, r):
         xi = 0.5 * (self.thickness[s] + self.thickness[r])
@@ -159,6 +182,8 @@ class FeatureSum:
         for s in range(scene.cloth_count):
             points = np.unique(self.faces[s])
             for r in range(scene.cloth_count, len(self.faces)):
+                if [s, r] in scene.ignored_pairs:
+                    continue
                 for p in points:
                     if not scene.prescribed[p]:
                         total += 0.25 * self.vertex_area[p] * self.point_against(x, p, s, r)
@@ -173,7 +198,37 @@ class FeatureSum:
                         total += 0.25 * sharpness * mean_area * sum_over_cloth
             for r in range(s, scene.cloth_count):
                 total += self.between_cloths(x, s, r)
+        bodies = range(scene.cloth_count, len(self.faces))
+        for s, r in itertools.combinations(bodies, 2):
+            still = all(scene.prescribed[self.faces[k][0][0]] for k in (s, r))
+            if not still and [s, r] not in scene.ignored_pairs:
+                total += self.between_bodies(x, s, r)
         return scene.kappa * total
+
+    def between_bodies(self, x, s, r):
+        total = 0.0
+        for a, b in ((s, r), (r, s)):
+            for v in np.unique(self.faces[a]):
+                area = min(self.corner_area[v], self.surface_area[b])
+                if area:
+                    total += 0.25 * area * self.point_against(x, v, a, b)
+        for c, e in itertools.product(edges_of(self.faces[s]), edges_of(self.faces[r])):
+            area = min(self.ridge_area[c], self.ridge_area[e])
+            area = float(np.float32(self.ridge_share[c] * self.ridge_share[e] * area))
+            if not area:
+                continue
+            inner = 0.0
+            # Each edge as a whole, less half of each end where another edge continues it.
+            for p, share_p in self.parts(c):
+                for q, share_q in self.parts(e):
+                    d_sq = distance_sq(x[p], x[q])
+                    inner += share_p * share_q * self.barrier(d_sq, s, r)
+            total += 0.5 * area * self.mollifier(x, c, e) * inner
+        return total
+
+    def parts(self, e):
+        ends = [([v], -0.5 * g) for v, g in zip(e, self.continuation[e], strict=True) if g]
+        return [(list(e), 1.0), *ends]
 
     def between_cloths(self, x, s, r):
         scene = self.scene

@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <array>
 #include <cstddef>
 #include <optional>
@@ -10,6 +11,7 @@
 #include <nanobind/eigen/dense.h>
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/tuple.h>
@@ -64,13 +66,16 @@ Eigen::VectorX<Index> index_vector(const std::vector<Index>& values) {
 contact::CollisionMesh collision_mesh(const Faces& faces,
                                       const Surfaces& vertex_surface,
                                       Index cloth_count,
-                                      bool self_contact) {
+                                      bool self_contact,
+                                      const std::vector<bool>& body_dynamic,
+                                      const std::vector<std::array<Index, 2>>& ignored_pairs) {
   std::vector<contact::CollisionMesh::Face> rows(faces.shape(0));
   for (std::size_t f = 0; f < rows.size(); ++f) rows[f] = {faces(f, 0), faces(f, 1), faces(f, 2)};
-  return {std::move(rows),
-          {vertex_surface.data(), vertex_surface.data() + vertex_surface.shape(0)},
-          cloth_count,
-          self_contact};
+  std::vector<Index> surface(vertex_surface.data(),
+                             vertex_surface.data() + vertex_surface.shape(0));
+  contact::SurfacePairs touching =
+      touching_surfaces(surface, cloth_count, self_contact, body_dynamic, ignored_pairs);
+  return {std::move(rows), std::move(surface), cloth_count, std::move(touching)};
 }
 
 void check_rows(const char* name, const Positions& x, const contact::CollisionMesh& mesh) {
@@ -88,8 +93,11 @@ class Search {
          const Surfaces& vertex_surface,
          Index cloth_count,
          bool self_contact,
-         const Positions& x_reference)
-      : mesh_(collision_mesh(faces, vertex_surface, cloth_count, self_contact)),
+         const Positions& x_reference,
+         const std::vector<bool>& body_dynamic,
+         const std::vector<std::array<Index, 2>>& ignored_pairs)
+      : mesh_(collision_mesh(
+            faces, vertex_surface, cloth_count, self_contact, body_dynamic, ignored_pairs)),
         broad_phase_(mesh_, checked("x_reference", x_reference)),
         list_(broad_phase_) {}
   Search(const Search&) = delete;
@@ -230,9 +238,11 @@ void collision_kernels(nb::module_& m) {
       "edge_edge"_a, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "xi"_a);
 
   nb::class_<Search>(m, "BroadPhase")
-      .def(nb::init<const Faces&, const Surfaces&, Index, bool, const Positions&>(),
+      .def(nb::init<const Faces&, const Surfaces&, Index, bool, const Positions&,
+                    const std::vector<bool>&, const std::vector<std::array<Index, 2>>&>(),
            "faces"_a.noconvert(), "vertex_surface"_a.noconvert(), "cloth_count"_a, "self_contact"_a,
-           "x_reference"_a.noconvert())
+           "x_reference"_a.noconvert(), "body_dynamic"_a = std::vector<bool>{},
+           "ignored_pairs"_a = std::vector<std::array<Index, 2>>{})
       .def("find", &Search::find, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "reach"_a)
       .def(
           "find",
@@ -258,6 +268,30 @@ void collision_kernels(nb::module_& m) {
 }
 
 }  // namespace
+
+contact::SurfacePairs touching_surfaces(const std::vector<Index>& vertex_surface,
+                                        Index cloth_count,
+                                        bool self_contact,
+                                        const std::vector<bool>& body_dynamic,
+                                        const std::vector<std::array<Index, 2>>& ignored_pairs) {
+  const Index last = vertex_surface.empty() ? -1 : std::ranges::max(vertex_surface);
+  const Index surface_count = std::max(cloth_count, last + 1);
+  if (!body_dynamic.empty() &&
+      static_cast<Index>(body_dynamic.size()) != surface_count - cloth_count) {
+    throw nb::value_error("collision mesh: `body_dynamic` must have one flag a body");
+  }
+  for (const auto& [a, b] : ignored_pairs) {
+    if (std::min(a, b) < 0 || std::max(a, b) >= surface_count) {
+      throw nb::value_error("collision mesh: `ignored_pairs` must refer to surfaces of the mesh");
+    }
+  }
+  const std::vector<char> dynamic(body_dynamic.begin(), body_dynamic.end());
+  return contact::touching_surfaces({.surface_count = surface_count,
+                                     .cloth_count = cloth_count,
+                                     .self_contact = self_contact,
+                                     .body_dynamic = dynamic,
+                                     .ignored = ignored_pairs});
+}
 
 void contact_kernels(nb::module_& m) {
   distance_kernels(m);

@@ -1,3 +1,4 @@
+#include <array>
 #include <string>
 #include <tuple>
 #include <utility>
@@ -6,6 +7,7 @@
 #include <Eigen/Core>
 #include <nanobind/eigen/dense.h>
 #include <nanobind/nanobind.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
@@ -13,7 +15,9 @@
 
 #include "bind/kernels/kernels.h"
 #include "contact/contact_set.h"
+#include "contact/feature_areas.h"
 #include "contact/friction_set.h"
+#include "contact/sharpness.h"
 
 namespace diffcloth::bind {
 namespace {
@@ -39,16 +43,17 @@ class ContactPotential {
   ContactPotential(const FaceRows& faces,
                    std::vector<Index> vertex_surface,
                    Index cloth_count,
-                   bool self_contact,
+                   contact::SurfacePairs touching,
                    const Positions& X,
                    const std::vector<bool>& prescribed,
                    contact::Parameters parameters)
-      : mesh_(face_list(faces), std::move(vertex_surface), cloth_count, self_contact),
+      : mesh_(face_list(faces), std::move(vertex_surface), cloth_count, std::move(touching)),
         prescribed_(prescribed.begin(), prescribed.end()),
         weights_(mesh_, X.data(), prescribed_),
         rest_(contact::measure(mesh_, X.data())),
         model_(mesh_, weights_, rest_, std::move(parameters), prescribed_),
-        broad_phase_(mesh_, X.data()) {}
+        broad_phase_(mesh_, X.data()),
+        X_(X) {}
   ContactPotential(const ContactPotential&) = delete;
   ContactPotential& operator=(const ContactPotential&) = delete;
 
@@ -174,6 +179,14 @@ class ContactPotential {
     return result;
   }
 
+  /// Of the bodies: A_v of vertices, theta and A_e of edges, and the areas of surfaces.
+  std::tuple<Values, Values, Values, Values> body_areas() const {
+    const contact::Bulge bulge = contact::bulge(mesh_, X_.data());
+    const contact::FeatureAreas areas = contact::feature_areas(mesh_, X_.data(), bulge);
+    return {to_values(areas.vertex), to_values(bulge.edge), to_values(areas.edge),
+            to_values(areas.surface)};
+  }
+
   /// Weights of a sum over all features: of edges, of vertices, and whether a face counts.
   std::tuple<std::vector<Index>, std::vector<Index>, std::vector<bool>> feature_weights() const {
     std::vector<Index> edge;
@@ -242,6 +255,7 @@ class ContactPotential {
   contact::ContactModel model_;
   contact::BroadPhase broad_phase_;
   contact::BroadPhase::Scratch scratch_;
+  Rows3 X_;
 };
 
 }  // namespace
@@ -253,9 +267,13 @@ void contact_potentials(nb::module_& m) {
           [](ContactPotential* self, const FaceRows& faces, std::vector<Index> vertex_surface,
              Index cloth_count, bool self_contact, const Positions& X,
              const std::vector<bool>& prescribed, double kappa, double d_hat, double slip,
-             std::vector<double> thickness, std::vector<double> friction) {
-            new (self) ContactPotential(faces, std::move(vertex_surface), cloth_count, self_contact,
-                                        X, prescribed,
+             std::vector<double> thickness, std::vector<double> friction,
+             const std::vector<bool>& body_dynamic,
+             const std::vector<std::array<Index, 2>>& ignored_pairs) {
+            contact::SurfacePairs touching = touching_surfaces(
+                vertex_surface, cloth_count, self_contact, body_dynamic, ignored_pairs);
+            new (self) ContactPotential(faces, std::move(vertex_surface), cloth_count,
+                                        std::move(touching), X, prescribed,
                                         {.kappa = kappa,
                                          .d_hat = d_hat,
                                          .slip = slip,
@@ -263,7 +281,9 @@ void contact_potentials(nb::module_& m) {
                                          .friction = std::move(friction)});
           },
           "faces"_a, "vertex_surface"_a, "cloth_count"_a, "self_contact"_a, "X"_a, "prescribed"_a,
-          "kappa"_a, "d_hat"_a, "slip"_a, "thickness"_a, "friction"_a)
+          "kappa"_a, "d_hat"_a, "slip"_a, "thickness"_a, "friction"_a,
+          "body_dynamic"_a = std::vector<bool>{},
+          "ignored_pairs"_a = std::vector<std::array<Index, 2>>{})
       .def("candidate_count", &ContactPotential::candidate_count, "x"_a)
       .def("energies", &ContactPotential::energies, "x"_a, "other"_a)
       .def("contacts", &ContactPotential::contacts, "x"_a)
@@ -286,6 +306,7 @@ void contact_potentials(nb::module_& m) {
              measure = values;
            })
       .def("sharpness", &ContactPotential::sharpness, "cloth"_a = 0)
+      .def("body_areas", &ContactPotential::body_areas)
       .def("continuation", &ContactPotential::continuation)
       .def("feature_weights", &ContactPotential::feature_weights)
       .def("edges", &ContactPotential::edges);

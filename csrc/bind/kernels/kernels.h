@@ -1,10 +1,22 @@
 #pragma once
 
+#include <array>
+#include <vector>
+
 #include <nanobind/nanobind.h>
+
+#include "contact/surface_pairs.h"
 
 namespace diffcloth::bind {
 
 namespace nb = nanobind;
+
+/// Which surfaces of a test's mesh touch; there are as many as its vertices and flags name.
+contact::SurfacePairs touching_surfaces(const std::vector<Index>& vertex_surface,
+                                        Index cloth_count,
+                                        bool self_contact,
+                                        const std::vector<bool>& body_dynamic,
+                                        const std::vector<std::array<Index, 2>>& ignored_pairs);
 
 /// Threads, for tests of what happens when they fail or are interrupted.
 void common_kernels(nb::module_& m);

@@ -1,0 +1,72 @@
+#pragma once
+
+#include <vector>
+
+#include "bodies/mechanisms.h"
+#include "potential/potential.h"
+
+namespace diffcloth::bodies {
+
+/// The potential of the mechanisms' coordinates q themselves:
+///
+///   sum over trees of 1/2 (q - t)^T A (q - t)  +  sum over limits of k b(u),
+///
+/// with everything quadratic (inertia, drives, damping) in the metric A and the target t. A limit acts
+/// from itself to `kZone` of the joint's range beyond it, its end: u is what is left to the end, and
+///
+///   b(u) = -(u - w)^2 log(u / w),   w the width of that zone,   0 for u >= w.
+class CoordinatePotential final : public Potential {
+ public:
+  /// Share of a joint's range that it can go beyond its limits.
+  static constexpr double kZone = 0.01;
+
+  /// @param first_point  of the nodes among all points
+  /// @param first_row    of the nodes in the linear system
+  /// @param targets      t [n]
+  /// @param metric       A, row by row, tree after tree [sum n_t^2]; its symmetric part counts
+  CoordinatePotential(const Mechanisms& mechanisms,
+                      Index first_point,
+                      Index first_row,
+                      const double* targets,
+                      const double* metric);
+
+  double energy(const double* x) const override;
+  double energy_change(const double* x, const double* to) const override;
+  void add_gradient(const double* x, double* g) const override;
+  void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
+  void add_hessian_product(const double* x, const double* z, double* y) const override;
+  void accumulate(const double* x, const double* z) override;
+
+  /// Append the diagonal of A for each number of the nodes.
+  void append_diagonal(std::vector<double>& out) const;
+
+  std::vector<double> target_bar;  ///< [n], zero until accumulate()
+  std::vector<double> metric_bar;  ///< [sum n_t^2]
+
+ private:
+  struct Tree {
+    std::vector<Index> slot;  // of its coordinates among the numbers of the nodes
+    Index first_coordinate;
+    std::size_t metric;  // where its block of A starts
+    Index first_node, last_node;
+    double fill;  // for the numbers of nodes that hold no coordinate
+  };
+
+  double at(const Tree& tree, Index i, Index j) const {
+    const std::size_t n = tree.slot.size();
+    return 0.5 * (metric_[tree.metric + n * i + j] + metric_[tree.metric + n * j + i]);
+  }
+  /// Visit the limits of free joints that act at some nodes: visit(slot, sign, u, w, k), where q moves
+  /// u by -sign.
+  template <class Visit>
+  void visit_limits(const double* nodes, Visit&& visit) const;
+
+  const Mechanisms& mechanisms_;
+  Index first_point_;
+  Index first_row_;
+  const double* targets_;
+  const double* metric_;
+  std::vector<Tree> trees_;
+};
+
+}  // namespace diffcloth::bodies

@@ -1,0 +1,538 @@
+#include "bodies/mechanisms.h"
+
+#include <algorithm>
+#include <cmath>
+#include <utility>
+
+namespace diffcloth::bodies {
+namespace {
+
+/// A B of rigid (or linear) transforms, each a 3 x 4 matrix.
+Mat34 compose(const Mat34& a, const Mat34& b) {
+  Mat34 c;
+  c.leftCols<3>() = a.leftCols<3>() * b.leftCols<3>();
+  c.col(3) = a.leftCols<3>() * b.col(3) + a.col(3);
+  return c;
+}
+
+double inner(const Mat34& a, const Mat34& b) { return a.cwiseProduct(b).sum(); }
+double inner(const Mat3& a, const Mat3& b) { return a.cwiseProduct(b).sum(); }
+
+Vec3 apply(const Mat34& t, const Vec3& v) { return t.leftCols<3>() * v + t.col(3); }
+
+Mat34 motion(const Link& link, double value) {
+  Mat34 m;
+  m.leftCols<3>() = Mat3::Identity();
+  m.col(3).setZero();
+  if (link.kind == JointKind::kRevolute) {
+    m.leftCols<3>() = Eigen::AngleAxisd(value, link.axis).toRotationMatrix();
+  } else if (link.kind == JointKind::kPrismatic) {
+    m.col(3) = value * link.axis;
+  }
+  return m;
+}
+
+}  // namespace
+
+/// A tree at a configuration. Derivatives by joints are in the root's frame.
+struct Mechanisms::Eval {
+  Exponential turn{Vec3::Zero()};  // of a free root
+  Vec3 center = Vec3::Zero();
+  Mat34 frame;                          // S
+  std::vector<Mat34> to_root;           // C_l
+  std::vector<Vec3> axis;               // of the joint of a link
+  std::vector<std::vector<Mat34>> by_joint;  // [link][k]: dC_l by the k-th joint of its path
+};
+
+// With moments M_l = sum over its vertices of ybar [v; 1]^T, whatever is linear in the vertices is an
+// inner product with M_l.
+
+Mechanisms::Mechanisms(MechanismsDescription description, const BodySet& bodies)
+    : given_(std::move(description)), vertices_(bodies.vertices) {
+  const auto n = static_cast<Index>(given_.coordinate_tree.size());
+  slot_.assign(static_cast<std::size_t>(n), -1);
+  std::vector<Index> tree_of(given_.tree_free.size(), -1);
+  Index coordinate = 0;
+  Index link = 0;
+  for (Index t = 0; t < static_cast<Index>(given_.tree_free.size()); ++t) {
+    Tree tree{.given = t,
+              .free = given_.tree_free[t] != 0,
+              .first_link = link,
+              .last_link = link,
+              .first_coordinate = coordinate,
+              .last_coordinate = coordinate,
+              .first_node = node_count(),
+              .last_node = node_count(),
+              .frame = 0};
+    while (link < static_cast<Index>(given_.links.size()) && given_.links[link].tree == t) ++link;
+    while (coordinate < n && given_.coordinate_tree[coordinate] == t) ++coordinate;
+    tree.last_link = link;
+    tree.last_coordinate = coordinate;
+    const bool is_obstacle =
+        tree.last_coordinate == tree.first_coordinate && tree.last_link == tree.first_link + 1;
+    if (is_obstacle) continue;
+    for (const char prescribed : {char{0}, char{1}}) {
+      Index in_node = 3;
+      for (Index c = tree.first_coordinate; c < tree.last_coordinate; ++c) {
+        if (given_.prescribed[c] != prescribed) continue;
+        if (in_node == 3) {
+          node_prescribed_.push_back(prescribed);
+          in_node = 0;
+        }
+        slot_[c] = 3 * (node_count() - 1) + in_node++;
+        has_free_ = has_free_ || prescribed == 0;
+      }
+    }
+    tree.last_node = node_count();
+    tree_of[t] = tree_count();
+    trees_.push_back(tree);
+  }
+  for (std::size_t t = 0; t < trees_.size(); ++t) {
+    trees_[t].frame = node_count() + 4 * static_cast<Index>(t);
+  }
+
+  path_.resize(given_.links.size());
+  for (std::size_t l = 0; l < given_.links.size(); ++l) {
+    const Link& own = given_.links[l];
+    if (own.parent >= 0) path_[l] = path_[own.parent];
+    if (own.kind != JointKind::kFixed) path_[l].push_back(static_cast<Index>(l));
+  }
+  for (std::size_t s = 0; s < given_.surface_link.size(); ++s) {
+    const Index l = given_.surface_link[s];
+    Surface surface{.tree = tree_of[given_.links[l].tree],
+                    .link = l,
+                    .dynamic = false,
+                    .first = bodies.vertex_start[s],
+                    .last = bodies.vertex_start[s + 1]};
+    surface.dynamic = given_.tree_free[given_.links[l].tree] != 0 ||
+                      std::ranges::any_of(path_[l], [&](Index joint) {
+                        return given_.prescribed[given_.links[joint].coordinate] == 0;
+                      });
+    surface_.push_back(surface);
+  }
+  find_levers();
+}
+
+std::vector<std::vector<Index>> Mechanisms::cliques() const {
+  std::vector<std::vector<Index>> result;
+  for (const Tree& tree : trees_) {
+    std::vector<Index> nodes;
+    for (Index k = tree.first_node; k < tree.last_node; ++k) nodes.push_back(k);
+    result.push_back(std::move(nodes));
+  }
+  return result;
+}
+
+Mechanisms::Eval Mechanisms::evaluate(const Tree& tree, const double* points) const {
+  Eval e;
+  for (int a = 0; a < 4; ++a) e.frame.col(a) = row(points, tree.frame + a);
+  if (tree.free) {
+    e.center = row(points, tree.first_node);
+    e.turn = Exponential(row(points, tree.first_node + 1));
+  }
+  const Index count = tree.last_link - tree.first_link;
+  e.to_root.resize(static_cast<std::size_t>(count));
+  e.axis.resize(static_cast<std::size_t>(count));
+  std::vector<Vec3> origin(static_cast<std::size_t>(count));
+  e.by_joint.resize(static_cast<std::size_t>(count));
+  for (Index l = tree.first_link; l < tree.last_link; ++l) {
+    const Link& link = given_.links[l];
+    const Index k = l - tree.first_link;
+    Mat34 joint = link.offset;
+    if (link.parent >= 0) joint = compose(e.to_root[link.parent - tree.first_link], link.offset);
+    e.axis[k] = joint.leftCols<3>() * link.axis;
+    origin[k] = joint.col(3);
+    double value = 0.0;
+    if (link.kind != JointKind::kFixed) {
+      value = link.multiplier * points[slot_[link.coordinate]] + link.constant;
+    }
+    e.to_root[k] = compose(joint, motion(link, value));
+    for (const Index m : path_[l]) {
+      const Index j = m - tree.first_link;
+      Mat34 d = Mat34::Zero();
+      if (given_.links[m].kind == JointKind::kRevolute) {
+        d = cross_matrix(e.axis[j]) * e.to_root[k];
+        d.col(3) -= e.axis[j].cross(origin[j]);
+      } else {
+        d.col(3) = e.axis[j];
+      }
+      e.by_joint[k].push_back(given_.links[m].multiplier * d);
+    }
+  }
+  return e;
+}
+
+void Mechanisms::set_frames(const double* poses, double* points) const {
+  for (const Tree& tree : trees_) {
+    const Pose pose = Eigen::Map<const Pose>(poses + 7 * tree.given);
+    const Mat3 r = rotation(pose);
+    for (int a = 0; a < 3; ++a) Eigen::Map<Vec3>(points + 3 * (tree.frame + a)) = r.col(a);
+    Eigen::Map<Vec3>(points + 3 * (tree.frame + 3)) = pose.head<3>();
+  }
+}
+
+void Mechanisms::set_frames_vjp(const double* poses,
+                                const double* points_bar,
+                                double* poses_bar) const {
+  const Mat3 basis = Mat3::Identity();
+  for (const Tree& tree : trees_) {
+    const Pose pose = Eigen::Map<const Pose>(poses + 7 * tree.given);
+    // The columns of R are the images of the axes, but do not move with the position.
+    Pose bar = transform_vjp(pose, basis.data(), 3, points_bar + 3 * tree.frame);
+    bar.head<3>() = row(points_bar, tree.frame + 3);
+    Eigen::Map<Pose>(poses_bar + 7 * tree.given) += bar;
+  }
+}
+
+void Mechanisms::place(const double* points, double* vertices) const {
+  for (Index t = 0; t < tree_count(); ++t) {
+    const Eval e = evaluate(trees_[t], points);
+    for (const Surface& s : surface_) {
+      if (s.tree != t) continue;
+      const Mat34 u = compose(e.frame, e.to_root[s.link - trees_[t].first_link]);
+      for (Index v = s.first; v < s.last; ++v) {
+        const Vec3 p = apply(u, row(vertices_.data(), v));
+        Eigen::Map<Vec3>(vertices + 3 * v) =
+            trees_[t].free ? Vec3(e.center + e.turn.value * p) : p;
+      }
+    }
+  }
+}
+
+void Mechanisms::clear(double* vertices) const {
+  for (const Surface& s : surface_) {
+    if (s.tree >= 0) std::fill(vertices + 3 * s.first, vertices + 3 * s.last, 0.0);
+  }
+}
+
+void Mechanisms::push_forward(const double* points, const double* change, double* vertices) const {
+  for (Index t = 0; t < tree_count(); ++t) {
+    const Tree& tree = trees_[t];
+    const Eval e = evaluate(tree, points);
+    Mat34 d_frame;
+    for (int a = 0; a < 4; ++a) d_frame.col(a) = row(change, tree.frame + a);
+    Vec3 d_center = Vec3::Zero();
+    Mat3 d_turn = Mat3::Zero();
+    if (tree.free) {
+      d_center = row(change, tree.first_node);
+      const Vec3 w = row(change, tree.first_node + 1);
+      for (int i = 0; i < 3; ++i) d_turn += w[i] * e.turn.first[i];
+    }
+    for (const Surface& s : surface_) {
+      if (s.tree != t) continue;
+      const Index k = s.link - tree.first_link;
+      Mat34 d_link = Mat34::Zero();
+      for (std::size_t m = 0; m < path_[s.link].size(); ++m) {
+        const Index c = given_.links[path_[s.link][m]].coordinate;
+        d_link += change[slot_[c]] * e.by_joint[k][m];
+      }
+      Mat34 d = compose(d_frame, e.to_root[k]);
+      d.noalias() += e.frame.leftCols<3>() * d_link;
+      const Mat34 total = d_turn * compose(e.frame, e.to_root[k]) + e.turn.value * d;
+      for (Index v = s.first; v < s.last; ++v) {
+        Eigen::Map<Vec3>(vertices + 3 * v) = d_center + apply(total, row(vertices_.data(), v));
+      }
+    }
+  }
+}
+
+std::vector<Mat34> Mechanisms::moments(const Tree& tree, const double* g) const {
+  std::vector<Mat34> result(static_cast<std::size_t>(tree.last_link - tree.first_link),
+                            Mat34::Zero());
+  for (const Surface& s : surface_) {
+    if (s.link < tree.first_link || s.link >= tree.last_link) continue;
+    Mat34& m = result[s.link - tree.first_link];
+    for (Index v = s.first; v < s.last; ++v) {
+      const Vec3 g_v = row(g, v);
+      m.leftCols<3>().noalias() += g_v * row(vertices_.data(), v).transpose();
+      m.col(3) += g_v;
+    }
+  }
+  return result;
+}
+
+void Mechanisms::pull_back(const double* points,
+                           const double* vertices_bar,
+                           double* points_bar) const {
+  for (const Tree& tree : trees_) {
+    const Eval e = evaluate(tree, points);
+    const std::vector<Mat34> moment = moments(tree, vertices_bar);
+    for (Index l = tree.first_link; l < tree.last_link; ++l) {
+      const Index k = l - tree.first_link;
+      const Mat34& m = moment[k];
+      if (m.isZero(0.0)) continue;
+      if (tree.free) {
+        const Mat34 u = compose(e.frame, e.to_root[k]);
+        Eigen::Map<Vec3>(points_bar + 3 * tree.first_node) += m.col(3);
+        for (int i = 0; i < 3; ++i) {
+          points_bar[3 * (tree.first_node + 1) + i] += inner(Mat34(e.turn.first[i] * u), m);
+        }
+      }
+      const Mat34 in_root = e.turn.value.transpose() * m;
+      const Mat34 in_frame = e.frame.leftCols<3>().transpose() * in_root;
+      for (std::size_t j = 0; j < path_[l].size(); ++j) {
+        points_bar[slot_[given_.links[path_[l][j]].coordinate]] +=
+            inner(e.by_joint[k][j], in_frame);
+      }
+      Mat34 frame_bar;
+      frame_bar.leftCols<3>() = in_root * e.to_root[k].transpose();
+      frame_bar.col(3) = in_root.col(3);
+      for (int a = 0; a < 4; ++a) {
+        Eigen::Map<Vec3>(points_bar + 3 * (tree.frame + a)) += frame_bar.col(a);
+      }
+    }
+  }
+}
+
+/// Second derivatives by the numbers of a tree's nodes, prescribed ones included; column-major.
+std::vector<double> Mechanisms::curvature(const Tree& tree,
+                                          const double* points,
+                                          const double* g) const {
+  const Index size = 3 * (tree.last_node - tree.first_node);
+  std::vector<double> k(static_cast<std::size_t>(size) * size, 0.0);
+  const auto add = [&](Index i, Index j, double value) {
+    k[i + static_cast<std::size_t>(size) * j] += value;
+  };
+  const Eval e = evaluate(tree, points);
+  const std::vector<Mat34> moment = moments(tree, g);
+  for (Index l = tree.first_link; l < tree.last_link; ++l) {
+    const Index at = l - tree.first_link;
+    const Mat34& m = moment[at];
+    if (m.isZero(0.0)) continue;
+    const Mat34 u = compose(e.frame, e.to_root[at]);
+    const Mat3 frame = e.frame.leftCols<3>();
+    const std::vector<Index>& path = path_[l];
+    const auto local = [&](std::size_t j) {
+      return slot_[given_.links[path[j]].coordinate] - 3 * tree.first_node;
+    };
+    if (tree.free) {
+      const Mat3 mu = m * u.transpose();
+      for (int i = 0; i < 3; ++i) {
+        for (int j = 0; j < 3; ++j) add(3 + i, 3 + j, inner(e.turn.second[i][j], mu));
+        for (std::size_t j = 0; j < path.size(); ++j) {
+          const double value = inner(Mat34(e.turn.first[i] * (frame * e.by_joint[at][j])), m);
+          add(3 + i, local(j), value);
+          add(local(j), 3 + i, value);
+        }
+      }
+    }
+    const Mat34 in_frame = frame.transpose() * (e.turn.value.transpose() * m);
+    for (std::size_t i = 0; i < path.size(); ++i) {
+      const Link& outer = given_.links[path[i]];
+      if (outer.kind != JointKind::kRevolute) continue;
+      const Mat3 turn =
+          outer.multiplier * cross_matrix(e.axis[path[i] - tree.first_link]);
+      for (std::size_t j = i; j < path.size(); ++j) {
+        const double value = inner(Mat34(turn * e.by_joint[at][j]), in_frame);
+        add(local(i), local(j), value);
+        if (i != j) add(local(j), local(i), value);
+      }
+    }
+  }
+  return k;
+}
+
+void Mechanisms::pull_back_change(const double* points,
+                                  const double* change,
+                                  const double* g,
+                                  double* points_bar) const {
+  for (const Tree& tree : trees_) {
+    const std::vector<double> k = curvature(tree, points, g);
+    const Index first = 3 * tree.first_node;
+    const Index size = 3 * tree.last_node - first;
+    for (Index j = 0; j < size; ++j) {
+      for (Index i = 0; i < size; ++i) {
+        points_bar[first + i] += k[i + static_cast<std::size_t>(size) * j] * change[first + j];
+      }
+    }
+    // By the frame: of Rdot S C m + R S Cdot m.
+    const Eval e = evaluate(tree, points);
+    const std::vector<Mat34> moment = moments(tree, g);
+    Mat3 d_turn = Mat3::Zero();
+    if (tree.free) {
+      const Vec3 w = row(change, tree.first_node + 1);
+      for (int i = 0; i < 3; ++i) d_turn += w[i] * e.turn.first[i];
+    }
+    for (Index l = tree.first_link; l < tree.last_link; ++l) {
+      const Index at = l - tree.first_link;
+      const Mat34& m = moment[at];
+      if (m.isZero(0.0)) continue;
+      Mat34 d_link = Mat34::Zero();
+      for (std::size_t j = 0; j < path_[l].size(); ++j) {
+        d_link += change[slot_[given_.links[path_[l][j]].coordinate]] * e.by_joint[at][j];
+      }
+      const Mat34 turned = d_turn.transpose() * m;
+      Mat34 frame_bar;
+      frame_bar.leftCols<3>() = turned * e.to_root[at].transpose() +
+                                e.turn.value.transpose() * m * d_link.transpose();
+      frame_bar.col(3) = turned.col(3);
+      for (int a = 0; a < 4; ++a) {
+        Eigen::Map<Vec3>(points_bar + 3 * (tree.frame + a)) += frame_bar.col(a);
+      }
+    }
+  }
+}
+
+linalg::Attachments Mechanisms::attachments(Index first_point, Index first_row) const {
+  linalg::Attachments out;
+  out.first = first_point;
+  for (const Surface& s : surface_) {
+    std::vector<Index> nodes;
+    if (s.tree >= 0 && s.dynamic) {
+      const Tree& tree = trees_[s.tree];
+      if (tree.free) nodes = {tree.first_node, tree.first_node + 1};
+      for (const Index joint : path_[s.link]) {
+        const Index node = slot_[given_.links[joint].coordinate] / 3;
+        if (!is_prescribed(node)) nodes.push_back(node);
+      }
+      std::ranges::sort(nodes);
+      nodes.erase(std::unique(nodes.begin(), nodes.end()), nodes.end());
+    }
+    for (Index v = s.first; v < s.last; ++v) {
+      for (const Index node : nodes) {
+        out.entries.push_back({.row = first_row + node, .jacobian = Mat3::Zero()});
+      }
+      out.start.push_back(static_cast<Index>(out.entries.size()));
+    }
+  }
+  return out;
+}
+
+void Mechanisms::differentiate(const double* points,
+                               Index first_row,
+                               linalg::Attachments& out) const {
+  for (Index t = 0; t < tree_count(); ++t) {
+    const Tree& tree = trees_[t];
+    const Eval e = evaluate(tree, points);
+    for (const Surface& s : surface_) {
+      if (s.tree != t || !s.dynamic || s.first == s.last) continue;
+      const Index at = s.link - tree.first_link;
+      // The derivative of the link's transform by each number of its nodes, in their order.
+      const auto* const begin = out.begin(out.first + s.first);
+      const auto count = static_cast<std::size_t>(out.end(out.first + s.first) - begin);
+      std::vector<std::array<Mat34, 3>> d(count);
+      for (auto& columns : d) columns.fill(Mat34::Zero());
+      const auto place_of = [&](Index node) {
+        for (std::size_t k = 0; k < count; ++k) {
+          if (begin[k].row == first_row + node) return k;
+        }
+        return count;
+      };
+      const Mat34 u = compose(e.frame, e.to_root[at]);
+      if (tree.free) {
+        for (int i = 0; i < 3; ++i) {
+          d[0][i].col(3) = Vec3::Unit(i);
+          d[1][i] = e.turn.first[i] * u;
+        }
+      }
+      const Mat3 to_world = e.turn.value * e.frame.leftCols<3>();
+      for (std::size_t j = 0; j < path_[s.link].size(); ++j) {
+        const Index slot = slot_[given_.links[path_[s.link][j]].coordinate];
+        if (is_prescribed(slot / 3)) continue;
+        d[place_of(slot / 3)][slot % 3] += to_world * e.by_joint[at][j];
+      }
+      for (Index v = s.first; v < s.last; ++v) {
+        const Vec3 local = row(vertices_.data(), v);
+        linalg::Attachments::Entry* entry =
+            out.entries.data() + out.start[v];
+        for (std::size_t k = 0; k < count; ++k) {
+          for (int i = 0; i < 3; ++i) entry[k].jacobian.col(i) = apply(d[k][i], local);
+        }
+      }
+    }
+  }
+}
+
+double Mechanisms::turn(const double* change) const {
+  double largest = 0.0;
+  for (const Tree& tree : trees_) {
+    const double root = tree.free ? row(change, tree.first_node + 1).norm() : 0.0;
+    largest = std::max(largest, root);
+    for (Index l = tree.first_link; l < tree.last_link; ++l) {
+      double sum = root;
+      for (const Index joint : path_[l]) {
+        const Link& link = given_.links[joint];
+        if (link.kind != JointKind::kRevolute) continue;
+        sum += std::abs(link.multiplier * change[slot_[link.coordinate]]);
+      }
+      largest = std::max(largest, sum);
+    }
+  }
+  return largest;
+}
+
+double Mechanisms::turn_between(const double* from, const double* to) const {
+  double largest = 0.0;
+  for (const Tree& tree : trees_) {
+    double root = 0.0;
+    if (!tree.free) {
+      // Of the frames' rotations: |R_b - R_a|_F = 2 sqrt(2) sin(angle / 2).
+      double sum = 0.0;
+      for (int a = 0; a < 3; ++a) {
+        sum += (row(to, tree.frame + a) - row(from, tree.frame + a)).squaredNorm();
+      }
+      root = 2.0 * std::asin(std::min(1.0, std::sqrt(sum / 8.0)));
+    }
+    for (Index l = tree.first_link; l < tree.last_link; ++l) {
+      double sum = root;
+      for (const Index joint : path_[l]) {
+        const Link& link = given_.links[joint];
+        if (link.kind != JointKind::kRevolute || given_.prescribed[link.coordinate] == 0) continue;
+        const Index slot = slot_[link.coordinate];
+        sum += std::abs(link.multiplier * (to[slot] - from[slot]));
+      }
+      largest = std::max(largest, sum);
+    }
+  }
+  return largest;
+}
+
+void Mechanisms::find_levers() {
+  lever_.assign(3 * static_cast<std::size_t>(node_count()), 0.0);
+  // Where all joints are at zero.
+  std::vector<double> zero(3 * static_cast<std::size_t>(point_count()), 0.0);
+  for (const Tree& tree : trees_) {
+    for (int a = 0; a < 3; ++a) zero[3 * (tree.frame + a) + a] = 1.0;
+    const Eval e = evaluate(tree, zero.data());
+    std::vector<Vec3> all;
+    double largest = 0.0;
+    for (Index l = tree.first_link; l < tree.last_link; ++l) {
+      const Index at = l - tree.first_link;
+      std::vector<Vec3> points{e.to_root[at].col(3)};
+      for (const Surface& s : surface_) {
+        if (s.link != l) continue;
+        if (s.first < s.last) points.clear();
+        for (Index v = s.first; v < s.last; ++v) {
+          points.push_back(apply(e.to_root[at], row(vertices_.data(), v)));
+        }
+      }
+      all.insert(all.end(), points.begin(), points.end());
+      for (const Index joint : path_[l]) {
+        const Link& link = given_.links[joint];
+        double& lever = lever_[slot_[link.coordinate]];
+        if (link.kind == JointKind::kPrismatic) {
+          lever = std::max(lever, std::abs(link.multiplier));
+          continue;
+        }
+        const Vec3 origin = e.to_root[joint - tree.first_link].col(3);
+        for (const Vec3& p : points) {
+          lever = std::max(lever, std::abs(link.multiplier) * (p - origin).norm());
+        }
+        largest = std::max(largest, lever);
+      }
+    }
+    Vec3 mean = Vec3::Zero();
+    for (const Vec3& p : all) mean += p / static_cast<double>(all.size());
+    double reach = 0.0;
+    for (const Vec3& p : all) reach = std::max(reach, (p - mean).norm());
+    for (Index c = tree.first_coordinate; c < tree.last_coordinate; ++c) {
+      const Index k = c - tree.first_coordinate;
+      double& lever = lever_[slot_[c]];
+      if (tree.free && k < 6) lever = k < 3 ? 1.0 : reach;
+      // A joint that turns points on its axis alone, or nothing: as far as others do.
+      if (lever == 0.0) lever = largest > 0.0 ? largest : std::max(reach, 1.0);
+    }
+  }
+}
+
+}  // namespace diffcloth::bodies

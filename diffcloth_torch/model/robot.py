@@ -1,0 +1,305 @@
+"""A robot: its mechanism, the surfaces of its links, and how its joints are driven."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from torch import Tensor
+
+from diffcloth_torch.checks import (
+    ANY_NUMBER,
+    NON_NEGATIVE,
+    POSITIVE,
+    FloatArray,
+    Range,
+    check_choice,
+    check_name,
+    check_number,
+    check_pairs,
+    check_range,
+    check_shape,
+    float_array,
+    float_tensor,
+    frozen,
+    texts,
+)
+from diffcloth_torch.errors import IgnoredLimitsWarning, InvalidInput
+from diffcloth_torch.geometry.poses import check_quaternions, pose_array
+from diffcloth_torch.geometry.surfaces import Surface
+from diffcloth_torch.model.collision_shapes import link_surface
+from diffcloth_torch.model.kinematics import link_frames, pose_frame
+from diffcloth_torch.model.mechanism import Mechanism
+from diffcloth_torch.model.robot_tree import make_mechanism
+from diffcloth_torch.model.urdf import read_urdf
+
+__all__ = ["ACTUATIONS", "BASES", "Robot"]
+
+BASES = ("fixed", "kinematic", "floating")
+ACTUATIONS = ("position", "velocity", "torque", "pd")
+
+_DIFFERENTIABLE = {
+    "joint_positions": "State.joint_positions or Control.joint_positions",
+    "stiffness": "Parameters.joint_stiffness",
+    "damping": "Parameters.joint_damping",
+    "friction": "Parameters.friction",
+    "thickness": "Parameters.thickness",
+}
+_POSE = "differentiate with respect to State.base_poses or Control.base_poses"
+
+
+class Robot:
+    """Links joined by joints; immutable. Made by `Robot.load`.
+
+    Attributes:
+        mechanism: Its tree of links and joints.
+        surfaces: Collision surface of each of the L links in the link's frame, or None; length L.
+        pose: Initial pose of the root link [px, py, pz, qw, qx, qy, qz], shape [7].
+        joint_positions: Initial [rad or m], shape [J].
+        stiffness: Of the drives of "pd" joints [N m/rad or N/m], zero for others; shape [J].
+        damping: Likewise [N m s/rad or N s/m], shape [J].
+        viscosity: Damping that the joints have of their own, likewise; shape [J].
+        friction: Friction coefficient of each link's surface [-], shape [L].
+        thickness: Full thickness of each link's surface [m], shape [L].
+        ignore_contact: Pairs of names of links that do not collide with each other.
+        name: Name in the scene; None lets the scene choose one.
+    """
+
+    mechanism: Mechanism
+    surfaces: tuple[Surface | None, ...]
+    pose: FloatArray
+    joint_positions: FloatArray
+    stiffness: FloatArray
+    damping: FloatArray
+    viscosity: FloatArray
+    friction: FloatArray
+    thickness: FloatArray
+    ignore_contact: tuple[tuple[str, str], ...]
+    name: str | None
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        mesh_root: str | Path | None = None,
+        base: str = "fixed",
+        pose: object = None,
+        joint_positions: object = None,
+        actuation: object = "pd",
+        stiffness: object = None,
+        damping: object = None,
+        friction: object = 0.4,
+        thickness: object = 0.0,
+        edge_length: float | None = None,
+        ignore_contact: Iterable[Sequence[str]] = (),
+        name: str | None = None,
+    ) -> Robot:
+        """Read a URDF file.
+
+        Joints may be fixed, revolute, continuous or prismatic. The J joints are those that move and
+        do not mimic. Links and joints keep the order of the file. What is one value, name -> value
+        or an array may leave names out: they have the default.
+
+        Args:
+            path: URDF file.
+            mesh_root: Folder outside of which no mesh file is read; "package://name/x" means x or
+                name/x in it. The folder of `path` by default.
+            base: "fixed", "kinematic" (the root link moves on prescribed poses) or "floating".
+            pose: Initial pose of the root link [px, py, pz, qw, qx, qy, qz]; the identity by
+                default.
+            joint_positions: Initial [rad or m], within the limits; one value, name -> value, or
+                [J]. Zero by default.
+            actuation: "position" and "velocity" prescribe the motion of a joint, "torque" and "pd"
+                leave it to forces; one, name -> mode, or J of them.
+            stiffness: Of the drives of "pd" joints [N m/rad or N/m], >= 0; one value, name ->
+                value, or [J].
+            damping: Likewise [N m s/rad or N s/m].
+            friction: Friction coefficient of the links' surfaces [-], >= 0; one, or link -> number.
+            thickness: Their full thickness [m], >= 0; one, or link -> number.
+            edge_length: Longest edge of the surfaces of boxes, cylinders and spheres [m], > 0; None
+                makes 12 triangles of a box, 1280 of a sphere and some 400 of a cylinder.
+            ignore_contact: Pairs of names of links that do not collide with each other. Links that
+                are rigidly joined, or by a single moving joint, never do.
+            name: Name in the scene.
+
+        Raises:
+            InvalidInput: If the file or an argument is not accepted; see docs/robots.md.
+            TypeError: If something has a wrong type.
+            OSError: If the file cannot be read.
+
+        Warns:
+            IgnoredLimitsWarning: If the file limits efforts or velocities or has dry joint
+                friction: none of them is applied.
+        """
+        file = Path(path)
+        check_choice("Robot.load: `base`", base, BASES)
+        if edge_length is not None:
+            edge_length = check_number(
+                "Robot.load: `edge_length`", edge_length, POSITIVE, instead="pass a plain number"
+            )
+        description = read_urdf(file)
+        moving = [joint for joint in description.joints if joint.moves]
+        modes = _modes(actuation, [joint.name for joint in moving])
+        mechanism = make_mechanism(file, description, base, modes)
+        root = file.parent if mesh_root is None else Path(mesh_root)
+        surfaces = [link_surface(link, file, root, edge_length) for link in description.links]
+        if description.unapplied:
+            warnings.warn(
+                f"{file}: {' and '.join(description.unapplied)} are read but not applied",
+                IgnoredLimitsWarning,
+                stacklevel=2,
+            )
+        return cls(
+            mechanism,
+            surfaces,
+            np.array([joint.viscosity for joint in moving]),
+            pose=pose,
+            joint_positions=joint_positions,
+            stiffness=stiffness,
+            damping=damping,
+            friction=friction,
+            thickness=thickness,
+            ignore_contact=ignore_contact,
+            name=name,
+        )
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        surfaces: Sequence[Surface | None],
+        viscosity: FloatArray,
+        *,
+        pose: object = None,
+        joint_positions: object = None,
+        stiffness: object = None,
+        damping: object = None,
+        friction: object = 0.4,
+        thickness: object = 0.0,
+        ignore_contact: Iterable[Sequence[str]] = (),
+        name: str | None = None,
+    ) -> None:
+        self.mechanism = mechanism
+        self.surfaces = tuple(surfaces)
+        self.viscosity = frozen(viscosity)
+        self.pose = frozen(pose_array("Robot: `pose`", pose, instead=_POSE))
+        joints, links = self.joint_names, self.link_names
+        self.joint_positions = _named("joint_positions", joint_positions, joints, 0.0)
+        _check_limits(mechanism, self.joint_positions)
+        driven = np.array([mode == "pd" for mode in mechanism.actuation], dtype=bool)
+        self.stiffness = frozen(driven * _named("stiffness", stiffness, joints, 0.0, NON_NEGATIVE))
+        self.damping = frozen(driven * _named("damping", damping, joints, 0.0, NON_NEGATIVE))
+        self.friction = _named("friction", friction, links, 0.4, NON_NEGATIVE)
+        self.thickness = _named("thickness", thickness, links, 0.0, NON_NEGATIVE)
+        self.ignore_contact = check_pairs("Robot: `ignore_contact`", ignore_contact, links)
+        self.name = check_name("Robot: `name`", name)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the J joints that move and do not mimic, in the order of the file."""
+        return self.mechanism.joint_names
+
+    @property
+    def link_names(self) -> tuple[str, ...]:
+        """Names of the L links, in the order of the file."""
+        return self.mechanism.link_names
+
+    def forward_kinematics(
+        self, joint_positions: Tensor, base_pose: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Frames of all links; differentiable any number of times, limits are not looked at.
+
+        Args:
+            joint_positions: [rad or m], shape [.., J].
+            base_pose: Pose of the root link, shape [.., 7]; `pose` by default. The leading axes of
+                both are broadcast.
+
+        Returns:
+            Name of a link -> its frame in the world, shape [.., 4, 4].
+        """
+        q = float_tensor("forward_kinematics: `joint_positions`", joint_positions)
+        joints = len(self.joint_names)
+        if q.shape[-1:] != (joints,):
+            raise InvalidInput(
+                f"forward_kinematics: `joint_positions` must have shape [.., {joints}], "
+                f"got {list(q.shape)}"
+            )
+        given = self.pose if base_pose is None else base_pose
+        pose = float_tensor("forward_kinematics: `base_pose`", given)
+        if pose.shape[-1:] != (7,):
+            raise InvalidInput(
+                f"forward_kinematics: `base_pose` must have shape [.., 7], got {list(pose.shape)}"
+            )
+        check_quaternions("forward_kinematics: `base_pose`", pose.detach().numpy())
+        try:
+            np.broadcast_shapes(q.shape[:-1], pose.shape[:-1])
+        except ValueError as error:
+            raise InvalidInput(
+                "forward_kinematics: `joint_positions` and `base_pose` must have leading axes that "
+                f"broadcast, got {list(q.shape)} and {list(pose.shape)}"
+            ) from error
+        frames = link_frames(self.mechanism, pose_frame(pose), q)
+        return dict(zip(self.link_names, frames.unbind(-3), strict=True))
+
+    def __repr__(self) -> str:
+        return (
+            f"Robot({self.name!r}, {self.mechanism.base}, {len(self.joint_names)} joints, "
+            f"{len(self.link_names)} links)"
+        )
+
+
+def _named(
+    field: str, given: object, names: Sequence[str], default: float, accepted: Range = ANY_NUMBER
+) -> FloatArray:
+    """One value for each name, from one for all, from name -> value, or from an array of them."""
+    label = f"Robot: `{field}`"
+    instead = f"differentiate with respect to {_DIFFERENTIABLE[field]}"
+    if isinstance(given, Mapping):
+        values = np.full(len(names), default)
+        for key, value in given.items():
+            if key not in names:
+                raise InvalidInput(f"{label} has the names {texts(names)}; got {key!r}")
+            number = float_array(f"{label}[{key!r}]", value, instead=instead)
+            check_shape(f"{label}[{key!r}]", number.shape, [()])
+            values[names.index(key)] = number
+    else:
+        values = float_array(label, default if given is None else given, instead=instead)
+        check_shape(label, values.shape, [(), (len(names),)])
+        values = np.array(np.broadcast_to(values, len(names)))
+    check_range(label, values, accepted)
+    return frozen(values)
+
+
+def _modes(given: object, names: Sequence[str]) -> list[str]:
+    """Actuation of each joint, from one for all, from name -> mode, or from a list of them."""
+    label = "Robot.load: `actuation`"
+    if isinstance(given, str):
+        modes: list[object] = [given] * len(names)
+    elif isinstance(given, Mapping):
+        unknown = [key for key in given if key not in names]
+        if unknown:
+            raise InvalidInput(f"{label} has the names {texts(names)}; got {unknown[0]!r}")
+        modes = [given.get(name, "pd") for name in names]
+    elif isinstance(given, Sequence):
+        check_shape(label, [len(given)], [(len(names),)])
+        modes = list(given)
+    else:
+        raise TypeError(
+            f"{label} must be a word, a dict or a list of words, got {type(given).__name__}"
+        )
+    return [
+        check_choice(f"{label} of {name!r}", mode, ACTUATIONS)
+        for name, mode in zip(names, modes, strict=True)
+    ]
+
+
+def _check_limits(mechanism: Mechanism, positions: FloatArray) -> None:
+    outside = (positions < mechanism.lower) | (positions > mechanism.upper)
+    if outside.any():
+        j = int(np.flatnonzero(outside)[0])
+        raise InvalidInput(
+            f"Robot: `joint_positions` of {mechanism.joint_names[j]!r} must be between its limits "
+            f"{mechanism.lower[j]:g} and {mechanism.upper[j]:g}, got {positions[j]:g} at [{j}]"
+        )

@@ -1,0 +1,163 @@
+"""From what a file says of a robot to its mechanism, checked for the motion that it shall have."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from diffcloth_torch.checks import FloatArray, IndexArray, frozen
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry.mass_properties import check_inertia
+from diffcloth_torch.model.mechanism import Mechanism
+from diffcloth_torch.model.urdf import Joint, RobotDescription
+
+__all__ = ["make_mechanism"]
+
+
+def make_mechanism(
+    file: Path, description: RobotDescription, base: str, actuation: Sequence[str]
+) -> Mechanism:
+    """Make the mechanism of a robot.
+
+    Args:
+        file: That it stands in; opens messages.
+        description: What the file says.
+        base: "fixed", "kinematic" or "floating".
+        actuation: Of the joints that move and do not mimic, in their order.
+
+    Raises:
+        InvalidInput: If limits leave a joint nothing, or what moves by forces has no mass or an
+            inertia that no body has.
+    """
+    links, joints = description.links, description.joints
+    carrier = {joint.child: joint for joint in joints}
+    index = {link.name: i for i, link in enumerate(links)}
+    leaders = [joint for joint in joints if joint.moves]
+    dof = {joint.name: j for j, joint in enumerate(leaders)}
+    by_name = {joint.name: joint for joint in joints}
+    above = [carrier.get(link.name) for link in links]  # None for the root
+    parent, followed = [], []
+    for joint in above:
+        parent.append(-1 if joint is None else index[joint.parent])
+        moves = joint is not None and joint.type != "fixed"
+        followed.append(_follow(joint, by_name, dof) if joint and moves else (-1, 1.0, 0.0))
+    lower, upper = _limits(file, joints, by_name, dof, actuation)
+    mechanism = Mechanism(
+        name=description.name,
+        base=base,
+        link_names=tuple(link.name for link in links),
+        parent=_indices(parent),
+        kind=tuple("fixed" if joint is None else _KINDS[joint.type] for joint in above),
+        offset=_stack([np.eye(4) if joint is None else joint.frame for joint in above]),
+        axis=_stack([np.zeros(3) if joint is None else joint.axis for joint in above]),
+        dof=_indices([j for j, _, _ in followed]),
+        multiplier=_stack([m for _, m, _ in followed]),
+        constant=_stack([c for _, _, c in followed]),
+        joint_names=tuple(joint.name for joint in leaders),
+        lower=lower,
+        upper=upper,
+        actuation=tuple(actuation),
+        mass=_stack([link.mass for link in links]),
+        center=_stack([link.center for link in links]),
+        inertia=_stack([(link.inertia + link.inertia.T) / 2 for link in links]),
+    )
+    _check_masses(file, mechanism)
+    return mechanism
+
+
+_KINDS = {
+    "fixed": "fixed",
+    "revolute": "revolute",
+    "continuous": "revolute",
+    "prismatic": "prismatic",
+}
+
+
+def _stack(values: Sequence[object]) -> FloatArray:
+    return frozen(np.array(values, dtype=np.float64))
+
+
+def _indices(values: Sequence[int]) -> IndexArray:
+    return frozen(np.array(values, dtype=np.int32))
+
+
+def _follow(
+    joint: Joint, by_name: Mapping[str, Joint], dof: Mapping[str, int]
+) -> tuple[int, float, float]:
+    """The joint j that a joint follows at last, and m, c such that its value is m q_j + c."""
+    multiplier, constant = 1.0, 0.0
+    while joint.mimic is not None:
+        name, factor, shift = joint.mimic
+        constant += multiplier * shift
+        multiplier *= factor
+        joint = by_name[name]
+    return dof[joint.name], multiplier, constant
+
+
+def _limits(
+    file: Path,
+    joints: Sequence[Joint],
+    by_name: Mapping[str, Joint],
+    dof: Mapping[str, int],
+    actuation: Sequence[str],
+) -> tuple[FloatArray, FloatArray]:
+    """Limits of the joints, narrowed by those of the joints that mimic them."""
+    lower, upper = np.full(len(dof), -np.inf), np.full(len(dof), np.inf)
+    for joint in joints:
+        if joint.type == "fixed":
+            continue
+        j, multiplier, constant = _follow(joint, by_name, dof)
+        limits = np.array([joint.lower, joint.upper])
+        if multiplier == 0.0:
+            if not limits[0] <= constant <= limits[1]:
+                raise InvalidInput(
+                    f"{file}: <joint name={joint.name!r}> <mimic>: `offset` must be between its "
+                    f"limits {limits[0]:g} and {limits[1]:g}, got {constant:g}"
+                )
+            continue
+        ends = np.sort((limits - constant) / multiplier)
+        lower[j], upper[j] = max(lower[j], ends[0]), min(upper[j], ends[1])
+    for name, j in dof.items():
+        where = f"{file}: <joint name={name!r}>"
+        if lower[j] > upper[j]:
+            raise InvalidInput(
+                f"{where}: its limits and those of the joints that mimic it must leave it a "
+                f"position, got none from {lower[j]:g} to {upper[j]:g}"
+            )
+        if lower[j] == upper[j] and actuation[j] in ("torque", "pd"):
+            raise InvalidInput(
+                f"{where}: limits of a joint under {actuation[j]!r} must leave it a range, got "
+                f"{lower[j]:g} for both; make its type 'fixed', or prescribe its position"
+            )
+    return frozen(lower), frozen(upper)
+
+
+def _check_masses(file: Path, mechanism: Mechanism) -> None:
+    """Require a mass and an inertia of all that forces move.
+
+    Links that fixed joints join are one body, so that one of them may be without a mass.
+    """
+    group = mechanism.rigid_group
+    for link in mechanism.order:
+        if not _moves_by_forces(mechanism, link):
+            continue
+        where = f"{file}: <link name={mechanism.link_names[link]!r}> <inertial>"
+        if mechanism.mass[group == group[link]].sum() == 0.0:
+            raise InvalidInput(
+                f"{where}: `mass` must be > 0 for a link that moves by forces, or for one that a "
+                "fixed joint joins to it, got 0"
+            )
+        if mechanism.mass[link] > 0.0:
+            check_inertia(f"{where}: `inertia`", mechanism.inertia[link])
+
+
+def _moves_by_forces(mechanism: Mechanism, link: int) -> bool:
+    """Whether a floating base, or a joint under torque or pd, is between the world and a link."""
+    while mechanism.parent[link] >= 0:
+        j = mechanism.dof[link]
+        if j >= 0 and mechanism.actuation[j] in ("torque", "pd"):
+            return True
+        link = int(mechanism.parent[link])
+    return mechanism.base == "floating"

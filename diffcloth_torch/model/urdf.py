@@ -1,0 +1,492 @@
+"""URDF files: read safely, checked entirely, and given to pytorch-kinematics only then.
+
+pytorch-kinematics answers bad files with NaN poses, endless recursion or nothing at all, and drops
+inertias and mimicking joints on the way to its chains. So a file is first reduced to the elements
+and attributes below, all checked; its parser reads what is left; and what a tree of links must
+satisfy is checked on what it returns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree.ElementTree import Element, ParseError, tostring
+
+import defusedxml.ElementTree
+import numpy as np
+
+from diffcloth_torch.checks import ANY_NUMBER, LARGEST, NON_NEGATIVE, FloatArray, Range, texts
+from diffcloth_torch.errors import InvalidInput
+
+__all__ = ["JOINT_TYPES", "SHAPES", "Joint", "Link", "RobotDescription", "Shape", "read_urdf"]
+
+JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic")
+SHAPES = ("box", "cylinder", "sphere", "mesh")
+
+# Robots with a thousand links have files of a few MB.
+_LARGEST_FILE = 16 * 2**20  # bytes
+_LONGEST_WORD = 1000
+
+# An axis shorter than this is taken for zero.
+_SHORTEST_AXIS = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A collision shape of a link.
+
+    Attributes:
+        kind: "box", "cylinder", "sphere" or "mesh".
+        frame: In the link's frame, shape [4, 4].
+        size: Lengths of a box; radius and length of a cylinder; radius of a sphere [m]; scale of a
+            mesh along its axes.
+        filename: Of a mesh, as written in the file; empty for others.
+    """
+
+    kind: str
+    frame: FloatArray
+    size: tuple[float, ...]
+    filename: str
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A link.
+
+    Attributes:
+        name: Its name.
+        mass: [kg].
+        center: Center of mass in the link's frame [m], shape [3].
+        inertia: About the center, in the link's axes [kg m^2], shape [3, 3].
+        shapes: Its collision shapes.
+    """
+
+    name: str
+    mass: float
+    center: FloatArray
+    inertia: FloatArray
+    shapes: tuple[Shape, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint between two links.
+
+    Attributes:
+        name: Its name.
+        type: "fixed", "revolute", "continuous" or "prismatic".
+        parent: Name of the link that it hangs on.
+        child: Name of the link that it carries.
+        frame: In the parent's frame, shape [4, 4].
+        axis: Of unit length in the joint's frame, shape [3].
+        lower: Lower limit [rad or m], -infinity without one.
+        upper: Upper limit [rad or m], infinity without one.
+        viscosity: Its damping [N m s/rad or N s/m].
+        mimic: Name of the joint whose value it follows, a multiplier and an offset; or None.
+    """
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    frame: FloatArray
+    axis: FloatArray
+    lower: float
+    upper: float
+    viscosity: float
+    mimic: tuple[str, float, float] | None
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves and does not mimic another joint."""
+        return self.type != "fixed" and self.mimic is None
+
+
+@dataclass(frozen=True, eq=False)
+class RobotDescription:
+    """What a file says of a robot: a tree of links.
+
+    Attributes:
+        name: Of the robot.
+        links: In the order of the file.
+        joints: In the order of the file.
+        unapplied: What the file has beyond that and no simulation of ours applies, such as effort
+            limits; in words.
+    """
+
+    name: str
+    links: tuple[Link, ...]
+    joints: tuple[Joint, ...]
+    unapplied: tuple[str, ...]
+
+
+def read_urdf(path: Path) -> RobotDescription:
+    """Read a URDF file.
+
+    Raises:
+        InvalidInput: If the file is not safe or well-formed XML, an element or value is not
+            accepted, or its links are no tree. The message names the file and the element.
+        OSError: If the file cannot be read.
+    """
+    with path.open("rb") as file:
+        data = file.read(_LARGEST_FILE + 1)
+    if len(data) > _LARGEST_FILE:
+        raise InvalidInput(f"{path}: a URDF file must be at most {_LARGEST_FILE >> 20} MiB")
+    try:
+        document = defusedxml.ElementTree.fromstring(data, forbid_dtd=True)
+    except defusedxml.DefusedXmlException as error:
+        raise InvalidInput(
+            f"{path}: a URDF file must have no DOCTYPE and no entities of its own: {error}"
+        ) from error
+    except (ParseError, ValueError, LookupError) as error:  # the latter: encodings
+        raise InvalidInput(f"{path}: not well-formed XML: {error}") from error
+    if document.tag != "robot":
+        raise InvalidInput(f"{path}: the root element must be <robot>, got <{document.tag}>")
+    reduced = _reduced(f"{path}: ", document, _ROBOT, ())
+    # Imported here: it imports matplotlib.
+    from pytorch_kinematics.urdf_parser_py.urdf import URDF
+
+    # Bytes, as its parser refuses text with an XML declaration. Written anew, so that both parsers
+    # see one document whatever the encoding of the file.
+    parse: Callable[[bytes], Any] = URDF.from_xml_string
+    return _description(str(path), parse(tostring(reduced)))
+
+
+# --- The document ---------------------------------------------------------------------------------
+
+
+class _Attribute(NamedTuple):
+    """Accepted text of an attribute; without a default it is required."""
+
+    numbers: int = 0  # how many; 0: a word
+    default: str | None = None
+    accepted: Range = ANY_NUMBER
+
+
+class _Child(NamedTuple):
+    element: _Element
+    required: bool = False
+    many: bool = False
+
+
+class _Element(NamedTuple):
+    attributes: dict[str, _Attribute]
+    children: dict[str, _Child]
+
+
+_NAME = _Attribute()
+_NUMBER = _Attribute(1)
+_SIZE = _Attribute(1, accepted=Range(0.0))
+_ORIGIN = _Child(
+    _Element({"xyz": _Attribute(3, "0 0 0"), "rpy": _Attribute(3, "0 0 0")}, {}),
+)
+_GEOMETRY = _Element(
+    {},
+    {
+        "box": _Child(_Element({"size": _Attribute(3, accepted=Range(0.0))}, {})),
+        "cylinder": _Child(_Element({"radius": _SIZE, "length": _SIZE}, {})),
+        "sphere": _Child(_Element({"radius": _SIZE}, {})),
+        "mesh": _Child(_Element({"filename": _NAME, "scale": _Attribute(3, "1 1 1")}, {})),
+    },
+)
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+_LINK = _Element(
+    {"name": _NAME},
+    {
+        "inertial": _Child(
+            _Element(
+                {},
+                {
+                    "origin": _ORIGIN,
+                    "mass": _Child(
+                        _Element({"value": _Attribute(1, accepted=NON_NEGATIVE)}, {}), required=True
+                    ),
+                    "inertia": _Child(_Element(dict.fromkeys(_MOMENTS, _NUMBER), {})),
+                },
+            )
+        ),
+        "collision": _Child(
+            _Element({}, {"origin": _ORIGIN, "geometry": _Child(_GEOMETRY, required=True)}),
+            many=True,
+        ),
+    },
+)
+_JOINT = _Element(
+    {"name": _NAME, "type": _NAME},
+    {
+        "origin": _ORIGIN,
+        "parent": _Child(_Element({"link": _NAME}, {}), required=True),
+        "child": _Child(_Element({"link": _NAME}, {}), required=True),
+        "axis": _Child(_Element({"xyz": _Attribute(3, "1 0 0")}, {})),
+        "limit": _Child(
+            _Element(
+                dict.fromkeys(("lower", "upper", "effort", "velocity"), _Attribute(1, "0")), {}
+            )
+        ),
+        "dynamics": _Child(
+            _Element(
+                {
+                    "damping": _Attribute(1, "0", NON_NEGATIVE),
+                    "friction": _Attribute(1, "0", NON_NEGATIVE),
+                },
+                {},
+            )
+        ),
+        "mimic": _Child(
+            _Element(
+                {
+                    "joint": _NAME,
+                    "multiplier": _Attribute(1, "1"),
+                    "offset": _Attribute(1, "0"),
+                },
+                {},
+            )
+        ),
+    },
+)
+_ROBOT = _Element(
+    {"name": _Attribute(0, "robot")},
+    {"link": _Child(_LINK, many=True), "joint": _Child(_JOINT, many=True)},
+)
+
+
+def _reduced(file: str, node: Element, grammar: _Element, above: Sequence[str]) -> Element:
+    """Copy an element with what the grammar knows of it, checked; the rest is not ours to read."""
+    name = node.get("name")
+    here = (*above, f"<{node.tag}>" if name is None else f"<{node.tag} name={name!r}>")
+    where = file + " ".join(here[1:] or here)  # <robot> goes without saying
+    copy = Element(node.tag)
+    for key, attribute in grammar.attributes.items():
+        copy.set(key, _checked(f"{where}: `{key}`", node.get(key, attribute.default), attribute))
+    found = [child for child in node if child.tag in grammar.children]
+    for tag, child in grammar.children.items():
+        count = sum(node.tag == tag for node in found)
+        if (count == 0 and child.required) or (count > 1 and not child.many):
+            raise InvalidInput(f"{where} must have one <{tag}>, got {count}")
+    copy.extend(_reduced(file, child, grammar.children[child.tag].element, here) for child in found)
+    if grammar is _GEOMETRY and len(copy) != 1:
+        got = ", ".join(f"<{child.tag}>" for child in node) or "none"
+        accepted = ", ".join(f"<{kind}>" for kind in SHAPES)
+        raise InvalidInput(f"{where} must hold one of {accepted}, got {got}")
+    return copy
+
+
+def _checked(label: str, text: str | None, attribute: _Attribute) -> str:
+    if text is None:
+        raise InvalidInput(f"{label} must be given")
+    if attribute.numbers == 0:
+        return _checked_word(label, text)
+    what = "a number" if attribute.numbers == 1 else f"{attribute.numbers} numbers"
+    accepted = f"{what} {attribute.accepted}" if attribute.accepted != ANY_NUMBER else what
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != attribute.numbers:
+        raise InvalidInput(f"{label} must be {accepted}, got {text!r}")
+    values = np.array(numbers)
+    outside = attribute.accepted.outside(values) | ~(np.abs(values) <= LARGEST)
+    if outside.any():
+        raise InvalidInput(f"{label} must be {accepted}, at most {LARGEST:g} in size, got {text!r}")
+    return " ".join(repr(number) for number in numbers)
+
+
+def _checked_word(label: str, text: str) -> str:
+    if not 0 < len(text) <= _LONGEST_WORD or not text.isprintable():
+        raise InvalidInput(
+            f"{label} must be printable and have 1 to {_LONGEST_WORD} characters, "
+            f"got {text[:_LONGEST_WORD]!r}"
+        )
+    return text
+
+
+# --- The robot ------------------------------------------------------------------------------------
+
+
+def _description(file: str, robot: Any) -> RobotDescription:
+    """Take a robot from the parser of pytorch-kinematics."""
+    if not robot.links:
+        raise InvalidInput(f"{file}: a robot must have a <link>, got none")
+    _check_names(file, "link", [link.name for link in robot.links])
+    _check_names(file, "joint", [joint.name for joint in robot.joints])
+    links = tuple(_link(link) for link in robot.links)
+    joints = tuple(_joint(file, joint) for joint in robot.joints)
+    _check_tree(file, [link.name for link in links], joints)
+    _check_mimics(file, joints)
+    return RobotDescription(robot.name, links, joints, tuple(_unapplied(robot)))
+
+
+def _check_names(file: str, kind: str, names: Sequence[str]) -> None:
+    seen = set()
+    for name in names:
+        if "/" in name:
+            raise InvalidInput(
+                f"{file}: a <{kind}> must have a name without '/', which stands between a robot "
+                f"and its {kind}s, got {name!r}"
+            )
+        if name in seen:
+            raise InvalidInput(f"{file}: two <{kind}> have the name {name!r}; it must be one")
+        seen.add(name)
+
+
+def _frame(origin: Any) -> FloatArray:
+    """Frame [4, 4] of an <origin>: turned about the fixed axes x, then y, then z."""
+    frame = np.eye(4)
+    if origin is None:
+        return frame
+    roll, pitch, yaw = origin.rpy
+    turn = np.eye(3)
+    for (i, j), angle in (((1, 2), roll), ((2, 0), pitch), ((0, 1), yaw)):
+        about = np.eye(3)
+        about[i, i] = about[j, j] = math.cos(angle)
+        about[j, i] = math.sin(angle)
+        about[i, j] = -about[j, i]
+        turn = about @ turn
+    frame[:3, :3], frame[:3, 3] = turn, origin.xyz
+    return frame
+
+
+def _link(link: Any) -> Link:
+    inertial = link.inertial
+    frame = _frame(inertial and inertial.origin)
+    inertia = np.zeros((3, 3))
+    if inertial and inertial.inertia:
+        inertia = np.array(inertial.inertia.to_matrix())
+    rotation = frame[:3, :3]
+    return Link(
+        name=link.name,
+        mass=inertial.mass if inertial else 0.0,
+        center=frame[:3, 3],
+        inertia=rotation @ inertia @ rotation.T,
+        shapes=tuple(_shape(collision) for collision in link.collisions),
+    )
+
+
+_SIZES = {
+    "box": ("size",),
+    "cylinder": ("radius", "length"),
+    "sphere": ("radius",),
+    "mesh": ("scale",),
+}
+
+
+def _shape(collision: Any) -> Shape:
+    geometry = collision.geometry
+    kind = type(geometry).__name__.lower()
+    size = np.hstack([getattr(geometry, field) for field in _SIZES[kind]])
+    return Shape(
+        kind=kind,
+        frame=_frame(collision.origin),
+        size=tuple(size.tolist()),
+        filename=geometry.filename if kind == "mesh" else "",
+    )
+
+
+def _joint(file: str, joint: Any) -> Joint:
+    where = f"{file}: <joint name={joint.name!r}>"
+    if joint.type not in JOINT_TYPES:
+        raise InvalidInput(
+            f"{where}: `type` must be one of {texts(JOINT_TYPES)}, got {joint.type!r}"
+        )
+    axis = np.array([1.0, 0.0, 0.0] if joint.axis is None else joint.axis)
+    length = float(np.linalg.norm(axis))
+    if joint.type != "fixed" and length < _SHORTEST_AXIS:
+        raise InvalidInput(
+            f"{where} <axis>: `xyz` must have a length of at least {_SHORTEST_AXIS:g}, "
+            f"got {length:g}"
+        )
+    lower, upper = -math.inf, math.inf
+    if joint.type in ("revolute", "prismatic"):
+        if joint.limit is None:
+            raise InvalidInput(
+                f"{where} of type {joint.type!r} must have a <limit>; a joint that turns without "
+                "limits has type 'continuous'"
+            )
+        lower, upper = joint.limit.lower, joint.limit.upper
+        if lower > upper:
+            raise InvalidInput(
+                f"{where} <limit>: `lower` must not be above `upper`, got {lower:g} and {upper:g}"
+            )
+    mimic = joint.mimic
+    if mimic is not None and joint.type == "fixed":
+        raise InvalidInput(f"{where} of type 'fixed' must have no <mimic>: it does not move")
+    return Joint(
+        name=joint.name,
+        type=joint.type,
+        parent=joint.parent,
+        child=joint.child,
+        frame=_frame(joint.origin),
+        axis=np.zeros(3) if joint.type == "fixed" else axis / length,
+        lower=lower,
+        upper=upper,
+        viscosity=joint.dynamics.damping if joint.dynamics else 0.0,
+        mimic=mimic and (mimic.joint, mimic.multiplier, mimic.offset),
+    )
+
+
+def _check_tree(file: str, links: Sequence[str], joints: Sequence[Joint]) -> None:
+    """Require that the joints make one tree of all links."""
+    holder: dict[str, str] = {}  # link -> the joint that carries it
+    children: dict[str, list[str]] = {link: [] for link in links}
+    for joint in joints:
+        for end, link in (("parent", joint.parent), ("child", joint.child)):
+            if link not in children:
+                raise InvalidInput(
+                    f"{file}: <joint name={joint.name!r}>: its {end} must be a <link> of the file, "
+                    f"got {link!r}"
+                )
+        if joint.child in holder:
+            raise InvalidInput(
+                f"{file}: <link name={joint.child!r}> must be the child of one joint, "
+                f"got {holder[joint.child]!r} and {joint.name!r}"
+            )
+        holder[joint.child] = joint.name
+        children[joint.parent].append(joint.child)
+    reached = [link for link in links if link not in holder]
+    if len(reached) > 1:
+        raise InvalidInput(
+            f"{file}: one <link> must be no child of a joint, the root; got {texts(reached)}"
+        )
+    for link in reached:
+        reached += children[link]
+    if len(reached) < len(links):
+        link = min(set(links) - set(reached))
+        raise InvalidInput(
+            f"{file}: the joints must make a tree, got a cycle that <link name={link!r}> is in or "
+            "hangs on"
+        )
+
+
+def _check_mimics(file: str, joints: Sequence[Joint]) -> None:
+    """Require that mimicking joints follow, at last, one that moves on its own."""
+    by_name = {joint.name: joint for joint in joints}
+    for joint in joints:
+        where = f"{file}: <joint name={joint.name!r}> <mimic>"
+        leader, followed = joint, {joint.name}
+        while leader.mimic is not None:
+            name = leader.mimic[0]
+            if name not in by_name or by_name[name].type == "fixed":
+                raise InvalidInput(
+                    f"{where}: `joint` must lead to a joint of the file that moves, got {name!r}"
+                )
+            if name in followed:
+                raise InvalidInput(
+                    f"{where}: `joint` must lead to a joint that does not mimic, got a cycle "
+                    f"through {name!r}"
+                )
+            followed.add(name)
+            leader = by_name[name]
+
+
+def _unapplied(robot: Any) -> Iterator[str]:
+    moving = [joint for joint in robot.joints if joint.type != "fixed"]
+    limits = [joint.limit for joint in moving if joint.limit]
+    if any(limit.effort for limit in limits):
+        yield "effort limits"
+    if any(limit.velocity for limit in limits):
+        yield "velocity limits"
+    if any(joint.dynamics and joint.dynamics.friction for joint in moving):
+        yield "Coulomb friction of joints"

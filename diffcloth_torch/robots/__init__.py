@@ -1,0 +1,39 @@
+"""Robots that come with the package, or with a package of its own: paths for `Robot.load`.
+
+`GRIPPER` is a palm with two fingers that slide towards each other; on a floating or kinematic base
+it has eight degrees of freedom. `panda()` finds the Franka Emika Panda in the extra `robots`.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, files
+from pathlib import Path
+
+__all__ = ["GRIPPER", "panda"]
+
+GRIPPER = Path(__file__).with_name("gripper.urdf")
+"""Made by scripts/make_gripper.py, which says its sizes."""
+
+_PANDA = "robots/panda_description/urdf/panda.urdf"
+
+
+def panda() -> tuple[Path, Path]:
+    """Find the Panda: its URDF file, and the `mesh_root` to load it with.
+
+    Its fourth joint must start below zero:
+
+        path, root = dc.robots.panda()
+        robot = dc.Robot.load(path, mesh_root=root, joint_positions={"panda_joint4": -1.5})
+
+    Raises:
+        ImportError: If the extra `robots` is not installed.
+    """
+    try:
+        found = files("example-robot-data") or []
+    except PackageNotFoundError:
+        found = []
+    for file in found:
+        if file.as_posix().endswith(f"/{_PANDA}"):
+            path = Path(str(file.locate())).resolve()
+            return path, path.parents[len(Path(_PANDA).parts) - 1]
+    raise ImportError("the Panda needs the extra `robots`: pip install 'diffcloth-torch[robots]'")

@@ -1,0 +1,29 @@
+"""What becomes of bodies and robots in a step: the fields of the state behind it."""
+
+from __future__ import annotations
+
+import torch
+
+from diffcloth_torch.geometry.rotation import pose_velocities
+from diffcloth_torch.sim.inputs import Fields
+from diffcloth_torch.sim.layout import Layout
+
+__all__ = ["prescribed_motion"]
+
+
+def prescribed_motion(layout: Layout, state: Fields, control: Fields, dt: float) -> Fields:
+    """Fields of the next state where bodies only move on prescribed poses.
+
+    Args:
+        layout: What the rows stand for.
+        state: Fields of the state before the step.
+        control: Completed fields of the control.
+        dt: Time step [s].
+    """
+    start, end = state["body_poses"], control["body_poses"]
+    velocities = torch.zeros(max(len(start), len(end)), start.shape[1], 6, dtype=torch.float64)
+    if end is not start:
+        moving = layout.kinematic_bodies
+        quotients = pose_velocities(start[:, moving], end[:, moving], dt)
+        velocities = velocities.index_copy(1, moving, quotients)
+    return {"body_poses": end, "body_velocities": velocities}

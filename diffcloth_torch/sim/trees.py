@@ -1,0 +1,82 @@
+"""The mechanisms of a scene as the core takes them: links one after the other, parents first."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.model.scene import Assembly
+
+__all__ = ["tree_arguments"]
+
+_KINDS = {"fixed": 0, "revolute": 1, "prismatic": 2}
+_ROOT = 6  # coordinates of a floating root
+
+
+def tree_arguments(assembly: Assembly, limit_stiffness: FloatArray) -> dict[str, Any]:
+    """Arguments of the core that describe all trees, bodies first.
+
+    Args:
+        assembly: Arrays of the scene.
+        limit_stiffness: Of the barriers at the limits of the n coordinates, shape [n].
+    """
+    links: dict[str, list[Any]] = {
+        name: []
+        for name in (
+            "tree",
+            "parent",
+            "kind",
+            "offset",
+            "axis",
+            "coordinate",
+            "multiplier",
+            "constant",
+        )
+    }
+    prescribed: list[bool] = []
+    lower: list[float] = []
+    upper: list[float] = []
+    place: dict[tuple[int, int], int] = {}  # of a mechanism's link in the list of all
+    for t, mechanism in enumerate(assembly.mechanisms):
+        if mechanism.base == "floating":
+            prescribed += [False] * _ROOT
+            lower += [-np.inf] * _ROOT
+            upper += [np.inf] * _ROOT
+        first_joint = len(prescribed)
+        for link in mechanism.order:
+            place[t, link] = len(place)
+            dof = int(mechanism.dof[link])
+            links["tree"].append(t)
+            links["parent"].append(place.get((t, int(mechanism.parent[link])), -1))
+            links["kind"].append(_KINDS[mechanism.kind[link]])
+            links["offset"].append(mechanism.offset[link])
+            links["axis"].append(mechanism.axis[link])
+            links["coordinate"].append(-1 if dof < 0 else first_joint + dof)
+            links["multiplier"].append(mechanism.multiplier[link])
+            links["constant"].append(mechanism.constant[link])
+        prescribed += [mode in ("position", "velocity") for mode in mechanism.actuation]
+        lower += mechanism.lower.tolist()
+        upper += mechanism.upper.tolist()
+    owners = zip(assembly.surface_mechanism.tolist(), assembly.surface_link.tolist(), strict=True)
+    return {
+        "tree_free": _indices([m.base == "floating" for m in assembly.mechanisms]),
+        "link_tree": _indices(links["tree"]),
+        "link_parent": _indices(links["parent"]),
+        "link_kind": _indices(links["kind"]),
+        "link_offset": np.array(links["offset"], dtype=np.float64).reshape(-1, 4, 4),
+        "link_axis": np.array(links["axis"], dtype=np.float64).reshape(-1, 3),
+        "link_coordinate": _indices(links["coordinate"]),
+        "link_multiplier": np.array(links["multiplier"], dtype=np.float64),
+        "link_constant": np.array(links["constant"], dtype=np.float64),
+        "surface_link": _indices([place[owner] for owner in owners]),
+        "coordinate_prescribed": _indices(prescribed),
+        "coordinate_lower": np.array(lower, dtype=np.float64),
+        "coordinate_upper": np.array(upper, dtype=np.float64),
+        "limit_stiffness": limit_stiffness,
+    }
+
+
+def _indices(values: list[Any]) -> np.ndarray[Any, np.dtype[np.int32]]:
+    return np.array(values, dtype=np.int32)

@@ -1,0 +1,172 @@
+"""Coordinates as unknowns: gradients of a step of the core by every input, against differences."""
+
+import numpy as np
+import pytest
+from bodies.core_mechanisms import DT, CoreScene, chain, one_body
+
+OUTPUTS = ("positions", "velocities", "body_forces", "coordinates")
+TURNED = [0.9887, 0.0897, 0.1195, 0.0]  # a quaternion, not quite of unit length
+BOXES = ([0.08, 0.08, 0.05], [0.05, 0.04, 0.12], [0.04, 0.04, 0.1], [0.03, 0.05, 0.06])
+
+
+def body_in_contact():
+    """A free box that has fallen onto the cloth: the inputs of its third step in contact."""
+    scene = CoreScene(one_body(), [[0.1, 0.12, 0.08]])
+    mass, inertia = 0.2, np.diag([3.5e-4, 2.7e-4, 4.1e-4])
+    metric = np.zeros((6, 6))
+    metric[:3, :3], metric[3:, 3:] = mass * np.eye(3), inertia
+    metric /= DT**2
+    q = np.array([0.02, 0.01, 0.07, 0.01, -0.02, 0.03])
+    speed = np.array([0.3, 0.1, -1.5, 1.0, 2.0, -1.0])
+    frame = [0.001, 0.002, -0.001, *TURNED]
+    touching, result = 0, None
+    while True:
+        target = q + DT * speed + DT**2 * np.array([0, 0, -9.81, 0, 0, 0])
+        arrays = scene.inputs(
+            result,
+            body_poses=[frame],
+            body_targets=[frame],
+            coordinates=q,
+            coordinate_ends=q,
+            coordinate_targets=target,
+            coordinate_metric=metric.ravel(),
+        )
+        result = scene.forward(arrays)
+        touching += int(result["contact_count"][0] > 0)
+        if touching == 3:
+            return scene, arrays
+        speed = (result["coordinates"][0] - q) / DT
+        q = result["coordinates"][0]
+
+
+def chain_in_contact(*, free):
+    """A chain that comes down on the cloth: its hinge beyond its limit, its slide on given values."""
+    rng = np.random.default_rng(1)
+    scene = CoreScene(chain(free=free), BOXES, cells=6)
+    n = 8 if free else 2
+    factor = rng.standard_normal((n, n))
+    metric = (0.01 * factor @ factor.T + 0.05 * np.eye(n)) / DT**2
+    q = np.array([0.198, 0.01])
+    frame = np.array([-0.05, 0, 0.27, *TURNED])
+    if free:
+        q = np.array([-0.05, 0, 0.27, 0.01, -0.02, 0.03, *q])
+        frame[:3] = 0.001, 0.002, 0.003
+    speed = np.zeros(n)
+    speed[-2] = 3.0
+    touching, result = 0, None
+    while True:
+        end = frame.copy()
+        target, ends = q + DT * speed, q.copy()
+        ends[-1] += 0.4 * DT
+        if free:
+            target[2] = q[2] - 1.5 * DT
+        else:
+            end[2] -= 1.5 * DT
+            end[3:] += 0.01 * rng.standard_normal(4)
+        arrays = scene.inputs(
+            result,
+            body_poses=[frame],
+            body_targets=[end],
+            coordinates=q,
+            coordinate_ends=ends,
+            coordinate_targets=target,
+            coordinate_metric=metric.ravel(),
+        )
+        result = scene.forward(arrays)
+        touching += int(result["contact_count"][0] > 0)
+        if touching == 3:
+            assert result["coordinates"][0][-2] > 0.2  # beyond the limit, within its zone
+            return scene, arrays
+        speed = 0.9 * (result["coordinates"][0] - q) / DT
+        speed[-2] += 0.5
+        q, frame = result["coordinates"][0], end
+
+
+CASES = {
+    "body": body_in_contact,
+    "chain": lambda: chain_in_contact(free=False),
+    "floating": lambda: chain_in_contact(free=True),
+}
+
+
+@pytest.fixture(scope="module", params=list(CASES))
+def case(request):
+    scene, arrays = CASES[request.param]()
+    rng = np.random.default_rng(2)
+    result = scene.forward(arrays)
+    cotangents = {name: rng.standard_normal(result[name].shape) for name in OUTPUTS}
+    return scene, arrays, cotangents, scene.gradients(arrays, cotangents)
+
+
+# Inputs, each with the step of its difference quotient.
+STEPS = {
+    "positions": 1e-7,
+    "velocities": 1e-5,
+    "body_poses": 1e-7,
+    "body_targets": 1e-7,
+    "pin_targets": 1e-7,
+    "forces": 1e-4,
+    "gravity": 1e-4,
+    "stretch": 1e-2,
+    "density": 1e-6,
+    "friction": 1e-5,
+    "thickness": 1e-8,
+    "barrier_distance": 1e-8,
+    "rest_positions": 1e-7,
+    "coordinates": 1e-7,
+    "coordinate_ends": 1e-7,
+    "coordinate_targets": 1e-7,
+    "coordinate_metric": 1e-3,
+}
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_gradients_agree_with_differences(case, name):
+    scene, arrays, cotangents, gradients = case
+    if name == "coordinate_ends" and not gradients[name].any():
+        pytest.skip("nothing is prescribed in this tree")
+    if name not in arrays:
+        arrays = {**arrays, name: scene.simulator.parameters().rest_positions.numpy()[None]}
+        gradients = scene.gradients(arrays, cotangents)
+    rng = np.random.default_rng(3)
+    direction = rng.standard_normal(arrays[name].shape)
+    if name in ("friction", "thickness"):
+        direction = abs(direction)
+    if name == "coordinate_metric":
+        n = int(direction.size**0.5)
+        direction = direction.reshape(n, n)
+        direction = (direction + direction.T).reshape(1, -1)
+
+    def loss(sign):
+        moved = {**arrays, name: arrays[name] + sign * STEPS[name] * direction}
+        result = scene.forward(moved)
+        return sum((result[key] * cotangents[key]).sum() for key in OUTPUTS)
+
+    quotient = (loss(1) - loss(-1)) / (2 * STEPS[name])
+    assert (gradients[name] * direction).sum() == pytest.approx(quotient, rel=1e-5, abs=1e-6)
+
+
+def test_a_body_prescribed_where_a_free_one_went_leaves_the_cloth_where_it_was():
+    # Without friction: its lag would be at where the body was in the iteration before.
+    scene, arrays = body_in_contact()
+    arrays["friction"] = 0 * arrays["friction"]
+    result = scene.forward(arrays)
+    prescribed = CoreScene(one_body(free=False), [[0.1, 0.12, 0.08]])
+    poses = []
+    for q in (arrays["coordinates"][0], result["coordinates"][0]):
+        poses.append(world_pose(arrays["body_poses"][0, 0], q))
+    same = {name: a for name, a in arrays.items() if not name.startswith("coordinate")}
+    same["body_poses"], same["body_targets"] = (np.array([[pose]]) for pose in poses)
+    again = prescribed.forward(same)
+    assert np.abs(again["positions"] - result["positions"]).max() < 1e-8
+    assert np.abs(again["body_forces"] - result["body_forces"]).max() < 1e-5
+
+
+def world_pose(frame, q):
+    """Pose of a free link: c + exp(w) (S v)."""
+    from scipy.spatial.transform import Rotation
+
+    w, x, y, z = frame[3:]
+    turn = Rotation.from_rotvec(q[3:])
+    x, y, z, w = (turn * Rotation.from_quat([x, y, z, w])).as_quat()
+    return [*(q[:3] + turn.apply(frame[:3])), w, x, y, z]
