@@ -16,7 +16,7 @@ from torch import Tensor
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.model.mechanism import Mechanism
 
-__all__ = ["ROOT", "Frames", "Tree", "root_frame"]
+__all__ = ["CROSS", "ROOT", "Frames", "Tree", "root_frame"]
 
 ROOT = 6  # velocities of the root, which come first
 
@@ -133,7 +133,7 @@ def root_frame(center: Tensor, rotation: Tensor, local_center: Tensor) -> Tensor
 
 def _rigid(arms: Tensor) -> Tensor:
     """Velocities of points at `arms` [B, L, 3] from a body's center, by its own; [B, L, 6, 6]."""
-    cross = (arms @ _CROSS).reshape(*arms.shape, 3)  # omega x arm = -arm x omega
+    cross = (arms @ CROSS).reshape(*arms.shape, 3)  # omega x arm = -arm x omega
     upper = torch.cat([_EYE.expand_as(cross), -cross], dim=-1)
     return torch.cat([upper, _LOWER.expand_as(upper)], dim=-2)
 
@@ -145,5 +145,5 @@ def _tensor(array: FloatArray) -> Tensor:
 _EYE = torch.eye(3, dtype=torch.float64)
 _LOWER = torch.eye(6, dtype=torch.float64)[3:]
 _LAST_ROW = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
-# arm @ _CROSS is the matrix of the cross product with arm, row after row.
-_CROSS = torch.linalg.cross(_EYE[:, None, :], _EYE[None, :, :]).transpose(1, 2).reshape(3, 9)
+# a @ CROSS is the matrix of the cross product a x, row after row.
+CROSS = torch.linalg.cross(_EYE[:, None, :], _EYE[None, :, :]).transpose(1, 2).reshape(3, 9)

@@ -30,6 +30,28 @@ _SERIES_ANGLE = 0.1
 _SMALLEST_SINE = 1e-9
 
 
+# The nine entries of a rotation matrix, row after row, from the sixteen products of a quaternion's
+# numbers, likewise: R = (w^2 - v . v) 1 + 2 v v^T + 2 w [v].
+_MATRIX_OF_PRODUCTS = (
+    torch.tensor(
+        [
+            [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, -1]],
+            [[0, 0, 0, -2], [0, 0, 2, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
+            [[0, 0, 2, 0], [0, 0, 0, 2], [0, 0, 0, 0], [0, 0, 0, 0]],
+            [[0, 0, 0, 2], [0, 0, 2, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
+            [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, 0, -1]],
+            [[0, -2, 0, 0], [0, 0, 0, 0], [0, 0, 0, 2], [0, 0, 0, 0]],
+            [[0, 0, -2, 0], [0, 0, 0, 2], [0, 0, 0, 0], [0, 0, 0, 0]],
+            [[0, 2, 0, 0], [0, 0, 0, 0], [0, 0, 0, 2], [0, 0, 0, 0]],
+            [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]],
+        ],
+        dtype=torch.float64,
+    )
+    .reshape(9, 16)
+    .T
+)
+
+
 def quaternion_exp(rotation_vector: Tensor) -> Tensor:
     """Unit quaternions of rotation vectors.
 
@@ -45,8 +67,8 @@ def quaternion_exp(rotation_vector: Tensor) -> Tensor:
     angle_sq = (rotation_vector * rotation_vector).sum(-1, keepdim=True)
     near_zero = angle_sq < _SERIES_ANGLE**2
     # Both branches are evaluated: each gets an argument at which it and its gradient are finite.
-    angle = torch.where(near_zero, torch.ones_like(angle_sq), angle_sq).sqrt()
-    s = torch.where(near_zero, angle_sq, torch.zeros_like(angle_sq)) / 4  # (a/2)^2
+    angle = torch.where(near_zero, 1.0, angle_sq).sqrt()
+    s = torch.where(near_zero, angle_sq, 0.0) / 4  # (a/2)^2
     cosine_series = 1 - s / 2 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56)))
     sine_series = (1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72)))) / 2
     cosine = torch.where(near_zero, cosine_series, torch.cos(angle / 2))
@@ -161,14 +183,9 @@ def interpolate_poses(times: Tensor, poses: Tensor, at: Tensor) -> Tensor:
 
 def quaternion_matrix(quaternion: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
-    q = quaternion
-    # Twice the products of all pairs, of which the matrix is made.
-    p = 2 * q.unsqueeze(-1) * q.unsqueeze(-2)
-    ww, xx, yy, zz = p.diagonal(dim1=-2, dim2=-1).unbind(-1)
-    wx, wy, wz = p[..., 0, 1], p[..., 0, 2], p[..., 0, 3]
-    xy, xz, yz = p[..., 1, 2], p[..., 1, 3], p[..., 2, 3]
-    rows = [ww + xx - 1, xy - wz, xz + wy, xy + wz, ww + yy - 1, yz - wx, xz - wy, yz + wx]
-    return torch.stack([*rows, ww + zz - 1], dim=-1).reshape(*q.shape[:-1], 3, 3)
+    products = quaternion.unsqueeze(-1) * quaternion.unsqueeze(-2)
+    entries = products.flatten(-2) @ _MATRIX_OF_PRODUCTS
+    return entries.reshape(*quaternion.shape[:-1], 3, 3)
 
 
 def rotation_exp(rotation_vector: Tensor) -> Tensor:
@@ -194,8 +211,8 @@ def torque_from_moment(rotation_vector: Tensor, moment: Tensor) -> Tensor:
     w = rotation_vector
     angle_sq = (w * w).sum(-1, keepdim=True)
     near_zero = angle_sq < _SERIES_ANGLE**2
-    half = torch.where(near_zero, torch.ones_like(angle_sq), angle_sq / 4).sqrt()
-    s = torch.where(near_zero, angle_sq, torch.zeros_like(angle_sq))
+    half = torch.where(near_zero, 1.0, angle_sq / 4).sqrt()
+    s = torch.where(near_zero, angle_sq, 0.0)
     # The first neglected term is 3e-9 0.1^10.
     series = 1 / 12 + s * (1 / 720 + s * (1 / 30240 + s * (1 / 1209600 + s / 47900160)))
     b = torch.where(near_zero, series, (1 - half / torch.tan(half)) / (4 * half * half))

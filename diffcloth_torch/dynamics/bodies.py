@@ -1,0 +1,176 @@
+"""Free rigid bodies over one step, all of them at once.
+
+With the angular momentum L about the center, in world axes, and the inertia J in body axes, the
+orientation moves by the midpoint rule,
+
+    R_pred = exp(h omega) R_n,  R_mid = exp(h omega/2) R_n,
+    omega = R_mid J^-1 R_mid^T (L + h torque).
+
+A body by itself keeps L to rounding, and its energy up to oscillations. Its coordinates are the
+center c and the rotation vector w with R = exp(w) R_pred; the core adds the inertia
+1/(2h^2) (m |c - c^|^2 + w^T I w) about the prediction to what it minimizes. The gradient of that at
+the solution is the contact force, which gives the body its momentum after the step: what contact
+takes from others arrives here.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffcloth_torch.dynamics.implicit import attach_root
+from diffcloth_torch.dynamics.kinematics import CROSS
+from diffcloth_torch.geometry.rotation import (
+    nearer_quaternion,
+    quaternion_exp,
+    quaternion_matrix,
+    quaternion_multiply,
+    rotation_exp,
+    torque_from_moment,
+)
+
+__all__ = ["BodyInertia", "BodyPrediction", "advance_bodies", "predict_bodies"]
+
+# Each gains a factor of about (h |Omega|)^2 / 8: at 30 rad/s and 10 ms the last one changes 1e-7.
+_ITERATIONS = 4
+
+
+class BodyInertia(NamedTuple):
+    """Mass [B or 1, K] kg; center [.., K, 3] m and inertia [.., K, 3, 3] kg m^2 in body axes."""
+
+    mass: Tensor
+    center: Tensor
+    inertia: Tensor
+
+
+class BodyPrediction(NamedTuple):
+    """What the core needs, and what `advance_bodies` does.
+
+    Attributes:
+        frames: Of the core, which turns and shifts them by the coordinates; poses [B, K, 7].
+        coordinates: Of the start, [B, K, 6].
+        target: t, [B, K, 6].
+        metric: A, [B, K, 6, 6].
+        inertia: What the bodies weigh.
+        poses: At the start, [B, K, 7].
+        momentum: Angular momentum without contact, [B, K, 3].
+    """
+
+    frames: Tensor
+    coordinates: Tensor
+    target: Tensor
+    metric: Tensor
+    inertia: BodyInertia
+    poses: Tensor
+    momentum: Tensor
+
+
+def predict_bodies(
+    poses: Tensor,
+    velocities: Tensor,
+    inertia: BodyInertia,
+    wrenches: Tensor,
+    gravity: Tensor,
+    dt: float,
+) -> BodyPrediction:
+    """Take a step without contact.
+
+    Args:
+        poses: Of the body frames, [B, K, 7].
+        velocities: Of the centers, then of rotation, in world axes; [B, K, 6].
+        inertia: What the bodies weigh.
+        wrenches: Forces at the centers and torques, in world axes; [B, K, 6].
+        gravity: [B or 1, 3] m/s^2.
+        dt: h [s].
+    """
+    quaternion = torch.nn.functional.normalize(poses[..., 3:], dim=-1)
+    rotation = quaternion_matrix(quaternion)
+    back = rotation.transpose(-1, -2)
+    center = poses[..., :3] + _apply(rotation, inertia.center)
+    speed = velocities[..., :3] + dt * (
+        gravity[..., None, :] + wrenches[..., :3] / inertia.mass[..., None]
+    )
+    # In body axes at the start.
+    spin = _apply(back, velocities[..., 3:])
+    momentum = _apply(inertia.inertia, spin) + dt * _apply(back, wrenches[..., 3:])
+    omega = _apply(rotation, _midpoint_spin(inertia.inertia, momentum, dt))
+
+    predicted = quaternion_multiply(quaternion_exp(dt * omega), quaternion)
+    turned = quaternion_matrix(predicted)
+    moments = turned @ inertia.inertia @ turned.transpose(-1, -2)
+    zeros = torch.zeros_like(omega)
+    mass = inertia.mass[..., None, None] * torch.eye(3, dtype=moments.dtype)
+    mass, none = mass.expand_as(moments), torch.zeros_like(moments)
+    metric = torch.cat([torch.cat([mass, none], -1), torch.cat([none, moments], -1)], dim=-2)
+    return BodyPrediction(
+        frames=torch.cat([-_apply(turned, inertia.center), predicted], dim=-1),
+        coordinates=torch.cat([center, -dt * omega], dim=-1),
+        target=torch.cat([center + dt * speed, zeros], dim=-1),
+        metric=metric / dt**2,
+        inertia=inertia,
+        poses=poses,
+        momentum=_apply(rotation, momentum),
+    )
+
+
+def advance_bodies(
+    prediction: BodyPrediction, coordinates: Tensor, kick: Tensor, dt: float
+) -> tuple[Tensor, Tensor]:
+    """Poses [B, K, 7] and velocities [B, K, 6] after a step.
+
+    Args:
+        prediction: Of the step.
+        coordinates: At its end, [B, K, 6].
+        kick: Forces at the centers and torques that change velocities only, [B, K, 6].
+        dt: h [s].
+    """
+    inertia = prediction.inertia
+    center, turn = torch.split(coordinates, 3, dim=-1)
+    predicted = prediction.frames[..., 3:]
+    quaternion = quaternion_multiply(quaternion_exp(turn), predicted)
+    rotation = quaternion_matrix(quaternion)
+    moment = _apply(prediction.metric[..., 3:, 3:], turn)
+    torque = torque_from_moment(turn, moment) + kick[..., 3:]
+    momentum = _apply(rotation.transpose(-1, -2), prediction.momentum + dt * torque)
+    spin = torch.linalg.solve(inertia.inertia.expand_as(rotation), momentum[..., None])[..., 0]
+    rate = (center - prediction.coordinates[..., :3]) / dt
+    rate = rate + dt * kick[..., :3] / inertia.mass[..., None]
+    sign = nearer_quaternion(quaternion, prediction.poses[..., 3:])
+    poses = torch.cat([center - _apply(rotation, inertia.center), sign], dim=-1)
+    return poses, torch.cat([rate, _apply(rotation, spin)], dim=-1)
+
+
+def _midpoint_spin(inertia: Tensor, momentum: Tensor, dt: float) -> Tensor:
+    """Omega [B, K, 3] with r = J Omega - exp(-h Omega / 2) momentum = 0, all in body axes."""
+    cross = dt / 2 * CROSS
+    with torch.no_grad():
+        spin = torch.linalg.solve(inertia.expand(*momentum.shape, 3), momentum[..., None])[..., 0]
+        for _ in range(_ITERATIONS):
+            turned = _turned_back(dt / 2 * spin, momentum)
+            # Newton, but for what the exponential adds of second order in h Omega.
+            slope = inertia - (turned @ cross).reshape(*turned.shape, 3)
+            residual = _apply(inertia, spin) - turned
+            spin = spin - torch.linalg.solve(slope, residual[..., None])[..., 0]
+
+    def residual_of(spin: Tensor) -> Tensor:
+        return _apply(inertia, spin) - _apply(rotation_exp(-dt / 2 * spin), momentum)
+
+    return attach_root(residual_of, spin)
+
+
+def _turned_back(turn: Tensor, vector: Tensor) -> Tensor:
+    """exp(-turn) vector; fast, and without a derivative at zero."""
+    angle = turn.norm(dim=-1, keepdim=True) + torch.finfo(turn.dtype).tiny
+    axis = turn * (torch.tan(angle / 2) / angle)  # times the tangent of half the angle
+    first = torch.linalg.cross(vector, axis)
+    second = torch.linalg.cross(first, axis)
+    scale = 2 / (1 + (axis * axis).sum(-1, keepdim=True))
+    result: Tensor = vector + (first + second) * scale
+    return result
+
+
+def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:
+    product: Tensor = (matrices @ vectors[..., None])[..., 0]
+    return product
