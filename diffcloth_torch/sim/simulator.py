@@ -20,6 +20,7 @@ from diffcloth_torch.checks import (
     check_shape,
 )
 from diffcloth_torch.dynamics.dynamics import Dynamics, Prediction
+from diffcloth_torch.dynamics.limits import limit_stiffness
 from diffcloth_torch.errors import IntersectingState, InvalidInput
 from diffcloth_torch.model.defaults import (
     check_barrier,
@@ -490,8 +491,9 @@ class Simulator:
         self._defaults["barrier_stiffness"] = _scalar(stiffness)
 
     def _check_barrier(self, owner: str, inputs: Fields) -> None:
-        if "barrier_distance" in inputs and self.contact.self_contact:
-            thickness = as_array(inputs["thickness"])[:, : self._assembly.cloth_count]
+        cloths = len(self.scene.cloths)
+        if cloths and "barrier_distance" in inputs and self.contact.self_contact:
+            thickness = as_array(inputs["thickness"])[:, :cloths]
             distance = as_array(inputs["barrier_distance"])
             check_barrier(owner, distance, thickness, self._nonadjacent_distance)
 
@@ -539,7 +541,8 @@ def _make_core(simulator: Simulator) -> _core.Simulator:
     assembly = simulator._assembly
     trees: dict[str, Any] = {}
     if simulator._dynamics is not None:
-        trees = tree_arguments(assembly, simulator._dynamics.limit_stiffness)
+        stiffness = limit_stiffness(assembly, simulator.dt, simulator.scene.gravity)
+        trees = tree_arguments(assembly, stiffness)
     return _core.Simulator(
         vertices=assembly.vertices,
         rest_vertices=assembly.rest_vertices,
