@@ -45,7 +45,7 @@ void add_coupling(const Objective& f,
 /// One joint step towards the ends. Returns the fraction of the remaining motion that it covers.
 double joint_step(Walk& walk, const std::vector<double>& ends) {
   const std::vector<double> d = prescribed_change(walk, ends);
-  const linalg::BlockMatrix matrix = walk.system.assemble(walk.x().data(), Curvature::kPositive);
+  const linalg::BlockMatrix matrix = walk.system.assemble(walk.x().data(), Curvature::kPositive, walk.g());
   std::vector<double> b = walk.g();
   add_coupling(walk.f, matrix, walk.x(), d, b);
   // Positive by construction, M/h^2 plus positive semi-definite parts, but for rounding.
@@ -72,7 +72,7 @@ double joint_step(Walk& walk, const std::vector<double>& ends) {
 }
 
 void relax(Walk& walk) {
-  const linalg::BlockMatrix matrix = walk.system.assemble(walk.x().data(), Curvature::kPositive);
+  const linalg::BlockMatrix matrix = walk.system.assemble(walk.x().data(), Curvature::kPositive, walk.g());
   const Factor factor = walk.system.factor(matrix);
   if (!factor) return;
   std::vector<double> p;

@@ -72,7 +72,7 @@ std::vector<double> most_negative(Walk& walk, const linalg::CholeskyFactor& shif
 }  // namespace
 
 bool leave_saddle(Walk& walk) {
-  const linalg::BlockMatrix H = walk.system.assemble(walk.x().data(), Curvature::kExact);
+  const linalg::BlockMatrix H = walk.system.assemble(walk.x().data(), Curvature::kExact, walk.g());
   const Factor shifted = shifted_factor(walk, H);
   if (!shifted) return false;
   const std::vector<double> d = most_negative(walk, *shifted);
