@@ -11,12 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from diffcloth_torch import robots
 from diffcloth_torch.config import shapes
 from diffcloth_torch.config.schema import (
     BodySection,
     ClothSection,
+    JointKeyframe,
     PinKeyframe,
     PoseSection,
+    RobotSection,
     RotationSection,
     RunConfig,
     Section,
@@ -32,6 +35,7 @@ from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
 from diffcloth_torch.model.rigid_body import RigidBody
+from diffcloth_torch.model.robot import Robot
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.controls import Control
 from diffcloth_torch.sim.simulator import Simulator
@@ -51,8 +55,9 @@ def build_scene(config: RunConfig, source: Path) -> Scene:
     _require_unique_names(config)
     cloths = [_cloth(section, config.root, source) for section in config.scene.cloths]
     bodies = [_body(section, config.root, source) for section in config.scene.bodies]
-    gravity = config.scene.gravity
-    return Scene(cloths, bodies) if gravity is None else Scene(cloths, bodies, gravity=gravity)
+    robots = [_robot(section, config.root, source) for section in config.scene.robots]
+    options = config.scene.model_dump(include={"gravity", "ignore_contact"}, exclude_none=True)
+    return Scene(cloths, bodies, robots, **options)
 
 
 def build_simulator(scene: Scene, section: SimulationSection) -> Simulator:
@@ -61,6 +66,7 @@ def build_simulator(scene: Scene, section: SimulationSection) -> Simulator:
         scene,
         section.dt,
         scheme=section.scheme,
+        coupling=section.coupling,
         contact=ContactOptions(**_given(section.contact)),
         solver=SolverOptions(**_given(section.solver)),
     )
@@ -73,6 +79,7 @@ def _given(section: Section) -> dict[str, Any]:
 def _require_unique_names(config: RunConfig) -> None:
     names = [cloth.name for cloth in config.scene.cloths]
     names += [body.name for body in config.scene.bodies]
+    names += [robot.name for robot in config.scene.robots]
     for name in names:
         if names.count(name) > 1:
             raise InvalidInput(f"`scene`: the name {name!r} must be given once, got it twice")
@@ -162,7 +169,7 @@ def _body(section: BodySection, root: str, source: Path) -> RigidBody:
         "motion": section.motion,
         "pose": pose_array(section.pose),
         "name": section.name,
-        **section.model_dump(include={"friction", "thickness"}, exclude_none=True),
+        **section.model_dump(include=_BODY_OPTIONS, exclude_none=True),
     }
     if shape.kind == "load":
         path = resolve_path(source, root, shape.path)
@@ -174,53 +181,147 @@ def _body(section: BodySection, root: str, source: Path) -> RigidBody:
     return _MAKERS[shape.kind](**arguments, **keywords)
 
 
+_BODY_OPTIONS = {"friction", "thickness", "density", "mass", "center", "inertia"}
 _MAKERS: dict[str, Callable[..., RigidBody]] = {
     "box": RigidBody.box,
     "sphere": RigidBody.sphere,
     "capsule": RigidBody.capsule,
+    "cylinder": RigidBody.cylinder,
     "plane": RigidBody.plane,
+}
+
+
+def _robot(section: RobotSection, root: str, source: Path) -> Robot:
+    path, mesh_root = _robot_file(section, root, source)
+    return Robot.load(
+        path,
+        mesh_root=mesh_root,
+        pose=pose_array(section.pose),
+        **section.model_dump(include=_ROBOT_OPTIONS, exclude_none=True),
+    )
+
+
+def _robot_file(section: RobotSection, root: str, source: Path) -> tuple[Path, Path | None]:
+    """The file that describes a robot, and the folder of its meshes, None for that of the file."""
+    if section.model is not None:
+        return robots.panda() if section.model == "panda" else (robots.GRIPPER, None)
+    assert section.path is not None  # the schema requires one of the two
+    path = resolve_path(source, root, section.path)
+    if section.mesh_root is None:
+        return path, None
+    folder = (source.resolve().parent / section.mesh_root).resolve()
+    allowed = (source.resolve().parent / root).resolve()
+    if not folder.is_relative_to(allowed):
+        raise InvalidInput(
+            f"{source}: the folder {section.mesh_root!r} must lie under the root {str(allowed)!r}"
+        )
+    return path, folder
+
+
+_ROBOT_OPTIONS = {
+    "base",
+    "joint_positions",
+    "actuation",
+    "stiffness",
+    "damping",
+    "friction",
+    "thickness",
+    "edge_length",
+    "ignore_contact",
+    "name",
 }
 
 
 # --- prescribed motion --------------------------------------------------------------------------
 
 
-def prescribed_poses(config: RunConfig, steps: int) -> Tensor:
-    """Poses of all bodies after each step, shape [steps, K, 7]; without keyframes they hold."""
-    times = _step_times(config.simulation.dt, steps)
-    poses = torch.empty(steps, len(config.scene.bodies), 7, dtype=torch.float64)
-    for k, body in enumerate(config.scene.bodies):
-        keyframes = [(0.0, pose_array(body.pose))]
-        if body.trajectory and body.trajectory[0].time == 0:
-            keyframes = []
-        keyframes += [(keyframe.time, pose_array(keyframe)) for keyframe in body.trajectory]
-        poses[:, k] = interpolate_poses(
-            torch.tensor([time for time, _ in keyframes], dtype=torch.float64),
-            torch.tensor(np.array([pose for _, pose in keyframes])),
-            times,
-        )
-    return poses
+def prescribed_poses(section: BodySection | RobotSection, dt: float, steps: int) -> Tensor:
+    """Poses of a body, or of the base of a robot, after each step, shape [steps, 7]."""
+    keyframes = [(0.0, pose_array(section.pose))]
+    if section.trajectory and section.trajectory[0].time == 0:
+        keyframes = []
+    keyframes += [(keyframe.time, pose_array(keyframe)) for keyframe in section.trajectory]
+    return interpolate_poses(
+        torch.tensor([time for time, _ in keyframes], dtype=torch.float64),
+        torch.tensor(np.array([pose for _, pose in keyframes])),
+        _step_times(dt, steps),
+    )
+
+
+Motions = dict[str, dict[str, Tensor]]
+"""Field of a control -> name -> values after each step."""
 
 
 def prescribed_controls(config: RunConfig, scene: Scene, steps: int) -> list[Control]:
-    """Controls of each step: the poses of the bodies and the positions of the moving pins."""
-    times = _step_times(config.simulation.dt, steps)
-    pins: dict[str, Tensor] = {}
-    soft_pins: dict[str, Tensor] = {}
+    """Controls of each step: what pins, bodies, bases and joints that have trajectories do."""
+    dt = config.simulation.dt
+    poses: Motions = {"body_poses": {}, "base_poses": {}}
+    for body in config.scene.bodies:
+        if body.trajectory:
+            poses["body_poses"][body.name] = prescribed_poses(body, dt, steps)
+    for robot in config.scene.robots:
+        if robot.trajectory:
+            poses["base_poses"][robot.name] = prescribed_poses(robot, dt, steps)
+    times = _step_times(dt, steps)
+    motions = _pin_motions(config, scene, times) | poses | _joint_motions(config, scene, times)
+    controls = []
+    for k in range(steps):
+        fields: dict[str, Any] = {
+            field: {name: values[k] for name, values in named.items()}
+            for field, named in motions.items()
+            if named
+        }
+        controls.append(Control(**fields))
+    return controls
+
+
+def _pin_motions(config: RunConfig, scene: Scene, times: Tensor) -> Motions:
+    motions: Motions = {"pins": {}, "soft_pins": {}}
     for section, cloth in zip(config.scene.cloths, scene.cloths, strict=True):
         for name, keyframes in section.pin_trajectories.items():
-            vertices = {**cloth.pins, **cloth.soft_pins}[name]
-            moved = _moved(torch.tensor(cloth.vertices[vertices]), keyframes, times)
-            (pins if name in cloth.pins else soft_pins)[f"{section.name}/{name}"] = moved
-    poses = prescribed_poses(config, steps) if scene.bodies else None
-    return [
-        Control(
-            pins={name: moved[k] for name, moved in pins.items()} or None,
-            soft_pins={name: moved[k] for name, moved in soft_pins.items()} or None,
-            body_poses=None if poses is None else poses[k],
+            field = "pins" if name in cloth.pins else "soft_pins"
+            start = torch.tensor(cloth.vertices[getattr(cloth, field)[name]])
+            motions[field][f"{section.name}/{name}"] = _moved(start, keyframes, times)
+    return motions
+
+
+def _joint_motions(config: RunConfig, scene: Scene, times: Tensor) -> Motions:
+    motions: Motions = {field: {} for field in _JOINT_FIELDS.values()}
+    for section, robot in zip(config.scene.robots, scene.robots, strict=True):
+        for name, keyframes in section.joint_trajectories.items():
+            field, start = _joint_field(section.name, name, robot)
+            values = _joint_values(keyframes, start, times)
+            motions[field][f"{section.name}/{name}"] = values
+    return motions
+
+
+_JOINT_FIELDS = {
+    "position": "joint_positions",
+    "pd": "joint_positions",
+    "velocity": "joint_velocities",
+    "torque": "joint_efforts",
+}
+
+
+def _joint_field(robot_name: str, joint: str, robot: Robot) -> tuple[str, float]:
+    """Field of a control that a joint's trajectory is for, and where it starts."""
+    names = robot.joint_names
+    if joint not in names:
+        raise InvalidInput(
+            f"`scene.robots`: `joint_trajectories` of {robot_name!r} may name its joints "
+            f"{', '.join(map(repr, names)) or 'none, it has none'}; got {joint!r}"
         )
-        for k in range(steps)
-    ]
+    index = names.index(joint)
+    field = _JOINT_FIELDS[robot.mechanism.actuation[index]]
+    return field, float(robot.joint_positions[index]) if field == "joint_positions" else 0.0
+
+
+def _joint_values(keyframes: Sequence[JointKeyframe], start: float, times: Tensor) -> Tensor:
+    """Values [n] at some times, on straight lines between keyframes."""
+    given = [(frame.time, frame.value) for frame in keyframes]
+    given = given if given[0][0] == 0 else [(0.0, start), *given]
+    at, values = np.array(given).T
+    return torch.from_numpy(np.interp(times.numpy(), at, values))
 
 
 def _step_times(dt: float, steps: int) -> Tensor:

@@ -33,12 +33,14 @@ __all__ = [
     "BoxSelection",
     "ClothSection",
     "ContactSection",
+    "JointKeyframe",
     "MaterialSection",
     "MeshFile",
     "OutputSection",
     "PictureSection",
     "PoseSection",
     "Positive",
+    "RobotSection",
     "RotationSection",
     "RunConfig",
     "SceneSection",
@@ -59,6 +61,7 @@ S = TypeVar("S", bound="Section")
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 Vector3 = Annotated[list[float], Len(3, 3)]
+Actuation = Literal["position", "velocity", "torque", "pd"]
 Lengths2 = Positive | Annotated[list[Positive], Len(2, 2)]
 Lengths3 = Positive | Annotated[list[Positive], Len(3, 3)]
 
@@ -195,6 +198,14 @@ class Capsule(Section):
     length: Positive
 
 
+class Cylinder(Section):
+    """Cylinder along z of `length` [m]."""
+
+    kind: Literal["cylinder"]
+    radius: Positive
+    length: Positive
+
+
 class Plane(Section):
     """Rectangle at z = 0 that faces up."""
 
@@ -276,34 +287,97 @@ class ClothSection(Section):
 
 
 class BodySection(Section):
-    """A rigid body. With a `trajectory` it is kinematic and starts at `pose` at time 0."""
+    """A rigid body. With a `trajectory` it is kinematic and starts at `pose` at time 0.
+
+    One that is dynamic has a `density` [kg/m^3] or a `mass` [kg].
+    """
 
     name: str
     shape: Annotated[
-        Box | Sphere | Capsule | Plane | Chair | MeshFile,
+        Box | Sphere | Capsule | Cylinder | Plane | Chair | MeshFile,
         Discriminator("kind"),
     ]
     pose: PoseSection = PoseSection()
-    motion: Literal["static", "kinematic"] = "static"
+    motion: Literal["static", "kinematic", "dynamic"] = "static"
     trajectory: list[PoseKeyframe] = []
     friction: Annotated[float, _limits("friction")] | None = None
     thickness: Annotated[float, _limits("thickness")] | None = None
+    density: Positive | None = None
+    mass: Positive | None = None
+    center: Vector3 | None = None
+    inertia: Annotated[list[Vector3], Len(3, 3)] | None = None
     color: Color | None = None
 
     @model_validator(mode="after")
     def _check_trajectory(self) -> BodySection:
         _require_increasing("trajectory", self.trajectory)
-        if self.trajectory and self.motion == "static":
+        if self.trajectory and self.motion != "kinematic":
             raise ValueError("has a `trajectory` and must have `motion: kinematic` for it")
         return self
 
 
+class JointKeyframe(Section):
+    """What a joint is told at a time [s].
+
+    The `value` is a position target where the joint's actuation is position or pd, a velocity
+    target where it is velocity, an effort where it is torque.
+    """
+
+    time: NonNegative
+    value: float
+
+
+Names = Annotated[list[str], Len(2, 2)]
+ForAll = float | dict[str, float]
+"""One value for all, or name -> value."""
+
+
+class RobotSection(Section):
+    """A robot, from the URDF file at `path` or one that is known by its name as `model`.
+
+    Its fields are those of `Robot.load`. With a `trajectory` its base is kinematic and starts at
+    `pose` at time 0. Joints that have no trajectory hold.
+    """
+
+    name: str
+    path: str | None = None
+    model: Literal["gripper", "panda"] | None = None
+    mesh_root: str | None = None
+    base: Literal["fixed", "kinematic", "floating"] = "fixed"
+    pose: PoseSection = PoseSection()
+    joint_positions: ForAll | None = None
+    actuation: Actuation | dict[str, Actuation] | None = None
+    stiffness: ForAll | None = None
+    damping: ForAll | None = None
+    friction: ForAll | None = None
+    thickness: ForAll | None = None
+    edge_length: Positive | None = None
+    ignore_contact: list[Names] = []
+    trajectory: list[PoseKeyframe] = []
+    joint_trajectories: dict[str, Annotated[list[JointKeyframe], Len(1)]] = {}
+    color: Color | None = None
+
+    @model_validator(mode="after")
+    def _check_robot(self) -> RobotSection:
+        _require_one(self, ("path", "model"))
+        if self.mesh_root is not None and self.path is None:
+            raise ValueError("has a `mesh_root` and must have a `path` for it")
+        _require_increasing("trajectory", self.trajectory)
+        if self.trajectory and self.base != "kinematic":
+            raise ValueError("has a `trajectory` and must have `base: kinematic` for it")
+        for name, keyframes in self.joint_trajectories.items():
+            _require_increasing(f"joint_trajectories.{name}", keyframes)
+        return self
+
+
 class SceneSection(Section):
-    """What is simulated."""
+    """What is simulated. Without cloths something must be dynamic."""
 
     gravity: Vector3 | None = None
-    cloths: Annotated[list[ClothSection], Len(1)]
+    cloths: list[ClothSection] = []
     bodies: list[BodySection] = []
+    robots: list[RobotSection] = []
+    ignore_contact: list[Names] = []
 
 
 # --- the run ------------------------------------------------------------------------------------
@@ -334,6 +408,7 @@ class SimulationSection(Section):
     dt: Positive
     steps: Annotated[int, Ge(1)]
     scheme: Literal["coupled", "split"] = "coupled"
+    coupling: Literal["monolithic", "rigid_to_cloth", "cloth_to_rigid"] = "monolithic"
     contact: ContactSection = ContactSection()
     solver: SolverSection = SolverSection()
 
@@ -396,7 +471,9 @@ def _require_one(section: Section, names: Iterable[str]) -> None:
         )
 
 
-def _require_increasing(name: str, keyframes: Iterable[PoseKeyframe | PinKeyframe]) -> None:
+def _require_increasing(
+    name: str, keyframes: Iterable[PoseKeyframe | PinKeyframe | JointKeyframe]
+) -> None:
     times = [keyframe.time for keyframe in keyframes]
     if any(b <= a for a, b in itertools.pairwise(times)):
         raise ValueError(f"must have increasing times in `{name}`, got {times}")
