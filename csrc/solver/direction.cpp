@@ -63,7 +63,8 @@ bool Directions::certify() {
 
 Directions::Direction Directions::next() {
   if (chord()) return {.kind = Kind::kChord, .first = 1.0};
-  const linalg::BlockMatrix H = walk_.system.assemble(walk_.x().data(), Curvature::kExact, walk_.g());
+  const linalg::BlockMatrix H =
+      walk_.system.assemble(walk_.x().data(), Curvature::kExact, walk_.g());
   if (s_ == 0.0) {
     bool indefinite = false;
     if (iterate(H, indefinite)) return {.kind = Kind::kIterated, .first = 1.0};
@@ -82,7 +83,8 @@ Directions::Direction Directions::next() {
 }
 
 Directions::Direction Directions::damp(const linalg::BlockMatrix& H) {
-  const linalg::BlockMatrix P = walk_.system.assemble(walk_.x().data(), Curvature::kPositive, walk_.g());
+  const linalg::BlockMatrix P =
+      walk_.system.assemble(walk_.x().data(), Curvature::kPositive, walk_.g());
   Factor factor;
   for (;; s_ = std::max(kFirstShare, kFailureGrowth * s_)) {
     walk_.context.checkpoint->check();

@@ -38,9 +38,7 @@ class LinearSystem {
   /// The Hessian at x, on the couplings of this point alone: a function of x, not of the way there.
   ///
   /// @param g  the gradient at x
-  linalg::BlockMatrix assemble(const double* x,
-                               Curvature curvature,
-                               const std::vector<double>& g);
+  linalg::BlockMatrix assemble(const double* x, Curvature curvature, const std::vector<double>& g);
 
   /// L L^T of a matrix that assemble() has made at the last point; null where it is not positive
   /// definite.

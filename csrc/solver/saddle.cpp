@@ -85,7 +85,8 @@ bool leave_saddle(Walk& walk) {
   // From far to near: the first point that is lower, and on while the next is lower still.
   const double length = kFirstMove * walk.f.length;
   std::vector<double> to;
-  double alpha = walk.watch(p, std::min(length, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
+  double alpha =
+      walk.watch(p, std::min(length, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
   double best = 0.0;
   double best_alpha = 0.0;
   for (int k = 0; k < kBacktracks && alpha > 0.0; ++k, alpha *= 0.5) {
