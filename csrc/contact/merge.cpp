@@ -282,4 +282,23 @@ void add_edge_terms(const CollisionMesh& mesh,
   }
 }
 
+void merge_shared_ends(std::vector<Term>& terms) {
+  const auto begins_with_edge = [](const Term& t) {
+    return t.pair.kind != PairKind::kEdgeEdge || t.pair.vertices[0] != t.pair.vertices[1];
+  };
+  const auto shared = std::ranges::stable_partition(terms, begins_with_edge).begin();
+  std::stable_sort(shared, terms.end(),
+                   [](const Term& p, const Term& q) { return p.pair.vertices < q.pair.vertices; });
+  auto last = shared;
+  for (auto term = shared; term != terms.end(); ++term) {
+    if (last != shared && (last - 1)->pair.vertices == term->pair.vertices) {
+      (last - 1)->coefficient += term->coefficient;
+    } else {
+      *last++ = *term;
+    }
+  }
+  terms.erase(std::remove_if(shared, last, [](const Term& t) { return t.coefficient == 0.0; }),
+              terms.end());
+}
+
 }  // namespace diffcloth::contact
