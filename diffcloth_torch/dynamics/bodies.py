@@ -116,7 +116,7 @@ def predict_bodies(
 
 
 def advance_bodies(
-    prediction: BodyPrediction, coordinates: Tensor, kick: Tensor, dt: float
+    prediction: BodyPrediction, coordinates: Tensor, kick: Tensor | None, dt: float
 ) -> tuple[Tensor, Tensor]:
     """Poses [B, K, 7] and velocities [B, K, 6] after a step.
 
@@ -132,11 +132,13 @@ def advance_bodies(
     quaternion = quaternion_multiply(quaternion_exp(turn), predicted)
     rotation = quaternion_matrix(quaternion)
     moment = _apply(prediction.metric[..., 3:, 3:], turn)
-    torque = torque_from_moment(turn, moment) + kick[..., 3:]
+    torque = torque_from_moment(turn, moment)
+    rate = (center - prediction.coordinates[..., :3]) / dt
+    if kick is not None:
+        torque = torque + kick[..., 3:]
+        rate = rate + dt * kick[..., :3] / inertia.mass[..., None]
     momentum = _apply(rotation.transpose(-1, -2), prediction.momentum + dt * torque)
     spin = torch.linalg.solve(inertia.inertia.expand_as(rotation), momentum[..., None])[..., 0]
-    rate = (center - prediction.coordinates[..., :3]) / dt
-    rate = rate + dt * kick[..., :3] / inertia.mass[..., None]
     sign = nearer_quaternion(quaternion, prediction.poses[..., 3:])
     poses = torch.cat([center - _apply(rotation, inertia.center), sign], dim=-1)
     return poses, torch.cat([rate, _apply(rotation, spin)], dim=-1)

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffcloth_torch.dynamics.drives import Drives, fold
+from diffcloth_torch.dynamics.drives import Drives, Gains, fold
 from diffcloth_torch.dynamics.implicit import attach_root
 from diffcloth_torch.dynamics.inertia import (
     Inertia,
@@ -37,6 +37,7 @@ from diffcloth_torch.dynamics.inertia import (
 from diffcloth_torch.dynamics.kinematics import ROOT, Tree, root_frame
 from diffcloth_torch.geometry.rotation import (
     nearer_quaternion,
+    pose_velocities,
     quaternion_exp,
     quaternion_log,
     quaternion_matrix,
@@ -138,6 +139,7 @@ class Chain:
     Attributes:
         mechanism: Its links and joints.
         coordinate_count: n: six of a floating base, and the J joints.
+        prescribed: Which of the coordinates are prescribed, [n].
     """
 
     def __init__(self, mechanism: Mechanism, dt: float, links: Tensor, points: Tensor) -> None:
@@ -156,7 +158,9 @@ class Chain:
         self.coordinate_count = joints + ROOT * self._floats
 
         prescribed = [mode in _PRESCRIBED for mode in mechanism.actuation]
-        self._prescribed = torch.tensor(prescribed)
+        self._prescribed = torch.tensor(prescribed, dtype=torch.bool)
+        base = torch.zeros(ROOT * self._floats, dtype=torch.bool)
+        self.prescribed = torch.cat([base, self._prescribed])
         self._modes = {
             mode: torch.tensor([m == mode for m in mechanism.actuation], dtype=torch.float64)
             for mode in ("position", "velocity", "torque", "pd")
@@ -172,7 +176,7 @@ class Chain:
         state: ChainState,
         control: ChainControl,
         inertia: Inertia,
-        drives: Drives,
+        gains: Gains,
         gravity: Tensor,
         contact: Tensor | None = None,
     ) -> ChainPrediction:
@@ -182,11 +186,11 @@ class Chain:
             state: At the start.
             control: What acts.
             inertia: What links and joints weigh.
-            drives: Gains of the joints.
+            gains: Of the joints.
             gravity: [B or 1, 3] m/s^2.
             contact: Forces on the vertices that act like the others, [B, V, 3] N.
         """
-        drives = self._drives(drives, control)
+        drives = self._drives(gains, control)
         local = inertia.center[..., self.mechanism.root, :]
         quaternion = torch.nn.functional.normalize(state.pose[..., 3:], dim=-1)
         start = _Configuration(*_placed(state.pose[..., :3], quaternion, local), state.joints)
@@ -288,13 +292,13 @@ class Chain:
 
     # Constituents
 
-    def _drives(self, drives: Drives, control: ChainControl) -> Drives:
+    def _drives(self, gains: Gains, control: ChainControl) -> Drives:
         """Zero what the actuation of a joint does not use."""
         pd, force = self._modes["pd"], self._modes["pd"] + self._modes["torque"]
         return Drives(
-            stiffness=pd * drives.stiffness,
-            damping=pd * drives.damping,
-            viscosity=drives.viscosity,
+            stiffness=pd * gains.stiffness,
+            damping=pd * gains.damping,
+            viscosity=gains.viscosity,
             positions=pd * control.joints,
             velocities=pd * control.rates,
             efforts=force * control.efforts,
@@ -313,9 +317,8 @@ class Chain:
         if self.mechanism.base == "kinematic":
             target = torch.nn.functional.normalize(control.pose[..., 3:], dim=-1)
             center, _ = _placed(control.pose[..., :3], target, local)
-            conjugate = quaternion * _CONJUGATE
-            turn = quaternion_log(quaternion_multiply(target, conjugate))
-            root = torch.cat([center - start.center, turn], dim=-1) / h
+            between = torch.cat([start.center, quaternion], -1), torch.cat([center, target], -1)
+            root = pose_velocities(*between, h)
         return torch.cat([root, rates], dim=-1), ends
 
     def _acting(
@@ -409,6 +412,3 @@ def _placed(position: Tensor, quaternion: Tensor, local: Tensor) -> tuple[Tensor
     """Center of mass and orientation of a link whose frame is at a pose."""
     rotation = quaternion_matrix(quaternion)
     return position + (rotation @ local[..., None])[..., 0], rotation
-
-
-_CONJUGATE = torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=torch.float64)

@@ -15,16 +15,30 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-__all__ = ["Drives", "fold"]
+__all__ = ["Drives", "Gains", "fold"]
 
 
-class Drives(NamedTuple):
-    """Gains and targets, zero where they do not apply; [B or 1, J].
+class Gains(NamedTuple):
+    """Of each joint, [B or 1, J].
 
     Attributes:
         stiffness: kp [N m/rad or N/m].
         damping: kd [N m s/rad or N s/m].
         viscosity: d of the joint itself, likewise.
+    """
+
+    stiffness: Tensor
+    damping: Tensor
+    viscosity: Tensor
+
+
+class Drives(NamedTuple):
+    """Gains and targets, zero where the actuation does not use them; [B or 1, J].
+
+    Attributes:
+        stiffness: As in `Gains`.
+        damping: Likewise.
+        viscosity: Likewise.
         positions: q_t [rad or m].
         velocities: qd_t [rad/s or m/s].
         efforts: Applied over the whole step as they are [N m or N].

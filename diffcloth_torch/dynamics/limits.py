@@ -1,0 +1,72 @@
+"""How stiff the barriers at the limits of joints are."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.dynamics.inertia import Inertia, Motion, mass_matrix
+from diffcloth_torch.dynamics.kinematics import ROOT, Tree
+from diffcloth_torch.model.mechanism import Mechanism
+from diffcloth_torch.model.scene import Assembly
+
+__all__ = ["ZONE", "limit_stiffness"]
+
+ZONE = 0.01
+"""Share of its range by which a joint may be beyond a limit."""
+
+# A joint whose whole weight rests on its limit is sqrt(1 / (3 . 30)) = 0.11 of the zone beyond it.
+_WEIGHT_MARGIN = 30.0
+
+
+def limit_stiffness(assembly: Assembly, dt: float, gravity: FloatArray) -> FloatArray:
+    """Stiffness of the barrier at the limits of each coordinate.
+
+    Beyond a limit the barrier's force grows from zero to infinity over the zone of width w, as
+    3 k w p^2 at a small share p of it. With
+
+        k = M_jj / h^2 + 30 Q_j / w
+
+    a limit is felt like the joint's own inertia, and its weight, a generalized force Q_j at most,
+    brings it to a tenth of the zone. M and Q are those of the scene at its start, where gravity may
+    point anywhere.
+
+    Args:
+        assembly: Arrays of the scene.
+        dt: h [s].
+        gravity: [3] m/s^2.
+
+    Returns:
+        k [N m/rad^2 or N/m], shape [n]; zero where there is no limit to keep.
+    """
+    parts = [np.empty(0)]
+    first = 0
+    strength = float(np.linalg.norm(gravity))
+    for mechanism in assembly.mechanisms:
+        joints = slice(first, first := first + mechanism.joint_count)
+        if mechanism.base == "floating":
+            parts.append(np.zeros(ROOT))
+        start, armature = assembly.joint_positions[joints], assembly.joint_armature[joints]
+        parts.append(_of_joints(mechanism, start, armature, dt, strength))
+    return np.concatenate(parts)
+
+
+def _of_joints(
+    mechanism: Mechanism, start: FloatArray, armature: FloatArray, dt: float, gravity: float
+) -> FloatArray:
+    modes = np.array(mechanism.actuation, dtype=object)
+    width = ZONE * (mechanism.upper - mechanism.lower)
+    limited = np.isfinite(width) & np.isin(modes, ("torque", "pd"))
+    if not limited.any():
+        return np.zeros(mechanism.joint_count)
+    tree = Tree(mechanism)
+    arrays = (mechanism.mass, mechanism.center, mechanism.inertia, armature)
+    inertia = Inertia(*(torch.from_numpy(np.array(a))[None] for a in arrays))
+    joints = torch.from_numpy(np.array(start))[None]
+    motion = Motion.at(tree, inertia, torch.eye(4, dtype=torch.float64)[None], joints)
+    mass = mass_matrix(motion, inertia)[0].diagonal()[ROOT:].numpy()
+    pull = motion.weighted[0, :, :3, ROOT:].norm(dim=1).sum(0).numpy()  # m |dc/dq| of all links
+    stiffness = mass / dt**2
+    stiffness[limited] += _WEIGHT_MARGIN * gravity * pull[limited] / width[limited]
+    return np.where(limited, stiffness, 0.0)
