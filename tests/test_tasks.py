@@ -22,8 +22,8 @@ from diffcloth_torch.geometry.rotation import (
     quaternion_multiply,
     rotate,
 )
-from diffcloth_torch.tasks.hit_cloth import shape_distance
 from diffcloth_torch.tasks.optimization import OptimizerSection, evaluate, optimize
+from diffcloth_torch.tasks.reach import shape_distance
 from diffcloth_torch.tasks.registry import load_task
 from diffcloth_torch.tasks.simulation import simulate
 
@@ -370,7 +370,7 @@ def test_the_wrong_number_of_action_rows_is_refused():
     ("assignment", "message"),
     [
         pytest.param("actions.body=tray", "'tray' in `actions.body`", id="body"),
-        pytest.param("target.cloth=towel", "'towel' in `target`", id="cloth"),
+        pytest.param("target.cloth=towel", "'towel' in `target.cloth`", id="cloth"),
         pytest.param("loss.steps=7", "`loss.steps`", id="steps"),
         pytest.param("scene.bodies.cuboid.motion=static", "motion: kinematic", id="static"),
     ],
