@@ -48,7 +48,7 @@ _MATRIX_OF_PRODUCTS = (
         dtype=torch.float64,
     )
     .reshape(9, 16)
-    .T
+    .T.unsqueeze(0)
 )
 
 
@@ -184,7 +184,8 @@ def interpolate_poses(times: Tensor, poses: Tensor, at: Tensor) -> Tensor:
 def quaternion_matrix(quaternion: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
     products = quaternion.unsqueeze(-1) * quaternion.unsqueeze(-2)
-    entries = products.flatten(-2) @ _MATRIX_OF_PRODUCTS
+    # One product for each rotation: those of all at once round by how many there are.
+    entries = products.flatten(-2).unsqueeze(-2) @ _MATRIX_OF_PRODUCTS
     return entries.reshape(*quaternion.shape[:-1], 3, 3)
 
 
