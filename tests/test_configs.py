@@ -137,7 +137,7 @@ REFUSED = [
         id="two-selections",
     ),
     pytest.param(
-        "scene.cloths=[]", r"`scene\.cloths` is not accepted|`scene\.cloths` must", id="no-cloth"
+        "scene.cloths=[]", r"`scene` must have a cloth in `cloths` unless", id="no-cloth"
     ),
     pytest.param("scene.gravity=[0, 0]", r"`scene\.gravity`.*3", id="short-vector"),
     pytest.param(

@@ -278,10 +278,15 @@ def test_bodies_follow_their_keyframes_and_static_ones_stay(tmp_path):
         "pose: {position: [-9, 0, 0]}, trajectory: [{time: 0.04, position: [-9, 0, 1]}]}]"
     )
     task = load_task(write_config(tmp_path, SHEET), [bodies])
-    poses = torch.stack([control.body_poses for control in prescribed(task)])
-    assert torch.equal(poses[:, 0], torch.tensor(task.scene.bodies[0].pose).expand(4, 7))
+    controls = list(prescribed(task))
+    assert all(set(control.body_poses) == {"mover"} for control in controls)
+    poses = torch.stack([control.body_poses["mover"] for control in controls])
     heights = torch.tensor([0.25, 0.5, 0.75, 1.0], dtype=torch.float64)
-    torch.testing.assert_close(poses[:, 1, 2], heights)
+    torch.testing.assert_close(poses[:, 2], heights)
+    states = list(simulate(task))
+    still = torch.tensor(task.scene.bodies[0].pose)
+    assert all(torch.equal(state.body_poses[0], still) for state in states)
+    assert torch.equal(states[-1].body_poses[1], poses[-1])
 
 
 def test_a_simulated_sheet_hangs_from_its_pins(tmp_path):
@@ -344,7 +349,8 @@ def test_actions_become_poses_of_the_body():
         "linear": (2, 3),
         "angular": (2, 3),
     }
-    poses = torch.stack([control.body_poses[0] for control in controls_of(task, actions)])
+    (name,) = task.scene.body_names
+    poses = torch.stack([control.body_poses[name] for control in controls_of(task, actions)])
     dt = task.simulator.dt
     expected = torch.tensor([0.0, -0.04 + 3 * dt, 0.95 + 3 * 2 * dt], dtype=torch.float64)
     torch.testing.assert_close(poses[-1, :3].detach(), expected)

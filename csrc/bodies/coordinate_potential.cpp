@@ -85,9 +85,8 @@ double CoordinatePotential::energy(const double* x) const {
       }
     }
   }
-  visit_limits(nodes, [&](Index, double, double u, double w, double k) {
-    e += k * limit_barrier(u, w);
-  });
+  visit_limits(nodes,
+               [&](Index, double, double u, double w, double k) { e += k * limit_barrier(u, w); });
   return e;
 }
 

@@ -38,9 +38,9 @@ Mat34 motion(const Link& link, double value) {
 struct Mechanisms::Eval {
   Exponential turn{Vec3::Zero()};  // of a free root
   Vec3 center = Vec3::Zero();
-  Mat34 frame;                          // S
-  std::vector<Mat34> to_root;           // C_l
-  std::vector<Vec3> axis;               // of the joint of a link
+  Mat34 frame;                               // S
+  std::vector<Mat34> to_root;                // C_l
+  std::vector<Vec3> axis;                    // of the joint of a link
   std::vector<std::vector<Mat34>> by_joint;  // [link][k]: dC_l by the k-th joint of its path
 };
 
@@ -192,8 +192,7 @@ void Mechanisms::place(const double* points, double* vertices) const {
       const Mat34 u = compose(e.frame, e.to_root[s.link - trees_[t].first_link]);
       for (Index v = s.first; v < s.last; ++v) {
         const Vec3 p = apply(u, row(vertices_.data(), v));
-        Eigen::Map<Vec3>(vertices + 3 * v) =
-            trees_[t].free ? Vec3(e.center + e.turn.value * p) : p;
+        Eigen::Map<Vec3>(vertices + 3 * v) = trees_[t].free ? Vec3(e.center + e.turn.value * p) : p;
       }
     }
   }
@@ -320,8 +319,7 @@ std::vector<double> Mechanisms::curvature(const Tree& tree,
     for (std::size_t i = 0; i < path.size(); ++i) {
       const Link& outer = given_.links[path[i]];
       if (outer.kind != JointKind::kRevolute) continue;
-      const Mat3 turn =
-          outer.multiplier * cross_matrix(e.axis[path[i] - tree.first_link]);
+      const Mat3 turn = outer.multiplier * cross_matrix(e.axis[path[i] - tree.first_link]);
       for (std::size_t j = i; j < path.size(); ++j) {
         const double value = inner(Mat34(turn * e.by_joint[at][j]), in_frame);
         add(local(i), local(j), value);
@@ -363,8 +361,8 @@ void Mechanisms::pull_back_change(const double* points,
       }
       const Mat34 turned = d_turn.transpose() * m;
       Mat34 frame_bar;
-      frame_bar.leftCols<3>() = turned * e.to_root[at].transpose() +
-                                e.turn.value.transpose() * m * d_link.transpose();
+      frame_bar.leftCols<3>() =
+          turned * e.to_root[at].transpose() + e.turn.value.transpose() * m * d_link.transpose();
       frame_bar.col(3) = turned.col(3);
       for (int a = 0; a < 4; ++a) {
         Eigen::Map<Vec3>(points_bar + 3 * (tree.frame + a)) += frame_bar.col(a);
@@ -433,8 +431,7 @@ void Mechanisms::differentiate(const double* points,
       }
       for (Index v = s.first; v < s.last; ++v) {
         const Vec3 local = row(vertices_.data(), v);
-        linalg::Attachments::Entry* entry =
-            out.entries.data() + out.start[v];
+        linalg::Attachments::Entry* entry = out.entries.data() + out.start[v];
         for (std::size_t k = 0; k < count; ++k) {
           for (int i = 0; i < 3; ++i) entry[k].jacobian.col(i) = apply(d[k][i], local);
         }

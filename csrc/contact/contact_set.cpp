@@ -228,6 +228,7 @@ void ContactModel::find(const std::vector<Candidate>& candidates,
     last = group_end(candidates, first);
     find_terms({candidates.data() + first, last - first}, x, scratch, terms);
   }
+  merge_shared_ends(terms);
   out.reserve(terms.size());
   for (const Term& term : terms) out.push_back(contact(term, x));
 }

@@ -129,7 +129,6 @@ class ContactModel {
                  Bar& bar) const;
   void pull_back_mu(const Candidate& pair, double mu_bar, Bar& bar) const;
 
-
  private:
   /// Candidates that act together: one, or those of a point or an edge and a body.
   std::size_t group_end(const std::vector<Candidate>& candidates, std::size_t first) const;

@@ -43,21 +43,63 @@ bool is_nearer(const NearEdge& a, const NearEdge& b) {
   return a.d_sq < b.d_sq * (1.0 + tie);
 }
 
-/// Whether a point's projection lies inside a triangle; then also its squared distance.
-bool projects_into(const Corners& x, double& d_sq) {
-  const Vec3 e0 = x[2] - x[1];
-  const Vec3 e1 = x[3] - x[1];
-  const Vec3 w = x[0] - x[1];
+/// Faces whose normals differ by a smaller angle [rad] are parts of one plane.
+constexpr double kFlat = 1e-9;
+
+Vec3 normal(const CollisionMesh& mesh, Index f, const double* x) {
+  const auto& [i, j, k] = mesh.faces[f];
+  return (row(x, j) - row(x, i)).cross(row(x, k) - row(x, i));
+}
+
+/// Whether a face and its only neighbor at an edge lie in one plane.
+bool is_flat(const CollisionMesh& mesh,
+             const FeatureWeights& weights,
+             Index face,
+             Index edge,
+             const double* x) {
+  constexpr Index kTwoFaces = -1;
+  if (weights.edge(edge) != kTwoFaces) return false;
+  const auto& [f, g] = mesh.edge_faces[edge];
+  const Vec3 n = normal(mesh, face, x);
+  const Vec3 m = normal(mesh, f == face ? g : f, x);
+  return n.cross(m).squaredNorm() <= kFlat * kFlat * n.squaredNorm() * m.squaredNorm();
+}
+
+enum class Projection : std::uint8_t { kOutside, kInside, kOnFlatBorder };
+
+/// Where a point's projection on the plane of a face lies; if not outside, also its squared distance.
+///
+/// On a border that runs through a plane the point is above the plane, and no edge: the second
+/// derivatives of the distance from that edge are none of this surface.
+Projection project(const CollisionMesh& mesh,
+                   const FeatureWeights& weights,
+                   Index face,
+                   const Vec3& p,
+                   const double* x,
+                   double& d_sq) {
+  const auto& [i, j, k] = mesh.faces[face];
+  const Vec3 e0 = row(x, j) - row(x, i);
+  const Vec3 e1 = row(x, k) - row(x, i);
+  const Vec3 w = p - row(x, i);
   const Vec3 n = e0.cross(e1);
   const double n_sq = n.squaredNorm();
   const double b0 = w.cross(e1).dot(n);
   const double b1 = e0.cross(w).dot(n);
   const double longest_sq = std::max(e0.squaredNorm(), e1.squaredNorm());
   const double least = kBorder * std::sqrt(n_sq * std::max(n_sq, longest_sq * w.squaredNorm()));
-  if (!(b0 > least && b1 > least && n_sq - b0 - b1 > least)) return false;
-  const Closest geometry = closest(PairKind::kPointTriangle, x);
+  // Times |n|^2, of the sides in the order of the face's edges.
+  const std::array<double, 3> from_side{b1, n_sq - b0 - b1, b0};
+  Projection result = Projection::kInside;
+  for (int side = 0; side < 3; ++side) {
+    if (from_side[side] > least) continue;
+    if (from_side[side] < -least || !is_flat(mesh, weights, face, mesh.face_edges[face][side], x)) {
+      return Projection::kOutside;
+    }
+    result = Projection::kOnFlatBorder;
+  }
+  const Closest geometry = closest(PairKind::kPointTriangle, {p, row(x, i), row(x, j), row(x, k)});
   d_sq = geometry.d_sq;
-  return geometry.parameter_count == 2;
+  return geometry.parameter_count == 2 ? result : Projection::kOutside;
 }
 
 bool is_beyond(const Vec3& p, const Vec3& a, const Vec3& b, const Vec3& c, double range) {
@@ -158,10 +200,13 @@ void add_point_terms(const CollisionMesh& mesh,
                      .coefficient = static_cast<double>(weight),
                      .d_sq = near.d_sq});
   };
+  // Of the faces around a border in a plane, the first one has the points above it.
+  bool taken = false;
   for (const Index f : faces) {
-    const auto& [i, j, k] = mesh.faces[f];
     double d_sq = 0.0;
-    if (projects_into({p, row(x, i), row(x, j), row(x, k)}, d_sq)) {
+    const Projection projection = project(mesh, weights, f, p, x, d_sq);
+    if (projection == Projection::kInside || (projection == Projection::kOnFlatBorder && !taken)) {
+      taken = taken || projection == Projection::kOnFlatBorder;
       parts.push_back({.kind = kFace, .ends = {-1, -1}, .id = f, .coefficient = 1.0, .d_sq = d_sq});
       continue;
     }
@@ -280,6 +325,25 @@ void add_edge_terms(const CollisionMesh& mesh,
     out.push_back(
         {.pair = pair, .coefficient = scale * part.coefficient, .d_sq = part.d_sq, .ends = ends});
   }
+}
+
+void merge_shared_ends(std::vector<Term>& terms) {
+  const auto begins_with_edge = [](const Term& t) {
+    return t.pair.kind != PairKind::kEdgeEdge || t.pair.vertices[0] != t.pair.vertices[1];
+  };
+  const auto shared = std::ranges::stable_partition(terms, begins_with_edge).begin();
+  std::stable_sort(shared, terms.end(),
+                   [](const Term& p, const Term& q) { return p.pair.vertices < q.pair.vertices; });
+  auto last = shared;
+  for (auto term = shared; term != terms.end(); ++term) {
+    if (last != shared && (last - 1)->pair.vertices == term->pair.vertices) {
+      (last - 1)->coefficient += term->coefficient;
+    } else {
+      *last++ = *term;
+    }
+  }
+  terms.erase(std::remove_if(shared, last, [](const Term& t) { return t.coefficient == 0.0; }),
+              terms.end());
 }
 
 }  // namespace diffcloth::contact

@@ -81,4 +81,9 @@ void add_edge_terms(const CollisionMesh& mesh,
                     MergeScratch& scratch,
                     std::vector<Term>& out);
 
+/// Merge the terms that begin with an end of an edge, {u, u, ...}: edges that continue each other share
+/// it, and each is a group of its own. They come last then, in the order of their corners; those that
+/// cancel are dropped.
+void merge_shared_ends(std::vector<Term>& terms);
+
 }  // namespace diffcloth::contact

@@ -74,18 +74,13 @@ void BlockMatrix::add_stencil(const std::array<Index, 4>& points, const Mat12& h
 }
 
 void BlockMatrix::add_attached(const std::array<Index, 4>& points, const Mat12& h) {
-  // The four points move with a few rows: dx = sum of G_r dz_r.
-  struct Row {
-    Index row;
-    Eigen::Matrix<double, 12, 3> g;
-  };
-  std::vector<Row> rows;
-  const auto find = [&](Index r) -> Row& {
-    for (Row& known : rows) {
+  motions_.clear();
+  const auto find = [&](Index r) -> Motion& {
+    for (Motion& known : motions_) {
       if (known.row == r) return known;
     }
-    rows.push_back({.row = r, .g = Eigen::Matrix<double, 12, 3>::Zero()});
-    return rows.back();
+    motions_.push_back({.row = r, .g = Eigen::Matrix<double, 12, 3>::Zero()});
+    return motions_.back();
   };
   for (int p = 0; p < 4; ++p) {
     if (has(points[p])) {
@@ -96,9 +91,9 @@ void BlockMatrix::add_attached(const std::array<Index, 4>& points, const Mat12& 
       }
     }
   }
-  for (const Row& s : rows) {
+  for (const Motion& s : motions_) {
     const Eigen::Matrix<double, 12, 3> hg = h * s.g;
-    for (const Row& r : rows) {
+    for (const Motion& r : motions_) {
       if (r.row >= s.row) add_block(r.row, s.row, r.g.transpose() * hg);
     }
   }

@@ -89,10 +89,17 @@ class BlockMatrix {
   }
   void add_attached(const std::array<Index, 4>& points, const Mat12& h);
 
+  /// How four points move with a row: dx = g dz.
+  struct Motion {
+    Index row;
+    Eigen::Matrix<double, 12, 3> g;
+  };
+
   std::shared_ptr<const MergedPattern> merged_;
   const std::vector<char>* fixed_;
   const Attachments* attachments_;
   std::vector<double> blocks_;
+  std::vector<Motion> motions_;  // scratch of add_attached
 };
 
 /// y += A x for a symmetric matrix given by its lower blocks on the pattern.

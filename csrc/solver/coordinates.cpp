@@ -62,8 +62,8 @@ void Coordinates::add_rows(const std::vector<double>& z, std::vector<double>& x)
 
 void Coordinates::clear_rows(std::vector<double>& x) const {
   std::fill_n(x.begin(), body_offset(), 0.0);
-  std::fill_n(x.begin() + node_offset(),
-              3 * static_cast<std::ptrdiff_t>(mechanisms_->node_count()), 0.0);
+  std::fill_n(x.begin() + node_offset(), 3 * static_cast<std::ptrdiff_t>(mechanisms_->node_count()),
+              0.0);
 }
 
 void Coordinates::place(std::vector<double>& x) const {
@@ -136,11 +136,10 @@ void Coordinates::add_curvature(const double* x,
                                 const std::vector<double>& g,
                                 linalg::BlockMatrix& A) const {
   if (!is_curved()) return;
-  mechanisms_->visit_curvature(x + node_offset(), g.data() + body_offset(),
-                               [&](Index i, Index j, const Mat3& block) {
-                                 A.add_block(cloth_vertex_count_ + i, cloth_vertex_count_ + j,
-                                             block);
-                               });
+  mechanisms_->visit_curvature(
+      x + node_offset(), g.data() + body_offset(), [&](Index i, Index j, const Mat3& block) {
+        A.add_block(cloth_vertex_count_ + i, cloth_vertex_count_ + j, block);
+      });
 }
 
 linalg::Couplings Coordinates::couplings_of_rows(const linalg::Couplings& points) const {

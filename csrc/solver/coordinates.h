@@ -109,7 +109,9 @@ class Coordinates {
 
  private:
   std::ptrdiff_t node_offset() const { return 3 * static_cast<std::ptrdiff_t>(vertex_count_); }
-  std::ptrdiff_t body_offset() const { return 3 * static_cast<std::ptrdiff_t>(cloth_vertex_count_); }
+  std::ptrdiff_t body_offset() const {
+    return 3 * static_cast<std::ptrdiff_t>(cloth_vertex_count_);
+  }
 
   Index cloth_vertex_count_;
   Index vertex_count_;

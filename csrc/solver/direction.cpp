@@ -51,7 +51,7 @@ bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
 }
 
 bool Directions::certify() {
-  factor_ = walk_.system.certify(walk_.x().data());
+  factor_ = walk_.system.certify(walk_.x().data(), walk_.g());
   if (!factor_) {
     ++walk_.context.counts->negative_curvature;
     return false;
@@ -63,7 +63,8 @@ bool Directions::certify() {
 
 Directions::Direction Directions::next() {
   if (chord()) return {.kind = Kind::kChord, .first = 1.0};
-  const linalg::BlockMatrix H = walk_.system.assemble(walk_.x().data(), Curvature::kExact);
+  const linalg::BlockMatrix H =
+      walk_.system.assemble(walk_.x().data(), Curvature::kExact, walk_.g());
   if (s_ == 0.0) {
     bool indefinite = false;
     if (iterate(H, indefinite)) return {.kind = Kind::kIterated, .first = 1.0};
@@ -82,7 +83,8 @@ Directions::Direction Directions::next() {
 }
 
 Directions::Direction Directions::damp(const linalg::BlockMatrix& H) {
-  const linalg::BlockMatrix P = walk_.system.assemble(walk_.x().data(), Curvature::kPositive);
+  const linalg::BlockMatrix P =
+      walk_.system.assemble(walk_.x().data(), Curvature::kPositive, walk_.g());
   Factor factor;
   for (;; s_ = std::max(kFirstShare, kFailureGrowth * s_)) {
     walk_.context.checkpoint->check();

@@ -19,7 +19,8 @@ constexpr int kBacktracks = 40;
 Search search(Walk& walk, const std::vector<double>& p, double first) {
   Search result;
   std::vector<double> to;
-  double alpha = walk.watch(p, std::min(first, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
+  double alpha =
+      walk.watch(p, std::min(first, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
   if (!(alpha > 0.0)) {
     result.result = SearchResult::kBlocked;
     return result;

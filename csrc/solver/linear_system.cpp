@@ -2,17 +2,16 @@
 
 namespace diffcloth::solver {
 
-linalg::BlockMatrix LinearSystem::assemble(const double* x, Curvature curvature) {
+linalg::BlockMatrix LinearSystem::assemble(const double* x,
+                                           Curvature curvature,
+                                           const std::vector<double>& g) {
   const Stopwatch::Scope scope(watch_, Phase::kAssembly);
   assembly_ = f_.assemblies->find(f_.couplings());
   linalg::BlockMatrix matrix({assembly_, &assembly_->merged}, f_.assemblies->fixed(),
                              &f_.coordinates->attachments());
   f_.for_each([&](const Potential& p) { p.add_hessian(x, curvature, matrix); });
-  if (f_.coordinates->is_curved() && curvature == Curvature::kExact) {
-    std::vector<double> g;
-    f_.gradient(x, g);
-    f_.coordinates->add_curvature(x, g, matrix);
-  }
+  // The positive one does without: what points do along their curves may be of any sign.
+  if (curvature == Curvature::kExact) f_.coordinates->add_curvature(x, g, matrix);
   return matrix;
 }
 

@@ -36,7 +36,9 @@ class LinearSystem {
       : f_(objective), workspace_(workspace), watch_(watch), counts_(counts) {}
 
   /// The Hessian at x, on the couplings of this point alone: a function of x, not of the way there.
-  linalg::BlockMatrix assemble(const double* x, Curvature curvature);
+  ///
+  /// @param g  the gradient at x
+  linalg::BlockMatrix assemble(const double* x, Curvature curvature, const std::vector<double>& g);
 
   /// L L^T of a matrix that assemble() has made at the last point; null where it is not positive
   /// definite.
@@ -59,7 +61,9 @@ class LinearSystem {
 
   /// Factor of the exact Hessian at x: the certificate that a point where the gradient vanishes is a
   /// minimum. Null where it is none.
-  Factor certify(const double* x) { return factor(assemble(x, Curvature::kExact)); }
+  Factor certify(const double* x, const std::vector<double>& g) {
+    return factor(assemble(x, Curvature::kExact, g));
+  }
 
  private:
   const Objective& f_;

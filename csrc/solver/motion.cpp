@@ -45,7 +45,8 @@ void add_coupling(const Objective& f,
 /// One joint step towards the ends. Returns the fraction of the remaining motion that it covers.
 double joint_step(Walk& walk, const std::vector<double>& ends) {
   const std::vector<double> d = prescribed_change(walk, ends);
-  const linalg::BlockMatrix matrix = walk.system.assemble(walk.x().data(), Curvature::kPositive);
+  const linalg::BlockMatrix matrix =
+      walk.system.assemble(walk.x().data(), Curvature::kPositive, walk.g());
   std::vector<double> b = walk.g();
   add_coupling(walk.f, matrix, walk.x(), d, b);
   // Positive by construction, M/h^2 plus positive semi-definite parts, but for rounding.
@@ -57,7 +58,8 @@ double joint_step(Walk& walk, const std::vector<double>& ends) {
   for (std::size_t a = 0; a < p.size(); ++a) p[a] += d[a];
 
   std::vector<double> to;
-  const double alpha = walk.watch(p, std::min(1.0, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
+  const double alpha =
+      walk.watch(p, std::min(1.0, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
   if (!(alpha > 0.0)) return 0.0;
   if (alpha == 1.0) {
     // To the bit; what follows has been placed by nodes that differ from these by rounding.
@@ -72,7 +74,8 @@ double joint_step(Walk& walk, const std::vector<double>& ends) {
 }
 
 void relax(Walk& walk) {
-  const linalg::BlockMatrix matrix = walk.system.assemble(walk.x().data(), Curvature::kPositive);
+  const linalg::BlockMatrix matrix =
+      walk.system.assemble(walk.x().data(), Curvature::kPositive, walk.g());
   const Factor factor = walk.system.factor(matrix);
   if (!factor) return;
   std::vector<double> p;

@@ -72,7 +72,7 @@ std::vector<double> most_negative(Walk& walk, const linalg::CholeskyFactor& shif
 }  // namespace
 
 bool leave_saddle(Walk& walk) {
-  const linalg::BlockMatrix H = walk.system.assemble(walk.x().data(), Curvature::kExact);
+  const linalg::BlockMatrix H = walk.system.assemble(walk.x().data(), Curvature::kExact, walk.g());
   const Factor shifted = shifted_factor(walk, H);
   if (!shifted) return false;
   const std::vector<double> d = most_negative(walk, *shifted);
@@ -85,7 +85,8 @@ bool leave_saddle(Walk& walk) {
   // From far to near: the first point that is lower, and on while the next is lower still.
   const double length = kFirstMove * walk.f.length;
   std::vector<double> to;
-  double alpha = walk.watch(p, std::min(length, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
+  double alpha =
+      walk.watch(p, std::min(length, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
   double best = 0.0;
   double best_alpha = 0.0;
   for (int k = 0; k < kBacktracks && alpha > 0.0; ++k, alpha *= 0.5) {

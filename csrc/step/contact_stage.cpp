@@ -225,7 +225,9 @@ void pull_back_solve(const Backward& step,
   const solver::Coordinates& coordinates = *f.coordinates;
   solver::LinearSystem system(f, *step.context.workspace, *step.context.watch,
                               *step.context.counts);
-  if (!factor) factor = system.certify(x.data());
+  Array gradient;
+  if (!factor || coordinates.is_curved()) f.gradient(x.data(), gradient);
+  if (!factor) factor = system.certify(x.data(), gradient);
   if (!factor) throw std::domain_error("the Hessian is not positive definite at the solution");
 
   Array b(x.size(), 0.0);
@@ -247,8 +249,6 @@ void pull_back_solve(const Backward& step,
   for (double& value : product) value = -value;
   coordinates.gather(x, product);
   if (coordinates.is_curved()) {
-    Array gradient;
-    f.gradient(x.data(), gradient);
     coordinates.subtract_change(x, zhat, gradient, product);
   }
   coordinates.add_rows(g, product);

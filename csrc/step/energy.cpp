@@ -80,8 +80,8 @@ double stiffness_for_bodies(const Scene& scene, const Inputs& inputs, double bar
   double result = 0.0;
   std::size_t first = 0;
   for (std::size_t t = 0; t < given.tree_free.size(); ++t) {
-    const auto n = static_cast<std::size_t>(
-        std::ranges::count(given.coordinate_tree, static_cast<Index>(t)));
+    const auto n =
+        static_cast<std::size_t>(std::ranges::count(given.coordinate_tree, static_cast<Index>(t)));
     if (given.tree_free[t] != 0) {
       const double mass = metric[first] * h * h;
       double area = 0.0;

@@ -198,7 +198,9 @@ linalg::BlockMatrix contact_free_hessian(Problem& p, const double* x, Curvature 
   Stopwatch watch;
   solver::Counts counts;
   linalg::CholeskyWorkspace workspace;
-  return solver::LinearSystem(f, workspace, watch, counts).assemble(x, curvature);
+  std::vector<double> g;
+  f.gradient(x, g);
+  return solver::LinearSystem(f, workspace, watch, counts).assemble(x, curvature, g);
 }
 
 std::vector<double> Problem::at(const double* rows) const {

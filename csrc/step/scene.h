@@ -35,8 +35,8 @@ struct Description {
   std::vector<Index> pins;                         ///< [P]
   std::vector<Index> soft_pins;                    ///< [Q]
   bodies::BodySet bodies;
-  bodies::MechanismsDescription mechanisms;      ///< empty: every body is a tree of one link
-  std::vector<std::array<Index, 3>> body_faces;  ///< indices into the bodies' vertices
+  bodies::MechanismsDescription mechanisms;         ///< empty: every body is a tree of one link
+  std::vector<std::array<Index, 3>> body_faces;     ///< indices into the bodies' vertices
   std::vector<std::array<Index, 2>> ignored_pairs;  ///< pairs of surfaces that never touch
   bool self_contact = true;
   double dt = 0.01;

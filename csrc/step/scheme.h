@@ -49,9 +49,7 @@ class Scheme {
   /// Find all points at the end of the step, and the contact forces on the bodies' vertices.
   ///
   /// @param x  in: at the start of the step
-  virtual void forward(const Forward& step,
-                       std::vector<double>& x,
-                       double* body_forces) const = 0;
+  virtual void forward(const Forward& step, std::vector<double>& x, double* body_forces) const = 0;
 
   /// From the cotangents of the end to those of all that the potentials depend on.
   virtual void backward(const Backward& step) const = 0;

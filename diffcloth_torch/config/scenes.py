@@ -248,39 +248,51 @@ def prescribed_poses(section: BodySection | RobotSection, dt: float, steps: int)
     )
 
 
+Motions = dict[str, dict[str, Tensor]]
+"""Field of a control -> name -> values after each step."""
+
+
 def prescribed_controls(config: RunConfig, scene: Scene, steps: int) -> list[Control]:
     """Controls of each step: what pins, bodies, bases and joints that have trajectories do."""
     dt = config.simulation.dt
-    pins: dict[str, Tensor] = {}
-    soft_pins: dict[str, Tensor] = {}
+    poses: Motions = {"body_poses": {}, "base_poses": {}}
+    for body in config.scene.bodies:
+        if body.trajectory:
+            poses["body_poses"][body.name] = prescribed_poses(body, dt, steps)
+    for robot in config.scene.robots:
+        if robot.trajectory:
+            poses["base_poses"][robot.name] = prescribed_poses(robot, dt, steps)
+    times = _step_times(dt, steps)
+    motions = _pin_motions(config, scene, times) | poses | _joint_motions(config, scene, times)
+    controls = []
+    for k in range(steps):
+        fields: dict[str, Any] = {
+            field: {name: values[k] for name, values in named.items()}
+            for field, named in motions.items()
+            if named
+        }
+        controls.append(Control(**fields))
+    return controls
+
+
+def _pin_motions(config: RunConfig, scene: Scene, times: Tensor) -> Motions:
+    motions: Motions = {"pins": {}, "soft_pins": {}}
     for section, cloth in zip(config.scene.cloths, scene.cloths, strict=True):
         for name, keyframes in section.pin_trajectories.items():
-            vertices = {**cloth.pins, **cloth.soft_pins}[name]
-            start = torch.tensor(cloth.vertices[vertices])
-            moved = _moved(start, keyframes, _step_times(dt, steps))
-            (pins if name in cloth.pins else soft_pins)[f"{section.name}/{name}"] = moved
-    by_field: dict[str, dict[str, Tensor]] = {"pins": pins, "soft_pins": soft_pins}
-    for field, sections in (("body_poses", config.scene.bodies), ("base_poses", config.scene.robots)):
-        by_field[field] = {
-            section.name: prescribed_poses(section, dt, steps)
-            for section in sections
-            if section.trajectory
-        }
+            field = "pins" if name in cloth.pins else "soft_pins"
+            start = torch.tensor(cloth.vertices[getattr(cloth, field)[name]])
+            motions[field][f"{section.name}/{name}"] = _moved(start, keyframes, times)
+    return motions
+
+
+def _joint_motions(config: RunConfig, scene: Scene, times: Tensor) -> Motions:
+    motions: Motions = {field: {} for field in _JOINT_FIELDS.values()}
     for section, robot in zip(config.scene.robots, scene.robots, strict=True):
         for name, keyframes in section.joint_trajectories.items():
             field, start = _joint_field(section.name, name, robot)
-            values = _joint_values(keyframes, start, _step_times(dt, steps))
-            by_field.setdefault(field, {})[f"{section.name}/{name}"] = values
-    return [
-        Control(
-            **{
-                field: {name: values[k] for name, values in named.items()}
-                for field, named in by_field.items()
-                if named
-            }
-        )
-        for k in range(steps)
-    ]
+            values = _joint_values(keyframes, start, times)
+            motions[field][f"{section.name}/{name}"] = values
+    return motions
 
 
 _JOINT_FIELDS = {

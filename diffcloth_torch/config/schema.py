@@ -379,6 +379,12 @@ class SceneSection(Section):
     robots: list[RobotSection] = []
     ignore_contact: list[Names] = []
 
+    @model_validator(mode="after")
+    def _check_cloths(self) -> SceneSection:
+        if not (self.cloths or self.robots or any(b.motion == "dynamic" for b in self.bodies)):
+            raise ValueError("must have a cloth in `cloths` unless a body or a robot is dynamic")
+        return self
+
 
 # --- the run ------------------------------------------------------------------------------------
 

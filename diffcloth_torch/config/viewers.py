@@ -35,6 +35,7 @@ def open_viewers(
 def _record(config: RunConfig, scene: Scene, folder: Path, goals: Sequence[Goal]) -> Viewer:
     paints = {cloth.name: Paint(cloth.color, cloth.back_color) for cloth in config.scene.cloths}
     paints |= {body.name: Paint(body.color) for body in config.scene.bodies}
+    paints |= {robot.name: Paint(robot.color) for robot in config.scene.robots}
     options = config.output.pictures.model_dump()
     return Record(
         folder,

@@ -21,7 +21,7 @@ class Mechanism:
         T_l = T_p offset_l motion(axis_l, multiplier_l q[dof_l] + constant_l),
 
     where motion turns about, or shifts along, the axis. Links are in the order of the file, parents
-    not necessarily first.
+    not necessarily first. Arrays are not marked read-only: torch takes no views of such.
 
     Attributes:
         name: Of the robot or body.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from diffcloth_torch.checks import FloatArray, IndexArray, frozen
+from diffcloth_torch.checks import FloatArray, IndexArray
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.mass_properties import check_inertia
 from diffcloth_torch.model.mechanism import Mechanism
@@ -76,11 +76,11 @@ _KINDS = {
 
 
 def _stack(values: Sequence[object]) -> FloatArray:
-    return frozen(np.array(values, dtype=np.float64))
+    return np.array(values, dtype=np.float64)
 
 
 def _indices(values: Sequence[int]) -> IndexArray:
-    return frozen(np.array(values, dtype=np.int32))
+    return np.array(values, dtype=np.int32)
 
 
 def _follow(
@@ -131,7 +131,7 @@ def _limits(
                 f"{where}: limits of a joint under {actuation[j]!r} must leave it a range, got "
                 f"{lower[j]:g} for both; make its type 'fixed', or prescribe its position"
             )
-    return frozen(lower), frozen(upper)
+    return lower, upper
 
 
 def _check_masses(file: Path, mechanism: Mechanism) -> None:

@@ -324,8 +324,8 @@ def _body_mechanism(name: str, body: RigidBody) -> Mechanism:
         upper=np.empty(0),
         actuation=(),
         mass=np.array([body.mass]),
-        center=body.center[None],
-        inertia=body.inertia[None],
+        center=np.array([body.center]),
+        inertia=np.array([body.inertia]),
     )
 
 

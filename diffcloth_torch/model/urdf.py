@@ -18,7 +18,15 @@ from xml.etree.ElementTree import Element, ParseError, tostring
 import defusedxml.ElementTree
 import numpy as np
 
-from diffcloth_torch.checks import ANY_NUMBER, LARGEST, NON_NEGATIVE, FloatArray, Range, texts
+from diffcloth_torch.checks import (
+    ANY_NUMBER,
+    LARGEST,
+    NON_NEGATIVE,
+    FloatArray,
+    Range,
+    check_choice,
+    texts,
+)
 from diffcloth_torch.errors import InvalidInput
 
 __all__ = ["JOINT_TYPES", "SHAPES", "Joint", "Link", "RobotDescription", "Shape", "read_urdf"]
@@ -164,6 +172,7 @@ class _Attribute(NamedTuple):
     numbers: int = 0  # how many; 0: a word
     default: str | None = None
     accepted: Range = ANY_NUMBER
+    words: tuple[str, ...] = ()  # the accepted ones, where not all are
 
 
 class _Child(NamedTuple):
@@ -215,7 +224,7 @@ _LINK = _Element(
     },
 )
 _JOINT = _Element(
-    {"name": _NAME, "type": _NAME},
+    {"name": _NAME, "type": _Attribute(words=JOINT_TYPES)},
     {
         "origin": _ORIGIN,
         "parent": _Child(_Element({"link": _NAME}, {}), required=True),
@@ -262,11 +271,12 @@ def _reduced(file: str, node: Element, grammar: _Element, above: Sequence[str]) 
     for key, attribute in grammar.attributes.items():
         copy.set(key, _checked(f"{where}: `{key}`", node.get(key, attribute.default), attribute))
     found = [child for child in node if child.tag in grammar.children]
-    for tag, child in grammar.children.items():
-        count = sum(node.tag == tag for node in found)
-        if (count == 0 and child.required) or (count > 1 and not child.many):
+    for tag, rule in grammar.children.items():
+        count = sum(child.tag == tag for child in found)
+        if (count == 0 and rule.required) or (count > 1 and not rule.many):
             raise InvalidInput(f"{where} must have one <{tag}>, got {count}")
-    copy.extend(_reduced(file, child, grammar.children[child.tag].element, here) for child in found)
+    for child in found:
+        copy.append(_reduced(file, child, grammar.children[child.tag].element, here))
     if grammar is _GEOMETRY and len(copy) != 1:
         got = ", ".join(f"<{child.tag}>" for child in node) or "none"
         accepted = ", ".join(f"<{kind}>" for kind in SHAPES)
@@ -277,6 +287,8 @@ def _reduced(file: str, node: Element, grammar: _Element, above: Sequence[str]) 
 def _checked(label: str, text: str | None, attribute: _Attribute) -> str:
     if text is None:
         raise InvalidInput(f"{label} must be given")
+    if attribute.words:
+        return check_choice(label, text, attribute.words)
     if attribute.numbers == 0:
         return _checked_word(label, text)
     what = "a number" if attribute.numbers == 1 else f"{attribute.numbers} numbers"
@@ -387,10 +399,6 @@ def _shape(collision: Any) -> Shape:
 
 def _joint(file: str, joint: Any) -> Joint:
     where = f"{file}: <joint name={joint.name!r}>"
-    if joint.type not in JOINT_TYPES:
-        raise InvalidInput(
-            f"{where}: `type` must be one of {texts(JOINT_TYPES)}, got {joint.type!r}"
-        )
     axis = np.array([1.0, 0.0, 0.0] if joint.axis is None else joint.axis)
     length = float(np.linalg.norm(axis))
     if joint.type != "fixed" and length < _SHORTEST_AXIS:

@@ -20,10 +20,11 @@ _PANDA = "robots/panda_description/urdf/panda.urdf"
 def panda() -> tuple[Path, Path]:
     """Find the Panda: its URDF file, and the `mesh_root` to load it with.
 
-    Its fourth joint must start below zero:
+    At zero its fourth joint is beyond its limit, and fingers and links overlap; this start does:
 
         path, root = dc.robots.panda()
-        robot = dc.Robot.load(path, mesh_root=root, joint_positions={"panda_joint4": -1.5})
+        start = {"panda_joint4": -1.5, "panda_joint6": 1.5, "panda_finger_joint1": 0.02}
+        robot = dc.Robot.load(path, mesh_root=root, joint_positions=start)
 
     Raises:
         ImportError: If the extra `robots` is not installed.

@@ -194,11 +194,10 @@ def control_fields(
         "forces": _zeros(len(assembly.vertices), 3),
     }
     if layout.has_coordinates:
-        driven = torch.tensor([mode == "pd" for mode in layout.actuation], dtype=torch.bool)
         unset |= {
             "body_wrenches": _zeros(len(layout.bodies), 6),
             "joint_positions": torch.where(
-                driven, state["joint_targets"], state["joint_positions"]
+                layout.driven, state["joint_targets"], state["joint_positions"]
             ),
             "joint_velocities": _zeros(len(layout.joint_names)),
             "joint_efforts": _zeros(len(layout.joint_names)),

@@ -44,6 +44,7 @@ class Layout:
         unforced: "body_wrenches" or "base_wrenches" -> why each row must be zero, or "".
         joint_names: "robot/joint" of each of the J joints.
         actuation: Of each joint, length J.
+        driven: Which joints have a pd drive, shape [J].
         settable: Field of a control -> which joints it sets, shape [J].
         massive: "body" or "link" -> which of them have mass and are moved by forces, [K] or [L].
         lower: Lower limits [rad or m], shape [J].
@@ -69,6 +70,7 @@ class Layout:
             f"{r.name}/{joint}" for r in self.robots for joint in r.joint_names
         )
         self.actuation = tuple(mode for robot in self.robots for mode in robot.actuation)
+        self.driven = torch.tensor([mode == "pd" for mode in self.actuation], dtype=torch.bool)
         self.lower = _joined([robot.lower for robot in self.robots])
         self.upper = _joined([robot.upper for robot in self.robots])
         body_motions = [f"that body is {_MOTIONS[body.base]}" for body in self.bodies]

@@ -19,6 +19,8 @@ from diffcloth_torch.checks import (
     check_number,
     check_shape,
 )
+from diffcloth_torch.dynamics.dynamics import Dynamics, Prediction
+from diffcloth_torch.dynamics.limits import limit_stiffness
 from diffcloth_torch.errors import IntersectingState, InvalidInput
 from diffcloth_torch.model.defaults import (
     check_barrier,
@@ -41,11 +43,12 @@ from diffcloth_torch.sim.inputs import (
 )
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.links import contact_wrenches, link_poses, link_velocities
-from diffcloth_torch.sim.motion import prescribed_motion
+from diffcloth_torch.sim.motion import dynamic_motion, prescribed_motion
 from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.rollout import roll_out
 from diffcloth_torch.sim.state import LinkSurfaces, State, Surfaces
 from diffcloth_torch.sim.step import as_array, refuse_transforms, take_step
+from diffcloth_torch.sim.trees import tree_arguments
 
 __all__ = ["Simulator"]
 
@@ -132,6 +135,9 @@ class Simulator:
         self._assembly = assemble(scene)
         self._layout = Layout(self._assembly)
         _check_motion(self)
+        self._dynamics = (
+            Dynamics(self._assembly, self.dt) if self._layout.has_coordinates else None
+        )
         self.surfaces = self._assembly.surface_names
         starts = self._assembly.cloth_vertex_start.tolist()
         rows = [slice(a, b) for a, b in pairwise(starts)]
@@ -261,13 +267,19 @@ class Simulator:
             TypeError: If a tensor of the state is not float64 on the CPU.
         """
         (before, wanted, physical), batch = self._fields(state, control, parameters)
-        inputs = self._core_inputs(before, wanted, physical)
+        prediction = self._predict(before, wanted, physical)
+        inputs = self._core_inputs(before, wanted, physical, prediction)
         outcome = take_step(self._core, inputs, batched=batch is not None)
         report = make_report(outcome.diagnostics, self._core.phases, batched=batch is not None)
         raise_on_failure(
             outcome.diagnostics, report, throw=self.solver.throw, batched=batch is not None
         )
-        after = prescribed_motion(self._layout, before, wanted, self.dt)
+        if self._dynamics is None or prediction is None:
+            after = prescribed_motion(self._layout, before, wanted, self.dt)
+        else:
+            after = dynamic_motion(
+                self._layout, self._dynamics, prediction, before, wanted, outcome, batch
+            )
         after["soft_pin_targets"] = wanted["soft_pins"]
         after["time"] = before["time"] + self.dt
         return State(
@@ -430,7 +442,7 @@ class Simulator:
     ) -> tuple[Fields, int | None]:
         """Inputs of the core, and the batch size."""
         fields, batch = self._fields(state, control, parameters)
-        return self._core_inputs(*fields), batch
+        return self._core_inputs(*fields, self._predict(*fields)), batch
 
     def _fields(
         self, state: State, control: Control | None, parameters: Parameters | None
@@ -444,8 +456,18 @@ class Simulator:
         self._check_barrier("parameters", physical)
         return (before, wanted, physical), batch
 
-    def _core_inputs(self, state: Fields, control: Fields, parameters: Fields) -> Fields:
+    def _predict(self, state: Fields, control: Fields, parameters: Fields) -> Prediction | None:
+        """What bodies and robots do by themselves; None where all are bodies on known poses."""
+        if self._dynamics is None:
+            return None
+        return self._dynamics.predict(state, control, parameters)
+
+    def _core_inputs(
+        self, state: Fields, control: Fields, parameters: Fields, prediction: Prediction | None
+    ) -> Fields:
         inputs = core_inputs(state, control, parameters)
+        if prediction is not None:
+            inputs |= prediction.core_inputs()
         rest = inputs.get("rest_positions")
         if rest is not None and not rest.requires_grad:
             scene_rest = self._defaults["rest_positions"].unsqueeze(0)
@@ -469,8 +491,9 @@ class Simulator:
         self._defaults["barrier_stiffness"] = _scalar(stiffness)
 
     def _check_barrier(self, owner: str, inputs: Fields) -> None:
-        if "barrier_distance" in inputs and self.contact.self_contact:
-            thickness = as_array(inputs["thickness"])[:, : self._assembly.cloth_count]
+        cloths = len(self.scene.cloths)
+        if cloths and "barrier_distance" in inputs and self.contact.self_contact:
+            thickness = as_array(inputs["thickness"])[:, :cloths]
             distance = as_array(inputs["barrier_distance"])
             check_barrier(owner, distance, thickness, self._nonadjacent_distance)
 
@@ -516,6 +539,10 @@ def _check_motion(simulator: Simulator) -> None:
 
 def _make_core(simulator: Simulator) -> _core.Simulator:
     assembly = simulator._assembly
+    trees: dict[str, Any] = {}
+    if simulator._dynamics is not None:
+        stiffness = limit_stiffness(assembly, simulator.dt, simulator.scene.gravity)
+        trees = tree_arguments(assembly, stiffness)
     return _core.Simulator(
         vertices=assembly.vertices,
         rest_vertices=assembly.rest_vertices,
@@ -536,6 +563,8 @@ def _make_core(simulator: Simulator) -> _core.Simulator:
         friction_iterations=simulator.contact.friction_iterations,
         tolerance=simulator.solver.tolerance,
         max_iterations=simulator.solver.max_iterations,
+        ignored_pairs=assembly.ignored_pairs,
+        **trees,
     )
 
 

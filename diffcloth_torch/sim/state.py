@@ -144,10 +144,11 @@ class State:
     def __post_init__(self) -> None:
         missing = [name for name in _ADDED if getattr(self, name) is None]
         if missing:
-            *environments, bodies = np.shape(self.body_poses)[:-1]
+            shape = np.shape(self.body_poses)
+            environments, bodies = shape[:-2], shape[-2] if len(shape) > 1 else 0
             for name in missing:
-                shape = shape_of(STATE[name].axes[0], {"K": bodies, "J": 0, "R": 0})
-                zeros = torch.zeros(*environments, *shape, dtype=torch.float64)
+                rows = shape_of(STATE[name].axes[0], {"K": bodies, "J": 0, "R": 0})
+                zeros = torch.zeros(*environments, *rows, dtype=torch.float64)
                 object.__setattr__(self, name, zeros)
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Ge, Len
@@ -104,7 +104,7 @@ class HitCloth:
         self.simulator = build_simulator(self.scene, config.simulation)
         self.steps = config.simulation.steps
         self.optimizer = config.optimizer
-        self._body = self.scene.body_names.index(config.actions.body)
+        self._name = config.actions.body
         cloth = self.scene.cloths[self.scene.cloth_names.index(config.target.cloth)]
         target = transform(cloth.rest_vertices, pose_array(config.target.pose))
         self._target = torch.from_numpy(target)
@@ -127,16 +127,17 @@ class HitCloth:
     def controller(self, actions: Mapping[str, Tensor]) -> Controller:
         """Integrate the actions to poses of the body; the rest of the scene follows keyframes."""
         twists = torch.cat([actions["linear"], actions["angular"]], dim=-1)
-        start = torch.from_numpy(self.scene.bodies[self._body].pose.copy())
+        body = self.scene.bodies[self.scene.body_names.index(self._name)]
+        start = torch.from_numpy(body.pose.copy())
         poses = integrate_poses(
             start,
             twists.repeat_interleave(self.config.actions.interval, dim=0)[: self.steps],
             self.simulator.dt,
         )
-        controls = [
-            control.replace(body_poses=_with_row(control.body_poses, self._body, pose))
-            for control, pose in zip(self._prescribed, poses, strict=True)
-        ]
+        controls = []
+        for control, pose in zip(self._prescribed, poses, strict=True):
+            others: Any = control.body_poses or {}  # by name
+            controls.append(control.replace(body_poses={**others, self._name: pose}))
         return lambda k, _state: controls[k]
 
     def loss(self, states: Sequence[State]) -> Tensor:
@@ -173,8 +174,3 @@ def _rows(name: str, rows: list[list[float]], count: int) -> Tensor:
             f"got {len(rows)}"
         )
     return torch.tensor(rows, dtype=torch.float64).expand(count, 3).clone()
-
-
-def _with_row(poses: Tensor | None, row: int, pose: Tensor) -> Tensor:
-    assert poses is not None  # the schema requires a body
-    return torch.cat([poses[:row], pose[None], poses[row + 1 :]])

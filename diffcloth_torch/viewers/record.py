@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from diffcloth_torch.checks import FloatArray, IndexArray
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.geometry.poses import transform
+from diffcloth_torch.model.kinematics import pose_frame
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.state import State
@@ -57,7 +59,7 @@ class Record:
             scene: What is shown.
             fps: Pictures per second, where `pictures` do not say.
             pictures: How they are made.
-            paints: Name of a cloth or body -> its colors.
+            paints: Name of a cloth, a body or a robot -> its colors.
             goals: Shapes that are shown beside it.
             name: Name of the files.
 
@@ -71,12 +73,12 @@ class Record:
         self._paints, self._goals = paints, goals
         self._fps = fps if self._options.fps is None else self._options.fps
         self._positions: list[NDArray[np.float64]] = []
-        self._poses: list[NDArray[np.float64]] = []
+        self._frames: list[NDArray[np.float64]] = []
 
     def show(self, state: State) -> None:
         """Keep one state."""
         self._positions.append(state.positions.detach().numpy().copy())
-        self._poses.append(state.body_poses.detach().numpy().copy())
+        self._frames.append(self._placed_frames(state))
 
     def __enter__(self) -> Record:
         """Have nothing more to open."""
@@ -98,7 +100,7 @@ class Record:
         sheet = []
         with self._stage() as stage, self._writer() as writer:
             for k in tqdm(range(count), desc="draw", unit="frame", disable=None):
-                image = stage.draw(self._positions[k], self._poses[k][self._shown_bodies()])
+                image = stage.draw(self._positions[k], self._frames[k])
                 writer(k, image)
                 if k in moments:
                     sheet.append(image)
@@ -106,7 +108,6 @@ class Record:
 
     def _stage(self) -> Stage:
         scene = self._scene
-        names = scene.body_names
         low, high = self._bounds()
         stage = Stage(
             [
@@ -116,8 +117,8 @@ class Record:
                 )
             ],
             [
-                (scene.bodies[k].vertices, Skin(scene.bodies[k].faces, self._paint(names[k])))
-                for k in self._shown_bodies()
+                (vertices, Skin(faces, self._paint(name)))
+                for name, vertices, faces in self._rigid_surfaces()
             ],
             size=self._options.size,
             bounds=(low, high),
@@ -139,12 +140,38 @@ class Record:
         """Bodies that are drawn: the floor of the stage stands for a level plane."""
         return [k for k, body in enumerate(self._scene.bodies) if not _is_floor(body)]
 
+    def _rigid_surfaces(self) -> list[tuple[str, FloatArray, IndexArray]]:
+        """Owner, vertices and faces of each body and link that is drawn."""
+        scene = self._scene
+        shown = [
+            (scene.body_names[k], scene.bodies[k].vertices, scene.bodies[k].faces)
+            for k in self._shown_bodies()
+        ]
+        for name, robot in zip(scene.robot_names, scene.robots, strict=True):
+            meshes = [surface for surface in robot.surfaces if surface is not None]
+            shown += [(name, mesh.vertices, mesh.faces) for mesh in meshes]
+        return shown
+
+    def _placed_frames(self, state: State) -> FloatArray:
+        """Frames [n, 4, 4] of what `_rigid_surfaces` lists."""
+        state = state.detach()
+        frames = [*pose_frame(state.body_poses)[self._shown_bodies()]]
+        first = 0
+        for robot, base in zip(self._scene.robots, state.base_poses, strict=True):
+            joints = state.joint_positions[first : first + len(robot.joint_names)]
+            first += len(joints)
+            placed = robot.forward_kinematics(joints, base)
+            links = zip(robot.link_names, robot.surfaces, strict=True)
+            frames += [placed[link] for link, surface in links if surface is not None]
+        stacked: FloatArray = np.array([frame.numpy() for frame in frames]).reshape(-1, 4, 4)
+        return stacked
+
     def _bounds(self) -> Bounds:
         points = [*self._positions, *(goal.vertices for goal in self._goals)]
-        for k in self._shown_bodies():
-            vertices = self._scene.bodies[k].vertices
-            poses = np.unique([pose[k] for pose in self._poses], axis=0)
-            points += [transform(vertices, pose) for pose in poses]
+        for k, (_, vertices, _) in enumerate(self._rigid_surfaces()):
+            frames = np.unique([frames[k] for frames in self._frames], axis=0)
+            points += [vertices @ frame[:3, :3].T + frame[:3, 3] for frame in frames]
+        points = [cloud for cloud in points if len(cloud)]
         lows = [cloud.min(axis=0) for cloud in points]
         highs = [cloud.max(axis=0) for cloud in points]
         return np.min(lows, axis=0), np.max(highs, axis=0)

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.viewers.floor import BACKGROUND, Floor, Shadow
 from diffcloth_torch.viewers.look import Camera, Goal, Paint
 
@@ -118,7 +117,7 @@ class Stage:
 
         Args:
             cloths: Cloths; their faces index the positions that `draw` gets.
-            bodies: Vertices in the body frame [m], shape [v, 3], and skin of each body.
+            bodies: Vertices [m], shape [v, 3], and skin of each body or link, in its frame.
             size: Width and height [pixels].
             bounds: Of all that will be drawn.
             ground: Height of the floor [m]; None leaves it out.
@@ -135,7 +134,7 @@ class Stage:
             (vertices, skin.faces, self._add_body(i, vertices, skin))
             for i, (vertices, skin) in enumerate(bodies)
         ]
-        self._poses: Points | None = None
+        self._frames: Points | None = None
         self._floor = None
         if ground is not None:
             self._floor = Floor(self._pv, self._plotter, bounds, ground)
@@ -162,12 +161,12 @@ class Stage:
             tube = border.strip(join=True).tube(radius=width)
             self._plotter.add_mesh(tube, color=_GOAL_COLOR, ambient=0.5)
 
-    def draw(self, positions: Points, poses: Points) -> Image:
+    def draw(self, positions: Points, frames: Points) -> Image:
         """Take one picture.
 
         Args:
             positions: Cloth vertices [m], shape [N, 3].
-            poses: Poses of the bodies, shape [K, 7].
+            frames: Of the bodies and links, shape [n, 4, 4].
 
         Returns:
             Colors, shape [height, width, 3].
@@ -177,11 +176,11 @@ class Stage:
             surface.move(positions)
             casters.append((positions, faces))
         for k, (rest, faces, surface) in enumerate(self._bodies):
-            vertices = transform(rest, poses[k])
-            if self._poses is None or (poses[k] != self._poses[k]).any():
+            vertices = rest @ frames[k, :3, :3].T + frames[k, :3, 3]
+            if self._frames is None or (frames[k] != self._frames[k]).any():
                 surface.move(vertices)
             casters.append((vertices, faces))
-        self._poses = poses.copy()
+        self._frames = frames.copy()
         if self._floor is not None:
             self._shadow.cast(casters)
         self._plotter.render()  # a screenshot alone would show the last picture again

@@ -25,7 +25,7 @@ def one_body(*, free=True):
 
 
 def chain(*, free):
-    """Four links: a hinge with limits, a slide on prescribed values, a hinge that mimics the first."""
+    """Four links: a hinge with limits, a prescribed slide, a hinge that mimics the first."""
     n = 6 if free else 0
     return trees(
         free,

@@ -40,7 +40,7 @@ def body_in_contact():
 
 
 def chain_in_contact(*, free):
-    """A chain that comes down on the cloth: its hinge beyond its limit, its slide on given values."""
+    """A chain that comes down on the cloth, its hinge beyond its limit, its slide prescribed."""
     rng = np.random.default_rng(1)
     scene = CoreScene(chain(free=free), BOXES, cells=6)
     n = 8 if free else 2

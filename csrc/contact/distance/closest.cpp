@@ -1,5 +1,7 @@
 #include "contact/distance/closest.h"
 
+#include <algorithm>
+#include <cmath>
 #include <limits>
 
 #include <Eigen/Geometry>
@@ -72,6 +74,14 @@ Mat2 inverse_metric(const Vec3& s0, const Vec3& s1, double determinant) {
   return M_inv / determinant;
 }
 
+/// How far outside a triangle a point counts as above it, in parameters: by the rounding of those. The
+/// distance does not notice.
+double border(const Vec3& e0, const Vec3& e1, const Vec3& w, double n_sq) {
+  constexpr double kBorder = 2e-12;
+  const double longest_sq = std::max(e0.squaredNorm(), e1.squaredNorm());
+  return kBorder * std::sqrt(std::max(1.0, longest_sq * w.squaredNorm() / n_sq));
+}
+
 Nearest nearer(const Nearest& p, const Nearest& q) { return q.d_sq < p.d_sq ? q : p; }
 
 Closest point_triangle(const Corners& x) {
@@ -83,7 +93,7 @@ Closest point_triangle(const Corners& x) {
   if (n_sq > kParallel * e0.squaredNorm() * e1.squaredNorm()) {
     const double b0 = w.cross(e1).dot(n) / n_sq;
     const double b1 = e0.cross(w).dot(n) / n_sq;
-    if (b0 > 0 && b1 > 0 && b0 + b1 < 1) {
+    if (std::min({b0, b1, 1 - b0 - b1}) > -border(e0, e1, w, n_sq)) {
       Closest out = empty();
       out.c << 1, -(1 - b0 - b1), -b0, -b1;
       out.parameter_count = 2;
