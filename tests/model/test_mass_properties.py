@@ -44,7 +44,7 @@ def test_a_far_and_turned_mesh_has_the_same_moments():
 def test_moments_are_those_of_trimesh(mesh):
     trimesh = pytest.importorskip("trimesh")
     vertices = mesh[0] @ TURN.T + [0.1, 0.2, 0.3]
-    vertices[:, 0] *= 1.7  # no symmetry
+    vertices[:, :2] *= 1.5 + 2 * vertices[:, 2:]  # no symmetry, and uneven triangles
     volume, center, inertia = mass_properties(vertices, mesh[1])
     expected = trimesh.Trimesh(vertices, mesh[1], process=False).mass_properties
     assert volume == pytest.approx(expected.mass, rel=1e-12)
