@@ -189,11 +189,27 @@ def test_what_does_not_move_by_forces_has_no_mass():
             dc.InvalidInput,
             "must face outward, so that it holds a volume > 0, got -1 m",
         ),
+        (
+            lambda: dc.RigidBody(*_flat(0.0), motion="dynamic", mass=1),
+            dc.InvalidInput,
+            "a volume > 0, got 0 m",
+        ),
+        (
+            lambda: dc.RigidBody(*_flat(1e-16), motion="dynamic", density=1),
+            dc.InvalidInput,
+            "a volume > 0, got .*e-17 m",
+        ),
     ],
 )
 def test_bad_mass_properties_are_refused(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+def _flat(height):
+    """A closed tetrahedron of next to no height."""
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, height]])
+    return vertices, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
 
 
 def _inward():
