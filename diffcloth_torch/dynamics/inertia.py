@@ -102,7 +102,7 @@ def slope(tree: Tree, motion: Motion, velocity: Tensor) -> Tensor:
     linear, angular = torch.split((motion.weighted @ nu)[..., 0], 3, dim=-1)
     carried = torch.cat([linear, angular + torch.linalg.cross(frames.centers, linear)], dim=-1)
     # Of all that hangs on each joint, first about the origin, then about the pivot.
-    F, N = torch.split(tree.reach.T @ carried, 3, dim=-1)
+    F, N = torch.split(tree.hanging @ carried, 3, dim=-1)
     N = N - torch.linalg.cross(frames.pivots, F)
     rate, omega = torch.split(twists[..., tree.moving, :], 3, dim=-1)
     arms = frames.pivots - frames.centers[..., tree.moving, :]
@@ -110,7 +110,8 @@ def slope(tree: Tree, motion: Motion, velocity: Tensor) -> Tensor:
     axis_rate = torch.linalg.cross(omega, frames.axes)
     turning = (axis_rate * N + frames.axes * torch.linalg.cross(F, pivot_rate)).sum(-1)
     sliding = (axis_rate * F).sum(-1)
-    joints = torch.lerp(sliding, turning, tree.revolute[:, 0]) @ tree.leaders
+    rows = torch.lerp(sliding, turning, tree.revolute[:, 0]).unsqueeze(-2)
+    joints = (rows @ tree.leaders)[..., 0, :]
     root_rate = velocity[..., :3]
     root = torch.linalg.cross(linear.sum(-2), root_rate)
     return torch.cat([torch.zeros_like(root_rate), root, joints], dim=-1)

@@ -40,12 +40,16 @@ class Frames(NamedTuple):
 class Tree:
     """The constants of a mechanism, as tensors.
 
+    Matrices have a first axis for the environments: a product of all of them at once would round by
+    how many there are.
+
     Attributes:
         mechanism: What it was made from.
         moving: Links whose joint to the parent moves, length A.
         reach: Whether link l hangs on joint a, as 0 or 1, shape [L, A].
         revolute: Whether joint a turns, as 0 or 1, shape [A, 1].
-        leaders: Matrix from the values of the J joints to those of the A joints, shape [A, J].
+        hanging: Its transpose, shape [1, A, L].
+        leaders: Matrix from the values of the J joints to those of the A joints, shape [1, A, J].
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
@@ -60,15 +64,16 @@ class Tree:
         turns = np.array([kind == "revolute" for kind in mechanism.kind])
 
         self.reach = _tensor(reach[:, self.moving])
+        self.hanging = _tensor(reach[:, self.moving].T)[None]
         self.revolute = _tensor(turns[self.moving, None])
-        self.leaders = _tensor(leaders[self.moving])
+        self.leaders = _tensor(leaders[self.moving])[None]
         # Of all L links, as the frames need them. About a unit axis a turn by u has the matrix
         # I + sin(u) K + (1 - cos(u)) K^2, with K the matrix of the cross product.
         cross = np.zeros((links, 4, 4))
         cross[:, :3, :3] = np.cross(np.eye(3), mechanism.axis[:, None, :]) * turns[:, None, None]
         shift = np.zeros((links, 4, 4))
         shift[:, :3, 3] = mechanism.axis * ~turns[:, None]
-        self._values = _tensor(leaders.T)
+        self._values = _tensor(leaders.T)[None]
         self._constants = _tensor(mechanism.constant * (mechanism.dof >= 0))
         self._offsets = _tensor(mechanism.offset)
         self._cross, self._cross_sq, self._shift = map(_tensor, (cross, cross @ cross, shift))
@@ -81,7 +86,8 @@ class Tree:
             root: Frame of the root link, shape [B or 1, 4, 4].
             joints: Values of the joints [rad or m], shape [B, J].
         """
-        values = (joints @ self._values + self._constants)[..., None, None]
+        values = (joints.unsqueeze(-2) @ self._values)[..., 0, :] + self._constants
+        values = values[..., None, None]
         motions = torch.sin(values) * self._cross + (1 - torch.cos(values)) * self._cross_sq
         steps = self._offsets + self._offsets @ (motions + values * self._shift)
         local = steps.unbind(-3)
@@ -146,4 +152,4 @@ _EYE = torch.eye(3, dtype=torch.float64)
 _LOWER = torch.eye(6, dtype=torch.float64)[3:]
 _LAST_ROW = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
 # a @ CROSS is the matrix of the cross product a x, row after row.
-CROSS = torch.linalg.cross(_EYE[:, None, :], _EYE[None, :, :]).transpose(1, 2).reshape(3, 9)
+CROSS = torch.linalg.cross(_EYE[:, None, :], _EYE[None, :, :]).transpose(1, 2).reshape(1, 3, 9)

@@ -30,26 +30,12 @@ _SERIES_ANGLE = 0.1
 _SMALLEST_SINE = 1e-9
 
 
-# The nine entries of a rotation matrix, row after row, from the sixteen products of a quaternion's
-# numbers, likewise: R = (w^2 - v . v) 1 + 2 v v^T + 2 w [v].
-_MATRIX_OF_PRODUCTS = (
-    torch.tensor(
-        [
-            [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, -1]],
-            [[0, 0, 0, -2], [0, 0, 2, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
-            [[0, 0, 2, 0], [0, 0, 0, 2], [0, 0, 0, 0], [0, 0, 0, 0]],
-            [[0, 0, 0, 2], [0, 0, 2, 0], [0, 0, 0, 0], [0, 0, 0, 0]],
-            [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, 0, -1]],
-            [[0, -2, 0, 0], [0, 0, 0, 0], [0, 0, 0, 2], [0, 0, 0, 0]],
-            [[0, 0, -2, 0], [0, 0, 0, 2], [0, 0, 0, 0], [0, 0, 0, 0]],
-            [[0, 2, 0, 0], [0, 0, 0, 0], [0, 0, 0, 2], [0, 0, 0, 0]],
-            [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]],
-        ],
-        dtype=torch.float64,
-    )
-    .reshape(9, 16)
-    .T
-)
+# The entries of a rotation matrix are twice a product of two entries of its quaternion plus or minus
+# another, less one on the diagonal; products of (w, x, y, z) are numbered row after row.
+_FIRST = torch.tensor([0, 6, 7, 6, 0, 11, 7, 11, 0])
+_SECOND = torch.tensor([5, 3, 2, 3, 10, 1, 2, 1, 15])
+_SIGN = torch.tensor([1, -1, 1, 1, 1, -1, -1, 1, 1], dtype=torch.float64)
+_IDENTITY = torch.eye(3, dtype=torch.float64).flatten()
 
 
 def quaternion_exp(rotation_vector: Tensor) -> Tensor:
@@ -183,9 +169,10 @@ def interpolate_poses(times: Tensor, poses: Tensor, at: Tensor) -> Tensor:
 
 def quaternion_matrix(quaternion: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
-    products = quaternion.unsqueeze(-1) * quaternion.unsqueeze(-2)
-    entries = products.flatten(-2) @ _MATRIX_OF_PRODUCTS
-    return entries.reshape(*quaternion.shape[:-1], 3, 3)
+    products = (quaternion.unsqueeze(-1) * quaternion.unsqueeze(-2)).flatten(-2)
+    # Not as a product of matrices, whose bits would depend on how many there are.
+    sums = products[..., _FIRST] + _SIGN * products[..., _SECOND]
+    return (2 * sums - _IDENTITY).reshape(*quaternion.shape[:-1], 3, 3)
 
 
 def rotation_exp(rotation_vector: Tensor) -> Tensor:
