@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 __all__ = [
+    "AddedMassWarning",
     "IgnoredLimitsWarning",
     "InfeasibleMotion",
     "IntersectingState",
@@ -45,6 +46,10 @@ class InfeasibleMotion(SimulationError):  # noqa: N818
 
 class NotConverged(SimulationError):  # noqa: N818
     """The iteration limit was reached before the residual fell below the tolerance."""
+
+
+class AddedMassWarning(UserWarning):
+    """A staggered coupling is used where a body is light against the cloth that it touches."""
 
 
 class IgnoredLimitsWarning(UserWarning):

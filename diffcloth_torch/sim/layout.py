@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.kinematics import Tree
@@ -107,6 +108,15 @@ class Layout:
     def has_coordinates(self) -> bool:
         """Whether the scene has more than cloths and bodies on prescribed poses."""
         return self.is_dynamic or bool(self.robots)
+
+    def mass_of(self, tree: int, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Mass of a body, or of all links of a robot [kg], from parameters; [B or 1]."""
+        count = len(self.bodies)
+        if tree < count:
+            return parameters["body_mass"][:, tree]
+        first = sum(robot.link_count for robot in self.robots[: tree - count])
+        links = slice(first, first + self.robots[tree - count].link_count)
+        return parameters["link_mass"][:, links].sum(1)
 
     def entry_shape(self, field: str, name: str) -> Shape:
         """Shape of what a control's mapping holds under a full name."""
