@@ -16,6 +16,7 @@ from typing import Any
 from diffcloth_torch import _core, robots
 from diffcloth_torch._moved import MOVED, find_old_modules
 from diffcloth_torch.errors import (
+    AddedMassWarning,
     IgnoredLimitsWarning,
     InfeasibleMotion,
     IntersectingState,
@@ -35,6 +36,7 @@ from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State, stack, where
 
 __all__ = [
+    "AddedMassWarning",
     "Cloth",
     "ContactOptions",
     "Control",

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 __all__ = [
+    "AddedMassWarning",
     "IgnoredLimitsWarning",
     "InfeasibleMotion",
     "IntersectingState",
@@ -49,3 +50,7 @@ class NotConverged(SimulationError):  # noqa: N818
 
 class IgnoredLimitsWarning(UserWarning):
     """A robot's file has effort or velocity limits, or dry joint friction: none is applied."""
+
+
+class AddedMassWarning(UserWarning):
+    """A staggered coupling moves something that is too light for the cloth that it touches."""

@@ -50,7 +50,7 @@ from diffcloth_torch.model.mechanism import Mechanism
 __all__ = ["Chain", "ChainControl", "ChainPrediction", "ChainState"]
 
 # They gain a factor of 1e3 each at 10 rad/s and 10 ms, and of 30 to 100 at 30 rad/s.
-_ITERATIONS = 5
+_ITERATIONS = 8
 
 _PRESCRIBED = ("position", "velocity")
 
