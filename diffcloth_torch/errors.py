@@ -54,3 +54,7 @@ class AddedMassWarning(UserWarning):
 
 class IgnoredLimitsWarning(UserWarning):
     """A robot's file has effort or velocity limits, or dry joint friction: none is applied."""
+
+
+class AddedMassWarning(UserWarning):
+    """A staggered coupling moves something that is too light for the cloth that it touches."""

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-__all__ = ["attach_root", "find_root"]
+__all__ = ["attach_root", "find_root", "jacobian"]
 
 Residual = Callable[[Tensor], Tensor]
 
@@ -20,7 +20,7 @@ def find_root(residual: Residual, guess: Tensor, iterations: int) -> Tensor:
         guess: Shape [..., n].
         iterations: Their number, fixed, so that the bits of one environment depend on no other.
     """
-    inverse = torch.linalg.inv(_jacobian(residual, guess))
+    inverse = torch.linalg.inv(jacobian(residual, guess))
     with torch.no_grad():
         x = guess
         for _ in range(iterations):
@@ -28,7 +28,7 @@ def find_root(residual: Residual, guess: Tensor, iterations: int) -> Tensor:
     return x
 
 
-def attach_root(residual: Residual, root: Tensor) -> Tensor:
+def attach_root(residual: Residual, root: Tensor, slope: Residual | None = None) -> Tensor:
     """Give a root its first derivative with respect to what r depends on.
 
     Along du the root moves by dx = -K^-1 (dr/du) du with K = dr/dx, and so does -K^-1 r with a
@@ -37,6 +37,7 @@ def attach_root(residual: Residual, root: Tensor) -> Tensor:
     Args:
         residual: As for `find_root`.
         root: x without a graph, shape [..., n].
+        slope: Gives K [..., row, column] at x; None differentiates r.
 
     Returns:
         The root, to the same bits, with a graph where r has one.
@@ -46,12 +47,13 @@ def attach_root(residual: Residual, root: Tensor) -> Tensor:
     value = residual(root)
     if not value.requires_grad:
         return root
-    K = _jacobian(residual, root)
+    with torch.no_grad():
+        K = jacobian(residual, root) if slope is None else slope(root)
     step: Tensor = torch.linalg.solve(K, value[..., None])[..., 0]
     return root - (step - step.detach())
 
 
-def _jacobian(residual: Residual, x: Tensor) -> Tensor:
+def jacobian(residual: Residual, x: Tensor) -> Tensor:
     """dr/dx, [..., row, column]: n copies of x, each of which gives one row, in one backward."""
     n = x.shape[-1]
     with torch.enable_grad():

@@ -31,8 +31,8 @@ _SERIES_ANGLE = 0.1
 _SMALLEST_SINE = 1e-9
 
 
-# An entry of a rotation matrix is twice a product of two entries of its quaternion plus or minus
-# another, less one on the diagonal; products of (w, x, y, z) are numbered row after row.
+# The entries of a rotation matrix are twice a product of two entries of its quaternion plus or
+# minus another, less one on the diagonal; products of (w, x, y, z) are numbered row after row.
 _FIRST = torch.tensor([0, 6, 7, 6, 0, 11, 7, 11, 0])
 _SECOND = torch.tensor([5, 3, 2, 3, 10, 1, 2, 1, 15])
 _SIGN = torch.tensor([1, -1, 1, 1, 1, -1, -1, 1, 1], dtype=torch.float64)

@@ -326,13 +326,13 @@ def test_prescribed_joints_arrive_exactly_and_take_their_effort():
 
 
 def test_a_joint_at_rest_holds_its_weight():
-    mechanism = pendulum(lengths=(1.0,), masses=(2.0,))
-    held = Chain(make_like(mechanism, actuation=("position",)), H, NO_LINKS, NO_POINTS)
-    joints = tensor([[0.7]])
-    _, after, efforts = step(held, at_rest(held, joints), control=controls(held, joints=joints))
-    # The axis +y turns the bob from below to -x; its weight pulls back with m g l sin.
-    torch.testing.assert_close(efforts, tensor([[2 * 9.81 * math.sin(0.7)]]), rtol=1e-13, atol=0)
-    assert (after.rates == 0).all()
+    chain = make_chain(make_like(pendulum(), actuation=("position", "torque")))
+    joints = tensor([[0.7, -0.7]])  # the second bob hangs straight down from the first
+    _, after, efforts = step(chain, at_rest(chain, joints), control=controls(chain, joints=joints))
+    # The axis +y turns the first bob from below to -x; the weight of both pulls back.
+    expected = tensor([[2 * 9.81 * math.sin(0.7), 0.0]])
+    torch.testing.assert_close(efforts, expected, rtol=1e-12, atol=0)
+    assert after.rates.abs().max() < 1e-15
 
 
 def make_like(mechanism, **fields):
