@@ -8,7 +8,6 @@ from itertools import pairwise
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.kinematics import Tree
@@ -37,6 +36,7 @@ class Layout:
         bodies: Mechanism of each of the K bodies.
         robots: Mechanism of each of the R robots.
         trees: Kinematics of each robot.
+        shaped_links: Which of the L links have a shape, in the order of the surfaces.
         rigid_vertices: Name of a body, or "robot/link" -> its rows among the V vertices.
         kinematic_bodies: Indices of the bodies on prescribed poses.
         is_dynamic: Whether forces move anything but the cloths.
@@ -57,6 +57,10 @@ class Layout:
         self.bodies = assembly.mechanisms[: assembly.body_count]
         self.robots = assembly.mechanisms[assembly.body_count :]
         self.trees = tuple(Tree(robot) for robot in self.robots)
+        first_links = np.cumsum([0, *(robot.link_count for robot in self.robots)])
+        of_robots = assembly.surface_mechanism >= assembly.body_count
+        owners = assembly.surface_mechanism[of_robots] - assembly.body_count
+        self.shaped_links = torch.from_numpy(first_links[owners] + assembly.surface_link[of_robots])
         starts = assembly.body_vertex_start.tolist()
         self.rigid_vertices = {
             name: slice(*ends)
@@ -108,15 +112,6 @@ class Layout:
     def has_coordinates(self) -> bool:
         """Whether the scene has more than cloths and bodies on prescribed poses."""
         return self.is_dynamic or bool(self.robots)
-
-    def mass_of(self, tree: int, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Mass of a body, or of all links of a robot [kg], from parameters; [B or 1]."""
-        count = len(self.bodies)
-        if tree < count:
-            return parameters["body_mass"][:, tree]
-        first = sum(robot.link_count for robot in self.robots[: tree - count])
-        links = slice(first, first + self.robots[tree - count].link_count)
-        return parameters["link_mass"][:, links].sum(1)
 
     def entry_shape(self, field: str, name: str) -> Shape:
         """Shape of what a control's mapping holds under a full name."""
