@@ -17,6 +17,7 @@ import diffcloth_torch as dc
 
 F64 = torch.float64
 PUBLIC = {
+    "AddedMassWarning": "",
     "Cloth": "load grid",
     "ContactOptions": (
         "barrier_distance barrier_stiffness friction_iterations slip_velocity self_contact"

@@ -278,7 +278,7 @@ def test_bodies_may_have_unreferenced_vertices_but_no_flat_faces():
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"motion": "dynamic"}, "'static', 'kinematic', got 'dynamic'"),
+        ({"motion": "free"}, "'static', 'kinematic', 'dynamic', got 'free'"),
         ({"pose": [0, 0, 0, 0, 0, 0, 0]}, "quaternion"),
         ({"pose": [0, 0, 0]}, r"\[7\], got \[3\]"),
         ({"friction": -1}, ">= 0"),

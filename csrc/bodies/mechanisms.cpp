@@ -156,7 +156,7 @@ Mechanisms::Eval Mechanisms::evaluate(const Tree& tree, const double* points) co
       } else {
         d.col(3) = e.axis[j];
       }
-      e.by_joint[k].push_back(given_.links[m].multiplier * d);
+      e.by_joint[k].emplace_back(given_.links[m].multiplier * d);
     }
   }
   return e;

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
 #include <limits>
 
 #include "contact/distance/mollifier.h"
@@ -204,7 +205,7 @@ Contact ContactModel::contact(const Term& term, const double* x) const {
   }
   for (int side = 0; side < 2; ++side) {
     // The distance of one end of an edge: the other one does not take part.
-    const int end = term.ends[side];
+    const std::int8_t end = term.ends[side];
     if (end >= 0) corner[2 * side + 1 - end] = corner[2 * side + end];
   }
   k.closest = closest(pair.kind, corner);

@@ -89,8 +89,9 @@ bool leave_saddle(Walk& walk) {
       walk.watch(p, std::min(length, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
   double best = 0.0;
   double best_alpha = 0.0;
-  for (int k = 0; k < kBacktracks && alpha > 0.0; ++k, alpha *= 0.5) {
+  for (int k = 0; k < kBacktracks; ++k, alpha *= 0.5) {
     if (k > 0) alpha = walk.watch(p, alpha, to);
+    if (!(alpha > 0.0)) break;
     const double change = walk.change(to);
     if (change < best) {
       best = change;

@@ -165,8 +165,8 @@ void merge(const solver::Outcome& outcome, Report& report) {
 }
 
 std::vector<Field> ContactStage::tape(const Scene& scene) {
-  const auto n =
-      static_cast<std::size_t>(scene.cloth_vertex_count() + scene.mechanisms.node_count());
+  const std::size_t n = static_cast<std::size_t>(scene.cloth_vertex_count()) +
+                        static_cast<std::size_t>(scene.mechanisms.node_count());
   const auto k = static_cast<std::size_t>(scene.given.friction_iterations);
   // Numbers of contacts, at the start and after each solve, spare backward the search for none.
   return {{.name = "iterates", .shape = {k, n, 3}},

@@ -124,7 +124,7 @@ std::vector<char> make_prescribed(const Description& d, const bodies::Mechanisms
   for (Index k = 0; k < mechanisms.node_count(); ++k) {
     prescribed.push_back(mechanisms.is_prescribed(k) ? 1 : 0);
   }
-  prescribed.insert(prescribed.end(), static_cast<std::size_t>(4 * mechanisms.tree_count()), 1);
+  prescribed.insert(prescribed.end(), 4 * static_cast<std::size_t>(mechanisms.tree_count()), 1);
   return prescribed;
 }
 

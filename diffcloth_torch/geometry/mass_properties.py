@@ -52,6 +52,8 @@ def mass_properties(
     det = np.linalg.det(corners)
     total = corners.sum(axis=1)
     volume = float(det.sum() / 6)
+    if volume == 0.0:
+        return 0.0, apex, np.zeros((3, 3))
     center = np.einsum("f,fi->i", det, total) / 24 / volume
     squares = np.einsum("f,fi,fj->ij", det, total, total)
     squares += np.einsum("f,fki,fkj->ij", det, corners, corners)

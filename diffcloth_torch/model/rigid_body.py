@@ -34,6 +34,10 @@ __all__ = ["MOTIONS", "RigidBody"]
 
 MOTIONS = ("static", "kinematic", "dynamic")
 
+# Of a closed mesh, over its extent cubed: a needle of 1 m by 1 um has 1e-12. Below this, rounding
+# decides on the volume.
+_SMALLEST_VOLUME = 1e-14
+
 _POSES = "differentiate with respect to State.body_poses or Control.body_poses"
 _MASS = "differentiate with respect to Parameters.body_mass"
 _CENTER = "differentiate with respect to Parameters.body_center"
@@ -133,27 +137,24 @@ class RigidBody:
             raise InvalidInput(
                 f"RigidBody: a dynamic body must have `density` or `mass`, one of them, got {got}"
             )
-        filled = None
-        if density is not None or center is None or inertia is None:
-            filled = self._filled_mesh()
-        if density is not None and filled is not None:
+        # The mesh is asked only where it must be: it may be open.
+        volume, middle, moments = 1.0, np.zeros(3), np.zeros((3, 3))
+        if mass is None or center is None or inertia is None:
+            volume, middle, moments = self._filled_mesh()
+        if mass is None:
             rho = check_number("RigidBody: `density`", density, POSITIVE, instead=_MASS)
-            self.mass = rho * filled[0]
+            self.mass = rho * volume
         else:
             self.mass = check_number("RigidBody: `mass`", mass, POSITIVE, instead=_MASS)
         if center is not None:
-            self.center = float_array("RigidBody: `center`", center, instead=_CENTER)
-            check_shape("RigidBody: `center`", self.center.shape, [(3,)])
-            check_finite("RigidBody: `center`", self.center)
-        elif filled is not None:
-            self.center = filled[1]
+            middle = float_array("RigidBody: `center`", center, instead=_CENTER)
+            check_shape("RigidBody: `center`", middle.shape, [(3,)])
+            check_finite("RigidBody: `center`", middle)
+        moments *= self.mass / volume
         if inertia is not None:
             moments = float_array("RigidBody: `inertia`", inertia, instead=_INERTIA)
-        elif filled is not None:
-            moments = self.mass / filled[0] * filled[2]
-        self.inertia = check_inertia("RigidBody: `inertia`", moments)
-        frozen(self.center)
-        frozen(self.inertia)
+        self.center = frozen(middle)
+        self.inertia = frozen(check_inertia("RigidBody: `inertia`", moments))
 
     def _filled_mesh(self) -> tuple[float, FloatArray, FloatArray]:
         """Volume, center and inertia for a density of one, of a mesh that must be closed."""
@@ -163,7 +164,8 @@ class RigidBody:
                 "mesh is not closed: some edge has no two faces of one orientation"
             )
         volume, center, inertia = mass_properties(self.vertices, self.faces)
-        if not volume > 0:
+        extent = float(np.ptp(self.vertices, axis=0).max())
+        if not volume > _SMALLEST_VOLUME * extent**3:
             raise InvalidInput(
                 "RigidBody: `faces` of a closed mesh must face outward, so that it holds a "
                 f"volume > 0, got {volume:g} m^3; reverse them, or give `mass`, `center` and "

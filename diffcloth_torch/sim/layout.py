@@ -36,6 +36,7 @@ class Layout:
         bodies: Mechanism of each of the K bodies.
         robots: Mechanism of each of the R robots.
         trees: Kinematics of each robot.
+        shaped_links: Which of the L links have a shape, in the order of the surfaces.
         rigid_vertices: Name of a body, or "robot/link" -> its rows among the V vertices.
         kinematic_bodies: Indices of the bodies on prescribed poses.
         is_dynamic: Whether forces move anything but the cloths.
@@ -56,6 +57,10 @@ class Layout:
         self.bodies = assembly.mechanisms[: assembly.body_count]
         self.robots = assembly.mechanisms[assembly.body_count :]
         self.trees = tuple(Tree(robot) for robot in self.robots)
+        first_links = np.cumsum([0, *(robot.link_count for robot in self.robots)])
+        of_robots = assembly.surface_mechanism >= assembly.body_count
+        owners = assembly.surface_mechanism[of_robots] - assembly.body_count
+        self.shaped_links = torch.from_numpy(first_links[owners] + assembly.surface_link[of_robots])
         starts = assembly.body_vertex_start.tolist()
         self.rigid_vertices = {
             name: slice(*ends)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
-from diffcloth_torch.dynamics.dynamics import Dynamics, Prediction
 from diffcloth_torch.geometry.rotation import pose_velocities
 from diffcloth_torch.sim.inputs import Fields
 from diffcloth_torch.sim.layout import Layout
-from diffcloth_torch.sim.step import Outcome
 
-__all__ = ["dynamic_motion", "prescribed_motion"]
+__all__ = ["held_targets", "prescribed_motion"]
 
 
 def prescribed_motion(layout: Layout, state: Fields, control: Fields, dt: float) -> Fields:
@@ -31,31 +30,6 @@ def prescribed_motion(layout: Layout, state: Fields, control: Fields, dt: float)
     return {"body_poses": end, "body_velocities": velocities}
 
 
-def dynamic_motion(
-    layout: Layout,
-    dynamics: Dynamics,
-    prediction: Prediction,
-    state: Fields,
-    control: Fields,
-    outcome: Outcome,
-    batch: int | None,
-) -> Fields:
-    """Fields of the next state where forces move something, or there are robots.
-
-    Args:
-        layout: What the rows stand for.
-        dynamics: Of the bodies and robots.
-        prediction: What it said before the step.
-        state: Fields of the state before the step.
-        control: Completed fields of the control.
-        outcome: Of the step.
-        batch: Batch size, None without a batch axis.
-    """
-    coordinates, forces = outcome.coordinates, outcome.body_forces
-    if coordinates is None:  # robots whose joints are all fixed
-        coordinates = forces.new_zeros((*forces.shape[:-2], 0))
-    if batch is None:
-        coordinates, forces = coordinates.unsqueeze(0), forces.unsqueeze(0)
-    after = dynamics.advance(prediction, coordinates, forces)
-    targets = torch.where(layout.driven, control["joint_positions"], state["joint_targets"])
-    return {**after, "joint_targets": targets}
+def held_targets(layout: Layout, state: Fields, control: Fields) -> Tensor:
+    """What pd drives pull to from now on, [B, J]."""
+    return torch.where(layout.driven, control["joint_positions"], state["joint_targets"])

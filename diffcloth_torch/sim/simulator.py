@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloth_torch import _core
 from diffcloth_torch.checks import (
     POSITIVE,
     check_choice,
@@ -32,6 +31,8 @@ from diffcloth_torch.model.options import COUPLINGS, SCHEMES, ContactOptions, So
 from diffcloth_torch.model.quantities import STATE, shape_of
 from diffcloth_torch.model.scene import Assembly, Scene, assemble
 from diffcloth_torch.sim.controls import Control, Parameters
+from diffcloth_torch.sim.cores import CoreOptions, make_core
+from diffcloth_torch.sim.coupling import Staggered
 from diffcloth_torch.sim.inputs import (
     Fields,
     check_control,
@@ -43,12 +44,11 @@ from diffcloth_torch.sim.inputs import (
 )
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.links import contact_wrenches, link_poses, link_velocities
-from diffcloth_torch.sim.motion import dynamic_motion, prescribed_motion
+from diffcloth_torch.sim.motion import held_targets, prescribed_motion
 from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.rollout import roll_out
 from diffcloth_torch.sim.state import LinkSurfaces, State, Surfaces
-from diffcloth_torch.sim.step import as_array, refuse_transforms, take_step
-from diffcloth_torch.sim.trees import tree_arguments
+from diffcloth_torch.sim.step import Outcome, as_array, refuse_transforms, take_step
 
 __all__ = ["Simulator"]
 
@@ -135,9 +135,7 @@ class Simulator:
         self._assembly = assemble(scene)
         self._layout = Layout(self._assembly)
         _check_motion(self)
-        self._dynamics = (
-            Dynamics(self._assembly, self.dt) if self._layout.has_coordinates else None
-        )
+        self._dynamics = Dynamics(self._assembly, self.dt) if self._layout.has_coordinates else None
         self.surfaces = self._assembly.surface_names
         starts = self._assembly.cloth_vertex_start.tolist()
         rows = [slice(a, b) for a, b in pairwise(starts)]
@@ -145,7 +143,22 @@ class Simulator:
         self.slices = {**dict(cloths), **self._layout.rigid_vertices}
         self.joint_slices = dict(self._assembly.joint_slices)
         self._surfaces = _surfaces(scene, self._assembly)
-        self._core = _make_core(self)
+        # Without cloths there is nothing to split or to couple.
+        options = CoreOptions(
+            bending_models=[cloth.bending_model for cloth in scene.cloths],
+            dt=self.dt,
+            scheme=scheme if scene.cloths else "coupled",
+            contact=contact,
+            solver=solver,
+        )
+        stiffness = None
+        if self._dynamics is not None:
+            stiffness = limit_stiffness(self._assembly, self.dt, scene.gravity)
+        self._core = make_core(self._assembly, options, stiffness)
+        self._staggered = None
+        in_turn = coupling != "monolithic" and scene.cloths and self._layout.is_dynamic
+        if in_turn and self._dynamics is not None and stiffness is not None:
+            self._staggered = Staggered(coupling, self._layout, self._dynamics, options, stiffness)
         self._nonadjacent_distance = self._core.smallest_nonadjacent_distance()
         self._defaults = scene_parameters(scene, self._assembly, has_contact(scene, contact))
         if has_contact(scene, contact):
@@ -267,19 +280,11 @@ class Simulator:
             TypeError: If a tensor of the state is not float64 on the CPU.
         """
         (before, wanted, physical), batch = self._fields(state, control, parameters)
-        prediction = self._predict(before, wanted, physical)
-        inputs = self._core_inputs(before, wanted, physical, prediction)
-        outcome = take_step(self._core, inputs, batched=batch is not None)
-        report = make_report(outcome.diagnostics, self._core.phases, batched=batch is not None)
-        raise_on_failure(
-            outcome.diagnostics, report, throw=self.solver.throw, batched=batch is not None
-        )
-        if self._dynamics is None or prediction is None:
-            after = prescribed_motion(self._layout, before, wanted, self.dt)
+        if self._staggered is None:
+            outcome, after = self._step_together(before, wanted, physical, batch)
         else:
-            after = dynamic_motion(
-                self._layout, self._dynamics, prediction, before, wanted, outcome, batch
-            )
+            outcome, after = self._step_in_turn(before, wanted, physical, batch)
+        report = make_report(outcome.diagnostics, self._core.phases, batched=batch is not None)
         after["soft_pin_targets"] = wanted["soft_pins"]
         after["time"] = before["time"] + self.dt
         return State(
@@ -290,6 +295,43 @@ class Simulator:
             report=report,
             _surfaces=self._surfaces,
         )
+
+    def _step_together(
+        self, state: Fields, control: Fields, parameters: Fields, batch: int | None
+    ) -> tuple[Outcome, Fields]:
+        """One solve for everything; its outcome, and fields of bodies and robots behind it."""
+        prediction = self._predict(state, control, parameters)
+        inputs = self._core_inputs(state, control, parameters, prediction)
+        outcome = take_step(self._core, inputs, batched=batch is not None)
+        self._check(outcome.diagnostics, batch)
+        if self._dynamics is None or prediction is None:
+            return outcome, prescribed_motion(self._layout, state, control, self.dt)
+        forces = outcome.body_forces if batch is not None else outcome.body_forces.unsqueeze(0)
+        coordinates = outcome.coordinates
+        if coordinates is None:  # robots without a joint that moves
+            coordinates = forces.new_zeros(len(forces), 0)
+        elif batch is None:
+            coordinates = coordinates.unsqueeze(0)
+        after = self._dynamics.advance(prediction, coordinates, forces)
+        return outcome, {**after, "joint_targets": held_targets(self._layout, state, control)}
+
+    def _step_in_turn(
+        self, state: Fields, control: Fields, parameters: Fields, batch: int | None
+    ) -> tuple[Outcome, Fields]:
+        """Like `_step_together`, by a staggered coupling."""
+        assert self._staggered is not None
+        inputs = self._core_inputs(state, control, parameters, None)
+        outcome, after = self._staggered.step(
+            state, control, parameters, inputs, lambda found: self._check(found, batch)
+        )
+        if batch is None:
+            outcome = outcome.first()
+        return outcome, {**after, "joint_targets": held_targets(self._layout, state, control)}
+
+    def _check(self, diagnostics: dict[str, Any], batch: int | None) -> None:
+        batched = batch is not None
+        report = make_report(diagnostics, self._core.phases, batched=batched)
+        raise_on_failure(diagnostics, report, throw=self.solver.throw, batched=batched)
 
     def rollout(
         self,
@@ -432,10 +474,17 @@ class Simulator:
             Accepted iterates, shape [M, N + V, 3] [m]: cloth vertices, then body vertices.
         """
         with torch.no_grad():
-            inputs, batch = self._inputs(state, control, parameters)
-        if batch is not None:
-            raise InvalidInput("path: `state` must be one environment, got a batch; use state[i]")
-        return torch.from_numpy(self._core.path(_arrays(inputs)))
+            fields, batch = self._fields(state, control, parameters)
+            if batch is not None:
+                raise InvalidInput(
+                    "path: `state` must be one environment, got a batch; use state[i]"
+                )
+            if self._staggered is not None:
+                inputs = self._core_inputs(*fields, None)
+                path = self._staggered.path(*fields, inputs, lambda found: self._check(found, None))
+                return torch.from_numpy(path)
+            inputs = self._core_inputs(*fields, self._predict(*fields))
+            return torch.from_numpy(self._core.path(_arrays(inputs)))
 
     def _inputs(
         self, state: State, control: Control | None, parameters: Parameters | None
@@ -535,37 +584,6 @@ def _check_motion(simulator: Simulator) -> None:
                 f"Simulator: the pd joint {name!r} must have gains: give `stiffness` or `damping` "
                 "to its Robot, or another `actuation`"
             )
-
-
-def _make_core(simulator: Simulator) -> _core.Simulator:
-    assembly = simulator._assembly
-    trees: dict[str, Any] = {}
-    if simulator._dynamics is not None:
-        stiffness = limit_stiffness(assembly, simulator.dt, simulator.scene.gravity)
-        trees = tree_arguments(assembly, stiffness)
-    return _core.Simulator(
-        vertices=assembly.vertices,
-        rest_vertices=assembly.rest_vertices,
-        faces=assembly.faces,
-        cloth_vertex_start=assembly.cloth_vertex_start,
-        cloth_face_start=assembly.cloth_face_start,
-        bending_models=[cloth.bending_model for cloth in simulator.scene.cloths],
-        pins=assembly.pins,
-        soft_pins=assembly.soft_pins,
-        body_vertices=assembly.body_vertices,
-        body_faces=assembly.body_faces,
-        body_vertex_start=assembly.body_vertex_start,
-        body_face_start=assembly.body_face_start,
-        self_contact=simulator.contact.self_contact,
-        dt=simulator.dt,
-        scheme=simulator.scheme,
-        metric=simulator.solver.metric,
-        friction_iterations=simulator.contact.friction_iterations,
-        tolerance=simulator.solver.tolerance,
-        max_iterations=simulator.solver.max_iterations,
-        ignored_pairs=assembly.ignored_pairs,
-        **trees,
-    )
 
 
 def _surfaces(scene: Scene, assembly: Assembly) -> Surfaces:

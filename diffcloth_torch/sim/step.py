@@ -76,6 +76,14 @@ class Outcome(NamedTuple):
     diagnostics: dict[str, Any]
     coordinates: Tensor | None = None
 
+    def first(self) -> Outcome:
+        """The first environment, without its axis; the diagnostics stay."""
+        return self._replace(
+            positions=self.positions[0],
+            velocities=self.velocities[0],
+            body_forces=self.body_forces[0],
+        )
+
 
 def take_step(core: _core.Simulator, inputs: dict[str, Tensor], *, batched: bool) -> Outcome:
     """Take one step; a tape is kept only if a gradient may be asked for.

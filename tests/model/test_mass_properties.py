@@ -44,7 +44,7 @@ def test_a_far_and_turned_mesh_has_the_same_moments():
 def test_moments_are_those_of_trimesh(mesh):
     trimesh = pytest.importorskip("trimesh")
     vertices = mesh[0] @ TURN.T + [0.1, 0.2, 0.3]
-    vertices[:, 0] *= 1.7  # no symmetry
+    vertices[:, :2] *= 1.5 + 2 * vertices[:, 2:]  # no symmetry, and uneven triangles
     volume, center, inertia = mass_properties(vertices, mesh[1])
     expected = trimesh.Trimesh(vertices, mesh[1], process=False).mass_properties
     assert volume == pytest.approx(expected.mass, rel=1e-12)
@@ -189,11 +189,27 @@ def test_what_does_not_move_by_forces_has_no_mass():
             dc.InvalidInput,
             "must face outward, so that it holds a volume > 0, got -1 m",
         ),
+        (
+            lambda: dc.RigidBody(*_flat(0.0), motion="dynamic", mass=1),
+            dc.InvalidInput,
+            "a volume > 0, got 0 m",
+        ),
+        (
+            lambda: dc.RigidBody(*_flat(1e-16), motion="dynamic", density=1),
+            dc.InvalidInput,
+            "a volume > 0, got .*e-17 m",
+        ),
     ],
 )
 def test_bad_mass_properties_are_refused(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+def _flat(height):
+    """A closed tetrahedron of next to no height."""
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, height]])
+    return vertices, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]
 
 
 def _inward():

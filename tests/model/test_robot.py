@@ -1,6 +1,7 @@
 """Robots: forward kinematics against Pinocchio, mimicking joints, limits, drives, names, scenes."""
 
 import pickle
+import re
 import runpy
 from pathlib import Path
 
@@ -529,3 +530,14 @@ def test_the_extra_is_named_where_the_panda_is_missing(monkeypatch):
     monkeypatch.setattr(dc.robots, "files", lambda name: [])
     with pytest.raises(ImportError, match=r"extra `robots`: pip install"):
         dc.robots.panda()
+
+
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.IgnoredLimitsWarning")
+def test_the_examples_of_the_docs_run():
+    panda()
+    page = (ROOT / "docs" / "robots.md").read_text()
+    names = {"joint_positions": torch.zeros(2, 8, dtype=F64)}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(block, names)
+    assert names["scene"].robots == (names["hand"],)
+    assert names["frames"]["panda_hand"].shape == (2, 4, 4)
