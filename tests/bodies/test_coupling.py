@@ -102,7 +102,7 @@ def test_all_couplings_agree_where_the_body_is_heavy():
 
 @STAGGERED
 def test_a_light_body_warns_once(coupling):
-    sim, state = trampoline(coupling, mass=0.002)
+    sim, state = trampoline(coupling, mass=0.002, height=0.0545, velocity=0.0)
     words = r"the added-mass number of 'box' is about [\d.]+, above 0\.5"
     with pytest.warns(dc.AddedMassWarning, match=words):
         state = sim.rollout(state, steps=10)[-1]
