@@ -167,7 +167,8 @@ def _midpoint_spin(inertia: Tensor, momentum: Tensor, dt: float) -> Tensor:
     with torch.no_grad():
         inverse = torch.linalg.inv(inertia.expand(*momentum.shape, 3))
         spin = _apply(inverse, momentum)
-        inverse = torch.linalg.inv(slope(spin))
+        turned = _turned_back(dt / 2 * spin, momentum)
+        inverse = torch.linalg.inv(inertia - dt / 2 * _cross(turned))  # `slope` to first order
         for _ in range(_ITERATIONS):
             left = _apply(inertia, spin) - _turned_back(dt / 2 * spin, momentum)
             spin = spin - _apply(inverse, left)

@@ -9,23 +9,44 @@ from torch import Tensor
 
 __all__ = ["attach_root", "find_root", "jacobian"]
 
+# Of the largest entry: a step that counts as none, and one that is rounding if it does not shrink.
+_TOLERANCE, _FLOOR = 1e-12, 1e-8
+_MOST_ITERATIONS = 40
+
 Residual = Callable[[Tensor], Tensor]
 
 
-def find_root(residual: Residual, guess: Tensor, iterations: int) -> Tensor:
-    """Root near a guess, without a graph: x <- x - K^-1 r(x) with K = dr/dx of the guess.
+def find_root(residual: Residual, guess: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
+    """Root near a guess by Broyden's method, without a graph.
+
+    An environment stops when its own step is small, so that its bits depend on no other.
 
     Args:
-        residual: r, [..., n] -> [..., n] for any leading axes; no environment sees another.
-        guess: Shape [..., n].
-        iterations: Their number, fixed, so that the bits of one environment depend on no other.
+        residual: r, [B, n] -> [B, n]; no environment sees another.
+        guess: Shape [B, n].
+        inverse: About that of dr/dx, shape [B, n, n].
+
+    Returns:
+        The root, and which environments have found theirs, shape [B].
     """
-    inverse = torch.linalg.inv(jacobian(residual, guess))
     with torch.no_grad():
-        x = guess
-        for _ in range(iterations):
-            x = x - (inverse @ residual(x)[..., None])[..., 0]
-    return x
+        x, H = guess, inverse
+        r = residual(x)
+        active = torch.ones(len(x), 1, dtype=torch.bool)
+        last = torch.full_like(x[:, :1], torch.inf)
+        for _ in range(_MOST_ITERATIONS):
+            step = -_times(H, r)
+            x = torch.where(active, x + step, x)
+            size, scale = step.abs().amax(-1, True), x.abs().amax(-1, True)
+            at_floor = (size <= _FLOOR * scale) & (size >= last / 2)
+            active = active & ~((size <= _TOLERANCE * scale) | at_floor)
+            if not active.any():
+                break
+            before, r, last = r, residual(x), size
+            change = _times(H, r - before)
+            row = (step[:, None] @ H) / (step * change).sum(-1)[:, None, None]
+            H = H + (step - change)[..., None] * row
+    return x, ~active[:, 0]
 
 
 def attach_root(residual: Residual, root: Tensor, slope: Residual | None = None) -> Tensor:
@@ -35,7 +56,7 @@ def attach_root(residual: Residual, root: Tensor, slope: Residual | None = None)
     constant K, however the root was found. There is no second derivative.
 
     Args:
-        residual: As for `find_root`.
+        residual: r, [..., n] -> [..., n] for any leading axes; no environment sees another.
         root: x without a graph, shape [..., n].
         slope: Gives K [..., row, column] at x; None differentiates r.
 
@@ -61,3 +82,8 @@ def jacobian(residual: Residual, x: Tensor) -> Tensor:
         rows = residual(copies).diagonal(dim1=0, dim2=-1).sum()
         (gradient,) = torch.autograd.grad(rows, copies)
     return gradient.movedim(0, -2)
+
+
+def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
+    product: Tensor = (matrices @ vectors[..., None])[..., 0]
+    return product
