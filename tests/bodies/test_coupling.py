@@ -11,7 +11,7 @@ from differences import directions, mismatch
 
 import diffcloth_torch as dc
 
-DT = 0.005
+DT = 0.002
 COUPLINGS = ("rigid_to_cloth", "cloth_to_rigid")
 STAGGERED = pytest.mark.parametrize("coupling", COUPLINGS)
 
@@ -43,7 +43,7 @@ def test_momentum_goes_from_the_body_to_the_sheet(coupling, scheme):
     """What the body's momentum lacks against its fall is the impulse of `body_forces`."""
     sim, state = trampoline(coupling, scheme=scheme)
     touched = False
-    for _ in range(4):
+    for _ in range(12):
         after = sim.step(state)
         force = after.body_forces.sum(0)
         touched |= bool(force[2] > 0.1)
@@ -56,7 +56,7 @@ def test_momentum_goes_from_the_body_to_the_sheet(coupling, scheme):
 
 def test_rigid_to_cloth_moves_bodies_with_their_velocities():
     sim, state = trampoline("rigid_to_cloth")
-    for _ in range(3):
+    for _ in range(12):
         after = sim.step(state)
         way = (after.body_poses - state.body_poses)[0, :3]
         free = DT * (state.body_velocities[0, :3] + DT * sim.parameters().gravity)
@@ -68,7 +68,7 @@ def test_rigid_to_cloth_moves_bodies_with_their_velocities():
 def test_cloth_to_rigid_solves_the_cloth_against_frozen_bodies():
     """The sheet sees the box where it was: a box held there leaves the same sheet."""
     sim, state = trampoline("cloth_to_rigid")
-    state = sim.rollout(state, steps=2)[-1]
+    state = sim.rollout(state, steps=8)[-1]
     after = sim.step(state)
     (box,) = sim.scene.bodies
     held = dc.RigidBody(box.vertices, box.faces, motion="kinematic", pose=box.pose, name="box")
@@ -83,8 +83,9 @@ def test_cloth_to_rigid_solves_the_cloth_against_frozen_bodies():
     expected = alone.step(
         state.replace(body_velocities=torch.zeros(1, 6, dtype=F64)), None, barrier
     )
-    assert torch.equal(after.positions, expected.positions)
-    assert torch.equal(after.body_forces, expected.body_forces)
+    assert after.body_forces.any()
+    torch.testing.assert_close(after.positions, expected.positions, rtol=0, atol=1e-11)
+    torch.testing.assert_close(after.body_forces, expected.body_forces, rtol=1e-7, atol=1e-7)
 
 
 def test_all_couplings_agree_where_the_body_is_heavy():
@@ -101,10 +102,10 @@ def test_all_couplings_agree_where_the_body_is_heavy():
 
 @STAGGERED
 def test_a_light_body_warns_once(coupling):
-    sim, state = trampoline(coupling, mass=0.01)
+    sim, state = trampoline(coupling, mass=0.002, height=0.0545, velocity=0.0)
     words = r"the added-mass number of 'box' is about [\d.]+, above 0\.5"
     with pytest.warns(dc.AddedMassWarning, match=words):
-        state = sim.rollout(state, steps=3)[-1]
+        state = sim.rollout(state, steps=10)[-1]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sim.step(state)
@@ -124,7 +125,7 @@ def test_cloth_to_rigid_refuses_a_motion_through_a_sheet():
 @STAGGERED
 def test_nothing_intersects_and_the_path_leads_there(coupling):
     sim, state = trampoline(coupling)
-    for _ in range(12):
+    for _ in range(20):
         path = sim.path(state)
         after = sim.step(state)
         n = len(after.positions)
@@ -188,7 +189,8 @@ def test_robots_step_in_turn_as_together_where_nothing_touches(coupling, tmp_pat
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
 def test_gradients_through_contact_are_those_of_differences(coupling, scheme):
     sim, start = trampoline(coupling, scheme=scheme)
-    start = sim.step(start).detach()
+    start = sim.rollout(start, steps=8)[-1].detach()
+    assert start.body_forces.any()
     g = torch.Generator().manual_seed(2)
     weights = {
         name: torch.randn(getattr(start, name).shape, dtype=F64, generator=g)
