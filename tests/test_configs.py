@@ -136,9 +136,7 @@ REFUSED = [
         r"pins\.a` must have exactly one of vertices, box, nearest",
         id="two-selections",
     ),
-    pytest.param(
-        "scene.cloths=[]", r"`scene` must have a cloth in `cloths` unless", id="no-cloth"
-    ),
+    pytest.param("scene.cloths=[]", r"`scene` must have a cloth in `cloths` unless", id="no-cloth"),
     pytest.param("scene.gravity=[0, 0]", r"`scene\.gravity`.*3", id="short-vector"),
     pytest.param(
         "output.pictures.ground=low",

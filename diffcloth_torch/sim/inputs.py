@@ -81,7 +81,22 @@ def state_fields(layout: Layout, state: State) -> tuple[Fields, int | None]:
         raise InvalidInput("step: `state` must hold at least one environment, got a batch of 0")
     for name in _POSES:
         check_quaternions(f"step: `state.{name}`", _numbers(getattr(state, name)))
+    _check_zones(layout, _numbers(fields["joint_positions"]))
     return fields, batch
+
+
+def _check_zones(layout: Layout, positions: FloatArray) -> None:
+    """Refuse joints that forces move where the barriers at their limits have no value."""
+    lower, upper = layout.farthest
+    beyond = (positions <= lower) | (positions >= upper)
+    if beyond.any():
+        at = tuple(int(i) for i in np.argwhere(beyond)[0])
+        joint = at[-1]
+        raise InvalidInput(
+            "step: `state.joint_positions` must be at most 1 % of the range beyond a limit where "
+            f"forces move a joint: between {lower[joint]:g} and {upper[joint]:g} (exclusive) for "
+            f"{layout.joint_names[joint]!r}, got {positions[at]:g} at [{joint}]"
+        )
 
 
 def _check_state_tensor(name: str, tensor: object) -> None:

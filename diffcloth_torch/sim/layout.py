@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.kinematics import Tree
+from diffcloth_torch.dynamics.limits import ZONE
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.quantities import CONTROL, Shape
@@ -50,6 +51,8 @@ class Layout:
         massive: "body" or "link" -> which of them have mass and are moved by forces, [K] or [L].
         lower: Lower limits [rad or m], shape [J].
         upper: Upper limits, likewise.
+        farthest: Ends of the zones beyond the limits of joints that forces move, infinite for
+            others; the lower, then the upper ones, shape [2, J].
     """
 
     def __init__(self, assembly: Assembly) -> None:
@@ -78,6 +81,11 @@ class Layout:
         self.driven = torch.tensor([mode == "pd" for mode in self.actuation], dtype=torch.bool)
         self.lower = _joined([robot.lower for robot in self.robots])
         self.upper = _joined([robot.upper for robot in self.robots])
+        moved = np.array([mode in ("torque", "pd") for mode in self.actuation], dtype=bool)
+        reach = np.where(np.isinf(self.upper - self.lower), 0.0, ZONE * (self.upper - self.lower))
+        self.farthest = np.where(
+            moved, [self.lower - reach, self.upper + reach], [[-np.inf], [np.inf]]
+        )
         body_motions = [f"that body is {_MOTIONS[body.base]}" for body in self.bodies]
         base_motions = [f"that robot's base is {robot.base}" for robot in self.robots]
         self.kept = {
