@@ -371,7 +371,9 @@ class Chain:
         if len(solved):
             mass = mass_matrix(self._motion(inertia, start), inertia)
             inverse = torch.linalg.inv(mass.detach()[..., solved[:, None], solved])
-            x, found = find_root(of_solved, guess[..., solved], inverse)
+            alone = (inverse @ given.detach()[..., solved, None])[..., 0]
+            scale = torch.cat([alone, known.detach()], dim=-1).abs().amax(-1)
+            x, found = find_root(of_solved, guess[..., solved], inverse, scale)
             self._check(found)
             velocity = complete(attach_root(of_solved, x))
         constraint = torch.zeros_like(start.joints)

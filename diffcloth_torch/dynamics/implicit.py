@@ -9,14 +9,16 @@ from torch import Tensor
 
 __all__ = ["attach_root", "find_root", "jacobian"]
 
-# Of the largest entry: a step that counts as none, and one that is rounding if it does not shrink.
+# Of the scale of x: a step that counts as none, and one that is rounding if it does not shrink.
 _TOLERANCE, _FLOOR = 1e-12, 1e-8
 _MOST_ITERATIONS = 40
 
 Residual = Callable[[Tensor], Tensor]
 
 
-def find_root(residual: Residual, guess: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
+def find_root(
+    residual: Residual, guess: Tensor, inverse: Tensor, scale: Tensor
+) -> tuple[Tensor, Tensor]:
     """Root near a guess by Broyden's method, without a graph.
 
     An environment stops when its own step is small, so that its bits depend on no other.
@@ -25,6 +27,7 @@ def find_root(residual: Residual, guess: Tensor, inverse: Tensor) -> tuple[Tenso
         residual: r, [B, n] -> [B, n]; no environment sees another.
         guess: Shape [B, n].
         inverse: About that of dr/dx, shape [B, n, n].
+        scale: Size of what adds up to x, whose rounding is in it, shape [B].
 
     Returns:
         The root, and which environments have found theirs, shape [B].
@@ -37,9 +40,10 @@ def find_root(residual: Residual, guess: Tensor, inverse: Tensor) -> tuple[Tenso
         for _ in range(_MOST_ITERATIONS):
             step = -_times(H, r)
             x = torch.where(active, x + step, x)
-            size, scale = step.abs().amax(-1, True), x.abs().amax(-1, True)
-            at_floor = (size <= _FLOOR * scale) & (size >= last / 2)
-            active = active & ~((size <= _TOLERANCE * scale) | at_floor)
+            size = step.abs().amax(-1, True)
+            whole = torch.maximum(x.abs().amax(-1, True), scale[:, None])
+            at_floor = (size <= _FLOOR * whole) & (size >= last / 2)
+            active = active & ~((size <= _TOLERANCE * whole) | at_floor)
             if not active.any():
                 break
             before, r, last = r, residual(x), size
