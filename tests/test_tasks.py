@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -471,8 +470,18 @@ PANDA = Short(
         "actions.efforts.panda_finger_joint1=[-20, -20]",
     ),
 )
+
+
+def has_panda():
+    try:
+        dc.robots.panda()
+    except ImportError:
+        return False
+    return True
+
+
 needs_panda = [
-    pytest.mark.skipif(find_spec("cmeel") is None, reason="needs the extra `robots`"),
+    pytest.mark.skipif(not has_panda(), reason="the Panda is in the extra `robots`"),
     pytest.mark.filterwarnings("ignore::diffcloth_torch.IgnoredLimitsWarning"),
 ]
 SHORT = [
