@@ -14,7 +14,7 @@ from diffcloth_torch.dynamics.kinematics import Tree
 from diffcloth_torch.dynamics.limits import ZONE
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.mechanism import Mechanism
-from diffcloth_torch.model.quantities import CONTROL, Shape
+from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Shape, shape_of
 from diffcloth_torch.model.scene import Assembly
 
 __all__ = ["MODES", "Layout"]
@@ -34,6 +34,9 @@ class Layout:
 
     Attributes:
         assembly: Arrays of the scene.
+        state_shapes: Shape of each field of a state that a step looks at.
+        control_shapes: Shape of each field of a control.
+        parameter_shapes: Accepted shapes of each parameter.
         bodies: Mechanism of each of the K bodies.
         robots: Mechanism of each of the R robots.
         trees: Kinematics of each robot.
@@ -57,6 +60,13 @@ class Layout:
 
     def __init__(self, assembly: Assembly) -> None:
         self.assembly = assembly
+        sizes = assembly.sizes
+        looked_at = {name: q for name, q in STATE.items() if not q.ignored}
+        self.state_shapes = {name: shape_of(q.axes[0], sizes) for name, q in looked_at.items()}
+        self.control_shapes = {name: shape_of(q.axes[0], sizes) for name, q in CONTROL.items()}
+        self.parameter_shapes = {
+            name: [shape_of(axes, sizes) for axes in q.axes] for name, q in PARAMETERS.items()
+        }
         self.bodies = assembly.mechanisms[: assembly.body_count]
         self.robots = assembly.mechanisms[assembly.body_count :]
         self.trees = tuple(Tree(robot) for robot in self.robots)
