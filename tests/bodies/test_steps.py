@@ -108,6 +108,35 @@ def test_velocities_of_bodies_on_poses_are_quotients(sim):
     torch.testing.assert_close(hand, expected)
 
 
+def test_they_are_where_nothing_but_cloths_moves_by_forces():
+    """The same quotients, and their gradients, in a scene without coordinates."""
+    bodies = [
+        dc.RigidBody.box(0.1, motion="kinematic", pose=[0, 0, 1, 1, 0, 0, 0]),
+        dc.RigidBody.plane(1.0, pose=[0, 0, -1, 1, 0, 0, 0]),
+        dc.RigidBody.box(0.1, motion="kinematic", pose=[0, 1, 1, 2, 0.1, 0, 0]),
+    ]
+    sim = dc.Simulator(dc.Scene([dc.Cloth.grid(2, 2, 0.1)], bodies), DT)
+    state = sim.initial_state()
+    assert not sim.step(state).body_velocities.any()
+    poses = state.body_poses.clone()
+    poses[0] = torch.tensor([0.01, 0, 1, 1, 0, 0.01, 0], dtype=F64)
+    poses[2] *= -1.0  # the quaternion's other sign
+    poses[2, :3] *= -1.0
+    after = sim.step(state, sim.control(body_poses=poses))
+    turn = 2 * np.arctan(0.01) / DT
+    expected = torch.zeros(3, 6, dtype=F64)
+    expected[0] = torch.tensor([0.01 / DT, 0, 0, 0, turn, 0], dtype=F64)
+    torch.testing.assert_close(after.body_velocities, expected)
+
+    def velocities(start, end):
+        given = state.replace(body_poses=start)
+        kept = torch.cat([end[:1], start[1:2], end[1:]])
+        return sim.step(given, dc.Control(body_poses=kept)).body_velocities
+
+    ends = torch.cat([poses[:1], poses[2:]]).requires_grad_()
+    assert torch.autograd.gradcheck(velocities, (state.body_poses.requires_grad_(), ends))
+
+
 def test_a_body_falls_and_is_pushed(sim):
     before = sim.initial_state()
     after = sim.step(before, sim.control(body_wrenches={"brick": [1.0, 0, 0, 0, 0, 0]}))
