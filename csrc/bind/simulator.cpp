@@ -472,6 +472,9 @@ void simulator(nb::module_& m) {
                  nb::cast<std::string>(k["metric"]), nb::cast<int>(k["friction_iterations"]),
                  nb::cast<double>(k["tolerance"]), nb::cast<int>(k["max_iterations"]));
              if (k.contains("tree_free")) description.mechanisms = describe_mechanisms(k);
+             if (k.contains("link_names")) {
+               description.link_names = nb::cast<std::vector<std::string>>(k["link_names"]);
+             }
              if (k.contains("ignored_pairs")) {
                const std::vector<Index> pairs = to_vector(indices("ignored_pairs"));
                for (std::size_t p = 0; p + 1 < pairs.size(); p += 2) {

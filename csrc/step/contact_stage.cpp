@@ -107,9 +107,7 @@ std::string blockers(const Scene& scene, const std::vector<Contact>& contacts) {
   std::string text;
   for (Index s = 0; s < scene.surface_count(); ++s) {
     if (!involved[s]) continue;
-    const bool is_cloth = s < scene.cloth_count();
-    text += (text.empty() ? "" : ", ") + std::string(is_cloth ? "cloth " : "body ") +
-            std::to_string(is_cloth ? s : s - scene.cloth_count());
+    text += (text.empty() ? "" : ", ") + describe_surface(scene, s);
   }
   return text;
 }

@@ -189,6 +189,14 @@ contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& r
   return m;
 }
 
+std::string describe_surface(const Scene& scene, Index surface) {
+  if (surface < scene.cloth_count()) return "cloth " + std::to_string(surface);
+  const Index body = surface - scene.cloth_count();
+  const std::vector<std::string>& links = scene.given.link_names;
+  const Index link = body - (scene.given.bodies.count() - static_cast<Index>(links.size()));
+  return link < 0 ? "body " + std::to_string(body) : "link " + links[link];
+}
+
 namespace {
 
 /// "cloth 0 edge (3, 8)": a primitive by its surface and that surface's own vertex numbers.
@@ -198,9 +206,7 @@ std::string describe(const Scene& scene, const char* kind, std::initializer_list
   const Index first = is_cloth ? scene.given.cloth_vertex_start[surface]
                                : scene.cloth_vertex_count() +
                                      scene.given.bodies.vertex_start[surface - scene.cloth_count()];
-  std::string text = (is_cloth ? "cloth " : "body ") +
-                     std::to_string(is_cloth ? surface : surface - scene.cloth_count()) + " " +
-                     kind + " (";
+  std::string text = describe_surface(scene, surface) + " " + kind + " (";
   const char* separator = "";
   for (const Index v : vertices) {
     text += separator + std::to_string(v - first);

@@ -38,6 +38,7 @@ struct Description {
   bodies::MechanismsDescription mechanisms;         ///< empty: every body is a tree of one link
   std::vector<std::array<Index, 3>> body_faces;     ///< indices into the bodies' vertices
   std::vector<std::array<Index, 2>> ignored_pairs;  ///< pairs of surfaces that never touch
+  std::vector<std::string> link_names;              ///< of the last surfaces; before come bodies
   bool self_contact = true;
   double dt = 0.01;
   std::string scheme = "coupled";
@@ -78,6 +79,9 @@ struct Scene {
 
 /// Rest quantities that weigh contacts, for a rest shape of the cloths.
 contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& rest);
+
+/// "cloth 0", "body 2", "link hand/palm": a surface in messages.
+std::string describe_surface(const Scene& scene, Index surface);
 
 /// Where two surfaces overlap or are closer than their thickness; empty where they are not.
 std::string find_overlap(const Scene& scene,

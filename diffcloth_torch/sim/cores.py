@@ -75,6 +75,7 @@ def make_core(
         tolerance=options.solver.tolerance,
         max_iterations=options.solver.max_iterations,
         ignored_pairs=assembly.ignored_pairs,
+        link_names=list(assembly.surface_names[assembly.cloth_count + assembly.body_count :]),
         **trees,
     )
 
