@@ -148,7 +148,11 @@ REFUSED = [
         r"`output\.pictures\.ground` must be a valid number or must be 'auto'",
         id="union",
     ),
-    pytest.param("task=dance", r"`task` must be one of drape, hit_cloth; got 'dance'", id="task"),
+    pytest.param(
+        "task=dance",
+        r"`task` must be one of drape, hit_cloth, push_cube, grasp_cloth; got 'dance'",
+        id="task",
+    ),
 ]
 
 

@@ -41,12 +41,14 @@ from diffcloth_torch.sim.controls import Control
 from diffcloth_torch.sim.simulator import Simulator
 
 __all__ = [
+    "Motions",
     "build_scene",
     "build_simulator",
     "pose_array",
-    "prescribed_controls",
+    "prescribed_motions",
     "prescribed_poses",
     "quaternion",
+    "step_controls",
 ]
 
 
@@ -252,8 +254,8 @@ Motions = dict[str, dict[str, Tensor]]
 """Field of a control -> name -> values after each step."""
 
 
-def prescribed_controls(config: RunConfig, scene: Scene, steps: int) -> list[Control]:
-    """Controls of each step: what pins, bodies, bases and joints that have trajectories do."""
+def prescribed_motions(config: RunConfig, scene: Scene, steps: int) -> Motions:
+    """What pins, bodies, bases and joints that have trajectories do."""
     dt = config.simulation.dt
     poses: Motions = {"body_poses": {}, "base_poses": {}}
     for body in config.scene.bodies:
@@ -263,7 +265,11 @@ def prescribed_controls(config: RunConfig, scene: Scene, steps: int) -> list[Con
         if robot.trajectory:
             poses["base_poses"][robot.name] = prescribed_poses(robot, dt, steps)
     times = _step_times(dt, steps)
-    motions = _pin_motions(config, scene, times) | poses | _joint_motions(config, scene, times)
+    return _pin_motions(config, scene, times) | poses | _joint_motions(config, scene, times)
+
+
+def step_controls(motions: Motions, steps: int) -> list[Control]:
+    """Controls of each step from what is moved throughout."""
     controls = []
     for k in range(steps):
         fields: dict[str, Any] = {

@@ -7,7 +7,12 @@ from pathlib import Path
 
 from torch import Tensor
 
-from diffcloth_torch.config.scenes import build_scene, build_simulator, prescribed_controls
+from diffcloth_torch.config.scenes import (
+    build_scene,
+    build_simulator,
+    prescribed_motions,
+    step_controls,
+)
 from diffcloth_torch.config.schema import RunConfig
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.optimization import Controller
@@ -27,7 +32,8 @@ class Drape:
         self.scene = build_scene(config, source)
         self.simulator = build_simulator(self.scene, config.simulation)
         self.steps = config.simulation.steps
-        self._prescribed = prescribed_controls(config, self.scene, self.steps)
+        motions = prescribed_motions(config, self.scene, self.steps)
+        self._prescribed = step_controls(motions, self.steps)
 
     def initial_state(self) -> State:
         """Make the state that the scene describes."""

@@ -9,12 +9,19 @@ from typing import Any
 from diffcloth_torch.config.schema import RunConfig, read_document, set_values, validate
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.tasks.drape import Drape
+from diffcloth_torch.tasks.grasp_cloth import GraspCloth
 from diffcloth_torch.tasks.hit_cloth import HitCloth
+from diffcloth_torch.tasks.push_cube import PushCube
 from diffcloth_torch.tasks.task import Task
 
 __all__ = ["TASKS", "load_config", "load_task", "make_task"]
 
-TASKS: dict[str, Any] = {"drape": Drape, "hit_cloth": HitCloth}
+TASKS: dict[str, Any] = {
+    "drape": Drape,
+    "hit_cloth": HitCloth,
+    "push_cube": PushCube,
+    "grasp_cloth": GraspCloth,
+}
 """Name -> class with a `Config` and a constructor that takes one and the path it was read from."""
 
 

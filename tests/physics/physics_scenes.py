@@ -76,28 +76,68 @@ def quaternion(axis, angle):
 class Judge:
     """The IPC Toolkit's verdict on states and on motions between them."""
 
-    def __init__(self, sim):
+    def __init__(self, sim, free_links=(), passing=()):
+        """Judge the scene of a simulator.
+
+        `free_links` names the links ("robot/link") that forces move; `passing` pairs of links that
+        do not collide. What is prescribed may overlap other things that are.
+        """
         ipctk = pytest.importorskip("ipctk")
-        self._ipctk = ipctk
-        self._bodies = sim.scene.bodies
+        self._ipctk, self._sim = ipctk, sim
         start = sim.initial_state()
-        faces, first, surface = [], 0, []
-        for item in [*sim.scene.cloths, *sim.scene.bodies]:
+        faces, first = [], 0
+        for count, item in self._meshes():
             faces.append(item.faces + first)
-            first += len(item.vertices)
-            surface += [len(faces)] * len(item.vertices)
+            first += count
         faces = np.concatenate(faces).astype(np.int32)
         points = self.points(start)
         self.mesh = ipctk.CollisionMesh(points, ipctk.edges(faces), faces)
-        cloth_count = len(start.positions)
-        # Bodies may overlap each other; nothing else may.
-        self.mesh.can_collide = ipctk.make_static_obstacle_filter(cloth_count)
+        self.mesh.can_collide = self._filter(len(start.positions), free_links, passing)
+
+    def _meshes(self):
+        """Number of vertices and mesh of each surface."""
+        scene = self._sim.scene
+        links = [mesh for robot in scene.robots for mesh in robot.surfaces if mesh is not None]
+        return [(len(item.vertices), item) for item in [*scene.cloths, *scene.bodies, *links]]
+
+    def _filter(self, cloth_count, free_links, passing):
+        """What may collide: no rigid surface with itself, nor two that are prescribed."""
+        scene = self._sim.scene
+        counts = [count for count, _ in self._meshes()][len(scene.cloths) :]
+        names = self._sim.surfaces[len(scene.cloths) :]
+        rigid = np.repeat(np.arange(len(names)), counts)
+        dynamic = {
+            name
+            for name, body in zip(scene.body_names, scene.bodies, strict=True)
+            if body.motion == "dynamic"
+        }
+        free = [name in dynamic or name in free_links for name in names]
+        alone = -1 - np.arange(cloth_count + len(rigid))  # a patch of its own for each vertex
+
+        def patches(of_surface):
+            """Filter of one patch for each value >= 0 of a surface, its own for what has -1."""
+            labels = np.concatenate([np.full(cloth_count, -1), np.asarray(of_surface)[rigid]])
+            labels = np.where(labels < 0, alone - alone.min(), len(alone) + labels)
+            return self._ipctk.make_vertex_patches_filter(labels.astype(np.int32))
+
+        held = len(names)
+        allowed = patches([k if is_free else held for k, is_free in enumerate(free)])
+        for pair in passing:
+            allowed = allowed & patches([0 if name in pair else -1 for name in names])
+        return allowed
 
     def points(self, state):
-        """Cloth and body vertices of a state."""
+        """Vertices of cloths, bodies and links of a state."""
         parts = [state.positions.detach().numpy()]
-        for body, pose in zip(self._bodies, state.body_poses.numpy(), strict=True):
+        for body, pose in zip(self._sim.scene.bodies, state.body_poses.numpy(), strict=True):
             parts.append(body.vertices @ matrix(pose[3:]).T + pose[:3])
+        if self._sim.scene.robots:
+            meshes = [mesh for robot in self._sim.scene.robots for mesh in robot.surfaces]
+            frames = self._sim.link_poses(state).values()
+            for mesh, frame in zip(meshes, frames, strict=True):
+                if mesh is not None:
+                    turn = frame[:3, :3].detach().numpy()
+                    parts.append(mesh.vertices @ turn.T + frame[:3, 3].detach().numpy())
         return np.concatenate(parts)
 
     def is_free(self, state):

@@ -1,0 +1,142 @@
+"""Grasp cloth: a robot grasps a cloth by friction and brings it into a target shape.
+
+What acts is one robot, in each control interval: its base by velocities if it is kinematic and by a
+force and a torque if it is floating, joints whose motion is prescribed by velocities, joints that
+drives move by efforts. The loss is the L2 distance between the cloth and its target shape.
+
+References:
+    The task "control a gripper to grasp and lift the cloth" of the paper, section V.D.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+import torch
+from annotated_types import Len
+from pydantic import model_validator
+from torch import Tensor
+
+from diffcloth_torch.config.scenes import Motions
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.tasks.reach import (
+    ActionSection,
+    Reach,
+    ReachConfig,
+    Rows,
+    ShapeSection,
+    ShapeTarget,
+    check_rigid_actions,
+    find_named,
+    rigid_motion,
+)
+from diffcloth_torch.viewers.look import Goal
+
+__all__ = ["GraspCloth", "GraspClothConfig"]
+
+_RIGID = {"linear", "angular", "force", "torque"}
+_JOINTS = {"velocities": ("velocity",), "efforts": ("torque", "pd")}
+"""Key of the actions -> how its joints must be actuated."""
+
+JointRows = dict[str, Annotated[list[float], Len(1)]]
+
+
+class RobotActionSection(ActionSection):
+    """The actions of one robot.
+
+    `linear` [m/s] and `angular` [rad/s] velocities of a kinematic base, or `force` [N] at the
+    center of mass of the root link and `torque` [N m] on a floating one, in world axes;
+    `velocities` [rad/s or m/s] of velocity joints and `efforts` [N m or N] on torque and pd
+    joints, by their names.
+    """
+
+    robot: str
+    linear: Rows | None = None
+    angular: Rows | None = None
+    force: Rows | None = None
+    torque: Rows | None = None
+    velocities: JointRows | None = None
+    efforts: JointRows | None = None
+
+
+class GraspClothConfig(ReachConfig):
+    """A scene, the robot that acts in it, the target shape and how to get there."""
+
+    actions: RobotActionSection
+    target: ShapeSection
+
+    @model_validator(mode="after")
+    def _check_references(self) -> GraspClothConfig:
+        robot = find_named("actions.robot", self.actions.robot, self.scene.robots)
+        if any(getattr(self.actions, name) for name in _RIGID):
+            check_rigid_actions(self.actions, robot)
+        elif not (self.actions.velocities or self.actions.efforts):
+            raise ValueError("must have actions of the base or of joints in `actions`")
+        find_named("target.cloth", self.target.cloth, self.scene.cloths)
+        for key in _JOINTS:
+            counts = {len(rows) for rows in (getattr(self.actions, key) or {}).values()}
+            if len(counts) > 1:
+                raise ValueError(f"must have equally many rows for all joints in `actions.{key}`")
+        return self
+
+
+class GraspCloth(Reach):
+    """A robot grasps a cloth and brings it into a target shape."""
+
+    Config = GraspClothConfig
+
+    def __init__(self, config: GraspClothConfig, source: Path) -> None:
+        """Build the scene of a configuration that was read from the file `source`."""
+        super().__init__(config, source)
+        self._actions = config.actions
+        self._target = ShapeTarget(self, config.target)
+        self._robot = self.scene.robots[self.scene.robot_names.index(config.actions.robot)]
+        self._check_joints()
+
+    def _check_joints(self) -> None:
+        mechanism = self._robot.mechanism
+        modes = dict(zip(mechanism.joint_names, mechanism.actuation, strict=True))
+        for key, accepted in _JOINTS.items():
+            names = [name for name, mode in modes.items() if mode in accepted]
+            for name in getattr(self._actions, key) or ():
+                if name not in names:
+                    raise InvalidInput(
+                        f"`actions.{key}` may name joints that are actuated by "
+                        f"{' or '.join(accepted)}: {', '.join(names) or 'none'}; got {name!r}"
+                    )
+
+    def initial_rows(self) -> dict[str, list[list[float]]]:
+        """What the base does, then velocities and efforts with a column for each joint."""
+        rows: dict[str, list[list[float]]] = self._actions.model_dump(
+            include=_RIGID, exclude_none=True
+        )
+        for key in _JOINTS:
+            columns = getattr(self._actions, key)
+            if columns:
+                rows[key] = [list(row) for row in zip(*columns.values(), strict=True)]
+        return rows
+
+    def motions(self, actions: Mapping[str, Tensor]) -> Motions:
+        """Move or push the base, and drive the joints."""
+        name = self._actions.robot
+        motions: Motions = {}
+        if any(key in actions for key in _RIGID):
+            start = torch.from_numpy(self._robot.pose.copy())
+            motions = rigid_motion(actions, name, start, self.simulator.dt, "base")
+        for key in _JOINTS:
+            joints = enumerate(getattr(self._actions, key) or ())
+            motions[f"joint_{key}"] = {
+                f"{name}/{joint}": actions[key][:, column] for column, joint in joints
+            }
+        return motions
+
+    def distance(self, state: State, measure: str) -> Tensor:
+        """L2 distance between the cloth and its target."""
+        return self._target.distance(state, measure)
+
+    def goals(self) -> list[Goal]:
+        """Show the target shape."""
+        return [self._target.goal]

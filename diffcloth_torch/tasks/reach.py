@@ -1,0 +1,258 @@
+"""What tasks share that act so that something gets somewhere: rows of actions, and a distance."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import torch
+from annotated_types import Ge, Len
+from pydantic import model_validator
+from torch import Tensor
+
+from diffcloth_torch.config.scenes import (
+    Motions,
+    build_scene,
+    build_simulator,
+    pose_array,
+    prescribed_motions,
+    step_controls,
+)
+from diffcloth_torch.config.schema import (
+    BodySection,
+    ClothSection,
+    PoseSection,
+    RobotSection,
+    RunConfig,
+    Section,
+    Vector3,
+)
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry.poses import transform
+from diffcloth_torch.geometry.rotation import integrate_poses
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.tasks.optimization import Controller, OptimizerSection
+from diffcloth_torch.viewers.look import Goal
+
+__all__ = [
+    "ActionSection",
+    "LossSection",
+    "Reach",
+    "ReachConfig",
+    "Rows",
+    "ShapeSection",
+    "ShapeTarget",
+    "check_rigid_actions",
+    "find_named",
+    "measured",
+    "rigid_motion",
+    "shape_distance",
+]
+
+Rows = Annotated[list[Vector3], Len(1)]
+"""Vectors, one for each control interval, or one for all."""
+
+
+class ActionSection(Section):
+    """Actions in rows, each of which holds for `interval` steps.
+
+    A single row holds for all intervals at the start and is optimized for each of them.
+    """
+
+    interval: Annotated[int, Ge(1)] = 1
+
+
+class LossSection(Section):
+    """The distance to the target, averaged over the last `steps` of the horizon.
+
+    "distance" is in meters, for a shape the root mean square of the distances between vertices;
+    "squared" is its square [m^2].
+    """
+
+    measure: Literal["distance", "squared"] = "distance"
+    steps: Annotated[int, Ge(1)] = 1
+
+
+class ReachConfig(RunConfig):
+    """A scene and how to get there; tasks add what acts and where to."""
+
+    actions: ActionSection
+    loss: LossSection = LossSection()
+    optimizer: OptimizerSection
+
+    @model_validator(mode="after")
+    def _check_steps(self) -> ReachConfig:
+        if self.loss.steps > self.simulation.steps:
+            raise ValueError("has more steps in `loss.steps` than in `simulation.steps`")
+        return self
+
+
+class Reach(ABC):
+    """Something acts, and something shall get to a target.
+
+    The start must make contact: without contact there is no gradient. Subclasses have a `Config`
+    and say what the actions are, what they do, and how far the target is.
+    """
+
+    def __init__(self, config: ReachConfig, source: Path) -> None:
+        """Build the scene of a configuration that was read from the file `source`."""
+        self.config = config
+        self.scene = build_scene(config, source)
+        self.simulator = build_simulator(self.scene, config.simulation)
+        self.steps = config.simulation.steps
+        self.optimizer = config.optimizer
+        self._loss = config.loss
+        self._interval = config.actions.interval
+        self._prescribed = prescribed_motions(config, self.scene, self.steps)
+
+    @abstractmethod
+    def initial_rows(self) -> dict[str, list[list[float]]]:
+        """Rows of each tensor of actions, as the configuration has them."""
+
+    @abstractmethod
+    def motions(self, actions: Mapping[str, Tensor]) -> Motions:
+        """Make targets and forces of all steps from actions that have a row for each step."""
+
+    @abstractmethod
+    def distance(self, state: State, measure: str) -> Tensor:
+        """Distance to the target, or its square, shape []."""
+
+    @abstractmethod
+    def goals(self) -> list[Goal]:
+        """Show the target."""
+
+    def initial_state(self) -> State:
+        """Make the state that the scene describes."""
+        return self.simulator.initial_state()
+
+    def actions(self) -> dict[str, Tensor]:
+        """Initial actions, each of shape [T, n] for T control intervals."""
+        intervals = -(-self.steps // self._interval)
+        return {
+            name: _tensor(name, rows, intervals).requires_grad_()
+            for name, rows in self.initial_rows().items()
+        }
+
+    def controller(self, actions: Mapping[str, Tensor]) -> Controller:
+        """Do what the actions say; the rest of the scene follows keyframes."""
+        each_step = {
+            name: rows.repeat_interleave(self._interval, dim=0)[: self.steps]
+            for name, rows in actions.items()
+        }
+        acted = self.motions(each_step)
+        fields = [*self._prescribed, *(name for name in acted if name not in self._prescribed)]
+        merged = {
+            field: {**self._prescribed.get(field, {}), **acted.get(field, {})} for field in fields
+        }
+        controls = step_controls(merged, self.steps)
+        return lambda k, _state: controls[k]
+
+    def loss(self, states: Sequence[State]) -> Tensor:
+        """Distance to the target, averaged over the last states."""
+        last = states[-self._loss.steps :]
+        return torch.stack([self.distance(state, self._loss.measure) for state in last]).mean()
+
+
+def _tensor(name: str, rows: list[list[float]], count: int) -> Tensor:
+    if len(rows) not in (1, count):
+        raise InvalidInput(
+            f"`actions.{name}` must have 1 row or one for each of the {count} control intervals, "
+            f"got {len(rows)}"
+        )
+    return torch.tensor(rows, dtype=torch.float64).expand(count, -1).clone()
+
+
+# --- rigid motion -------------------------------------------------------------------------------
+
+
+def rigid_motion(
+    actions: Mapping[str, Tensor], name: str, start: Tensor, dt: float, kind: str
+) -> Motions:
+    """Move a rigid body or the base of a robot by velocities, or push it by forces.
+
+    Args:
+        actions: Either `linear` [m/s] and `angular` [rad/s] velocities, or `force` [N] at the
+            center of mass and `torque` [N m], in world axes, shape [steps, 3].
+        name: Name of the body or robot.
+        start: Its pose at the start, shape [7].
+        dt: Time step [s].
+        kind: "body" or "base".
+    """
+    if "force" in actions:
+        wrenches = torch.cat([actions["force"], actions["torque"]], dim=-1)
+        return {f"{kind}_wrenches": {name: wrenches}}
+    twists = torch.cat([actions["linear"], actions["angular"]], dim=-1)
+    return {f"{kind}_poses": {name: integrate_poses(start, twists, dt)}}
+
+
+def check_rigid_actions(given: Section, actor: BodySection | RobotSection) -> None:
+    """Require velocities for what is kinematic and has no trajectory, forces for what is free."""
+    key, free = ("base", "floating") if isinstance(actor, RobotSection) else ("motion", "dynamic")
+    names = [name for name in ("linear", "angular", "force", "torque") if getattr(given, name)]
+    if names not in (["linear", "angular"], ["force", "torque"]):
+        raise ValueError(
+            "must have in `actions` either `linear` and `angular` or `force` and `torque`, got "
+            f"{', '.join(names) or 'none'}"
+        )
+    needed = "kinematic" if names[0] == "linear" else free
+    if getattr(actor, key) != needed or actor.trajectory:
+        raise ValueError(
+            f"must give {actor.name!r}, which acts by `{names[0]}` and `{names[1]}`, "
+            f"`{key}: {needed}` and no `trajectory`"
+        )
+
+
+Named = TypeVar("Named", ClothSection, BodySection, RobotSection)
+
+
+def find_named(key: str, name: str, sections: Sequence[Named]) -> Named:
+    """Find the section of the scene that a key names."""
+    for section in sections:
+        if section.name == name:
+            return section
+    names = ", ".join(repr(section.name) for section in sections)
+    raise ValueError(f"names {name!r} in `{key}`, which must be one of {names or 'none'}")
+
+
+# --- targets ------------------------------------------------------------------------------------
+
+
+class ShapeSection(Section):
+    """The rest shape of a cloth at a pose."""
+
+    cloth: str
+    pose: PoseSection
+
+
+class ShapeTarget:
+    """A shape that a cloth shall take."""
+
+    def __init__(self, task: Reach, section: ShapeSection) -> None:
+        """Pose the rest shape of a cloth."""
+        cloth = task.scene.cloths[task.scene.cloth_names.index(section.cloth)]
+        target = transform(cloth.rest_vertices, pose_array(section.pose))
+        self._rows = task.simulator.slices[section.cloth]
+        self._target = torch.from_numpy(target)
+        self.goal = Goal(target, cloth.faces)
+
+    def distance(self, state: State, measure: str) -> Tensor:
+        """L2 distance between the cloth and the shape, as `shape_distance` has it."""
+        return shape_distance(state.positions[self._rows], self._target, measure)
+
+
+def measured(mean_square: Tensor, measure: str) -> Tensor:
+    """Take a square [m^2] as it is, or its root [m]."""
+    return mean_square.sqrt() if measure == "distance" else mean_square
+
+
+def shape_distance(vertices: Tensor, target: Tensor, measure: str = "distance") -> Tensor:
+    """L2 distance between two shapes over the square root of the number of vertices, or its square.
+
+    Args:
+        vertices: Positions [m], shape [n, 3].
+        target: Positions [m], shape [n, 3].
+        measure: "distance" [m] or "squared" [m^2].
+    """
+    return measured((vertices - target).square().sum(dim=-1).mean(), measure)

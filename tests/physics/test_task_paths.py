@@ -1,0 +1,111 @@
+"""What the tasks do never intersects, robots included: every path of a whole attempt is judged."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from physics_scenes import Judge
+
+import diffcloth_torch as dc
+from diffcloth_torch.tasks.registry import load_task
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+GRIPPER_LINKS = {"gripper/left_finger", "gripper/right_finger"}
+PANDA_LINKS = {"panda/panda_leftfinger", "panda/panda_rightfinger"}
+HAND = "panda/panda_hand"
+
+# The whole motion in longer steps, on fewer vertices.
+CASES = [
+    pytest.param(
+        "push_cube.yaml",
+        [
+            "simulation.dt=0.025",
+            "simulation.steps=40",
+            "actions.interval=4",
+            "scene.cloths.sheet.shape={kind: grid, rows: 8, columns: 8, size: 0.3}",
+        ],
+        (),
+        (),
+        id="push_cube",
+    ),
+    pytest.param(
+        "hit_cloth_dynamic.yaml",
+        [
+            "simulation.dt=0.05",
+            "simulation.steps=20",
+            "actions.interval=2",
+            "scene.cloths.sheet.shape={kind: grid, rows: 10, columns: 10}",
+        ],
+        (),
+        (),
+        id="hit_cloth_dynamic",
+    ),
+    pytest.param(
+        "grasp_cloth.yaml",
+        [
+            "simulation.dt=0.05",
+            "simulation.steps=32",
+            "actions.interval=2",
+            "loss.steps=20",
+            "scene.cloths.cloth.shape={kind: grid, rows: 12, columns: 12, size: 0.12}",
+        ],
+        GRIPPER_LINKS,
+        (),
+        id="grasp_cloth",
+    ),
+    pytest.param(
+        "panda_pick.yaml",
+        [
+            "simulation.dt=0.05",
+            "simulation.steps=28",
+            "actions.interval=2",
+            "scene.cloths.cloth.shape={kind: grid, rows: 10, columns: 10, size: 0.12}",
+        ],
+        PANDA_LINKS,
+        [(HAND, finger) for finger in sorted(PANDA_LINKS)],
+        id="panda_pick",
+        marks=[
+            pytest.mark.slow,
+            pytest.mark.filterwarnings("ignore::diffcloth_torch.IgnoredLimitsWarning"),
+        ],
+    ),
+]
+
+
+@pytest.mark.parametrize(("config", "assignments", "free_links", "passing"), CASES)
+def test_no_attempt_intersects(config, assignments, free_links, passing):
+    if "panda" in config:
+        try:
+            dc.robots.panda()
+        except ImportError:
+            pytest.skip("the Panda is in the extra `robots`")
+    task = load_task(CONFIGS / config, assignments)
+    judge = Judge(task.simulator, free_links, passing)
+    state = task.initial_state()
+    assert judge.is_free(state)
+    touched = 0
+    with torch.no_grad():
+        controller = task.controller(task.actions())
+        for k in range(task.steps):
+            control = controller(k, state)
+            path = task.simulator.path(state, control).numpy()
+            assert judge.is_free_path(path), k
+            state = task.simulator.step(state, control)
+            assert judge.is_free(state), k
+            touched += state.report.contact_count > 0
+    assert touched > task.steps / 4
+
+
+@pytest.mark.parametrize("finger", sorted(GRIPPER_LINKS))
+def test_the_judge_sees_a_finger_in_a_cloth(finger):
+    task = load_task(CONFIGS / "grasp_cloth.yaml")
+    judge = Judge(task.simulator, GRIPPER_LINKS)
+    points = judge.points(task.initial_state())
+    rows = task.simulator.slices[finger]
+    shift = len(task.initial_state().positions)
+    height = 0.105 - points[shift + rows.start : shift + rows.stop, 2].mean()
+    moved = points.copy()
+    moved[shift + rows.start : shift + rows.stop, 2] += height
+    assert judge.is_free_path([points, points])
+    assert not judge.is_free_path([points, moved])
