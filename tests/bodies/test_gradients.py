@@ -6,8 +6,6 @@ import torch
 from coupled_scenes import BASES, COUPLINGS, F64
 from differences import difference
 
-import diffcloth_torch as dc
-
 pytestmark = pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
 
 # Length of the direction along which an input moves; of parameters, as a share of their values.
@@ -170,9 +168,9 @@ def test_the_gradient_by_each_input_is_that_of_differences(coupling, base, kind)
 @pytest.mark.parametrize(("coupling", "base"), CASES)
 def test_everything_touches_and_rubs_along_the_whole_chain(coupling, base):
     """Otherwise the other tests would prove little."""
-    sim, state = coupled_scenes.in_contact(coupling, base)
-    fixed = coupled_scenes.control(sim), coupled_scenes.parameters(sim)
-    for state in sim.rollout(state, [fixed[0]] * 20, fixed[1]):
+    sim, start = coupled_scenes.in_contact(coupling, base)
+    controls = [coupled_scenes.control(sim)] * 20
+    for state in sim.rollout(start, controls, coupled_scenes.parameters(sim)):
         wrenches = sim.contact_wrenches(state)
         for name in ("box", "hand/left_finger", "hand/right_finger"):
             assert wrenches[name][:3].norm() > 0.01
