@@ -48,9 +48,9 @@ class NotConverged(SimulationError):  # noqa: N818
     """The iteration limit was reached before the residual fell below the tolerance."""
 
 
-class AddedMassWarning(UserWarning):
-    """A staggered coupling is used where a body is light against the cloth that it touches."""
-
-
 class IgnoredLimitsWarning(UserWarning):
     """A robot's file has effort or velocity limits, or dry joint friction: none is applied."""
+
+
+class AddedMassWarning(UserWarning):
+    """A staggered coupling moves something that is too light for the cloth that it touches."""

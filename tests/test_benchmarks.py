@@ -108,3 +108,12 @@ def test_every_factorization_is_timed():
         assert result.stdout.count(f"\n{name}, ") == 2
     for method in ("multifrontal (portable)", "eigen"):
         assert result.stdout.count(method) >= 4
+
+
+def test_what_moves_by_forces_is_timed_beside_what_is_given():
+    command = [sys.executable, "-m", "benchmarks.coupling", "--quick"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    rows = [line.split() for line in result.stdout.splitlines()]
+    assert [row[0] for row in rows[1:]] == ["free", "gripper"]
+    assert all(float(row[-1]) >= 1 for row in rows[1:])  # steps in contact

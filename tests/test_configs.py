@@ -6,10 +6,15 @@ import math
 from pathlib import Path
 
 import pytest
+import torch
 
 from diffcloth_torch.config.schema import read_document, resolve_path, set_values
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.tasks.registry import load_config
+from diffcloth_torch.robots import GRIPPER
+from diffcloth_torch.tasks.registry import load_config, load_task
+from diffcloth_torch.tasks.simulation import simulate
+
+F64 = torch.float64
 
 MINIMAL = """
 task: drape
@@ -136,9 +141,7 @@ REFUSED = [
         r"pins\.a` must have exactly one of vertices, box, nearest",
         id="two-selections",
     ),
-    pytest.param(
-        "scene.cloths=[]", r"`scene` must have a cloth in `cloths` unless", id="no-cloth"
-    ),
+    pytest.param("scene.cloths=[]", r"`scene` must have a cloth in `cloths` unless", id="no-cloth"),
     pytest.param("scene.gravity=[0, 0]", r"`scene\.gravity`.*3", id="short-vector"),
     pytest.param(
         "output.pictures.ground=low",
@@ -246,6 +249,106 @@ class TestRoot:
     def test_a_missing_file_is_named(self, files):
         with pytest.raises(InvalidInput, match=r"there is no file 'x\.obj'"):
             resolve_path(files / "project/configs/a.yaml", ".", "x.obj")
+
+
+MOVING = """
+task: drape
+simulation: {dt: 0.01, steps: 4, coupling: rigid_to_cloth, contact: {barrier_distance: 0.002}}
+scene:
+  cloths:
+    - {name: sheet, shape: {kind: grid, rows: 3, columns: 3, size: 0.2}, pins: {a: {vertices: [0]}}}
+  bodies:
+    - {name: ball, shape: {kind: cylinder, radius: 0.05, length: 0.1}, motion: dynamic, mass: 0.3,
+       pose: {position: [0, 0, 0.5]}}
+    - {name: crate, shape: {kind: box, size: 0.1}, motion: dynamic, density: 100,
+       pose: {position: [1, 0, 0.5]}, inertia: [[1, 0, 0], [0, 1, 0], [0, 0, 1.5]]}
+  robots:
+    - {name: left, model: gripper, base: kinematic, pose: {position: [-1, 0, 0]}, stiffness: 100,
+       damping: {left_finger_joint: 2}, joint_positions: 0.01, friction: {palm: 0.9},
+       trajectory: [{time: 0.02, position: [-1, 0, 0.01]}],
+       joint_trajectories: {left_finger_joint: [{time: 0.02, value: 0.03}]}}
+    - {name: right, model: gripper, pose: {position: [2, 0, 0]},
+       actuation: {left_finger_joint: velocity, right_finger_joint: torque},
+       joint_trajectories: {left_finger_joint: [{time: 0, value: 0.2}],
+                            right_finger_joint: [{time: 0.04, value: 4}]}}
+  ignore_contact: [[ball, left/palm], [sheet, crate]]
+"""
+
+
+def test_what_moves_by_forces_is_built(write):
+    path = write(MOVING)
+    task = load_task(path, [])
+    scene = task.scene
+    assert [body.motion for body in scene.bodies] == ["dynamic", "dynamic"]
+    assert scene.bodies[0].mass == 0.3
+    assert scene.bodies[1].inertia[2, 2] == 1.5
+    assert scene.bodies[1].mass == pytest.approx(0.1)
+    left, right = scene.robots
+    assert (left.mechanism.base, right.mechanism.base) == ("kinematic", "fixed")
+    assert left.damping.tolist() == [2, 0]
+    assert left.joint_positions.tolist() == [0.01, 0.01]
+    assert left.friction.tolist() == [0.9, 0.4, 0.4]
+    assert right.mechanism.actuation == ("velocity", "torque")
+    assert scene.ignore_contact == (("ball", "left/palm"), ("sheet", "crate"))
+    assert task.simulator.coupling == "rigid_to_cloth"
+
+
+def test_bases_and_joints_follow_their_keyframes(write):
+    task = load_task(write(MOVING), [])
+    controller = task.controller({})
+    controls = [controller(k, None) for k in range(4)]
+    assert all(control.body_poses is None for control in controls)
+    bases = torch.stack([control.base_poses["left"] for control in controls])
+    torch.testing.assert_close(bases[:, 2], torch.tensor([0.005, 0.01, 0.01, 0.01], dtype=F64))
+
+    def values(field, name):
+        return [float(getattr(control, field)[name]) for control in controls]
+
+    positions = values("joint_positions", "left/left_finger_joint")
+    assert positions == pytest.approx([0.02, 0.03, 0.03, 0.03])
+    assert values("joint_velocities", "right/left_finger_joint") == [0.2] * 4
+    efforts = values("joint_efforts", "right/right_finger_joint")
+    assert efforts == pytest.approx([1.0, 2.0, 3.0, 4.0])
+    end = list(simulate(task))[-1]
+    assert end.base_poses[0, 2] == 0.01
+    assert end.joint_positions[2] == pytest.approx(4 * 0.01 * 0.2)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("scene.bodies.ball.mass=-1", r"`scene\.bodies\[0\]\.mass` must be greater than 0"),
+        ("scene.bodies.ball.density=2", "`density` or `mass`, one of them, got both"),
+        ("scene.bodies.ball.motion=static", "`mass` needs motion="),
+        ("scene.bodies.ball.trajectory=[{time: 1}]", "must have `motion: kinematic` for it"),
+        ("scene.robots.left.path=x.urdf", "exactly one of path, model, got path, model"),
+        ("scene.robots.left.mesh_root=.", "must have a `path` for it"),
+        ("scene.robots.left.base=fixed", "must have `base: kinematic` for it"),
+        ("scene.robots.left.actuation=servo", "`scene.robots.0..actuation` must be 'position'"),
+        ("scene.robots.left.name=ball", "the name 'ball' must be given once"),
+        ("scene.robots.left.stiffness={thumb: 1}", "has the names .*'thumb'"),
+        (
+            "scene.robots.left.joint_trajectories={thumb: [{time: 1, value: 1}]}",
+            "may name its joints 'left_finger_joint', 'right_finger_joint'; got 'thumb'",
+        ),
+        ("scene.ignore_contact=[[ball, moon]]", "`ignore_contact` .*'moon'"),
+        ("simulation.coupling=loose", "must be 'monolithic', 'rigid_to_cloth' or 'cloth_to_rigid'"),
+    ],
+)
+def test_bad_bodies_and_robots_are_refused(write, assignment, message):
+    with pytest.raises(InvalidInput, match=message):
+        load_task(write(MOVING), [assignment])
+
+
+def test_a_robot_is_read_from_a_file_under_the_root(write, tmp_path):
+    (tmp_path / "hand.urdf").write_bytes(GRIPPER.read_bytes())
+    changes = ["scene.robots.left.model=null", "scene.robots.left.path=hand.urdf"]
+    scene = load_task(write(MOVING), changes).scene
+    assert scene.robots[0].link_names == scene.robots[1].link_names
+    with pytest.raises(InvalidInput, match="must lie under the root"):
+        load_task(write(MOVING), [changes[0], "scene.robots.left.path=../hand.urdf"])
+    with pytest.raises(InvalidInput, match=r"the folder '\.\./' must lie under the root"):
+        load_task(write(MOVING), [*changes, "scene.robots.left.mesh_root=../"])
 
 
 SHIPPED = Path(__file__).parent.parent / "configs"

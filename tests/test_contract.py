@@ -22,7 +22,10 @@ PUBLIC = {
     "ContactOptions": (
         "barrier_distance barrier_stiffness friction_iterations slip_velocity self_contact"
     ),
-    "Control": "pins soft_pins body_poses forces replace",
+    "Control": (
+        "pins soft_pins body_poses forces body_wrenches joint_positions joint_velocities "
+        "joint_efforts base_poses base_wrenches replace"
+    ),
     "IgnoredLimitsWarning": "",
     "InfeasibleMotion": "",
     "IntersectingState": "",
@@ -31,14 +34,19 @@ PUBLIC = {
     "NotConverged": "",
     "Parameters": (
         "stretch bending poisson density damping friction thickness barrier_stiffness "
-        "barrier_distance slip_velocity pin_stiffness gravity rest_positions replace"
+        "barrier_distance slip_velocity pin_stiffness gravity rest_positions body_mass "
+        "body_center body_inertia link_mass link_center link_inertia joint_stiffness joint_damping "
+        "joint_viscosity joint_armature replace"
     ),
     "Report": "select stack where",
     "RigidBody": "load box sphere capsule cylinder plane",
     "Robot": "load forward_kinematics joint_names link_names",
     "Scene": "",
     "SimulationError": "",
-    "Simulator": "initial_state control parameters step rollout energy",
+    "Simulator": (
+        "initial_state control parameters step rollout energy link_poses link_velocities "
+        "contact_wrenches"
+    ),
     "SolverOptions": "tolerance max_iterations throw metric",
     "State": "batch_size replace detach export",
     "build_info": "",

@@ -75,6 +75,12 @@ def test_states_controls_and_parameters_load(load):
     assert saved["state"].report.counts == {}
     assert saved["batch"][1].report.counts == {}
     assert saved["parameters"].replace(stretch=2.0).stretch == 2.0
+    for state, batch in ((saved["state"], ()), (saved["batch"], (2,))):
+        assert torch.equal(state.body_velocities, torch.zeros(*batch, 1, 6, dtype=torch.float64))
+        assert state.joint_positions.shape == (*batch, 0)
+        assert state.base_poses.shape == (*batch, 0, 7)
+    assert saved["control"].joint_positions is None
+    assert saved["parameters"].body_mass is None
 
 
 def test_a_simulator_loads_and_goes_on_from_saved_states(tmp_path):
@@ -83,6 +89,7 @@ def test_a_simulator_loads_and_goes_on_from_saved_states(tmp_path):
     assert type(simulator) is dc.Simulator
     assert type(simulator.scene) is dc.Scene
     assert (simulator.scheme, simulator.dt) == ("split", 0.01)
+    assert simulator.coupling == "monolithic"
     assert simulator.solver.metric == "identity"
     assert simulator.contact.friction_iterations == 1
     (cloth,) = simulator.scene.cloths

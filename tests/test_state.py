@@ -9,6 +9,7 @@ import torch
 
 import diffcloth_torch as dc
 from diffcloth_torch.geometry.meshes import read_mesh
+from diffcloth_torch.model.quantities import STATE
 
 
 def make(seed=0, *, report=True, batch=()):
@@ -28,10 +29,32 @@ def make(seed=0, *, report=True, batch=()):
         body_forces=random(5, 3),
         time=random(),
         report=diagnostics,
+        body_velocities=random(2, 6),
+        joint_positions=random(3),
+        joint_velocities=random(3),
+        joint_targets=random(3),
+        joint_efforts=random(3),
+        base_poses=random(1, 7),
+        base_velocities=random(1, 6),
     )
 
 
-TENSORS = ("positions", "velocities", "body_poses", "soft_pin_targets", "body_forces", "time")
+TENSORS = tuple(STATE)
+
+
+@pytest.mark.parametrize("batch", [(), (4,)])
+def test_what_is_left_out_becomes_rows_of_zeros(batch):
+    """The fields that the first version has, by position and by name."""
+    full = make(batch=batch)
+    first = [getattr(full, name) for name in TENSORS[:6]]
+    named = dict(zip(TENSORS[:6], first, strict=True))
+    for state in (dc.State(*first), dc.State(**named), dc.State(*first, full.report)):
+        assert torch.equal(state.body_forces, full.body_forces)
+        assert torch.equal(state.body_velocities, torch.zeros(*batch, 2, 6, dtype=torch.float64))
+        for name in ("joint_positions", "joint_velocities", "joint_targets", "joint_efforts"):
+            assert getattr(state, name).shape == (*batch, 0)
+        assert state.base_poses.shape == (*batch, 0, 7)
+        assert state.base_velocities.shape == (*batch, 0, 6)
 
 
 def test_stack_then_select_returns_each_state():

@@ -307,7 +307,8 @@ nb::object Simulator::path(const nb::dict& inputs) {
   const auto all = static_cast<std::size_t>(scene_.vertex_count());
   Owned<double> result = make_array<double>({path.size(), all, 3});
   for (std::size_t k = 0; k < path.size(); ++k) {
-    std::ranges::copy(path[k], result.data + 3 * all * k);
+    // Behind the vertices come the coordinates of mechanisms.
+    std::copy_n(path[k].begin(), 3 * all, result.data + 3 * all * k);
   }
   return result.array;
 }

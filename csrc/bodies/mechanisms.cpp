@@ -104,8 +104,10 @@ Mechanisms::Mechanisms(MechanismsDescription description, const BodySet& bodies)
                     .dynamic = false,
                     .first = bodies.vertex_start[s],
                     .last = bodies.vertex_start[s + 1]};
-    surface.dynamic = given_.tree_free[given_.links[l].tree] != 0 ||
-                      std::ranges::any_of(path_[l], [&](Index joint) {
+    // The six coordinates of a free root may be prescribed too, all of them.
+    const bool root_moves = surface.tree >= 0 && trees_[surface.tree].free &&
+                            given_.prescribed[trees_[surface.tree].first_coordinate] == 0;
+    surface.dynamic = root_moves || std::ranges::any_of(path_[l], [&](Index joint) {
                         return given_.prescribed[given_.links[joint].coordinate] == 0;
                       });
     surface_.push_back(surface);

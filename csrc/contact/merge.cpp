@@ -98,8 +98,9 @@ Projection project(const CollisionMesh& mesh,
     result = Projection::kOnFlatBorder;
   }
   const Closest geometry = closest(PairKind::kPointTriangle, {p, row(x, i), row(x, j), row(x, k)});
+  if (geometry.parameter_count != 2) return Projection::kOutside;
   d_sq = geometry.d_sq;
-  return geometry.parameter_count == 2 ? result : Projection::kOutside;
+  return result;
 }
 
 bool is_beyond(const Vec3& p, const Vec3& a, const Vec3& b, const Vec3& c, double range) {
@@ -200,13 +201,9 @@ void add_point_terms(const CollisionMesh& mesh,
                      .coefficient = static_cast<double>(weight),
                      .d_sq = near.d_sq});
   };
-  // Of the faces around a border in a plane, the first one has the points above it.
-  bool taken = false;
   for (const Index f : faces) {
     double d_sq = 0.0;
-    const Projection projection = project(mesh, weights, f, p, x, d_sq);
-    if (projection == Projection::kInside || (projection == Projection::kOnFlatBorder && !taken)) {
-      taken = taken || projection == Projection::kOnFlatBorder;
+    if (project(mesh, weights, f, p, x, d_sq) == Projection::kInside) {
       parts.push_back({.kind = kFace, .ends = {-1, -1}, .id = f, .coefficient = 1.0, .d_sq = d_sq});
       continue;
     }
@@ -227,7 +224,18 @@ void add_point_terms(const CollisionMesh& mesh,
   }
   merge(parts, range);
 
-  for (const Part& part : parts) {
+  for (Part& part : parts) {
+    // What remains of a border in a plane is of the first face there that has the point above it.
+    for (const Index f : faces) {
+      if (part.kind == kFace) break;
+      const bool has =
+          part.kind == kEdge
+              ? std::ranges::find(mesh.face_edges[f], part.id) != mesh.face_edges[f].end()
+              : std::ranges::find(mesh.faces[f], part.id) != mesh.faces[f].end();
+      if (!has || project(mesh, weights, f, p, x, part.d_sq) != Projection::kOnFlatBorder) continue;
+      part.kind = kFace;
+      part.id = f;
+    }
     Candidate pair{.kind = PairKind::kPointTriangle,
                    .vertices = {point, part.id, part.id, part.id},
                    .a = point,

@@ -9,8 +9,8 @@ constant velocities nu along it. With the momentum p(q, nu) = M nu and the slope
 
 where tau are gravity, wrenches and efforts. Velocity products are thus implicit, and the scheme is
 symplectic: by itself a robot neither gains nor loses energy in the long run. The first line is
-solved by a fixed number of Newton iterations with the first matrix. Where the motion of the base or
-of a joint is prescribed its velocity is known, and the residual is its effort.
+solved by iterations that start at nu_n and M(q_n). Where the motion of the base or of a joint is
+prescribed its velocity is known, and the residual is its effort.
 
 **Advance.** After the step the velocities nu over it are those between its two ends; the second
 line makes them nu_n+1. A robot that did not move has no velocity, whatever holds it.
@@ -48,9 +48,6 @@ from diffcloth_torch.geometry.rotation import (
 from diffcloth_torch.model.mechanism import Mechanism
 
 __all__ = ["Chain", "ChainControl", "ChainPrediction", "ChainState"]
-
-# They gain a factor of 1e3 each at 10 rad/s and 10 ms, and of 30 to 100 at 30 rad/s.
-_ITERATIONS = 5
 
 _PRESCRIBED = ("position", "velocity")
 
@@ -191,24 +188,21 @@ class Chain:
             contact: Forces on the vertices that act like the others, [B, V, 3] N.
         """
         drives = self._drives(gains, control)
+        moved_by_force = self._modes["pd"] + self._modes["torque"]
+        inertia = inertia._replace(armature=moved_by_force * inertia.armature)
         local = inertia.center[..., self.mechanism.root, :]
         quaternion = torch.nn.functional.normalize(state.pose[..., 3:], dim=-1)
         start = _Configuration(*_placed(state.pose[..., :3], quaternion, local), state.joints)
         known, ends = self._prescribed_motion(start, quaternion, control, local)
 
-        here = self._motion(inertia, start)
-        acting = self._acting(here, inertia, control, drives, gravity)
-        if contact is not None:
-            acting = acting + self._generalized(here, contact)
-        before = torch.cat([state.velocity, state.rates], dim=-1)
-        if self.mechanism.base == "fixed":
-            before = torch.cat([torch.zeros_like(state.velocity), state.rates], dim=-1)
-        given = momentum(here, inertia, before) + self._dt * acting
-        velocity, constraint = self._solve(inertia, start, known, before, given)
-
+        # Of a robot that no force moves only the motion counts.
+        velocity, constraint = known, torch.zeros_like(start.joints)
+        if self.mechanism.is_dynamic:
+            given = self._given(inertia, start, state, control, drives, gravity, contact)
+            guess = torch.cat([state.velocity, state.rates], dim=-1).detach()
+            velocity, constraint = self._solve(inertia, start, known, guess, given)
         end = self._moved(start, velocity, self._dt)
         joints = torch.where(self._prescribed, ends, end.joints)
-        mass = mass_matrix(self._motion(inertia, end), inertia)
         coordinates, free = state.joints, joints
         root_start, root_end = state.pose, state.pose
         if self.mechanism.base == "kinematic":
@@ -221,8 +215,7 @@ class Chain:
             predicted = quaternion_multiply(quaternion_exp(turn), quaternion)
             offset = -(end.rotation @ local[..., None])[..., 0]
             root_start = root_end = torch.cat([offset, predicted], dim=-1)
-        n = self.coordinate_count
-        inertial = mass[..., -n:, -n:] / self._dt**2 if n else mass[..., :0, :0]
+        inertial = self._inertial(inertia, end)
         metric, target = fold(drives, inertial, free, state.joints, self._dt, self._unknown)
         return ChainPrediction(
             root_start=root_start,
@@ -281,8 +274,7 @@ class Chain:
         if self._prescribed.any():
             inertial = (prediction.inertial @ (coordinates - prediction.free)[..., None])[..., 0]
             load = self._generalized(placed, forces)[..., ROOT:]
-            drag = prediction.drives.viscosity * over[..., ROOT:]
-            held = prediction.constraint + self._at_joints(inertial) + drag - load
+            held = prediction.constraint + self._at_joints(inertial) - load
             efforts = torch.where(self._prescribed, held, efforts)
         velocity = over
         if len(self._solved):
@@ -298,7 +290,7 @@ class Chain:
         return Drives(
             stiffness=pd * gains.stiffness,
             damping=pd * gains.damping,
-            viscosity=gains.viscosity,
+            viscosity=force * gains.viscosity,
             positions=pd * control.joints,
             velocities=pd * control.rates,
             efforts=force * control.efforts,
@@ -321,24 +313,44 @@ class Chain:
             root = pose_velocities(*between, h)
         return torch.cat([root, rates], dim=-1), ends
 
-    def _acting(
+    def _given(
         self,
-        here: Motion,
         inertia: Inertia,
+        start: _Configuration,
+        state: ChainState,
         control: ChainControl,
         drives: Drives,
         gravity: Tensor,
+        contact: Tensor | None,
     ) -> Tensor:
-        """Generalized forces of gravity, wrench and efforts, [B, 6 + J]."""
+        """M(q_n) nu_n + h tau(q_n), [B, 6 + J]."""
+        here = self._motion(inertia, start)
         weights = inertia.mass[..., None] * torch.nn.functional.pad(gravity, (0, 3))[..., None, :]
-        return generalized_force(here, weights) + torch.cat([control.wrench, drives.efforts], -1)
+        acting = torch.cat([control.wrench, drives.efforts], dim=-1)
+        acting = acting + generalized_force(here, weights)
+        if contact is not None:
+            acting = acting + self._generalized(here, contact)
+        root = state.velocity
+        if self.mechanism.base == "fixed":
+            root = torch.zeros_like(root)
+        before = torch.cat([root, state.rates], dim=-1)
+        return momentum(here, inertia, before) + self._dt * acting
+
+    def _inertial(self, inertia: Inertia, at: _Configuration) -> Tensor:
+        """M/h^2 of the coordinates, [B, n, n]."""
+        n = self.coordinate_count
+        if not self.mechanism.is_dynamic:
+            return at.joints.new_zeros(len(at.joints), n, n)
+        mass = mass_matrix(self._motion(inertia, at), inertia)
+        rows = slice(mass.shape[-1] - n, None)
+        return mass[..., rows, rows] / self._dt**2
 
     def _solve(
         self,
         inertia: Inertia,
         start: _Configuration,
         known: Tensor,
-        before: Tensor,
+        guess: Tensor,
         given: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Velocities over the step without contact, and the efforts on prescribed joints."""
@@ -357,20 +369,24 @@ class Chain:
 
         velocity = known
         if len(solved):
-            x = find_root(of_solved, before.detach()[..., solved], _ITERATIONS)
-            self._check(x)
+            mass = mass_matrix(self._motion(inertia, start), inertia)
+            inverse = torch.linalg.inv(mass.detach()[..., solved[:, None], solved])
+            alone = (inverse @ given.detach()[..., solved, None])[..., 0]
+            scale = torch.cat([alone, known.detach()], dim=-1).abs().amax(-1)
+            x, found = find_root(of_solved, guess[..., solved], inverse, scale)
+            self._check(found)
             velocity = complete(attach_root(of_solved, x))
         constraint = torch.zeros_like(start.joints)
         if self._prescribed.any():
             constraint = self._prescribed * self._at_joints(residual(velocity)) / h
         return velocity, constraint
 
-    def _check(self, velocity: Tensor) -> None:
-        lost = torch.nonzero(~velocity.isfinite().all(-1))[:, 0].tolist()
+    def _check(self, found: Tensor) -> None:
+        lost = torch.nonzero(~found)[:, 0].tolist()
         if lost:
             raise SimulationError(
                 f"step: the velocities of robot {self.mechanism.name!r} are too large for a time "
-                f"step of {self._dt:g} s; links must turn by less than half a turn in it",
+                f"step of {self._dt:g} s; its links may turn by about a radian in it",
                 environments=lost,
             )
 

@@ -11,7 +11,6 @@ from torch import Tensor
 __all__ = [
     "integrate_poses",
     "interpolate_poses",
-    "matrix_quaternion",
     "nearer_quaternion",
     "pose_velocities",
     "quaternion_exp",
@@ -31,8 +30,8 @@ _SERIES_ANGLE = 0.1
 _SMALLEST_SINE = 1e-9
 
 
-# An entry of a rotation matrix is twice a product of two entries of its quaternion plus or minus
-# another, less one on the diagonal; products of (w, x, y, z) are numbered row after row.
+# The entries of a rotation matrix are twice a product of two entries of its quaternion plus or
+# minus another, less one on the diagonal; products of (w, x, y, z) are numbered row after row.
 _FIRST = torch.tensor([0, 6, 7, 6, 0, 11, 7, 11, 0])
 _SECOND = torch.tensor([5, 3, 2, 3, 10, 1, 2, 1, 15])
 _SIGN = torch.tensor([1, -1, 1, 1, 1, -1, -1, 1, 1], dtype=torch.float64)
@@ -174,28 +173,6 @@ def quaternion_matrix(quaternion: Tensor) -> Tensor:
     # Not as a product of matrices, whose bits would depend on how many there are.
     sums = products[..., _FIRST] + _SIGN * products[..., _SECOND]
     return (2 * sums - _IDENTITY).reshape(*quaternion.shape[:-1], 3, 3)
-
-
-def matrix_quaternion(rotation: Tensor) -> Tensor:
-    """Unit quaternions [..., 4] of rotation matrices [..., 3, 3]; that of the pair with w >= 0.
-
-    The products q q^T follow from the matrix; the row of the largest entry gives q without loss.
-    """
-    xx, yy, zz = rotation.diagonal(dim1=-2, dim2=-1).unbind(-1)
-    cross = rotation - rotation.mT
-    w_times = torch.stack([cross[..., 2, 1], cross[..., 0, 2], cross[..., 1, 0]], dim=-1)
-    # Four times the products; the diagonal of the symmetric part is set apart.
-    symmetric = rotation + rotation.mT
-    squares = torch.stack(
-        [1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], dim=-1
-    )
-    vectors = symmetric - torch.diag_embed(symmetric.diagonal(dim1=-2, dim2=-1))
-    upper = torch.cat([torch.zeros_like(squares[..., :1]), w_times], dim=-1)
-    lower = torch.cat([w_times[..., None], vectors], dim=-1)
-    products = torch.cat([upper[..., None, :], lower], dim=-2) + torch.diag_embed(squares)
-    largest = squares.argmax(dim=-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
-    quaternion = torch.nn.functional.normalize(products.gather(-2, largest)[..., 0, :], dim=-1)
-    return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
 
 
 def rotation_exp(rotation_vector: Tensor) -> Tensor:

@@ -71,6 +71,7 @@ _PER_FACE: tuple[Axes, ...] = ((), ("C",), ("F",))
 _PAIRS: tuple[Axes, ...] = ((), ("S", "S"))
 _ONE: tuple[Axes, ...] = ((),)
 _JOINTS: tuple[Axes, ...] = (("J",),)
+_OF_SURFACES = "Material.{0}, RigidBody.{0}, Robot.{0}"
 _POSES, _TWIST, _WRENCH = "m, -", "m/s, rad/s", "N, N m"
 
 STATE = _table(
@@ -106,8 +107,8 @@ _TAKEN_BY_THE_CORE = (
     Quantity("poisson", "-", _PER_FACE, "Material.poisson", POISSON),
     Quantity("density", "kg/m^2", _PER_FACE, "Material.density", POSITIVE),
     Quantity("damping", "s", _PER_FACE, "Material.damping", NON_NEGATIVE),
-    Quantity("friction", "-", _PAIRS, "Material.friction, RigidBody.friction", NON_NEGATIVE),
-    Quantity("thickness", "m", (("S",),), "Material.thickness, RigidBody.thickness", NON_NEGATIVE),
+    Quantity("friction", "-", _PAIRS, _OF_SURFACES.format("friction"), NON_NEGATIVE),
+    Quantity("thickness", "m", (("S",),), _OF_SURFACES.format("thickness"), NON_NEGATIVE),
     Quantity("barrier_stiffness", "Pa", _ONE, "ContactOptions.barrier_stiffness", POSITIVE),
     Quantity("barrier_distance", "m", _ONE, "ContactOptions.barrier_distance", POSITIVE),
     Quantity("slip_velocity", "m/s", _ONE, "ContactOptions.slip_velocity", POSITIVE),

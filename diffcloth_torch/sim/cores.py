@@ -36,19 +36,24 @@ class CoreOptions(NamedTuple):
 
 
 def make_core(
-    assembly: Assembly, options: CoreOptions, limit_stiffness: FloatArray | None = None
+    assembly: Assembly,
+    options: CoreOptions,
+    limit_stiffness: FloatArray | None = None,
+    *,
+    all_prescribed: bool = False,
 ) -> _core.Simulator:
     """Make a core.
 
     Args:
         assembly: Arrays of the scene.
         options: What else there is to say.
-        limit_stiffness: Of the barriers at the limits of coordinates, shape [n]; None makes every
-            surface that is no cloth a body on prescribed poses.
+        limit_stiffness: Of the barriers at the limits of coordinates, shape [n]; None where all
+            bodies move on prescribed poses.
+        all_prescribed: Whether all coordinates move as they are told.
     """
     trees: dict[str, Any] = {}
     if limit_stiffness is not None:
-        trees = tree_arguments(assembly, limit_stiffness)
+        trees = tree_arguments(assembly, limit_stiffness, all_prescribed=all_prescribed)
     return _core.Simulator(
         vertices=assembly.vertices,
         rest_vertices=assembly.rest_vertices,

@@ -1,33 +1,21 @@
-"""The two staggered couplings: cloths, and what forces move, are solved for one after the other.
-
-Both take three steps in another order: a step of the cloths against surfaces on known poses, a step
-of bodies and robots without cloths, and the exchange of contact forces f.
-
-`rigid_to_cloth`: bodies move with their velocities, which hold the last impulse; the cloths are
-solved against this motion; the new impulse h f changes the velocities of the bodies only.
-
-`cloth_to_rigid`: the cloths are solved against frozen bodies, which prescribed motion alone moves;
-then the bodies move under f. No cloth may be in their way.
-
-Either is right to first order while the cloth that a body touches is light against it. The
-added-mass number N estimates how it is: (mass of that cloth + h^2 stiffness of the contact) / mass
-of the body. From N = 1 on the exchange overshoots, from 3 or 4 on it creates energy.
-"""
+"""The staggered couplings of a scene: the solves that `dynamics.coupling` puts in their order."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.checks import FloatArray
-from diffcloth_torch.dynamics.dynamics import Dynamics
+from diffcloth_torch.checks import FloatArray, IndexArray
+from diffcloth_torch.dynamics.coupling import added_mass_numbers, cloth_to_rigid, rigid_to_cloth
+from diffcloth_torch.dynamics.dynamics import Dynamics, Prediction
 from diffcloth_torch.errors import AddedMassWarning, InfeasibleMotion
-from diffcloth_torch.geometry.rotation import matrix_quaternion
+from diffcloth_torch.model.kinematics import pose_frame
 from diffcloth_torch.sim.cores import CoreOptions, make_core, with_all_pinned, without_cloths
 from diffcloth_torch.sim.inputs import Fields
 from diffcloth_torch.sim.layout import Layout
@@ -41,35 +29,22 @@ Check = Callable[[dict[str, Any]], None]
 
 _LARGEST_ADDED_MASS = 0.5
 
-# Of the barrier at half of its distance d_hat from a surface: its stiffness is 3.49 / d_hat times
-# its force, and its pressure on a surface 4.33 / 4 times the barrier stiffness.
-_STIFFNESS_OF_FORCE = 3.49
-_PRESSURE_OF_STIFFNESS = 4.33 / 4
 
-
-class _Fields(NamedTuple):
-    """Checked and completed fields of a step, and the inputs that the core has of them."""
-
-    state: Fields
-    control: Fields
-    parameters: Fields
-    inputs: Fields
-
-
-class _Stages(NamedTuple):
-    """What the stages of a step found, each with a leading axis of environments.
+class _Solved(NamedTuple):
+    """A solve, with a leading axis of environments.
 
     Attributes:
-        cloth: Of the cloths; None without any.
-        rigid: Of bodies and robots alone.
-        after: Fields of the state behind the step.
-        paths: Functions that give the polylines of the solves that move cloths or bodies.
+        outcome: What it found.
+        coordinates: Of bodies and robots at the end of the step, [B, n].
     """
 
-    cloth: Outcome | None
-    rigid: Outcome
-    after: Fields
-    paths: list[Callable[[], FloatArray]]
+    outcome: Outcome
+    coordinates: Tensor
+
+    @property
+    def body_forces(self) -> Tensor:
+        """On the vertices of bodies and links, [B, V, 3] N."""
+        return self.outcome.body_forces
 
 
 class Staggered:
@@ -83,7 +58,7 @@ class Staggered:
         options: CoreOptions,
         limit_stiffness: FloatArray,
     ) -> None:
-        """Make the cores of the stages.
+        """Make the cores of the solves.
 
         Args:
             coupling: Which of the two.
@@ -96,13 +71,13 @@ class Staggered:
         self._dt = options.dt
         assembly = layout.assembly
         coupled = options._replace(scheme="coupled")
-        self._rigid = make_core(
-            without_cloths(assembly), coupled._replace(bending_models=()), limit_stiffness
-        )
-        self._has_cloths = assembly.cloth_count > 0
-        if self._has_cloths:
-            self._cloth = make_core(assembly, options)
-            self._judge = make_core(with_all_pinned(assembly), coupled)
+        alone = coupled._replace(bending_models=())
+        self._rigid = make_core(without_cloths(assembly), alone, limit_stiffness)
+        self._cloth = make_core(assembly, options, limit_stiffness, all_prescribed=True)
+        # Nothing moves by itself there: a step succeeds where a motion is free of collisions.
+        pinned = with_all_pinned(assembly)
+        self._judge = make_core(pinned, coupled, limit_stiffness, all_prescribed=True)
+        self._face_area = _face_areas(assembly.rest_vertices, assembly.faces)
         self._warned = False
 
     def step(
@@ -114,99 +89,75 @@ class Staggered:
             state: Checked fields of the state.
             control: Completed fields of the control.
             parameters: Checked parameters.
-            inputs: Those of the core that are no coordinates.
-            check: Looks at the diagnostics of each stage.
+            inputs: Those of the core that do not concern bodies and robots.
+            check: Looks at the diagnostics of each solve.
         """
-        stages = self._run(_Fields(state, control, parameters, inputs), check)
-        cloth, rigid = stages.cloth, stages.rigid
-        if cloth is None:
-            return rigid, stages.after
-        self._warn(cloth.body_forces, parameters)
-        outcome = Outcome(
-            positions=cloth.positions,
-            velocities=cloth.velocities,
-            body_forces=cloth.body_forces + rigid.body_forces,
-            diagnostics=_merged(cloth.diagnostics, rigid.diagnostics),
-        )
-        return outcome, stages.after
+        outcome, after, _ = self._solve(state, control, parameters, inputs, check)
+        return outcome, after
 
     def path(
         self, state: Fields, control: Fields, parameters: Fields, inputs: Fields, check: Check
     ) -> FloatArray:
         """Polyline along which the surfaces of one environment move, [M, N + V, 3]."""
-        stages = self._run(_Fields(state, control, parameters, inputs), check)
-        return np.concatenate([path() for path in stages.paths])
+        *_, paths = self._solve(state, control, parameters, inputs, check)
+        return np.concatenate([path() for path in paths])
 
-    def _run(self, fields: _Fields, check: Check) -> _Stages:
+    def _solve(
+        self, state: Fields, control: Fields, parameters: Fields, inputs: Fields, check: Check
+    ) -> tuple[Outcome, Fields, list[Callable[[], FloatArray]]]:
+        """Outcome, fields behind the step, and the polylines of what is solved with the cloths."""
+        paths: list[Callable[[], FloatArray]] = []
+
+        def predict(contact: Tensor | None) -> Prediction:
+            return self._dynamics.predict(state, control, parameters, contact)
+
+        def solve_rigid(prediction: Prediction) -> _Solved:
+            given = self._without_cloths(inputs) | prediction.core_inputs()
+            outcome = take_step(self._rigid, given, batched=True)
+            check(outcome.diagnostics)
+            ends = outcome.coordinates
+            return _Solved(outcome, prediction.coordinates if ends is None else ends)
+
+        def solve_cloth(prediction: Prediction, ends: Tensor) -> _Solved:
+            given = inputs | prediction.core_inputs() | {"coordinate_ends": ends}
+            outcome = take_step(self._cloth, given, batched=True)
+            check(outcome.diagnostics)
+            paths.append(partial(self._cloth.path, _arrays(given)))
+            return _Solved(outcome, ends)
+
+        def check_path(cloth: _Solved, prediction: Prediction, start: Tensor, end: Tensor) -> None:
+            given = self._standing_still(inputs, cloth.outcome.positions)
+            given |= prediction.core_inputs() | {
+                "body_poses": prediction.body_targets,
+                "coordinates": start,
+                "coordinate_ends": end,
+            }
+            arrays = _arrays(given)
+            self._require_free_way(arrays)
+            paths.append(partial(self._judge.path, arrays))
+
         if self._coupling == "rigid_to_cloth":
-            return self._rigid_to_cloth(fields, check)
-        return self._cloth_to_rigid(fields, check)
-
-    def _rigid_to_cloth(self, fields: _Fields, check: Check) -> _Stages:
-        dynamics = self._dynamics
-        prediction = dynamics.predict(fields.state, fields.control, fields.parameters)
-        rigid, coordinates = self._solve_rigid(prediction.core_inputs(), fields.inputs, check)
-        after = dynamics.advance(prediction, coordinates, rigid.body_forces)
-        if not self._has_cloths:
-            return _Stages(None, rigid, after, [])
-        inputs = self._cloth_inputs(fields.inputs, fields.state, after)
-        cloth = take_step(self._cloth, inputs, batched=True)
-        check(cloth.diagnostics)
-        kicked = dynamics.advance(
-            prediction, coordinates, rigid.body_forces, kick=cloth.body_forces
+            solved = rigid_to_cloth(self._dynamics, predict(None), solve_rigid, solve_cloth)
+        else:
+            solved = cloth_to_rigid(self._dynamics, predict, solve_rigid, solve_cloth, check_path)
+        cloth = solved.cloth.outcome
+        self._warn(cloth, solved.fields, parameters)
+        outcome = Outcome(
+            positions=cloth.positions,
+            velocities=cloth.velocities,
+            body_forces=solved.body_forces,
+            diagnostics=_merged(cloth.diagnostics, solved.rigid.outcome.diagnostics),
         )
-        return _Stages(cloth, rigid, kicked, [lambda: self._cloth.path(_arrays(inputs))])
+        return outcome, solved.fields, paths
 
-    def _cloth_to_rigid(self, fields: _Fields, check: Check) -> _Stages:
-        state, control = fields.state, fields.control
-        frozen = self._frozen(state, control)
-        forces, cloth, paths = None, None, []
-        if self._has_cloths:
-            inputs = self._cloth_inputs(fields.inputs, state, frozen)
-            cloth = take_step(self._cloth, inputs, batched=True)
-            check(cloth.diagnostics)
-            forces = cloth.body_forces
-            paths.append(lambda: self._cloth.path(_arrays(inputs)))
-        prediction = self._dynamics.predict(state, control, fields.parameters, contact=forces)
-        rigid, coordinates = self._solve_rigid(prediction.core_inputs(), fields.inputs, check)
-        after = self._dynamics.advance(prediction, coordinates, rigid.body_forces)
-        if cloth is not None:
-            judged = self._judge_inputs(fields.inputs, cloth.positions, frozen, after)
-            self._require_free_way(judged)
-            paths.append(lambda: self._judge.path(judged))
-        return _Stages(cloth, rigid, after, paths)
-
-    def _frozen(self, state: Fields, control: Fields) -> Fields:
-        """Where prescribed motion alone takes bodies and robots."""
-        layout, joints = self._layout, state["joint_positions"]
-        turned = joints + self._dt * control["joint_velocities"]
-        modes = layout.actuation
-        ends = torch.where(_which(modes, "velocity"), turned, joints)
-        ends = torch.where(_which(modes, "position"), control["joint_positions"], ends)
-        return {
-            "body_poses": control["body_poses"],
-            "base_poses": control["base_poses"],
-            "joint_positions": ends,
-        }
-
-    def _solve_rigid(
-        self, coordinates: Fields, inputs: Fields, check: Check
-    ) -> tuple[Outcome, Tensor]:
-        """Solve for bodies and robots alone; their outcome, and coordinates [B, n] at its end."""
-        outcome = take_step(self._rigid, self._rigid_inputs(coordinates, inputs), batched=True)
-        check(outcome.diagnostics)
-        ends = outcome.coordinates
-        return outcome, coordinates["coordinates"] if ends is None else ends
-
-    def _rigid_inputs(self, coordinates: Fields, inputs: Fields) -> Fields:
-        cloths, surfaces = self._layout.assembly.cloth_count, self._layout.assembly.surface_count
-        environments = len(inputs["positions"])
-        none = torch.zeros(environments, 0, 3, dtype=torch.float64)
+    def _without_cloths(self, inputs: Fields) -> Fields:
+        """What concerns bodies and links alone."""
+        assembly = self._layout.assembly
+        cloths, surfaces = assembly.cloth_count, assembly.surface_count
+        none = torch.zeros(len(inputs["positions"]), 0, 3, dtype=torch.float64)
         names = ("positions", "velocities", "pin_targets", "soft_pin_targets", "forces")
-        rigid = dict.fromkeys(names, none)
-        for name in ("gravity", "barrier_stiffness", "barrier_distance", "slip_velocity"):
-            if name in inputs:
-                rigid[name] = inputs[name]
+        kept = ("gravity", "barrier_stiffness", "barrier_distance", "slip_velocity")
+        rigid = dict.fromkeys(names, none) | {k: inputs[k] for k in kept if k in inputs}
         if "thickness" in inputs:
             rigid["thickness"] = inputs["thickness"][:, cloths:]
             friction = inputs["friction"]
@@ -214,104 +165,99 @@ class Staggered:
                 pairs = friction.reshape(-1, surfaces, surfaces)
                 friction = pairs[:, cloths:, cloths:].reshape(len(pairs), -1)
             rigid["friction"] = friction
-        return {**rigid, **coordinates}
+        return rigid
 
-    def _cloth_inputs(self, inputs: Fields, start: Fields, end: Fields) -> Fields:
-        poses = {
-            "body_poses": _surface_poses(self._layout, start),
-            "body_targets": _surface_poses(self._layout, end),
+    def _standing_still(self, inputs: Fields, positions: Tensor) -> Fields:
+        """All cloth vertices pinned where they are."""
+        return inputs | {
+            "positions": positions,
+            "pin_targets": positions,
+            "velocities": torch.zeros_like(positions),
+            "soft_pin_targets": positions[:, :0],
         }
-        return {**inputs, **poses}
-
-    def _judge_inputs(
-        self, inputs: Fields, positions: Tensor, start: Fields, end: Fields
-    ) -> dict[str, FloatArray]:
-        given = self._cloth_inputs(inputs, start, end)
-        given["positions"] = given["pin_targets"] = positions
-        given["velocities"] = torch.zeros_like(positions)
-        given["soft_pin_targets"] = positions[:, :0]
-        return _arrays(given)
 
     def _require_free_way(self, inputs: dict[str, FloatArray]) -> None:
-        """Refuse a motion of the bodies through cloths that stand still."""
+        """Refuse a motion of bodies and robots through cloths that stand still."""
         result = self._judge.forward(inputs, False, torch.get_num_threads())
         blocked = np.flatnonzero(result["status"] != CONVERGED).tolist()
         if blocked:
             raise InfeasibleMotion(
-                f"step: the bodies of environments {blocked} cannot move on without passing "
-                'through a cloth; lower dt, or use coupling="monolithic"',
+                f"step: what forces move in the environments {blocked} cannot go on without "
+                'passing through a cloth; lower dt, or use coupling="monolithic"',
                 environments=blocked,
             )
 
-    def _warn(self, forces: Tensor, parameters: Fields) -> None:
+    def _warn(self, cloth: Outcome, after: Fields, parameters: Fields) -> None:
         """Warn once where the cloth that a body touches is not light against it."""
-        if self._warned:
+        if self._warned or not cloth.body_forces.detach().any():
             return
-        number, name = self._added_mass(forces.detach(), parameters)
-        if number > _LARGEST_ADDED_MASS:
+        assembly = self._layout.assembly
+        with torch.no_grad():
+            numbers = added_mass_numbers(
+                assembly,
+                self._surface_frames(after),
+                self._surface_masses(parameters),
+                cloth.positions,
+                self._vertex_masses(parameters["density"]),
+                cloth.body_forces,
+                parameters["barrier_distance"].reshape(-1),
+                self._dt,
+            ).amax(0)
+        worst = int(numbers.argmax())
+        if numbers[worst] > _LARGEST_ADDED_MASS:
             self._warned = True
+            name = assembly.surface_names[assembly.cloth_count + worst]
             warnings.warn(
-                f"step: the staggered coupling {self._coupling!r} gets inaccurate, and then "
-                f"unstable, where the cloth that a body touches is heavy or stiff against it: the "
-                f"added-mass number of {name!r} is about {number:.2g}, beyond "
-                f'{_LARGEST_ADDED_MASS:g}; use coupling="monolithic", or a smaller dt',
+                f"step: the coupling {self._coupling!r} gets inaccurate, and then unstable, where "
+                "what a body touches is heavy or stiff against it: the added-mass number of "
+                f"{name!r} is about {float(numbers[worst]):.2g}, above {_LARGEST_ADDED_MASS:g}; "
+                'use coupling="monolithic", or a smaller dt',
                 AddedMassWarning,
-                stacklevel=4,
+                stacklevel=5,
             )
 
-    def _added_mass(self, forces: Tensor, parameters: Fields) -> tuple[float, str]:
-        """Estimate of the largest added-mass number from contact forces [B, V, 3], and whose it is.
+    def _surface_frames(self, fields: Fields) -> Tensor:
+        """Frames of all bodies, then of the links that have a shape, [B, K + Lc, 4, 4]."""
+        bodies = pose_frame(fields["body_poses"])
+        links = link_poses(self._layout, fields)
+        names = self._layout.rigid_vertices
+        return torch.cat([bodies, *(links[n][:, None] for n in names if n in links)], dim=1)
 
-        The force on a body tells how stiff a contact is, and how large, if it is at half of the
-        barrier's distance.
-        """
-        layout, assembly = self._layout, self._layout.assembly
-        worst = (0.0, "")
-        distance = parameters["barrier_distance"].detach()
-        stiffness = parameters["barrier_stiffness"].detach()
-        density = parameters["density"].detach().mean(1, keepdim=True)
-        owners = assembly.surface_mechanism
-        for t, mechanism in enumerate(assembly.mechanisms):
-            if not mechanism.is_dynamic:
-                continue
-            surfaces = np.flatnonzero(owners == t)
-            spans = zip(
-                assembly.body_vertex_start[surfaces],
-                assembly.body_vertex_start[surfaces + 1],
-                strict=True,
-            )
-            rows = torch.tensor([v for a, b in spans for v in range(a, b)], dtype=torch.int64)
-            force = forces[:, rows].norm(dim=-1).sum(1, keepdim=True)
-            area = force / (_PRESSURE_OF_STIFFNESS * stiffness)
-            contact = self._dt**2 * _STIFFNESS_OF_FORCE * force / distance
-            mass = layout.mass_of(t, parameters).detach().reshape(-1, 1)
-            number = float(((density * area + contact) / mass).max())
-            worst = max(worst, (number, mechanism.name))
-        return worst
+    def _surface_masses(self, parameters: Fields) -> Tensor:
+        """Masses of them, zero where nothing is dynamic, [B or 1, K + Lc]."""
+        layout = self._layout
+        bodies = torch.zeros(1, len(layout.bodies), dtype=torch.float64)
+        links = torch.zeros(1, sum(r.link_count for r in layout.robots), dtype=torch.float64)
+        bodies = parameters.get("body_mass", bodies)
+        links = parameters.get("link_mass", links)[:, layout.shaped_links]
+        environments = max(len(bodies), len(links))
+        return torch.cat([m.expand(environments, -1) for m in (bodies, links)], dim=1)
+
+    def _vertex_masses(self, density: Tensor) -> Tensor:
+        """Masses of the cloths' vertices [B or 1, N] from densities [B or 1, 1 or C or F]."""
+        assembly = self._layout.assembly
+        if density.shape[1] == assembly.cloth_count:
+            counts = torch.from_numpy(np.diff(assembly.cloth_face_start)).long()
+            density = density.repeat_interleave(counts, dim=1)
+        corners = torch.from_numpy(assembly.faces).long().flatten()
+        parts = (density * self._face_area / 3).repeat_interleave(3, dim=1)
+        zeros = torch.zeros(len(parts), len(assembly.vertices), dtype=torch.float64)
+        return zeros.index_add(1, corners, parts)
 
 
-def _surface_poses(layout: Layout, fields: Fields) -> Tensor:
-    """Poses of all bodies, then of the links that have a shape, [B, K + Lc, 7]."""
-    poses = [fields["body_poses"]]
-    frames = link_poses(layout, fields)
-    for name in layout.assembly.surface_names[layout.assembly.cloth_count :]:
-        if name in frames:
-            frame = frames[name]
-            pose = torch.cat([frame[:, :3, 3], matrix_quaternion(frame[:, :3, :3])], dim=-1)
-            poses.append(pose[:, None])
-    environments = max(len(part) for part in poses)
-    return torch.cat([part.expand(environments, -1, -1) for part in poses], dim=1)
-
-
-def _which(modes: tuple[str, ...], mode: str) -> Tensor:
-    return torch.tensor([m == mode for m in modes], dtype=torch.bool)
+def _face_areas(rest: FloatArray, faces: IndexArray) -> Tensor:
+    a, b, c = (rest[faces[:, i]] for i in range(3))
+    return torch.from_numpy(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
 
 def _merged(cloth: dict[str, Any], rigid: dict[str, Any]) -> dict[str, Any]:
-    """Diagnostics of a step from those of its two solves."""
-    worst = {"status": np.maximum, "residual": np.maximum}
-    least = {"minimum_distance": np.minimum, "motion_fraction": np.minimum}
-    combine = {**worst, **least}
+    """Diagnostics of a step from those of its two solves; what is not listed here is added."""
+    combine = {
+        "status": np.maximum,
+        "residual": np.maximum,
+        "minimum_distance": np.minimum,
+        "motion_fraction": np.minimum,
+    }
     merged = {
         name: combine.get(name, np.add)(values, rigid[name])
         for name, values in cloth.items()

@@ -25,7 +25,7 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.poses import check_quaternions
 from diffcloth_torch.geometry.surfaces import check_areas
-from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Shape, shape_of
+from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Shape
 from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.state import State
@@ -61,13 +61,11 @@ def state_fields(layout: Layout, state: State) -> tuple[Fields, int | None]:
     """Check a state; returns its tensors and its batch size, None without a batch axis."""
     if not isinstance(state, State):
         raise TypeError(f"step: `state` must be a State, got {type(state).__name__}")
-    sizes = layout.assembly.sizes
-    shapes = {name: shape_of(q.axes[0], sizes) for name, q in STATE.items() if not q.ignored}
-    for name in shapes:
+    for name in layout.state_shapes:
         _check_state_tensor(name, getattr(state, name))
     batch = state.batch_size
     fields = {}
-    for name, shape in shapes.items():
+    for name, shape in layout.state_shapes.items():
         tensor = getattr(state, name)
         label = f"step: `state.{name}`"
         if name == "positions":
@@ -81,7 +79,23 @@ def state_fields(layout: Layout, state: State) -> tuple[Fields, int | None]:
         raise InvalidInput("step: `state` must hold at least one environment, got a batch of 0")
     for name in _POSES:
         check_quaternions(f"step: `state.{name}`", _numbers(getattr(state, name)))
+    if layout.joint_names:
+        _check_zones(layout, _numbers(fields["joint_positions"]))
     return fields, batch
+
+
+def _check_zones(layout: Layout, positions: FloatArray) -> None:
+    """Refuse joints that forces move where the barriers at their limits have no value."""
+    lower, upper = layout.farthest
+    beyond = (positions <= lower) | (positions >= upper)
+    if beyond.any():
+        at = tuple(int(i) for i in np.argwhere(beyond)[0])
+        joint = at[-1]
+        raise InvalidInput(
+            "step: `state.joint_positions` must be at most 1 % of the range beyond a limit where "
+            f"forces move a joint: between {lower[joint]:g} and {upper[joint]:g} (exclusive) for "
+            f"{layout.joint_names[joint]!r}, got {positions[at]:g} at [{joint}]"
+        )
 
 
 def _check_state_tensor(name: str, tensor: object) -> None:
@@ -106,16 +120,15 @@ def check_control(layout: Layout, control: Control) -> Control:
     """Promote a control to tensors and check everything that does not depend on a state."""
     if not isinstance(control, Control):
         raise TypeError(f"step: `control` must be a Control, got {type(control).__name__}")
-    sizes = layout.assembly.sizes
     checked: dict[str, Tensor | dict[str, Tensor]] = {}
-    for field, quantity in CONTROL.items():
+    for field, shape in layout.control_shapes.items():
         given = getattr(control, field)
         if given is None:
             continue
         if field in layout.groups and isinstance(given, Mapping):
             checked[field] = _named_targets(layout, field, given)
         else:
-            tensor = _target(field, field, given, shape_of(quantity.axes[0], sizes))
+            tensor = _target(field, field, given, shape)
             _check_rows(layout, field, _numbers(tensor))
             checked[field] = tensor
     return Control(**checked)  # type: ignore[arg-type]
@@ -308,7 +321,6 @@ def parameter_fields(
     """Check parameters; a field that is None takes the default, `defaults` has all there are."""
     checked = check_parameters(parameters)
     fields = {}
-    sizes = layout.assembly.sizes
     for name, quantity in PARAMETERS.items():
         given = getattr(checked, name)
         if name not in defaults:
@@ -321,7 +333,7 @@ def parameter_fields(
         tensor = defaults[name] if given is None else given
         if given is not None:
             check_range(label, _numbers(tensor), quantity.accepted)
-        shared = [shape_of(axes, sizes) for axes in quantity.axes]
+        shared = layout.parameter_shapes[name]
         unbatched = given is None or name in parameters._unbatched
         environments = _environments(label, tuple(tensor.shape), shared, batch, unbatched)
         row = quantity.row_shape

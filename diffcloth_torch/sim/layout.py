@@ -8,13 +8,13 @@ from itertools import pairwise
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.kinematics import Tree
+from diffcloth_torch.dynamics.limits import ZONE
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.mechanism import Mechanism
-from diffcloth_torch.model.quantities import CONTROL, Shape
+from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Shape, shape_of
 from diffcloth_torch.model.scene import Assembly
 
 __all__ = ["MODES", "Layout"]
@@ -34,9 +34,13 @@ class Layout:
 
     Attributes:
         assembly: Arrays of the scene.
+        state_shapes: Shape of each field of a state that a step looks at.
+        control_shapes: Shape of each field of a control.
+        parameter_shapes: Accepted shapes of each parameter.
         bodies: Mechanism of each of the K bodies.
         robots: Mechanism of each of the R robots.
         trees: Kinematics of each robot.
+        shaped_links: Which of the L links have a shape, in the order of the surfaces.
         rigid_vertices: Name of a body, or "robot/link" -> its rows among the V vertices.
         kinematic_bodies: Indices of the bodies on prescribed poses.
         is_dynamic: Whether forces move anything but the cloths.
@@ -50,13 +54,26 @@ class Layout:
         massive: "body" or "link" -> which of them have mass and are moved by forces, [K] or [L].
         lower: Lower limits [rad or m], shape [J].
         upper: Upper limits, likewise.
+        farthest: Ends of the zones beyond the limits of joints that forces move, infinite for
+            others; the lower, then the upper ones, shape [2, J].
     """
 
     def __init__(self, assembly: Assembly) -> None:
         self.assembly = assembly
+        sizes = assembly.sizes
+        looked_at = {name: q for name, q in STATE.items() if not q.ignored}
+        self.state_shapes = {name: shape_of(q.axes[0], sizes) for name, q in looked_at.items()}
+        self.control_shapes = {name: shape_of(q.axes[0], sizes) for name, q in CONTROL.items()}
+        self.parameter_shapes = {
+            name: [shape_of(axes, sizes) for axes in q.axes] for name, q in PARAMETERS.items()
+        }
         self.bodies = assembly.mechanisms[: assembly.body_count]
         self.robots = assembly.mechanisms[assembly.body_count :]
         self.trees = tuple(Tree(robot) for robot in self.robots)
+        first_links = np.cumsum([0, *(robot.link_count for robot in self.robots)])
+        of_robots = assembly.surface_mechanism >= assembly.body_count
+        owners = assembly.surface_mechanism[of_robots] - assembly.body_count
+        self.shaped_links = torch.from_numpy(first_links[owners] + assembly.surface_link[of_robots])
         starts = assembly.body_vertex_start.tolist()
         self.rigid_vertices = {
             name: slice(*ends)
@@ -74,6 +91,11 @@ class Layout:
         self.driven = torch.tensor([mode == "pd" for mode in self.actuation], dtype=torch.bool)
         self.lower = _joined([robot.lower for robot in self.robots])
         self.upper = _joined([robot.upper for robot in self.robots])
+        moved = np.array([mode in ("torque", "pd") for mode in self.actuation], dtype=bool)
+        reach = np.where(np.isinf(self.upper - self.lower), 0.0, ZONE * (self.upper - self.lower))
+        self.farthest = np.where(
+            moved, [self.lower - reach, self.upper + reach], [[-np.inf], [np.inf]]
+        )
         body_motions = [f"that body is {_MOTIONS[body.base]}" for body in self.bodies]
         base_motions = [f"that robot's base is {robot.base}" for robot in self.robots]
         self.kept = {
@@ -108,15 +130,6 @@ class Layout:
     def has_coordinates(self) -> bool:
         """Whether the scene has more than cloths and bodies on prescribed poses."""
         return self.is_dynamic or bool(self.robots)
-
-    def mass_of(self, tree: int, parameters: Mapping[str, Tensor]) -> Tensor:
-        """Mass of a body, or of all links of a robot [kg], from parameters; [B or 1]."""
-        count = len(self.bodies)
-        if tree < count:
-            return parameters["body_mass"][:, tree]
-        first = sum(robot.link_count for robot in self.robots[: tree - count])
-        links = slice(first, first + self.robots[tree - count].link_count)
-        return parameters["link_mass"][:, links].sum(1)
 
     def entry_shape(self, field: str, name: str) -> Shape:
         """Shape of what a control's mapping holds under a full name."""

@@ -143,15 +143,21 @@ class Simulator:
         self.slices = {**dict(cloths), **self._layout.rigid_vertices}
         self.joint_slices = dict(self._assembly.joint_slices)
         self._surfaces = _surfaces(scene, self._assembly)
+        # Without cloths there is nothing to split or to couple.
         options = CoreOptions(
-            [cloth.bending_model for cloth in scene.cloths], self.dt, scheme, contact, solver
+            bending_models=[cloth.bending_model for cloth in scene.cloths],
+            dt=self.dt,
+            scheme=scheme if scene.cloths else "coupled",
+            contact=contact,
+            solver=solver,
         )
         stiffness = None
         if self._dynamics is not None:
             stiffness = limit_stiffness(self._assembly, self.dt, scene.gravity)
         self._core = make_core(self._assembly, options, stiffness)
         self._staggered = None
-        if coupling != "monolithic" and self._dynamics is not None and stiffness is not None:
+        in_turn = coupling != "monolithic" and scene.cloths and self._layout.is_dynamic
+        if in_turn and self._dynamics is not None and stiffness is not None:
             self._staggered = Staggered(coupling, self._layout, self._dynamics, options, stiffness)
         self._nonadjacent_distance = self._core.smallest_nonadjacent_distance()
         self._defaults = scene_parameters(scene, self._assembly, has_contact(scene, contact))

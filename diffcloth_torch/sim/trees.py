@@ -15,12 +15,15 @@ _KINDS = {"fixed": 0, "revolute": 1, "prismatic": 2}
 _ROOT = 6  # coordinates of a floating root
 
 
-def tree_arguments(assembly: Assembly, limit_stiffness: FloatArray) -> dict[str, Any]:
+def tree_arguments(
+    assembly: Assembly, limit_stiffness: FloatArray, *, all_prescribed: bool = False
+) -> dict[str, Any]:
     """Arguments of the core that describe all trees, bodies first.
 
     Args:
         assembly: Arrays of the scene.
         limit_stiffness: Of the barriers at the limits of the n coordinates, shape [n].
+        all_prescribed: Whether the values of all coordinates at the end of a step are given.
     """
     links: dict[str, list[Any]] = {
         name: []
@@ -71,7 +74,7 @@ def tree_arguments(assembly: Assembly, limit_stiffness: FloatArray) -> dict[str,
         "link_multiplier": np.array(links["multiplier"], dtype=np.float64),
         "link_constant": np.array(links["constant"], dtype=np.float64),
         "surface_link": _indices([place[owner] for owner in owners]),
-        "coordinate_prescribed": _indices(prescribed),
+        "coordinate_prescribed": _indices([all_prescribed or given for given in prescribed]),
         "coordinate_lower": np.array(lower, dtype=np.float64),
         "coordinate_upper": np.array(upper, dtype=np.float64),
         "limit_stiffness": limit_stiffness,

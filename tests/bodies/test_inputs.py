@@ -247,6 +247,21 @@ def test_state_tensors_are_checked(layout, scene, field):
         state_fields(layout, state.replace(**{field: bad.float()}))
 
 
+def test_a_joint_beyond_the_zone_of_its_limit_is_refused(layout, scene):
+    """Of joints that forces move: turn has the range -1 .. 1.8, where the one that follows ends."""
+    state = make_state(scene)
+
+    def at(*positions):
+        return state.replace(joint_positions=torch.tensor(positions, dtype=F64))
+
+    state_fields(layout, at(0.1, 1.8 + 0.027, 50.0, 0.01, 0.02))
+    state_fields(layout, at(7.0, 0.0, 0.0, -1.0, 1.0))  # prescribed
+    with pytest.raises(
+        dc.InvalidInput, match=r"-1\.028 and 1\.828 .*'arm/turn', got 1\.829 at \[1\]"
+    ):
+        state_fields(layout, at(0.1, 1.8 + 0.029, 0.0, 0.01, 0.02))
+
+
 def test_a_base_without_orientation_is_refused(layout, scene):
     state = make_state(scene)
     with pytest.raises(dc.InvalidInput, match=r"`state.base_poses` .*quaternion"):

@@ -108,6 +108,35 @@ def test_velocities_of_bodies_on_poses_are_quotients(sim):
     torch.testing.assert_close(hand, expected)
 
 
+def test_they_are_where_nothing_but_cloths_moves_by_forces():
+    """The same quotients, and their gradients, in a scene without coordinates."""
+    bodies = [
+        dc.RigidBody.box(0.1, motion="kinematic", pose=[0, 0, 1, 1, 0, 0, 0]),
+        dc.RigidBody.plane(1.0, pose=[0, 0, -1, 1, 0, 0, 0]),
+        dc.RigidBody.box(0.1, motion="kinematic", pose=[0, 1, 1, 2, 0.1, 0, 0]),
+    ]
+    sim = dc.Simulator(dc.Scene([dc.Cloth.grid(2, 2, 0.1)], bodies), DT)
+    state = sim.initial_state()
+    assert not sim.step(state).body_velocities.any()
+    poses = state.body_poses.clone()
+    poses[0] = torch.tensor([0.01, 0, 1, 1, 0, 0.01, 0], dtype=F64)
+    poses[2] *= -1.0  # the quaternion's other sign
+    poses[2, :3] *= -1.0
+    after = sim.step(state, sim.control(body_poses=poses))
+    turn = 2 * np.arctan(0.01) / DT
+    expected = torch.zeros(3, 6, dtype=F64)
+    expected[0] = torch.tensor([0.01 / DT, 0, 0, 0, turn, 0], dtype=F64)
+    torch.testing.assert_close(after.body_velocities, expected)
+
+    def velocities(start, end):
+        given = state.replace(body_poses=start)
+        kept = torch.cat([end[:1], start[1:2], end[1:]])
+        return sim.step(given, dc.Control(body_poses=kept)).body_velocities
+
+    ends = torch.cat([poses[:1], poses[2:]]).requires_grad_()
+    assert torch.autograd.gradcheck(velocities, (state.body_poses.requires_grad_(), ends))
+
+
 def test_a_body_falls_and_is_pushed(sim):
     before = sim.initial_state()
     after = sim.step(before, sim.control(body_wrenches={"brick": [1.0, 0, 0, 0, 0, 0]}))
@@ -191,6 +220,39 @@ def test_contact_wrenches_carry_the_weight():
     torque = torch.linalg.cross(state.body_poses[1, :3], -weight)
     torch.testing.assert_close(wrenches["floor"][3:], torque, rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(wrenches["body1"][3:], torch.zeros(3, dtype=F64), atol=1e-4, rtol=0)
+
+
+def test_a_gripper_holds_a_sheet_with_its_efforts():
+    """Two fingers close on a hanging sheet with 2 N each: they stop at once, and do not rebound."""
+    pose = [0, 0.003, 0.09, np.cos(np.pi / 4), np.sin(np.pi / 4), 0, 0]
+    sheet = dc.Cloth.grid(9, 9, 0.1, pose=pose, pins={"top": range(72, 81)})
+    hand = dc.Robot.load(dc.robots.GRIPPER, actuation="torque", joint_positions=0.03, name="hand")
+    sim = dc.Simulator(dc.Scene([sheet], [], [hand]), DT, solver=dc.SolverOptions(tolerance=1e-10))
+    with torch.no_grad():
+        control = sim.control(joint_efforts=[2.0, 2.0])
+        state = sim.rollout(sim.initial_state(), [control] * 8)[-1]
+    assert (state.joint_positions > 0.0385).all()
+    assert state.joint_velocities.abs().max() < 5e-3
+    wrenches = sim.contact_wrenches(state)
+    for finger, force in (("hand/left_finger", 2.0), ("hand/right_finger", -2.0)):
+        assert wrenches[finger][1] == pytest.approx(force, rel=2e-3)
+
+    g = torch.Generator().manual_seed(0)
+    weights = torch.randn(state.positions.shape, dtype=F64, generator=g)
+
+    def loss(efforts):
+        end = sim.rollout(state, [dc.Control(joint_efforts=efforts)] * 3)[-1]
+        joints = end.joint_positions + 0.1 * end.joint_velocities
+        return (weights * end.positions).sum() + joints[0] - 2 * joints[1]
+
+    def value(efforts):
+        with torch.no_grad():
+            return float(loss(efforts))
+
+    efforts = torch.tensor([2.0, 2.0], dtype=F64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(loss(efforts), efforts)
+    for d in directions(efforts, g):
+        assert mismatch(value, efforts.detach(), gradient, d, 1e-3, 1e-7) < 1e-6
 
 
 # --- Batches, purity, saving ---------------------------------------------------------------------

@@ -97,6 +97,24 @@ def test_quaternions_keep_their_sign_and_any_length_is_accepted():
         start = pose
 
 
+def test_more_than_half_a_turn_in_a_step_keeps_the_sign_too():
+    start = tensor([[[0, 0, 0, 1.0, 0, 0, 0]]])
+    ((pose, _, _),) = fly(start, tensor([[[0, 0, 0, 400.0, 0, 0]]]), 1)
+    expected = -tensor([math.cos(2.0), math.sin(2.0), 0, 0])
+    torch.testing.assert_close(pose[0, 0, 3:], expected, rtol=0, atol=1e-13)
+
+
+def test_a_torque_acts_in_world_axes():
+    turned = tensor([[[0, 0, 0, 0.5, 0.5, 0.5, 0.5]]])  # x to y to z to x
+    ((_, velocity, momentum),) = fly(
+        turned, torch.zeros(1, 1, 6, dtype=F64), 1, wrench=(0, 0, 0, 0.2, 0, 0)
+    )
+    torch.testing.assert_close(momentum[0, 0], tensor([H * 0.2, 0, 0]), rtol=0, atol=1e-17)
+    # The body's z axis is along the world's x.
+    expected = tensor([H * 0.2 / 0.06, 0, 0])
+    torch.testing.assert_close(velocity[0, 0, 3:], expected, rtol=0, atol=1e-15)
+
+
 def test_contact_gives_the_body_exactly_its_impulse():
     """A (q - t) is the generalized force; as a torque in world axes it changes L by h times it."""
     prediction = predict_bodies(
@@ -325,14 +343,30 @@ def test_prescribed_joints_arrive_exactly_and_take_their_effort():
     torch.testing.assert_close(again.joints, after.joints, rtol=0, atol=1e-11)
 
 
+def test_a_prescribed_joint_takes_what_a_drive_beside_it_does():
+    rng = np.random.default_rng(8)
+    mixed = make_chain(make(*TREES["chain"], rng=rng, actuation=("position", "pd", "position")))
+    _, joints, _ = random_configuration(mixed.mechanism, rng)
+    drives = gains(mixed, stiffness=tensor([[0, 300.0, 0]]), damping=tensor([[0, 5.0, 0]]))
+    control = controls(mixed, joints=joints + tensor([[0, 0.1, 0]]))
+    _, after, efforts = step(mixed, at_rest(mixed, joints), control=control, drives=drives)
+    assert (after.joints - joints)[0, 1] > 1e-3
+    free = make_chain(make_like(mixed.mechanism, actuation=("torque",) * 3))
+    pushed = controls(free, efforts=efforts)
+    _, again, _ = step(free, at_rest(free, joints), control=pushed)
+    # One takes the masses at the end of the motion without drives, the other those on its way.
+    moved = (after.joints - joints).abs().max()
+    assert (again.joints - after.joints).abs().max() < 0.01 * moved
+
+
 def test_a_joint_at_rest_holds_its_weight():
-    mechanism = pendulum(lengths=(1.0,), masses=(2.0,))
-    held = Chain(make_like(mechanism, actuation=("position",)), H, NO_LINKS, NO_POINTS)
-    joints = tensor([[0.7]])
-    _, after, efforts = step(held, at_rest(held, joints), control=controls(held, joints=joints))
-    # The axis +y turns the bob from below to -x; its weight pulls back with m g l sin.
-    torch.testing.assert_close(efforts, tensor([[2 * 9.81 * math.sin(0.7)]]), rtol=1e-13, atol=0)
-    assert (after.rates == 0).all()
+    chain = make_chain(make_like(pendulum(), actuation=("position", "torque")))
+    joints = tensor([[0.7, -0.7]])  # the second bob hangs straight down from the first
+    _, after, efforts = step(chain, at_rest(chain, joints), control=controls(chain, joints=joints))
+    # The axis +y turns the first bob from below to -x; the weight of both pulls back.
+    expected = tensor([[2 * 9.81 * math.sin(0.7), 0.0]])
+    torch.testing.assert_close(efforts, expected, rtol=1e-12, atol=0)
+    assert after.rates.abs().max() < 1e-15
 
 
 def make_like(mechanism, **fields):

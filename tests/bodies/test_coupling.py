@@ -1,0 +1,227 @@
+"""The staggered couplings: what each does in which order, where they warn, their gradients."""
+
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from body_scenes import F64, make_scene
+from differences import directions, mismatch
+
+import diffcloth_torch as dc
+
+DT = 0.002
+COUPLINGS = ("rigid_to_cloth", "cloth_to_rigid")
+STAGGERED = pytest.mark.parametrize("coupling", COUPLINGS)
+
+
+def trampoline(coupling, *, mass=2.0, height=0.057, scheme="coupled", dt=DT, velocity=-0.2):
+    """A box that falls on a sheet, which is held at its border; and the state of the fall."""
+    n = 5
+    border = [i for i in range(n * n) if i // n in (0, n - 1) or i % n in (0, n - 1)]
+    material = dc.Material(stretch=200.0, density=0.3)
+    sheet = dc.Cloth.grid(n, n, 0.3, pins={"border": border}, material=material)
+    pose = [0.013, 0.021, height, 1, 0.02, 0.01, 0.03]
+    box = dc.RigidBody.box(0.1, motion="dynamic", mass=mass, pose=pose, name="box")
+    sim = dc.Simulator(
+        dc.Scene([sheet], [box]),
+        dt,
+        scheme=scheme,
+        coupling=coupling,
+        contact=dc.ContactOptions(barrier_distance=0.004),
+        solver=dc.SolverOptions(tolerance=1e-10),
+    )
+    state = sim.initial_state()
+    falling = torch.tensor([[0.01, 0.0, velocity, 0.1, 0.2, 0.0]], dtype=F64)
+    return sim, state.replace(body_velocities=falling)
+
+
+@STAGGERED
+@pytest.mark.parametrize("scheme", ["coupled", "split"])
+def test_momentum_goes_from_the_body_to_the_sheet(coupling, scheme):
+    """What the body's momentum lacks against its fall is the impulse of `body_forces`."""
+    sim, state = trampoline(coupling, scheme=scheme)
+    touched = False
+    for _ in range(12):
+        after = sim.step(state)
+        force = after.body_forces.sum(0)
+        touched |= bool(force[2] > 0.1)
+        gained = 2.0 * (after.body_velocities[0, :3] - state.body_velocities[0, :3]) / DT
+        weight = torch.tensor([0.0, 0.0, -2.0 * 9.81], dtype=F64)
+        torch.testing.assert_close(gained, weight + force, rtol=1e-9, atol=1e-9)
+        state = after
+    assert touched
+
+
+def test_rigid_to_cloth_moves_bodies_with_their_velocities():
+    sim, state = trampoline("rigid_to_cloth")
+    for _ in range(12):
+        after = sim.step(state)
+        way = (after.body_poses - state.body_poses)[0, :3]
+        free = DT * (state.body_velocities[0, :3] + DT * sim.parameters().gravity)
+        torch.testing.assert_close(way, free, rtol=1e-9, atol=1e-15)
+        state = after
+    assert state.body_velocities[0, 2] > free[2] / DT  # the impulse is in the velocity
+
+
+def test_cloth_to_rigid_solves_the_cloth_against_frozen_bodies():
+    """The sheet sees the box where it was: a box held there leaves the same sheet."""
+    sim, state = trampoline("cloth_to_rigid")
+    state = sim.rollout(state, steps=8)[-1]
+    after = sim.step(state)
+    (box,) = sim.scene.bodies
+    held = dc.RigidBody(box.vertices, box.faces, motion="kinematic", pose=box.pose, name="box")
+    alone = dc.Simulator(
+        dc.Scene(sim.scene.cloths, [held]),
+        DT,
+        contact=sim.contact,
+        solver=sim.solver,
+    )
+    same = sim.parameters()
+    barrier = alone.parameters().replace(barrier_stiffness=same.barrier_stiffness)
+    expected = alone.step(
+        state.replace(body_velocities=torch.zeros(1, 6, dtype=F64)), None, barrier
+    )
+    assert after.body_forces.any()
+    torch.testing.assert_close(after.positions, expected.positions, rtol=0, atol=1e-11)
+    torch.testing.assert_close(after.body_forces, expected.body_forces, rtol=1e-7, atol=1e-7)
+
+
+def test_all_couplings_agree_where_the_body_is_heavy():
+    ends = []
+    for coupling in ("monolithic", *COUPLINGS):
+        sim, state = trampoline(coupling, mass=20.0, dt=1e-3)
+        with torch.no_grad():
+            ends.append(sim.rollout(state, steps=40)[-1])
+    for end in ends[1:]:
+        fall = ends[0].body_poses[0, 2] - 0.057
+        assert abs(end.body_poses[0, 2] - ends[0].body_poses[0, 2]) < 0.02 * abs(fall)
+        torch.testing.assert_close(end.body_velocities, ends[0].body_velocities, atol=4e-3, rtol=0)
+
+
+@STAGGERED
+def test_a_light_body_warns_once(coupling):
+    sim, state = trampoline(coupling, mass=0.002, height=0.0545, velocity=0.0)
+    words = r"the added-mass number of 'box' is about [\d.]+, above 0\.5"
+    with pytest.warns(dc.AddedMassWarning, match=words):
+        state = sim.rollout(state, steps=10)[-1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sim.step(state)
+
+
+def test_cloth_to_rigid_refuses_a_motion_through_a_sheet():
+    """The frozen box does not touch the sheet, which cannot make way when the box then moves."""
+    sim, state = trampoline("cloth_to_rigid", height=0.08, velocity=-30.0)
+    with pytest.raises(dc.InfeasibleMotion, match="cannot go on without passing through a cloth"):
+        sim.step(state)
+    both = dc.stack([sim.initial_state(), state])
+    with pytest.raises(dc.InfeasibleMotion, match="what forces move in the environments") as caught:
+        sim.step(both)
+    assert caught.value.environments == (1,)
+
+
+@STAGGERED
+def test_nothing_intersects_and_the_path_leads_there(coupling):
+    sim, state = trampoline(coupling)
+    for _ in range(20):
+        path = sim.path(state)
+        after = sim.step(state)
+        n = len(after.positions)
+        torch.testing.assert_close(path[-1][:n], after.positions, rtol=0, atol=1e-14)
+        placed = sim.scene.bodies[0].vertices @ rotation(after.body_poses[0]).T
+        placed = torch.from_numpy(placed) + after.body_poses[0, :3]
+        torch.testing.assert_close(path[-1][n:], placed, rtol=0, atol=1e-14)
+        assert sim._core.find_overlap(inputs_of(sim, after)) is None
+        state = after
+    assert after.report.minimum_distance < 0.004
+
+
+def rotation(pose):
+    w, x, y, z = (pose[3:] / pose[3:].norm()).tolist()
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def inputs_of(sim, state):
+    inputs, _ = sim._inputs(state, None, None)
+    return {name: np.ascontiguousarray(value.detach().numpy()) for name, value in inputs.items()}
+
+
+@STAGGERED
+def test_batches_and_pickles_have_the_same_bits(coupling):
+    sim, state = trampoline(coupling)
+    other = sim.step(state)
+    batch = sim.step(dc.stack([state, other]))
+    copy = pickle.loads(pickle.dumps(sim))
+    assert copy.coupling == coupling
+    for i, start in enumerate((state, other)):
+        single = copy.step(start)
+        for name in ("positions", "velocities", "body_poses", "body_velocities", "body_forces"):
+            assert torch.equal(getattr(batch[i], name), getattr(single, name)), name
+
+
+@STAGGERED
+def test_robots_step_in_turn_as_together_where_nothing_touches(coupling, tmp_path):
+    """Without contact the order does not matter."""
+    scene = make_scene(tmp_path)
+    ends = []
+    for name in ("monolithic", coupling):
+        sim = dc.Simulator(scene, DT, coupling=name)
+        control = sim.control(
+            joint_positions={"slide": 0.01, "turn": 0.2},
+            joint_velocities={"left_finger_joint": 0.1},
+            body_wrenches={"brick": [0, 0, 1, 0, 0.01, 0]},
+        )
+        ends.append(sim.rollout(sim.initial_state(), [control] * 3)[-1])
+    for name in ("positions", "body_poses", "joint_positions", "joint_velocities", "base_poses"):
+        a, b = (getattr(end, name) for end in ends)
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-10)
+
+
+@STAGGERED
+@pytest.mark.parametrize("scheme", ["coupled", "split"])
+def test_gradients_through_contact_are_those_of_differences(coupling, scheme):
+    sim, start = trampoline(coupling, scheme=scheme)
+    start = sim.rollout(start, steps=8)[-1].detach()
+    assert start.body_forces.any()
+    g = torch.Generator().manual_seed(2)
+    weights = {
+        name: torch.randn(getattr(start, name).shape, dtype=F64, generator=g)
+        for name in ("positions", "velocities", "body_poses", "body_velocities", "body_forces")
+    }
+    cases = {
+        "velocities": (start.velocities, 1e-3),
+        "body_velocities": (start.body_velocities, 1e-3),
+        "body_mass": (sim.parameters().body_mass, 1e-3),
+        "stretch": (sim.parameters().stretch, 1e-1),
+        "friction": (sim.parameters().friction, 1e-3),
+        "barrier_stiffness": (sim.parameters().barrier_stiffness, 1e-1),
+        "gravity": (sim.parameters().gravity, 1e-2),
+    }
+    for name, (x, step) in cases.items():
+
+        def loss(x, name=name):
+            state, parameters = start, sim.parameters()
+            if hasattr(state, name):
+                state = state.replace(**{name: x})
+            else:
+                parameters = parameters.replace(**{name: x})
+            end = sim.rollout(state, parameters=parameters, steps=2)[-1]
+            return sum((w * getattr(end, key)).sum() for key, w in weights.items())
+
+        def value(x, loss=loss):
+            with torch.no_grad():
+                return float(loss(x))
+
+        x = x.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(loss(x), x)
+        for d in directions(x, torch.Generator().manual_seed(1)):
+            error = mismatch(value, x.detach(), gradient, d, step, 1e-5)
+            assert error < 1e-5, (name, error)

@@ -1,0 +1,314 @@
+"""Bodies and robots of a scene together: rows, limits, and couplings in two solves."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from mechanisms import F64, tensor
+from torch import Tensor
+
+import diffcloth_torch as dc
+from diffcloth_torch.dynamics.coupling import added_mass_numbers, cloth_to_rigid, rigid_to_cloth
+from diffcloth_torch.dynamics.dynamics import Dynamics
+from diffcloth_torch.dynamics.limits import ZONE, limit_stiffness
+from diffcloth_torch.geometry.rotation import quaternion_exp, rotate
+from diffcloth_torch.model.defaults import scene_parameters
+from diffcloth_torch.model.scene import assemble
+from diffcloth_torch.robots import GRIPPER
+
+H = 0.01
+
+
+class Solution(NamedTuple):
+    coordinates: Tensor
+    body_forces: Tensor
+
+
+def make_scene(actuation="pd", gravity=(0, 0, -9.81), base="floating"):
+    bodies = [
+        dc.RigidBody.plane(4.0, name="floor"),
+        dc.RigidBody.box(0.2, motion="dynamic", mass=0.5, pose=[0, -1, 1, 1, 0, 0, 0], name="a"),
+        dc.RigidBody.box(0.2, motion="kinematic", pose=[0, 1, 1, 1, 0, 0, 0], name="hand"),
+        dc.RigidBody.box([0.1, 0.2, 0.3], motion="dynamic", mass=2.0, pose=[1, 1, 1, 0, 1, 0, 0]),
+    ]
+    cloth = dc.Cloth.grid(3, 3, 0.2, pose=[0, 0, 3, 1, 0, 0, 0])
+    gains = {"stiffness": 40.0, "damping": 2.0} if "pd" in actuation else {}
+    robot = dc.Robot.load(
+        GRIPPER, base=base, actuation=actuation, pose=[2, 0, 1, 1, 0, 0, 0], name="grip", **gains
+    )
+    return dc.Scene([cloth], bodies, [robot], gravity=gravity)
+
+
+def raised(poses, row):
+    """With one body 1 cm higher."""
+    return poses.index_add(1, torch.tensor([row]), tensor([[[0, 0, 0.01, 0, 0, 0, 0]]]))
+
+
+def fields(assembly, moved, seed=0, batch=1):
+    """State and control in motion, and the parameters of the scene, with their leading axis."""
+    rng = np.random.default_rng(seed)
+    K, J, R = len(assembly.body_poses), len(assembly.joint_positions), len(assembly.base_poses)
+
+    def noise(*shape, scale=1.0):
+        return tensor(scale * rng.normal(size=(batch, *shape)))
+
+    body_poses = tensor(assembly.body_poses)[None] + noise(K, 7, scale=0.02)
+    base_poses = tensor(assembly.base_poses)[None] + noise(R, 7, scale=0.02)
+    joints = tensor(assembly.joint_positions)[None] + noise(J, scale=0.003)
+    state = {
+        "body_poses": body_poses,
+        "body_velocities": noise(K, 6),
+        "joint_positions": joints,
+        "joint_velocities": noise(J, scale=0.1),
+        "base_poses": base_poses,
+        "base_velocities": noise(R, 6),
+    }
+    control = {
+        "body_poses": raised(body_poses, moved),
+        "body_wrenches": noise(K, 6),
+        "joint_positions": joints + noise(J, scale=0.003),
+        "joint_velocities": noise(J, scale=0.1),
+        "joint_efforts": noise(J, scale=0.1),
+        "base_poses": base_poses + noise(R, 7, scale=0.01),
+        "base_wrenches": noise(R, 6, scale=0.01),  # on a light gripper
+    }
+    return state, control
+
+
+def parameters_of(scene, assembly):
+    defaults = scene_parameters(scene, assembly, True)
+    return {name: value[None] for name, value in defaults.items() if value.dim()}
+
+
+@pytest.fixture
+def world():
+    scene = make_scene()
+    assembly = assemble(scene)
+    return assembly, Dynamics(assembly, H), parameters_of(scene, assembly), *fields(assembly, 2)
+
+
+def test_rows_of_a_prediction(world):
+    _, dynamics, parameters, state, control = world
+    p = dynamics.predict(state, control, parameters)
+    assert p.body_poses.shape == p.body_targets.shape == (1, 5, 7)
+    assert dynamics.coordinate_count == 6 + 6 + 6 + 2
+    for rows in (p.coordinates, p.coordinate_ends, p.coordinate_targets):
+        assert rows.shape == (1, 20)
+    assert p.coordinate_metric.shape == (1, 36 + 36 + 64)
+    # What is not free passes unchanged; a free root's frame is the same at both ends.
+    assert torch.equal(p.body_poses[:, [0, 2]], state["body_poses"][:, [0, 2]])
+    assert torch.equal(p.body_targets[:, [0, 2]], control["body_poses"][:, [0, 2]])
+    assert torch.equal(p.body_poses[:, [1, 3, 4]], p.body_targets[:, [1, 3, 4]])
+    # Its points are at c + exp(w) (S v), here where the state says.
+    v = tensor([[0.1, 0.2, -0.3]])
+    for row, pose, first in ((1, state["body_poses"][0, 1], 0), (4, state["base_poses"][0, 0], 12)):
+        c, w = p.coordinates[0, first : first + 3], p.coordinates[0, first + 3 : first + 6]
+        S = p.body_poses[0, row]
+        got = c + rotate(quaternion_exp(w), rotate(S[3:], v) + S[:3])
+        unit = torch.nn.functional.normalize(pose[3:], dim=0)
+        torch.testing.assert_close(got, pose[:3] + rotate(unit, v), rtol=0, atol=1e-14)
+
+
+def test_fields_of_the_state_after(world):
+    assembly, dynamics, parameters, state, control = world
+    p = dynamics.predict(state, control, parameters)
+    forces = torch.zeros(1, len(assembly.body_vertices), 3, dtype=F64)
+    after = dynamics.advance(p, p.coordinate_targets, forces)
+    assert set(after) == {*state, "joint_efforts"}
+    for name, values in state.items():
+        assert after[name].shape == values.shape
+    assert not after["body_velocities"][0, 0].any()
+    assert torch.equal(after["body_poses"][:, [0, 2]], control["body_poses"][:, [0, 2]])
+    # Momentum: v + h (g + f / m)
+    gravity = parameters["gravity"].reshape(3)
+    for k, mass in ((1, 0.5), (3, 2.0)):
+        push = control["body_wrenches"][0, k, :3] / mass
+        expected = state["body_velocities"][0, k, :3] + H * (gravity + push)
+        torch.testing.assert_close(after["body_velocities"][0, k, :3], expected, rtol=0, atol=1e-12)
+
+
+def test_a_scene_of_static_and_kinematic_bodies_passes_through():
+    bodies = [
+        dc.RigidBody.plane(4.0),
+        dc.RigidBody.box(0.2, motion="kinematic", pose=[0, 1, 1, 1, 0, 0, 0]),
+    ]
+    scene = dc.Scene([dc.Cloth.grid(3, 3, 0.2, pose=[0, 0, 3, 1, 0, 0, 0])], bodies)
+    assembly = assemble(scene)
+    dynamics = Dynamics(assembly, H)
+    state, control = fields(assembly, 1)
+    p = dynamics.predict(state, control, parameters_of(scene, assembly))
+    assert p.coordinates.shape == (1, 0)
+    assert torch.equal(p.body_poses, state["body_poses"])
+    assert torch.equal(p.body_targets, control["body_poses"])
+    after = dynamics.advance(p, p.coordinates, torch.zeros(1, 12, 3, dtype=F64))
+    assert torch.equal(after["body_poses"], control["body_poses"])
+
+
+def test_a_robot_under_position_control_needs_no_masses():
+    scene = make_scene(actuation="position", base="fixed")
+    assembly = assemble(scene)
+    parameters = parameters_of(scene, assembly)
+    dynamics = Dynamics(assembly, H)
+    state, control = fields(assembly, 2)
+    assert not {name for name in parameters if name.startswith(("link_", "joint_"))}
+    p = dynamics.predict(state, control, parameters)
+    forces = tensor(np.random.default_rng(0).normal(size=(1, len(assembly.body_vertices), 3)))
+    after = dynamics.advance(p, torch.where(dynamics.prescribed, p.coordinate_ends, 0.0), forces)
+    assert torch.equal(after["joint_positions"], control["joint_positions"])
+    # The constraint holds against contact alone: fingers slide along y, apart from each other.
+    rows = dict(zip(assembly.surface_names[1:], range(99), strict=False))
+    for j, finger in enumerate(("left_finger", "right_finger")):
+        s = rows[f"grip/{finger}"]
+        own = forces[0, slice(*assembly.body_vertex_start[s : s + 2].tolist())].sum(0)
+        # The axis in the world: by differences of the link's frame.
+        axis = finger_axis(dynamics, p, state, j)
+        torch.testing.assert_close(after["joint_efforts"][0, j], -(own @ axis), atol=1e-12, rtol=0)
+
+
+def finger_axis(dynamics, prediction, state, joint):
+    chain = dynamics._chains[0]
+    base = prediction.chains[0].start.rotation[0]
+    links = np.flatnonzero(chain.mechanism.dof == joint)
+    link = int(links[0])
+    return base @ tensor(chain.mechanism.offset[link][:3, :3] @ chain.mechanism.axis[link])
+
+
+# Limits
+
+
+def test_a_joint_rests_on_its_limit_near_its_beginning():
+    """Weight against the slope of the barrier k b(u), b = -(u - w)^2 log(u / w)."""
+    scene = make_scene(actuation="torque", base="fixed")
+    assembly = assemble(scene)
+    k = limit_stiffness(assembly, H, scene.gravity)
+    assert k.shape == (14,)
+    assert not k[:12].any()
+    mechanism = assembly.mechanisms[-1]
+    for j in range(2):
+        width = ZONE * (mechanism.upper[j] - mechanism.lower[j])
+        weight = 9.81 * mechanism.mass[mechanism.dof == j].sum()
+        u = width * np.linspace(0.5, 1, 1001)[:-1]
+        force = k[12 + j] * (2 * (u - width) * np.log(u / width) + (u - width) ** 2 / u)
+        share = 1 - u[np.argmin(abs(force - weight))] / width
+        assert share < 0.12
+
+
+def test_joints_without_a_limit_to_keep_have_no_barrier():
+    assembly = assemble(make_scene(actuation="position", base="fixed"))
+    assert not limit_stiffness(assembly, H, np.zeros(3)).any()
+
+
+# Couplings
+
+
+def spring_forces(assembly, coordinates):
+    """Made-up forces of a cloth that depend on where bodies are."""
+    rng = np.random.default_rng(5)
+    shape = (coordinates.shape[1], len(assembly.body_vertices) * 3)
+    matrix = tensor(rng.normal(size=shape, scale=0.01))
+    return (coordinates @ matrix).reshape(len(coordinates), -1, 3)
+
+
+def solvers(assembly, seen):
+    def solve_rigid(prediction):
+        seen.append(("rigid", prediction))
+        none = torch.zeros(1, len(assembly.body_vertices), 3, dtype=F64)
+        return Solution(prediction.coordinate_targets, none)
+
+    def solve_cloth(prediction, coordinates):
+        seen.append(("cloth", coordinates))
+        return Solution(coordinates, spring_forces(assembly, coordinates))
+
+    return solve_rigid, solve_cloth
+
+
+def total_force(assembly, forces, row):
+    return forces[0, slice(*assembly.body_vertex_start[row : row + 2].tolist())].sum(0)
+
+
+def test_rigid_to_cloth_gives_the_impulse_to_velocities(world):
+    assembly, dynamics, parameters, state, control = world
+    seen = []
+    p = dynamics.predict(state, control, parameters)
+    result = rigid_to_cloth(dynamics, p, *solvers(assembly, seen))
+    assert [name for name, _ in seen] == ["rigid", "cloth"]
+    free = dynamics.advance(p, p.coordinate_targets, 0 * result.body_forces)
+    for name in ("body_poses", "joint_positions", "base_poses"):
+        assert torch.equal(result.fields[name], free[name])
+    for k, mass in ((1, 0.5), (3, 2.0)):
+        kick = H * total_force(assembly, result.body_forces, k) / mass
+        got = (result.fields["body_velocities"] - free["body_velocities"])[0, k, :3]
+        torch.testing.assert_close(got, kick, rtol=1e-12, atol=1e-12)
+
+
+def test_cloth_to_rigid_lets_the_cloth_go_first(world):
+    assembly, dynamics, parameters, state, control = world
+    seen, checked = [], []
+
+    def predict(contact):
+        return dynamics.predict(state, control, parameters, contact)
+
+    def check_path(cloth, prediction, start, end):
+        checked.append((start, end))
+
+    result = cloth_to_rigid(dynamics, predict, *solvers(assembly, seen), check_path)
+    assert [name for name, _ in seen] == ["cloth", "rigid"]
+    p = predict(None)
+    assert torch.equal(seen[0][1], p.coordinates)  # nothing is prescribed: all is still
+    ((start, end),) = checked
+    moved = seen[1][1]
+    assert torch.equal(start, moved.coordinates)
+    assert torch.equal(end, moved.coordinate_targets)
+    free = dynamics.advance(p, p.coordinate_targets, 0 * result.body_forces)
+    for k, mass in ((1, 0.5), (3, 2.0)):
+        push = H * total_force(assembly, result.body_forces, k) / mass
+        got = (result.fields["body_velocities"] - free["body_velocities"])[0, k]
+        torch.testing.assert_close(got[:3], push, rtol=1e-10, atol=1e-10)
+        shift = (result.fields["body_poses"] - free["body_poses"])[0, k, :3]
+        assert shift.norm() > 0
+    assert (result.fields["joint_velocities"] != free["joint_velocities"]).all()
+
+
+@pytest.mark.parametrize("order", ["rigid_to_cloth", "cloth_to_rigid"])
+def test_gradients_through_couplings(world, order):
+    assembly, dynamics, parameters, state, control = world
+    names = ("body_poses", "body_velocities", "joint_velocities", "base_velocities")
+
+    def go(*values):
+        now = state | dict(zip(names, values[:4], strict=True))
+        physical = parameters | {"body_mass": values[4], "link_mass": values[5]}
+
+        def predict(contact):
+            return dynamics.predict(now, control, physical, contact)
+
+        solve = solvers(assembly, [])
+        if order == "rigid_to_cloth":
+            result = rigid_to_cloth(dynamics, predict(None), *solve)
+        else:
+            result = cloth_to_rigid(dynamics, predict, *solve, lambda *_: None)
+        return (*result.fields.values(), result.body_forces)
+
+    inputs = [state[name] for name in names] + [parameters["body_mass"], parameters["link_mass"]]
+    inputs = [t.clone().requires_grad_() for t in inputs]
+    # Forces of order 10 on light things: differences of velocities of order 10.
+    assert torch.autograd.gradcheck(go, inputs, rtol=1e-5, atol=1e-6, fast_mode=True)
+
+
+def test_added_mass_numbers(world):
+    assembly, _, _, state, _ = world
+    frames = torch.eye(4, dtype=F64).repeat(1, 7, 1, 1)
+    frames[0, :4, :3, 3] = state["body_poses"][0, :, :3]
+    frames[0, 4:, 2, 3] = 50.0
+    masses = tensor([[0, 0.5, 0, 2.0, 1, 1, 1]])
+    # Three vertices: at body "a" (half a side of 0.1 and the reach of 0.01), just beyond, far away.
+    at = frames[0, 1, :3, 3]
+    positions = (at + tensor([[0.109, 0, 0.1], [0.111, 0, 0], [9, 9, 9]]))[None]
+    forces = torch.zeros(1, len(assembly.body_vertices), 3, dtype=F64)
+    forces[0, assembly.body_vertex_start[1], 2] = -6.0
+    forces[0, assembly.body_vertex_start[0], 2] = 6.0
+    numbers = added_mass_numbers(
+        assembly, frames, masses, positions, tensor([[0.1, 0.2, 0.4]]), forces, tensor([0.01]), H
+    )
+    expected = (0.1 + H * H * 3.0 * 6.0 / 0.01) / 0.5
+    torch.testing.assert_close(numbers, tensor([[0, expected, 0, 0, 0, 0, 0]]))
