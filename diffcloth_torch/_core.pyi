@@ -39,6 +39,7 @@ class Simulator:
         friction_iterations: int,
         tolerance: float,
         max_iterations: int,
+        link_names: list[str] = ...,
         ignored_pairs: NDArray[np.int32] = ...,
         **trees: NDArray[Any],
     ) -> None: ...

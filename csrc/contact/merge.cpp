@@ -232,9 +232,12 @@ void add_point_terms(const CollisionMesh& mesh,
           part.kind == kEdge
               ? std::ranges::find(mesh.face_edges[f], part.id) != mesh.face_edges[f].end()
               : std::ranges::find(mesh.faces[f], part.id) != mesh.faces[f].end();
-      if (!has || project(mesh, weights, f, p, x, part.d_sq) != Projection::kOnFlatBorder) continue;
+      if (!has) continue;
+      double d_sq = 0.0;
+      if (project(mesh, weights, f, p, x, d_sq) != Projection::kOnFlatBorder) continue;
       part.kind = kFace;
       part.id = f;
+      part.d_sq = d_sq;
     }
     Candidate pair{.kind = PairKind::kPointTriangle,
                    .vertices = {point, part.id, part.id, part.id},

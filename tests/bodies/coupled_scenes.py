@@ -1,0 +1,102 @@
+"""A cloth, a dynamic box that slides on it, and a gripper that holds its edge."""
+
+from functools import cache
+
+import numpy as np
+import scenes
+import torch
+
+import diffcloth_torch as dc
+from diffcloth_torch.robots import GRIPPER
+
+F64 = torch.float64
+DT = 0.01
+COUPLINGS = ("monolithic", "rigid_to_cloth", "cloth_to_rigid")
+BASES = ("fixed", "floating")
+GRAVITY = np.array([0.4, -0.3, -9.81])
+WEIGHT = 0.46 * 9.81  # of the gripper [N]
+
+# Of the gripper: its fingers point along -x and close along z.
+_FACING = [0.5, -0.5, -0.5, 0.5]
+
+# Staggered couplings need bodies that are heavy against the cloth; less gravity keeps their weight.
+_HEAVIER = {"monolithic": 1.0, "rigid_to_cloth": 10.0, "cloth_to_rigid": 10.0}
+
+
+def simulator(coupling, base, **options):
+    vertices, faces = scenes.grid(5, 5, edge=0.06, seed=3)
+    vertices = scenes.turned(vertices - vertices.mean(axis=0), (0.3, 1, 0), 0.04)
+    cloth = dc.Cloth(
+        vertices,
+        faces,
+        material=scenes.material(faces, stretch=200.0),
+        soft_pins={"rim": [0, 1, 2, 3, 4, 5, 10, 15, 20]},
+        pin_stiffness=60.0,
+    )
+    heavier = _HEAVIER[coupling]
+    box = dc.RigidBody.box(
+        [0.07, 0.09, 0.05],
+        motion="dynamic",
+        mass=0.05 * heavier,
+        pose=[-0.02, 0.01, 0.033, 1, 0.02, 0.02, 0.2],
+        name="box",
+    )
+    edge = vertices[np.argmax(vertices[:, 0])]
+    hand = dc.Robot.load(
+        GRIPPER,
+        base=base,
+        pose=[edge[0] + 0.061, 0.013, edge[2] + 0.001, *_FACING],
+        joint_positions=0.035,
+        stiffness=400.0,
+        damping=3.0,
+        friction=0.6,
+        name="hand",
+    )
+    given = {"barrier_distance": 0.01, "barrier_stiffness": 60.0, "slip_velocity": 0.02}
+    return dc.Simulator(
+        dc.Scene([cloth], [box], [hand], gravity=GRAVITY / heavier),
+        DT,
+        coupling=coupling,
+        contact=dc.ContactOptions(**{**given, **options}),
+        solver=dc.SolverOptions(tolerance=1e-10, max_iterations=1000),
+    )
+
+
+def parameters(sim):
+    """Those of the scene; fingers are as much heavier as the box is."""
+    given = sim.parameters()
+    heavier = _HEAVIER[sim.coupling]
+    return given.replace(
+        link_mass=heavier * given.link_mass,
+        link_inertia=heavier * given.link_inertia,
+        joint_viscosity=given.joint_viscosity + 0.02,
+        joint_armature=given.joint_armature + 0.001,
+    )
+
+
+def control(sim):
+    """Fingers that close, a base that is held against gravity, and pushes on everything."""
+    state = sim.initial_state()
+    lift = WEIGHT * (sim.scene.robots[0].mechanism.base == "floating")
+    return dc.Control(
+        forces=scenes.tensor_noise(state.positions.shape, 0.002, 5),
+        soft_pins=state.soft_pin_targets + scenes.tensor_noise((9, 3), 0.002, 6),
+        body_wrenches=torch.tensor([[0.02, 0.03, -0.1, 1e-3, 2e-3, 3e-3]], dtype=F64),
+        joint_positions=torch.tensor([0.0385, 0.038], dtype=F64),
+        joint_velocities=torch.tensor([0.02, 0.01], dtype=F64),
+        joint_efforts=torch.tensor([0.1, -0.05], dtype=F64),
+        base_wrenches=torch.tensor([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]], dtype=F64) * lift,
+    )
+
+
+@cache
+def in_contact(coupling, base):
+    """A simulator, and a state in which the box slides on the cloth and the gripper holds it."""
+    sim = simulator(coupling, base)
+    state = sim.initial_state()
+    slide = torch.tensor([[0.2, 0.07, -0.02, 0.5, 0.0, 1.0]], dtype=F64)
+    state = state.replace(body_velocities=slide)
+    with torch.no_grad():
+        for _ in range(3):
+            state = sim.step(state, control(sim), parameters(sim))
+    return sim, state.detach()
