@@ -7,9 +7,8 @@ import scenes
 import torch
 from differences import directions, mismatch
 
-import diffcloth_torch as dc
-from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.geometry.poses import transform
+from diffcloth_torch.model.quantities import PARAMETERS
 
 F64 = torch.float64
 

@@ -1,0 +1,168 @@
+"""What cloths, bodies and robots do to each other is equal and opposite."""
+
+import coupled_scenes
+import numpy as np
+import pytest
+import scenes
+import torch
+from coupled_scenes import BASES, COUPLINGS, DT, F64
+from torch.linalg import cross
+
+import diffcloth_torch as dc
+from diffcloth_torch.geometry.poses import transform
+
+pytestmark = pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
+
+EXACT = 1e-9  # [N], [N m], [kg m/s], beside forces of up to 1 N
+
+
+def masses(sim):
+    """A third of the mass of each adjacent face [kg]."""
+    (cloth,) = sim.scene.cloths
+    faces = torch.tensor(np.array(cloth.faces, dtype=np.int64))
+    a, b, c = torch.tensor(np.array(cloth.rest_vertices))[faces].unbind(1)
+    share = sim.parameters().density * 0.5 * cross(b - a, c - a).norm(dim=1) / 3
+    return torch.zeros(len(cloth.vertices), dtype=F64).index_add(
+        0, faces.flatten(), share.repeat_interleave(3)
+    )
+
+
+def placed(sim, state):
+    """Vertices of all bodies and links, as `body_forces` has them."""
+    parts = [
+        torch.from_numpy(transform(np.array(body.vertices), pose.numpy()))
+        for body, pose in zip(sim.scene.bodies, state.body_poses, strict=True)
+    ]
+    poses = sim.link_poses(state)
+    for robot, name in zip(sim.scene.robots, sim.joint_slices, strict=True):
+        for link, surface in zip(robot.link_names, robot.surfaces, strict=True):
+            if surface is not None:
+                frame = poses[f"{name}/{link}"]
+                parts.append(torch.tensor(surface.vertices) @ frame[:3, :3].T + frame[:3, 3])
+    return torch.cat(parts)
+
+
+def resultant(points, forces):
+    """Sum of the forces, and of their torques about the origin."""
+    return torch.cat([forces.sum(0), cross(points, forces).sum(0)])
+
+
+def on_cloth(sim, before, after, outer):
+    """What contact does to the cloth: its inertia less other forces, elastic ones adding to zero.
+
+    `outer` are forces on its vertices.
+    """
+    inertia = masses(sim)[:, None] * (after.velocities - before.velocities) / DT
+    return resultant(after.positions, inertia - outer)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+@pytest.mark.parametrize("base", BASES)
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_forces_of_cloth_box_and_gripper_cancel(coupling, base, friction):
+    sim, state = coupled_scenes.in_contact(coupling, base)
+    given = coupled_scenes.parameters(sim).replace(friction=torch.tensor(friction, dtype=F64))
+    control = coupled_scenes.control(sim)
+    (cloth,) = sim.scene.cloths
+    pins = list(cloth.soft_pins["rim"])
+    with torch.no_grad():
+        for _ in range(5):
+            after = sim.step(state, control, given)
+            outer = control.forces + masses(sim)[:, None] * given.gravity
+            outer[pins] += given.pin_stiffness * (control.soft_pins - after.positions[pins])
+            cloth_side = on_cloth(sim, state, after, outer)
+            other_side = resultant(placed(sim, after), after.body_forces)
+            assert cloth_side[:3].norm() > 0.01
+            assert (cloth_side + other_side)[:3].abs().max() < EXACT
+            # In `cloth_to_rigid` the forces of the cloth act where bodies have been.
+            if friction == 0.0 and coupling != "cloth_to_rigid":
+                assert (cloth_side + other_side)[3:].abs().max() < EXACT
+            state = after
+
+
+def thrown(coupling, friction, mass):
+    """A tumbling box that hits a free cloth, without gravity."""
+    vertices, faces = scenes.grid(5, 5, edge=0.06, seed=3)
+    vertices -= vertices.mean(axis=0)
+    density = np.where(np.arange(len(faces)) % 2, 0.2, 0.6)
+    material = dc.Material(stretch=100.0, density=density, friction=friction, damping=0.002)
+    cloth = dc.Cloth(vertices, faces, material=material)
+    box = dc.RigidBody.box(
+        [0.07, 0.09, 0.05],
+        motion="dynamic",
+        mass=mass,
+        pose=[0.01, 0.02, 0.06, 1, 0.2, 0.3, 0.1],
+        friction=friction,
+    )
+    sim = dc.Simulator(
+        dc.Scene([cloth], [box], gravity=(0, 0, 0)),
+        DT,
+        coupling=coupling,
+        contact=dc.ContactOptions(barrier_distance=0.008),
+        solver=dc.SolverOptions(tolerance=1e-12),
+    )
+    start = torch.tensor([[0.2, 0.1, -0.3, 3.0, -5.0, 2.0]], dtype=F64)
+    return sim, sim.initial_state().replace(body_velocities=start)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_a_free_cloth_and_a_free_box_keep_their_momentum(coupling, friction):
+    mass = 0.01 if coupling == "monolithic" else 0.3
+    sim, state = thrown(coupling, friction, mass)
+
+    def momentum(state):
+        of_cloth = (masses(sim)[:, None] * state.velocities).sum(0)
+        return of_cloth + mass * state.body_velocities[0, :3]
+
+    start, passed = momentum(state), 0.0
+    with torch.no_grad():
+        for _ in range(20):
+            after = sim.step(state)
+            assert (momentum(after) - momentum(state)).abs().max() < EXACT
+            pushed = on_cloth(sim, state, after, torch.zeros_like(after.positions))
+            where = after if coupling != "cloth_to_rigid" else state
+            net = pushed + resultant(placed(sim, where), after.body_forces)
+            assert net[:3].abs().max() < EXACT
+            if friction == 0.0:
+                assert net[3:].abs().max() < EXACT
+            passed += DT * float(pushed[:3].norm())
+            state = after
+    assert (momentum(state) - start).abs().max() < EXACT
+    assert passed > 1e-3
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_boxes_that_collide_keep_their_momentum(friction):
+    boxes = [
+        dc.RigidBody.box(
+            [0.1, 0.15, 0.2], motion="dynamic", mass=mass, pose=pose, friction=friction
+        )
+        for mass, pose in (
+            (0.3, [0, 0, 0, 1, 0.1, 0.2, 0.3]),
+            (2.0, [0.03, 0.02, 0.24, 1, -0.2, 0.1, 0]),
+        )
+    ]
+    sim = dc.Simulator(
+        dc.Scene([], boxes, gravity=(0, 0, 0)),
+        DT,
+        contact=dc.ContactOptions(barrier_distance=0.004),
+        solver=dc.SolverOptions(tolerance=1e-12),
+    )
+    state = sim.initial_state().replace(
+        body_velocities=torch.tensor(
+            [[0.2, 0, 1.0, 1, 2, 3], [0, 0.1, -0.5, -2, 1, 1.0]], dtype=F64
+        )
+    )
+    mass = torch.tensor([[0.3], [2.0]], dtype=F64)
+    first = (mass * state.body_velocities[:, :3]).sum(0)
+    touched = 0
+    for _ in range(20):
+        state = sim.step(state)
+        net = resultant(placed(sim, state), state.body_forces)
+        assert net[:3].abs().max() < EXACT
+        if friction == 0.0:
+            assert net[3:].abs().max() < EXACT
+        assert ((mass * state.body_velocities[:, :3]).sum(0) - first).abs().max() < EXACT
+        touched += bool(state.body_forces.any())
+    assert touched

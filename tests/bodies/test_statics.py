@@ -1,0 +1,103 @@
+"""Bodies at rest stay, stick and slide as they should, and weigh what they weigh."""
+
+import math
+
+import numpy as np
+import pytest
+import scenes
+import torch
+
+import diffcloth_torch as dc
+
+F64 = torch.float64
+DT = 0.01
+G = 9.81
+FLOOR = dc.RigidBody.plane(2.0, name="floor")
+
+
+def rolled(sim, seconds, state=None):
+    """States of every step."""
+    with torch.no_grad():
+        start = sim.initial_state() if state is None else state
+        return sim.rollout(start, steps=round(seconds / sim.dt))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_cube_and_a_stack_of_cubes_stay(count):
+    """5 s after they have come to rest on each other they are where they were."""
+    gap = 7e-4
+    cubes = [
+        dc.RigidBody.box(
+            0.1,
+            motion="dynamic",
+            density=500.0,
+            pose=[0.0, 0.0, 0.05 + gap + k * (0.1 + gap), 1, 0, 0, 0],
+        )
+        for k in range(count)
+    ]
+    sim = dc.Simulator(
+        dc.Scene([], [FLOOR, *cubes]), DT, contact=dc.ContactOptions(barrier_distance=1e-3)
+    )
+    rest = rolled(sim, 0.5)[-1]
+    poses = torch.stack([state.body_poses for state in rolled(sim, 5.0, rest)])
+    drift = poses - rest.body_poses
+    assert drift[..., :3].norm(dim=-1).max() < 1e-4
+    assert 0.05 * drift[..., 3:].norm(dim=-1).max() < 1e-4
+    wrenches = sim.contact_wrenches(rolled(sim, DT, rest)[-1])
+    for name in sim.surfaces[1:]:  # each carries those above it, and itself
+        assert wrenches[name][2] == pytest.approx(500 * 1e-3 * G, rel=1e-4)
+    assert wrenches["floor"][2] == pytest.approx(-count * 500 * 1e-3 * G, rel=1e-4)
+
+
+@pytest.mark.parametrize("off", [-0.9, 0.9], ids=["sticks", "slides"])
+@pytest.mark.parametrize("friction", [0.2, 0.4, 0.7])
+def test_a_cube_on_an_incline_slides_from_the_friction_angle_on(friction, off):
+    """Off the friction angle by less than one degree, on a tilted plane."""
+    angle = math.atan(friction) + math.radians(off)
+    slope = np.array([0, math.sin(angle / 2), 0, math.cos(angle / 2)])[[3, 0, 1, 2]]
+    normal = np.array([math.sin(angle), 0, math.cos(angle)])
+    downhill = torch.tensor([math.cos(angle), 0, -math.sin(angle)], dtype=F64)
+    plane = dc.RigidBody.plane(4.0, pose=[0, 0, 0, *slope], friction=friction)
+    place = 0.0507 * normal + [0.0, 0.013, 0.0]
+    cube = dc.RigidBody.box(
+        0.1, motion="dynamic", density=300.0, pose=[*place, *slope], friction=friction
+    )
+    sim = dc.Simulator(
+        dc.Scene([], [plane, cube]), DT, contact=dc.ContactOptions(barrier_distance=1e-3)
+    )
+    settled, *_, last = rolled(sim, 1.0)[20:]
+    way = ((last.body_poses - settled.body_poses)[1, :3] * downhill).sum()
+    speed = (last.body_velocities[1, :3] * downhill).sum()
+    if off < 0:
+        # Sticking is creeping below the slip velocity.
+        assert abs(speed) < 1e-3
+        assert way < 1e-3
+    else:
+        acceleration = G * (math.sin(angle) - friction * math.cos(angle))
+        gained = speed - (settled.body_velocities[1, :3] * downhill).sum()
+        seconds = float(last.time - settled.time)
+        assert gained == pytest.approx(acceleration * seconds, rel=0.02)
+
+
+def test_a_box_dropped_into_a_pinned_cloth_settles_on_it():
+    vertices, faces = scenes.grid(7, 7, edge=0.06, seed=4)
+    vertices -= vertices.mean(axis=0)
+    rim = np.flatnonzero(np.abs(vertices[:, :2]).max(axis=1) > 0.15)
+    cloth = dc.Cloth(
+        vertices,
+        faces,
+        material=dc.Material(stretch=400.0, density=0.2, damping=0.05),
+        pins={"rim": rim},
+    )
+    box = dc.RigidBody.box(
+        [0.1, 0.12, 0.06], motion="dynamic", mass=0.2, pose=[0.01, 0.005, 0.12, 1, 0.1, 0.2, 0.3]
+    )
+    sim = dc.Simulator(dc.Scene([cloth], [box]), DT)
+    state = rolled(sim, 4.0)[-1]
+    assert state.body_velocities.abs().max() < 1e-3
+    assert state.body_poses[0, 2] < 0.05  # in the hollow that it has made
+    force = sim.contact_wrenches(state)["body0"]
+    weight = 0.2 * G
+    assert force[2] == pytest.approx(weight, rel=1e-4)
+    assert force[:2].abs().max() < 1e-4 * weight
+    assert force[3:].abs().max() < 1e-4 * weight * 0.1
