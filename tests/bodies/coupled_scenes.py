@@ -69,8 +69,8 @@ def parameters(sim):
     return given.replace(
         link_mass=heavier * given.link_mass,
         link_inertia=heavier * given.link_inertia,
-        joint_viscosity=given.joint_viscosity + 0.02,
-        joint_armature=given.joint_armature + 0.001,
+        joint_viscosity=given.joint_viscosity + 1.0,
+        joint_armature=given.joint_armature + 0.02,
     )
 
 
@@ -100,3 +100,26 @@ def in_contact(coupling, base):
         for _ in range(3):
             state = sim.step(state, control(sim), parameters(sim))
     return sim, state.detach()
+
+
+def cloth_masses(sim):
+    """A third of the mass of each adjacent face, shape [N] [kg]."""
+    if not sim.scene.cloths:
+        return torch.zeros(0, dtype=F64)
+    (cloth,) = sim.scene.cloths
+    faces = torch.tensor(np.array(cloth.faces, dtype=np.int64))
+    a, b, c = torch.tensor(np.array(cloth.rest_vertices))[faces].unbind(1)
+    share = sim.parameters().density * torch.linalg.cross(b - a, c - a).norm(dim=1) / 6
+    masses = torch.zeros(len(cloth.vertices), dtype=F64)
+    return masses.index_add(0, faces.flatten(), share.repeat_interleave(3))
+
+
+def matrices(poses):
+    """Homogeneous matrices of poses [.., 7]."""
+    w, u = torch.split(torch.nn.functional.normalize(poses[..., 3:], dim=-1), [1, 3], dim=-1)
+    eye = torch.eye(3, dtype=F64).expand(*poses.shape[:-1], 3, 3)
+    K = torch.linalg.cross(u[..., None, :].expand_as(eye), eye).mT
+    frames = torch.eye(4, dtype=F64).repeat(*poses.shape[:-1], 1, 1)
+    frames[..., :3, :3] = eye + 2 * w[..., None] * K + 2 * K @ K
+    frames[..., :3, 3] = poses[..., :3]
+    return frames

@@ -5,33 +5,21 @@ import numpy as np
 import pytest
 import scenes
 import torch
-from coupled_scenes import BASES, COUPLINGS, DT, F64
+from coupled_scenes import BASES, COUPLINGS, DT, F64, cloth_masses, matrices
 from torch.linalg import cross
 
 import diffcloth_torch as dc
-from diffcloth_torch.geometry.poses import transform
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
 
 EXACT = 1e-9  # [N], [N m], [kg m/s], beside forces of up to 1 N
 
 
-def masses(sim):
-    """A third of the mass of each adjacent face [kg]."""
-    (cloth,) = sim.scene.cloths
-    faces = torch.tensor(np.array(cloth.faces, dtype=np.int64))
-    a, b, c = torch.tensor(np.array(cloth.rest_vertices))[faces].unbind(1)
-    share = sim.parameters().density * 0.5 * cross(b - a, c - a).norm(dim=1) / 3
-    return torch.zeros(len(cloth.vertices), dtype=F64).index_add(
-        0, faces.flatten(), share.repeat_interleave(3)
-    )
-
-
 def placed(sim, state):
     """Vertices of all bodies and links, as `body_forces` has them."""
     parts = [
-        torch.from_numpy(transform(np.array(body.vertices), pose.numpy()))
-        for body, pose in zip(sim.scene.bodies, state.body_poses, strict=True)
+        torch.tensor(body.vertices) @ frame[:3, :3].T + frame[:3, 3]
+        for body, frame in zip(sim.scene.bodies, matrices(state.body_poses), strict=True)
     ]
     poses = sim.link_poses(state)
     for robot, name in zip(sim.scene.robots, sim.joint_slices, strict=True):
@@ -52,7 +40,7 @@ def on_cloth(sim, before, after, outer):
 
     `outer` are forces on its vertices.
     """
-    inertia = masses(sim)[:, None] * (after.velocities - before.velocities) / DT
+    inertia = cloth_masses(sim)[:, None] * (after.velocities - before.velocities) / DT
     return resultant(after.positions, inertia - outer)
 
 
@@ -68,7 +56,7 @@ def test_forces_of_cloth_box_and_gripper_cancel(coupling, base, friction):
     with torch.no_grad():
         for _ in range(5):
             after = sim.step(state, control, given)
-            outer = control.forces + masses(sim)[:, None] * given.gravity
+            outer = control.forces + cloth_masses(sim)[:, None] * given.gravity
             outer[pins] += given.pin_stiffness * (control.soft_pins - after.positions[pins])
             cloth_side = on_cloth(sim, state, after, outer)
             other_side = resultant(placed(sim, after), after.body_forces)
@@ -112,7 +100,7 @@ def test_a_free_cloth_and_a_free_box_keep_their_momentum(coupling, friction):
     sim, state = thrown(coupling, friction, mass)
 
     def momentum(state):
-        of_cloth = (masses(sim)[:, None] * state.velocities).sum(0)
+        of_cloth = (cloth_masses(sim)[:, None] * state.velocities).sum(0)
         return of_cloth + mass * state.body_velocities[0, :3]
 
     start, passed = momentum(state), 0.0
