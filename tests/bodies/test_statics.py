@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scenes
 import torch
+from body_scenes import load_arm
 
 import diffcloth_torch as dc
 
@@ -101,3 +102,89 @@ def test_a_box_dropped_into_a_pinned_cloth_settles_on_it():
     assert force[2] == pytest.approx(weight, rel=1e-4)
     assert force[:2].abs().max() < 1e-4 * weight
     assert force[3:].abs().max() < 1e-4 * weight * 0.1
+
+
+# --- Robots --------------------------------------------------------------------------------------
+
+
+def weightless(robot, *bodies):
+    options = dc.ContactOptions(barrier_distance=2e-3)
+    return dc.Simulator(dc.Scene([], bodies, [robot], gravity=(0, 0, 0)), DT, contact=options)
+
+
+@pytest.mark.parametrize(
+    ("joint", "side", "limit", "span"),
+    [
+        ("slide", 1, 0.3, 0.5),
+        ("slide", -1, -0.2, 0.5),
+        # The joint that follows it is at its own limit there: 0.5 turn + 0.1 = 1.
+        ("turn", 1, 1.8, 2.8),
+        ("turn", -1, -1.0, 2.8),
+    ],
+)
+@pytest.mark.parametrize("effort", [0.1, 5.0])
+def test_a_joint_driven_at_its_limit_stops_within_a_hundredth_of_its_range(
+    joint, side, limit, span, effort, tmp_path
+):
+    sim = weightless(load_arm(tmp_path, actuation="torque", name="arm"))
+    given = sim.parameters()
+    # Something to damp what the limit throws back.
+    given = given.replace(joint_viscosity=torch.full((3,), 2.0, dtype=F64))
+    control = sim.control(joint_efforts={joint: side * effort})
+    row = sim.scene.robots[0].joint_names.index(joint)
+    state = sim.initial_state()
+    with torch.no_grad():
+        for _ in range(1500):
+            state = sim.step(state, control, given)
+            beyond = side * (float(state.joint_positions[row]) - limit)
+            assert beyond < 0.01 * span
+            if state.joint_velocities.abs().max() < 1e-6 and beyond > 0:
+                break
+    assert beyond > 0  # the barrier begins at the limit
+    assert state.joint_velocities.abs().max() < 1e-6
+
+
+def test_a_joint_that_follows_another_pushes_its_leader(tmp_path):
+    """At rest drives balance contact forces f: effort = -sum f . dx/dq, of all points x."""
+    robot = load_arm(
+        tmp_path,
+        stiffness={"slide": 300.0, "turn": 3.0, "spin": 2.0},
+        damping={"slide": 60.0, "turn": 0.6, "spin": 0.4},
+        joint_positions=[0.0, 0.4, 0.2],
+        name="arm",
+    )
+    (surface,) = (s for s in robot.surfaces if s is not None)
+
+    def points(q):
+        frame = robot.forward_kinematics(q)["d"]
+        return torch.tensor(surface.vertices) @ frame[:3, :3].T + frame[:3, 3]
+
+    start = torch.tensor(robot.joint_positions)
+    tip = points(start).numpy()
+    # A wall beside the tip that then moves into it by 1 cm.
+    wall = dc.RigidBody.box(
+        [0.1, 0.2, 0.2],
+        motion="kinematic",
+        pose=[tip[:, 0].max() + 0.053, *tip[:, 1:].mean(axis=0), 1, 0, 0.05, 0],
+        friction=0.0,
+        name="wall",
+    )
+    sim = weightless(robot, wall)
+    state = sim.initial_state()
+    with torch.no_grad():
+        for k in range(400):
+            pose = state.body_poses.clone()
+            pose[0, 0] -= 1e-3 * (k < 10)
+            state = sim.step(state, dc.Control(body_poses=pose))
+    assert state.joint_velocities.abs().max() < 1e-5
+    frames = sim.link_poses(state)
+    follow = frames["arm/c"][:3, :3].T @ frames["arm/d"][:3, :3]
+    angle = float(torch.atan2(follow[0, 2], follow[0, 0]))
+    assert angle == pytest.approx(0.5 * float(state.joint_positions[1]) + 0.1, abs=1e-12)
+
+    forces = state.body_forces[sim.slices["arm/d"]]
+    assert forces.sum(0).norm() > 0.1
+    jacobian = torch.autograd.functional.jacobian(points, state.joint_positions)
+    balance = state.joint_efforts + torch.einsum("vi,vij->j", forces, jacobian)
+    assert state.joint_efforts.abs().min() > 1e-3
+    assert balance.abs().max() < 1e-4 * state.joint_efforts.abs().max()

@@ -1,0 +1,123 @@
+"""With bodies and robots in contact too: the same bits alone, in a batch and on every thread."""
+
+import coupled_scenes
+import pytest
+import torch
+from coupled_scenes import BASES, COUPLINGS
+
+import diffcloth_torch as dc
+
+pytestmark = pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
+
+CASES = pytest.mark.parametrize(
+    ("coupling", "base"), [(coupling, base) for coupling in COUPLINGS for base in BASES]
+)
+MOVED = ("positions", "velocities", "body_poses", "body_velocities", "joint_positions")
+MOVED += ("joint_velocities", "base_poses", "base_velocities")
+FIELDS = (*MOVED, "soft_pin_targets", "body_forces", "joint_targets", "joint_efforts", "time")
+
+
+@pytest.fixture
+def threads():
+    """A function that sets the number of threads; it is reset afterwards."""
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+def starts(coupling, base, count=3):
+    """A simulator, and states in contact at several times."""
+    sim, state = coupled_scenes.in_contact(coupling, base)
+    controls = [coupled_scenes.control(sim)] * (count - 1)
+    with torch.no_grad():
+        later = sim.rollout(state, controls, coupled_scenes.parameters(sim))
+    return sim, [state, *later]
+
+
+def same(a, b):
+    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in FIELDS)
+
+
+def pull(sim, state, steps=2):
+    """States after some steps, and gradients of a loss on the last of them by the start."""
+    leaves = {name: getattr(state, name).clone().requires_grad_() for name in MOVED}
+    masses = coupled_scenes.parameters(sim)
+    controls = [coupled_scenes.control(sim)] * steps
+    states = sim.rollout(state.replace(**leaves), controls, masses)
+    end = states[-1]
+    loss = sum((getattr(end, name) ** 2).sum() for name in (*MOVED, "body_forces"))
+    given = [x for x in leaves.values() if x.numel()]
+    return states, torch.autograd.grad(loss, given)
+
+
+@CASES
+def test_a_batch_has_the_bits_of_its_environments_on_any_threads(coupling, base, threads):
+    sim, singles = starts(coupling, base)
+    threads(1)
+    alone = [pull(sim, state) for state in singles]
+    for count in (1, 2, 4):
+        threads(count)
+        states, gradients = pull(sim, dc.stack(singles))
+        for i, (own_states, own_gradients) in enumerate(alone):
+            assert all(same(a[i], b) for a, b in zip(states, own_states, strict=True))
+            pairs = zip(gradients, own_gradients, strict=True)
+            assert all(torch.equal(a[i], b) for a, b in pairs)
+
+
+@CASES
+def test_a_step_repeats_to_the_bit_whatever_went_before(coupling, base):
+    """No cache may show: neither another step in between, nor another simulator of the scene."""
+    sim, singles = starts(coupling, base)
+    first, gradients = pull(sim, singles[0])
+    pull(sim, singles[2])
+    for again in (sim, coupled_scenes.simulator(coupling, base)):
+        states, others = pull(again, singles[0])
+        assert all(map(same, states, first))
+        assert all(map(torch.equal, gradients, others))
+
+
+@CASES
+def test_environments_that_are_reset_go_on_as_if_alone(coupling, base):
+    """`where` puts the start in the place of some, whose gradients then end there."""
+    sim, singles = starts(coupling, base)
+    given = (coupled_scenes.control(sim), coupled_scenes.parameters(sim))
+    batch = dc.stack(singles)
+    velocities = batch.velocities.clone().requires_grad_()
+    after = sim.step(batch.replace(velocities=velocities), *given)
+    fresh = dc.stack([sim.initial_state()] * 3)
+    mixed = dc.where(torch.tensor([False, True, False]), fresh, after)
+    end = sim.step(mixed, *given)
+    assert same(end[1], sim.step(sim.initial_state(), *given))
+    for i in (0, 2):
+        assert same(end[i], sim.step(sim.step(singles[i], *given), *given))
+    (gradient,) = torch.autograd.grad(end.body_poses.sum() + end.joint_positions.sum(), velocities)
+    assert not gradient[1].any()
+    assert gradient[0].any()
+    assert gradient[2].any()
+
+
+@CASES
+def test_a_checkpointed_rollout_has_the_same_gradients(coupling, base):
+    sim, (start, *_) = starts(coupling, base)
+    found = []
+    for every in (None, 1, 3):
+        x = start.body_velocities.clone().requires_grad_()
+        masses = coupled_scenes.parameters(sim)
+        mass = masses.body_mass.clone().requires_grad_()
+        gains = masses.joint_stiffness.clone().requires_grad_()
+        given = masses.replace(body_mass=mass, joint_stiffness=gains)
+        control = coupled_scenes.control(sim)
+        targets = control.joint_positions.clone().requires_grad_()
+        states = sim.rollout(
+            start.replace(body_velocities=x),
+            [control.replace(joint_positions=targets)] * 5,
+            given,
+            checkpoint_every=every,
+        )
+        end = states[-1]
+        loss = end.positions.sum() + end.joint_positions.sum() + end.body_poses[0, :3].sum()
+        found.append((end, torch.autograd.grad(loss, (x, mass, gains, targets))))
+    for end, gradients in found[1:]:
+        assert same(end, found[0][0])
+        assert all(map(torch.equal, gradients, found[0][1]))
+    assert all(gradient.any() for gradient in found[0][1])
