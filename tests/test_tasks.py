@@ -436,6 +436,7 @@ PUSH = Short(
         "scene.cloths.sheet.shape={kind: grid, rows: 5, columns: 5, size: 0.3}",
         "scene.cloths.sheet.pose.position=[0, -0.056, 0.17]",
         "scene.cloths.sheet.pins={left: {vertices: [20]}, right: {vertices: [24]}}",
+        "actions.pins={left: [[0, 0.3, 0]], right: [[0, 0.3, 0]]}",
         "scene.bodies.floor.friction=0",
         "scene.bodies.cube.friction=0",
         "simulation.steps=6",

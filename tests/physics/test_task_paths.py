@@ -20,9 +20,10 @@ CASES = [
     pytest.param(
         "push_cube.yaml",
         [
-            "simulation.dt=0.025",
-            "simulation.steps=40",
-            "actions.interval=4",
+            "simulation.dt=0.05",
+            "simulation.steps=30",
+            "actions.interval=2",
+            "loss.steps=6",
             "scene.cloths.sheet.shape={kind: grid, rows: 8, columns: 8, size: 0.3}",
         ],
         (),
