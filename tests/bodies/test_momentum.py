@@ -68,6 +68,19 @@ def test_forces_of_cloth_box_and_gripper_cancel(coupling, base, friction):
             state = after
 
 
+def spins(sim, state):
+    """Angular momentum of each body about its center, [K, 3]."""
+    turn, inertia = matrices(state.body_poses)[:, :3, :3], sim.parameters().body_inertia
+    rates = state.body_velocities[:, 3:, None]
+    return (turn @ inertia @ turn.mT @ rates)[..., 0]
+
+
+def turned_by_contact(sim, after, where):
+    """Its change in a step, from the contact forces where they act."""
+    wrenches = sim.contact_wrenches(where.replace(body_forces=after.body_forces))
+    return DT * torch.stack([wrenches[name][3:] for name in sim.surfaces if name in wrenches])
+
+
 def thrown(coupling, friction, mass):
     """A tumbling box that hits a free cloth, without gravity."""
     vertices, faces = scenes.grid(5, 5, edge=0.06, seed=3)
@@ -114,6 +127,8 @@ def test_a_free_cloth_and_a_free_box_keep_their_momentum(coupling, friction):
             assert net[:3].abs().max() < EXACT
             if friction == 0.0:
                 assert net[3:].abs().max() < EXACT
+            gained = spins(sim, after) - spins(sim, state)
+            assert (gained - turned_by_contact(sim, after, where)).abs().max() < EXACT * DT
             passed += DT * float(pushed[:3].norm())
             state = after
     assert (momentum(state) - start).abs().max() < EXACT
@@ -146,7 +161,9 @@ def test_boxes_that_collide_keep_their_momentum(friction):
     first = (mass * state.body_velocities[:, :3]).sum(0)
     touched = 0
     for _ in range(20):
-        state = sim.step(state)
+        before, state = state, sim.step(state)
+        gained = spins(sim, state) - spins(sim, before)
+        assert (gained - turned_by_contact(sim, state, state)).abs().max() < EXACT * DT
         net = resultant(placed(sim, state), state.body_forces)
         assert net[:3].abs().max() < EXACT
         if friction == 0.0:
