@@ -14,6 +14,7 @@ DT = 0.01
 COUPLINGS = ("monolithic", "rigid_to_cloth", "cloth_to_rigid")
 BASES = ("fixed", "floating")
 GRAVITY = np.array([0.4, -0.3, -9.81])
+WARM_UP = 3  # steps before a scene is in contact
 WEIGHT = 0.46 * 9.81  # of the gripper [N]
 
 # Of the gripper: its fingers point along -x and close along z.
@@ -47,6 +48,7 @@ def simulator(coupling, base, **options):
         base=base,
         pose=[edge[0] + 0.061, 0.013, edge[2] + 0.001, *_FACING],
         joint_positions=0.035,
+        actuation=("position", "pd") if base == "kinematic" else "pd",
         stiffness=400.0,
         damping=3.0,
         friction=0.6,
@@ -77,7 +79,8 @@ def parameters(sim):
 def control(sim):
     """Fingers that close, a base that is held against gravity, and pushes on everything."""
     state = sim.initial_state()
-    lift = WEIGHT * (sim.scene.robots[0].mechanism.base == "floating")
+    base = sim.scene.robots[0].mechanism.base
+    lift = WEIGHT * (base == "floating")
     return dc.Control(
         forces=scenes.tensor_noise(state.positions.shape, 0.002, 5),
         soft_pins=state.soft_pin_targets + scenes.tensor_noise((9, 3), 0.002, 6),
@@ -85,8 +88,25 @@ def control(sim):
         joint_positions=torch.tensor([0.0385, 0.038], dtype=F64),
         joint_velocities=torch.tensor([0.02, 0.01], dtype=F64),
         joint_efforts=torch.tensor([0.1, -0.05], dtype=F64),
+        base_poses=state.base_poses if base == "kinematic" else None,
         base_wrenches=torch.tensor([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]], dtype=F64) * lift,
     )
+
+
+def controls(sim, first, steps, start=0):
+    """`first` for each step; what is prescribed moves on, so that it never just stands still.
+
+    A step in which nothing prescribed moves may find another minimum than one in which it does.
+    """
+    if sim.scene.robots[0].mechanism.base != "kinematic":
+        return [first] * steps
+    way = torch.tensor([[3e-4, 2e-4, -3e-4, 3e-3, 2e-3, 0.0, -3e-3]], dtype=F64)
+    return [
+        first.replace(
+            base_poses=first.base_poses + k * way, joint_positions=first.joint_positions - k * 2e-4
+        )
+        for k in range(start + 1, start + 1 + steps)
+    ]
 
 
 @cache
@@ -97,8 +117,8 @@ def in_contact(coupling, base):
     slide = torch.tensor([[0.2, 0.07, -0.02, 0.5, 0.0, 1.0]], dtype=F64)
     state = state.replace(body_velocities=slide)
     with torch.no_grad():
-        for _ in range(3):
-            state = sim.step(state, control(sim), parameters(sim))
+        given = controls(sim, control(sim), WARM_UP), parameters(sim)
+        state = sim.rollout(state, *given)[-1]
     return sim, state.detach()
 
 
