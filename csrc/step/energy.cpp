@@ -69,21 +69,44 @@ double stiffness_for_cloths(const Scene& scene, const Inputs& inputs, double bar
   return kFactor * barrier_distance * mean_diagonal / (eta * mean_weight);
 }
 
-/// kappa at which the heaviest free body, resting on one of six sides, stays d_hat / 2 away. Without
-/// gravity, where it crosses the gap from rest in a time step.
-double stiffness_for_bodies(const Scene& scene, const Inputs& inputs, double barrier_distance) {
+/// Mass that a contact with a tree feels [kg]: all of a free root's; of joints the most that one of
+/// them, with its drive, has at the farthest point that it moves. Zero where forces move nothing.
+///
+/// @param metric  the tree's block of A, [n_t^2]
+/// @param first   the tree's first coordinate; it has `count` of them
+double felt_mass(const Scene& scene, const double* metric, Index first, Index count) {
+  const bodies::MechanismsDescription& given = scene.mechanisms.given();
+  const double h = scene.given.dt;
+  if (count > 0 && given.tree_free[given.coordinate_tree[first]] != 0) return metric[0] * h * h;
+  double result = 0.0;
+  for (Index k = 0; k < count; ++k) {
+    if (given.prescribed[first + k] != 0) continue;
+    const double lever = scene.mechanisms.lever()[scene.mechanisms.slot(first + k)];
+    const std::ptrdiff_t diagonal = static_cast<std::ptrdiff_t>(k) * (count + 1);
+    result = std::max(result, metric[diagonal] * h * h / (lever * lever));
+  }
+  return result;
+}
+
+/// kappa at which the heaviest tree, resting on one of six sides, stays d_hat / 2 away. Without gravity,
+/// where it crosses the gap from rest in a time step.
+///
+/// @param with_joints  whether trees count whose roots are prescribed
+double stiffness_for_bodies(const Scene& scene,
+                            const Inputs& inputs,
+                            double barrier_distance,
+                            bool with_joints) {
   const bodies::MechanismsDescription& given = scene.mechanisms.given();
   const double* metric = inputs.data(Input::kCoordinateMetric);
   const double h = scene.given.dt;
   const double gravity = row(inputs.data(Input::kGravity), 0).norm();
   const double acceleration = gravity > 0.0 ? gravity : barrier_distance / (h * h);
   double result = 0.0;
-  std::size_t first = 0;
+  Index first = 0;
   for (std::size_t t = 0; t < given.tree_free.size(); ++t) {
     const auto n =
-        static_cast<std::size_t>(std::ranges::count(given.coordinate_tree, static_cast<Index>(t)));
-    if (given.tree_free[t] != 0) {
-      const double mass = metric[first] * h * h;
+        static_cast<Index>(std::ranges::count(given.coordinate_tree, static_cast<Index>(t)));
+    if (given.tree_free[t] != 0 || with_joints) {
       double area = 0.0;
       double xi = 0.0;
       for (Index v = scene.cloth_vertex_count(); v < scene.vertex_count(); ++v) {
@@ -97,9 +120,11 @@ double stiffness_for_bodies(const Scene& scene, const Inputs& inputs, double bar
       }
       const double weight = 0.25 * area / 6.0;
       const double slope = at_half_gap(xi, barrier_distance).slope;
+      const double mass = felt_mass(scene, metric, first, n);
       if (weight > 0.0) result = std::max(result, mass * acceleration / (weight * slope));
     }
-    first += n * n;
+    metric += static_cast<std::ptrdiff_t>(n) * n;
+    first += n;
   }
   return result;
 }
@@ -112,7 +137,9 @@ double default_barrier_stiffness(const Scene& scene,
   double kappa = 0.0;
   if (scene.cloth_count() > 0) kappa = stiffness_for_cloths(scene, inputs, barrier_distance);
   if (scene.mechanisms.has_free()) {
-    kappa = std::max(kappa, stiffness_for_bodies(scene, inputs, barrier_distance));
+    kappa = std::max(kappa, stiffness_for_bodies(scene, inputs, barrier_distance, false));
+    // Where nothing else gives a scale, joints do.
+    if (kappa == 0.0) kappa = stiffness_for_bodies(scene, inputs, barrier_distance, true);
   }
   return kappa;
 }

@@ -188,3 +188,36 @@ def test_a_joint_that_follows_another_pushes_its_leader(tmp_path):
     balance = state.joint_efforts + torch.einsum("vi,vij->j", forces, jacobian)
     assert state.joint_efforts.abs().min() > 1e-3
     assert balance.abs().max() < 1e-4 * state.joint_efforts.abs().max()
+
+
+def test_a_wall_pushes_an_arm_that_is_alone_with_it(tmp_path):
+    """Without a cloth or a free body the barrier takes its default from the joints."""
+    robot = load_arm(
+        tmp_path,
+        stiffness={"slide": 300.0, "turn": 3.0, "spin": 2.0},
+        damping={"slide": 60.0, "turn": 0.6, "spin": 0.4},
+        joint_positions=[0.0, 0.4, 0.2],
+        name="arm",
+    )
+    (surface,) = (surface for surface in robot.surfaces if surface is not None)
+    frame = robot.forward_kinematics(torch.tensor(robot.joint_positions))["d"].numpy()
+    tip = surface.vertices @ frame[:3, :3].T + frame[:3, 3]
+    pose = [tip[:, 0].max() + 0.053, *tip[:, 1:].mean(axis=0), 1, 0, 0.05, 0]
+    wall = dc.RigidBody.box([0.1, 0.2, 0.2], motion="kinematic", pose=pose, name="wall")
+    sim = dc.Simulator(
+        dc.Scene([], [wall], [robot], gravity=(0, 0, 0)),
+        DT,
+        contact=dc.ContactOptions(barrier_distance=2e-3),
+    )
+    assert sim.parameters().barrier_stiffness > 0
+    state = sim.initial_state()
+    with torch.no_grad():
+        for _ in range(8):
+            poses = state.body_poses.clone()
+            poses[0, 0] -= 0.1 * DT
+            state = sim.step(state, dc.Control(body_poses=poses))
+    force = state.body_forces[sim.slices["arm/d"]].sum(0)
+    assert force[0] < -0.1
+    # The drives hold against it.
+    assert state.joint_efforts.abs().max() > 0.01
+    assert sim.initial_state().joint_positions[1] - state.joint_positions[1] > 0.01
