@@ -49,8 +49,6 @@ from diffcloth_torch.model.mechanism import Mechanism
 
 __all__ = ["Chain", "ChainControl", "ChainPrediction", "ChainState"]
 
-_PRESCRIBED = ("position", "velocity")
-
 
 class ChainState(NamedTuple):
     """State of a robot.
@@ -154,13 +152,13 @@ class Chain:
         joints = mechanism.joint_count
         self.coordinate_count = joints + ROOT * self._floats
 
-        prescribed = [mode in _PRESCRIBED for mode in mechanism.actuation]
-        self._prescribed = torch.tensor(prescribed, dtype=torch.bool)
+        prescribed = ~mechanism.forced
+        self._prescribed = torch.from_numpy(prescribed)
         base = torch.zeros(ROOT * self._floats, dtype=torch.bool)
         self.prescribed = torch.cat([base, self._prescribed])
         self._modes = {
             mode: torch.tensor([m == mode for m in mechanism.actuation], dtype=torch.float64)
-            for mode in ("position", "velocity", "torque", "pd")
+            for mode in ("position", "velocity", "pd")
         }
         # What is solved for, among the entries of nu and among the coordinates.
         first = ROOT - ROOT * self._floats
@@ -188,8 +186,7 @@ class Chain:
             contact: Forces on the vertices that act like the others, [B, V, 3] N.
         """
         drives = self._drives(gains, control)
-        moved_by_force = self._modes["pd"] + self._modes["torque"]
-        inertia = inertia._replace(armature=moved_by_force * inertia.armature)
+        inertia = inertia._replace(armature=~self._prescribed * inertia.armature)
         local = inertia.center[..., self.mechanism.root, :]
         quaternion = torch.nn.functional.normalize(state.pose[..., 3:], dim=-1)
         start = _Configuration(*_placed(state.pose[..., :3], quaternion, local), state.joints)
@@ -249,8 +246,8 @@ class Chain:
             contact: Forces on the vertices that the step was solved with, [B, V, 3] N.
             kick: More forces, which change velocities only.
         """
-        pose, end, known = prediction.root_end, prediction.start, prediction.known
-        inertia, start, joints = prediction.inertia, prediction.start, coordinates
+        pose, known, start = prediction.root_end, prediction.known, prediction.start
+        inertia, joints = prediction.inertia, coordinates
         local = inertia.center[..., self.mechanism.root, :]
         if self._floats:
             center, turn, joints = torch.split(coordinates, [3, 3, joints.shape[-1] - ROOT], dim=-1)
@@ -286,7 +283,7 @@ class Chain:
 
     def _drives(self, gains: Gains, control: ChainControl) -> Drives:
         """Zero what the actuation of a joint does not use."""
-        pd, force = self._modes["pd"], self._modes["pd"] + self._modes["torque"]
+        pd, force = self._modes["pd"], ~self._prescribed
         return Drives(
             stiffness=pd * gains.stiffness,
             damping=pd * gains.damping,

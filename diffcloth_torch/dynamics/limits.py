@@ -55,9 +55,8 @@ def limit_stiffness(assembly: Assembly, dt: float, gravity: FloatArray) -> Float
 def _of_joints(
     mechanism: Mechanism, start: FloatArray, armature: FloatArray, dt: float, gravity: float
 ) -> FloatArray:
-    modes = np.array(mechanism.actuation, dtype=object)
     width = ZONE * (mechanism.upper - mechanism.lower)
-    limited = np.isfinite(width) & np.isin(modes, ("torque", "pd"))
+    limited = np.isfinite(width) & mechanism.forced
     if not limited.any():
         return np.zeros(mechanism.joint_count)
     tree = Tree(mechanism)

@@ -75,12 +75,12 @@ def _rigid_values(assembly: Assembly) -> dict[str, FloatArray]:
             for field in ("mass", "center", "inertia"):
                 rows = [m.is_dynamic * getattr(m, field) for m in mechanisms]
                 values[f"{owner}_{field}"] = np.concatenate(rows)
-    driven = np.array([mode in ("torque", "pd") for r in robots for mode in r.actuation])
-    if driven.any():
+    forced = np.concatenate([np.empty(0, dtype=bool), *(robot.forced for robot in robots)])
+    if forced.any():
         values["joint_stiffness"] = assembly.stiffness
         values["joint_damping"] = assembly.damping
-        values["joint_viscosity"] = driven * assembly.joint_viscosity
-        values["joint_armature"] = driven * assembly.joint_armature
+        values["joint_viscosity"] = forced * assembly.joint_viscosity
+        values["joint_armature"] = forced * assembly.joint_armature
     return values
 
 

@@ -6,10 +6,14 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray, IndexArray
 
-__all__ = ["Mechanism"]
+__all__ = ["FORCED", "Mechanism"]
+
+FORCED = ("torque", "pd")
+"""Actuations that leave a joint's motion to forces."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +76,11 @@ class Mechanism:
         return len(self.joint_names)
 
     @property
+    def forced(self) -> NDArray[np.bool_]:
+        """Which joints forces move; the motion of the others is prescribed. Shape [J]."""
+        return np.array([mode in FORCED for mode in self.actuation], dtype=bool)
+
+    @property
     def root(self) -> int:
         """Index of the root link."""
         return int(np.flatnonzero(self.parent < 0)[0])
@@ -108,5 +117,4 @@ class Mechanism:
     @property
     def is_dynamic(self) -> bool:
         """Whether anything here moves by forces."""
-        driven = any(mode in ("torque", "pd") for mode in self.actuation)
-        return self.base == "floating" or driven
+        return self.base == "floating" or bool(self.forced.any())

@@ -10,7 +10,7 @@ import numpy as np
 from diffcloth_torch.checks import FloatArray, IndexArray
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.mass_properties import check_inertia
-from diffcloth_torch.model.mechanism import Mechanism
+from diffcloth_torch.model.mechanism import FORCED, Mechanism
 from diffcloth_torch.model.urdf import Joint, RobotDescription
 
 __all__ = ["make_mechanism"]
@@ -126,7 +126,7 @@ def _limits(
                 f"{where}: its limits and those of the joints that mimic it must leave it a "
                 f"position, got none from {lower[j]:g} to {upper[j]:g}"
             )
-        if lower[j] == upper[j] and actuation[j] in ("torque", "pd"):
+        if lower[j] == upper[j] and actuation[j] in FORCED:
             raise InvalidInput(
                 f"{where}: limits of a joint under {actuation[j]!r} must leave it a range, got "
                 f"{lower[j]:g} for both; make its type 'fixed', or prescribe its position"
@@ -157,7 +157,7 @@ def _moves_by_forces(mechanism: Mechanism, link: int) -> bool:
     """Whether a floating base, or a joint under torque or pd, is between the world and a link."""
     while mechanism.parent[link] >= 0:
         j = mechanism.dof[link]
-        if j >= 0 and mechanism.actuation[j] in ("torque", "pd"):
+        if j >= 0 and mechanism.forced[j]:
             return True
         link = int(mechanism.parent[link])
     return mechanism.base == "floating"

@@ -91,7 +91,7 @@ class Layout:
         self.driven = torch.tensor([mode == "pd" for mode in self.actuation], dtype=torch.bool)
         self.lower = _joined([robot.lower for robot in self.robots])
         self.upper = _joined([robot.upper for robot in self.robots])
-        moved = np.array([mode in ("torque", "pd") for mode in self.actuation], dtype=bool)
+        moved = np.concatenate([np.empty(0, dtype=bool), *(r.forced for r in self.robots)])
         reach = np.where(np.isinf(self.upper - self.lower), 0.0, ZONE * (self.upper - self.lower))
         self.farthest = np.where(
             moved, [self.lower - reach, self.upper + reach], [[-np.inf], [np.inf]]

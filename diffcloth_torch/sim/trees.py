@@ -59,7 +59,7 @@ def tree_arguments(
             links["coordinate"].append(-1 if dof < 0 else first_joint + dof)
             links["multiplier"].append(mechanism.multiplier[link])
             links["constant"].append(mechanism.constant[link])
-        prescribed += [mode in ("position", "velocity") for mode in mechanism.actuation]
+        prescribed += (~mechanism.forced).tolist()
         lower += mechanism.lower.tolist()
         upper += mechanism.upper.tolist()
     owners = zip(assembly.surface_mechanism.tolist(), assembly.surface_link.tolist(), strict=True)

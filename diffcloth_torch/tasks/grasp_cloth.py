@@ -21,6 +21,7 @@ from torch import Tensor
 
 from diffcloth_torch.config.scenes import Motions
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.model.mechanism import FORCED
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.reach import (
     ActionSection,
@@ -38,7 +39,7 @@ from diffcloth_torch.viewers.look import Goal
 __all__ = ["GraspCloth", "GraspClothConfig"]
 
 _RIGID = {"linear", "angular", "force", "torque"}
-_JOINTS = {"velocities": ("velocity",), "efforts": ("torque", "pd")}
+_JOINTS = {"velocities": ("velocity",), "efforts": FORCED}
 """Key of the actions -> how its joints must be actuated."""
 
 JointRows = dict[str, Annotated[list[float], Len(1)]]
