@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.model.kinematics import Kinematics, constant, joined_frame
 from diffcloth_torch.model.mechanism import Mechanism
 
 __all__ = ["CROSS", "ROOT", "Frames", "Tree", "root_frame"]
@@ -63,39 +63,12 @@ class Tree:
         leaders[self.moving, mechanism.dof[self.moving]] = mechanism.multiplier[self.moving]
         turns = np.array([kind == "revolute" for kind in mechanism.kind])
 
-        self.reach = _tensor(reach[:, self.moving])
-        self.hanging = _tensor(reach[:, self.moving].T)[None]
-        self.revolute = _tensor(turns[self.moving, None])
-        self.leaders = _tensor(leaders[self.moving])[None]
-        # Of all L links, as the frames need them. About a unit axis a turn by u has the matrix
-        # I + sin(u) K + (1 - cos(u)) K^2, with K the matrix of the cross product.
-        cross = np.zeros((links, 4, 4))
-        cross[:, :3, :3] = np.cross(np.eye(3), mechanism.axis[:, None, :]) * turns[:, None, None]
-        shift = np.zeros((links, 4, 4))
-        shift[:, :3, 3] = mechanism.axis * ~turns[:, None]
-        self._values = _tensor(leaders.T)[None]
-        self._constants = _tensor(mechanism.constant * (mechanism.dof >= 0))
-        self._offsets = _tensor(mechanism.offset)
-        self._cross, self._cross_sq, self._shift = map(_tensor, (cross, cross @ cross, shift))
-        self._axes = _tensor(mechanism.axis[self.moving])
-
-    def poses(self, root: Tensor, joints: Tensor) -> Tensor:
-        """Frames of the links, shape [B, L, 4, 4].
-
-        Args:
-            root: Frame of the root link, shape [B or 1, 4, 4].
-            joints: Values of the joints [rad or m], shape [B, J].
-        """
-        values = (joints.unsqueeze(-2) @ self._values)[..., 0, :] + self._constants
-        values = values[..., None, None]
-        motions = torch.sin(values) * self._cross + (1 - torch.cos(values)) * self._cross_sq
-        steps = self._offsets + self._offsets @ (motions + values * self._shift)
-        local = steps.unbind(-3)
-        placed = {self.mechanism.root: root.expand_as(local[0])}
-        for link in self.mechanism.order[1:]:
-            placed[link] = placed[int(self.mechanism.parent[link])] @ local[link]
-        rows = [placed[link] for link in range(self.mechanism.link_count)]
-        return torch.stack(rows, dim=-3)
+        self.reach = constant(reach[:, self.moving])
+        self.hanging = constant(reach[:, self.moving].T)[None]
+        self.revolute = constant(turns[self.moving, None])
+        self.leaders = constant(leaders[self.moving])[None]
+        self._kinematics = Kinematics(mechanism)
+        self._axes = constant(mechanism.axis[self.moving])
 
     def frames(self, root: Tensor, joints: Tensor, centers: Tensor) -> Frames:
         """Where everything is that the dynamics asks for.
@@ -105,7 +78,7 @@ class Tree:
             joints: Values of the joints [rad or m], shape [B, J].
             centers: Centers of mass in the links' frames [m], shape [B or 1, L, 3].
         """
-        poses = self.poses(root, joints)
+        poses = self._kinematics.frames(root, joints)
         moving = poses[..., self.moving, :, :]
         return Frames(
             poses=poses,
@@ -132,9 +105,7 @@ class Tree:
 
 def root_frame(center: Tensor, rotation: Tensor, local_center: Tensor) -> Tensor:
     """Frame [B, 4, 4] of a link at `rotation`, by its center in the world and in itself [B, 3]."""
-    position = center - (rotation @ local_center[..., None])[..., 0]
-    upper = torch.cat([rotation.expand(*position.shape, 3), position[..., None]], dim=-1)
-    return torch.cat([upper, _LAST_ROW.expand(*upper.shape[:-2], 1, 4)], dim=-2)
+    return joined_frame(rotation, center - (rotation @ local_center[..., None])[..., 0])
 
 
 def _rigid(arms: Tensor) -> Tensor:
@@ -144,12 +115,7 @@ def _rigid(arms: Tensor) -> Tensor:
     return torch.cat([upper, _LOWER.expand_as(upper)], dim=-2)
 
 
-def _tensor(array: FloatArray) -> Tensor:
-    return torch.from_numpy(np.array(array, dtype=np.float64))
-
-
 _EYE = torch.eye(3, dtype=torch.float64)
 _LOWER = torch.eye(6, dtype=torch.float64)[3:]
-_LAST_ROW = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
 # a @ CROSS is the matrix of the cross product a x, row after row.
 CROSS = torch.linalg.cross(_EYE[:, None, :], _EYE[None, :, :]).transpose(1, 2).reshape(1, 3, 9)

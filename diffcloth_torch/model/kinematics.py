@@ -2,79 +2,93 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.geometry.rotation import quaternion_matrix
 from diffcloth_torch.model.mechanism import Mechanism
 
-__all__ = ["link_frames", "pose_frame"]
+__all__ = ["Kinematics", "constant", "joined_frame", "link_frames", "pose_frame"]
+
+
+class Kinematics:
+    """The constants of a mechanism that its links' frames depend on, as tensors.
+
+    A joint turns about an axis of unit length that is a constant: with K the matrix of its cross
+    product,
+
+        R = 1 + sin(a) K + (1 - cos(a)) K^2
+
+    is smooth in a everywhere, unlike the exponential of a rotation vector at zero.
+    """
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        self.mechanism = mechanism
+        moving = np.flatnonzero(mechanism.dof >= 0)
+        # A first axis for the environments: a product of all of them at once would round by how
+        # many there are.
+        leaders = np.zeros((1, mechanism.joint_count, mechanism.link_count))
+        leaders[0, mechanism.dof[moving], moving] = mechanism.multiplier[moving]
+        turns = np.array([kind == "revolute" for kind in mechanism.kind])[:, None]
+        cross, shift = (np.zeros((mechanism.link_count, 4, 4)) for _ in range(2))
+        cross[:, :3, :3] = np.cross(np.eye(3), mechanism.axis[:, None, :]) * turns[..., None]
+        shift[:, :3, 3] = mechanism.axis * ~turns
+        self._leaders = constant(leaders)
+        self._constants = constant(mechanism.constant * (mechanism.dof >= 0))
+        self._offsets = constant(mechanism.offset)
+        self._cross, self._cross_sq, self._shift = map(constant, (cross, cross @ cross, shift))
+        self._order = mechanism.order[1:]
+
+    def frames(self, root: Tensor, joints: Tensor) -> Tensor:
+        """Frames of all links; differentiable any number of times.
+
+        Args:
+            root: Frames of the root link, shape [..., 4, 4].
+            joints: Values of the joints [rad or m], shape [..., J]; the leading axes of both are
+                broadcast.
+
+        Returns:
+            Frames, shape [..., L, 4, 4].
+        """
+        shape = np.broadcast_shapes(root.shape[:-2], joints.shape[:-1])
+        count, links = math.prod(shape), self.mechanism.link_count
+        rows = joints.expand(*shape, joints.shape[-1]).reshape(count, 1, joints.shape[-1])
+        values = (rows @ self._leaders)[:, 0]
+        values = (values + self._constants)[..., None, None]
+        motions = torch.sin(values) * self._cross + (1 - torch.cos(values)) * self._cross_sq
+        steps = self._offsets + self._offsets @ (motions + values * self._shift)
+        local = steps.unbind(-3)
+        placed = {self.mechanism.root: root.expand(*shape, 4, 4).reshape(count, 4, 4)}
+        for link in self._order:
+            placed[link] = placed[int(self.mechanism.parent[link])] @ local[link]
+        frames = torch.stack([placed[link] for link in range(links)], dim=1)
+        return frames.reshape(*shape, links, 4, 4)
+
+
+def link_frames(mechanism: Mechanism, root_frame: Tensor, joint_positions: Tensor) -> Tensor:
+    """Frames of all links, [..., L, 4, 4]: see `Kinematics.frames`."""
+    return Kinematics(mechanism).frames(root_frame, joint_positions)
 
 
 def pose_frame(pose: Tensor) -> Tensor:
     """Frames [..., 4, 4] of poses [..., 7], whose quaternions are normalized."""
     quaternion = pose[..., 3:] / torch.linalg.vector_norm(pose[..., 3:], dim=-1, keepdim=True)
-    w, v = quaternion[..., :1, None], quaternion[..., 1:]
-    # R = (2 w² − 1) 1 + 2 v vᵀ + 2 w hat(v)
-    rotation = (
-        (2 * w * w - 1) * torch.eye(3, dtype=pose.dtype)
-        + 2 * v[..., :, None] * v[..., None, :]
-        + 2 * w * _hat(v)
-    )
-    return _frame(rotation, pose[..., :3])
+    return joined_frame(quaternion_matrix(quaternion), pose[..., :3])
 
 
-def link_frames(mechanism: Mechanism, root_frame: Tensor, joint_positions: Tensor) -> Tensor:
-    """Frames of all links; differentiable any number of times.
-
-    A joint turns about an axis z of unit length that is a constant, so that
-
-        R = 1 + sin(a) hat(z) + (1 − cos(a)) hat(z)²
-
-    is smooth in a everywhere, unlike the exponential of a rotation vector at zero.
-
-    Args:
-        mechanism: The tree.
-        root_frame: Frames of the root link, shape [..., 4, 4].
-        joint_positions: [rad or m], shape [..., J]; the leading axes of both are broadcast.
-
-    Returns:
-        Frames, shape [..., L, 4, 4].
-    """
-    shape = np.broadcast_shapes(root_frame.shape[:-2], joint_positions.shape[:-1])
-    frames: list[Tensor] = [root_frame] * mechanism.link_count
-    offset, axis = (torch.from_numpy(np.array(a)) for a in (mechanism.offset, mechanism.axis))
-    for link in mechanism.order:
-        if link == mechanism.root:
-            frames[link] = root_frame.expand(*shape, 4, 4)
-            continue
-        frame = frames[int(mechanism.parent[link])] @ offset[link]
-        if mechanism.kind[link] != "fixed":
-            value = joint_positions[..., int(mechanism.dof[link])]
-            value = float(mechanism.multiplier[link]) * value + float(mechanism.constant[link])
-            frame = frame @ _motion(mechanism.kind[link], axis[link], value)
-        frames[link] = frame
-    return torch.stack(frames, dim=-3)
+def joined_frame(rotation: Tensor, translation: Tensor) -> Tensor:
+    """Frames [..., 4, 4] of rotations [..., 3, 3] and translations [..., 3]."""
+    top = torch.cat([rotation.expand(*translation.shape, 3), translation[..., None]], dim=-1)
+    return torch.cat([top, _LAST_ROW.expand(*top.shape[:-2], 1, 4)], dim=-2)
 
 
-def _motion(kind: str, axis: Tensor, value: Tensor) -> Tensor:
-    """Frames [..., 4, 4] of a joint moved by values [...]."""
-    identity = torch.eye(3, dtype=value.dtype)
-    if kind == "prismatic":
-        return _frame(identity.expand(*value.shape, 3, 3), value[..., None] * axis)
-    z, a = _hat(axis), value[..., None, None]
-    rotation = identity + torch.sin(a) * z + (1 - torch.cos(a)) * (z @ z)
-    return _frame(rotation, torch.zeros(*value.shape, 3, dtype=value.dtype))
+def constant(array: FloatArray) -> Tensor:
+    """Copy an array of any real numbers into a float64 tensor."""
+    return torch.from_numpy(np.array(array, dtype=np.float64))
 
 
-def _frame(rotation: Tensor, translation: Tensor) -> Tensor:
-    top = torch.cat([rotation, translation[..., None]], dim=-1)
-    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype).expand(*top.shape[:-2], 1, 4)
-    return torch.cat([top, bottom], dim=-2)
-
-
-def _hat(v: Tensor) -> Tensor:
-    """Matrices of the cross product, v x u = hat(v) u."""
-    x, y, z = v.unbind(-1)
-    o = torch.zeros_like(x)
-    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).reshape(*v.shape, 3)
+_LAST_ROW = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)

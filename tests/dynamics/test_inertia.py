@@ -64,7 +64,7 @@ def own_rows(judge, values):
 
 def test_frames(judge):
     pose, joints, _, q, _, _ = state(judge)
-    got = judge.tree.poses(frame_of(pose), joints)[0].numpy()
+    got = motion_at(judge, pose, joints).frames.poses[0].numpy()
     pin.forwardKinematics(judge.model, judge.data, q)
     for l, (joint, place) in judge.place.items():
         expected = (judge.data.oMi[joint] * place).homogeneous
