@@ -18,10 +18,10 @@ from diffcloth_torch.dynamics.chain import Chain, ChainControl, ChainPrediction,
 from diffcloth_torch.dynamics.drives import Gains
 from diffcloth_torch.dynamics.inertia import Inertia
 from diffcloth_torch.geometry.rotation import (
-    pose_velocities,
     quaternion_exp,
     quaternion_multiply,
     rotate,
+    row_velocities,
 )
 from diffcloth_torch.model.scene import Assembly
 
@@ -152,10 +152,7 @@ class Dynamics:
 
         bodies = self._predict_bodies(now, acting, parameters, gravity, contact)
         start, end = now["body_poses"], acting["body_poses"]
-        velocities = torch.zeros(batch, start.shape[1], 6, dtype=start.dtype)
-        if len(self._moved):
-            rates = pose_velocities(start[:, self._moved], end[:, self._moved], self.dt)
-            velocities = velocities.index_copy(1, self._moved, rates)
+        velocities = row_velocities(start, end, self._moved, self.dt)
         held = end
         if bodies is not None:
             held = end.index_copy(1, self._free, start[:, self._free])

@@ -19,6 +19,7 @@ __all__ = [
     "quaternion_multiply",
     "rotate",
     "rotation_exp",
+    "row_velocities",
     "torque_from_moment",
 ]
 
@@ -142,6 +143,25 @@ def pose_velocities(start: Tensor, end: Tensor, dt: float) -> Tensor:
     conjugate = before * torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=before.dtype)
     turn = quaternion_log(quaternion_multiply(after, conjugate))
     return torch.cat([end[..., :3] - start[..., :3], turn], dim=-1) / dt
+
+
+def row_velocities(start: Tensor, end: Tensor, rows: Tensor, dt: float) -> Tensor:
+    """Velocities of some rows of poses, zero in the others: see `pose_velocities`.
+
+    Args:
+        start: Poses, shape [B, K, 7].
+        end: Likewise; either may have one environment for all.
+        rows: Indices of the rows that move.
+        dt: Time between them [s].
+
+    Returns:
+        Shape [B, K, 6].
+    """
+    shape = (max(len(start), len(end)), start.shape[1], 6)
+    velocities = torch.zeros(shape, dtype=start.dtype)
+    if not len(rows):
+        return velocities
+    return velocities.index_copy(1, rows, pose_velocities(start[:, rows], end[:, rows], dt))
 
 
 def interpolate_poses(times: Tensor, poses: Tensor, at: Tensor) -> Tensor:

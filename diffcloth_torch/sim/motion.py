@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from diffcloth_torch.geometry.rotation import pose_velocities
+from diffcloth_torch.geometry.rotation import row_velocities
 from diffcloth_torch.sim.inputs import Fields
 from diffcloth_torch.sim.layout import Layout
 
@@ -22,12 +22,9 @@ def prescribed_motion(layout: Layout, state: Fields, control: Fields, dt: float)
         dt: Time step [s].
     """
     start, end = state["body_poses"], control["body_poses"]
-    velocities = torch.zeros(max(len(start), len(end)), start.shape[1], 6, dtype=torch.float64)
-    if end is not start:
-        moving = layout.kinematic_bodies
-        quotients = pose_velocities(start[:, moving], end[:, moving], dt)
-        velocities = velocities.index_copy(1, moving, quotients)
-    return {"body_poses": end, "body_velocities": velocities}
+    moving = layout.kinematic_bodies
+    rows = moving[:0] if end is start else moving  # unset targets hold
+    return {"body_poses": end, "body_velocities": row_velocities(start, end, rows, dt)}
 
 
 def held_targets(layout: Layout, state: Fields, control: Fields) -> Tensor:
