@@ -396,6 +396,7 @@ bodies::MechanismsDescription describe_mechanisms(const nb::kwargs& k) {
   m.lower = doubles("coordinate_lower");
   m.upper = doubles("coordinate_upper");
   m.limit_stiffness = doubles("limit_stiffness");
+  m.limit_zone = nb::cast<double>(k["limit_zone"]);
   m.surface_link = indices("surface_link");
   const std::vector<Index> tree = indices("link_tree");
   const std::vector<Index> parent = indices("link_parent");

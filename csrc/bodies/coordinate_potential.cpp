@@ -66,7 +66,7 @@ void CoordinatePotential::visit_limits(const double* nodes, Visit&& visit) const
   for (Index c = 0; c < mechanisms_.coordinate_count(); ++c) {
     if (given.prescribed[c] != 0) continue;
     const double q = nodes[mechanisms_.slot(c)];
-    const double w = kZone * (given.upper[c] - given.lower[c]);
+    const double w = given.limit_zone * (given.upper[c] - given.lower[c]);
     if (!std::isfinite(w)) continue;
     visit(mechanisms_.slot(c), 1.0, given.upper[c] + w - q, w, given.limit_stiffness[c]);
     visit(mechanisms_.slot(c), -1.0, q - given.lower[c] + w, w, given.limit_stiffness[c]);

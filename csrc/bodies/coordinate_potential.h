@@ -12,14 +12,11 @@ namespace diffcloth::bodies {
 ///   sum over trees of 1/2 (q - t)^T A (q - t)  +  sum over limits of k b(u),
 ///
 /// with everything quadratic (inertia, drives, damping) in the metric A and the target t. A limit acts
-/// from itself to `kZone` of the joint's range beyond it, its end: u is what is left to the end, and
+/// from itself to `limit_zone` of the joint's range beyond it, its end: u is what is left to the end, and
 ///
 ///   b(u) = -(u - w)^2 log(u / w),   w the width of that zone,   0 for u >= w.
 class CoordinatePotential final : public Potential {
  public:
-  /// Share of a joint's range that it can go beyond its limits.
-  static constexpr double kZone = 0.01;
-
   /// @param first_point  of the nodes among all points
   /// @param first_row    of the nodes in the linear system
   /// @param targets      t [n]

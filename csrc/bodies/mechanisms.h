@@ -37,6 +37,7 @@ struct MechanismsDescription {
   std::vector<double> lower;           ///< [n] limits of free joints; infinite where there are none
   std::vector<double> upper;
   std::vector<double> limit_stiffness;  ///< [n]
+  double limit_zone = 0.0;              ///< share of its range that a joint can go beyond a limit
   std::vector<Index> surface_link;      ///< [surfaces]
 };
 

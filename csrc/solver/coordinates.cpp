@@ -5,8 +5,6 @@
 #include <limits>
 #include <numbers>
 
-#include "bodies/coordinate_potential.h"
-
 namespace diffcloth::solver {
 namespace {
 
@@ -190,7 +188,7 @@ double Coordinates::largest_fraction(const std::vector<double>& x,
   double fraction = kLargestTurn / mechanisms_->turn(nodes(dx));
   const bodies::MechanismsDescription& given = mechanisms_->given();
   for (Index c = 0; c < mechanisms_->coordinate_count(); ++c) {
-    const double zone = bodies::CoordinatePotential::kZone * (given.upper[c] - given.lower[c]);
+    const double zone = given.limit_zone * (given.upper[c] - given.lower[c]);
     if (given.prescribed[c] != 0 || !std::isfinite(zone)) continue;
     const double q = nodes(x)[mechanisms_->slot(c)];
     const double change = nodes(dx)[mechanisms_->slot(c)];

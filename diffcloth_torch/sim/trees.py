@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.dynamics.limits import ZONE
 from diffcloth_torch.model.scene import Assembly
 
 __all__ = ["tree_arguments"]
@@ -78,6 +79,7 @@ def tree_arguments(
         "coordinate_lower": np.array(lower, dtype=np.float64),
         "coordinate_upper": np.array(upper, dtype=np.float64),
         "limit_stiffness": limit_stiffness,
+        "limit_zone": ZONE,
     }
 
 
