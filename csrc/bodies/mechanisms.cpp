@@ -107,6 +107,7 @@ Mechanisms::Mechanisms(MechanismsDescription description, const BodySet& bodies)
     // The six coordinates of a free root may be prescribed too, all of them.
     const bool root_moves = surface.tree >= 0 && trees_[surface.tree].free &&
                             given_.prescribed[trees_[surface.tree].first_coordinate] == 0;
+    if (surface.tree >= 0) trees_[surface.tree].surfaces.push_back(static_cast<Index>(s));
     surface.dynamic = root_moves || std::ranges::any_of(path_[l], [&](Index joint) {
                         return given_.prescribed[given_.links[joint].coordinate] == 0;
                       });
@@ -187,14 +188,14 @@ void Mechanisms::set_frames_vjp(const double* poses,
 }
 
 void Mechanisms::place(const double* points, double* vertices) const {
-  for (Index t = 0; t < tree_count(); ++t) {
-    const Eval e = evaluate(trees_[t], points);
-    for (const Surface& s : surface_) {
-      if (s.tree != t) continue;
-      const Mat34 u = compose(e.frame, e.to_root[s.link - trees_[t].first_link]);
+  for (const Tree& tree : trees_) {
+    const Eval e = evaluate(tree, points);
+    for (const Index surface : tree.surfaces) {
+      const Surface& s = surface_[surface];
+      const Mat34 u = compose(e.frame, e.to_root[s.link - tree.first_link]);
       for (Index v = s.first; v < s.last; ++v) {
         const Vec3 p = apply(u, row(vertices_.data(), v));
-        Eigen::Map<Vec3>(vertices + 3 * v) = trees_[t].free ? Vec3(e.center + e.turn.value * p) : p;
+        Eigen::Map<Vec3>(vertices + 3 * v) = tree.free ? Vec3(e.center + e.turn.value * p) : p;
       }
     }
   }
@@ -206,29 +207,41 @@ void Mechanisms::clear(double* vertices) const {
   }
 }
 
+/// Change of a free root's rotation.
+Mat3 Mechanisms::turn_rate(const Tree& tree, const Eval& at, const double* change) {
+  Mat3 rate = Mat3::Zero();
+  if (!tree.free) return rate;
+  const Vec3 w = row(change, tree.first_node + 1);
+  for (int i = 0; i < 3; ++i) rate += w[i] * at.turn.first[i];
+  return rate;
+}
+
+/// Change of a link's transform to the root.
+Mat34 Mechanisms::link_rate(const Tree& tree,
+                            const Eval& at,
+                            Index link,
+                            const double* change) const {
+  Mat34 rate = Mat34::Zero();
+  for (std::size_t m = 0; m < path_[link].size(); ++m) {
+    const Index c = given_.links[path_[link][m]].coordinate;
+    rate += change[slot_[c]] * at.by_joint[link - tree.first_link][m];
+  }
+  return rate;
+}
+
 void Mechanisms::push_forward(const double* points, const double* change, double* vertices) const {
-  for (Index t = 0; t < tree_count(); ++t) {
-    const Tree& tree = trees_[t];
+  for (const Tree& tree : trees_) {
     const Eval e = evaluate(tree, points);
     Mat34 d_frame;
     for (int a = 0; a < 4; ++a) d_frame.col(a) = row(change, tree.frame + a);
     Vec3 d_center = Vec3::Zero();
-    Mat3 d_turn = Mat3::Zero();
-    if (tree.free) {
-      d_center = row(change, tree.first_node);
-      const Vec3 w = row(change, tree.first_node + 1);
-      for (int i = 0; i < 3; ++i) d_turn += w[i] * e.turn.first[i];
-    }
-    for (const Surface& s : surface_) {
-      if (s.tree != t) continue;
+    if (tree.free) d_center = row(change, tree.first_node);
+    const Mat3 d_turn = turn_rate(tree, e, change);
+    for (const Index surface : tree.surfaces) {
+      const Surface& s = surface_[surface];
       const Index k = s.link - tree.first_link;
-      Mat34 d_link = Mat34::Zero();
-      for (std::size_t m = 0; m < path_[s.link].size(); ++m) {
-        const Index c = given_.links[path_[s.link][m]].coordinate;
-        d_link += change[slot_[c]] * e.by_joint[k][m];
-      }
       Mat34 d = compose(d_frame, e.to_root[k]);
-      d.noalias() += e.frame.leftCols<3>() * d_link;
+      d.noalias() += e.frame.leftCols<3>() * link_rate(tree, e, s.link, change);
       const Mat34 total = d_turn * compose(e.frame, e.to_root[k]) + e.turn.value * d;
       for (Index v = s.first; v < s.last; ++v) {
         Eigen::Map<Vec3>(vertices + 3 * v) = d_center + apply(total, row(vertices_.data(), v));
@@ -240,8 +253,8 @@ void Mechanisms::push_forward(const double* points, const double* change, double
 std::vector<Mat34> Mechanisms::moments(const Tree& tree, const double* g) const {
   std::vector<Mat34> result(static_cast<std::size_t>(tree.last_link - tree.first_link),
                             Mat34::Zero());
-  for (const Surface& s : surface_) {
-    if (s.link < tree.first_link || s.link >= tree.last_link) continue;
+  for (const Index surface : tree.surfaces) {
+    const Surface& s = surface_[surface];
     Mat34& m = result[s.link - tree.first_link];
     for (Index v = s.first; v < s.last; ++v) {
       const Vec3 g_v = row(g, v);
@@ -250,6 +263,13 @@ std::vector<Mat34> Mechanisms::moments(const Tree& tree, const double* g) const 
     }
   }
   return result;
+}
+
+/// Add the cotangent of a tree's frame.
+void Mechanisms::add_to_frame(const Tree& tree, const Mat34& bar, double* points_bar) {
+  for (int a = 0; a < 4; ++a) {
+    Eigen::Map<Vec3>(points_bar + 3 * (tree.frame + a)) += bar.col(a);
+  }
 }
 
 void Mechanisms::pull_back(const double* points,
@@ -278,24 +298,18 @@ void Mechanisms::pull_back(const double* points,
       Mat34 frame_bar;
       frame_bar.leftCols<3>() = in_root * e.to_root[k].transpose();
       frame_bar.col(3) = in_root.col(3);
-      for (int a = 0; a < 4; ++a) {
-        Eigen::Map<Vec3>(points_bar + 3 * (tree.frame + a)) += frame_bar.col(a);
-      }
+      add_to_frame(tree, frame_bar, points_bar);
     }
   }
 }
 
-/// Second derivatives by the numbers of a tree's nodes, prescribed ones included; column-major.
-std::vector<double> Mechanisms::curvature(const Tree& tree,
-                                          const double* points,
-                                          const double* g) const {
+/// Second derivatives by the numbers of a tree's nodes, prescribed ones included.
+Eigen::MatrixXd Mechanisms::curvature(const Tree& tree,
+                                      const Eval& e,
+                                      const std::vector<Mat34>& moment) const {
   const Index size = 3 * (tree.last_node - tree.first_node);
-  std::vector<double> k(static_cast<std::size_t>(size) * size, 0.0);
-  const auto add = [&](Index i, Index j, double value) {
-    k[i + static_cast<std::size_t>(size) * j] += value;
-  };
-  const Eval e = evaluate(tree, points);
-  const std::vector<Mat34> moment = moments(tree, g);
+  Eigen::MatrixXd k = Eigen::MatrixXd::Zero(size, size);
+  const auto add = [&](Index i, Index j, double value) { k(i, j) += value; };
   for (Index l = tree.first_link; l < tree.last_link; ++l) {
     const Index at = l - tree.first_link;
     const Mat34& m = moment[at];
@@ -332,43 +346,35 @@ std::vector<double> Mechanisms::curvature(const Tree& tree,
   return k;
 }
 
+Eigen::MatrixXd Mechanisms::curvature(const Tree& tree,
+                                      const double* points,
+                                      const double* g) const {
+  return curvature(tree, evaluate(tree, points), moments(tree, g));
+}
+
 void Mechanisms::pull_back_change(const double* points,
                                   const double* change,
                                   const double* g,
                                   double* points_bar) const {
   for (const Tree& tree : trees_) {
-    const std::vector<double> k = curvature(tree, points, g);
-    const Index first = 3 * tree.first_node;
-    const Index size = 3 * tree.last_node - first;
-    for (Index j = 0; j < size; ++j) {
-      for (Index i = 0; i < size; ++i) {
-        points_bar[first + i] += k[i + static_cast<std::size_t>(size) * j] * change[first + j];
-      }
-    }
-    // By the frame: of Rdot S C m + R S Cdot m.
     const Eval e = evaluate(tree, points);
     const std::vector<Mat34> moment = moments(tree, g);
-    Mat3 d_turn = Mat3::Zero();
-    if (tree.free) {
-      const Vec3 w = row(change, tree.first_node + 1);
-      for (int i = 0; i < 3; ++i) d_turn += w[i] * e.turn.first[i];
-    }
+    const Eigen::MatrixXd k = curvature(tree, e, moment);
+    Eigen::Map<Eigen::VectorXd>(points_bar + 3 * tree.first_node, k.rows()) +=
+        k.lazyProduct(Eigen::Map<const Eigen::VectorXd>(change + 3 * tree.first_node, k.cols()));
+    // By the frame: of Rdot S C m + R S Cdot m.
+    const Mat3 d_turn = turn_rate(tree, e, change);
     for (Index l = tree.first_link; l < tree.last_link; ++l) {
       const Index at = l - tree.first_link;
       const Mat34& m = moment[at];
       if (m.isZero(0.0)) continue;
-      Mat34 d_link = Mat34::Zero();
-      for (std::size_t j = 0; j < path_[l].size(); ++j) {
-        d_link += change[slot_[given_.links[path_[l][j]].coordinate]] * e.by_joint[at][j];
-      }
       const Mat34 turned = d_turn.transpose() * m;
       Mat34 frame_bar;
       frame_bar.leftCols<3>() =
-          turned * e.to_root[at].transpose() + e.turn.value.transpose() * m * d_link.transpose();
+          turned * e.to_root[at].transpose() +
+          e.turn.value.transpose() * m * link_rate(tree, e, l, change).transpose();
       frame_bar.col(3) = turned.col(3);
-      for (int a = 0; a < 4; ++a) {
-        Eigen::Map<Vec3>(points_bar + 3 * (tree.frame + a)) += frame_bar.col(a);
-      }
+      add_to_frame(tree, frame_bar, points_bar);
     }
   }
 }
@@ -401,11 +407,11 @@ linalg::Attachments Mechanisms::attachments(Index first_point, Index first_row) 
 void Mechanisms::differentiate(const double* points,
                                Index first_row,
                                linalg::Attachments& out) const {
-  for (Index t = 0; t < tree_count(); ++t) {
-    const Tree& tree = trees_[t];
+  for (const Tree& tree : trees_) {
     const Eval e = evaluate(tree, points);
-    for (const Surface& s : surface_) {
-      if (s.tree != t || !s.dynamic || s.first == s.last) continue;
+    for (const Index surface : tree.surfaces) {
+      const Surface& s = surface_[surface];
+      if (!s.dynamic || s.first == s.last) continue;
       const Index at = s.link - tree.first_link;
       // The derivative of the link's transform by each number of its nodes, in their order.
       const auto* const begin = out.begin(out.first + s.first);
@@ -498,7 +504,8 @@ void Mechanisms::find_levers() {
     for (Index l = tree.first_link; l < tree.last_link; ++l) {
       const Index at = l - tree.first_link;
       std::vector<Vec3> points{e.to_root[at].col(3)};
-      for (const Surface& s : surface_) {
+      for (const Index surface : tree.surfaces) {
+        const Surface& s = surface_[surface];
         if (s.link != l) continue;
         if (s.first < s.last) points.clear();
         for (Index v = s.first; v < s.last; ++v) {

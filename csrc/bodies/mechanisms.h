@@ -135,6 +135,7 @@ class Mechanisms {
     Index first_coordinate, last_coordinate;
     Index first_node, last_node;
     Index frame;  // first of its four nodes among all points
+    std::vector<Index> surfaces;
   };
   struct Surface {
     Index tree = -1;  // among trees_; -1: not of these
@@ -145,8 +146,14 @@ class Mechanisms {
   struct Eval;
 
   Eval evaluate(const Tree& tree, const double* points) const;
+  static Mat3 turn_rate(const Tree& tree, const Eval& at, const double* change);
+  Mat34 link_rate(const Tree& tree, const Eval& at, Index link, const double* change) const;
   std::vector<Mat34> moments(const Tree& tree, const double* vertices) const;
-  std::vector<double> curvature(const Tree& tree, const double* points, const double* g) const;
+  static void add_to_frame(const Tree& tree, const Mat34& bar, double* points_bar);
+  Eigen::MatrixXd curvature(const Tree& tree,
+                            const Eval& at,
+                            const std::vector<Mat34>& moment) const;
+  Eigen::MatrixXd curvature(const Tree& tree, const double* points, const double* g) const;
   void find_levers();
 
   MechanismsDescription given_;
@@ -163,9 +170,8 @@ class Mechanisms {
 template <class Visit>
 void Mechanisms::visit_curvature(const double* points, const double* g, Visit&& visit) const {
   for (const Tree& tree : trees_) {
-    const std::vector<double> k = curvature(tree, points, g);
+    const Eigen::MatrixXd all = curvature(tree, points, g);
     const Index count = tree.last_node - tree.first_node;
-    const Eigen::Map<const Eigen::MatrixXd> all(k.data(), 3 * count, 3 * count);
     for (Index i = 0; i < count; ++i) {
       if (is_prescribed(tree.first_node + i)) continue;
       for (Index j = 0; j <= i; ++j) {
