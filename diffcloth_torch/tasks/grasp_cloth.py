@@ -22,61 +22,46 @@ from torch import Tensor
 from diffcloth_torch.config.scenes import Motions
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.mechanism import FORCED
-from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.reach import (
-    ActionSection,
-    Reach,
-    ReachConfig,
-    Rows,
-    ShapeSection,
-    ShapeTarget,
+    ReachShape,
+    RigidActionSection,
+    ShapeConfig,
     check_rigid_actions,
     find_named,
     rigid_motion,
 )
-from diffcloth_torch.viewers.look import Goal
 
 __all__ = ["GraspCloth", "GraspClothConfig"]
 
-_RIGID = {"linear", "angular", "force", "torque"}
 _JOINTS = {"velocities": ("velocity",), "efforts": FORCED}
 """Key of the actions -> how its joints must be actuated."""
 
 JointRows = dict[str, Annotated[list[float], Len(1)]]
 
 
-class RobotActionSection(ActionSection):
-    """The actions of one robot.
+class RobotActionSection(RigidActionSection):
+    """The actions of one robot: of its base, and of its joints by their names.
 
-    `linear` [m/s] and `angular` [rad/s] velocities of a kinematic base, or `force` [N] at the
-    center of mass of the root link and `torque` [N m] on a floating one, in world axes;
-    `velocities` [rad/s or m/s] of velocity joints and `efforts` [N m or N] on torque and pd
-    joints, by their names.
+    `velocities` [rad/s or m/s] are of velocity joints, `efforts` [N m or N] of torque and pd ones.
     """
 
     robot: str
-    linear: Rows | None = None
-    angular: Rows | None = None
-    force: Rows | None = None
-    torque: Rows | None = None
     velocities: JointRows | None = None
     efforts: JointRows | None = None
 
 
-class GraspClothConfig(ReachConfig):
+class GraspClothConfig(ShapeConfig):
     """A scene, the robot that acts in it, the target shape and how to get there."""
 
     actions: RobotActionSection
-    target: ShapeSection
 
     @model_validator(mode="after")
-    def _check_references(self) -> GraspClothConfig:
+    def _check_actor(self) -> GraspClothConfig:
         robot = find_named("actions.robot", self.actions.robot, self.scene.robots)
-        if any(getattr(self.actions, name) for name in _RIGID):
+        if self.actions.rigid_rows():
             check_rigid_actions(self.actions, robot)
         elif not (self.actions.velocities or self.actions.efforts):
             raise ValueError("must have actions of the base or of joints in `actions`")
-        find_named("target.cloth", self.target.cloth, self.scene.cloths)
         for key in _JOINTS:
             counts = {len(rows) for rows in (getattr(self.actions, key) or {}).values()}
             if len(counts) > 1:
@@ -84,7 +69,7 @@ class GraspClothConfig(ReachConfig):
         return self
 
 
-class GraspCloth(Reach):
+class GraspCloth(ReachShape):
     """A robot grasps a cloth and brings it into a target shape."""
 
     Config = GraspClothConfig
@@ -93,7 +78,6 @@ class GraspCloth(Reach):
         """Build the scene of a configuration that was read from the file `source`."""
         super().__init__(config, source)
         self._actions = config.actions
-        self._target = ShapeTarget(self, config.target)
         self._robot = self.scene.robots[self.scene.robot_names.index(config.actions.robot)]
         self._check_joints()
 
@@ -111,9 +95,7 @@ class GraspCloth(Reach):
 
     def initial_rows(self) -> dict[str, list[list[float]]]:
         """What the base does, then velocities and efforts with a column for each joint."""
-        rows: dict[str, list[list[float]]] = self._actions.model_dump(
-            include=_RIGID, exclude_none=True
-        )
+        rows = self._actions.rigid_rows()
         for key in _JOINTS:
             columns = getattr(self._actions, key)
             if columns:
@@ -124,7 +106,7 @@ class GraspCloth(Reach):
         """Move or push the base, and drive the joints."""
         name = self._actions.robot
         motions: Motions = {}
-        if any(key in actions for key in _RIGID):
+        if self._actions.rigid_rows():
             start = torch.from_numpy(self._robot.pose.copy())
             motions = rigid_motion(actions, name, start, self.simulator.dt, "base")
         for key in _JOINTS:
@@ -133,11 +115,3 @@ class GraspCloth(Reach):
                 f"{name}/{joint}": actions[key][:, column] for column, joint in joints
             }
         return motions
-
-    def distance(self, state: State, measure: str) -> Tensor:
-        """L2 distance between the cloth and its target."""
-        return self._target.distance(state, measure)
-
-    def goals(self) -> list[Goal]:
-        """Show the target shape."""
-        return [self._target.goal]

@@ -18,52 +18,37 @@ from pydantic import model_validator
 from torch import Tensor
 
 from diffcloth_torch.config.scenes import Motions
-from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.reach import (
-    ActionSection,
-    Reach,
-    ReachConfig,
-    Rows,
-    ShapeSection,
-    ShapeTarget,
+    ReachShape,
+    RigidActionSection,
+    ShapeConfig,
     check_rigid_actions,
     find_named,
     rigid_motion,
 )
-from diffcloth_torch.viewers.look import Goal
 
 __all__ = ["HitCloth", "HitClothConfig"]
 
 
-class BodyActionSection(ActionSection):
-    """The actions of one body.
-
-    Either `linear` [m/s] and `angular` [rad/s] velocities of a kinematic body, or `force` [N] at
-    the center of mass and `torque` [N m] on a dynamic one; all in world axes.
-    """
+class BodyActionSection(RigidActionSection):
+    """The actions of one body."""
 
     body: str
-    linear: Rows | None = None
-    angular: Rows | None = None
-    force: Rows | None = None
-    torque: Rows | None = None
 
 
-class HitClothConfig(ReachConfig):
+class HitClothConfig(ShapeConfig):
     """A scene, the body that acts in it, the target shape and how to get there."""
 
     actions: BodyActionSection
-    target: ShapeSection
 
     @model_validator(mode="after")
-    def _check_references(self) -> HitClothConfig:
+    def _check_actor(self) -> HitClothConfig:
         body = find_named("actions.body", self.actions.body, self.scene.bodies)
         check_rigid_actions(self.actions, body)
-        find_named("target.cloth", self.target.cloth, self.scene.cloths)
         return self
 
 
-class HitCloth(Reach):
+class HitCloth(ReachShape):
     """A body strikes a cloth into a target shape."""
 
     Config = HitClothConfig
@@ -72,13 +57,10 @@ class HitCloth(Reach):
         """Build the scene of a configuration that was read from the file `source`."""
         super().__init__(config, source)
         self._actions = config.actions
-        self._target = ShapeTarget(self, config.target)
 
     def initial_rows(self) -> dict[str, list[list[float]]]:
         """Velocities, or a force and a torque."""
-        return self._actions.model_dump(
-            include={"linear", "angular", "force", "torque"}, exclude_none=True
-        )
+        return self._actions.rigid_rows()
 
     def motions(self, actions: Mapping[str, Tensor]) -> Motions:
         """Move the body, or push it."""
@@ -86,11 +68,3 @@ class HitCloth(Reach):
         body = self.scene.bodies[self.scene.body_names.index(name)]
         start = torch.from_numpy(body.pose.copy())
         return rigid_motion(actions, name, start, self.simulator.dt, "body")
-
-    def distance(self, state: State, measure: str) -> Tensor:
-        """L2 distance between the cloth and its target."""
-        return self._target.distance(state, measure)
-
-    def goals(self) -> list[Goal]:
-        """Show the target shape."""
-        return [self._target.goal]

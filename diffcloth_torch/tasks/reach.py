@@ -41,9 +41,11 @@ __all__ = [
     "LossSection",
     "Reach",
     "ReachConfig",
+    "ReachShape",
+    "RigidActionSection",
     "Rows",
+    "ShapeConfig",
     "ShapeSection",
-    "ShapeTarget",
     "check_rigid_actions",
     "find_named",
     "measured",
@@ -167,6 +169,27 @@ def _tensor(name: str, rows: list[list[float]], count: int) -> Tensor:
 # --- rigid motion -------------------------------------------------------------------------------
 
 
+class RigidActionSection(ActionSection):
+    """Actions on a rigid body, or on the base of a robot.
+
+    Either `linear` [m/s] and `angular` [rad/s] velocities of what is kinematic, or `force` [N] at
+    the center of mass (of the root link) and `torque` [N m] on what is free; all in world axes.
+    """
+
+    linear: Rows | None = None
+    angular: Rows | None = None
+    force: Rows | None = None
+    torque: Rows | None = None
+
+    def rigid_rows(self) -> dict[str, list[list[float]]]:
+        """Those of the four that are given."""
+        rows: dict[str, list[list[float]]] = self.model_dump(include=set(_RIGID), exclude_none=True)
+        return rows
+
+
+_RIGID = ("linear", "angular", "force", "torque")
+
+
 def rigid_motion(
     actions: Mapping[str, Tensor], name: str, start: Tensor, dt: float, kind: str
 ) -> Motions:
@@ -187,10 +210,10 @@ def rigid_motion(
     return {f"{kind}_poses": {name: integrate_poses(start, twists, dt)}}
 
 
-def check_rigid_actions(given: Section, actor: BodySection | RobotSection) -> None:
+def check_rigid_actions(given: RigidActionSection, actor: BodySection | RobotSection) -> None:
     """Require velocities for what is kinematic and has no trajectory, forces for what is free."""
     key, free = ("base", "floating") if isinstance(actor, RobotSection) else ("motion", "dynamic")
-    names = [name for name in ("linear", "angular", "force", "torque") if getattr(given, name)]
+    names = [name for name in _RIGID if getattr(given, name)]
     if names not in (["linear", "angular"], ["force", "torque"]):
         raise ValueError(
             "must have in `actions` either `linear` and `angular` or `force` and `torque`, got "
@@ -226,20 +249,37 @@ class ShapeSection(Section):
     pose: PoseSection
 
 
-class ShapeTarget:
-    """A shape that a cloth shall take."""
+class ShapeConfig(ReachConfig):
+    """A scene, the shape that a cloth shall take, and how to get there."""
 
-    def __init__(self, task: Reach, section: ShapeSection) -> None:
-        """Pose the rest shape of a cloth."""
-        cloth = task.scene.cloths[task.scene.cloth_names.index(section.cloth)]
+    target: ShapeSection
+
+    @model_validator(mode="after")
+    def _check_target(self) -> ShapeConfig:
+        find_named("target.cloth", self.target.cloth, self.scene.cloths)
+        return self
+
+
+class ReachShape(Reach):
+    """Something acts, and a cloth shall take a shape."""
+
+    def __init__(self, config: ShapeConfig, source: Path) -> None:
+        """Build the scene of a configuration that was read from the file `source`."""
+        super().__init__(config, source)
+        section = config.target
+        cloth = self.scene.cloths[self.scene.cloth_names.index(section.cloth)]
         target = transform(cloth.rest_vertices, pose_array(section.pose))
-        self._rows = task.simulator.slices[section.cloth]
+        self._rows = self.simulator.slices[section.cloth]
         self._target = torch.from_numpy(target)
-        self.goal = Goal(target, cloth.faces)
+        self._goal = Goal(target, cloth.faces)
 
     def distance(self, state: State, measure: str) -> Tensor:
-        """L2 distance between the cloth and the shape, as `shape_distance` has it."""
+        """L2 distance between the cloth and its target, as `shape_distance` has it."""
         return shape_distance(state.positions[self._rows], self._target, measure)
+
+    def goals(self) -> list[Goal]:
+        """Show the target shape."""
+        return [self._goal]
 
 
 def measured(mean_square: Tensor, measure: str) -> Tensor:
