@@ -6,85 +6,19 @@ import numpy as np
 import pytest
 import scenes
 import torch
-from coupled_scenes import COUPLINGS, DT, F64, matrices
+from coupled_scenes import COUPLINGS, DT, F64
+from physics.physics_scenes import Judge
 
 import diffcloth_torch as dc
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
-ipctk = pytest.importorskip("ipctk")
 SLOW = pytest.mark.slow
 
 
-class Judge:
-    """The IPC Toolkit's verdict on states and on motions, with bodies and links among each other.
-
-    Pairs of one rigid surface, of two prescribed ones and of `ignored` names do not count.
-    """
-
-    def __init__(self, sim, ignored=()):
-        self.sim = sim
-        points = self.points(sim.initial_state())
-        surfaces = [*sim.scene.cloths, *sim.scene.bodies]
-        prescribed = [False] * len(sim.scene.cloths)
-        prescribed += [body.motion != "dynamic" for body in sim.scene.bodies]
-        for robot in sim.scene.robots:
-            links = [surface for surface in robot.surfaces if surface is not None]
-            surfaces += links
-            prescribed += [False] * len(links)
-        starts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
-        faces = np.concatenate([s.faces + a for s, a in zip(surfaces, starts, strict=False)])
-        forbidden = {}
-        spans = [range(a, b) for a, b in itertools.pairwise(starts)]
-        for i, j in itertools.combinations_with_replacement(range(len(surfaces)), 2):
-            rigid = i == j >= len(sim.scene.cloths)
-            names = {sim.surfaces[i], sim.surfaces[j]}
-            if rigid or (prescribed[i] and prescribed[j]) or names in map(set, ignored):
-                pairs = itertools.product(spans[i], spans[j])
-                forbidden |= {(min(p), max(p)): False for p in pairs}
-        faces = faces.astype(np.int32)
-        self.mesh = ipctk.CollisionMesh(points, ipctk.edges(faces), faces)
-        self.mesh.can_collide = ipctk.make_sparse_filter(forbidden, True)
-
-    def points(self, state):
-        """Vertices of all surfaces."""
-        parts = [state.positions]
-        frames = list(matrices(state.body_poses))
-        shapes = [body.vertices for body in self.sim.scene.bodies]
-        links = list(self.sim.link_poses(state).values())
-        for robot in self.sim.scene.robots:
-            for surface in robot.surfaces:
-                frame = links.pop(0)
-                if surface is not None:
-                    frames.append(frame)
-                    shapes.append(surface.vertices)
-        for vertices, frame in zip(shapes, frames, strict=True):
-            parts.append(torch.tensor(vertices) @ frame[:3, :3].T + frame[:3, 3])
-        return torch.cat(parts).numpy()
-
-    def is_free(self, state):
-        return not ipctk.has_intersections(self.mesh, self.points(state))
-
-    def is_free_path(self, path):
-        """Whether the straight motions between the configurations of a path are collision-free."""
-        return all(itertools.starmap(self._is_free_motion, itertools.pairwise(path)))
-
-    def _is_free_motion(self, a, b, depth=6):
-        # Both collision detections err on the safe side, each where the other need not, and both
-        # less in short motions.
-        if any(
-            ipctk.is_step_collision_free(self.mesh, a, b, narrow_phase_ccd=ccd)
-            for ccd in (
-                ipctk.AdditiveCCD(max_iterations=1_000, conservative_rescaling=0.99),
-                ipctk.TightInclusionCCD(max_iterations=1_000),
-            )
-        ):
-            return True
-        if depth == 0 or ipctk.has_intersections(self.mesh, b):
-            return False
-        middle = 0.5 * (a + b)
-        return self._is_free_motion(a, middle, depth - 1) and self._is_free_motion(
-            middle, b, depth - 1
-        )
+def judge_of(sim, ignored=()):
+    """Judge with all links as free ones; pairs of names in `ignored` do not count."""
+    links = sim.surfaces[len(sim.scene.cloths) + len(sim.scene.bodies) :]
+    return Judge(sim, free_links=links, passing=ignored)
 
 
 FIELDS = (
@@ -98,8 +32,8 @@ def roll(sim, state, steps, control=None, *, ignored=(), ignored_between=()):
 
     Pairs `ignored_between` may meet between two states. A refusal leaves the given state alone.
     """
-    judge = Judge(sim, ignored)
-    judge_between = Judge(sim, [*ignored, *ignored_between])
+    judge = judge_of(sim, ignored)
+    judge_between = judge_of(sim, [*ignored, *ignored_between])
     assert judge.is_free(state)
     states = [state]
     with torch.no_grad():
