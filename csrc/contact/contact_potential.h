@@ -1,5 +1,6 @@
 #pragma once
 
+#include <utility>
 #include <vector>
 
 #include "contact/broad_phase.h"
@@ -42,10 +43,10 @@ class ContactPotential final : public Potential {
     stand_at(x);
   }
 
-  /// Stand at a point that is known to have no contact.
-  void look_at_nothing() {
+  /// Stand at a point whose contacts are known.
+  void adopt(std::vector<Contact> contacts) {
     candidates_.clear();
-    contacts_.clear();
+    contacts_ = std::move(contacts);
     has_energies_ = false;
   }
 

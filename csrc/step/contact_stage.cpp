@@ -61,15 +61,14 @@ class Sum {
   }
 
   /// Contacts at a point, found from scratch; the contact potential stands there.
-  ///
-  /// @param any  false where it is known that there are none
-  const std::vector<Contact>& contacts_at(const Array& x, bool any = true) {
-    if (contact_ && any) {
-      contact_->look_at(x.data());
-    } else if (contact_) {
-      contact_->look_at_nothing();
-    }
+  const std::vector<Contact>& contacts_at(const Array& x) {
+    if (contact_) contact_->look_at(x.data());
     return contacts();
+  }
+
+  /// Stand where these are the contacts.
+  void adopt(std::vector<Contact> contacts) {
+    if (contact_) contact_->adopt(std::move(contacts));
   }
 
   /// Contacts where the contact potential stands.
@@ -178,11 +177,13 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
   const int friction_iterations = problem.scene.given.friction_iterations;
   Sum sum(*this, problem, step.detection, nullptr);
   const Motion motion(problem);
-  const auto keep_count = [&](int k, std::size_t count) {
-    if (!step.tape.empty()) step.tape["contacts"][k] = static_cast<double>(count);
+  const auto keep = [&](int k, const std::vector<Contact>& contacts) {
+    if (step.tape.empty()) return;
+    step.tape["contacts"][k] = static_cast<double>(contacts.size());
+    step.kept.contacts.push_back(contacts);
   };
   const std::vector<Contact>& at_start = sum.contacts_at(x);
-  keep_count(0, at_start.size());
+  keep(0, at_start);
   sum.lag(at_start);
   // Everything at its end, unknowns where inertia alone (or x^D) would put them.
   const Array first_guess = problem.predicted(inertia.target().data());
@@ -193,7 +194,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
         solver::minimize(sum.objective, x, motion, solves == 0 ? &first_guess : nullptr,
                          std::move(factor), step.context);
     merge(outcome, step.report);
-    step.factors.push_back(outcome.factor);
+    step.kept.factors.push_back(outcome.factor);
     factor = outcome.factor;
     if (!step.tape.empty()) {
       Array rows;
@@ -203,7 +204,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
     ++solves;
     if (step.report.result != Result::kConverged) break;
     const std::vector<Contact>& contacts = sum.contacts();
-    keep_count(solves, contacts.size());
+    keep(solves, contacts);
     // Without contact before and after, another solve would be the same one.
     if (!sum.friction && contacts.empty()) break;
     if (solves < friction_iterations) sum.lag(contacts);
@@ -265,17 +266,27 @@ void ContactStage::backward(const Backward& step, Array g) {
   Sum sum(*this, problem, step.detection, &bars.contact);
   const auto at = [&](std::size_t k) { return problem.at(step.tape["iterates"] + k * size); };
   const double* const counts = step.tape["contacts"];
+  // Contacts at the start, k = 0, or where solve k has ended.
+  const auto contacts_at = [&](std::size_t k, const Array& x) -> std::vector<Contact> {
+    if (counts[k] == 0.0) return {};
+    return k < step.kept.contacts.size() ? step.kept.contacts[k] : sum.contacts_at(x);
+  };
+  Array x_lag = at(solves - 1);
+  std::vector<Contact> lag = contacts_at(solves, x_lag);
   for (std::size_t k = solves; k-- > 0;) {
     step.context.checkpoint->check();
-    const Array x = at(k);
-    const Array x_lag = k == 0 ? problem.start : at(k - 1);
-    sum.lag(sum.contacts_at(x_lag, counts[k] > 0.0));
+    const Array x = std::move(x_lag);
+    std::vector<Contact> contacts = std::move(lag);
+    x_lag = k == 0 ? problem.start : at(k - 1);
+    lag = contacts_at(k, x_lag);
+    sum.lag(lag);
     if (sum.friction) sum.friction->set_lag(x_lag.data());
-    sum.contacts_at(x, counts[k + 1] > 0.0);
-    sum.objective.stand_at(x.data());
+    sum.adopt(std::move(contacts));
+    problem.coordinates.stand_at(x.data());
     const std::size_t place = first_factor + k;
+    const FactorCache::Factors& factors = step.kept.factors;
     pull_back_solve(step, sum.objective, x,
-                    place < step.factors.size() ? step.factors[place] : nullptr, g,
+                    place < factors.size() ? factors[place] : nullptr, g,
                     k + 1 == solves ? &bars.body_forces : nullptr);
 
     std::ranges::fill(g, 0.0);

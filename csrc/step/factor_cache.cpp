@@ -2,14 +2,16 @@
 
 namespace diffcloth::step {
 
-std::int64_t FactorCache::insert(Factors factors) {
+std::int64_t FactorCache::insert(Kept kept) {
   std::size_t bytes = 0;
-  for (const auto& factor : factors) {
+  for (const auto& factor : kept.factors) {
     if (factor) bytes += factor->bytes();
   }
+  for (const auto& contacts : kept.contacts) bytes += contacts.size() * sizeof(contact::Contact);
   const std::lock_guard lock(mutex_);
   const std::int64_t key = next_++;
-  entries_.push_back({.key = key, .bytes = bytes, .factors = std::move(factors)});
+  entries_.push_back(
+      {.key = key, .bytes = bytes, .kept = std::make_shared<const Kept>(std::move(kept))});
   bytes_ += bytes;
   while (bytes_ > kBytes) {
     bytes_ -= entries_.front().bytes;
@@ -18,12 +20,12 @@ std::int64_t FactorCache::insert(Factors factors) {
   return key;
 }
 
-FactorCache::Factors FactorCache::find(std::int64_t key) const {
+std::shared_ptr<const FactorCache::Kept> FactorCache::find(std::int64_t key) const {
   const std::lock_guard lock(mutex_);
   for (const Entry& entry : entries_) {
-    if (entry.key == key) return entry.factors;
+    if (entry.key == key) return entry.kept;
   }
-  return {};
+  return std::make_shared<const Kept>();
 }
 
 std::size_t FactorCache::bytes() const {

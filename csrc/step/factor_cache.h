@@ -6,26 +6,34 @@
 #include <mutex>
 #include <vector>
 
+#include "contact/contact_set.h"
 #include "linalg/cholesky.h"
 
 namespace diffcloth::step {
 
-/// Factors of recent steps, by key, up to a number of bytes; the oldest go first.
+/// Factors and contacts of recent steps, by key, up to a number of bytes; the oldest go first.
 ///
-/// A factor is a function of the point where it was made: backward makes what is gone again, with the
+/// Both are functions of the point where they were found: backward finds what is gone again, with the
 /// same bits.
 class FactorCache {
  public:
   using Factors = std::vector<std::shared_ptr<const linalg::CholeskyFactor>>;
+  using Contacts = std::vector<std::vector<contact::Contact>>;
 
-  std::int64_t insert(Factors factors);
+  /// Of one step, each in its scheme's own order.
+  struct Kept {
+    Factors factors;
+    Contacts contacts;
+  };
 
-  /// The factors of a key; empty where they are gone.
-  Factors find(std::int64_t key) const;
+  std::int64_t insert(Kept kept);
+
+  /// What is kept of a key; empty where it is gone.
+  std::shared_ptr<const Kept> find(std::int64_t key) const;
 
   void clear();
 
-  /// What the factors that are kept take up; at most kBytes.
+  /// What everything that is kept takes up; at most kBytes.
   std::size_t bytes() const;
 
   static constexpr std::size_t kBytes = std::size_t{256} << 20;
@@ -34,7 +42,7 @@ class FactorCache {
   struct Entry {
     std::int64_t key;
     std::size_t bytes;
-    Factors factors;
+    std::shared_ptr<const Kept> kept;
   };
   mutable std::mutex mutex_;
   std::list<Entry> entries_;  // oldest first

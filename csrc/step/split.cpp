@@ -55,7 +55,7 @@ Array solve_elastic_stage(const Forward& step) {
       solver::minimize(f, x, Motion(problem), nullptr, nullptr, step.context);
   step.context.path = path;
   merge(outcome, step.report);
-  step.factors.push_back(outcome.factor);
+  step.kept.factors.push_back(outcome.factor);
   return x;
 }
 
@@ -91,7 +91,8 @@ void Split::backward(const Backward& step) const {
   g.resize(problem.coordinates.size(), 0.0);
   const Array x = problem.predicted(x_d);
   problem.coordinates.stand_at(x.data());
-  pull_back_solve(step, f, x, step.factors.empty() ? nullptr : step.factors.front(), g, nullptr);
+  const FactorCache::Factors& factors = step.kept.factors;
+  pull_back_solve(step, f, x, factors.empty() ? nullptr : factors.front(), g, nullptr);
 }
 
 }  // namespace diffcloth::step

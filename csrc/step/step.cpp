@@ -62,13 +62,13 @@ Report forward(const Scene& scene,
                           .watch = &watch,
                           .counts = &report.counts,
                           .path = path};
-  FactorCache::Factors kept;
+  FactorCache::Kept kept;
   std::vector<double> x = problem.start;
   scene.scheme->forward({.problem = problem,
                          .detection = detection,
                          .context = context,
                          .tape = tape,
-                         .factors = kept,
+                         .kept = kept,
                          .report = report},
                         x, outputs["body_forces"]);
   std::copy_n(x.begin(), problem.cloth_size, positions);
@@ -118,11 +118,12 @@ void backward(const Scene& scene,
                           .workspace = &workspace,
                           .watch = &watch,
                           .counts = &counts};
+  const auto kept = factors.find(static_cast<std::int64_t>(*tape["key"]));
   scene.scheme->backward({.problem = problem,
                           .detection = detection,
                           .context = context,
                           .tape = tape,
-                          .factors = factors.find(static_cast<std::int64_t>(*tape["key"])),
+                          .kept = *kept,
                           .cotangents = bars});
   bars.add_predicted(problem, gradients);
   bars.write(problem, gradients);
