@@ -22,6 +22,14 @@ class CandidateList {
  public:
   explicit CandidateList(const BroadPhase& broad_phase) : broad_phase_(&broad_phase) {}
 
+  /// Make the list at the start of a motion that will follow, if it is short enough for one.
+  void prepare(const double* x_t0,
+               const double* x_t1,
+               std::span<const double> reach,
+               BroadPhase::Scratch& scratch) {
+    build(x_t0, x_t1, reach, scratch);
+  }
+
   /// Pairs of the broad phase, sorted; every pair that comes within the sum of the two reaches at
   /// any time of the straight motion is among them.
   ///

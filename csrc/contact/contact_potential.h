@@ -37,6 +37,12 @@ class ContactPotential final : public Potential {
     has_energies_ = false;
   }
 
+  /// Stand at a point that a motion leads from.
+  void stand_at_start(const double* x) {
+    watch(x, x);
+    stand_at(x);
+  }
+
   /// Stand at a point that no motion leads from: its pairs alone, without a list for later.
   void look_at(const double* x) {
     detection_.broad_phase.find(x, x, model_.reach(), detection_.scratch, candidates_);

@@ -60,6 +60,12 @@ class Sum {
     objective.contact = contact_ ? &*contact_ : nullptr;
   }
 
+  /// Contacts at the start of a motion; the contact potential stands there.
+  const std::vector<Contact>& contacts_at_start(const Array& x) {
+    if (contact_) contact_->stand_at_start(x.data());
+    return contacts();
+  }
+
   /// Contacts at a point, found from scratch; the contact potential stands there.
   const std::vector<Contact>& contacts_at(const Array& x) {
     if (contact_) contact_->look_at(x.data());
@@ -182,7 +188,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
     step.tape["contacts"][k] = static_cast<double>(contacts.size());
     step.kept.contacts.push_back(contacts);
   };
-  const std::vector<Contact>& at_start = sum.contacts_at(x);
+  const std::vector<Contact>& at_start = sum.contacts_at_start(x);
   keep(0, at_start);
   sum.lag(at_start);
   // Everything at its end, unknowns where inertia alone (or x^D) would put them.
@@ -285,8 +291,7 @@ void ContactStage::backward(const Backward& step, Array g) {
     problem.coordinates.stand_at(x.data());
     const std::size_t place = first_factor + k;
     const FactorCache::Factors& factors = step.kept.factors;
-    pull_back_solve(step, sum.objective, x,
-                    place < factors.size() ? factors[place] : nullptr, g,
+    pull_back_solve(step, sum.objective, x, place < factors.size() ? factors[place] : nullptr, g,
                     k + 1 == solves ? &bars.body_forces : nullptr);
 
     std::ranges::fill(g, 0.0);

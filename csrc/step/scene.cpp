@@ -220,6 +220,7 @@ std::string describe(const Scene& scene, const char* kind, std::initializer_list
 std::string find_overlap(const Scene& scene,
                          const double* x,
                          const std::vector<double>& thickness,
+                         const std::vector<contact::Candidate>& candidates,
                          contact::BroadPhase::Scratch& scratch) {
   const contact::CollisionMesh& mesh = scene.collision_mesh;
   if (const auto pair = scene.broad_phase.find_intersection(x, scratch)) {
@@ -228,14 +229,10 @@ std::string find_overlap(const Scene& scene,
     return describe(scene, "edge", {e[0], e[1]}) + " intersects " +
            describe(scene, "face", {f[0], f[1], f[2]});
   }
-  std::vector<double> half(thickness);
-  half.resize(static_cast<std::size_t>(mesh.surface_count()), 0.0);
-  for (double& value : half) value *= 0.5;
-  std::vector<contact::Candidate> candidates;
-  scene.broad_phase.find(x, x, half, scratch, candidates);
   for (const contact::Candidate& pair : candidates) {
     const auto& v = pair.vertices;
-    const double xi = half[mesh.vertex_surface[v[0]]] + half[mesh.vertex_surface[v[3]]];
+    const double xi =
+        0.5 * (thickness[mesh.vertex_surface[v[0]]] + thickness[mesh.vertex_surface[v[3]]]);
     const double d = std::sqrt(contact::distance_sq(pair.kind, contact::corners(v, x)));
     if (d > xi) continue;
     const std::string gap = " are " + std::to_string(d) + " m apart, closer than their thickness " +

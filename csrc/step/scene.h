@@ -84,9 +84,12 @@ contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& r
 std::string describe_surface(const Scene& scene, Index surface);
 
 /// Where two surfaces overlap or are closer than their thickness; empty where they are not.
+///
+/// @param candidates  all pairs that are that close, at least
 std::string find_overlap(const Scene& scene,
                          const double* x,
                          const std::vector<double>& thickness,
+                         const std::vector<contact::Candidate>& candidates,
                          contact::BroadPhase::Scratch& scratch);
 
 }  // namespace diffcloth::step

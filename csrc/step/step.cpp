@@ -28,8 +28,14 @@ std::string find_overlap(const Scene& scene, const Inputs& inputs) {
   if (const double* given = inputs.data(Input::kThickness)) {
     std::copy_n(given, thickness.size(), thickness.begin());
   }
+  std::vector<double> half(thickness);
+  for (double& value : half) value *= 0.5;
+  const Problem problem(scene, inputs);
+  const double* const x = problem.start.data();
   contact::BroadPhase::Scratch scratch;
-  return find_overlap(scene, Problem(scene, inputs).start.data(), thickness, scratch);
+  std::vector<contact::Candidate> candidates;
+  scene.broad_phase.find(x, x, half, scratch, candidates);
+  return find_overlap(scene, x, thickness, candidates, scratch);
 }
 
 Report forward(const Scene& scene,
@@ -47,8 +53,15 @@ Report forward(const Scene& scene,
   std::copy_n(problem.start.begin(), problem.cloth_size, positions);
   if (problem.contact) {
     const Stopwatch::Scope scope(watch, Phase::kDetection);
-    report.message = find_overlap(scene, problem.start.data(),
-                                  problem.contact->parameters().thickness, detection.scratch);
+    const double* const x = problem.start.data();
+    const std::vector<double>& reach = problem.contact->reach();
+    // One list for this, the contacts at the start, and the way to where inertia leads.
+    const std::vector<double> guess = problem.predicted(problem.inertia.target().data());
+    detection.candidates.prepare(x, guess.data(), reach, detection.scratch);
+    std::vector<contact::Candidate> candidates;
+    detection.candidates.find(x, x, reach, detection.scratch, candidates);
+    report.message = find_overlap(scene, x, problem.contact->parameters().thickness, candidates,
+                                  detection.scratch);
     if (!report.message.empty()) {
       report.result = Result::kIntersectingStart;
       return report;
