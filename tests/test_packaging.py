@@ -88,7 +88,7 @@ def test_importing_the_package_leaves_out(module):
 
 def test_the_command_is_installed():
     (command,) = importlib.metadata.entry_points(group="console_scripts", name="diffcloth")
-    assert command.value == "diffcloth_torch.cli:main"
+    assert command.value == "diffcloth_cli:main"
     assert callable(command.load())
 
 
