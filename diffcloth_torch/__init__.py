@@ -34,6 +34,7 @@ from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.report import Report
 from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State, stack, where
+from diffcloth_torch.viewers.render import render
 
 __all__ = [
     "AddedMassWarning",
@@ -56,6 +57,7 @@ __all__ = [
     "SolverOptions",
     "State",
     "build_info",
+    "render",
     "robots",
     "stack",
     "where",
