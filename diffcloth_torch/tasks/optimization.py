@@ -40,14 +40,21 @@ class OptimizerSection(Section):
     """Stochastic gradient descent.
 
     `learning_rates` has one entry for each tensor of actions. `clip` limits the norm of the
-    gradient of each of them; by default nothing is clipped. `failures` is how many attempts in a
-    row may fail before the loop gives up. `stop_below` ends it when the loss is smaller.
+    gradient of each of them; by default nothing is clipped. With `restart`, momentum starts anew
+    from zero where the loss has risen, so that much of it does not swing across a narrow valley.
+    `failures` is how many attempts in a row may fail before the loop gives up. `stop_below` ends it
+    when the loss is smaller.
+
+    References:
+        O'Donoghue and Candès, "Adaptive restart for accelerated gradient schemes", Foundations of
+        Computational Mathematics 15 (2015), the function scheme.
     """
 
     iterations: Annotated[int, Ge(1)]
     learning_rates: dict[str, Annotated[float, Gt(0)]]
     momentum: Annotated[float, Ge(0), Lt(1)] = 0.0
     nesterov: bool = False
+    restart: bool = False
     clip: Positive | None = None
     failures: Annotated[int, Ge(0)] = 6
     checkpoint_every: Annotated[int, Ge(1)] | None = None
@@ -215,7 +222,10 @@ def optimize(
                 progress.failed(len(failures))
                 continue
             failed_in_a_row = 0
+            risen = bool(history) and evaluation.loss > history[-1]["loss"]
             history.append(evaluation.record())
+            if options.restart and risen:
+                descent = _descent(actions, options)
             _clip(actions, options.clip)
             descent.step()
             better = found is None or evaluation.loss < found.best.loss
