@@ -167,7 +167,7 @@ def test_the_module_runs():
     [
         pytest.param(["--help"], 0, id="help"),
         pytest.param(["optimize", "--help"], 0, id="help-of-a-command"),
-        pytest.param(["run", "x.yaml", "--otu", "y"], 2, id="misspelled"),
+        pytest.param(["run", "x.yaml", "--sett", "y"], 2, id="misspelled"),
     ],
 )
 def test_what_needs_no_simulation_reads_no_torch(arguments, code):
