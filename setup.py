@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+from importlib.metadata import distribution
 from pathlib import Path
 
 from setuptools import Extension, setup
@@ -43,6 +44,20 @@ class CMakeBuild(build_ext):
         component = ext.name.rpartition(".")[2]
         install = ["cmake", "--install", str(self.cmake_folder), "--component", component]
         subprocess.run([*install, "--prefix", str(package.parent)], check=True)
+        copy_licenses(package / "licenses")
+
+
+def copy_licenses(folder: Path) -> None:
+    """Copy the license texts of what is compiled into the core: a wheel must carry them."""
+    nanobind = distribution("nanobind")
+    (text,) = [file for file in nanobind.files or () if file.name == "LICENSE"]
+    (header,) = [file for file in nanobind.files or () if file.name == "robin_map.h"]
+    folder.mkdir(exist_ok=True)
+    (folder / "nanobind.txt").write_text(text.read_text(), encoding="utf-8")
+    # This one stands in the comment above the code.
+    comment = header.read_text().partition("*/")[0] + "*/\n"
+    assert "MIT License" in comment
+    (folder / "robin_map.txt").write_text(comment, encoding="utf-8")
 
 
 setup(

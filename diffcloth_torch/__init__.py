@@ -11,9 +11,20 @@ Units are SI, z is up, quaternions are (w, x, y, z), and everything is float64 o
 
 from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
-from diffcloth_torch import _core, robots
+if find_spec("diffcloth_torch._core") is None:
+    # Python looks into the current folder first: in a clone it finds the sources, and not what
+    # `pip install .` has put elsewhere.
+    raise ImportError(
+        f"{Path(__file__).parent} holds the sources of diffcloth_torch without a core that was "
+        "compiled for this Python: start Python in another folder to import an installed package, "
+        "or run  pip install -e .  where the sources are"
+    )
+
+from diffcloth_torch import robots
 from diffcloth_torch._moved import MOVED, find_old_modules
 from diffcloth_torch.errors import (
     AddedMassWarning,
@@ -34,6 +45,7 @@ from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.report import Report
 from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State, stack, where
+from diffcloth_torch.viewers.render import render
 
 __all__ = [
     "AddedMassWarning",
@@ -56,6 +68,7 @@ __all__ = [
     "SolverOptions",
     "State",
     "build_info",
+    "render",
     "robots",
     "stack",
     "where",
@@ -64,6 +77,8 @@ __all__ = [
 
 def build_info() -> dict[str, Any]:
     """Say what the C++ core was built with: libraries, compiler and options."""
+    from diffcloth_torch import _core
+
     return dict(_core.build_info())
 
 

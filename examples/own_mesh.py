@@ -9,11 +9,13 @@ import torch
 
 import diffcloth_torch as dc
 
-# The mesh, in meters, falls a centimeter onto a floor, and slides along x until friction stops it.
+# The mesh, in meters, falls onto a floor that is as far below it as the barrier reaches, whatever
+# its size, and slides along x until friction stops it.
 cloth = dc.Cloth.load(sys.argv[1], material=dc.Material(stretch=300, friction=0.4), name="cloth")
 low, high = cloth.vertices.min(axis=0), cloth.vertices.max(axis=0)
 x, y = (low + high)[:2] / 2
-floor = dc.RigidBody.plane(10 * (high - low).max(), pose=[x, y, low[2] - 0.01, 1, 0, 0, 0])
+gap = dc.Simulator(dc.Scene([cloth]), dt=0.01).parameters().barrier_distance.item()
+floor = dc.RigidBody.plane(10 * (high - low).max(), pose=[x, y, low[2] - gap, 1, 0, 0, 0])
 simulator = dc.Simulator(dc.Scene([cloth], [floor]), dt=0.01)
 
 start = simulator.initial_state()

@@ -93,26 +93,38 @@ fingerprint() {
   } | sha256sum
 }
 
-# install_package EXTRA...: the package, editable, unless it is there and nothing has changed.
+# install_package EXTRA...: the package, editable, unless it is there and nothing has changed; then
+# the extras that are missing, which builds nothing.
 install_package() {
-  local extra now stale='' switches=${CMAKE_ARGS:-}
+  local extra now missing=() stale='' switches=${CMAKE_ARGS:-}
   now=$(fingerprint)
+  [[ $(cat "$venv/installed" 2>/dev/null) == "$now" ]] || stale=yes
   compgen -G 'diffcloth_torch/_core*.so' >/dev/null || stale=yes
-  if [[ " $* " == *" test "* ]]; then # tests call single kernels
-    switches+=" -DDIFFCLOTH_KERNELS=ON"
+  # Tests call single kernels. Once built, they are built again with the rest.
+  if [[ " $* " == *" test "* ]]; then
     compgen -G 'diffcloth_torch/_kernels*.so' >/dev/null || stale=yes
+    switches+=" -DDIFFCLOTH_KERNELS=ON"
+  elif compgen -G 'diffcloth_torch/_kernels*.so' >/dev/null; then
+    switches+=" -DDIFFCLOTH_KERNELS=ON"
+  fi
+
+  if [[ -n $stale ]]; then
+    say "Building the package and installing what it needs: a few minutes the first time"
+    # The build's own requirements go into .venv, so that a second build compiles only what changed.
+    pip_install setuptools cmake ninja nanobind cmeel-eigen
+    CMAKE_ARGS=$switches PATH=$venv/bin:$PATH pip_install --no-build-isolation --editable .
+    echo "$now" >"$venv/installed"
   fi
   for extra in "$@"; do
-    [[ $(cat "$venv/installed-$extra" 2>/dev/null) == "$now" ]] || stale=yes
+    [[ $(cat "$venv/installed-$extra" 2>/dev/null) == "$now" ]] || missing+=("$extra")
   done
-  [[ -n $stale ]] || return 0
-
-  say "Building the package and installing what it needs ($*): a few minutes the first time"
-  # The build's own requirements go into .venv, so that a second build compiles only what changed.
-  pip_install setuptools cmake ninja nanobind cmeel-eigen
-  CMAKE_ARGS=$switches PATH=$venv/bin:$PATH pip_install --no-build-isolation --editable ".[$(
-    IFS=,
-    echo "$*"
-  )]"
-  for extra in "$@"; do echo "$now" >"$venv/installed-$extra"; done
+  if ((${#missing[@]})); then
+    say "Installing the extras ${missing[*]}"
+    # The name, not the folder: pip sees that the package is there.
+    pip_install "diffcloth-torch[$(
+      IFS=,
+      echo "${missing[*]}"
+    )]"
+    for extra in "${missing[@]}"; do echo "$now" >"$venv/installed-$extra"; done
+  fi
 }

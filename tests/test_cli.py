@@ -13,8 +13,9 @@ import torch
 from click.testing import CliRunner
 
 import diffcloth_torch as dc
-from diffcloth_torch.cli import main
+from diffcloth_cli import main
 from diffcloth_torch.sim.simulator import Simulator
+from diffcloth_torch.tasks.registry import check_document, load_config
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -32,8 +33,11 @@ output: {viewers: [meshes]}
 SMALL_HIT = [
     "--set=scene.cloths.sheet.shape={kind: grid, rows: 4, columns: 4}",
     "--set=simulation.steps=4",
+    # Close enough that the push makes contact.
+    "--set=scene.bodies.cuboid.pose={position: [0, -0.03, 0.95]}",
     "--set=loss.steps=1",
     "--set=optimizer.iterations=2",
+    "--set=optimizer.checkpoint_every=null",
     "--set=output.viewers=[meshes]",
 ]
 
@@ -152,13 +156,237 @@ def test_info_names_what_was_built(call):
         assert f"core: {name}" in result.output
 
 
-def test_the_module_runs_and_imports_nothing_heavy():
+def test_the_module_runs():
+    command = [sys.executable, "-m", "diffcloth_torch", "--help"]
+    shown = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert shown.stdout.startswith("Usage: diffcloth ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [
+        pytest.param(["--help"], 0, id="help"),
+        pytest.param(["optimize", "--help"], 0, id="help-of-a-command"),
+        pytest.param(["run", "x.yaml", "--sett", "y"], 2, id="misspelled"),
+    ],
+)
+def test_what_needs_no_simulation_reads_no_torch(arguments, code):
+    """It takes seconds to import."""
+    script = (
+        "import sys, diffcloth_cli\n"
+        f"try: diffcloth_cli.main({arguments!r})\n"
+        "except SystemExit as end: code = end.code\n"
+        "print(code, sorted({'torch', 'numpy', 'diffcloth_torch'} & set(sys.modules)))"
+    )
+    command = [sys.executable, "-c", script]
+    shown = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert shown.stdout.splitlines()[-1] == f"{code} []"
+
+
+def test_the_commands_import_nothing_that_only_pictures_need():
     code = (
-        "import sys; import diffcloth_torch.cli; "
+        "import sys; import diffcloth_torch.commands; "
         "heavy = {'pyvista', 'matplotlib', 'trimesh', 'imageio'} & set(sys.modules); "
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
-    command = [sys.executable, "-m", "diffcloth_torch", "--help"]
-    shown = subprocess.run(command, check=True, capture_output=True, text=True)
-    assert shown.stdout.startswith("Usage: diffcloth ")
+
+
+# --- results that are there already -------------------------------------------------------------
+
+
+def test_results_are_not_overwritten_unless_told(call, tmp_path):
+    assert call("run", "sheet.yaml").exit_code == 0
+    file = tmp_path / "results/sheet/metrics.json"
+    before = file.read_bytes()
+    again = call("run", "sheet.yaml", "--set", "simulation.steps=2")
+    assert again.exit_code == 2
+    assert "--overwrite replaces" in one_sentence(again)
+    assert file.read_bytes() == before
+
+    (file.parent / "loss.png").write_bytes(b"of an earlier run")
+    (file.parent / "notes.txt").write_text("not ours")
+    told = call("run", "sheet.yaml", "--set", "simulation.steps=2", "--overwrite")
+    assert told.exit_code == 0, told.output
+    assert json.loads(file.read_text())["steps"] == 2
+    names = {path.name for path in file.parent.iterdir()}
+    assert names == {"metrics.json", "meshes", "notes.txt"}
+
+
+def test_a_refused_configuration_overwrites_nothing(call, tmp_path):
+    assert call("run", "sheet.yaml").exit_code == 0
+    wrong = call("run", "sheet.yaml", "--overwrite", "--set", "simulation.dt=-1")
+    assert wrong.exit_code == 2
+    assert (tmp_path / "results/sheet/metrics.json").is_file()
+
+
+def test_metrics_hold_defaults_as_they_were_used(call, tmp_path):
+    assert call("run", "sheet.yaml").exit_code == 0
+    used = json.loads((tmp_path / "results/sheet/metrics.json").read_text())["used"]
+    cloth = dc.Cloth.grid(4, 4, pins={"corner": [0]})
+    simulator = dc.Simulator(dc.Scene([cloth]), 0.01)
+    parameters = simulator.parameters()
+    assert used["contact"]["barrier_distance"] == parameters.barrier_distance.item()
+    assert used["contact"]["barrier_stiffness"] == parameters.barrier_stiffness.item()
+    assert used["contact"]["friction_iterations"] == dc.ContactOptions().friction_iterations
+    assert used["solver"] == vars(dc.SolverOptions())
+    assert used["bending_models"] == {"sheet": cloth.bending_model}
+    assert used["parameters"]["stretch"] == parameters.stretch.tolist()
+    assert used["parameters"]["gravity"] == [0.0, 0.0, -9.81]
+
+
+# --- interruptions ------------------------------------------------------------------------------
+
+
+class Interrupt:
+    """Ctrl-C before some step of a process."""
+
+    def __init__(self, monkeypatch, before):
+        real, taken = Simulator.step, []
+
+        def step(simulator, *args, **kwargs):
+            if len(taken) == before:
+                monkeypatch.setattr(Simulator, "step", real)
+                raise KeyboardInterrupt
+            taken.append(1)
+            return real(simulator, *args, **kwargs)
+
+        monkeypatch.setattr(Simulator, "step", step)
+
+
+def results(folder):
+    """What two runs have in common to the bit: no seconds."""
+    metrics = json.loads((folder / "metrics.json").read_text())
+    with np.load(folder / "actions.npz") as arrays:
+        actions = {name: arrays[name].tobytes() for name in arrays.files}
+    steps = [{**step, "seconds": 0} for step in metrics["per_step_of_best"]]
+    names = ("losses", "best_loss", "best_iteration", "minimum_distance", "steps", "failures")
+    meshes = [path.read_bytes() for path in sorted((folder / "meshes").iterdir())]
+    return actions, steps, {name: metrics[name] for name in names}, meshes
+
+
+@pytest.mark.parametrize(
+    ("before", "finished"),
+    [pytest.param(1, 0, id="in-iteration-0"), pytest.param(9, 2, id="in-iteration-2")],
+)
+def test_an_interrupted_optimization_goes_on_with_the_same_bits(
+    call, tmp_path, monkeypatch, before, finished
+):
+    arguments = ["optimize", CONFIGS / "hit_cloth.yaml", *SMALL_HIT]
+    more = "--set=optimizer.iterations=4"
+    whole = call(*arguments, more, "--out", "whole")
+    assert whole.exit_code == 0, whole.output
+
+    Interrupt(monkeypatch, before)
+    broken = call(*arguments, more, "--out", "broken")
+    assert broken.exit_code == 130
+    assert f"in iteration {finished}: broken has {finished} finished" in broken.stderr
+    assert "diffcloth optimize --resume broken" in broken.stderr
+
+    resumed = call("optimize", "--resume", "broken")
+    assert resumed.exit_code == 0, resumed.output
+    assert results(tmp_path / "broken") == results(tmp_path / "whole")
+
+
+def test_a_finished_optimization_takes_more_iterations(call, tmp_path):
+    arguments = ["optimize", CONFIGS / "hit_cloth.yaml", *SMALL_HIT]
+    assert call(*arguments, "--set=optimizer.iterations=3", "--out", "whole").exit_code == 0
+    assert call(*arguments, "--out", "parts").exit_code == 0
+    more = call("optimize", "--resume", "parts", "--set", "optimizer.iterations=3")
+    assert more.exit_code == 0, more.output
+    assert results(tmp_path / "parts") == results(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        pytest.param(["--resume", "nowhere"], "must hold what `diffcloth optimize`", id="none"),
+        pytest.param(["--resume", "broken"], "is not what `diffcloth optimize` wrote", id="bytes"),
+        pytest.param(
+            ["--resume", "good", "--set", "simulation.dt=1"],
+            "the key must be in optimizer or output",
+            id="other-section",
+        ),
+    ],
+)
+def test_what_cannot_be_resumed(call, tmp_path, arguments, message):
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken/resume.pt").write_bytes(b"no such thing")
+    (tmp_path / "good").mkdir()
+    saved = {"config": {}, "source": "x.yaml", "start": {}, "found": None}
+    torch.save(saved, tmp_path / "good/resume.pt")
+    result = call("optimize", *arguments)
+    assert result.exit_code == 2
+    assert message in one_sentence(result)
+
+
+def test_resume_takes_the_rest_from_its_folder(call):
+    result = call("optimize", "sheet.yaml", "--resume", "x", "--out", "y")
+    assert result.exit_code == 2
+    assert "--resume takes these from its DIRECTORY: --out, CONFIG" in result.stderr
+    assert "Missing argument 'CONFIG'" in call("optimize").stderr
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_a_configuration_comes_back_from_its_record(path):
+    config = load_config(path)
+    assert check_document(config.model_dump(mode="json"), path) == config
+
+
+def test_an_interrupted_run_keeps_its_steps(call, tmp_path, monkeypatch):
+    Interrupt(monkeypatch, 2)
+    result = call("run", "sheet.yaml", "--out", "out")
+    assert result.exit_code == 130
+    assert "Interrupted after step 2 of 3: out/metrics.json" in result.stderr
+    metrics = json.loads((tmp_path / "out/metrics.json").read_text())
+    assert metrics["steps"] == 2
+    assert metrics["error"] == "interrupted after step 2"
+
+
+# --- actions of another run ---------------------------------------------------------------------
+
+
+def test_the_actions_of_a_run_start_another(call, tmp_path):
+    arguments = [CONFIGS / "hit_cloth.yaml", *SMALL_HIT]
+    assert call("optimize", *arguments, "--out", "first").exit_code == 0
+    file = tmp_path / "first/actions.npz"
+    for command, out in (("run", "played"), ("optimize", "second")):
+        result = call(command, *arguments, "--actions", file, "--out", out)
+        assert result.exit_code == 0, result.output
+    first = json.loads((tmp_path / "first/metrics.json").read_text())
+    second = json.loads((tmp_path / "second/metrics.json").read_text())
+    assert second["initial_loss"] == first["best_loss"] < first["initial_loss"]
+    mesh = "meshes/frame_0004.obj"
+    assert (tmp_path / "played" / mesh).read_bytes() == (tmp_path / "first" / mesh).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        pytest.param({"linear": np.zeros((1, 3))}, "must hold linear [1, 3], angular", id="name"),
+        pytest.param(
+            {"linear": np.zeros((2, 3)), "angular": np.zeros((1, 3))}, "linear [2, 3]", id="shape"
+        ),
+        pytest.param(
+            {"linear": np.full((1, 3), np.nan), "angular": np.zeros((1, 3))}, "finite", id="nan"
+        ),
+        pytest.param(
+            {"linear": np.zeros((1, 3), int), "angular": np.zeros((1, 3))}, "float64", id="dtype"
+        ),
+        pytest.param(None, "is not an `actions.npz`", id="bytes"),
+    ],
+)
+def test_actions_must_fit(call, tmp_path, arrays, message):
+    file = tmp_path / "actions.npz"
+    file.write_bytes(b"no such thing") if arrays is None else np.savez(file, **arrays)
+    arguments = [CONFIGS / "hit_cloth.yaml", *SMALL_HIT, "--actions", file, "--out", "out"]
+    result = call("optimize", *arguments)
+    assert result.exit_code == 2
+    assert message in one_sentence(result)
+    assert not (tmp_path / "out").exists()
+
+
+def test_actions_need_a_task_that_has_some(call, tmp_path):
+    np.savez(tmp_path / "a.npz", linear=np.zeros((1, 3)))
+    result = call("run", "sheet.yaml", "--actions", "a.npz")
+    assert "the task 'drape' has no actions" in one_sentence(result)

@@ -50,6 +50,7 @@ PUBLIC = {
     "SolverOptions": "tolerance max_iterations throw metric",
     "State": "batch_size replace detach export",
     "build_info": "",
+    "render": "",
     "robots": "GRIPPER panda",
     "stack": "",
     "where": "",

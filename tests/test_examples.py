@@ -17,6 +17,7 @@ from click.testing import CliRunner
 import diffcloth_torch as dc
 
 ROOT = Path(__file__).resolve().parents[1]
+SHARED_CLOTH = ROOT.parent / "shared" / "data" / "cloth"
 
 
 @pytest.fixture
@@ -63,6 +64,27 @@ def test_example_of_the_readme(own_mesh, monkeypatch):
     names = {}
     exec(compile(code, "README.md", "exec"), names)
     check_throw(names)
+
+
+@pytest.mark.slow
+def test_example_of_the_readme_on_meshes_of_any_size():
+    """From 30 cm to 70 m: it falls on the floor, stays, and slides less with more friction."""
+    if not SHARED_CLOTH.is_dir():
+        if os.environ.get("CI"):
+            pytest.fail(f"the test data is absent: {SHARED_CLOTH}")
+        pytest.skip("the test data is absent: ../shared/data/cloth")
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    meshes = sorted(SHARED_CLOTH.glob("*.obj"))
+    assert len(meshes) >= 5
+    for mesh in meshes:
+        names = {}
+        exec(compile(code.replace('"shirt.obj"', repr(str(mesh))), "README.md", "exec"), names)
+        assert names["end"].report.contact_count > 0, mesh
+        assert 0 < names["loss"].item() < 20 * 0.01 * 0.5, mesh
+        assert names["throw"].grad[0] > 0.01, mesh
+        assert names["friction"].grad < -1e-4, mesh
+        # The barrier does not push it away.
+        assert names["end"].velocities[:, 2].mean() < 0.01, mesh
 
 
 def test_example_of_the_readme_is_the_script():

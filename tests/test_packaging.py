@@ -3,6 +3,7 @@
 import importlib.metadata
 import importlib.resources
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -55,6 +56,51 @@ def test_only_tests_have_the_single_kernels():
     assert not list(folder.glob("_kernels*"))
 
 
+def test_a_wheel_carries_its_licenses():
+    folder = Path(_core.__file__).parent
+    dist_info = list(folder.parent.glob("diffcloth_torch-*.dist-info"))
+    if not dist_info:
+        pytest.skip("about wheels: an editable install has them elsewhere")
+    names = {path.name for path in (dist_info[0] / "licenses").iterdir()}
+    assert names == {"LICENSE", "NOTICE"}
+    texts = {path.name: path.read_text() for path in (folder / "licenses").iterdir()}
+    assert set(texts) == {"nanobind.txt", "robin_map.txt"}
+    assert "Wenzel Jakob" in texts["nanobind.txt"]
+    assert "MIT License" in texts["robin_map.txt"]
+
+
+def test_a_step_is_taken():
+    """The one that a fresh environment needs no data for: wheels are tested by it."""
+    code = """
+import torch, diffcloth_torch as dc
+cloth = dc.Cloth.grid(5, 5, 0.3, pose=[0, 0, 0.002, 1, 0, 0, 0])
+simulator = dc.Simulator(dc.Scene([cloth], [dc.RigidBody.plane(2.0)]), 0.01)
+start = simulator.initial_state()
+positions = start.positions.clone().requires_grad_()
+end = simulator.step(start.replace(positions=positions))
+end.positions.square().sum().backward()
+print(end.report.converged, bool(torch.isfinite(positions.grad).all()))
+"""
+    assert run_python(code) == "True True"
+
+
+def test_sources_without_a_core_say_what_to_do(tmp_path):
+    sources = tmp_path / "diffcloth_torch"
+    shutil.copytree(
+        Path(diffcloth_torch.__file__).parent,
+        sources,
+        ignore=shutil.ignore_patterns("*.so", "__pycache__"),
+    )
+    # Alone on the path: the finder of an editable install would add the core to these sources.
+    code = f"import sys; sys.path[:0] = [{str(tmp_path)!r}]; import diffcloth_torch"
+    command = [sys.executable, "-S", "-c", code]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode == 1
+    last = result.stderr.strip().splitlines()[-1]
+    assert last.startswith(f"ImportError: {sources} holds the sources of diffcloth_torch without a")
+    assert "pip install -e ." in last
+
+
 def test_build_info_names_every_part():
     info = _core.build_info()
     assert set(info) == {
@@ -88,7 +134,7 @@ def test_importing_the_package_leaves_out(module):
 
 def test_the_command_is_installed():
     (command,) = importlib.metadata.entry_points(group="console_scripts", name="diffcloth")
-    assert command.value == "diffcloth_torch.cli:main"
+    assert command.value == "diffcloth_cli:main"
     assert callable(command.load())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from dataclasses import dataclass
@@ -695,6 +696,19 @@ def test_momentum_and_clipping_are_those_of_torch():
         velocity = 0.5 * velocity + math.copysign(min(abs(2 * a), 0.1), a)
         a -= 0.25 * velocity
     assert losses == pytest.approx(expected, rel=1e-5)
+
+
+def test_momentum_starts_anew_where_the_loss_rises():
+    losses = optimize(Bowl(descend(momentum=0.9, restart=True))).metrics()["losses"]
+    a, velocity, expected = 1.0, 0.0, []
+    for _ in range(5):
+        if expected and a * a > expected[-1]:
+            velocity = 0.0
+        expected.append(a * a)
+        velocity = 0.9 * velocity + 2 * a
+        a -= 0.25 * velocity
+    assert losses == pytest.approx(expected, rel=1e-5)
+    assert any(b > a for a, b in itertools.pairwise(losses))
 
 
 def test_the_loop_stops_below_a_loss():

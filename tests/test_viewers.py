@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import builtins
+import itertools
 import typing
 
 import numpy as np
 import pytest
+import torch
 
 import diffcloth_torch as dc
 from diffcloth_torch.config import schema
@@ -122,7 +124,7 @@ def test_a_scene_is_drawn_without_a_configuration(tmp_path):
 def test_the_drawn_floor_stands_for_a_static_level_plane(tmp_path, body, floor):
     pytest.importorskip("pyvista")
     record = Record(tmp_path, dc.Scene([dc.Cloth.grid(3, 3)], [body]), fps=10)
-    assert record._shown_bodies() == ([] if floor else [0])
+    assert [surface.shown for surface in record._rigid] == [not floor]
 
 
 def test_a_mesh_sequence_has_one_file_per_state(make_task, tmp_path):
@@ -175,7 +177,47 @@ class TestRecord:
         assert (tmp_path / "animation.mp4").stat().st_size > 500
         frames = sorted(path.name for path in (tmp_path / "animation_frames").iterdir())
         assert frames == [f"{k:04d}.png" for k in range(5)]
-        assert read_image(tmp_path / "animation.png").shape == (120, 2 * 160 + 8, 3)
+        # Two moments and the legend, in two rows of two.
+        assert read_image(tmp_path / "animation.png").shape == (2 * 120 + 8, 2 * 160 + 8, 3)
+
+    def test_the_overview_has_five_moments_and_a_legend(self, make_task, tmp_path):
+        task = make_task("output.pictures.video=none")
+        record(task, tmp_path)
+        image = read_image(tmp_path / "animation.png")
+        assert image.shape == (2 * 120 + 8, 3 * 160 + 2 * 8, 3)
+        cells = [
+            image[top : top + 120, left : left + 160] for top in (0, 128) for left in (0, 168, 336)
+        ]
+        legend = cells.pop()
+        for color in 255 * np.eye(3, dtype=int):  # of the sheet's front, the ball, the back
+            assert (legend == color).all(axis=-1).sum() > 8
+        # The times differ, in the same place; what is shown hardly moves.
+        for a, b in itertools.pairwise(cells):
+            assert (a[:14, :80] != b[:14, :80]).any()
+        assert not (tmp_path / "animation.mp4").exists()
+
+    def test_labels_can_be_left_out(self, make_task, tmp_path):
+        images = []
+        for labels in ("true", "false"):
+            task = make_task(
+                "output.pictures.sheet=1",
+                "output.pictures.video=none",
+                f"output.pictures.labels={labels}",
+            )
+            record(task, tmp_path, [task.initial_state()])
+            images.append(read_image(tmp_path / "animation.png"))
+        with_labels, without = images
+        assert without.shape == (120, 160, 3)
+        below = with_labels[120:]
+        assert len(below) % 2 == 0
+        assert has_hue(below, 0)  # the sheet's front
+        assert (with_labels[:14, :80] < 100).any()
+        assert not (without[:14, :80] < 100).any()
+
+    def test_an_overview_can_be_left_out(self, make_task, tmp_path):
+        record(make_task("output.pictures.video=gif", "output.pictures.sheet=0"), tmp_path)
+        assert (tmp_path / "animation.gif").exists()
+        assert not (tmp_path / "animation.png").exists()
 
     def test_a_gif_can_be_had(self, make_task, tmp_path):
         record(make_task("output.pictures.video=gif"), tmp_path)
@@ -207,13 +249,14 @@ class TestRecord:
         moved = state.replace(positions=state.positions + 0.5)
         record(task, tmp_path, [state, moved])
         image = read_image(tmp_path / "animation.png")
-        assert np.abs(image[:, :160] - image[:, -160:]).max() > 50
+        assert np.abs(image[20:120, :160] - image[20:120, -160:]).max() > 50
 
     def test_a_floor_takes_a_shadow(self, make_task, tmp_path):
         lightness = {}
         for ground in ("null", "-0.5"):
             task = make_task(
                 f"output.pictures.ground={ground}",
+                "output.pictures.labels=false",
                 "output.pictures.sheet=1",
                 "output.pictures.video=none",
             )
@@ -240,6 +283,95 @@ class TestRecord:
         with pytest.raises(type(error)):
             record(task, tmp_path, failing())
         assert (tmp_path / "animation.png").exists() == drawn
+
+
+# --- without a configuration --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def landing():
+    """A scene whose sheet lies on a ball, above a floor that is drawn as such."""
+    sheet = dc.Cloth.grid(7, 7, 0.5, pose=[0, 0, 0.31, 1, 0, 0, 0], name="sheet")
+    floor = dc.RigidBody.plane(9.0, name="floor")
+    ball = dc.RigidBody.sphere(0.15, subdivisions=1, pose=[0, 0, 0.15, 1, 0, 0, 0], name="ball")
+    scene = dc.Scene([sheet], [floor, ball])
+    simulator = dc.Simulator(scene, 0.02)
+    with torch.no_grad():
+        start = simulator.initial_state()
+        return scene, [start, *simulator.rollout(start, steps=4)]
+
+
+@pytest.mark.usefixtures("pictures")
+class TestRender:
+    def test_the_ending_says_what_is_made(self, landing, tmp_path):
+        scene, states = landing
+        for name in ("a.mp4", "b.gif", "c.png"):
+            dc.render(scene, states, tmp_path / name, size=(160, 120))
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mp4", "b.gif", "c.png"]
+        assert read_image(tmp_path / "c.png").shape == (248, 496, 3)
+
+    def test_an_animation_takes_as_long_as_the_motion(self, landing, tmp_path):
+        import imageio.v2 as imageio
+
+        scene, states = landing
+        dc.render(scene, states, tmp_path / "a.mp4", size=(160, 120))
+        with imageio.get_reader(tmp_path / "a.mp4") as video:
+            assert video.get_meta_data()["fps"] == pytest.approx(50)
+            assert video.count_frames() == 5
+
+    def test_contact_forces_are_drawn_on_request(self, landing, tmp_path):
+        scene, states = landing
+        assert states[-1].body_forces.any()
+        reds = {}
+        for forces in (False, True):
+            file = tmp_path / f"{forces}.png"
+            dc.render(scene, states[-1], file, size=(320, 240), labels=False, contact_forces=forces)
+            image = read_image(file)
+            reds[forces] = (image[..., 0] > 2 * image[..., 1:].max(axis=-1)).sum()
+        assert reds[False] == 0
+        assert reds[True] > 50
+
+    def test_arrows_are_the_forces_of_what_is_shown(self, landing, tmp_path):
+        scene, states = landing
+        pictures = Pictures(contact_forces=True, video="none")
+        viewer = Record(tmp_path, scene, fps=10, pictures=pictures)
+        for state in states:
+            viewer.show(state)
+        arrows, entries = viewer._arrows(2.0)
+        forces = states[-1].body_forces.numpy()[4:]  # without those of the floor
+        largest = max(
+            np.linalg.norm(state.body_forces.numpy()[4:], axis=1).max() for state in states
+        )
+        np.testing.assert_allclose(arrows[-1], forces * 0.2 * 2.0 / largest)
+        assert entries[-1].text == f"contact force, longest {largest:.3g} N"
+
+    @pytest.mark.parametrize(
+        ("change", "error", "message"),
+        [
+            pytest.param({"path": "a.avi"}, dc.InvalidInput, "must end in .mp4", id="ending"),
+            pytest.param({"path": "no/a.png"}, dc.InvalidInput, "folder of `path`", id="folder"),
+            pytest.param({"states": []}, dc.InvalidInput, "at least one state", id="none"),
+            pytest.param({"states": [3]}, TypeError, r"got int at \[0\]", id="type"),
+            pytest.param({"moments": 0}, dc.InvalidInput, "`moments`", id="moments"),
+            pytest.param({"size": (161, 120)}, dc.InvalidInput, "two even numbers", id="size"),
+            pytest.param({"fps": 0}, dc.InvalidInput, "`fps`", id="fps"),
+        ],
+    )
+    def test_arguments_are_checked(self, landing, tmp_path, change, error, message):
+        scene, states = landing
+        arguments = {"states": states, "path": "a.png", **change}
+        path = tmp_path / arguments.pop("path")
+        with pytest.raises(error, match=message):
+            dc.render(scene, arguments.pop("states"), path, **arguments)
+        assert not list(tmp_path.iterdir())
+
+    def test_states_must_be_of_the_scene(self, landing, tmp_path):
+        scene, states = landing
+        other = dc.Simulator(dc.Scene([dc.Cloth.grid(3, 3)]), 0.01).initial_state()
+        with pytest.raises(dc.InvalidInput, match=r"states\[1\] must be of this scene"):
+            dc.render(scene, [states[0], other], tmp_path / "a.png")
+        with pytest.raises(dc.InvalidInput, match=r"states\[0\] is a batch"):
+            dc.render(scene, dc.stack(states), tmp_path / "a.png")
 
 
 def test_a_missing_package_is_named_before_anything_runs(make_task, tmp_path, monkeypatch):

@@ -436,7 +436,9 @@ class PictureSection(Section):
     fps: Annotated[float, Gt(0), Le(240)] | None = None
     video: Literal["mp4", "gif", "none"] = Pictures.video
     frames: bool = Pictures.frames
-    sheet: Annotated[int, Ge(1), Le(12)] = Pictures.sheet
+    sheet: Annotated[int, Ge(0), Le(12)] = Pictures.sheet
+    labels: bool = Pictures.labels
+    contact_forces: bool = Pictures.contact_forces
     ground: float | Literal["auto"] | None = Pictures.ground
     camera: CameraSection = CameraSection()
 

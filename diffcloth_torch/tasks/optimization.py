@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Protocol
 
 import torch
@@ -21,7 +21,15 @@ from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.statistics import rollout_statistics
 
-__all__ = ["Controller", "Evaluation", "Optimization", "OptimizerSection", "evaluate", "optimize"]
+__all__ = [
+    "Actions",
+    "Controller",
+    "Evaluation",
+    "Optimization",
+    "OptimizerSection",
+    "evaluate",
+    "optimize",
+]
 
 Actions = dict[str, Tensor]
 Controller = Callable[[int, State], Control]
@@ -32,14 +40,21 @@ class OptimizerSection(Section):
     """Stochastic gradient descent.
 
     `learning_rates` has one entry for each tensor of actions. `clip` limits the norm of the
-    gradient of each of them; by default nothing is clipped. `failures` is how many attempts in a
-    row may fail before the loop gives up. `stop_below` ends it when the loss is smaller.
+    gradient of each of them; by default nothing is clipped. With `restart`, momentum starts anew
+    from zero where the loss has risen, so that much of it does not swing across a narrow valley.
+    `failures` is how many attempts in a row may fail before the loop gives up. `stop_below` ends it
+    when the loss is smaller.
+
+    References:
+        O'Donoghue and Candès, "Adaptive restart for accelerated gradient schemes", Foundations of
+        Computational Mathematics 15 (2015), the function scheme.
     """
 
     iterations: Annotated[int, Ge(1)]
     learning_rates: dict[str, Annotated[float, Gt(0)]]
     momentum: Annotated[float, Ge(0), Lt(1)] = 0.0
     nesterov: bool = False
+    restart: bool = False
     clip: Positive | None = None
     failures: Annotated[int, Ge(0)] = 6
     checkpoint_every: Annotated[int, Ge(1)] | None = None
@@ -95,14 +110,16 @@ class Evaluation:
 
 @dataclass(frozen=True, eq=False)
 class Optimization:
-    """What a loop has found so far.
+    """What a loop has found so far, and what it needs to go on.
 
     Attributes:
-        first: Evaluation of the initial actions.
+        first: Evaluation of the initial actions, without its states.
         best: Evaluation with the smallest loss.
         history: Record of each evaluation, in order.
         failures: Message of each attempt that failed, with the iteration it was for.
-        seconds: Time since the start [s].
+        seconds: Time since the start [s], without interruptions.
+        next_actions: Actions of the next iteration.
+        momenta: Momentum of each tensor of actions; empty without momentum.
     """
 
     first: Evaluation
@@ -110,6 +127,18 @@ class Optimization:
     history: list[dict[str, Any]]
     failures: list[dict[str, Any]]
     seconds: float
+    next_actions: Actions
+    momenta: Actions
+
+    def record(self) -> dict[str, Any]:
+        """All of it, as what `torch.load` reads with `weights_only`."""
+        return vars(self) | {"first": vars(self.first), "best": vars(self.best)}
+
+    @staticmethod
+    def restore(record: Mapping[str, Any]) -> Optimization:
+        """Make one from its `record`."""
+        first, best = (Evaluation(**record[name]) for name in ("first", "best"))
+        return Optimization(**{**record, "first": first, "best": best})
 
     def metrics(self) -> dict[str, Any]:
         """Numbers of the loop for a file."""
@@ -140,7 +169,11 @@ class Optimization:
 
 
 def optimize(
-    task: _Optimizable, report: Callable[[Optimization], None] = lambda _: None
+    task: _Optimizable,
+    report: Callable[[Optimization], None] = lambda _: None,
+    *,
+    start: Actions | None = None,
+    found: Optimization | None = None,
 ) -> Optimization:
     """Minimize the loss of a task by gradient descent.
 
@@ -149,7 +182,10 @@ def optimize(
 
     Args:
         task: What to optimize.
-        report: Called after each evaluation with what was found so far.
+        report: Called after each iteration with what was found so far.
+        start: Actions to start from, leaf tensors; by default those of the task.
+        found: What an earlier loop over the same task reported: it is continued, with the same
+            bits that the earlier loop would have had.
 
     Returns:
         The evaluations and how they came about.
@@ -159,15 +195,21 @@ def optimize(
         InvalidInput: If the learning rates do not fit the actions.
     """
     options = task.optimizer
-    actions = task.actions()
-    descent = _descent(actions, options)
+    actions = task.actions() if start is None else start
     history: list[dict[str, Any]] = []
     failures: list[dict[str, Any]] = []
-    found: Optimization | None = None
+    before = 0.0
+    descent = _descent(actions, options)
+    if found is not None:
+        history, failures = list(found.history), list(found.failures)
+        before = found.seconds
+        _put(actions, found.next_actions)
+        for name, momentum in found.momenta.items():
+            descent.state[actions[name]]["momentum_buffer"] = momentum.clone()
     failed_in_a_row = 0
-    start = time.perf_counter()
-    with _progress(task, options) as progress:
-        while len(history) < options.iterations:
+    begin = time.perf_counter()
+    with _progress(task, options, len(history)) as progress:
+        while len(history) < options.iterations and not _good_enough(found, options):
             try:
                 evaluation = evaluate(task, actions, on_step=progress.step)
             except (InfeasibleMotion, NotConverged) as error:
@@ -180,23 +222,31 @@ def optimize(
                 progress.failed(len(failures))
                 continue
             failed_in_a_row = 0
+            risen = bool(history) and evaluation.loss > history[-1]["loss"]
             history.append(evaluation.record())
+            if options.restart and risen:
+                descent = _descent(actions, options)
+            _clip(actions, options.clip)
+            descent.step()
             better = found is None or evaluation.loss < found.best.loss
             found = Optimization(
-                first=evaluation if found is None else found.first,
+                first=replace(evaluation, states=[]) if found is None else found.first,
                 best=evaluation if better or found is None else found.best,
                 history=history,
                 failures=failures,
-                seconds=time.perf_counter() - start,
+                seconds=before + time.perf_counter() - begin,
+                next_actions=_copies(actions),
+                momenta=_momenta(actions, descent),
             )
             progress.done(evaluation.loss, found.best.loss)
             report(found)
-            if options.stop_below is not None and found.best.loss < options.stop_below:
-                break
-            _clip(actions, options.clip)
-            descent.step()
     assert found is not None  # at least one iteration
     return found
+
+
+def _good_enough(found: Optimization | None, options: OptimizerSection) -> bool:
+    limit = options.stop_below
+    return found is not None and limit is not None and found.best.loss < limit
 
 
 def evaluate(
@@ -232,7 +282,7 @@ def evaluate(
     end = time.perf_counter()
     return Evaluation(
         loss=value,
-        actions={name: tensor.detach().clone() for name, tensor in actions.items()},
+        actions=_copies(actions),
         states=[state.detach() for state in states],
         gradient_norms={name: _gradient(name, tensor) for name, tensor in actions.items()},
         statistics=rollout_statistics(states),
@@ -258,6 +308,22 @@ def _descent(actions: Actions, options: OptimizerSection) -> torch.optim.SGD:
     return torch.optim.SGD(groups, momentum=options.momentum, nesterov=options.nesterov)
 
 
+def _copies(actions: Actions) -> Actions:
+    return {name: tensor.detach().clone() for name, tensor in actions.items()}
+
+
+def _momenta(actions: Actions, descent: torch.optim.SGD) -> Actions:
+    # Without momentum SGD has no buffer.
+    buffers = {name: descent.state[a].get("momentum_buffer") for name, a in actions.items()}
+    return {name: buffer.clone() for name, buffer in buffers.items() if buffer is not None}
+
+
+def _put(actions: Actions, values: Actions) -> None:
+    with torch.no_grad():
+        for name, tensor in actions.items():
+            tensor.copy_(values[name])
+
+
 def _halve_towards(actions: Actions, best: Actions) -> None:
     with torch.no_grad():
         for name, tensor in actions.items():
@@ -277,9 +343,9 @@ def _message(error: SimulationError) -> str:
 class _Progress:
     """A bar over the steps of all iterations."""
 
-    def __init__(self, bar: tqdm[Any], steps: int) -> None:
+    def __init__(self, bar: tqdm[Any], steps: int, iterations: int) -> None:
         self._bar, self._steps = bar, steps
-        self._iterations = 0
+        self._iterations = iterations
         self._texts: dict[str, str] = {}
 
     def step(self, k: int) -> None:
@@ -302,8 +368,8 @@ class _Progress:
 
 
 @contextmanager
-def _progress(task: _Optimizable, options: OptimizerSection) -> Iterator[_Progress]:
-    total = task.steps * options.iterations
+def _progress(task: _Optimizable, options: OptimizerSection, done: int) -> Iterator[_Progress]:
+    total, initial = task.steps * options.iterations, task.steps * done
     # disable=None: quiet where the output is no terminal.
-    with tqdm(total=total, desc="optimize", unit="step", disable=None) as bar:
-        yield _Progress(bar, task.steps)
+    with tqdm(total=total, initial=initial, desc="optimize", unit="step", disable=None) as bar:
+        yield _Progress(bar, task.steps, done)

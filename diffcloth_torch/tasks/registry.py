@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from diffcloth_torch.tasks.hit_cloth import HitCloth
 from diffcloth_torch.tasks.push_cube import PushCube
 from diffcloth_torch.tasks.task import Task
 
-__all__ = ["TASKS", "load_config", "load_task", "make_task"]
+__all__ = ["TASKS", "check_document", "load_config", "load_task", "make_task"]
 
 TASKS: dict[str, Any] = {
     "drape": Drape,
@@ -35,13 +35,25 @@ def load_config(path: str | Path, assignments: Iterable[str] = ()) -> RunConfig:
     Raises:
         InvalidInput: If the file, a key or a value is not accepted.
     """
-    document = set_values(read_document(path), assignments)
+    return check_document(set_values(read_document(path), assignments), path)
+
+
+def check_document(document: Mapping[str, Any], path: str | Path) -> RunConfig:
+    """Check what a configuration file holds against the schema of its task.
+
+    Args:
+        document: Keys and values.
+        path: Where it was read from, for messages.
+
+    Raises:
+        InvalidInput: If a key or a value is not accepted.
+    """
     name = document.get("task")
     if name not in TASKS:
         accepted = ", ".join(TASKS)
         got = "it is missing" if name is None else f"got {name!r}"
         raise InvalidInput(f"{path}: `task` must be one of {accepted}; {got}")
-    config: RunConfig = validate(TASKS[name].Config, document, path)
+    config: RunConfig = validate(TASKS[name].Config, dict(document), path)
     return config
 
 

@@ -8,19 +8,24 @@ import torch
 from tqdm import tqdm
 
 from diffcloth_torch.sim.state import State
+from diffcloth_torch.tasks.optimization import Actions
 from diffcloth_torch.tasks.task import Task
 
 __all__ = ["simulate"]
 
 
-def simulate(task: Task) -> Iterator[State]:
-    """Yield the initial state and the state after each step, with the task's initial actions.
+def simulate(task: Task, actions: Actions | None = None) -> Iterator[State]:
+    """Yield the initial state and the state after each step.
+
+    Args:
+        task: What to simulate.
+        actions: What is done, as `task.actions()` has it; by default just that.
 
     Raises:
         SimulationError: If a step fails.
     """
     with torch.no_grad():
-        controller = task.controller(task.actions())
+        controller = task.controller(task.actions() if actions is None else actions)
         state = task.initial_state()
     yield state
     # disable=None: quiet where the output is no terminal.

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from diffcloth_torch.sim.report import Report
 from diffcloth_torch.sim.state import State
 
-__all__ = ["rollout_statistics", "step_records", "write_metrics"]
+__all__ = ["replace_file", "rollout_statistics", "step_records", "write_metrics"]
 
 
 def _reports(states: Sequence[State]) -> list[Report]:
@@ -63,6 +64,13 @@ def _finite(distance: float) -> float | None:
 def write_metrics(path: Path, metrics: dict[str, Any]) -> None:
     """Write numbers as JSON; the file is complete or the old one."""
     text = json.dumps(metrics, indent=2, allow_nan=False) + "\n"
+    with replace_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def replace_file(path: Path) -> Iterator[Path]:
+    """Give a path to write to, which becomes `path` when all is written."""
     part = path.with_suffix(".part")
-    part.write_text(text, encoding="utf-8")
+    yield part
     part.replace(path)

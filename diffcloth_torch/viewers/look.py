@@ -9,7 +9,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Camera", "Goal", "Paint", "Pictures"]
+__all__ = ["FORCE_COLOR", "GOAL_COLOR", "Camera", "Goal", "Paint", "Pictures"]
+
+_FRONT_COLORS = ("#2a6f97", "#c8553d", "#5b7f4b", "#7d5a8c")
+_BACK_COLORS = ("#f2c078", "#f3dcc0", "#e3dcae", "#e0cfe8")
+_BODY_COLORS = ("#8d99ae", "#a39b8b", "#7f9183")
+GOAL_COLOR = "#2f9e78"
+FORCE_COLOR = "#b3123f"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +46,11 @@ class Pictures:
         fps: Pictures per second; None plays in real time.
         video: Kind of the animation.
         frames: Whether every picture of the animation is kept.
-        sheet: Moments in the overview picture, from the first to the last.
+        sheet: Moments in the overview picture, from the first to the last; 0 leaves it out.
+        labels: Whether the time and a legend are written.
+        contact_forces: Whether arrows show the contact forces on the vertices of bodies and links
+            (`State.body_forces`). They end where the forces act; the longest of the motion is a
+            fifth of the size of the scene.
         ground: Height of a floor that is only drawn [m]: "auto" takes that of a static level plane
             of the scene, or lies below everything; None leaves it out.
         camera: Where pictures are taken from.
@@ -50,7 +60,9 @@ class Pictures:
     fps: float | None = None
     video: Literal["mp4", "gif", "none"] = "mp4"
     frames: bool = False
-    sheet: int = 3
+    sheet: int = 5
+    labels: bool = True
+    contact_forces: bool = False
     ground: float | Literal["auto"] | None = "auto"
     camera: Camera = Camera()
 
@@ -66,6 +78,17 @@ class Paint:
 
     color: str | None = None
     back_color: str | None = None
+
+    def for_cloth(self, index: int) -> Paint:
+        """Take what is None from the palette of cloths."""
+        return Paint(
+            self.color or _FRONT_COLORS[index % len(_FRONT_COLORS)],
+            self.back_color or _BACK_COLORS[index % len(_BACK_COLORS)],
+        )
+
+    def for_body(self, index: int) -> Paint:
+        """Take what is None from the palette of bodies and robots."""
+        return Paint(self.color or _BODY_COLORS[index % len(_BODY_COLORS)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType, TracebackType
@@ -20,7 +21,8 @@ from diffcloth_torch.model.kinematics import pose_frame
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.state import State
-from diffcloth_torch.viewers.look import Goal, Paint, Pictures
+from diffcloth_torch.viewers.labels import Entry, legend_below, overview, write_time
+from diffcloth_torch.viewers.look import FORCE_COLOR, GOAL_COLOR, Goal, Paint, Pictures
 from diffcloth_torch.viewers.stage import Bounds, Skin, Stage, require_pyvista
 
 __all__ = ["Record"]
@@ -30,8 +32,18 @@ Image = NDArray[np.uint8]
 _DEFAULT_PICTURES = Pictures()
 
 _GAP_BELOW = 0.04  # of the size of the scene, between the lowest point and a floor of ours
-_SHEET_MARGIN = 8  # pixels between the pictures of an overview
+_LONGEST_ARROW = 0.2  # of the size of the scene, for the largest force
 _GIF_STEP = 2  # every so many pixels of a picture are kept in a GIF
+
+
+@dataclass(frozen=True, eq=False)
+class _Rigid:
+    """A surface of a body or a link; vertices [v, 3] in its frame, faces [f, 3]."""
+
+    owner: str
+    vertices: FloatArray
+    faces: IndexArray
+    shown: bool
 
 
 class Record:
@@ -70,15 +82,25 @@ class Record:
         self._options = pictures
         _require_writer(self._options.video)
         self._folder, self._scene, self._name = folder, scene, name
-        self._paints, self._goals = paints, goals
+        self._goals = goals
+        self._rigid = _rigid_surfaces(scene)
+        shown = dict.fromkeys(surface.owner for surface in self._rigid if surface.shown)
+        self._paints = {
+            name: paints.get(name, Paint()).for_cloth(i) for i, name in enumerate(scene.cloth_names)
+        } | {name: paints.get(name, Paint()).for_body(i) for i, name in enumerate(shown)}
         self._fps = fps if self._options.fps is None else self._options.fps
         self._positions: list[NDArray[np.float64]] = []
         self._frames: list[NDArray[np.float64]] = []
+        self._times: list[float] = []
+        self._forces: list[NDArray[np.float64]] = []
 
     def show(self, state: State) -> None:
         """Keep one state."""
         self._positions.append(state.positions.detach().numpy().copy())
         self._frames.append(self._placed_frames(state))
+        self._times.append(float(state.time))
+        if self._options.contact_forces:
+            self._forces.append(self._shown_forces(state))
 
     def __enter__(self) -> Record:
         """Have nothing more to open."""
@@ -96,29 +118,60 @@ class Record:
 
     def _draw_all(self) -> None:
         count = len(self._positions)
-        moments = sorted({round(i) for i in np.linspace(0, count - 1, self._options.sheet)})
+        moments = {round(i) for i in np.linspace(0, count - 1, self._options.sheet)}
+        all_are_kept = self._options.frames or self._options.video != "none"
+        step = float(np.diff(self._times).min(initial=1.0))
+        low, high = self._bounds()
+        arrows, entries = self._arrows(float(np.linalg.norm(high - low)))
+        labels = self._options.labels
         sheet = []
-        with self._stage() as stage, self._writer() as writer:
-            for k in tqdm(range(count), desc="draw", unit="frame", disable=None):
-                image = stage.draw(self._positions[k], self._frames[k])
-                writer(k, image)
+        with self._stage(low, high) as stage, self._writer() as writer:
+            drawn = range(count) if all_are_kept else sorted(moments)
+            for k in tqdm(drawn, desc="draw", unit="frame", disable=None):
+                image = stage.draw(self._positions[k], self._frames[k], arrows[k])
+                if labels:
+                    image = write_time(image, self._times[k], step)
                 if k in moments:
                     sheet.append(image)
-        _write_image(self._folder / f"{self._name}.png", _side_by_side(sheet))
+                if all_are_kept:
+                    writer(k, legend_below(image, entries) if labels else image)
+        if sheet:
+            if len(sheet) == 1:
+                image = legend_below(sheet[0], entries) if labels else sheet[0]
+            else:
+                image = overview(sheet, entries if labels else [])
+            _write_image(self._folder / f"{self._name}.png", image)
 
-    def _stage(self) -> Stage:
+    def _arrows(self, size: float) -> tuple[Sequence[FloatArray | None], list[Entry]]:
+        """Arrows [m] of each state where forces are shown, and all lines of the legend."""
+        entries = []
+        for name, paint in self._paints.items():
+            colors = [color for color in (paint.color, paint.back_color) if color is not None]
+            sides = " (front, back)" if len(colors) > 1 else ""
+            entries.append(Entry(name + sides, tuple(colors)))
+        if self._goals:
+            entries.append(Entry("target", (GOAL_COLOR,)))
+        if not self._options.contact_forces:
+            return [None] * len(self._positions), entries
+        norms = [np.linalg.norm(forces, axis=1).max(initial=0.0) for forces in self._forces]
+        largest = float(max(norms))
+        entries.append(Entry(f"contact force, longest {largest:.3g} N", (FORCE_COLOR,)))
+        scale = _LONGEST_ARROW * size / largest if largest > 0 else 0.0
+        return [scale * forces for forces in self._forces], entries
+
+    def _stage(self, low: FloatArray, high: FloatArray) -> Stage:
         scene = self._scene
-        low, high = self._bounds()
         stage = Stage(
             [
-                Skin(cloth.faces + start, self._paint(name))
+                Skin(cloth.faces + start, self._paints[name])
                 for cloth, name, start in zip(
                     scene.cloths, scene.cloth_names, self._cloth_starts(), strict=True
                 )
             ],
             [
-                (vertices, Skin(faces, self._paint(name)))
-                for name, vertices, faces in self._rigid_surfaces()
+                (surface.vertices, Skin(surface.faces, self._paints[surface.owner]))
+                for surface in self._rigid
+                if surface.shown
             ],
             size=self._options.size,
             bounds=(low, high),
@@ -129,33 +182,14 @@ class Record:
             stage.add_goal(goal)
         return stage
 
-    def _paint(self, name: str) -> Paint:
-        return self._paints.get(name, Paint())
-
     def _cloth_starts(self) -> list[int]:
         counts = [len(cloth.vertices) for cloth in self._scene.cloths]
         return [0, *np.cumsum(counts[:-1]).tolist()]
 
-    def _shown_bodies(self) -> list[int]:
-        """Bodies that are drawn: the floor of the stage stands for a level plane."""
-        return [k for k, body in enumerate(self._scene.bodies) if not _is_floor(body)]
-
-    def _rigid_surfaces(self) -> list[tuple[str, FloatArray, IndexArray]]:
-        """Owner, vertices and faces of each body and link that is drawn."""
-        scene = self._scene
-        shown = [
-            (scene.body_names[k], scene.bodies[k].vertices, scene.bodies[k].faces)
-            for k in self._shown_bodies()
-        ]
-        for name, robot in zip(scene.robot_names, scene.robots, strict=True):
-            meshes = [surface for surface in robot.surfaces if surface is not None]
-            shown += [(name, mesh.vertices, mesh.faces) for mesh in meshes]
-        return shown
-
     def _placed_frames(self, state: State) -> FloatArray:
-        """Frames [n, 4, 4] of what `_rigid_surfaces` lists."""
+        """Frames [n, 4, 4] of the surfaces that are shown."""
         state = state.detach()
-        frames = [*pose_frame(state.body_poses)[self._shown_bodies()]]
+        frames = [*pose_frame(state.body_poses)]
         first = 0
         for robot, base in zip(self._scene.robots, state.base_poses, strict=True):
             joints = state.joint_positions[first : first + len(robot.joint_names)]
@@ -163,14 +197,26 @@ class Record:
             placed = robot.forward_kinematics(joints, base)
             links = zip(robot.link_names, robot.surfaces, strict=True)
             frames += [placed[link] for link, surface in links if surface is not None]
-        stacked: FloatArray = np.array([frame.numpy() for frame in frames]).reshape(-1, 4, 4)
+        chosen = [
+            frame.numpy()
+            for frame, surface in zip(frames, self._rigid, strict=True)
+            if surface.shown
+        ]
+        stacked: FloatArray = np.array(chosen).reshape(-1, 4, 4)
         return stacked
+
+    def _shown_forces(self, state: State) -> FloatArray:
+        """Contact forces on the vertices of the surfaces that are shown [N], shape [v, 3]."""
+        counts = [len(surface.vertices) for surface in self._rigid]
+        shown = np.repeat([surface.shown for surface in self._rigid], counts).astype(bool)
+        forces: FloatArray = state.body_forces.detach().numpy()[shown]
+        return forces
 
     def _bounds(self) -> Bounds:
         points = [*self._positions, *(goal.vertices for goal in self._goals)]
-        for k, (_, vertices, _) in enumerate(self._rigid_surfaces()):
+        for k, surface in enumerate(surface for surface in self._rigid if surface.shown):
             frames = np.unique([frames[k] for frames in self._frames], axis=0)
-            points += [vertices @ frame[:3, :3].T + frame[:3, 3] for frame in frames]
+            points += [surface.vertices @ frame[:3, :3].T + frame[:3, 3] for frame in frames]
         points = [cloud for cloud in points if len(cloud)]
         lows = [cloud.min(axis=0) for cloud in points]
         highs = [cloud.max(axis=0) for cloud in points]
@@ -233,6 +279,21 @@ def _require_writer(video: str) -> None:
             )
 
 
+def _rigid_surfaces(scene: Scene) -> list[_Rigid]:
+    """Bodies, then links that have a shape, as in `State.body_forces`.
+
+    The floor of the stage stands for a level plane, which is not shown.
+    """
+    surfaces = [
+        _Rigid(name, body.vertices, body.faces, not _is_floor(body))
+        for name, body in zip(scene.body_names, scene.bodies, strict=True)
+    ]
+    for name, robot in zip(scene.robot_names, scene.robots, strict=True):
+        meshes = [surface for surface in robot.surfaces if surface is not None]
+        surfaces += [_Rigid(name, mesh.vertices, mesh.faces, True) for mesh in meshes]
+    return surfaces
+
+
 def _placed(body: RigidBody) -> NDArray[np.float64]:
     return transform(body.vertices, body.pose)
 
@@ -247,9 +308,3 @@ def _write_image(path: Path, image: Image) -> None:
     import imageio.v2 as imageio
 
     imageio.imwrite(path, image)
-
-
-def _side_by_side(images: list[Image]) -> Image:
-    margin = np.full((images[0].shape[0], _SHEET_MARGIN, 3), 255, dtype=np.uint8)
-    parts = [part for image in images for part in (margin, image)][1:]
-    return np.concatenate(parts, axis=1)

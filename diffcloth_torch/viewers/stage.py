@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.viewers.floor import BACKGROUND, Floor, Shadow
-from diffcloth_torch.viewers.look import Camera, Goal, Paint
+from diffcloth_torch.viewers.look import FORCE_COLOR, GOAL_COLOR, Camera, Goal, Paint
 
 __all__ = ["Bounds", "Skin", "Stage", "require_pyvista"]
 
@@ -24,11 +24,6 @@ Triangles = NDArray[np.integer[Any]]
 Image = NDArray[np.uint8]
 Bounds = tuple[Points, Points]
 """Lowest and highest coordinates [m], each of shape [3]."""
-
-_FRONT_COLORS = ("#2a6f97", "#c8553d", "#5b7f4b", "#7d5a8c")
-_BACK_COLORS = ("#f2c078", "#f3dcc0", "#e3dcae", "#e0cfe8")
-_BODY_COLORS = ("#8d99ae", "#a39b8b", "#7f9183")
-_GOAL_COLOR = "#2f9e78"
 
 # Directions to the lights, for a camera that looks along +y: they turn with it, so that what is
 # seen is lit. The key light also casts the shadow.
@@ -41,6 +36,7 @@ _CLOTH_SHINE = {"ambient": 0.36, "diffuse": 0.78, "specular": 0.1, "specular_pow
 _BODY_SHINE = {"ambient": 0.4, "diffuse": 0.7, "specular": 0.25, "specular_power": 25}
 
 _VIEW_ANGLE = 26.0  # vertical, in degrees: long enough a lens that nothing looks bent
+_SHORTEST_ARROW = 0.002  # of the size of the scene; shorter ones are left out
 _CREASE_ANGLE = 35.0  # degrees between faces of a body above which an edge is drawn sharp
 
 _INSTALL = (
@@ -55,7 +51,7 @@ class Skin:
 
     Attributes:
         faces: Vertex indices, shape [f, 3].
-        paint: Its colors.
+        paint: Its colors, none of them None.
     """
 
     faces: Triangles
@@ -129,10 +125,9 @@ class Stage:
         self._plotter.set_background(BACKGROUND)
         self._plotter.enable_anti_aliasing("msaa", multi_samples=8)
         sun = self._light(camera.azimuth)
-        self._cloths = [(skin.faces, self._add_cloth(i, skin)) for i, skin in enumerate(cloths)]
+        self._cloths = [(skin.faces, self._add_cloth(skin)) for skin in cloths]
         self._bodies = [
-            (vertices, skin.faces, self._add_body(i, vertices, skin))
-            for i, (vertices, skin) in enumerate(bodies)
+            (vertices, skin.faces, self._add_body(vertices, skin)) for vertices, skin in bodies
         ]
         self._frames: Points | None = None
         self._floor = None
@@ -152,21 +147,23 @@ class Stage:
     def add_goal(self, goal: Goal) -> None:
         """Show a shape to reach: translucent, with its border."""
         shape = self._pv.PolyData.from_regular_faces(goal.vertices, goal.faces)
-        self._plotter.add_mesh(shape, color=_GOAL_COLOR, opacity=0.25, lighting=False)
+        self._plotter.add_mesh(shape, color=GOAL_COLOR, opacity=0.25, lighting=False)
         border = shape.extract_feature_edges(
             boundary_edges=True, feature_edges=False, manifold_edges=False, non_manifold_edges=False
         )
         if border.n_cells:
             width = 0.0012 * float(np.linalg.norm(self._bounds[1] - self._bounds[0]))
             tube = border.strip(join=True).tube(radius=width)
-            self._plotter.add_mesh(tube, color=_GOAL_COLOR, ambient=0.5)
+            self._plotter.add_mesh(tube, color=GOAL_COLOR, ambient=0.5)
 
-    def draw(self, positions: Points, frames: Points) -> Image:
+    def draw(self, positions: Points, frames: Points, arrows: Points | None = None) -> Image:
         """Take one picture.
 
         Args:
             positions: Cloth vertices [m], shape [N, 3].
             frames: Of the bodies and links, shape [n, 4, 4].
+            arrows: Along the vertices of the bodies and links, at which they end [m], one body
+                after the other, shape [V, 3].
 
         Returns:
             Colors, shape [height, width, 3].
@@ -181,11 +178,24 @@ class Stage:
                 surface.move(vertices)
             casters.append((vertices, faces))
         self._frames = frames.copy()
+        if arrows is not None:
+            self._show_arrows([vertices for vertices, _ in casters[len(self._cloths) :]], arrows)
         if self._floor is not None:
             self._shadow.cast(casters)
         self._plotter.render()  # a screenshot alone would show the last picture again
         image = self._plotter.screenshot(return_img=True)
         return np.ascontiguousarray(image[..., :3])
+
+    def _show_arrows(self, ends: Sequence[Points], arrows: Points) -> None:
+        lengths = np.linalg.norm(arrows, axis=1)
+        seen = lengths > _SHORTEST_ARROW * np.linalg.norm(self._bounds[1] - self._bounds[0])
+        if not seen.any():
+            self._plotter.remove_actor("arrows")
+            return
+        cloud = self._pv.PolyData(np.concatenate(ends)[seen] - arrows[seen])
+        cloud["arrows"] = arrows[seen]
+        shapes = cloud.glyph(orient="arrows", scale="arrows", geom=self._pv.Arrow())
+        self._plotter.add_mesh(shapes, name="arrows", color=FORCE_COLOR, ambient=0.5)
 
     def _light(self, azimuth: float) -> Points:
         """Add the lights; returns the direction to the one that casts the shadow."""
@@ -205,24 +215,24 @@ class Stage:
         sun: Points = turn @ _SUN
         return sun
 
-    def _add_cloth(self, index: int, skin: Skin) -> _Surface:
+    def _add_cloth(self, skin: Skin) -> _Surface:
         vertices = np.zeros((int(skin.faces.max()) + 1, 3))
         surface = _Surface(self._pv.PolyData.from_regular_faces(vertices, skin.faces), None)
-        back = skin.paint.back_color or _BACK_COLORS[index % len(_BACK_COLORS)]
         self._plotter.add_mesh(
             surface.shown,
-            color=skin.paint.color or _FRONT_COLORS[index % len(_FRONT_COLORS)],
+            color=skin.paint.color,
             smooth_shading=True,
-            backface_params={"color": back, **_CLOTH_SHINE},
+            backface_params={"color": skin.paint.back_color, **_CLOTH_SHINE},
             **_CLOTH_SHINE,
         )
         return surface
 
-    def _add_body(self, index: int, vertices: Points, skin: Skin) -> _Surface:
+    def _add_body(self, vertices: Points, skin: Skin) -> _Surface:
         polydata = self._pv.PolyData.from_regular_faces(vertices, skin.faces)
         surface = _Surface(polydata, _CREASE_ANGLE)
-        color = skin.paint.color or _BODY_COLORS[index % len(_BODY_COLORS)]
-        self._plotter.add_mesh(surface.shown, color=color, smooth_shading=True, **_BODY_SHINE)
+        self._plotter.add_mesh(
+            surface.shown, color=skin.paint.color, smooth_shading=True, **_BODY_SHINE
+        )
         return surface
 
     def _aim(self, camera: Camera) -> None:

@@ -1,0 +1,328 @@
+"""What the commands of the command line do; each returns the sentence to say at the end."""
+
+from __future__ import annotations
+
+import platform
+import time
+import zipfile
+from collections.abc import Iterable, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from diffcloth_torch import build_info
+from diffcloth_torch.config.schema import set_values
+from diffcloth_torch.config.viewers import open_viewers
+from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.model.quantities import PARAMETERS
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.tasks.optimization import Actions, Optimization
+from diffcloth_torch.tasks.optimization import optimize as run_optimization
+from diffcloth_torch.tasks.registry import TASKS, check_document, load_task, make_task
+from diffcloth_torch.tasks.simulation import simulate
+from diffcloth_torch.tasks.statistics import (
+    replace_file,
+    rollout_statistics,
+    step_records,
+    write_metrics,
+)
+from diffcloth_torch.tasks.task import Optimizable, Task
+from diffcloth_torch.viewers.curves import draw_loss_curve
+
+__all__ = ["info", "optimize", "resume", "run"]
+
+# What a run or its pictures need beyond Python; `info` says which of them are there.
+_PACKAGES = ("torch", "numpy", "trimesh", "matplotlib", "pyvista", "imageio", "imageio-ffmpeg")
+
+# Files in a folder of results; meshes and frames are replaced by the viewers that write them.
+_METRICS, _RESUME = "metrics.json", "resume.pt"
+_RESULTS = (
+    *(_METRICS, _RESUME, "actions.pt", "actions.npz", "loss.png"),
+    *("animation.mp4", "animation.gif", "animation.png"),
+)
+
+# What may change when an optimization goes on; the rest decides what was found so far.
+_RESUMABLE = ("optimizer", "output")
+
+
+def run(
+    config: Path,
+    assignments: Iterable[str] = (),
+    out: Path | None = None,
+    *,
+    overwrite: bool = False,
+    actions: Path | None = None,
+) -> str:
+    """Simulate a configuration without optimizing.
+
+    Args:
+        config: YAML file.
+        assignments: "key=value" each, see `set_values`.
+        out: Folder for the results; by default results/ and the name of `config`.
+        overwrite: Whether results that are there already are replaced.
+        actions: File `actions.npz` of a run whose actions are used instead of the initial ones.
+
+    Raises:
+        InvalidInput: If an argument or the configuration is not accepted.
+        SimulationError: If a step fails; what came before it is kept.
+        KeyboardInterrupt: If the user ends it; the message says what is kept.
+    """
+    out = _check_folder(config, out, overwrite)
+    task = load_task(config, assignments)
+    start_actions = _read_actions(task, actions)
+    states: list[State] = []
+    start = time.perf_counter()
+    try:
+        _clear(out)
+        with open_viewers(task.config, task.scene, out, task.goals()) as viewers:
+            for state in simulate(task, start_actions):
+                viewers.show(state)
+                states.append(state)
+            seconds = time.perf_counter() - start
+    except SimulationError as error:
+        after = _after(states)
+        _write_run(task, states[1:], out, time.perf_counter() - start, str(error))
+        raise type(error)(f"{config}: {error} ({after})", report=error.report) from error
+    except KeyboardInterrupt as error:
+        after = _after(states)
+        _write_run(task, states[1:], out, time.perf_counter() - start, f"interrupted {after}")
+        raise KeyboardInterrupt(
+            f"{after} of {task.steps}: {out / _METRICS} has the steps so far; the same command "
+            "with --overwrite starts again"
+        ) from error
+    _write_run(task, states[1:], out, seconds)
+    return f"{len(states) - 1} steps in {seconds:.1f} s; results are in {out}"
+
+
+def _after(states: Sequence[State]) -> str:
+    return f"after step {len(states) - 1}" if states else "after the start"
+
+
+def _write_run(
+    task: Task, states: Sequence[State], out: Path, seconds: float, error: str | None = None
+) -> None:
+    metrics = {
+        "task": task.config.task,
+        "seconds": seconds,
+        "error": error,
+        **rollout_statistics(states),
+        "per_step": step_records(states),
+        **_values_used(task),
+    }
+    write_metrics(out / _METRICS, metrics)
+
+
+def optimize(
+    config: Path,
+    assignments: Iterable[str] = (),
+    out: Path | None = None,
+    *,
+    overwrite: bool = False,
+    actions: Path | None = None,
+) -> str:
+    """Optimize the actions of a configuration, and show the best of them.
+
+    Arguments and errors are those of `run`.
+    """
+    out = _check_folder(config, out, overwrite)
+    task = load_task(config, assignments)
+    if not isinstance(task, Optimizable):
+        able = ", ".join(name for name, kind in TASKS.items() if hasattr(kind, "loss"))
+        raise InvalidInput(
+            f"{config}: the task {task.config.task!r} has nothing to optimize: use "
+            f"`diffcloth run`; tasks that have are {able}"
+        )
+    start = _read_actions(task, actions)
+    _clear(out)
+    return _optimize(task, config, out, start, None)
+
+
+def resume(folder: Path, assignments: Iterable[str] = ()) -> str:
+    """Go on with an optimization that was interrupted, or has more iterations now.
+
+    It continues with the bits that it would have had without the interruption, if the build and
+    the type of machine are the same.
+
+    Args:
+        folder: Its results.
+        assignments: "key=value" each, of the sections `optimizer` and `output`.
+
+    Raises:
+        InvalidInput: If the folder has no such results, or another section is changed.
+    """
+    file = folder / _RESUME
+    if not file.is_file():
+        raise InvalidInput(
+            f"--resume: {folder} must hold what `diffcloth optimize` wrote: no {file}"
+        )
+    try:
+        saved = torch.load(file, weights_only=True)
+        document, source = saved["config"], Path(saved["source"])
+        start = {name: tensor.requires_grad_() for name, tensor in saved["start"].items()}
+        record = saved["found"]
+        found = None if record is None else Optimization.restore(record)
+    except (OSError, MemoryError):
+        raise
+    except Exception as error:  # whatever unpickling makes of bytes that are not its own
+        raise InvalidInput(f"--resume: {file} is not what `diffcloth optimize` wrote") from error
+    for assignment in assignments:
+        if assignment.partition(".")[0] not in _RESUMABLE:
+            raise InvalidInput(
+                f"--set with --resume: the key must be in {' or '.join(_RESUMABLE)}, "
+                f"got {assignment!r}"
+            )
+    task = make_task(check_document(set_values(document, assignments), source), source)
+    assert isinstance(task, Optimizable)
+    return _optimize(task, source, folder, start, found)
+
+
+def _optimize(
+    task: Optimizable, source: Path, out: Path, start: Actions, found: Optimization | None
+) -> str:
+    # Before the long part: a package may be missing.
+    viewers = open_viewers(task.config, task.scene, out, task.goals())
+
+    # After every iteration, so that one that is interrupted loses only itself.
+    def keep(sofar: Optimization) -> None:
+        nonlocal found
+        found = sofar
+        _write_optimization(task, sofar, out)
+        _write_resume(task, source, start, sofar, out)
+
+    try:
+        _write_resume(task, source, start, found, out)
+        found = run_optimization(task, report=keep, start=start, found=found)
+    except KeyboardInterrupt as error:
+        done = 0 if found is None else len(found.history)
+        best = "" if found is None else f", the best with a loss of {found.best.loss:.5f}"
+        raise KeyboardInterrupt(
+            f"in iteration {done}: {out} has {done} finished iterations{best}; go on with  "
+            f"diffcloth optimize --resume {out}"
+        ) from error
+    draw_loss_curve(out / "loss.png", found.metrics()["losses"])
+    with viewers:
+        for state in [task.initial_state(), *found.best.states]:
+            viewers.show(state)
+    return (
+        f"loss {found.first.loss:.5f} -> {found.best.loss:.5f} in {len(found.history)} iterations, "
+        f"{found.seconds:.1f} s; results are in {out}"
+    )
+
+
+def _write_optimization(task: Task, found: Optimization, out: Path) -> None:
+    metrics = {
+        "task": task.config.task,
+        **found.metrics(),
+        "per_step_of_best": step_records(found.best.states),
+        **_values_used(task),
+    }
+    write_metrics(out / _METRICS, metrics)
+    torch.save({"best": found.best.actions, "initial": found.first.actions}, out / "actions.pt")
+    arrays: dict[str, Any] = {name: a.numpy() for name, a in found.best.actions.items()}
+    np.savez(out / "actions.npz", **arrays)
+
+
+def _write_resume(
+    task: Task, source: Path, start: Actions, found: Optimization | None, out: Path
+) -> None:
+    saved = {
+        "config": task.config.model_dump(mode="json"),
+        "source": str(source.resolve()),
+        "start": {name: tensor.detach() for name, tensor in start.items()},
+        "found": None if found is None else found.record(),
+    }
+    with replace_file(out / _RESUME) as part:
+        torch.save(saved, part)
+
+
+def _values_used(task: Task) -> dict[str, Any]:
+    """The configuration, and what stood for each value that it leaves to a default.
+
+    `used` has the options of contact and solver, the bending model of each cloth, and all
+    parameters but the rest positions, which are those of the mesh.
+    """
+    simulator = task.simulator
+    parameters = simulator.parameters()
+    values = {name: getattr(parameters, name) for name in PARAMETERS if name != "rest_positions"}
+    given = {name: value.tolist() for name, value in values.items() if value is not None}
+    chosen = {name: given[name] for name in ("barrier_distance", "barrier_stiffness")}
+    return {
+        "config": task.config.model_dump(mode="json"),
+        "used": {
+            "contact": vars(simulator.contact) | chosen,
+            "solver": dict(vars(simulator.solver)),
+            "bending_models": {
+                name: cloth.bending_model
+                for name, cloth in zip(task.scene.cloth_names, task.scene.cloths, strict=True)
+            },
+            "parameters": given,
+        },
+    }
+
+
+def _check_folder(config: Path, out: Path | None, overwrite: bool) -> Path:
+    folder = Path("results") / config.stem if out is None else out
+    if folder.is_dir() and any(folder.iterdir()) and not overwrite:
+        going_on = f", `optimize --resume {folder}` goes on" if (folder / _RESUME).exists() else ""
+        raise InvalidInput(
+            f"--out: {folder} holds results already: --overwrite replaces them{going_on}, and "
+            "--out names another folder"
+        )
+    return folder
+
+
+def _clear(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in _RESULTS:
+        (folder / name).unlink(missing_ok=True)
+
+
+def _read_actions(task: Task, file: Path | None) -> Actions:
+    """The initial actions of a task, or those in a file."""
+    actions = task.actions()
+    if file is None:
+        return actions
+    if not actions:
+        raise InvalidInput(f"--actions: the task {task.config.task!r} has no actions")
+    try:
+        with np.load(file, allow_pickle=False) as arrays:
+            given = {name: arrays[name] for name in arrays.files}
+    except (ValueError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+        raise InvalidInput(f"--actions: {file} is not an `actions.npz` of a run") from error
+    wanted = {name: list(tensor.shape) for name, tensor in actions.items()}
+    got = {name: list(array.shape) for name, array in given.items()}
+    if got != wanted:
+        raise InvalidInput(f"--actions: {file} must hold {_shapes(wanted)}, got {_shapes(got)}")
+    for name, array in given.items():
+        if array.dtype != np.float64 or not np.isfinite(array).all():
+            raise InvalidInput(f"--actions: {name!r} of {file} must be finite and float64")
+    return {name: torch.from_numpy(given[name]).requires_grad_() for name in actions}
+
+
+def _shapes(shapes: dict[str, list[int]]) -> str:
+    return ", ".join(f"{name} {shape}" for name, shape in shapes.items()) or "nothing"
+
+
+def info() -> str:
+    """Say what was built in, and which packages are there."""
+    rows: dict[str, Any] = {
+        "diffcloth-torch": _version("diffcloth-torch"),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        **{package: _version(package) for package in _PACKAGES},
+        "torch threads": torch.get_num_threads(),
+        "tasks": ", ".join(TASKS),
+    }
+    rows |= {f"core: {name}": value for name, value in build_info().items()}
+    width = max(map(len, rows))
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"

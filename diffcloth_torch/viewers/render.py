@@ -1,0 +1,114 @@
+"""Pictures of a scene and its states in one call, without a configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.viewers.look import Camera, Pictures
+from diffcloth_torch.viewers.record import Record
+
+__all__ = ["render"]
+
+_ONE_STATE_FPS = 25.0
+
+
+def render(
+    scene: Scene,
+    states: State | Sequence[State],
+    path: str | Path,
+    *,
+    size: Sequence[int] = Pictures.size,
+    fps: float | None = None,
+    moments: int = Pictures.sheet,
+    labels: bool = True,
+    contact_forces: bool = False,
+    camera: Camera | None = None,
+) -> None:
+    """Draw states: an animation (.mp4, .gif), or an overview of some moments (.png).
+
+        dc.render(scene, [start, *states], "motion.mp4")
+        dc.render(scene, states[-1], "end.png", contact_forces=True)
+
+    Args:
+        scene: What the states are of.
+        states: In the order of time; none of them a batch.
+        path: File to write, in a folder that exists; a file that is there is replaced.
+        size: Width and height of a picture [pixels], even numbers from 64 to 4096.
+        fps: Pictures per second of an animation, > 0; None plays in real time.
+        moments: How many pictures an overview has, from the first to the last, >= 1.
+        labels: Whether the time and a legend are written.
+        contact_forces: Whether arrows show the contact forces on bodies and links
+            (`State.body_forces`).
+        camera: Where pictures are taken from; None looks from the front, a little from above.
+
+    Raises:
+        InvalidInput: If an argument is not accepted, or a package is missing: the message says how
+            to install it.
+        TypeError: If `states` holds something else.
+    """
+    path = Path(path)
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in ("mp4", "gif", "png"):
+        raise InvalidInput(f"render: `path` must end in .mp4, .gif or .png, got {str(path)!r}")
+    if not path.parent.is_dir():
+        raise InvalidInput(f"render: the folder of `path` must exist, got {str(path)!r}")
+    shown = [states] if isinstance(states, State) else list(states)
+    _check_states(scene, shown)
+    if len(size) != 2 or any(n % 2 or not 64 <= n <= 4096 for n in size):
+        raise InvalidInput(f"render: `size` must be two even numbers in 64 .. 4096, got {size}")
+    if moments < 1:
+        raise InvalidInput(f"render: `moments` must be at least 1, got {moments}")
+    if fps is not None and not 0 < fps < np.inf:
+        raise InvalidInput(f"render: `fps` must be greater than 0, got {fps}")
+
+    video: Literal["mp4", "gif", "none"] = "mp4" if kind == "mp4" else "gif"
+    pictures = Pictures(
+        size=size,
+        video="none" if kind == "png" else video,
+        sheet=moments if kind == "png" else 0,
+        labels=labels,
+        contact_forces=contact_forces,
+        camera=Camera() if camera is None else camera,
+    )
+    real_time = _real_time(shown)
+    with Record(
+        path.parent,
+        scene,
+        fps=real_time if fps is None else fps,
+        pictures=pictures,
+        name=path.stem,
+    ) as record:
+        for state in shown:
+            record.show(state)
+
+
+def _check_states(scene: Scene, states: Sequence[State]) -> None:
+    if not states:
+        raise InvalidInput("render: `states` must hold at least one state")
+    vertices = sum(len(cloth.vertices) for cloth in scene.cloths)
+    for i, state in enumerate(states):
+        if not isinstance(state, State):
+            raise TypeError(f"render: `states` must be states, got {type(state).__name__} at [{i}]")
+        if state.batch_size is not None:
+            raise InvalidInput(f"render: states[{i}] is a batch; take one of it by its index")
+        shapes = {"positions": (vertices, 3), "body_poses": (len(scene.bodies), 7)}
+        for name, shape in shapes.items():
+            got = tuple(getattr(state, name).shape)
+            if got != shape:
+                raise InvalidInput(
+                    f"render: states[{i}] must be of this scene, whose `{name}` have shape "
+                    f"{list(shape)}, got {list(got)}"
+                )
+
+
+def _real_time(states: Sequence[State]) -> float:
+    """Pictures per second that take as long as the motion."""
+    duration = float(states[-1].time) - float(states[0].time)
+    return (len(states) - 1) / duration if duration > 0 else _ONE_STATE_FPS
