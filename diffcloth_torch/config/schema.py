@@ -175,6 +175,23 @@ class Disk(Section):
     edge_length: Positive
 
 
+class Strip(Section):
+    """Strip along x, bent downwards by `bend` degrees about an axis along y, at the origin.
+
+    Its `width` [m] is one, or those of its two ends. The middle of the bend is at the share
+    `middle` of its length.
+    """
+
+    kind: Literal["strip"]
+    length: Positive
+    width: Lengths2
+    rows: Annotated[int, Ge(2)]
+    columns: Annotated[int, Ge(2)]
+    bend: Annotated[float, Ge(0), Le(180)] = 0.0
+    radius: Positive = 0.1
+    middle: Annotated[float, Gt(0), Lt(1)] = 0.5
+
+
 class Box(Section):
     """Cuboid with sides of `size` [m]."""
 
@@ -262,7 +279,7 @@ class ClothSection(Section):
     """A cloth."""
 
     name: str
-    shape: Annotated[Grid | Disk | ClothFile, Discriminator("kind")]
+    shape: Annotated[Grid | Disk | Strip | ClothFile, Discriminator("kind")]
     pose: PoseSection = PoseSection()
     material: MaterialSection = MaterialSection()
     pins: dict[str, Selection] = {}

@@ -9,7 +9,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Camera", "Goal", "Paint", "Pictures"]
+from diffcloth_torch.geometry import shapes
+
+__all__ = ["Camera", "Goal", "Paint", "Pictures", "marker"]
+
+_MARKER_SUBDIVISIONS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,3 +83,9 @@ class Goal:
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
+
+
+def marker(position: NDArray[np.float64], radius: float) -> Goal:
+    """Mark a point to reach, of shape [3], by a small sphere [m]."""
+    vertices, faces = shapes.sphere(radius, _MARKER_SUBDIVISIONS)
+    return Goal(vertices + position, faces.astype(np.int32))
