@@ -149,7 +149,9 @@ def _generated(name: str, generate: Any, arguments: dict[str, Any]) -> Any:
         raise InvalidInput(f"`scene`: the shape of {name!r} cannot be made: {error}") from error
 
 
-def select_vertices(name: str, selection: Selection, vertices: NDArray[np.float64]) -> NDArray[np.int64]:
+def select_vertices(
+    name: str, selection: Selection, vertices: NDArray[np.float64]
+) -> NDArray[np.int64]:
     """Vertices that a selection names, in increasing order but for a list, which keeps its own."""
     if selection.vertices is not None:
         return np.array(selection.vertices)

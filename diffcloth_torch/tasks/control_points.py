@@ -1,7 +1,7 @@
 """Control points: springs pull points of cloths along trajectories to targets, through contact.
 
-Nothing is optimized: what is judged is whether the cloths get through without intersecting, and how
-far from their targets the points end.
+Nothing is optimized: what counts is whether the cloths get there without intersecting, and how far
+from their targets the points end.
 
 References:
     The experiments "self-intersection" and "cloth and rigid body" of the paper, section V.B.
@@ -24,7 +24,10 @@ __all__ = ["ControlPoints", "ControlPointsConfig"]
 
 
 class ControlPointsConfig(RunConfig):
-    """A scene with soft pins, the control points; targets are shown with a radius [m]."""
+    """A scene with soft pins, each group of which is a control point.
+
+    Targets are shown with the radius `marker_radius` [m].
+    """
 
     marker_radius: Positive = 0.01
 
@@ -44,38 +47,24 @@ class ControlPoints(Drape):
         """Build the scene of a configuration that was read from the file `source`."""
         super().__init__(config, source)
         self._radius = config.marker_radius
-        groups = [
-            (self.simulator.slices[name].start, pins)
-            for name, cloth in zip(self.scene.cloth_names, self.scene.cloths, strict=True)
-            for pins in cloth.soft_pins.values()
-        ]
-        self._points = [first + torch.tensor(pins) for first, pins in groups]
-        self._targets = self._last_targets()
-
-    def _last_targets(self) -> list[Tensor]:
-        """Where the springs of each group pull to in the end, shape [q, 3] each."""
-        targets = self.initial_state().soft_pin_targets
-        parts = list(targets.split([len(points) for points in self._points]))
-        moved = self._prescribed[-1].soft_pins or {}
-        names = [
-            f"{name}/{pins}"
-            for name, cloth in zip(self.scene.cloth_names, self.scene.cloths, strict=True)
-            for pins in cloth.soft_pins
-        ]
-        return [moved.get(name, part) for name, part in zip(names, parts, strict=True)]
+        self._points: list[Tensor] = []
+        self._targets: list[Tensor] = []
+        for name, cloth in zip(self.scene.cloth_names, self.scene.cloths, strict=True):
+            first = self.simulator.slices[name].start
+            for pins, vertices in cloth.soft_pins.items():
+                moved = self._motions["soft_pins"].get(f"{name}/{pins}")
+                held = torch.tensor(cloth.vertices[vertices])
+                self._points.append(first + torch.tensor(vertices))
+                self._targets.append((held if moved is None else moved[-1]).mean(dim=0))
 
     def distances(self, state: State) -> Tensor:
-        """Distance of each group of control points to its last target, shape [groups], in meters.
+        """Distance of each control point to its last target [m], shape [groups].
 
-        It is that of their means: a group is one point that is held by several vertices.
+        A group of soft pins is one control point, held by several vertices: their mean counts.
         """
-        return torch.stack(
-            [
-                (state.positions[points].mean(dim=0) - target.mean(dim=0)).norm()
-                for points, target in zip(self._points, self._targets, strict=True)
-            ]
-        )
+        points = torch.stack([state.positions[rows].mean(dim=0) for rows in self._points])
+        return (points - torch.stack(self._targets)).norm(dim=1)
 
     def goals(self) -> list[Goal]:
-        """Mark the last target of each group."""
-        return [marker(target.mean(dim=0).numpy(), self._radius) for target in self._targets]
+        """Mark the last target of each control point."""
+        return [marker(target.numpy(), self._radius) for target in self._targets]
