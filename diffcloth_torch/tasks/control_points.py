@@ -63,7 +63,8 @@ class ControlPoints(Drape):
         A group of soft pins is one control point, held by several vertices: their mean counts.
         """
         points = torch.stack([state.positions[rows].mean(dim=0) for rows in self._points])
-        return (points - torch.stack(self._targets)).norm(dim=1)
+        distances: Tensor = (points - torch.stack(self._targets)).norm(dim=1)
+        return distances
 
     def goals(self) -> list[Goal]:
         """Mark the last target of each control point."""

@@ -20,11 +20,11 @@ __all__ = ["TASKS", "load_config", "load_task", "make_task"]
 
 TASKS: dict[str, Any] = {
     "drape": Drape,
-    "control_points": ControlPoints,
-    "two_cloths": TwoCloths,
     "hit_cloth": HitCloth,
     "push_cube": PushCube,
     "grasp_cloth": GraspCloth,
+    "two_cloths": TwoCloths,
+    "control_points": ControlPoints,
 }
 """Name -> class with a `Config` and a constructor that takes one and the path it was read from."""
 

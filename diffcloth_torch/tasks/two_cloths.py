@@ -18,6 +18,7 @@ from torch import Tensor
 
 from diffcloth_torch.config.scenes import Motions, select_vertices
 from diffcloth_torch.config.schema import Positive, Section, Selection, Vector3
+from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.sim.controls import Control
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.optimization import Controller
@@ -92,6 +93,11 @@ class TwoCloths(Reach):
         """Share of each vertex of the scene in a force, shape [N]."""
         cloth = self.scene.cloths[self.scene.cloth_names.index(section.cloth)]
         chosen = select_vertices(f"{key}.at", section.at, cloth.vertices)
+        if chosen.max() >= len(cloth.vertices):
+            raise InvalidInput(
+                f"`{key}.at.vertices` must be between 0 and {len(cloth.vertices) - 1}, vertices of "
+                f"{section.cloth!r}, got {chosen.max()}"
+            )
         shares = torch.zeros(len(self.simulator.initial_state().positions), dtype=torch.float64)
         first = self.simulator.slices[section.cloth].start
         shares[first + torch.from_numpy(chosen)] = 1 / len(chosen)
