@@ -183,19 +183,22 @@ def table(title: str, columns: Sequence[str], rows: Sequence[tuple[str, list[str
 
 @click.command(help=__doc__.replace("\n\n    ", "\n\n\b\n    "))
 @click.option("--only", type=click.Choice(list(EXPERIMENTS)), help="One of the experiments.")
+@click.option(
+    "--method", "methods", multiple=True, type=click.Choice(list(METHODS)), help="By default all."
+)
 @click.option("--quick", is_flag=True, help="Small meshes and few steps.")
 @click.option(
     "--pictures",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     help="Folder for a picture of each experiment: the start, then the end by each method.",
 )
-def main(only: str | None, quick: bool, pictures: Path | None) -> None:
+def main(only: str | None, methods: tuple[str, ...], quick: bool, pictures: Path | None) -> None:
     torch.set_num_threads(1)
     for name in [only] if only else EXPERIMENTS:
         experiment = EXPERIMENTS[name]
         rows, ends, errors = [], [], []
-        for method, changes in METHODS.items():
-            assignments = [*changes, "simulation.solver.throw=false"]
+        for method in methods or METHODS:
+            assignments = [*METHODS[method], "simulation.solver.throw=false"]
             assignments += experiment.frictionless if "frictionless" in method else ()
             assignments += experiment.short if quick else ()
             task = load_task(CONFIGS / experiment.config, assignments)

@@ -88,6 +88,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "coupled": ("coupled", {}),
     "split, mass": ("split", {"metric": "mass"}),
     "split, identity": ("split", {"metric": "identity"}),
+    "split, elastic": ("split", {"metric": "elastic"}),
 }
 """Name -> scheme and options of the solver."""
 
@@ -203,14 +204,18 @@ def row(simulator: dc.Simulator, rollout: Rollout) -> list[str]:
 
 @click.command(help=__doc__.replace("\n\n", "\n\n\b\n"))
 @click.option("--scene", "names", multiple=True, type=click.Choice(list(SCENES)))
+@click.option(
+    "--method", "methods", multiple=True, type=click.Choice(list(METHODS)), help="By default all."
+)
 @click.option("--size", default=20, show_default=True, help="Vertices along a side of the sheet.")
 @click.option("--quick", is_flag=True, help="7 x 7 vertices, 10 steps.")
-def main(names: tuple[str, ...], size: int, quick: bool) -> None:
+def main(names: tuple[str, ...], methods: tuple[str, ...], size: int, quick: bool) -> None:
     torch.set_num_threads(1)
     for name in names or SCENES:
         scene = SCENES[name]
         rows, failures = [], []
-        for method, (scheme, options) in METHODS.items():
+        for method in methods or METHODS:
+            scheme, options = METHODS[method]
             solver = dc.SolverOptions(tolerance=1e-8, **options)
             made = scene.make(7 if quick else size)
             simulator = dc.Simulator(made, DT, scheme=scheme, solver=solver)
