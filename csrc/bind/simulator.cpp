@@ -336,9 +336,11 @@ nb::object Simulator::find_overlap(const nb::dict& inputs) const {
 }
 
 step::Metric to_metric(const std::string& name) {
+  if (name == "elastic") return step::Metric::kElastic;
   if (name == "mass") return step::Metric::kMass;
   if (name == "identity") return step::Metric::kIdentity;
-  throw nb::value_error(("metric must be one of 'mass', 'identity', got '" + name + "'").c_str());
+  throw nb::value_error(
+      ("metric must be one of 'elastic', 'mass', 'identity', got '" + name + "'").c_str());
 }
 
 step::Description describe(const Doubles& vertices,

@@ -7,8 +7,9 @@
 //   impulse            r = h s E g(x)          (no other force acts along E: the step's momentum)
 //   relative velocity  u = E (x - x_n) / (h s) - v_out,
 //
-// and (r, u) obey the law of Signorini and Coulomb: r = Phi(r - m u), see projective/coulomb.h. So the
-// impulses are no unknowns. Elsewhere g = 0. Let P = I - n n^T. The equations along E of each case are
+// and (r, u) obey the law of Signorini and Coulomb: r = Phi(r - rho u), see projective/coulomb.h; which
+// masses rho > 0 has no influence on the solution, and those of h^2 times the diagonal of the constant
+// matrix M / h^2 + L predict its cases well. So the impulses are no unknowns. Elsewhere g = 0. Let P = I - n n^T. The equations along E of each case are
 //
 //   taking off   E g = 0
 //   sticking     u = 0
@@ -21,10 +22,10 @@
 //
 //   K w = L H w + F w.
 //
-// K is not symmetric, but S = Z H Z + F + (I - Z) M / h^2 is: the system without the coupling of friction
+// K is not symmetric, but S = Z H Z + F + (I - Z) rho / h^2 is: the system without the coupling of friction
 // and normal force. It has the pattern of H, its Cholesky factor preconditions GMRES, and shows that
 // the solution is a minimum where the friction is frozen. Off the solution the same operators, with t and k
-// of s = r - m u, are those of a semismooth Newton method.
+// of s = r - rho u, are those of a semismooth Newton method.
 //
 // Adjoint. For the cotangent g_x of x, let lambda = Z lambda solve  K^T lambda = Z (g_x + H eta), with eta
 // those of the forces E g at nodes, which the bodies feel. Then z = L^T lambda - eta goes through the
@@ -213,6 +214,7 @@ class NodalSystem {
         p_(stage.problem_),
         contacts_(stage.contacts_),
         partner_(stage.partner_),
+        inertia_(stage.inertia_),
         inv_h_sq_(1.0 / (p_.h * p_.h)) {}
 
   /// What the equations are at a point.
@@ -221,7 +223,7 @@ class NodalSystem {
     Array g;  ///< of all points
     std::vector<Coulomb> laws;
     std::vector<Vec3> u;    ///< relative velocities [m/s]
-    double merit = 0.0;     ///< sum of |residual|^2 / mass [J]
+    double merit = 0.0;     ///< sum of |residual|^2 / rho [J]
   };
 
   void look(Point& at) const {
@@ -241,14 +243,15 @@ class NodalSystem {
     at.merit = 0.0;
     for (std::size_t i = 0; i < p_.masses.size(); ++i) {
       if (p_.scene.prescribed[i] != 0) continue;
-      at.merit += row(residual.data(), static_cast<Index>(i)).squaredNorm() / p_.masses[i];
+      at.merit += row(residual.data(), static_cast<Index>(i)).squaredNorm() / inertia_[i];
     }
   }
 
+  /// rho of a contact: that of the vertex, or what two of them have against each other.
   double mass(const NodalContact& c) const {
-    const double m = p_.masses[c.vertex];
+    const double m = inertia_[c.vertex];
     if (c.partner < 0) return m;
-    return m * p_.masses[c.partner] / (m + p_.masses[c.partner]);
+    return m * inertia_[c.partner] / (m + inertia_[c.partner]);
   }
 
   Vec3 velocity(const NodalContact& c, const Array& x) const {
@@ -425,6 +428,7 @@ class NodalSystem {
   const Problem& p_;
   const std::vector<NodalContact>& contacts_;
   const std::vector<Index>& partner_;
+  const Array& inertia_;
   double inv_h_sq_;
 };
 
@@ -527,6 +531,12 @@ NodalStage::NodalStage(Problem& problem, bool vertices_touch)
     contacts_ = projective::find_contacts(swept(problem), obstacles_, &spheres);
   } else {
     contacts_ = projective::find_contacts(swept(problem), obstacles_, nullptr);
+  }
+  if (contacts_.empty()) return;
+  const elastic::ConstantForm form = problem.constant_form();
+  for (std::size_t i = 0; i < problem.masses.size(); ++i) {
+    const double stiffness = form.values()[form.pattern().column_start()[i]];
+    inertia_.push_back(problem.masses[i] + problem.h * problem.h * stiffness);
   }
   partner_.assign(problem.masses.size(), -1);
   bool pairs = false;

@@ -50,7 +50,8 @@ class NodalStage {
   Problem& problem_;
   std::vector<projective::Obstacle> obstacles_;
   std::vector<projective::NodalContact> contacts_;
-  std::vector<Index> partner_;        ///< [N] vertex in contact with each, or -1
+  std::vector<Index> partner_;          ///< [N] vertex in contact with each, or -1
+  std::vector<double> inertia_;         ///< [N] rho, see nodal_stage.cpp [kg]
   std::unique_ptr<Potential> pattern_;  ///< couplings of pairs; null without pairs
 };
 

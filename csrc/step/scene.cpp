@@ -193,7 +193,9 @@ Scene::Scene(Description description)
           with_nodes(topology.vertex_count, elastic::cliques(topology, stencils), mechanisms),
           fixed_rows(prescribed, topology.vertex_count, mechanisms)),
       diagonal_assemblies(with_nodes(topology.vertex_count, {}, mechanisms),
-                          fixed_rows(prescribed, topology.vertex_count, mechanisms)) {
+                          fixed_rows(prescribed, topology.vertex_count, mechanisms)),
+      constant_matrices(elastic_assemblies.base(),
+                        {prescribed.begin(), prescribed.begin() + topology.vertex_count}) {
   given.bodies.pose = surface_poses(mechanisms);
   slots = elastic::slots(topology, stencils, elastic_assemblies.base());
 }

@@ -14,6 +14,7 @@
 #include "elastic/elastic.h"
 #include "mesh/rest_shape.h"
 #include "mesh/topology.h"
+#include "projective/constant_matrix.h"
 #include "projective/nodal_contact.h"
 #include "solver/assembly_cache.h"
 #include "solver/walk.h"
@@ -23,7 +24,7 @@ namespace diffcloth::step {
 class Scheme;
 
 /// Norm of the contact stage of `split`.
-enum class Metric : std::uint8_t { kMass, kIdentity };
+enum class Metric : std::uint8_t { kElastic, kMass, kIdentity };
 
 /// What a simulator is made from.
 struct Description {
@@ -46,7 +47,7 @@ struct Description {
   bool self_contact = true;
   double dt = 0.01;
   std::string scheme = "coupled";
-  Metric metric = Metric::kMass;
+  Metric metric = Metric::kElastic;
   int friction_iterations = 2;
   solver::Options options{};
 };
@@ -78,8 +79,9 @@ struct Scene {
   std::vector<projective::FaceSearch> face_search;  ///< [surfaces of bodies] where nodes touch them
   elastic::Slots slots;
 
-  mutable solver::AssemblyCache elastic_assemblies;   ///< over the elastic pattern
-  mutable solver::AssemblyCache diagonal_assemblies;  ///< over isolated vertices
+  mutable solver::AssemblyCache elastic_assemblies;           ///< over the elastic pattern
+  mutable solver::AssemblyCache diagonal_assemblies;          ///< over isolated vertices
+  mutable projective::ConstantMatrixCache constant_matrices;  ///< over the elastic pattern
 };
 
 /// Rest quantities that weigh contacts, for a rest shape of the cloths.

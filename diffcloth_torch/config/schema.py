@@ -405,7 +405,7 @@ class SolverSection(Section):
     tolerance: Positive | None = None
     max_iterations: Annotated[int, Ge(1)] | None = None
     throw: bool | None = None
-    metric: Literal["mass", "identity"] | None = None
+    metric: Literal["elastic", "mass", "identity"] | None = None
 
 
 class SimulationSection(Section):

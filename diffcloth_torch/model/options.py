@@ -10,7 +10,7 @@ from diffcloth_torch.model.quantities import check_parameter
 __all__ = ["COUPLINGS", "METRICS", "SCHEMES", "ContactOptions", "SolverOptions"]
 
 SCHEMES = ("coupled", "split", "projective")
-METRICS = ("mass", "identity")
+METRICS = ("elastic", "mass", "identity")
 COUPLINGS = ("monolithic", "rigid_to_cloth", "cloth_to_rigid")
 
 
@@ -57,13 +57,15 @@ class SolverOptions:
         max_iterations: Newton iterations that a step may take over all its solves, >= 1.
         throw: Whether a step that does not converge raises `NotConverged`; otherwise the last
             feasible iterate comes back with `report.converged` False.
-        metric: Norm of the contact stage of the "split" scheme: "mass" or "identity".
+        metric: Norm of the contact stage of the scheme "split": "elastic" (the masses plus h^2
+            times the constant matrix of Projective Dynamics), "mass", or "identity" (the paper's
+            Eq. 22). None means "elastic" for "split"; the others have no choice.
     """
 
     tolerance: float = 1e-6
     max_iterations: int = 200
     throw: bool = True
-    metric: str = "mass"
+    metric: str | None = None
 
     def __post_init__(self) -> None:
         tolerance = check_number(
@@ -73,4 +75,5 @@ class SolverOptions:
         iterations = check_count("SolverOptions: `max_iterations`", self.max_iterations, 1)
         object.__setattr__(self, "max_iterations", iterations)
         object.__setattr__(self, "throw", check_bool("SolverOptions: `throw`", self.throw))
-        check_choice("SolverOptions: `metric`", self.metric, METRICS)
+        if self.metric is not None:
+            check_choice("SolverOptions: `metric`", self.metric, METRICS)

@@ -131,7 +131,8 @@ class Simulator:
         self.dt = check_number("Simulator: `dt`", dt, POSITIVE, instead=instead)
         self.scheme = check_choice("Simulator: `scheme`", scheme, SCHEMES)
         self.coupling = check_choice("Simulator: `coupling`", coupling, COUPLINGS)
-        if scheme != "split" and solver.metric != _DEFAULT_SOLVER.metric:
+        # The other schemes measure inertia in the masses; "mass", once the default, says just that.
+        if scheme != "split" and solver.metric not in (None, "mass"):
             raise InvalidInput(
                 f"Simulator: `solver.metric` {solver.metric!r} needs scheme 'split', got {scheme!r}"
             )
