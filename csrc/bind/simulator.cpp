@@ -386,6 +386,15 @@ step::Description describe(const Doubles& vertices,
   return d;
 }
 
+projective::PrimitiveKind to_primitive(const std::string& kind) {
+  using enum projective::PrimitiveKind;
+  if (kind == "plane") return kPlane;
+  if (kind == "sphere") return kSphere;
+  if (kind == "capsule") return kCapsule;
+  if (kind == "box") return kBox;
+  return kNone;
+}
+
 /// Trees of links, from the arrays that say what they are; see bodies::MechanismsDescription.
 bodies::MechanismsDescription describe_mechanisms(const nb::kwargs& k) {
   const auto doubles = [&](const char* name) { return to_vector(nb::cast<Doubles>(k[name])); };
@@ -475,6 +484,14 @@ void simulator(nb::module_& m) {
                  nb::cast<std::string>(k["metric"]), nb::cast<int>(k["friction_iterations"]),
                  nb::cast<double>(k["tolerance"]), nb::cast<int>(k["max_iterations"]));
              if (k.contains("tree_free")) description.mechanisms = describe_mechanisms(k);
+             if (k.contains("primitive_kinds")) {
+               const auto sizes = doubles("primitive_sizes");
+               for (const auto& kind : nb::cast<std::vector<std::string>>(k["primitive_kinds"])) {
+                 const auto i = static_cast<Index>(description.primitives.size());
+                 description.primitives.push_back(
+                     {.kind = to_primitive(kind), .size = row(sizes.data(), i)});
+               }
+             }
              if (k.contains("link_names")) {
                description.link_names = nb::cast<std::vector<std::string>>(k["link_names"]);
              }

@@ -15,6 +15,7 @@
 #include "mesh/rest_shape.h"
 #include "mesh/topology.h"
 #include "projective/constant_matrix.h"
+#include "projective/nodal_contact.h"
 #include "solver/assembly_cache.h"
 #include "solver/walk.h"
 
@@ -39,6 +40,9 @@ struct Description {
   bodies::MechanismsDescription mechanisms;         ///< empty: every body is a tree of one link
   std::vector<std::array<Index, 3>> body_faces;     ///< indices into the bodies' vertices
   std::vector<std::array<Index, 2>> ignored_pairs;  ///< pairs of surfaces that never touch
+  /// [surfaces of bodies] of those that cloths touch at their nodes, instead of by the barrier;
+  /// empty: none
+  std::vector<projective::Primitive> primitives;
   std::vector<std::string> link_names;              ///< of the last surfaces; before come bodies
   bool self_contact = true;
   double dt = 0.01;
@@ -72,6 +76,7 @@ struct Scene {
   contact::RestMeasures measures;           ///< of given.rest_vertices and the bodies
   contact::FeatureWeights feature_weights;  ///< likewise
   contact::BroadPhase broad_phase;
+  std::vector<projective::FaceSearch> face_search;  ///< [surfaces of bodies] where nodes touch them
   elastic::Slots slots;
 
   mutable solver::AssemblyCache elastic_assemblies;           ///< over the elastic pattern

@@ -9,9 +9,8 @@
 #include <utility>
 
 #include "elastic/elastic_nearness.h"
-#include "solver/newton.h"
 #include "step/contact_stage.h"
-#include "step/motion.h"
+#include "step/elastic_stage.h"
 
 namespace diffcloth::step {
 namespace {
@@ -83,22 +82,6 @@ class Nearness {
   std::optional<elastic::ElasticNearness> elastic_;
 };
 
-/// x^D: pins are at their targets, and so are the bodies, which nothing here looks at.
-Array solve_elastic_stage(const Forward& step) {
-  Problem& problem = step.problem;
-  const solver::Objective f = problem.objective(problem.inertia, problem.elastic_potentials(),
-                                                problem.scene.elastic_assemblies);
-  Array x = problem.predicted(problem.inertia.target().data());
-  // Its way is no motion of the cloth.
-  auto* const path = std::exchange(step.context.path, nullptr);
-  const solver::Outcome outcome =
-      solver::minimize(f, x, Motion(problem), nullptr, nullptr, step.context);
-  step.context.path = path;
-  merge(outcome, step.report);
-  step.factors.push_back(outcome.factor);
-  return x;
-}
-
 }  // namespace
 
 std::vector<Field> Split::tape(const Scene& scene) const {
@@ -110,9 +93,8 @@ std::vector<Field> Split::tape(const Scene& scene) const {
 
 void Split::forward(const Forward& step, Array& x, double* body_forces) const {
   Problem& problem = step.problem;
-  Array x_d = solve_elastic_stage(step);
+  Array x_d = ElasticStage(problem, false).forward(step, body_forces);
   x_d.resize(problem.cloth_size);
-  if (!step.tape.empty()) std::ranges::copy(x_d, step.tape["elastic"]);
   Nearness(problem, x_d).stage().forward(step, x, body_forces);
 }
 
@@ -123,13 +105,9 @@ void Split::backward(const Backward& step) const {
   nearness.stage().backward(step, step.cotangents.rows);
   nearness.add_masses_bar(step.cotangents.masses);
 
-  const solver::Objective f = problem.objective(problem.inertia, problem.elastic_potentials(),
-                                                problem.scene.elastic_assemblies);
   Array g = nearness.target_bar();
   g.resize(problem.coordinates.size(), 0.0);
-  const Array x = problem.predicted(x_d);
-  problem.coordinates.stand_at(x.data());
-  pull_back_solve(step, f, x, step.factors.empty() ? nullptr : step.factors.front(), g, nullptr);
+  ElasticStage(problem, false).backward(step, g, step.cotangents.body_forces);
 }
 
 }  // namespace diffcloth::step

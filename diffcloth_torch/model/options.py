@@ -9,7 +9,7 @@ from diffcloth_torch.model.quantities import check_parameter
 
 __all__ = ["COUPLINGS", "METRICS", "SCHEMES", "ContactOptions", "SolverOptions"]
 
-SCHEMES = ("coupled", "split")
+SCHEMES = ("coupled", "split", "projective")
 METRICS = ("elastic", "mass", "identity")
 COUPLINGS = ("monolithic", "rigid_to_cloth", "cloth_to_rigid")
 
