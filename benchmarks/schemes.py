@@ -89,6 +89,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "split, mass": ("split", {"metric": "mass"}),
     "split, identity": ("split", {"metric": "identity"}),
     "split, elastic": ("split", {"metric": "elastic"}),
+    "projective": ("projective", {}),
 }
 """Name -> scheme and options of the solver."""
 

@@ -430,7 +430,7 @@ class SimulationSection(Section):
 
     dt: Positive
     steps: Annotated[int, Ge(1)]
-    scheme: Literal["coupled", "split"] = "coupled"
+    scheme: Literal["coupled", "split", "projective"] = "coupled"
     coupling: Literal["monolithic", "rigid_to_cloth", "cloth_to_rigid"] = "monolithic"
     contact: ContactSection = ContactSection()
     solver: SolverSection = SolverSection()
