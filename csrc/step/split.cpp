@@ -6,9 +6,11 @@
 
 #include <algorithm>
 #include <optional>
+#include <string_view>
 #include <utility>
 
 #include "elastic/elastic_nearness.h"
+#include "projective/local_global.h"
 #include "solver/newton.h"
 #include "step/contact_stage.h"
 #include "step/motion.h"
@@ -83,12 +85,49 @@ class Nearness {
   std::optional<elastic::ElasticNearness> elastic_;
 };
 
-/// x^D: pins are at their targets, and so are the bodies, which nothing here looks at.
-Array solve_elastic_stage(const Forward& step) {
+std::string_view words(projective::Status status) {
+  switch (status) {
+    case projective::Status::kConverged:
+      return {};
+    case projective::Status::kIterationLimit:
+      return "the local/global iterations of the step are used up";
+    case projective::Status::kRoundingFloor:
+      return "rounding hides any further decrease of the elastic stage";
+    case projective::Status::kOverflow:
+      return "the forces of the elastic stage are not finite";
+  }
+  __builtin_unreachable();
+}
+
+/// By local/global iterations. No factor comes out of them: backward makes it.
+void solve_by_projective_dynamics(const Forward& step, Array& x) {
+  Problem& problem = step.problem;
+  const Stopwatch::Scope scope(*step.context.watch, Phase::kSolve);
+  const auto matrix = problem.constant_matrix();
+  projective::Objective f{.potentials = {&problem.inertia},
+                          .matrix = matrix.get(),
+                          .masses = &problem.masses,
+                          .h = problem.h};
+  for (const Potential* p : problem.elastic_potentials()) f.potentials.push_back(p);
+  const solver::Options& given = step.context.options;
+  const projective::Outcome outcome = projective::minimize(
+      f, x,
+      {.tolerance = given.tolerance,
+       .max_iterations = projective::kIterationsPerNewton * given.max_iterations},
+      *step.context.checkpoint);
+  step.report.counts.local_global += outcome.iterations;
+  step.report.residual = std::max(step.report.residual, outcome.residual);
+  if (outcome.status != projective::Status::kConverged) {
+    step.report.result = Result::kNotConverged;
+    step.report.message = words(outcome.status);
+  }
+  step.factors.push_back(nullptr);
+}
+
+void solve_by_newton(const Forward& step, Array& x) {
   Problem& problem = step.problem;
   const solver::Objective f = problem.objective(problem.inertia, problem.elastic_potentials(),
                                                 problem.scene.elastic_assemblies);
-  Array x = problem.predicted(problem.inertia.target().data());
   // Its way is no motion of the cloth.
   auto* const path = std::exchange(step.context.path, nullptr);
   const solver::Outcome outcome =
@@ -96,6 +135,16 @@ Array solve_elastic_stage(const Forward& step) {
   step.context.path = path;
   merge(outcome, step.report);
   step.factors.push_back(outcome.factor);
+}
+
+/// x^D: pins are at their targets, and so are the bodies, which nothing here looks at.
+Array solve_elastic_stage(const Forward& step) {
+  Array x = step.problem.predicted(step.problem.inertia.target().data());
+  if (step.problem.scene.given.elastic == ElasticSolver::kProjective) {
+    solve_by_projective_dynamics(step, x);
+  } else {
+    solve_by_newton(step, x);
+  }
   return x;
 }
 
