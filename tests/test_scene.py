@@ -85,6 +85,7 @@ def test_a_bad_scene_is_refused(arguments, keywords, error, message):
         (lambda: dc.SolverOptions(tolerance=0.0), dc.InvalidInput, "> 0"),
         (lambda: dc.SolverOptions(tolerance="1e-3"), TypeError, "real numbers"),
         (lambda: dc.SolverOptions(max_iterations=0), dc.InvalidInput, "at least 1"),
+        (lambda: dc.SolverOptions(elastic="pd"), dc.InvalidInput, "'newton', 'projective'"),
         (lambda: dc.SolverOptions(metric="norm"), dc.InvalidInput, "'elastic', 'mass', 'identity'"),
     ],
 )

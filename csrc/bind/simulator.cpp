@@ -343,6 +343,13 @@ step::Metric to_metric(const std::string& name) {
       ("metric must be one of 'elastic', 'mass', 'identity', got '" + name + "'").c_str());
 }
 
+step::ElasticSolver to_elastic_solver(const std::string& name) {
+  if (name == "newton") return step::ElasticSolver::kNewton;
+  if (name == "projective") return step::ElasticSolver::kProjective;
+  throw nb::value_error(
+      ("elastic must be one of 'newton', 'projective', got '" + name + "'").c_str());
+}
+
 step::Description describe(const Doubles& vertices,
                            const Doubles& rest_vertices,
                            const Indices& faces,
@@ -483,6 +490,7 @@ void simulator(nb::module_& m) {
                  nb::cast<double>(k["dt"]), nb::cast<std::string>(k["scheme"]),
                  nb::cast<std::string>(k["metric"]), nb::cast<int>(k["friction_iterations"]),
                  nb::cast<double>(k["tolerance"]), nb::cast<int>(k["max_iterations"]));
+             description.elastic = to_elastic_solver(nb::cast<std::string>(k["elastic"]));
              if (k.contains("tree_free")) description.mechanisms = describe_mechanisms(k);
              if (k.contains("primitive_kinds")) {
                const auto sizes = doubles("primitive_sizes");

@@ -39,6 +39,9 @@ class ConstantMatrix {
 
   const std::vector<double>& values() const { return values_; }
 
+  /// The free vertices.
+  const std::vector<Index>& vertices() const { return analysis_->vertex; }
+
   /// x = A^-1 b, [N, 3]; zero at pins. b and x may be one array.
   void solve(const double* b, double* x, Scratch& scratch) const;
 

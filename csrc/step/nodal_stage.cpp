@@ -49,6 +49,7 @@
 #include <utility>
 
 #include "linalg/gmres.h"
+#include "projective/anderson.h"
 #include "solver/linear_system.h"
 
 namespace diffcloth::step {
@@ -128,6 +129,13 @@ void spread(const NodalContact& c, const Vec3& e, double* v) {
   const Vec3 part = scale(c) * e;
   Eigen::Map<Vec3>(v + 3 * c.vertex) += part;
   if (c.partner >= 0) Eigen::Map<Vec3>(v + 3 * c.partner) -= part;
+}
+
+/// Of masses of vertices: that of the vertex, or what two of them have against each other.
+double reduced(const Array& masses, const NodalContact& c) {
+  const double m = masses[c.vertex];
+  if (c.partner < 0) return m;
+  return m * masses[c.partner] / (m + masses[c.partner]);
 }
 
 Vec3 tangential(const Vec3& e, const Vec3& n) { return e - n * n.dot(e); }
@@ -237,7 +245,7 @@ class NodalSystem {
       const NodalContact& c = contacts_[k];
       at.u[k] = velocity(c, at.x);
       const Vec3 r = p_.h * scale(c) * relative(c, at.g.data());
-      at.laws[k] = projective::coulomb(r - mass(c) * at.u[k], c.normal, c.friction);
+      at.laws[k] = projective::coulomb(r - rho(c) * at.u[k], c.normal, c.friction);
       spread(c, -at.laws[k].impulse / scale(c), residual.data());
     }
     at.merit = 0.0;
@@ -247,12 +255,7 @@ class NodalSystem {
     }
   }
 
-  /// rho of a contact: that of the vertex, or what two of them have against each other.
-  double mass(const NodalContact& c) const {
-    const double m = inertia_[c.vertex];
-    if (c.partner < 0) return m;
-    return m * inertia_[c.partner] / (m + inertia_[c.partner]);
-  }
+  double rho(const NodalContact& c) const { return reduced(inertia_, c); }
 
   Vec3 velocity(const NodalContact& c, const Array& x) const {
     const Vec3 moved = relative(c, x.data()) - relative(c, p_.start.data());
@@ -275,7 +278,7 @@ class NodalSystem {
   /// k (P - t t^T) e.
   Vec3 turning(const NodalContact& c, const Coulomb& law, const Vec3& e) const {
     if (law.kind != ContactCase::kSlipping) return Vec3::Zero();
-    const double k = law.ratio * mass(c) * inv_h_sq_ / (scale(c) * scale(c));
+    const double k = law.ratio * rho(c) * inv_h_sq_ / (scale(c) * scale(c));
     const Vec3 across = tangential(e, c.normal) - law.direction * law.direction.dot(e);
     return k * across;
   }
@@ -508,7 +511,7 @@ linalg::BlockMatrix NodalSystem::without_coupling(const Point& at,
     const Coulomb& law = at.laws[k];
     if (law.kind == ContactCase::kTakingOff) continue;
     Mat3 added;
-    const double m = mass(c) * inv_h_sq_ / (scale(c) * scale(c));
+    const double m = rho(c) * inv_h_sq_ / (scale(c) * scale(c));
     for (int a = 0; a < 3; ++a) {
       const Vec3 axis = Vec3::Unit(a);
       added.col(a) = m * held(c, law, axis) + turning(c, law, axis);
@@ -560,25 +563,87 @@ solver::Objective objective(Problem& problem, Potential* pattern) {
   return problem.objective(problem.inertia, std::move(others), problem.scene.elastic_assemblies);
 }
 
-/// Where a step begins: every vertex flies freely, and those in contact obey the law on their own.
-Array first_guess(Problem& problem,
-                  const NodalSystem& system,
-                  const std::vector<NodalContact>& contacts,
-                  const solver::Objective& f) {
-  Array x = problem.predicted(problem.inertia.target().data());
-  for (const NodalContact& c : contacts) {
+}  // namespace
+
+void NodalStage::start(Array& x) const {
+  const solver::Objective f = objective(problem_, pattern_.get());
+  const NodalSystem system(*this, f);
+  for (const NodalContact& c : contacts_) {
     const Vec3 u = system.velocity(c, x);
-    const double m = system.mass(c);
+    const double m = system.rho(c);
     const Vec3 r = projective::coulomb(-m * u, c.normal, c.friction).impulse;
-    spread(c, problem.h * scale(c) / m * r, x.data());
+    spread(c, problem_.h * scale(c) / m * r, x.data());
   }
   // Where that would collapse the cloth, where it stands is the better place to begin.
-  Array held = problem.predicted(problem.start.data());
+  Array held = problem_.predicted(problem_.start.data());
   system.clear_approach(held);
-  return f.energy(x.data()) <= f.energy(held.data()) ? x : held;
+  if (f.energy(held.data()) < f.energy(x.data())) x = std::move(held);
 }
 
-}  // namespace
+projective::Outcome NodalStage::iterate(const projective::Options& options,
+                                        const Checkpoint& checkpoint,
+                                        Array& x) const {
+  const solver::Objective f = objective(problem_, pattern_.get());
+  const NodalSystem system(*this, f);
+  const auto matrix = problem_.constant_matrix();
+  projective::ConstantMatrix::Scratch scratch;
+  projective::Anderson anderson(problem_.cloth_size);
+  projective::Outcome outcome;
+  Array g;
+  Array force(problem_.cloth_size);
+  Array p(problem_.cloth_size);
+  Array q(problem_.cloth_size);
+  Array plain(problem_.cloth_size);  // where the last iteration leads without acceleration
+  Array to = x;
+  double last = std::numeric_limits<double>::infinity();
+  bool accelerated = false;
+  for (;; ++outcome.iterations) {
+    checkpoint.check();
+    f.stand_at(x.data());
+    f.gradient(x.data(), g);
+    std::copy_n(g.begin(), force.size(), force.begin());
+    for (const NodalContact& c : contacts_) {
+      const double h_s = problem_.h * scale(c);
+      const Vec3 r = h_s * relative(c, g.data());
+      // With the true masses for rho the iteration contracts wherever the cloth is taut.
+      const Vec3 s = r - reduced(problem_.masses, c) * system.velocity(c, x);
+      spread(c, -projective::coulomb(s, c.normal, c.friction).impulse / h_s, force.data());
+    }
+    outcome.residual = 0.0;
+    for (const Index i : matrix->vertices()) {
+      const double rate = problem_.h * row(force.data(), i).norm() / problem_.masses[i];
+      if (!std::isfinite(rate)) {
+        outcome.status = projective::Status::kOverflow;
+        return outcome;
+      }
+      outcome.residual = std::max(outcome.residual, rate);
+    }
+    if (outcome.residual < options.tolerance) {
+      outcome.status = projective::Status::kConverged;
+      return outcome;
+    }
+    if (outcome.iterations == options.max_iterations) return outcome;
+    matrix->solve(force.data(), p.data(), scratch);
+    double size = 0.0;
+    for (std::size_t a = 0; a < p.size(); ++a) {
+      p[a] = -p[a];
+      q[a] = -force[a];
+      size += p[a] * q[a];
+    }
+    if (accelerated && size > last) {
+      // Acceleration has led astray: go on from where the plain iteration leads.
+      anderson.restart();
+      std::ranges::copy(plain, x.begin());
+      accelerated = false;
+      continue;
+    }
+    last = size;
+    for (std::size_t a = 0; a < p.size(); ++a) plain[a] = x[a] + p[a];
+    anderson.next(x.data(), p.data(), q.data(), to.data());
+    x.swap(to);
+    accelerated = true;
+  }
+}
 
 solver::Outcome NodalStage::solve(solver::Context& context, Array& x) const {
   const solver::Objective f = objective(problem_, pattern_.get());
@@ -588,7 +653,7 @@ solver::Outcome NodalStage::solve(solver::Context& context, Array& x) const {
   solver::Outcome outcome;
   NodalSystem::Point here;
   NodalSystem::Point there;
-  here.x = first_guess(problem_, system, contacts_, f);
+  here.x = x;
   system.look(here);
   double blend = 0.0;
   const auto finish = [&](solver::Status status) {

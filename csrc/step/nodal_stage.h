@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "projective/coulomb.h"
+#include "projective/local_global.h"
 #include "projective/nodal_contact.h"
 #include "solver/newton.h"
 #include "step/scheme.h"
@@ -24,10 +25,22 @@ class NodalStage {
 
   bool has_contacts() const { return !contacts_.empty(); }
 
-  /// Solve for the end of the step.
+  /// Where a solve begins: every vertex flies freely, and those in contact obey the law on their own.
   ///
-  /// @param x  out: all points; prescribed ones at their ends
+  /// @param x  in: all points at the inertial prediction, prescribed ones at their ends
+  void start(std::vector<double>& x) const;
+
+  /// Solve by a semismooth Newton method.
+  ///
+  /// @param x  in: a start; out: the solution
   solver::Outcome solve(solver::Context& context, std::vector<double>& x) const;
+
+  /// Solve by local/global iterations with impulses (Ly et al. 2020), accelerated.
+  ///
+  /// @param x  in: a start; out: the solution
+  projective::Outcome iterate(const projective::Options& options,
+                              const Checkpoint& checkpoint,
+                              std::vector<double>& x) const;
 
   /// Count the cases of the law at a solution, and add the forces on the bodies' vertices there: minus
   /// the forces on the nodes, shared by the corners of the nearest faces.

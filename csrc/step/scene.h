@@ -26,6 +26,9 @@ class Scheme;
 /// Norm of the contact stage of `split`.
 enum class Metric : std::uint8_t { kElastic, kMass, kIdentity };
 
+/// How the elastic stage of `split` is solved.
+enum class ElasticSolver : std::uint8_t { kNewton, kProjective };
+
 /// What a simulator is made from.
 struct Description {
   std::vector<double> vertices;       ///< [3 N] initial positions [m]
@@ -48,6 +51,7 @@ struct Description {
   double dt = 0.01;
   std::string scheme = "coupled";
   Metric metric = Metric::kElastic;
+  ElasticSolver elastic = ElasticSolver::kNewton;
   int friction_iterations = 2;
   solver::Options options{};
 };

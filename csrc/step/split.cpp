@@ -6,7 +6,6 @@
 
 #include <algorithm>
 #include <optional>
-#include <utility>
 
 #include "elastic/elastic_nearness.h"
 #include "step/contact_stage.h"

@@ -423,6 +423,7 @@ class SolverSection(Section):
     max_iterations: Annotated[int, Ge(1)] | None = None
     throw: bool | None = None
     metric: Literal["elastic", "mass", "identity"] | None = None
+    elastic: Literal["newton", "projective"] | None = None
 
 
 class SimulationSection(Section):

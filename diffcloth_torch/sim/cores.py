@@ -71,6 +71,7 @@ def make_core(
         dt=options.dt,
         scheme=options.scheme,
         metric=options.solver.metric or "elastic",
+        elastic=options.solver.elastic,
         friction_iterations=options.contact.friction_iterations,
         tolerance=options.solver.tolerance,
         max_iterations=options.solver.max_iterations,

@@ -136,6 +136,11 @@ class Simulator:
             raise InvalidInput(
                 f"Simulator: `solver.metric` {solver.metric!r} needs scheme 'split', got {scheme!r}"
             )
+        if scheme == "coupled" and solver.elastic == "projective":
+            raise InvalidInput(
+                "Simulator: `solver.elastic` 'projective' needs a scheme with an elastic stage of its "
+                "own, 'split' or 'projective'; 'coupled' has none"
+            )
         self._assembly = assemble(scene, all_nodal=scheme == "projective")
         self._layout = Layout(self._assembly)
         _check_motion(self)

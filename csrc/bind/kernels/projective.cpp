@@ -2,14 +2,18 @@
 #include <cstdint>
 #include <memory>
 #include <stdexcept>
+#include <string>
 #include <utility>
 #include <vector>
 
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/shared_ptr.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
 
 #include "bind/kernels/kernels.h"
 #include "projective/constant_matrix.h"
+#include "projective/primitives.h"
 
 namespace diffcloth::bind {
 namespace {
@@ -48,9 +52,39 @@ class ConstantMatrices {
   projective::ConstantMatrixCache cache_;
 };
 
+projective::Primitive primitive_named(const std::string& kind, const std::vector<double>& size) {
+  using enum projective::PrimitiveKind;
+  if (size.size() != 3) throw std::invalid_argument("nearest: `size` must have three numbers");
+  const Vec3 lengths = row(size.data(), 0);
+  if (kind == "plane") return {.kind = kPlane, .size = lengths};
+  if (kind == "sphere") return {.kind = kSphere, .size = lengths};
+  if (kind == "capsule") return {.kind = kCapsule, .size = lengths};
+  if (kind == "box") return {.kind = kBox, .size = lengths};
+  throw std::invalid_argument("nearest: `kind` is unknown: '" + kind + "'");
+}
+
+/// Distance, normal, surface point and the derivatives of both by a point, 1 + 3 + 3 + 9 + 9 numbers.
+std::vector<double> nearest(const std::string& kind,
+                            const std::vector<double>& size,
+                            const std::vector<double>& point) {
+  const Vec3 y = row(point.data(), 0);
+  const projective::Nearest near = projective::nearest(primitive_named(kind, size), y);
+  std::vector<double> out{near.distance};
+  const auto append = [&](const auto& values) {
+    out.insert(out.end(), values.data(), values.data() + values.size());
+  };
+  append(near.normal);
+  append(near.surface_point(y));
+  append(near.normal_derivative);
+  append(near.surface_point_derivative());
+  return out;
+}
+
 }  // namespace
 
 void projective_kernels(nb::module_& m) {
+  m.def("nearest", &nearest, "kind"_a, "size"_a, "point"_a,
+        "What a primitive is seen from a point of its frame.");
   nb::class_<projective::ConstantMatrix>(m, "ConstantMatrix")
       .def(
           "solve",
