@@ -199,6 +199,8 @@ def iterations(reports: list[dc.Report]) -> str:
 def row(simulator: dc.Simulator, rollout: Rollout) -> list[str]:
     states, scene = rollout.states, simulator.scene
     reports = [state.report for state in states[1:]]
+    if not reports:
+        return ["-"] * len(COLUMNS)
     mass = masses(scene.cloths[0])
     crossings = Crossings(scene)
     return [
@@ -208,7 +210,7 @@ def row(simulator: dc.Simulator, rollout: Rollout) -> list[str]:
         f"{100 * (max(stretch(scene, state) for state in states) - 1):.1f}",
         iterations(reports),
         f"{1e3 * sum(rollout.seconds) / len(reports):.0f}",
-        f"{median(rollout.errors):.0e}",
+        f"{median(rollout.errors):.0e}" if rollout.errors else "-",
     ]
 
 
@@ -217,7 +219,7 @@ def row(simulator: dc.Simulator, rollout: Rollout) -> list[str]:
 @click.option(
     "--method", "methods", multiple=True, type=click.Choice(list(METHODS)), help="By default all."
 )
-@click.option("--size", default=20, show_default=True, help="Vertices along a side of the sheet.")
+@click.option("--size", default=16, show_default=True, help="Vertices along a side of the sheet.")
 @click.option("--quick", is_flag=True, help="7 x 7 vertices, 10 steps.")
 def main(names: tuple[str, ...], methods: tuple[str, ...], size: int, quick: bool) -> None:
     torch.set_num_threads(1)
