@@ -75,13 +75,10 @@ def test_gradients_of_a_slide_on_a_sphere(reference, steps):
     assert all(slipping > 0 for _, _, slipping in pattern)
     (gradient,) = torch.autograd.grad(loss, x)
     direction = torch.randn(625, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    size = 1e-8  # at 1e-7 m vertices change from one case of the law to another within 20 steps
     with torch.no_grad():
-        for size in (1e-7, 1e-8):
-            ends = [final(x + sign * size * direction) for sign in (1, -1)]
-            if ends[0][1] == ends[1][1] == pattern:
-                break
-        else:
-            pytest.fail("the contact pattern changes within 1e-8 m: no derivative to compare with")
+        ends = [final(x + sign * size * direction) for sign in (1, -1)]
+    assert ends[0][1] == ends[1][1] == pattern
     difference = (ends[0][0] - ends[1][0]).item() / (2 * size)
     scale = (gradient * direction).norm().item()
     assert abs(difference - (gradient * direction).sum().item()) < 1e-5 * scale
