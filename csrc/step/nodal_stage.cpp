@@ -537,6 +537,7 @@ linalg::BlockMatrix NodalSystem::without_coupling(const Point& at,
 NodalStage::NodalStage(Problem& problem, bool vertices_touch)
     : problem_(problem), obstacles_(make_obstacles(problem)) {
   const Scene& scene = problem.scene;
+  if (problem.inputs.data(Input::kFriction) == nullptr) return;  // nothing can touch
   if (vertices_touch) {
     const projective::Spheres spheres = make_spheres(problem);
     contacts_ = projective::find_contacts(swept(problem), obstacles_, &spheres);

@@ -306,6 +306,7 @@ class BodySection(Section):
     mass: Positive | None = None
     center: Vector3 | None = None
     inertia: Annotated[list[Vector3], Len(3, 3)] | None = None
+    nodal_contact: bool | None = None
     color: Color | None = None
 
     @model_validator(mode="after")
@@ -414,7 +415,7 @@ class SimulationSection(Section):
 
     dt: Positive
     steps: Annotated[int, Ge(1)]
-    scheme: Literal["coupled", "split"] = "coupled"
+    scheme: Literal["coupled", "split", "projective"] = "coupled"
     coupling: Literal["monolithic", "rigid_to_cloth", "cloth_to_rigid"] = "monolithic"
     contact: ContactSection = ContactSection()
     solver: SolverSection = SolverSection()

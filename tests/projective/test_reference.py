@@ -1,4 +1,4 @@
-"""The baseline against a trajectory of the original DiffCloth, and its gradients through a slide."""
+"""The baseline against a trajectory of the original DiffCloth, and gradients of a slide."""
 
 import os
 from pathlib import Path
@@ -29,9 +29,7 @@ def simulator(reference, tolerance, **options):
         reference["positions"][0], reference["faces"], material=material, bending_model="hinge"
     )
     # A contact band of .1: half of the sum of both thicknesses.
-    ball = dc.RigidBody.sphere(
-        2.0, pose=[0.6, -2.1, 0.2, 1, 0, 0, 0], friction=0.3, thickness=0.2
-    )
+    ball = dc.RigidBody.sphere(2.0, pose=[0.6, -2.1, 0.2, 1, 0, 0, 0], friction=0.3, thickness=0.2)
     return dc.Simulator(
         dc.Scene([cloth], [ball], gravity=(0.0, -9.8, 0.0)),
         1 / 180,
