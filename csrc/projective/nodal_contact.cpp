@@ -4,6 +4,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
+#include <memory>
 #include <tuple>
 #include <unordered_map>
 #include <utility>
@@ -11,6 +12,53 @@
 #include "contact/distance/closest.h"
 
 namespace diffcloth::projective {
+
+/// Points by the cells of a grid.
+class Cells {
+ public:
+  explicit Cells(double size) : size_(size) {}
+
+  double size() const { return size_; }
+  void add(const Vec3& x, Index point) { cells_[key(cell(x))].push_back(point); }
+
+  /// Call visit(j) for every point in the cells around x: those within `size`, and some others. One
+  /// point may be visited more than once.
+  template <class Visit>
+  void around(const Vec3& x, Visit&& visit) const {
+    const auto c = cell(x);
+    for (std::int64_t a = -1; a <= 1; ++a) {
+      for (std::int64_t b = -1; b <= 1; ++b) {
+        for (std::int64_t d = -1; d <= 1; ++d) {
+          const auto found = cells_.find(key({c[0] + a, c[1] + b, c[2] + d}));
+          if (found == cells_.end()) continue;
+          for (const Index j : found->second) visit(j);
+        }
+      }
+    }
+  }
+
+ private:
+  using Cell = std::array<std::int64_t, 3>;
+
+  Cell cell(const Vec3& x) const {
+    Cell c{};
+    // Bounded, so that a cast of far points is defined; they only share cells.
+    constexpr double kFar = 1e15;
+    for (int k = 0; k < 3; ++k) {
+      c[k] = static_cast<std::int64_t>(std::floor(std::clamp(x[k] / size_, -kFar, kFar)));
+    }
+    return c;
+  }
+  static std::uint64_t key(const Cell& c) {
+    std::uint64_t hash = 0;
+    for (const std::int64_t k : c) hash = hash * 0x9E3779B97F4A7C15U + static_cast<std::uint64_t>(k);
+    return hash;
+  }
+
+  double size_;
+  std::unordered_map<std::uint64_t, std::vector<Index>> cells_;
+};
+
 namespace {
 
 using bodies::Pose;
@@ -112,52 +160,6 @@ void add_obstacle_contacts(const Swept& cloths,
   }
 }
 
-/// Vertices by the cells of a grid.
-class Cells {
- public:
-  Cells(const std::vector<Vec3>& x, const std::vector<char>& left_out, double size) : size_(size) {
-    for (std::size_t i = 0; i < x.size(); ++i) {
-      if (left_out[i] == 0) cells_[key(cell(x[i]))].push_back(static_cast<Index>(i));
-    }
-  }
-
-  /// Call visit(j) for every vertex in the cells around a point.
-  template <class Visit>
-  void around(const Vec3& x, Visit&& visit) const {
-    const auto c = cell(x);
-    for (std::int64_t a = -1; a <= 1; ++a) {
-      for (std::int64_t b = -1; b <= 1; ++b) {
-        for (std::int64_t d = -1; d <= 1; ++d) {
-          const auto found = cells_.find(key({c[0] + a, c[1] + b, c[2] + d}));
-          if (found == cells_.end()) continue;
-          for (const Index j : found->second) visit(j);
-        }
-      }
-    }
-  }
-
- private:
-  using Cell = std::array<std::int64_t, 3>;
-
-  Cell cell(const Vec3& x) const {
-    Cell c{};
-    // Bounded, so that a cast of far points is defined; they only share cells.
-    constexpr double kFar = 1e15;
-    for (int k = 0; k < 3; ++k) {
-      c[k] = static_cast<std::int64_t>(std::floor(std::clamp(x[k] / size_, -kFar, kFar)));
-    }
-    return c;
-  }
-  static std::uint64_t key(const Cell& c) {
-    std::uint64_t hash = 0;
-    for (const std::int64_t k : c) hash = hash * 0x9E3779B97F4A7C15U + static_cast<std::uint64_t>(k);
-    return hash;
-  }
-
-  double size_;
-  std::unordered_map<std::uint64_t, std::vector<Index>> cells_;
-};
-
 void add_pair_contacts(const Swept& cloths,
                        const Spheres& spheres,
                        std::vector<NodalContact>& contacts) {
@@ -171,7 +173,10 @@ void add_pair_contacts(const Swept& cloths,
   std::vector<Vec3> x(n);
   for (const double fraction : kFractions) {
     for (Index i = 0; i < cloths.size(); ++i) x[i] = cloths.at(i, fraction);
-    const Cells cells(x, busy, size);
+    Cells cells(size);
+    for (Index i = 0; i < cloths.size(); ++i) {
+      if (busy[i] == 0) cells.add(x[i], i);
+    }
     std::vector<std::tuple<double, Index, Index>> found;
     for (Index i = 0; i < cloths.size(); ++i) {
       if (busy[i] != 0) continue;
@@ -261,33 +266,36 @@ FaceSearch::FaceSearch(std::vector<std::array<Index, 3>> faces, const std::vecto
     std::array<Vec3, 3>& corners = corners_.emplace_back();
     for (int k = 0; k < 3; ++k) corners[k] = row(vertices.data(), face[k]);
     const Vec3 center = (corners[0] + corners[1] + corners[2]) / 3.0;
-    double radius = 0.0;
-    for (const Vec3& corner : corners) radius = std::max(radius, (corner - center).norm());
+    for (const Vec3& corner : corners) radius_ = std::max(radius_, (corner - center).norm());
     center_.push_back(center);
-    radius_.push_back(radius);
   }
+  auto cells = std::make_shared<Cells>(2.0 * radius_);
+  for (std::size_t f = 0; f < center_.size(); ++f) {
+    cells->add(center_[f], static_cast<Index>(f));
+  }
+  cells_ = std::move(cells);
 }
 
 FaceSearch::Share FaceSearch::share(const Vec3& y) const {
-  const auto look = [&](std::size_t f) {
+  Index best = -1;
+  contact::Closest closest{};
+  closest.d_sq = std::numeric_limits<double>::infinity();
+  const auto look = [&](Index f) {
+    // No point of the face is nearer than its center less the radius.
+    const double reach = std::sqrt(closest.d_sq) + radius_;
+    if ((y - center_[f]).squaredNorm() > reach * reach) return;
     const auto& [a, b, c] = corners_[f];
-    return contact::closest(contact::PairKind::kPointTriangle, {y, a, b, c});
-  };
-  // First the nearest center, then what can be nearer than that face.
-  std::size_t first = 0;
-  for (std::size_t f = 1; f < faces_.size(); ++f) {
-    if ((y - center_[f]).squaredNorm() < (y - center_[first]).squaredNorm()) first = f;
-  }
-  std::size_t best = first;
-  contact::Closest closest = look(first);
-  for (std::size_t f = 0; f < faces_.size(); ++f) {
-    const double reach = std::sqrt(closest.d_sq) + radius_[f];
-    if (f == first || (y - center_[f]).squaredNorm() > reach * reach) continue;
-    const contact::Closest other = look(f);
-    if (other.d_sq < closest.d_sq) {
-      closest = other;
+    const contact::Closest found =
+        contact::closest(contact::PairKind::kPointTriangle, {y, a, b, c});
+    // The first of equals, in whatever order they are looked at.
+    if (found.d_sq < closest.d_sq || (found.d_sq == closest.d_sq && f < best)) {
+      closest = found;
       best = f;
     }
+  };
+  cells_->around(y, look);
+  if (!(std::sqrt(closest.d_sq) + radius_ <= cells_->size())) {
+    for (Index f = 0; f < static_cast<Index>(faces_.size()); ++f) look(f);
   }
   const Eigen::Matrix<double, 2, 12> beta = contact::beta_jacobian(closest);
   return {.corners = faces_[best],

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <array>
+#include <memory>
 #include <span>
 #include <vector>
 
@@ -83,6 +84,8 @@ FrameBar pull_back(const NodalContact& contact,
                    const Vec3& velocity_bar,
                    const Vec3& surface_point_bar);
 
+class Cells;
+
 /// Faces of a body, to find the one that is nearest to a point of its frame.
 class FaceSearch {
  public:
@@ -101,7 +104,8 @@ class FaceSearch {
   std::vector<std::array<Index, 3>> faces_;
   std::vector<std::array<Vec3, 3>> corners_;
   std::vector<Vec3> center_;
-  std::vector<double> radius_;
+  double radius_ = 0.0;  ///< of all faces around their centers
+  std::shared_ptr<const Cells> cells_;
 };
 
 }  // namespace diffcloth::projective

@@ -74,6 +74,14 @@ constexpr double kContraction = 0.25;
 /// As in solver/newton.cpp: a step below this share of the tolerance is not worth taking.
 constexpr double kSettled = 0.1;
 constexpr int kHalvings = 40;
+/// Steps down the energy after which Newton's step is taken whatever it does to the residual: the
+/// friction that they freeze may go round in circles.
+constexpr int kMostDescents = 3;
+/// Newton steps that are taken where no way leads down.
+constexpr int kMostIdle = 20;
+/// Of the exact Hessian's projection, where that is indefinite: see solver/direction.h.
+constexpr double kLeastBlend = 0.1;
+constexpr double kMostBlend = 1e12;
 
 /// Couplings of rows of which one is in contact with another vertex: the eliminated unknowns of a pair
 /// couple all neighbors of both.
@@ -529,6 +537,7 @@ linalg::BlockMatrix NodalSystem::without_coupling(const Point& at,
 NodalStage::NodalStage(Problem& problem, bool vertices_touch)
     : problem_(problem), obstacles_(make_obstacles(problem)) {
   const Scene& scene = problem.scene;
+  if (problem.inputs.data(Input::kFriction) == nullptr) return;  // nothing can touch
   if (vertices_touch) {
     const projective::Spheres spheres = make_spheres(problem);
     contacts_ = projective::find_contacts(swept(problem), obstacles_, &spheres);
@@ -556,6 +565,12 @@ NodalStage::NodalStage(Problem& problem, bool vertices_touch)
 }
 
 namespace {
+
+double largest(const Array& change) {
+  double size = 0.0;
+  for (const double value : change) size = std::max(size, std::abs(value));
+  return size;
+}
 
 solver::Objective objective(Problem& problem, Potential* pattern) {
   std::vector<Potential*> others = problem.elastic_potentials();
@@ -656,6 +671,7 @@ solver::Outcome NodalStage::solve(solver::Context& context, Array& x) const {
   here.x = x;
   system.look(here);
   double blend = 0.0;
+  int idle = 0;
   const auto finish = [&](solver::Status status) {
     outcome.status = status;
     x = std::move(here.x);
@@ -666,47 +682,43 @@ solver::Outcome NodalStage::solve(solver::Context& context, Array& x) const {
     there.x = here.x;
     for (std::size_t a = 0; a < problem_.cloth_size; ++a) there.x[a] += alpha * p[a];
   };
+  int descents = 0;  // since Newton's method last had its way
   for (;; ++context.iterations) {
     context.checkpoint->check();
     const linalg::BlockMatrix H = linear.assemble(here.x.data(), Curvature::kExact, here.g);
-    linalg::BlockMatrix S = system.without_coupling(here, H);
-    solver::Factor factor = linear.factor(S);
+    solver::Factor factor = linear.factor(system.without_coupling(here, H));
     const Array d = system.constraint_step(here);
     Array p;
-    const auto size_of = [&](const Array& change) {
-      double size = 0.0;
-      for (const double value : change) size = std::max(size, std::abs(value));
-      return std::isfinite(size) ? size : std::numeric_limits<double>::infinity();
-    };
-    bool small = false;
+    bool solved = false;
     if (factor) {
       const Stopwatch::Scope scope(*context.watch, Phase::kSolve);
       Array b = system.right_side(here, H, d, false);
       system.project(here, b);
-      // What GMRES cannot solve is no direction, but the energy has one.
-      const bool solved =
-          system.solve(here, H, *factor, false, b, kDirectionTolerance, p).converged;
+      solved = system.solve(here, H, *factor, false, b, kDirectionTolerance, p).converged;
       for (std::size_t a = 0; a < p.size(); ++a) p[a] += d[a];
-      const double step = size_of(p);
+      const double step = largest(p);
       outcome.residual = step / problem_.h;
       if (solved && step <= kSettled * goal) {
         outcome.factor = factor;
         return finish(solver::Status::kConverged);
       }
-      small = solved && step < goal;
-      if (solved && context.iterations < context.options.max_iterations) {
+      if (solved) {
         go(p, 1.0);
         system.look(there);
-        if (there.merit <= kContraction * here.merit) {
+        const bool contracts = there.merit <= kContraction * here.merit;
+        if (!contracts && step < goal) {  // what is left of the residual is rounding
+          outcome.factor = factor;
+          return finish(solver::Status::kConverged);
+        }
+        if (context.iterations >= context.options.max_iterations) {
+          return finish(solver::Status::kIterationLimit);
+        }
+        if (contracts || (descents >= kMostDescents && std::isfinite(there.merit))) {
+          descents = 0;
           ++context.counts->exact;
           std::swap(here, there);
           continue;
         }
-      }
-      // Rounding, or a change of case, is all that is left.
-      if (small) {
-        outcome.factor = factor;
-        return finish(solver::Status::kConverged);
       }
     } else {
       ++context.counts->negative_curvature;
@@ -715,35 +727,42 @@ solver::Outcome NodalStage::solve(solver::Context& context, Array& x) const {
       return finish(solver::Status::kIterationLimit);
     }
 
-    // Friction frozen, the step minimizes an energy: go down that one.
-    blend = factor ? 0.0 : std::max(0.1, 0.3 * blend);
-    if (!factor) {
+    // With its friction frozen the step minimizes an energy: go down that one.
+    blend = factor ? 0.0 : std::max(kLeastBlend, blend / 4.0);
+    if (factor) {
+      ++context.counts->exact;
+    } else {
+      ++context.counts->projected;
       const linalg::BlockMatrix positive =
           linear.assemble(here.x.data(), Curvature::kPositive, here.g);
-      for (; !factor; blend *= 4.0) {
+      for (;; blend *= 4.0) {
+        if (!(blend < kMostBlend)) return finish(solver::Status::kRoundingFloor);
         linalg::BlockMatrix damped = H;
         damped.blend(positive, blend);
         factor = linear.factor(system.without_coupling(here, damped));
-        if (blend > 1e12) return finish(solver::Status::kRoundingFloor);
+        if (factor) break;
       }
-      ++context.counts->projected;
-    } else {
-      ++context.counts->exact;
     }
+    const Stopwatch::Scope scope(*context.watch, Phase::kLineSearch);
     Array b = system.right_side(here, H, d, true);
     system.project(here, b);
-    p.assign(b.size(), 0.0);
-    factor->solve(b.data(), p.data());
-    for (std::size_t a = 0; a < p.size(); ++a) p[a] += d[a];
+    Array down(b.size(), 0.0);
+    factor->solve(b.data(), down.data());
+    for (std::size_t a = 0; a < down.size(); ++a) down[a] += d[a];
     bool moved = false;
-    const Stopwatch::Scope scope(*context.watch, Phase::kLineSearch);
     double alpha = 1.0;
     for (int k = 0; k < kHalvings && !moved; ++k, alpha *= 0.5) {
-      go(p, alpha);
+      go(down, alpha);
       system.clear_approach(there.x);
       moved = system.frozen_energy_change(here, there.x) < 0.0;
     }
-    if (!moved) return finish(solver::Status::kRoundingFloor);
+    ++descents;
+    if (!moved) {
+      // The cases of the law at hand point nowhere: those behind Newton's step may.
+      if (!solved || idle >= kMostIdle) return finish(solver::Status::kRoundingFloor);
+      ++idle;
+      go(p, 1.0);
+    }
     system.look(there);
     std::swap(here, there);
   }

@@ -190,7 +190,15 @@ def _body(section: BodySection, root: str, source: Path) -> RigidBody:
     return _MAKERS[shape.kind](**arguments, **keywords)
 
 
-_BODY_OPTIONS = {"friction", "thickness", "density", "mass", "center", "inertia"}
+_BODY_OPTIONS = {
+    "friction",
+    "thickness",
+    "density",
+    "mass",
+    "center",
+    "inertia",
+    "nodal_contact",
+}
 _MAKERS: dict[str, Callable[..., RigidBody]] = {
     "box": RigidBody.box,
     "sphere": RigidBody.sphere,

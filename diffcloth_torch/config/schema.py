@@ -323,6 +323,7 @@ class BodySection(Section):
     mass: Positive | None = None
     center: Vector3 | None = None
     inertia: Annotated[list[Vector3], Len(3, 3)] | None = None
+    nodal_contact: bool | None = None
     color: Color | None = None
 
     @model_validator(mode="after")

@@ -164,7 +164,7 @@ class RigidBody:
     def _of(
         cls,
         primitive: Primitive,
-        mesh: tuple[FloatArray, IndexArray],
+        mesh: tuple[object, object],
         *,
         nodal_contact: bool = False,
         **keywords: Any,

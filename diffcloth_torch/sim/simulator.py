@@ -138,8 +138,8 @@ class Simulator:
             )
         if scheme == "coupled" and solver.elastic == "projective":
             raise InvalidInput(
-                "Simulator: `solver.elastic` 'projective' needs a scheme with an elastic stage of its "
-                "own, 'split' or 'projective'; 'coupled' has none"
+                "Simulator: `solver.elastic` 'projective' needs a scheme with an elastic stage of "
+                "its own, 'split' or 'projective'; 'coupled' has none"
             )
         self._assembly = assemble(scene, all_nodal=scheme == "projective")
         self._layout = Layout(self._assembly)

@@ -45,7 +45,7 @@ class Step:
 
 
 def on_body(kind, case, *, moving=True, scheme="projective", tolerance=1e-11, **options):
-    """A sheet that lies on a body whose frame is turned, with a pin and a soft pin; and its step."""
+    """A step of a sheet on a body whose frame is turned, with a pin and a soft pin."""
     make, top, turn = BODIES[kind]
     friction, velocity = CASES[case]
     vertices, faces = grid(6, 6, seed=3)

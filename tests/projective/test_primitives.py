@@ -48,8 +48,12 @@ def test_derivatives_are_those_of_differences(kind):
             d = step * np.eye(3)[k]
             above, below = nearest(kind, y + d), nearest(kind, y - d)
             np.testing.assert_allclose((above[0] - below[0]) / (2 * step), normal[k], atol=1e-8)
-            np.testing.assert_allclose((above[1] - below[1]) / (2 * step), by_normal[:, k], atol=1e-6)
-            np.testing.assert_allclose((above[2] - below[2]) / (2 * step), by_point[:, k], atol=1e-6)
+            np.testing.assert_allclose(
+                (above[1] - below[1]) / (2 * step), by_normal[:, k], atol=1e-6
+            )
+            np.testing.assert_allclose(
+                (above[2] - below[2]) / (2 * step), by_point[:, k], atol=1e-6
+            )
 
 
 @pytest.mark.parametrize("kind", SOLIDS)

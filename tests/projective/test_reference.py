@@ -1,4 +1,4 @@
-"""The baseline against a trajectory of the original DiffCloth, and its gradients through a slide."""
+"""The baseline against a trajectory of the original DiffCloth, and gradients of a slide."""
 
 import os
 from pathlib import Path
@@ -29,9 +29,7 @@ def simulator(reference, tolerance, **options):
         reference["positions"][0], reference["faces"], material=material, bending_model="hinge"
     )
     # A contact band of .1: half of the sum of both thicknesses.
-    ball = dc.RigidBody.sphere(
-        2.0, pose=[0.6, -2.1, 0.2, 1, 0, 0, 0], friction=0.3, thickness=0.2
-    )
+    ball = dc.RigidBody.sphere(2.0, pose=[0.6, -2.1, 0.2, 1, 0, 0, 0], friction=0.3, thickness=0.2)
     return dc.Simulator(
         dc.Scene([cloth], [ball], gravity=(0.0, -9.8, 0.0)),
         1 / 180,
@@ -75,13 +73,10 @@ def test_gradients_of_a_slide_on_a_sphere(reference, steps):
     assert all(slipping > 0 for _, _, slipping in pattern)
     (gradient,) = torch.autograd.grad(loss, x)
     direction = torch.randn(625, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    size = 1e-8  # at 1e-7 m vertices change from one case of the law to another within 20 steps
     with torch.no_grad():
-        for size in (1e-7, 1e-8):
-            ends = [final(x + sign * size * direction) for sign in (1, -1)]
-            if ends[0][1] == ends[1][1] == pattern:
-                break
-        else:
-            pytest.fail("the contact pattern changes within 1e-8 m: no derivative to compare with")
+        ends = [final(x + sign * size * direction) for sign in (1, -1)]
+    assert ends[0][1] == ends[1][1] == pattern
     difference = (ends[0][0] - ends[1][0]).item() / (2 * size)
     scale = (gradient * direction).norm().item()
     assert abs(difference - (gradient * direction).sum().item()) < 1e-5 * scale

@@ -40,7 +40,9 @@ def test_nodal_contact_is_true_or_false():
     ("body", "message"),
     [
         pytest.param(
-            lambda **k: dc.RigidBody(BOX.vertices, BOX.faces, **k), "mesh or cylinder 'it'", id="mesh"
+            lambda **k: dc.RigidBody(BOX.vertices, BOX.faces, **k),
+            "mesh or cylinder 'it'",
+            id="mesh",
         ),
         pytest.param(
             lambda **k: dc.RigidBody.box(0.1, motion="dynamic", mass=1.0, **k),
