@@ -36,11 +36,14 @@ class Simulator:
         dt: float,
         scheme: str,
         metric: str,
+        elastic: str,
         friction_iterations: int,
         tolerance: float,
         max_iterations: int,
         link_names: list[str] = ...,
         ignored_pairs: NDArray[np.int32] = ...,
+        primitive_kinds: list[str] = ...,
+        primitive_sizes: NDArray[np.float64] = ...,
         **trees: NDArray[Any] | float,
     ) -> None: ...
     def smallest_nonadjacent_distance(self) -> float: ...

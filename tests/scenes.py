@@ -109,7 +109,7 @@ def simulator(
     bodies=(),
     *,
     scheme="coupled",
-    metric="mass",
+    metric=None,
     gravity=(0.4, -0.3, -9.81),
     tolerance=TOLERANCE,
     **contact,
@@ -391,6 +391,6 @@ REGIMES = {
 
 
 @cache
-def regime(name, scheme="coupled", metric="mass", friction_iterations=2):
+def regime(name, scheme="coupled", metric=None, friction_iterations=2):
     """A scene by name; made once."""
     return REGIMES[name](scheme=scheme, metric=metric, friction_iterations=friction_iterations)

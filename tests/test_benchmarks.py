@@ -8,7 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+
+import diffcloth_torch as dc
+from benchmarks.crossings import Crossings
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -117,3 +122,92 @@ def test_what_moves_by_forces_is_timed_beside_what_is_given():
     rows = [line.split() for line in result.stdout.splitlines()]
     assert [row[0] for row in rows[1:]] == ["free", "gripper"]
     assert all(float(row[-1]) >= 1 for row in rows[1:])  # steps in contact
+
+
+def read_tables(*command):
+    """Title -> method -> column -> cell, of the tables that a benchmark prints."""
+    result = subprocess.run(
+        [sys.executable, "-m", *command], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    lines = [line for line in result.stdout.splitlines() if line.startswith("| ")]
+    tables = {}
+    for line in lines:
+        first, *cells = (cell.strip() for cell in line.strip("|").split("|"))
+        if cells[0] == "pairs":
+            title, columns = first, cells
+            tables[title] = {}
+        else:
+            tables[title][first] = dict(zip(columns, cells, strict=True))
+    return tables
+
+
+def test_experiments_are_compared_by_scheme():
+    tables = read_tables("benchmarks.experiments", "--quick")
+    assert list(tables) == ["tie", "cloth_on_cube"]
+    for rows in tables.values():
+        for method in ("split", "coupled, frictionless", "coupled"):
+            assert rows[method]["pairs"] == "0"
+    cube = tables["cloth_on_cube"]
+    assert int(cube["projective"]["pairs"]) > 0
+    assert float(cube["coupled"]["distance [mm]"]) < 100  # from half a meter
+
+
+def test_schemes_are_compared_on_the_same_scenes():
+    tables = read_tables("benchmarks.schemes", "--quick")
+    assert list(tables) == ["sphere", "floor", "box"]
+    for rows in tables.values():
+        for method, row in rows.items():
+            assert float(row["gradient"]) < 1e-3, method
+            if method != "projective":
+                assert row["pairs"] == "0", method
+            if method != "split, identity":
+                assert float(row["momentum"]) < 1e-5, method
+        assert float(rows["split, identity"]["momentum"]) > 1e-3
+        assert float(rows["coupled"]["energy"]) < 1e-6
+
+
+def test_crossings_are_those_of_triangles():
+    """Two sheets that pierce each other, against all pairs of edges and triangles."""
+    sheets = [
+        dc.Cloth.grid(4, 4, 1.0, name="level"),
+        dc.Cloth.grid(5, 5, 0.9, name="steep", pose=[9, 0, 0, 0.8, 0.6, 0, 0]),
+    ]
+    scene = dc.Scene(sheets, [dc.RigidBody.sphere(0.2, subdivisions=0, pose=[0, 0, 9, 1, 0, 0, 0])])
+    state = dc.Simulator(scene, 0.01).initial_state()
+    crossings = Crossings(scene)
+    assert crossings.count(state) == 0
+    moved = state.positions.clone()
+    moved[16:, 0] -= 9 - 0.013
+    moved[:, 2] += torch.linspace(0, 0.1, len(moved), dtype=torch.float64)
+    poses = state.body_poses.clone()
+    poses[:, 2] = 0.11
+    state = state.replace(positions=moved, body_poses=poses)
+    points = crossings.points(state)
+    faces = np.concatenate(
+        [sheets[0].faces, 16 + sheets[1].faces, len(moved) + scene.bodies[0].faces]
+    )
+    expected = {
+        (i, j)
+        for i in range(len(faces) - len(scene.bodies[0].faces))
+        for j in range(i + 1, len(faces))
+        if not set(faces[i]) & set(faces[j])
+        and (
+            pierces(points[faces[i]], points[faces[j]])
+            or pierces(points[faces[j]], points[faces[i]])
+        )
+    }
+    assert crossings.count(state) == len(expected) > 10
+
+
+def pierces(a, b):
+    """Whether an edge of triangle `a` passes through triangle `b`."""
+    for p, q in ((a[0], a[1]), (a[1], a[2]), (a[2], a[0])):
+        # p + t (q - p) = b0 + u (b1 - b0) + v (b2 - b0)
+        matrix = np.stack([p - q, b[1] - b[0], b[2] - b[0]], axis=1)
+        if abs(np.linalg.det(matrix)) < 1e-12:
+            continue  # parallel, and not in the plane
+        t, u, v = np.linalg.solve(matrix, p - b[0])
+        if 0 <= t <= 1 and u >= 0 and v >= 0 and u + v <= 1:
+            return True
+    return False

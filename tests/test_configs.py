@@ -150,7 +150,8 @@ REFUSED = [
     ),
     pytest.param(
         "task=dance",
-        r"`task` must be one of drape, hit_cloth, push_cube, grasp_cloth; got 'dance'",
+        r"`task` must be one of drape, hit_cloth, push_cube, grasp_cloth, two_cloths, "
+        r"control_points; got 'dance'",
         id="task",
     ),
 ]

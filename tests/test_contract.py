@@ -47,7 +47,7 @@ PUBLIC = {
         "initial_state control parameters step rollout energy link_poses link_velocities "
         "contact_wrenches"
     ),
-    "SolverOptions": "tolerance max_iterations throw metric",
+    "SolverOptions": "tolerance max_iterations throw metric elastic",
     "State": "batch_size replace detach export",
     "build_info": "",
     "render": "",
@@ -209,6 +209,11 @@ def test_the_default_barrier_follows_from_the_cloths_alone():
         ({"dt": torch.tensor(0.1, requires_grad=True)}, dc.InvalidInput, "no gradient"),
         ({"scheme": "projective"}, dc.InvalidInput, "'coupled', 'split', got 'projective'"),
         ({"solver": dc.SolverOptions(metric="identity")}, dc.InvalidInput, "needs scheme 'split'"),
+        (
+            {"solver": dc.SolverOptions(elastic="projective")},
+            dc.InvalidInput,
+            "'split'; 'coupled' has none",
+        ),
         ({"solver": dc.ContactOptions()}, TypeError, "`solver` must be a SolverOptions"),
         (
             {"contact": dc.ContactOptions(barrier_distance=0.2)},

@@ -144,6 +144,31 @@ def test_a_disk_is_the_same_every_time():
         np.testing.assert_array_equal(a, b)
 
 
+def test_a_bent_strip_keeps_its_lengths_and_opens_downwards():
+    flat, bent, faces = shapes.strip(1.4, [0.04, 0.09], 4, 60, 180, 0.07, 0.4)
+    edges, _ = edges_of(faces)
+    assert len(flat) - len(edges) + len(faces) == 1  # Euler: a disk
+    along = np.abs(np.diff(edges)[:, 0]) == 1
+    lengths = [np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1) for x in (flat, bent)]
+    np.testing.assert_allclose(lengths[1][along], lengths[0][along], rtol=1e-12)
+    # Across, chords of the bend are shorter than the arc, which is straight in the flat strip.
+    np.testing.assert_allclose(lengths[1], lengths[0], rtol=2e-2)
+    row = bent.reshape(4, 60, 3)[0]
+    assert flat.reshape(4, 60, 3)[[0, -1], :, 1].T[[0, -1]] == pytest.approx(
+        np.array([[-0.02, 0.02], [-0.045, 0.045]])
+    )
+    assert row[[0, -1], 0] == pytest.approx([-0.07, 0.07], abs=1e-3)
+    assert row[:, 2].max() == pytest.approx(0.07, abs=1e-3)
+    sides = (0.4 * 1.4 - np.pi * 0.035, 0.6 * 1.4 - np.pi * 0.035)
+    assert row[[0, -1], 2] == pytest.approx([-sides[0], -sides[1]], abs=2e-3)
+
+
+def test_a_strip_that_is_not_bent_is_flat():
+    flat, bent, _ = shapes.strip(1.0, 0.1, 3, 11, 0, 0.1, 0.5)
+    np.testing.assert_allclose(bent[:, :2], flat[:, :2], atol=1e-15)
+    np.testing.assert_allclose(bent[:, 2], 0.1, atol=1e-15)  # at the top of the bend
+
+
 def test_a_chair_is_closed_and_has_the_volume_of_its_parts():
     w, d, h, back, t = 0.5, 0.4, 0.45, 0.5, 0.05
     vertices, faces = shapes.chair(w, d, h, back, t, 0.1)
@@ -163,6 +188,11 @@ def test_a_chair_is_closed_and_has_the_volume_of_its_parts():
     [
         pytest.param("{kind: disk, radius: 1, edge_length: 3}", "edge_length", id="coarse"),
         pytest.param("{kind: disk, radius: 1, edge_length: 1e-5}", "edge_length", id="fine"),
+        pytest.param(
+            "{kind: strip, length: 1, width: 0.1, rows: 3, columns: 9, bend: 180, radius: 0.4}",
+            "`bend` and `radius` must fit",
+            id="bend",
+        ),
     ],
 )
 def test_a_shape_that_cannot_be_made_is_refused(tmp_path, shape, message):
@@ -482,6 +512,28 @@ def has_panda():
     return True
 
 
+# Two strips that start in contact.
+TWO = Short(
+    "two_cloths.yaml",
+    (
+        *(
+            f"scene.cloths.{name}.shape={{kind: strip, length: 0.3, width: 0.06, rows: 3, "
+            "columns: 15, bend: 180, radius: 0.05}"
+            for name in ("blue", "red")
+        ),
+        "scene.cloths.red.pose.position=[0.06, 0, 0]",
+        "scene.cloths.blue.material.bending=1e-3",
+        "scene.cloths.red.material.bending=1e-3",
+        "pull.at={vertices: [0, 15, 30, 14, 29, 44]}",
+        "actions.at={vertices: [0, 15, 30, 14, 29, 44]}",
+        "actions.force=[[-0.3, 0.02, 0.04]]",
+        "simulation.steps=8",
+        "actions.interval=4",
+        "loss.steps=2",
+    ),
+)
+
+
 needs_panda = [
     pytest.mark.skipif(not has_panda(), reason="the Panda is in the extra `robots`"),
     pytest.mark.filterwarnings("ignore::diffcloth_torch.IgnoredLimitsWarning"),
@@ -491,6 +543,7 @@ SHORT = [
     pytest.param(DYNAMIC, id="hit_cloth_dynamic"),
     pytest.param(GRASP, id="grasp_cloth"),
     pytest.param(PANDA, id="panda_pick", marks=needs_panda),
+    pytest.param(TWO, id="two_cloths"),
 ]
 
 
@@ -607,6 +660,15 @@ def test_the_distance_of_a_body_is_that_of_its_center():
             id="pins-that-follow",
         ),
         pytest.param(PUSH, "scene.bodies.cube.motion=static", "`motion: dynamic`", id="fixed-cube"),
+        pytest.param(TWO, "pull.cloth=green", "'green' in `pull.cloth`", id="pulled"),
+        pytest.param(TWO, "target.cloth=green", "'green' in `target.cloth`", id="center"),
+        pytest.param(
+            TWO,
+            "actions.at={box: {lower: [5, 5, 5], upper: [6, 6, 6]}}",
+            "box of actions.at must hold a vertex",
+            id="pulled-nowhere",
+        ),
+        pytest.param(TWO, "pull.at={vertices: [45]}", r"pull\.at", id="pulled-beyond"),
         pytest.param(PUSH, "target.body=ball", "'ball' in `target.body`", id="target"),
         pytest.param(GRASP, "actions.robot=hand", "'hand' in `actions.robot`", id="robot"),
         pytest.param(GRASP, "scene.robots.gripper.base=fixed", "`base: kinematic`", id="base"),
@@ -630,6 +692,84 @@ def test_the_distance_of_a_body_is_that_of_its_center():
 def test_actions_must_fit_what_acts(short, assignment, message):
     with pytest.raises(dc.InvalidInput, match=message):
         short.load(assignment)
+
+
+# --- two cloths, and control points --------------------------------------------------------------
+
+
+def test_the_shipped_forces_are_those_on_the_ends_of_two_hooked_cloths():
+    task = load_task(CONFIGS / "two_cloths.yaml")
+    control = controls_of(task, task.actions())[0]
+    forces = control.forces.detach()
+    blue, red = (forces[task.simulator.slices[name]] for name in ("blue", "red"))
+    torch.testing.assert_close(red.sum(dim=0), torch.tensor([0.3, 0, 0.047], dtype=torch.float64))
+    torch.testing.assert_close(blue.sum(dim=0), torch.tensor([-0.3, 0, 0.047], dtype=torch.float64))
+    for name, part in (("blue", blue), ("red", red)):
+        pulled = part.abs().sum(dim=1) > 0
+        ends = task.scene.cloths[task.scene.cloth_names.index(name)].rest_vertices[:, 0]
+        np.testing.assert_array_equal(pulled.numpy(), np.isclose(np.abs(ends), 0.2))
+
+
+def test_the_distance_of_a_cloth_is_that_of_its_center():
+    task = TWO.load("target.position=[0.3, 0.4, 0.5]")
+    start = task.initial_state()
+    rows = task.simulator.slices["blue"]
+    moved = start.positions.clone()
+    moved[rows] -= moved[rows].mean(dim=0) - torch.tensor([0.0, 0.0, 0.5])
+    state = start.replace(positions=moved)
+    assert task.distance(state, "distance").item() == pytest.approx(0.5)
+    (goal,) = task.goals()
+    np.testing.assert_allclose(goal.vertices.mean(axis=0), [0.3, 0.4, 0.5], atol=1e-12)
+
+
+CUBE = Short(
+    "cloth_on_cube.yaml",
+    (
+        "scene.cloths.cloth.shape={kind: grid, rows: 7, columns: 7, size: 0.5}",
+        "scene.cloths.cloth.soft_pins={corner_0: {vertices: [0]}, corner_1: {vertices: [6]}, "
+        "corner_2: {vertices: [42, 43]}, corner_3: {vertices: [48]}}",
+        "simulation.dt=0.1",
+        "simulation.steps=12",
+    ),
+)
+
+
+def test_control_points_are_followed_to_their_last_targets():
+    task = CUBE.load("scene.cloths.cloth.pin_trajectories.corner_0=[{time: 9}]")
+    start = task.initial_state()
+    ends = torch.tensor([0.0, 0.5, 0.5, 0.5], dtype=torch.float64)
+    torch.testing.assert_close(task.distances(start), ends)
+    # A group is where the mean of its vertices is.
+    turned = start.positions.clone()
+    turned[42] += torch.tensor([0.0, 0.0, 0.1])
+    turned[43] -= torch.tensor([0.0, 0.0, 0.1])
+    torch.testing.assert_close(task.distances(start.replace(positions=turned)), ends)
+    centers = np.array([goal.vertices.mean(axis=0) for goal in task.goals()])
+    expected = start.positions.numpy()[[0, 6, 42, 48]]
+    expected[2] = start.positions.numpy()[[42, 43]].mean(axis=0)
+    expected[1:, 2] -= 0.5
+    np.testing.assert_allclose(centers, expected, atol=1e-12)
+
+
+def test_control_points_reach_their_targets_as_far_as_the_cloth_lets_them():
+    task = CUBE.load()
+    states = list(simulate(task))
+    assert all(state.report.converged for state in states[1:])
+    distances = task.distances(states[-1])
+    assert 0.01 < distances.max() < 0.1  # from half a meter
+    assert max(state.report.contact_count for state in states[1:]) > 0
+
+
+def test_control_points_are_soft_pins():
+    with pytest.raises(dc.InvalidInput, match="must have `soft_pins`"):
+        CUBE.load("scene.cloths.cloth.soft_pins={}", "scene.cloths.cloth.pin_trajectories={}")
+
+
+def test_the_shipped_tie_is_the_one_of_the_paper():
+    task = load_task(CONFIGS / "tie.yaml")
+    (tie,) = task.scene.cloths
+    assert np.ptp(tie.rest_vertices[:, 0]) == pytest.approx(1.4)
+    assert {name: len(rows) for name, rows in tie.soft_pins.items()} == {"narrow": 5, "wide": 5}
 
 
 # --- the loop, on a task without a simulation ---------------------------------------------------

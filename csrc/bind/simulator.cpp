@@ -336,9 +336,18 @@ nb::object Simulator::find_overlap(const nb::dict& inputs) const {
 }
 
 step::Metric to_metric(const std::string& name) {
+  if (name == "elastic") return step::Metric::kElastic;
   if (name == "mass") return step::Metric::kMass;
   if (name == "identity") return step::Metric::kIdentity;
-  throw nb::value_error(("metric must be one of 'mass', 'identity', got '" + name + "'").c_str());
+  throw nb::value_error(
+      ("metric must be one of 'elastic', 'mass', 'identity', got '" + name + "'").c_str());
+}
+
+step::ElasticSolver to_elastic_solver(const std::string& name) {
+  if (name == "newton") return step::ElasticSolver::kNewton;
+  if (name == "projective") return step::ElasticSolver::kProjective;
+  throw nb::value_error(
+      ("elastic must be one of 'newton', 'projective', got '" + name + "'").c_str());
 }
 
 step::Description describe(const Doubles& vertices,
@@ -382,6 +391,15 @@ step::Description describe(const Doubles& vertices,
   d.friction_iterations = friction_iterations;
   d.options = {.tolerance = tolerance, .max_iterations = max_iterations};
   return d;
+}
+
+projective::PrimitiveKind to_primitive(const std::string& kind) {
+  using enum projective::PrimitiveKind;
+  if (kind == "plane") return kPlane;
+  if (kind == "sphere") return kSphere;
+  if (kind == "capsule") return kCapsule;
+  if (kind == "box") return kBox;
+  return kNone;
 }
 
 /// Trees of links, from the arrays that say what they are; see bodies::MechanismsDescription.
@@ -472,7 +490,16 @@ void simulator(nb::module_& m) {
                  nb::cast<double>(k["dt"]), nb::cast<std::string>(k["scheme"]),
                  nb::cast<std::string>(k["metric"]), nb::cast<int>(k["friction_iterations"]),
                  nb::cast<double>(k["tolerance"]), nb::cast<int>(k["max_iterations"]));
+             description.elastic = to_elastic_solver(nb::cast<std::string>(k["elastic"]));
              if (k.contains("tree_free")) description.mechanisms = describe_mechanisms(k);
+             if (k.contains("primitive_kinds")) {
+               const auto sizes = doubles("primitive_sizes");
+               for (const auto& kind : nb::cast<std::vector<std::string>>(k["primitive_kinds"])) {
+                 const auto i = static_cast<Index>(description.primitives.size());
+                 description.primitives.push_back(
+                     {.kind = to_primitive(kind), .size = row(sizes.data(), i)});
+               }
+             }
              if (k.contains("link_names")) {
                description.link_names = nb::cast<std::vector<std::string>>(k["link_names"]);
              }

@@ -287,6 +287,24 @@ void add_hessian_product(const Element& element, const double* x, const double* 
   scatter(element, R * change.dq_total(), R * change.V, y);
 }
 
+ScalarBars constant_mixed(const Element& element, const double* u, const double* z, double* c_bar) {
+  const Mat3 Y_u = second_derivatives(element, u);
+  const Mat3 Y_z = second_derivatives(element, z);
+  const Mat3 Q = form(element.poisson);
+  if (c_bar != nullptr) {
+    const Index v0 = element.vertices[0];
+    const Mat3 q_u = element.weight * Q * Y_u.transpose();
+    const Mat3 q_z = element.weight * Q * Y_z.transpose();
+    for (Index i = 1; i < element.size(); ++i) {
+      const Index v = element.vertices[i];
+      Eigen::Map<Vec3>(c_bar + 3 * i) +=
+          q_u * (row(z, v) - row(z, v0)) + q_z * (row(u, v) - row(u, v0));
+    }
+  }
+  return {.weight = (Y_u * Q).cwiseProduct(Y_z).sum(),
+          .poisson = element.weight * (Y_u * form_derivative()).cwiseProduct(Y_z).sum()};
+}
+
 // phi = z . grad E = weight [ <s Q, ds> + damping <s_n Q, ds_n> ] with ds the change of s along z:
 // ds = R^T Y(z) - w x b. By symmetry of second derivatives, the gradient of phi with respect to
 // (Y, F) is the change of (dE/dY, dE/dF) along z, and that with respect to (Y(z), F(z)) is
@@ -297,12 +315,7 @@ ScalarBars mixed(const Element& element,
                  const double* z,
                  const GeometryBars& bars) {
   const bool with_rest = bars.c != nullptr;
-  if (element.flat && x_n == nullptr && !with_rest) {
-    const Mat3 Y = second_derivatives(element, x);
-    const Mat3 dY = second_derivatives(element, z);
-    return {.weight = (Y * form(element.poisson)).cwiseProduct(dY).sum(),
-            .poisson = element.weight * (Y * form_derivative()).cwiseProduct(dY).sum()};
-  }
+  if (element.flat && x_n == nullptr && !with_rest) return constant_mixed(element, x, z, nullptr);
   const BodyState state = body_state(element, x);
   const BodyChange change = body_change(element, state, z);
   const Mat3& R = state.frame.R;

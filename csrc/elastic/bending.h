@@ -69,6 +69,9 @@ struct ScalarBars {
   double damping = 0.0;
 };
 
+/// Cotangents for phi = weight <Y(u) Q, Y(z)>, the form of add_constant(); c_bar may be null.
+ScalarBars constant_mixed(const Element& element, const double* u, const double* z, double* c_bar);
+
 /// Where the cotangents of the geometry of an element are added. Null pointers are skipped.
 struct GeometryBars {
   double* c = nullptr;               ///< 3 a vertex

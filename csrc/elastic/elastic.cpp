@@ -6,23 +6,12 @@
 
 #include "elastic/bending.h"
 #include "elastic/damping.h"
+#include "elastic/elements.h"
 #include "elastic/frame.h"
 #include "elastic/stretch.h"
 
 namespace diffcloth::elastic {
 namespace {
-
-Index face_count(const Model& model) { return static_cast<Index>(model.topology->faces.size()); }
-
-Mat32 face_gradient(const Model& model, Index f, const double* x) {
-  const std::array<Index, 3>& face = model.topology->faces[f];
-  return deformation_gradient(model.rest->shape_gradient[f], row(x, face[0]), row(x, face[1]),
-                              row(x, face[2]));
-}
-
-double stretch_weight(const Model& model, Index f) {
-  return model.stretch[f] * model.rest->area[f];
-}
 
 double damping_weight(const Model& model, Index f) {
   return model.damping[f] / model.h * stretch_weight(model, f);
@@ -30,56 +19,11 @@ double damping_weight(const Model& model, Index f) {
 
 bool is_damped(const Model& model, Index f) { return model.damping[f] != 0.0; }
 
-/// The mean over the faces of a bending element.
-double element_mean(const Model& model, Index e, const std::vector<double>& face_values) {
-  const auto [f0, f1] = model.stencils->faces[e];
-  return f1 < 0 ? face_values[f0] : 0.5 * (face_values[f0] + face_values[f1]);
-}
-
-/// The transpose of element_mean().
-void add_to_faces(const Model& model, Index e, double bar, std::vector<double>& face_bars) {
-  const auto [f0, f1] = model.stencils->faces[e];
-  if (f1 < 0) {
-    face_bars[f0] += bar;
-  } else {
-    face_bars[f0] += 0.5 * bar;
-    face_bars[f1] += 0.5 * bar;
-  }
-}
-
-bending::Element bending_element(const Model& model, Index e) {
-  const mesh::BendingStencils& stencils = *model.stencils;
-  const Prepared& prepared = model.prepared;
-  return {.vertices = stencils.element(e),
-          .c = model.rest->curvature_operator.data() + 3 * stencils.start[e],
-          .g = &model.rest->shape_gradient[stencils.faces[e][0]],
-          .weight = prepared.bending[e],
-          .poisson = prepared.poisson[e],
-          .damping = prepared.damping[e],
-          .b = &model.rest->curvature[e],
-          .b_n = &prepared.curvature_n[e],
-          .flat = prepared.flat[e] != 0};
-}
-
-std::span<const Index> bending_slots(const Slots& slots, Index e) {
-  return {slots.bending.data() + slots.bending_start[e],
-          static_cast<std::size_t>(slots.bending_start[e + 1] - slots.bending_start[e])};
-}
-
 /// y_p += P g_p over the corners of a face.
 void scatter(const Model& model, Index f, const Mat32& P, double* y) {
   for (int p = 0; p < 3; ++p) {
     Eigen::Map<Vec3>(y + 3 * model.topology->faces[f][p]) +=
         P * model.rest->shape_gradient[f].row(p).transpose();
-  }
-}
-
-/// g_p += F_bar^T x_p, with x relative to the first corner (the gradients sum to zero).
-void scatter_gradient_bar(
-    const Model& model, Index f, const Mat32& F_bar, const double* x, mesh::ShapeGradient& g_bar) {
-  const std::array<Index, 3>& face = model.topology->faces[f];
-  for (int p = 1; p < 3; ++p) {
-    g_bar.row(p) += (row(x, face[p]) - row(x, face[0])).transpose() * F_bar;
   }
 }
 

@@ -23,8 +23,12 @@ void ElasticPotential::add_hessian(const double* x,
 }
 
 void ElasticPotential::accumulate(const double* x, const double* z) {
+  add_mixed(model_, x, negated(z, model_.topology->vertex_count).data(), with_rest_, bar());
+}
+
+Bar& ElasticPotential::bar() {
   if (bar_.stretch.empty()) bar_ = Bar(*model_.topology, *model_.stencils);
-  add_mixed(model_, x, negated(z, model_.topology->vertex_count).data(), with_rest_, bar_);
+  return bar_;
 }
 
 AnchorPotential::AnchorPotential(Anchors anchors)

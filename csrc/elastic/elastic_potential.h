@@ -27,7 +27,13 @@ class ElasticPotential final : public Potential {
   }
 
   void accumulate(const double* x, const double* z) override;
-  Bar& bar() { return bar_; }
+
+  const Model& model() const { return model_; }
+  const Slots& slots() const { return slots_; }
+  bool with_rest() const { return with_rest_; }
+
+  /// Zero until something is accumulated.
+  Bar& bar();
 
  private:
   const Model& model_;
@@ -53,6 +59,8 @@ class AnchorPotential final : public Potential {
     elastic::add_hessian_product(anchors_, z, y);
   }
   void accumulate(const double* x, const double* z) override;
+
+  const Anchors& anchors() const { return anchors_; }
 
   std::vector<double> stiffness_bar;  ///< [A]
   std::vector<double> target_bar;     ///< [3 A]

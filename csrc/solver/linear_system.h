@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cstdint>
 #include <memory>
 #include <vector>
 
@@ -15,12 +16,13 @@ using Factor = std::shared_ptr<const linalg::CholeskyFactor>;
 
 /// What a step did, for the report.
 struct Counts {
-  int exact = 0;               ///< Newton steps with the exact Hessian, factored or by CG
-  int chord = 0;               ///< steps with an older factor
-  int projected = 0;           ///< steps with a Hessian blended with its projection
-  int negative_curvature = 0;  ///< Hessians that were found indefinite
-  int factorizations = 0;      ///< numeric ones, those that failed included
-  int analyses = 0;            ///< symbolic ones
+  int exact = 0;                  ///< Newton steps with the exact Hessian, factored or by CG
+  int chord = 0;                  ///< steps with an older factor
+  int projected = 0;              ///< steps with a Hessian blended with its projection
+  int negative_curvature = 0;     ///< Hessians that were found indefinite
+  std::int64_t local_global = 0;  ///< iterations of Projective Dynamics
+  int factorizations = 0;         ///< numeric ones, those that failed included
+  int analyses = 0;               ///< symbolic ones
 };
 
 /// The Newton system H p = -g of an objective, at the point where it stands: assembled, factored,

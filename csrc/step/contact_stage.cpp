@@ -134,7 +134,7 @@ void write_body_forces(const Problem& problem, const Sum& sum, const Array& x, d
   if (sum.objective.contact != nullptr) sum.objective.contact->add_gradient(x.data(), g.data());
   if (sum.friction) sum.friction->add_gradient(x.data(), g.data());
   const std::size_t end = 3 * static_cast<std::size_t>(problem.scene.vertex_count());
-  for (std::size_t a = problem.cloth_size; a < end; ++a) out[a - problem.cloth_size] = -g[a];
+  for (std::size_t a = problem.cloth_size; a < end; ++a) out[a - problem.cloth_size] -= g[a];
 }
 
 std::string_view words(solver::Status status) {

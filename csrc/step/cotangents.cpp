@@ -21,11 +21,13 @@ void write_surfaces(const Problem& p, const Cotangents& bars, const Gradients& g
   if (double* out = gradients[Input::kBodyPoses]) {
     const double* poses = p.inputs.data(Input::kBodyPoses);
     bodies.place_vjp(poses, start.data() + p.cloth_size, out);
+    add_to(out, bars.body_poses);
     mechanisms.set_frames_vjp(poses, p.coordinates.nodes(start), out);
   }
   if (double* out = gradients[Input::kBodyTargets]) {
     const double* poses = p.inputs.data(Input::kBodyTargets);
     bodies.place_vjp(poses, bars.ends.data() + p.cloth_size, out);
+    add_to(out, bars.body_targets);
     mechanisms.set_frames_vjp(poses, p.coordinates.nodes(bars.ends), out);
   }
   for (Index c = 0; c < mechanisms.coordinate_count(); ++c) {
@@ -121,6 +123,8 @@ Cotangents::Cotangents(const Problem& p)
       ends(p.start.size(), 0.0),
       velocities(p.cloth_size, 0.0),
       masses(p.masses.size(), 0.0),
+      body_poses(p.inputs[Input::kBodyPoses].count, 0.0),
+      body_targets(p.inputs[Input::kBodyTargets].count, 0.0),
       contact(p.scene.collision_mesh) {}
 
 void Cotangents::add_predicted(Problem& p, const Gradients& gradients) {

@@ -23,6 +23,8 @@ struct Cotangents {
   std::vector<double> velocities;   ///< v_n
   std::vector<double> masses;       ///< [N]
   std::vector<double> body_forces;  ///< of the output [3 V]
+  std::vector<double> body_poses;   ///< of the poses at the start, beyond what `start` pulls back
+  std::vector<double> body_targets;  ///< likewise, at the end
   contact::ContactModel::Bar contact;
 };
 

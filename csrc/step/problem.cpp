@@ -180,6 +180,20 @@ std::vector<Potential*> Problem::elastic_potentials() {
   return result;
 }
 
+elastic::ConstantForm Problem::constant_form() const {
+  return {model, scene.slots, anchors ? anchors->anchors() : elastic::Anchors{},
+          scene.elastic_assemblies.base()};
+}
+
+std::shared_ptr<const projective::ConstantMatrix> Problem::constant_matrix() const {
+  const elastic::ConstantForm form = constant_form();
+  std::vector<double> values = form.values();
+  for (std::size_t i = 0; i < masses.size(); ++i) {
+    values[form.pattern().column_start()[i]] += masses[i] / (h * h);
+  }
+  return scene.constant_matrices.find(values);
+}
+
 solver::Objective Problem::objective(Proximity& inertia_or_nearness,
                                      std::vector<Potential*> others,
                                      solver::AssemblyCache& assemblies) {

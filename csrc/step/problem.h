@@ -4,8 +4,10 @@
 #include <optional>
 #include <vector>
 
+#include "elastic/constant_form.h"
 #include "elastic/elastic_potential.h"
 #include "potential/proximity.h"
+#include "projective/constant_matrix.h"
 #include "step/inputs.h"
 #include "step/scene.h"
 
@@ -48,6 +50,12 @@ class Problem {
 
   /// Elasticity and anchors.
   std::vector<Potential*> elastic_potentials();
+
+  /// L of elasticity and anchors.
+  elastic::ConstantForm constant_form() const;
+
+  /// A = M/h^2 + L over the cloths' free vertices, factored.
+  std::shared_ptr<const projective::ConstantMatrix> constant_matrix() const;
 
   /// A sum of potentials over the cloths' vertices, without contact.
   solver::Objective objective(Proximity& inertia,

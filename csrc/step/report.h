@@ -24,6 +24,9 @@ struct Report {
   double minimum_distance = 0.0;  ///< of the pairs in contact; infinite without contact [m]
   Index contact_count = 0;
   double motion_fraction = 1.0;
+  Index taking_off = 0;  ///< nodes in dry frictional contact, by the cases of its law
+  Index sticking = 0;
+  Index slipping = 0;
   solver::Counts counts;
   Seconds seconds{};
   std::string message;
@@ -41,8 +44,12 @@ struct Report {
     visit("count_chord", static_cast<std::int64_t>(counts.chord));
     visit("count_projected", static_cast<std::int64_t>(counts.projected));
     visit("count_negative_curvature", static_cast<std::int64_t>(counts.negative_curvature));
+    visit("count_local_global", counts.local_global);
     visit("count_factorizations", static_cast<std::int64_t>(counts.factorizations));
     visit("count_analyses", static_cast<std::int64_t>(counts.analyses));
+    visit("count_taking_off", static_cast<std::int64_t>(taking_off));
+    visit("count_sticking", static_cast<std::int64_t>(sticking));
+    visit("count_slipping", static_cast<std::int64_t>(slipping));
   }
 };
 

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <numeric>
+#include <utility>
 
 #include "step/scheme.h"
 
@@ -22,6 +23,11 @@ contact::CollisionMesh make_collision_mesh(const Description& d,
     std::fill(surface.begin() + d.cloth_vertex_start[c],
               surface.begin() + d.cloth_vertex_start[c + 1], c);
   }
+  std::vector<std::array<Index, 2>> ignored = d.ignored_pairs;
+  for (std::size_t k = 0; k < d.primitives.size(); ++k) {
+    if (d.primitives[k].kind == projective::PrimitiveKind::kNone) continue;
+    for (Index c = 0; c < cloths; ++c) ignored.push_back({c, cloths + static_cast<Index>(k)});
+  }
   std::vector<char> dynamic;
   for (Index k = 0; k < d.bodies.count(); ++k) {
     dynamic.push_back(mechanisms.is_dynamic(k) ? 1 : 0);
@@ -33,7 +39,7 @@ contact::CollisionMesh make_collision_mesh(const Description& d,
                                       .cloth_count = cloths,
                                       .self_contact = d.self_contact,
                                       .body_dynamic = dynamic,
-                                      .ignored = d.ignored_pairs})};
+                                      .ignored = ignored})};
 }
 
 /// All surfaces as given: the reference that the collision trees are built from.
@@ -128,6 +134,22 @@ std::vector<char> make_prescribed(const Description& d, const bodies::Mechanisms
   return prescribed;
 }
 
+/// Of the bodies that nodes touch.
+std::vector<projective::FaceSearch> face_searches(const Description& d) {
+  std::vector<projective::FaceSearch> searches(d.primitives.size());
+  for (std::size_t k = 0; k < d.primitives.size(); ++k) {
+    if (d.primitives[k].kind == projective::PrimitiveKind::kNone) continue;
+    std::vector<std::array<Index, 3>> faces;
+    for (const auto& face : d.body_faces) {
+      const bool own =
+          face[0] >= d.bodies.vertex_start[k] && face[0] < d.bodies.vertex_start[k + 1];
+      if (own) faces.push_back(face);
+    }
+    searches[k] = projective::FaceSearch(std::move(faces), d.bodies.vertices);
+  }
+  return searches;
+}
+
 /// Those of rows: of the cloth's vertices and the nodes of coordinates.
 std::vector<char> fixed_rows(const std::vector<char>& prescribed,
                              Index cloth_vertex_count,
@@ -166,11 +188,14 @@ Scene::Scene(Description description)
       measures(contact::measure(collision_mesh, all_rest_positions(given).data())),
       feature_weights(collision_mesh, all_rest_positions(given).data(), prescribed),
       broad_phase(collision_mesh, reference_positions(given).data()),
+      face_search(face_searches(given)),
       elastic_assemblies(
           with_nodes(topology.vertex_count, elastic::cliques(topology, stencils), mechanisms),
           fixed_rows(prescribed, topology.vertex_count, mechanisms)),
       diagonal_assemblies(with_nodes(topology.vertex_count, {}, mechanisms),
-                          fixed_rows(prescribed, topology.vertex_count, mechanisms)) {
+                          fixed_rows(prescribed, topology.vertex_count, mechanisms)),
+      constant_matrices(elastic_assemblies.base(),
+                        {prescribed.begin(), prescribed.begin() + topology.vertex_count}) {
   given.bodies.pose = surface_poses(mechanisms);
   slots = elastic::slots(topology, stencils, elastic_assemblies.base());
 }

@@ -14,6 +14,8 @@
 #include "elastic/elastic.h"
 #include "mesh/rest_shape.h"
 #include "mesh/topology.h"
+#include "projective/constant_matrix.h"
+#include "projective/nodal_contact.h"
 #include "solver/assembly_cache.h"
 #include "solver/walk.h"
 
@@ -22,7 +24,10 @@ namespace diffcloth::step {
 class Scheme;
 
 /// Norm of the contact stage of `split`.
-enum class Metric : std::uint8_t { kMass, kIdentity };
+enum class Metric : std::uint8_t { kElastic, kMass, kIdentity };
+
+/// How the elastic stage of `split` is solved.
+enum class ElasticSolver : std::uint8_t { kNewton, kProjective };
 
 /// What a simulator is made from.
 struct Description {
@@ -38,11 +43,15 @@ struct Description {
   bodies::MechanismsDescription mechanisms;         ///< empty: every body is a tree of one link
   std::vector<std::array<Index, 3>> body_faces;     ///< indices into the bodies' vertices
   std::vector<std::array<Index, 2>> ignored_pairs;  ///< pairs of surfaces that never touch
+  /// [surfaces of bodies] of those that cloths touch at their nodes, instead of by the barrier;
+  /// empty: none
+  std::vector<projective::Primitive> primitives;
   std::vector<std::string> link_names;              ///< of the last surfaces; before come bodies
   bool self_contact = true;
   double dt = 0.01;
   std::string scheme = "coupled";
-  Metric metric = Metric::kMass;
+  Metric metric = Metric::kElastic;
+  ElasticSolver elastic = ElasticSolver::kNewton;
   int friction_iterations = 2;
   solver::Options options{};
 };
@@ -71,10 +80,12 @@ struct Scene {
   contact::RestMeasures measures;           ///< of given.rest_vertices and the bodies
   contact::FeatureWeights feature_weights;  ///< likewise
   contact::BroadPhase broad_phase;
+  std::vector<projective::FaceSearch> face_search;  ///< [surfaces of bodies] where nodes touch them
   elastic::Slots slots;
 
-  mutable solver::AssemblyCache elastic_assemblies;   ///< over the elastic pattern
-  mutable solver::AssemblyCache diagonal_assemblies;  ///< over isolated vertices
+  mutable solver::AssemblyCache elastic_assemblies;           ///< over the elastic pattern
+  mutable solver::AssemblyCache diagonal_assemblies;          ///< over isolated vertices
+  mutable projective::ConstantMatrixCache constant_matrices;  ///< over the elastic pattern
 };
 
 /// Rest quantities that weigh contacts, for a rest shape of the cloths.

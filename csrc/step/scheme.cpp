@@ -5,16 +5,18 @@
 #include <string>
 
 #include "step/coupled.h"
+#include "step/projective.h"
 #include "step/split.h"
 
 namespace diffcloth::step {
 namespace {
 
 /// All schemes: a new one is a line here.
-std::array<const Scheme*, 2> schemes() {
+std::array<const Scheme*, 3> schemes() {
   static const Coupled coupled;
   static const Split split;
-  return {&coupled, &split};
+  static const Projective projective;
+  return {&coupled, &split, &projective};
 }
 
 }  // namespace

@@ -5,59 +5,81 @@
 #include "step/split.h"
 
 #include <algorithm>
+#include <optional>
 
-#include "solver/newton.h"
+#include "elastic/elastic_nearness.h"
 #include "step/contact_stage.h"
-#include "step/motion.h"
+#include "step/elastic_stage.h"
 
 namespace diffcloth::step {
 namespace {
 
 using Array = std::vector<double>;
 
-/// G_i of the contact stage [kg].
-Array stage_metric(const Problem& p) {
-  if (p.scene.given.metric == Metric::kMass) return p.masses;
-  // The literal metric weighs all vertices alike; the mean mass keeps the energy in joules.
-  double mean = 0.0;
-  for (const double m : p.masses) mean += m;
-  mean /= static_cast<double>(p.masses.size());
-  Array metric(p.masses.size(), mean);
-  return metric;
-}
-
-/// Its adjoint: into the masses.
-void add_stage_metric(const Problem& p, const Array& bar, Array& masses_bar) {
-  double mean = 0.0;
-  for (const double value : bar) mean += value;
-  mean /= static_cast<double>(bar.size());
-  for (std::size_t i = 0; i < bar.size(); ++i) {
-    masses_bar[i] += p.scene.given.metric == Metric::kMass ? bar[i] : mean;
+/// Nearness to x^D, in the metric G of the contact stage.
+///
+/// `elastic` is G = h^2 A with A = M/h^2 + L the constant matrix of the whole elastic stage, soft pins
+/// and damping included: what contact pushes then pulls along what it hangs on, as it would in one
+/// solve with that matrix for a Hessian. L annihilates constants, so that a free cloth keeps its
+/// momentum as it does in the masses alone.
+class Nearness {
+ public:
+  Nearness(Problem& problem, const Array& x_d)
+      : problem_(problem), inertial_(diagonal(problem), x_d, problem.h) {
+    if (problem.scene.given.metric != Metric::kElastic) return;
+    elastic_.emplace(problem.constant_form(), problem.elasticity,
+                     problem.anchors ? &*problem.anchors : nullptr, x_d);
   }
-}
 
-ContactStage stage(Problem& problem, Proximity& nearness) {
-  return {.inertia = nearness,
-          .others = {},
-          .assemblies = problem.scene.diagonal_assemblies,
-          .first_factor = 1};
-}
+  ContactStage stage() {
+    const Scene& scene = problem_.scene;
+    if (!elastic_) {
+      return {.inertia = inertial_,
+              .others = {},
+              .assemblies = scene.diagonal_assemblies,
+              .first_factor = 1};
+    }
+    return {.inertia = inertial_,
+            .others = {&*elastic_},
+            .assemblies = scene.elastic_assemblies,
+            .first_factor = 1};
+  }
 
-/// x^D: pins are at their targets, and so are the bodies, which nothing here looks at.
-Array solve_elastic_stage(const Forward& step) {
-  Problem& problem = step.problem;
-  const solver::Objective f = problem.objective(problem.inertia, problem.elastic_potentials(),
-                                                problem.scene.elastic_assemblies);
-  Array x = problem.predicted(problem.inertia.target().data());
-  // Its way is no motion of the cloth.
-  auto* const path = std::exchange(step.context.path, nullptr);
-  const solver::Outcome outcome =
-      solver::minimize(f, x, Motion(problem), nullptr, nullptr, step.context);
-  step.context.path = path;
-  merge(outcome, step.report);
-  step.kept.factors.push_back(outcome.factor);
-  return x;
-}
+  /// Cotangent of x^D.
+  Array target_bar() const {
+    Array bar = inertial_.target_bar;
+    if (!elastic_) return bar;
+    for (std::size_t a = 0; a < bar.size(); ++a) bar[a] += elastic_->target_bar[a];
+    return bar;
+  }
+
+  /// Into the cotangents of the masses that G is made of.
+  void add_masses_bar(Array& masses_bar) const {
+    const Array& bar = inertial_.metric_bar;
+    double mean = 0.0;
+    for (const double value : bar) mean += value;
+    mean /= static_cast<double>(bar.size());
+    for (std::size_t i = 0; i < bar.size(); ++i) {
+      masses_bar[i] += problem_.scene.given.metric == Metric::kIdentity ? mean : bar[i];
+    }
+  }
+
+ private:
+  /// G less h^2 L, which is diagonal [kg].
+  static Array diagonal(const Problem& p) {
+    if (p.scene.given.metric != Metric::kIdentity) return p.masses;
+    // The literal metric weighs all vertices alike; the mean mass keeps the energy in joules.
+    double mean = 0.0;
+    for (const double m : p.masses) mean += m;
+    mean /= static_cast<double>(p.masses.size());
+    Array metric(p.masses.size(), mean);
+    return metric;
+  }
+
+  Problem& problem_;
+  Proximity inertial_;
+  std::optional<elastic::ElasticNearness> elastic_;
+};
 
 }  // namespace
 
@@ -70,29 +92,21 @@ std::vector<Field> Split::tape(const Scene& scene) const {
 
 void Split::forward(const Forward& step, Array& x, double* body_forces) const {
   Problem& problem = step.problem;
-  Array x_d = solve_elastic_stage(step);
+  Array x_d = ElasticStage(problem, false).forward(step, body_forces);
   x_d.resize(problem.cloth_size);
-  if (!step.tape.empty()) std::ranges::copy(x_d, step.tape["elastic"]);
-
-  Proximity nearness(stage_metric(problem), std::move(x_d), problem.h);
-  stage(problem, nearness).forward(step, x, body_forces);
+  Nearness(problem, x_d).stage().forward(step, x, body_forces);
 }
 
 void Split::backward(const Backward& step) const {
   Problem& problem = step.problem;
   const double* x_d = step.tape["elastic"];
-  Proximity nearness(stage_metric(problem), Array(x_d, x_d + problem.cloth_size), problem.h);
-  stage(problem, nearness).backward(step, step.cotangents.rows);
-  add_stage_metric(problem, nearness.metric_bar, step.cotangents.masses);
+  Nearness nearness(problem, Array(x_d, x_d + problem.cloth_size));
+  nearness.stage().backward(step, step.cotangents.rows);
+  nearness.add_masses_bar(step.cotangents.masses);
 
-  const solver::Objective f = problem.objective(problem.inertia, problem.elastic_potentials(),
-                                                problem.scene.elastic_assemblies);
-  Array g = nearness.target_bar;
+  Array g = nearness.target_bar();
   g.resize(problem.coordinates.size(), 0.0);
-  const Array x = problem.predicted(x_d);
-  problem.coordinates.stand_at(x.data());
-  const FactorCache::Factors& factors = step.kept.factors;
-  pull_back_solve(step, f, x, factors.empty() ? nullptr : factors.front(), g, nullptr);
+  ElasticStage(problem, false).backward(step, g, step.cotangents.body_forces);
 }
 
 }  // namespace diffcloth::step

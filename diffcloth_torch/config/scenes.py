@@ -48,6 +48,7 @@ __all__ = [
     "prescribed_motions",
     "prescribed_poses",
     "quaternion",
+    "select_vertices",
     "step_controls",
 ]
 
@@ -110,20 +111,24 @@ def _cloth(section: ClothSection, root: str, source: Path) -> Cloth:
     if shape.kind == "grid":
         sheet = Cloth.grid(shape.rows, shape.columns, shape.size)
         rest, faces = sheet.vertices, sheet.faces
+        start = rest
     elif shape.kind == "disk":
         rest, faces = _generated(section.name, shapes.disk, _given(shape))
+        start = rest
+    elif shape.kind == "strip":
+        rest, start, faces = _generated(section.name, shapes.strip, _given(shape))
     else:
-        rest, faces = read_mesh(resolve_path(source, root, shape.path))
-        rest = shape.scale * rest
-    vertices = transform(rest, pose_array(section.pose))
-    if shape.kind == "load" and shape.rest is not None:
-        rest = shape.scale * read_mesh(resolve_path(source, root, shape.rest))[0]
+        start, faces = read_mesh(resolve_path(source, root, shape.path))
+        start = rest = shape.scale * start
+        if shape.rest is not None:
+            rest = shape.scale * read_mesh(resolve_path(source, root, shape.rest))[0]
+    vertices = transform(start, pose_array(section.pose))
     options: dict[str, Any] = section.model_dump(
         include={"pin_stiffness", "bending_model"}, exclude_none=True
     )
     for kind in ("pins", "soft_pins"):
         options[kind] = {
-            name: _selected(f"{section.name}.{kind}.{name}", selection, vertices)
+            name: select_vertices(f"{section.name}.{kind}.{name}", selection, vertices)
             for name, selection in getattr(section, kind).items()
         }
     return Cloth(
@@ -144,7 +149,9 @@ def _generated(name: str, generate: Any, arguments: dict[str, Any]) -> Any:
         raise InvalidInput(f"`scene`: the shape of {name!r} cannot be made: {error}") from error
 
 
-def _selected(name: str, selection: Selection, vertices: NDArray[np.float64]) -> NDArray[np.int64]:
+def select_vertices(
+    name: str, selection: Selection, vertices: NDArray[np.float64]
+) -> NDArray[np.int64]:
     """Vertices that a selection names, in increasing order but for a list, which keeps its own."""
     if selection.vertices is not None:
         return np.array(selection.vertices)
@@ -159,7 +166,7 @@ def _selected(name: str, selection: Selection, vertices: NDArray[np.float64]) ->
     if chosen.size == 0:
         low, high = vertices.min(axis=0).round(4), vertices.max(axis=0).round(4)
         raise InvalidInput(
-            f"`scene`: the box of {name} must hold a vertex; the cloth lies between "
+            f"the box of {name} must hold a vertex; the cloth lies between "
             f"{low.tolist()} and {high.tolist()}"
         )
     return chosen
@@ -183,7 +190,15 @@ def _body(section: BodySection, root: str, source: Path) -> RigidBody:
     return _MAKERS[shape.kind](**arguments, **keywords)
 
 
-_BODY_OPTIONS = {"friction", "thickness", "density", "mass", "center", "inertia"}
+_BODY_OPTIONS = {
+    "friction",
+    "thickness",
+    "density",
+    "mass",
+    "center",
+    "inertia",
+    "nodal_contact",
+}
 _MAKERS: dict[str, Callable[..., RigidBody]] = {
     "box": RigidBody.box,
     "sphere": RigidBody.sphere,

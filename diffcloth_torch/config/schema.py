@@ -175,6 +175,23 @@ class Disk(Section):
     edge_length: Positive
 
 
+class Strip(Section):
+    """Strip along x, bent downwards by `bend` degrees about an axis along y, at the origin.
+
+    Its `width` [m] is one, or those of its two ends. The middle of the bend is at the share
+    `middle` of its length.
+    """
+
+    kind: Literal["strip"]
+    length: Positive
+    width: Lengths2
+    rows: Annotated[int, Ge(2)]
+    columns: Annotated[int, Ge(2)]
+    bend: Annotated[float, Ge(0), Le(180)] = 0.0
+    radius: Positive = 0.1
+    middle: Annotated[float, Gt(0), Lt(1)] = 0.5
+
+
 class Box(Section):
     """Cuboid with sides of `size` [m]."""
 
@@ -262,7 +279,7 @@ class ClothSection(Section):
     """A cloth."""
 
     name: str
-    shape: Annotated[Grid | Disk | ClothFile, Discriminator("kind")]
+    shape: Annotated[Grid | Disk | Strip | ClothFile, Discriminator("kind")]
     pose: PoseSection = PoseSection()
     material: MaterialSection = MaterialSection()
     pins: dict[str, Selection] = {}
@@ -306,6 +323,7 @@ class BodySection(Section):
     mass: Positive | None = None
     center: Vector3 | None = None
     inertia: Annotated[list[Vector3], Len(3, 3)] | None = None
+    nodal_contact: bool | None = None
     color: Color | None = None
 
     @model_validator(mode="after")
@@ -405,7 +423,8 @@ class SolverSection(Section):
     tolerance: Positive | None = None
     max_iterations: Annotated[int, Ge(1)] | None = None
     throw: bool | None = None
-    metric: Literal["mass", "identity"] | None = None
+    metric: Literal["elastic", "mass", "identity"] | None = None
+    elastic: Literal["newton", "projective"] | None = None
 
 
 class SimulationSection(Section):
@@ -413,7 +432,7 @@ class SimulationSection(Section):
 
     dt: Positive
     steps: Annotated[int, Ge(1)]
-    scheme: Literal["coupled", "split"] = "coupled"
+    scheme: Literal["coupled", "split", "projective"] = "coupled"
     coupling: Literal["monolithic", "rigid_to_cloth", "cloth_to_rigid"] = "monolithic"
     contact: ContactSection = ContactSection()
     solver: SolverSection = SolverSection()

@@ -15,7 +15,13 @@ from diffcloth_torch.model.quantities import FACE_QUANTITIES
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Assembly, Scene
 
-__all__ = ["check_barrier", "choose_barrier_distance", "has_contact", "scene_parameters"]
+__all__ = [
+    "check_barrier",
+    "choose_barrier_distance",
+    "has_barrier",
+    "has_contact",
+    "scene_parameters",
+]
 
 # The barrier distance, as parts of the median cloth edge and of the smallest distance between
 # elements of the rest mesh that are not neighbors. Beyond one half of the latter, the surface would
@@ -28,6 +34,16 @@ _LARGEST_PART_OF_NONADJACENT = 0.5
 def has_contact(scene: Scene, contact: ContactOptions) -> bool:
     """Whether any two surfaces of the scene may touch."""
     return len(scene.surface_names) > 1 or (contact.self_contact and len(scene.cloths) > 0)
+
+
+def has_barrier(scene: Scene, contact: ContactOptions, scheme: str) -> bool:
+    """Whether the barrier keeps any two surfaces of the scene apart."""
+    if scheme == "projective":
+        return False
+    nodal = sum(body.nodal_contact for body in scene.bodies)
+    if len(scene.surface_names) - nodal > 1 or (contact.self_contact and len(scene.cloths) > 0):
+        return True
+    return nodal > 0 and scene.is_dynamic
 
 
 def scene_parameters(scene: Scene, assembly: Assembly, contact: bool) -> dict[str, Tensor]:

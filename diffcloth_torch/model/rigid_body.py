@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from diffcloth_torch.checks import (
     POSITIVE,
     FloatArray,
     IndexArray,
+    check_bool,
     check_choice,
     check_count,
     check_finite,
@@ -30,7 +31,7 @@ from diffcloth_torch.geometry.surfaces import surface_arrays
 from diffcloth_torch.model.cloth import plane_size
 from diffcloth_torch.model.quantities import check_parameter
 
-__all__ = ["MOTIONS", "RigidBody"]
+__all__ = ["MOTIONS", "Primitive", "RigidBody"]
 
 MOTIONS = ("static", "kinematic", "dynamic")
 
@@ -42,6 +43,19 @@ _POSES = "differentiate with respect to State.body_poses or Control.body_poses"
 _MASS = "differentiate with respect to Parameters.body_mass"
 _CENTER = "differentiate with respect to Parameters.body_center"
 _INERTIA = "differentiate with respect to Parameters.body_inertia"
+
+
+class Primitive(NamedTuple):
+    """An analytic surface around the origin of a body's frame.
+
+    Attributes:
+        kind: "plane" (z = 0, the solid below), "sphere", "capsule" (along z) or "box".
+        size: Nothing; radius; radius and half length of the cylinder; half lengths [m]. Filled up
+            with zeros.
+    """
+
+    kind: str
+    size: tuple[float, float, float]
 
 
 class RigidBody:
@@ -57,6 +71,9 @@ class RigidBody:
         mass: Mass [kg]; it, center and inertia are zero where the body is not dynamic.
         center: Center of mass in the body frame [m], shape [3].
         inertia: About the center, in body axes [kg m^2], shape [3, 3].
+        nodal_contact: Whether cloths touch the body at their vertices, by dry friction, instead of
+            through the barrier.
+        primitive: What the mesh stands for; None of one that was given or is a cylinder.
         name: Name in the scene; None lets the scene choose one.
     """
 
@@ -70,6 +87,8 @@ class RigidBody:
     mass: float = 0.0
     center: FloatArray = frozen(np.zeros(3))
     inertia: FloatArray = frozen(np.zeros((3, 3)))
+    nodal_contact: bool = False
+    primitive: Primitive | None = None
     name: str | None
 
     def __init__(
@@ -85,6 +104,7 @@ class RigidBody:
         mass: float | None = None,
         center: object = None,
         inertia: object = None,
+        nodal_contact: bool = False,
         name: str | None = None,
     ) -> None:
         """Check and copy the arguments.
@@ -106,11 +126,16 @@ class RigidBody:
             inertia: About the center, in body axes [kg m^2], shape [3, 3]; symmetric, positive
                 definite, no principal moment above the sum of the others. It does not follow from
                 a `center` that is given: it is then still that of the evenly filled mesh.
+            nodal_contact: Whether cloths touch the body at their vertices, by dry friction without
+                smoothing, instead of through the barrier: for bodies made by `box`, `sphere`,
+                `capsule` or `plane` that are not dynamic. Cloths may then cut through it between
+                their vertices. Scheme "projective" treats all bodies so.
             name: Name in the scene.
 
         Raises:
             InvalidInput: If a shape, an index or a value is not accepted, or if a dynamic body
-                lacks what its open mesh cannot give.
+                lacks what its open mesh cannot give, or if `nodal_contact` is asked of a mesh
+                or of a dynamic body.
             TypeError: If something has a wrong type.
         """
         self.vertices, self.faces = surface_arrays("RigidBody", vertices, faces, instead=_POSES)
@@ -120,6 +145,33 @@ class RigidBody:
         self.thickness = check_parameter("RigidBody", "thickness", thickness)
         self._set_mass_properties(density=density, mass=mass, center=center, inertia=inertia)
         self.name = check_name("RigidBody: `name`", name)
+        self._set_primitive(None, nodal_contact)
+
+    def _set_primitive(self, primitive: Primitive | None, nodal_contact: object) -> None:
+        self.primitive = primitive
+        self.nodal_contact = check_bool("RigidBody: `nodal_contact`", nodal_contact)
+        if self.nodal_contact and primitive is None:
+            raise InvalidInput(
+                "RigidBody: `nodal_contact` needs a body made by box, sphere, capsule or plane, "
+                "got a mesh or a cylinder"
+            )
+        if self.nodal_contact and self.motion == "dynamic":
+            raise InvalidInput(
+                'RigidBody: `nodal_contact` needs motion="static" or "kinematic", got "dynamic"'
+            )
+
+    @classmethod
+    def _of(
+        cls,
+        primitive: Primitive,
+        mesh: tuple[object, object],
+        *,
+        nodal_contact: bool = False,
+        **keywords: Any,
+    ) -> RigidBody:
+        body = cls(*mesh, **keywords)
+        body._set_primitive(primitive, nodal_contact)
+        return body
 
     def _set_mass_properties(
         self, *, density: object, mass: object, center: object, inertia: object
@@ -197,7 +249,10 @@ class RigidBody:
         lengths = float_array("RigidBody.box: `size`", size)
         check_shape("RigidBody.box: `size`", lengths.shape, [(), (3,)])
         check_range("RigidBody.box: `size`", lengths, POSITIVE)
-        return cls(*shapes.box(np.broadcast_to(lengths, 3)), **keywords)
+        sides = np.broadcast_to(lengths, 3)
+        x, y, z = (sides / 2).tolist()
+        primitive = Primitive("box", (x, y, z))
+        return cls._of(primitive, shapes.box(sides), **keywords)
 
     @classmethod
     def sphere(cls, radius: float, *, subdivisions: int = 3, **keywords: Any) -> RigidBody:
@@ -210,7 +265,8 @@ class RigidBody:
         """
         length = check_number("RigidBody.sphere: `radius`", radius, POSITIVE, instead=_POSES)
         check_count("RigidBody.sphere: `subdivisions`", subdivisions, 0)
-        return cls(*shapes.sphere(length, subdivisions), **keywords)
+        primitive = Primitive("sphere", (length, 0.0, 0.0))
+        return cls._of(primitive, shapes.sphere(length, subdivisions), **keywords)
 
     @classmethod
     def capsule(cls, radius: float, length: float, **keywords: Any) -> RigidBody:
@@ -224,7 +280,8 @@ class RigidBody:
         name = "RigidBody.capsule: `{}`"
         r = check_number(name.format("radius"), radius, POSITIVE, instead=_POSES)
         h = check_number(name.format("length"), length, POSITIVE, instead=_POSES)
-        return cls(*shapes.capsule(r, h), **keywords)
+        primitive = Primitive("capsule", (r, h / 2, 0.0))
+        return cls._of(primitive, shapes.capsule(r, h), **keywords)
 
     @classmethod
     def cylinder(cls, radius: float, length: float, **keywords: Any) -> RigidBody:
@@ -244,11 +301,14 @@ class RigidBody:
     def plane(cls, size: object, **keywords: Any) -> RigidBody:
         """Make a rectangle of two triangles at z = 0 that faces up, centered at the origin.
 
+        In contact at nodes the plane is infinite, and what is below it is inside.
+
         Args:
             size: Lengths along x and y [m], or one length for both.
             **keywords: As for `RigidBody`.
         """
-        return cls(*shapes.plane(plane_size("RigidBody.plane: `size`", size)), **keywords)
+        mesh = shapes.plane(plane_size("RigidBody.plane: `size`", size))
+        return cls._of(Primitive("plane", (0.0, 0.0, 0.0)), mesh, **keywords)
 
     def __repr__(self) -> str:
         return f"RigidBody({self.name!r}, {self.motion}, {len(self.faces)} faces)"

@@ -21,7 +21,7 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.mechanism import Mechanism
-from diffcloth_torch.model.rigid_body import RigidBody
+from diffcloth_torch.model.rigid_body import Primitive, RigidBody
 from diffcloth_torch.model.robot import Robot
 
 __all__ = ["Assembly", "Scene", "assemble"]
@@ -176,6 +176,8 @@ class Assembly:
         surface_link: Link of that mechanism, shape [K + Lc].
         surface_names: Of cloths, bodies and "robot/link"; length S.
         ignored_pairs: Pairs of surfaces a < b that are not tested for contact; shape [m, 2].
+        primitives: Of each surface after the cloths, where cloths touch it at their vertices; None
+            where they do not; length K + Lc.
         base_poses: Initial poses of the root links of robots, shape [R, 7].
         joint_slices: Name of a robot -> its rows among the J joints.
         link_slices: Name of a robot -> its rows among the L links.
@@ -206,6 +208,7 @@ class Assembly:
     surface_link: IndexArray
     surface_names: tuple[str, ...]
     ignored_pairs: IndexArray
+    primitives: tuple[Primitive | None, ...]
     base_poses: FloatArray
     joint_slices: Mapping[str, slice]
     link_slices: Mapping[str, slice]
@@ -249,8 +252,13 @@ class Assembly:
         return len(self.surface_names)
 
 
-def assemble(scene: Scene) -> Assembly:
-    """Concatenate the arrays of a scene."""
+def assemble(scene: Scene, *, all_nodal: bool = False) -> Assembly:
+    """Concatenate the arrays of a scene.
+
+    Args:
+        scene: The scene.
+        all_nodal: Whether cloths touch all bodies at their vertices, asked or not.
+    """
     vertices, faces, vertex_start, face_start = _concatenate(scene.cloths)
     links = [
         (len(scene.bodies) + r, link, surface)
@@ -293,6 +301,10 @@ def assemble(scene: Scene) -> Assembly:
         surface_link=surface_link,
         surface_names=scene.surface_names,
         ignored_pairs=_ignored_pairs(scene),
+        primitives=(
+            *(b.primitive if all_nodal or b.nodal_contact else None for b in scene.bodies),
+            *(None for _ in links),
+        ),
         base_poses=np.array([robot.pose for robot in scene.robots]).reshape(-1, 7),
         joint_slices=_slices(scene.robot_names, [len(r.joint_names) for r in scene.robots]),
         link_slices=_slices(scene.robot_names, [len(r.link_names) for r in scene.robots]),

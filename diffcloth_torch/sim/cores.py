@@ -23,7 +23,7 @@ class CoreOptions(NamedTuple):
     Attributes:
         bending_models: Of each cloth.
         dt: Time step [s].
-        scheme: "coupled" or "split".
+        scheme: "coupled", "split" or "projective".
         contact: Contact options.
         solver: Solver options.
     """
@@ -70,11 +70,16 @@ def make_core(
         self_contact=options.contact.self_contact,
         dt=options.dt,
         scheme=options.scheme,
-        metric=options.solver.metric,
+        metric=options.solver.metric or "elastic",
+        elastic=options.solver.elastic,
         friction_iterations=options.contact.friction_iterations,
         tolerance=options.solver.tolerance,
         max_iterations=options.solver.max_iterations,
         ignored_pairs=assembly.ignored_pairs,
+        primitive_kinds=[p.kind if p is not None else "none" for p in assembly.primitives],
+        primitive_sizes=np.array(
+            [p.size if p is not None else (0.0, 0.0, 0.0) for p in assembly.primitives]
+        ).reshape(-1, 3),
         link_names=list(assembly.surface_names[assembly.cloth_count + assembly.body_count :]),
         **trees,
     )

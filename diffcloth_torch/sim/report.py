@@ -27,12 +27,14 @@ class Report:
         minimum_distance: Smallest distance between mid-surfaces in contact [m], which is above half
             the sum of their thicknesses; infinite where nothing is within the barrier's reach.
         contact_count: Contacts within the barrier distance: pairs of primitives of cloths; of a
-            cloth and a body, features that are not hidden behind nearer ones.
+            cloth and a body, features that are not hidden behind nearer ones. In "projective"
+            vertices that stick or slip.
         motion_fraction: Part of the prescribed motion that was reached, 1 for all of it.
         seconds: Phase of the step -> time [s]; the phases add up to the time in the core.
         counts: What was done -> how often: steps with the `exact` Hessian, `chord` steps with an
             older factor, steps with a `projected` Hessian, Hessians of `negative_curvature`,
-            numeric `factorizations`, failed ones included, and symbolic `analyses`.
+            numeric `factorizations`, failed ones included, and symbolic `analyses`; vertices in dry
+            frictional contact that are `taking_off`, `sticking` and `slipping`.
     """
 
     converged: bool | Tensor

@@ -24,6 +24,7 @@ from diffcloth_torch.errors import IntersectingState, InvalidInput
 from diffcloth_torch.model.defaults import (
     check_barrier,
     choose_barrier_distance,
+    has_barrier,
     has_contact,
     scene_parameters,
 )
@@ -62,7 +63,7 @@ class Simulator:
     Attributes:
         scene: What is simulated.
         dt: Time step [s].
-        scheme: "coupled" or "split".
+        scheme: "coupled", "split" or "projective".
         coupling: "monolithic", "rigid_to_cloth" or "cloth_to_rigid".
         contact: Contact options, as given.
         solver: Solver options.
@@ -99,7 +100,9 @@ class Simulator:
             dt: Time step [s], > 0.
             scheme: "coupled" solves elasticity and contact together; "split" solves elasticity
                 first and then contact, near its result. It takes what forces move only with the
-                staggered couplings.
+                staggered couplings. "projective" solves elasticity with dry friction at the
+                cloths' vertices, against bodies that are boxes, spheres, capsules or planes: the
+                baseline, in which surfaces may cross between vertices.
             coupling: How cloths and what forces move act on each other: "monolithic" solves for
                 both together; "rigid_to_cloth" moves bodies with their velocities, solves the
                 cloths against them, and changes those velocities by the contact impulses;
@@ -128,11 +131,17 @@ class Simulator:
         self.dt = check_number("Simulator: `dt`", dt, POSITIVE, instead=instead)
         self.scheme = check_choice("Simulator: `scheme`", scheme, SCHEMES)
         self.coupling = check_choice("Simulator: `coupling`", coupling, COUPLINGS)
-        if scheme != "split" and solver.metric != _DEFAULT_SOLVER.metric:
+        # The other schemes measure inertia in the masses; "mass", once the default, says just that.
+        if scheme != "split" and solver.metric not in (None, "mass"):
             raise InvalidInput(
                 f"Simulator: `solver.metric` {solver.metric!r} needs scheme 'split', got {scheme!r}"
             )
-        self._assembly = assemble(scene)
+        if scheme == "coupled" and solver.elastic == "projective":
+            raise InvalidInput(
+                "Simulator: `solver.elastic` 'projective' needs a scheme with an elastic stage of "
+                "its own, 'split' or 'projective'; 'coupled' has none"
+            )
+        self._assembly = assemble(scene, all_nodal=scheme == "projective")
         self._layout = Layout(self._assembly)
         _check_motion(self)
         self._dynamics = Dynamics(self._assembly, self.dt) if self._layout.has_coordinates else None
@@ -161,9 +170,10 @@ class Simulator:
             self._staggered = Staggered(coupling, self._layout, self._dynamics, options, stiffness)
         self._nonadjacent_distance = self._core.smallest_nonadjacent_distance()
         self._defaults = scene_parameters(scene, self._assembly, has_contact(scene, contact))
-        if has_contact(scene, contact):
+        if has_barrier(scene, contact, scheme):
             self._choose_barrier()
-        self._check_overlap()
+        if scheme != "projective":
+            self._check_overlap()
 
     def __reduce__(self) -> tuple[Any, ...]:
         arguments = (self.scene, self.dt, self.scheme, self.contact, self.solver, self.coupling)
@@ -577,12 +587,37 @@ def _check_motion(simulator: Simulator) -> None:
             "'rigid_to_cloth' and 'cloth_to_rigid'; the scene has something that forces move and "
             "`coupling` is 'monolithic'"
         )
+    if simulator.scheme == "projective":
+        _check_projective(simulator.scene)
+    if simulator.scheme == "coupled":
+        for name, body in zip(simulator.scene.body_names, simulator.scene.bodies, strict=True):
+            if body.nodal_contact:
+                raise InvalidInput(
+                    "Simulator: scheme 'coupled' has no contact at nodes, which body "
+                    f"{name!r} asks for by `nodal_contact`; use scheme 'split' or 'projective'"
+                )
     gains = assembly.stiffness + assembly.damping
     for name, mode, gain in zip(layout.joint_names, layout.actuation, gains, strict=True):
         if mode == "pd" and gain == 0.0:
             raise InvalidInput(
                 f"Simulator: the pd joint {name!r} must have gains: give `stiffness` or `damping` "
                 "to its Robot, or another `actuation`"
+            )
+
+
+def _check_projective(scene: Scene) -> None:
+    for name in scene.robot_names:
+        raise InvalidInput(f"Simulator: scheme 'projective' takes no robots, got {name!r}")
+    for name, body in zip(scene.body_names, scene.bodies, strict=True):
+        if body.motion == "dynamic":
+            raise InvalidInput(
+                "Simulator: scheme 'projective' takes static and kinematic bodies, got the "
+                f"dynamic body {name!r}"
+            )
+        if body.primitive is None:
+            raise InvalidInput(
+                "Simulator: scheme 'projective' takes bodies made by box, sphere, capsule or "
+                f"plane, got the mesh or cylinder {name!r}"
             )
 
 

@@ -32,8 +32,8 @@ class Drape:
         self.scene = build_scene(config, source)
         self.simulator = build_simulator(self.scene, config.simulation)
         self.steps = config.simulation.steps
-        motions = prescribed_motions(config, self.scene, self.steps)
-        self._prescribed = step_controls(motions, self.steps)
+        self._motions = prescribed_motions(config, self.scene, self.steps)
+        self._prescribed = step_controls(self._motions, self.steps)
 
     def initial_state(self) -> State:
         """Make the state that the scene describes."""

@@ -139,17 +139,20 @@ class Reach(ABC):
 
     def controller(self, actions: Mapping[str, Tensor]) -> Controller:
         """Do what the actions say; the rest of the scene follows keyframes."""
-        each_step = {
-            name: rows.repeat_interleave(self._interval, dim=0)[: self.steps]
-            for name, rows in actions.items()
-        }
-        acted = self.motions(each_step)
+        acted = self.motions(self.each_step(actions))
         fields = [*self._prescribed, *(name for name in acted if name not in self._prescribed)]
         merged = {
             field: {**self._prescribed.get(field, {}), **acted.get(field, {})} for field in fields
         }
         controls = step_controls(merged, self.steps)
         return lambda k, _state: controls[k]
+
+    def each_step(self, actions: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Repeat the row of each control interval for its steps: shape [steps, n]."""
+        return {
+            name: rows.repeat_interleave(self._interval, dim=0)[: self.steps]
+            for name, rows in actions.items()
+        }
 
     def loss(self, states: Sequence[State]) -> Tensor:
         """Distance to the target, averaged over the last states."""

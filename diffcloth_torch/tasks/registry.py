@@ -8,11 +8,13 @@ from typing import Any
 
 from diffcloth_torch.config.schema import RunConfig, read_document, set_values, validate
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.tasks.control_points import ControlPoints
 from diffcloth_torch.tasks.drape import Drape
 from diffcloth_torch.tasks.grasp_cloth import GraspCloth
 from diffcloth_torch.tasks.hit_cloth import HitCloth
 from diffcloth_torch.tasks.push_cube import PushCube
 from diffcloth_torch.tasks.task import Task
+from diffcloth_torch.tasks.two_cloths import TwoCloths
 
 __all__ = ["TASKS", "check_document", "load_config", "load_task", "make_task"]
 
@@ -21,6 +23,8 @@ TASKS: dict[str, Any] = {
     "hit_cloth": HitCloth,
     "push_cube": PushCube,
     "grasp_cloth": GraspCloth,
+    "two_cloths": TwoCloths,
+    "control_points": ControlPoints,
 }
 """Name -> class with a `Config` and a constructor that takes one and the path it was read from."""
 

@@ -9,13 +9,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FORCE_COLOR", "GOAL_COLOR", "Camera", "Goal", "Paint", "Pictures"]
+from diffcloth_torch.geometry import shapes
+
+__all__ = ["FORCE_COLOR", "GOAL_COLOR", "Camera", "Goal", "Paint", "Pictures", "marker"]
 
 _FRONT_COLORS = ("#2a6f97", "#c8553d", "#5b7f4b", "#7d5a8c")
 _BACK_COLORS = ("#f2c078", "#f3dcc0", "#e3dcae", "#e0cfe8")
 _BODY_COLORS = ("#8d99ae", "#a39b8b", "#7f9183")
 GOAL_COLOR = "#2f9e78"
 FORCE_COLOR = "#b3123f"
+_MARKER_SUBDIVISIONS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,3 +105,9 @@ class Goal:
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
+
+
+def marker(position: NDArray[np.float64], radius: float) -> Goal:
+    """Mark a point to reach, of shape [3], by a small sphere [m]."""
+    vertices, faces = shapes.sphere(radius, _MARKER_SUBDIVISIONS)
+    return Goal(vertices + position, faces.astype(np.int32))

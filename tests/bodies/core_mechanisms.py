@@ -110,6 +110,7 @@ class CoreScene:
             dt=DT,
             scheme="coupled",
             metric="mass",
+            elastic="newton",
             friction_iterations=2,
             tolerance=1e-10,
             max_iterations=500,

@@ -11,12 +11,12 @@ import torch
 import diffcloth_torch as dc
 
 F64 = torch.float64
-SCHEMES = [("coupled", "mass"), ("split", "mass")]
+SCHEMES = ["coupled", "split"]
 
 
-@pytest.fixture(params=SCHEMES, ids="-".join)
+@pytest.fixture(params=SCHEMES)
 def case(request):
-    return scenes.regime("pinned", *request.param)
+    return scenes.regime("pinned", request.param)
 
 
 @pytest.fixture

@@ -56,6 +56,45 @@ CASES = [
         id="grasp_cloth",
     ),
     pytest.param(
+        "two_cloths.yaml",
+        [
+            "simulation.dt=0.02",
+            "simulation.steps=30",
+            "actions.interval=5",
+        ],
+        (),
+        (),
+        id="two_cloths",
+    ),
+    pytest.param(
+        "tie.yaml",
+        [
+            "simulation.dt=0.05",
+            "simulation.steps=60",
+            "scene.cloths.tie.shape.rows=3",
+            "scene.cloths.tie.shape.columns=50",
+            "scene.cloths.tie.soft_pins={narrow: {vertices: [0, 50, 100]}, "
+            "wide: {vertices: [49, 99, 149]}}",
+            "scene.cloths.tie.pin_stiffness=20",
+        ],
+        (),
+        (),
+        id="tie",
+    ),
+    pytest.param(
+        "cloth_on_cube.yaml",
+        [
+            "simulation.dt=0.05",
+            "simulation.steps=24",
+            "scene.cloths.cloth.shape={kind: grid, rows: 13, columns: 13, size: 0.5}",
+            "scene.cloths.cloth.soft_pins={corner_0: {vertices: [0]}, corner_1: {vertices: [12]}, "
+            "corner_2: {vertices: [156]}, corner_3: {vertices: [168]}}",
+        ],
+        (),
+        (),
+        id="cloth_on_cube",
+    ),
+    pytest.param(
         "panda_pick.yaml",
         [
             "simulation.dt=0.05",

@@ -18,6 +18,7 @@
 
 #include "bind/kernels/kernels.h"
 #include "elastic/anchors.h"
+#include "elastic/constant_form.h"
 #include "linalg/block_pattern.h"
 #include "mesh/rest_shape.h"
 #include "mesh/topology.h"
@@ -201,6 +202,36 @@ class Elastic {
     return result;
   }
 
+  /// L of the constant form with anchors, a product with it, what it costs to go from u by s, and
+  /// the cotangents of  z . L u.
+  nb::dict constant_form(const Indices& vertex,
+                         const Values& stiffness,
+                         const Positions& u,
+                         const Positions& s,
+                         const Positions& z) const {
+    check_rows("stiffness", stiffness.shape(0), vertex.shape(0));
+    const elastic::Anchors anchors{.vertex = {vertex.data(), vertex.size()},
+                                   .stiffness = {stiffness.data(), stiffness.size()},
+                                   .target = {}};
+    const elastic::ConstantForm form(model_, slots_, anchors, pattern_);
+    std::vector<double> product(u.size(), 0.0);
+    form.add_product(positions("u", u).data(), product.data());
+    elastic::Bar bar(topology_, stencils_);
+    elastic::add_constant_form_mixed(model_, u.data(), positions("z", z).data(), true, bar);
+    std::vector<double> X_bar(X_.size(), 0.0);
+    mesh::rest_shape_vjp(topology_, stencils_, X_.data(), bar.rest, X_bar.data());
+    nb::dict result;
+    result["values"] = vector_array(form.values());
+    result["product"] = rows_array(product);
+    result["energy_change"] = form.energy_change(u.data(), positions("s", s).data());
+    result["stretch"] = vector_array(bar.stretch);
+    result["bending"] = vector_array(bar.bending);
+    result["poisson"] = vector_array(bar.poisson);
+    result["damping"] = vector_array(bar.damping);
+    result["X"] = rows_array(X_bar);
+    return result;
+  }
+
   nb::dict rest() const {
     std::vector<double> gradients;
     for (const mesh::ShapeGradient& g : rest_.shape_gradient) {
@@ -335,6 +366,8 @@ void elastic_kernels(nb::module_& m) {
       .def("block_pairs", &Elastic::block_pairs)
       .def("hessian_product", &Elastic::hessian_product, "x"_a.noconvert(), "z"_a.noconvert())
       .def("mixed", &Elastic::mixed, "x"_a.noconvert(), "z"_a.noconvert(), "with_rest"_a)
+      .def("constant_form", &Elastic::constant_form, "vertex"_a.noconvert(),
+           "stiffness"_a.noconvert(), "u"_a.noconvert(), "s"_a.noconvert(), "z"_a.noconvert())
       .def("rest", &Elastic::rest)
       .def("rest_vjp", &Elastic::rest_vjp)
       .def_prop_ro("stencil_start", &Elastic::stencil_start, nb::rv_policy::automatic)

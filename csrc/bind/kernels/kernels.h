@@ -33,4 +33,7 @@ void linalg_kernels(nb::module_& m);
 /// Rest shape and elastic potentials one by one, for tests against independent references.
 void elastic_kernels(nb::module_& m);
 
+/// The constant matrix of Projective Dynamics, for tests against independent references.
+void projective_kernels(nb::module_& m);
+
 }  // namespace diffcloth::bind

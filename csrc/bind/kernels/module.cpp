@@ -10,4 +10,5 @@ NB_MODULE(_kernels, m) {
   diffcloth::bind::contact_potentials(m);
   diffcloth::bind::elastic_kernels(m);
   diffcloth::bind::linalg_kernels(m);
+  diffcloth::bind::projective_kernels(m);
 }

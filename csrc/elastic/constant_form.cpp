@@ -1,0 +1,122 @@
+#include "elastic/constant_form.h"
+
+#include "elastic/bending.h"
+#include "elastic/elements.h"
+
+namespace diffcloth::elastic {
+namespace {
+
+/// 1 + k_d/h of a face: damping resists a change over the step like stretch resists it from rest.
+double face_factor(const Model& model, Index f) {
+  return model.damping[f] == 0.0 ? 1.0 : 1.0 + model.damping[f] / model.h;
+}
+
+double element_factor(const Model& model, Index e) { return 1.0 + model.prepared.damping[e]; }
+
+void add_face_mixed(
+    const Model& model, Index f, const double* u, const double* z, bool with_rest, Bar& bar) {
+  const double k_s = model.stretch[f];
+  const double area = model.rest->area[f];
+  const double factor = face_factor(model, f);
+  const Mat32 F_u = face_gradient(model, f, u);
+  const Mat32 F_z = face_gradient(model, f, z);
+  const double work = F_u.cwiseProduct(F_z).sum();
+  bar.stretch[f] += area * factor * work;
+  if (model.h > 0.0) bar.damping[f] += k_s * area / model.h * work;
+  if (!with_rest) return;
+  bar.rest.area[f] += k_s * factor * work;
+  mesh::ShapeGradient& g_bar = bar.rest.shape_gradient[f];
+  scatter_gradient_bar(model, f, k_s * area * factor * F_z, u, g_bar);
+  scatter_gradient_bar(model, f, k_s * area * factor * F_u, z, g_bar);
+}
+
+void add_element_mixed(
+    const Model& model, Index e, const double* u, const double* z, bool with_rest, Bar& bar) {
+  const double factor = element_factor(model, e);
+  bending::Element element = bending_element(model, e);
+  element.weight *= factor;
+  double* const c_bar =
+      with_rest ? bar.rest.curvature_operator.data() + 3 * model.stencils->start[e] : nullptr;
+  const bending::ScalarBars scalar = bending::constant_mixed(element, u, z, c_bar);
+  add_to_faces(model, e, scalar.weight * factor * model.rest->bending_area[e], bar.bending);
+  add_to_faces(model, e, scalar.poisson, bar.poisson);
+  if (model.h > 0.0) {
+    add_to_faces(model, e, scalar.weight * model.prepared.bending[e] / model.h, bar.damping);
+  }
+  if (with_rest) {
+    bar.rest.bending_area[e] += scalar.weight * factor * element_mean(model, e, model.bending);
+  }
+}
+
+}  // namespace
+
+ConstantForm::ConstantForm(const Model& model,
+                           const Slots& slots,
+                           const Anchors& anchors,
+                           const linalg::BlockPattern& pattern)
+    : pattern_(&pattern),
+      vertex_count_(model.topology->vertex_count),
+      values_(static_cast<std::size_t>(slots.block_count), 0.0),
+      anchor_vertex_(anchors.vertex.begin(), anchors.vertex.end()),
+      anchor_stiffness_(anchors.stiffness.begin(), anchors.stiffness.end()) {
+  for (Index f = 0; f < face_count(model); ++f) {
+    const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
+    const double weight = face_factor(model, f) * stretch_weight(model, f);
+    const Index* slot = slots.stretch.data() + 6 * static_cast<std::ptrdiff_t>(f);
+    for (int p = 0; p < 3; ++p) {
+      for (int q = 0; q <= p; ++q) values_[*slot++] += weight * g.row(p).dot(g.row(q));
+    }
+  }
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    bending::Element element = bending_element(model, e);
+    element.weight *= element_factor(model, e);
+    bending::add_constant(element, bending_slots(slots, e), values_.data());
+  }
+  for (std::size_t a = 0; a < anchor_vertex_.size(); ++a) {
+    values_[pattern.column_start()[anchor_vertex_[a]]] += anchor_stiffness_[a];
+  }
+}
+
+double ConstantForm::energy_change(const double* u, const double* s) const {
+  double change = 0.0;
+  for (Index j = 0; j < vertex_count_; ++j) {
+    for (Index k = pattern_->column_start()[j] + 1; k < pattern_->column_start()[j + 1]; ++k) {
+      const Index i = pattern_->row()[k];
+      const Vec3 ds = row(s, i) - row(s, j);
+      change -= values_[k] * ds.dot(row(u, i) - row(u, j) + 0.5 * ds);
+    }
+  }
+  for (std::size_t a = 0; a < anchor_vertex_.size(); ++a) {
+    const Vec3 ds = row(s, anchor_vertex_[a]);
+    change += anchor_stiffness_[a] * ds.dot(row(u, anchor_vertex_[a]) + 0.5 * ds);
+  }
+  return change;
+}
+
+void ConstantForm::add_product(const double* u, double* y) const {
+  for (Index j = 0; j < vertex_count_; ++j) {
+    const Vec3 u_j = row(u, j);
+    Vec3 y_j = Vec3::Zero();
+    for (Index k = pattern_->column_start()[j] + 1; k < pattern_->column_start()[j + 1]; ++k) {
+      const Index i = pattern_->row()[k];
+      const Vec3 pull = values_[k] * (row(u, i) - u_j);
+      Eigen::Map<Vec3>(y + 3 * i) -= pull;
+      y_j += pull;
+    }
+    Eigen::Map<Vec3>(y + 3 * j) += y_j;
+  }
+  for (std::size_t a = 0; a < anchor_vertex_.size(); ++a) {
+    const Index i = anchor_vertex_[a];
+    Eigen::Map<Vec3>(y + 3 * i) += anchor_stiffness_[a] * row(u, i);
+  }
+}
+
+void add_constant_form_mixed(
+    const Model& model, const double* u, const double* z, bool with_rest, Bar& bar) {
+  for (Index f = 0; f < face_count(model); ++f) add_face_mixed(model, f, u, z, with_rest, bar);
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    add_element_mixed(model, e, u, z, with_rest, bar);
+  }
+}
+
+}  // namespace diffcloth::elastic

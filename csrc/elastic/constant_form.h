@@ -1,0 +1,58 @@
+#pragma once
+
+#include <vector>
+
+#include "elastic/anchors.h"
+#include "elastic/elastic.h"
+#include "linalg/block_pattern.h"
+
+namespace diffcloth::elastic {
+
+/// The constant quadratic form of Projective Dynamics (Bouaziz et al. 2014, Eq. 10; the paper's Sec.
+/// III.B), one scalar matrix L for all three axes:
+///
+///   1/2 u^T L u = sum_faces    k_s A / 2 (1 + k_d/h) |F(u)|^2
+///               + sum_elements D A / 2 (1 + k_d/h) <Y(u) Q, Y(u)>
+///               + sum_anchors  k_a / 2 |u_i|^2,
+///
+/// F(u) the gradient of a displacement u and Y(u) its second derivatives. It is the Hessian of the
+/// energy of all cloths less what depends on how triangles turn: no smaller than the Hessian of the
+/// stretch, equal to it in flat bending and anchors. For damping and for curved rest shapes it is a
+/// positive matrix of the right size, which is all that a solve with it needs.
+///
+/// Without anchors L annihilates constants. Entries act on differences of displacements, so that a
+/// force on one vertex is minus that on another to the last bit.
+class ConstantForm {
+ public:
+  /// @param model    prepared
+  /// @param pattern  that of the slots; outlives the form
+  ConstantForm(const Model& model,
+               const Slots& slots,
+               const Anchors& anchors,
+               const linalg::BlockPattern& pattern);
+
+  /// L, one value a slot of the pattern [N/m].
+  const std::vector<double>& values() const { return values_; }
+  const linalg::BlockPattern& pattern() const { return *pattern_; }
+
+  /// 1/2 (u + s)^T L (u + s) - 1/2 u^T L u  [J].
+  double energy_change(const double* u, const double* s) const;
+
+  /// y += L u.
+  void add_product(const double* u, double* y) const;
+
+ private:
+  const linalg::BlockPattern* pattern_;
+  Index vertex_count_;  ///< the pattern may have further rows
+  std::vector<double> values_;
+  std::vector<Index> anchor_vertex_;
+  std::vector<double> anchor_stiffness_;
+};
+
+/// bar += d/d theta (z . L u) for each theta of the model. Anchors get z_i . u_i.
+///
+/// @param with_rest  whether the cotangents of the rest shape are wanted
+void add_constant_form_mixed(
+    const Model& model, const double* u, const double* z, bool with_rest, Bar& bar);
+
+}  // namespace diffcloth::elastic

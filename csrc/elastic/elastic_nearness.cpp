@@ -1,0 +1,69 @@
+#include "elastic/elastic_nearness.h"
+
+#include <utility>
+
+namespace diffcloth::elastic {
+
+ElasticNearness::ElasticNearness(ConstantForm form,
+                                 ElasticPotential& elasticity,
+                                 AnchorPotential* anchors,
+                                 std::vector<double> target)
+    : target_bar(target.size(), 0.0),
+      form_(std::move(form)),
+      elasticity_(elasticity),
+      anchors_(anchors),
+      target_(std::move(target)) {}
+
+std::vector<double> ElasticNearness::offset(const double* x) const {
+  std::vector<double> u(target_.size());
+  for (std::size_t a = 0; a < u.size(); ++a) u[a] = x[a] - target_[a];
+  return u;
+}
+
+double ElasticNearness::energy(const double* x) const {
+  const std::vector<double> zero(target_.size(), 0.0);
+  return form_.energy_change(zero.data(), offset(x).data());
+}
+
+double ElasticNearness::energy_change(const double* x, const double* to) const {
+  std::vector<double> step(target_.size());
+  for (std::size_t a = 0; a < step.size(); ++a) step[a] = to[a] - x[a];
+  return form_.energy_change(offset(x).data(), step.data());
+}
+
+void ElasticNearness::add_gradient(const double* x, double* g) const {
+  form_.add_product(offset(x).data(), g);
+}
+
+void ElasticNearness::add_hessian(const double* /*x*/,
+                                  Curvature /*curvature*/,
+                                  linalg::BlockMatrix& A) const {
+  const std::vector<double>& values = form_.values();
+  std::vector<double> blocks(9 * values.size(), 0.0);
+  for (std::size_t k = 0; k < values.size(); ++k) {
+    for (std::size_t a = 0; a < 3; ++a) blocks[9 * k + 4 * a] = values[k];
+  }
+  A.add_base(blocks);
+}
+
+void ElasticNearness::add_hessian_product(const double* /*x*/, const double* z, double* y) const {
+  form_.add_product(z, y);
+}
+
+// grad P = L (x - y): y gets L z, and what L is made of -z . dL (x - y).
+void ElasticNearness::accumulate(const double* x, const double* z) {
+  form_.add_product(z, target_bar.data());
+  const std::vector<double> u = offset(x);
+  std::vector<double> minus_u = u;
+  for (double& value : minus_u) value = -value;
+  add_constant_form_mixed(elasticity_.model(), minus_u.data(), z, elasticity_.with_rest(),
+                          elasticity_.bar());
+  if (anchors_ == nullptr) return;
+  const Anchors& anchors = anchors_->anchors();
+  for (std::size_t a = 0; a < anchors.vertex.size(); ++a) {
+    const Index i = anchors.vertex[a];
+    anchors_->stiffness_bar[a] -= row(z, i).dot(row(u.data(), i));
+  }
+}
+
+}  // namespace diffcloth::elastic

@@ -1,0 +1,43 @@
+#pragma once
+
+#include <vector>
+
+#include "elastic/constant_form.h"
+#include "elastic/elastic_potential.h"
+
+namespace diffcloth::elastic {
+
+/// Nearness to a target in the constant form of the elastic energy,  P = 1/2 (x - y)^T L (x - y).
+///
+/// With nearness in the masses it is that in G = M + h^2 L: see step/split.cpp. What L is made of is
+/// what the elastic potentials are made of: they keep the cotangents for both.
+class ElasticNearness final : public Potential {
+ public:
+  /// @param elasticity  of the cloths; outlives this potential, like the anchors
+  /// @param anchors     may be null
+  /// @param target      y [3 N]
+  ElasticNearness(ConstantForm form,
+                  ElasticPotential& elasticity,
+                  AnchorPotential* anchors,
+                  std::vector<double> target);
+
+  double energy(const double* x) const override;
+  double energy_change(const double* x, const double* to) const override;
+  void add_gradient(const double* x, double* g) const override;
+  void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
+  void add_hessian_product(const double* x, const double* z, double* y) const override;
+  void accumulate(const double* x, const double* z) override;
+
+  std::vector<double> target_bar;  ///< [3 N], zero until accumulate()
+
+ private:
+  /// u = x - y [3 N].
+  std::vector<double> offset(const double* x) const;
+
+  ConstantForm form_;
+  ElasticPotential& elasticity_;
+  AnchorPotential* anchors_;
+  std::vector<double> target_;
+};
+
+}  // namespace diffcloth::elastic

@@ -1,0 +1,60 @@
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "common/interrupt.h"
+#include "potential/potential.h"
+#include "projective/constant_matrix.h"
+
+namespace diffcloth::projective {
+
+/// What local/global iterations minimize: a sum of potentials over the cloths' vertices.
+struct Objective {
+  std::vector<const Potential*> potentials;
+  const ConstantMatrix* matrix;       ///< A: no smaller than their Hessian, or of its size
+  const std::vector<double>* masses;  ///< [N] [kg]
+  double h;                           ///< time step [s]
+};
+
+/// Iterations that are allowed for each of Newton's: one takes about as much less time, and they
+/// converge linearly.
+inline constexpr std::int64_t kIterationsPerNewton = 50;
+
+struct Options {
+  double tolerance;             ///< on max_i h |g_i| / m_i over the free vertices [m/s]
+  std::int64_t max_iterations;  ///< of this solve
+};
+
+enum class Status : std::uint8_t {
+  kConverged,
+  kIterationLimit,
+  kRoundingFloor,  ///< steps are lost in the rounding of positions, or raise the energy
+  kOverflow,       ///< forces are not finite
+};
+
+struct Outcome {
+  Status status = Status::kIterationLimit;
+  double residual = 0.0;        ///< max_i h |g_i| / m_i where x is [m/s]
+  std::int64_t iterations = 0;  ///< global solves
+};
+
+/// Find a stationary point of an objective by local/global iterations (Bouaziz et al. 2014; the paper's
+/// Sec. III.B) with Anderson acceleration.
+///
+/// One iteration is  x <- x - A^-1 grad P(x). For terms 1/2 |S x - R(x)|^2, R the nearest point of what
+/// they are constrained to, that is the local projection and the global solve, as
+/// grad P = A x - b(x). Other terms are taken by their gradient, so that the solution is that of the
+/// potentials, whatever A. The energy never rises: an accelerated step that would raise it is replaced
+/// by the plain one, halved where even that does.
+///
+/// Nothing looks at the curvature at the solution: from a start that is symmetric it may be a saddle.
+///
+/// @param x  in: a start, [N, 3] and whatever else potentials look at; out: the solution, or the last
+///           iterate whose gradient was finite. Pins stay.
+Outcome minimize(const Objective& objective,
+                 std::vector<double>& x,
+                 const Options& options,
+                 const Checkpoint& checkpoint);
+
+}  // namespace diffcloth::projective

@@ -1,0 +1,41 @@
+#pragma once
+
+#include <cstdint>
+
+#include "common/types.h"
+
+namespace diffcloth::projective {
+
+/// Analytic surfaces around the origin of a body's frame. kNone: the body is a mesh and no more.
+enum class PrimitiveKind : std::uint8_t { kNone, kPlane, kSphere, kCapsule, kBox };
+
+/// A solid with a signed distance in closed form.
+struct Primitive {
+  PrimitiveKind kind = PrimitiveKind::kNone;
+  /// Plane z <= 0: unused. Sphere: (radius, -, -). Capsule along z: (radius, half length of the
+  /// cylinder, -). Box: half of its lengths [m].
+  Vec3 size = Vec3::Zero();
+};
+
+/// What a primitive is seen from a point.
+struct Nearest {
+  double distance;         ///< negative inside [m]
+  Vec3 normal;             ///< outward; the gradient of the distance
+  Mat3 normal_derivative;  ///< dn/dy: symmetric, it maps n to zero [1/m]
+
+  /// The nearest point of the surface.
+  Vec3 surface_point(const Vec3& y) const { return y - distance * normal; }
+
+  /// Its derivative by y; symmetric.
+  Mat3 surface_point_derivative() const {
+    return Mat3::Identity() - normal * normal.transpose() - distance * normal_derivative;
+  }
+};
+
+/// Signed distance, normal and its derivative at a point of the body's frame.
+///
+/// Where several points of the surface are nearest (a center, the axis of a capsule, the diagonals
+/// inside a box), one of the normals.
+Nearest nearest(const Primitive& primitive, const Vec3& y);
+
+}  // namespace diffcloth::projective

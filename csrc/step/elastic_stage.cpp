@@ -1,0 +1,115 @@
+#include "step/elastic_stage.h"
+
+#include <algorithm>
+#include <string_view>
+#include <utility>
+
+#include "projective/local_global.h"
+#include "solver/newton.h"
+#include "step/contact_stage.h"
+#include "step/motion.h"
+
+namespace diffcloth::step {
+namespace {
+
+std::string_view words(projective::Status status) {
+  switch (status) {
+    case projective::Status::kConverged:
+      return {};
+    case projective::Status::kIterationLimit:
+      return "the local/global iterations of the step are used up";
+    case projective::Status::kRoundingFloor:
+      return "rounding hides any further decrease of the elastic stage";
+    case projective::Status::kOverflow:
+      return "the forces of the elastic stage are not finite";
+  }
+  __builtin_unreachable();
+}
+
+projective::Outcome minimize(Problem& problem,
+                             const projective::Options& options,
+                             const Checkpoint& checkpoint,
+                             std::vector<double>& x) {
+  const auto matrix = problem.constant_matrix();
+  projective::Objective f{.potentials = {&problem.inertia},
+                          .matrix = matrix.get(),
+                          .masses = &problem.masses,
+                          .h = problem.h};
+  for (const Potential* p : problem.elastic_potentials()) f.potentials.push_back(p);
+  return projective::minimize(f, x, options, checkpoint);
+}
+
+/// By local/global iterations. No factor comes out of them: backward makes it.
+void solve_by_projective_dynamics(Problem& problem,
+                                  const Forward& step,
+                                  const NodalStage& nodes,
+                                  std::vector<double>& x) {
+  const Stopwatch::Scope scope(*step.context.watch, Phase::kSolve);
+  const solver::Options& given = step.context.options;
+  const projective::Options options{
+      .tolerance = given.tolerance,
+      .max_iterations = projective::kIterationsPerNewton * given.max_iterations};
+  const Checkpoint& checkpoint = *step.context.checkpoint;
+  const projective::Outcome outcome = nodes.has_contacts()
+                                          ? nodes.iterate(options, checkpoint, x)
+                                          : minimize(problem, options, checkpoint, x);
+  step.report.counts.local_global += outcome.iterations;
+  step.report.residual = std::max(step.report.residual, outcome.residual);
+  if (outcome.status != projective::Status::kConverged) {
+    step.report.result = Result::kNotConverged;
+    step.report.message = words(outcome.status);
+  }
+  step.kept.factors.push_back(nullptr);
+}
+
+solver::Objective objective(Problem& problem) {
+  return problem.objective(problem.inertia, problem.elastic_potentials(),
+                           problem.scene.elastic_assemblies);
+}
+
+void solve_by_newton(Problem& problem,
+                     const Forward& step,
+                     const NodalStage& nodes,
+                     std::vector<double>& x) {
+  // Its way is no motion of the cloth.
+  auto* const path = std::exchange(step.context.path, nullptr);
+  const solver::Outcome outcome =
+      nodes.has_contacts() ? nodes.solve(step.context, x)
+                           : solver::minimize(objective(problem), x, Motion(problem), nullptr,
+                                              nullptr, step.context);
+  step.context.path = path;
+  merge(outcome, step.report);
+  step.kept.factors.push_back(outcome.factor);
+}
+
+}  // namespace
+
+std::vector<double> ElasticStage::forward(const Forward& step, double* body_forces) const {
+  // Pins are at their targets, and so are the bodies.
+  std::vector<double> x = problem_.predicted(problem_.inertia.target().data());
+  if (nodes_.has_contacts()) nodes_.start(x);
+  if (problem_.scene.given.elastic == ElasticSolver::kProjective) {
+    solve_by_projective_dynamics(problem_, step, nodes_, x);
+  } else {
+    solve_by_newton(problem_, step, nodes_, x);
+  }
+  if (nodes_.has_contacts()) nodes_.finish(x, step.report, body_forces);
+  if (!step.tape.empty()) std::copy_n(x.begin(), problem_.cloth_size, step.tape["elastic"]);
+  return x;
+}
+
+void ElasticStage::backward(const Backward& step,
+                            const std::vector<double>& g,
+                            const std::vector<double>& force_bar) const {
+  const std::vector<double> x = problem_.predicted(step.tape["elastic"]);
+  const solver::Factor factor = step.kept.factors.empty() ? nullptr : step.kept.factors.front();
+  if (nodes_.has_contacts()) {
+    nodes_.backward(step, x, factor, g, force_bar);
+    return;
+  }
+  const solver::Objective f = objective(problem_);
+  f.stand_at(x.data());
+  pull_back_solve(step, f, x, factor, g, nullptr);
+}
+
+}  // namespace diffcloth::step

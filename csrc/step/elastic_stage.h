@@ -1,0 +1,32 @@
+#pragma once
+
+#include <vector>
+
+#include "step/nodal_stage.h"
+#include "step/scheme.h"
+
+namespace diffcloth::step {
+
+/// The stage of a scheme that comes without the barrier: inertia, elasticity and anchors, with dry
+/// frictional contact at nodes where there is any. It is on the tape as "elastic": its positions.
+class ElasticStage {
+ public:
+  /// @param vertices_touch  whether vertices of cloths are in contact with each other
+  ElasticStage(Problem& problem, bool vertices_touch)
+      : problem_(problem), nodes_(problem, vertices_touch) {}
+
+  /// All points at its end; the contact forces on the bodies' vertices are added to body_forces.
+  std::vector<double> forward(const Forward& step, double* body_forces) const;
+
+  /// @param g          cotangent of the rows at its end
+  /// @param force_bar  of the forces on the bodies' vertices
+  void backward(const Backward& step,
+                const std::vector<double>& g,
+                const std::vector<double>& force_bar) const;
+
+ private:
+  Problem& problem_;
+  NodalStage nodes_;
+};
+
+}  // namespace diffcloth::step

@@ -1,0 +1,71 @@
+#pragma once
+
+#include <memory>
+#include <vector>
+
+#include "projective/coulomb.h"
+#include "projective/local_global.h"
+#include "projective/nodal_contact.h"
+#include "solver/newton.h"
+#include "step/scheme.h"
+
+namespace diffcloth::step {
+
+/// The stage of a scheme that has dry frictional contact at nodes: inertia, elasticity and anchors,
+/// with the law of Signorini and Coulomb at each node in contact (the paper's Eqs. 3-5). Contacts are
+/// found once, on the straight way from x_n to the inertial prediction.
+///
+/// See nodal_stage.cpp for the equations and their adjoint.
+class NodalStage {
+ public:
+  /// @param vertices_touch  whether vertices of cloths are in contact with each other too
+  NodalStage(Problem& problem, bool vertices_touch);
+  NodalStage(const NodalStage&) = delete;
+  NodalStage& operator=(const NodalStage&) = delete;
+
+  bool has_contacts() const { return !contacts_.empty(); }
+
+  /// Where a solve begins: every vertex flies freely, and those in contact obey the law on their own.
+  ///
+  /// @param x  in: all points at the inertial prediction, prescribed ones at their ends
+  void start(std::vector<double>& x) const;
+
+  /// Solve by a semismooth Newton method.
+  ///
+  /// @param x  in: a start; out: the solution
+  solver::Outcome solve(solver::Context& context, std::vector<double>& x) const;
+
+  /// Solve by local/global iterations with impulses (Ly et al. 2020), accelerated.
+  ///
+  /// @param x  in: a start; out: the solution
+  projective::Outcome iterate(const projective::Options& options,
+                              const Checkpoint& checkpoint,
+                              std::vector<double>& x) const;
+
+  /// Count the cases of the law at a solution, and add the forces on the bodies' vertices there: minus
+  /// the forces on the nodes, shared by the corners of the nearest faces.
+  void finish(const std::vector<double>& x, Report& report, double* body_forces) const;
+
+  /// The adjoint, for a solution x.
+  ///
+  /// @param factor     as solve() gave it, or null to make it again
+  /// @param g          cotangent of the rows at the end
+  /// @param force_bar  cotangents of the forces on the bodies' vertices
+  void backward(const Backward& step,
+                const std::vector<double>& x,
+                solver::Factor factor,
+                const std::vector<double>& g,
+                const std::vector<double>& force_bar) const;
+
+ private:
+  friend class NodalSystem;
+
+  Problem& problem_;
+  std::vector<projective::Obstacle> obstacles_;
+  std::vector<projective::NodalContact> contacts_;
+  std::vector<Index> partner_;          ///< [N] vertex in contact with each, or -1
+  std::vector<double> inertia_;         ///< [N] rho, see nodal_stage.cpp [kg]
+  std::unique_ptr<Potential> pattern_;  ///< couplings of pairs; null without pairs
+};
+
+}  // namespace diffcloth::step

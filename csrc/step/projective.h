@@ -1,0 +1,17 @@
+#pragma once
+
+#include "step/scheme.h"
+
+namespace diffcloth::step {
+
+/// The baseline of the paper (Sec. III.A): inertia + elasticity + anchors with dry frictional contact at
+/// nodes, and no barrier. Surfaces may cross between nodes.
+class Projective final : public Scheme {
+ public:
+  std::string_view name() const override { return "projective"; }
+  std::vector<Field> tape(const Scene& scene) const override;
+  void forward(const Forward& step, std::vector<double>& x, double* body_forces) const override;
+  void backward(const Backward& step) const override;
+};
+
+}  // namespace diffcloth::step

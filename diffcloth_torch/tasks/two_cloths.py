@@ -1,0 +1,132 @@
+"""Two cloths: hooked into each other, they are pulled apart until one is where it shall be.
+
+A constant force pulls the one. What acts is the force on the other, for each control interval. The
+loss is the distance between the center of a cloth, the mean of its vertices, and its target.
+
+References:
+    The experiment "checking differentiation calculation" of the paper, section V.C.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from pydantic import model_validator
+from torch import Tensor
+
+from diffcloth_torch.config.scenes import Motions, select_vertices
+from diffcloth_torch.config.schema import Positive, Section, Selection, Vector3
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.sim.controls import Control
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.tasks.optimization import Controller
+from diffcloth_torch.tasks.reach import (
+    ActionSection,
+    Reach,
+    ReachConfig,
+    Rows,
+    find_named,
+    measured,
+)
+from diffcloth_torch.viewers.look import Goal, marker
+
+__all__ = ["TwoCloths", "TwoClothsConfig"]
+
+
+class PullSection(Section):
+    """A constant force [N] on vertices of a cloth, which share it evenly."""
+
+    cloth: str
+    at: Selection
+    force: Vector3
+
+
+class ForceActionSection(ActionSection):
+    """Forces [N] on vertices of a cloth, which share them evenly."""
+
+    cloth: str
+    at: Selection
+    force: Rows
+
+
+class CenterSection(Section):
+    """Where the center of a cloth shall be [m]; it is shown with a radius [m]."""
+
+    cloth: str
+    position: Vector3
+    marker_radius: Positive = 0.01
+
+
+class TwoClothsConfig(ReachConfig):
+    """A scene, the forces that act in it, the target of a cloth's center, and how to get there."""
+
+    pull: PullSection
+    actions: ForceActionSection
+    target: CenterSection
+
+    @model_validator(mode="after")
+    def _check_references(self) -> TwoClothsConfig:
+        for key in ("pull", "actions", "target"):
+            find_named(f"{key}.cloth", getattr(self, key).cloth, self.scene.cloths)
+        return self
+
+
+class TwoCloths(Reach):
+    """Two cloths pull at each other until one is at a target."""
+
+    Config = TwoClothsConfig
+
+    def __init__(self, config: TwoClothsConfig, source: Path) -> None:
+        """Build the scene of a configuration that was read from the file `source`."""
+        super().__init__(config, source)
+        self._force = config.actions.force
+        self._acting = self._shares("actions", config.actions)
+        pull = torch.tensor(config.pull.force, dtype=torch.float64)
+        self._constant = self._shares("pull", config.pull)[:, None] * pull
+        self._rows = self.simulator.slices[config.target.cloth]
+        self._target = torch.tensor(config.target.position, dtype=torch.float64)
+        self._radius = config.target.marker_radius
+
+    def _shares(self, key: str, section: PullSection | ForceActionSection) -> Tensor:
+        """Share of each vertex of the scene in a force, shape [N]."""
+        cloth = self.scene.cloths[self.scene.cloth_names.index(section.cloth)]
+        chosen = select_vertices(f"{key}.at", section.at, cloth.vertices)
+        if chosen.max() >= len(cloth.vertices):
+            raise InvalidInput(
+                f"`{key}.at.vertices` must be between 0 and {len(cloth.vertices) - 1}, vertices of "
+                f"{section.cloth!r}, got {chosen.max()}"
+            )
+        shares = torch.zeros(len(self.simulator.initial_state().positions), dtype=torch.float64)
+        first = self.simulator.slices[section.cloth].start
+        shares[first + torch.from_numpy(chosen)] = 1 / len(chosen)
+        return shares
+
+    def initial_rows(self) -> dict[str, list[list[float]]]:
+        """Forces on the cloth that acts."""
+        return {"force": self._force}
+
+    def motions(self, actions: Mapping[str, Tensor]) -> Motions:
+        """Move nothing but by forces."""
+        return {}
+
+    def controller(self, actions: Mapping[str, Tensor]) -> Controller:
+        """Pull at both cloths; the rest of the scene follows keyframes."""
+        follow = super().controller(actions)
+        acting = self.each_step(actions)["force"]
+
+        def control(k: int, state: State) -> Control:
+            forces = self._constant + self._acting[:, None] * acting[k]
+            return follow(k, state).replace(forces=forces)
+
+        return control
+
+    def distance(self, state: State, measure: str) -> Tensor:
+        """Distance between the center of the cloth and its target."""
+        away = state.positions[self._rows].mean(dim=0) - self._target
+        return measured(away.square().sum(), measure)
+
+    def goals(self) -> list[Goal]:
+        """Mark where the center shall be."""
+        return [marker(self._target.numpy(), self._radius)]

@@ -1,0 +1,222 @@
+"""Dry friction at vertices: Coulomb's law without smoothing, and exact gradients of one step."""
+
+import numpy as np
+import pytest
+import torch
+from differences import directions, mismatch
+from nodal_scenes import BODIES, CASES, DT, counts, on_body
+from scenes import F64
+
+import diffcloth_torch as dc
+
+G = 9.81
+
+
+def loss(step, generator):
+    """A sum of all outputs with random weights."""
+    weights = [torch.randn(36, 3, dtype=F64, generator=generator) for _ in range(2)]
+    forces = torch.randn(step.state.body_forces.shape, dtype=F64, generator=generator)
+
+    def value(changes=None):
+        after = step(changes)
+        return (
+            (after.positions * weights[0]).sum()
+            + DT * (after.velocities * weights[1]).sum()
+            + 1e-2 * (after.body_forces * forces).sum()
+        )
+
+    return value
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("kind", BODIES)
+def test_gradients_of_a_step_are_those_of_differences(kind, case):
+    step = on_body(kind, case)
+    found = dict(zip(("taking_off", "sticking", "slipping"), counts(step()), strict=True))
+    assert sum(found.values()) > 0
+    assert found[case] > 0 or kind != "plane"
+    generator = torch.Generator().manual_seed(0)
+    value = loss(step, generator)
+    leaves = {name: t.detach().clone().requires_grad_() for name, t in step.inputs.items()}
+    gradients = torch.autograd.grad(value(leaves), list(leaves.values()))
+    for (name, tensor), gradient in zip(step.inputs.items(), gradients, strict=True):
+        size = 1e-6 if name in ("state.positions", "control.pins") else 1e-4
+        size *= max(1.0, float(tensor.abs().max()) if name.startswith("parameters") else 1.0)
+        for direction in directions(tensor, generator):
+
+            def along(moved, name=name):
+                with torch.no_grad():
+                    return value({name: moved}).item()
+
+            error = mismatch(along, tensor, gradient, direction, size, 1e-6)
+            assert error < 1e-5, (name, error)
+
+
+def test_the_normal_turns_with_the_vertex():
+    # On a sphere the gradient by positions is far off where the frame is taken for constant.
+    # It is the same sheet, sliding, with a derivative that only the frame has.
+    step = on_body("sphere", "slipping", moving=False)
+    x = step.inputs["state.positions"].clone().requires_grad_()
+    step({"state.positions": x}).velocities[:, 2].sum().backward()
+    direction = torch.zeros_like(x)
+    direction[:, 0] = 1.0
+    difference = sum(
+        sign
+        * step({"state.positions": x.detach() + sign * 1e-6 * direction}).velocities[:, 2].sum()
+        for sign in (-1, 1)
+    )
+    assert (x.grad * direction).sum().item() == pytest.approx(difference.item() / 2e-6, rel=1e-6)
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("kind", ["plane", "sphere"])
+def test_projective_dynamics_finds_what_newton_finds(kind, case):
+    newton = on_body(kind, case, tolerance=1e-10)
+    local_global = on_body(kind, case, tolerance=1e-9, elastic="projective")
+    after, expected = local_global(newton.inputs), newton()
+    assert after.report.counts["local_global"] > 0
+    assert counts(after) == counts(expected)
+    assert (after.positions - expected.positions).abs().max() < 1e-8
+
+
+def test_a_tape_of_projective_dynamics_gives_the_gradient_of_newton():
+    steps = [
+        on_body("sphere", "slipping", tolerance=1e-9, elastic=e) for e in ("newton", "projective")
+    ]
+    gradients = []
+    for step in steps:
+        x = steps[0].inputs["state.positions"].clone().requires_grad_()
+        after = step({**steps[0].inputs, "state.positions": x})
+        gradients.append(torch.autograd.grad((after.positions**2).sum(), x)[0])
+    torch.testing.assert_close(*gradients, rtol=1e-6, atol=1e-8)
+
+
+def patch(friction, incline=0.0, dt=0.01, scheme="projective", **options):
+    """A small sheet on a plane tilted about y, in contact; and the direction down the plane."""
+    sheet = dc.Cloth.grid(3, 3, size=(0.1, 0.1))
+    c, s = np.cos(incline), np.sin(incline)
+    R = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    vertices = (np.array(sheet.vertices) + np.array([0, 0, 9.9e-4])) @ R.T
+    cloth = dc.Cloth(
+        vertices,
+        sheet.faces,
+        material=dc.Material(stretch=500.0, bending=1e-3, density=0.2, friction=friction),
+    )
+    turn = [np.cos(incline / 2), 0, np.sin(incline / 2), 0]
+    floor = dc.RigidBody.plane(
+        1.0, pose=[0, 0, 0, *turn], friction=friction, thickness=2e-3, nodal_contact=True
+    )
+    sim = dc.Simulator(
+        dc.Scene([cloth], [floor]),
+        dt,
+        scheme=scheme,
+        contact=dc.ContactOptions(self_contact=False),
+        solver=dc.SolverOptions(tolerance=1e-9, **options),
+    )
+    return sim, sim.initial_state(), torch.from_numpy(R @ [1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("scheme", ["projective", "split"])
+@pytest.mark.parametrize("friction", [0.1, 0.3, 0.5, 0.7])
+def test_a_sheet_sticks_without_creep_below_its_friction_angle_and_slides_above(friction, scheme):
+    sim, state, _ = patch(friction, np.arctan(friction) - 1e-3, scheme=scheme)
+    start = state.positions
+    for _ in range(20):
+        state = sim.step(state)
+    assert counts(state) == (0, 9, 0)
+    assert (state.positions - start).abs().max() < 1e-12
+
+    sim, state, down = patch(friction, np.arctan(friction) + 1e-3, scheme=scheme)
+    for _ in range(20):
+        state = sim.step(state)
+    assert counts(state) == (0, 0, 9)
+    theta = np.arctan(friction) + 1e-3
+    acceleration = G * (np.sin(theta) - friction * np.cos(theta))
+    speeds = state.velocities @ down
+    torch.testing.assert_close(
+        speeds, torch.full_like(speeds, 0.2 * acceleration), rtol=1e-6, atol=1e-9
+    )
+
+
+def test_a_slide_accelerates_as_coulomb_says():
+    # mu .49 on tan(theta) = .5: a = g (sin - mu cos) = .087743 m/s^2.
+    sim, state, down = patch(0.49, np.arctan(0.5))
+    for _ in range(10):
+        state = sim.step(state)
+    assert (state.velocities @ down).mean().item() / 0.1 == pytest.approx(0.087743, rel=1e-5)
+
+
+@pytest.mark.parametrize(("v_0", "mu"), [(2.0, 0.5), (10.0, 0.8)])
+def test_stopping_distance_and_its_gradients(v_0, mu):
+    # Implicit Euler of a = -mu g: v_k = v_0 - k mu g h until it stops in the last, shorter step.
+    h = 0.01
+    sim, state, _ = patch(mu, dt=h)
+    speed = torch.tensor(v_0, dtype=F64, requires_grad=True)
+    friction = torch.tensor(mu, dtype=F64, requires_grad=True)
+    direction = torch.tensor([1.0, 0.0, 0.0], dtype=F64)
+    x = state.positions
+    state = state.replace(velocities=speed * direction.expand_as(x))
+    parameters = sim.parameters().replace(friction=friction)
+    steps = int(v_0 / (mu * G * h))
+    for _ in range(steps + 3):
+        state = sim.step(state, None, parameters)
+    assert state.velocities.detach().abs().max() < 1e-9
+    distance = (state.positions - x)[:, 0].mean()
+    expected = h * (steps * v_0 - 0.5 * steps * (steps + 1) * mu * G * h)
+    assert distance.item() == pytest.approx(expected, rel=1e-7)
+    d_speed, d_friction = torch.autograd.grad(distance, (speed, friction))
+    assert d_speed.item() == pytest.approx(h * steps, rel=1e-6)
+    assert d_friction.item() == pytest.approx(-0.5 * h * h * G * steps * (steps + 1), rel=1e-6)
+
+
+def test_a_floor_bears_the_weight_and_no_more():
+    sim, state, _ = patch(0.5)
+    for _ in range(5):
+        state = sim.step(state)
+    weight = 0.2 * 0.1 * 0.1 * G
+    torch.testing.assert_close(
+        state.body_forces.sum(0), torch.tensor([0.0, 0.0, -weight], dtype=F64), rtol=1e-7, atol=1e-9
+    )
+
+
+def test_an_obstacle_carries_what_sticks_to_it():
+    sim, state, _ = patch(0.8)
+    body = sim.scene.bodies[0]
+    moving = dc.RigidBody.plane(
+        1.0, motion="kinematic", pose=body.pose, friction=0.8, thickness=2e-3, nodal_contact=True
+    )
+    sim = dc.Simulator(
+        dc.Scene(sim.scene.cloths, [moving]),
+        0.01,
+        scheme="projective",
+        contact=dc.ContactOptions(self_contact=False),
+        solver=dc.SolverOptions(tolerance=1e-10),
+    )
+    state = sim.initial_state()
+    for k in range(1, 6):
+        poses = state.body_poses.clone()
+        poses[0, 0] = 1e-4 * k
+        state = sim.step(state, dc.Control(body_poses=poses))
+    assert counts(state)[1] == 9
+    moved = state.positions - sim.initial_state().positions
+    torch.testing.assert_close(
+        moved, torch.tensor([5e-4, 0, 0], dtype=F64).expand_as(moved), rtol=0, atol=1e-10
+    )
+
+
+def test_contacts_of_a_batch_are_those_of_its_environments():
+    step = on_body("sphere", "slipping")
+    states = dc.stack([step.state, step.state.replace(velocities=0.5 * step.state.velocities)])
+    both = step.sim.step(states)
+    for i in range(2):
+        one = step.sim.step(states[i])
+        assert torch.equal(both.positions[i], one.positions)
+        assert torch.equal(both.body_forces[i], one.body_forces)
+
+
+def test_split_leaves_nodal_bodies_out_of_the_barrier():
+    step = on_body("plane", "slipping", scheme="split")
+    after = step()
+    assert counts(after)[2] > 0
+    assert after.report.contact_count == 0
+    assert step.sim.parameters().barrier_distance is None

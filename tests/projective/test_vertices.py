@@ -1,0 +1,113 @@
+"""Vertices of cloths in contact with each other: equal and opposite impulses, exact gradients."""
+
+import numpy as np
+import pytest
+import torch
+from differences import directions, mismatch
+from nodal_scenes import DT, Step, counts
+from scenes import F64, grid, material, tensor_noise
+
+import diffcloth_torch as dc
+
+
+def stacked(elastic="newton", friction=0.3, tolerance=1e-10):
+    """A sheet that falls on another one and slides over it; nothing else holds them."""
+    edge = 0.1
+    lower, faces = grid(5, 5, seed=1, jitter=0.05)
+    upper = lower + np.array([0.3 * edge, 0.1 * edge, 0.8 * edge])
+    cloths = [
+        dc.Cloth(v, faces, rest_vertices=lower, material=material(faces, k, friction=friction))
+        for k, v in enumerate((lower, upper))
+    ]
+    sim = dc.Simulator(
+        dc.Scene(cloths, gravity=(0.0, 0.0, 0.0)),
+        DT,
+        scheme="projective",
+        solver=dc.SolverOptions(tolerance=tolerance, elastic=elastic),
+    )
+    state = sim.initial_state()
+    velocities = 0.1 * tensor_noise((50, 3), 1.0, 4)
+    velocities[25:] += torch.tensor([1.0, 0.3, -2.0], dtype=F64)
+    state = state.replace(velocities=velocities)
+    inputs = {"state.positions": state.positions, "state.velocities": state.velocities}
+    for name in ("friction", "stretch", "density", "damping", "rest_positions"):
+        inputs[f"parameters.{name}"] = getattr(sim.parameters(), name)
+    return Step(sim, state, inputs)
+
+
+def momentum(step, state):
+    density = step.sim.parameters().density
+    triangles = torch.cat([torch.from_numpy(np.array(c.faces)) for c in step.sim.scene.cloths])
+    triangles[len(triangles) // 2 :] += 25
+    rest = step.sim.parameters().rest_positions
+    a, b, c = (rest[triangles[:, k]] for k in range(3))
+    masses = torch.zeros(50, dtype=F64)
+    share = density * torch.linalg.cross(b - a, c - a).norm(dim=1) / 6
+    for k in range(3):
+        masses.index_add_(0, triangles[:, k], share)
+    return masses @ state.velocities
+
+
+@pytest.mark.parametrize("elastic", ["newton", "projective"])
+def test_pairs_keep_the_momentum(elastic):
+    step = stacked(elastic)
+    state, before = step.state, momentum(step, step.state)
+    touched = 0
+    for _ in range(5):
+        state = step.sim.step(state)
+        touched += sum(counts(state)[1:])
+    assert touched > 10
+    torch.testing.assert_close(momentum(step, state), before, rtol=0, atol=1e-9)
+
+
+def test_newton_and_projective_dynamics_agree():
+    newton, local_global = stacked(), stacked("projective", tolerance=1e-9)
+    after, expected = local_global(newton.inputs), newton()
+    assert counts(after) == counts(expected)
+    assert sum(counts(expected)[1:]) > 0
+    assert (after.positions - expected.positions).abs().max() < 1e-8
+
+
+@pytest.mark.parametrize("friction", [0.05, 2.0])
+def test_gradients_of_pairs_are_those_of_differences(friction):
+    step = stacked(friction=friction, tolerance=1e-11)
+    _, sticking, slipping = counts(step())
+    assert slipping > 0 if friction < 0.5 else sticking > 0
+    generator = torch.Generator().manual_seed(0)
+    weights = [torch.randn(50, 3, dtype=F64, generator=generator) for _ in range(2)]
+
+    def value(changes=None):
+        after = step(changes)
+        return (after.positions * weights[0]).sum() + DT * (after.velocities * weights[1]).sum()
+
+    leaves = {name: t.detach().clone().requires_grad_() for name, t in step.inputs.items()}
+    gradients = torch.autograd.grad(value(leaves), list(leaves.values()))
+    for (name, tensor), gradient in zip(step.inputs.items(), gradients, strict=True):
+        size = 1e-6 if "positions" in name else 1e-4 * max(1.0, float(tensor.abs().max()))
+        for direction in directions(tensor, generator):
+
+            def along(moved, name=name):
+                with torch.no_grad():
+                    return value({name: moved}).item()
+
+            error = mismatch(along, tensor, gradient, direction, size, 1e-6)
+            assert error < 1e-5, (name, error)
+
+
+def test_self_contact_is_what_the_options_say():
+    lower, faces = grid(5, 5, seed=1, jitter=0.05)
+    folded = lower.copy()
+    # One half of the sheet turned over the other, closer than its vertices' spheres.
+    over = folded[:, 0] > 0.02
+    folded[over, 0] = 0.04 - folded[over, 0]
+    folded[over, 2] += 0.05
+    for self_contact in (True, False):
+        sim = dc.Simulator(
+            dc.Scene([dc.Cloth(folded, faces, rest_vertices=lower, material=material(faces))]),
+            DT,
+            scheme="projective",
+            contact=dc.ContactOptions(self_contact=self_contact),
+            solver=dc.SolverOptions(throw=False),
+        )
+        after = sim.step(sim.initial_state())
+        assert (sum(counts(after)) > 0) == self_contact
