@@ -64,9 +64,8 @@ class Iteration {
     return change <= 0.0;
   }
 
-  /// Go on from the plain step, or a part of it.
+  /// Take the plain step, or a part of it.
   bool halve() {
-    anderson_.restart();
     double share = 1.0;
     for (int k = 0; k < kHalvings; ++k, share *= 0.5) {
       for (std::size_t a = 0; a < size_; ++a) to_[a] = x_[a] + share * p_[a];

@@ -10,6 +10,7 @@
 #include <utility>
 
 #include "elastic/elastic_nearness.h"
+#include "elastic/repeated_elasticity.h"
 #include "projective/local_global.h"
 #include "solver/newton.h"
 #include "step/contact_stage.h"
@@ -104,11 +105,13 @@ void solve_by_projective_dynamics(const Forward& step, Array& x) {
   Problem& problem = step.problem;
   const Stopwatch::Scope scope(*step.context.watch, Phase::kSolve);
   const auto matrix = problem.constant_matrix();
-  projective::Objective f{.potentials = {&problem.inertia},
+  const elastic::RepeatedElasticity elasticity(problem.model, problem.scene.slots,
+                                               problem.scene.elastic_assemblies.base());
+  projective::Objective f{.potentials = {&problem.inertia, &elasticity},
                           .matrix = matrix.get(),
                           .masses = &problem.masses,
                           .h = problem.h};
-  for (const Potential* p : problem.elastic_potentials()) f.potentials.push_back(p);
+  if (problem.anchors) f.potentials.push_back(&*problem.anchors);
   const solver::Options& given = step.context.options;
   const projective::Outcome outcome = projective::minimize(
       f, x,
