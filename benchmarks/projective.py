@@ -3,10 +3,10 @@
     python -m benchmarks.projective            # under a minute
     python -m benchmarks.projective --quick    # seconds, on a small mesh
 
-25 x 25 vertices, 4.5 m wide, on a sphere of radius 2 m, in steps of 1/180 s (the scene of
-DiffCloth's first experiment, Li et al. 2022). Each row is one way to solve the elastic stage, to one
-tolerance. The fastest of the steps in contact, in milliseconds and in EF: one factorization of the
-contact-free Hessian by Eigen, the fastest of those in between. Backward is of a random loss of
+25 x 25 vertices, 4.5 m wide, on a sphere of radius 2 m, in steps of 1/180 s: the scene of the
+reference trajectory that the tests compare with. Each row is one way to solve the elastic stage, to
+one tolerance. The fastest of the steps in contact, in milliseconds and in EF: one factorization of
+the contact-free Hessian by Eigen, the fastest of those in between. Backward is of a random loss of
 positions.
 """
 

@@ -211,3 +211,12 @@ def pierces(a, b):
         if 0 <= t <= 1 and u >= 0 and v >= 0 and u + v <= 1:
             return True
     return False
+
+
+def test_the_baseline_is_timed_with_both_elastic_solvers():
+    command = [sys.executable, "-m", "benchmarks.projective", "--quick"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    rows = [line.split() for line in result.stdout.splitlines()]
+    assert [row[0] for row in rows[1:]] == 2 * ["newton", "projective"]
+    assert all(int(row[2]) > 0 for row in rows[1:])  # vertices in contact

@@ -1,5 +1,7 @@
 #include "elastic/constant_form.h"
 
+#include <utility>
+
 #include "elastic/bending.h"
 #include "elastic/elements.h"
 
@@ -49,6 +51,16 @@ void add_element_mixed(
 }
 
 }  // namespace
+
+ConstantForm::ConstantForm(const linalg::BlockPattern& pattern,
+                           Index vertices,
+                           std::vector<double> values)
+    : pattern_(&pattern), vertex_count_(vertices), values_(std::move(values)) {}
+
+ConstantForm ConstantForm::of_flat_bending(const Model& model,
+                                           const linalg::BlockPattern& pattern) {
+  return {pattern, model.topology->vertex_count, model.prepared.constant};
+}
 
 ConstantForm::ConstantForm(const Model& model,
                            const Slots& slots,

@@ -31,6 +31,9 @@ class ConstantForm {
                const Anchors& anchors,
                const linalg::BlockPattern& pattern);
 
+  /// That of flat bending alone, which is its energy.
+  static ConstantForm of_flat_bending(const Model& model, const linalg::BlockPattern& pattern);
+
   /// L, one value a slot of the pattern [N/m].
   const std::vector<double>& values() const { return values_; }
   const linalg::BlockPattern& pattern() const { return *pattern_; }
@@ -42,6 +45,8 @@ class ConstantForm {
   void add_product(const double* u, double* y) const;
 
  private:
+  ConstantForm(const linalg::BlockPattern& pattern, Index vertices, std::vector<double> values);
+
   const linalg::BlockPattern* pattern_;
   Index vertex_count_;  ///< the pattern may have further rows
   std::vector<double> values_;

@@ -185,7 +185,7 @@ double energy(const Model& model, const double* x) {
   return total;
 }
 
-double energy_change(const Model& model, const double* x0, const double* x1) {
+double energy_change(const Model& model, const double* x0, const double* x1, Elements elements) {
   double total = 0.0;
   for (Index f = 0; f < face_count(model); ++f) {
     const std::array<Index, 3>& face = model.topology->faces[f];
@@ -202,12 +202,13 @@ double energy_change(const Model& model, const double* x0, const double* x1) {
     }
   }
   for (Index e = 0; e < model.stencils->size(); ++e) {
+    if (elements == Elements::kButFlat && model.prepared.flat[e] != 0) continue;
     total += bending::energy_change(bending_element(model, e), x0, x1);
   }
   return total;
 }
 
-void add_gradient(const Model& model, const double* x, double* g) {
+void add_gradient(const Model& model, const double* x, double* g, Elements elements) {
   for (Index f = 0; f < face_count(model); ++f) {
     const Mat32 F = face_gradient(model, f, x);
     Mat32 P = stretch::stress(stretch_weight(model, f), F);
@@ -217,6 +218,7 @@ void add_gradient(const Model& model, const double* x, double* g) {
     scatter(model, f, P, g);
   }
   for (Index e = 0; e < model.stencils->size(); ++e) {
+    if (elements == Elements::kButFlat && model.prepared.flat[e] != 0) continue;
     bending::add_gradient(bending_element(model, e), x, g);
   }
 }

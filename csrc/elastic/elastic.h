@@ -61,12 +61,22 @@ void prepare(Model& model, const Slots& slots);
 /// Stretch and bending energy, without damping [J].
 double energy(const Model& model, const double* x);
 
+/// Which elements a sum is over: flat bending elements can be left to their matrix,
+/// `prepared.constant`.
+enum class Elements : std::uint8_t { kAll, kButFlat };
+
 /// Energy at x1 minus energy at x0, damping included, as a sum of differences of the elements that
 /// do not cancel [J].
-double energy_change(const Model& model, const double* x0, const double* x1);
+double energy_change(const Model& model,
+                     const double* x0,
+                     const double* x1,
+                     Elements elements = Elements::kAll);
 
 /// g += grad E(x), damping included, [N, 3] [N].
-void add_gradient(const Model& model, const double* x, double* g);
+void add_gradient(const Model& model,
+                  const double* x,
+                  double* g,
+                  Elements elements = Elements::kAll);
 
 /// blocks += the Hessian at x, damping included, 9 doubles a slot [N/m].
 void add_hessian(

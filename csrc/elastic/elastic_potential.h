@@ -7,7 +7,7 @@
 namespace diffcloth::elastic {
 
 /// Stretch, bending and damping of all cloths as a potential. See elastic.h.
-class ElasticPotential final : public Potential {
+class ElasticPotential : public Potential {
  public:
   /// @param model      prepared; outlives the potential
   /// @param slots      of its elements in the base pattern

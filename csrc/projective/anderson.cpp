@@ -31,7 +31,7 @@ Anderson::Anderson(std::size_t size) : size_(size), last_end_(size), last_p_(siz
     change.p.resize(size);
     change.q.resize(size);
   }
-  products_.setZero();
+  products_.setZero(kWindow, kWindow);
 }
 
 void Anderson::next(const double* x, const double* p, const double* q, double* to) {

@@ -11,6 +11,15 @@ namespace {
 
 /// A step below this share of the largest coordinate is lost in rounding.
 constexpr double kResolution = 1e-15;
+/// Relative size of a change of energy that rounding can fake. Below, the slope decides.
+constexpr double kEnergyNoise = 1e-11;
+constexpr double kWolfeSlope = 0.8;
+/// Iterations after which the scale of the energy is looked up again.
+constexpr int kEnergyAge = 50;
+/// Iterations that neither shrink the residual by this much nor gain more than noise, after which
+/// the floor of rounding is reached.
+constexpr int kIdle = 1000;
+constexpr double kProgress = 0.9;
 /// Halvings after which a step that raises the energy gives up.
 constexpr int kHalvings = 40;
 
@@ -22,6 +31,7 @@ class Iteration {
         x_(x),
         size_(3 * objective.masses->size()),
         g_(x.size()),
+        g_to_(x.size()),
         p_(size_),
         q_(size_),
         to_(x),
@@ -43,7 +53,7 @@ class Iteration {
       step = std::max(step, std::abs(p_[a]));
       extent = std::max(extent, std::abs(x_[a]));
     }
-    if (!(step > kResolution * extent)) return false;
+    if (!(step > kResolution * extent) || idles()) return false;
     anderson_.next(x_.data(), p_.data(), q_.data(), to_.data());
     if (!gains() && !halve()) return false;
     x_.swap(to_);
@@ -58,15 +68,39 @@ class Iteration {
   }
 
  private:
-  bool gains() const {
-    double change = 0.0;
-    for (const Potential* p : f_.potentials) change += p->energy_change(x_.data(), to_.data());
-    return change <= 0.0;
+  bool gains() {
+    change_ = 0.0;
+    for (const Potential* p : f_.potentials) change_ += p->energy_change(x_.data(), to_.data());
+    return change_ < 0.0 || (change_ <= noise_ && is_flat());
   }
 
-  /// Go on from the plain step, or a part of it.
+  /// Whether the way to `to` goes down, and ends where it is flatter.
+  bool is_flat() {
+    set_gradient(to_, g_to_);
+    double slope = 0.0;
+    double slope_to = 0.0;
+    for (const Index i : f_.matrix->vertices()) {
+      const Vec3 step = row(to_.data(), i) - row(x_.data(), i);
+      slope += step.dot(row(g_.data(), i));
+      slope_to += step.dot(row(g_to_.data(), i));
+    }
+    return slope < 0.0 && slope_to <= -kWolfeSlope * slope;
+  }
+
+  bool idles() {
+    if (age_++ % kEnergyAge == 0) {
+      double energy = 0.0;
+      for (const Potential* p : f_.potentials) energy += p->energy(x_.data());
+      noise_ = kEnergyNoise * std::abs(energy);
+    }
+    const bool progress = residual_ < kProgress * best_ || change_ < -noise_;
+    idle_ = progress ? 0 : idle_ + 1;
+    best_ = std::min(best_, residual_);
+    return idle_ > kIdle;
+  }
+
+  /// Take the plain step, or a part of it.
   bool halve() {
-    anderson_.restart();
     double share = 1.0;
     for (int k = 0; k < kHalvings; ++k, share *= 0.5) {
       for (std::size_t a = 0; a < size_; ++a) to_[a] = x_[a] + share * p_[a];
@@ -75,9 +109,13 @@ class Iteration {
     return false;
   }
 
+  void set_gradient(const std::vector<double>& x, std::vector<double>& g) const {
+    std::ranges::fill(g, 0.0);
+    for (const Potential* p : f_.potentials) p->add_gradient(x.data(), g.data());
+  }
+
   void look() {
-    std::ranges::fill(g_, 0.0);
-    for (const Potential* p : f_.potentials) p->add_gradient(x_.data(), g_.data());
+    set_gradient(x_, g_);
     residual_ = 0.0;
     for (const Index i : f_.matrix->vertices()) {
       const double rate = f_.h * row(g_.data(), i).norm() / (*f_.masses)[i];
@@ -92,10 +130,15 @@ class Iteration {
   const Objective& f_;
   std::vector<double>& x_;
   std::size_t size_;
-  std::vector<double> g_, p_, q_, to_;
+  std::vector<double> g_, g_to_, p_, q_, to_;
   Anderson anderson_;
   ConstantMatrix::Scratch scratch_;
   double residual_ = 0.0;
+  double change_ = -std::numeric_limits<double>::infinity();  // of the last step [J]
+  double noise_ = 0.0;                                        // what rounding can fake of it
+  double best_ = std::numeric_limits<double>::infinity();
+  int age_ = 0;
+  int idle_ = 0;
 };
 
 }  // namespace

@@ -51,7 +51,8 @@ class Cells {
   }
   static std::uint64_t key(const Cell& c) {
     std::uint64_t hash = 0;
-    for (const std::int64_t k : c) hash = hash * 0x9E3779B97F4A7C15U + static_cast<std::uint64_t>(k);
+    for (const std::int64_t k : c)
+      hash = hash * 0x9E3779B97F4A7C15U + static_cast<std::uint64_t>(k);
     return hash;
   }
 
@@ -144,16 +145,16 @@ void add_obstacle_contacts(const Swept& cloths,
         deepest = depth;
         const Vec3 point = near.surface_point(y);
         found = true;
-        contact = {.vertex = i,
-                   .partner = -1,
-                   .obstacle = static_cast<Index>(o),
-                   .fraction = kFractions[k],
-                   .friction = obstacles[o].friction[cloth],
-                   .normal = frame.R * near.normal,
-                   .velocity =
-                       (placed(obstacles[o].end, point) - placed(obstacles[o].start, point)) /
-                       cloths.h,
-                   .surface_point = point};
+        contact = {
+            .vertex = i,
+            .partner = -1,
+            .obstacle = static_cast<Index>(o),
+            .fraction = kFractions[k],
+            .friction = obstacles[o].friction[cloth],
+            .normal = frame.R * near.normal,
+            .velocity =
+                (placed(obstacles[o].end, point) - placed(obstacles[o].start, point)) / cloths.h,
+            .surface_point = point};
       }
       if (found) contacts.push_back(contact);
     }
@@ -253,8 +254,7 @@ FrameBar pull_back(const NodalContact& contact,
                      near.surface_point_derivative() * b_bar;
   out.vertex = R * y_bar;
   // y_bar . R^T (x - p) is also (R y_bar) . (x - p).
-  Pose pose_bar =
-      turn_vjp(pose, near.normal, normal_bar) + turn_vjp(pose, y_bar, from_origin);
+  Pose pose_bar = turn_vjp(pose, near.normal, normal_bar) + turn_vjp(pose, y_bar, from_origin);
   pose_bar.head<3>() -= out.vertex;
   pull_back_pose(o, contact.fraction, pose_bar, out);
   return out;

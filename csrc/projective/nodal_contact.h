@@ -24,10 +24,11 @@ struct Obstacle {
 
 /// Vertices of cloths as spheres that touch each other.
 struct Spheres {
-  std::vector<double> radius;             ///< [N] [m]
-  std::vector<std::vector<Index>> apart;  ///< [N] vertices beyond the own one that each never touches
-  std::vector<double> friction;           ///< [cloths^2]
-  std::vector<char> touching;             ///< [cloths^2] whether vertices of two cloths may touch
+  std::vector<double> radius;  ///< [N] [m]
+  std::vector<std::vector<Index>>
+      apart;                     ///< [N] vertices beyond the own one that each never touches
+  std::vector<double> friction;  ///< [cloths^2]
+  std::vector<char> touching;    ///< [cloths^2] whether vertices of two cloths may touch
 };
 
 /// Cloths on the straight way from the start of a step to where inertia and external forces alone
@@ -48,13 +49,13 @@ struct Swept {
 /// Contact of a vertex with an obstacle or another vertex: a frame that holds for the whole step.
 struct NodalContact {
   Index vertex;
-  Index partner;         ///< the other vertex, or -1
-  Index obstacle;        ///< place of the obstacle, or -1
-  double fraction;       ///< of the step at which the frame was taken: 0, 1/2 or 1
-  double friction;       ///< mu
-  Vec3 normal;           ///< toward the vertex, in the world
-  Vec3 velocity;         ///< of the obstacle's material at the contact over the step [m/s]
-  Vec3 surface_point;    ///< of the obstacle that is nearest, in its frame [m]
+  Index partner;       ///< the other vertex, or -1
+  Index obstacle;      ///< place of the obstacle, or -1
+  double fraction;     ///< of the step at which the frame was taken: 0, 1/2 or 1
+  double friction;     ///< mu
+  Vec3 normal;         ///< toward the vertex, in the world
+  Vec3 velocity;       ///< of the obstacle's material at the contact over the step [m/s]
+  Vec3 surface_point;  ///< of the obstacle that is nearest, in its frame [m]
 };
 
 /// Contacts of a step: at most one a vertex.

@@ -4,6 +4,7 @@
 #include <string_view>
 #include <utility>
 
+#include "elastic/repeated_elasticity.h"
 #include "projective/local_global.h"
 #include "solver/newton.h"
 #include "step/contact_stage.h"
@@ -31,11 +32,13 @@ projective::Outcome minimize(Problem& problem,
                              const Checkpoint& checkpoint,
                              std::vector<double>& x) {
   const auto matrix = problem.constant_matrix();
-  projective::Objective f{.potentials = {&problem.inertia},
+  const elastic::RepeatedElasticity elasticity(problem.model, problem.scene.slots,
+                                               problem.scene.elastic_assemblies.base());
+  projective::Objective f{.potentials = {&problem.inertia, &elasticity},
                           .matrix = matrix.get(),
                           .masses = &problem.masses,
                           .h = problem.h};
-  for (const Potential* p : problem.elastic_potentials()) f.potentials.push_back(p);
+  if (problem.anchors) f.potentials.push_back(&*problem.anchors);
   return projective::minimize(f, x, options, checkpoint);
 }
 
@@ -73,10 +76,10 @@ void solve_by_newton(Problem& problem,
                      std::vector<double>& x) {
   // Its way is no motion of the cloth.
   auto* const path = std::exchange(step.context.path, nullptr);
-  const solver::Outcome outcome =
-      nodes.has_contacts() ? nodes.solve(step.context, x)
-                           : solver::minimize(objective(problem), x, Motion(problem), nullptr,
-                                              nullptr, step.context);
+  const solver::Outcome outcome = nodes.has_contacts()
+                                      ? nodes.solve(step.context, x)
+                                      : solver::minimize(objective(problem), x, Motion(problem),
+                                                         nullptr, nullptr, step.context);
   step.context.path = path;
   merge(outcome, step.report);
   step.kept.factors.push_back(outcome.factor);

@@ -48,6 +48,7 @@
 #include <stdexcept>
 #include <utility>
 
+#include "elastic/repeated_elasticity.h"
 #include "linalg/gmres.h"
 #include "projective/anderson.h"
 #include "solver/linear_system.h"
@@ -122,9 +123,7 @@ class PairPattern final : public Potential {
   std::vector<std::pair<Index, Index>> pairs_;
 };
 
-double scale(const NodalContact& c) {
-  return c.partner < 0 ? 1.0 : 1.0 / std::numbers::sqrt2;
-}
+double scale(const NodalContact& c) { return c.partner < 0 ? 1.0 : 1.0 / std::numbers::sqrt2; }
 
 /// E v.
 Vec3 relative(const NodalContact& c, const double* v) {
@@ -238,8 +237,8 @@ class NodalSystem {
     Array x;
     Array g;  ///< of all points
     std::vector<Coulomb> laws;
-    std::vector<Vec3> u;    ///< relative velocities [m/s]
-    double merit = 0.0;     ///< sum of |residual|^2 / rho [J]
+    std::vector<Vec3> u;  ///< relative velocities [m/s]
+    double merit = 0.0;   ///< sum of |residual|^2 / rho [J]
   };
 
   void look(Point& at) const {
@@ -311,8 +310,7 @@ class NodalSystem {
     for (std::size_t k = 0; k < contacts_.size(); ++k) {
       const NodalContact& c = contacts_[k];
       const Vec3 e = relative(c, v.data());
-      spread(c,
-             -held(c, at.laws[k], e) - c.friction * c.normal.dot(e) * at.laws[k].direction,
+      spread(c, -held(c, at.laws[k], e) - c.friction * c.normal.dot(e) * at.laws[k].direction,
              v.data());
     }
     clear_fixed(v);
@@ -395,8 +393,8 @@ class NodalSystem {
       if (law.kind == ContactCase::kSlipping) {
         const Vec3 e_t = tangential(e, c.normal);
         const double along = law.direction.dot(e);
-        const double normal = frozen ? law.impulse.dot(c.normal) / (p_.h * scale(c))
-                                     : c.normal.dot(e);
+        const double normal =
+            frozen ? law.impulse.dot(c.normal) / (p_.h * scale(c)) : c.normal.dot(e);
         equations = law.direction * (along - c.friction * normal) +
                     (1.0 + law.ratio) * (e_t - law.direction * along);
       }
@@ -559,16 +557,20 @@ NodalStage::NodalStage(Problem& problem, bool vertices_touch)
     pairs = true;
   }
   if (pairs) {
-    pattern_ = std::make_unique<PairPattern>(scene.elastic_assemblies.base(), partner_,
-                                             scene.prescribed);
+    pattern_ =
+        std::make_unique<PairPattern>(scene.elastic_assemblies.base(), partner_, scene.prescribed);
   }
 }
 
 namespace {
 
+/// Largest change [m]; infinite where one is not finite.
 double largest(const Array& change) {
   double size = 0.0;
-  for (const double value : change) size = std::max(size, std::abs(value));
+  for (const double value : change) {
+    if (!std::isfinite(value)) return std::numeric_limits<double>::infinity();
+    size = std::max(size, std::abs(value));
+  }
   return size;
 }
 
@@ -601,10 +603,14 @@ projective::Outcome NodalStage::iterate(const projective::Options& options,
   const solver::Objective f = objective(problem_, pattern_.get());
   const NodalSystem system(*this, f);
   const auto matrix = problem_.constant_matrix();
+  const elastic::RepeatedElasticity elasticity(problem_.model, problem_.scene.slots,
+                                               problem_.scene.elastic_assemblies.base());
+  std::vector<const Potential*> potentials{&problem_.inertia, &elasticity};
+  if (problem_.anchors) potentials.push_back(&*problem_.anchors);
   projective::ConstantMatrix::Scratch scratch;
   projective::Anderson anderson(problem_.cloth_size);
   projective::Outcome outcome;
-  Array g;
+  Array g(problem_.cloth_size);
   Array force(problem_.cloth_size);
   Array p(problem_.cloth_size);
   Array q(problem_.cloth_size);
@@ -614,9 +620,9 @@ projective::Outcome NodalStage::iterate(const projective::Options& options,
   bool accelerated = false;
   for (;; ++outcome.iterations) {
     checkpoint.check();
-    f.stand_at(x.data());
-    f.gradient(x.data(), g);
-    std::copy_n(g.begin(), force.size(), force.begin());
+    std::ranges::fill(g, 0.0);
+    for (const Potential* potential : potentials) potential->add_gradient(x.data(), g.data());
+    force = g;
     for (const NodalContact& c : contacts_) {
       const double h_s = problem_.h * scale(c);
       const Vec3 r = h_s * relative(c, g.data());
@@ -886,8 +892,8 @@ void NodalStage::backward(const Backward& step,
       bars.contact.friction[a * surfaces + other] += 0.5 * friction_bar;
       bars.contact.friction[other * surfaces + a] += 0.5 * friction_bar;
     }
-    const projective::FrameBar frame = projective::pull_back(c, cloths, obstacles_, normal_bar,
-                                                             h_s * q_e, surface_point_bar[k]);
+    const projective::FrameBar frame =
+        projective::pull_back(c, cloths, obstacles_, normal_bar, h_s * q_e, surface_point_bar[k]);
     const auto add_vertex = [&](Index i, const Vec3& bar) {
       Eigen::Map<Vec3>(bars.start.data() + 3 * i) += (1.0 - c.fraction) * bar;
       Eigen::Map<Vec3>(problem_.inertia.target_bar.data() + 3 * i) += c.fraction * bar;

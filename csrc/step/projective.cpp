@@ -8,8 +8,7 @@
 namespace diffcloth::step {
 
 std::vector<Field> Projective::tape(const Scene& scene) const {
-  return {
-      {.name = "elastic", .shape = {static_cast<std::size_t>(scene.cloth_vertex_count()), 3}}};
+  return {{.name = "elastic", .shape = {static_cast<std::size_t>(scene.cloth_vertex_count()), 3}}};
 }
 
 void Projective::forward(const Forward& step, std::vector<double>& x, double* body_forces) const {

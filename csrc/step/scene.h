@@ -46,7 +46,7 @@ struct Description {
   /// [surfaces of bodies] of those that cloths touch at their nodes, instead of by the barrier;
   /// empty: none
   std::vector<projective::Primitive> primitives;
-  std::vector<std::string> link_names;              ///< of the last surfaces; before come bodies
+  std::vector<std::string> link_names;  ///< of the last surfaces; before come bodies
   bool self_contact = true;
   double dt = 0.01;
   std::string scheme = "coupled";

@@ -20,10 +20,12 @@ class Report:
 
     Attributes:
         converged: Whether every solve of the step ended in a local minimum: the exact Hessian is
-            positive definite there, and its Newton step is below the tolerance.
+            positive definite there, and its Newton step is below the tolerance. Of Projective
+            Dynamics, whether its residual is.
         iterations: Newton iterations of all solves of the step, its prescribed motion included.
-        residual: Largest displacement of the last Newton step, as a velocity [m/s]; of several
-            solves the largest.
+        residual: Largest displacement of the last Newton step, as a velocity [m/s]; of Projective
+            Dynamics the largest change of velocity by the residual force; of several solves the
+            largest.
         minimum_distance: Smallest distance between mid-surfaces in contact [m], which is above half
             the sum of their thicknesses; infinite where nothing is within the barrier's reach.
         contact_count: Contacts within the barrier distance: pairs of primitives of cloths; of a
@@ -33,8 +35,9 @@ class Report:
         seconds: Phase of the step -> time [s]; the phases add up to the time in the core.
         counts: What was done -> how often: steps with the `exact` Hessian, `chord` steps with an
             older factor, steps with a `projected` Hessian, Hessians of `negative_curvature`,
-            numeric `factorizations`, failed ones included, and symbolic `analyses`; vertices in dry
-            frictional contact that are `taking_off`, `sticking` and `slipping`.
+            `local_global` iterations of Projective Dynamics, numeric `factorizations`, failed ones
+            included, and symbolic `analyses`; vertices in dry frictional contact that are
+            `taking_off`, `sticking` and `slipping`.
     """
 
     converged: bool | Tensor
