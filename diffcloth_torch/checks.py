@@ -261,13 +261,13 @@ def check_name(name: str, value: object) -> str | None:
     return value
 
 
-def check_pairs(
-    name: str, value: Iterable[Sequence[str]], accepted: Sequence[str]
-) -> tuple[tuple[str, str], ...]:
-    """Require pairs of two different names of those that are accepted."""
+def check_pairs(name: str, value: Any, accepted: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Require an iterable of pairs of two different names of those that are accepted."""
     pairs = []
+    if not isinstance(value, Iterable) or getattr(value, "ndim", 1) == 0:
+        raise TypeError(f"{name} must be a list of pairs of names, got {type(value).__name__}")
     for i, pair in enumerate(value):
-        if isinstance(pair, str) or len(pair) != 2 or pair[0] == pair[1]:
+        if not isinstance(pair, list | tuple) or len(pair) != 2 or pair[0] == pair[1]:
             raise InvalidInput(f"{name} must hold pairs of two names, got {pair!r} at [{i}]")
         for entry in pair:
             if entry not in accepted:

@@ -9,13 +9,20 @@ from pathlib import Path
 
 from diffcloth_torch.errors import InvalidInput
 
-__all__ = ["INTEGER", "NUMBER", "read_regular_file"]
+__all__ = ["INTEGER", "NUMBER", "as_path", "read_regular_file"]
 
 INTEGER = re.compile(rb"[+-]?[0-9]+")
 """An integer in a text file. Python alone would also read 1_0 and digits of other scripts."""
 
 NUMBER = re.compile(rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?:nan|inf)")
 """A number in a text file, as C writes it."""
+
+
+def as_path(name: str, value: object) -> Path:
+    """Require text or a path object."""
+    if not isinstance(value, str | Path):
+        raise TypeError(f"{name} must be a string or a Path, got {type(value).__name__}")
+    return Path(value)
 
 
 def read_regular_file(path: Path, largest: int) -> bytes:

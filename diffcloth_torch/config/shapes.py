@@ -142,7 +142,8 @@ def union_of_boxes(boxes: list[tuple[Interval, Interval, Interval]], edge_length
         ValueError: If there would be more than a million cells.
     """
     spans = [np.diff(sorted({end for box in boxes for end in box[k]})) for k in range(3)]
-    cells = np.prod([np.ceil(span / edge_length).sum() for span in spans])
+    with np.errstate(over="ignore"):
+        cells = np.prod([np.ceil(span / edge_length).sum() for span in spans])
     if not cells <= _MOST_CELLS:
         raise ValueError(
             f"`edge_length` must cut the boxes into at most {_MOST_CELLS} cells, got "

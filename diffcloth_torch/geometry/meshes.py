@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.files import INTEGER, NUMBER, read_regular_file
+from diffcloth_torch.files import INTEGER, NUMBER, as_path, read_regular_file
 from diffcloth_torch.geometry.ply import read_ply, write_ply
 
 __all__ = ["MeshPart", "read_mesh", "write_mesh"]
@@ -37,9 +37,10 @@ def read_mesh(path: str | Path) -> tuple[FloatArray, Indices]:
         InvalidInput: If the file is empty, malformed, of another format, larger than 1 GiB, no
             regular file, or has numbers that are not finite or other polygons than triangles. The
             message names the line, the vertex or the face.
+        TypeError: If the path is none.
         OSError: If the file cannot be read.
     """
-    path = Path(path)
+    path = as_path("mesh file: `path`", path)
     readers = {".obj": _read_obj, ".ply": read_ply, ".stl": _read_stl}
     reader = readers.get(path.suffix.lower())
     if reader is None:
@@ -60,7 +61,7 @@ def read_mesh(path: str | Path) -> tuple[FloatArray, Indices]:
 
 def write_mesh(path: str | Path, parts: Sequence[MeshPart]) -> None:
     """Write named surfaces, in their order, to an .obj or .ply file; numbers survive exactly."""
-    path = Path(path)
+    path = as_path("export: `path`", path)
     suffix = path.suffix.lower()
     if suffix == ".obj":
         _write_obj(path, parts)

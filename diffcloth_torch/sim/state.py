@@ -145,7 +145,7 @@ class State:
     def __post_init__(self) -> None:
         missing = [name for name in _ADDED if getattr(self, name) is None]
         if missing:
-            shape = np.shape(self.body_poses)
+            shape: tuple[int, ...] = getattr(self.body_poses, "shape", ())
             environments, bodies = shape[:-2], shape[-2] if len(shape) > 1 else 0
             for name in missing:
                 rows = shape_of(STATE[name].axes[0], {"K": bodies, "J": 0, "R": 0})
