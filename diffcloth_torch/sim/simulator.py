@@ -55,8 +55,8 @@ from diffcloth_torch.sim.step import Outcome, as_array, refuse_transforms, take_
 __all__ = ["Simulator"]
 
 # A start is deep inside the barrier below this part of the gap at rest: a sheet is then thrown
-# up by more than the barrier distance.
-_DEEP = 0.5
+# up by several barrier distances.
+_DEEP = 0.25
 
 # What a step may be off by when its solver stops: in a scene of micrometers the default tolerance
 # would be as long as the barrier.
