@@ -65,6 +65,13 @@ bool is_needed(const step::Scene& scene, const step::Inputs& inputs, Input input
     case Input::kBarrierDistance:
     case Input::kSlipVelocity:
       return inputs.data(Input::kBarrierStiffness) != nullptr;
+    case Input::kStretch:
+    case Input::kBending:
+    case Input::kDensity:
+    case Input::kDamping:
+      return scene.cloth_count() > 0;
+    case Input::kPinStiffness:
+      return !scene.given.soft_pins.empty();
     case Input::kCoordinateTargets:
     case Input::kCoordinateMetric:
       return scene.mechanisms.has_free();
@@ -123,7 +130,6 @@ std::vector<std::size_t> accepted_counts(const step::Scene& scene, Input input) 
   const std::size_t faces = scene.topology.faces.size();
   const auto cloths = static_cast<std::size_t>(scene.cloth_count());
   const auto surfaces = static_cast<std::size_t>(scene.surface_count());
-  const std::size_t soft = scene.given.soft_pins.size();
   switch (input) {
     case Input::kPositions:
     case Input::kVelocities:
@@ -136,7 +142,7 @@ std::vector<std::size_t> accepted_counts(const step::Scene& scene, Input input) 
     case Input::kPinTargets:
       return {3 * scene.given.pins.size()};
     case Input::kSoftPinTargets:
-      return {3 * soft};
+      return {3 * scene.given.soft_pins.size()};
     case Input::kGravity:
       return {3};
     case Input::kStretch:
@@ -144,7 +150,6 @@ std::vector<std::size_t> accepted_counts(const step::Scene& scene, Input input) 
     case Input::kPoisson:
     case Input::kDensity:
     case Input::kDamping:
-      if (faces == 0) return {0};
       return {1, cloths, faces};
     case Input::kFriction:
       return {1, surfaces * surfaces};
@@ -155,7 +160,6 @@ std::vector<std::size_t> accepted_counts(const step::Scene& scene, Input input) 
     case Input::kSlipVelocity:
       return {1};
     case Input::kPinStiffness:
-      if (soft == 0) return {0};
       return {1, cloths};
     case Input::kCoordinates:
     case Input::kCoordinateEnds:

@@ -17,7 +17,7 @@ void check_description(const step::Description& description);
 void check_mechanisms(const bodies::MechanismsDescription& mechanisms, Index surfaces);
 
 /// Numbers that one environment may have of an input of this scene; several counts where it may be
-/// given in several ways. Empty: the scene has no such thing.
+/// given in several ways.
 std::vector<std::size_t> accepted_counts(const step::Scene& scene, step::Input input);
 
 /// Require that one environment's inputs have all that a step of the scene reads, of accepted counts.
