@@ -39,6 +39,7 @@ __all__ = [
     "float_tensor",
     "frozen",
     "index_array",
+    "is_dense",
     "refuse_gradient",
     "texts",
 ]
@@ -47,6 +48,9 @@ FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int32]
 
 _FLOAT64_BYTES = 8
+# Counts reach the core as 32-bit integers.
+_LARGEST_COUNT = 2**31 - 1
+_LARGEST_SHOWN = 10**30
 # Integers are accepted where a float is meant; float16, bfloat16 and float32 widen without loss.
 _PROMOTABLE = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 _INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
@@ -108,10 +112,7 @@ def float_array(name: str, value: object, *, instead: str = "pass a detached ten
     refuse_gradient(name, value, instead)
     if isinstance(value, Tensor):
         return np.array(float_tensor(name, value).numpy(), dtype=np.float64, order="C")
-    try:
-        array = np.asarray(value)
-    except ValueError as error:  # ragged nested lists
-        raise InvalidInput(f"{name} must be a rectangular array of numbers: {error}") from error
+    array = _array(name, value, "numbers")
     if array.dtype.kind not in "fiu" or array.dtype.itemsize > _FLOAT64_BYTES:
         raise TypeError(
             f"{name} must hold real numbers of at most 64 bits, got dtype {array.dtype}"
@@ -123,23 +124,43 @@ def float_tensor(name: str, value: object) -> Tensor:
     """Promote to a float64 tensor on the CPU; a tensor keeps its graph, other values are copied."""
     if not isinstance(value, Tensor):
         return torch.from_numpy(float_array(name, value))
-    if value.layout != torch.strided:
-        raise TypeError(
-            f"{name} must be a dense tensor, got {value.layout}; call .to_dense() first"
-        )
-    if value.device.type != "cpu":
-        raise TypeError(f"{name} must be on the CPU, got {value.device}; call .cpu() first")
+    _require_dense(name, value)
     if value.dtype not in _PROMOTABLE + _INTEGERS:
         raise TypeError(f"{name} must be a tensor of real numbers, got {value.dtype}")
     return value.to(torch.float64)
 
 
+def is_dense(value: Tensor) -> bool:
+    """Tell whether a tensor is one plain block of memory; nested and sparse ones are not."""
+    return not value.is_nested and value.layout == torch.strided
+
+
+def _require_dense(name: str, value: Tensor) -> None:
+    if not is_dense(value):
+        kind = "a nested tensor" if value.is_nested else str(value.layout)
+        raise TypeError(f"{name} must be a dense tensor, got {kind}; make it dense first")
+    if value.device.type != "cpu":
+        raise TypeError(f"{name} must be on the CPU, got {value.device}; call .cpu() first")
+
+
+def _array(name: str, value: object, content: str) -> NDArray[Any]:
+    """Take what NumPy reads as an array, and refuse what would lose a part of its meaning."""
+    if isinstance(value, np.ma.MaskedArray):
+        raise TypeError(
+            f"{name} must not be a masked array, as its mask would be lost; fill it first"
+        )
+    if isinstance(value, Tensor):
+        _require_dense(name, value)
+        value = value.detach()
+    try:
+        return np.asarray(value)
+    except (ValueError, RuntimeError) as error:  # ragged lists; tensors with a graph inside lists
+        raise InvalidInput(f"{name} must be a rectangular array of {content}: {error}") from error
+
+
 def index_array(name: str, value: object, count: int) -> IndexArray:
     """Copy vertex indices into a new int32 array, each in 0 .. count - 1."""
-    try:
-        array = np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
-    except ValueError as error:  # ragged nested lists
-        raise InvalidInput(f"{name} must be a rectangular array of indices: {error}") from error
+    array = _array(name, value, "indices")
     if array.size and array.dtype.kind not in "iu":
         raise TypeError(f"{name} must hold integers, got dtype {array.dtype}")
     outside = (array < 0) | (array >= count)
@@ -199,13 +220,17 @@ def check_number(name: str, value: object, accepted: Range, *, instead: str) -> 
     return float(array)
 
 
-def check_count(name: str, value: object, minimum: int) -> int:
-    """Require an integer of at least `minimum`."""
+def check_count(name: str, value: object, minimum: int, maximum: int = _LARGEST_COUNT) -> int:
+    """Require an integer of at least `minimum` and at most `maximum`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} must be an integer, got {type(value).__name__}")
-    if value < minimum:
-        raise InvalidInput(f"{name} must be at least {minimum}, got {value}")
-    return int(value)
+    count = int(value)
+    if not minimum <= count <= maximum:
+        # Python writes out no integer of thousands of digits.
+        got = f"{count}" if abs(count) < _LARGEST_SHOWN else f"one of {count.bit_length()} bits"
+        bound = f"at least {minimum}" if count < minimum else f"at most {maximum}"
+        raise InvalidInput(f"{name} must be {bound}, got {got}")
+    return count
 
 
 def check_bool(name: str, value: object) -> bool:
@@ -217,9 +242,12 @@ def check_bool(name: str, value: object) -> bool:
 
 def check_choice(name: str, value: object, accepted: Sequence[str]) -> str:
     """Require one of the accepted words."""
+    if not isinstance(value, str):
+        kind = type(value).__name__
+        raise TypeError(f"{name} must be a string, one of {texts(accepted)}, got {kind}")
     if value not in accepted:
         raise InvalidInput(f"{name} must be one of {texts(accepted)}, got {value!r}")
-    return str(value)
+    return value
 
 
 def check_name(name: str, value: object) -> str | None:
@@ -233,13 +261,13 @@ def check_name(name: str, value: object) -> str | None:
     return value
 
 
-def check_pairs(
-    name: str, value: Iterable[Sequence[str]], accepted: Sequence[str]
-) -> tuple[tuple[str, str], ...]:
-    """Require pairs of two different names of those that are accepted."""
+def check_pairs(name: str, value: Any, accepted: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Require an iterable of pairs of two different names of those that are accepted."""
     pairs = []
+    if not isinstance(value, Iterable) or getattr(value, "ndim", 1) == 0:
+        raise TypeError(f"{name} must be a list of pairs of names, got {type(value).__name__}")
     for i, pair in enumerate(value):
-        if isinstance(pair, str) or len(pair) != 2 or pair[0] == pair[1]:
+        if not isinstance(pair, list | tuple) or len(pair) != 2 or pair[0] == pair[1]:
             raise InvalidInput(f"{name} must hold pairs of two names, got {pair!r} at [{i}]")
         for entry in pair:
             if entry not in accepted:

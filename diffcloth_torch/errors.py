@@ -37,7 +37,7 @@ class SimulationError(RuntimeError):
 
 
 class IntersectingState(SimulationError):  # noqa: N818
-    """Two surfaces already intersect, or are closer than their thickness, at the start."""
+    """Two surfaces overlap at the start: they intersect, touch, or are closer than allowed."""
 
 
 class InfeasibleMotion(SimulationError):  # noqa: N818

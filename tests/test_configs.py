@@ -56,7 +56,7 @@ def test_scientific_notation_is_a_number(write, text, value):
 
 
 def test_a_duplicate_key_is_refused_with_its_line(write):
-    with pytest.raises(InvalidInput, match=r"`steps` occurs twice.*line 2"):
+    with pytest.raises(InvalidInput, match=r"line 2: .*duplicate key \"steps\""):
         read_document(write("a: {steps: 1,\n  steps: 2}"))
 
 

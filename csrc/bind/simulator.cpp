@@ -1,4 +1,5 @@
 #include <algorithm>
+#include <cmath>
 #include <map>
 #include <memory>
 #include <stdexcept>
@@ -11,6 +12,7 @@
 #include <nanobind/stl/vector.h>
 
 #include "bind/bind.h"
+#include "bind/checks.h"
 #include "bind/environments.h"
 #include "contact/nonadjacent_distance.h"
 #include "step/scheme.h"
@@ -50,9 +52,15 @@ std::vector<T> to_vector(const nb::ndarray<const T, nb::c_contig, nb::device::cp
 }
 
 std::vector<std::array<Index, 3>> to_faces(const Indices& array) {
+  if (array.size() % 3 != 0) throw nb::value_error("core: faces must have three vertices each");
   std::vector<std::array<Index, 3>> faces(array.size() / 3);
   std::copy_n(array.data(), array.size(), faces.empty() ? nullptr : faces.front().data());
   return faces;
+}
+
+bool is_finite(const Doubles& array) {
+  return std::all_of(array.data(), array.data() + array.size(),
+                     [](double value) { return std::isfinite(value); });
 }
 
 /// The arrays of a call, and what one environment sees of them.
@@ -61,14 +69,30 @@ struct Arrays {
   std::array<bool, kInputCount> present{};
   std::size_t environments = 1;
 
-  explicit Arrays(const nb::dict& inputs) {
+  /// @param finite  whether numbers are checked too: what came back from Python may be anything
+  Arrays(const step::Scene& scene, const nb::dict& inputs, bool finite = false) {
     for (std::size_t k = 0; k < kInputCount; ++k) {
       const nb::str name(step::kInputNames[k]);
       if (!inputs.contains(name)) continue;
       array[k] = nb::cast<Doubles>(inputs[name]);
       present[k] = true;
     }
-    environments = array[static_cast<std::size_t>(Input::kPositions)].shape(0);
+    constexpr auto kPositions = static_cast<std::size_t>(Input::kPositions);
+    if (!present[kPositions] || array[kPositions].ndim() == 0 || array[kPositions].shape(0) == 0) {
+      throw nb::value_error("core: `positions` must hold one environment or more");
+    }
+    environments = array[kPositions].shape(0);
+    for (std::size_t k = 0; k < kInputCount; ++k) {
+      if (!present[k]) continue;
+      const std::string name = std::string("core: `") + step::kInputNames[k];
+      if (array[k].ndim() == 0 || (array[k].shape(0) != 1 && array[k].shape(0) != environments)) {
+        throw nb::value_error((name + "` must have the rows of one environment or of all").c_str());
+      }
+      if (finite && !is_finite(array[k])) {
+        throw nb::value_error((name + "` must be finite").c_str());
+      }
+    }
+    check_inputs(scene, environment(0));
   }
 
   step::Inputs environment(std::size_t b) const {
@@ -97,12 +121,17 @@ class Simulator {
   nb::object path(const nb::dict& inputs);
   double smallest_nonadjacent_distance() const;
   double default_barrier_stiffness(const nb::dict& inputs, double barrier_distance) const {
-    const Arrays arrays(inputs);
+    const Arrays arrays(scene_, inputs);
+    if (!arrays.present[static_cast<std::size_t>(Input::kThickness)]) {
+      throw nb::value_error("core: `thickness` is missing");
+    }
     return step::default_barrier_stiffness(scene_, arrays.environment(0), barrier_distance);
   }
   nb::object find_overlap(const nb::dict& inputs) const;
+  nb::object find_close_start(const nb::dict& inputs) const;
   double reference_factorization_seconds(const nb::dict& inputs, int repeats) const {
-    const Arrays arrays(inputs);
+    const Arrays arrays(scene_, inputs);
+    if (repeats < 1) throw nb::value_error("core: `repeats` must be at least 1");
     const nb::gil_scoped_release nogil;
     return step::reference_factorization_seconds(scene_, arrays.environment(0), repeats);
   }
@@ -159,13 +188,18 @@ class Saved {
       const std::string name = prefix + field.name;
       auto array = nb::cast<Doubles>(from[name.c_str()]);
       if (array.size() != environments * field.size()) {
-        throw nb::value_error(("backward: `" + name + "` must have " +
+        throw nb::value_error(("core: `" + name + "` must have " +
                                std::to_string(environments * field.size()) + " numbers, got " +
                                std::to_string(array.size()))
                                   .c_str());
       }
       entries_.push_back({.name = field.name, .array = array, .size = field.size()});
     }
+  }
+
+  bool is_finite() const {
+    return std::ranges::all_of(entries_,
+                               [](const Entry& entry) { return bind::is_finite(entry.array); });
   }
 
   /// Whether an environment's arrays are zero throughout.
@@ -222,7 +256,7 @@ void add_reports(const std::vector<step::Report>& reports, nb::dict& out) {
 }
 
 nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
-  const Arrays arrays(inputs);
+  const Arrays arrays(scene_, inputs);
   const std::size_t b = arrays.environments;
   nb::dict out;
   const Outputs outputs(step::output_fields(scene_), b, "", out);
@@ -243,9 +277,10 @@ nb::dict Simulator::backward(const nb::dict& inputs,
                              const nb::dict& cotangents,
                              const std::vector<std::string>& needs,
                              int threads) {
-  const Arrays arrays(inputs);
+  const Arrays arrays(scene_, inputs, true);
   const std::size_t b = arrays.environments;
   const Saved tapes(step::tape_fields(scene_), b, "tape_", tape);
+  if (!tapes.is_finite()) throw nb::value_error("core: the tape must be finite");
   const Saved bars(step::output_fields(scene_), b, "", cotangents);
 
   // Each environment writes into its own copy; shared inputs are then summed in index order.
@@ -296,7 +331,7 @@ nb::dict Simulator::backward(const nb::dict& inputs,
 }
 
 nb::object Simulator::path(const nb::dict& inputs) {
-  const Arrays arrays(inputs);
+  const Arrays arrays(scene_, inputs);
   nb::dict unused;
   const Outputs outputs(step::output_fields(scene_), 1, "", unused);
   std::vector<std::vector<double>> path;
@@ -314,7 +349,7 @@ nb::object Simulator::path(const nb::dict& inputs) {
 }
 
 nb::object Simulator::energy(const nb::dict& inputs) const {
-  const Arrays arrays(inputs);
+  const Arrays arrays(scene_, inputs);
   Owned<double> result = make_array<double>({arrays.environments});
   for (std::size_t e = 0; e < arrays.environments; ++e) {
     result.data[e] = step::potential_energy(scene_, arrays.environment(e));
@@ -330,9 +365,16 @@ double Simulator::smallest_nonadjacent_distance() const {
 }
 
 nb::object Simulator::find_overlap(const nb::dict& inputs) const {
-  const Arrays arrays(inputs);
+  const Arrays arrays(scene_, inputs);
   const std::string text = step::find_overlap(scene_, arrays.environment(0));
   return text.empty() ? nb::none() : nb::cast(text);
+}
+
+nb::object Simulator::find_close_start(const nb::dict& inputs) const {
+  const Arrays arrays(scene_, inputs);
+  const auto found = step::find_close_start(scene_, arrays.environment(0));
+  if (!found) return nb::none();
+  return nb::make_tuple(found->elements, found->gap, found->rest_gap);
 }
 
 step::Metric to_metric(const std::string& name) {
@@ -403,7 +445,7 @@ projective::PrimitiveKind to_primitive(const std::string& kind) {
 }
 
 /// Trees of links, from the arrays that say what they are; see bodies::MechanismsDescription.
-bodies::MechanismsDescription describe_mechanisms(const nb::kwargs& k) {
+bodies::MechanismsDescription describe_mechanisms(const nb::kwargs& k, Index surfaces) {
   const auto doubles = [&](const char* name) { return to_vector(nb::cast<Doubles>(k[name])); };
   const auto indices = [&](const char* name) { return to_vector(nb::cast<Indices>(k[name])); };
   bodies::MechanismsDescription m;
@@ -437,7 +479,8 @@ bodies::MechanismsDescription describe_mechanisms(const nb::kwargs& k) {
   for (std::size_t l = 0; l < links; ++l) {
     const Eigen::Matrix<double, 4, 4, Eigen::RowMajor> frame(offset.data() + 16 * l);
     if (parent[l] >= static_cast<Index>(l) || coordinate[l] >= static_cast<Index>(n) ||
-        tree[l] < 0 || tree[l] >= static_cast<Index>(m.tree_free.size())) {
+        kind[l] < 0 || kind[l] > static_cast<Index>(bodies::JointKind::kPrismatic) || tree[l] < 0 ||
+        tree[l] >= static_cast<Index>(m.tree_free.size())) {
       throw nb::value_error("trees: parents must precede links, and indices must be in range");
     }
     m.links.push_back({.tree = tree[l],
@@ -467,6 +510,7 @@ bodies::MechanismsDescription describe_mechanisms(const nb::kwargs& k) {
     while (c < n && m.coordinate_tree[c] == static_cast<Index>(t)) ++c;
   }
   if (c != n) throw nb::value_error("trees: coordinates must go tree after tree");
+  check_mechanisms(m, surfaces);
   return m;
 }
 
@@ -491,10 +535,13 @@ void simulator(nb::module_& m) {
                  nb::cast<std::string>(k["metric"]), nb::cast<int>(k["friction_iterations"]),
                  nb::cast<double>(k["tolerance"]), nb::cast<int>(k["max_iterations"]));
              description.elastic = to_elastic_solver(nb::cast<std::string>(k["elastic"]));
-             if (k.contains("tree_free")) description.mechanisms = describe_mechanisms(k);
              if (k.contains("primitive_kinds")) {
                const auto sizes = doubles("primitive_sizes");
-               for (const auto& kind : nb::cast<std::vector<std::string>>(k["primitive_kinds"])) {
+               const auto kinds = nb::cast<std::vector<std::string>>(k["primitive_kinds"]);
+               if (sizes.size() != 3 * kinds.size()) {
+                 throw nb::value_error("`primitive_sizes` must have three numbers a primitive");
+               }
+               for (const auto& kind : kinds) {
                  const auto i = static_cast<Index>(description.primitives.size());
                  description.primitives.push_back(
                      {.kind = to_primitive(kind), .size = row(sizes.data(), i)});
@@ -508,6 +555,10 @@ void simulator(nb::module_& m) {
                for (std::size_t p = 0; p + 1 < pairs.size(); p += 2) {
                  description.ignored_pairs.push_back({pairs[p], pairs[p + 1]});
                }
+             }
+             check_description(description);
+             if (k.contains("tree_free")) {
+               description.mechanisms = describe_mechanisms(k, description.bodies.count());
              }
              new (self) Simulator(std::move(description));
            })
@@ -525,6 +576,9 @@ void simulator(nb::module_& m) {
            "Seconds of one factorization of the contact-free Hessian by Eigen, for benchmarks.")
       .def("find_overlap", &Simulator::find_overlap, "inputs"_a,
            "Where surfaces overlap at the start of the first environment's step, or None.")
+      .def("find_close_start", &Simulator::find_close_start, "inputs"_a,
+           "Elements that are closest at the start of the first environment's step, their gap and "
+           "the one at rest [m], or None.")
       .def("forget_factors", &Simulator::forget_factors,
            "Drop the factors kept for backward; they are made again when needed.")
       .def_prop_ro("factor_bytes", &Simulator::factor_bytes,

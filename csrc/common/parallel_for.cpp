@@ -4,6 +4,8 @@
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
+#include <cstddef>
+#include <cstdlib>
 #include <exception>
 #include <mutex>
 #include <system_error>
@@ -11,6 +13,20 @@
 #include <vector>
 
 namespace diffcloth {
+
+namespace {
+
+/// Whether a new thread has memory to begin with, of which it takes what its exceptions will need: a
+/// lack of that later would end the process instead of raising an error.
+bool take_memory() {
+  constexpr std::size_t kBytes = std::size_t{1} << 18;
+  void* volatile probe = std::malloc(kBytes);  // volatile: or it would be optimized away
+  if (probe == nullptr) return false;
+  std::free(probe);
+  return std::uncaught_exceptions() == 0;
+}
+
+}  // namespace
 
 void parallel_for(Index count,
                   int threads,
@@ -35,7 +51,7 @@ void parallel_for(Index count,
     }
   };
   const auto work_beside_caller = [&] {
-    work(false);
+    if (take_memory()) work(false);
     const std::lock_guard lock(mutex);
     --running;
     finished.notify_one();

@@ -268,6 +268,11 @@ void ContactStage::backward(const Backward& step, Array g) {
   Problem& problem = step.problem;
   Cotangents& bars = step.cotangents;
   const std::size_t size = problem.coordinates.size();
+  // The tape has been in other hands: hooks on saved tensors may return anything.
+  if (!(*step.tape["solves"] >= 0.0 &&
+        *step.tape["solves"] <= problem.scene.given.friction_iterations)) {
+    throw std::invalid_argument("core: the tape must have at most one solve a friction iteration");
+  }
   const auto solves = static_cast<std::size_t>(*step.tape["solves"]);
   Sum sum(*this, problem, step.detection, &bars.contact);
   const auto at = [&](std::size_t k) { return problem.at(step.tape["iterates"] + k * size); };

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <numeric>
+#include <sstream>
 #include <utility>
 
 #include "step/scheme.h"
@@ -242,6 +243,44 @@ std::string describe(const Scene& scene, const char* kind, std::initializer_list
 
 }  // namespace
 
+std::optional<ClosePair> find_closest(const Scene& scene,
+                                      const double* x,
+                                      const std::vector<double>& thickness,
+                                      double reach,
+                                      const std::vector<contact::Candidate>& candidates) {
+  const std::vector<Index>& surface = scene.collision_mesh.vertex_surface;
+  std::optional<ClosePair> closest;
+  for (const contact::Candidate& pair : candidates) {
+    const auto& v = pair.vertices;
+    const double xi = 0.5 * (thickness[surface[v[0]]] + thickness[surface[v[3]]]);
+    const double d = std::sqrt(contact::distance_sq(pair.kind, contact::corners(v, x)));
+    if (d - xi > reach || (closest && d - xi >= closest->distance - closest->thickness)) continue;
+    closest = {.distance = d, .thickness = xi, .pair = pair};
+  }
+  return closest;
+}
+
+std::vector<contact::Candidate> find_near(const Scene& scene,
+                                          const double* x,
+                                          const std::vector<double>& thickness,
+                                          double reach,
+                                          contact::BroadPhase::Scratch& scratch) {
+  std::vector<double> half(thickness);
+  for (double& value : half) value = 0.5 * (value + reach);
+  std::vector<contact::Candidate> candidates;
+  scene.broad_phase.find(x, x, half, scratch, candidates);
+  return candidates;
+}
+
+std::string describe_pair(const Scene& scene, const contact::Candidate& pair) {
+  const auto& v = pair.vertices;
+  if (pair.kind == contact::PairKind::kPointTriangle) {
+    return describe(scene, "vertex", {v[0]}) + " and " +
+           describe(scene, "face", {v[1], v[2], v[3]});
+  }
+  return describe(scene, "edge", {v[0], v[1]}) + " and " + describe(scene, "edge", {v[2], v[3]});
+}
+
 std::string find_overlap(const Scene& scene,
                          const double* x,
                          const std::vector<double>& thickness,
@@ -254,22 +293,14 @@ std::string find_overlap(const Scene& scene,
     return describe(scene, "edge", {e[0], e[1]}) + " intersects " +
            describe(scene, "face", {f[0], f[1], f[2]});
   }
-  for (const contact::Candidate& pair : candidates) {
-    const auto& v = pair.vertices;
-    const double xi =
-        0.5 * (thickness[mesh.vertex_surface[v[0]]] + thickness[mesh.vertex_surface[v[3]]]);
-    const double d = std::sqrt(contact::distance_sq(pair.kind, contact::corners(v, x)));
-    if (d > xi) continue;
-    const std::string gap = " are " + std::to_string(d) + " m apart, closer than their thickness " +
-                            std::to_string(xi) + " m";
-    if (pair.kind == contact::PairKind::kPointTriangle) {
-      return describe(scene, "vertex", {v[0]}) + " and " +
-             describe(scene, "face", {v[1], v[2], v[3]}) + gap;
-    }
-    return describe(scene, "edge", {v[0], v[1]}) + " and " + describe(scene, "edge", {v[2], v[3]}) +
-           gap;
-  }
-  return {};
+  const std::optional<ClosePair> closest = find_closest(scene, x, thickness, 0.0, candidates);
+  if (!closest) return {};
+  const std::string elements = describe_pair(scene, closest->pair);
+  if (closest->distance == 0.0) return elements + " touch";
+  std::ostringstream text;
+  text << elements << " are " << closest->distance << " m apart, closer than their thickness "
+       << closest->thickness << " m";
+  return text.str();
 }
 
 }  // namespace diffcloth::step

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -93,6 +94,32 @@ contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& r
 
 /// "cloth 0", "body 2", "link hand/palm": a surface in messages.
 std::string describe_surface(const Scene& scene, Index surface);
+
+/// Two primitives near each other, and how far they must be apart at least [m].
+struct ClosePair {
+  double distance;
+  double thickness;  ///< mean of that of their surfaces
+  contact::Candidate pair;
+};
+
+/// All pairs whose surfaces are within `reach` beyond their thickness, and some others.
+///
+/// @param thickness  [surfaces] [m]
+std::vector<contact::Candidate> find_near(const Scene& scene,
+                                          const double* x,
+                                          const std::vector<double>& thickness,
+                                          double reach,
+                                          contact::BroadPhase::Scratch& scratch);
+
+/// The candidate with the smallest gap, of those up to `reach`.
+std::optional<ClosePair> find_closest(const Scene& scene,
+                                      const double* x,
+                                      const std::vector<double>& thickness,
+                                      double reach,
+                                      const std::vector<contact::Candidate>& candidates);
+
+/// "cloth 0 vertex (4) and body 1 face (0, 1, 3)".
+std::string describe_pair(const Scene& scene, const contact::Candidate& pair);
 
 /// Where two surfaces overlap or are closer than their thickness; empty where they are not.
 ///

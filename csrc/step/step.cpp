@@ -28,13 +28,10 @@ std::string find_overlap(const Scene& scene, const Inputs& inputs) {
   if (const double* given = inputs.data(Input::kThickness)) {
     std::copy_n(given, thickness.size(), thickness.begin());
   }
-  std::vector<double> half(thickness);
-  for (double& value : half) value *= 0.5;
   const Problem problem(scene, inputs);
   const double* const x = problem.start.data();
   contact::BroadPhase::Scratch scratch;
-  std::vector<contact::Candidate> candidates;
-  scene.broad_phase.find(x, x, half, scratch, candidates);
+  const auto candidates = find_near(scene, x, thickness, 0.0, scratch);
   return find_overlap(scene, x, thickness, candidates, scratch);
 }
 

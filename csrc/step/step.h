@@ -1,5 +1,6 @@
 #pragma once
 
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -47,6 +48,16 @@ void backward(const Scene& scene,
 
 /// Where surfaces overlap at the start of the step, or are closer than their thickness; else empty.
 std::string find_overlap(const Scene& scene, const Inputs& inputs);
+
+/// The closest pair of the start of the step within the barrier's reach.
+struct CloseStart {
+  std::string elements;
+  double gap;       ///< between the surfaces [m]
+  double rest_gap;  ///< at which the barrier carries the heaviest cloth's own weight [m]
+};
+
+/// Absent where nothing is within the barrier's reach, or nothing can touch.
+std::optional<CloseStart> find_close_start(const Scene& scene, const Inputs& inputs);
 
 /// Elastic energy + gravity + soft pins + barrier at the positions of the inputs [J].
 double potential_energy(const Scene& scene, const Inputs& inputs);

@@ -5,13 +5,11 @@ from __future__ import annotations
 import difflib
 import itertools
 import math
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-import yaml
 from annotated_types import Ge, Gt, Interval, Le, Len, Lt
 from pydantic import (
     BaseModel,
@@ -22,8 +20,12 @@ from pydantic import (
     create_model,
     model_validator,
 )
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, ScalarEvent
 
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.viewers.look import Camera, Pictures
@@ -509,50 +511,28 @@ def _require_increasing(
 # --- reading ------------------------------------------------------------------------------------
 
 
-class _Loader(yaml.SafeLoader):
-    """The safe loader; it refuses a key that occurs twice and reads 1e-3 as a number."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, str):
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"a key must be text, got {key!r}", key_node.start_mark
-                )
-            if key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key `{key}` occurs twice", key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep)
-
-
-# YAML 1.1 demands a dot and a signed exponent: to PyYAML 1e-3 is text.
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(?:[0-9][0-9_]*(?:\.[0-9_]*)?|\.[0-9]+)[eE][-+]?[0-9]+$"),
-    list("-+0123456789."),
-)
-
-# A configuration is a page of text; a larger file is a mistake, refused before it is parsed.
-_LARGEST_CONFIG_BYTES = 1_000_000
+# A configuration is a page of text. These bounds are far beyond one; what exceeds them is a
+# mistake, or would fill the memory.
+_LARGEST_CONFIG_BYTES = 1 << 20
+_MOST_VALUES = 100_000  # aliases written out
+_DEEPEST = 50
 
 
 def read_document(path: str | Path) -> Document:
-    """Read a YAML mapping.
+    """Read a YAML 1.2 mapping.
 
     Raises:
-        InvalidInput: If the file is missing, too large, not YAML, not a mapping, or repeats a key.
+        InvalidInput: If the file is missing, too large, no regular file, not YAML, not a mapping,
+            nested too deeply, holds itself, or repeats a key.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InvalidInput(f"{path}: there is no such file")
-    if path.stat().st_size > _LARGEST_CONFIG_BYTES:
-        raise InvalidInput(f"{path}: a configuration has at most {_LARGEST_CONFIG_BYTES} bytes")
     try:
-        document = _parse(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        data = read_regular_file(path, _LARGEST_CONFIG_BYTES)
+    except FileNotFoundError as error:
+        raise InvalidInput(f"{path}: there is no such file") from error
+    try:
+        document = _parse(data.decode("utf-8"))
+    except ValueError as error:
         raise InvalidInput(f"{path}: not readable as YAML: {_one_line(error)}") from error
     if not isinstance(document, dict):
         raise InvalidInput(f"{path}: a configuration must be a mapping of keys to values")
@@ -560,7 +540,62 @@ def read_document(path: str | Path) -> Document:
 
 
 def _parse(text: str) -> Any:
-    return yaml.load(text, Loader=_Loader)  # which derives from SafeLoader
+    """Read YAML 1.2; raises ValueError where that fails."""
+    reader = YAML(typ="safe", pure=True)
+    try:
+        _check_extent(reader.parse(text))
+        document = reader.load(text)
+    except MemoryError:
+        raise
+    except MarkedYAMLError as error:
+        line = "" if error.problem_mark is None else f"line {error.problem_mark.line + 1}: "
+        raise ValueError(f"{line}{error.problem or error.context}") from error
+    except Exception as error:  # also what Python's own conversions of dates and numbers raise
+        raise ValueError(str(error)) from error
+    _check_plain(document, "the file")
+    return document
+
+
+def _check_extent(events: Iterable[Any]) -> None:
+    """Bound depth and size of a document with its aliases written out, before they are."""
+    sizes: dict[str, int] = {}  # of anchored values
+    opened: list[tuple[str | None, int]] = []  # anchor of a collection, and values before it
+    count = 0
+    for event in events:
+        name = getattr(event, "anchor", None)
+        if isinstance(event, AliasEvent):
+            if name not in sizes:
+                raise ValueError(f"the alias *{name} must follow the end of what it stands for")
+            count += sizes[name]
+        elif isinstance(event, CollectionStartEvent):
+            opened.append((name, count))
+            count += 1
+        elif isinstance(event, CollectionEndEvent):
+            name, before = opened.pop()
+            if name is not None:
+                sizes[name] = count - before
+        elif isinstance(event, ScalarEvent):
+            count += 1
+            if name is not None:
+                sizes[name] = 1
+        if count > _MOST_VALUES:
+            raise ValueError(f"it must have at most {_MOST_VALUES} values, aliases written out")
+        if len(opened) > _DEEPEST:
+            raise ValueError(f"it must be at most {_DEEPEST} levels deep")
+
+
+def _check_plain(value: Any, place: str) -> None:
+    """Refuse what YAML knows and a configuration does not: dates, sets, keys that are no text."""
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            if not isinstance(key, str):
+                raise ValueError(f"a key must be text, got {key!r} in {place}")
+            _check_plain(entry, f"`{key}`")
+    elif isinstance(value, list):
+        for entry in value:
+            _check_plain(entry, place)
+    elif not isinstance(value, str | bool | int | float | None):
+        raise ValueError(f"{place} must hold text or numbers, got a {type(value).__name__}")
 
 
 def _one_line(error: Exception) -> str:
@@ -585,7 +620,7 @@ def set_values(document: Document, assignments: Iterable[str]) -> Document:
             raise InvalidInput(f"--set: must be key=value, got {assignment!r}")
         try:
             value = _parse(text)
-        except yaml.YAMLError as error:
+        except ValueError as error:
             raise InvalidInput(f"--set {key}: the value is not YAML: {_one_line(error)}") from error
         *parents, last = key.split(".")
         place: Any = changed

@@ -16,7 +16,10 @@ Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 
 # Edges across a disk: fewer make no round sheet, more no sheet that anyone could simulate.
 _FEWEST_EDGES = 2
-_MOST_EDGES = 1000
+_MOST_EDGES = 100
+
+# Cells between the planes of boxes, filled or not.
+_MOST_CELLS = 1_000_000
 
 # Rounds in which each point moves to the mean of its neighbors. After ten the smallest angle no
 # longer grows; the mesh stays irregular.
@@ -183,7 +186,18 @@ def union_of_boxes(boxes: list[tuple[Interval, Interval, Interval]], edge_length
     Args:
         boxes: Intervals along x, y and z of each box [m].
         edge_length: Longest side of a cell [m].
+
+    Raises:
+        ValueError: If there would be more than a million cells.
     """
+    spans = [np.diff(sorted({end for box in boxes for end in box[k]})) for k in range(3)]
+    with np.errstate(over="ignore"):
+        cells = np.prod([np.ceil(span / edge_length).sum() for span in spans])
+    if not cells <= _MOST_CELLS:
+        raise ValueError(
+            f"`edge_length` must cut the boxes into at most {_MOST_CELLS} cells, got "
+            f"{edge_length:g} m, which makes {cells:.3g}"
+        )
     planes = [_subdivided({end for box in boxes for end in box[k]}, edge_length) for k in range(3)]
     centers = np.meshgrid(*[(p[1:] + p[:-1]) / 2 for p in planes], indexing="ij")
     filled = np.zeros(centers[0].shape, dtype=bool)

@@ -1,15 +1,21 @@
-"""PLY files: a reader that keeps every vertex in its place and refuses polygons, and a writer."""
+"""PLY files: a reader that keeps every vertex in its place and refuses polygons, and a writer.
+
+Readers of others that a package under this license can stand on triangulate polygons, round indices
+that are no integers, or wait for the end of a header that never comes.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.files import INTEGER, NUMBER
 
 __all__ = ["read_ply", "write_ply"]
 
@@ -26,6 +32,9 @@ _TYPES = {
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _CORNERS = ("vertex_indices", "vertex_index")
 
+Columns = dict[str, NDArray[Any]]
+"""Values of an element's properties by name: [rows], or [rows, n] of a list."""
+
 
 class _Property(NamedTuple):
     name: str
@@ -39,9 +48,17 @@ class _Element(NamedTuple):
     properties: list[_Property]
 
 
-def read_ply(path: Path) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Read vertices [n, 3] and triangles [f, 3] of an ASCII or binary PLY file."""
-    data = path.read_bytes()
+def read_ply(path: Path, data: bytes) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Read vertices [n, 3] and triangles [f, 3] of an ASCII or binary PLY file.
+
+    Args:
+        path: Opens the messages.
+        data: What the file holds.
+
+    Raises:
+        InvalidInput: If the file is malformed, has other polygons than triangles, or an index that
+            is none of a vertex.
+    """
     order, elements, body = _read_header(path, data)
     vertices = np.empty((0, 3))
     faces = np.empty((0, 3), dtype=np.int64)
@@ -49,14 +66,9 @@ def read_ply(path: Path) -> tuple[FloatArray, NDArray[np.int64]]:
     for element in elements:
         columns = cursor.read(element)
         if element.name == "vertex":
-            missing = [axis for axis in "xyz" if axis not in columns]
-            if missing:
-                raise InvalidInput(f"{path}: the vertices have no property {missing[0]!r}")
             vertices = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=-1)
         elif element.name == "face":
-            corners = next((columns[name] for name in _CORNERS if name in columns), None)
-            if corners is None:
-                raise InvalidInput(f"{path}: the faces have no list 'vertex_indices'")
+            corners = next(columns[name] for name in _CORNERS if name in columns)
             faces = corners.astype(np.int64).reshape(-1, 3)
         if vertices.size and faces.size:
             break  # what follows (edges, materials) is of no interest and may hold any list
@@ -84,37 +96,87 @@ def write_ply(path: Path, vertices: FloatArray, faces: NDArray[np.int32]) -> Non
     path.write_bytes(header.encode("ascii") + vertices.astype("<f8").tobytes() + rows.tobytes())
 
 
+# --- The header -----------------------------------------------------------------------------------
+
+
+def _header_lines(path: Path, data: bytes) -> Iterator[tuple[str, int]]:
+    """Lines of the header, each with the place behind it."""
+    start = 0
+    while (end := data.find(b"\n", start)) >= 0:
+        yield data[start:end].decode("ascii", errors="replace").rstrip("\r"), end + 1
+        start = end + 1
+    raise InvalidInput(f"{path}: not a PLY file: it has no header from 'ply' to 'end_header'")
+
+
 def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], bytes]:
-    end = data.find(b"end_header")
-    if not data.startswith(b"ply") or end < 0:
-        raise InvalidInput(f"{path}: not a PLY file: it has no header from 'ply' to 'end_header'")
-    body = data[data.index(b"\n", end) + 1 :] if b"\n" in data[end:] else b""
+    if not data.startswith((b"ply\n", b"ply\r\n")):
+        raise InvalidInput(f"{path}: not a PLY file: its first line is not 'ply'")
     order = ""
     elements: list[_Element] = []
-    for number, line in enumerate(data[:end].decode("ascii", errors="replace").splitlines(), 1):
+    body = b""
+    for number, (line, behind) in enumerate(_header_lines(path, data), start=1):
         try:
             match line.split():
-                case ["format", kind, _]:
+                case ["end_header"]:
+                    body = data[behind:]
+                    break
+                case ["format", kind, "1.0"]:
                     order = _ORDERS[kind]
                 case ["element", name, count]:
-                    elements.append(_Element(name, int(count), []))
+                    elements.append(_Element(name, _count(count.encode()), []))
                 case ["property", "list", count_type, kind, name]:
                     column = _Property(name, _TYPES[kind], _TYPES[count_type])
                     elements[-1].properties.append(column)
                 case ["property", kind, name]:
                     elements[-1].properties.append(_Property(name, _TYPES[kind], None))
+                case ["ply"] if number == 1:
+                    pass
+                case [] | ["comment" | "obj_info", *_]:
+                    pass
+                case _:
+                    raise ValueError(line)
         except (KeyError, ValueError, IndexError) as error:
-            raise InvalidInput(f"{path}:{number}: malformed header line {line!r}") from error
-    # Every element takes at least a byte: a count beyond that is refused before it is allocated.
+            raise InvalidInput(f"{path}:{number}: malformed header line {line[:80]!r}") from error
+    if not order:
+        raise InvalidInput(f"{path}: the header has no format line; one of {', '.join(_ORDERS)}")
+    _check_elements(path, elements, body)
+    return order, elements, body
+
+
+def _count(word: bytes) -> int:
+    if not INTEGER.fullmatch(word) or (count := int(word)) < 0:
+        raise ValueError(word)
+    return count
+
+
+def _check_elements(path: Path, elements: list[_Element], body: bytes) -> None:
     for element in elements:
-        if not 0 <= element.rows <= len(body):
+        names = [column.name for column in element.properties]
+        if [e.name for e in elements].count(element.name) > 1 or len(set(names)) < len(names):
+            raise InvalidInput(f"{path}: the header names {element.name!r} or a part of it twice")
+        # Every row takes at least a byte: more of them are refused before they are allocated.
+        if element.rows > len(body):
             raise InvalidInput(
                 f"{path}: the header says {element.rows} x {element.name!r}, "
                 f"but only {len(body)} bytes follow it"
             )
-    if not order:
-        raise InvalidInput(f"{path}: the header has no format line; one of {', '.join(_ORDERS)}")
-    return order, elements, body
+        for column in element.properties:
+            if column.count_type is not None and column.count_type.startswith("f"):
+                raise InvalidInput(
+                    f"{path}: the list {column.name!r} must have a length that is an integer"
+                )
+        single = {column.name for column in element.properties if column.count_type is None}
+        if element.name == "vertex" and (missing := [a for a in "xyz" if a not in single]):
+            raise InvalidInput(f"{path}: the vertices have no property {missing[0]!r}")
+        if element.name == "face":
+            lists = [c for c in element.properties if c.name in _CORNERS and c.name not in single]
+            if not lists:
+                raise InvalidInput(f"{path}: the faces have no list 'vertex_indices'")
+            if lists[0].type.startswith("f"):
+                raise InvalidInput(f"{path}: the list {lists[0].name!r} must hold integers")
+
+
+# --- The body -------------------------------------------------------------------------------------
 
 
 def _check_triangle(path: Path, element: _Element, column: _Property, row: int, count: int) -> None:
@@ -133,34 +195,50 @@ class _Ascii:
         self._words = body.split()
         self._at = 0
 
-    def read(self, element: _Element) -> dict[str, NDArray[np.float64]]:
-        columns: dict[str, list[list[float]]] = {p.name: [] for p in element.properties}
+    def read(self, element: _Element) -> Columns:
+        columns: dict[str, list[Any]] = {column.name: [] for column in element.properties}
         for row in range(element.rows):
             for column in element.properties:
-                count = 1
-                if column.count_type is not None:
-                    count = int(self._take(element, row, 1)[0])
+                values = columns[column.name]
+                if column.count_type is None:
+                    values += self._take(element, row, column.type, 1)
+                else:
+                    count = int(self._take(element, row, column.count_type, 1)[0])
+                    if count < 0:
+                        self._refuse(element, row, f"a length of {count}")
                     _check_triangle(self._path, element, column, row, count)
-                columns[column.name].append(self._take(element, row, count))
-        return {
-            p.name: np.array(columns[p.name]).reshape(element.rows, -1).squeeze(-1)
-            if p.count_type is None
-            else np.array(columns[p.name] if p.name in _CORNERS else [])
-            for p in element.properties
-        }
+                    entries = self._take(element, row, column.type, count)
+                    if column.name in _CORNERS:  # other lists may be of any length
+                        values.append(entries)
+        return {name: np.array(values) for name, values in columns.items()}
 
-    def _take(self, element: _Element, row: int, count: int) -> list[float]:
+    def _take(self, element: _Element, row: int, kind: str, count: int) -> list[float]:
         words = self._words[self._at : self._at + count]
         self._at += count
-        try:
-            numbers = [float(word) for word in words]
-        except ValueError as error:
-            raise InvalidInput(
-                f"{self._path}: {element.name} {row} must hold numbers: {error}"
-            ) from error
-        if len(numbers) < count:
+        if len(words) < count:
             raise InvalidInput(f"{self._path}: the file ends within {element.name} {row}")
-        return numbers
+        pattern, read = (NUMBER, float) if kind.startswith("f") else (INTEGER, _index)
+        for word in words:
+            if not pattern.fullmatch(word):
+                self._refuse(element, row, repr(word[:40].decode("ascii", errors="replace")))
+        try:
+            return [read(word) for word in words]
+        except ValueError as error:
+            self._refuse(element, row, str(error))
+
+    def _refuse(self, element: _Element, row: int, got: str) -> NoReturn:
+        raise InvalidInput(
+            f"{self._path}: {element.name} {row} must hold numbers of the types in the header, "
+            f"got {got}"
+        )
+
+
+def _index(word: bytes) -> int:
+    """An integer that fits the largest type that PLY has."""
+    value = int(word)
+    if not -(2**31) <= value < 2**32:
+        raise ValueError(f"{word[:40].decode()} beyond 32 bits")
+    return value
 
 
 class _Binary:
@@ -172,31 +250,34 @@ class _Binary:
         self._order = order
         self._at = 0
 
-    def read(self, element: _Element) -> dict[str, NDArray[np.generic]]:
+    def read(self, element: _Element) -> Columns:
         """Read rows of equal size, which they are when each list is as long as in the first row."""
+        if element.rows == 0 or not element.properties:
+            return {p.name: np.empty(0) for p in element.properties}
+        # Fields go by their place: a property may have any name.
         fields: list[tuple[str, str] | tuple[str, str, int]] = []
-        lists = [p for p in element.properties if p.count_type is not None]
         offset = self._at
-        for column in element.properties:
+        for i, column in enumerate(element.properties):
             kind = np.dtype(self._order + column.type)
             if column.count_type is None:
-                fields.append((column.name, kind.str))
+                fields.append((f"{i}", kind.str))
                 offset += kind.itemsize
                 continue
             count_kind = np.dtype(self._order + column.count_type)
-            first = self._body[offset : offset + count_kind.itemsize]
-            count = int(np.frombuffer(first, count_kind)[0]) if element.rows and first else 0
-            if element.rows:
-                _check_triangle(self._path, element, column, 0, count)
-            fields += [("#" + column.name, count_kind.str), (column.name, kind.str, count)]
+            self._require(element, offset + count_kind.itemsize)
+            count = int(np.frombuffer(self._body, count_kind, 1, offset)[0])
+            _check_triangle(self._path, element, column, 0, count)
+            if count < 0:
+                raise InvalidInput(f"{self._path}: {element.name} 0 has a list of length {count}")
             offset += count_kind.itemsize + count * kind.itemsize
+            self._require(element, offset)
+            fields += [(f"#{i}", count_kind.str), (f"{i}", kind.str, count)]
         rows = np.dtype(fields)
-        if rows.itemsize * element.rows > len(self._body) - self._at:
-            raise InvalidInput(f"{self._path}: the file ends within the {element.name} rows")
+        self._require(element, self._at + rows.itemsize * element.rows)
         table = np.frombuffer(self._body, rows, element.rows, self._at)
-        for column in lists:
-            counts = table["#" + column.name]
-            other = np.flatnonzero(counts != counts[:1]) if len(counts) else counts
+        for i, column in enumerate(element.properties):
+            counts = table[f"#{i}"] if column.count_type is not None else np.empty(0)
+            other = np.flatnonzero(counts != counts[:1])
             if other.size:
                 row = int(other[0])
                 _check_triangle(self._path, element, column, row, int(counts[row]))
@@ -204,4 +285,8 @@ class _Binary:
                     f"{self._path}: lists {column.name!r} of different lengths cannot be read"
                 )
         self._at += rows.itemsize * element.rows
-        return {p.name: table[p.name] for p in element.properties}
+        return {p.name: table[f"{i}"] for i, p in enumerate(element.properties)}
+
+    def _require(self, element: _Element, end: int) -> None:
+        if end > len(self._body):
+            raise InvalidInput(f"{self._path}: the file ends within the {element.name} rows")

@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray
 
-__all__ = ["Mesh", "box", "capsule", "cylinder", "grid", "plane", "sphere"]
+__all__ = ["MOST_FACES", "Mesh", "box", "capsule", "cylinder", "grid", "plane", "sphere"]
 
 Mesh = tuple[FloatArray, NDArray[np.int64]]
+
+MOST_FACES = 4_000_000
+"""Of a generated mesh: more than any step could take, and refused before they take the memory."""
 
 # Segments around a capsule and rings on each of its caps: 5 degrees off a true circle at most.
 _CAPSULE_SEGMENTS = 32

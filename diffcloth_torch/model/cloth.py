@@ -145,8 +145,13 @@ class Cloth:
             pose: Where to put it: [px, py, pz, qw, qx, qy, qz].
             **keywords: As for `Cloth`.
         """
-        check_count("Cloth.grid: `rows`", rows, 2)
-        check_count("Cloth.grid: `columns`", columns, 2)
+        rows = check_count("Cloth.grid: `rows`", rows, 2)
+        columns = check_count("Cloth.grid: `columns`", columns, 2)
+        if 2 * (rows - 1) * (columns - 1) > shapes.MOST_FACES:
+            raise InvalidInput(
+                "Cloth.grid: `rows` and `columns` must make at most "
+                f"{shapes.MOST_FACES} triangles, got {rows} x {columns} vertices"
+            )
         vertices, faces = shapes.grid(rows, columns, plane_size("Cloth.grid: `size`", size))
         return cls._posed("Cloth.grid", vertices, faces, pose, keywords)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +39,9 @@ MOTIONS = ("static", "kinematic", "dynamic")
 # Of a closed mesh, over its extent cubed: a needle of 1 m by 1 um has 1e-12. Below this, rounding
 # decides on the volume.
 _SMALLEST_VOLUME = 1e-14
+
+# Of a sphere that begins with 20 triangles.
+_MOST_SUBDIVISIONS = int(math.log(shapes.MOST_FACES / 20, 4))
 
 _POSES = "differentiate with respect to State.body_poses or Control.body_poses"
 _MASS = "differentiate with respect to Parameters.body_mass"
@@ -260,11 +264,11 @@ class RigidBody:
 
         Args:
             radius: Radius of the sphere [m], > 0.
-            subdivisions: Times that each triangle is split in four, >= 0; 3 gives 1280 triangles.
+            subdivisions: Times that each triangle is split in four, 0 .. 8; 3 gives 1280 triangles.
             **keywords: As for `RigidBody`.
         """
         length = check_number("RigidBody.sphere: `radius`", radius, POSITIVE, instead=_POSES)
-        check_count("RigidBody.sphere: `subdivisions`", subdivisions, 0)
+        check_count("RigidBody.sphere: `subdivisions`", subdivisions, 0, _MOST_SUBDIVISIONS)
         primitive = Primitive("sphere", (length, 0.0, 0.0))
         return cls._of(primitive, shapes.sphere(length, subdivisions), **keywords)
 

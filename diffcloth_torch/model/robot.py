@@ -27,6 +27,7 @@ from diffcloth_torch.checks import (
     texts,
 )
 from diffcloth_torch.errors import IgnoredLimitsWarning, InvalidInput
+from diffcloth_torch.files import as_path
 from diffcloth_torch.geometry.poses import check_quaternions, pose_array
 from diffcloth_torch.geometry.surfaces import Surface
 from diffcloth_torch.model.collision_shapes import link_surface
@@ -134,7 +135,7 @@ class Robot:
             IgnoredLimitsWarning: If the file limits efforts or velocities or has dry joint
                 friction: none of them is applied.
         """
-        file = Path(path)
+        file = as_path("Robot.load: `path`", path)
         check_choice("Robot.load: `base`", base, BASES)
         if edge_length is not None:
             edge_length = check_number(
@@ -144,7 +145,7 @@ class Robot:
         moving = [joint for joint in description.joints if joint.moves]
         modes = _modes(actuation, [joint.name for joint in moving])
         mechanism = make_mechanism(file, description, base, modes)
-        root = file.parent if mesh_root is None else Path(mesh_root)
+        root = file.parent if mesh_root is None else as_path("Robot.load: `mesh_root`", mesh_root)
         surfaces = [link_surface(link, file, root, edge_length) for link in description.links]
         if description.unapplied:
             warnings.warn(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -128,8 +128,8 @@ class Scene:
         return f"Scene(cloths={list(self.cloths)}, bodies={list(self.bodies)}{robots})"
 
 
-def _instances(field: str, given: Iterable[object], kind: type[S]) -> tuple[S, ...]:
-    if not isinstance(given, Iterable):
+def _instances(field: str, given: Any, kind: type[S]) -> tuple[S, ...]:
+    if not isinstance(given, Iterable) or getattr(given, "ndim", 1) == 0:
         raise TypeError(f"Scene: `{field}` must be a list of {kind.__name__}")
     items = []
     for i, item in enumerate(given):

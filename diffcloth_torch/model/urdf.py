@@ -28,6 +28,7 @@ from diffcloth_torch.checks import (
     texts,
 )
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.files import read_regular_file
 
 __all__ = ["JOINT_TYPES", "SHAPES", "Joint", "Link", "RobotDescription", "Shape", "read_urdf"]
 
@@ -139,10 +140,7 @@ def read_urdf(path: Path) -> RobotDescription:
             accepted, or its links are no tree. The message names the file and the element.
         OSError: If the file cannot be read.
     """
-    with path.open("rb") as file:
-        data = file.read(_LARGEST_FILE + 1)
-    if len(data) > _LARGEST_FILE:
-        raise InvalidInput(f"{path}: a URDF file must be at most {_LARGEST_FILE >> 20} MiB")
+    data = read_regular_file(path, _LARGEST_FILE)
     try:
         document = defusedxml.ElementTree.fromstring(data, forbid_dtd=True)
     except defusedxml.DefusedXmlException as error:

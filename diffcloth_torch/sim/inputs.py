@@ -21,6 +21,7 @@ from diffcloth_torch.checks import (
     check_range,
     check_shape,
     float_tensor,
+    is_dense,
 )
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.poses import check_quaternions
@@ -108,11 +109,11 @@ def _check_state_tensor(name: str, tensor: object) -> None:
         raise TypeError(
             f"step: `state.{name}` must be a torch tensor, got {type(tensor).__name__}; {remedy}"
         )
-    cpu = tensor.device.type == "cpu" and tensor.layout == torch.strided
-    if tensor.dtype != torch.float64 or not cpu:
+    if tensor.dtype != torch.float64 or tensor.device.type != "cpu" or not is_dense(tensor):
+        layout = "nested" if tensor.is_nested else tensor.layout
         raise TypeError(
             f"step: `state.{name}` must be a dense float64 tensor on the CPU, "
-            f"got {tensor.dtype} on {tensor.device}; {remedy}"
+            f"got {tensor.dtype} on {tensor.device}, {layout}; {remedy}"
         )
 
 

@@ -57,7 +57,7 @@ def raise_on_failure(
         (
             IntersectingState,
             status == INTERSECTING,
-            "surfaces intersect, or are closer than their thickness, in the given state",
+            "surfaces overlap in the given state",
         ),
         (
             InfeasibleMotion,

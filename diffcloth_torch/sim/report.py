@@ -6,10 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from diffcloth_torch._moved import allow_loading
+from diffcloth_torch.errors import InvalidInput
 
 __all__ = ["Report"]
 
@@ -49,9 +51,36 @@ class Report:
     seconds: dict[str, float | Tensor]
     counts: dict[str, int | Tensor] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        # Reports come back from files, too: what is wrong is said here, not where it is used.
+        for entry in fields(Report):
+            value = self.__dict__.get(entry.name)
+            table = value if entry.name in _TABLES else {None: value}
+            if not isinstance(table, dict):
+                kind = type(table).__name__
+                raise TypeError(f"Report: `{entry.name}` must be a dict of numbers, got {kind}")
+            for name, number in table.items():
+                if not isinstance(number, bool | int | float | Tensor):
+                    label = entry.name if name is None else f"{entry.name}[{name!r}]"
+                    kind = type(number).__name__
+                    raise TypeError(f"Report: `{label}` must be a number or a tensor, got {kind}")
+
     def __setstate__(self, state: dict[str, Any]) -> None:
         # Reports that the first version saved count nothing.
         self.__dict__.update({"counts": {}} | state)
+        self.__post_init__()
+
+    def check_environments(self, owner: str, count: int | None) -> None:
+        """Require tensors of shape [count], or numbers where there is no batch axis."""
+        shape = [] if count is None else [count]
+        for entry in fields(Report):
+            value = getattr(self, entry.name)
+            for number in value.values() if entry.name in _TABLES else [value]:
+                if list(np.shape(number)) != shape:
+                    raise InvalidInput(
+                        f"{owner}: `report.{entry.name}` must have shape {shape}, as the state "
+                        f"has environments, got {list(np.shape(number))}"
+                    )
 
     def select(self, index: int | slice) -> Report:
         """Report of one environment, or of some."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
+from functools import wraps
 from itertools import pairwise
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -53,8 +55,35 @@ from diffcloth_torch.sim.step import Outcome, as_array, refuse_transforms, take_
 
 __all__ = ["Simulator"]
 
+# A start is deep inside the barrier below this part of the gap at rest: a sheet is then thrown
+# up by several barrier distances.
+_DEEP = 0.25
+
+# What a step may be off by when its solver stops: in a scene of micrometers the default tolerance
+# would be as long as the barrier.
+_LARGEST_PART_OF_BARRIER = 0.1
+
 _DEFAULT_CONTACT = ContactOptions()
 _DEFAULT_SOLVER = SolverOptions()
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def _memory_errors(method: Callable[P, T]) -> Callable[P, T]:
+    """Let torch's lack of memory be the error that NumPy and the core raise for theirs."""
+
+    @wraps(method)
+    def guarded(*args: P.args, **keywords: P.kwargs) -> T:
+        try:
+            return method(*args, **keywords)
+        except RuntimeError as error:
+            if "can't allocate memory" in str(error):
+                raise MemoryError(f"{method.__name__}: {error}") from error
+            raise
+
+    return guarded
 
 
 class Simulator:
@@ -95,6 +124,8 @@ class Simulator:
     ) -> None:
         """Prepare the solver and choose the barrier where it is not given.
 
+        A start deep inside the barrier is a warning: it throws surfaces apart.
+
         Args:
             scene: What is simulated.
             dt: Time step [s], > 0.
@@ -111,7 +142,7 @@ class Simulator:
             solver: Tolerance and limits of the solver.
 
         Raises:
-            IntersectingState: If surfaces of the scene intersect or are closer than their
+            IntersectingState: If surfaces of the scene intersect, touch, or are closer than their
                 thickness.
             InvalidInput: If a value is not accepted, the barrier is too wide for the meshes, or a
                 pd joint has no gains.
@@ -172,8 +203,9 @@ class Simulator:
         self._defaults = scene_parameters(scene, self._assembly, has_contact(scene, contact))
         if has_barrier(scene, contact, scheme):
             self._choose_barrier()
+        self._check_tolerance()
         if scheme != "projective":
-            self._check_overlap()
+            self._check_start()
 
     def __reduce__(self) -> tuple[Any, ...]:
         arguments = (self.scene, self.dt, self.scheme, self.contact, self.solver, self.coupling)
@@ -182,6 +214,7 @@ class Simulator:
     def __repr__(self) -> str:
         return f"Simulator({self.scene!r}, dt={self.dt:g}, scheme={self.scheme!r})"
 
+    @_memory_errors
     def initial_state(self, batch_size: int | None = None) -> State:
         """Make the state that the scene describes, at rest.
 
@@ -265,6 +298,7 @@ class Simulator:
         copies = {name: tensor.clone() for name, tensor in self._defaults.items()}
         return Parameters(**copies, _unbatched=tuple(copies))
 
+    @_memory_errors
     def step(
         self,
         state: State,
@@ -556,14 +590,36 @@ class Simulator:
             distance = as_array(inputs["barrier_distance"])
             check_barrier(owner, distance, thickness, self._nonadjacent_distance)
 
-    def _check_overlap(self) -> None:
-        inputs, _ = self._inputs(self.initial_state(), None, None)
-        overlap = self._core.find_overlap(_arrays(inputs))
+    def _check_tolerance(self) -> None:
+        """Refuse a solver that stops before it sees lengths as small as the scene's."""
+        if "barrier_distance" not in self._defaults:
+            return
+        distance = float(self._defaults["barrier_distance"])
+        largest = _LARGEST_PART_OF_BARRIER * distance / self.dt
+        if self.solver.tolerance > largest:
+            raise InvalidInput(
+                f"Simulator: `solver.tolerance` must be at most {largest:.3g} m/s, with which a "
+                f"step is known to {_LARGEST_PART_OF_BARRIER:g} of the barrier distance "
+                f"{distance:.3g} m, got {self.solver.tolerance:.3g}"
+            )
+
+    def _check_start(self) -> None:
+        """Refuse surfaces that overlap, and warn of those that the barrier would throw apart."""
+        inputs = _arrays(self._inputs(self.initial_state(), None, None)[0])
+        overlap = self._core.find_overlap(inputs)
         if overlap is not None:
             raise IntersectingState(
-                "Simulator: surfaces of the scene intersect, or are closer than their thickness: "
-                f"{overlap}",
+                f"Simulator: surfaces of the scene overlap: {overlap}; move them apart",
                 environments=(0,),
+            )
+        close = self._core.find_close_start(inputs)
+        if close is not None and close[1] < _DEEP * close[2]:
+            elements, gap, rest_gap = close
+            warnings.warn(
+                f"Simulator: the barrier will throw surfaces apart: {elements} start {gap:.3g} m "
+                f"apart, while at rest their gap would be about {rest_gap:.3g} m; start with more, "
+                "or give a smaller `contact.barrier_distance`",
+                stacklevel=3,
             )
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch._moved import allow_loading
+from diffcloth_torch.checks import is_dense
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import MeshPart, write_mesh
 from diffcloth_torch.geometry.poses import transform
@@ -144,7 +145,7 @@ class State:
     def __post_init__(self) -> None:
         missing = [name for name in _ADDED if getattr(self, name) is None]
         if missing:
-            shape = np.shape(self.body_poses)
+            shape: tuple[int, ...] = getattr(self.body_poses, "shape", ())
             environments, bodies = shape[:-2], shape[-2] if len(shape) > 1 else 0
             for name in missing:
                 rows = shape_of(STATE[name].axes[0], {"K": bodies, "J": 0, "R": 0})
@@ -173,6 +174,7 @@ class State:
 
     def __getitem__(self, index: int | slice) -> State:
         """Take one environment of a batch, without the batch axis, or a slice of the batch."""
+        _check_state("state[i]", self)
         size = self._require_batch("state[i]")
         if not isinstance(index, slice):
             if isinstance(index, bool) or not isinstance(index, int | np.integer):
@@ -206,6 +208,7 @@ class State:
             InvalidInput: If the state is a batch, was not made by a simulator, or the file ending
                 is another.
         """
+        _check_state("export: the state", self)
         if self.batch_size is not None:
             raise InvalidInput("export: the state must be a single one; use state[i].export(...)")
         if self._surfaces is None:
@@ -254,10 +257,16 @@ def stack(states: Sequence[State]) -> State:
 
     Raises:
         InvalidInput: If there is none, one is a batch already, or their shapes differ.
+        TypeError: If one is no State, or holds what a state does not.
     """
+    given: Any = states
+    if not isinstance(given, Sequence):
+        kind = type(given).__name__
+        raise TypeError(f"stack: `states` must be a sequence of states, got {kind}")
     if len(states) == 0:
         raise InvalidInput("stack: `states` must hold at least one state")
     for i, state in enumerate(states):
+        _check_state(f"stack: `states[{i}]`", state)
         if state.batch_size is not None:
             raise InvalidInput(f"stack: `states` must have no batch axis, got one at [{i}]")
     tensors = {}
@@ -283,11 +292,12 @@ def where(mask: Tensor, a: State, b: State) -> State:
         b: A batch, or one state for all environments.
 
     Raises:
-        InvalidInput: If the batch sizes differ.
-        TypeError: If `mask` is not a boolean tensor.
+        InvalidInput: If the batch sizes or other shapes differ.
+        TypeError: If `mask` is not a boolean tensor, or `a` or `b` is no State.
     """
     _check_mask(mask)
     for name, state in (("a", a), ("b", b)):
+        _check_state(f"where: `{name}`", state)
         if state.batch_size not in (None, len(mask)):
             raise InvalidInput(
                 f"where: `{name}` must have {len(mask)} environments, as `mask`, "
@@ -296,10 +306,40 @@ def where(mask: Tensor, a: State, b: State) -> State:
     tensors = {}
     for name in _TENSORS:
         x, y = getattr(a, name), getattr(b, name)
-        single = max(x.dim() - (a.batch_size is not None), y.dim() - (b.batch_size is not None))
-        tensors[name] = torch.where(mask.reshape(-1, *[1] * single), x, y)
+        shapes = [list(z.shape[state.batch_size is not None :]) for z, state in ((x, a), (y, b))]
+        if shapes[0] != shapes[1]:
+            raise InvalidInput(
+                f"where: `{name}` must have the same shape in both states, got {shapes[0]} in `a` "
+                f"and {shapes[1]} in `b`"
+            )
+        tensors[name] = torch.where(mask.reshape(-1, *[1] * len(shapes[0])), x, y)
     report = Report.where(mask, a.report, b.report)
     return State(**tensors, report=report, _surfaces=a._surfaces)
+
+
+def _check_state(name: str, state: Any) -> None:
+    """Require a state whose fields are what they are said to be: it may come from a file."""
+    if not isinstance(state, State):
+        raise TypeError(f"{name} must be a State, got {type(state).__name__}")
+    for entry in _TENSORS:
+        value = getattr(state, entry)
+        if not isinstance(value, Tensor) or not is_dense(value):
+            kind = "another layout" if isinstance(value, Tensor) else type(value).__name__
+            raise TypeError(f"{name}: `{entry}` must be a dense torch tensor, got {kind}")
+    batch = state.batch_size
+    for entry in _TENSORS:
+        shape = getattr(state, entry).shape
+        if batch is not None and shape[:1] != (batch,):
+            raise InvalidInput(
+                f"{name}: `{entry}` must have {batch} environments, as `positions`, "
+                f"got {list(shape)}"
+            )
+    report: Any = state.report
+    if report is not None:
+        if not isinstance(report, Report):
+            kind = type(report).__name__
+            raise TypeError(f"{name}: `report` must be a Report or None, got {kind}")
+        report.check_environments(name, batch)
 
 
 def _check_mask(mask: object) -> None:

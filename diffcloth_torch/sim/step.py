@@ -28,7 +28,8 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from diffcloth_torch import _core
-from diffcloth_torch.errors import NotConverged, SimulationError
+from diffcloth_torch.checks import is_dense
+from diffcloth_torch.errors import InvalidInput, NotConverged, SimulationError
 from diffcloth_torch.sim.controls import tensors_of
 
 __all__ = [
@@ -150,6 +151,7 @@ class _Step(torch.autograd.Function):
         tape = {k: torch.from_numpy(v) for k, v in result.items() if k.startswith(_TAPE)}
         # The inputs themselves, not the arrays: their version counters notice edits in place.
         ctx.save_for_backward(*tensors, *tape.values())
+        ctx.shapes = [t.shape for t in (*tensors, *tape.values())]
         ctx.core, ctx.names, ctx.tape_names, ctx.batched = core, names, tuple(tape), batched
         diagnostics.update(_diagnostics(result))
         ctx.unconverged = np.flatnonzero(result["status"] != CONVERGED).tolist()
@@ -187,7 +189,23 @@ def _refuse_unconverged(ctx, cotangents):
         )
 
 
+def _check_saved(ctx, saved):
+    """Refuse what hooks on saved tensors return instead of what a step has saved."""
+    for name, shape, tensor in zip((*ctx.names, *ctx.tape_names), ctx.shapes, saved, strict=True):
+        if tensor.dtype != torch.float64 or tensor.device.type != "cpu" or not is_dense(tensor):
+            raise TypeError(
+                f"backward: saved `{name}` must come back as a dense float64 tensor on the CPU, "
+                f"got {tensor.dtype} on {tensor.device}"
+            )
+        if tensor.shape != shape:
+            raise InvalidInput(
+                f"backward: saved `{name}` must come back with shape {list(shape)}, "
+                f"got {list(tensor.shape)}"
+            )
+
+
 def _backward(ctx, saved, cotangents, needs):
+    _check_saved(ctx, saved)
     arrays = [as_array(t) for t in saved]
     count = len(ctx.names)
     seeds = [c if ctx.batched else c.unsqueeze(0) for c in cotangents]
@@ -201,6 +219,8 @@ def _backward(ctx, saved, cotangents, needs):
         )
     except _core.SimulationError as error:
         raise SimulationError(f"backward: {error}") from error
+    except ValueError as error:  # numbers that hooks on saved tensors have changed
+        raise InvalidInput(f"backward: {error}") from error
     return {name: torch.from_numpy(gradients[name]) for name in needs}
 
 

@@ -1,0 +1,56 @@
+"""Files from outside: only regular ones, of a bounded size, are read."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from pathlib import Path
+
+from diffcloth_torch.errors import InvalidInput
+
+__all__ = ["INTEGER", "NUMBER", "as_path", "read_regular_file"]
+
+INTEGER = re.compile(rb"[+-]?[0-9]+")
+"""An integer in a text file. Python alone would also read 1_0 and digits of other scripts."""
+
+NUMBER = re.compile(rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?|[+-]?(?:nan|inf)")
+"""A number in a text file, as C writes it."""
+
+
+def as_path(name: str, value: object) -> Path:
+    """Require text or a path object."""
+    if not isinstance(value, str | Path):
+        raise TypeError(f"{name} must be a string or a Path, got {type(value).__name__}")
+    return Path(value)
+
+
+def read_regular_file(path: Path, largest: int) -> bytes:
+    """Read a file whole.
+
+    A pipe or a device, also behind a link, would be waited for without end.
+
+    Args:
+        path: The file.
+        largest: Most bytes that it may have.
+
+    Raises:
+        InvalidInput: If it is no regular file, or larger.
+        OSError: If there is no such file, or it cannot be read.
+    """
+    try:
+        regular = stat.S_ISREG(path.stat().st_mode)
+    except ValueError as error:  # a NUL in the path
+        raise InvalidInput(f"{str(path)!r} is no path: {error}") from error
+    if regular:
+        # What stands at the path may have changed since: to open it must not wait either.
+        with open(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb") as file:  # noqa: PTH123
+            status = os.fstat(file.fileno())
+            regular = stat.S_ISREG(status.st_mode)
+            if regular and status.st_size <= largest:
+                data = file.read(largest + 1)
+                if len(data) <= largest:
+                    return data
+    if not regular:
+        raise InvalidInput(f"{path}: must be a regular file, no folder, pipe or device")
+    raise InvalidInput(f"{path}: must be at most {largest >> 20} MiB")

@@ -1,0 +1,265 @@
+"""The border to C++: the core reads arrays by the sizes that it expects, and must refuse others."""
+
+import numpy as np
+import pytest
+import torch
+
+import diffcloth_torch as dc
+from diffcloth_torch import _core
+from diffcloth_torch.sim import cores
+from diffcloth_torch.sim.step import as_array
+
+F64 = torch.float64
+REFUSED = (ValueError, TypeError, RuntimeError, KeyError)
+
+
+def make():
+    """A scene that has every input and a tape with contacts."""
+    cloth = dc.Cloth.grid(
+        4, 4, pins={"a": [0]}, soft_pins={"b": [15]}, pose=[0, 0, 0.04, 1, 0, 0, 0]
+    )
+    box = dc.RigidBody.box(0.2, motion="dynamic", mass=1.0, pose=[0, 0, -0.2, 1, 0, 0, 0])
+    hand = dc.Robot.load(dc.robots.GRIPPER, pose=[0, 0, 3, 1, 0, 0, 0], stiffness=1.0, damping=1.0)
+    return dc.Simulator(dc.Scene([cloth], [box], [hand]), 0.01)
+
+
+@pytest.fixture(scope="module")
+def sim():
+    return make()
+
+
+@pytest.fixture(scope="module")
+def inputs(sim):
+    parameters = sim.parameters()
+    stretched = parameters.replace(rest_positions=1.01 * parameters.rest_positions)
+    tensors, _ = sim._inputs(sim.initial_state(), None, stretched)
+    assert set(tensors) == set(_core.input_names)
+    return {name: as_array(tensor) for name, tensor in tensors.items()}
+
+
+@pytest.fixture(scope="module")
+def forward(sim, inputs):
+    return sim._core.forward(inputs, True, 1)
+
+
+def backward(sim, inputs, out, **changes):
+    arguments = {
+        "inputs": inputs,
+        "tape": {name: array for name, array in out.items() if name.startswith("tape_")},
+        "cotangents": {
+            name: np.ones_like(out[name])
+            for name in ("positions", "velocities", "body_forces", "coordinates")
+        },
+        "needs": list(inputs),
+    }
+    return sim._core.backward(*(arguments | changes).values(), 1)
+
+
+def test_the_inputs_are_good_ones(sim, inputs, forward):
+    assert forward["status"][0] == 0
+    gradients = backward(sim, inputs, forward)
+    assert {name: a.shape for name, a in gradients.items()} == {
+        name: a.shape for name, a in inputs.items()
+    }
+
+
+def wrong(array):
+    """Arrays of other sizes: each is shorter, longer or of other rows than it should be."""
+    flat = array.reshape(len(array), -1)
+    return {
+        "a number less": flat[:, :-1].copy(),
+        "a number more": np.concatenate([flat, flat[:, :1]], axis=1),
+        "twice": np.concatenate([flat, flat], axis=1),
+        "no row": array[:0].copy(),
+        "three rows": np.concatenate([array] * 3),
+        "no axis": np.array(1.0),
+    }
+
+
+KINDS = list(wrong(np.zeros((1, 2))))
+OPTIONAL = {"poisson", "rest_positions", "barrier_stiffness"}
+
+
+@pytest.mark.boundary
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", _core.input_names)
+def test_an_input_of_another_size_is_refused(sim, inputs, forward, name, kind):
+    bad = inputs | {name: wrong(inputs[name])[kind]}
+    # Three rows of positions are a batch of three, whose other inputs are shared.
+    batch = name == "positions" and kind == "three rows"
+    calls = [
+        lambda: sim._core.forward(bad, True, 1),
+        lambda: sim._core.energy(bad),
+        lambda: sim._core.find_overlap(bad),
+        lambda: sim._core.find_close_start(bad),
+        lambda: sim._core.path(bad),
+        lambda: sim._core.default_barrier_stiffness(bad, 0.01),
+        lambda: sim._core.reference_factorization_seconds(bad, 1),
+    ]
+    for call in calls if not batch else []:
+        with pytest.raises(ValueError, match=f"core: `{name}`"):
+            call()
+    with pytest.raises(ValueError, match="core: "):
+        backward(sim, bad, forward)
+
+
+@pytest.mark.boundary
+@pytest.mark.parametrize("name", [n for n in _core.input_names if n not in OPTIONAL])
+def test_an_input_that_is_not_there_is_refused(sim, inputs, name):
+    without = {key: array for key, array in inputs.items() if key != name}
+    with pytest.raises(ValueError, match=f"core: `{name}`"):
+        sim._core.forward(without, False, 1)
+
+
+@pytest.mark.boundary
+@pytest.mark.parametrize("scheme", ["coupled", "split"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_tape_or_cotangent_of_another_size_is_refused(scheme, kind):
+    sim = make()
+    if scheme == "split":  # it takes nothing that forces move
+        sim = dc.Simulator(dc.Scene([dc.Cloth.grid(4, 4)]), 0.01, scheme="split")
+    tensors, _ = sim._inputs(sim.initial_state(), None, None)
+    inputs = {name: as_array(tensor) for name, tensor in tensors.items()}
+    out = sim._core.forward(inputs, True, 1)
+    names = [n for n in ("positions", "velocities", "body_forces", "coordinates") if n in out]
+    tape = {name: array for name, array in out.items() if name.startswith("tape_")}
+    cotangents = {name: np.ones_like(out[name]) for name in names}
+    for table, key in ((tape, "tape"), (cotangents, "cotangents")):
+        for name, array in table.items():
+            bad = wrong(array)[kind]
+            if bad.size == array.size:
+                continue
+            arguments = {"tape": tape, "cotangents": cotangents} | {key: table | {name: bad}}
+            with pytest.raises(ValueError, match=f"core: `{name}` must have"):
+                sim._core.backward(inputs, *arguments.values(), list(inputs), 1)
+            without = {other: a for other, a in table.items() if other != name}
+            with pytest.raises(KeyError):
+                sim._core.backward(inputs, *(arguments | {key: without}).values(), list(inputs), 1)
+
+
+@pytest.mark.boundary
+@pytest.mark.parametrize("value", [-1.0, 3.0, 1e300, np.nan, np.inf])
+def test_a_tape_of_more_solves_than_there_are_is_refused(sim, inputs, forward, value):
+    tape = {name: array for name, array in forward.items() if name.startswith("tape_")}
+    tape["tape_solves"] = np.full_like(tape["tape_solves"], value)
+    with pytest.raises(ValueError, match="core: the tape must"):
+        backward(sim, inputs, forward, tape=tape)
+
+
+@pytest.mark.boundary
+@pytest.mark.parametrize("change", ["shape", "dtype", "nan"])
+def test_hooks_on_saved_tensors_cannot_reach_the_core_with_something_else(sim, change):
+    def unpack(tensor):
+        if change == "shape":
+            return tensor[..., :1] if tensor.dim() else tensor
+        return tensor.float() if change == "dtype" else torch.full_like(tensor, torch.nan)
+
+    state = sim.initial_state()
+    x = state.positions.clone().requires_grad_()
+    with torch.autograd.graph.saved_tensors_hooks(lambda t: t, unpack):
+        loss = sim.step(state.replace(positions=x)).positions.sum()
+        error, message = {
+            "shape": (dc.InvalidInput, "backward: saved `.*` must come back with shape"),
+            "dtype": (TypeError, "backward: saved `.*` must come back as a dense float64 tensor"),
+            "nan": (dc.InvalidInput, "backward: core: .* must be finite"),
+        }[change]
+        with pytest.raises(error, match=message):
+            loss.backward()
+    assert sim.step(state).report.converged
+
+
+# --- What a core is made from --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def arguments():
+    """What the package hands to the core for the scene."""
+    taken = {}
+
+    class Spy:
+        def __init__(self, **keywords):
+            taken.update(keywords)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cores._core, "Simulator", Spy)
+        with pytest.raises(AttributeError):  # the spy can do nothing else
+            make()
+    return taken
+
+
+INDICES = [
+    "faces",
+    "cloth_vertex_start",
+    "cloth_face_start",
+    "pins",
+    "soft_pins",
+    "body_faces",
+    "body_vertex_start",
+    "link_tree",
+    "link_parent",
+    "link_kind",
+    "link_coordinate",
+    "surface_link",
+]
+ARRAYS = [
+    *INDICES,
+    "vertices",
+    "rest_vertices",
+    "body_vertices",
+    "coordinate_lower",
+    "limit_stiffness",
+    "link_offset",
+    "link_axis",
+    "link_constant",
+    "coordinate_prescribed",
+    "tree_free",
+]
+
+
+def test_the_arguments_are_good_ones(arguments):
+    assert _core.Simulator(**arguments).smallest_nonadjacent_distance() > 0
+
+
+@pytest.mark.boundary
+@pytest.mark.parametrize("value", [-2, 10**6, 2**31 - 1, -(2**31)])
+@pytest.mark.parametrize("name", INDICES)
+def test_an_index_out_of_range_is_refused(arguments, name, value):
+    for place in (0, -1):
+        bad = arguments[name].copy()
+        bad.reshape(-1)[place] = value
+        with pytest.raises(REFUSED, match=r"core: |trees: |topology: "):
+            _core.Simulator(**(arguments | {name: bad}))
+
+
+@pytest.mark.boundary
+@pytest.mark.parametrize("name", ARRAYS)
+def test_an_array_of_another_length_is_refused(arguments, name):
+    array = arguments[name]
+    for bad in (array.reshape(-1)[:-1], np.concatenate([array.reshape(-1)] * 2)):
+        if name in ("pins", "soft_pins") or (name == "body_faces" and len(bad) % 3 == 0):
+            continue  # there may be any number of them
+        with pytest.raises(REFUSED, match=r"core: |trees: "):
+            _core.Simulator(**(arguments | {name: bad}))
+
+
+@pytest.mark.boundary
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("dt", 0.0),
+        ("dt", float("nan")),
+        ("friction_iterations", 0),
+        ("friction_iterations", -1),
+        ("max_iterations", 0),
+        ("ignored_pairs", np.array([[0, 99]], dtype=np.int32)),
+        ("ignored_pairs", np.array([[-1, 0]], dtype=np.int32)),
+        ("bending_models", ["patch", "patch"]),
+        ("bending_models", []),
+        ("link_names", ["a"] * 99),
+        ("scheme", "none"),
+        ("metric", "none"),
+    ],
+)
+def test_another_value_out_of_range_is_refused(arguments, name, value):
+    with pytest.raises(ValueError, match=r"core: |scheme must|metric must"):
+        _core.Simulator(**(arguments | {name: value}))
