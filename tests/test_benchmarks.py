@@ -117,3 +117,12 @@ def test_what_moves_by_forces_is_timed_beside_what_is_given():
     rows = [line.split() for line in result.stdout.splitlines()]
     assert [row[0] for row in rows[1:]] == ["free", "gripper"]
     assert all(float(row[-1]) >= 1 for row in rows[1:])  # steps in contact
+
+
+def test_the_baseline_is_timed_with_both_elastic_solvers():
+    command = [sys.executable, "-m", "benchmarks.projective", "--quick"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    rows = [line.split() for line in result.stdout.splitlines()]
+    assert [row[0] for row in rows[1:]] == 2 * ["newton", "projective"]
+    assert all(int(row[2]) > 0 for row in rows[1:])  # vertices in contact

@@ -108,7 +108,7 @@ REFUSED = [
     ),
     pytest.param(
         "simulation.scheme=implicit",
-        r"`simulation\.scheme` must be 'coupled' or 'split', got 'implicit'",
+        r"`simulation\.scheme` must be 'coupled', 'split' or 'projective', got 'implicit'",
         id="scheme",
     ),
     pytest.param(
@@ -168,6 +168,16 @@ def test_a_body_with_a_trajectory_must_be_kinematic(write):
     body = "{name: b, shape: {kind: box, size: 1}, trajectory: [{time: 1}]}"
     with pytest.raises(InvalidInput, match=r"`scene\.bodies\[0\]` has a `trajectory` and must"):
         load_config(write(MINIMAL), [f"scene.bodies=[{body}]"])
+
+
+def test_nodal_contact_and_its_scheme_are_read(write):
+    bodies = (
+        "  bodies:\n    - {name: ball, shape: {kind: sphere, radius: 0.1}, nodal_contact: true,"
+    )
+    text = MINIMAL.replace("steps: 3", "steps: 3, scheme: projective") + bodies
+    task = load_task(write(text + " pose: {position: [0, 0, -1]}}\n"))
+    assert task.simulator.scheme == "projective"
+    assert task.scene.bodies[0].nodal_contact
 
 
 def test_keyframes_must_come_in_order(write):

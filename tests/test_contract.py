@@ -206,12 +206,12 @@ def test_the_default_barrier_follows_from_the_cloths_alone():
     [
         ({"dt": 0.0}, dc.InvalidInput, "`dt` must be finite and > 0, got 0"),
         ({"dt": torch.tensor(0.1, requires_grad=True)}, dc.InvalidInput, "no gradient"),
-        ({"scheme": "implicit"}, dc.InvalidInput, "'split', 'projective', got 'implicit'"),
+        ({"scheme": "fast"}, dc.InvalidInput, "'coupled', 'split', 'projective', got 'fast'"),
         ({"solver": dc.SolverOptions(metric="identity")}, dc.InvalidInput, "needs scheme 'split'"),
         (
             {"solver": dc.SolverOptions(elastic="projective")},
             dc.InvalidInput,
-            "'coupled' has none",
+            "'split' or 'projective'; 'coupled' has none",
         ),
         ({"solver": dc.ContactOptions()}, TypeError, "`solver` must be a SolverOptions"),
         (

@@ -34,12 +34,6 @@ Anderson::Anderson(std::size_t size) : size_(size), last_end_(size), last_p_(siz
   products_.setZero(kWindow, kWindow);
 }
 
-void Anderson::restart() {
-  count_ = 0;
-  newest_ = -1;
-  has_last_ = false;
-}
-
 void Anderson::next(const double* x, const double* p, const double* q, double* to) {
   for (std::size_t a = 0; a < size_; ++a) to[a] = x[a] + p[a];
   if (has_last_) {

@@ -15,14 +15,11 @@ namespace diffcloth::projective {
 /// found from it.
 class Anderson {
  public:
-  /// Steps that are combined. With five it takes up to four times as many iterations to small
-  /// residuals; with more than twenty few less.
+  /// Steps that are combined. Five take two to four times as many iterations to small residuals,
+  /// and more than twenty gain little.
   static constexpr int kWindow = 20;
 
   explicit Anderson(std::size_t size);
-
-  /// Forget all steps.
-  void restart();
 
   /// Where to go from x: x + p, or better. All arrays have the size of the iteration.
   ///

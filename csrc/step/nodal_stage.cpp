@@ -653,7 +653,7 @@ projective::Outcome NodalStage::iterate(const projective::Options& options,
     }
     if (accelerated && size > last) {
       // Acceleration has led astray: go on from where the plain iteration leads.
-      anderson.restart();
+      anderson = projective::Anderson(problem_.cloth_size);
       std::ranges::copy(plain, x.begin());
       accelerated = false;
       continue;
