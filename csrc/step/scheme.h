@@ -18,8 +18,8 @@ struct Forward {
   Problem& problem;
   contact::Detection& detection;
   solver::Context& context;
-  const Arrays<double>& tape;     ///< empty where no tape is wanted
-  FactorCache::Kept& kept;  ///< for backward
+  const Arrays<double>& tape;  ///< empty where no tape is wanted
+  FactorCache::Kept& kept;     ///< for backward
   Report& report;
 };
 
