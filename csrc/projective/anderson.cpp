@@ -1,6 +1,7 @@
 #include "projective/anderson.h"
 
 #include <algorithm>
+#include <array>
 
 #include <Eigen/QR>
 
@@ -13,7 +14,7 @@ constexpr double kDependent = 1e-12;
 double dot(const std::vector<double>& a, const double* b) {
   // Four sums, so that one addition need not wait for the last.
   const std::size_t n = a.size();
-  double sum[4] = {0.0, 0.0, 0.0, 0.0};
+  std::array<double, 4> sum{};
   std::size_t k = 0;
   for (; k + 4 <= n; k += 4) {
     for (std::size_t i = 0; i < 4; ++i) sum[i] += a[k + i] * b[k + i];
