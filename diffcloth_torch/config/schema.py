@@ -559,10 +559,15 @@ def _parse(text: str) -> Any:
 def _check_extent(events: Iterable[Any]) -> None:
     """Bound depth and size of a document with its aliases written out, before they are."""
     sizes: dict[str, int] = {}  # of anchored values
+    anchors: set[str] = set()
     opened: list[tuple[str | None, int]] = []  # anchor of a collection, and values before it
     count = 0
     for event in events:
         name = getattr(event, "anchor", None)
+        if name is not None and not isinstance(event, AliasEvent):
+            if name in anchors:
+                raise ValueError(f"the anchor &{name} must stand once")
+            anchors.add(name)
         if isinstance(event, AliasEvent):
             if name not in sizes:
                 raise ValueError(f"the alias *{name} must follow the end of what it stands for")
