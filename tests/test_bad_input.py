@@ -57,7 +57,7 @@ MASKED = np.ma.masked_array(np.zeros((9, 3)), mask=np.eye(9, 3))
         (
             lambda _: grid(scheme=np.array(["coupled", "split"])),
             TypeError,
-            "`scheme` must be a string, one of 'coupled', 'split', got ndarray",
+            "`scheme` must be a string, one of 'coupled', 'split', 'projective', got ndarray",
         ),
         (lambda _: grid(coupling=["a"]), TypeError, "`coupling` must be a string, .* got list"),
         (lambda _: dc.stack([1]), TypeError, r"`states\[0\]` must be a State, got int"),

@@ -113,7 +113,7 @@ REFUSED = [
     ),
     pytest.param(
         "scene.cloths.sheet.shape.kind=square",
-        r"`scene\.cloths\[0\]\.shape` must have as `kind` one of 'grid', 'disk', 'load'",
+        r"`scene\.cloths\[0\]\.shape` must have as `kind` one of 'grid', 'disk', 'strip', 'load'",
         id="shape",
     ),
     pytest.param(
