@@ -1,12 +1,10 @@
 #pragma once
 
-#include <memory>
 #include <vector>
 
-#include "projective/coulomb.h"
 #include "projective/local_global.h"
-#include "projective/nodal_contact.h"
 #include "solver/newton.h"
+#include "step/nodal_contacts.h"
 #include "step/scheme.h"
 
 namespace diffcloth::step {
@@ -15,15 +13,16 @@ namespace diffcloth::step {
 /// with the law of Signorini and Coulomb at each node in contact (the paper's Eqs. 3-5). Contacts are
 /// found once, on the straight way from x_n to the inertial prediction.
 ///
-/// See nodal_stage.cpp for the equations and their adjoint.
+/// See nodal_system.cpp for the equations, nodal_adjoint.cpp for their adjoint.
 class NodalStage {
  public:
   /// @param vertices_touch  whether vertices of cloths are in contact with each other too
-  NodalStage(Problem& problem, bool vertices_touch);
+  NodalStage(Problem& problem, bool vertices_touch)
+      : problem_(problem), contacts_(problem, vertices_touch) {}
   NodalStage(const NodalStage&) = delete;
   NodalStage& operator=(const NodalStage&) = delete;
 
-  bool has_contacts() const { return !contacts_.empty(); }
+  bool has_contacts() const { return !contacts_.list.empty(); }
 
   /// Where a solve begins: every vertex flies freely, and those in contact obey the law on their own.
   ///
@@ -58,14 +57,11 @@ class NodalStage {
                 const std::vector<double>& force_bar) const;
 
  private:
-  friend class NodalSystem;
+  /// Inertia, elasticity and anchors.
+  solver::Objective objective() const;
 
   Problem& problem_;
-  std::vector<projective::Obstacle> obstacles_;
-  std::vector<projective::NodalContact> contacts_;
-  std::vector<Index> partner_;          ///< [N] vertex in contact with each, or -1
-  std::vector<double> inertia_;         ///< [N] rho, see nodal_stage.cpp [kg]
-  std::unique_ptr<Potential> pattern_;  ///< couplings of pairs; null without pairs
+  NodalContacts contacts_;
 };
 
 }  // namespace diffcloth::step

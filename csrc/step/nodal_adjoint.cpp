@@ -1,0 +1,144 @@
+// The adjoint of dry frictional contact at nodes, in the terms of nodal_system.cpp.
+//
+// For the cotangent g_x of x, let lambda = Z lambda solve  K^T lambda = Z (g_x + H eta), with eta
+// those of the forces E g at nodes, which the bodies feel. Then z = L^T lambda - eta goes through the
+// potentials as in contact_stage.cpp. The cotangent of E (x - x_n) - h s v_out at fixed g is minus
+//
+//   q = (I - P) E (g_x - H z)  +  F lambda            (the first term without P where it sticks)
+//
+// and those of the frame are
+//
+//   n_bar  = (n . E g) lambda_E + mu (t . lambda_E) E g - (n . q) h s u,     v_bar = h s q,
+//   mu_bar = (n . E g) (t . lambda_E).
+
+#include <algorithm>
+#include <stdexcept>
+#include <utility>
+
+#include "solver/linear_system.h"
+#include "step/nodal_stage.h"
+#include "step/nodal_system.h"
+
+namespace diffcloth::step {
+
+using Array = std::vector<double>;
+using projective::ContactCase;
+using projective::Coulomb;
+using projective::NodalContact;
+
+namespace {
+
+/// Of the adjoint, relative.
+constexpr double kAdjointTolerance = 1e-12;
+/// What rounding may leave of it on a badly conditioned mesh.
+constexpr double kLargestAdjointError = 1e-8;
+
+}  // namespace
+
+void NodalStage::backward(const Backward& step,
+                          const Array& x,
+                          solver::Factor factor,
+                          const Array& g,
+                          const Array& force_bar) const {
+  Cotangents& bars = step.cotangents;
+  const solver::Objective f = objective();
+  const NodalSystem system(problem_, contacts_, f);
+  solver::LinearSystem linear(f, *step.context.workspace, *step.context.watch,
+                              *step.context.counts);
+  NodalSystem::Point at;
+  at.x = x;
+  system.look(at);
+  const linalg::BlockMatrix H = linear.assemble(x.data(), Curvature::kExact, at.g);
+  if (!factor) factor = linear.factor(system.without_coupling(at, H));
+  if (!factor) throw std::domain_error("the Hessian is not positive definite at the solution");
+
+  // The bodies' forces: minus E g, shared.
+  Array eta(f.coordinates->size(), 0.0);
+  std::vector<Vec3> surface_point_bar(contacts_.list.size(), Vec3::Zero());
+  for (std::size_t k = 0; k < contacts_.list.size(); ++k) {
+    const NodalContact& c = contacts_.list[k];
+    if (c.obstacle < 0 || at.laws[k].kind == ContactCase::kTakingOff) continue;
+    const Index body = contacts_.obstacles[c.obstacle].body;
+    const auto share = problem_.scene.face_search[body].share(c.surface_point);
+    const Vec3 force = relative(c, at.g.data());
+    Vec3 weights_bar;
+    for (int a = 0; a < 3; ++a) {
+      const Vec3 bar = row(force_bar.data(), share.corners[a]);
+      spread(c, -share.weights[a] * bar, eta.data());
+      weights_bar[a] = -bar.dot(force);
+    }
+    surface_point_bar[k] = share.weights_by_point.transpose() * weights_bar;
+  }
+  Array b = g;
+  system.clear_fixed(b);
+  H.add_product(eta.data(), b.data());
+  system.project(at, b);
+  Array lambda;
+  const auto solved = system.solve(at, H, *factor, true, b, kAdjointTolerance, lambda);
+  if (!solved.converged) {
+    // The floor of rounding may lie above the tolerance: then what has been found must do.
+    Array again;
+    if (!system.solve(at, H, *factor, true, b, kLargestAdjointError, again).converged) {
+      throw std::domain_error("the adjoint of nodal friction did not converge");
+    }
+  }
+
+  Array z = lambda;
+  system.couple_transposed(at, z);
+  for (std::size_t a = 0; a < z.size(); ++a) z[a] -= eta[a];
+  Array z_points(x.size(), 0.0);
+  f.coordinates->add_rows(z, z_points);
+  Array q;
+  f.hessian_product(x.data(), z_points.data(), q);
+  for (double& value : q) value = -value;
+  f.coordinates->add_rows(g, q);
+  for (Index i = 0; i < f.coordinates->point_count(); ++i) {
+    if (f.coordinates->prescribed()[i] == 0) continue;
+    for (Index a = 3 * i; a < 3 * i + 3; ++a) bars.ends[a] += q[a];
+  }
+  f.for_each([&](Potential& p) { p.accumulate(x.data(), z_points.data()); });
+
+  const projective::Swept cloths = swept(problem_);
+  const Index surfaces = problem_.scene.surface_count();
+  for (std::size_t k = 0; k < contacts_.list.size(); ++k) {
+    const NodalContact& c = contacts_.list[k];
+    const Coulomb& law = at.laws[k];
+    if (law.kind == ContactCase::kTakingOff) continue;
+    const double h_s = problem_.h * scale(c);
+    const Vec3 lambda_e = relative(c, lambda.data());
+    const Vec3 q_held = NodalSystem::held(c, law, relative(c, q.data()));
+    const Vec3 q_e = q_held + system.turning(c, law, lambda_e);
+    spread(c, q_e, bars.start.data());
+    Vec3 normal_bar = Vec3::Zero();
+    if (law.kind == ContactCase::kSlipping) {
+      const Vec3 force = relative(c, at.g.data());
+      const double normal_force = c.normal.dot(force);
+      const double along = law.direction.dot(lambda_e);
+      normal_bar = normal_force * lambda_e + c.friction * along * force -
+                   c.normal.dot(q_held) * h_s * at.u[k];
+      const Index a = problem_.scene.vertex_cloth[c.vertex];
+      const Index other = c.partner >= 0
+                              ? problem_.scene.vertex_cloth[c.partner]
+                              : problem_.scene.cloth_count() + contacts_.obstacles[c.obstacle].body;
+      const double friction_bar = normal_force * along;
+      bars.contact.friction[a * surfaces + other] += 0.5 * friction_bar;
+      bars.contact.friction[other * surfaces + a] += 0.5 * friction_bar;
+    }
+    const projective::FrameBar frame = projective::pull_back(
+        c, cloths, contacts_.obstacles, normal_bar, h_s * q_e, surface_point_bar[k]);
+    const auto add_vertex = [&](Index i, const Vec3& bar) {
+      Eigen::Map<Vec3>(bars.start.data() + 3 * i) += (1.0 - c.fraction) * bar;
+      Eigen::Map<Vec3>(problem_.inertia.target_bar.data() + 3 * i) += c.fraction * bar;
+    };
+    add_vertex(c.vertex, frame.vertex);
+    if (c.partner >= 0) {
+      add_vertex(c.partner, frame.partner);
+    } else {
+      const Index pose = problem_.scene.given.bodies.pose[contacts_.obstacles[c.obstacle].body];
+      Eigen::Map<bodies::Pose>(bars.body_poses.data() + 7 * pose) += frame.start;
+      Eigen::Map<bodies::Pose>(bars.body_targets.data() + 7 * pose) += frame.end;
+    }
+  }
+}
+
+}  // namespace diffcloth::step

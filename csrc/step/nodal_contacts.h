@@ -1,0 +1,28 @@
+#pragma once
+
+#include <memory>
+#include <vector>
+
+#include "potential/potential.h"
+#include "projective/nodal_contact.h"
+#include "step/problem.h"
+
+namespace diffcloth::step {
+
+/// What touches in a stage with contact at nodes: found once, on the straight way from x_n to the
+/// inertial prediction.
+struct NodalContacts {
+  /// @param vertices_touch  whether vertices of cloths are in contact with each other too
+  NodalContacts(Problem& problem, bool vertices_touch);
+
+  std::vector<projective::Obstacle> obstacles;
+  std::vector<projective::NodalContact> list;
+  std::vector<Index> partner;            ///< [N] vertex in contact with each, or -1
+  std::vector<double> inertia;           ///< [N] rho, see nodal_system.cpp [kg]
+  std::unique_ptr<Potential> couplings;  ///< of pairs, without energy; null without pairs
+};
+
+/// The cloths on that way.
+projective::Swept swept(const Problem& problem);
+
+}  // namespace diffcloth::step

@@ -1,0 +1,117 @@
+#pragma once
+
+#include <vector>
+
+#include "linalg/block_matrix.h"
+#include "linalg/cholesky.h"
+#include "linalg/gmres.h"
+#include "projective/coulomb.h"
+#include "projective/nodal_contact.h"
+#include "solver/objective.h"
+#include "step/nodal_contacts.h"
+#include "step/problem.h"
+
+namespace diffcloth::step {
+
+/// s of a contact: see nodal_system.cpp.
+double scale(const projective::NodalContact& contact);
+
+/// E v.
+Vec3 relative(const projective::NodalContact& contact, const double* v);
+
+/// v += E^T e.
+void spread(const projective::NodalContact& contact, const Vec3& e, double* v);
+
+/// Of masses of vertices: that of the vertex, or what two of them have against each other.
+double reduced(const std::vector<double>& masses, const projective::NodalContact& contact);
+
+/// The equations of a stage at one point.
+class NodalSystem {
+ public:
+  /// @param f  inertia, elasticity and anchors, and the couplings of the contacts
+  NodalSystem(const Problem& problem, const NodalContacts& contacts, const solver::Objective& f)
+      : f_(f),
+        p_(problem),
+        contacts_(contacts.list),
+        partner_(contacts.partner),
+        inertia_(contacts.inertia),
+        inv_h_sq_(1.0 / (p_.h * p_.h)) {}
+
+  /// What the equations are at a point.
+  struct Point {
+    std::vector<double> x;
+    std::vector<double> g;  ///< of all points
+    std::vector<projective::Coulomb> laws;
+    std::vector<Vec3> u;  ///< relative velocities [m/s]
+    double merit = 0.0;   ///< sum of |residual|^2 / rho [J]
+  };
+
+  void look(Point& at) const;
+
+  double rho(const projective::NodalContact& c) const { return reduced(inertia_, c); }
+
+  Vec3 velocity(const projective::NodalContact& c, const std::vector<double>& x) const;
+
+  /// What holds along E at this case of the law: I - P, or all, or nothing.
+  static Vec3 held(const projective::NodalContact& c,
+                   const projective::Coulomb& law,
+                   const Vec3& e);
+
+  /// k (P - t t^T) e.
+  Vec3 turning(const projective::NodalContact& c,
+               const projective::Coulomb& law,
+               const Vec3& e) const;
+
+  /// v = Z v, zero at fixed rows.
+  void project(const Point& at, std::vector<double>& v) const;
+
+  void clear_fixed(std::vector<double>& v) const;
+
+  /// v = L v.
+  void couple(const Point& at, std::vector<double>& v) const;
+
+  /// v = L^T v for v = Z v.
+  void couple_transposed(const Point& at, std::vector<double>& v) const;
+
+  /// y += F v.
+  void add_turning(const Point& at, const std::vector<double>& v, std::vector<double>& y) const;
+
+  /// S in place of H.
+  linalg::BlockMatrix without_coupling(const Point& at, const linalg::BlockMatrix& H) const;
+
+  /// Solve K w = b, or K^T w = b, for b = Z b.
+  linalg::GmresOutcome solve(const Point& at,
+                             const linalg::BlockMatrix& H,
+                             const linalg::CholeskyFactor& S,
+                             bool transposed,
+                             const std::vector<double>& b,
+                             double tolerance,
+                             std::vector<double>& w) const;
+
+  /// What brings the held parts to where they must be.
+  std::vector<double> constraint_step(const Point& at) const;
+
+  /// Minus the equations at the free parts, and minus what the constraints' step d does to them.
+  ///
+  /// @param frozen  with friction as large as it is now, whatever becomes of the normal forces
+  std::vector<double> right_side(const Point& at,
+                                 const linalg::BlockMatrix& H,
+                                 const std::vector<double>& d,
+                                 bool frozen) const;
+
+  /// Move the points that approach what they touch back to where they do not.
+  void clear_approach(std::vector<double>& x) const;
+
+  /// Change from one point to another of the energy with friction as large as at the first.
+  double frozen_energy_change(const Point& at, const std::vector<double>& to) const;
+
+ private:
+  const solver::Objective& f_;
+  const Problem& p_;
+  const std::vector<projective::NodalContact>& contacts_;
+  const std::vector<Index>& partner_;
+  const std::vector<double>& inertia_;
+  double inv_h_sq_;
+};
+
+}  // namespace diffcloth::step
