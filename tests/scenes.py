@@ -365,7 +365,7 @@ def on_sphere(friction=0.4, rows=6, body_friction=None, **options):
         material=material(faces, friction=friction),
     )
     sim = simulator([cloth], [ball], **options)
-    state = settled(sim, sim.initial_state(), 8, velocity=(0.4, 0.1, 0.0))
+    state = settled(sim, sim.initial_state(), 4, velocity=(0.4, 0.1, 0.0))
     return Case(sim, state, {"forces": tensor_noise(state.positions.shape, 0.001, 5)})
 
 
