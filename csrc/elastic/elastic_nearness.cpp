@@ -56,8 +56,10 @@ void ElasticNearness::accumulate(const double* x, const double* z) {
   const std::vector<double> u = offset(x);
   std::vector<double> minus_u = u;
   for (double& value : minus_u) value = -value;
-  add_constant_form_mixed(elasticity_.model(), minus_u.data(), z, elasticity_.with_rest(),
-                          elasticity_.bar());
+  if (elasticity_.wanted() != Wanted::kNone) {
+    add_constant_form_mixed(elasticity_.model(), minus_u.data(), z,
+                            elasticity_.wanted() == Wanted::kMaterialsAndRest, elasticity_.bar());
+  }
   if (anchors_ == nullptr) return;
   const Anchors& anchors = anchors_->anchors();
   for (std::size_t a = 0; a < anchors.vertex.size(); ++a) {

@@ -11,8 +11,8 @@ std::vector<double> negated(const double* z, Index vertex_count) {
 
 }  // namespace
 
-ElasticPotential::ElasticPotential(const Model& model, const Slots& slots, bool with_rest)
-    : model_(model), slots_(slots), with_rest_(with_rest) {}
+ElasticPotential::ElasticPotential(const Model& model, const Slots& slots, Wanted wanted)
+    : model_(model), slots_(slots), wanted_(wanted) {}
 
 void ElasticPotential::add_hessian(const double* x,
                                    Curvature curvature,
@@ -23,7 +23,9 @@ void ElasticPotential::add_hessian(const double* x,
 }
 
 void ElasticPotential::accumulate(const double* x, const double* z) {
-  add_mixed(model_, x, negated(z, model_.topology->vertex_count).data(), with_rest_, bar());
+  if (wanted_ == Wanted::kNone && !model_.prepared.damped) return;
+  add_mixed(model_, x, negated(z, model_.topology->vertex_count).data(),
+            wanted_ == Wanted::kMaterialsAndRest, bar());
 }
 
 Bar& ElasticPotential::bar() {

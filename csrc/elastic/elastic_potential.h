@@ -1,18 +1,23 @@
 #pragma once
 
+#include <cstdint>
+
 #include "elastic/anchors.h"
 #include "elastic/elastic.h"
 #include "potential/potential.h"
 
 namespace diffcloth::elastic {
 
+/// Which cotangents of an elastic model someone asks for; those of x_n, through damping, always count.
+enum class Wanted : std::uint8_t { kNone, kMaterials, kMaterialsAndRest };
+
 /// Stretch, bending and damping of all cloths as a potential. See elastic.h.
 class ElasticPotential : public Potential {
  public:
-  /// @param model      prepared; outlives the potential
-  /// @param slots      of its elements in the base pattern
-  /// @param with_rest  whether the cotangents of the rest shape are wanted
-  ElasticPotential(const Model& model, const Slots& slots, bool with_rest);
+  /// @param model   prepared; outlives the potential
+  /// @param slots   of its elements in the base pattern
+  /// @param wanted  what accumulate() keeps
+  ElasticPotential(const Model& model, const Slots& slots, Wanted wanted);
 
   double energy(const double* x) const override { return elastic::energy(model_, x); }
   double energy_change(const double* x, const double* to) const override {
@@ -30,7 +35,7 @@ class ElasticPotential : public Potential {
 
   const Model& model() const { return model_; }
   const Slots& slots() const { return slots_; }
-  bool with_rest() const { return with_rest_; }
+  Wanted wanted() const { return wanted_; }
 
   /// Zero until something is accumulated.
   Bar& bar();
@@ -38,7 +43,7 @@ class ElasticPotential : public Potential {
  private:
   const Model& model_;
   const Slots& slots_;
-  bool with_rest_;
+  Wanted wanted_;
   Bar bar_;
 };
 

@@ -12,7 +12,7 @@ namespace diffcloth::elastic {
 class RepeatedElasticity final : public ElasticPotential {
  public:
   RepeatedElasticity(const Model& model, const Slots& slots, const linalg::BlockPattern& pattern)
-      : ElasticPotential(model, slots, false),
+      : ElasticPotential(model, slots, Wanted::kNone),
         flat_bending_(ConstantForm::of_flat_bending(model, pattern)),
         step_(3 * static_cast<std::size_t>(model.topology->vertex_count)) {}
 

@@ -164,6 +164,7 @@ void add_obstacle_contacts(const Swept& cloths,
 void add_pair_contacts(const Swept& cloths,
                        const Spheres& spheres,
                        std::vector<NodalContact>& contacts) {
+  if (std::ranges::count(spheres.touching, 1) == 0) return;
   const auto n = static_cast<std::size_t>(cloths.size());
   const auto cloth_count =
       static_cast<Index>(std::lround(std::sqrt(static_cast<double>(spheres.touching.size()))));

@@ -134,7 +134,7 @@ elastic::Model elastic_model(const Scene& scene,
 
 }  // namespace
 
-Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, bool with_rest)
+Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, elastic::Wanted wanted)
     : scene(scene_in),
       inputs(inputs_in),
       h(scene_in.given.dt),
@@ -152,7 +152,7 @@ Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, bool with_rest)
       ends(end_positions(scene, inputs, start)),
       inertia(masses, predicted_positions(inputs, masses, h), h),
       model(elastic_model(scene, inputs, *rest, h)),
-      elasticity(model, scene.slots, with_rest) {
+      elasticity(model, scene.slots, wanted) {
   const std::vector<Index>& soft = scene.given.soft_pins;
   if (!soft.empty()) {
     const View stiffness = inputs[Input::kPinStiffness];

@@ -18,8 +18,10 @@ namespace diffcloth::step {
 /// Forward and backward build the same one, so that both see the same bits.
 class Problem {
  public:
-  /// @param with_rest  whether the cotangents of the rest shape will be wanted
-  Problem(const Scene& scene, const Inputs& inputs, bool with_rest = false);
+  /// @param wanted  which cotangents of materials and the rest shape will be
+  Problem(const Scene& scene,
+          const Inputs& inputs,
+          elastic::Wanted wanted = elastic::Wanted::kNone);
   Problem(const Problem&) = delete;
   Problem& operator=(const Problem&) = delete;
 

@@ -6,6 +6,19 @@
 #include "step/scheme.h"
 
 namespace diffcloth::step {
+namespace {
+
+elastic::Wanted wanted(const Gradients& gradients) {
+  using enum elastic::Wanted;
+  if (gradients[Input::kRestPositions] != nullptr) return kMaterialsAndRest;
+  for (const Input input : {Input::kStretch, Input::kBending, Input::kPoisson, Input::kDamping}) {
+    if (gradients[input] != nullptr) return kMaterials;
+  }
+  return kNone;
+}
+
+}  // namespace
+
 std::vector<Field> output_fields(const Scene& scene) {
   const auto n = static_cast<std::size_t>(scene.cloth_vertex_count());
   const std::size_t v = static_cast<std::size_t>(scene.vertex_count()) - n;
@@ -105,7 +118,7 @@ void backward(const Scene& scene,
   Stopwatch watch;
   solver::Counts counts;
   contact::Detection detection(scene.broad_phase);
-  Problem problem(scene, inputs, gradients[Input::kRestPositions] != nullptr);
+  Problem problem(scene, inputs, wanted(gradients));
   Cotangents bars(problem);
 
   const double* const x_bar = cotangents["positions"];
