@@ -138,8 +138,8 @@ def test_a_tape_or_cotangent_of_another_size_is_refused(scheme, kind):
 
 
 @pytest.mark.boundary
-@pytest.mark.parametrize("value", [-1.0, 3.0, 1e300, np.nan, np.inf])
-def test_a_tape_of_more_solves_than_there_are_is_refused(sim, inputs, forward, value):
+@pytest.mark.parametrize("value", [-1.0, 0.0, 0.5, 3.0, 1e300, np.nan, np.inf])
+def test_a_tape_of_more_or_fewer_solves_than_there_are_is_refused(sim, inputs, forward, value):
     tape = {name: array for name, array in forward.items() if name.startswith("tape_")}
     tape["tape_solves"] = np.full_like(tape["tape_solves"], value)
     with pytest.raises(ValueError, match="core: the tape must"):

@@ -269,9 +269,10 @@ void ContactStage::backward(const Backward& step, Array g) {
   Cotangents& bars = step.cotangents;
   const std::size_t size = problem.coordinates.size();
   // The tape has been in other hands: hooks on saved tensors may return anything.
-  if (!(*step.tape["solves"] >= 0.0 &&
+  if (!(*step.tape["solves"] >= 1.0 &&
         *step.tape["solves"] <= problem.scene.given.friction_iterations)) {
-    throw std::invalid_argument("core: the tape must have at most one solve a friction iteration");
+    throw std::invalid_argument(
+        "core: the tape must have one solve or more, and at most one a friction iteration");
   }
   const auto solves = static_cast<std::size_t>(*step.tape["solves"]);
   Sum sum(*this, problem, step.detection, &bars.contact);
