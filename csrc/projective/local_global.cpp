@@ -76,7 +76,7 @@ class Iteration {
 
   /// Whether the way to `to` goes down, and ends where it is flatter.
   bool is_flat() {
-    set_gradient(to_, g_to_);
+    f_.gradient(to_, g_to_);
     double slope = 0.0;
     double slope_to = 0.0;
     for (const Index i : f_.matrix->vertices()) {
@@ -109,22 +109,9 @@ class Iteration {
     return false;
   }
 
-  void set_gradient(const std::vector<double>& x, std::vector<double>& g) const {
-    std::ranges::fill(g, 0.0);
-    for (const Potential* p : f_.potentials) p->add_gradient(x.data(), g.data());
-  }
-
   void look() {
-    set_gradient(x_, g_);
-    residual_ = 0.0;
-    for (const Index i : f_.matrix->vertices()) {
-      const double rate = f_.h * row(g_.data(), i).norm() / (*f_.masses)[i];
-      if (!std::isfinite(rate)) {
-        residual_ = std::numeric_limits<double>::infinity();
-        return;
-      }
-      residual_ = std::max(residual_, rate);
-    }
+    f_.gradient(x_, g_);
+    residual_ = f_.largest_rate(g_);
   }
 
   const Objective& f_;
@@ -142,6 +129,21 @@ class Iteration {
 };
 
 }  // namespace
+
+void Objective::gradient(const std::vector<double>& x, std::vector<double>& g) const {
+  std::ranges::fill(g, 0.0);
+  for (const Potential* p : potentials) p->add_gradient(x.data(), g.data());
+}
+
+double Objective::largest_rate(const std::vector<double>& force) const {
+  double largest = 0.0;
+  for (const Index i : matrix->vertices()) {
+    const double rate = h * row(force.data(), i).norm() / (*masses)[i];
+    if (!std::isfinite(rate)) return std::numeric_limits<double>::infinity();
+    largest = std::max(largest, rate);
+  }
+  return largest;
+}
 
 Outcome minimize(const Objective& objective,
                  std::vector<double>& x,

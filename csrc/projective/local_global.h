@@ -15,6 +15,12 @@ struct Objective {
   const ConstantMatrix* matrix;       ///< A: no smaller than their Hessian, or of its size
   const std::vector<double>* masses;  ///< [N] [kg]
   double h;                           ///< time step [s]
+
+  /// g = grad P at x.
+  void gradient(const std::vector<double>& x, std::vector<double>& g) const;
+
+  /// max_i h |f_i| / m_i over the free vertices [m/s]; infinite where a force is not finite.
+  double largest_rate(const std::vector<double>& force) const;
 };
 
 /// Iterations that are allowed for each of Newton's: one takes about as much less time, and they

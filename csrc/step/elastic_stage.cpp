@@ -27,21 +27,6 @@ std::string_view words(projective::Status status) {
   __builtin_unreachable();
 }
 
-projective::Outcome minimize(Problem& problem,
-                             const projective::Options& options,
-                             const Checkpoint& checkpoint,
-                             std::vector<double>& x) {
-  const auto matrix = problem.constant_matrix();
-  const elastic::RepeatedElasticity elasticity(problem.model, problem.scene.slots,
-                                               problem.scene.elastic_assemblies.base());
-  projective::Objective f{.potentials = {&problem.inertia, &elasticity},
-                          .matrix = matrix.get(),
-                          .masses = &problem.masses,
-                          .h = problem.h};
-  if (problem.anchors) f.potentials.push_back(&*problem.anchors);
-  return projective::minimize(f, x, options, checkpoint);
-}
-
 /// By local/global iterations. No factor comes out of them: backward makes it.
 void solve_by_projective_dynamics(Problem& problem,
                                   const Forward& step,
@@ -53,9 +38,17 @@ void solve_by_projective_dynamics(Problem& problem,
       .tolerance = given.tolerance,
       .max_iterations = projective::kIterationsPerNewton * given.max_iterations};
   const Checkpoint& checkpoint = *step.context.checkpoint;
+  const auto matrix = problem.constant_matrix();
+  const elastic::RepeatedElasticity elasticity(problem.model, problem.scene.slots,
+                                               problem.scene.elastic_assemblies.base());
+  projective::Objective f{.potentials = {&problem.inertia, &elasticity},
+                          .matrix = matrix.get(),
+                          .masses = &problem.masses,
+                          .h = problem.h};
+  if (problem.anchors) f.potentials.push_back(&*problem.anchors);
   const projective::Outcome outcome = nodes.has_contacts()
-                                          ? nodes.iterate(options, checkpoint, x)
-                                          : minimize(problem, options, checkpoint, x);
+                                          ? nodes.iterate(f, options, checkpoint, x)
+                                          : projective::minimize(f, x, options, checkpoint);
   step.report.counts.local_global += outcome.iterations;
   step.report.residual = std::max(step.report.residual, outcome.residual);
   if (outcome.status != projective::Status::kConverged) {

@@ -5,7 +5,6 @@
 #include <limits>
 #include <utility>
 
-#include "elastic/repeated_elasticity.h"
 #include "projective/anderson.h"
 #include "step/nodal_system.h"
 
@@ -37,16 +36,12 @@ void NodalStage::start(Array& x) const {
   if (f.energy(held.data()) < f.energy(x.data())) x = std::move(held);
 }
 
-projective::Outcome NodalStage::iterate(const projective::Options& options,
+projective::Outcome NodalStage::iterate(const projective::Objective& smooth,
+                                        const projective::Options& options,
                                         const Checkpoint& checkpoint,
                                         Array& x) const {
   const solver::Objective f = objective();
   const NodalSystem system(problem_, contacts_, f);
-  const auto matrix = problem_.constant_matrix();
-  const elastic::RepeatedElasticity elasticity(problem_.model, problem_.scene.slots,
-                                               problem_.scene.elastic_assemblies.base());
-  std::vector<const Potential*> potentials{&problem_.inertia, &elasticity};
-  if (problem_.anchors) potentials.push_back(&*problem_.anchors);
   projective::ConstantMatrix::Scratch scratch;
   projective::Anderson anderson(problem_.cloth_size);
   projective::Outcome outcome;
@@ -60,8 +55,7 @@ projective::Outcome NodalStage::iterate(const projective::Options& options,
   bool accelerated = false;
   for (;; ++outcome.iterations) {
     checkpoint.check();
-    std::ranges::fill(g, 0.0);
-    for (const Potential* potential : potentials) potential->add_gradient(x.data(), g.data());
+    smooth.gradient(x, g);
     force = g;
     for (const NodalContact& c : contacts_.list) {
       const double h_s = problem_.h * scale(c);
@@ -70,21 +64,17 @@ projective::Outcome NodalStage::iterate(const projective::Options& options,
       const Vec3 s = r - reduced(problem_.masses, c) * system.velocity(c, x);
       spread(c, -projective::coulomb(s, c.normal, c.friction).impulse / h_s, force.data());
     }
-    outcome.residual = 0.0;
-    for (const Index i : matrix->vertices()) {
-      const double rate = problem_.h * row(force.data(), i).norm() / problem_.masses[i];
-      if (!std::isfinite(rate)) {
-        outcome.status = projective::Status::kOverflow;
-        return outcome;
-      }
-      outcome.residual = std::max(outcome.residual, rate);
+    outcome.residual = smooth.largest_rate(force);
+    if (!std::isfinite(outcome.residual)) {
+      outcome.status = projective::Status::kOverflow;
+      return outcome;
     }
     if (outcome.residual < options.tolerance) {
       outcome.status = projective::Status::kConverged;
       return outcome;
     }
     if (outcome.iterations == options.max_iterations) return outcome;
-    matrix->solve(force.data(), p.data(), scratch);
+    smooth.matrix->solve(force.data(), p.data(), scratch);
     double size = 0.0;
     for (std::size_t a = 0; a < p.size(); ++a) {
       p[a] = -p[a];

@@ -36,8 +36,10 @@ class NodalStage {
 
   /// Solve by local/global iterations with impulses (Ly et al. 2020), accelerated.
   ///
+  /// @param smooth  what is minimized where nothing touches
   /// @param x  in: a start; out: the solution
-  projective::Outcome iterate(const projective::Options& options,
+  projective::Outcome iterate(const projective::Objective& smooth,
+                              const projective::Options& options,
                               const Checkpoint& checkpoint,
                               std::vector<double>& x) const;
 
