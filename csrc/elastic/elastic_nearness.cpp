@@ -54,9 +54,9 @@ void ElasticNearness::add_hessian_product(const double* /*x*/, const double* z, 
 void ElasticNearness::accumulate(const double* x, const double* z) {
   form_.add_product(z, target_bar.data());
   const std::vector<double> u = offset(x);
-  std::vector<double> minus_u = u;
-  for (double& value : minus_u) value = -value;
   if (elasticity_.wanted() != Wanted::kNone) {
+    std::vector<double> minus_u = u;
+    for (double& value : minus_u) value = -value;
     add_constant_form_mixed(elasticity_.model(), minus_u.data(), z,
                             elasticity_.wanted() == Wanted::kMaterialsAndRest, elasticity_.bar());
   }

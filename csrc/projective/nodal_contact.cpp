@@ -162,16 +162,16 @@ void add_obstacle_contacts(const Swept& cloths,
 }
 
 void add_pair_contacts(const Swept& cloths,
-                       const Spheres& spheres,
+                       const Touching& touching,
                        std::vector<NodalContact>& contacts) {
-  if (std::ranges::count(spheres.touching, 1) == 0) return;
+  const auto& [radius, apart] = *touching.spheres;
   const auto n = static_cast<std::size_t>(cloths.size());
   const auto cloth_count =
-      static_cast<Index>(std::lround(std::sqrt(static_cast<double>(spheres.touching.size()))));
+      static_cast<Index>(std::lround(std::sqrt(static_cast<double>(touching.may_touch.size()))));
   std::vector<char> busy(cloths.prescribed.begin(),
                          cloths.prescribed.begin() + static_cast<std::ptrdiff_t>(n));
   for (const NodalContact& c : contacts) busy[c.vertex] = 1;
-  const double size = 2.0 * *std::ranges::max_element(spheres.radius);
+  const double size = 2.0 * *std::ranges::max_element(radius);
   std::vector<Vec3> x(n);
   for (const double fraction : kFractions) {
     for (Index i = 0; i < cloths.size(); ++i) x[i] = cloths.at(i, fraction);
@@ -186,9 +186,9 @@ void add_pair_contacts(const Swept& cloths,
         if (j <= i) return;
         const Index pair = cloths.cloth[i] * cloth_count + cloths.cloth[j];
         const double distance = (x[i] - x[j]).norm();
-        const double depth = distance - spheres.radius[i] - spheres.radius[j];
-        if (!(depth < 0.0) || !(distance > 0.0) || spheres.touching[pair] == 0) return;
-        if (std::ranges::binary_search(spheres.apart[i], j)) return;
+        const double depth = distance - radius[i] - radius[j];
+        if (!(depth < 0.0) || !(distance > 0.0) || touching.may_touch[pair] == 0) return;
+        if (std::ranges::binary_search(apart[i], j)) return;
         found.emplace_back(depth, i, j);
       });
     }
@@ -201,7 +201,7 @@ void add_pair_contacts(const Swept& cloths,
            .partner = j,
            .obstacle = -1,
            .fraction = fraction,
-           .friction = spheres.friction[cloths.cloth[i] * cloth_count + cloths.cloth[j]],
+           .friction = touching.friction[cloths.cloth[i] * cloth_count + cloths.cloth[j]],
            .normal = (x[i] - x[j]).normalized(),
            .velocity = Vec3::Zero(),
            .surface_point = Vec3::Zero()});
@@ -213,10 +213,10 @@ void add_pair_contacts(const Swept& cloths,
 
 std::vector<NodalContact> find_contacts(const Swept& cloths,
                                         std::span<const Obstacle> obstacles,
-                                        const Spheres* spheres) {
+                                        const Touching* touching) {
   std::vector<NodalContact> contacts;
   add_obstacle_contacts(cloths, obstacles, contacts);
-  if (spheres != nullptr) add_pair_contacts(cloths, *spheres, contacts);
+  if (touching != nullptr) add_pair_contacts(cloths, *touching, contacts);
   return contacts;
 }
 

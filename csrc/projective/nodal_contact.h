@@ -22,13 +22,18 @@ struct Obstacle {
   std::vector<double> friction;  ///< [cloths]
 };
 
-/// Vertices of cloths as spheres that touch each other.
-struct Spheres {
+/// Spheres around the vertices of cloths.
+struct VertexSpheres {
   std::vector<double> radius;  ///< [N] [m]
-  std::vector<std::vector<Index>>
-      apart;                     ///< [N] vertices beyond the own one that each never touches
+  /// [N] vertices beyond the own one that each never touches
+  std::vector<std::vector<Index>> apart;
+};
+
+/// Which of them touch each other, and how.
+struct Touching {
+  const VertexSpheres* spheres;
   std::vector<double> friction;  ///< [cloths^2]
-  std::vector<char> touching;    ///< [cloths^2] whether vertices of two cloths may touch
+  std::vector<char> may_touch;   ///< [cloths^2]
 };
 
 /// Cloths on the straight way from the start of a step to where inertia and external forces alone
@@ -64,10 +69,10 @@ struct NodalContact {
 /// of an obstacle, and there the one that it is deepest in. Then pairs of vertices that touch nothing
 /// yet, likewise; the deepest first where a vertex touches several.
 ///
-/// @param spheres  null where vertices do not touch each other
+/// @param touching  null where vertices do not touch each other
 std::vector<NodalContact> find_contacts(const Swept& cloths,
                                         std::span<const Obstacle> obstacles,
-                                        const Spheres* spheres);
+                                        const Touching* touching);
 
 /// Cotangents of what the frame of a contact depends on.
 struct FrameBar {

@@ -11,9 +11,7 @@ namespace diffcloth::step {
 /// frictional contact at nodes where there is any. It is on the tape as "elastic": its positions.
 class ElasticStage {
  public:
-  /// @param vertices_touch  whether vertices of cloths are in contact with each other
-  ElasticStage(Problem& problem, bool vertices_touch)
-      : problem_(problem), nodes_(problem, vertices_touch) {}
+  explicit ElasticStage(Problem& problem) : problem_(problem), nodes_(problem) {}
 
   /// All points at its end; the contact forces on the bodies' vertices are added to body_forces.
   std::vector<double> forward(const Forward& step, double* body_forces) const;

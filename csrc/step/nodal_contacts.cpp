@@ -4,7 +4,10 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <optional>
 #include <utility>
+
+#include "step/scheme.h"
 
 namespace diffcloth::step {
 
@@ -88,32 +91,20 @@ std::vector<Obstacle> make_obstacles(const Problem& p) {
   return obstacles;
 }
 
-/// Spheres around all vertices, half as large as the shortest edge there at rest.
-projective::Spheres make_spheres(const Problem& p) {
+/// How the vertices of cloths touch each other; absent where none may.
+std::optional<projective::Touching> make_touching(const Problem& p) {
   const Scene& scene = p.scene;
-  const auto n = static_cast<std::size_t>(scene.cloth_vertex_count());
-  projective::Spheres spheres;
-  spheres.radius.assign(n, std::numeric_limits<double>::infinity());
-  spheres.apart.resize(n);
-  for (Index e = 0; e < scene.collision_mesh.cloth_edge_count; ++e) {
-    const auto& [i, j] = scene.collision_mesh.edges[e];
-    const double length =
-        (row(scene.given.rest_vertices.data(), i) - row(scene.given.rest_vertices.data(), j))
-            .norm();
-    for (const auto& [a, b] : {std::pair{i, j}, std::pair{j, i}}) {
-      spheres.radius[a] = std::min(spheres.radius[a], 0.5 * length);
-      spheres.apart[a].push_back(b);
-    }
-  }
-  for (auto& others : spheres.apart) std::ranges::sort(others);
+  if (!scene.scheme->vertices_touch()) return {};
+  projective::Touching touching{.spheres = &scene.vertex_spheres, .friction = {}, .may_touch = {}};
   for (Index a = 0; a < scene.cloth_count(); ++a) {
     for (Index b = 0; b < scene.cloth_count(); ++b) {
-      spheres.friction.push_back(pair_friction(p, a, b));
+      touching.friction.push_back(pair_friction(p, a, b));
       const bool touch = may_touch(p, a, b) && (a != b || scene.given.self_contact);
-      spheres.touching.push_back(touch ? 1 : 0);
+      touching.may_touch.push_back(touch ? 1 : 0);
     }
   }
-  return spheres;
+  if (std::ranges::count(touching.may_touch, 1) == 0) return {};
+  return touching;
 }
 
 }  // namespace
@@ -126,16 +117,11 @@ projective::Swept swept(const Problem& p) {
           .prescribed = p.scene.prescribed};
 }
 
-NodalContacts::NodalContacts(Problem& problem, bool vertices_touch)
-    : obstacles(make_obstacles(problem)) {
+NodalContacts::NodalContacts(Problem& problem) : obstacles(make_obstacles(problem)) {
   const Scene& scene = problem.scene;
   if (problem.inputs.data(Input::kFriction) == nullptr) return;  // nothing can touch
-  if (vertices_touch) {
-    const projective::Spheres spheres = make_spheres(problem);
-    list = projective::find_contacts(swept(problem), obstacles, &spheres);
-  } else {
-    list = projective::find_contacts(swept(problem), obstacles, nullptr);
-  }
+  const std::optional<projective::Touching> touching = make_touching(problem);
+  list = projective::find_contacts(swept(problem), obstacles, touching ? &*touching : nullptr);
   if (list.empty()) return;
   const elastic::ConstantForm form = problem.constant_form();
   for (std::size_t i = 0; i < problem.masses.size(); ++i) {

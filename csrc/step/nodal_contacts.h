@@ -12,8 +12,7 @@ namespace diffcloth::step {
 /// What touches in a stage with contact at nodes: found once, on the straight way from x_n to the
 /// inertial prediction.
 struct NodalContacts {
-  /// @param vertices_touch  whether vertices of cloths are in contact with each other too
-  NodalContacts(Problem& problem, bool vertices_touch);
+  explicit NodalContacts(Problem& problem);
 
   std::vector<projective::Obstacle> obstacles;
   std::vector<projective::NodalContact> list;

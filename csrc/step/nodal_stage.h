@@ -16,9 +16,7 @@ namespace diffcloth::step {
 /// See nodal_system.cpp for the equations, nodal_adjoint.cpp for their adjoint.
 class NodalStage {
  public:
-  /// @param vertices_touch  whether vertices of cloths are in contact with each other too
-  NodalStage(Problem& problem, bool vertices_touch)
-      : problem_(problem), contacts_(problem, vertices_touch) {}
+  explicit NodalStage(Problem& problem) : problem_(problem), contacts_(problem) {}
   NodalStage(const NodalStage&) = delete;
   NodalStage& operator=(const NodalStage&) = delete;
 

@@ -14,14 +14,13 @@ std::vector<Field> Projective::tape(const Scene& scene) const {
 void Projective::forward(const Forward& step, std::vector<double>& x, double* body_forces) const {
   step.report.minimum_distance = std::numeric_limits<double>::infinity();
   if (step.context.path != nullptr) step.context.path->push_back(x);
-  x = ElasticStage(step.problem, true).forward(step, body_forces);
+  x = ElasticStage(step.problem).forward(step, body_forces);
   if (step.context.path != nullptr) step.context.path->push_back(x);
   step.report.contact_count = step.report.sticking + step.report.slipping;
 }
 
 void Projective::backward(const Backward& step) const {
-  std::vector<double> g = step.cotangents.rows;
-  ElasticStage(step.problem, true).backward(step, g, step.cotangents.body_forces);
+  ElasticStage(step.problem).backward(step, step.cotangents.rows, step.cotangents.body_forces);
 }
 
 }  // namespace diffcloth::step

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <numeric>
 #include <sstream>
 #include <utility>
@@ -151,6 +152,26 @@ std::vector<projective::FaceSearch> face_searches(const Description& d) {
   return searches;
 }
 
+/// Spheres half as large as the shortest edge at their vertex at rest; those of an edge never touch.
+projective::VertexSpheres make_vertex_spheres(const Description& d,
+                                              const contact::CollisionMesh& mesh) {
+  const double* const X = d.rest_vertices.data();
+  const std::size_t n = d.rest_vertices.size() / 3;
+  projective::VertexSpheres spheres;
+  spheres.radius.assign(n, std::numeric_limits<double>::infinity());
+  spheres.apart.resize(n);
+  for (Index e = 0; e < mesh.cloth_edge_count; ++e) {
+    const auto& [i, j] = mesh.edges[e];
+    const double length = (row(X, i) - row(X, j)).norm();
+    for (const auto& [a, b] : {std::pair{i, j}, std::pair{j, i}}) {
+      spheres.radius[a] = std::min(spheres.radius[a], 0.5 * length);
+      spheres.apart[a].push_back(b);
+    }
+  }
+  for (auto& others : spheres.apart) std::ranges::sort(others);
+  return spheres;
+}
+
 /// Those of rows: of the cloth's vertices and the nodes of coordinates.
 std::vector<char> fixed_rows(const std::vector<char>& prescribed,
                              Index cloth_vertex_count,
@@ -190,6 +211,8 @@ Scene::Scene(Description description)
       feature_weights(collision_mesh, all_rest_positions(given).data(), prescribed),
       broad_phase(collision_mesh, reference_positions(given).data()),
       face_search(face_searches(given)),
+      vertex_spheres(scheme->vertices_touch() ? make_vertex_spheres(given, collision_mesh)
+                                              : projective::VertexSpheres()),
       elastic_assemblies(
           with_nodes(topology.vertex_count, elastic::cliques(topology, stencils), mechanisms),
           fixed_rows(prescribed, topology.vertex_count, mechanisms)),

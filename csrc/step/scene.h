@@ -27,7 +27,7 @@ class Scheme;
 /// Norm of the contact stage of `split`.
 enum class Metric : std::uint8_t { kElastic, kMass, kIdentity };
 
-/// How the elastic stage of `split` is solved.
+/// How the elastic stage of `split` and `projective` is solved.
 enum class ElasticSolver : std::uint8_t { kNewton, kProjective };
 
 /// What a simulator is made from.
@@ -82,6 +82,7 @@ struct Scene {
   contact::FeatureWeights feature_weights;  ///< likewise
   contact::BroadPhase broad_phase;
   std::vector<projective::FaceSearch> face_search;  ///< [surfaces of bodies] where nodes touch them
+  projective::VertexSpheres vertex_spheres;         ///< where the scheme lets vertices touch
   elastic::Slots slots;
 
   mutable solver::AssemblyCache elastic_assemblies;           ///< over the elastic pattern

@@ -43,6 +43,9 @@ class Scheme {
 
   virtual std::string_view name() const = 0;
 
+  /// Whether vertices of cloths are in contact with each other.
+  virtual bool vertices_touch() const { return false; }
+
   /// What backward needs of forward beyond the inputs: positions, no contacts and no matrices.
   virtual std::vector<Field> tape(const Scene& scene) const = 0;
 

@@ -92,7 +92,7 @@ std::vector<Field> Split::tape(const Scene& scene) const {
 
 void Split::forward(const Forward& step, Array& x, double* body_forces) const {
   Problem& problem = step.problem;
-  Array x_d = ElasticStage(problem, false).forward(step, body_forces);
+  Array x_d = ElasticStage(problem).forward(step, body_forces);
   x_d.resize(problem.cloth_size);
   Nearness(problem, x_d).stage().forward(step, x, body_forces);
 }
@@ -106,7 +106,7 @@ void Split::backward(const Backward& step) const {
 
   Array g = nearness.target_bar();
   g.resize(problem.coordinates.size(), 0.0);
-  ElasticStage(problem, false).backward(step, g, step.cotangents.body_forces);
+  ElasticStage(problem).backward(step, g, step.cotangents.body_forces);
 }
 
 }  // namespace diffcloth::step
