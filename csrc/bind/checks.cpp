@@ -118,8 +118,8 @@ void check_mechanisms(const bodies::MechanismsDescription& m, Index surfaces) {
     roots += root ? 1 : 0;
     // Trees go one after the other, each with one root, which comes first.
     const bool good = link.parent >= -1 && std::cmp_less(link.parent, l) &&
-                      link.kind <= bodies::JointKind::kPrismatic && link.tree == roots - 1 &&
-                      (root || m.links[link.parent].tree == link.tree) && link.coordinate >= -1;
+                      link.tree == roots - 1 && (root || m.links[link.parent].tree == link.tree) &&
+                      link.coordinate >= -1;
     require(good, "link " + std::to_string(l) + " must stand in its tree, behind its parent");
   }
   require(roots == trees, "every tree must have a root, and a root its tree");

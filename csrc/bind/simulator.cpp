@@ -435,15 +435,6 @@ step::Description describe(const Doubles& vertices,
   return d;
 }
 
-projective::PrimitiveKind to_primitive(const std::string& kind) {
-  using enum projective::PrimitiveKind;
-  if (kind == "plane") return kPlane;
-  if (kind == "sphere") return kSphere;
-  if (kind == "capsule") return kCapsule;
-  if (kind == "box") return kBox;
-  return kNone;
-}
-
 /// Trees of links, from the arrays that say what they are; see bodies::MechanismsDescription.
 bodies::MechanismsDescription describe_mechanisms(const nb::kwargs& k, Index surfaces) {
   const auto doubles = [&](const char* name) { return to_vector(nb::cast<Doubles>(k[name])); };
@@ -478,10 +469,9 @@ bodies::MechanismsDescription describe_mechanisms(const nb::kwargs& k, Index sur
   m.coordinate_tree.assign(n, -1);
   for (std::size_t l = 0; l < links; ++l) {
     const Eigen::Matrix<double, 4, 4, Eigen::RowMajor> frame(offset.data() + 16 * l);
-    if (parent[l] >= static_cast<Index>(l) || coordinate[l] >= static_cast<Index>(n) ||
-        kind[l] < 0 || kind[l] > static_cast<Index>(bodies::JointKind::kPrismatic) || tree[l] < 0 ||
-        tree[l] >= static_cast<Index>(m.tree_free.size())) {
-      throw nb::value_error("trees: parents must precede links, and indices must be in range");
+    if (coordinate[l] >= static_cast<Index>(n) || kind[l] < 0 ||
+        kind[l] > static_cast<Index>(bodies::JointKind::kPrismatic)) {
+      throw nb::value_error("trees: kinds and coordinates of links must be in range");
     }
     m.links.push_back({.tree = tree[l],
                        .parent = parent[l],
@@ -544,7 +534,7 @@ void simulator(nb::module_& m) {
                for (const auto& kind : kinds) {
                  const auto i = static_cast<Index>(description.primitives.size());
                  description.primitives.push_back(
-                     {.kind = to_primitive(kind), .size = row(sizes.data(), i)});
+                     {.kind = projective::primitive_kind(kind), .size = row(sizes.data(), i)});
                }
              }
              if (k.contains("link_names")) {

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <stdexcept>
+#include <string>
 
 namespace diffcloth::projective {
 namespace {
@@ -41,6 +42,17 @@ Nearest nearest_of_box(const Vec3& half, const Vec3& y) {
 }
 
 }  // namespace
+
+PrimitiveKind primitive_kind(std::string_view name) {
+  if (name == "none") return PrimitiveKind::kNone;
+  if (name == "plane") return PrimitiveKind::kPlane;
+  if (name == "sphere") return PrimitiveKind::kSphere;
+  if (name == "capsule") return PrimitiveKind::kCapsule;
+  if (name == "box") return PrimitiveKind::kBox;
+  throw std::invalid_argument(
+      "a primitive must be one of 'none', 'plane', 'sphere', 'capsule', 'box', got '" +
+      std::string(name) + "'");
+}
 
 Nearest nearest(const Primitive& primitive, const Vec3& y) {
   switch (primitive.kind) {

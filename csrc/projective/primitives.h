@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <string_view>
 
 #include "common/types.h"
 
@@ -8,6 +9,11 @@ namespace diffcloth::projective {
 
 /// Analytic surfaces around the origin of a body's frame. kNone: the body is a mesh and no more.
 enum class PrimitiveKind : std::uint8_t { kNone, kPlane, kSphere, kCapsule, kBox };
+
+/// The kind of a name: "none", "plane", "sphere", "capsule" or "box".
+///
+/// @throws std::invalid_argument
+PrimitiveKind primitive_kind(std::string_view name);
 
 /// A solid with a signed distance in closed form.
 struct Primitive {

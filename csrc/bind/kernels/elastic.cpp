@@ -185,6 +185,13 @@ class Elastic {
     return rows_array(y);
   }
 
+  static void add_materials(const elastic::Bar& bar, nb::dict& result) {
+    result["stretch"] = vector_array(bar.stretch);
+    result["bending"] = vector_array(bar.bending);
+    result["poisson"] = vector_array(bar.poisson);
+    result["damping"] = vector_array(bar.damping);
+  }
+
   nb::dict mixed(const Positions& x, const Positions& z, bool with_rest) const {
     elastic::Bar bar(topology_, stencils_);
     elastic::add_mixed(model_, positions("x", x).data(), positions("z", z).data(), with_rest, bar);
@@ -193,10 +200,7 @@ class Elastic {
       mesh::rest_shape_vjp(topology_, stencils_, X_.data(), bar.rest, X_bar.data());
     }
     nb::dict result;
-    result["stretch"] = vector_array(bar.stretch);
-    result["bending"] = vector_array(bar.bending);
-    result["poisson"] = vector_array(bar.poisson);
-    result["damping"] = vector_array(bar.damping);
+    add_materials(bar, result);
     result["x_n"] = rows_array(bar.x_n);
     result["X"] = rows_array(X_bar);
     return result;
@@ -224,10 +228,7 @@ class Elastic {
     result["values"] = vector_array(form.values());
     result["product"] = rows_array(product);
     result["energy_change"] = form.energy_change(u.data(), positions("s", s).data());
-    result["stretch"] = vector_array(bar.stretch);
-    result["bending"] = vector_array(bar.bending);
-    result["poisson"] = vector_array(bar.poisson);
-    result["damping"] = vector_array(bar.damping);
+    add_materials(bar, result);
     result["X"] = rows_array(X_bar);
     return result;
   }

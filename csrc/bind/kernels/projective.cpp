@@ -53,14 +53,8 @@ class ConstantMatrices {
 };
 
 projective::Primitive primitive_named(const std::string& kind, const std::vector<double>& size) {
-  using enum projective::PrimitiveKind;
   if (size.size() != 3) throw std::invalid_argument("nearest: `size` must have three numbers");
-  const Vec3 lengths = row(size.data(), 0);
-  if (kind == "plane") return {.kind = kPlane, .size = lengths};
-  if (kind == "sphere") return {.kind = kSphere, .size = lengths};
-  if (kind == "capsule") return {.kind = kCapsule, .size = lengths};
-  if (kind == "box") return {.kind = kBox, .size = lengths};
-  throw std::invalid_argument("nearest: `kind` is unknown: '" + kind + "'");
+  return {.kind = projective::primitive_kind(kind), .size = row(size.data(), 0)};
 }
 
 /// Distance, normal, surface point and the derivatives of both by a point, 1 + 3 + 3 + 9 + 9 numbers.
