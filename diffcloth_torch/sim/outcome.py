@@ -49,8 +49,6 @@ def raise_on_failure(
 ) -> None:
     """Raise what is most wrong in any environment; `throw` says whether `NotConverged` is."""
     status = diagnostics["status"]
-    if not status.any():
-        return
     # Bodies stand at the targets in the new state, so that a motion cut short has no state.
     unfinished = (status == UNCONVERGED) & (diagnostics["motion_fraction"] < 1)
     failures: list[tuple[type[SimulationError], np.ndarray[Any, Any], str]] = [

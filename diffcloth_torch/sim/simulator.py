@@ -373,6 +373,8 @@ class Simulator:
         return outcome, {**after, "joint_targets": held_targets(self._layout, state, control)}
 
     def _check(self, diagnostics: dict[str, Any], batch: int | None) -> None:
+        if not diagnostics["status"].any():
+            return
         batched = batch is not None
         report = make_report(diagnostics, self._core.phases, batched=batched)
         raise_on_failure(diagnostics, report, throw=self.solver.throw, batched=batched)
