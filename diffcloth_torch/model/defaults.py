@@ -91,7 +91,7 @@ def _rigid_values(assembly: Assembly) -> dict[str, FloatArray]:
             for field in ("mass", "center", "inertia"):
                 rows = [m.is_dynamic * getattr(m, field) for m in mechanisms]
                 values[f"{owner}_{field}"] = np.concatenate(rows)
-    forced = np.concatenate([np.empty(0, dtype=bool), *(robot.forced for robot in robots)])
+    forced = assembly.forced
     if forced.any():
         values["joint_stiffness"] = assembly.stiffness
         values["joint_damping"] = assembly.damping

@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diffcloth_torch.checks import (
     FloatArray,
@@ -235,6 +236,11 @@ class Assembly:
             "L": sum(robot.link_count for robot in robots),
             "R": len(robots),
         }
+
+    @property
+    def forced(self) -> NDArray[np.bool_]:
+        """Which joints forces move, shape [J]: see `Mechanism.forced`."""
+        return np.concatenate([np.empty(0, dtype=bool), *(m.forced for m in self.mechanisms)])
 
     @property
     def cloth_count(self) -> int:

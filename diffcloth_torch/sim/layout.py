@@ -91,10 +91,9 @@ class Layout:
         self.driven = torch.tensor([mode == "pd" for mode in self.actuation], dtype=torch.bool)
         self.lower = _joined([robot.lower for robot in self.robots])
         self.upper = _joined([robot.upper for robot in self.robots])
-        moved = np.concatenate([np.empty(0, dtype=bool), *(r.forced for r in self.robots)])
         reach = np.where(np.isinf(self.upper - self.lower), 0.0, ZONE * (self.upper - self.lower))
         self.farthest = np.where(
-            moved, [self.lower - reach, self.upper + reach], [[-np.inf], [np.inf]]
+            assembly.forced, [self.lower - reach, self.upper + reach], [[-np.inf], [np.inf]]
         )
         body_motions = [f"that body is {_MOTIONS[body.base]}" for body in self.bodies]
         base_motions = [f"that robot's base is {robot.base}" for robot in self.robots]
