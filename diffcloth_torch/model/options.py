@@ -63,8 +63,9 @@ class SolverOptions:
         metric: Norm of the contact stage of the scheme "split": "elastic" (the masses plus h^2
             times the constant matrix of Projective Dynamics), "mass", or "identity" (the paper's
             Eq. 22). None means "elastic" for "split"; the others have no choice.
-        elastic: What solves the elastic stage of the scheme "split": "newton", or "projective", the
-            local/global iterations of Projective Dynamics. Both find the same positions.
+        elastic: What solves the elastic stage of the schemes "split" and "projective": "newton", or
+            "projective", the local/global iterations of Projective Dynamics. Both find the same
+            positions.
     """
 
     tolerance: float = 1e-6
