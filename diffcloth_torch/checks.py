@@ -71,6 +71,12 @@ class Range(NamedTuple):
             inside = (values > self.low) & (values < self.high)
         return ~inside
 
+    def holds(self, least: float, greatest: float) -> bool:
+        """Whether numbers between two are inside; NaN is not."""
+        if self.closed:
+            return self.low <= least and greatest <= self.high
+        return self.low < least and greatest < self.high
+
     def __str__(self) -> str:
         """Say the range in words, to follow "must be"."""
         if math.isinf(self.low) and math.isinf(self.high):
@@ -196,13 +202,18 @@ def check_range(name: str, values: FloatArray, accepted: Range) -> None:
     What is positive must not be so small, and nothing so large, that powers of it leave the range
     of float64.
     """
+    smallest = SMALLEST if accepted.low == 0.0 and not accepted.closed else -LARGEST
+    if values.size == 0:
+        return
+    # Each step checks all it is given: where nothing is wrong, two numbers tell.
+    least, greatest = float(values.min()), float(values.max())
+    if accepted.holds(least, greatest) and smallest <= least and greatest <= LARGEST:
+        return
     _refuse(name, values, accepted.outside(values) | ~np.isfinite(values), str(accepted))
-    size = np.abs(values)
     too_large = f"at most {LARGEST:g} in size, as powers of it would overflow"
-    _refuse(name, values, size > LARGEST, too_large)
-    if accepted.low == 0.0 and not accepted.closed:
-        too_small = f"at least {SMALLEST:g}, as powers of it would vanish"
-        _refuse(name, values, size < SMALLEST, too_small)
+    _refuse(name, values, np.abs(values) > LARGEST, too_large)
+    too_small = f"at least {SMALLEST:g}, as powers of it would vanish"
+    _refuse(name, values, values < smallest, too_small)
 
 
 def _refuse(name: str, values: FloatArray, wrong: NDArray[np.bool_], accepted: str) -> None:

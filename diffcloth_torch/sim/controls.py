@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from typing import Any
 
 from torch import Tensor
@@ -133,10 +133,11 @@ def tensors_of(record: Any) -> Iterator[Tensor]:
     """Go through the tensors of a State, Control or Parameters; anything else has none."""
     if not is_dataclass(record):
         return
-    for entry in fields(record):
-        value = getattr(record, entry.name)
-        values = value.values() if isinstance(value, Mapping) else (value,)
-        yield from (tensor for tensor in values if isinstance(tensor, Tensor))
+    for value in vars(record).values():
+        if isinstance(value, Tensor):
+            yield value
+        elif isinstance(value, Mapping):
+            yield from (entry for entry in value.values() if isinstance(entry, Tensor))
 
 
 allow_loading(Control, Parameters)

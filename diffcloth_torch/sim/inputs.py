@@ -37,6 +37,7 @@ __all__ = [
     "check_parameters",
     "control_fields",
     "core_inputs",
+    "default_fields",
     "parameter_fields",
     "state_fields",
 ]
@@ -199,13 +200,11 @@ def control_fields(
 ) -> Fields:
     """Complete a control: prescribed things and pd targets hold the state's, the rest is zero."""
     checked = check_control(layout, Control() if control is None else control)
-    assembly = layout.assembly
-    pins = torch.from_numpy(assembly.pins.astype(np.int64))
     unset = {
-        "pins": state["positions"][:, pins],
+        "pins": state["positions"][:, layout.pins],
         "soft_pins": state["soft_pin_targets"],
         "body_poses": state["body_poses"],
-        "forces": _zeros(len(assembly.vertices), 3),
+        "forces": _zeros(len(layout.assembly.vertices), 3),
     }
     if layout.has_coordinates:
         unset |= {
@@ -316,33 +315,36 @@ def check_parameters(parameters: Parameters) -> Parameters:
 def parameter_fields(
     layout: Layout,
     parameters: Parameters,
-    defaults: Mapping[str, Tensor],
+    defaults: Fields,
     batch: int | None,
 ) -> Fields:
     """Check parameters; a field that is None takes the default, `defaults` has all there are."""
     checked = check_parameters(parameters)
-    fields = {}
+    fields = dict(defaults)
     for name, quantity in PARAMETERS.items():
         given = getattr(checked, name)
-        if name not in defaults:
-            if given is not None:
-                raise InvalidInput(
-                    f"parameters: `{name}` must be None: it has no meaning in this scene"
-                )
+        if given is None:
             continue
         label = f"parameters: `{name}`"
-        tensor = defaults[name] if given is None else given
-        if given is not None:
-            check_range(label, _numbers(tensor), quantity.accepted)
+        if name not in defaults:
+            raise InvalidInput(f"{label} must be None: it has no meaning in this scene")
+        check_range(label, _numbers(given), quantity.accepted)
         shared = layout.parameter_shapes[name]
-        unbatched = given is None or name in parameters._unbatched
-        environments = _environments(label, tuple(tensor.shape), shared, batch, unbatched)
-        row = quantity.row_shape
-        rows = tensor.numel() // (environments * math.prod(row))
-        fields[name] = tensor.reshape(environments, rows, *row)
-        if given is not None:
-            _check_values(layout, name, _numbers(fields[name]), _numbers(defaults[name]))
+        unbatched = name in parameters._unbatched
+        environments = _environments(label, tuple(given.shape), shared, batch, unbatched)
+        fields[name] = _rows(given, environments, quantity.row_shape)
+        _check_values(layout, name, _numbers(fields[name]), _numbers(defaults[name]))
     return fields
+
+
+def default_fields(defaults: Mapping[str, Tensor]) -> Fields:
+    """Give values of parameters, of one environment, the axes of fields."""
+    return {name: _rows(tensor, 1, PARAMETERS[name].row_shape) for name, tensor in defaults.items()}
+
+
+def _rows(tensor: Tensor, environments: int, row: Shape) -> Tensor:
+    rows = tensor.numel() // (environments * math.prod(row))
+    return tensor.reshape(environments, rows, *row)
 
 
 def _check_values(layout: Layout, name: str, values: FloatArray, default: FloatArray) -> None:

@@ -37,6 +37,7 @@ class Layout:
         state_shapes: Shape of each field of a state that a step looks at.
         control_shapes: Shape of each field of a control.
         parameter_shapes: Accepted shapes of each parameter.
+        pins: Vertices that are pinned, shape [P].
         bodies: Mechanism of each of the K bodies.
         robots: Mechanism of each of the R robots.
         trees: Kinematics of each robot.
@@ -67,6 +68,7 @@ class Layout:
         self.parameter_shapes = {
             name: [shape_of(axes, sizes) for axes in q.axes] for name, q in PARAMETERS.items()
         }
+        self.pins = torch.from_numpy(assembly.pins.astype(np.int64))
         self.bodies = assembly.mechanisms[: assembly.body_count]
         self.robots = assembly.mechanisms[assembly.body_count :]
         self.trees = tuple(Tree(robot) for robot in self.robots)

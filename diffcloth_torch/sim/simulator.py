@@ -42,6 +42,7 @@ from diffcloth_torch.sim.inputs import (
     check_parameters,
     control_fields,
     core_inputs,
+    default_fields,
     parameter_fields,
     state_fields,
 )
@@ -201,6 +202,7 @@ class Simulator:
             self._staggered = Staggered(coupling, self._layout, self._dynamics, options, stiffness)
         self._nonadjacent_distance = self._core.smallest_nonadjacent_distance()
         self._defaults = scene_parameters(scene, self._assembly, has_contact(scene, contact))
+        self._default_fields = default_fields(self._defaults)
         if has_barrier(scene, contact, scheme):
             self._choose_barrier()
         self._check_tolerance()
@@ -473,8 +475,7 @@ class Simulator:
 
     def _centers(self, owner: str, parameters: Parameters | None, batch: int | None) -> Tensor:
         """Centers of mass of bodies or links, zero where nothing is dynamic; [B or 1, rows, 3]."""
-        given = Parameters() if parameters is None else parameters
-        fields = parameter_fields(self._layout, given, self._defaults, batch)
+        fields = self._physical(parameters, batch)
         rows = self._assembly.sizes["K" if owner == "body" else "L"]
         return fields.get(f"{owner}_center", torch.zeros(1, rows, 3, dtype=torch.float64))
 
@@ -546,10 +547,16 @@ class Simulator:
         refuse_transforms(state, control, parameters)
         before, batch = state_fields(self._layout, state)
         wanted = control_fields(self._layout, control, before, batch)
-        given = Parameters() if parameters is None else parameters
-        physical = parameter_fields(self._layout, given, self._defaults, batch)
-        self._check_barrier("parameters", physical)
+        physical = self._physical(parameters, batch)
         return (before, wanted, physical), batch
+
+    def _physical(self, parameters: Parameters | None, batch: int | None) -> Fields:
+        """Check parameters and complete them by those of the scene, which are checked already."""
+        if parameters is None:
+            return self._default_fields
+        physical = parameter_fields(self._layout, parameters, self._default_fields, batch)
+        self._check_barrier("parameters", physical)
+        return physical
 
     def _predict(self, state: Fields, control: Fields, parameters: Fields) -> Prediction | None:
         """What bodies and robots do by themselves; None where all are bodies on known poses."""
@@ -565,8 +572,8 @@ class Simulator:
             inputs |= prediction.core_inputs()
         rest = inputs.get("rest_positions")
         if rest is not None and not rest.requires_grad:
-            scene_rest = self._defaults["rest_positions"].unsqueeze(0)
-            if torch.equal(rest, scene_rest):
+            scene_rest = self._default_fields["rest_positions"]
+            if rest is scene_rest or torch.equal(rest, scene_rest):
                 del inputs["rest_positions"]  # the core has prepared the rest shape of the scene
         return inputs
 
@@ -577,13 +584,14 @@ class Simulator:
             distance = choose_barrier_distance(self.scene, self._nonadjacent_distance, self.contact)
         self._defaults["slip_velocity"] = _scalar(self.contact.slip_velocity)
         self._defaults["barrier_distance"] = _scalar(distance)
-        fields = parameter_fields(self._layout, Parameters(), self._defaults, None)
-        self._check_barrier("Simulator", fields)
+        self._default_fields = default_fields(self._defaults)
+        self._check_barrier("Simulator", self._default_fields)
         stiffness = self.contact.barrier_stiffness
         if stiffness is None:
             inputs, _ = self._inputs(self.initial_state(), None, None)
             stiffness = self._core.default_barrier_stiffness(_arrays(inputs), distance)
         self._defaults["barrier_stiffness"] = _scalar(stiffness)
+        self._default_fields = default_fields(self._defaults)
 
     def _check_barrier(self, owner: str, inputs: Fields) -> None:
         cloths = len(self.scene.cloths)

@@ -11,6 +11,7 @@ from diffcloth_torch.model.scene import assemble
 from diffcloth_torch.sim.inputs import (
     check_control,
     control_fields,
+    default_fields,
     parameter_fields,
     state_fields,
 )
@@ -298,7 +299,7 @@ def with_row(tensor, row, value):
 def test_a_bad_parameter_is_refused(layout, defaults, name, row, value, message):
     wrong = dc.Parameters(**{name: with_row(defaults[name], row, value)})
     with pytest.raises(dc.InvalidInput, match=message):
-        parameter_fields(layout, wrong, defaults, None)
+        parameter_fields(layout, wrong, default_fields(defaults), None)
 
 
 def test_rows_of_what_forces_do_not_move_are_free(layout, defaults):
@@ -306,23 +307,22 @@ def test_rows_of_what_forces_do_not_move_are_free(layout, defaults):
         body_mass=with_row(defaults["body_mass"], 0, 7.0),
         body_inertia=with_row(defaults["body_inertia"], 1, -1.0),
     )
-    fields = parameter_fields(layout, given, defaults, None)
+    fields = parameter_fields(layout, given, default_fields(defaults), None)
     assert fields["body_mass"].tolist() == [[7.0, 0.0, 0.5]]
     assert fields["body_inertia"].shape == (1, 3, 3, 3)
 
 
 def test_an_inertia_means_its_symmetric_part(layout, defaults):
     skew = torch.tensor([[0, 1.0, 2], [-1, 0, 3], [-2, -3, 0]], dtype=F64)
-    parameter_fields(
-        layout, dc.Parameters(body_inertia=defaults["body_inertia"] + skew), defaults, None
-    )
+    given = dc.Parameters(body_inertia=defaults["body_inertia"] + skew)
+    parameter_fields(layout, given, default_fields(defaults), None)
 
 
 def test_batched_parameters_have_one_axis_more(layout, defaults):
     given = dc.Parameters(
         body_mass=1.0 + rows(2, 3), link_inertia=defaults["link_inertia"].expand(2, -1, -1, -1)
     )
-    fields = parameter_fields(layout, given, defaults, 2)
+    fields = parameter_fields(layout, given, default_fields(defaults), 2)
     assert fields["body_mass"].shape == (2, 3)
     assert fields["link_inertia"].shape[:2] == (2, 8)
     assert fields["gravity"].shape == (1, 3)
