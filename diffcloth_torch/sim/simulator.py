@@ -32,7 +32,7 @@ from diffcloth_torch.model.defaults import (
 )
 from diffcloth_torch.model.options import COUPLINGS, SCHEMES, ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import STATE, shape_of
-from diffcloth_torch.model.scene import Assembly, Scene, assemble
+from diffcloth_torch.model.scene import Scene, assemble
 from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.cores import CoreOptions, make_core
 from diffcloth_torch.sim.coupling import Staggered
@@ -51,7 +51,8 @@ from diffcloth_torch.sim.links import contact_wrenches, link_poses, link_velocit
 from diffcloth_torch.sim.motion import held_targets, prescribed_motion
 from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.rollout import roll_out
-from diffcloth_torch.sim.state import LinkSurfaces, State, Surfaces
+from diffcloth_torch.sim.schemes import check_scheme
+from diffcloth_torch.sim.state import State, Surfaces
 from diffcloth_torch.sim.step import Outcome, as_array, refuse_transforms, take_step
 
 __all__ = ["Simulator"]
@@ -163,19 +164,10 @@ class Simulator:
         self.dt = check_number("Simulator: `dt`", dt, POSITIVE, instead=instead)
         self.scheme = check_choice("Simulator: `scheme`", scheme, SCHEMES)
         self.coupling = check_choice("Simulator: `coupling`", coupling, COUPLINGS)
-        # The other schemes measure inertia in the masses; "mass", once the default, says just that.
-        if scheme != "split" and solver.metric not in (None, "mass"):
-            raise InvalidInput(
-                f"Simulator: `solver.metric` {solver.metric!r} needs scheme 'split', got {scheme!r}"
-            )
-        if scheme == "coupled" and solver.elastic == "projective":
-            raise InvalidInput(
-                "Simulator: `solver.elastic` 'projective' needs a scheme with an elastic stage of "
-                "its own, 'split' or 'projective'; 'coupled' has none"
-            )
         self._assembly = assemble(scene, all_nodal=scheme == "projective")
         self._layout = Layout(self._assembly)
-        _check_motion(self)
+        _check_gains(self._layout)
+        check_scheme(self.scheme, self.coupling, scene, self._layout, solver)
         self._dynamics = Dynamics(self._assembly, self.dt) if self._layout.has_coordinates else None
         self.surfaces = self._assembly.surface_names
         starts = self._assembly.cloth_vertex_start.tolist()
@@ -183,7 +175,7 @@ class Simulator:
         cloths = zip(scene.cloth_names, rows, strict=True)
         self.slices = {**dict(cloths), **self._layout.rigid_vertices}
         self.joint_slices = dict(self._assembly.joint_slices)
-        self._surfaces = _surfaces(scene, self._assembly)
+        self._surfaces = Surfaces.of(scene, self._assembly)
         # Without cloths there is nothing to split or to couple.
         options = CoreOptions(
             bending_models=[cloth.bending_model for cloth in scene.cloths],
@@ -644,62 +636,14 @@ def _restore(
     return Simulator(scene, dt, scheme=scheme, coupling=coupling, contact=contact, solver=solver)
 
 
-def _check_motion(simulator: Simulator) -> None:
-    """Refuse what the scheme cannot move, and drives without gains."""
-    layout, assembly = simulator._layout, simulator._assembly
-    if simulator.scheme == "split" and simulator.coupling == "monolithic" and layout.is_dynamic:
-        raise InvalidInput(
-            "Simulator: scheme 'split' takes prescribed bodies and the staggered couplings "
-            "'rigid_to_cloth' and 'cloth_to_rigid'; the scene has something that forces move and "
-            "`coupling` is 'monolithic'"
-        )
-    if simulator.scheme == "projective":
-        _check_projective(simulator.scene)
-    if simulator.scheme == "coupled":
-        for name, body in zip(simulator.scene.body_names, simulator.scene.bodies, strict=True):
-            if body.nodal_contact:
-                raise InvalidInput(
-                    "Simulator: scheme 'coupled' has no contact at nodes, which body "
-                    f"{name!r} asks for by `nodal_contact`; use scheme 'split' or 'projective'"
-                )
-    gains = assembly.stiffness + assembly.damping
+def _check_gains(layout: Layout) -> None:
+    gains = layout.assembly.stiffness + layout.assembly.damping
     for name, mode, gain in zip(layout.joint_names, layout.actuation, gains, strict=True):
         if mode == "pd" and gain == 0.0:
             raise InvalidInput(
                 f"Simulator: the pd joint {name!r} must have gains: give `stiffness` or `damping` "
                 "to its Robot, or another `actuation`"
             )
-
-
-def _check_projective(scene: Scene) -> None:
-    for name in scene.robot_names:
-        raise InvalidInput(f"Simulator: scheme 'projective' takes no robots, got {name!r}")
-    for name, body in zip(scene.body_names, scene.bodies, strict=True):
-        if body.motion == "dynamic":
-            raise InvalidInput(
-                "Simulator: scheme 'projective' takes static and kinematic bodies, got the "
-                f"dynamic body {name!r}"
-            )
-        if body.primitive is None:
-            raise InvalidInput(
-                "Simulator: scheme 'projective' takes bodies made by box, sphere, capsule or "
-                f"plane, got the mesh or cylinder {name!r}"
-            )
-
-
-def _surfaces(scene: Scene, assembly: Assembly) -> Surfaces:
-    starts = zip(scene.cloths, assembly.cloth_vertex_start.tolist(), strict=False)
-    return Surfaces(
-        cloth_names=list(scene.cloth_names),
-        cloth_faces=[torch.from_numpy(cloth.faces + start) for cloth, start in starts],
-        body_names=list(scene.body_names),
-        body_vertices=[torch.from_numpy(np.array(body.vertices)) for body in scene.bodies],
-        body_faces=[torch.from_numpy(np.array(body.faces)) for body in scene.bodies],
-        robots=tuple(
-            LinkSurfaces.of(name, robot)
-            for name, robot in zip(scene.robot_names, scene.robots, strict=True)
-        ),
-    )
 
 
 def _arrays(inputs: Fields) -> dict[str, NDArray[np.float64]]:

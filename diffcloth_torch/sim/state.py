@@ -20,6 +20,7 @@ from diffcloth_torch.model.kinematics import link_frames, pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.quantities import STATE, shape_of
 from diffcloth_torch.model.robot import Robot
+from diffcloth_torch.model.scene import Assembly, Scene
 from diffcloth_torch.sim.report import Report
 
 __all__ = ["State", "Surfaces", "check_field_names", "stack", "where"]
@@ -97,6 +98,22 @@ class Surfaces:
     body_vertices: list[Tensor]
     body_faces: list[Tensor]
     robots: tuple[LinkSurfaces, ...] = ()
+
+    @staticmethod
+    def of(scene: Scene, assembly: Assembly) -> Surfaces:
+        """Take them from a scene."""
+        starts = zip(scene.cloths, assembly.cloth_vertex_start.tolist(), strict=False)
+        return Surfaces(
+            cloth_names=list(scene.cloth_names),
+            cloth_faces=[torch.from_numpy(cloth.faces + start) for cloth, start in starts],
+            body_names=list(scene.body_names),
+            body_vertices=[torch.from_numpy(np.array(body.vertices)) for body in scene.bodies],
+            body_faces=[torch.from_numpy(np.array(body.faces)) for body in scene.bodies],
+            robots=tuple(
+                LinkSurfaces.of(name, robot)
+                for name, robot in zip(scene.robot_names, scene.robots, strict=True)
+            ),
+        )
 
 
 @dataclass(frozen=True, eq=False)
