@@ -13,6 +13,8 @@ class SimulationError(RuntimeError): ...
 
 def build_info() -> dict[str, Any]: ...
 
+class Kept: ...
+
 class Simulator:
     phases: list[str]
     largest_factor_bytes: int
@@ -56,5 +58,11 @@ class Simulator:
     def forget_factors(self) -> None: ...
     def forward(self, inputs: Arrays, tape: bool, threads: int) -> dict[str, Any]: ...
     def backward(
-        self, inputs: Arrays, tape: Arrays, cotangents: Arrays, needs: list[str], threads: int
+        self,
+        inputs: Arrays,
+        tape: Arrays,
+        kept: Kept,
+        cotangents: Arrays,
+        needs: list[str],
+        threads: int,
     ) -> Arrays: ...

@@ -46,6 +46,7 @@ def backward(sim, inputs, out, **changes):
     arguments = {
         "inputs": inputs,
         "tape": {name: array for name, array in out.items() if name.startswith("tape_")},
+        "kept": out["kept"],
         "cotangents": {
             name: np.ones_like(out[name])
             for name in ("positions", "velocities", "body_forces", "coordinates")
@@ -129,7 +130,8 @@ def test_a_tape_or_cotangent_of_another_size_is_refused(scheme, kind):
             bad = wrong(array)[kind]
             if bad.size == array.size:
                 continue
-            arguments = {"tape": tape, "cotangents": cotangents} | {key: table | {name: bad}}
+            arguments = {"tape": tape, "kept": out["kept"], "cotangents": cotangents}
+            arguments |= {key: table | {name: bad}}
             with pytest.raises(ValueError, match=f"core: `{name}` must have"):
                 sim._core.backward(inputs, *arguments.values(), list(inputs), 1)
             without = {other: a for other, a in table.items() if other != name}

@@ -107,6 +107,11 @@ struct Arrays {
   }
 };
 
+/// What a step with a tape keeps for its backward, environment by environment: given up with the tape.
+struct KeptSteps {
+  std::vector<std::shared_ptr<step::FactorCache::Ticket>> tickets;
+};
+
 class Simulator {
  public:
   explicit Simulator(step::Description description) : scene_(std::move(description)) {}
@@ -114,6 +119,7 @@ class Simulator {
   nb::dict forward(const nb::dict& inputs, bool tape, int threads);
   nb::dict backward(const nb::dict& inputs,
                     const nb::dict& tape,
+                    const KeptSteps& kept,
                     const nb::dict& cotangents,
                     const std::vector<std::string>& needs,
                     int threads);
@@ -263,17 +269,22 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   const Outputs tapes(tape ? step::tape_fields(scene_) : std::vector<step::Field>(), b, "tape_",
                       out);
   std::vector<step::Report> reports(b);
+  KeptSteps kept{.tickets = decltype(KeptSteps::tickets)(b)};
   for_environments(b, threads, [&](Index i, const Checkpoint& checkpoint) {
     const auto e = static_cast<std::size_t>(i);
+    step::Kept found;
     reports[e] = step::forward(scene_, arrays.environment(e), checkpoint, outputs.environment(e),
-                               tapes.environment(e), &factors_, nullptr);
+                               tapes.environment(e), found, nullptr);
+    if (tape) kept.tickets[e] = factors_.insert(std::move(found));
   });
+  if (tape) out["kept"] = nb::cast(std::move(kept));
   add_reports(reports, out);
   return out;
 }
 
 nb::dict Simulator::backward(const nb::dict& inputs,
                              const nb::dict& tape,
+                             const KeptSteps& kept,
                              const nb::dict& cotangents,
                              const std::vector<std::string>& needs,
                              int threads) {
@@ -281,6 +292,9 @@ nb::dict Simulator::backward(const nb::dict& inputs,
   const std::size_t b = arrays.environments;
   const Saved tapes(step::tape_fields(scene_), b, "tape_", tape);
   if (!tapes.is_finite()) throw nb::value_error("core: the tape must be finite");
+  if (kept.tickets.size() != b) {
+    throw nb::value_error("core: `kept` must be of as many environments as the inputs");
+  }
   const Saved bars(step::output_fields(scene_), b, "", cotangents);
 
   // Each environment writes into its own copy; shared inputs are then summed in index order.
@@ -318,8 +332,8 @@ nb::dict Simulator::backward(const nb::dict& inputs,
     if (bars.is_zero(e)) return;
     step::Gradients gradients;
     for (Wanted& w : wanted) gradients.data[w.input] = w.own.data() + e * w.count;
-    step::backward(scene_, arrays.environment(e), tapes.environment(e), bars.environment(e),
-                   checkpoint, gradients, factors_);
+    step::backward(scene_, arrays.environment(e), tapes.environment(e), *kept.tickets[e]->find(),
+                   bars.environment(e), checkpoint, gradients);
   });
   for (const Wanted& w : wanted) {
     for (std::size_t e = 0; e < b; ++e) {
@@ -336,7 +350,8 @@ nb::object Simulator::path(const nb::dict& inputs) {
   const Outputs outputs(step::output_fields(scene_), 1, "", unused);
   std::vector<std::vector<double>> path;
   for_environments(1, 1, [&](Index, const Checkpoint& checkpoint) {
-    step::forward(scene_, arrays.environment(0), checkpoint, outputs.environment(0), {}, nullptr,
+    step::Kept kept;
+    step::forward(scene_, arrays.environment(0), checkpoint, outputs.environment(0), {}, kept,
                   &path);
   });
   const auto all = static_cast<std::size_t>(scene_.vertex_count());
@@ -510,6 +525,7 @@ void simulator(nb::module_& m) {
   static nb::object simulation_error =
       nb::exception<std::domain_error>(m, "SimulationError", PyExc_RuntimeError);
 
+  nb::class_<KeptSteps>(m, "Kept");
   nb::class_<Simulator>(m, "Simulator")
       .def("__init__",
            [](Simulator* self, nb::kwargs k) {
@@ -553,8 +569,8 @@ void simulator(nb::module_& m) {
              new (self) Simulator(std::move(description));
            })
       .def("forward", &Simulator::forward, "inputs"_a, "tape"_a, "threads"_a)
-      .def("backward", &Simulator::backward, "inputs"_a, "tape"_a, "cotangents"_a, "needs"_a,
-           "threads"_a)
+      .def("backward", &Simulator::backward, "inputs"_a, "tape"_a, "kept"_a, "cotangents"_a,
+           "needs"_a, "threads"_a)
       .def("energy", &Simulator::energy, "inputs"_a)
       .def("path", &Simulator::path, "inputs"_a,
            "Accepted iterates of the first environment's step [M, N + V, 3].")

@@ -296,7 +296,7 @@ void ContactStage::backward(const Backward& step, Array g) {
     sum.adopt(std::move(contacts));
     problem.coordinates.stand_at(x.data());
     const std::size_t place = first_factor + k;
-    const FactorCache::Factors& factors = step.kept.factors;
+    const auto& factors = step.kept.factors;
     pull_back_solve(step, sum.objective, x, place < factors.size() ? factors[place] : nullptr, g,
                     k + 1 == solves ? &bars.body_forces : nullptr);
 

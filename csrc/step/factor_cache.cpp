@@ -1,42 +1,58 @@
 #include "step/factor_cache.h"
 
+#include <iterator>
+#include <utility>
+
 namespace diffcloth::step {
 
-std::int64_t FactorCache::insert(Kept kept) {
-  std::size_t bytes = 0;
-  for (const auto& factor : kept.factors) {
-    if (factor) bytes += factor->bytes();
+std::size_t Kept::bytes() const {
+  std::size_t sum = 0;
+  for (const auto& factor : factors) {
+    if (factor) sum += factor->bytes();
   }
-  for (const auto& contacts : kept.contacts) bytes += contacts.size() * sizeof(contact::Contact);
-  const std::lock_guard lock(mutex_);
-  const std::int64_t key = next_++;
-  entries_.push_back(
-      {.key = key, .bytes = bytes, .kept = std::make_shared<const Kept>(std::move(kept))});
-  bytes_ += bytes;
-  while (bytes_ > kBytes) {
-    bytes_ -= entries_.front().bytes;
-    entries_.pop_front();
-  }
-  return key;
+  for (const auto& list : contacts) sum += list.size() * sizeof(contact::Contact);
+  return sum;
 }
 
-std::shared_ptr<const FactorCache::Kept> FactorCache::find(std::int64_t key) const {
-  const std::lock_guard lock(mutex_);
-  for (const Entry& entry : entries_) {
-    if (entry.key == key) return entry.kept;
+void FactorCache::Room::shrink(std::size_t largest) {
+  const std::lock_guard lock(mutex);
+  while (bytes > largest) {
+    bytes -= entries.front().bytes;
+    entries.front().ticket->entry_ = entries.end();
+    entries.pop_front();
   }
-  return std::make_shared<const Kept>();
+}
+
+std::unique_ptr<FactorCache::Ticket> FactorCache::insert(Kept kept) {
+  std::unique_ptr<Ticket> ticket(new Ticket(room_, std::move(kept)));
+  room_->shrink(kBytes);
+  return ticket;
 }
 
 std::size_t FactorCache::bytes() const {
-  const std::lock_guard lock(mutex_);
-  return bytes_;
+  const std::lock_guard lock(room_->mutex);
+  return room_->bytes;
 }
 
-void FactorCache::clear() {
-  const std::lock_guard lock(mutex_);
-  entries_.clear();
-  bytes_ = 0;
+FactorCache::Ticket::Ticket(std::shared_ptr<Room> room, Kept kept) : room_(std::move(room)) {
+  const std::size_t bytes = kept.bytes();
+  auto shared = std::make_shared<const Kept>(std::move(kept));
+  const std::lock_guard lock(room_->mutex);
+  room_->entries.push_back({.bytes = bytes, .kept = std::move(shared), .ticket = this});
+  room_->bytes += bytes;
+  entry_ = std::prev(room_->entries.end());
+}
+
+FactorCache::Ticket::~Ticket() {
+  const std::lock_guard lock(room_->mutex);
+  if (entry_ == room_->entries.end()) return;
+  room_->bytes -= entry_->bytes;
+  room_->entries.erase(entry_);
+}
+
+std::shared_ptr<const Kept> FactorCache::Ticket::find() const {
+  const std::lock_guard lock(room_->mutex);
+  return entry_ != room_->entries.end() ? entry_->kept : std::make_shared<const Kept>();
 }
 
 }  // namespace diffcloth::step

@@ -1,6 +1,6 @@
 #pragma once
 
-#include <cstdint>
+#include <cstddef>
 #include <list>
 #include <memory>
 #include <mutex>
@@ -11,27 +11,28 @@
 
 namespace diffcloth::step {
 
-/// Factors and contacts of recent steps, by key, up to a number of bytes; the oldest go first.
-///
-/// Both are functions of the point where they were found: backward finds what is gone again, with the
-/// same bits.
+/// What forward leaves for backward to use again. All of it is a function of the inputs and the tape:
+/// backward finds what is gone again, with the same bits.
+struct Kept {
+  /// Of one step, each in its scheme's own order.
+  std::vector<std::shared_ptr<const linalg::CholeskyFactor>> factors;
+  std::vector<std::vector<contact::Contact>> contacts;
+
+  std::size_t bytes() const;
+};
+
+/// What is kept of steps whose backward can still be asked for, up to a number of bytes; the oldest go
+/// first.
 class FactorCache {
  public:
-  using Factors = std::vector<std::shared_ptr<const linalg::CholeskyFactor>>;
-  using Contacts = std::vector<std::vector<contact::Contact>>;
+  class Ticket;
 
-  /// Of one step, each in its scheme's own order.
-  struct Kept {
-    Factors factors;
-    Contacts contacts;
-  };
+  FactorCache() : room_(std::make_shared<Room>()) {}
 
-  std::int64_t insert(Kept kept);
+  /// Keep something for as long as its ticket lives, and there is room.
+  std::unique_ptr<Ticket> insert(Kept kept);
 
-  /// What is kept of a key; empty where it is gone.
-  std::shared_ptr<const Kept> find(std::int64_t key) const;
-
-  void clear();
+  void clear() { room_->shrink(0); }
 
   /// What everything that is kept takes up; at most kBytes.
   std::size_t bytes() const;
@@ -40,14 +41,41 @@ class FactorCache {
 
  private:
   struct Entry {
-    std::int64_t key;
     std::size_t bytes;
     std::shared_ptr<const Kept> kept;
+    Ticket* ticket;
   };
-  mutable std::mutex mutex_;
-  std::list<Entry> entries_;  // oldest first
-  std::size_t bytes_ = 0;
-  std::int64_t next_ = 1;
+
+  /// Shared with the tickets, which may outlive the cache.
+  struct Room {
+    mutable std::mutex mutex;
+    std::list<Entry> entries;  // oldest first
+    std::size_t bytes = 0;
+
+    /// Drop the oldest until no more than this is left.
+    void shrink(std::size_t largest);
+  };
+
+  std::shared_ptr<Room> room_;
+};
+
+/// The right to what is kept of one step.
+class FactorCache::Ticket {
+ public:
+  ~Ticket();
+  Ticket(const Ticket&) = delete;
+  Ticket& operator=(const Ticket&) = delete;
+
+  /// What is kept; nothing where it had to go.
+  std::shared_ptr<const Kept> find() const;
+
+ private:
+  friend class FactorCache;
+
+  Ticket(std::shared_ptr<Room> room, Kept kept);
+
+  std::shared_ptr<Room> room_;
+  std::list<Entry>::iterator entry_;  // the end where it had to go
 };
 
 }  // namespace diffcloth::step

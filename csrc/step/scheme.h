@@ -19,7 +19,7 @@ struct Forward {
   contact::Detection& detection;
   solver::Context& context;
   const Arrays<double>& tape;  ///< empty where no tape is wanted
-  FactorCache::Kept& kept;     ///< for backward
+  Kept& kept;                  ///< for backward
   Report& report;
 };
 
@@ -29,7 +29,7 @@ struct Backward {
   contact::Detection& detection;
   solver::Context& context;
   const Arrays<const double>& tape;
-  const FactorCache::Kept& kept;  ///< empty where it is gone
+  const Kept& kept;  ///< empty where it is gone
   Cotangents& cotangents;
 };
 

@@ -30,11 +30,7 @@ std::vector<Field> output_fields(const Scene& scene) {
   return fields;
 }
 
-std::vector<Field> tape_fields(const Scene& scene) {
-  std::vector<Field> fields = scene.scheme->tape(scene);
-  fields.push_back({.name = "key", .shape = {1}});
-  return fields;
-}
+std::vector<Field> tape_fields(const Scene& scene) { return scene.scheme->tape(scene); }
 
 std::string find_overlap(const Scene& scene, const Inputs& inputs) {
   std::vector<double> thickness(static_cast<std::size_t>(scene.surface_count()), 0.0);
@@ -53,7 +49,7 @@ Report forward(const Scene& scene,
                const Checkpoint& checkpoint,
                const Arrays<double>& outputs,
                const Arrays<double>& tape,
-               FactorCache* factors,
+               Kept& kept,
                std::vector<std::vector<double>>* path) {
   Stopwatch watch;
   Report report;
@@ -85,7 +81,6 @@ Report forward(const Scene& scene,
                           .watch = &watch,
                           .counts = &report.counts,
                           .path = path};
-  FactorCache::Kept kept;
   std::vector<double> x = problem.start;
   scene.scheme->forward({.problem = problem,
                          .detection = detection,
@@ -102,7 +97,6 @@ Report forward(const Scene& scene,
   for (std::size_t a = 0; a < problem.cloth_size; ++a) {
     velocities[a] = (positions[a] - problem.start[a]) / problem.h;
   }
-  if (!tape.empty()) *tape["key"] = static_cast<double>(factors->insert(std::move(kept)));
   report.iterations = context.iterations;
   report.seconds = watch.read();
   return report;
@@ -111,10 +105,10 @@ Report forward(const Scene& scene,
 void backward(const Scene& scene,
               const Inputs& inputs,
               const Arrays<const double>& tape,
+              const Kept& kept,
               const Arrays<const double>& cotangents,
               const Checkpoint& checkpoint,
-              const Gradients& gradients,
-              FactorCache& factors) {
+              const Gradients& gradients) {
   Stopwatch watch;
   solver::Counts counts;
   contact::Detection detection(scene.broad_phase);
@@ -141,12 +135,11 @@ void backward(const Scene& scene,
                           .workspace = &workspace,
                           .watch = &watch,
                           .counts = &counts};
-  const auto kept = factors.find(static_cast<std::int64_t>(*tape["key"]));
   scene.scheme->backward({.problem = problem,
                           .detection = detection,
                           .context = context,
                           .tape = tape,
-                          .kept = *kept,
+                          .kept = kept,
                           .cotangents = bars});
   bars.add_predicted(problem, gradients);
   bars.write(problem, gradients);

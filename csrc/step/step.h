@@ -17,34 +17,35 @@ namespace diffcloth::step {
 /// are any, "coordinates" [n].
 std::vector<Field> output_fields(const Scene& scene);
 
-/// What backward needs of forward: the fields of the scheme, and "key", of factors in the cache.
+/// What backward needs of forward beyond the inputs: the fields of the scheme.
 std::vector<Field> tape_fields(const Scene& scene);
 
 /// One step of the scene's scheme.
 ///
 /// @param outputs  named like output_fields(), zeroed
 /// @param tape     named like tape_fields(), zeroed; empty where no tape is wanted
-/// @param factors  where the factors for backward are kept; null without a tape
+/// @param kept     for backward; nothing where it failed
 /// @param path     where the accepted iterates (all vertices) are appended, or null
 Report forward(const Scene& scene,
                const Inputs& inputs,
                const Checkpoint& checkpoint,
                const Arrays<double>& outputs,
                const Arrays<double>& tape,
-               FactorCache* factors,
+               Kept& kept,
                std::vector<std::vector<double>>* path);
 
 /// Gradients of a step that forward() took: see contact_stage.cpp for the derivation.
 ///
+/// @param kept        what forward kept, or nothing
 /// @param cotangents  of the outputs, by their names
 /// @throws std::domain_error when the solution is not a local minimum.
 void backward(const Scene& scene,
               const Inputs& inputs,
               const Arrays<const double>& tape,
+              const Kept& kept,
               const Arrays<const double>& cotangents,
               const Checkpoint& checkpoint,
-              const Gradients& gradients,
-              FactorCache& factors);
+              const Gradients& gradients);
 
 /// Where surfaces overlap at the start of the step, or are closer than their thickness; else empty.
 std::string find_overlap(const Scene& scene, const Inputs& inputs);

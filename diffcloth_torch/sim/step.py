@@ -49,6 +49,7 @@ CONVERGED, UNCONVERGED, INFEASIBLE, INTERSECTING = 0, 1, 2, 3
 # The last one only of scenes that have coordinates.
 _OUTPUTS = ("positions", "velocities", "body_forces", "coordinates")
 _TAPE = "tape_"
+_KEPT = "kept"
 _TRANSFORMS = (
     "step: torch.func transforms, forward-mode derivatives and vectorized Jacobians are not "
     "supported; use torch.autograd.grad or .backward(), and a loop over the rows of a Jacobian"
@@ -153,6 +154,8 @@ class _Step(torch.autograd.Function):
         ctx.save_for_backward(*tensors, *tape.values())
         ctx.shapes = [t.shape for t in (*tensors, *tape.values())]
         ctx.core, ctx.names, ctx.tape_names, ctx.batched = core, names, tuple(tape), batched
+        # Factors and contacts, which the core forgets when the graph goes.
+        ctx.kept = result.pop(_KEPT)
         diagnostics.update(_diagnostics(result))
         ctx.unconverged = np.flatnonzero(result["status"] != CONVERGED).tolist()
         return _outputs(result, batched)
@@ -213,6 +216,7 @@ def _backward(ctx, saved, cotangents, needs):
         gradients = ctx.core.backward(
             dict(zip(ctx.names, arrays[:count], strict=True)),
             dict(zip(ctx.tape_names, arrays[count:], strict=True)),
+            ctx.kept,
             {name: as_array(c) for name, c in zip(_OUTPUTS, seeds, strict=False)},
             needs,
             torch.get_num_threads(),

@@ -122,9 +122,9 @@ def test_only_what_is_needed_is_computed(coupled, monkeypatch):
         def __getattr__(self, name):
             return getattr(core, name)
 
-        def backward(self, inputs, tape, cotangents, needs, threads):
+        def backward(self, inputs, tape, kept, cotangents, needs, threads):
             asked.append(sorted(needs))
-            return core.backward(inputs, tape, cotangents, needs, threads)
+            return core.backward(inputs, tape, kept, cotangents, needs, threads)
 
     monkeypatch.setattr(coupled.sim, "_core", Spy())
     values = {k: t.clone() for k, t in coupled.inputs().items()}

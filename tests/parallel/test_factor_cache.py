@@ -1,5 +1,7 @@
 """Factors are kept for backward up to a number of bytes, and made again where they are gone."""
 
+import gc
+
 import pytest
 import torch
 from parallel_scenes import batch, simulator
@@ -22,6 +24,31 @@ def test_factors_are_kept_up_to_a_number_of_bytes():
     assert sizes[-1] > largest - sizes[0] - 1
     core.forget_factors()
     assert core.factor_bytes == 0
+
+
+def test_factors_go_with_the_graph_that_may_ask_for_them():
+    sim, state = simulator(12), batch(12, 2)
+    x = state.positions.clone().requires_grad_()
+    for _ in range(3):
+        after = sim.step(state.replace(positions=x))
+        (after.positions**2).sum().backward()
+        of_one_step = sim._core.factor_bytes
+    assert of_one_step > 0
+    kept = [sim.step(state.replace(positions=x)) for _ in range(2)]
+    assert sim._core.factor_bytes == 3 * of_one_step
+    del after, kept
+    assert sim._core.factor_bytes == 0
+
+
+@pytest.mark.boundary
+def test_what_is_kept_may_outlive_its_simulator():
+    sim = dc.Simulator(dc.Scene([dc.Cloth.grid(5, 5)]), 0.01)
+    state = sim.initial_state()
+    after = sim.step(state.replace(velocities=state.velocities.clone().requires_grad_()))
+    assert sim._core.factor_bytes > 0
+    del sim
+    gc.collect()
+    after.positions.sum().backward()
 
 
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
