@@ -70,6 +70,13 @@ def hanging(n: int) -> Scene:
     return Scene(dc.Scene([dc.Cloth(vertices, faces, pins=pins)]), approach=10)
 
 
+def stiff(n: int) -> Scene:
+    """Hang upright by two corners, so stiff that the sheet buckles: free of contact."""
+    pins = {"corners": [n * (n - 1), n * n - 1]}
+    cloth = _upright(n, pins=pins, material=dc.Material(stretch=1e4))
+    return Scene(dc.Scene([cloth]), approach=10)
+
+
 def plane(n: int) -> Scene:
     """Slide on a floor: every vertex in contact."""
     vertices, faces = sheet(n)
@@ -100,6 +107,17 @@ def self_contact(n: int) -> Scene:
     return Scene(dc.Scene([cloth]), approach=14)
 
 
+def two_sheets(n: int) -> Scene:
+    """Drop a turned sheet on another one, whose edges are held."""
+    vertices, faces = sheet(n)
+    rim = np.abs(vertices[:, :2]).max(axis=1) > 0.5 - 1e-9
+    lower = dc.Cloth(vertices, faces, pins={"rim": np.flatnonzero(rim).tolist()})
+    c, s = np.cos(0.3), np.sin(0.3)
+    turned = 0.6 * vertices @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    turned[:, 2] += 0.5 / (n - 1)
+    return Scene(dc.Scene([lower, dc.Cloth(turned, faces)]), approach=14)
+
+
 def moving_body(n: int) -> Scene:
     """Push a box into a sheet that hangs by its upper edge."""
     cloth = _upright(n, pins={"edge": range(n * (n - 1), n * n)})
@@ -109,9 +127,11 @@ def moving_body(n: int) -> Scene:
 
 SCENES: dict[str, Callable[[int], Scene]] = {
     "hanging": hanging,
+    "stiff": stiff,
     "plane": plane,
     "sphere": sphere,
     "self-contact": self_contact,
+    "two-sheets": two_sheets,
     "moving-body": moving_body,
 }
 

@@ -9,8 +9,19 @@
 namespace diffcloth::contact {
 namespace {
 
-/// Items a leaf may hold: few enough that two leaves are compared outright.
-constexpr Index kLeafSize = 4;
+constexpr Index kLeafSize = kBoxGroup;
+
+/// Smallest box around a group; NaN does not count.
+Box around(const BoxGroup& group) {
+  Box box = kEmptyBox;
+  for (int axis = 0; axis < 3; ++axis) {
+    for (int k = 0; k < kBoxGroup; ++k) {
+      box.lo[axis] = std::min(box.lo[axis], group.lo[axis][k]);
+      box.hi[axis] = std::max(box.hi[axis], group.hi[axis][k]);
+    }
+  }
+  return box;
+}
 
 }  // namespace
 
@@ -50,14 +61,8 @@ void BoxTree::refit(Boxes& boxes) const {
   boxes.nodes.resize(nodes_.size());
   for (std::size_t k = nodes_.size(); k-- > 0;) {
     const Node& node = nodes_[k];
-    if (node.left > 0) {
-      boxes.nodes[k] = united(boxes.nodes[node.left], boxes.nodes[node.left + 1]);
-    } else {
-      boxes.nodes[k] = boxes.items[node.first];
-      for (Index i = node.first + 1; i < node.last; ++i) {
-        boxes.nodes[k] = united(boxes.nodes[k], boxes.items[i]);
-      }
-    }
+    boxes.nodes[k] = node.left > 0 ? united(boxes.nodes[node.left], boxes.nodes[node.left + 1])
+                                   : around(boxes.items[node.first / kLeafSize]);
   }
 }
 

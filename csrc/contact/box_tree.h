@@ -2,10 +2,13 @@
 
 #include <algorithm>
 #include <array>
+#include <cstddef>
+#include <limits>
 #include <span>
 #include <vector>
 
 #include "common/types.h"
+#include "contact/box_group.h"
 
 namespace diffcloth::contact {
 
@@ -14,6 +17,12 @@ struct Box {
   std::array<double, 3> lo;
   std::array<double, 3> hi;
 };
+
+inline constexpr Box kEmptyBox{
+    .lo = {std::numeric_limits<double>::infinity(), std::numeric_limits<double>::infinity(),
+           std::numeric_limits<double>::infinity()},
+    .hi = {-std::numeric_limits<double>::infinity(), -std::numeric_limits<double>::infinity(),
+           -std::numeric_limits<double>::infinity()}};
 
 /// Whether two closed boxes have a point in common; in full, because the outcome of each comparison
 /// is as good as random.
@@ -48,8 +57,8 @@ inline Box united(const Box& a, const Box& b) {
 /// that what a search visits, and in which order, does not depend on earlier searches.
 class BoxTree {
  public:
-  /// A node holds the items first .. last - 1 of items(); a leaf has no children (left = 0).
-  /// Its children are the nodes left and left + 1, behind the node itself.
+  /// A node holds the items first .. last - 1 of items(); a leaf has no children (left = 0), and its
+  /// items are one group. Its children are the nodes left and left + 1, behind the node itself.
   struct Node {
     Index first;
     Index last;
@@ -58,7 +67,7 @@ class BoxTree {
 
   /// Boxes of a tree at one moment, in the order of items() and of nodes().
   struct Boxes {
-    std::vector<Box> items;
+    std::vector<BoxGroup> items;
     std::vector<Box> nodes;
   };
 
@@ -72,10 +81,24 @@ class BoxTree {
   const std::vector<Index>& items() const { return items_; }
   const std::vector<Node>& nodes() const { return nodes_; }
 
-  /// Recompute the nodes' boxes from boxes.items.
-  void refit(Boxes& boxes) const;
+  /// Compute the boxes of all items and nodes from those of the items.
+  template <class BoxOf>
+  void fit(Boxes& boxes, BoxOf&& box_of) const {
+    boxes.items.resize((items_.size() + kBoxGroup - 1) / kBoxGroup);
+    for (std::size_t k = 0; k < kBoxGroup * boxes.items.size(); ++k) {
+      const Box box = k < items_.size() ? box_of(items_[k]) : kEmptyBox;
+      BoxGroup& group = boxes.items[k / kBoxGroup];
+      for (int axis = 0; axis < 3; ++axis) {
+        group.lo[axis][k % kBoxGroup] = box.lo[axis];
+        group.hi[axis][k % kBoxGroup] = box.hi[axis];
+      }
+    }
+    refit(boxes);
+  }
 
  private:
+  void refit(Boxes& boxes) const;
+
   std::vector<Index> items_;
   std::vector<Node> nodes_;
 };

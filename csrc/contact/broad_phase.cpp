@@ -2,7 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
+#include <cstdint>
 #include <numeric>
 #include <span>
 #include <utility>
@@ -27,8 +27,36 @@ bool has_vertex(const CollisionMesh::Face& face, Index v) {
   return (face[0] == v) | (face[1] == v) | (face[2] == v);
 }
 
-/// Append all (item of a, item of b) whose boxes are within range. Which items of two leaves do is as good
-/// as random: every pair is written, and kept by counting on, which spares the processor the guess.
+NearBoxes near_boxes_here() {
+  static const NearBoxes best = near_boxes(linalg::best_level());
+  return best;
+}
+
+/// Append the pairs of items of two leaves that are near each other. Which are is as good as random: every
+/// pair is written, and kept by counting on, which spares the processor the guess.
+void append_pairs(const BoxTree& tree_a,
+                  Index first_a,
+                  const BoxTree& tree_b,
+                  Index first_b,
+                  std::uint32_t near,
+                  PairList& pairs) {
+  if (near == 0) return;
+  IndexPair* end = pairs.room(kBoxGroup * kBoxGroup);
+  // What a leaf does not hold is near nothing; it is not read either.
+  const Index size_a = std::min<Index>(kBoxGroup, tree_a.items().size() - first_a);
+  const Index size_b = std::min<Index>(kBoxGroup, tree_b.items().size() - first_b);
+  const Index* const a = tree_a.items().data() + first_a;
+  const Index* const b = tree_b.items().data() + first_b;
+  for (Index k = 0; k < size_a; ++k) {
+    for (Index l = 0; l < size_b; ++l) {
+      *end = {a[k], b[l]};
+      end += (near >> (kBoxGroup * k + l)) & 1U;
+    }
+  }
+  pairs.end_at(end);
+}
+
+/// Append all (item of a, item of b) whose boxes are within range.
 void append_overlaps(const BoxTree& tree_a,
                      const BoxTree::Boxes& a,
                      const BoxTree& tree_b,
@@ -36,6 +64,7 @@ void append_overlaps(const BoxTree& tree_a,
                      double range,
                      PairList& stack,
                      PairList& pairs) {
+  const NearBoxes near = near_boxes_here();
   if (tree_a.empty() || tree_b.empty() || !overlap(a.nodes[0], b.nodes[0])) return;
   stack.clear();
   stack.push({0, 0});
@@ -44,14 +73,8 @@ void append_overlaps(const BoxTree& tree_a,
     const BoxTree::Node& p = tree_a.nodes()[i];
     const BoxTree::Node& q = tree_b.nodes()[j];
     if (p.left == 0 && q.left == 0) {
-      IndexPair* end = pairs.room((p.last - p.first) * (q.last - q.first));
-      for (Index k = p.first; k < p.last; ++k) {
-        for (Index l = q.first; l < q.last; ++l) {
-          *end = {tree_a.items()[k], tree_b.items()[l]};
-          end += are_near(a.items[k], b.items[l], range);
-        }
-      }
-      pairs.end_at(end);
+      append_pairs(tree_a, p.first, tree_b, q.first,
+                   near(a.items[p.first / kBoxGroup], b.items[q.first / kBoxGroup], range), pairs);
       continue;
     }
     const bool split_a = q.left == 0 || (p.left != 0 && p.last - p.first >= q.last - q.first);
@@ -73,6 +96,8 @@ void append_self_overlaps(const BoxTree& tree,
                           PairList& stack,
                           PairList& pairs) {
   if (tree.empty()) return;
+  constexpr std::uint32_t kAbove = 0b0000'1000'1100'1110;  // bits of l > k
+  const NearBoxes near = near_boxes_here();
   stack.clear();
   stack.push({0, 0});
   while (stack.size() > 0) {
@@ -80,14 +105,9 @@ void append_self_overlaps(const BoxTree& tree,
     const BoxTree::Node& p = tree.nodes()[i];
     const BoxTree::Node& q = tree.nodes()[j];
     if (p.left == 0 && q.left == 0) {
-      IndexPair* end = pairs.room((p.last - p.first) * (q.last - q.first));
-      for (Index k = p.first; k < p.last; ++k) {
-        for (Index l = i == j ? k + 1 : q.first; l < q.last; ++l) {
-          *end = {tree.items()[k], tree.items()[l]};
-          end += are_near(boxes.items[k], boxes.items[l], range);
-        }
-      }
-      pairs.end_at(end);
+      const BoxGroup& group = boxes.items[p.first / kBoxGroup];
+      const std::uint32_t found = near(group, boxes.items[q.first / kBoxGroup], range);
+      append_pairs(tree, p.first, tree, q.first, i == j ? found & kAbove : found, pairs);
     } else if (i == j) {
       stack.push({p.left, p.left});
       stack.push({p.left + 1, p.left + 1});
@@ -137,10 +157,6 @@ void sort_pairs(PairList& pairs, BroadPhase::Scratch& scratch) {
     first = last;
   }
 }
-
-constexpr double kInfinity = std::numeric_limits<double>::infinity();
-constexpr Box kEmptyBox{.lo = {kInfinity, kInfinity, kInfinity},
-                        .hi = {-kInfinity, -kInfinity, -kInfinity}};
 
 Box point_box(const double* x, Index v) {
   const std::array<double, 3> p{x[3 * v], x[3 * v + 1], x[3 * v + 2]};
@@ -226,18 +242,13 @@ void BroadPhase::fit(const Sweep& sweep, Index surface, const Vec3& frame, Scrat
     scratch.vertex_boxes[v] =
         swept(point_box(sweep.x_t0, v), point_box(sweep.x_t1, v), frame, sweep.reach[surface]);
   }
-  const auto fit_tree = [&](const BoxTree& tree, BoxTree::Boxes& target, auto&& box_of) {
-    target.items.resize(tree.items().size());
-    for (std::size_t k = 0; k < target.items.size(); ++k) target.items[k] = box_of(tree.items()[k]);
-    tree.refit(target);
-  };
   const std::vector<Box>& of_vertex = scratch.vertex_boxes;
-  fit_tree(trees.vertices, boxes.vertices, [&](Index v) { return of_vertex[v]; });
-  fit_tree(trees.edges, boxes.edges, [&](Index e) {
+  trees.vertices.fit(boxes.vertices, [&](Index v) { return of_vertex[v]; });
+  trees.edges.fit(boxes.edges, [&](Index e) {
     const auto& [i, j] = mesh_.edges[e];
     return united(of_vertex[i], of_vertex[j]);
   });
-  fit_tree(trees.faces, boxes.faces, [&](Index f) {
+  trees.faces.fit(boxes.faces, [&](Index f) {
     const auto& [i, j, k] = mesh_.faces[f];
     return united(united(of_vertex[i], of_vertex[j]), of_vertex[k]);
   });

@@ -34,6 +34,23 @@ Differences between(PairKind kind, const Corners& x) {
   __builtin_unreachable();
 }
 
+/// Whether the boxes around the two motions are farther apart than `gap` along an axis. They are finite.
+bool stay_apart(PairKind kind, const Corners& x_t0, const Corners& x_t1, double gap) {
+  std::array<Vec3, 4> lo;
+  std::array<Vec3, 4> hi;
+  for (int i = 0; i < 4; ++i) {
+    lo[i] = x_t0[i].cwiseMin(x_t1[i]);
+    hi[i] = x_t0[i].cwiseMax(x_t1[i]);
+  }
+  const int last_of_a = kind == PairKind::kPointTriangle ? 0 : 1;
+  const int first_of_b = last_of_a + 1;
+  const Vec3 lo_a = lo[0].cwiseMin(lo[last_of_a]);
+  const Vec3 hi_a = hi[0].cwiseMax(hi[last_of_a]);
+  const Vec3 lo_b = lo[first_of_b].cwiseMin(lo[2]).cwiseMin(lo[3]);
+  const Vec3 hi_b = hi[first_of_b].cwiseMax(hi[2]).cwiseMax(hi[3]);
+  return ((lo_a - hi_b).array() > gap).any() || ((lo_b - hi_a).array() > gap).any();
+}
+
 /// Latest time up to which n . (start + time motion) >= bound holds from t on, for all differences;
 /// -infinity where it does not hold at t.
 double certified_time(
@@ -54,23 +71,24 @@ double certified_time(
 }  // namespace
 
 double safe_step(PairKind kind, const Corners& x_t0, const Corners& x_t1, double xi) {
-  Vec3 d_vector = separation(kind, x_t0);
-  double d = d_vector.norm();
   double largest = 0;
+  Corners U;
   for (int i = 0; i < 4; ++i) {
     largest = std::max({largest, x_t0[i].cwiseAbs().maxCoeff(), x_t1[i].cwiseAbs().maxCoeff()});
+    U[i] = x_t1[i] - x_t0[i];
   }
-  if (!(d > xi + kRounding * largest)) return 0;
-
-  Corners U;
-  for (int i = 0; i < 4; ++i) U[i] = x_t1[i] - x_t0[i];
-  const Differences start = between(kind, x_t0);
   const Differences motion = between(kind, U);
   double lp_sq = 0;
   for (const Vec3& m : motion) {
     if (!std::isfinite(m.squaredNorm())) return 0;  // nothing can be certified
     lp_sq = std::max(lp_sq, m.squaredNorm());
   }
+  const double touching = xi + kRounding * largest;
+  if (stay_apart(kind, x_t0, x_t1, touching)) return 1;
+  Vec3 d_vector = separation(kind, x_t0);
+  double d = d_vector.norm();
+  if (!(d > touching)) return 0;
+  const Differences start = between(kind, x_t0);
   const double lp = std::sqrt(lp_sq);
 
   const double g = kGapLeft * (d - xi);

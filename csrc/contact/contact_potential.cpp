@@ -1,7 +1,7 @@
 #include "contact/contact_potential.h"
 
 #include <algorithm>
-#include <numeric>
+#include <utility>
 
 #include "contact/ccd.h"
 
@@ -39,26 +39,40 @@ double ContactPotential::safe_fraction(const double* x, const double* to) const 
   return alpha;
 }
 
+bool ContactPotential::is_at(const Measured& measured, const double* x) const {
+  return !measured.x.empty() && std::equal(measured.x.begin(), measured.x.end(), x);
+}
+
+void ContactPotential::measure(const double* x, Measured& out) const {
+  out.x.assign(x, x + 3 * static_cast<std::ptrdiff_t>(model_.mesh().vertex_count));
+  model_.measure(candidates_, x, out.near);
+}
+
 void ContactPotential::stand_at(const double* x) {
-  model_.find(candidates_, x, contacts_);
-  has_energies_ = false;
+  if (is_at(here_, x)) return;
+  if (is_at(trial_, x)) {
+    std::swap(here_, trial_);
+  } else {
+    measure(x, here_);
+  }
+  model_.find(here_.near, x, contacts_);
 }
 
 double ContactPotential::energy(const double* x) const {
-  std::vector<double> energies;
-  model_.energies(candidates_, x, energies);
-  return std::accumulate(energies.begin(), energies.end(), 0.0);
+  Measured scratch;
+  return near_at(x, scratch).energy();
 }
 
 double ContactPotential::energy_change(const double* x, const double* to) const {
-  if (!has_energies_) {
-    model_.energies(candidates_, x, energies_);
-    has_energies_ = true;
-  }
-  model_.energies(candidates_, to, trial_energies_);
-  double change = 0.0;
-  for (std::size_t k = 0; k < energies_.size(); ++k) change += trial_energies_[k] - energies_[k];
-  return change;
+  measure(to, trial_);
+  Measured scratch;
+  return contact::energy_change(near_at(x, scratch), trial_.near);
+}
+
+const Near& ContactPotential::near_at(const double* x, Measured& scratch) const {
+  if (is_at(here_, x)) return here_.near;
+  measure(x, scratch);
+  return scratch.near;
 }
 
 void ContactPotential::add_gradient(const double* x, double* g) const {

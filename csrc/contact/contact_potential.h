@@ -34,7 +34,6 @@ class ContactPotential final : public Potential {
   /// Find every pair that comes within reach on the straight motion x -> to.
   void watch(const double* x, const double* to) {
     detection_.candidates.find(x, to, model_.reach(), detection_.scratch, candidates_);
-    has_energies_ = false;
   }
 
   /// Stand at a point that a motion leads from.
@@ -53,7 +52,7 @@ class ContactPotential final : public Potential {
   void adopt(std::vector<Contact> contacts) {
     candidates_.clear();
     contacts_ = std::move(contacts);
-    has_energies_ = false;
+    here_.x.clear();
   }
 
   /// Fraction of the watched motion x -> to that is certified free of collisions.
@@ -76,14 +75,22 @@ class ContactPotential final : public Potential {
   void accumulate(const double* x, const double* z) override;
 
  private:
+  /// What is near at a point.
+  struct Measured {
+    std::vector<double> x;  ///< all vertices; empty where nothing is known
+    Near near;
+  };
+  bool is_at(const Measured& measured, const double* x) const;
+  void measure(const double* x, Measured& out) const;
+  const Near& near_at(const double* x, Measured& scratch) const;
+
   const ContactModel& model_;
   Detection& detection_;
   ContactModel::Bar* bar_;
   std::vector<Candidate> candidates_;
   std::vector<Contact> contacts_;
-  mutable std::vector<double> energies_;  ///< of the candidates where the potential stands
-  mutable bool has_energies_ = false;
-  mutable std::vector<double> trial_energies_;
+  Measured here_;           ///< where the potential stands
+  mutable Measured trial_;  ///< where the energy was last asked for: often where it stands next
 };
 
 /// Lagged friction as a potential of the displacement over the step. See friction_set.h.

@@ -219,34 +219,20 @@ Contact ContactModel::contact(const Term& term, const double* x) const {
   return k;
 }
 
-void ContactModel::find(const std::vector<Candidate>& candidates,
-                        const double* x,
-                        std::vector<Contact>& out) const {
-  out.clear();
-  MergeScratch scratch;
-  std::vector<Term> terms;
-  for (std::size_t first = 0, last = 0; first < candidates.size(); first = last) {
-    last = group_end(candidates, first);
-    find_terms({candidates.data() + first, last - first}, x, scratch, terms);
-  }
-  merge_shared_ends(terms);
-  out.reserve(terms.size());
-  for (const Term& term : terms) out.push_back(contact(term, x));
-}
-
-void ContactModel::energies(const std::vector<Candidate>& candidates,
-                            const double* x,
-                            std::vector<double>& out) const {
+void ContactModel::measure(const std::vector<Candidate>& candidates,
+                           const double* x,
+                           Near& out) const {
   constexpr double kInfinity = std::numeric_limits<double>::infinity();
-  out.assign(candidates.size(), 0.0);
+  out.terms.clear();
+  out.energies.clear();
   MergeScratch scratch;
-  std::vector<Term> terms;
   for (std::size_t first = 0, last = 0; first < candidates.size(); first = last) {
     last = group_end(candidates, first);
-    terms.clear();
-    find_terms({candidates.data() + first, last - first}, x, scratch, terms);
+    const std::size_t begin = out.terms.size();
+    find_terms({candidates.data() + first, last - first}, x, scratch, out.terms);
     double sum = 0.0;
-    for (const Term& term : terms) {
+    for (std::size_t k = begin; k < out.terms.size(); ++k) {
+      const Term& term = out.terms[k];
       const double b = barrier(term.d_sq, xi(term.pair), parameters_.d_hat);
       if (b == kInfinity) {
         // Whatever multiplies it, be it zero for exactly parallel edges, or negative.
@@ -257,8 +243,34 @@ void ContactModel::energies(const std::vector<Candidate>& candidates,
       const double m = eps > 0.0 ? mollifier(corners(term.pair.vertices, x), eps) : 1.0;
       sum += parameters_.kappa * (term.coefficient * area(term.pair)) * m * b;
     }
-    out[first] = sum;
+    if (sum == 0.0) continue;
+    const Candidate& head = candidates[first];
+    out.energies.push_back({.kind = head.kind,
+                            .a = head.a,
+                            .surface = surface_b(head),
+                            .b = between_cloths(head) ? head.b : -1,
+                            .value = sum});
   }
+}
+
+void ContactModel::find(const Near& near, const double* x, std::vector<Contact>& out) const {
+  std::vector<Term> terms = near.terms;
+  merge_shared_ends(terms);
+  out.clear();
+  out.reserve(terms.size());
+  for (const Term& term : terms) out.push_back(contact(term, x));
+}
+
+double Near::energy() const {
+  double sum = 0.0;
+  for (const Energy& e : energies) sum += e.value;
+  return sum;
+}
+
+double energy_change(const Near& p, const Near& q) {
+  double change = 0.0;
+  for_each_energy(p, q, [&](double e_p, double e_q) { change += e_q - e_p; });
+  return change;
 }
 
 void ContactModel::add_gradient(const std::vector<Contact>& contacts,

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <span>
+#include <tuple>
 #include <vector>
 
 #include "common/types.h"
@@ -36,6 +37,44 @@ struct Contact {
   double mollifier;  ///< m
   bool mollified;    ///< m < 1: its derivatives count
 };
+
+/// The pairs of one configuration that are within reach, by their distances: all that the energy
+/// needs, and what its derivatives begin with.
+///
+/// A function of the configuration, whatever candidates it was found among.
+struct Near {
+  /// The energy of candidates that act together: one, or those of a point or an edge and a body.
+  struct Energy {
+    PairKind kind;
+    Index a;
+    Index surface;
+    Index b;       ///< -1 of a body as a whole
+    double value;  ///< [J], not zero; +infinity where d <= xi
+  };
+  std::vector<Term> terms;       ///< in the order of the candidates
+  std::vector<Energy> energies;  ///< likewise
+
+  /// Sum of the energies [J].
+  double energy() const;
+};
+
+/// Visit the energies of the same pairs in two configurations, 0 where there is none.
+template <class Visit>
+void for_each_energy(const Near& p, const Near& q, Visit&& visit) {
+  const auto key = [](const Near::Energy& e) { return std::tie(e.kind, e.a, e.surface, e.b); };
+  auto i = p.energies.begin();
+  auto j = q.energies.begin();
+  while (i != p.energies.end() || j != q.energies.end()) {
+    const bool in_p = i != p.energies.end() && (j == q.energies.end() || key(*i) <= key(*j));
+    const bool in_q = j != q.energies.end() && (i == p.energies.end() || key(*j) <= key(*i));
+    visit(in_p ? i->value : 0.0, in_q ? j->value : 0.0);
+    if (in_p) ++i;
+    if (in_q) ++j;
+  }
+}
+
+/// Energy of q minus that of p, pair by pair [J].
+double energy_change(const Near& p, const Near& q);
 
 /// Barrier contacts of one configuration: sum of kappa w m b(D; xi, d_hat)  [J].
 ///
@@ -77,17 +116,13 @@ class ContactModel {
   /// Friction coefficient of a pair.
   double mu(const Candidate& pair) const;
 
-  /// The contacts among the candidates at x, in their order.
-  void find(const std::vector<Candidate>& candidates,
-            const double* x,
-            std::vector<Contact>& out) const;
+  /// What is within reach at x.
+  ///
+  /// @param candidates  sorted, everything within reach among them
+  void measure(const std::vector<Candidate>& candidates, const double* x, Near& out) const;
 
-  /// Energies at x [J], whose sum is that of the contacts; +infinity where d <= xi. Each entry is
-  /// that of one candidate, or of a point or an edge against a body, in the place of its first
-  /// candidate: entries of one list are comparable between positions.
-  void energies(const std::vector<Candidate>& candidates,
-                const double* x,
-                std::vector<double>& out) const;
+  /// The contacts at x, in the order of the terms.
+  void find(const Near& near, const double* x, std::vector<Contact>& out) const;
 
   /// g += grad B.
   void add_gradient(const std::vector<Contact>& contacts, const double* x, double* g) const;

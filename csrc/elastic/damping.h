@@ -29,7 +29,7 @@ inline Mat32 stress(double weight, const Mat32& F, const Mat32& F_n) {
 double energy_change(
     double weight, const Mat32& F0, const Mat32& F1, const Mat32& dF, const Mat32& F_n);
 
-/// The Hessian's 3x3 blocks of the lower-triangle pairs, in the order of stretch::hessian():
+/// The Hessian's 3x3 blocks of the lower-triangle pairs, (0,0), (1,0), (1,1), (2,0), (2,1), (2,2):
 ///
 ///   H_pq = weight / 2 [ (g_p^T (C - C_n) g_q) I + (F g_q)(F g_p)^T + (g_p.g_q) F F^T ].
 ///

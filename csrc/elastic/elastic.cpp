@@ -1,5 +1,6 @@
 #include "elastic/elastic.h"
 
+#include <algorithm>
 #include <array>
 #include <span>
 #include <stdexcept>
@@ -29,14 +30,52 @@ void scatter(const Model& model, Index f, const Mat32& P, double* y) {
 
 void add_face_blocks(const std::array<Index, 3>& face,
                      const Index* slots,
+                     const std::vector<Index>& place,
                      const std::array<Mat3, 6>& element,
                      double* blocks) {
   int k = 0;
   for (int p = 0; p < 3; ++p) {
     for (int q = 0; q <= p; ++q, ++k) {
-      linalg::add_block(blocks, slots[k], face[p] < face[q], element[k]);
+      linalg::add_block(blocks, place[slots[k]], face[p] < face[q], element[k]);
     }
   }
+}
+
+/// All triangles in lanes, in their order.
+std::vector<StretchBatch> stretch_batches(const Model& model, const Slots& slots) {
+  const Index count = face_count(model);
+  std::vector<StretchBatch> batches((count + kStretchLanes - 1) / kStretchLanes);
+  for (std::size_t b = 0; b < batches.size(); ++b) {
+    StretchBatch& batch = batches[b];
+    const auto first = static_cast<Index>(b) * kStretchLanes;
+    batch.size = std::min(kStretchLanes, count - first);
+    for (int l = 0; l < kStretchLanes; ++l) {
+      const Index f = first + std::min(l, batch.size - 1);
+      const std::array<Index, 3>& face = model.topology->faces[f];
+      const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
+      const Index* const face_slots = slots.stretch.data() + 6 * static_cast<std::ptrdiff_t>(f);
+      std::array<int, 3> corner{0, 1, 2};
+      std::ranges::sort(corner, {}, [&](int p) { return face[p]; });
+      int k = 0;
+      for (int p = 0; p < 3; ++p) {
+        batch.vertex[p][l] = face[corner[p]];
+        for (int q = 0; q <= p; ++q, ++k) {
+          const auto [low, high] = std::minmax(corner[p], corner[q]);
+          batch.slot[k][l] = face_slots[linalg::lower(high, low)];
+        }
+      }
+      for (int p = 1; p < 3; ++p) {
+        for (int a = 0; a < 2; ++a) batch.g[2 * (p - 1) + a][l] = g(corner[p], a);
+      }
+      batch.weight[l] = l < batch.size ? stretch_weight(model, f) : 0.0;
+    }
+  }
+  return batches;
+}
+
+const StretchKernels& kernels() {
+  static const StretchKernels& best = stretch_kernels(linalg::best_level());
+  return best;
 }
 
 void add_face_mixed(
@@ -149,6 +188,7 @@ void prepare(Model& model, const Slots& slots) {
   prepared.flat.resize(element_count);
   prepared.curvature_n.resize(element_count);
   prepared.constant.assign(slots.block_count, 0.0);
+  prepared.stretch = stretch_batches(model, slots);
   prepared.bends = false;
   prepared.damped = false;
   for (Index f = 0; f < face_count(model); ++f) prepared.damped |= is_damped(model, f);
@@ -185,73 +225,71 @@ double energy(const Model& model, const double* x) {
   return total;
 }
 
-double energy_change(const Model& model, const double* x0, const double* x1, Elements elements) {
-  double total = 0.0;
-  for (Index f = 0; f < face_count(model); ++f) {
+double energy_change(const Model& model, const double* x0, const double* x1) {
+  const Prepared& prepared = model.prepared;
+  double total = kernels().energy_change(prepared.stretch.data(), prepared.stretch.size(), x0, x1);
+  for (Index f = 0; prepared.damped && f < face_count(model); ++f) {
+    if (!is_damped(model, f)) continue;
     const std::array<Index, 3>& face = model.topology->faces[f];
-    const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
-    const Mat32 F0 = face_gradient(model, f, x0);
-    const Mat32 F1 = face_gradient(model, f, x1);
-    const Mat32 dF = deformation_gradient(g, row(x1, face[0]) - row(x0, face[0]),
-                                          row(x1, face[1]) - row(x0, face[1]),
-                                          row(x1, face[2]) - row(x0, face[2]));
-    total += stretch::energy_change(stretch_weight(model, f), F0, F1, dF);
-    if (is_damped(model, f)) {
-      total += damping::energy_change(damping_weight(model, f), F0, F1, dF,
-                                      face_gradient(model, f, model.x_n));
-    }
+    const Mat32 dF = deformation_gradient(
+        model.rest->shape_gradient[f], row(x1, face[0]) - row(x0, face[0]),
+        row(x1, face[1]) - row(x0, face[1]), row(x1, face[2]) - row(x0, face[2]));
+    total +=
+        damping::energy_change(damping_weight(model, f), face_gradient(model, f, x0),
+                               face_gradient(model, f, x1), dF, face_gradient(model, f, model.x_n));
   }
-  for (Index e = 0; e < model.stencils->size(); ++e) {
-    if (elements == Elements::kButFlat && model.prepared.flat[e] != 0) continue;
-    total += bending::energy_change(bending_element(model, e), x0, x1);
+  for (Index e = 0; prepared.bends && e < model.stencils->size(); ++e) {
+    if (prepared.flat[e] == 0) total += bending::energy_change(bending_element(model, e), x0, x1);
   }
   return total;
 }
 
-void add_gradient(const Model& model, const double* x, double* g, Elements elements) {
-  for (Index f = 0; f < face_count(model); ++f) {
-    const Mat32 F = face_gradient(model, f, x);
-    Mat32 P = stretch::stress(stretch_weight(model, f), F);
-    if (is_damped(model, f)) {
-      P += damping::stress(damping_weight(model, f), F, face_gradient(model, f, model.x_n));
-    }
-    scatter(model, f, P, g);
+void add_gradient(const Model& model, const double* x, double* g) {
+  const Prepared& prepared = model.prepared;
+  kernels().add_gradient(prepared.stretch.data(), prepared.stretch.size(), x, g);
+  for (Index f = 0; prepared.damped && f < face_count(model); ++f) {
+    if (!is_damped(model, f)) continue;
+    scatter(model, f,
+            damping::stress(damping_weight(model, f), face_gradient(model, f, x),
+                            face_gradient(model, f, model.x_n)),
+            g);
   }
-  for (Index e = 0; e < model.stencils->size(); ++e) {
-    if (elements == Elements::kButFlat && model.prepared.flat[e] != 0) continue;
-    bending::add_gradient(bending_element(model, e), x, g);
+  for (Index e = 0; prepared.bends && e < model.stencils->size(); ++e) {
+    if (prepared.flat[e] == 0) bending::add_gradient(bending_element(model, e), x, g);
   }
 }
 
-void add_hessian(
-    const Model& model, const Slots& slots, const double* x, Curvature curvature, double* blocks) {
+void add_hessian(const Model& model,
+                 const Slots& slots,
+                 const double* x,
+                 Curvature curvature,
+                 const std::vector<Index>& place,
+                 double* blocks) {
   const bool positive = curvature == Curvature::kPositive;
-  for (Index f = 0; f < face_count(model); ++f) {
-    const std::array<Index, 3>& face = model.topology->faces[f];
-    const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
-    const Index* face_slots = slots.stretch.data() + 6 * static_cast<std::ptrdiff_t>(f);
-    const Mat32 F = face_gradient(model, f, x);
-    add_face_blocks(face, face_slots, stretch::hessian(stretch_weight(model, f), g, F, positive),
-                    blocks);
-    if (is_damped(model, f)) {
-      const Mat32 F_n = face_gradient(model, f, model.x_n);
-      add_face_blocks(face, face_slots,
-                      damping::hessian(damping_weight(model, f), g, F, F_n, positive), blocks);
-    }
-  }
+  const Prepared& prepared = model.prepared;
   for (Index slot = 0; slot < slots.block_count; ++slot) {
-    double* block = blocks + 9 * static_cast<std::ptrdiff_t>(slot);
-    const double value = model.prepared.constant[slot];
+    double* block = blocks + 9 * static_cast<std::ptrdiff_t>(place[slot]);
+    const double value = prepared.constant[slot];
     block[0] += value;
     block[4] += value;
     block[8] += value;
   }
-  if (!model.prepared.bends) return;
-  for (Index e = 0; e < model.stencils->size(); ++e) {
-    const bending::Element element = bending_element(model, e);
-    if (!element.flat) {
-      bending::add_hessian(element, bending_slots(slots, e), x, positive, blocks);
-    }
+  kernels().add_hessian(prepared.stretch.data(), prepared.stretch.size(), x, positive, place.data(),
+                        blocks);
+  for (Index f = 0; prepared.damped && f < face_count(model); ++f) {
+    if (!is_damped(model, f)) continue;
+    add_face_blocks(
+        model.topology->faces[f], slots.stretch.data() + 6 * static_cast<std::ptrdiff_t>(f), place,
+        damping::hessian(damping_weight(model, f), model.rest->shape_gradient[f],
+                         face_gradient(model, f, x), face_gradient(model, f, model.x_n), positive),
+        blocks);
+  }
+  std::vector<Index> places;
+  for (Index e = 0; prepared.bends && e < model.stencils->size(); ++e) {
+    if (prepared.flat[e] != 0) continue;
+    places.clear();
+    for (const Index slot : bending_slots(slots, e)) places.push_back(place[slot]);
+    bending::add_hessian(bending_element(model, e), places, x, positive, blocks);
   }
 }
 

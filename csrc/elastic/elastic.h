@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "common/types.h"
+#include "elastic/stretch_lanes.h"
 #include "linalg/block_pattern.h"
 #include "mesh/rest_shape.h"
 #include "mesh/topology.h"
@@ -35,8 +36,9 @@ struct Prepared {
   std::vector<std::uint8_t> flat;  ///< [B] no rest curvature and no damping: a constant Hessian
   std::vector<Mat3> curvature_n;   ///< [B] body-frame curvature at x_n, where damped
   std::vector<double> constant;    ///< [slots] sum of the flat elements' Hessians, times I
-  bool damped = false;             ///< some face has damping
-  bool bends = false;              ///< some element is not flat
+  std::vector<StretchBatch> stretch;
+  bool damped = false;  ///< some face has damping
+  bool bends = false;   ///< some element is not flat
 };
 
 /// The elastic energy of all cloths and its damping over one step.
@@ -61,26 +63,25 @@ void prepare(Model& model, const Slots& slots);
 /// Stretch and bending energy, without damping [J].
 double energy(const Model& model, const double* x);
 
-/// Which elements a sum is over: flat bending elements can be left to their matrix,
-/// `prepared.constant`.
-enum class Elements : std::uint8_t { kAll, kButFlat };
+// What follows is of all elements but the flat ones of bending, whose energy is quadratic: that of
+// their matrix, `prepared.constant`. See ConstantForm::of_flat_bending().
 
 /// Energy at x1 minus energy at x0, damping included, as a sum of differences of the elements that
 /// do not cancel [J].
-double energy_change(const Model& model,
-                     const double* x0,
-                     const double* x1,
-                     Elements elements = Elements::kAll);
+double energy_change(const Model& model, const double* x0, const double* x1);
 
 /// g += grad E(x), damping included, [N, 3] [N].
-void add_gradient(const Model& model,
-                  const double* x,
-                  double* g,
-                  Elements elements = Elements::kAll);
+void add_gradient(const Model& model, const double* x, double* g);
 
-/// blocks += the Hessian at x, damping included, 9 doubles a slot [N/m].
-void add_hessian(
-    const Model& model, const Slots& slots, const double* x, Curvature curvature, double* blocks);
+/// blocks += the Hessian at x, damping and flat elements included [N/m].
+///
+/// @param place  [slots] where each slot lies in blocks, 9 doubles a place
+void add_hessian(const Model& model,
+                 const Slots& slots,
+                 const double* x,
+                 Curvature curvature,
+                 const std::vector<Index>& place,
+                 double* blocks);
 
 /// y += H(x) z over all vertices, with the exact Hessian and without a matrix.
 void add_hessian_product(const Model& model, const double* x, const double* z, double* y);

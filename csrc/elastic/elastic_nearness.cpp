@@ -39,11 +39,10 @@ void ElasticNearness::add_hessian(const double* /*x*/,
                                   Curvature /*curvature*/,
                                   linalg::BlockMatrix& A) const {
   const std::vector<double>& values = form_.values();
-  std::vector<double> blocks(9 * values.size(), 0.0);
   for (std::size_t k = 0; k < values.size(); ++k) {
-    for (std::size_t a = 0; a < 3; ++a) blocks[9 * k + 4 * a] = values[k];
+    double* block = A.blocks() + 9 * static_cast<std::ptrdiff_t>(A.slot_of_base()[k]);
+    for (int a = 0; a < 3; ++a) block[4 * a] += values[k];
   }
-  A.add_base(blocks);
 }
 
 void ElasticNearness::add_hessian_product(const double* /*x*/, const double* z, double* y) const {

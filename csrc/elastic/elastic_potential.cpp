@@ -11,15 +11,30 @@ std::vector<double> negated(const double* z, Index vertex_count) {
 
 }  // namespace
 
-ElasticPotential::ElasticPotential(const Model& model, const Slots& slots, Wanted wanted)
-    : model_(model), slots_(slots), wanted_(wanted) {}
+ElasticPotential::ElasticPotential(const Model& model,
+                                   const Slots& slots,
+                                   const linalg::BlockPattern& pattern,
+                                   Wanted wanted)
+    : model_(model),
+      slots_(slots),
+      wanted_(wanted),
+      flat_bending_(ConstantForm::of_flat_bending(model, pattern)),
+      change_(3 * static_cast<std::size_t>(model.topology->vertex_count)) {}
+
+double ElasticPotential::energy_change(const double* x, const double* to) const {
+  for (std::size_t a = 0; a < change_.size(); ++a) change_[a] = to[a] - x[a];
+  return elastic::energy_change(model_, x, to) + flat_bending_.energy_change(x, change_.data());
+}
+
+void ElasticPotential::add_gradient(const double* x, double* g) const {
+  elastic::add_gradient(model_, x, g);
+  flat_bending_.add_product(x, g);
+}
 
 void ElasticPotential::add_hessian(const double* x,
                                    Curvature curvature,
                                    linalg::BlockMatrix& A) const {
-  std::vector<double> blocks(9 * static_cast<std::size_t>(slots_.block_count), 0.0);
-  elastic::add_hessian(model_, slots_, x, curvature, blocks.data());
-  A.add_base(blocks);
+  elastic::add_hessian(model_, slots_, x, curvature, A.slot_of_base(), A.blocks());
 }
 
 void ElasticPotential::accumulate(const double* x, const double* z) {

@@ -1,8 +1,10 @@
 #pragma once
 
 #include <cstdint>
+#include <vector>
 
 #include "elastic/anchors.h"
+#include "elastic/constant_form.h"
 #include "elastic/elastic.h"
 #include "potential/potential.h"
 
@@ -12,20 +14,20 @@ namespace diffcloth::elastic {
 enum class Wanted : std::uint8_t { kNone, kMaterials, kMaterialsAndRest };
 
 /// Stretch, bending and damping of all cloths as a potential. See elastic.h.
-class ElasticPotential : public Potential {
+class ElasticPotential final : public Potential {
  public:
-  /// @param model   prepared; outlives the potential
-  /// @param slots   of its elements in the base pattern
-  /// @param wanted  what accumulate() keeps
-  ElasticPotential(const Model& model, const Slots& slots, Wanted wanted);
+  /// @param model    prepared; outlives the potential
+  /// @param slots    of its elements in the base pattern
+  /// @param pattern  the base pattern
+  /// @param wanted   what accumulate() keeps
+  ElasticPotential(const Model& model,
+                   const Slots& slots,
+                   const linalg::BlockPattern& pattern,
+                   Wanted wanted);
 
   double energy(const double* x) const override { return elastic::energy(model_, x); }
-  double energy_change(const double* x, const double* to) const override {
-    return elastic::energy_change(model_, x, to);
-  }
-  void add_gradient(const double* x, double* g) const override {
-    elastic::add_gradient(model_, x, g);
-  }
+  double energy_change(const double* x, const double* to) const override;
+  void add_gradient(const double* x, double* g) const override;
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
   void add_hessian_product(const double* x, const double* z, double* y) const override {
     elastic::add_hessian_product(model_, x, z, y);
@@ -44,6 +46,8 @@ class ElasticPotential : public Potential {
   const Model& model_;
   const Slots& slots_;
   Wanted wanted_;
+  ConstantForm flat_bending_;
+  mutable std::vector<double> change_;  ///< scratch
   Bar bar_;
 };
 

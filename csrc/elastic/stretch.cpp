@@ -1,28 +1,10 @@
 #include "elastic/stretch.h"
 
-#include <algorithm>
-#include <cmath>
-
 namespace diffcloth::elastic::stretch {
 namespace {
 
 /// Area ratio below which a frame need not be orthonormal to rounding.
 constexpr double kNearlyDegenerate = 1e-4;
-
-/// A symmetric 2x2 matrix with its eigenvalues clamped to at most 1.
-Mat2 clamp_to_one(const Mat2& A) {
-  const double mean = 0.5 * (A(0, 0) + A(1, 1));
-  const double half = 0.5 * (A(0, 0) - A(1, 1));
-  const double radius = std::hypot(half, A(0, 1));
-  if (mean + radius <= 1.0) return A;
-  if (mean - radius >= 1.0) return Mat2::Identity();
-  // Here radius > 0. A = mean I + D with D^2 = radius^2 I: rescale D about the clamped mean.
-  const double low = mean - radius;
-  const double scale = 0.5 * (1.0 - low) / radius;
-  Mat2 result = scale * (A - mean * Mat2::Identity());
-  result.diagonal().array() += 0.5 * (1.0 + low);
-  return result;
-}
 
 }  // namespace
 
@@ -32,46 +14,6 @@ double energy(double weight, const Mat32& F) {
     return 0.5 * weight * (F - polar.R.leftCols<2>()).squaredNorm();
   }
   return 0.5 * weight * (F.squaredNorm() - 2.0 * polar.t + 2.0);
-}
-
-double energy_change(double weight, const Mat32& F0, const Mat32& F1, const Mat32& dF) {
-  const Frame frame0 = frame(F0);
-  const Frame frame1 = frame(F1);
-  if (std::min(frame0.d, frame1.d) < kNearlyDegenerate) {
-    return energy(weight, F1) - energy(weight, F0);
-  }
-  const Mat32 R0 = frame0.R.leftCols<2>();
-  const Mat32 R1 = frame1.R.leftCols<2>();
-  const Mat32 dR = R1 - R0;
-  const Mat2 dS = stretch_tensor(F1, frame1) - stretch_tensor(F0, frame0);
-  const double work = ((F0 - R0) + (F1 - R1)).cwiseProduct(dF).sum();
-  return 0.5 * weight * (work - 0.5 * dS.cwiseProduct(dR.transpose() * dR).sum());
-}
-
-std::array<Mat3, 6> hessian(double weight,
-                            const mesh::ShapeGradient& g,
-                            const Mat32& F,
-                            bool positive) {
-  const Frame polar = frame(F);
-  const double t_inv = positive ? std::min(1.0 / polar.t, 0.5) : 1.0 / polar.t;
-  const Mat2 S_inv = positive ? clamp_to_one(polar.S_inv) : polar.S_inv;
-  const Vec3 r1 = polar.R.col(0);
-  const Vec3 r2 = polar.R.col(1);
-  const Mat3 nn = polar.R.col(2) * polar.R.col(2).transpose();
-
-  std::array<Vec3, 3> e;
-  for (int p = 0; p < 3; ++p) e[p] = g(p, 0) * r2 - g(p, 1) * r1;
-  std::array<Mat3, 6> blocks;
-  int k = 0;
-  for (int p = 0; p < 3; ++p) {
-    for (int q = 0; q <= p; ++q, ++k) {
-      const double normal = g.row(p).dot(S_inv * g.row(q).transpose());
-      blocks[k].noalias() = (-weight * t_inv) * e[p] * e[q].transpose();
-      blocks[k] -= (weight * normal) * nn;
-      blocks[k].diagonal().array() += weight * g.row(p).dot(g.row(q));
-    }
-  }
-  return blocks;
 }
 
 Mat32 stress_change(double weight, const Mat32& F, const Mat32& G) {

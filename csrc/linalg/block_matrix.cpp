@@ -2,6 +2,8 @@
 
 #include <algorithm>
 
+#include "linalg/dense_kernels.h"
+
 namespace diffcloth::linalg {
 
 void sort_couplings(Couplings& pairs) {
@@ -47,15 +49,6 @@ BlockMatrix::BlockMatrix(std::shared_ptr<const MergedPattern> merged,
       fixed_(&fixed),
       attachments_(attachments),
       blocks_(9 * static_cast<std::size_t>(merged_->pattern.block_count()), 0.0) {}
-
-void BlockMatrix::add_base(const std::vector<double>& base_blocks) {
-  const double* from = base_blocks.data();
-  for (const Index slot : merged_->slot_of_base) {
-    double* to = blocks_.data() + 9 * static_cast<std::ptrdiff_t>(slot);
-    for (int a = 0; a < 9; ++a) to[a] += from[a];
-    from += 9;
-  }
-}
 
 void BlockMatrix::add_stencil(const std::array<Index, 4>& points, const Mat12& h) {
   if (std::ranges::any_of(points, [&](Index v) { return is_attached(v); })) {
@@ -112,18 +105,15 @@ void BlockMatrix::add_product(const double* x, double* y) const {
 }
 
 void add_product(const BlockPattern& pattern, const double* blocks, const double* x, double* y) {
-  const std::vector<Index>& start = pattern.column_start();
-  const std::vector<Index>& row = pattern.row();
-  for (Index j = 0; j < pattern.size(); ++j) {
-    const Vec3 x_j(x[3 * j], x[3 * j + 1], x[3 * j + 2]);
-    Vec3 y_j = Eigen::Map<const Mat3>(blocks + 9 * static_cast<std::ptrdiff_t>(start[j])) * x_j;
-    for (Index k = start[j] + 1; k < start[j + 1]; ++k) {
-      const Index i = row[k];
-      const Eigen::Map<const Mat3> block(blocks + 9 * static_cast<std::ptrdiff_t>(k));
-      Eigen::Map<Vec3>(y + 3 * i) += block * x_j;
-      y_j += block.transpose() * Eigen::Map<const Vec3>(x + 3 * i);
-    }
-    Eigen::Map<Vec3>(y + 3 * j) += y_j;
+  static const DenseKernels& kernels = dense_kernels(best_level());
+  const auto n = static_cast<std::ptrdiff_t>(pattern.size());
+  std::vector<double> wide(8 * static_cast<std::size_t>(n), 0.0);
+  double* const wide_y = wide.data() + 4 * n;
+  for (std::ptrdiff_t i = 0; i < n; ++i) std::copy_n(x + 3 * i, 3, wide.data() + 4 * i);
+  kernels.multiply_blocks(pattern.column_start().data(), pattern.row().data(), pattern.size(),
+                          blocks, wide.data(), wide_y);
+  for (std::ptrdiff_t i = 0; i < n; ++i) {
+    for (int a = 0; a < 3; ++a) y[3 * i + a] += wide_y[4 * i + a];
   }
 }
 

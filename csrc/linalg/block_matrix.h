@@ -43,8 +43,8 @@ class BlockMatrix {
   const double* blocks() const { return blocks_.data(); }
   double* blocks() { return blocks_.data(); }
 
-  /// Add a matrix on the base pattern.
-  void add_base(const std::vector<double>& base_blocks);
+  /// Where the slots of the base pattern lie in blocks().
+  const std::vector<Index>& slot_of_base() const { return merged_->slot_of_base; }
 
   /// Add value times I to the diagonal block of vertex i.
   void add_to_diagonal(Index i, double value) {

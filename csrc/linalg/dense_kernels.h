@@ -3,10 +3,9 @@
 #include <cstddef>
 #include <cstdint>
 
-namespace diffcloth::linalg {
+#include "linalg/kernel_level.h"
 
-/// Instructions that the dense kernels use.
-enum class KernelLevel : std::uint8_t { kPortable, kAvx2, kAvx512 };
+namespace diffcloth::linalg {
 
 /// Shape of a supernode's dense matrices, in scalars. All are column-major.
 ///
@@ -44,6 +43,15 @@ struct ChildMap {
 /// one rounding each. Levels with fused multiply-add (all but kPortable on x86-64) therefore agree
 /// in every bit.
 struct DenseKernels {
+  /// y += A x for a symmetric matrix given by its lower 3x3 blocks on a BlockPattern. Vectors have four
+  /// numbers a row, the last of which means nothing. The same bits on every level.
+  void (*multiply_blocks)(const std::int32_t* column_start,
+                          const std::int32_t* row,
+                          std::int32_t size,
+                          const double* blocks,
+                          const double* x,
+                          double* y);
+
   /// L of the panel in place, 1 / l_jj on the diagonal, and U = -L_2 L_2^T, where L_2 are the rows
   /// below the triangle. False, at once, at a pivot that is not positive and finite.
   ///
@@ -77,14 +85,6 @@ constexpr int kColumnBlock = 96;
 
 /// Most vectors that one call of forward() or backward() takes.
 constexpr int kMaxVectors = 4;
-
-const char* name(KernelLevel level);
-
-/// Whether this build and this processor have the instructions.
-bool supported(KernelLevel level);
-
-/// The fastest level that is supported.
-KernelLevel best_level();
 
 /// The kernels of a supported level.
 const DenseKernels& dense_kernels(KernelLevel level);

@@ -324,18 +324,92 @@ void add_to_update(const Front& child,
   }
 }
 
+/// y := L^-1 y for `width` columns l of a panel from their diagonal on, in registers.
+template <int Width>
+DIFFCLOTH_INLINE void solve_triangle(const double* l, std::ptrdiff_t ld, double* y) {
+  double t[Width];
+#pragma GCC unroll 8
+  for (int i = 0; i < Width; ++i) t[i] = y[i];
+#pragma GCC unroll 8
+  for (int j = 0; j < Width; ++j) {
+    t[j] *= l[j * ld + j];
+#pragma GCC unroll 8
+    for (int i = j + 1; i < Width; ++i) t[i] = subtract_product_of(t[i], l[j * ld + i], t[j]);
+  }
+#pragma GCC unroll 8
+  for (int i = 0; i < Width; ++i) y[i] = t[i];
+}
+
+/// y := L^-T y, likewise.
+template <int Width>
+DIFFCLOTH_INLINE void solve_transposed_triangle(const double* l, std::ptrdiff_t ld, double* y) {
+  double t[Width];
+#pragma GCC unroll 8
+  for (int i = 0; i < Width; ++i) t[i] = y[i];
+#pragma GCC unroll 8
+  for (int j = Width - 1; j >= 0; --j) {
+    t[j] *= l[j * ld + j];
+#pragma GCC unroll 8
+    for (int i = 0; i < j; ++i) t[i] = subtract_product_of(t[i], l[i * ld + j], t[j]);
+  }
+#pragma GCC unroll 8
+  for (int i = 0; i < Width; ++i) y[i] = t[i];
+}
+
+/// The same for a width of up to kLanes; supernodes are made of vertices of three columns each, and
+/// widths of the rest are what is left of those.
+DIFFCLOTH_INLINE void solve_triangle(const double* l, std::ptrdiff_t ld, int width, double* y) {
+  switch (width) {
+    case 1:
+      return solve_triangle<1>(l, ld, y);
+    case 2:
+      return solve_triangle<2>(l, ld, y);
+    case 3:
+      return solve_triangle<3>(l, ld, y);
+    case 4:
+      return solve_triangle<4>(l, ld, y);
+    case 5:
+      return solve_triangle<5>(l, ld, y);
+    case 6:
+      return solve_triangle<6>(l, ld, y);
+    case 7:
+      return solve_triangle<7>(l, ld, y);
+    default:
+      return solve_triangle<8>(l, ld, y);
+  }
+}
+
+DIFFCLOTH_INLINE void solve_transposed_triangle(const double* l,
+                                                std::ptrdiff_t ld,
+                                                int width,
+                                                double* y) {
+  switch (width) {
+    case 1:
+      return solve_transposed_triangle<1>(l, ld, y);
+    case 2:
+      return solve_transposed_triangle<2>(l, ld, y);
+    case 3:
+      return solve_transposed_triangle<3>(l, ld, y);
+    case 4:
+      return solve_transposed_triangle<4>(l, ld, y);
+    case 5:
+      return solve_transposed_triangle<5>(l, ld, y);
+    case 6:
+      return solve_transposed_triangle<6>(l, ld, y);
+    case 7:
+      return solve_transposed_triangle<7>(l, ld, y);
+    default:
+      return solve_transposed_triangle<8>(l, ld, y);
+  }
+}
+
 template <int R>
 void forward(const Front& front, const double* panel, double* c, std::ptrdiff_t stride) {
   for (int column = 0; column < front.columns; column += kLanes) {
     const int width = front.columns - column < kLanes ? front.columns - column : kLanes;
     const double* const l = panel + static_cast<std::ptrdiff_t>(column) * front.ld;
     for (int r = 0; r < R; ++r) {
-      double* const y = c + r * stride + column;
-      for (int j = 0; j < width; ++j) {
-        const double* const l_j = l + static_cast<std::ptrdiff_t>(j) * front.ld + column;
-        y[j] *= l_j[j];
-        for (int i = j + 1; i < width; ++i) y[i] = subtract_product_of(y[i], l_j[i], y[j]);
-      }
+      solve_triangle(l + column, front.ld, width, c + r * stride + column);
     }
     for (int row = column + kLanes; row < front.ld; row += kLanes) {
       Pack sum[R];
@@ -393,12 +467,7 @@ void backward(const Front& front, const double* panel, double* c, std::ptrdiff_t
                           stride);
     }
     for (int r = 0; r < R; ++r) {
-      double* const y = c + r * stride + column;
-      for (j = width - 1; j >= 0; --j) {
-        const double* const l_j = l + j * ld + column;
-        for (int i = width - 1; i > j; --i) y[j] = subtract_product_of(y[j], l_j[i], y[i]);
-        y[j] *= l_j[j];
-      }
+      solve_transposed_triangle(l + column, ld, width, c + r * stride + column);
     }
   }
 }
@@ -430,7 +499,53 @@ void backward(
   }
 }
 
-constexpr DenseKernels kKernels{.factor = factor,
+using Four = double __attribute__((vector_size(32)));
+using UnalignedFour = double __attribute__((vector_size(32), aligned(8), may_alias));
+
+DIFFCLOTH_INLINE const UnalignedFour& four(const double* from) {
+  return *reinterpret_cast<const UnalignedFour*>(from);
+}
+
+/// Columns of a block, each in the first three lanes; nothing behind the block is read.
+struct Columns {
+  Four c[3];
+
+  DIFFCLOTH_INLINE explicit Columns(const double* block)
+      : c{four(block), four(block + 3), Four{block[6], block[7], block[8], 0.0}} {}
+
+  DIFFCLOTH_INLINE void add_product(const Four& x, Four& y) const {
+    y += c[0] * x[0] + c[1] * x[1] + c[2] * x[2];
+  }
+};
+
+void multiply_blocks(const std::int32_t* column_start,
+                     const std::int32_t* row,
+                     std::int32_t size,
+                     const double* blocks,
+                     const double* x,
+                     double* y) {
+  for (std::int32_t j = 0; j < size; ++j) {
+    const Four x_j = four(x + 4 * static_cast<std::ptrdiff_t>(j));
+    Four dots[3] = {};
+    std::int32_t k = column_start[j];
+    Four y_j = {};
+    Columns(blocks + 9 * static_cast<std::ptrdiff_t>(k)).add_product(x_j, y_j);
+    for (++k; k < column_start[j + 1]; ++k) {
+      const Columns block(blocks + 9 * static_cast<std::ptrdiff_t>(k));
+      const std::ptrdiff_t i = 4 * static_cast<std::ptrdiff_t>(row[k]);
+      const Four x_i = four(x + i);
+      Four y_i = four(y + i);
+      block.add_product(x_j, y_i);
+      *reinterpret_cast<UnalignedFour*>(y + i) = y_i;
+      for (int a = 0; a < 3; ++a) dots[a] += block.c[a] * x_i;
+    }
+    for (int a = 0; a < 3; ++a) y_j[a] += dots[a][0] + dots[a][1] + dots[a][2];
+    *reinterpret_cast<UnalignedFour*>(y + 4 * static_cast<std::ptrdiff_t>(j)) += y_j;
+  }
+}
+
+constexpr DenseKernels kKernels{.multiply_blocks = multiply_blocks,
+                                .factor = factor,
                                 .add_to_panel = add_to_panel,
                                 .add_to_update = add_to_update,
                                 .forward = forward,

@@ -4,7 +4,6 @@
 #include <string_view>
 #include <utility>
 
-#include "elastic/repeated_elasticity.h"
 #include "projective/local_global.h"
 #include "solver/newton.h"
 #include "step/contact_stage.h"
@@ -39,9 +38,7 @@ void solve_by_projective_dynamics(Problem& problem,
       .max_iterations = projective::kIterationsPerNewton * given.max_iterations};
   const Checkpoint& checkpoint = *step.context.checkpoint;
   const auto matrix = problem.constant_matrix();
-  const elastic::RepeatedElasticity elasticity(problem.model, problem.scene.slots,
-                                               problem.scene.elastic_assemblies.base());
-  projective::Objective f{.potentials = {&problem.inertia, &elasticity},
+  projective::Objective f{.potentials = {&problem.inertia, &problem.elasticity},
                           .matrix = matrix.get(),
                           .masses = &problem.masses,
                           .h = problem.h};

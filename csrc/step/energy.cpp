@@ -19,9 +19,9 @@ double potential_energy(const Scene& scene, const Inputs& inputs) {
     contact::BroadPhase::Scratch scratch;
     std::vector<contact::Candidate> candidates;
     scene.broad_phase.find(x, x, p.contact->reach(), scratch, candidates);
-    std::vector<double> energies;
-    p.contact->energies(candidates, x, energies);
-    energy = std::accumulate(energies.begin(), energies.end(), energy);
+    contact::Near near;
+    p.contact->measure(candidates, x, near);
+    energy += near.energy();
   }
   return energy;
 }

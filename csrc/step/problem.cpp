@@ -152,7 +152,7 @@ Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, elastic::Wanted
       ends(end_positions(scene, inputs, start)),
       inertia(masses, predicted_positions(inputs, masses, h), h),
       model(elastic_model(scene, inputs, *rest, h)),
-      elasticity(model, scene.slots, wanted) {
+      elasticity(model, scene.slots, scene.elastic_assemblies.base(), wanted) {
   const std::vector<Index>& soft = scene.given.soft_pins;
   if (!soft.empty()) {
     const View stiffness = inputs[Input::kPinStiffness];

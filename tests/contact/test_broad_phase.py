@@ -445,3 +445,23 @@ def test_a_single_triangle_has_no_elements_apart():
     mesh = kernels.BroadPhase(np.array([[0, 1, 2]], np.int32), np.zeros(3, np.int32), 1, True, x)
     assert mesh.smallest_nonadjacent_distance(x) == np.inf
     assert len(mesh.find(x, x, 1.0)) == 0
+
+
+@pytest.mark.parametrize("level", kernels.kernel_levels())
+def test_near_boxes(level):
+    """Boxes with margins that sum up to the range: within it without them, as the crow flies."""
+    rng = np.random.default_rng(5)
+    found = 0
+    for _ in range(200):
+        margin, extent = 0.1, rng.uniform(0.0, 0.2, (8, 3))
+        center = rng.uniform(-0.4, 0.4, (8, 3))
+        boxes = np.stack([center - extent - margin, center + extent + margin], axis=1)
+        boxes[7] = [[np.inf] * 3, [-np.inf] * 3]  # none
+        bits = kernels.near_boxes(level, boxes, 2 * margin)
+        for p, q in itertools.product(range(4), range(4)):
+            a, b = boxes[p], boxes[4 + q]
+            apart = np.maximum(a[0] - b[1], b[0] - a[1]) + 2 * margin
+            expected = q != 3 and np.linalg.norm(np.maximum(apart, 0.0)) <= 2 * margin
+            assert bool(bits >> (4 * p + q) & 1) == expected
+            found += expected
+    assert 0 < found < 200 * 12

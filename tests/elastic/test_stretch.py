@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
-from elastic_meshes import MESHES, differences, grid, model, rigid
+from elastic_meshes import MESHES, differences, grid, jittered, model, rigid
+
+from diffcloth_torch import _kernels
 
 K_S = 100.0  # [N/m]
 RNG = np.random.default_rng(3)
@@ -131,3 +133,21 @@ def test_energy_change_does_not_cancel(size):
     # Rounding of the forces times the step; extended precision itself limits the reference.
     allowed = 1e-13 * K_S * size * len(faces) + 1e-17 * K_S * len(faces)
     assert abs(elastic.energy_change(x0, x1) - float(expected)) < allowed
+
+
+@pytest.mark.parametrize("positive", [False, True])
+def test_instructions_do_not_change_a_bit(positive):
+    """Regular, compressed, degenerate; their number is no multiple of that of the lanes."""
+    X, faces = jittered(6, 4)
+    rng = np.random.default_rng(7)
+    x0 = X * [0.9, 1.2, 1.0] + 0.2 * rng.normal(size=X.shape)
+    x0[1] = x0[0]
+    x1 = x0 + 0.1 * rng.normal(size=X.shape)
+    elastic = model(X, faces, stretch=K_S)
+    results = [elastic.stretch(level, x0, x1, positive) for level in _kernels.kernel_levels()]
+    assert len(faces) % 8 != 0
+    assert np.abs(results[0][1]).max() > 0.0
+    for change, gradient, blocks in results[1:]:
+        assert change == results[0][0]
+        np.testing.assert_array_equal(gradient, results[0][1])
+        np.testing.assert_array_equal(blocks, results[0][2])

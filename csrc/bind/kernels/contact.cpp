@@ -14,11 +14,13 @@
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/pair.h>
+#include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>
 
 #include "bind/kernels/kernels.h"
 #include "contact/barrier.h"
+#include "contact/box_group.h"
 #include "contact/broad_phase.h"
 #include "contact/candidate_list.h"
 #include "contact/ccd.h"
@@ -39,6 +41,7 @@ template <class Scalar, class Shape>
 using Array = nb::ndarray<const Scalar, Shape, nb::c_contig, nb::device::cpu>;
 using OnePair = Array<double, nb::shape<4, 3>>;
 using Pairs = Array<double, nb::shape<-1, 4, 3>>;
+using Boxes = Array<double, nb::shape<8, 2, 3>>;
 using Positions = Array<double, nb::shape<-1, 3>>;
 using Faces = Array<Index, nb::shape<-1, 3>>;
 using Surfaces = Array<Index, nb::shape<-1>>;
@@ -236,6 +239,22 @@ void collision_kernels(nb::module_& m) {
         return out;
       },
       "edge_edge"_a, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "xi"_a);
+
+  m.def(
+      "near_boxes",
+      [](const std::string& level, const Boxes& boxes, double range) {
+        std::array<contact::BoxGroup, 2> groups;
+        for (int k = 0; k < 2 * contact::kBoxGroup; ++k) {
+          contact::BoxGroup& group = groups[k / contact::kBoxGroup];
+          for (int axis = 0; axis < 3; ++axis) {
+            group.lo[axis][k % contact::kBoxGroup] = boxes(k, 0, axis);
+            group.hi[axis][k % contact::kBoxGroup] = boxes(k, 1, axis);
+          }
+        }
+        return contact::near_boxes(level_named(level))(groups[0], groups[1], range);
+      },
+      "level"_a, "boxes"_a.noconvert(), "range"_a,
+      "Which of the first four boxes, [8, 2, 3], are near which of the other four: bits.");
 
   nb::class_<Search>(m, "BroadPhase")
       .def(nb::init<const Faces&, const Surfaces&, Index, bool, const Positions&,

@@ -62,10 +62,16 @@ class ContactPotential {
   /// Entries that are comparable between x and another position.
   std::pair<Values, Values> energies(const Positions& x, const Positions& other) {
     const std::vector<contact::Candidate> pairs = candidates(x, other);
+    contact::Near at_x;
+    contact::Near at_other;
+    model_.measure(pairs, x.data(), at_x);
+    model_.measure(pairs, other.data(), at_other);
     std::vector<double> a;
     std::vector<double> b;
-    model_.energies(pairs, x.data(), a);
-    model_.energies(pairs, other.data(), b);
+    contact::for_each_energy(at_x, at_other, [&](double e_x, double e_other) {
+      a.push_back(e_x);
+      b.push_back(e_other);
+    });
     return {to_values(a), to_values(b)};
   }
 
@@ -221,8 +227,10 @@ class ContactPotential {
   }
 
   std::vector<contact::Contact> find(const Positions& x) {
+    contact::Near near;
     std::vector<contact::Contact> found;
-    model_.find(candidates(x, x), x.data(), found);
+    model_.measure(candidates(x, x), x.data(), near);
+    model_.find(near, x.data(), found);
     return found;
   }
 

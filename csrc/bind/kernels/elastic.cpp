@@ -6,6 +6,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <numeric>
 #include <optional>
 #include <span>
 #include <stdexcept>
@@ -19,6 +20,7 @@
 #include "bind/kernels/kernels.h"
 #include "elastic/anchors.h"
 #include "elastic/constant_form.h"
+#include "elastic/elastic_potential.h"
 #include "linalg/block_pattern.h"
 #include "mesh/rest_shape.h"
 #include "mesh/topology.h"
@@ -134,20 +136,43 @@ class Elastic {
   }
 
   double energy_change(const Positions& x0, const Positions& x1) const {
-    return elastic::energy_change(model_, positions("x0", x0).data(), positions("x1", x1).data());
+    return potential().energy_change(positions("x0", x0).data(), positions("x1", x1).data());
   }
 
   Array gradient(const Positions& x) const {
     std::vector<double> g(x.size(), 0.0);
-    elastic::add_gradient(model_, positions("x", x).data(), g.data());
+    potential().add_gradient(positions("x", x).data(), g.data());
     return rows_array(g);
   }
 
   Array hessian_blocks(const Positions& x, bool positive) const {
     std::vector<double> blocks(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
     const auto curvature = positive ? Curvature::kPositive : Curvature::kExact;
-    elastic::add_hessian(model_, slots_, positions("x", x).data(), curvature, blocks.data());
+    std::vector<Index> place(pattern_.block_count());
+    std::iota(place.begin(), place.end(), 0);
+    elastic::add_hessian(model_, slots_, positions("x", x).data(), curvature, place, blocks.data());
     return owned(blocks.data(), {blocks.size() / 9, 9});
+  }
+
+  /// Stretch alone by the kernels of a level: change of the energy, gradient and Hessian's blocks.
+  nb::tuple stretch(const std::string& level,
+                    const Positions& x0,
+                    const Positions& x1,
+                    bool positive) const {
+    const elastic::StretchKernels& kernels = elastic::stretch_kernels(level_named(level));
+    const std::vector<elastic::StretchBatch>& batches = model_.prepared.stretch;
+    const std::vector<double> from = positions("x0", x0);
+    const std::vector<double> to = positions("x1", x1);
+    std::vector<double> g(from.size(), 0.0);
+    std::vector<double> blocks(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
+    std::vector<Index> place(pattern_.block_count());
+    std::iota(place.begin(), place.end(), 0);
+    kernels.add_gradient(batches.data(), batches.size(), from.data(), g.data());
+    kernels.add_hessian(batches.data(), batches.size(), from.data(), positive, place.data(),
+                        blocks.data());
+    return nb::make_tuple(
+        kernels.energy_change(batches.data(), batches.size(), from.data(), to.data()),
+        rows_array(g), owned(blocks.data(), {blocks.size() / 9, 9}));
   }
 
   /// (row, column) of every block, in the order of hessian_blocks().
@@ -294,6 +319,10 @@ class Elastic {
   }
 
  private:
+  elastic::ElasticPotential potential() const {
+    return {model_, slots_, pattern_, elastic::Wanted::kNone};
+  }
+
   std::vector<double> positions(const char* name, const Positions& x) const {
     check_rows(name, x.shape(0), topology_.vertex_count);
     return {x.data(), x.data() + x.size()};
@@ -361,6 +390,8 @@ void elastic_kernels(nb::module_& m) {
            "x_n"_a.noconvert().none())
       .def("energy", &Elastic::energy, "x"_a.noconvert())
       .def("energy_change", &Elastic::energy_change, "x0"_a.noconvert(), "x1"_a.noconvert())
+      .def("stretch", &Elastic::stretch, "level"_a, "x0"_a.noconvert(), "x1"_a.noconvert(),
+           "positive"_a = false)
       .def("gradient", &Elastic::gradient, "x"_a.noconvert())
       .def("hessian", &Elastic::hessian, "x"_a.noconvert(), "positive"_a)
       .def("hessian_blocks", &Elastic::hessian_blocks, "x"_a.noconvert(), "positive"_a)

@@ -1,11 +1,13 @@
 #pragma once
 
 #include <array>
+#include <string>
 #include <vector>
 
 #include <nanobind/nanobind.h>
 
 #include "contact/surface_pairs.h"
+#include "linalg/kernel_level.h"
 
 namespace diffcloth::bind {
 
@@ -17,6 +19,9 @@ contact::SurfacePairs touching_surfaces(const std::vector<Index>& vertex_surface
                                         bool self_contact,
                                         const std::vector<bool>& body_dynamic,
                                         const std::vector<std::array<Index, 2>>& ignored_pairs);
+
+/// The level of that name, among those that this machine has.
+linalg::KernelLevel level_named(const std::string& name);
 
 /// Threads, for tests of what happens when they fail or are interrupted.
 void common_kernels(nb::module_& m);

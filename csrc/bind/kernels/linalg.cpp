@@ -42,14 +42,6 @@ std::vector<linalg::KernelLevel> supported_levels() {
   return result;
 }
 
-linalg::KernelLevel level_named(const std::string& name) {
-  for (const linalg::KernelLevel level : supported_levels()) {
-    if (name == linalg::name(level)) return level;
-  }
-  throw std::invalid_argument("Cholesky: `level` must be one of this machine's, got '" + name +
-                              "'");
-}
-
 linalg::Ordering ordering_named(const std::string& name) {
   using enum linalg::Ordering;
   for (const linalg::Ordering ordering : {kAutomatic, kMinimumDegree, kNestedDissection}) {
@@ -145,6 +137,13 @@ class Factor {
 };
 
 }  // namespace
+
+linalg::KernelLevel level_named(const std::string& name) {
+  for (const linalg::KernelLevel level : supported_levels()) {
+    if (name == linalg::name(level)) return level;
+  }
+  throw std::invalid_argument("`level` must be one of this machine's, got '" + name + "'");
+}
 
 void linalg_kernels(nb::module_& m) {
   m.def("cholesky_backends", [] {

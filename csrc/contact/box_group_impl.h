@@ -1,0 +1,41 @@
+// The comparison of two groups of boxes, written once over packs of `kPack` doubles, which the file
+// that includes this one defines. Everything here is in an anonymous namespace, for the reason given in
+// linalg/dense_kernels_impl.h.
+
+#pragma once
+
+#include "contact/box_group.h"
+
+namespace diffcloth::contact {
+namespace {
+
+using Pack = double __attribute__((vector_size(8 * kPack)));
+using Mask = long long __attribute__((vector_size(8 * kPack)));
+using Stored = double __attribute__((vector_size(8 * kPack), aligned(8), may_alias));
+
+std::uint32_t find_near_boxes(const BoxGroup& a, const BoxGroup& b, double range) {
+  std::uint32_t result = 0;
+  for (int p = 0; p < kBoxGroup; ++p) {
+    for (int first = 0; first < kBoxGroup; first += kPack) {
+      Pack sum = {};
+      Mask near = Mask{} == Mask{};
+      for (int k = 0; k < 3; ++k) {
+        const Pack lo = *reinterpret_cast<const Stored*>(b.lo[k] + first);
+        const Pack hi = *reinterpret_cast<const Stored*>(b.hi[k] + first);
+        near &= (a.lo[k][p] <= hi) & (lo <= a.hi[k][p]);
+        const Pack over = a.lo[k][p] - hi;
+        const Pack under = lo - a.hi[k][p];
+        const Pack apart = (over > under ? over : under) + range;
+        sum += apart > 0.0 ? apart * apart : Pack{};
+      }
+      near &= ~(sum > range * range);
+      for (int l = 0; l < kPack; ++l) {
+        result |= static_cast<std::uint32_t>(near[l] & 1) << (kBoxGroup * p + first + l);
+      }
+    }
+  }
+  return result;
+}
+
+}  // namespace
+}  // namespace diffcloth::contact

@@ -1,0 +1,65 @@
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "linalg/kernel_level.h"
+
+namespace diffcloth::elastic {
+
+// Plain arrays: those of the standard library are templates, see linalg/dense_kernels_impl.h.
+// NOLINTBEGIN(modernize-avoid-c-arrays)
+
+/// Triangles that go through the arithmetic of stretch side by side.
+inline constexpr int kStretchLanes = 8;
+
+/// Eight triangles, or fewer: the lanes behind the last one repeat it, without weight. The corners of
+/// each are in ascending order, so that its blocks are all in a lower triangle.
+struct StretchBatch {
+  std::int32_t size;                      ///< lanes that count
+  std::int32_t vertex[3][kStretchLanes];  ///< ascending
+  std::int32_t slot[6][kStretchLanes];    ///< of the pairs (0,0), (1,0), (1,1), (2,0), (2,1), (2,2)
+  double g[4][kStretchLanes];             ///< shape gradients of corners 1 and 2 [1/m]
+  double weight[kStretchLanes];           ///< k_s A [N m]
+};
+
+// NOLINTEND(modernize-avoid-c-arrays)
+
+/// The stretch of many triangles, E of stretch.h, in lanes.
+///
+/// Only sums, products, quotients and roots, each rounded once, in one order: every level has the same
+/// bits.
+struct StretchKernels {
+  /// E(x1) - E(x0), summed in the order of the triangles. With both frames orthonormal,
+  ///
+  ///   dE = k_s A / 2 ( <F0 - R0 + F1 - R1, dF> - 1/2 <S1 - S0, dR^T dR> ),
+  ///
+  /// with dF from differences of positions.
+  double (*energy_change)(const StretchBatch* batches,
+                          std::size_t count,
+                          const double* x0,
+                          const double* x1);
+
+  /// g += grad E.
+  void (*add_gradient)(const StretchBatch* batches, std::size_t count, const double* x, double* g);
+
+  /// blocks += the Hessian,
+  ///
+  ///   H_pq = k_s A [ (g_p.g_q) I - (1/t) e_p e_q^T - (g_p^T S^-1 g_q) n n^T ],
+  ///   e_p = g_p0 r2 - g_p1 r1,
+  ///
+  /// or its projection, which clamps 1/t to 1/2 and the eigenvalues of S^-1 to 1.
+  ///
+  /// @param place  where a slot lies in blocks
+  void (*add_hessian)(const StretchBatch* batches,
+                      std::size_t count,
+                      const double* x,
+                      bool positive,
+                      const std::int32_t* place,
+                      double* blocks);
+};
+
+/// @throws std::invalid_argument  where this processor or build has none of that level
+const StretchKernels& stretch_kernels(linalg::KernelLevel level);
+
+}  // namespace diffcloth::elastic

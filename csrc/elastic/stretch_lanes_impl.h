@@ -1,0 +1,285 @@
+// The arithmetic of StretchKernels, written once. Loops over lanes are plain ones, which compilers turn
+// into the instructions that a file is compiled for. Everything here is in an anonymous namespace,
+// for the reason given in linalg/dense_kernels_impl.h.
+
+#pragma once
+
+#include <cstddef>
+
+#include "elastic/stretch_lanes.h"
+
+// NOLINTBEGIN(modernize-avoid-c-arrays)
+
+#define DIFFCLOTH_INLINE inline __attribute__((always_inline))
+
+namespace diffcloth::elastic {
+namespace {
+
+/// As in frame.h and stretch.cpp.
+constexpr double kDegenerateFrame = 1e-8;
+constexpr double kNearlyDegenerateFrame = 1e-4;
+
+constexpr int kLanes = kStretchLanes;
+
+DIFFCLOTH_INLINE double larger(double a, double b) { return a > b ? a : b; }
+DIFFCLOTH_INLINE double smaller(double a, double b) { return a < b ? a : b; }
+
+/// Two vectors along the sides of each triangle, from corner 0 to corners 1 and 2.
+struct Sides {
+  alignas(64) double at[6][kLanes];
+};
+
+DIFFCLOTH_INLINE void gather_sides(const StretchBatch& batch, const double* x, Sides& sides) {
+  for (int l = 0; l < kLanes; ++l) {
+    const double* const x0 = x + 3 * static_cast<std::ptrdiff_t>(batch.vertex[0][l]);
+    const double* const x1 = x + 3 * static_cast<std::ptrdiff_t>(batch.vertex[1][l]);
+    const double* const x2 = x + 3 * static_cast<std::ptrdiff_t>(batch.vertex[2][l]);
+    for (int k = 0; k < 3; ++k) {
+      sides.at[k][l] = x1[k] - x0[k];
+      sides.at[3 + k][l] = x2[k] - x0[k];
+    }
+  }
+}
+
+/// The same of x1 - x0, whose differences are taken first.
+DIFFCLOTH_INLINE void gather_change(const StretchBatch& batch,
+                                    const double* x0,
+                                    const double* x1,
+                                    Sides& sides) {
+  for (int l = 0; l < kLanes; ++l) {
+    const std::ptrdiff_t i = 3 * static_cast<std::ptrdiff_t>(batch.vertex[0][l]);
+    const std::ptrdiff_t j = 3 * static_cast<std::ptrdiff_t>(batch.vertex[1][l]);
+    const std::ptrdiff_t m = 3 * static_cast<std::ptrdiff_t>(batch.vertex[2][l]);
+    for (int k = 0; k < 3; ++k) {
+      const double origin = x1[i + k] - x0[i + k];
+      sides.at[k][l] = (x1[j + k] - x0[j + k]) - origin;
+      sides.at[3 + k][l] = (x1[m + k] - x0[m + k]) - origin;
+    }
+  }
+}
+
+/// The two columns of F of one lane.
+struct Gradient {
+  double a[3], b[3];
+};
+
+DIFFCLOTH_INLINE Gradient gradient(const StretchBatch& batch, const Sides& sides, int l) {
+  Gradient F;
+  for (int k = 0; k < 3; ++k) {
+    F.a[k] = sides.at[k][l] * batch.g[0][l] + sides.at[3 + k][l] * batch.g[2][l];
+    F.b[k] = sides.at[k][l] * batch.g[1][l] + sides.at[3 + k][l] * batch.g[3][l];
+  }
+  return F;
+}
+
+DIFFCLOTH_INLINE double dot(const double* a, const double* b) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+/// See Frame in frame.h.
+struct Polar {
+  double r1[3], r2[3], n[3];
+  double c11, c12, c22;
+  double s11, s12, s22;  ///< S^-1
+  double t, d;           ///< d is not floored
+};
+
+DIFFCLOTH_INLINE Polar polar_of(const Gradient& F) {
+  Polar p;
+  double normal[3];
+  normal[0] = F.a[1] * F.b[2] - F.a[2] * F.b[1];
+  normal[1] = F.a[2] * F.b[0] - F.a[0] * F.b[2];
+  normal[2] = F.a[0] * F.b[1] - F.a[1] * F.b[0];
+  p.c11 = dot(F.a, F.a);
+  p.c12 = dot(F.a, F.b);
+  p.c22 = dot(F.b, F.b);
+  p.d = __builtin_sqrt(dot(normal, normal));
+  const double d = larger(p.d, kDegenerateFrame);
+  p.t = larger(__builtin_sqrt(p.c11 + p.c22 + 2.0 * p.d), kDegenerateFrame);
+  const double scale = 1.0 / (d * p.t);
+  p.s11 = (p.c22 + d) * scale;
+  p.s12 = -p.c12 * scale;
+  p.s22 = (p.c11 + d) * scale;
+  const double inv_d = 1.0 / d;
+  for (int k = 0; k < 3; ++k) {
+    p.r1[k] = F.a[k] * p.s11 + F.b[k] * p.s12;
+    p.r2[k] = F.a[k] * p.s12 + F.b[k] * p.s22;
+    p.n[k] = normal[k] * inv_d;
+  }
+  return p;
+}
+
+/// |F - R|^2, in a form that needs no frame where there is hardly one.
+DIFFCLOTH_INLINE double strain_sq(const Gradient& F, const Polar& p) {
+  double regular = 0.0;
+  for (int k = 0; k < 3; ++k) {
+    const double a = F.a[k] - p.r1[k];
+    const double b = F.b[k] - p.r2[k];
+    regular += a * a + b * b;
+  }
+  const double degenerate = p.c11 + p.c22 - 2.0 * p.t + 2.0;
+  return p.d >= kNearlyDegenerateFrame ? regular : degenerate;
+}
+
+double energy_change(const StretchBatch* batches,
+                     std::size_t count,
+                     const double* x0,
+                     const double* x1) {
+  double total = 0.0;
+  for (const StretchBatch* batch = batches; batch != batches + count; ++batch) {
+    Sides start;
+    Sides end;
+    Sides change;
+    gather_sides(*batch, x0, start);
+    gather_sides(*batch, x1, end);
+    gather_change(*batch, x0, x1, change);
+    alignas(64) double energy[kLanes];
+    for (int l = 0; l < kLanes; ++l) {
+      const Gradient F0 = gradient(*batch, start, l);
+      const Gradient F1 = gradient(*batch, end, l);
+      const Gradient dF = gradient(*batch, change, l);
+      const Polar p0 = polar_of(F0);
+      const Polar p1 = polar_of(F1);
+      double work = 0.0;
+      double dr1[3];
+      double dr2[3];
+      for (int k = 0; k < 3; ++k) {
+        work += ((F0.a[k] - p0.r1[k]) + (F1.a[k] - p1.r1[k])) * dF.a[k];
+        work += ((F0.b[k] - p0.r2[k]) + (F1.b[k] - p1.r2[k])) * dF.b[k];
+        dr1[k] = p1.r1[k] - p0.r1[k];
+        dr2[k] = p1.r2[k] - p0.r2[k];
+      }
+      const double inv_t0 = 1.0 / p0.t;
+      const double inv_t1 = 1.0 / p1.t;
+      const double dS11 = (p1.c11 + p1.d) * inv_t1 - (p0.c11 + p0.d) * inv_t0;
+      const double dS12 = p1.c12 * inv_t1 - p0.c12 * inv_t0;
+      const double dS22 = (p1.c22 + p1.d) * inv_t1 - (p0.c22 + p0.d) * inv_t0;
+      const double turned =
+          dS11 * dot(dr1, dr1) + 2.0 * (dS12 * dot(dr1, dr2)) + dS22 * dot(dr2, dr2);
+      const double regular = work - 0.5 * turned;
+      const double difference = strain_sq(F1, p1) - strain_sq(F0, p0);
+      const bool is_regular = smaller(p0.d, p1.d) >= kNearlyDegenerateFrame;
+      energy[l] = (0.5 * batch->weight[l]) * (is_regular ? regular : difference);
+    }
+    for (int l = 0; l < batch->size; ++l) total += energy[l];
+  }
+  return total;
+}
+
+void add_gradient(const StretchBatch* batches, std::size_t count, const double* x, double* g) {
+  for (const StretchBatch* batch = batches; batch != batches + count; ++batch) {
+    Sides sides;
+    gather_sides(*batch, x, sides);
+    alignas(64) double force[6][kLanes];  // on corners 1 and 2
+    for (int l = 0; l < kLanes; ++l) {
+      const Gradient F = gradient(*batch, sides, l);
+      const Polar p = polar_of(F);
+      for (int k = 0; k < 3; ++k) {
+        const double a = batch->weight[l] * (F.a[k] - p.r1[k]);
+        const double b = batch->weight[l] * (F.b[k] - p.r2[k]);
+        force[k][l] = a * batch->g[0][l] + b * batch->g[1][l];
+        force[3 + k][l] = a * batch->g[2][l] + b * batch->g[3][l];
+      }
+    }
+    for (int l = 0; l < batch->size; ++l) {
+      double* const g0 = g + 3 * static_cast<std::ptrdiff_t>(batch->vertex[0][l]);
+      double* const g1 = g + 3 * static_cast<std::ptrdiff_t>(batch->vertex[1][l]);
+      double* const g2 = g + 3 * static_cast<std::ptrdiff_t>(batch->vertex[2][l]);
+      for (int k = 0; k < 3; ++k) {
+        g0[k] -= force[k][l] + force[3 + k][l];
+        g1[k] += force[k][l];
+        g2[k] += force[3 + k][l];
+      }
+    }
+  }
+}
+
+/// Clamp 1/t to 1/2, and the eigenvalues of S^-1 to 1.
+DIFFCLOTH_INLINE void project(Polar& p, double& inv_t) {
+  inv_t = smaller(inv_t, 0.5);
+  const double mean = 0.5 * (p.s11 + p.s22);
+  const double half = 0.5 * (p.s11 - p.s22);
+  const double radius = __builtin_sqrt(half * half + p.s12 * p.s12);
+  const double low = mean - radius;
+  // The matrix as it is, the identity, or its larger eigenvalue alone lowered to 1; there radius > 0.
+  const bool below = mean + radius <= 1.0;
+  const bool above = low >= 1.0;
+  const double scale = 0.5 * (1.0 - low) / radius;
+  const double middle = 0.5 * (1.0 + low);
+  const double s11 = scale * half + middle;
+  const double s12 = scale * p.s12;
+  const double s22 = middle - scale * half;
+  p.s11 = below ? p.s11 : (above ? 1.0 : s11);
+  p.s12 = below ? p.s12 : (above ? 0.0 : s12);
+  p.s22 = below ? p.s22 : (above ? 1.0 : s22);
+}
+
+template <bool Positive>
+DIFFCLOTH_INLINE void hessians(const StretchBatch& batch,
+                               const double* x,
+                               double (&h)[54][kLanes]) {
+  Sides sides;
+  gather_sides(batch, x, sides);
+  for (int l = 0; l < kLanes; ++l) {
+    Polar p = polar_of(gradient(batch, sides, l));
+    double inv_t = 1.0 / p.t;
+    if (Positive) project(p, inv_t);
+    const double w = batch.weight[l];
+    const double u[3] = {-(batch.g[0][l] + batch.g[2][l]), batch.g[0][l], batch.g[2][l]};
+    const double v[3] = {-(batch.g[1][l] + batch.g[3][l]), batch.g[1][l], batch.g[3][l]};
+    int k = 0;
+#pragma GCC unroll 3
+    for (int i = 0; i < 3; ++i) {
+#pragma GCC unroll 3
+      for (int j = 0; j <= i; ++j, k += 9) {
+        const double s_u = p.s11 * u[j] + p.s12 * v[j];
+        const double s_v = p.s12 * u[j] + p.s22 * v[j];
+        const double normal = w * (u[i] * s_u + v[i] * s_v);
+        const double both = w * (u[i] * u[j] + v[i] * v[j]);
+        const double turn = w * inv_t;
+#pragma GCC unroll 3
+        for (int b = 0; b < 3; ++b) {
+          const double e_j = u[j] * p.r2[b] - v[j] * p.r1[b];
+#pragma GCC unroll 3
+          for (int a = 0; a < 3; ++a) {
+            const double e_i = u[i] * p.r2[a] - v[i] * p.r1[a];
+            h[k + a + 3 * b][l] =
+                (a == b ? both : 0.0) - turn * (e_i * e_j) - normal * (p.n[a] * p.n[b]);
+          }
+        }
+      }
+    }
+  }
+}
+
+void add_hessian(const StretchBatch* batches,
+                 std::size_t count,
+                 const double* x,
+                 bool positive,
+                 const std::int32_t* place,
+                 double* blocks) {
+  alignas(64) double h[54][kLanes];
+  for (const StretchBatch* batch = batches; batch != batches + count; ++batch) {
+    if (positive) {
+      hessians<true>(*batch, x, h);
+    } else {
+      hessians<false>(*batch, x, h);
+    }
+    for (int l = 0; l < batch->size; ++l) {
+      for (int k = 0; k < 6; ++k) {
+        double* const block = blocks + 9 * static_cast<std::ptrdiff_t>(place[batch->slot[k][l]]);
+        for (int a = 0; a < 9; ++a) block[a] += h[9 * k + a][l];
+      }
+    }
+  }
+}
+
+constexpr StretchKernels kKernels{
+    .energy_change = energy_change, .add_gradient = add_gradient, .add_hessian = add_hessian};
+
+}  // namespace
+}  // namespace diffcloth::elastic
+
+#undef DIFFCLOTH_INLINE
+
+// NOLINTEND(modernize-avoid-c-arrays)
