@@ -35,6 +35,8 @@ SMALL_HIT = [
     "--set=simulation.steps=4",
     # Close enough that the push makes contact.
     "--set=scene.bodies.cuboid.pose={position: [0, -0.03, 0.95]}",
+    "--set=actions.linear=[[0, 0.75, 0.35]]",
+    "--set=actions.angular=[[0.8, 0, 0]]",
     "--set=loss.steps=1",
     "--set=optimizer.iterations=2",
     "--set=optimizer.checkpoint_every=null",

@@ -357,8 +357,12 @@ SMALL = [
 ]
 
 
+# One action for all intervals.
+PUSH_ONCE = ["actions.linear=[[0, 0.75, 0.35]]", "actions.angular=[[0.8, 0, 0]]"]
+
+
 def small_hit(*assignments):
-    return load_task(CONFIGS / "hit_cloth.yaml", [*SMALL, *assignments])
+    return load_task(CONFIGS / "hit_cloth.yaml", [*SMALL, *PUSH_ONCE, *assignments])
 
 
 def test_the_shipped_task_is_the_one_of_the_paper():

@@ -172,7 +172,7 @@ def _midpoint_spin(inertia: Tensor, momentum: Tensor, dt: float) -> Tensor:
         for _ in range(_ITERATIONS):
             left = _apply(inertia, spin) - _turned_back(dt / 2 * spin, momentum)
             spin = spin - _apply(inverse, left)
-    return attach_root(residual, spin, slope)
+    return attach_root(residual, spin, (inertia, momentum), slope)
 
 
 def _turned_back(turn: Tensor, vector: Tensor) -> Tensor:

@@ -195,9 +195,9 @@ class Chain:
         # Of a robot that no force moves only the motion counts.
         velocity, constraint = known, torch.zeros_like(start.joints)
         if self.mechanism.is_dynamic:
-            given = self._given(inertia, start, state, control, drives, gravity, contact)
-            guess = torch.cat([state.velocity, state.rates], dim=-1).detach()
-            velocity, constraint = self._solve(inertia, start, known, guess, given)
+            here = self._motion(inertia, start)
+            given = self._given(inertia, here, state, control, drives, gravity, contact)
+            velocity, constraint = self._solve(inertia, start, here, known, given)
         end = self._moved(start, velocity, self._dt)
         joints = torch.where(self._prescribed, ends, end.joints)
         coordinates, free = state.joints, joints
@@ -313,7 +313,7 @@ class Chain:
     def _given(
         self,
         inertia: Inertia,
-        start: _Configuration,
+        here: Motion,
         state: ChainState,
         control: ChainControl,
         drives: Drives,
@@ -321,7 +321,6 @@ class Chain:
         contact: Tensor | None,
     ) -> Tensor:
         """M(q_n) nu_n + h tau(q_n), [B, 6 + J]."""
-        here = self._motion(inertia, start)
         weights = inertia.mass[..., None] * torch.nn.functional.pad(gravity, (0, 3))[..., None, :]
         acting = torch.cat([control.wrench, drives.efforts], dim=-1)
         acting = acting + generalized_force(here, weights)
@@ -346,8 +345,8 @@ class Chain:
         self,
         inertia: Inertia,
         start: _Configuration,
+        here: Motion,
         known: Tensor,
-        guess: Tensor,
         given: Tensor,
     ) -> tuple[Tensor, Tensor]:
         """Velocities over the step without contact, and the efforts on prescribed joints."""
@@ -366,13 +365,16 @@ class Chain:
 
         velocity = known
         if len(solved):
-            mass = mass_matrix(self._motion(inertia, start), inertia)
-            inverse = torch.linalg.inv(mass.detach()[..., solved[:, None], solved])
-            alone = (inverse @ given.detach()[..., solved, None])[..., 0]
-            scale = torch.cat([alone, known.detach()], dim=-1).abs().amax(-1)
-            x, found = find_root(of_solved, guess[..., solved], inverse, scale)
+            with torch.no_grad():
+                # Without velocity products, but for those of what is prescribed.
+                mass = mass_matrix(here, inertia)
+                rest = given - (mass @ known[..., None])[..., 0]
+                inverse = torch.linalg.inv(mass[..., solved[:, None], solved])
+                guess = (inverse @ rest[..., solved, None])[..., 0]
+                scale = torch.cat([guess, known], dim=-1).abs().amax(-1)
+                x, found = find_root(of_solved, guess, inverse, scale)
             self._check(found)
-            velocity = complete(attach_root(of_solved, x))
+            velocity = complete(attach_root(of_solved, x, (*inertia, *start, known, given)))
         constraint = torch.zeros_like(start.joints)
         if self._prescribed.any():
             constraint = self._prescribed * self._at_joints(residual(velocity)) / h

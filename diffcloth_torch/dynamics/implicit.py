@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import torch
 from torch import Tensor
@@ -43,7 +43,9 @@ def find_root(
             size = step.abs().amax(-1, True)
             whole = torch.maximum(x.abs().amax(-1, True), scale[:, None])
             at_floor = (size <= _FLOOR * whole) & (size >= last / 2)
-            active = active & ~((size <= _TOLERANCE * whole) | at_floor)
+            # The next step, which shrinks at least as this one did.
+            ahead = size * torch.where(last.isinf(), 1.0, size / last)
+            active = active & ~((ahead <= _TOLERANCE * whole) | at_floor)
             if not active.any():
                 break
             before, r, last = r, residual(x), size
@@ -53,7 +55,9 @@ def find_root(
     return x, ~active[:, 0]
 
 
-def attach_root(residual: Residual, root: Tensor, slope: Residual | None = None) -> Tensor:
+def attach_root(
+    residual: Residual, root: Tensor, inputs: Iterable[Tensor], slope: Residual | None = None
+) -> Tensor:
     """Give a root its first derivative with respect to what r depends on.
 
     Along du the root moves by dx = -K^-1 (dr/du) du with K = dr/dx, and so does -K^-1 r with a
@@ -62,16 +66,15 @@ def attach_root(residual: Residual, root: Tensor, slope: Residual | None = None)
     Args:
         residual: r, [..., n] -> [..., n] for any leading axes; no environment sees another.
         root: x without a graph, shape [..., n].
+        inputs: All that r depends on; it has a graph where one of them has.
         slope: Gives K [..., row, column] at x; None differentiates r.
 
     Returns:
         The root, to the same bits, with a graph where r has one.
     """
-    if not torch.is_grad_enabled():
+    if not (torch.is_grad_enabled() and any(u.requires_grad for u in inputs)):
         return root
     value = residual(root)
-    if not value.requires_grad:
-        return root
     with torch.no_grad():
         K = jacobian(residual, root) if slope is None else slope(root)
     step: Tensor = torch.linalg.solve(K, value[..., None])[..., 0]

@@ -5,6 +5,8 @@ A rotation vector w turns by |w| radians about w / |w|. Everything is differenti
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -26,6 +28,12 @@ __all__ = [
 # Below this angle [rad] the exponential is summed as a series; its first neglected terms are
 # 0.1^10 / (2^10 10!) = 3e-20 for the cosine and less for the sine.
 _SERIES_ANGLE = 0.1
+
+# Of (a/2)^2 to the powers of 1 to 4: in cos(a/2) - 1, and in sin(a/2) / (a/2) - 1.
+_SERIES = torch.tensor(
+    [[(-1) ** k / math.factorial(2 * k + i) for k in range(1, 5)] for i in range(2)],
+    dtype=torch.float64,
+)
 
 # sin(a / 2) below which a logarithm takes a / sin(a / 2) = 2, right to rounding.
 _SMALLEST_SINE = 1e-9
@@ -54,13 +62,14 @@ def quaternion_exp(rotation_vector: Tensor) -> Tensor:
     angle_sq = (rotation_vector * rotation_vector).sum(-1, keepdim=True)
     near_zero = angle_sq < _SERIES_ANGLE**2
     # Both branches are evaluated: each gets an argument at which it and its gradient are finite.
-    angle = torch.where(near_zero, 1.0, angle_sq).sqrt()
-    s = torch.where(near_zero, angle_sq, 0.0) / 4  # (a/2)^2
-    cosine_series = 1 - s / 2 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56)))
-    sine_series = (1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72)))) / 2
-    cosine = torch.where(near_zero, cosine_series, torch.cos(angle / 2))
-    sine_over_angle = torch.where(near_zero, sine_series, torch.sin(angle / 2) / angle)
-    return torch.cat([cosine, sine_over_angle * rotation_vector], dim=-1)
+    half = torch.where(near_zero, 4.0, angle_sq).sqrt() / 2
+    s = torch.where(near_zero, angle_sq, 0.0) / 4
+    s_sq = s * s
+    powers = torch.cat([s, s_sq, s * s_sq, s_sq * s_sq], dim=-1)
+    series = 1 + (powers.unsqueeze(-2) * _SERIES).sum(-1)
+    closed = torch.cat([torch.cos(half), torch.sin(half) / half], dim=-1)
+    cosine, sine_over_half = torch.where(near_zero, series, closed).split(1, dim=-1)
+    return torch.cat([cosine, sine_over_half / 2 * rotation_vector], dim=-1)
 
 
 def quaternion_log(quaternion: Tensor) -> Tensor:
@@ -191,7 +200,7 @@ def quaternion_matrix(quaternion: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
     products = (quaternion.unsqueeze(-1) * quaternion.unsqueeze(-2)).flatten(-2)
     # Not as a product of matrices, whose bits would depend on how many there are.
-    sums = products[..., _FIRST] + _SIGN * products[..., _SECOND]
+    sums = products.index_select(-1, _FIRST) + _SIGN * products.index_select(-1, _SECOND)
     return (2 * sums - _IDENTITY).reshape(*quaternion.shape[:-1], 3, 3)
 
 

@@ -144,15 +144,20 @@ def test_a_joint_driven_at_its_limit_stops_within_a_hundredth_of_its_range(
     assert state.joint_velocities[row].abs() < 1e-3
 
 
-def test_a_joint_that_follows_another_pushes_its_leader(tmp_path):
-    """At rest drives balance contact forces f: effort = -sum f . dx/dq, of all points x."""
-    robot = load_arm(
-        tmp_path,
+def driven_arm(folder):
+    """An arm whose drives give way to what pushes its tip."""
+    return load_arm(
+        folder,
         stiffness={"slide": 300.0, "turn": 3.0, "spin": 2.0},
         damping={"slide": 60.0, "turn": 0.6, "spin": 0.4},
         joint_positions=[0.0, 0.4, 0.2],
         name="arm",
     )
+
+
+def test_a_joint_that_follows_another_pushes_its_leader(tmp_path):
+    """At rest drives balance contact forces f: effort = -sum f . dx/dq, of all points x."""
+    robot = driven_arm(tmp_path)
     (surface,) = (s for s in robot.surfaces if s is not None)
 
     def points(q):
@@ -192,13 +197,7 @@ def test_a_joint_that_follows_another_pushes_its_leader(tmp_path):
 
 def test_a_wall_pushes_an_arm_that_is_alone_with_it(tmp_path):
     """Without a cloth or a free body the barrier takes its default from the joints."""
-    robot = load_arm(
-        tmp_path,
-        stiffness={"slide": 300.0, "turn": 3.0, "spin": 2.0},
-        damping={"slide": 60.0, "turn": 0.6, "spin": 0.4},
-        joint_positions=[0.0, 0.4, 0.2],
-        name="arm",
-    )
+    robot = driven_arm(tmp_path)
     (surface,) = (surface for surface in robot.surfaces if surface is not None)
     frame = robot.forward_kinematics(torch.tensor(robot.joint_positions))["d"].numpy()
     tip = surface.vertices @ frame[:3, :3].T + frame[:3, 3]

@@ -124,7 +124,7 @@ def test_bias(judge):
         rate[:3] = rotation @ np.cross(v[3:6], v[:3] + np.cross(v[3:6], center))
         M = mass_matrix(motion_at(judge, pose, joints), inertia_of(judge.mechanism))[0].numpy()
         got = got + M @ rate
-    np.testing.assert_allclose(C.T @ got, expected, rtol=1e-11, atol=1e-11)  # products of speeds
+    np.testing.assert_allclose(C.T @ got, expected, **CLOSE)
 
 
 def test_forces_at_points(judge):
@@ -160,7 +160,7 @@ def test_acceleration_without_mimic():
     M = mass_matrix(motion_at(judge, pose, joints), inertia_of(judge.mechanism))[0, 6:, 6:]
     got = torch.linalg.solve(M, tensor(tau) - bias(judge, pose, joints, nu)[0, 6:])
     expected = pin.aba(judge.model, judge.data, q, v, tau)
-    np.testing.assert_allclose(got.numpy(), expected, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(got.numpy(), expected, **CLOSE)
 
 
 def test_second_derivatives():

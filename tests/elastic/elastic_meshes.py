@@ -86,6 +86,30 @@ def rigid(x: np.ndarray, seed: int = 0) -> np.ndarray:
     return np.ascontiguousarray(x @ rotation.T + rng.normal(size=3))
 
 
+def rest_mesh(rest: str) -> tuple[np.ndarray, np.ndarray]:
+    """Irregular rest shape in general position: flat, or on a cylinder or a sphere."""
+    X, faces = grid(4, 3, "alternating")
+    X[:, :2] += 0.1 * np.random.default_rng(8).normal(size=(len(X), 2))
+    match rest:
+        case "cylinder":
+            X = on_cylinder(X, 0.3, 0.4)
+        case "sphere":
+            X = on_sphere(X, 5.0)
+    return rigid(X), faces
+
+
+def random_materials(
+    rng: np.random.Generator, face_count: int, damped: float
+) -> dict[str, np.ndarray]:
+    """Materials that differ from face to face; `damped` scales the damping."""
+    return {
+        "stretch": 2.0 * rng.uniform(1, 2, face_count),
+        "bending": 0.5 * rng.uniform(1, 2, face_count),
+        "poisson": 0.3 * rng.uniform(0.5, 1, face_count),
+        "damping": 0.02 * rng.uniform(0.5, 1, face_count) * damped,
+    }
+
+
 def model(
     X: np.ndarray,
     faces: np.ndarray,

@@ -2,31 +2,23 @@
 
 import numpy as np
 import pytest
-from elastic_meshes import Elastic, differences, grid, on_cylinder, on_sphere, rigid, set_parameters
+from elastic_meshes import (
+    Elastic,
+    differences,
+    grid,
+    on_cylinder,
+    random_materials,
+    rest_mesh,
+    set_parameters,
+)
 
 RNG = np.random.default_rng(7)
 
 
-def rest_mesh(rest):
-    X, faces = grid(4, 3, "alternating")
-    X[:, :2] += 0.1 * np.random.default_rng(8).normal(size=(len(X), 2))
-    match rest:
-        case "cylinder":
-            X = on_cylinder(X, 0.3, 0.4)
-        case "sphere":
-            X = on_sphere(X, 5.0)
-    return rigid(X), faces
-
-
 def problem(rest, bending_model, damped):
     X, faces = rest_mesh(rest)
-    parameters = {
-        "stretch": 2.0 * RNG.uniform(1, 2, len(faces)),
-        "bending": 0.5 * RNG.uniform(1, 2, len(faces)),
-        "poisson": 0.3 * RNG.uniform(0.5, 1, len(faces)),
-        "damping": 0.02 * RNG.uniform(0.5, 1, len(faces)) * damped,
-        "x_n": X + 0.1 * RNG.normal(size=X.shape),
-    }
+    parameters = random_materials(RNG, len(faces), damped)
+    parameters["x_n"] = X + 0.1 * RNG.normal(size=X.shape)
     x = parameters["x_n"] + 0.1 * RNG.normal(size=X.shape)
     z = RNG.normal(size=X.shape)
     return Elastic(X, faces, bending_model), X, faces, parameters, x, z

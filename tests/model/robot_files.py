@@ -70,7 +70,7 @@ def two_links(content="", kind="revolute", **keywords):
     return link("base"), link("arm"), joint("hinge", "base", "arm", kind, content, **keywords)
 
 
-def random_robot(rng, links=8):
+def random_robot(rng, links=8, content=INERTIAL):
     """A random tree; links are in another order than its branches, so that parents come late."""
 
     def three(scale=1.0):
@@ -78,7 +78,7 @@ def random_robot(rng, links=8):
 
     order = rng.permutation(links)
     kinds = ["fixed", "revolute", "continuous", "prismatic"]
-    parts = [link(f"l{i}") for i in order]
+    parts = [link(f"l{i}", content) for i in order]
     leaders = []
     for i in rng.permutation(np.arange(1, links)):
         kind = kinds[rng.integers(4)]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from robot_files import (
+    INERTIAL,
     data,
     joint,
     link,
@@ -51,6 +52,50 @@ def compare_with_pinocchio(path, robot, seed=0):
 def test_frames_of_random_trees_are_those_of_pinocchio(tmp_path, seed):
     path = save(tmp_path, random_robot(np.random.default_rng(seed)))
     compare_with_pinocchio(path, dc.Robot.load(path, actuation="position"), seed)
+
+
+BOX = INERTIAL + (
+    '<collision><origin xyz="0.1 0 0.2" rpy="0.3 0.2 0.1"/><geometry><box size="0.1 0.2 0.3"/>'
+    "</geometry></collision>"
+)
+
+
+def compare_with_core(robot, seed):
+    """Vertices of links at both ends of a step in the core, and by forward kinematics."""
+    rng = np.random.default_rng(seed)
+    cloth = dc.Cloth.grid(2, 2, pose=[0, 0, 100, 1, 0, 0, 0])  # a scene needs something to move
+    sim = dc.Simulator(dc.Scene([cloth], [], [robot]), 0.01)
+    m = robot.mechanism
+    q = torch.from_numpy(rng.uniform(-1, 1, (2, m.joint_count)).clip(m.lower, m.upper))
+    pose = torch.from_numpy(rng.normal(size=(2, 7)))
+    pose = torch.cat([pose[:, :3], torch.nn.functional.normalize(pose[:, 3:], dim=1)], dim=1)
+    start = sim.initial_state().replace(joint_positions=q[0], base_poses=pose[:1])
+    joints = dict(zip(robot.joint_names, q[1], strict=True))
+    control = dc.Control(joint_positions=joints, base_poses={robot.name: pose[1]})
+    path = sim.path(start, control)
+    for at, row in enumerate((0, -1)):
+        frames = robot.forward_kinematics(q[at], pose[at])
+        expected = [
+            torch.tensor(mesh.vertices) @ frames[name][:3, :3].T + frames[name][:3, 3]
+            for name, mesh in zip(robot.link_names, robot.surfaces, strict=True)
+            if mesh is not None
+        ]
+        got = path[row, len(cloth.vertices) :]
+        torch.testing.assert_close(got, torch.cat(expected), **FRAMES)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_core_places_random_trees_as_forward_kinematics_does(tmp_path, seed):
+    path = save(tmp_path, random_robot(np.random.default_rng(seed), content=BOX))
+    robot = dc.Robot.load(path, base="kinematic", actuation="position", name="tree")
+    compare_with_core(robot, seed)
+
+
+def test_the_core_places_the_panda_as_forward_kinematics_does():
+    path, root = panda()
+    start = {"panda_joint4": -1.0}
+    options = {"base": "kinematic", "actuation": "position", "joint_positions": start}
+    compare_with_core(quietly(path, mesh_root=root, name="panda", **options), seed=0)
 
 
 @pytest.mark.parametrize("name", ["joint_limit_robot", "prismatic_robot", "simple_y_arm"])

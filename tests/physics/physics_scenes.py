@@ -167,6 +167,48 @@ class Judge:
         )
 
 
+def free_links(scene):
+    """Names of the links that forces move: beyond a joint under force, or on a floating base."""
+    names = set()
+    for name, robot in zip(scene.robot_names, scene.robots, strict=True):
+        m = robot.mechanism
+        moves = np.full(m.link_count, m.base == "floating")
+        for link in m.order[1:]:
+            moves[link] |= moves[m.parent[link]] or (m.dof[link] >= 0 and m.forced[m.dof[link]])
+        names |= {f"{name}/{m.link_names[i]}" for i in np.flatnonzero(moves)}
+    return names
+
+
+def joined_links(scene):
+    """Pairs of names of links that a joint or a fixed joint holds together."""
+    return [
+        (f"{name}/{a}", f"{name}/{b}")
+        for name, robot in zip(scene.robot_names, scene.robots, strict=True)
+        for a, b in robot.mechanism.adjacent_links
+    ]
+
+
+def judge_attempt(task, actions):
+    """Judge the whole way of an attempt: what is wrong, and in how many steps things touch."""
+    sim = task.simulator
+    judge = Judge(sim, free_links(task.scene), joined_links(task.scene))
+    state = task.initial_state()
+    wrong = [] if judge.is_free(state) else ["the start intersects"]
+    touched = 0
+    with torch.no_grad():
+        controller = task.controller(actions)
+        for k in range(task.steps):
+            control = controller(k, state)
+            path = sim.path(state, control).numpy()
+            if not judge.is_free_path(path):
+                wrong.append(f"the path of step {k} crosses something")
+            state = sim.step(state, control)
+            if not judge.is_free(state):
+                wrong.append(f"the state after step {k} intersects")
+            touched += state.report.contact_count > 0
+    return wrong, touched
+
+
 def matrix(q):
     """Rotation matrix of a quaternion wxyz."""
     w, u = q[0] / np.linalg.norm(q), np.asarray(q[1:]) / np.linalg.norm(q)
