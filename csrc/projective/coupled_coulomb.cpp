@@ -5,6 +5,9 @@
 #include <numbers>
 
 #include <Eigen/Cholesky>
+#include <Eigen/LU>
+
+#include "projective/coulomb.h"
 
 namespace diffcloth::projective {
 namespace {
@@ -13,6 +16,13 @@ namespace {
 constexpr int kDirections = 32;
 constexpr int kRefinements = 60;
 constexpr double kAngle = 1e-15;
+/// Sweeps after which Newton's method may take over, and its steps.
+constexpr int kSweepsPerPolish = 20;
+constexpr int kNewtonSteps = 10;
+constexpr double kNewtonContraction = 0.5;
+/// Sweeps after which contacts take a smaller share of their step: full ones may go round in circles.
+constexpr int kSweepsPerShare = 100;
+constexpr double kLeastShare = 0.125;
 /// Changes of impulses that are none, relative to the largest.
 constexpr double kRounding = 1e-14;
 
@@ -107,6 +117,85 @@ class Slip {
   Vec3 t_1_, t_2_;
 };
 
+/// The law of all contacts as equations  r = Phi(r - m u), u = q + W r, see coulomb.h.
+class Equations {
+ public:
+  Equations(const Eigen::MatrixXd& W,
+            const Eigen::VectorXd& q,
+            const std::vector<RoughPlane>& planes)
+      : W_(W), q_(q), planes_(planes) {}
+
+  /// Newton's steps while they contract what is left of the equations.
+  void polish(Eigen::VectorXd& r) const {
+    Eigen::VectorXd left = residual(r);
+    for (int k = 0; k < kNewtonSteps; ++k) {
+      const Eigen::VectorXd next = r - jacobian(r).partialPivLu().solve(left);
+      const Eigen::VectorXd left_next = residual(next);
+      if (!(left_next.norm() < kNewtonContraction * left.norm())) return;
+      r = next;
+      left = left_next;
+    }
+  }
+
+ private:
+  /// A mass of a contact, of the size of that which it meets [kg].
+  double mass(Eigen::Index k) const { return 3.0 / W_.block<3, 3>(3 * k, 3 * k).trace(); }
+
+  /// r - m u of a contact.
+  Vec3 probe(Eigen::Index k, const Eigen::VectorXd& r, const Eigen::VectorXd& u) const {
+    return r.segment<3>(3 * k) - mass(k) * u.segment<3>(3 * k);
+  }
+
+  Coulomb law(Eigen::Index k, const Vec3& s) const {
+    const RoughPlane& plane = planes_[static_cast<std::size_t>(k)];
+    return coulomb(s, plane.normal, plane.friction);
+  }
+
+  Eigen::Index size() const { return static_cast<Eigen::Index>(planes_.size()); }
+
+  Eigen::VectorXd residual(const Eigen::VectorXd& r) const {
+    const Eigen::VectorXd u = q_ + W_ * r;
+    Eigen::VectorXd left = r;
+    for (Eigen::Index k = 0; k < size(); ++k) {
+      left.segment<3>(3 * k) -= law(k, probe(k, r, u)).impulse;
+    }
+    return left;
+  }
+
+  Eigen::MatrixXd jacobian(const Eigen::VectorXd& r) const {
+    const Eigen::VectorXd u = q_ + W_ * r;
+    Eigen::MatrixXd J = Eigen::MatrixXd::Identity(r.size(), r.size());
+    for (Eigen::Index k = 0; k < size(); ++k) {
+      const Mat3 D = impulse_by_probe(k, probe(k, r, u));
+      J.middleRows<3>(3 * k) += mass(k) * D * W_.middleRows<3>(3 * k);
+      J.block<3, 3>(3 * k, 3 * k) -= D;
+    }
+    return J;
+  }
+
+  Mat3 impulse_by_probe(Eigen::Index k, const Vec3& s) const {
+    const auto& [n, friction] = planes_[static_cast<std::size_t>(k)];
+    const Coulomb at = law(k, s);
+    switch (at.kind) {
+      case ContactCase::kTakingOff:
+        return Mat3::Zero();
+      case ContactCase::kSticking:
+        return Mat3::Identity();
+      case ContactCase::kSlipping:
+        break;
+    }
+    const Vec3& t = at.direction;
+    // dr = turn ds across the slip; with ratio = limit / (|s_T| - limit), turn = limit / |s_T|.
+    const double turn = at.ratio / (1.0 + at.ratio);
+    const Mat3 across = Mat3::Identity() - n * n.transpose() - t * t.transpose();
+    return (n + friction * t) * n.transpose() + turn * across;
+  }
+
+  const Eigen::MatrixXd& W_;
+  const Eigen::VectorXd& q_;
+  const std::vector<RoughPlane>& planes_;
+};
+
 }  // namespace
 
 Vec3 solve_coulomb(const Mat3& A, const Vec3& b, const RoughPlane& plane, const Vec3& last) {
@@ -126,8 +215,11 @@ bool solve_coulomb(const Eigen::MatrixXd& W,
                    int max_sweeps,
                    Eigen::VectorXd& r) {
   const auto m = static_cast<Eigen::Index>(planes.size());
+  const Equations equations(W, q, planes);
   const Eigen::VectorXd guess = r;
+  double share = 1.0;
   for (int sweep = 0; sweep < max_sweeps; ++sweep) {
+    if (sweep > 0 && sweep % kSweepsPerShare == 0) share = std::max(kLeastShare, 0.5 * share);
     double change = 0.0;  // of this sweep, and of all
     double moved = 0.0;
     double size = 0.0;
@@ -136,13 +228,15 @@ bool solve_coulomb(const Eigen::MatrixXd& W,
       const Vec3 last = r.segment<3>(3 * k);
       // W is symmetric, and its columns are contiguous.
       const Vec3 b = q.segment<3>(3 * k) + W.middleCols<3>(3 * k).transpose() * r - A * last;
-      const Vec3 next = solve_coulomb(A, b, planes[static_cast<std::size_t>(k)], last);
+      const Vec3 solution = solve_coulomb(A, b, planes[static_cast<std::size_t>(k)], last);
+      const Vec3 next = last + share * (solution - last);
       change = std::max(change, (next - last).norm());
       moved = std::max(moved, (next - guess.segment<3>(3 * k)).norm());
       size = std::max(size, next.norm());
       r.segment<3>(3 * k) = next;
     }
     if (change <= std::max(tolerance * moved, kRounding * size)) return true;
+    if (sweep % kSweepsPerPolish == kSweepsPerPolish - 1) equations.polish(r);
   }
   return false;
 }

@@ -16,9 +16,11 @@ struct RoughPlane {
 
 /// Find impulses r and velocities u = q + W r that obey the law at each of several contacts, by block
 /// Gauss-Seidel iterations: each contact in turn is solved exactly with the impulses of all others
-/// (Moreau 1999; Jean 1999).
+/// (Moreau 1999; Jean 1999). They settle the cases; Newton's method on all contacts, tried now and then,
+/// settles the rest.
 ///
 /// A solution exists for every friction, as each contact can be kept on its own (Acary et al. 2011).
+/// Where much of the normal impulses comes from friction, these iterations need not find it.
 ///
 /// @param W  [3 m, 3 m] symmetric, positive definite [1/kg]
 /// @param q  [3 m] velocities without impulses [m/s]
