@@ -125,23 +125,6 @@ void ConstantMatrix::solve(const double* b, double* x, Scratch& y) const {
   for (Index j = 0; j < n; ++j) Eigen::Map<Vec3>(x + 3 * vertex[j]) = y[j].head<3>();
 }
 
-void ConstantMatrix::multiply(const double* x, double* y) const {
-  const ConstantAnalysis& a = *analysis_;
-  std::fill_n(y, 3 * static_cast<std::size_t>(a.vertex_count), 0.0);
-  for (std::size_t j = 0; j < a.vertex.size(); ++j) {
-    const Index v = a.vertex[j];
-    const Vec3 x_j = diffcloth::row(x, v);
-    Vec3 y_j = values_[a.slot[a.column_start[j]]] * x_j;
-    for (Index k = a.column_start[j] + 1; k < a.column_start[j + 1]; ++k) {
-      const Index w = a.vertex[a.row[k]];
-      const double value = values_[a.slot[k]];
-      Eigen::Map<Vec3>(y + 3 * w) += value * x_j;
-      y_j += value * diffcloth::row(x, w);
-    }
-    Eigen::Map<Vec3>(y + 3 * v) += y_j;
-  }
-}
-
 std::size_t ConstantMatrix::bytes() const {
   return sizeof(*this) + sizeof(Index) * (start_.capacity() + row_.capacity()) +
          sizeof(double) * (values_.capacity() + factor_.capacity() + inverse_diagonal_.capacity());

@@ -45,9 +45,6 @@ class ConstantMatrix {
   /// x = A^-1 b, [N, 3]; zero at pins. b and x may be one array.
   void solve(const double* b, double* x, Scratch& scratch) const;
 
-  /// y = A x, [N, 3], with x taken as zero at pins; zero there.
-  void multiply(const double* x, double* y) const;
-
   /// What it takes up.
   std::size_t bytes() const;
 

@@ -31,34 +31,42 @@ std::vector<double> start_vector(const Coordinates& coordinates) {
   return d;
 }
 
-Factor shifted_factor(Walk& walk, const linalg::BlockMatrix& exact) {
-  const std::vector<double> metric = walk.f.metric();
+Factor shifted_factor(const std::vector<double>& metric,
+                      LinearSystem& system,
+                      const Checkpoint& checkpoint,
+                      const linalg::BlockMatrix& exact) {
   linalg::BlockMatrix H = exact;
   double added = 0.0;
   double shift = kFirstShift;
   for (int k = 0; k < kShifts; ++k, shift *= kShiftGrowth) {
-    walk.context.checkpoint->check();
+    checkpoint.check();
     for (Index i = 0; i < H.pattern().size(); ++i) {
       H.add_to_diagonal(i, (shift - added) * row(metric.data(), i));
     }
     added = shift;
-    if (Factor factor = walk.system.factor(H)) return factor;
+    if (Factor factor = system.factor(H)) return factor;
   }
   return nullptr;
 }
 
-/// Direction of the smallest eigenvalue of H relative to the metric, its largest entry 1.
-std::vector<double> most_negative(Walk& walk, const linalg::CholeskyFactor& shifted) {
-  const std::vector<double> metric = walk.f.metric();
-  std::vector<double> d = start_vector(*walk.f.coordinates);
+}  // namespace
+
+std::vector<double> most_negative(const Objective& f,
+                                  LinearSystem& system,
+                                  const Checkpoint& checkpoint,
+                                  const linalg::BlockMatrix& H) {
+  const std::vector<double> metric = f.metric();
+  const Factor shifted = shifted_factor(metric, system, checkpoint, H);
+  if (!shifted) return {};
+  std::vector<double> d = start_vector(*f.coordinates);
   std::vector<double> b(d.size(), 0.0);
   std::vector<double> p;
   for (int k = 0; k < kInverseIterations; ++k) {
-    walk.context.checkpoint->check();
+    checkpoint.check();
     for (std::size_t a = 0; a < d.size(); ++a) b[a] = metric[a] * d[a];
-    shifted.solve(b.data(), d.data());
-    walk.f.coordinates->push_forward(d, p);
-    const double size = walk.displacement(p);
+    shifted->solve(b.data(), d.data());
+    f.coordinates->push_forward(d, p);
+    const double size = f.coordinates->displacement(p);
     for (double& value : d) value /= size;
   }
   // The largest entry decides the sign; of equal ones the first.
@@ -66,19 +74,16 @@ std::vector<double> most_negative(Walk& walk, const linalg::CholeskyFactor& shif
   if (*top < 0.0) {
     for (double& value : d) value = -value;
   }
+  b.assign(d.size(), 0.0);
+  H.add_product(d.data(), b.data());
+  if (!(dot(d, b) < 0.0)) return {};
   return d;
 }
 
-}  // namespace
-
 bool leave_saddle(Walk& walk) {
   const linalg::BlockMatrix H = walk.system.assemble(walk.x().data(), Curvature::kExact, walk.g());
-  const Factor shifted = shifted_factor(walk, H);
-  if (!shifted) return false;
-  const std::vector<double> d = most_negative(walk, *shifted);
-  std::vector<double> product(d.size(), 0.0);
-  H.add_product(d.data(), product.data());
-  if (!(dot(d, product) < 0.0)) return false;
+  const std::vector<double> d = most_negative(walk.f, walk.system, *walk.context.checkpoint, H);
+  if (d.empty()) return false;
   std::vector<double> p;
   walk.f.coordinates->push_forward(d, p);
 

@@ -1,8 +1,34 @@
+// How a stage with dry friction at nodes is solved.
+//
+// Newton's method on the equations of nodal_system.cpp is quick where it knows the case of each contact,
+// but between cases its residual is no measure of the way to go: steps that reduce it, and steps that
+// do not, may go round in circles. So it is taken at its word only where it contracts the residual below
+// all that was seen before. Else an energy leads. With friction as large as some impulses allow the step
+// minimizes
+//
+//   E_r(x) = energy + sum mu r_n |u_T|     over  n . u >= 0,
+//
+// and its solutions are the x that minimize E_r for their own impulses r. Two ways lead down:
+//
+//   * Newton's step on E_r with the impulses and the cases at hand, which costs no more than one of those
+//     above;
+//   * after some of these, or where they lead nowhere, the solution of the whole law at the linearized
+//     forces. It decides on all cases at once, and minimizes E_r to second order for its own r, so that
+//     it goes down wherever it is not zero.
+//
+// Where the Hessian is indefinite these would crawl past a saddle of E_r, or end there: once their
+// steps shrink, the solver leaves along the most negative direction.
+
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
+#include <limits>
+#include <optional>
 #include <utility>
+#include <vector>
 
 #include "solver/linear_system.h"
+#include "solver/saddle.h"
 #include "step/nodal_stage.h"
 #include "step/nodal_system.h"
 
@@ -12,18 +38,22 @@ using Array = std::vector<double>;
 
 namespace {
 
+constexpr double kInfinity = std::numeric_limits<double>::infinity();
+
 /// Of a direction of Newton's method: less would not shorten the way.
 constexpr double kDirectionTolerance = 1e-4;
 /// A Newton step must reduce the squared residual by this much; else the energy leads.
 constexpr double kContraction = 0.25;
 /// As in solver/newton.cpp: a step below this share of the tolerance is not worth taking.
 constexpr double kSettled = 0.1;
+/// Steps down with the cases at hand before the law is solved as a whole, and the halvings of each.
+constexpr int kMostDescents = 8;
+constexpr int kFewHalvings = 6;
 constexpr int kHalvings = 40;
-/// Steps down the energy after which Newton's step is taken whatever it does to the residual: the
-/// friction that they freeze may go round in circles.
-constexpr int kMostDescents = 3;
-/// Newton steps that are taken where no way leads down.
-constexpr int kMostIdle = 20;
+/// Steps that have shrunk by this much while the Hessian is indefinite lead to a saddle.
+constexpr double kShrunk = 1e-2;
+/// Share of the mean edge that the first trial away from a saddle moves a vertex by.
+constexpr double kFirstMove = 0.25;
 /// Of the exact Hessian's projection, where that is indefinite: see solver/direction.h.
 constexpr double kLeastBlend = 0.1;
 constexpr double kMostBlend = 1e12;
@@ -31,120 +61,231 @@ constexpr double kMostBlend = 1e12;
 double largest(const Array& change) {
   double size = 0.0;
   for (const double value : change) {
-    if (!std::isfinite(value)) return std::numeric_limits<double>::infinity();
+    if (!std::isfinite(value)) return kInfinity;
     size = std::max(size, std::abs(value));
   }
   return size;
 }
 
+/// One solve: where it stands, and the ways on from there.
+class NodalSolve {
+ public:
+  NodalSolve(const Problem& problem,
+             const NodalContacts& contacts,
+             const solver::Objective& f,
+             solver::Context& context,
+             Array& x)
+      : f_(f),
+        context_(context),
+        system_(problem, contacts, f),
+        linear_(f, *context.workspace, *context.watch, *context.counts),
+        h_(problem.h),
+        goal_(context.options.tolerance * problem.h),
+        x_(x) {
+    here_.x = x;
+    system_.look(here_);
+  }
+
+  solver::Outcome run() {
+    for (;; ++context_.iterations) {
+      context_.checkpoint->check();
+      H_.emplace(linear_.assemble(here_.x.data(), Curvature::kExact, here_.g));
+      S_.emplace(system_.without_coupling(here_, *H_));
+      factor_ = linear_.factor(*S_);
+      if (!factor_) ++context_.counts->negative_curvature;
+      constraint_step_ = system_.constraint_step(here_);
+      const Newton newton = factor_ ? try_newton() : Newton::kNoStep;
+      if (newton == Newton::kArrived) return finish(solver::Status::kConverged);
+      if (context_.iterations >= context_.options.max_iterations) {
+        return finish(solver::Status::kIterationLimit);
+      }
+      if (newton != Newton::kContracts) {
+        const Stopwatch::Scope scope(*context_.watch, Phase::kLineSearch);
+        const bool moved =
+            (is_near_saddle() && leave_saddle()) || descend_by_cases() || descend_by_law();
+        if (!moved) {
+          return finish(factor_ ? solver::Status::kRoundingFloor : solver::Status::kSaddle);
+        }
+        system_.look(there_);
+      }
+      ++(factor_ ? context_.counts->exact : context_.counts->projected);
+      std::swap(here_, there_);
+    }
+  }
+
+ private:
+  enum class Newton : std::uint8_t { kNoStep, kContracts, kArrived };
+
+  solver::Outcome finish(solver::Status status) {
+    outcome_.status = status;
+    if (status == solver::Status::kConverged) outcome_.factor = factor_;
+    x_ = std::move(here_.x);
+    return outcome_;
+  }
+
+  /// Set `there` to where a fraction of a change of the rows leads.
+  void go(const Array& p, double alpha) {
+    there_.x = here_.x;
+    const std::size_t size = std::min(p.size(), there_.x.size());
+    for (std::size_t a = 0; a < size; ++a) there_.x[a] += alpha * p[a];
+  }
+
+  /// Remember how long a step is.
+  void measure(double step) {
+    last_ = step;
+    longest_ = std::max(longest_, step);
+  }
+
+  /// Newton's step from here to there.
+  Newton try_newton() {
+    const Stopwatch::Scope scope(*context_.watch, Phase::kSolve);
+    blend_ = 0.0;
+    least_ = std::min(least_, here_.merit);
+    Array b = system_.right_side(here_, *H_, constraint_step_, false);
+    system_.project(here_, b);
+    Array p;
+    if (!system_.solve(here_, *H_, *factor_, false, b, kDirectionTolerance, p).converged) {
+      return Newton::kNoStep;
+    }
+    for (std::size_t a = 0; a < p.size(); ++a) p[a] += constraint_step_[a];
+    const double step = largest(p);
+    outcome_.residual = step / h_;
+    if (step <= kSettled * goal_) return Newton::kArrived;
+    go(p, 1.0);
+    system_.look(there_);
+    if (there_.merit <= kContraction * least_) {
+      measure(step);
+      descents_ = 0;
+      return Newton::kContracts;
+    }
+    // Below the tolerance, what is left of the residual is rounding.
+    return step < goal_ ? Newton::kArrived : Newton::kNoStep;
+  }
+
+  /// A factor of the form that a Hessian takes, of the exact one blended with as little of its projection
+  /// as it needs; null where nothing helps.
+  template <class Form>
+  solver::Factor damped(const linalg::BlockMatrix& exact, Form&& form) {
+    const linalg::BlockMatrix positive =
+        linear_.assemble(here_.x.data(), Curvature::kPositive, here_.g);
+    for (blend_ = std::max(kLeastBlend, blend_ / 4.0); blend_ < kMostBlend; blend_ *= 4.0) {
+      linalg::BlockMatrix matrix = exact;
+      matrix.blend(positive, blend_);
+      if (solver::Factor factor = linear_.factor(form(matrix))) return factor;
+    }
+    return nullptr;
+  }
+
+  /// Change of the energy with friction as large as the impulses allow, from here to a fraction of p.
+  double change(const Array& p, double alpha, const std::vector<Vec3>& impulses) {
+    go(p, alpha);
+    system_.clear_approach(there_.x);
+    return system_.frozen_energy_change(here_, impulses, there_.x);
+  }
+
+  bool descend(const Array& p, const std::vector<Vec3>& impulses, int halvings) {
+    double alpha = 1.0;
+    for (int k = 0; k < halvings; ++k, alpha *= 0.5) {
+      if (!(change(p, alpha, impulses) < 0.0)) continue;
+      measure(largest(p));
+      return true;
+    }
+    return false;
+  }
+
+  std::vector<Vec3> impulses() const {
+    std::vector<Vec3> result;
+    for (const projective::Coulomb& law : here_.laws) result.push_back(law.impulse);
+    return result;
+  }
+
+  bool descend_by_cases() {
+    if (descents_ == kMostDescents) return false;
+    ++descents_;
+    solver::Factor factor = factor_;
+    if (!factor) {
+      factor = damped(*H_, [&](const linalg::BlockMatrix& matrix) {
+        return system_.without_coupling(here_, matrix);
+      });
+    }
+    if (!factor) return false;
+    Array b = system_.right_side(here_, *H_, constraint_step_, true);
+    system_.project(here_, b);
+    Array p(b.size(), 0.0);
+    factor->solve(b.data(), p.data());
+    for (std::size_t a = 0; a < p.size(); ++a) p[a] += constraint_step_[a];
+    if (descend(p, impulses(), kFewHalvings)) return true;
+    descents_ = kMostDescents;
+    return false;
+  }
+
+  bool descend_by_law() {
+    if (system_.clear_approach(here_.x)) system_.look(here_);
+    const linalg::BlockMatrix exact = linear_.assemble(here_.x.data(), Curvature::kExact, here_.g);
+    solver::Factor factor = linear_.factor(exact);
+    if (!factor) factor = damped(exact, [](const linalg::BlockMatrix& matrix) { return matrix; });
+    if (!factor) return false;
+    const NodalSystem::Linearized solution = system_.solve_linearized(here_, *factor);
+    return descend(solution.p, solution.impulses, kHalvings);
+  }
+
+  bool is_near_saddle() const { return !factor_ && last_ <= kShrunk * longest_; }
+
+  /// Along the most negative direction, to either side, from far to near: the first point that is
+  /// lower, and on while the next is lower still.
+  bool leave_saddle() {
+    const Array p = solver::most_negative(f_, linear_, *context_.checkpoint, *S_);
+    if (p.empty()) return false;
+    const std::vector<Vec3> frozen = impulses();
+    double best = 0.0;
+    double best_alpha = 0.0;
+    double alpha = kFirstMove * f_.length;
+    for (int k = 0; k < 2 * kHalvings; ++k, alpha *= k % 2 == 0 ? -0.5 : -1.0) {
+      const double gained = change(p, alpha, frozen);
+      if (gained < best) {
+        best = gained;
+        best_alpha = alpha;
+      } else if (best < 0.0) {
+        break;
+      }
+    }
+    if (!(best < 0.0)) return false;
+    change(p, best_alpha, frozen);
+    // Whatever was seen before belongs to the saddle.
+    last_ = least_ = kInfinity;
+    longest_ = 0.0;
+    descents_ = 0;
+    return true;
+  }
+
+  const solver::Objective& f_;
+  solver::Context& context_;
+  NodalSystem system_;
+  solver::LinearSystem linear_;
+  double h_;
+  double goal_;  // the tolerance of a step [m]
+  Array& x_;
+  solver::Outcome outcome_;
+
+  NodalSystem::Point here_;
+  NodalSystem::Point there_;
+  std::optional<linalg::BlockMatrix> H_;
+  std::optional<linalg::BlockMatrix> S_;
+  solver::Factor factor_;  // of S; null where it is indefinite
+  Array constraint_step_;
+
+  double blend_ = 0.0;
+  int descents_ = 0;          // by cases, since Newton's method last had its way
+  double least_ = kInfinity;  // of the residuals where S is definite
+  double last_ = kInfinity;   // length of the last step [m]
+  double longest_ = 0.0;      // of all steps so far [m]
+};
+
 }  // namespace
 
 solver::Outcome NodalStage::solve(solver::Context& context, Array& x) const {
   const solver::Objective f = objective();
-  const NodalSystem system(problem_, contacts_, f);
-  solver::LinearSystem linear(f, *context.workspace, *context.watch, *context.counts);
-  const double goal = context.options.tolerance * problem_.h;
-  solver::Outcome outcome;
-  NodalSystem::Point here;
-  NodalSystem::Point there;
-  here.x = x;
-  system.look(here);
-  double blend = 0.0;
-  int idle = 0;
-  const auto finish = [&](solver::Status status) {
-    outcome.status = status;
-    x = std::move(here.x);
-    return outcome;
-  };
-  // Where `there` is, by the fraction alpha of a change of the rows.
-  const auto go = [&](const Array& p, double alpha) {
-    there.x = here.x;
-    for (std::size_t a = 0; a < problem_.cloth_size; ++a) there.x[a] += alpha * p[a];
-  };
-  int descents = 0;  // since Newton's method last had its way
-  for (;; ++context.iterations) {
-    context.checkpoint->check();
-    const linalg::BlockMatrix H = linear.assemble(here.x.data(), Curvature::kExact, here.g);
-    solver::Factor factor = linear.factor(system.without_coupling(here, H));
-    const Array d = system.constraint_step(here);
-    Array p;
-    bool solved = false;
-    if (factor) {
-      const Stopwatch::Scope scope(*context.watch, Phase::kSolve);
-      Array b = system.right_side(here, H, d, false);
-      system.project(here, b);
-      solved = system.solve(here, H, *factor, false, b, kDirectionTolerance, p).converged;
-      for (std::size_t a = 0; a < p.size(); ++a) p[a] += d[a];
-      const double step = largest(p);
-      outcome.residual = step / problem_.h;
-      if (solved && step <= kSettled * goal) {
-        outcome.factor = factor;
-        return finish(solver::Status::kConverged);
-      }
-      if (solved) {
-        go(p, 1.0);
-        system.look(there);
-        const bool contracts = there.merit <= kContraction * here.merit;
-        if (!contracts && step < goal) {  // what is left of the residual is rounding
-          outcome.factor = factor;
-          return finish(solver::Status::kConverged);
-        }
-        if (context.iterations >= context.options.max_iterations) {
-          return finish(solver::Status::kIterationLimit);
-        }
-        if (contracts || (descents >= kMostDescents && std::isfinite(there.merit))) {
-          descents = 0;
-          ++context.counts->exact;
-          std::swap(here, there);
-          continue;
-        }
-      }
-    } else {
-      ++context.counts->negative_curvature;
-    }
-    if (context.iterations >= context.options.max_iterations) {
-      return finish(solver::Status::kIterationLimit);
-    }
-
-    // With its friction frozen the step minimizes an energy: go down that one.
-    blend = factor ? 0.0 : std::max(kLeastBlend, blend / 4.0);
-    if (factor) {
-      ++context.counts->exact;
-    } else {
-      ++context.counts->projected;
-      const linalg::BlockMatrix positive =
-          linear.assemble(here.x.data(), Curvature::kPositive, here.g);
-      for (;; blend *= 4.0) {
-        if (!(blend < kMostBlend)) return finish(solver::Status::kRoundingFloor);
-        linalg::BlockMatrix damped = H;
-        damped.blend(positive, blend);
-        factor = linear.factor(system.without_coupling(here, damped));
-        if (factor) break;
-      }
-    }
-    const Stopwatch::Scope scope(*context.watch, Phase::kLineSearch);
-    Array b = system.right_side(here, H, d, true);
-    system.project(here, b);
-    Array down(b.size(), 0.0);
-    factor->solve(b.data(), down.data());
-    for (std::size_t a = 0; a < down.size(); ++a) down[a] += d[a];
-    bool moved = false;
-    double alpha = 1.0;
-    for (int k = 0; k < kHalvings && !moved; ++k, alpha *= 0.5) {
-      go(down, alpha);
-      system.clear_approach(there.x);
-      moved = system.frozen_energy_change(here, there.x) < 0.0;
-    }
-    ++descents;
-    if (!moved) {
-      // The cases of the law at hand point nowhere: those behind Newton's step may.
-      if (!solved || idle >= kMostIdle) return finish(solver::Status::kRoundingFloor);
-      ++idle;
-      go(p, 1.0);
-    }
-    system.look(there);
-    std::swap(here, there);
-  }
+  return NodalSolve(problem_, contacts_, f, context, x).run();
 }
 
 }  // namespace diffcloth::step

@@ -32,8 +32,13 @@
 
 #include <algorithm>
 #include <array>
+#include <functional>
 #include <numbers>
 #include <utility>
+
+#include <Eigen/Core>
+
+#include "projective/coupled_coulomb.h"
 
 namespace diffcloth::step {
 
@@ -45,6 +50,11 @@ using projective::NodalContact;
 namespace {
 
 constexpr int kMostProducts = 300;
+/// Of the law at linearized forces, relative: it shows a direction.
+constexpr double kLawTolerance = 1e-4;
+constexpr int kMostSweeps = 500;
+/// Columns of its matrix that are solved for at a time.
+constexpr Eigen::Index kColumns = 48;
 
 Vec3 tangential(const Vec3& e, const Vec3& n) { return e - n * n.dot(e); }
 
@@ -224,18 +234,84 @@ Array NodalSystem::right_side(const Point& at,
   return b;
 }
 
-void NodalSystem::clear_approach(Array& x) const {
+bool NodalSystem::clear_approach(Array& x) const {
+  bool any = false;
   for (const NodalContact& c : contacts_) {
-    const double approach = std::min(c.normal.dot(velocity(c, x)), 0.0);
+    const double approach = c.normal.dot(velocity(c, x));
+    if (!(approach < 0.0)) continue;
     spread(c, -p_.h * scale(c) * approach * c.normal, x.data());
+    any = true;
   }
+  return any;
 }
 
-double NodalSystem::frozen_energy_change(const Point& at, const Array& to) const {
+NodalSystem::Linearized NodalSystem::solve_linearized(const Point& at,
+                                                      const linalg::CholeskyFactor& H) const {
+  const auto m = static_cast<Eigen::Index>(contacts_.size());
+  const std::size_t size = f_.coordinates->size();
+  const auto contact = [&](Eigen::Index k) -> const NodalContact& {
+    return contacts_[static_cast<std::size_t>(k)];
+  };
+  const auto to_rows = [&](const NodalContact& c, const Vec3& r, Array& force) {
+    spread(c, r / (p_.h * scale(c)), force.data());
+  };
+  const auto to_velocity = [&](const NodalContact& c, const Array& p) -> Vec3 {
+    return relative(c, p.data()) / (p_.h * scale(c));
+  };
+  // What each impulse does to each velocity, some columns at a time.
+  Eigen::MatrixXd W(3 * m, 3 * m);
+  std::vector<Array> columns(static_cast<std::size_t>(std::min(kColumns, 3 * m)), Array(size));
+  for (Eigen::Index first = 0; first < 3 * m; first += kColumns) {
+    const Eigen::Index count = std::min(kColumns, 3 * m - first);
+    std::vector<const double*> forces;
+    std::vector<double*> changes;
+    for (Eigen::Index j = 0; j < count; ++j) {
+      Array& column = columns[static_cast<std::size_t>(j)];
+      std::ranges::fill(column, 0.0);
+      to_rows(contact((first + j) / 3), Vec3::Unit((first + j) % 3), column);
+      forces.push_back(column.data());
+      changes.push_back(column.data());
+    }
+    H.solve(forces, changes);
+    for (Eigen::Index j = 0; j < count; ++j) {
+      for (Eigen::Index k = 0; k < m; ++k) {
+        W.block<3, 1>(3 * k, first + j) =
+            to_velocity(contact(k), columns[static_cast<std::size_t>(j)]);
+      }
+    }
+  }
+
+  Array force(size, 0.0);
+  std::transform(at.g.begin(), at.g.begin() + static_cast<std::ptrdiff_t>(p_.cloth_size),
+                 force.begin(), std::negate<>());
+  clear_fixed(force);
+  Linearized result{.p = Array(size, 0.0), .impulses = {}};
+  H.solve(force.data(), result.p.data());
+  Eigen::VectorXd q(3 * m);
+  Eigen::VectorXd r(3 * m);
+  std::vector<projective::RoughPlane> planes;
+  for (Eigen::Index k = 0; k < m; ++k) {
+    const NodalContact& c = contact(k);
+    q.segment<3>(3 * k) = at.u[static_cast<std::size_t>(k)] + to_velocity(c, result.p);
+    r.segment<3>(3 * k) = at.laws[static_cast<std::size_t>(k)].impulse;
+    planes.push_back({.normal = c.normal, .friction = c.friction});
+  }
+  projective::solve_coulomb(W, q, planes, kLawTolerance, kMostSweeps, r);
+  for (Eigen::Index k = 0; k < m; ++k) {
+    result.impulses.emplace_back(r.segment<3>(3 * k));
+    to_rows(contact(k), r.segment<3>(3 * k), force);
+  }
+  H.solve(force.data(), result.p.data());
+  return result;
+}
+
+double NodalSystem::frozen_energy_change(const Point& at,
+                                         const std::vector<Vec3>& impulses,
+                                         const Array& to) const {
   double change = f_.energy_change(at.x.data(), to.data());
   for (std::size_t k = 0; k < contacts_.size(); ++k) {
     const NodalContact& c = contacts_[k];
-    const double limit = c.friction * at.laws[k].impulse.dot(c.normal);
+    const double limit = c.friction * impulses[k].dot(c.normal);
     change += limit *
               (tangential(velocity(c, to), c.normal).norm() - tangential(at.u[k], c.normal).norm());
   }

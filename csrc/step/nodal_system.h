@@ -99,11 +99,23 @@ class NodalSystem {
                                  const std::vector<double>& d,
                                  bool frozen) const;
 
-  /// Move the points that approach what they touch back to where they do not.
-  void clear_approach(std::vector<double>& x) const;
+  /// Move the points that approach what they touch back to where they do not; whether there were any.
+  bool clear_approach(std::vector<double>& x) const;
 
-  /// Change from one point to another of the energy with friction as large as at the first.
-  double frozen_energy_change(const Point& at, const std::vector<double>& to) const;
+  /// A change of the rows, and the impulses along the way [N s].
+  struct Linearized {
+    std::vector<double> p;
+    std::vector<Vec3> impulses;
+  };
+
+  /// Solve the law of all contacts at once, with forces g + H p for a change p of the rows. It takes
+  /// 72 m^2 bytes and 3 m solves with H for m contacts.
+  Linearized solve_linearized(const Point& at, const linalg::CholeskyFactor& H) const;
+
+  /// Change from one point to another of the energy with friction as large as impulses [N s] allow.
+  double frozen_energy_change(const Point& at,
+                              const std::vector<Vec3>& impulses,
+                              const std::vector<double>& to) const;
 
  private:
   const solver::Objective& f_;

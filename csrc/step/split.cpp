@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <optional>
+#include <utility>
 
 #include "elastic/elastic_nearness.h"
 #include "step/contact_stage.h"
@@ -33,15 +34,11 @@ class Nearness {
 
   ContactStage stage() {
     const Scene& scene = problem_.scene;
-    if (!elastic_) {
-      return {.inertia = inertial_,
-              .others = {},
-              .assemblies = scene.diagonal_assemblies,
-              .first_factor = 1};
-    }
+    std::vector<Potential*> others;
+    if (elastic_) others.push_back(&*elastic_);
     return {.inertia = inertial_,
-            .others = {&*elastic_},
-            .assemblies = scene.elastic_assemblies,
+            .others = std::move(others),
+            .assemblies = elastic_ ? scene.elastic_assemblies : scene.diagonal_assemblies,
             .first_factor = 1};
   }
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from differences import directions, mismatch
 from scenes import F64, grid, material, tensor_noise
 
 import diffcloth_torch as dc
@@ -95,6 +96,28 @@ def on_body(kind, case, *, moving=True, scheme="projective", tolerance=1e-11, **
         if isinstance(value, torch.Tensor) and name != "thickness":
             inputs[f"parameters.{name}"] = value
     return Step(sim, state, inputs)
+
+
+def assert_gradients_are_those_of_differences(value, inputs, sizes, generator):
+    """Compare the gradient of a function of named inputs with central differences.
+
+    Args:
+        value: Maps a table of changed inputs to a scalar.
+        inputs: Name -> tensor.
+        sizes: Name -> step of the differences.
+        generator: Of the directions.
+    """
+    leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in inputs.items()}
+    gradients = torch.autograd.grad(value(leaves), list(leaves.values()))
+    for (name, tensor), gradient in zip(inputs.items(), gradients, strict=True):
+        for direction in directions(tensor, generator):
+
+            def along(moved, name=name):
+                with torch.no_grad():
+                    return value({name: moved}).item()
+
+            error = mismatch(along, tensor, gradient, direction, sizes[name], 1e-6)
+            assert error < 1e-5, (name, error)
 
 
 def counts(state):

@@ -30,22 +30,19 @@ def random_values(pairs):
 
 
 @pytest.mark.parametrize("fixed", [[], [0, 37, 38, 99], list(range(1, 100))], ids=len)
-def test_solve_and_product_are_those_of_the_free_vertices(fixed):
+def test_a_solve_is_that_of_the_free_vertices(fixed):
     pairs = grid_graph(10, 10)
     values, A = random_values(pairs)
     pinned = np.zeros(100, bool)
     pinned[fixed] = True
     matrix = _kernels.ConstantMatrices(pairs, pinned).find(values)
     b = RNG.normal(size=(100, 3))
-    x, y = np.full((2, 100, 3), np.nan)
+    x = np.full((100, 3), np.nan)
     matrix.solve(b, x)
     expected = np.zeros((100, 3))
     free = ~pinned
     expected[free] = np.linalg.solve(A[np.ix_(free, free)], b[free])
     np.testing.assert_allclose(x, expected, atol=1e-13)
-    matrix.multiply(b, y)
-    expected[free] = A[np.ix_(free, free)] @ b[free]
-    np.testing.assert_allclose(y, expected, atol=1e-13 * np.abs(expected).max())
 
 
 def test_all_vertices_may_be_fixed():

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from differences import directions, mismatch
-from nodal_scenes import DT, Step, counts
+from nodal_scenes import DT, Step, assert_gradients_are_those_of_differences, counts
 from scenes import F64, grid, material, tensor_noise
 
 import diffcloth_torch as dc
@@ -80,18 +79,11 @@ def test_gradients_of_pairs_are_those_of_differences(friction):
         after = step(changes)
         return (after.positions * weights[0]).sum() + DT * (after.velocities * weights[1]).sum()
 
-    leaves = {name: t.detach().clone().requires_grad_() for name, t in step.inputs.items()}
-    gradients = torch.autograd.grad(value(leaves), list(leaves.values()))
-    for (name, tensor), gradient in zip(step.inputs.items(), gradients, strict=True):
-        size = 1e-6 if "positions" in name else 1e-4 * max(1.0, float(tensor.abs().max()))
-        for direction in directions(tensor, generator):
-
-            def along(moved, name=name):
-                with torch.no_grad():
-                    return value({name: moved}).item()
-
-            error = mismatch(along, tensor, gradient, direction, size, 1e-6)
-            assert error < 1e-5, (name, error)
+    sizes = {
+        name: 1e-6 if "positions" in name else 1e-4 * max(1.0, float(tensor.abs().max()))
+        for name, tensor in step.inputs.items()
+    }
+    assert_gradients_are_those_of_differences(value, step.inputs, sizes, generator)
 
 
 def test_self_contact_is_what_the_options_say():

@@ -13,6 +13,7 @@
 
 #include "bind/kernels/kernels.h"
 #include "projective/constant_matrix.h"
+#include "projective/coupled_coulomb.h"
 #include "projective/primitives.h"
 
 namespace diffcloth::bind {
@@ -74,11 +75,36 @@ std::vector<double> nearest(const std::string& kind,
   return out;
 }
 
+/// Impulses of m contacts, 3 m numbers; normals are rows.
+std::vector<double> solve_coulomb(const std::vector<double>& W,
+                                  const std::vector<double>& q,
+                                  const std::vector<double>& normals,
+                                  double friction,
+                                  double tolerance,
+                                  int max_sweeps) {
+  const auto size = static_cast<Eigen::Index>(q.size());
+  if (W.size() != q.size() * q.size() || normals.size() != q.size() || q.size() % 3 != 0) {
+    throw std::invalid_argument("solve_coulomb: W is [3 m, 3 m], q and normals have 3 m numbers");
+  }
+  std::vector<projective::RoughPlane> planes;
+  for (Index k = 0; 3 * k < static_cast<Index>(size); ++k) {
+    planes.push_back({.normal = row(normals.data(), k), .friction = friction});
+  }
+  Eigen::VectorXd r = Eigen::VectorXd::Zero(size);
+  const bool solved = projective::solve_coulomb(
+      Eigen::Map<const Eigen::MatrixXd>(W.data(), size, size),
+      Eigen::Map<const Eigen::VectorXd>(q.data(), size), planes, tolerance, max_sweeps, r);
+  if (!solved) throw std::runtime_error("solve_coulomb: no solution was found");
+  return {r.begin(), r.end()};
+}
+
 }  // namespace
 
 void projective_kernels(nb::module_& m) {
   m.def("nearest", &nearest, "kind"_a, "size"_a, "point"_a,
         "What a primitive is seen from a point of its frame.");
+  m.def("solve_coulomb", &solve_coulomb, "W"_a, "q"_a, "normals"_a, "friction"_a, "tolerance"_a,
+        "max_sweeps"_a, "Impulses that obey Coulomb's law with the velocities q + W r.");
   nb::class_<projective::ConstantMatrix>(m, "ConstantMatrix")
       .def(
           "solve",
@@ -86,13 +112,7 @@ void projective_kernels(nb::module_& m) {
             projective::ConstantMatrix::Scratch scratch;
             self.solve(b.data(), x.data(), scratch);
           },
-          "b"_a.noconvert(), "x"_a.noconvert())
-      .def(
-          "multiply",
-          [](const projective::ConstantMatrix& self, const Rows& x, const MutableRows& y) {
-            self.multiply(x.data(), y.data());
-          },
-          "x"_a.noconvert(), "y"_a.noconvert());
+          "b"_a.noconvert(), "x"_a.noconvert());
   nb::class_<ConstantMatrices>(m, "ConstantMatrices",
                                "The constant matrices of Projective Dynamics on one pattern.")
       .def(nb::init<const Pairs&, const Flags&>(), "pairs"_a.noconvert(), "fixed"_a.noconvert())
