@@ -13,7 +13,7 @@ import torch
 import diffcloth_torch as dc
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -30,6 +30,18 @@ def test_files_that_are_named_exist(page):
     ):
         if path != "tests/oracles":  # where such references go
             assert (ROOT / path).exists(), path
+
+
+def test_the_reference_has_every_public_name():
+    pages = [page.read_text() for page in ROOT.glob("docs/reference/*.md")]
+    named = re.findall(r"^\.\. auto\w+:: diffcloth_torch\.(\w+)$", "\n".join(pages), re.M)
+    assert sorted(named) == sorted(dc.__all__)
+
+
+def test_the_gallery_shows_every_picture_that_a_configuration_makes():
+    text = (ROOT / "docs/gallery.md").read_text()
+    shown = set(re.findall(r"\]\(images/(\w+\.png)\)", text))
+    assert shown == {path.name for path in ROOT.glob("docs/images/*.png")}
 
 
 @pytest.mark.parametrize("record", [dc.Parameters, dc.Control, dc.ContactOptions])

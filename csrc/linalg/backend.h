@@ -56,8 +56,6 @@ struct Elimination {
 std::unique_ptr<const AnalysisBackend> analyze_multifrontal(const Elimination& elimination,
                                                             KernelLevel level);
 std::unique_ptr<const AnalysisBackend> analyze_eigen(const Elimination& elimination);
-#ifdef DIFFCLOTH_HAS_CHOLMOD
 std::unique_ptr<const AnalysisBackend> analyze_cholmod(const Elimination& elimination);
-#endif
 
 }  // namespace diffcloth::linalg

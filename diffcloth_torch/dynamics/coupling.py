@@ -12,8 +12,9 @@ gain energy.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -52,7 +53,8 @@ Cloth = TypeVar("Cloth", bound=ClothSolution)
 Rigid = TypeVar("Rigid", bound=RigidSolution)
 
 
-class Staggered(NamedTuple, Generic[Cloth, Rigid]):
+@dataclass(frozen=True)
+class Staggered(Generic[Cloth, Rigid]):
     """A step in two solves.
 
     Attributes:

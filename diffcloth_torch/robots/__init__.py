@@ -22,9 +22,9 @@ def panda() -> tuple[Path, Path]:
 
     At zero its fourth joint is beyond its limit, and fingers and links overlap; this start does:
 
-        path, root = dc.robots.panda()
-        start = {"panda_joint4": -1.5, "panda_joint6": 1.5, "panda_finger_joint1": 0.02}
-        robot = dc.Robot.load(path, mesh_root=root, joint_positions=start)
+    >>> path, root = dc.robots.panda()
+    >>> start = {"panda_joint4": -1.5, "panda_joint6": 1.5, "panda_finger_joint1": 0.02}
+    >>> robot = dc.Robot.load(path, mesh_root=root, joint_positions=start)
 
     Raises:
         ImportError: If the extra `robots` is not installed.

@@ -33,8 +33,8 @@ def render(
 ) -> None:
     """Draw states: an animation (.mp4, .gif), or an overview of some moments (.png).
 
-        dc.render(scene, [start, *states], "motion.mp4")
-        dc.render(scene, states[-1], "end.png", contact_forces=True)
+    >>> dc.render(scene, [start, *states], "motion.mp4")
+    >>> dc.render(scene, states[-1], "end.png", contact_forces=True)
 
     Args:
         scene: What the states are of.
