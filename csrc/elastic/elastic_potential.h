@@ -27,6 +27,12 @@ class ElasticPotential : public Potential {
     elastic::add_gradient(model_, x, g);
   }
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
+  void extrapolate(const double* x, const double* to) override {
+    extrapolated_ = extrapolated_stresses(model_, x, to);
+  }
+  void add_extrapolation(const double* x,
+                         Curvature curvature,
+                         linalg::BlockMatrix& A) const override;
   void add_hessian_product(const double* x, const double* z, double* y) const override {
     elastic::add_hessian_product(model_, x, z, y);
   }
@@ -45,6 +51,7 @@ class ElasticPotential : public Potential {
   const Slots& slots_;
   Wanted wanted_;
   Bar bar_;
+  std::vector<Mat2> extrapolated_;  ///< [F] second stresses
 };
 
 /// Soft pins as a potential. See anchors.h.

@@ -24,6 +24,12 @@ Mat2 clamp_to_one(const Mat2& A) {
   return result;
 }
 
+/// The positive part of a symmetric 2x2 matrix.
+Mat2 positive_part(const Mat2& A) {
+  const Mat2 I = Mat2::Identity();
+  return I - clamp_to_one(I - A);
+}
+
 }  // namespace
 
 double energy(double weight, const Mat32& F) {
@@ -69,6 +75,42 @@ std::array<Mat3, 6> hessian(double weight,
       blocks[k].noalias() = (-weight * t_inv) * e[p] * e[q].transpose();
       blocks[k] -= (weight * normal) * nn;
       blocks[k].diagonal().array() += weight * g.row(p).dot(g.row(q));
+    }
+  }
+  return blocks;
+}
+
+Mat2 second_stress(double weight, const Mat32& F) {
+  return weight * (Mat2::Identity() - frame(F).S_inv);
+}
+
+Mat2 extrapolated_stress(double weight, const Mat32& F, const Mat32& G) {
+  // From F T = dE/dF:  F dT = d(dE/dF) - G T, and the left inverse of F is S^-1 R^T.
+  const Frame polar = frame(F);
+  const Mat2 T = second_stress(weight, F);
+  const Mat32 F_dT = stress_change(weight, F, G) - G * T;
+  const Mat2 dT = polar.S_inv * (polar.R.leftCols<2>().transpose() * F_dT);
+  return T + 0.5 * (dT + dT.transpose());
+}
+
+std::array<Mat3, 6> extrapolation(double weight,
+                                  const mesh::ShapeGradient& g,
+                                  const Mat32& F,
+                                  const Mat2& extrapolated,
+                                  bool positive) {
+  const Mat2 T = second_stress(weight, F);
+  Mat2 dT = extrapolated - T;
+  Mat3 along = Mat3::Identity();
+  if (positive) {
+    dT = positive_part(extrapolated) - positive_part(T);
+    const Vec3 n = frame(F).R.col(2);
+    along = n * n.transpose();
+  }
+  std::array<Mat3, 6> blocks;
+  int k = 0;
+  for (int p = 0; p < 3; ++p) {
+    for (int q = 0; q <= p; ++q, ++k) {
+      blocks[k] = g.row(p).dot(dT * g.row(q).transpose()) * along;
     }
   }
   return blocks;

@@ -69,20 +69,8 @@ std::vector<double> most_negative(Walk& walk, const linalg::CholeskyFactor& shif
   return d;
 }
 
-}  // namespace
-
-bool leave_saddle(Walk& walk) {
-  const linalg::BlockMatrix H = walk.system.assemble(walk.x().data(), Curvature::kExact, walk.g());
-  const Factor shifted = shifted_factor(walk, H);
-  if (!shifted) return false;
-  const std::vector<double> d = most_negative(walk, *shifted);
-  std::vector<double> product(d.size(), 0.0);
-  H.add_product(d.data(), product.data());
-  if (!(dot(d, product) < 0.0)) return false;
-  std::vector<double> p;
-  walk.f.coordinates->push_forward(d, p);
-
-  // From far to near: the first point that is lower, and on while the next is lower still.
+/// Go to the first lower point along p, from far to near, and on while the next is lower still.
+bool go_down(Walk& walk, const std::vector<double>& p) {
   const double length = kFirstMove * walk.f.length;
   std::vector<double> to;
   double alpha =
@@ -104,6 +92,24 @@ bool leave_saddle(Walk& walk) {
   walk.go(to);
   walk.refresh();
   return true;
+}
+
+}  // namespace
+
+bool leave_saddle(Walk& walk) {
+  const linalg::BlockMatrix H = walk.system.assemble(walk.x().data(), Curvature::kExact, walk.g());
+  const Factor shifted = shifted_factor(walk, H);
+  if (!shifted) return false;
+  const std::vector<double> d = most_negative(walk, *shifted);
+  std::vector<double> product(d.size(), 0.0);
+  H.add_product(d.data(), product.data());
+  if (!(dot(d, product) < 0.0)) return false;
+  std::vector<double> p;
+  walk.f.coordinates->push_forward(d, p);
+  if (go_down(walk, p)) return true;
+  // What is left of the gradient may outweigh the curvature on one side.
+  for (double& value : p) value = -value;
+  return go_down(walk, p);
 }
 
 }  // namespace diffcloth::solver
