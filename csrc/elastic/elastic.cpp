@@ -293,6 +293,33 @@ void add_hessian(const Model& model,
   }
 }
 
+std::vector<Mat2> extrapolated_stresses(const Model& model, const double* x, const double* to) {
+  std::vector<Mat2> stresses;
+  stresses.reserve(model.topology->faces.size());
+  for (Index f = 0; f < face_count(model); ++f) {
+    const Mat32 F = face_gradient(model, f, x);
+    const Mat32 G = face_gradient(model, f, to) - F;
+    stresses.push_back(stretch::extrapolated_stress(stretch_weight(model, f), F, G));
+  }
+  return stresses;
+}
+
+void add_extrapolation(const Model& model,
+                       const Slots& slots,
+                       const double* x,
+                       const std::vector<Mat2>& stresses,
+                       Curvature curvature,
+                       double* blocks) {
+  const bool positive = curvature == Curvature::kPositive;
+  for (Index f = 0; f < face_count(model); ++f) {
+    add_face_blocks(model.topology->faces[f],
+                    slots.stretch.data() + 6 * static_cast<std::size_t>(f),
+                    stretch::extrapolation(stretch_weight(model, f), model.rest->shape_gradient[f],
+                                           face_gradient(model, f, x), stresses[f], positive),
+                    blocks);
+  }
+}
+
 void add_hessian_product(const Model& model, const double* x, const double* z, double* y) {
   for (Index f = 0; f < face_count(model); ++f) {
     const Mat32 F = face_gradient(model, f, x);

@@ -83,6 +83,18 @@ void add_hessian(const Model& model,
                  const std::vector<Index>& place,
                  double* blocks);
 
+/// Second stress of each face after a straight motion from x, in the linear model of that motion; what
+/// damping adds to stresses is left out.
+std::vector<Mat2> extrapolated_stresses(const Model& model, const double* x, const double* to);
+
+/// blocks += the Hessian at x with these second stresses less that with the actual ones.
+void add_extrapolation(const Model& model,
+                       const Slots& slots,
+                       const double* x,
+                       const std::vector<Mat2>& stresses,
+                       Curvature curvature,
+                       double* blocks);
+
 /// y += H(x) z over all vertices, with the exact Hessian and without a matrix.
 void add_hessian_product(const Model& model, const double* x, const double* z, double* y);
 

@@ -37,6 +37,14 @@ void ElasticPotential::add_hessian(const double* x,
   elastic::add_hessian(model_, slots_, x, curvature, A.slot_of_base(), A.blocks());
 }
 
+void ElasticPotential::add_extrapolation(const double* x,
+                                         Curvature curvature,
+                                         linalg::BlockMatrix& A) const {
+  std::vector<double> blocks(9 * static_cast<std::size_t>(slots_.block_count), 0.0);
+  elastic::add_extrapolation(model_, slots_, x, extrapolated_, curvature, blocks.data());
+  A.add_base(blocks);
+}
+
 void ElasticPotential::accumulate(const double* x, const double* z) {
   if (wanted_ == Wanted::kNone && !model_.prepared.damped) return;
   add_mixed(model_, x, negated(z, model_.topology->vertex_count).data(),

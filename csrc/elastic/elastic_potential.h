@@ -29,6 +29,12 @@ class ElasticPotential final : public Potential {
   double energy_change(const double* x, const double* to) const override;
   void add_gradient(const double* x, double* g) const override;
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
+  void extrapolate(const double* x, const double* to) override {
+    extrapolated_ = extrapolated_stresses(model_, x, to);
+  }
+  void add_extrapolation(const double* x,
+                         Curvature curvature,
+                         linalg::BlockMatrix& A) const override;
   void add_hessian_product(const double* x, const double* z, double* y) const override {
     elastic::add_hessian_product(model_, x, z, y);
   }
@@ -49,6 +55,7 @@ class ElasticPotential final : public Potential {
   ConstantForm flat_bending_;
   mutable std::vector<double> change_;  ///< scratch
   Bar bar_;
+  std::vector<Mat2> extrapolated_;  ///< [F] second stresses
 };
 
 /// Soft pins as a potential. See anchors.h.

@@ -42,6 +42,16 @@ class Potential {
   /// A += the Hessian; A leaves out the rows that are not its own.
   virtual void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const = 0;
 
+  /// Points have moved straight from x to `to`: remember the stresses that a linear model of the motion
+  /// has there.
+  virtual void extrapolate(const double* /*x*/, const double* /*to*/) {}
+
+  /// A += the Hessian with the stresses of the last extrapolate() less that with the actual ones, where
+  /// the last motion ended. The positive one leaves a positive Hessian positive.
+  virtual void add_extrapolation(const double* /*x*/,
+                                 Curvature /*curvature*/,
+                                 linalg::BlockMatrix& /*A*/) const {}
+
   /// y += H z over all vertices, exact.
   virtual void add_hessian_product(const double* x, const double* z, double* y) const = 0;
 

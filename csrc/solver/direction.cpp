@@ -79,12 +79,24 @@ Directions::Direction Directions::next() {
     ++walk_.context.counts->negative_curvature;
     s_ = kFirstShare;
   }
-  return damp(H);
+  return damp(H, walk_.system.assemble(walk_.x().data(), Curvature::kPositive, walk_.g()));
 }
 
-Directions::Direction Directions::damp(const linalg::BlockMatrix& H) {
-  const linalg::BlockMatrix P =
-      walk_.system.assemble(walk_.x().data(), Curvature::kPositive, walk_.g());
+Directions::Direction Directions::next_extrapolated() {
+  const double* x = walk_.x().data();
+  const linalg::BlockMatrix H = walk_.system.assemble_extrapolated(x, Curvature::kExact, walk_.g());
+  if (Factor factor = walk_.system.factor(H)) {
+    factor_ = std::move(factor);
+    ++walk_.context.counts->exact;
+    walk_.system.solve(*factor_, walk_.g(), p_);
+    return {.kind = Kind::kExtrapolated, .first = 1.0};
+  }
+  ++walk_.context.counts->negative_curvature;
+  if (s_ == 0.0) s_ = kFirstShare;
+  return damp(H, walk_.system.assemble_extrapolated(x, Curvature::kPositive, walk_.g()));
+}
+
+Directions::Direction Directions::damp(const linalg::BlockMatrix& H, const linalg::BlockMatrix& P) {
   Factor factor;
   for (;; s_ = std::max(kFirstShare, kFailureGrowth * s_)) {
     walk_.context.checkpoint->check();
@@ -132,6 +144,7 @@ bool Directions::retry(Kind kind) {
   switch (kind) {
     case Kind::kChord:
     case Kind::kIterated:
+    case Kind::kExtrapolated:
       factor_ = nullptr;
       return true;
     case Kind::kFactored:

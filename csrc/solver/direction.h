@@ -16,6 +16,7 @@ enum class Kind : std::uint8_t {
   kIterated,  ///< the exact Hessian, by conjugate gradients
   kChord,     ///< a factor of the exact Hessian at an earlier point
   kDamped,    ///< the exact Hessian blended with its projection
+  kExtrapolated,  ///< the exact Hessian with extrapolated stresses
 };
 
 /// The next direction of a minimization, as cheap as what the last ones have shown allows.
@@ -37,11 +38,23 @@ class Directions {
   /// Compute the next direction into p().
   Direction next();
 
+  /// The same, of Hessians with extrapolated stresses; factored, as excursions need exact directions.
+  Direction next_extrapolated();
+
   /// Compute the direction of the exact Hessian, factored here. False where it is indefinite.
   bool certify();
 
   const std::vector<double>& p() const { return p_; }
   const Factor& factor() const { return factor_; }
+
+  /// The share of the projection in damped directions.
+  double share() const { return s_; }
+
+  /// Be back where the direction was p, with that share.
+  void resume(const std::vector<double>& p, double share) {
+    p_ = p;
+    s_ = share;
+  }
 
   /// Learn from how the last direction was walked.
   void learn(const Direction& direction, const Search& search);
@@ -55,7 +68,7 @@ class Directions {
  private:
   bool chord();
   bool iterate(const linalg::BlockMatrix& H, bool& indefinite);
-  Direction damp(const linalg::BlockMatrix& H);
+  Direction damp(const linalg::BlockMatrix& H, const linalg::BlockMatrix& P);
 
   Walk& walk_;
   Factor factor_;

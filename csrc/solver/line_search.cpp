@@ -16,44 +16,53 @@ constexpr int kBacktracks = 40;
 
 }  // namespace
 
-Search search(Walk& walk, const std::vector<double>& p, double first) {
+double Trial::enough(double slope) const { return kArmijo * alpha * slope; }
+
+Trial farthest(Walk& walk, const std::vector<double>& p, double first) {
+  Trial trial;
+  trial.alpha =
+      walk.watch(p, std::min(first, walk.f.coordinates->largest_fraction(walk.x(), p)), trial.to);
+  if (trial.alpha > 0.0) trial.gain = walk.change(trial.to);
+  return trial;
+}
+
+double noise(const Walk& walk) { return kEnergyNoise * std::abs(walk.f.energy(walk.x().data())); }
+
+Search search(Walk& walk, const std::vector<double>& p, Trial trial) {
   Search result;
-  std::vector<double> to;
-  double alpha =
-      walk.watch(p, std::min(first, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
-  if (!(alpha > 0.0)) {
+  if (!(trial.alpha > 0.0)) {
     result.result = SearchResult::kBlocked;
     return result;
   }
   const double slope = dot(walk.g(), p);
   const std::vector<double> start = walk.x();
-  double noise = -1.0;  // not needed before a trial fails
+  double smallest = -1.0;  // not needed before a trial fails
 
-  for (; result.backtracks < kBacktracks; ++result.backtracks, alpha *= 0.5) {
+  for (; result.backtracks < kBacktracks; ++result.backtracks, trial.alpha *= 0.5) {
+    walk.context.checkpoint->check();
     if (result.backtracks > 0) {
       if (walk.f.coordinates->is_curved()) {
-        alpha = walk.watch(p, alpha, to);
-        if (!(alpha > 0.0)) break;
+        trial.alpha = walk.watch(p, trial.alpha, trial.to);
+        if (!(trial.alpha > 0.0)) break;
       } else {
-        walk.f.coordinates->retract(start, p, alpha, to);
+        walk.f.coordinates->retract(start, p, trial.alpha, trial.to);
       }
+      trial.gain = walk.change(trial.to);
     }
-    walk.context.checkpoint->check();
-    const double gain = walk.change(to);
-    const bool decreased = gain <= kArmijo * alpha * slope;
+    const bool decreased = trial.gain <= trial.enough(slope);
     if (!decreased) {
-      if (noise < 0.0) noise = kEnergyNoise * std::abs(walk.f.energy(start.data()));
-      if (!(std::abs(gain) <= noise)) continue;
+      if (smallest < 0.0) smallest = noise(walk);
+      if (!(std::abs(trial.gain) <= smallest)) continue;
     }
     if (decreased) {
-      walk.go(to);
+      walk.go(trial.to);
       walk.refresh();
-    } else if (!walk.go_if_flat(to, p, kWolfeSlope * std::abs(slope))) {
+    } else if (!walk.go_if_flat(trial.to, p, kWolfeSlope * std::abs(slope))) {
       continue;
     }
     result.result = SearchResult::kMoved;
-    result.alpha = alpha;
-    result.gain = gain;
+    result.alpha = trial.alpha;
+    result.gain = trial.gain;
     result.measured = decreased;
     return result;
   }

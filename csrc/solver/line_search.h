@@ -21,10 +21,26 @@ struct Search {
   bool measured = true;  ///< the decrease was larger than what rounding can fake
 };
 
+/// The first point that a search along a direction looks at.
+struct Trial {
+  double alpha = 0.0;      ///< fraction of the direction; 0 where collisions leave no way
+  std::vector<double> to;  ///< the point
+  double gain = 0.0;       ///< change of the objective [J]
+
+  /// The change that is decrease enough (Armijo), from the slope along the direction [J].
+  double enough(double slope) const;
+};
+
+/// The largest collision-free fraction of p, at most the first.
+Trial farthest(Walk& walk, const std::vector<double>& p, double first);
+
+/// The smallest change of the objective that rounding cannot fake, where the walk stands [J].
+double noise(const Walk& walk);
+
 /// Walk along p by the largest collision-free fraction that decreases the objective enough
 /// (Armijo), or, where the change drowns in rounding, flattens its slope (approximate Wolfe).
 ///
-/// @param first  fraction that is tried first, >= 1 to go beyond the full step
-Search search(Walk& walk, const std::vector<double>& p, double first);
+/// @param trial  where to begin: what farthest() has found
+Search search(Walk& walk, const std::vector<double>& p, Trial trial);
 
 }  // namespace diffcloth::solver

@@ -15,6 +15,15 @@ linalg::BlockMatrix LinearSystem::assemble(const double* x,
   return matrix;
 }
 
+linalg::BlockMatrix LinearSystem::assemble_extrapolated(const double* x,
+                                                        Curvature curvature,
+                                                        const std::vector<double>& g) {
+  linalg::BlockMatrix matrix = assemble(x, curvature, g);
+  const Stopwatch::Scope scope(watch_, Phase::kAssembly);
+  f_.for_each([&](const Potential& p) { p.add_extrapolation(x, curvature, matrix); });
+  return matrix;
+}
+
 Factor LinearSystem::factor(const linalg::BlockMatrix& matrix) {
   const Stopwatch::Scope analysis_scope(watch_, Phase::kAnalysis);
   const Assembly::Found found = assembly_->analysis();

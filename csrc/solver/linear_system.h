@@ -42,6 +42,11 @@ class LinearSystem {
   /// @param g  the gradient at x
   linalg::BlockMatrix assemble(const double* x, Curvature curvature, const std::vector<double>& g);
 
+  /// The Hessian at x with extrapolated stresses: see Potential::extrapolate().
+  linalg::BlockMatrix assemble_extrapolated(const double* x,
+                                            Curvature curvature,
+                                            const std::vector<double>& g);
+
   /// L L^T of a matrix that assemble() has made at the last point; null where it is not positive
   /// definite.
   Factor factor(const linalg::BlockMatrix& matrix);

@@ -80,7 +80,7 @@ void relax(Walk& walk) {
   if (!factor) return;
   std::vector<double> p;
   walk.system.solve(*factor, walk.g(), p);
-  search(walk, p, 1.0);
+  search(walk, p, farthest(walk, p, 1.0));
 }
 
 bool has_arrived(const Walk& walk, const std::vector<double>& ends) {

@@ -1,7 +1,9 @@
 #include "solver/newton.h"
 
 #include <algorithm>
+#include <cmath>
 #include <limits>
+#include <optional>
 #include <utility>
 
 #include "solver/direction.h"
@@ -21,6 +23,15 @@ constexpr double kResolution = 1e-15;
 /// the floor of rounding is reached.
 constexpr int kIdle = 5;
 constexpr double kProgress = 0.9;
+/// Steps that an excursion may take to end below its start; the share that collisions must leave of
+/// each.
+constexpr int kExcursion = 6;
+constexpr double kFree = 0.3;
+/// Steps of a solve before the first excursion: most solves end sooner.
+constexpr int kPatience = 8;
+/// After an excursion in vain the next steps are ordinary ones, twice as many as the last time, at most
+/// so many.
+constexpr int kLongestWait = 64;
 
 class Descent {
  public:
@@ -47,6 +58,10 @@ class Descent {
   Next escape();
   Next no_way(const Directions::Direction& direction, double step, SearchResult result);
   bool idles(double step, const Search& search);
+  Next go(const Directions::Direction& direction);
+  Search walk_along(const Directions::Direction& direction);
+  Search wander(const Trial& trial);
+  Next come_back();
 
   Walk& walk_;
   Directions directions_;
@@ -57,6 +72,26 @@ class Descent {
   double settled_step_ = std::numeric_limits<double>::infinity();
   double best_ = std::numeric_limits<double>::infinity();
   int idle_ = 0;
+
+  /// Steps that may raise the objective, as long as they end below where they began.
+  ///
+  /// Stiff cloth moves in a curved valley: a step along its tangent stretches it, and a search that
+  /// only goes down takes hundreds of short ones. But the next Newton step relaxes what the last one
+  /// has stretched, and goes on along the valley, provided that its Hessian has the stresses of the
+  /// linear model of that step, which stretches nothing, and not the spurious ones (Magisano,
+  /// Leonetti, Garcea 2017: Newton's method with mixed integration points).
+  struct Excursion {
+    Walk::Place start;
+    std::vector<double> p;  ///< the first direction
+    Directions::Direction direction;
+    double share;          ///< of the projection, at the start
+    double enough;         ///< change to end with [J]
+    double balance = 0.0;  ///< change so far [J]
+    int steps = 0;
+  };
+  std::optional<Excursion> excursion_;
+  int wait_ = kPatience;  ///< ordinary steps before the next one
+  int next_wait_ = 1;     ///< after the next one in vain
 };
 
 /// Leave a saddle, or stop there.
@@ -105,8 +140,59 @@ Descent::Next Descent::no_way(const Directions::Direction& direction,
   return stop(result == SearchResult::kBlocked ? Status::kBlocked : Status::kRoundingFloor);
 }
 
+/// Walk along the direction. Where the full step would raise the objective it may begin an excursion.
+Search Descent::walk_along(const Directions::Direction& direction) {
+  const std::vector<double>& p = directions_.p();
+  Trial trial = farthest(walk_, p, direction.first);
+  const double slope = dot(walk_.g(), p);
+  const double enough = trial.enough(slope);
+  const bool rises =
+      slope < 0.0 && trial.alpha > kFree && std::isfinite(trial.gain) && trial.gain > enough;
+  if (wait_ == 0 && direction.kind != Kind::kDamped && rises && trial.gain > noise(walk_)) {
+    excursion_ = {.start = walk_.place(),
+                  .p = p,
+                  .direction = direction,
+                  .share = directions_.share(),
+                  .enough = enough};
+    return wander(trial);
+  }
+  wait_ = std::max(wait_ - 1, 0);
+  return search(walk_, p, std::move(trial));
+}
+
+/// One step of an excursion: its last one where it ends below the start, none where it leads nowhere.
+Search Descent::wander(const Trial& trial) {
+  const double balance = excursion_->balance + trial.gain;
+  const bool ends = trial.alpha > 0.0 && balance <= excursion_->enough;
+  if (!ends && !(trial.alpha > kFree && std::isfinite(balance) && excursion_->steps < kExcursion)) {
+    return {.result = SearchResult::kNoGain};
+  }
+  walk_.go_extrapolating(trial.to);
+  excursion_->balance = balance;
+  ++excursion_->steps;
+  if (ends) {
+    excursion_.reset();
+    next_wait_ = 1;
+  }
+  return {.result = SearchResult::kMoved, .alpha = trial.alpha, .gain = trial.gain};
+}
+
+/// Undo an excursion, and go on from its start in the ordinary way.
+Descent::Next Descent::come_back() {
+  const Excursion excursion = std::move(*excursion_);
+  excursion_.reset();
+  wait_ = next_wait_;
+  next_wait_ = std::min(2 * next_wait_, kLongestWait);
+  walk_.back(excursion.start);
+  directions_.resume(excursion.p, excursion.share);
+  return go(excursion.direction);
+}
+
 Descent::Next Descent::take(const Directions::Direction& direction) {
   const double step = walk_.displacement(directions_.p());
+  const bool is_lost = !(step > kResolution * walk_.f.coordinates->extent(walk_.x()));
+  // A minimum above the start of an excursion is none to end in.
+  if (excursion_ && (step < goal_ || is_lost)) return come_back();
   residual_ = step / walk_.f.h;
   if (direction.kind == Kind::kDamped) {
     if (step < kSettled * goal_) {
@@ -123,10 +209,16 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
       settled_step_ = step;
     }
   }
-  if (!(step > kResolution * walk_.f.coordinates->extent(walk_.x()))) {
-    return no_way(direction, step, SearchResult::kNoGain);
-  }
-  const Search search = solver::search(walk_, directions_.p(), direction.first);
+  if (is_lost) return no_way(direction, step, SearchResult::kNoGain);
+  return go(direction);
+}
+
+/// Walk along the direction, and learn from it.
+Descent::Next Descent::go(const Directions::Direction& direction) {
+  const double step = walk_.displacement(directions_.p());
+  const Search search =
+      excursion_ ? wander(farthest(walk_, directions_.p(), 1.0)) : walk_along(direction);
+  if (search.result != SearchResult::kMoved && excursion_) return come_back();
   if (search.result != SearchResult::kMoved) {
     settling_ = false;
     return no_way(direction, step, search.result);
@@ -141,6 +233,7 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
 
 /// What is here when the iterations are used up: the residual of this very point.
 Status Descent::look() {
+  if (excursion_) walk_.back(excursion_->start);
   const bool minimum = directions_.certify();
   if (!minimum) directions_.next();
   const double step = walk_.displacement(directions_.p());
@@ -157,7 +250,9 @@ Status Descent::run() {
       continue;
     }
     if (!walk_.spend()) return look();
-    if (take(directions_.next()) == Next::kStop) return status_;
+    if (take(excursion_ ? directions_.next_extrapolated() : directions_.next()) == Next::kStop) {
+      return status_;
+    }
   }
 }
 

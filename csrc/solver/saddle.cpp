@@ -49,6 +49,31 @@ Factor shifted_factor(const std::vector<double>& metric,
   return nullptr;
 }
 
+/// Go to the first lower point along p, from far to near, and on while the next is lower still.
+bool go_down(Walk& walk, const std::vector<double>& p) {
+  const double length = kFirstMove * walk.f.length;
+  std::vector<double> to;
+  double alpha =
+      walk.watch(p, std::min(length, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
+  double best = 0.0;
+  double best_alpha = 0.0;
+  for (int k = 0; k < kBacktracks; ++k, alpha *= 0.5) {
+    if (k > 0) alpha = walk.watch(p, alpha, to);
+    if (!(alpha > 0.0)) break;
+    const double change = walk.change(to);
+    if (change < best) {
+      best = change;
+      best_alpha = alpha;
+    } else if (best_alpha > 0.0) {
+      break;
+    }
+  }
+  if (best_alpha == 0.0 || !(walk.watch(p, best_alpha, to) > 0.0)) return false;
+  walk.go(to);
+  walk.refresh();
+  return true;
+}
+
 }  // namespace
 
 std::vector<double> most_negative(const Objective& f,
@@ -86,29 +111,10 @@ bool leave_saddle(Walk& walk) {
   if (d.empty()) return false;
   std::vector<double> p;
   walk.f.coordinates->push_forward(d, p);
-
-  // From far to near: the first point that is lower, and on while the next is lower still.
-  const double length = kFirstMove * walk.f.length;
-  std::vector<double> to;
-  double alpha =
-      walk.watch(p, std::min(length, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
-  double best = 0.0;
-  double best_alpha = 0.0;
-  for (int k = 0; k < kBacktracks; ++k, alpha *= 0.5) {
-    if (k > 0) alpha = walk.watch(p, alpha, to);
-    if (!(alpha > 0.0)) break;
-    const double change = walk.change(to);
-    if (change < best) {
-      best = change;
-      best_alpha = alpha;
-    } else if (best_alpha > 0.0) {
-      break;
-    }
-  }
-  if (best_alpha == 0.0 || !(walk.watch(p, best_alpha, to) > 0.0)) return false;
-  walk.go(to);
-  walk.refresh();
-  return true;
+  if (go_down(walk, p)) return true;
+  // What is left of the gradient may outweigh the curvature on one side.
+  for (double& value : p) value = -value;
+  return go_down(walk, p);
 }
 
 }  // namespace diffcloth::solver

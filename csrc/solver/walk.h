@@ -108,6 +108,30 @@ class Walk {
     record();
   }
 
+  /// Where the walk stands, to come back to.
+  struct Place {
+    std::vector<double> x;
+    std::size_t steps;  ///< on the recorded path
+  };
+  Place place() const {
+    return {.x = x_, .steps = context.path == nullptr ? 0 : context.path->size()};
+  }
+
+  /// Be back at a place, as if nothing had been walked since.
+  void back(const Place& place) {
+    x_ = place.x;
+    if (context.path != nullptr) context.path->resize(place.steps);
+    watch(x_);
+    refresh();
+  }
+
+  /// Go to a point of the watched motion, with stresses extrapolated from here.
+  void go_extrapolating(const std::vector<double>& to) {
+    f.for_each([&](Potential& p) { p.extrapolate(x_.data(), to.data()); });
+    go(to);
+    refresh();
+  }
+
   /// Go to a point of the watched motion unless the slope along p there is above a bound.
   bool go_if_flat(const std::vector<double>& to, const std::vector<double>& p, double bound) {
     std::vector<double> x_before = to;

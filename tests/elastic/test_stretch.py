@@ -88,6 +88,50 @@ def test_projected_hessian_clamps_the_eigenvalues_of_an_element(state):
         assert np.abs(positive - exact).max() > 1e-3 * K_S
 
 
+def second_stress(F):
+    """T = k_s A (I - S^-1) of the triangle, by a singular value decomposition of F = R S."""
+    X, _ = TRIANGLE
+    area = 0.5 * abs(np.linalg.det(X[1:, :2] - X[0, :2]))
+    _, values, V = np.linalg.svd(F, full_matrices=False)
+    return K_S * area * (np.eye(2) - V.T @ np.diag(1 / values) @ V)
+
+
+def positive_part(A):
+    values, V = np.linalg.eigh(A)
+    return V @ np.diag(np.maximum(values, 0)) @ V.T
+
+
+@pytest.mark.parametrize("state", STATES)
+@pytest.mark.parametrize("positive", [False, True])
+def test_extrapolated_hessian_has_the_stress_of_the_linear_model(state, positive):
+    X, faces = TRIANGLE
+    elastic = model(X, faces, stretch=K_S)
+    x0 = X @ state.T + 0.02 * RNG.normal(size=X.shape)
+    x = x0 + 0.2 * RNG.normal(size=X.shape)
+    to_gradient = np.linalg.inv((X[1:, :2] - X[0, :2]).T)
+
+    def gradient(x):
+        return (x[1:] - x[0]).T @ to_gradient
+
+    F0, F = gradient(x0), gradient(x)
+    step = 1e-5
+    change = second_stress(F0 + step * (F - F0)) - second_stress(F0 - step * (F - F0))
+    extrapolated, actual = second_stress(F0) + change / (2 * step), second_stress(F)
+    along = np.eye(3)
+    if positive:
+        extrapolated, actual = positive_part(extrapolated), positive_part(actual)
+        n = np.cross(F[:, 0], F[:, 1])
+        along = np.outer(n, n) / (n @ n)
+    shapes = np.vstack([-to_gradient.sum(axis=0), to_gradient])
+    expected = np.kron(shapes @ (extrapolated - actual) @ shapes.T, along)
+    H = elastic.extrapolated_hessian(x0, x, positive)
+    np.testing.assert_allclose(H - elastic.hessian(x, positive), expected, atol=1e-6 * K_S)
+    if not positive:
+        assert np.abs(expected).max() > 1e-2 * K_S
+    else:
+        assert np.linalg.eigvalsh(H)[0] > -1e-11 * K_S
+
+
 @pytest.mark.parametrize(
     "x",
     [

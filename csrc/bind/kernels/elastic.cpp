@@ -188,19 +188,35 @@ class Elastic {
   }
 
   Array hessian(const Positions& x, bool positive) const {
-    const Array blocks = hessian_blocks(x, positive);
+    return dense(hessian_blocks(x, positive).data());
+  }
+
+  /// The Hessian at x with stresses extrapolated on the straight way from x0.
+  Array extrapolated_hessian(const Positions& x0, const Positions& x, bool positive) const {
+    const Curvature curvature = positive ? Curvature::kPositive : Curvature::kExact;
+    const std::vector<double> from = positions("x0", x0);
+    const std::vector<double> to = positions("x", x);
+    std::vector<double> blocks(9 * static_cast<std::size_t>(slots_.block_count), 0.0);
+    elastic::add_hessian(model_, slots_, to.data(), curvature, blocks.data());
+    elastic::add_extrapolation(model_, slots_, to.data(),
+                               elastic::extrapolated_stresses(model_, from.data(), to.data()),
+                               curvature, blocks.data());
+    return dense(blocks.data());
+  }
+
+  Array dense(const double* blocks) const {
     const Index n = topology_.vertex_count;
-    Eigen::MatrixXd dense = Eigen::MatrixXd::Zero(3 * n, 3 * n);
+    Eigen::MatrixXd matrix = Eigen::MatrixXd::Zero(3 * n, 3 * n);
     for (Index j = 0; j < n; ++j) {
       for (Index s = pattern_.column_start()[j]; s < pattern_.column_start()[j + 1]; ++s) {
         const Index i = pattern_.row()[s];
-        const Mat3 block = Eigen::Map<const Mat3>(blocks.data() + 9 * s);
-        dense.block<3, 3>(3 * i, 3 * j) = block;
-        dense.block<3, 3>(3 * j, 3 * i) = block.transpose();
+        const Mat3 block = Eigen::Map<const Mat3>(blocks + 9 * s);
+        matrix.block<3, 3>(3 * i, 3 * j) = block;
+        matrix.block<3, 3>(3 * j, 3 * i) = block.transpose();
       }
     }
     const std::size_t size = 3 * static_cast<std::size_t>(n);
-    return owned(dense.data(), {size, size});
+    return owned(matrix.data(), {size, size});
   }
 
   Array hessian_product(const Positions& x, const Positions& z) const {
@@ -394,6 +410,8 @@ void elastic_kernels(nb::module_& m) {
            "positive"_a = false)
       .def("gradient", &Elastic::gradient, "x"_a.noconvert())
       .def("hessian", &Elastic::hessian, "x"_a.noconvert(), "positive"_a)
+      .def("extrapolated_hessian", &Elastic::extrapolated_hessian, "x0"_a.noconvert(),
+           "x"_a.noconvert(), "positive"_a)
       .def("hessian_blocks", &Elastic::hessian_blocks, "x"_a.noconvert(), "positive"_a)
       .def("block_pairs", &Elastic::block_pairs)
       .def("hessian_product", &Elastic::hessian_product, "x"_a.noconvert(), "z"_a.noconvert())
