@@ -151,11 +151,11 @@ double energy_change(const StretchBatch* batches,
       }
       const double inv_t0 = 1.0 / p0.t;
       const double inv_t1 = 1.0 / p1.t;
-      const double dS11 = (p1.c11 + p1.d) * inv_t1 - (p0.c11 + p0.d) * inv_t0;
-      const double dS12 = p1.c12 * inv_t1 - p0.c12 * inv_t0;
-      const double dS22 = (p1.c22 + p1.d) * inv_t1 - (p0.c22 + p0.d) * inv_t0;
+      const double dS_uu = (p1.c11 + p1.d) * inv_t1 - (p0.c11 + p0.d) * inv_t0;
+      const double dS_uv = p1.c12 * inv_t1 - p0.c12 * inv_t0;
+      const double dS_vv = (p1.c22 + p1.d) * inv_t1 - (p0.c22 + p0.d) * inv_t0;
       const double turned =
-          dS11 * dot(dr1, dr1) + 2.0 * (dS12 * dot(dr1, dr2)) + dS22 * dot(dr2, dr2);
+          dS_uu * dot(dr1, dr1) + 2.0 * (dS_uv * dot(dr1, dr2)) + dS_vv * dot(dr2, dr2);
       const double regular = work - 0.5 * turned;
       const double difference = strain_sq(F1, p1) - strain_sq(F0, p0);
       const bool is_regular = smaller(p0.d, p1.d) >= kNearlyDegenerateFrame;
