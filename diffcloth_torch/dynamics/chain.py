@@ -187,7 +187,7 @@ class Chain:
         """
         drives = self._drives(gains, control)
         inertia = inertia._replace(armature=~self._prescribed * inertia.armature)
-        local = inertia.center[..., self.mechanism.root, :]
+        local = inertia.center[..., self._tree.root, :]
         quaternion = torch.nn.functional.normalize(state.pose[..., 3:], dim=-1)
         start = _Configuration(*_placed(state.pose[..., :3], quaternion, local), state.joints)
         known, ends = self._prescribed_motion(start, quaternion, control, local)
@@ -248,13 +248,14 @@ class Chain:
         """
         pose, known, start = prediction.root_end, prediction.known, prediction.start
         inertia, joints = prediction.inertia, coordinates
-        local = inertia.center[..., self.mechanism.root, :]
+        local = inertia.center[..., self._tree.root, :]
         if self._floats:
             center, turn, joints = torch.split(coordinates, [3, 3, joints.shape[-1] - ROOT], dim=-1)
             predicted = prediction.root_end[..., 3:]
-            quaternion = quaternion_multiply(quaternion_exp(turn), predicted)
+            last = quaternion_exp(turn)
+            quaternion = quaternion_multiply(last, predicted)
             first = quaternion_exp(-prediction.coordinates[..., 3:ROOT])
-            turned = quaternion_log(quaternion_multiply(quaternion_exp(turn), first))
+            turned = quaternion_log(quaternion_multiply(last, first))
             rotation = quaternion_matrix(quaternion)
             end = _Configuration(center, rotation, joints)
             quaternion = nearer_quaternion(quaternion, prediction.pose[..., 3:])
@@ -418,7 +419,7 @@ class Chain:
         )
 
     def _motion(self, inertia: Inertia, at: _Configuration) -> Motion:
-        local = inertia.center[..., self.mechanism.root, :]
+        local = inertia.center[..., self._tree.root, :]
         return Motion.at(self._tree, inertia, root_frame(at.center, at.rotation, local), at.joints)
 
     def _generalized(self, motion: Motion, forces: Tensor) -> Tensor:

@@ -45,6 +45,7 @@ class Tree:
 
     Attributes:
         mechanism: What it was made from.
+        root: Index of the root link.
         moving: Links whose joint to the parent moves, length A.
         reach: Whether link l hangs on joint a, as 0 or 1, shape [L, A].
         revolute: Whether joint a turns, as 0 or 1, shape [A, 1].
@@ -53,7 +54,7 @@ class Tree:
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
-        self.mechanism = mechanism
+        self.mechanism, self.root = mechanism, mechanism.root
         links = mechanism.link_count
         self.moving = np.flatnonzero(mechanism.dof >= 0).tolist()
         reach = np.eye(links)
@@ -92,7 +93,7 @@ class Tree:
 
         A joint that turns moves the center by axis x (center - pivot), one that slides by its axis.
         """
-        root = frames.centers[..., self.mechanism.root, :]
+        root = frames.centers[..., self.root, :]
         arms = frames.centers[..., :, None, :] - frames.pivots[..., None, :, :]  # [B, L, A, 3]
         axes = frames.axes[..., None, :, :].expand_as(arms)
         turned = torch.linalg.cross(axes, arms)

@@ -68,7 +68,8 @@ def quaternion_exp(rotation_vector: Tensor) -> Tensor:
     powers = torch.cat([s, s_sq, s * s_sq, s_sq * s_sq], dim=-1)
     series = 1 + (powers.unsqueeze(-2) * _SERIES).sum(-1)
     closed = torch.cat([torch.cos(half), torch.sin(half) / half], dim=-1)
-    cosine, sine_over_half = torch.where(near_zero, series, closed).split(1, dim=-1)
+    parts = torch.where(near_zero, series, closed)
+    cosine, sine_over_half = parts[..., :1], parts[..., 1:]
     return torch.cat([cosine, sine_over_half / 2 * rotation_vector], dim=-1)
 
 

@@ -27,7 +27,6 @@ class Kinematics:
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
-        self.mechanism = mechanism
         moving = np.flatnonzero(mechanism.dof >= 0)
         # A first axis for the environments: a product of all of them at once would round by how
         # many there are.
@@ -41,7 +40,8 @@ class Kinematics:
         self._constants = constant(mechanism.constant * (mechanism.dof >= 0))
         self._offsets = constant(mechanism.offset)
         self._cross, self._cross_sq, self._shift = map(constant, (cross, cross @ cross, shift))
-        self._order = mechanism.order[1:]
+        self._root = mechanism.root
+        self._parents = [(link, int(mechanism.parent[link])) for link in mechanism.order[1:]]
 
     def frames(self, root: Tensor, joints: Tensor) -> Tensor:
         """Frames of all links; differentiable any number of times.
@@ -55,18 +55,18 @@ class Kinematics:
             Frames, shape [..., L, 4, 4].
         """
         shape = np.broadcast_shapes(root.shape[:-2], joints.shape[:-1])
-        count, links = math.prod(shape), self.mechanism.link_count
+        count = math.prod(shape)
         rows = joints.expand(*shape, joints.shape[-1]).reshape(count, 1, joints.shape[-1])
         values = (rows @ self._leaders)[:, 0]
         values = (values + self._constants)[..., None, None]
         motions = torch.sin(values) * self._cross + (1 - torch.cos(values)) * self._cross_sq
         steps = self._offsets + self._offsets @ (motions + values * self._shift)
         local = steps.unbind(-3)
-        placed = {self.mechanism.root: root.expand(*shape, 4, 4).reshape(count, 4, 4)}
-        for link in self._order:
-            placed[link] = placed[int(self.mechanism.parent[link])] @ local[link]
-        frames = torch.stack([placed[link] for link in range(links)], dim=1)
-        return frames.reshape(*shape, links, 4, 4)
+        placed = {self._root: root.expand(*shape, 4, 4).reshape(count, 4, 4)}
+        for link, parent in self._parents:
+            placed[link] = placed[parent] @ local[link]
+        frames = torch.stack([placed[link] for link in range(len(placed))], dim=1)
+        return frames.reshape(*shape, len(placed), 4, 4)
 
 
 def link_frames(mechanism: Mechanism, root_frame: Tensor, joint_positions: Tensor) -> Tensor:

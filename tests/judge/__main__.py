@@ -39,6 +39,8 @@ def main(folders: tuple[Path, ...]) -> None:
         source = Path(saved["source"])
         task = make_task(check_document(saved["config"], source), source)
         found = saved["found"]
+        if found is None:
+            raise click.ClickException(f"{folder} holds no finished iteration")
         wrong, touched = judge_attempt(task, found["best"]["actions"])
         click.echo(
             f"{folder.name}: best loss {found['best']['loss']:.3g} of {len(found['history'])} "
