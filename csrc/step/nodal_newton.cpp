@@ -103,9 +103,7 @@ class NodalSolve {
         const Stopwatch::Scope scope(*context_.watch, Phase::kLineSearch);
         const bool moved =
             (is_near_saddle() && leave_saddle()) || descend_by_cases() || descend_by_law();
-        if (!moved) {
-          return finish(factor_ ? solver::Status::kRoundingFloor : solver::Status::kSaddle);
-        }
+        if (!moved) return finish(solver::Status::kUnsolved);
         system_.look(there_);
       }
       ++(factor_ ? context_.counts->exact : context_.counts->projected);
