@@ -13,6 +13,7 @@ enum class Status : std::uint8_t {
   kRoundingFloor,   ///< rounding hides any further decrease
   kBlocked,         ///< every direction is blocked by collisions
   kSaddle,          ///< the gradient vanishes where the Hessian is indefinite, and nothing is lower
+  kUnsolved,        ///< friction at nodes: no way leads on, and no solution was found
   kInfeasibleMotion,
 };
 

@@ -150,6 +150,8 @@ std::string_view words(solver::Status status) {
       return "surfaces are so close that rounding lets none of them move";
     case solver::Status::kSaddle:
       return "at a saddle, and no lower point was found from there";
+    case solver::Status::kUnsolved:
+      return "no solution of the law of friction at vertices was found";
   }
   __builtin_unreachable();
 }

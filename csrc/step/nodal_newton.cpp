@@ -49,7 +49,7 @@ constexpr double kSettled = 0.1;
 /// Steps down with the cases at hand before the law is solved as a whole, and the halvings of each.
 constexpr int kMostDescents = 8;
 constexpr int kFewHalvings = 6;
-constexpr int kHalvings = 40;
+constexpr int kHalvings = 20;
 /// Steps that have shrunk by this much while the Hessian is indefinite lead to a saddle.
 constexpr double kShrunk = 1e-2;
 /// Share of the mean edge that the first trial away from a saddle moves a vertex by.
@@ -103,9 +103,7 @@ class NodalSolve {
         const Stopwatch::Scope scope(*context_.watch, Phase::kLineSearch);
         const bool moved =
             (is_near_saddle() && leave_saddle()) || descend_by_cases() || descend_by_law();
-        if (!moved) {
-          return finish(factor_ ? solver::Status::kRoundingFloor : solver::Status::kSaddle);
-        }
+        if (!moved) return finish(solver::Status::kUnsolved);
         system_.look(there_);
       }
       ++(factor_ ? context_.counts->exact : context_.counts->projected);

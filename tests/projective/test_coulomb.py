@@ -17,7 +17,7 @@ def contacts(m, seed, condition):
     return (W + W.T) / 2, q, normals
 
 
-@pytest.mark.parametrize("condition", [10.0, 100.0])
+@pytest.mark.parametrize("condition", [5.0, 30.0])
 @pytest.mark.parametrize("friction", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("m", [1, 2, 12, 40])
 def test_impulses_and_velocities_obey_the_law(m, friction, condition):
