@@ -309,11 +309,12 @@ void add_extrapolation(const Model& model,
                        const double* x,
                        const std::vector<Mat2>& stresses,
                        Curvature curvature,
+                       const std::vector<Index>& place,
                        double* blocks) {
   const bool positive = curvature == Curvature::kPositive;
   for (Index f = 0; f < face_count(model); ++f) {
     add_face_blocks(model.topology->faces[f],
-                    slots.stretch.data() + 6 * static_cast<std::size_t>(f),
+                    slots.stretch.data() + 6 * static_cast<std::ptrdiff_t>(f), place,
                     stretch::extrapolation(stretch_weight(model, f), model.rest->shape_gradient[f],
                                            face_gradient(model, f, x), stresses[f], positive),
                     blocks);

@@ -93,6 +93,7 @@ void add_extrapolation(const Model& model,
                        const double* x,
                        const std::vector<Mat2>& stresses,
                        Curvature curvature,
+                       const std::vector<Index>& place,
                        double* blocks);
 
 /// y += H(x) z over all vertices, with the exact Hessian and without a matrix.

@@ -40,9 +40,8 @@ void ElasticPotential::add_hessian(const double* x,
 void ElasticPotential::add_extrapolation(const double* x,
                                          Curvature curvature,
                                          linalg::BlockMatrix& A) const {
-  std::vector<double> blocks(9 * static_cast<std::size_t>(slots_.block_count), 0.0);
-  elastic::add_extrapolation(model_, slots_, x, extrapolated_, curvature, blocks.data());
-  A.add_base(blocks);
+  elastic::add_extrapolation(model_, slots_, x, extrapolated_, curvature, A.slot_of_base(),
+                             A.blocks());
 }
 
 void ElasticPotential::accumulate(const double* x, const double* z) {

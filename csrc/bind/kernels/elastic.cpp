@@ -148,9 +148,8 @@ class Elastic {
   Array hessian_blocks(const Positions& x, bool positive) const {
     std::vector<double> blocks(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
     const auto curvature = positive ? Curvature::kPositive : Curvature::kExact;
-    std::vector<Index> place(pattern_.block_count());
-    std::iota(place.begin(), place.end(), 0);
-    elastic::add_hessian(model_, slots_, positions("x", x).data(), curvature, place, blocks.data());
+    elastic::add_hessian(model_, slots_, positions("x", x).data(), curvature, own_places(),
+                         blocks.data());
     return owned(blocks.data(), {blocks.size() / 9, 9});
   }
 
@@ -165,10 +164,8 @@ class Elastic {
     const std::vector<double> to = positions("x1", x1);
     std::vector<double> g(from.size(), 0.0);
     std::vector<double> blocks(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
-    std::vector<Index> place(pattern_.block_count());
-    std::iota(place.begin(), place.end(), 0);
     kernels.add_gradient(batches.data(), batches.size(), from.data(), g.data());
-    kernels.add_hessian(batches.data(), batches.size(), from.data(), positive, place.data(),
+    kernels.add_hessian(batches.data(), batches.size(), from.data(), positive, own_places().data(),
                         blocks.data());
     return nb::make_tuple(
         kernels.energy_change(batches.data(), batches.size(), from.data(), to.data()),
@@ -197,11 +194,18 @@ class Elastic {
     const std::vector<double> from = positions("x0", x0);
     const std::vector<double> to = positions("x", x);
     std::vector<double> blocks(9 * static_cast<std::size_t>(slots_.block_count), 0.0);
-    elastic::add_hessian(model_, slots_, to.data(), curvature, blocks.data());
+    elastic::add_hessian(model_, slots_, to.data(), curvature, own_places(), blocks.data());
     elastic::add_extrapolation(model_, slots_, to.data(),
                                elastic::extrapolated_stresses(model_, from.data(), to.data()),
-                               curvature, blocks.data());
+                               curvature, own_places(), blocks.data());
     return dense(blocks.data());
+  }
+
+  /// Every slot of the base pattern in its own place.
+  std::vector<Index> own_places() const {
+    std::vector<Index> place(pattern_.block_count());
+    std::iota(place.begin(), place.end(), 0);
+    return place;
   }
 
   Array dense(const double* blocks) const {
