@@ -510,8 +510,11 @@ DIFFCLOTH_INLINE const UnalignedFour& four(const double* from) {
 struct Columns {
   Four c[3];
 
-  DIFFCLOTH_INLINE explicit Columns(const double* block)
-      : c{four(block), four(block + 3), Four{block[6], block[7], block[8], 0.0}} {}
+  DIFFCLOTH_INLINE void read(const double* block) {
+    c[0] = four(block);
+    c[1] = four(block + 3);
+    c[2] = Four{block[6], block[7], block[8], 0.0};
+  }
 
   DIFFCLOTH_INLINE void add_product(const Four& x, Four& y) const {
     y += c[0] * x[0] + c[1] * x[1] + c[2] * x[2];
@@ -529,9 +532,11 @@ void multiply_blocks(const std::int32_t* column_start,
     Four dots[3] = {};
     std::int32_t k = column_start[j];
     Four y_j = {};
-    Columns(blocks + 9 * static_cast<std::ptrdiff_t>(k)).add_product(x_j, y_j);
+    Columns block;
+    block.read(blocks + 9 * static_cast<std::ptrdiff_t>(k));
+    block.add_product(x_j, y_j);
     for (++k; k < column_start[j + 1]; ++k) {
-      const Columns block(blocks + 9 * static_cast<std::ptrdiff_t>(k));
+      block.read(blocks + 9 * static_cast<std::ptrdiff_t>(k));
       const std::ptrdiff_t i = 4 * static_cast<std::ptrdiff_t>(row[k]);
       const Four x_i = four(x + i);
       Four y_i = four(y + i);
