@@ -23,7 +23,7 @@
 #include <cmath>
 #include <cstdint>
 #include <limits>
-#include <optional>
+#include <memory>
 #include <utility>
 #include <vector>
 
@@ -89,8 +89,9 @@ class NodalSolve {
   solver::Outcome run() {
     for (;; ++context_.iterations) {
       context_.checkpoint->check();
-      H_.emplace(linear_.assemble(here_.x.data(), Curvature::kExact, here_.g));
-      S_.emplace(system_.without_coupling(here_, *H_));
+      H_ = std::make_unique<const linalg::BlockMatrix>(
+          linear_.assemble(here_.x.data(), Curvature::kExact, here_.g));
+      S_ = std::make_unique<const linalg::BlockMatrix>(system_.without_coupling(here_, *H_));
       factor_ = linear_.factor(*S_);
       if (!factor_) ++context_.counts->negative_curvature;
       constraint_step_ = system_.constraint_step(here_);
@@ -193,6 +194,7 @@ class NodalSolve {
 
   std::vector<Vec3> impulses() const {
     std::vector<Vec3> result;
+    result.reserve(here_.laws.size());
     for (const projective::Coulomb& law : here_.laws) result.push_back(law.impulse);
     return result;
   }
@@ -267,9 +269,9 @@ class NodalSolve {
 
   NodalSystem::Point here_;
   NodalSystem::Point there_;
-  std::optional<linalg::BlockMatrix> H_;
-  std::optional<linalg::BlockMatrix> S_;
-  solver::Factor factor_;  // of S; null where it is indefinite
+  std::unique_ptr<const linalg::BlockMatrix> H_;  // exact, at `here`
+  std::unique_ptr<const linalg::BlockMatrix> S_;  // see nodal_system.cpp
+  solver::Factor factor_;                         // of S; null where it is indefinite
   Array constraint_step_;
 
   double blend_ = 0.0;

@@ -29,6 +29,7 @@ using MutableRows = nb::ndarray<double, nb::shape<-1, 3>, nb::c_contig, nb::devi
 
 linalg::BlockPattern pattern_of(const Pairs& pairs, std::size_t vertices) {
   std::vector<std::pair<Index, Index>> list;
+  list.reserve(pairs.shape(0));
   for (std::size_t k = 0; k < pairs.shape(0); ++k) list.emplace_back(pairs(k, 0), pairs(k, 1));
   return linalg::BlockPattern::from_pairs(static_cast<Index>(vertices), std::move(list));
 }
