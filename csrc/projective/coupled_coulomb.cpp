@@ -202,7 +202,7 @@ Vec3 solve_coulomb(const Mat3& A, const Vec3& b, const RoughPlane& plane, const 
   const Vec3& n = plane.normal;
   if (!(n.dot(b) < 0.0)) return Vec3::Zero();
   if (!(plane.friction > 0.0)) return -n.dot(b) / n.dot(A * n) * n;
-  const Vec3 stuck = -A.llt().solve(b);
+  Vec3 stuck = -A.llt().solve(b);
   const double r_n = n.dot(stuck);
   if (r_n > 0.0 && (stuck - r_n * n).norm() <= plane.friction * r_n) return stuck;
   return Slip(A, b, plane, last).solve();
