@@ -9,26 +9,23 @@ namespace {
 /// Area ratio below which a frame need not be orthonormal to rounding.
 constexpr double kNearlyDegenerate = 1e-4;
 
-/// A symmetric 2x2 matrix with its eigenvalues clamped to at most 1.
-Mat2 clamp_to_one(const Mat2& A) {
+/// A symmetric 2x2 matrix with its eigenvalues clamped to at most top.
+Mat2 clamp(const Mat2& A, double top) {
   const double mean = 0.5 * (A(0, 0) + A(1, 1));
   const double half = 0.5 * (A(0, 0) - A(1, 1));
   const double radius = std::hypot(half, A(0, 1));
-  if (mean + radius <= 1.0) return A;
-  if (mean - radius >= 1.0) return Mat2::Identity();
+  if (mean + radius <= top) return A;
+  if (mean - radius >= top) return top * Mat2::Identity();
   // Here radius > 0. A = mean I + D with D^2 = radius^2 I: rescale D about the clamped mean.
   const double low = mean - radius;
-  const double scale = 0.5 * (1.0 - low) / radius;
+  const double scale = 0.5 * (top - low) / radius;
   Mat2 result = scale * (A - mean * Mat2::Identity());
-  result.diagonal().array() += 0.5 * (1.0 + low);
+  result.diagonal().array() += 0.5 * (top + low);
   return result;
 }
 
 /// The positive part of a symmetric 2x2 matrix.
-Mat2 positive_part(const Mat2& A) {
-  const Mat2 I = Mat2::Identity();
-  return I - clamp_to_one(I - A);
-}
+Mat2 positive_part(const Mat2& A) { return -clamp(-A, 0.0); }
 
 }  // namespace
 
@@ -60,7 +57,7 @@ std::array<Mat3, 6> hessian(double weight,
                             bool positive) {
   const Frame polar = frame(F);
   const double t_inv = positive ? std::min(1.0 / polar.t, 0.5) : 1.0 / polar.t;
-  const Mat2 S_inv = positive ? clamp_to_one(polar.S_inv) : polar.S_inv;
+  const Mat2 S_inv = positive ? clamp(polar.S_inv, 1.0) : polar.S_inv;
   const Vec3 r1 = polar.R.col(0);
   const Vec3 r2 = polar.R.col(1);
   const Mat3 nn = polar.R.col(2) * polar.R.col(2).transpose();
