@@ -78,6 +78,14 @@ const StretchKernels& kernels() {
   return best;
 }
 
+/// Where bending is stiffer than this many times inertia, forces by the matrix have torques of its
+/// rounding that turn cloth: each element by itself has none.
+constexpr double kStiffest = 1e8;
+
+bool is_by_matrix(const Model& model, Index e) {
+  return model.prepared.by_matrix && model.prepared.flat[e] != 0;
+}
+
 void add_face_mixed(
     const Model& model, Index f, const double* x, const double* z, bool with_rest, Bar& bar) {
   const double k_s = model.stretch[f];
@@ -189,6 +197,7 @@ void prepare(Model& model, const Slots& slots) {
   prepared.curvature_n.resize(element_count);
   prepared.constant.assign(slots.block_count, 0.0);
   prepared.stretch = stretch_batches(model, slots);
+  prepared.by_matrix = true;
   prepared.bends = false;
   prepared.damped = false;
   for (Index f = 0; f < face_count(model); ++f) prepared.damped |= is_damped(model, f);
@@ -212,6 +221,9 @@ void prepare(Model& model, const Slots& slots) {
       prepared.curvature_n[e] = bending::body_curvature(element, model.x_n);
     }
   }
+  const double stiffest = prepared.constant.empty() ? 0.0 : std::ranges::max(prepared.constant);
+  prepared.by_matrix = stiffest <= kStiffest * model.least_inertia;
+  prepared.bends |= !prepared.by_matrix;
 }
 
 double energy(const Model& model, const double* x) {
@@ -239,7 +251,7 @@ double energy_change(const Model& model, const double* x0, const double* x1) {
                                face_gradient(model, f, x1), dF, face_gradient(model, f, model.x_n));
   }
   for (Index e = 0; prepared.bends && e < model.stencils->size(); ++e) {
-    if (prepared.flat[e] == 0) total += bending::energy_change(bending_element(model, e), x0, x1);
+    if (!is_by_matrix(model, e)) total += bending::energy_change(bending_element(model, e), x0, x1);
   }
   return total;
 }
@@ -255,7 +267,7 @@ void add_gradient(const Model& model, const double* x, double* g) {
             g);
   }
   for (Index e = 0; prepared.bends && e < model.stencils->size(); ++e) {
-    if (prepared.flat[e] == 0) bending::add_gradient(bending_element(model, e), x, g);
+    if (!is_by_matrix(model, e)) bending::add_gradient(bending_element(model, e), x, g);
   }
 }
 

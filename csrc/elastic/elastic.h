@@ -37,8 +37,9 @@ struct Prepared {
   std::vector<Mat3> curvature_n;   ///< [B] body-frame curvature at x_n, where damped
   std::vector<double> constant;    ///< [slots] sum of the flat elements' Hessians, times I
   std::vector<StretchBatch> stretch;
-  bool damped = false;  ///< some face has damping
-  bool bends = false;   ///< some element is not flat
+  bool damped = false;    ///< some face has damping
+  bool by_matrix = true;  ///< energy and gradient of flat elements are those of their matrix
+  bool bends = false;     ///< some element is evaluated by itself
 };
 
 /// The elastic energy of all cloths and its damping over one step.
@@ -52,6 +53,7 @@ struct Model {
   std::vector<double> damping;  ///< [F] k_d [s]
   double h = 0.0;               ///< time step [s]; only damping needs it
   const double* x_n = nullptr;  ///< [N, 3] start of the step [m]; only damping needs it
+  double least_inertia = 0.0;   ///< smallest M / h^2 of a vertex [N/m]
   Prepared prepared;            ///< filled by prepare()
 };
 
@@ -63,8 +65,8 @@ void prepare(Model& model, const Slots& slots);
 /// Stretch and bending energy, without damping [J].
 double energy(const Model& model, const double* x);
 
-// What follows is of all elements but the flat ones of bending, whose energy is quadratic: that of
-// their matrix, `prepared.constant`. See ConstantForm::of_flat_bending().
+// What follows leaves out the flat elements of bending where `prepared.by_matrix`: their energy is
+// quadratic, that of their matrix. See ConstantForm::of_flat_bending().
 
 /// Energy at x1 minus energy at x0, damping included, as a sum of differences of the elements that
 /// do not cancel [J].

@@ -79,24 +79,32 @@ Directions::Direction Directions::next() {
     ++walk_.context.counts->negative_curvature;
     s_ = kFirstShare;
   }
-  return damp(H, walk_.system.assemble(walk_.x().data(), Curvature::kPositive, walk_.g()));
+  const std::optional<Direction> damped =
+      damp(H, walk_.system.assemble(walk_.x().data(), Curvature::kPositive, walk_.g()));
+  if (!damped) {
+    throw std::domain_error(
+        "the projected Hessian is not positive definite: the stiffnesses of "
+        "the scene differ by more than float64 can hold");
+  }
+  return *damped;
 }
 
-Directions::Direction Directions::next_extrapolated() {
+std::optional<Directions::Direction> Directions::next_extrapolated() {
   const double* x = walk_.x().data();
   const linalg::BlockMatrix H = walk_.system.assemble_extrapolated(x, Curvature::kExact, walk_.g());
   if (Factor factor = walk_.system.factor(H)) {
     factor_ = std::move(factor);
     ++walk_.context.counts->exact;
     walk_.system.solve(*factor_, walk_.g(), p_);
-    return {.kind = Kind::kExtrapolated, .first = 1.0};
+    return Direction{.kind = Kind::kExtrapolated, .first = 1.0};
   }
   ++walk_.context.counts->negative_curvature;
   if (s_ == 0.0) s_ = kFirstShare;
   return damp(H, walk_.system.assemble_extrapolated(x, Curvature::kPositive, walk_.g()));
 }
 
-Directions::Direction Directions::damp(const linalg::BlockMatrix& H, const linalg::BlockMatrix& P) {
+std::optional<Directions::Direction> Directions::damp(const linalg::BlockMatrix& H,
+                                                      const linalg::BlockMatrix& P) {
   Factor factor;
   for (;; s_ = std::max(kFirstShare, kFailureGrowth * s_)) {
     walk_.context.checkpoint->check();
@@ -104,11 +112,7 @@ Directions::Direction Directions::damp(const linalg::BlockMatrix& H, const linal
     A.blend(P, s_);
     factor = walk_.system.factor(A);
     if (factor) break;
-    if (s_ > kLargestShare) {
-      throw std::domain_error(
-          "the projected Hessian is not positive definite: the stiffnesses of "
-          "the scene differ by more than float64 can hold");
-    }
+    if (s_ > kLargestShare) return std::nullopt;
   }
   ++walk_.context.counts->projected;
   walk_.system.solve(*factor, walk_.g(), p_);
@@ -121,8 +125,8 @@ Directions::Direction Directions::damp(const linalg::BlockMatrix& H, const linal
   H.add_product(z.data(), Hz.data());
   const double curvature = dot(z, Hz);
   const double best = curvature > 0.0 ? -slope_ / curvature : kLargestGrowth;
-  return {.kind = Kind::kDamped,
-          .first = best > kWorthGrowing ? std::min(best, kLargestGrowth) : 1.0};
+  return Direction{.kind = Kind::kDamped,
+                   .first = best > kWorthGrowing ? std::min(best, kLargestGrowth) : 1.0};
 }
 
 void Directions::learn(const Direction& direction, const Search& search) {

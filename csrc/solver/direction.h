@@ -2,6 +2,7 @@
 
 #include <cstdint>
 #include <limits>
+#include <optional>
 #include <utility>
 #include <vector>
 
@@ -39,7 +40,8 @@ class Directions {
   Direction next();
 
   /// The same, of Hessians with extrapolated stresses; factored, as excursions need exact directions.
-  Direction next_extrapolated();
+  /// None where rounding leaves no positive definite one.
+  std::optional<Direction> next_extrapolated();
 
   /// Compute the direction of the exact Hessian, factored here. False where it is indefinite.
   bool certify();
@@ -68,7 +70,7 @@ class Directions {
  private:
   bool chord();
   bool iterate(const linalg::BlockMatrix& H, bool& indefinite);
-  Direction damp(const linalg::BlockMatrix& H, const linalg::BlockMatrix& P);
+  std::optional<Direction> damp(const linalg::BlockMatrix& H, const linalg::BlockMatrix& P);
 
   Walk& walk_;
   Factor factor_;

@@ -27,6 +27,8 @@ constexpr double kProgress = 0.9;
 /// each.
 constexpr int kExcursion = 6;
 constexpr double kFree = 0.3;
+/// An excursion begins with a step of more than this share of an edge.
+constexpr double kFar = 0.03;
 /// Steps of a solve before the first excursion: most solves end sooner.
 constexpr int kPatience = 8;
 /// After an excursion in vain the next steps are ordinary ones, twice as many as the last time, at most
@@ -48,6 +50,7 @@ class Descent {
  private:
   enum class Next : std::uint8_t { kGoOn, kStop };
 
+  Next proceed();
   Next settle();
   Status look();
   Next take(const Directions::Direction& direction);
@@ -148,7 +151,8 @@ Search Descent::walk_along(const Directions::Direction& direction) {
   const double enough = trial.enough(slope);
   const bool rises =
       slope < 0.0 && trial.alpha > kFree && std::isfinite(trial.gain) && trial.gain > enough;
-  if (wait_ == 0 && direction.kind != Kind::kDamped && rises && trial.gain > noise(walk_)) {
+  const bool far = walk_.displacement(p) > kFar * walk_.f.length;
+  if (wait_ == 0 && direction.kind != Kind::kDamped && far && rises && trial.gain > noise(walk_)) {
     excursion_ = {.start = walk_.place(),
                   .p = p,
                   .direction = direction,
@@ -242,6 +246,12 @@ Status Descent::look() {
   return minimum ? Status::kConverged : Status::kSaddle;
 }
 
+Descent::Next Descent::proceed() {
+  if (!excursion_) return take(directions_.next());
+  const std::optional<Directions::Direction> direction = directions_.next_extrapolated();
+  return direction ? take(*direction) : come_back();
+}
+
 Status Descent::run() {
   for (;;) {
     if (settling_) {
@@ -250,9 +260,7 @@ Status Descent::run() {
       continue;
     }
     if (!walk_.spend()) return look();
-    if (take(excursion_ ? directions_.next_extrapolated() : directions_.next()) == Next::kStop) {
-      return status_;
-    }
+    if (proceed() == Next::kStop) return status_;
   }
 }
 

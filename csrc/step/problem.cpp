@@ -115,6 +115,7 @@ std::vector<double> predicted_positions(const Inputs& in,
 elastic::Model elastic_model(const Scene& scene,
                              const Inputs& in,
                              const mesh::RestShape& rest,
+                             const std::vector<double>& masses,
                              double h) {
   elastic::Model model;
   model.topology = &scene.topology;
@@ -128,6 +129,7 @@ elastic::Model elastic_model(const Scene& scene,
   model.damping = spread(in[Input::kDamping], scene.face_cloth);
   model.h = h;
   model.x_n = in.data(Input::kPositions);
+  if (!masses.empty()) model.least_inertia = std::ranges::min(masses) / (h * h);
   elastic::prepare(model, scene.slots);
   return model;
 }
@@ -151,7 +153,7 @@ Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, elastic::Wanted
       start(start_positions(scene, inputs)),
       ends(end_positions(scene, inputs, start)),
       inertia(masses, predicted_positions(inputs, masses, h), h),
-      model(elastic_model(scene, inputs, *rest, h)),
+      model(elastic_model(scene, inputs, *rest, masses, h)),
       elasticity(model, scene.slots, scene.elastic_assemblies.base(), wanted) {
   const std::vector<Index>& soft = scene.given.soft_pins;
   if (!soft.empty()) {

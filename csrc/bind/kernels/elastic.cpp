@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <limits>
 #include <memory>
 #include <numeric>
 #include <optional>
@@ -128,6 +129,8 @@ class Elastic {
       x_n_ = positions("x_n", *x_n);
       model_.x_n = x_n_.data();
     }
+    model_.least_inertia =
+        std::numeric_limits<double>::infinity();  // flat elements by their matrix
     elastic::prepare(model_, slots_);
   }
 
