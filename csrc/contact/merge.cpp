@@ -201,16 +201,19 @@ void add_point_terms(const CollisionMesh& mesh,
                      .coefficient = static_cast<double>(weight),
                      .d_sq = near.d_sq});
   };
+  const auto near_edge = [&edges](Index e) -> const NearEdge& {
+    return *std::ranges::lower_bound(edges, e, {}, &NearEdge::edge);
+  };
   for (const Index f : faces) {
     double d_sq = 0.0;
     if (project(mesh, weights, f, p, x, d_sq) == Projection::kInside) {
       parts.push_back({.kind = kFace, .ends = {-1, -1}, .id = f, .coefficient = 1.0, .d_sq = d_sq});
       continue;
     }
-    const NearEdge* nearest = nullptr;
-    for (const Index e : mesh.face_edges[f]) {
-      const auto at = std::ranges::lower_bound(edges, e, {}, &NearEdge::edge);
-      if (nearest == nullptr || is_nearer(*at, *nearest)) nearest = &*at;
+    const auto& [first, second, third] = mesh.face_edges[f];
+    const NearEdge* nearest = &near_edge(first);
+    for (const Index e : {second, third}) {
+      if (is_nearer(near_edge(e), *nearest)) nearest = &near_edge(e);
     }
     push_on_edge(*nearest, 1);
   }

@@ -87,12 +87,13 @@ class Descent {
     Walk::Place start;
     std::vector<double> p;  ///< the first direction
     Directions::Direction direction;
-    double share;          ///< of the projection, at the start
-    double enough;         ///< change to end with [J]
+    double share = 0.0;    ///< of the projection, at the start
+    double enough = 0.0;   ///< change to end with [J]
     double balance = 0.0;  ///< change so far [J]
     int steps = 0;
   };
-  std::optional<Excursion> excursion_;
+  bool away_ = false;  ///< on an excursion
+  Excursion excursion_;
   int wait_ = kPatience;  ///< ordinary steps before the next one
   int next_wait_ = 1;     ///< after the next one in vain
 };
@@ -158,6 +159,7 @@ Search Descent::walk_along(const Directions::Direction& direction) {
                   .direction = direction,
                   .share = directions_.share(),
                   .enough = enough};
+    away_ = true;
     return wander(trial);
   }
   wait_ = std::max(wait_ - 1, 0);
@@ -166,16 +168,16 @@ Search Descent::walk_along(const Directions::Direction& direction) {
 
 /// One step of an excursion: its last one where it ends below the start, none where it leads nowhere.
 Search Descent::wander(const Trial& trial) {
-  const double balance = excursion_->balance + trial.gain;
-  const bool ends = trial.alpha > 0.0 && balance <= excursion_->enough;
-  if (!ends && !(trial.alpha > kFree && std::isfinite(balance) && excursion_->steps < kExcursion)) {
+  const double balance = excursion_.balance + trial.gain;
+  const bool ends = trial.alpha > 0.0 && balance <= excursion_.enough;
+  if (!ends && !(trial.alpha > kFree && std::isfinite(balance) && excursion_.steps < kExcursion)) {
     return {.result = SearchResult::kNoGain};
   }
   walk_.go_extrapolating(trial.to);
-  excursion_->balance = balance;
-  ++excursion_->steps;
+  excursion_.balance = balance;
+  ++excursion_.steps;
   if (ends) {
-    excursion_.reset();
+    away_ = false;
     next_wait_ = 1;
   }
   return {.result = SearchResult::kMoved, .alpha = trial.alpha, .gain = trial.gain};
@@ -183,20 +185,19 @@ Search Descent::wander(const Trial& trial) {
 
 /// Undo an excursion, and go on from its start in the ordinary way.
 Descent::Next Descent::come_back() {
-  const Excursion excursion = std::move(*excursion_);
-  excursion_.reset();
+  away_ = false;
   wait_ = next_wait_;
   next_wait_ = std::min(2 * next_wait_, kLongestWait);
-  walk_.back(excursion.start);
-  directions_.resume(excursion.p, excursion.share);
-  return go(excursion.direction);
+  walk_.back(excursion_.start);
+  directions_.resume(excursion_.p, excursion_.share);
+  return go(excursion_.direction);
 }
 
 Descent::Next Descent::take(const Directions::Direction& direction) {
   const double step = walk_.displacement(directions_.p());
   const bool is_lost = !(step > kResolution * walk_.f.coordinates->extent(walk_.x()));
   // A minimum above the start of an excursion is none to end in.
-  if (excursion_ && (step < goal_ || is_lost)) return come_back();
+  if (away_ && (step < goal_ || is_lost)) return come_back();
   residual_ = step / walk_.f.h;
   if (direction.kind == Kind::kDamped) {
     if (step < kSettled * goal_) {
@@ -221,8 +222,8 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
 Descent::Next Descent::go(const Directions::Direction& direction) {
   const double step = walk_.displacement(directions_.p());
   const Search search =
-      excursion_ ? wander(farthest(walk_, directions_.p(), 1.0)) : walk_along(direction);
-  if (search.result != SearchResult::kMoved && excursion_) return come_back();
+      away_ ? wander(farthest(walk_, directions_.p(), 1.0)) : walk_along(direction);
+  if (search.result != SearchResult::kMoved && away_) return come_back();
   if (search.result != SearchResult::kMoved) {
     settling_ = false;
     return no_way(direction, step, search.result);
@@ -237,7 +238,7 @@ Descent::Next Descent::go(const Directions::Direction& direction) {
 
 /// What is here when the iterations are used up: the residual of this very point.
 Status Descent::look() {
-  if (excursion_) walk_.back(excursion_->start);
+  if (away_) walk_.back(excursion_.start);
   const bool minimum = directions_.certify();
   if (!minimum) directions_.next();
   const double step = walk_.displacement(directions_.p());
@@ -247,7 +248,7 @@ Status Descent::look() {
 }
 
 Descent::Next Descent::proceed() {
-  if (!excursion_) return take(directions_.next());
+  if (!away_) return take(directions_.next());
   const std::optional<Directions::Direction> direction = directions_.next_extrapolated();
   return direction ? take(*direction) : come_back();
 }
