@@ -27,7 +27,7 @@ constexpr double kProgress = 0.9;
 /// each.
 constexpr int kExcursion = 6;
 constexpr double kFree = 0.3;
-/// An excursion begins with a step of more than this share of an edge.
+/// In contact an excursion begins with a step of more than this share of an edge.
 constexpr double kFar = 0.03;
 /// Steps of a solve before the first excursion: most solves end sooner.
 constexpr int kPatience = 8;
@@ -152,7 +152,9 @@ Search Descent::walk_along(const Directions::Direction& direction) {
   const double enough = trial.enough(slope);
   const bool rises =
       slope < 0.0 && trial.alpha > kFree && std::isfinite(trial.gain) && trial.gain > enough;
-  const bool far = walk_.displacement(p) > kFar * walk_.f.length;
+  // The next step relaxes what this one stretches, but not what it drives into barriers.
+  const bool touches = walk_.f.contact != nullptr && !walk_.f.contact->contacts().empty();
+  const bool far = !touches || walk_.displacement(p) > kFar * walk_.f.length;
   if (wait_ == 0 && direction.kind != Kind::kDamped && far && rises && trial.gain > noise(walk_)) {
     excursion_ = {.start = walk_.place(),
                   .p = p,

@@ -1,19 +1,24 @@
 """Newton's method finds a solution of the law in every step of sheets that fall and fold."""
 
+import importlib
+from pathlib import Path
+
 import pytest
 import torch
 
 import diffcloth_torch as dc
-from benchmarks.scenes import DT
-from benchmarks.schemes import SCENES
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize("name", ["sphere", "box"])
-def test_every_step_of_a_drape_converges(name):
+def test_every_step_of_a_drape_converges(name, monkeypatch):
     # Steps in which cases of the law alternate, and steps past saddles.
-    scene = SCENES[name]
+    monkeypatch.syspath_prepend(ROOT)
+    schemes = importlib.import_module("benchmarks.schemes")
+    scene = schemes.SCENES[name]
     solver = dc.SolverOptions(tolerance=1e-9, max_iterations=60)
-    sim = dc.Simulator(scene.make(16), DT, scheme="projective", solver=solver)
+    sim = dc.Simulator(scene.make(16), schemes.DT, scheme="projective", solver=solver)
     state = sim.initial_state()
     indefinite = 0
     with torch.no_grad():
