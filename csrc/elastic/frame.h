@@ -6,14 +6,12 @@
 #include <Eigen/Geometry>
 
 #include "common/types.h"
+#include "elastic/degenerate.h"
 #include "mesh/rest_shape.h"
 
 namespace diffcloth::elastic {
 
 using Mat32 = Eigen::Matrix<double, 3, 2>;
-
-/// Smallest area ratio and stretch that enter a division: a degenerate triangle stays finite.
-inline constexpr double kDegenerate = 1e-8;
 
 /// Deformation gradient of a triangle, F = sum_p x_p g_p^T.
 inline Mat32 deformation_gradient(const mesh::ShapeGradient& g,
@@ -50,13 +48,6 @@ inline Frame frame(const Mat32& F) {
   result.R.leftCols<2>() = F * result.S_inv;
   result.R.col(2) = normal / d;
   return result;
-}
-
-/// S = R^T F, symmetric: (C + d I) / t.
-inline Mat2 stretch_tensor(const Mat32& F, const Frame& frame) {
-  Mat2 S = F.transpose() * F;
-  S.diagonal().array() += frame.d;
-  return S / frame.t;
 }
 
 // First and second derivatives of the frame. For a change dF write K = R^T dF (3x2). The frame

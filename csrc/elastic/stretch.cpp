@@ -5,9 +5,6 @@
 namespace diffcloth::elastic::stretch {
 namespace {
 
-/// Area ratio below which a frame need not be orthonormal to rounding.
-constexpr double kNearlyDegenerate = 1e-4;
-
 /// A symmetric 2x2 matrix with its eigenvalues clamped to at least 0.
 Mat2 positive_part(const Mat2& A) {
   const double mean = 0.5 * (A(0, 0) + A(1, 1));

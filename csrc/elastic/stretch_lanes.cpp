@@ -1,7 +1,5 @@
 #include "elastic/stretch_lanes.h"
 
-#include <stdexcept>
-
 namespace diffcloth::elastic {
 
 extern const StretchKernels kPortableStretch;
@@ -11,9 +9,7 @@ extern const StretchKernels kAvx512Stretch;
 #endif
 
 const StretchKernels& stretch_kernels(linalg::KernelLevel level) {
-  if (!linalg::supported(level)) {
-    throw std::invalid_argument("this processor or build has no such kernels");
-  }
+  linalg::check_supported(level);
 #ifdef DIFFCLOTH_X86_KERNELS
   if (level == linalg::KernelLevel::kAvx512) return kAvx512Stretch;
   if (level == linalg::KernelLevel::kAvx2) return kAvx2Stretch;

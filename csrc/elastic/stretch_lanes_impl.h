@@ -6,6 +6,7 @@
 
 #include <cstddef>
 
+#include "elastic/degenerate.h"
 #include "elastic/stretch_lanes.h"
 
 // NOLINTBEGIN(modernize-avoid-c-arrays)
@@ -14,10 +15,6 @@
 
 namespace diffcloth::elastic {
 namespace {
-
-/// As in frame.h and stretch.cpp.
-constexpr double kDegenerateFrame = 1e-8;
-constexpr double kNearlyDegenerateFrame = 1e-4;
 
 constexpr int kLanes = kStretchLanes;
 
@@ -94,8 +91,8 @@ DIFFCLOTH_INLINE Polar polar_of(const Gradient& F) {
   p.c12 = dot(F.a, F.b);
   p.c22 = dot(F.b, F.b);
   p.d = __builtin_sqrt(dot(normal, normal));
-  const double d = larger(p.d, kDegenerateFrame);
-  p.t = larger(__builtin_sqrt(p.c11 + p.c22 + 2.0 * p.d), kDegenerateFrame);
+  const double d = larger(p.d, kDegenerate);
+  p.t = larger(__builtin_sqrt(p.c11 + p.c22 + 2.0 * p.d), kDegenerate);
   const double scale = 1.0 / (d * p.t);
   p.s11 = (p.c22 + d) * scale;
   p.s12 = -p.c12 * scale;
@@ -118,7 +115,7 @@ DIFFCLOTH_INLINE double strain_sq(const Gradient& F, const Polar& p) {
     regular += a * a + b * b;
   }
   const double degenerate = p.c11 + p.c22 - 2.0 * p.t + 2.0;
-  return p.d >= kNearlyDegenerateFrame ? regular : degenerate;
+  return p.d >= kNearlyDegenerate ? regular : degenerate;
 }
 
 double energy_change(const StretchBatch* batches,
@@ -158,7 +155,7 @@ double energy_change(const StretchBatch* batches,
           dS_uu * dot(dr1, dr1) + 2.0 * (dS_uv * dot(dr1, dr2)) + dS_vv * dot(dr2, dr2);
       const double regular = work - 0.5 * turned;
       const double difference = strain_sq(F1, p1) - strain_sq(F0, p0);
-      const bool is_regular = smaller(p0.d, p1.d) >= kNearlyDegenerateFrame;
+      const bool is_regular = smaller(p0.d, p1.d) >= kNearlyDegenerate;
       energy[l] = (0.5 * batch->weight[l]) * (is_regular ? regular : difference);
     }
     for (int l = 0; l < batch->size; ++l) total += energy[l];

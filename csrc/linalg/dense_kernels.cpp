@@ -1,7 +1,5 @@
 #include "linalg/dense_kernels.h"
 
-#include <stdexcept>
-
 namespace diffcloth::linalg {
 
 extern const DenseKernels kPortableKernels;
@@ -11,9 +9,7 @@ extern const DenseKernels kAvx512Kernels;
 #endif
 
 const DenseKernels& dense_kernels(KernelLevel level) {
-  if (!supported(level)) {
-    throw std::invalid_argument("this processor or build has no such kernels");
-  }
+  check_supported(level);
 #ifdef DIFFCLOTH_X86_KERNELS
   if (level == KernelLevel::kAvx512) return kAvx512Kernels;
   if (level == KernelLevel::kAvx2) return kAvx2Kernels;

@@ -28,6 +28,12 @@ bool supported(KernelLevel level) {
 #endif
 }
 
+void check_supported(KernelLevel level) {
+  if (!supported(level)) {
+    throw std::invalid_argument("this processor or build has no such kernels");
+  }
+}
+
 KernelLevel best_level() {
   static const KernelLevel best = [] {
     if (supported(KernelLevel::kAvx512)) return KernelLevel::kAvx512;

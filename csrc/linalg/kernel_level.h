@@ -12,6 +12,9 @@ const char* name(KernelLevel level);
 /// Whether this build and this processor have the instructions.
 bool supported(KernelLevel level);
 
+/// @throws std::invalid_argument  where they have not
+void check_supported(KernelLevel level);
+
 /// The fastest level that is supported.
 KernelLevel best_level();
 
