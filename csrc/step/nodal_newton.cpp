@@ -89,8 +89,7 @@ class NodalSolve {
   solver::Outcome run() {
     for (;; ++context_.iterations) {
       context_.checkpoint->check();
-      H_ = std::make_unique<const linalg::BlockMatrix>(
-          linear_.assemble(here_.x.data(), Curvature::kExact, here_.g));
+      assemble();
       S_ = std::make_unique<const linalg::BlockMatrix>(system_.without_coupling(here_, *H_));
       factor_ = linear_.factor(*S_);
       if (!factor_) ++context_.counts->negative_curvature;
@@ -120,6 +119,11 @@ class NodalSolve {
     if (status == solver::Status::kConverged) outcome_.factor = factor_;
     x_ = std::move(here_.x);
     return outcome_;
+  }
+
+  void assemble() {
+    H_ = std::make_unique<const linalg::BlockMatrix>(
+        linear_.assemble(here_.x.data(), Curvature::kExact, here_.g));
   }
 
   /// Set `there` to where a fraction of a change of the rows leads.
@@ -161,14 +165,14 @@ class NodalSolve {
     return step < goal_ ? Newton::kArrived : Newton::kNoStep;
   }
 
-  /// A factor of the form that a Hessian takes, of the exact one blended with as little of its projection
-  /// as it needs; null where nothing helps.
+  /// A factor of the form that a Hessian takes, of H blended with as little of its projection as it
+  /// needs; null where nothing helps.
   template <class Form>
-  solver::Factor damped(const linalg::BlockMatrix& exact, Form&& form) {
+  solver::Factor damped(Form&& form) {
     const linalg::BlockMatrix positive =
         linear_.assemble(here_.x.data(), Curvature::kPositive, here_.g);
     for (blend_ = std::max(kLeastBlend, blend_ / 4.0); blend_ < kMostBlend; blend_ *= 4.0) {
-      linalg::BlockMatrix matrix = exact;
+      linalg::BlockMatrix matrix = *H_;
       matrix.blend(positive, blend_);
       if (solver::Factor factor = linear_.factor(form(matrix))) return factor;
     }
@@ -204,7 +208,7 @@ class NodalSolve {
     ++descents_;
     solver::Factor factor = factor_;
     if (!factor) {
-      factor = damped(*H_, [&](const linalg::BlockMatrix& matrix) {
+      factor = damped([&](const linalg::BlockMatrix& matrix) {
         return system_.without_coupling(here_, matrix);
       });
     }
@@ -220,10 +224,12 @@ class NodalSolve {
   }
 
   bool descend_by_law() {
-    if (system_.clear_approach(here_.x)) system_.look(here_);
-    const linalg::BlockMatrix exact = linear_.assemble(here_.x.data(), Curvature::kExact, here_.g);
-    solver::Factor factor = linear_.factor(exact);
-    if (!factor) factor = damped(exact, [](const linalg::BlockMatrix& matrix) { return matrix; });
+    if (system_.clear_approach(here_.x)) {
+      system_.look(here_);
+      assemble();
+    }
+    solver::Factor factor = linear_.factor(*H_);
+    if (!factor) factor = damped([](const linalg::BlockMatrix& matrix) { return matrix; });
     if (!factor) return false;
     const NodalSystem::Linearized solution = system_.solve_linearized(here_, *factor);
     return descend(solution.p, solution.impulses, kHalvings);
