@@ -574,16 +574,19 @@ class Simulator:
         distance = self.contact.barrier_distance
         if distance is None:
             distance = choose_barrier_distance(self.scene, self._nonadjacent_distance, self.contact)
-        self._defaults["slip_velocity"] = _scalar(self.contact.slip_velocity)
-        self._defaults["barrier_distance"] = _scalar(distance)
-        self._default_fields = default_fields(self._defaults)
+        slip_velocity = self.contact.slip_velocity
+        self._add_defaults(slip_velocity=slip_velocity, barrier_distance=distance)
         self._check_barrier("Simulator", self._default_fields)
         stiffness = self.contact.barrier_stiffness
         if stiffness is None:
             inputs, _ = self._inputs(self.initial_state(), None, None)
             stiffness = self._core.default_barrier_stiffness(_arrays(inputs), distance)
-        self._defaults["barrier_stiffness"] = _scalar(stiffness)
-        self._default_fields = default_fields(self._defaults)
+        self._add_defaults(barrier_stiffness=stiffness)
+
+    def _add_defaults(self, **values: float) -> None:
+        tensors = {n: torch.tensor(v, dtype=torch.float64) for n, v in values.items()}
+        self._defaults |= tensors
+        self._default_fields |= default_fields(tensors)
 
     def _check_barrier(self, owner: str, inputs: Fields) -> None:
         cloths = len(self.scene.cloths)
@@ -648,10 +651,6 @@ def _check_gains(layout: Layout) -> None:
 
 def _arrays(inputs: Fields) -> dict[str, NDArray[np.float64]]:
     return {name: as_array(tensor) for name, tensor in inputs.items()}
-
-
-def _scalar(value: float) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
 
 
 def _unbatched(named: dict[str, Tensor], batch: int | None) -> dict[str, Tensor]:
