@@ -1,6 +1,7 @@
 """Factors are kept for backward up to a number of bytes, and made again where they are gone."""
 
 import gc
+import weakref
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ from parallel_scenes import batch, simulator
 
 import diffcloth_torch as dc
 from diffcloth_torch import _core
+from diffcloth_torch.sim.step import as_array
 
 
 def test_factors_are_kept_up_to_a_number_of_bytes():
@@ -40,8 +42,7 @@ def test_factors_go_with_the_graph_that_may_ask_for_them():
     assert sim._core.factor_bytes == 0
 
 
-@pytest.mark.boundary
-def test_what_is_kept_may_outlive_its_simulator():
+def test_a_graph_may_outlive_its_simulator():
     sim = dc.Simulator(dc.Scene([dc.Cloth.grid(5, 5)]), 0.01)
     state = sim.initial_state()
     after = sim.step(state.replace(velocities=state.velocities.clone().requires_grad_()))
@@ -49,6 +50,19 @@ def test_what_is_kept_may_outlive_its_simulator():
     del sim
     gc.collect()
     after.positions.sum().backward()
+
+
+def test_what_is_kept_may_outlive_the_core():
+    sim = dc.Simulator(dc.Scene([dc.Cloth.grid(5, 5)]), 0.01)
+    inputs, _ = sim._inputs(sim.initial_state(), None, None)
+    arrays = {name: as_array(tensor) for name, tensor in inputs.items()}
+    kept = sim._core.forward(arrays, True, 1)["kept"]
+    assert sim._core.factor_bytes > 0
+    simulator = weakref.ref(sim)  # the only one to hold the core
+    del sim
+    gc.collect()
+    assert simulator() is None
+    del kept  # gives its place back to a cache that is gone
 
 
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
