@@ -17,17 +17,20 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def test_the_seconds_of_a_report_are_those_of_the_step():
     ball = dc.RigidBody.sphere(0.2, pose=[0.01, 0.02, -0.205, 1, 0, 0, 0])
-    sim = dc.Simulator(dc.Scene([dc.Cloth.grid(20, 20)], [ball]), 0.01)
+    sim = dc.Simulator(dc.Scene([dc.Cloth.grid(32, 32)], [ball]), 0.01)
     state = sim.initial_state()
-    told = wall = 0.0
+    untold = []
     with torch.no_grad():
         for _ in range(8):
             begin = time.perf_counter()
             state = sim.step(state)
-            wall += time.perf_counter() - begin
-            told += sum(state.report.seconds.values())
-    # The rest is what Python does around the core, about a millisecond a step.
-    assert 0.92 * wall < told <= wall
+            wall = time.perf_counter() - begin
+            told = sum(state.report.seconds.values())
+            assert told <= wall
+            untold.append((wall - told) / wall)
+    # The rest is what Python does around the core: about 1.5 of 50 ms and more.
+    # The best step is free of whatever else the machine had to do.
+    assert min(untold) < 0.06, untold
 
 
 SELF_CONTACT = """
