@@ -89,9 +89,10 @@ class BlockMatrix {
   }
   void add_attached(const std::array<Index, 4>& points, const Mat12& h);
 
-  /// How four points move with a row: dx = g dz.
+  /// How four points move with a row: dx = g dz, or one of them alone, where it is the row.
   struct Motion {
     Index row;
+    int point;  ///< among the four; -1: see g
     Eigen::Matrix<double, 12, 3> g;
   };
 
