@@ -13,6 +13,27 @@ class SimulationError(RuntimeError): ...
 
 def build_info() -> dict[str, Any]: ...
 
+class FreeMotion:
+    def __init__(
+        self,
+        *,
+        parent: list[int],
+        order: list[int],
+        kind: list[int],
+        offset: NDArray[np.float64],
+        axis: NDArray[np.float64],
+        dof: list[int],
+        multiplier: NDArray[np.float64],
+        constant: NDArray[np.float64],
+        joint_count: int,
+        solved: list[int],
+        root_moves: bool,
+        dt: float,
+    ) -> None: ...
+    def solve(
+        self, *arrays: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]: ...
+
 class Kept: ...
 
 class Simulator:

@@ -8,5 +8,6 @@ NB_MODULE(_core, m) {
   m.doc() = "C++ core of diffcloth_torch. The public interface is the Python package.";
 
   diffcloth::bind::build_info(m);
+  diffcloth::bind::free_motion(m);
   diffcloth::bind::simulator(m);
 }

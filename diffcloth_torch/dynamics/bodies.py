@@ -20,8 +20,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffcloth_torch.dynamics.free_motion import body_motion, solve_motion
 from diffcloth_torch.dynamics.implicit import attach_root
+from diffcloth_torch.dynamics.inertia import Inertia
 from diffcloth_torch.dynamics.kinematics import CROSS
+from diffcloth_torch.errors import SimulationError
+from diffcloth_torch.geometry.products import times
 from diffcloth_torch.geometry.rotation import (
     nearer_quaternion,
     quaternion_exp,
@@ -32,9 +36,6 @@ from diffcloth_torch.geometry.rotation import (
 )
 
 __all__ = ["BodyInertia", "BodyPrediction", "advance_bodies", "predict_bodies"]
-
-# Each gains a factor of about (h |Omega|)^2 / 8, with the matrix of the first.
-_ITERATIONS = 4
 
 # Added to angles that something is divided by; its third power is still a number.
 _NO_ANGLE = 1e-100
@@ -91,14 +92,14 @@ def predict_bodies(
     quaternion = torch.nn.functional.normalize(poses[..., 3:], dim=-1)
     rotation = quaternion_matrix(quaternion)
     back = rotation.transpose(-1, -2)
-    center = poses[..., :3] + _apply(rotation, inertia.center)
+    center = poses[..., :3] + times(rotation, inertia.center)
     speed = velocities[..., :3] + dt * (
         gravity[..., None, :] + wrenches[..., :3] / inertia.mass[..., None]
     )
     # In body axes at the start.
-    spin = _apply(back, velocities[..., 3:])
-    momentum = _apply(inertia.inertia, spin) + dt * _apply(back, wrenches[..., 3:])
-    omega = _apply(rotation, _midpoint_spin(inertia.inertia, momentum, dt))
+    spin = times(back, velocities[..., 3:])
+    momentum = times(inertia.inertia, spin) + dt * times(back, wrenches[..., 3:])
+    omega = times(rotation, _midpoint_spin(inertia.inertia, momentum, dt))
 
     predicted = quaternion_multiply(quaternion_exp(dt * omega), quaternion)
     turned = quaternion_matrix(predicted)
@@ -108,13 +109,13 @@ def predict_bodies(
     mass, none = mass.expand_as(moments), torch.zeros_like(moments)
     metric = torch.cat([torch.cat([mass, none], -1), torch.cat([none, moments], -1)], dim=-2)
     return BodyPrediction(
-        frames=torch.cat([-_apply(turned, inertia.center), predicted], dim=-1),
+        frames=torch.cat([-times(turned, inertia.center), predicted], dim=-1),
         coordinates=torch.cat([center, -dt * omega], dim=-1),
         target=torch.cat([center + dt * speed, zeros], dim=-1),
         metric=metric / dt**2,
         inertia=inertia,
         poses=poses,
-        momentum=_apply(rotation, momentum),
+        momentum=times(rotation, momentum),
     )
 
 
@@ -134,24 +135,24 @@ def advance_bodies(
     predicted = prediction.frames[..., 3:]
     quaternion = quaternion_multiply(quaternion_exp(turn), predicted)
     rotation = quaternion_matrix(quaternion)
-    moment = _apply(prediction.metric[..., 3:, 3:], turn)
+    moment = times(prediction.metric[..., 3:, 3:], turn)
     torque = torque_from_moment(turn, moment)
     rate = (center - prediction.coordinates[..., :3]) / dt
     if kick is not None:
         torque = torque + kick[..., 3:]
         rate = rate + dt * kick[..., :3] / inertia.mass[..., None]
-    momentum = _apply(rotation.transpose(-1, -2), prediction.momentum + dt * torque)
+    momentum = times(rotation.transpose(-1, -2), prediction.momentum + dt * torque)
     spin = torch.linalg.solve(inertia.inertia.expand_as(rotation), momentum[..., None])[..., 0]
     sign = nearer_quaternion(quaternion, prediction.poses[..., 3:])
-    poses = torch.cat([center - _apply(rotation, inertia.center), sign], dim=-1)
-    return poses, torch.cat([rate, _apply(rotation, spin)], dim=-1)
+    poses = torch.cat([center - times(rotation, inertia.center), sign], dim=-1)
+    return poses, torch.cat([rate, times(rotation, spin)], dim=-1)
 
 
 def _midpoint_spin(inertia: Tensor, momentum: Tensor, dt: float) -> Tensor:
     """Omega [B, K, 3] with r = J Omega - exp(-h Omega / 2) momentum = 0, all in body axes."""
 
     def residual(spin: Tensor) -> Tensor:
-        return _apply(inertia, spin) - _apply(rotation_exp(-dt / 2 * spin), momentum)
+        return times(inertia, spin) - times(rotation_exp(-dt / 2 * spin), momentum)
 
     def slope(spin: Tensor) -> Tensor:
         # d(exp(-x) v) = y x (D dx) with y = exp(-x) v and the left Jacobian D of the exponential.
@@ -161,36 +162,38 @@ def _midpoint_spin(inertia: Tensor, momentum: Tensor, dt: float) -> Tensor:
         first = 2 * (torch.sin(angle / 2) / angle) ** 2
         second = (angle - torch.sin(angle)) / angle**3
         D = torch.eye(3, dtype=x.dtype) - first * X + second * (X @ X)
-        K: Tensor = inertia - dt / 2 * _cross(_turned_back(x, momentum)) @ D
+        K: Tensor = inertia - dt / 2 * _cross(times(rotation_exp(-x), momentum)) @ D
         return K
 
-    with torch.no_grad():
-        inverse = torch.linalg.inv(inertia.expand(*momentum.shape, 3))
-        spin = _apply(inverse, momentum)
-        turned = _turned_back(dt / 2 * spin, momentum)
-        inverse = torch.linalg.inv(inertia - dt / 2 * _cross(turned))  # `slope` to first order
-        for _ in range(_ITERATIONS):
-            left = _apply(inertia, spin) - _turned_back(dt / 2 * spin, momentum)
-            spin = spin - _apply(inverse, left)
+    spin, found = _solve_spin(inertia, momentum, dt)
+    lost = torch.nonzero(~found.all(-1))[:, 0].tolist()
+    if lost:
+        raise SimulationError(
+            f"step: a rigid body turns too fast for a time step of {dt:g} s; it may turn by about "
+            "a radian in it",
+            environments=lost,
+        )
     return attach_root(residual, spin, (inertia, momentum), slope)
 
 
-def _turned_back(turn: Tensor, vector: Tensor) -> Tensor:
-    """exp(-turn) vector; fast, and without a derivative at zero."""
-    angle = turn.norm(dim=-1, keepdim=True) + _NO_ANGLE
-    axis = turn * (torch.tan(angle / 2) / angle)  # times the tangent of half the angle
-    first = torch.linalg.cross(vector, axis)
-    second = torch.linalg.cross(first, axis)
-    scale = 2 / (1 + (axis * axis).sum(-1, keepdim=True))
-    result: Tensor = vector + (first + second) * scale
-    return result
+def _solve_spin(inertia: Tensor, momentum: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    """Omega [B, K, 3] without a graph, and where it was found [B, K]."""
+    batch, count = momentum.shape[:2]
+    # To the core each body is an environment of its own.
+    none = momentum.new_zeros(batch * count, 0)
+    zeros = momentum.new_zeros(batch * count, 3)
+    given = torch.cat([zeros, momentum.reshape(-1, 3)], dim=-1)
+    matrices = inertia.expand(batch, count, 3, 3).reshape(-1, 1, 3, 3)
+    body = Inertia(mass=_ONE, center=zeros[:1, None], inertia=matrices, armature=none[:1])
+    start = (zeros[:1], _EYE, none[:1])
+    spin, found = solve_motion(body_motion(dt), body, start, torch.zeros_like(given[:1]), given)
+    return spin.reshape(batch, count, 3), found.reshape(batch, count)
+
+
+_ONE = torch.ones(1, 1, dtype=torch.float64)
+_EYE = torch.eye(3, dtype=torch.float64)[None]
 
 
 def _cross(vectors: Tensor) -> Tensor:
     matrices: Tensor = (vectors @ CROSS).reshape(*vectors.shape, 3)
     return matrices
-
-
-def _apply(matrices: Tensor, vectors: Tensor) -> Tensor:
-    product: Tensor = (matrices @ vectors[..., None])[..., 0]
-    return product

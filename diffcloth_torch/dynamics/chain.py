@@ -24,7 +24,8 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.dynamics.drives import Drives, Gains, fold
-from diffcloth_torch.dynamics.implicit import attach_root, find_root
+from diffcloth_torch.dynamics.free_motion import robot_motion, solve_motion
+from diffcloth_torch.dynamics.implicit import attach_root
 from diffcloth_torch.dynamics.inertia import (
     Inertia,
     Motion,
@@ -36,6 +37,7 @@ from diffcloth_torch.dynamics.inertia import (
 )
 from diffcloth_torch.dynamics.kinematics import ROOT, Tree, root_frame
 from diffcloth_torch.errors import SimulationError
+from diffcloth_torch.geometry.products import times
 from diffcloth_torch.geometry.rotation import (
     nearer_quaternion,
     pose_velocities,
@@ -165,6 +167,7 @@ class Chain:
         solved = [i for i in range(ROOT + joints) if i < ROOT or not prescribed[i - ROOT]]
         self._solved = torch.tensor([i for i in solved if i >= first], dtype=torch.long)
         self._unknown = self._solved - first
+        self._free_motion = robot_motion(mechanism, self._solved, dt)
 
     def predict(
         self,
@@ -197,7 +200,7 @@ class Chain:
         if self.mechanism.is_dynamic:
             here = self._motion(inertia, start)
             given = self._given(inertia, here, state, control, drives, gravity, contact)
-            velocity, constraint = self._solve(inertia, start, here, known, given)
+            velocity, constraint = self._solve(inertia, start, known, given)
         end = self._moved(start, velocity, self._dt)
         joints = torch.where(self._prescribed, ends, end.joints)
         coordinates, free = state.joints, joints
@@ -210,7 +213,7 @@ class Chain:
             free = torch.cat([end.center, torch.zeros_like(turn), joints], dim=-1)
             ends = torch.cat([coordinates[..., :ROOT], ends], dim=-1)
             predicted = quaternion_multiply(quaternion_exp(turn), quaternion)
-            offset = -(end.rotation @ local[..., None])[..., 0]
+            offset = -times(end.rotation, local)
             root_start = root_end = torch.cat([offset, predicted], dim=-1)
         inertial = self._inertial(inertia, end)
         metric, target = fold(drives, inertial, free, state.joints, self._dt, self._unknown)
@@ -259,7 +262,7 @@ class Chain:
             rotation = quaternion_matrix(quaternion)
             end = _Configuration(center, rotation, joints)
             quaternion = nearer_quaternion(quaternion, prediction.pose[..., 3:])
-            pose = torch.cat([center - (rotation @ local[..., None])[..., 0], quaternion], dim=-1)
+            pose = torch.cat([center - times(rotation, local), quaternion], dim=-1)
             root_rate = torch.cat([center - start.center, turned], dim=-1) / self._dt
         else:
             root_rate = known[..., :ROOT]
@@ -270,7 +273,7 @@ class Chain:
         forces = contact if kick is None else contact + kick
         efforts = prediction.drives.applied_efforts(start.joints, joints, self._dt)
         if self._prescribed.any():
-            inertial = (prediction.inertial @ (coordinates - prediction.free)[..., None])[..., 0]
+            inertial = times(prediction.inertial, coordinates - prediction.free)
             load = self._generalized(placed, forces)[..., ROOT:]
             held = prediction.constraint + self._at_joints(inertial) - load
             efforts = torch.where(self._prescribed, held, efforts)
@@ -346,7 +349,6 @@ class Chain:
         self,
         inertia: Inertia,
         start: _Configuration,
-        here: Motion,
         known: Tensor,
         given: Tensor,
     ) -> tuple[Tensor, Tensor]:
@@ -366,14 +368,7 @@ class Chain:
 
         velocity = known
         if len(solved):
-            with torch.no_grad():
-                # Without velocity products, but for those of what is prescribed.
-                mass = mass_matrix(here, inertia)
-                rest = given - (mass @ known[..., None])[..., 0]
-                inverse = torch.linalg.inv(mass[..., solved[:, None], solved])
-                guess = (inverse @ rest[..., solved, None])[..., 0]
-                scale = torch.cat([guess, known], dim=-1).abs().amax(-1)
-                x, found = find_root(of_solved, guess, inverse, scale)
+            x, found = solve_motion(self._free_motion, inertia, start, known, given)
             self._check(found)
             velocity = complete(attach_root(of_solved, x, (*inertia, *start, known, given)))
         constraint = torch.zeros_like(start.joints)
@@ -434,4 +429,4 @@ class Chain:
 def _placed(position: Tensor, quaternion: Tensor, local: Tensor) -> tuple[Tensor, Tensor]:
     """Center of mass and orientation of a link whose frame is at a pose."""
     rotation = quaternion_matrix(quaternion)
-    return position + (rotation @ local[..., None])[..., 0], rotation
+    return position + times(rotation, local), rotation

@@ -7,52 +7,9 @@ from collections.abc import Callable, Iterable
 import torch
 from torch import Tensor
 
-__all__ = ["attach_root", "find_root", "jacobian"]
-
-# Of the scale of x: a step that counts as none, and one that is rounding if it does not shrink.
-_TOLERANCE, _FLOOR = 1e-12, 1e-8
-_MOST_ITERATIONS = 40
+__all__ = ["attach_root", "jacobian"]
 
 Residual = Callable[[Tensor], Tensor]
-
-
-def find_root(
-    residual: Residual, guess: Tensor, inverse: Tensor, scale: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Root near a guess by Broyden's method, without a graph.
-
-    An environment stops when its own step is small, so that its bits depend on no other.
-
-    Args:
-        residual: r, [B, n] -> [B, n]; no environment sees another.
-        guess: Shape [B, n].
-        inverse: About that of dr/dx, shape [B, n, n].
-        scale: Size of what adds up to x, whose rounding is in it, shape [B].
-
-    Returns:
-        The root, and which environments have found theirs, shape [B].
-    """
-    with torch.no_grad():
-        x, H = guess, inverse
-        r = residual(x)
-        active = torch.ones(len(x), 1, dtype=torch.bool)
-        last = torch.full_like(x[:, :1], torch.inf)
-        for _ in range(_MOST_ITERATIONS):
-            step = -_times(H, r)
-            x = torch.where(active, x + step, x)
-            size = step.abs().amax(-1, True)
-            whole = torch.maximum(x.abs().amax(-1, True), scale[:, None])
-            at_floor = (size <= _FLOOR * whole) & (size >= last / 2)
-            # The next step, which shrinks at least as this one did.
-            ahead = size * torch.where(last.isinf(), 1.0, size / last)
-            active = active & ~((ahead <= _TOLERANCE * whole) | at_floor)
-            if not active.any():
-                break
-            before, r, last = r, residual(x), size
-            change = _times(H, r - before)
-            row = (step[:, None] @ H) / (step * change).sum(-1)[:, None, None]
-            H = H + (step - change)[..., None] * row
-    return x, ~active[:, 0]
 
 
 def attach_root(
@@ -89,8 +46,3 @@ def jacobian(residual: Residual, x: Tensor) -> Tensor:
         rows = residual(copies).diagonal(dim1=0, dim2=-1).sum()
         (gradient,) = torch.autograd.grad(rows, copies)
     return gradient.movedim(0, -2)
-
-
-def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
-    product: Tensor = (matrices @ vectors[..., None])[..., 0]
-    return product

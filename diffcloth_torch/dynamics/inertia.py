@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.dynamics.kinematics import Frames, Tree
+from diffcloth_torch.geometry.products import times
 
 __all__ = [
     "Inertia",
@@ -85,7 +86,7 @@ def mass_matrix(motion: Motion, inertia: Inertia) -> Tensor:
 
 def momentum(motion: Motion, inertia: Inertia, velocity: Tensor) -> Tensor:
     """M nu of velocities nu [B, 6 + J], likewise."""
-    of_links = (motion.weighted @ velocity[..., None, :, None])[..., 0]
+    of_links = times(motion.weighted, velocity[..., None, :])
     return generalized_force(motion, of_links) + _at_joints(inertia.armature) * velocity
 
 
@@ -97,9 +98,9 @@ def slope(tree: Tree, motion: Motion, velocity: Tensor) -> Tensor:
         motion: Its links.
         velocity: nu.
     """
-    frames, nu = motion.frames, velocity[..., None, :, None]
-    twists = (motion.jacobian @ nu)[..., 0]  # [B, L, 6]
-    linear, angular = torch.split((motion.weighted @ nu)[..., 0], 3, dim=-1)
+    frames, nu = motion.frames, velocity[..., None, :]
+    twists = times(motion.jacobian, nu)  # [B, L, 6]
+    linear, angular = torch.split(times(motion.weighted, nu), 3, dim=-1)
     carried = torch.cat([linear, angular + torch.linalg.cross(frames.centers, linear)], dim=-1)
     # Of all that hangs on each joint, first about the origin, then about the pivot.
     F, N = torch.split(tree.hanging @ carried, 3, dim=-1)
@@ -136,7 +137,7 @@ def wrenches_of_forces(frames: Frames, links: Tensor, points: Tensor, forces: Te
         Shape [B, L, 6], N and N m.
     """
     poses = frames.poses[..., links, :, :]
-    placed = (poses[..., :3, :3] @ points[..., None])[..., 0] + poses[..., :3, 3]
+    placed = times(poses[..., :3, :3], points) + poses[..., :3, 3]
     arms = placed - frames.centers[..., links, :]
     parts = torch.cat([forces, torch.linalg.cross(arms, forces)], dim=-1)
     zeros = parts.new_zeros(*parts.shape[:-2], frames.centers.shape[-2], 6)

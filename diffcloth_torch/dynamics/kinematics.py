@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch.geometry.products import times
 from diffcloth_torch.model.kinematics import Kinematics, constant, joined_frame
 from diffcloth_torch.model.mechanism import Mechanism
 
@@ -83,8 +84,8 @@ class Tree:
         moving = poses[..., self.moving, :, :]
         return Frames(
             poses=poses,
-            centers=(poses[..., :3, :3] @ centers[..., None])[..., 0] + poses[..., :3, 3],
-            axes=(moving[..., :3, :3] @ self._axes[..., None])[..., 0],
+            centers=times(poses[..., :3, :3], centers) + poses[..., :3, 3],
+            axes=times(moving[..., :3, :3], self._axes),
             pivots=moving[..., :3, 3],
         )
 
@@ -106,7 +107,7 @@ class Tree:
 
 def root_frame(center: Tensor, rotation: Tensor, local_center: Tensor) -> Tensor:
     """Frame [B, 4, 4] of a link at `rotation`, by its center in the world and in itself [B, 3]."""
-    return joined_frame(rotation, center - (rotation @ local_center[..., None])[..., 0])
+    return joined_frame(rotation, center - times(rotation, local_center))
 
 
 def _rigid(arms: Tensor) -> Tensor:

@@ -64,7 +64,7 @@ class Kinematics:
         local = steps.unbind(-3)
         placed = {self._root: root.expand(*shape, 4, 4).reshape(count, 4, 4)}
         for link, parent in self._parents:
-            placed[link] = placed[parent] @ local[link]
+            placed[link] = torch.bmm(placed[parent], local[link])
         frames = torch.stack([placed[link] for link in range(len(placed))], dim=1)
         return frames.reshape(*shape, len(placed), 4, 4)
 

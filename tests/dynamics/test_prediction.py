@@ -425,6 +425,19 @@ def test_velocities_beyond_half_a_turn_in_a_step_are_refused():
         step(chain, at_rest(chain, rates=tensor([[1e200, 0, 0]])))
 
 
+def test_a_body_that_turns_too_fast_is_refused():
+    """With the environment, and only where it does."""
+    spins = torch.zeros(2, 1, 6, dtype=F64)
+    spins[:, 0, 3:] = tensor([[1.0, 2.0, 3.0], [1e200, 0.0, 1e200]])
+    inertia = BodyInertia(tensor([[1.0]]), tensor([[[0, 0, 0]]]), tensor([[np.diag([1, 2, 2.5])]]))
+    pose = tensor([0, 0, 0, 1, 0, 0, 0]).expand(2, 1, 7)
+    none = torch.zeros(2, 1, 6, dtype=F64)
+    predict_bodies(pose[:1], spins[:1], inertia, none[:1], GRAVITY, H)
+    with pytest.raises(SimulationError, match=r"turns too fast for a time step of 0.01") as error:
+        predict_bodies(pose, spins, inertia, none, GRAVITY, H)
+    assert error.value.environments == (1,)
+
+
 CASES = [
     ("fixed", "torque"),
     ("fixed", ("pd", "position", "torque")),
