@@ -206,7 +206,8 @@ class Simulator:
         return _restore, arguments
 
     def __repr__(self) -> str:
-        return f"Simulator({self.scene!r}, dt={self.dt:g}, scheme={self.scheme!r})"
+        coupling = "" if self.coupling == "monolithic" else f", coupling={self.coupling!r}"
+        return f"Simulator({self.scene!r}, dt={self.dt:g}, scheme={self.scheme!r}{coupling})"
 
     @_memory_errors
     def initial_state(self, batch_size: int | None = None) -> State:
