@@ -44,8 +44,8 @@ PUBLIC = {
     "Scene": "",
     "SimulationError": "",
     "Simulator": (
-        "initial_state control parameters step rollout energy link_poses link_velocities "
-        "contact_wrenches"
+        "initial_state control parameters step rollout energy kinetic_energy momentum "
+        "vertex_masses link_poses link_velocities contact_wrenches"
     ),
     "SolverOptions": "tolerance max_iterations throw metric elastic",
     "State": "batch_size replace detach export",

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from diffcloth_torch.dynamics.implicit import attach_root
 from diffcloth_torch.dynamics.kinematics import CROSS
+from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.geometry.rotation import (
     nearer_quaternion,
     quaternion_exp,
@@ -30,8 +31,9 @@ from diffcloth_torch.geometry.rotation import (
     rotation_exp,
     torque_from_moment,
 )
+from diffcloth_torch.model.kinematics import pose_frame
 
-__all__ = ["BodyInertia", "BodyPrediction", "advance_bodies", "predict_bodies"]
+__all__ = ["BodyInertia", "BodyPrediction", "advance_bodies", "body_totals", "predict_bodies"]
 
 # Each gains a factor of about (h |Omega|)^2 / 8, with the matrix of the first.
 _ITERATIONS = 4
@@ -116,6 +118,25 @@ def predict_bodies(
         poses=poses,
         momentum=_apply(rotation, momentum),
     )
+
+
+def body_totals(poses: Tensor, velocities: Tensor, inertia: BodyInertia, gravity: Tensor) -> Totals:
+    """Momentum and energy of all bodies.
+
+    Args:
+        poses: Of the body frames, [B, K, 7].
+        velocities: Of the centers, then of rotation, in world axes; [B, K, 6].
+        inertia: What the bodies weigh.
+        gravity: [B or 1, 3] m/s^2.
+    """
+    frames = pose_frame(poses)
+    rotation = frames[..., :3, :3]
+    center = frames[..., :3, 3] + _apply(rotation, inertia.center)
+    spin = _apply(rotation.transpose(-1, -2), velocities[..., 3:])
+    angular = _apply(rotation, _apply(inertia.inertia, spin))
+    momenta = torch.cat([inertia.mass[..., None] * velocities[..., :3], angular], dim=-1)
+    kinetic = ordered_sum((momenta * velocities).flatten(-2)) / 2
+    return Totals.of(center, momenta, kinetic, inertia.mass, gravity)
 
 
 def advance_bodies(

@@ -24,11 +24,13 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.dynamics.kinematics import Frames, Tree
+from diffcloth_torch.dynamics.totals import about_origin
 
 __all__ = [
     "Inertia",
     "Motion",
     "generalized_force",
+    "link_momenta",
     "mass_matrix",
     "momentum",
     "slope",
@@ -83,9 +85,15 @@ def mass_matrix(motion: Motion, inertia: Inertia) -> Tensor:
     return matrix + torch.diag_embed(_at_joints(inertia.armature))
 
 
+def link_momenta(motion: Motion, velocity: Tensor) -> Tensor:
+    """h_l of velocities nu [B, 6 + J]: linear, then angular about the centers; [B, L, 6]."""
+    momenta: Tensor = (motion.weighted @ velocity[..., None, :, None])[..., 0]
+    return momenta
+
+
 def momentum(motion: Motion, inertia: Inertia, velocity: Tensor) -> Tensor:
     """M nu of velocities nu [B, 6 + J], likewise."""
-    of_links = (motion.weighted @ velocity[..., None, :, None])[..., 0]
+    of_links = link_momenta(motion, velocity)
     return generalized_force(motion, of_links) + _at_joints(inertia.armature) * velocity
 
 
@@ -99,8 +107,9 @@ def slope(tree: Tree, motion: Motion, velocity: Tensor) -> Tensor:
     """
     frames, nu = motion.frames, velocity[..., None, :, None]
     twists = (motion.jacobian @ nu)[..., 0]  # [B, L, 6]
-    linear, angular = torch.split((motion.weighted @ nu)[..., 0], 3, dim=-1)
-    carried = torch.cat([linear, angular + torch.linalg.cross(frames.centers, linear)], dim=-1)
+    momenta = link_momenta(motion, velocity)
+    linear = momenta[..., :3]
+    carried = about_origin(frames.centers, momenta)
     # Of all that hangs on each joint, first about the origin, then about the pivot.
     F, N = torch.split(tree.hanging @ carried, 3, dim=-1)
     N = N - torch.linalg.cross(frames.pivots, F)
