@@ -155,16 +155,6 @@ def difference(simulator: dc.Simulator, state: dc.State, seed: int) -> float:
     return (values[0] - values[1]) / (2 * epsilon)
 
 
-def masses(cloth: dc.Cloth) -> Tensor:
-    """A third of the mass of each adjacent face [kg], shape [n]."""
-    a, b, c = (cloth.rest_vertices[cloth.faces[:, k]] for k in range(3))
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    shares = np.zeros(len(cloth.vertices))
-    for k in range(3):
-        np.add.at(shares, cloth.faces[:, k], cloth.material.density * areas / 3)
-    return torch.from_numpy(shares)
-
-
 def momentum_error(mass: Tensor, states: list[dc.State]) -> float:
     """What no force accounts for, over the impulse of gravity in a step."""
     weight = mass.sum() * torch.tensor([0.0, 0.0, -9.81], dtype=torch.float64)
@@ -178,14 +168,11 @@ def momentum_error(mass: Tensor, states: list[dc.State]) -> float:
 
 def energy_gained(simulator: dc.Simulator, mass: Tensor, states: list[dc.State]) -> float:
     """Sum of the rises of the mechanical energy, over what there is to lose."""
-
-    def kinetic(state: dc.State) -> float:
-        return (mass @ state.velocities.square().sum(dim=1)).item() / 2
-
-    energies = [simulator.energy(state).item() + kinetic(state) for state in states]
+    kinetic = [simulator.kinetic_energy(state).item() for state in states]
+    energies = [simulator.energy(s).item() + k for s, k in zip(states, kinetic, strict=True)]
     rises = np.maximum(np.diff(energies), 0).sum()
     heights = torch.stack([mass @ state.positions[:, 2] for state in states])
-    available = kinetic(states[0]) + 9.81 * (heights[0] - heights.min()).item()
+    available = kinetic[0] + 9.81 * (heights[0] - heights.min()).item()
     return float(rises / available)
 
 
@@ -201,7 +188,7 @@ def row(simulator: dc.Simulator, rollout: Rollout) -> list[str]:
     reports = [state.report for state in states[1:]]
     if not reports:
         return ["-"] * len(COLUMNS)
-    mass = masses(scene.cloths[0])
+    mass = simulator.vertex_masses()
     crossings = Crossings(scene)
     return [
         f"{max(crossings.count(state) for state in states)}",

@@ -9,11 +9,12 @@
 Units are SI, z is up, quaternions are (w, x, y, z), and everything is float64 on the CPU.
 """
 
+from collections.abc import Iterable
 from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 if find_spec("diffcloth_torch._core") is None:
     # Python looks into the current folder first: in a clone it finds the sources, and not what
@@ -35,6 +36,7 @@ from diffcloth_torch.errors import (
     NotConverged,
     SimulationError,
 )
+from diffcloth_torch.files import as_path
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
@@ -46,6 +48,9 @@ from diffcloth_torch.sim.report import Report
 from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State, stack, where
 from diffcloth_torch.viewers.render import render
+
+if TYPE_CHECKING:
+    from diffcloth_torch.tasks.task import LoadedConfig
 
 __all__ = [
     "AddedMassWarning",
@@ -68,6 +73,7 @@ __all__ = [
     "SolverOptions",
     "State",
     "build_info",
+    "load_config",
     "render",
     "robots",
     "stack",
@@ -80,6 +86,40 @@ def build_info() -> dict[str, Any]:
     from diffcloth_torch import _core
 
     return dict(_core.build_info())
+
+
+def load_config(path: str | Path, assignments: Iterable[str] = ()) -> "LoadedConfig":
+    """Read a configuration of the command line, and build what it describes.
+
+    >>> scene, simulator, task = dc.load_config("configs/drape.yaml", ["simulation.steps=50"])
+    >>> controller = task.controller(task.actions())
+    >>> states = simulator.rollout(task.initial_state(), controller, steps=task.steps)
+
+    Args:
+        path: YAML file.
+        assignments: "key=value" each, as after `--set`.
+
+    Returns:
+        What is simulated, its simulator, and the task.
+
+    Raises:
+        InvalidInput: If the file, a key or a value is not accepted.
+        IntersectingState: If surfaces of the scene intersect or touch.
+    """
+    from diffcloth_torch.tasks.registry import load_task
+    from diffcloth_torch.tasks.task import LoadedConfig
+
+    changes: list[Any] = [*assignments]
+    if isinstance(assignments, str) or not all(isinstance(change, str) for change in changes):
+        raise TypeError(
+            f'load_config: `assignments` must be a list of "key=value", got {assignments!r}'
+        )
+    task = load_task(as_path("load_config: `path`", path), changes)
+    return LoadedConfig(task.scene, task.simulator, task)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, *(name for name in globals() if name.startswith("__")), "__version__"]
 
 
 def __getattr__(name: str) -> Any:

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 import diffcloth_torch as dc
 from diffcloth_cli import main
 from diffcloth_torch.sim.simulator import Simulator
-from diffcloth_torch.tasks.registry import check_document, load_config
+from diffcloth_torch.tasks.registry import check_document, read_config
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -331,7 +331,7 @@ def test_resume_takes_the_rest_from_its_folder(call):
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_a_configuration_comes_back_from_its_record(path):
-    config = load_config(path)
+    config = read_config(path)
     assert check_document(config.model_dump(mode="json"), path) == config
 
 

@@ -8,13 +8,15 @@ from pathlib import Path
 import pytest
 import torch
 
+import diffcloth_torch as dc
 from diffcloth_torch.config.schema import read_document, resolve_path, set_values
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.robots import GRIPPER
-from diffcloth_torch.tasks.registry import load_config, load_task
+from diffcloth_torch.tasks.registry import load_task, read_config
 from diffcloth_torch.tasks.simulation import simulate
 
 F64 = torch.float64
+CONFIGS = Path(__file__).parents[1] / "configs"
 
 MINIMAL = """
 task: drape
@@ -77,7 +79,7 @@ def test_a_missing_file_is_refused(tmp_path):
 
 
 def test_a_minimal_configuration_takes_the_defaults(write):
-    config = load_config(write(MINIMAL))
+    config = read_config(write(MINIMAL))
     assert config.simulation.dt == 0.01
     assert config.simulation.scheme == "coupled"
     assert config.scene.cloths[0].material.stretch is None
@@ -160,7 +162,7 @@ REFUSED = [
 @pytest.mark.parametrize(("assignment", "message"), REFUSED)
 def test_a_bad_value_is_refused_by_name(write, assignment, message):
     with pytest.raises(InvalidInput, match=message) as caught:
-        load_config(write(MINIMAL), [assignment])
+        read_config(write(MINIMAL), [assignment])
     assert str(caught.value).startswith(str(write(MINIMAL)))
     assert "\n" not in str(caught.value)
 
@@ -168,7 +170,7 @@ def test_a_bad_value_is_refused_by_name(write, assignment, message):
 def test_a_body_with_a_trajectory_must_be_kinematic(write):
     body = "{name: b, shape: {kind: box, size: 1}, trajectory: [{time: 1}]}"
     with pytest.raises(InvalidInput, match=r"`scene\.bodies\[0\]` has a `trajectory` and must"):
-        load_config(write(MINIMAL), [f"scene.bodies=[{body}]"])
+        read_config(write(MINIMAL), [f"scene.bodies=[{body}]"])
 
 
 def test_nodal_contact_and_its_scheme_are_read(write):
@@ -187,11 +189,11 @@ def test_keyframes_must_come_in_order(write):
         "trajectory: [{time: 2}, {time: 1}]}"
     )
     with pytest.raises(InvalidInput, match=r"increasing times in `trajectory`, got \[2"):
-        load_config(write(MINIMAL), [f"scene.bodies=[{body}]"])
+        read_config(write(MINIMAL), [f"scene.bodies=[{body}]"])
 
 
 def test_set_changes_values_by_name_and_by_index(write):
-    config = load_config(
+    config = read_config(
         write(MINIMAL),
         [
             "simulation.dt=1e-3",
@@ -228,7 +230,7 @@ def test_set_leaves_the_document_alone():
 )
 def test_a_bad_assignment_is_refused(write, assignment, message):
     with pytest.raises(InvalidInput, match=message):
-        load_config(write(MINIMAL), [assignment])
+        read_config(write(MINIMAL), [assignment])
 
 
 class TestRoot:
@@ -371,5 +373,57 @@ SHIPPED = Path(__file__).parent.parent / "configs"
 
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.stem)
 def test_the_shipped_configurations_fit_the_schema(path):
-    config = load_config(path)
+    config = read_config(path)
     assert math.isfinite(config.simulation.dt)
+
+
+# --- From Python ---------------------------------------------------------------------------------
+
+
+def test_a_configuration_gives_scene_simulator_and_task():
+    loaded = dc.load_config(CONFIGS / "drape.yaml", ["simulation.steps=2", "simulation.dt=0.005"])
+    scene, simulator, task = loaded
+    assert (loaded.scene, loaded.simulator, loaded.task) == (scene, simulator, task)
+    assert simulator.scene is scene
+    assert task.simulator is simulator
+    assert (simulator.dt, task.steps, task.config.task) == (0.005, 2, "drape")
+    assert scene.cloth_names == ("tablecloth",)
+    with torch.no_grad():
+        controller = task.controller(task.actions())
+        states = simulator.rollout(task.initial_state(), controller, steps=task.steps)
+    # The command line simulates the same.
+    for state, expected in zip(states, [*simulate(task)][1:], strict=True):
+        assert torch.equal(state.positions, expected.positions)
+    assert len(repr(loaded)) < 300
+    assert "task='drape', 2 steps" in repr(loaded)
+
+
+def test_a_name_of_a_file_will_do():
+    assert dc.load_config(str(CONFIGS / "drape.yaml")).task.steps == 150
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        pytest.param(("none.yaml",), InvalidInput, "none.yaml: there is no such file", id="file"),
+        pytest.param((5,), TypeError, "`path` must be a string or a Path, got int", id="path"),
+        pytest.param(
+            (CONFIGS / "drape.yaml", "simulation.steps=2"),
+            TypeError,
+            "`assignments` must be a list of",
+            id="text",
+        ),
+        pytest.param(
+            (CONFIGS / "drape.yaml", [3]), TypeError, "`assignments` must be a list of", id="number"
+        ),
+        pytest.param(
+            (CONFIGS / "drape.yaml", ["simulation.dt=-1"]),
+            InvalidInput,
+            "simulation.dt",
+            id="value",
+        ),
+    ],
+)
+def test_a_configuration_that_is_not_accepted(arguments, error, message):
+    with pytest.raises(error, match=message):
+        dc.load_config(*arguments)

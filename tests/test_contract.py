@@ -44,12 +44,13 @@ PUBLIC = {
     "Scene": "",
     "SimulationError": "",
     "Simulator": (
-        "initial_state control parameters step rollout energy link_poses link_velocities "
-        "contact_wrenches"
+        "initial_state control parameters step rollout energy kinetic_energy momentum "
+        "vertex_masses link_poses link_velocities contact_wrenches"
     ),
     "SolverOptions": "tolerance max_iterations throw metric elastic",
     "State": "batch_size replace detach export",
     "build_info": "",
+    "load_config": "",
     "render": "",
     "robots": "GRIPPER panda",
     "stack": "",
@@ -111,6 +112,13 @@ def test_the_public_names_are_these():
     for name, members in PUBLIC.items():
         for member in members.split():
             assert hasattr(getattr(dc, name), member), f"{name}.{member}"
+
+
+@pytest.mark.parametrize("module", [dc, dc.robots], ids=lambda module: module.__name__)
+def test_a_module_shows_its_public_names_alone(module):
+    shown = [name for name in dir(module) if not name.startswith("__")]
+    assert shown == sorted(module.__all__)
+    assert {"__doc__", "__file__"} < set(dir(module))
 
 
 def test_build_info_is_a_dict():

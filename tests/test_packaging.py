@@ -126,6 +126,13 @@ def test_a_blas_is_named_where_cholmod_calls_one():
     assert (blas == "none") == ("cholmod" not in kernels.cholesky_backends())
 
 
+def test_importing_the_package_warns_of_nothing():
+    command = [sys.executable, "-W", "error", "-c", "import diffcloth_torch"]
+    folder = Path(__file__).parent  # as in `run_python`
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    assert result.stderr == ""
+
+
 @pytest.mark.parametrize("module", ["matplotlib", "pytorch_kinematics", "pyvista", "trimesh"])
 def test_importing_the_package_leaves_out(module):
     code = f"import sys, diffcloth_torch; print({module!r} in sys.modules)"

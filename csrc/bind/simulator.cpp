@@ -123,7 +123,7 @@ class Simulator {
                     const nb::dict& cotangents,
                     const std::vector<std::string>& needs,
                     int threads);
-  nb::object energy(const nb::dict& inputs) const;
+  nb::dict stored_energy(const nb::dict& inputs) const;
   nb::object path(const nb::dict& inputs);
   double smallest_nonadjacent_distance() const;
   double default_barrier_stiffness(const nb::dict& inputs, double barrier_distance) const {
@@ -363,13 +363,22 @@ nb::object Simulator::path(const nb::dict& inputs) {
   return result.array;
 }
 
-nb::object Simulator::energy(const nb::dict& inputs) const {
+nb::dict Simulator::stored_energy(const nb::dict& inputs) const {
   const Arrays arrays(scene_, inputs);
-  Owned<double> result = make_array<double>({arrays.environments});
+  nb::dict result;
+  std::map<std::string, double*> parts;
   for (std::size_t e = 0; e < arrays.environments; ++e) {
-    result.data[e] = step::potential_energy(scene_, arrays.environment(e));
+    const step::StoredEnergy energy = step::stored_energy(scene_, arrays.environment(e));
+    energy.for_each([&](const char* name, double value) {
+      if (!parts.contains(name)) {
+        Owned<double> part = make_array<double>({arrays.environments});
+        parts[name] = part.data;
+        result[name] = part.array;
+      }
+      parts[name][e] = value;
+    });
   }
-  return result.array;
+  return result;
 }
 
 double Simulator::smallest_nonadjacent_distance() const {
@@ -571,7 +580,7 @@ void simulator(nb::module_& m) {
       .def("forward", &Simulator::forward, "inputs"_a, "tape"_a, "threads"_a)
       .def("backward", &Simulator::backward, "inputs"_a, "tape"_a, "kept"_a, "cotangents"_a,
            "needs"_a, "threads"_a)
-      .def("energy", &Simulator::energy, "inputs"_a)
+      .def("stored_energy", &Simulator::stored_energy, "inputs"_a)
       .def("path", &Simulator::path, "inputs"_a,
            "Accepted iterates of the first environment's step [M, N + V, 3].")
       .def("smallest_nonadjacent_distance", &Simulator::smallest_nonadjacent_distance)

@@ -226,11 +226,16 @@ void prepare(Model& model, const Slots& slots) {
   prepared.bends |= !prepared.by_matrix;
 }
 
-double energy(const Model& model, const double* x) {
+double stretch_energy(const Model& model, const double* x) {
   double total = 0.0;
   for (Index f = 0; f < face_count(model); ++f) {
     total += stretch::energy(stretch_weight(model, f), face_gradient(model, f, x));
   }
+  return total;
+}
+
+double bending_energy(const Model& model, const double* x) {
+  double total = 0.0;
   for (Index e = 0; e < model.stencils->size(); ++e) {
     total += bending::energy(bending_element(model, e), x);
   }

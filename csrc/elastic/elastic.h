@@ -62,8 +62,16 @@ struct Model {
 /// @throws std::invalid_argument where damping has no start of the step or no time step
 void prepare(Model& model, const Slots& slots);
 
-/// Stretch and bending energy, without damping [J].
-double energy(const Model& model, const double* x);
+/// Energy of the membranes, without damping [J].
+double stretch_energy(const Model& model, const double* x);
+
+/// Energy of bending, without damping [J].
+double bending_energy(const Model& model, const double* x);
+
+/// Both [J].
+inline double energy(const Model& model, const double* x) {
+  return stretch_energy(model, x) + bending_energy(model, x);
+}
 
 // What follows leaves out the flat elements of bending where `prepared.by_matrix`: their energy is
 // quadratic, that of their matrix. See ConstantForm::of_flat_bending().

@@ -6,22 +6,21 @@
 
 namespace diffcloth::step {
 
-double potential_energy(const Scene& scene, const Inputs& inputs) {
+StoredEnergy stored_energy(const Scene& scene, const Inputs& inputs) {
   Problem p(scene, inputs);
   const double* x = p.start.data();
-  double energy = 0.0;
-  for (const Potential* potential : p.elastic_potentials()) energy += potential->energy(x);
-  const Vec3 gravity = row(inputs.data(Input::kGravity), 0);
-  for (std::size_t i = 0; i < p.masses.size(); ++i) {
-    energy -= p.masses[i] * gravity.dot(row(x, static_cast<Index>(i)));
-  }
+  StoredEnergy energy{
+      .stretch = elastic::stretch_energy(p.model, x),
+      .bending = elastic::bending_energy(p.model, x),
+  };
+  if (p.anchors) energy.soft_pins = p.anchors->energy(x);
   if (p.contact) {
     contact::BroadPhase::Scratch scratch;
     std::vector<contact::Candidate> candidates;
     scene.broad_phase.find(x, x, p.contact->reach(), scratch, candidates);
     contact::Near near;
     p.contact->measure(candidates, x, near);
-    energy += near.energy();
+    energy.contact = near.energy();
   }
   return energy;
 }

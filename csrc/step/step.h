@@ -60,8 +60,24 @@ struct CloseStart {
 /// Absent where nothing is within the barrier's reach, or nothing can touch.
 std::optional<CloseStart> find_close_start(const Scene& scene, const Inputs& inputs);
 
-/// Elastic energy + gravity + soft pins + barrier at the positions of the inputs [J].
-double potential_energy(const Scene& scene, const Inputs& inputs);
+/// What cloths and contact store at the positions of the inputs [J]. Of weights, Python knows.
+struct StoredEnergy {
+  double stretch = 0.0;
+  double bending = 0.0;
+  double soft_pins = 0.0;
+  double contact = 0.0;  ///< of the barrier
+
+  /// Call visit(name, value) for every part.
+  template <class Visit>
+  void for_each(Visit&& visit) const {
+    visit("stretch", stretch);
+    visit("bending", bending);
+    visit("soft_pins", soft_pins);
+    visit("contact", contact);
+  }
+};
+
+StoredEnergy stored_energy(const Scene& scene, const Inputs& inputs);
 
 /// The unit EF that speeds are stated in: seconds of one numeric factorization of the contact-free
 /// Hessian at the inputs' positions by Eigen's SimplicialLDLT, minimum degree order, no BLAS; the

@@ -24,6 +24,7 @@ from diffcloth_torch.dynamics.free_motion import body_motion, solve_motion
 from diffcloth_torch.dynamics.implicit import attach_root
 from diffcloth_torch.dynamics.inertia import Inertia
 from diffcloth_torch.dynamics.kinematics import CROSS
+from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.errors import SimulationError
 from diffcloth_torch.geometry.products import times
 from diffcloth_torch.geometry.rotation import (
@@ -34,8 +35,9 @@ from diffcloth_torch.geometry.rotation import (
     rotation_exp,
     torque_from_moment,
 )
+from diffcloth_torch.model.kinematics import pose_frame
 
-__all__ = ["BodyInertia", "BodyPrediction", "advance_bodies", "predict_bodies"]
+__all__ = ["BodyInertia", "BodyPrediction", "advance_bodies", "body_totals", "predict_bodies"]
 
 # Added to angles that something is divided by; its third power is still a number.
 _NO_ANGLE = 1e-100
@@ -117,6 +119,25 @@ def predict_bodies(
         poses=poses,
         momentum=times(rotation, momentum),
     )
+
+
+def body_totals(poses: Tensor, velocities: Tensor, inertia: BodyInertia, gravity: Tensor) -> Totals:
+    """Momentum and energy of all bodies.
+
+    Args:
+        poses: Of the body frames, [B, K, 7].
+        velocities: Of the centers, then of rotation, in world axes; [B, K, 6].
+        inertia: What the bodies weigh.
+        gravity: [B or 1, 3] m/s^2.
+    """
+    frames = pose_frame(poses)
+    rotation = frames[..., :3, :3]
+    center = frames[..., :3, 3] + times(rotation, inertia.center)
+    spin = times(rotation.transpose(-1, -2), velocities[..., 3:])
+    angular = times(rotation, times(inertia.inertia, spin))
+    momenta = torch.cat([inertia.mass[..., None] * velocities[..., :3], angular], dim=-1)
+    kinetic = ordered_sum((momenta * velocities).flatten(-2)) / 2
+    return Totals.of(center, momenta, kinetic, inertia.mass, gravity)
 
 
 def advance_bodies(

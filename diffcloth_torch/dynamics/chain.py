@@ -30,12 +30,14 @@ from diffcloth_torch.dynamics.inertia import (
     Inertia,
     Motion,
     generalized_force,
+    link_momenta,
     mass_matrix,
     momentum,
     slope,
     wrenches_of_forces,
 )
 from diffcloth_torch.dynamics.kinematics import ROOT, Tree, root_frame
+from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.errors import SimulationError
 from diffcloth_torch.geometry.products import times
 from diffcloth_torch.geometry.rotation import (
@@ -47,6 +49,7 @@ from diffcloth_torch.geometry.rotation import (
     quaternion_multiply,
     rotation_exp,
 )
+from diffcloth_torch.model.kinematics import pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
 
 __all__ = ["Chain", "ChainControl", "ChainPrediction", "ChainState"]
@@ -189,7 +192,7 @@ class Chain:
             contact: Forces on the vertices that act like the others, [B, V, 3] N.
         """
         drives = self._drives(gains, control)
-        inertia = inertia._replace(armature=~self._prescribed * inertia.armature)
+        inertia = self._with_forced_armature(inertia)
         local = inertia.center[..., self._tree.root, :]
         quaternion = torch.nn.functional.normalize(state.pose[..., 3:], dim=-1)
         start = _Configuration(*_placed(state.pose[..., :3], quaternion, local), state.joints)
@@ -283,7 +286,36 @@ class Chain:
         root_velocity, rates = torch.split(velocity, [ROOT, velocity.shape[-1] - ROOT], dim=-1)
         return ChainState(pose, root_velocity, joints, rates), efforts
 
+    def totals(self, state: ChainState, inertia: Inertia, gravity: Tensor) -> Totals:
+        """Momentum and energy of a state; none where no force moves the robot.
+
+        Args:
+            state: Where the robot is, and how it moves.
+            inertia: What links and joints weigh.
+            gravity: [B or 1, 3] m/s^2.
+        """
+        if not self.mechanism.is_dynamic:
+            return Totals.zero(len(state.pose))
+        inertia = self._with_forced_armature(inertia)
+        motion = Motion.at(self._tree, inertia, pose_frame(state.pose), state.joints)
+        velocity = self._velocity(state)
+        # T = p . nu / 2
+        kinetic = ordered_sum(momentum(motion, inertia, velocity) * velocity) / 2
+        momenta = link_momenta(motion, velocity)
+        return Totals.of(motion.frames.centers, momenta, kinetic, inertia.mass, gravity)
+
     # Constituents
+
+    def _with_forced_armature(self, inertia: Inertia) -> Inertia:
+        """Drives of prescribed joints are part of what prescribes them."""
+        return inertia._replace(armature=~self._prescribed * inertia.armature)
+
+    def _velocity(self, state: ChainState) -> Tensor:
+        """Velocities nu, [B, 6 + J]."""
+        root = state.velocity
+        if self.mechanism.base == "fixed":
+            root = torch.zeros_like(root)
+        return torch.cat([root, state.rates], dim=-1)
 
     def _drives(self, gains: Gains, control: ChainControl) -> Drives:
         """Zero what the actuation of a joint does not use."""
@@ -330,11 +362,7 @@ class Chain:
         acting = acting + generalized_force(here, weights)
         if contact is not None:
             acting = acting + self._generalized(here, contact)
-        root = state.velocity
-        if self.mechanism.base == "fixed":
-            root = torch.zeros_like(root)
-        before = torch.cat([root, state.rates], dim=-1)
-        return momentum(here, inertia, before) + self._dt * acting
+        return momentum(here, inertia, self._velocity(state)) + self._dt * acting
 
     def _inertial(self, inertia: Inertia, at: _Configuration) -> Tensor:
         """M/h^2 of the coordinates, [B, n, n]."""

@@ -12,11 +12,13 @@ from diffcloth_torch.dynamics.bodies import (
     BodyInertia,
     BodyPrediction,
     advance_bodies,
+    body_totals,
     predict_bodies,
 )
 from diffcloth_torch.dynamics.chain import Chain, ChainControl, ChainPrediction, ChainState
 from diffcloth_torch.dynamics.drives import Gains
 from diffcloth_torch.dynamics.inertia import Inertia
+from diffcloth_torch.dynamics.totals import Totals
 from diffcloth_torch.geometry.rotation import (
     quaternion_exp,
     quaternion_multiply,
@@ -238,6 +240,52 @@ class Dynamics:
             ),
         }
 
+    def totals(self, state: Fields, parameters: Fields) -> Totals:
+        """Momentum and energy of what forces move, bodies and robots.
+
+        Args:
+            state: Fields of a state, each with a leading axis B.
+            parameters: As for `predict`.
+        """
+        gravity = parameters["gravity"].reshape(-1, 3)
+        free = self._free
+        result = Totals.zero(len(state["body_poses"]))
+        if len(free):
+            poses, velocities = state["body_poses"][:, free], state["body_velocities"][:, free]
+            result = body_totals(poses, velocities, self._body_inertia(parameters), gravity)
+        for i, chain in enumerate(self._chains):
+            of_chain = chain.totals(
+                self._chain_state(i, state), self._chain_inertia(i, parameters), gravity
+            )
+            result = result.plus(of_chain)
+        return result
+
+    def _body_inertia(self, parameters: Fields) -> BodyInertia:
+        free = self._free
+        return BodyInertia(
+            mass=parameters["body_mass"][:, free],
+            center=parameters["body_center"][:, free],
+            inertia=_symmetric(parameters["body_inertia"][:, free]),
+        )
+
+    def _chain_inertia(self, i: int, parameters: Fields) -> Inertia:
+        joints, links, _ = self._chain_rows[i]
+        return Inertia(
+            mass=_rows(parameters, "link_mass", links),
+            center=_rows(parameters, "link_center", links, 3),
+            inertia=_symmetric(_rows(parameters, "link_inertia", links, 3, 3)),
+            armature=_rows(parameters, "joint_armature", joints),
+        )
+
+    def _chain_state(self, i: int, state: Fields) -> ChainState:
+        joints = self._chain_rows[i][0]
+        return ChainState(
+            pose=state["base_poses"][:, i],
+            velocity=state["base_velocities"][:, i],
+            joints=state["joint_positions"][:, joints],
+            rates=state["joint_velocities"][:, joints],
+        )
+
     def _predict_bodies(
         self,
         state: Fields,
@@ -251,11 +299,7 @@ class Dynamics:
             return None
         poses, velocities = state["body_poses"][:, free], state["body_velocities"][:, free]
         wrenches = control["body_wrenches"][:, free]
-        inertia = BodyInertia(
-            mass=parameters["body_mass"][:, free],
-            center=parameters["body_center"][:, free],
-            inertia=_symmetric(parameters["body_inertia"][:, free]),
-        )
+        inertia = self._body_inertia(parameters)
         if contact is not None:
             turned = torch.nn.functional.normalize(poses[..., 3:], dim=-1)
             wrenches = wrenches + self._wrenches(turned, inertia.center, contact)
@@ -270,25 +314,14 @@ class Dynamics:
         gravity: Tensor,
         contact: Tensor | None,
     ) -> ChainPrediction:
-        chain, (joints, links, vertices) = self._chains[i], self._chain_rows[i]
-        inertia = Inertia(
-            mass=_rows(parameters, "link_mass", links),
-            center=_rows(parameters, "link_center", links, 3),
-            inertia=_symmetric(_rows(parameters, "link_inertia", links, 3, 3)),
-            armature=_rows(parameters, "joint_armature", joints),
-        )
+        joints, _, vertices = self._chain_rows[i]
         gains = Gains(
             stiffness=_rows(parameters, "joint_stiffness", joints),
             damping=_rows(parameters, "joint_damping", joints),
             viscosity=_rows(parameters, "joint_viscosity", joints),
         )
-        return chain.predict(
-            ChainState(
-                pose=state["base_poses"][:, i],
-                velocity=state["base_velocities"][:, i],
-                joints=state["joint_positions"][:, joints],
-                rates=state["joint_velocities"][:, joints],
-            ),
+        return self._chains[i].predict(
+            self._chain_state(i, state),
             ChainControl(
                 pose=control["base_poses"][:, i],
                 wrench=control["base_wrenches"][:, i],
@@ -296,7 +329,7 @@ class Dynamics:
                 rates=control["joint_velocities"][:, joints],
                 efforts=control["joint_efforts"][:, joints],
             ),
-            inertia,
+            self._chain_inertia(i, parameters),
             gains,
             gravity,
             None if contact is None else contact[:, vertices],

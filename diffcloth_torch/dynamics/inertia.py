@@ -24,12 +24,14 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.dynamics.kinematics import Frames, Tree
+from diffcloth_torch.dynamics.totals import about_origin
 from diffcloth_torch.geometry.products import times
 
 __all__ = [
     "Inertia",
     "Motion",
     "generalized_force",
+    "link_momenta",
     "mass_matrix",
     "momentum",
     "slope",
@@ -84,9 +86,14 @@ def mass_matrix(motion: Motion, inertia: Inertia) -> Tensor:
     return matrix + torch.diag_embed(_at_joints(inertia.armature))
 
 
+def link_momenta(motion: Motion, velocity: Tensor) -> Tensor:
+    """h_l of velocities nu [B, 6 + J]: linear, then angular about the centers; [B, L, 6]."""
+    return times(motion.weighted, velocity[..., None, :])
+
+
 def momentum(motion: Motion, inertia: Inertia, velocity: Tensor) -> Tensor:
     """M nu of velocities nu [B, 6 + J], likewise."""
-    of_links = times(motion.weighted, velocity[..., None, :])
+    of_links = link_momenta(motion, velocity)
     return generalized_force(motion, of_links) + _at_joints(inertia.armature) * velocity
 
 
@@ -98,10 +105,11 @@ def slope(tree: Tree, motion: Motion, velocity: Tensor) -> Tensor:
         motion: Its links.
         velocity: nu.
     """
-    frames, nu = motion.frames, velocity[..., None, :]
-    twists = times(motion.jacobian, nu)  # [B, L, 6]
-    linear, angular = torch.split(times(motion.weighted, nu), 3, dim=-1)
-    carried = torch.cat([linear, angular + torch.linalg.cross(frames.centers, linear)], dim=-1)
+    frames = motion.frames
+    twists = times(motion.jacobian, velocity[..., None, :])  # [B, L, 6]
+    momenta = link_momenta(motion, velocity)
+    linear = momenta[..., :3]
+    carried = about_origin(frames.centers, momenta)
     # Of all that hangs on each joint, first about the origin, then about the pivot.
     F, N = torch.split(tree.hanging @ carried, 3, dim=-1)
     N = N - torch.linalg.cross(frames.pivots, F)

@@ -172,7 +172,8 @@ class Cloth:
         return cls(placed, faces, **keywords)
 
     def __repr__(self) -> str:
-        return f"Cloth({self.name!r}, {len(self.vertices)} vertices, {len(self.faces)} faces)"
+        name = "" if self.name is None else f"{self.name!r}, "
+        return f"Cloth({name}{len(self.vertices)} vertices, {len(self.faces)} faces)"
 
     def __getstate__(self) -> dict[str, Any]:
         plain = {"pins": dict(self.pins), "soft_pins": dict(self.soft_pins)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from diffcloth_torch.checks import (
@@ -13,6 +13,7 @@ from diffcloth_torch.checks import (
     frozen,
 )
 from diffcloth_torch.model.quantities import FACE_QUANTITIES, PARAMETERS, check_parameter
+from diffcloth_torch.reprs import field_text, record_text
 
 __all__ = ["Material"]
 
@@ -49,6 +50,11 @@ class Material:
             self._keep(field, frozen(values) if values.ndim else float(values))
         for field in ("friction", "thickness"):
             self._keep(field, check_parameter("Material", field, getattr(self, field)))
+
+    def __repr__(self) -> str:
+        return record_text(
+            "Material", (field_text(f.name, getattr(self, f.name)) for f in fields(self))
+        )
 
     def _keep(self, field: str, value: Any) -> None:
         object.__setattr__(self, field, value)

@@ -315,4 +315,5 @@ class RigidBody:
         return cls._of(Primitive("plane", (0.0, 0.0, 0.0)), mesh, **keywords)
 
     def __repr__(self) -> str:
-        return f"RigidBody({self.name!r}, {self.motion}, {len(self.faces)} faces)"
+        name = "" if self.name is None else f"{self.name!r}, "
+        return f"RigidBody({name}{self.motion}, {len(self.faces)} faces)"

@@ -245,8 +245,9 @@ class Robot:
         return dict(zip(self.link_names, frames.unbind(-3), strict=True))
 
     def __repr__(self) -> str:
+        name = "" if self.name is None else f"{self.name!r}, "
         return (
-            f"Robot({self.name!r}, {self.mechanism.base}, {len(self.joint_names)} joints, "
+            f"Robot({name}{self.mechanism.base} base, {len(self.joint_names)} joints, "
             f"{len(self.link_names)} links)"
         )
 

@@ -17,6 +17,10 @@ GRIPPER = Path(__file__).with_name("gripper.urdf")
 _PANDA = "robots/panda_description/urdf/panda.urdf"
 
 
+def __dir__() -> list[str]:
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]
+
+
 def panda() -> tuple[Path, Path]:
     """Find the Panda: its URDF file, and the `mesh_root` to load it with.
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, is_dataclass, replace
 from typing import Any
 
 from torch import Tensor
 
 from diffcloth_torch._moved import allow_loading
+from diffcloth_torch.model.quantities import CONTROL, PARAMETERS
+from diffcloth_torch.reprs import field_text, record_text
 from diffcloth_torch.sim.state import check_field_names
 
 __all__ = ["Control", "Parameters", "tensors_of"]
@@ -53,6 +55,9 @@ class Control:
     joint_efforts: Tensor | Mapping[str, Tensor] | None = None
     base_poses: Tensor | Mapping[str, Tensor] | None = None
     base_wrenches: Tensor | Mapping[str, Tensor] | None = None
+
+    def __repr__(self) -> str:
+        return _text(self, CONTROL)
 
     def replace(self, **changes: Any) -> Control:
         """Copy with some fields replaced."""
@@ -122,11 +127,21 @@ class Parameters:
     # Fields that a simulator made without a batch axis: their [C] or [F] is never taken for [B].
     _unbatched: tuple[str, ...] = field(default=(), repr=False)
 
+    def __repr__(self) -> str:
+        return _text(self, PARAMETERS)
+
     def replace(self, **changes: Any) -> Parameters:
         """Copy with some fields replaced."""
         check_field_names("Parameters.replace", self, changes)
         unbatched = tuple(name for name in self._unbatched if name not in changes)
         return replace(self, **changes, _unbatched=unbatched)
+
+
+def _text(record: Control | Parameters, names: Iterable[str]) -> str:
+    """What is set in a record."""
+    values = ((name, getattr(record, name)) for name in names)
+    parts = (field_text(name, value) for name, value in values if value is not None)
+    return record_text(type(record).__name__, parts)
 
 
 def tensors_of(record: Any) -> Iterator[Tensor]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.checks import FloatArray, IndexArray
+from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.coupling import added_mass_numbers, cloth_to_rigid, rigid_to_cloth
 from diffcloth_torch.dynamics.dynamics import Dynamics, Prediction
 from diffcloth_torch.errors import AddedMassWarning, InfeasibleMotion
@@ -20,6 +20,7 @@ from diffcloth_torch.sim.cores import CoreOptions, make_core, with_all_pinned, w
 from diffcloth_torch.sim.inputs import Fields
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.links import link_poses
+from diffcloth_torch.sim.masses import vertex_masses
 from diffcloth_torch.sim.step import CONVERGED, Outcome, as_array, take_step
 
 __all__ = ["Staggered"]
@@ -77,7 +78,6 @@ class Staggered:
         # Nothing moves by itself there: a step succeeds where a motion is free of collisions.
         pinned = with_all_pinned(assembly)
         self._judge = make_core(pinned, coupled, limit_stiffness, all_prescribed=True)
-        self._face_area = _face_areas(assembly.rest_vertices, assembly.faces)
         self._warned = False
 
     def step(
@@ -198,7 +198,7 @@ class Staggered:
                 self._surface_frames(after),
                 self._surface_masses(parameters),
                 cloth.positions,
-                self._vertex_masses(parameters["density"]),
+                vertex_masses(assembly, parameters),
                 cloth.body_forces,
                 parameters["barrier_distance"].reshape(-1),
                 self._dt,
@@ -232,22 +232,6 @@ class Staggered:
         links = parameters.get("link_mass", links)[:, layout.shaped_links]
         environments = max(len(bodies), len(links))
         return torch.cat([m.expand(environments, -1) for m in (bodies, links)], dim=1)
-
-    def _vertex_masses(self, density: Tensor) -> Tensor:
-        """Masses of the cloths' vertices [B or 1, N] from densities [B or 1, 1 or C or F]."""
-        assembly = self._layout.assembly
-        if density.shape[1] == assembly.cloth_count:
-            counts = torch.from_numpy(np.diff(assembly.cloth_face_start)).long()
-            density = density.repeat_interleave(counts, dim=1)
-        corners = torch.from_numpy(assembly.faces).long().flatten()
-        parts = (density * self._face_area / 3).repeat_interleave(3, dim=1)
-        zeros = torch.zeros(len(parts), len(assembly.vertices), dtype=torch.float64)
-        return zeros.index_add(1, corners, parts)
-
-
-def _face_areas(rest: FloatArray, faces: IndexArray) -> Tensor:
-    a, b, c = (rest[faces[:, i]] for i in range(3))
-    return torch.from_numpy(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
 
 def _merged(cloth: dict[str, Any], rigid: dict[str, Any]) -> dict[str, Any]:

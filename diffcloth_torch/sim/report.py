@@ -12,8 +12,9 @@ from torch import Tensor
 
 from diffcloth_torch._moved import allow_loading
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.reprs import record_text, value_text
 
-__all__ = ["Report"]
+__all__ = ["Report", "outcome_text"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +71,21 @@ class Report:
         self.__dict__.update({"counts": {}} | state)
         self.__post_init__()
 
+    def __repr__(self) -> str:
+        parts = [
+            f"{entry.name}={_range_text(getattr(self, entry.name))}"
+            for entry in fields(Report)
+            if entry.name not in _TABLES
+        ]
+        for table in _TABLES:
+            # What never happened is left out.
+            texts = {name: _range_text(number) for name, number in getattr(self, table).items()}
+            entries = [f"{name}: {text}" for name, text in texts.items() if text != "0"] or [""]
+            entries[0] = f"{table}={{{entries[0]}"
+            entries[-1] += "}"
+            parts += entries
+        return record_text("Report", parts)
+
     def check_environments(self, owner: str, count: int | None) -> None:
         """Require tensors of shape [count], or numbers where there is no batch axis."""
         shape = [] if count is None else [count]
@@ -111,6 +127,24 @@ def _tensor(value: Any) -> Tensor:
     return (
         torch.tensor(value, dtype=torch.float64) if type(value) is float else torch.as_tensor(value)
     )
+
+
+def outcome_text(report: Report | None) -> str:
+    """A report within another text."""
+    if report is None:
+        return "None"
+    names = ("converged", "iterations")
+    return f"Report({', '.join(f'{n}={_range_text(getattr(report, n))}' for n in names)}, ...)"
+
+
+def _range_text(values: Any) -> str:
+    """A number, or what the numbers of a batch range over."""
+    if not isinstance(values, Tensor) or values.dim() == 0 or values.numel() == 0:
+        return value_text(values)
+    if values.dtype == torch.bool and values.any() and not values.all():
+        return f"{int(values.sum())} of {values.numel()}"
+    low, high = (value_text(values.aminmax()[i].item()) for i in range(2))
+    return low if low == high else f"{low} .. {high}"
 
 
 # Fields that hold several numbers by name.

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import wraps
 from itertools import pairwise
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Literal, ParamSpec, TypeVar, overload
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from diffcloth_torch.checks import (
     POSITIVE,
+    check_bool,
     check_choice,
     check_count,
     check_number,
@@ -22,6 +23,7 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.dynamics.dynamics import Dynamics, Prediction
 from diffcloth_torch.dynamics.limits import limit_stiffness
+from diffcloth_torch.dynamics.totals import Totals
 from diffcloth_torch.errors import IntersectingState, InvalidInput
 from diffcloth_torch.model.defaults import (
     check_barrier,
@@ -48,6 +50,7 @@ from diffcloth_torch.sim.inputs import (
 )
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.links import contact_wrenches, link_poses, link_velocities
+from diffcloth_torch.sim.masses import cloth_totals, vertex_masses
 from diffcloth_torch.sim.motion import held_targets, prescribed_motion
 from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.rollout import roll_out
@@ -206,7 +209,8 @@ class Simulator:
         return _restore, arguments
 
     def __repr__(self) -> str:
-        return f"Simulator({self.scene!r}, dt={self.dt:g}, scheme={self.scheme!r})"
+        coupling = "" if self.coupling == "monolithic" else f", coupling={self.coupling!r}"
+        return f"Simulator({self.scene!r}, dt={self.dt:g}, scheme={self.scheme!r}{coupling})"
 
     @_memory_errors
     def initial_state(self, batch_size: int | None = None) -> State:
@@ -465,23 +469,101 @@ class Simulator:
         centers = [self._centers(owner, parameters, batch) for owner in ("body", "link")]
         return _unbatched(contact_wrenches(self._layout, fields, forces, *centers), batch)
 
+    def _totals(self, state: Fields, parameters: Fields) -> Totals:
+        """Momentum and energy of all that has mass."""
+        totals = cloth_totals(self._assembly, state, parameters)
+        if self._dynamics is not None:
+            totals = totals.plus(self._dynamics.totals(state, parameters))
+        return totals
+
     def _centers(self, owner: str, parameters: Parameters | None, batch: int | None) -> Tensor:
         """Centers of mass of bodies or links, zero where nothing is dynamic; [B or 1, rows, 3]."""
         fields = self._physical(parameters, batch)
         rows = self._assembly.sizes["K" if owner == "body" else "L"]
         return fields.get(f"{owner}_center", torch.zeros(1, rows, 3, dtype=torch.float64))
 
-    def energy(self, state: State, parameters: Parameters | None = None) -> Tensor:
-        """Elastic energy, gravity, soft pins and barrier at the positions of a state [J].
+    def vertex_masses(
+        self, parameters: Parameters | None = None, *, batch_size: int | None = None
+    ) -> Tensor:
+        """Masses of the cloths' vertices, differentiable in density and rest shape.
 
         Args:
-            state: Where things are. It must not require a gradient: there is none.
+            parameters: Physical parameters; None takes those of the scene.
+            batch_size: Number of environments, >= 1; needed where parameters have a batch axis.
+
+        Returns:
+            A third of the mass of each face around a vertex [kg], shape [N], or [B, N] in a batch.
+        """
+        if batch_size is not None:
+            check_count("vertex_masses: `batch_size`", batch_size, 1)
+        masses = vertex_masses(self._assembly, self._physical(parameters, batch_size))
+        return _own_copy(masses, batch_size)
+
+    def momentum(self, state: State, parameters: Parameters | None = None) -> Tensor:
+        """Momentum of all that has mass, differentiable in both arguments.
+
+        That is cloths with their pinned vertices, dynamic bodies, and whole robots of which forces
+        move at least a part. Bodies and robots that only follow prescribed motion have no mass.
+
+        Args:
+            state: Where things are, and how they move.
             parameters: Physical parameters; None takes those of the scene.
 
         Returns:
-            Energy, shape [], or [B] in a batch.
+            Linear momentum, then angular momentum about the origin of the world [kg m/s,
+            kg m^2/s], shape [6], or [B, 6] in a batch.
         """
-        inputs, batch = self._inputs(state, None, parameters)
+        fields, batch = state_fields(self._layout, state)
+        result = self._totals(fields, self._physical(parameters, batch)).momentum
+        return result if batch is not None else result[0]
+
+    def kinetic_energy(self, state: State, parameters: Parameters | None = None) -> Tensor:
+        """Kinetic energy of what `momentum` counts, differentiable in both arguments.
+
+        The inertia of drives, `joint_armature`, adds its part at joints that forces move.
+
+        Args:
+            state: Where things are, and how they move.
+            parameters: Physical parameters; None takes those of the scene.
+
+        Returns:
+            Energy [J], shape [], or [B] in a batch.
+        """
+        fields, batch = state_fields(self._layout, state)
+        result = self._totals(fields, self._physical(parameters, batch)).kinetic_energy
+        return result if batch is not None else result[0]
+
+    @overload
+    def energy(
+        self, state: State, parameters: Parameters | None = None, *, parts: Literal[False] = False
+    ) -> Tensor: ...
+
+    @overload
+    def energy(
+        self, state: State, parameters: Parameters | None = None, *, parts: Literal[True]
+    ) -> dict[str, Tensor]: ...
+
+    def energy(
+        self, state: State, parameters: Parameters | None = None, *, parts: bool = False
+    ) -> Tensor | dict[str, Tensor]:
+        """Potential energy at the positions of a state: elasticity, soft pins, gravity, contact.
+
+        Gravity is that of cloths, and of the bodies and robots that `momentum` counts; it is zero
+        at the origin of the world. What drives and stops of joints store is left out.
+
+        Args:
+            state: Where things are. It must not require a gradient: there is none.
+            parameters: Physical parameters; None takes those of the scene. They must not require a
+                gradient either.
+            parts: Whether to return what adds up to the energy.
+
+        Returns:
+            Energy [J], shape [], or [B] in a batch; with `parts` a dict of such tensors:
+            "stretch", "bending", "soft_pins", "contact" (the barrier's) and "gravity".
+        """
+        check_bool("energy: `parts`", parts)
+        fields, batch = self._fields(state, None, parameters)
+        inputs = self._core_inputs(*fields, self._predict(*fields))
         if torch.is_grad_enabled():
             for name, tensor in inputs.items():
                 if tensor.requires_grad:
@@ -489,8 +571,16 @@ class Simulator:
                         f"energy: `{name}` must not require a gradient, energy has none; "
                         "call it under torch.no_grad() or with a detached state"
                     )
-        energies = torch.from_numpy(self._core.energy(_arrays(inputs)))
-        return energies if batch is not None else energies[0]
+        stored = self._core.stored_energy(_arrays(inputs))
+        energies = {name: torch.from_numpy(values) for name, values in stored.items()}
+        before, _, physical = fields
+        with torch.no_grad():
+            energies["gravity"] = self._totals(before, physical).gravity_energy
+        energies = _unbatched(energies, batch)
+        if parts:
+            return energies
+        first, *rest = energies.values()
+        return sum(rest, first)
 
     def path(
         self,
@@ -658,6 +748,6 @@ def _unbatched(named: dict[str, Tensor], batch: int | None) -> dict[str, Tensor]
 
 
 def _own_copy(tensor: Tensor, batch: int | None) -> Tensor:
-    """Copy rows [nb, ...] of the inputs, so that the new state shares no storage with them."""
+    """Copy rows [nb, ...], so that what a caller gets shares no storage with them."""
     rows = tensor[0] if batch is None else tensor.expand(batch, *tensor.shape[1:])
     return rows.clone(memory_format=torch.contiguous_format)

@@ -21,7 +21,8 @@ from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.quantities import STATE, shape_of
 from diffcloth_torch.model.robot import Robot
 from diffcloth_torch.model.scene import Assembly, Scene
-from diffcloth_torch.sim.report import Report
+from diffcloth_torch.reprs import field_text, record_text
+from diffcloth_torch.sim.report import Report, outcome_text
 
 __all__ = ["State", "Surfaces", "check_field_names", "stack", "where"]
 
@@ -173,6 +174,16 @@ class State:
         # States that the first version saved have no robots, and bodies without velocities.
         self.__dict__.update(state)
         self.__post_init__()
+
+    def __repr__(self) -> str:
+        # What a scene lacks has no rows, and is left out.
+        tensors = {name: getattr(self, name) for name in ("time", *_TENSORS)}
+        there = {n: t for n, t in tensors.items() if not isinstance(t, Tensor) or t.numel()}
+        parts = [field_text(name, value) for name, value in there.items()]
+        parts.append(f"report={outcome_text(self.report)}")
+        if self.batch_size is not None:
+            parts.insert(0, f"batch_size={self.batch_size}")
+        return record_text("State", parts)
 
     @property
     def batch_size(self) -> int | None:

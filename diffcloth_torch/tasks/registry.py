@@ -16,7 +16,7 @@ from diffcloth_torch.tasks.push_cube import PushCube
 from diffcloth_torch.tasks.task import Task
 from diffcloth_torch.tasks.two_cloths import TwoCloths
 
-__all__ = ["TASKS", "check_document", "load_config", "load_task", "make_task"]
+__all__ = ["TASKS", "check_document", "load_task", "make_task", "read_config"]
 
 TASKS: dict[str, Any] = {
     "drape": Drape,
@@ -29,7 +29,7 @@ TASKS: dict[str, Any] = {
 """Name -> class with a `Config` and a constructor that takes one and the path it was read from."""
 
 
-def load_config(path: str | Path, assignments: Iterable[str] = ()) -> RunConfig:
+def read_config(path: str | Path, assignments: Iterable[str] = ()) -> RunConfig:
     """Read a configuration, change values and check it against the schema of its task.
 
     Args:
@@ -69,4 +69,4 @@ def make_task(config: RunConfig, path: str | Path) -> Task:
 
 def load_task(path: str | Path, assignments: Iterable[str] = ()) -> Task:
     """Read a configuration and build what it describes."""
-    return make_task(load_config(path, assignments), path)
+    return make_task(read_config(path, assignments), path)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -14,7 +14,7 @@ from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.optimization import Controller, OptimizerSection
 from diffcloth_torch.viewers.look import Goal
 
-__all__ = ["Controller", "Optimizable", "Task"]
+__all__ = ["Controller", "LoadedConfig", "Optimizable", "Task"]
 
 
 class Task(Protocol):
@@ -58,3 +58,23 @@ class Optimizable(Task, Protocol):
     def loss(self, states: Sequence[State]) -> Tensor:
         """Loss of the states after each step, shape []."""
         ...
+
+
+class LoadedConfig(NamedTuple):
+    """What a configuration describes.
+
+    Attributes:
+        scene: Cloths, bodies and robots.
+        simulator: Steps the scene.
+        task: How the scene is controlled, and what it aims at.
+    """
+
+    scene: Scene
+    simulator: Simulator
+    task: Task
+
+    def __repr__(self) -> str:
+        return (
+            f"LoadedConfig({self.simulator!r}, task={self.task.config.task!r}, "
+            f"{self.task.steps} steps)"
+        )

@@ -1,0 +1,68 @@
+"""Momentum and energy of all that moves in a scene: sums over points, bodies and links."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+__all__ = ["Totals", "about_origin", "ordered_sum"]
+
+
+class Totals(NamedTuple):
+    """Of each environment.
+
+    Attributes:
+        momentum: Linear, then angular about the origin of the world [kg m/s, kg m^2/s], [B, 6].
+        kinetic_energy: [B] J.
+        gravity_energy: Of weights, zero at the origin of the world, [B] J.
+    """
+
+    momentum: Tensor
+    kinetic_energy: Tensor
+    gravity_energy: Tensor
+
+    @staticmethod
+    def of(
+        centers: Tensor, momenta: Tensor, kinetic_energy: Tensor, masses: Tensor, gravity: Tensor
+    ) -> Totals:
+        """Sum up points, bodies or links.
+
+        Args:
+            centers: [B, n, 3] m.
+            momenta: Linear, then angular about the centers, [B, n, 6].
+            kinetic_energy: Of all, [B] J.
+            masses: [B or 1, n] kg.
+            gravity: [B or 1, 3] m/s^2.
+        """
+        weights = masses[..., None] * gravity[:, None]
+        return Totals(
+            momentum=ordered_sum(about_origin(centers, momenta).transpose(-1, -2)),
+            kinetic_energy=kinetic_energy,
+            gravity_energy=-ordered_sum((weights * centers).flatten(-2)),
+        )
+
+    @staticmethod
+    def zero(environments: int) -> Totals:
+        """Where nothing moves."""
+        zeros = torch.zeros(environments, 6, dtype=torch.float64)
+        return Totals(zeros, zeros[:, 0], zeros[:, 0])
+
+    def plus(self, other: Totals) -> Totals:
+        """Of both."""
+        return Totals(*(a + b for a, b in zip(self, other, strict=True)))
+
+
+def ordered_sum(values: Tensor) -> Tensor:
+    """Sum over the last axis, one number after the other.
+
+    `sum` would round by how many environments and threads there are.
+    """
+    return values.cumsum(-1)[..., -1]
+
+
+def about_origin(centers: Tensor, momenta: Tensor) -> Tensor:
+    """Momenta [.., 6] about centers [.., 3], about the origin of the world."""
+    linear, angular = torch.split(momenta, 3, dim=-1)
+    return torch.cat([linear, angular + torch.linalg.cross(centers, linear)], dim=-1)

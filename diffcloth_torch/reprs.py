@@ -1,0 +1,65 @@
+"""Records in a few lines: numbers where there are few, else dtype and shape."""
+
+from __future__ import annotations
+
+import reprlib
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloth_torch.checks import is_dense
+
+__all__ = ["field_text", "record_text", "value_text"]
+
+_MOST_NUMBERS = 4
+_LINE = 88
+
+
+def value_text(value: object) -> str:
+    """A value in a few words; `(grad)` follows a tensor that requires a gradient."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Tensor):
+        shape = "[nested]" if value.is_nested else str(list(value.shape))
+        text = f"{str(value.dtype).removeprefix('torch.')}{shape}"
+        if is_dense(value) and value.device.type == "cpu" and value.numel() <= _MOST_NUMBERS:
+            text = _numbers_text(value.detach()) if value.numel() else text
+        return f"{text} (grad)" if value.requires_grad else text
+    if isinstance(value, np.ndarray):
+        if 0 < value.size <= _MOST_NUMBERS:
+            return _numbers_text(value)
+        return f"{value.dtype}{list(value.shape)}"
+    if isinstance(value, Mapping):
+        entries = (f"{name!r}: {value_text(entry)}" for name, entry in value.items())
+        return f"{{{', '.join(entries)}}}"
+    return reprlib.repr(value)
+
+
+def field_text(name: str, value: object) -> str:
+    """A field and its value."""
+    return f"{name}={value_text(value)}"
+
+
+def record_text(kind: str, parts: Iterable[str]) -> str:
+    """What a record holds, broken between its parts into lines."""
+    first, *rest = [*parts, ""]
+    lines = [f"{kind}({first}"]
+    for part in rest[:-1]:
+        lines[-1] += ","
+        if len(lines[-1]) + len(part) + 1 < _LINE:
+            lines[-1] += f" {part}"
+        else:
+            lines.append(f"    {part}")
+    return "\n".join(lines) + ")"
+
+
+def _numbers_text(values: Tensor | NDArray[Any]) -> str:
+    def text(nested: Any) -> str:
+        if isinstance(nested, list):
+            return f"[{', '.join(map(text, nested))}]"
+        return value_text(nested)
+
+    return text(values.tolist())

@@ -1,0 +1,138 @@
+"""What public objects say of themselves: a few lines, and what is there."""
+
+import numpy as np
+import pytest
+import torch
+
+import diffcloth_torch as dc
+
+F64 = torch.float64
+FEW = 10  # lines, of at most the width of a terminal
+WIDTH = 100
+
+
+@pytest.fixture(scope="module")
+def simulator():
+    cloth = dc.Cloth.grid(
+        24, 24, pins={"edge": range(24)}, pose=[0, 0, 1, 1, 0, 0, 0], name="sheet"
+    )
+    bodies = [
+        dc.RigidBody.sphere(0.2, motion="dynamic", mass=1.0, pose=[0, 0, -1, 1, 0, 0, 0]),
+        dc.RigidBody.plane(4.0, pose=[0, 0, -2, 1, 0, 0, 0], name="floor"),
+    ]
+    hand = dc.Robot.load(dc.robots.GRIPPER, pose=[0, 0, 3, 1, 0, 0, 0], actuation="torque")
+    return dc.Simulator(dc.Scene([cloth], bodies, [hand]), 0.01)
+
+
+@pytest.fixture(scope="module")
+def state(simulator):
+    with torch.no_grad():
+        return simulator.step(simulator.initial_state())
+
+
+def lines(record):
+    text = repr(record).splitlines()
+    assert len(text) <= FEW, repr(record)
+    assert max(map(len, text)) <= WIDTH, repr(record)
+    assert "tensor(" not in repr(record)
+    return " ".join(line.strip() for line in text)
+
+
+def test_a_state_says_time_shapes_and_how_the_step_went(simulator, state):
+    text = lines(state)
+    assert text.startswith("State(time=0.01, positions=float64[576, 3], velocities=float64[576, 3]")
+    assert "body_poses=float64[2, 7]" in text
+    assert "joint_positions=[" in text
+    assert f"report=Report(converged=True, iterations={state.report.iterations}, ...))" in text
+    assert "soft_pin_targets" not in text  # there are none
+    assert "report=None" in lines(simulator.initial_state())
+
+
+def test_a_batch_says_so(simulator):
+    text = lines(simulator.initial_state(64))
+    assert text.startswith("State(batch_size=64, time=float64[64], positions=float64[64, 576, 3]")
+    one = lines(simulator.initial_state(1))
+    assert one.startswith("State(batch_size=1, time=[0]")
+
+
+def test_parameters_say_numbers_and_shapes(simulator):
+    given = simulator.parameters()
+    text = lines(given)
+    assert text.startswith("Parameters(stretch=550, bending=1e-05, poisson=0.3, density=0.124")
+    assert "gravity=[0, 0, -9.81]" in text
+    assert "rest_positions=float64[576, 3]" in text
+    assert "None" not in text
+    assert "pin_stiffness" not in text
+    faces = torch.full((1058,), 2.0, dtype=F64, requires_grad=True)
+    asked = given.replace(stretch=faces, bending=torch.tensor(0.5, requires_grad=True))
+    assert "stretch=float64[1058] (grad), bending=0.5 (grad)" in lines(asked)
+    assert repr(dc.Parameters()) == "Parameters()"
+
+
+def test_a_control_says_what_is_set(simulator):
+    assert repr(dc.Control()) == "Control()"
+    named = dc.Control(pins={"sheet/edge": torch.zeros(24, 3)}, joint_efforts=[0.5, 1.0])
+    assert repr(named) == "Control(pins={'sheet/edge': float32[24, 3]}, joint_efforts=[0.5, 1.0])"
+
+
+@pytest.mark.filterwarnings("ignore:The PyTorch API of nested tensors")
+def test_what_is_no_tensor_or_not_on_the_cpu_is_said_too(state):
+    """Nothing checks the fields of a record before a step does."""
+    nested = torch.nested.nested_tensor([torch.zeros(2), torch.zeros(3)])
+    for value, text in (
+        (None, "velocities=None"),
+        (torch.zeros(2, device="meta"), "velocities=float32[2]"),
+        (torch.zeros(2, 2).to_sparse(), "velocities=float32[2, 2]"),
+        (nested, "velocities=float32[nested]"),
+        (np.zeros((0, 3)), "velocities=float64[0, 3]"),
+        (np.ones(2), "velocities=[1, 1]"),
+        ([0.0] * 1000, "velocities=[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, ...]"),
+    ):
+        assert text in lines(state.replace(velocities=value))
+
+
+def test_a_report_says_its_numbers(state):
+    text = lines(state.report)
+    assert text.startswith(
+        f"Report(converged=True, iterations={state.report.iterations}, residual="
+    )
+    assert "seconds={detection: " in text
+    counted = [f"{name}: {count}" for name, count in state.report.counts.items() if count]
+    assert text.endswith(f"counts={{{', '.join(counted)}}})")
+    assert "sticking" not in text  # never happened
+
+
+def test_a_report_of_a_batch_says_what_its_numbers_range_over(simulator):
+    falling = simulator.initial_state(2)
+    velocities = falling.velocities.clone()
+    velocities[1] += 0.1 * torch.randn(velocities[1].shape, generator=torch.Generator(), dtype=F64)
+    with torch.no_grad():
+        report = simulator.step(falling.replace(velocities=velocities)).report
+    low, high = sorted(report.iterations.tolist())
+    assert low < high
+    assert f"converged=True, iterations={low} .. {high}, residual=" in lines(report)
+    mixed = dc.Report(**{**vars(report), "converged": torch.tensor([True, False]), "counts": {}})
+    assert lines(mixed).startswith("Report(converged=1 of 2, ")
+    assert lines(mixed).endswith("counts={})")
+
+
+def test_what_a_scene_is_made_of(simulator):
+    cloth, hand = simulator.scene.cloths[0], simulator.scene.robots[0]
+    ball, floor = simulator.scene.bodies
+    assert repr(cloth) == "Cloth('sheet', 576 vertices, 1058 faces)"
+    assert repr(floor) == "RigidBody('floor', static, 2 faces)"
+    assert repr(ball) == f"RigidBody(dynamic, {len(ball.faces)} faces)"
+    assert repr(hand) == "Robot(fixed base, 2 joints, 3 links)"
+    scene = f"Scene(cloths=[{cloth!r}], bodies=[{ball!r}, {floor!r}], robots=[{hand!r}])"
+    assert repr(simulator.scene) == scene
+    assert repr(simulator) == f"Simulator({scene}, dt=0.01, scheme='coupled')"
+    with_faces = dc.Material(stretch=np.linspace(1, 2, 1058), friction=0.25)
+    assert lines(with_faces) == (
+        "Material(stretch=float64[1058], bending=1e-05, poisson=0.3, density=0.124, damping=0, "
+        "friction=0.25, thickness=0)"
+    )
+
+
+def test_a_coupling_that_was_chosen_is_said(simulator):
+    other = dc.Simulator(simulator.scene, 0.01, coupling="rigid_to_cloth")
+    assert repr(other).endswith("scheme='coupled', coupling='rigid_to_cloth')")
