@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from diffcloth_torch import build_info
-from diffcloth_torch.config.schema import set_values
+from diffcloth_torch.config.documents import set_values
 from diffcloth_torch.config.viewers import open_viewers
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.model.quantities import PARAMETERS

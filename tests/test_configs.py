@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.config.schema import read_document, resolve_path, set_values
+from diffcloth_torch.config.documents import read_document, resolve_path, set_values
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.robots import GRIPPER
 from diffcloth_torch.tasks.registry import load_task, read_config

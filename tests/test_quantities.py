@@ -15,6 +15,7 @@ import diffcloth_torch as dc
 from diffcloth_torch import _core
 from diffcloth_torch.checks import POSITIVE
 from diffcloth_torch.config import schema
+from diffcloth_torch.config.validation import validate
 from diffcloth_torch.model.quantities import (
     CONTROL,
     DERIVED,
@@ -151,7 +152,7 @@ def test_a_value_beyond_the_range_is_refused_wherever_it_enters(sim, name, value
     for section in (schema.MaterialSection, schema.ContactSection):
         if name in section.model_fields:
             with pytest.raises(dc.InvalidInput, match=rf"`{name}` must be "):
-                schema.validate(section, {name: value}, "here")
+                validate(section, {name: value}, "here")
 
 
 def sources(name):
@@ -176,6 +177,6 @@ def test_the_schema_of_a_material_has_the_fields_of_a_material():
     assert list(schema.MaterialSection.model_fields) == fields
     assert list(FACE_QUANTITIES) == fields[: len(FACE_QUANTITIES)]
     given = dict.fromkeys(fields, 0.25)
-    section = schema.validate(schema.MaterialSection, given, "here")
+    section = validate(schema.MaterialSection, given, "here")
     assert section.model_dump() == given
     assert schema.MaterialSection().model_dump() == dict.fromkeys(fields)

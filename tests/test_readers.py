@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import diffcloth_torch as dc
-from diffcloth_torch.config.schema import read_document
+from diffcloth_torch.config.documents import read_document
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.model.urdf import read_urdf
 

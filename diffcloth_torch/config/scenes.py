@@ -13,6 +13,7 @@ from torch import Tensor
 
 from diffcloth_torch import robots
 from diffcloth_torch.config import shapes
+from diffcloth_torch.config.documents import resolve_path
 from diffcloth_torch.config.schema import (
     BodySection,
     ClothSection,
@@ -25,7 +26,6 @@ from diffcloth_torch.config.schema import (
     Section,
     Selection,
     SimulationSection,
-    resolve_path,
 )
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import read_mesh

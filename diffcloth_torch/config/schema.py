@@ -1,4 +1,4 @@
-"""Configurations: YAML files, read safely and checked against a schema before anything runs."""
+"""The schema of configurations: what a file may hold, checked before anything runs."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Interval, Le, Len, Lt
 from pydantic import (
@@ -16,16 +15,10 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
-    ValidationError,
     create_model,
     model_validator,
 )
-from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError
-from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, ScalarEvent
 
-from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.viewers.look import Camera, Pictures
@@ -51,14 +44,7 @@ __all__ = [
     "SimulationSection",
     "SolverSection",
     "Vector3",
-    "read_document",
-    "resolve_path",
-    "set_values",
-    "validate",
 ]
-
-Document = dict[str, Any]
-S = TypeVar("S", bound="Section")
 
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
@@ -506,240 +492,3 @@ def _require_increasing(
     times = [keyframe.time for keyframe in keyframes]
     if any(b <= a for a, b in itertools.pairwise(times)):
         raise ValueError(f"must have increasing times in `{name}`, got {times}")
-
-
-# --- reading ------------------------------------------------------------------------------------
-
-
-# A configuration is a page of text. These bounds are far beyond one; what exceeds them is a
-# mistake, or would fill the memory.
-_LARGEST_CONFIG_BYTES = 1 << 20
-_MOST_VALUES = 100_000  # aliases written out
-_DEEPEST = 50
-
-
-def read_document(path: str | Path) -> Document:
-    """Read a YAML 1.2 mapping.
-
-    Raises:
-        InvalidInput: If the file is missing, too large, no regular file, not YAML, not a mapping,
-            nested too deeply, holds itself, or repeats a key.
-    """
-    path = Path(path)
-    try:
-        data = read_regular_file(path, _LARGEST_CONFIG_BYTES)
-    except FileNotFoundError as error:
-        raise InvalidInput(f"{path}: there is no such file") from error
-    try:
-        document = _parse(data.decode("utf-8"))
-    except ValueError as error:
-        raise InvalidInput(f"{path}: not readable as YAML: {_one_line(error)}") from error
-    if not isinstance(document, dict):
-        raise InvalidInput(f"{path}: a configuration must be a mapping of keys to values")
-    return document
-
-
-def _parse(text: str) -> Any:
-    """Read YAML 1.2; raises ValueError where that fails."""
-    reader = YAML(typ="safe", pure=True)
-    try:
-        _check_extent(reader.parse(text))
-        document = reader.load(text)
-    except MemoryError:
-        raise
-    except MarkedYAMLError as error:
-        line = "" if error.problem_mark is None else f"line {error.problem_mark.line + 1}: "
-        raise ValueError(f"{line}{error.problem or error.context}") from error
-    except Exception as error:  # also what Python's own conversions of dates and numbers raise
-        raise ValueError(str(error)) from error
-    _check_plain(document, "the file")
-    return document
-
-
-def _check_extent(events: Iterable[Any]) -> None:
-    """Bound depth and size of a document with its aliases written out, before they are."""
-    sizes: dict[str, int] = {}  # of anchored values
-    anchors: set[str] = set()
-    opened: list[tuple[str | None, int]] = []  # anchor of a collection, and values before it
-    count = 0
-    for event in events:
-        name = getattr(event, "anchor", None)
-        if name is not None and not isinstance(event, AliasEvent):
-            if name in anchors:
-                raise ValueError(f"the anchor &{name} must stand once")
-            anchors.add(name)
-        if isinstance(event, AliasEvent):
-            if name not in sizes:
-                raise ValueError(f"the alias *{name} must follow the end of what it stands for")
-            count += sizes[name]
-        elif isinstance(event, CollectionStartEvent):
-            opened.append((name, count))
-            count += 1
-        elif isinstance(event, CollectionEndEvent):
-            name, before = opened.pop()
-            if name is not None:
-                sizes[name] = count - before
-        elif isinstance(event, ScalarEvent):
-            count += 1
-            if name is not None:
-                sizes[name] = 1
-        if count > _MOST_VALUES:
-            raise ValueError(f"it must have at most {_MOST_VALUES} values, aliases written out")
-        if len(opened) > _DEEPEST:
-            raise ValueError(f"it must be at most {_DEEPEST} levels deep")
-
-
-def _check_plain(value: Any, place: str) -> None:
-    """Refuse what YAML knows and a configuration does not: dates, sets, keys that are no text."""
-    if isinstance(value, dict):
-        for key, entry in value.items():
-            if not isinstance(key, str):
-                raise ValueError(f"a key must be text, got {key!r} in {place}")
-            _check_plain(entry, f"`{key}`")
-    elif isinstance(value, list):
-        for entry in value:
-            _check_plain(entry, place)
-    elif not isinstance(value, str | bool | int | float | None):
-        raise ValueError(f"{place} must hold text or numbers, got a {type(value).__name__}")
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
-
-
-def set_values(document: Document, assignments: Iterable[str]) -> Document:
-    """Copy a document with values changed.
-
-    Args:
-        document: What a configuration file holds.
-        assignments: "key=value" each; the key is dotted, an item of a list is addressed by its
-            number or its `name`, and the value is YAML.
-
-    Raises:
-        InvalidInput: If an assignment is malformed or its key cannot exist.
-    """
-    changed: Document = _copy(document)
-    for assignment in assignments:
-        key, equals, text = assignment.partition("=")
-        if not equals or not key:
-            raise InvalidInput(f"--set: must be key=value, got {assignment!r}")
-        try:
-            value = _parse(text)
-        except ValueError as error:
-            raise InvalidInput(f"--set {key}: the value is not YAML: {_one_line(error)}") from error
-        *parents, last = key.split(".")
-        place: Any = changed
-        for part in parents:
-            place = _descend(key, place, part)
-        if isinstance(place, list):
-            place[_item(key, place, last)] = value
-        elif isinstance(place, dict):
-            place[last] = value
-        else:
-            raise InvalidInput(f"--set {key}: `{last}` lies below a plain value")
-    return changed
-
-
-def _copy(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _copy(entry) for key, entry in value.items()}
-    return [_copy(entry) for entry in value] if isinstance(value, list) else value
-
-
-def _descend(key: str, place: Any, part: str) -> Any:
-    if isinstance(place, list):
-        return place[_item(key, place, part)]
-    if isinstance(place, dict):
-        return place.setdefault(part, {})  # a section that the file leaves to its defaults
-    raise InvalidInput(f"--set {key}: `{part}` lies below a plain value")
-
-
-def _item(key: str, items: list[Any], part: str) -> int:
-    names = [item.get("name") if isinstance(item, dict) else None for item in items]
-    if part in names:
-        return names.index(part)
-    if part.isdecimal() and int(part) < len(items):
-        return int(part)
-    named = [str(name) for name in names if name is not None]
-    accepted = ", ".join([f"0 .. {len(items) - 1}", *named]) if items else "none, it is empty"
-    raise InvalidInput(f"--set {key}: the items of the list are {accepted}; got `{part}`")
-
-
-def validate(model: type[S], document: Document, source: str | Path) -> S:
-    """Check a document against a schema.
-
-    Raises:
-        InvalidInput: If a key is unknown or missing, or a value is not accepted; the message
-            names the key, the value and what is accepted.
-    """
-    try:
-        return model.model_validate(document)
-    except ValidationError as error:
-        problems = _sentences(document, error.errors())
-        more = f" ({len(problems) - 1} more problems)" if len(problems) > 1 else ""
-        raise InvalidInput(f"{source}: {problems[0]}{more}") from error
-
-
-def _sentences(document: Document, problems: Iterable[Any]) -> list[str]:
-    """One sentence for each key that has a problem."""
-    messages: dict[str, list[str]] = {}
-    shown: dict[str, str] = {}
-    for problem in problems:
-        name = _key_text(document, problem["loc"], missing=problem["type"] == "missing")
-        messages.setdefault(name, []).append(_message(problem))
-        given = problem["input"]
-        plain = problem["type"] not in ("missing", "value_error") and not isinstance(given, dict)
-        shown[name] = f", got {given!r}" if plain else ""
-    # A value that may be of several types has a message for each type.
-    return [
-        f"`{name}` {' or '.join(dict.fromkeys(texts))}{shown[name]}".replace("``", "the file")
-        for name, texts in messages.items()
-    ]
-
-
-def _message(problem: Any) -> str:
-    kind, context = problem["type"], problem.get("ctx", {})
-    if kind == "missing":
-        return "is missing"
-    if kind == "value_error":
-        return str(context["error"])
-    if kind == "union_tag_not_found":
-        return "needs the key `kind`"
-    if kind == "union_tag_invalid":
-        return f"must have as `kind` one of {context['expected_tags']}; got {context['tag']!r}"
-    text = str(problem["msg"]).removeprefix("Input should ")
-    return f"must {text}" if text != problem["msg"] else f"is not accepted: {text}"
-
-
-def _key_text(document: Document, location: tuple[int | str, ...], *, missing: bool) -> str:
-    """Write a place as in the file: pydantic's also names the member of a union that was tried."""
-    text = ""
-    place: Any = document
-    for i, part in enumerate(location):
-        in_mapping = isinstance(place, dict) and part in place
-        in_list = isinstance(place, list) and isinstance(part, int) and part < len(place)
-        if in_mapping or in_list:
-            place = place[part]
-        elif not (missing and i == len(location) - 1):
-            continue
-        text += f"[{part}]" if isinstance(part, int) else f".{part}"
-    return text.removeprefix(".")
-
-
-def resolve_path(config: Path, root: str, given: str) -> Path:
-    """File that a configuration names, relative to the configuration and under its root.
-
-    Raises:
-        InvalidInput: If it lies elsewhere or does not exist.
-    """
-    folder = config.resolve().parent
-    allowed = (folder / root).resolve()
-    path = (folder / given).resolve()
-    if not path.is_relative_to(allowed):
-        raise InvalidInput(
-            f"{config}: the file {given!r} must lie under the root {str(allowed)!r}; declare a "
-            "higher one with the key `root`, relative to the configuration (for example `root: ..`)"
-        )
-    if not path.is_file():
-        raise InvalidInput(f"{config}: there is no file {given!r} (looked for {str(path)!r})")
-    return path

@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from diffcloth_torch.config.schema import RunConfig, read_document, set_values, validate
+from diffcloth_torch.config.documents import read_document, set_values
+from diffcloth_torch.config.schema import RunConfig
+from diffcloth_torch.config.validation import validate
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.tasks.control_points import ControlPoints
 from diffcloth_torch.tasks.drape import Drape
