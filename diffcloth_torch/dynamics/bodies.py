@@ -22,6 +22,7 @@ from torch import Tensor
 
 from diffcloth_torch.dynamics.implicit import attach_root
 from diffcloth_torch.dynamics.kinematics import CROSS
+from diffcloth_torch.dynamics.linear import inverse, solve
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.geometry.rotation import (
     nearer_quaternion,
@@ -162,7 +163,7 @@ def advance_bodies(
         torque = torque + kick[..., 3:]
         rate = rate + dt * kick[..., :3] / inertia.mass[..., None]
     momentum = _apply(rotation.transpose(-1, -2), prediction.momentum + dt * torque)
-    spin = torch.linalg.solve(inertia.inertia.expand_as(rotation), momentum[..., None])[..., 0]
+    spin = solve(inertia.inertia.expand_as(rotation), momentum)
     sign = nearer_quaternion(quaternion, prediction.poses[..., 3:])
     poses = torch.cat([center - _apply(rotation, inertia.center), sign], dim=-1)
     return poses, torch.cat([rate, _apply(rotation, spin)], dim=-1)
@@ -186,13 +187,12 @@ def _midpoint_spin(inertia: Tensor, momentum: Tensor, dt: float) -> Tensor:
         return K
 
     with torch.no_grad():
-        inverse = torch.linalg.inv(inertia.expand(*momentum.shape, 3))
-        spin = _apply(inverse, momentum)
+        spin = _apply(inverse(inertia.expand(*momentum.shape, 3)), momentum)
         turned = _turned_back(dt / 2 * spin, momentum)
-        inverse = torch.linalg.inv(inertia - dt / 2 * _cross(turned))  # `slope` to first order
+        inverted = inverse(inertia - dt / 2 * _cross(turned))  # of `slope` to first order
         for _ in range(_ITERATIONS):
             left = _apply(inertia, spin) - _turned_back(dt / 2 * spin, momentum)
-            spin = spin - _apply(inverse, left)
+            spin = spin - _apply(inverted, left)
     return attach_root(residual, spin, (inertia, momentum), slope)
 
 

@@ -36,6 +36,7 @@ from diffcloth_torch.dynamics.inertia import (
     wrenches_of_forces,
 )
 from diffcloth_torch.dynamics.kinematics import ROOT, Tree, root_frame
+from diffcloth_torch.dynamics.linear import inverse, solve
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.errors import SimulationError
 from diffcloth_torch.geometry.rotation import (
@@ -398,10 +399,10 @@ class Chain:
                 # Without velocity products, but for those of what is prescribed.
                 mass = mass_matrix(here, inertia)
                 rest = given - (mass @ known[..., None])[..., 0]
-                inverse = torch.linalg.inv(mass[..., solved[:, None], solved])
-                guess = (inverse @ rest[..., solved, None])[..., 0]
+                inverted = inverse(mass[..., solved[:, None], solved])
+                guess = (inverted @ rest[..., solved, None])[..., 0]
                 scale = torch.cat([guess, known], dim=-1).abs().amax(-1)
-                x, found = find_root(of_solved, guess, inverse, scale)
+                x, found = find_root(of_solved, guess, inverted, scale)
             self._check(found)
             velocity = complete(attach_root(of_solved, x, (*inertia, *start, known, given)))
         constraint = torch.zeros_like(start.joints)
@@ -434,7 +435,7 @@ class Chain:
             ahead = ahead + h * self._generalized(placed, kick)
         change = (ahead - momentum(placed, inertia, over))[..., solved]
         mass = mass_matrix(placed, inertia)[..., solved[:, None], solved]
-        return over.index_add(-1, solved, torch.linalg.solve(mass, change[..., None])[..., 0])
+        return over.index_add(-1, solved, solve(mass, change))
 
     def _moved(self, start: _Configuration, velocity: Tensor, time: float) -> _Configuration:
         """Where constant velocities lead."""

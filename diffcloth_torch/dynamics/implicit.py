@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable
 import torch
 from torch import Tensor
 
+from diffcloth_torch.dynamics.linear import solve
+
 __all__ = ["attach_root", "find_root", "jacobian"]
 
 # Of the scale of x: a step that counts as none, and one that is rounding if it does not shrink.
@@ -77,7 +79,7 @@ def attach_root(
     value = residual(root)
     with torch.no_grad():
         K = jacobian(residual, root) if slope is None else slope(root)
-    step: Tensor = torch.linalg.solve(K, value[..., None])[..., 0]
+    step = solve(K, value)
     return root - (step - step.detach())
 
 
