@@ -90,7 +90,7 @@ def test_an_input_of_another_size_is_refused(sim, inputs, forward, name, kind):
     batch = name == "positions" and kind == "three rows"
     calls = [
         lambda: sim._core.forward(bad, True, 1),
-        lambda: sim._core.energy(bad),
+        lambda: sim._core.stored_energy(bad),
         lambda: sim._core.find_overlap(bad),
         lambda: sim._core.find_close_start(bad),
         lambda: sim._core.path(bad),

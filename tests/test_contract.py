@@ -674,7 +674,8 @@ def tensor_bytes():
     pointers = {
         o.untyped_storage().data_ptr(): o.untyped_storage().nbytes()
         for o in gc.get_objects()
-        if type(o) is torch.Tensor
+        # torch 2.4 leaves tensors about that are not defined.
+        if type(o) is torch.Tensor and torch._C._has_storage(o)
     }
     return sum(pointers.values())
 

@@ -24,9 +24,9 @@ from diffcloth_torch.dynamics.free_motion import body_motion, solve_motion
 from diffcloth_torch.dynamics.implicit import attach_root
 from diffcloth_torch.dynamics.inertia import Inertia
 from diffcloth_torch.dynamics.kinematics import CROSS
+from diffcloth_torch.dynamics.linear import solve, times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.errors import SimulationError
-from diffcloth_torch.geometry.products import times
 from diffcloth_torch.geometry.rotation import (
     nearer_quaternion,
     quaternion_exp,
@@ -163,7 +163,7 @@ def advance_bodies(
         torque = torque + kick[..., 3:]
         rate = rate + dt * kick[..., :3] / inertia.mass[..., None]
     momentum = times(rotation.transpose(-1, -2), prediction.momentum + dt * torque)
-    spin = torch.linalg.solve(inertia.inertia.expand_as(rotation), momentum[..., None])[..., 0]
+    spin = solve(inertia.inertia.expand_as(rotation), momentum)
     sign = nearer_quaternion(quaternion, prediction.poses[..., 3:])
     poses = torch.cat([center - times(rotation, inertia.center), sign], dim=-1)
     return poses, torch.cat([rate, times(rotation, spin)], dim=-1)

@@ -37,9 +37,9 @@ from diffcloth_torch.dynamics.inertia import (
     wrenches_of_forces,
 )
 from diffcloth_torch.dynamics.kinematics import ROOT, Tree, root_frame
+from diffcloth_torch.dynamics.linear import solve, times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.errors import SimulationError
-from diffcloth_torch.geometry.products import times
 from diffcloth_torch.geometry.rotation import (
     nearer_quaternion,
     pose_velocities,
@@ -429,7 +429,7 @@ class Chain:
             ahead = ahead + h * self._generalized(placed, kick)
         change = (ahead - momentum(placed, inertia, over))[..., solved]
         mass = mass_matrix(placed, inertia)[..., solved[:, None], solved]
-        return over.index_add(-1, solved, torch.linalg.solve(mass, change[..., None])[..., 0])
+        return over.index_add(-1, solved, solve(mass, change))
 
     def _moved(self, start: _Configuration, velocity: Tensor, time: float) -> _Configuration:
         """Where constant velocities lead."""

@@ -15,6 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffcloth_torch.dynamics.linear import solve
+
 __all__ = ["Drives", "Gains", "fold"]
 
 
@@ -86,5 +88,4 @@ def fold(
     metric = inertial + torch.diag_embed(torch.nn.functional.pad(gains, (n - joints, 0)))
     force = torch.nn.functional.pad(pull, (n - joints, 0))[..., unknown]
     solved = metric[..., unknown[:, None], unknown]
-    shift = torch.linalg.solve(solved, force[..., None])[..., 0]
-    return metric, predicted.index_add(-1, unknown, -shift)
+    return metric, predicted.index_add(-1, unknown, -solve(solved, force))

@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable
 import torch
 from torch import Tensor
 
+from diffcloth_torch.dynamics.linear import solve
+
 __all__ = ["attach_root", "jacobian"]
 
 Residual = Callable[[Tensor], Tensor]
@@ -34,7 +36,7 @@ def attach_root(
     value = residual(root)
     with torch.no_grad():
         K = jacobian(residual, root) if slope is None else slope(root)
-    step: Tensor = torch.linalg.solve(K, value[..., None])[..., 0]
+    step = solve(K, value)
     return root - (step - step.detach())
 
 

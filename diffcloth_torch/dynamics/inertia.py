@@ -24,8 +24,8 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.dynamics.kinematics import Frames, Tree
+from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.dynamics.totals import about_origin
-from diffcloth_torch.geometry.products import times
 
 __all__ = [
     "Inertia",

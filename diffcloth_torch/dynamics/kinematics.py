@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.geometry.products import times
+from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.model.kinematics import Kinematics, constant, joined_frame
 from diffcloth_torch.model.mechanism import Mechanism
 
