@@ -9,7 +9,7 @@ __all__ = ["solve", "times"]
 
 
 def solve(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """x with M x = v, from M [.., n, n] and v [.., n].
+    """The x with M x = v, from M [.., n, n] and v [.., n].
 
     torch 2.4 factors M or its transpose, whichever lies better in memory, and rounds accordingly.
     What indexing, `expand` and `movedim` return does not lie alike in a batch of one and in one of
