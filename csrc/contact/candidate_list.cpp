@@ -1,6 +1,7 @@
 #include "contact/candidate_list.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 
 #include "contact/distance/separation.h"
@@ -8,8 +9,9 @@
 namespace diffcloth::contact {
 namespace {
 
-/// A skin is this many times the motion at hand, but within these shares of the largest reach: a
-/// thin one is soon used up, a thick one holds pairs that never meet.
+/// A skin is this many times the motion at hand, but within these shares of the smallest and of the
+/// largest reach: a thin one is soon used up, a thick one holds pairs that never meet. What is
+/// thick itself has enough of these already.
 constexpr double kAhead = 2.0;
 constexpr double kThinnest = 0.5;
 constexpr double kThickest = 4.0;
@@ -67,6 +69,26 @@ void CandidateList::measure_approach(const double* x_t0,
   }
 }
 
+/// Square of how much the two primitives of a pair can have come closer since the reference, at most:
+/// the largest change of a vector between their corners. That between any two of their points is a
+/// mean of those.
+double CandidateList::pair_approach_sq(const Candidate& pair,
+                                       const double* x_t0,
+                                       const double* x_t1) const {
+  const int first = pair.kind == PairKind::kPointTriangle ? 1 : 2;  // corner of the second one
+  double result = 0.0;
+  for (const double* x : {x_t0, x_t1}) {
+    std::array<Vec3, 4> u;
+    for (int i = 0; i < 4; ++i) {
+      u[i] = row(x, pair.vertices[i]) - row(reference_.data(), pair.vertices[i]);
+    }
+    for (int i = 0; i < first; ++i) {
+      for (int j = first; j < 4; ++j) raise(result, (u[i] - u[j]).squaredNorm());
+    }
+  }
+  return result;
+}
+
 /// Whether no pair beyond the skin can have come within reach.
 bool CandidateList::covers(std::span<const double> approach, std::span<const double> reach) const {
   if (!std::ranges::equal(reach, reach_)) return false;
@@ -93,11 +115,13 @@ bool CandidateList::build(const double* x_t0,
   double size = 0.0;
   for (const double value : reference_) size = std::max(size, std::abs(value));
   rounding_ = kRounding * size;
-  const double largest_reach = reach.empty() ? 0.0 : *std::ranges::max_element(reach);
+  const auto [smallest, largest] = std::ranges::minmax_element(reach);
+  const double least = reach.empty() ? 0.0 : kThinnest * *smallest;
+  const double most = reach.empty() ? 0.0 : kThickest * *largest;
   measure_approach(x_t0, x_t1, approach_);
   double approach = 0.0;
   for (const double value : approach_) raise(approach, value);
-  skin_ = std::clamp(kAhead * 0.5 * approach, kThinnest * largest_reach, kThickest * largest_reach);
+  skin_ = std::clamp(kAhead * 0.5 * approach, least, most);
   if (!covers(approach_, reach)) {
     reference_.clear();
     return false;
@@ -108,13 +132,18 @@ bool CandidateList::build(const double* x_t0,
   broad_phase_->find(x_t0, x_t0, with_skin, scratch, kept_);
   distance_.clear();
   surfaces_.clear();
-  for (const Candidate& pair : kept_) {
+  std::erase_if(kept_, [&](const Candidate& pair) {
     const auto& v = pair.vertices;
     const Corners corner{row(x_t0, v[0]), row(x_t0, v[1]), row(x_t0, v[2]), row(x_t0, v[3])};
-    distance_.push_back(std::sqrt(distance_sq(pair.kind, corner)));
-    surfaces_.push_back(mesh.vertex_surface[v[0]] * static_cast<Index>(count) +
-                        mesh.vertex_surface[v[3]]);
-  }
+    const double distance = std::sqrt(distance_sq(pair.kind, corner));
+    const Index s = mesh.vertex_surface[v[0]];
+    const Index r = mesh.vertex_surface[v[3]];
+    // Boxes are near sooner than what is in them.
+    if (distance > with_skin[s] + with_skin[r] + 2.0 * rounding_) return true;
+    distance_.push_back(distance);
+    surfaces_.push_back(s * static_cast<Index>(count) + r);
+    return false;
+  });
   return true;
 }
 
@@ -141,7 +170,13 @@ void CandidateList::find(const double* x_t0,
   }
   out.clear();
   for (std::size_t k = 0; k < kept_.size(); ++k) {
-    if (!(distance_[k] > approach_[surfaces_[k]])) out.push_back(kept_[k]);
+    if (distance_[k] > approach_[surfaces_[k]]) continue;
+    // A surface counts as near as its fastest part; few of its pairs are.
+    const Index s = surfaces_[k];
+    const double together = reach[s / count] + reach[s % count] + 2.0 * rounding_;
+    const double spare = distance_[k] - together;
+    if (spare > 0.0 && spare * spare > pair_approach_sq(kept_[k], x_t0, x_t1)) continue;
+    out.push_back(kept_[k]);
   }
 }
 

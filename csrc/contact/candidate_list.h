@@ -13,8 +13,8 @@ namespace diffcloth::contact {
 /// A solver searches along one short motion after the other. The list keeps the pairs near one
 /// configuration together with their distances there, and answers from them for as long as no pair
 /// can have come near that is not among them: distances change by no more than the surfaces have
-/// moved towards each other, whatever common motion they share. What is left of a list near the end
-/// of a solve is the contacts and little else.
+/// moved towards each other, whatever common motion they share. Of what it keeps it answers with the
+/// pairs whose own corners have moved that far: near the end of a solve the contacts and little else.
 ///
 /// Only a memory: of what it leaves out nothing comes within reach, so that contacts, energies and
 /// collision-free steps are those of BroadPhase::find, to the bit.
@@ -47,6 +47,7 @@ class CandidateList {
   /// [surfaces^2] by how much two surfaces can have come closer since the reference, at most; 0 of
   /// those that never touch.
   void measure_approach(const double* x_t0, const double* x_t1, std::vector<double>& out) const;
+  double pair_approach_sq(const Candidate& pair, const double* x_t0, const double* x_t1) const;
   bool covers(std::span<const double> approach, std::span<const double> reach) const;
   bool build(const double* x_t0,
              const double* x_t1,
