@@ -33,7 +33,7 @@ void NodalStage::start(Array& x) const {
   // Where that would collapse the cloth, where it stands is the better place to begin.
   Array held = problem_.predicted(problem_.start.data());
   system.clear_approach(held);
-  if (f.energy(held.data()) < f.energy(x.data())) x = std::move(held);
+  if (f.energy_change(x.data(), held.data()) < 0.0) x = std::move(held);
 }
 
 projective::Outcome NodalStage::iterate(const projective::Objective& smooth,
