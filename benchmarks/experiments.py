@@ -8,8 +8,8 @@ Each row is one run of configs/tie.yaml or configs/cloth_on_cube.yaml. `pairs` c
 triangles that intersect, as the IPC Toolkit finds them: the most in a state, and `states` in how
 many states there are any. `stuck` counts steps that did not converge, or after which nothing was
 possible any more. `distance` is how far the control points are from their targets in the end, the
-farthest of them, `stretch` how long an edge is in the worst state, over its length at rest. Times
-are of the processor.
+farthest of them, `stretch` how long an edge is in the worst state, over its length at rest. `turns`
+is how often the ends of a strip are wound around each other in the end. Times are of the processor.
 """
 
 from __future__ import annotations
@@ -87,6 +87,7 @@ class Run:
     pairs: list[int]
     stuck: int
     distance: float
+    turns: float | None
     stretch: float
     iterations: int
     seconds: float
@@ -98,6 +99,7 @@ class Run:
             f"{sum(count > 0 for count in self.pairs)} of {len(self.pairs)}",
             f"{self.stuck}",
             f"{1e3 * self.distance:.1f}",
+            "-" if self.turns is None else f"{self.turns:.1f}",
             f"{self.stretch:.2f}",
             f"{self.iterations / max(1, len(self.states) - 1):.1f}",
             f"{self.seconds:.0f}",
@@ -109,6 +111,7 @@ COLUMNS = (
     "states",
     "stuck",
     "distance [mm]",
+    "turns",
     "stretch",
     "iterations a step",
     "time [s]",
@@ -139,6 +142,7 @@ def play(task: ControlPoints) -> Run:
         pairs=pairs,
         stuck=unconverged + task.steps - len(reports),
         distance=task.distances(states[-1]).max().item(),
+        turns=turns(task, states[-1]),
         stretch=max(stretch(task.scene, state) for state in states),
         iterations=sum(report.iterations for report in reports),
         seconds=seconds,
@@ -158,6 +162,40 @@ def stretch(scene: dc.Scene, state: dc.State) -> float:
         largest = max(largest, float((lengths[0] / lengths[1]).max()))
         first += len(cloth.vertices)
     return largest
+
+
+def turns(task: ControlPoints, state: dc.State) -> float | None:
+    """Turns of the ends of the first cloth around each other; None where that is no strip.
+
+    Its middle line is cut at the middle of the bend.
+    """
+    shape = task.config.scene.cloths[0].shape
+    if shape.kind != "strip":
+        return None
+    points = state.positions.numpy()[: shape.rows * shape.columns]
+    line = points.reshape(shape.rows, shape.columns, 3).mean(axis=0)
+    middle = round(shape.middle * shape.columns)
+    return abs(linking(line[:middle], line[middle:]))
+
+
+def linking(a: np.ndarray, b: np.ndarray) -> float:
+    """The linking integral of Gauss of two polygons, [n, 3] and [m, 3].
+
+    A whole number if both are closed; about the number of turns where two ends are wound around
+    each other. The directions from points of one segment to points of another cover a solid angle,
+    that of a quadrilateral whose corners are the directions between their ends.
+
+    References:
+        Klenin and Langowski, Computation of writhe in modeling of supercoiled DNA, 2000, method 1a.
+    """
+    between = b[None, :] - a[:, None]
+    corners = [between[:-1, :-1], between[:-1, 1:], between[1:, 1:], between[1:, :-1]]
+    normals = [np.cross(corners[k], corners[(k + 1) % 4]) for k in range(4)]
+    normals = [n / np.linalg.norm(n, axis=-1, keepdims=True) for n in normals]
+    cosines = [(normals[k] * normals[(k + 1) % 4]).sum(axis=-1) for k in range(4)]
+    angle = sum(np.arcsin(np.clip(cosine, -1, 1)) for cosine in cosines)
+    across = np.cross(np.diff(b, axis=0)[None, :], np.diff(a, axis=0)[:, None])
+    return float((angle * np.sign((across * corners[0]).sum(axis=-1))).sum() / (4 * np.pi))
 
 
 def draw(experiment: Experiment, states: list[dc.State], path: Path) -> None:

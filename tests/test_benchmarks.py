@@ -150,8 +150,22 @@ def test_experiments_are_compared_by_scheme():
         for method in ("split", "coupled, frictionless", "coupled"):
             assert rows[method]["pairs"] == "0"
     cube = tables["cloth_on_cube"]
+    assert float(tables["tie"]["coupled"]["turns"]) >= 0
+    assert cube["coupled"]["turns"] == "-"
     assert int(cube["projective"]["pairs"]) > 0
     assert float(cube["coupled"]["distance [mm]"]) < 100  # from half a meter
+
+
+def test_turns_are_those_of_links(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT)
+    linking = importlib.import_module("benchmarks.experiments").linking
+    t = np.linspace(0, 2 * np.pi, 13)
+    ring = np.stack([np.cos(t), np.sin(t), 0 * t], axis=1)
+    other = np.stack([1 + np.cos(t), 0 * t + 0.01, np.sin(t)], axis=1)
+    # Solid angles that add up to that of a sphere, but for rounding.
+    assert abs(linking(ring, other)) == pytest.approx(1, abs=1e-12)
+    assert linking(ring, other[::-1]) == pytest.approx(-linking(ring, other), abs=1e-12)
+    assert linking(ring, other + np.array([3, 0, 0])) == pytest.approx(0, abs=1e-12)
 
 
 def test_schemes_are_compared_on_the_same_scenes():

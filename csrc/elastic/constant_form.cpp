@@ -68,7 +68,7 @@ ConstantForm::ConstantForm(const Model& model,
                            const linalg::BlockPattern& pattern)
     : pattern_(&pattern),
       vertex_count_(model.topology->vertex_count),
-      values_(static_cast<std::size_t>(slots.block_count), 0.0),
+      values_(model.prepared.constant),
       anchor_vertex_(anchors.vertex.begin(), anchors.vertex.end()),
       anchor_stiffness_(anchors.stiffness.begin(), anchors.stiffness.end()) {
   for (Index f = 0; f < face_count(model); ++f) {
@@ -81,6 +81,7 @@ ConstantForm::ConstantForm(const Model& model,
   }
   for (Index e = 0; e < model.stencils->size(); ++e) {
     bending::Element element = bending_element(model, e);
+    if (element.flat) continue;
     element.weight *= element_factor(model, e);
     bending::add_constant(element, bending_slots(slots, e), values_.data());
   }

@@ -36,6 +36,7 @@ enum class Status : std::uint8_t {
   kConverged,
   kIterationLimit,
   kRoundingFloor,  ///< steps are lost in the rounding of positions, or raise the energy
+  kStalled,        ///< contact at nodes: the residual no longer shrinks
   kOverflow,       ///< forces are not finite
 };
 

@@ -278,25 +278,40 @@ FaceSearch::FaceSearch(std::vector<std::array<Index, 3>> faces, const std::vecto
 }
 
 FaceSearch::Share FaceSearch::share(const Vec3& y) const {
+  struct Near {
+    double center_sq;
+    Index face;
+  };
+  std::vector<Near> near;
   Index best = -1;
   contact::Closest closest{};
-  closest.d_sq = std::numeric_limits<double>::infinity();
-  const auto look = [&](Index f) {
-    // No point of the face is nearer than its center less the radius.
-    const double reach = std::sqrt(closest.d_sq) + radius_;
-    if ((y - center_[f]).squaredNorm() > reach * reach) return;
-    const auto& [a, b, c] = corners_[f];
-    const contact::Closest found =
-        contact::closest(contact::PairKind::kPointTriangle, {y, a, b, c});
-    // The first of equals, in whatever order they are looked at.
-    if (found.d_sq < closest.d_sq || (found.d_sq == closest.d_sq && f < best)) {
-      closest = found;
-      best = f;
+  const auto find = [&] {
+    // No face is farther than its center, nor nearer than that less the radius.
+    double reach = std::numeric_limits<double>::infinity();
+    for (const Near& n : near) reach = std::min(reach, n.center_sq);
+    reach = std::sqrt(reach) + radius_;
+    best = -1;
+    for (const auto& [center_sq, f] : near) {
+      if (center_sq > reach * reach) continue;
+      const auto& [a, b, c] = corners_[f];
+      const contact::Closest found =
+          contact::closest(contact::PairKind::kPointTriangle, {y, a, b, c});
+      // The first of equals, in whatever order they are looked at.
+      if (best < 0 || found.d_sq < closest.d_sq || (found.d_sq == closest.d_sq && f < best)) {
+        closest = found;
+        best = f;
+      }
     }
   };
-  cells_->around(y, look);
-  if (!(std::sqrt(closest.d_sq) + radius_ <= cells_->size())) {
-    for (Index f = 0; f < static_cast<Index>(faces_.size()); ++f) look(f);
+  const auto add = [&](Index f) {
+    near.push_back({.center_sq = (y - center_[f]).squaredNorm(), .face = f});
+  };
+  cells_->around(y, add);
+  find();
+  if (best < 0 || !(std::sqrt(closest.d_sq) + radius_ <= cells_->size())) {
+    near.clear();
+    for (Index f = 0; f < static_cast<Index>(faces_.size()); ++f) add(f);
+    find();
   }
   const Eigen::Matrix<double, 2, 12> beta = contact::beta_jacobian(closest);
   return {.corners = faces_[best],

@@ -21,6 +21,7 @@ struct Counts {
   int projected = 0;              ///< steps with a Hessian blended with its projection
   int negative_curvature = 0;     ///< Hessians that were found indefinite
   std::int64_t local_global = 0;  ///< iterations of Projective Dynamics
+  int left_to_newton = 0;         ///< solves that these have given up
   int factorizations = 0;         ///< numeric ones, those that failed included
   int analyses = 0;               ///< symbolic ones
 };

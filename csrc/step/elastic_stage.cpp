@@ -20,39 +20,12 @@ std::string_view words(projective::Status status) {
       return "the local/global iterations of the step are used up";
     case projective::Status::kRoundingFloor:
       return "rounding hides any further decrease of the elastic stage";
+    case projective::Status::kStalled:
+      return "the local/global iterations of the step have stalled";
     case projective::Status::kOverflow:
       return "the forces of the elastic stage are not finite";
   }
   __builtin_unreachable();
-}
-
-/// By local/global iterations. No factor comes out of them: backward makes it.
-void solve_by_projective_dynamics(Problem& problem,
-                                  const Forward& step,
-                                  const NodalStage& nodes,
-                                  std::vector<double>& x) {
-  const Stopwatch::Scope scope(*step.context.watch, Phase::kSolve);
-  const solver::Options& given = step.context.options;
-  const projective::Options options{
-      .tolerance = given.tolerance,
-      .max_iterations = projective::kIterationsPerNewton * given.max_iterations};
-  const Checkpoint& checkpoint = *step.context.checkpoint;
-  const auto matrix = problem.constant_matrix();
-  projective::Objective f{.potentials = {&problem.inertia, &problem.elasticity},
-                          .matrix = matrix.get(),
-                          .masses = &problem.masses,
-                          .h = problem.h};
-  if (problem.anchors) f.potentials.push_back(&*problem.anchors);
-  const projective::Outcome outcome = nodes.has_contacts()
-                                          ? nodes.iterate(f, options, checkpoint, x)
-                                          : projective::minimize(f, x, options, checkpoint);
-  step.report.counts.local_global += outcome.iterations;
-  step.report.residual = std::max(step.report.residual, outcome.residual);
-  if (outcome.status != projective::Status::kConverged) {
-    step.report.result = Result::kNotConverged;
-    step.report.message = words(outcome.status);
-  }
-  step.kept.factors.push_back(nullptr);
 }
 
 solver::Objective objective(Problem& problem) {
@@ -73,6 +46,45 @@ void solve_by_newton(Problem& problem,
   step.context.path = path;
   merge(outcome, step.report);
   step.kept.factors.push_back(outcome.factor);
+}
+
+/// By local/global iterations, from which no factor comes: backward makes it. What they give up Newton's
+/// method solves, from the same start.
+void solve_by_projective_dynamics(Problem& problem,
+                                  const Forward& step,
+                                  const NodalStage& nodes,
+                                  std::vector<double>& x) {
+  const solver::Options& given = step.context.options;
+  const projective::Options options{
+      .tolerance = given.tolerance,
+      .max_iterations = projective::kIterationsPerNewton * given.max_iterations};
+  const Checkpoint& checkpoint = *step.context.checkpoint;
+  const std::vector<double> start = x;
+  projective::Outcome outcome;
+  {
+    const Stopwatch::Scope scope(*step.context.watch, Phase::kSolve);
+    const auto matrix = problem.constant_matrix();
+    projective::Objective f{.potentials = {&problem.inertia, &problem.elasticity},
+                            .matrix = matrix.get(),
+                            .masses = &problem.masses,
+                            .h = problem.h};
+    if (problem.anchors) f.potentials.push_back(&*problem.anchors);
+    outcome = nodes.has_contacts() ? nodes.iterate(f, options, checkpoint, x)
+                                   : projective::minimize(f, x, options, checkpoint);
+  }
+  step.report.counts.local_global += outcome.iterations;
+  if (outcome.status == projective::Status::kStalled) {
+    ++step.report.counts.left_to_newton;
+    x = start;
+    solve_by_newton(problem, step, nodes, x);
+    return;
+  }
+  step.report.residual = std::max(step.report.residual, outcome.residual);
+  if (outcome.status != projective::Status::kConverged) {
+    step.report.result = Result::kNotConverged;
+    step.report.message = words(outcome.status);
+  }
+  step.kept.factors.push_back(nullptr);
 }
 
 }  // namespace

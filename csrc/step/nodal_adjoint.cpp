@@ -55,7 +55,9 @@ void NodalStage::backward(const Backward& step,
   // The bodies' forces: minus E g, shared.
   Array eta(f.coordinates->size(), 0.0);
   std::vector<Vec3> surface_point_bar(contacts_.list.size(), Vec3::Zero());
-  for (std::size_t k = 0; k < contacts_.list.size(); ++k) {
+  const bool forces_count =
+      std::ranges::any_of(force_bar, [](double value) { return value != 0.0; });
+  for (std::size_t k = 0; forces_count && k < contacts_.list.size(); ++k) {
     const NodalContact& c = contacts_.list[k];
     if (c.obstacle < 0 || at.laws[k].kind == ContactCase::kTakingOff) continue;
     const Index body = contacts_.obstacles[c.obstacle].body;
@@ -71,7 +73,7 @@ void NodalStage::backward(const Backward& step,
   }
   Array b = g;
   system.clear_fixed(b);
-  H.add_product(eta.data(), b.data());
+  if (forces_count) H.add_product(eta.data(), b.data());
   system.project(at, b);
   Array lambda;
   const auto solved = system.solve(at, H, *factor, true, b, kAdjointTolerance, lambda);
@@ -88,10 +90,11 @@ void NodalStage::backward(const Backward& step,
   for (std::size_t a = 0; a < z.size(); ++a) z[a] -= eta[a];
   Array z_points(x.size(), 0.0);
   f.coordinates->add_rows(z, z_points);
-  Array q;
-  f.hessian_product(x.data(), z_points.data(), q);
-  for (double& value : q) value = -value;
-  f.coordinates->add_rows(g, q);
+  Array change(z.size(), 0.0);
+  H.add_product(z.data(), change.data());
+  for (std::size_t a = 0; a < change.size(); ++a) change[a] = g[a] - change[a];
+  Array q(x.size(), 0.0);
+  f.coordinates->add_rows(change, q);
   for (Index i = 0; i < f.coordinates->point_count(); ++i) {
     if (f.coordinates->prescribed()[i] == 0) continue;
     for (Index a = 3 * i; a < 3 * i + 3; ++a) bars.ends[a] += q[a];

@@ -9,6 +9,13 @@
 #include "step/nodal_system.h"
 
 namespace diffcloth::step {
+namespace {
+
+/// Local/global iterations that do not halve the residual, after which they are given up: near a saddle
+/// it must grow on the way down, which they do not follow.
+constexpr int kIdle = 100;
+
+}  // namespace
 
 using Array = std::vector<double>;
 using projective::ContactCase;
@@ -33,7 +40,7 @@ void NodalStage::start(Array& x) const {
   // Where that would collapse the cloth, where it stands is the better place to begin.
   Array held = problem_.predicted(problem_.start.data());
   system.clear_approach(held);
-  if (f.energy(held.data()) < f.energy(x.data())) x = std::move(held);
+  if (f.energy_change(x.data(), held.data()) < 0.0) x = std::move(held);
 }
 
 projective::Outcome NodalStage::iterate(const projective::Objective& smooth,
@@ -52,6 +59,8 @@ projective::Outcome NodalStage::iterate(const projective::Objective& smooth,
   Array plain(problem_.cloth_size);  // where the last iteration leads without acceleration
   Array to = x;
   double last = std::numeric_limits<double>::infinity();
+  double best = std::numeric_limits<double>::infinity();
+  int idle = 0;
   bool accelerated = false;
   for (;; ++outcome.iterations) {
     checkpoint.check();
@@ -74,6 +83,15 @@ projective::Outcome NodalStage::iterate(const projective::Objective& smooth,
       return outcome;
     }
     if (outcome.iterations == options.max_iterations) return outcome;
+    ++idle;
+    if (outcome.residual < 0.5 * best) {
+      best = outcome.residual;
+      idle = 0;
+    }
+    if (idle == kIdle) {
+      outcome.status = projective::Status::kStalled;
+      return outcome;
+    }
     smooth.matrix->solve(force.data(), p.data(), scratch);
     double size = 0.0;
     for (std::size_t a = 0; a < p.size(); ++a) {

@@ -32,7 +32,8 @@ class NodalStage {
   /// @param x  in: a start; out: the solution
   solver::Outcome solve(solver::Context& context, std::vector<double>& x) const;
 
-  /// Solve by local/global iterations with impulses (Ly et al. 2020), accelerated.
+  /// Solve by local/global iterations with impulses (Ly et al. 2020), accelerated. They are given up
+  /// where they stall.
   ///
   /// @param smooth  what is minimized where nothing touches
   /// @param x  in: a start; out: the solution

@@ -345,7 +345,7 @@ linalg::BlockMatrix NodalSystem::without_coupling(const Point& at,
       projections.push_back({.own = own, .other = other});
     }
   }
-  // Blocks that a contact touches leave their place, and come back projected.
+  // Blocks of pairs leave their place, and come back projected where both vertices are.
   struct Moved {
     Index p, q;
     Mat3 block;
@@ -356,6 +356,11 @@ linalg::BlockMatrix NodalSystem::without_coupling(const Point& at,
       const Index p = pattern.row()[k];
       if (p >= n || (place[p] < 0 && place[q] < 0)) continue;
       Eigen::Map<Mat3> block(S.blocks() + 9 * static_cast<std::ptrdiff_t>(k));
+      if (partner_[p] < 0 && partner_[q] < 0) {
+        if (place[p] >= 0) block = projections[place[p]].own * block;
+        if (place[q] >= 0) block = block * projections[place[q]].own.transpose();
+        continue;
+      }
       moved.push_back({.p = p, .q = q, .block = block});
       block.setZero();
     }

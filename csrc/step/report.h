@@ -45,6 +45,7 @@ struct Report {
     visit("count_projected", static_cast<std::int64_t>(counts.projected));
     visit("count_negative_curvature", static_cast<std::int64_t>(counts.negative_curvature));
     visit("count_local_global", counts.local_global);
+    visit("count_left_to_newton", static_cast<std::int64_t>(counts.left_to_newton));
     visit("count_factorizations", static_cast<std::int64_t>(counts.factorizations));
     visit("count_analyses", static_cast<std::int64_t>(counts.analyses));
     visit("count_taking_off", static_cast<std::int64_t>(taking_off));

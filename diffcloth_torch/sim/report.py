@@ -38,9 +38,10 @@ class Report:
         seconds: Phase of the step -> time [s]; the phases add up to the time in the core.
         counts: What was done -> how often: steps with the `exact` Hessian, `chord` steps with an
             older factor, steps with a `projected` Hessian, Hessians of `negative_curvature`,
-            `local_global` iterations of Projective Dynamics, numeric `factorizations`, failed ones
-            included, and symbolic `analyses`; vertices in dry frictional contact that are
-            `taking_off`, `sticking` and `slipping`.
+            `local_global` iterations of Projective Dynamics, solves that these have
+            `left_to_newton`, numeric `factorizations`, failed ones included, and symbolic
+            `analyses`; vertices in dry frictional contact that are `taking_off`, `sticking` and
+            `slipping`.
     """
 
     converged: bool | Tensor
