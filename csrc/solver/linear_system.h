@@ -58,6 +58,11 @@ class LinearSystem {
              const std::vector<double>& b,
              std::vector<double>& p);
 
+  /// The same for several right sides at once, each with the bits that it has alone.
+  void solve(const linalg::CholeskyFactor& factor,
+             const std::vector<std::vector<double>>& b,
+             std::vector<std::vector<double>>& p);
+
   /// The same for a matrix, by conjugate gradients with a factor of a nearby one.
   linalg::Convergence solve(const linalg::BlockMatrix& matrix,
                             const linalg::CholeskyFactor& nearby,

@@ -39,8 +39,7 @@ void NodalStage::backward(const Backward& step,
                           const Array& x,
                           solver::Factor factor,
                           const Array& g,
-                          const Array& force_bar) const {
-  Cotangents& bars = step.cotangents;
+                          Cotangents& bars) const {
   const solver::Objective f = objective();
   const NodalSystem system(problem_, contacts_, f);
   solver::LinearSystem linear(f, *step.context.workspace, *step.context.watch,
@@ -63,7 +62,7 @@ void NodalStage::backward(const Backward& step,
     const Vec3 force = relative(c, at.g.data());
     Vec3 weights_bar;
     for (int a = 0; a < 3; ++a) {
-      const Vec3 bar = row(force_bar.data(), share.corners[a]);
+      const Vec3 bar = row(bars.body_forces.data(), share.corners[a]);
       spread(c, -share.weights[a] * bar, eta.data());
       weights_bar[a] = -bar.dot(force);
     }
