@@ -575,6 +575,9 @@ void simulator(nb::module_& m) {
                      {.kind = projective::primitive_kind(kind), .size = row(sizes.data(), i)});
                }
              }
+             if (k.contains("large_factor")) {  // only tests say it
+               description.options.large_factor = nb::cast<std::size_t>(k["large_factor"]);
+             }
              if (k.contains("link_names")) {
                description.link_names = nb::cast<std::vector<std::string>>(k["link_names"]);
              }

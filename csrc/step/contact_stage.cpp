@@ -204,7 +204,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
         solver::minimize(sum.objective, x, motion, solves == 0 ? &first_guess : nullptr,
                          std::move(factor), step.context);
     merge(outcome, step.report);
-    step.kept.factors.push_back(outcome.factor);
+    step.kept.add(outcome.factor);
     factor = outcome.factor;
     if (!step.tape.empty()) {
       Array rows;

@@ -52,7 +52,7 @@ void solve_by_projective_dynamics(Problem& problem,
     step.report.result = Result::kNotConverged;
     step.report.message = words(outcome.status);
   }
-  step.kept.factors.push_back(nullptr);
+  step.kept.add(nullptr);
 }
 
 solver::Objective objective(Problem& problem) {
@@ -72,7 +72,7 @@ void solve_by_newton(Problem& problem,
                                                          nullptr, nullptr, step.context);
   step.context.path = path;
   merge(outcome, step.report);
-  step.kept.factors.push_back(outcome.factor);
+  step.kept.add(outcome.factor);
 }
 
 }  // namespace
