@@ -49,6 +49,7 @@ docs/experiments
 docs/gallery
 docs/reference/index
 docs/design
+docs/performance
 docs/notation
 CONTRIBUTING
 CHANGELOG

@@ -317,8 +317,11 @@ def folded(thickness=0.0, **options):
     return Case(sim, state.replace(velocities=v), {"forces": tensor_noise(v.shape, 0.001, 5)})
 
 
-def stacked(**options):
-    """One cloth slides on another, softly pinned one; densities and thicknesses differ."""
+def stacked(dragged=False, **options):
+    """One cloth slides on another, softly pinned one; densities and thicknesses differ.
+
+    Where it is dragged, pins over the lower one move it.
+    """
     lower, faces = grid(6, 6, seed=11)
     upper, upper_faces = grid(5, 5, edge=0.09, seed=12)
     upper = turned(turned(upper, (0, 0, 1), 0.03), (1, 0.5, 0), 0.006)
@@ -343,13 +346,18 @@ def stacked(**options):
             ),
             soft_pins={"one": [12]},
             pin_stiffness=3.0,
+            pins={"grip": [7, 8]} if dragged else None,
         ),
     ]
     sim = simulator(cloths, **options)
     state = settled(sim, sim.initial_state(), 4)
     v = 0.05 * tensor_noise(state.velocities.shape, 1.0, 9)
     v[36:] += torch.tensor([0.5, -0.3, -0.1], dtype=F64)
-    return Case(sim, state.replace(velocities=v), {"forces": tensor_noise(v.shape, 0.001, 5)})
+    control = {"forces": tensor_noise(v.shape, 0.001, 5)}
+    if dragged:
+        way = torch.tensor([0.004, -0.002, -0.001], dtype=F64)
+        control["pins"] = state.positions[[36 + 7, 36 + 8]] + way
+    return Case(sim, state.replace(velocities=v), control)
 
 
 def on_sphere(friction=0.4, rows=6, body_friction=None, **options):
@@ -385,6 +393,7 @@ REGIMES = {
     "folded": folded,
     "folded_thick": lambda **o: folded(thickness=0.003, **o),
     "stacked": stacked,
+    "dragged": lambda **o: stacked(dragged=True, **o),
     "sphere": on_sphere,
     "poking": poking,
 }

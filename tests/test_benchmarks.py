@@ -125,6 +125,54 @@ def test_what_moves_by_forces_is_timed_beside_what_is_given():
     assert all(float(row[-1]) >= 1 for row in rows[1:])  # steps in contact
 
 
+@pytest.fixture(scope="module")
+def figures(tmp_path_factory):
+    """A folder with the page of a quick run against this very checkout."""
+    docs = tmp_path_factory.mktemp("figures")
+    run_figures("--quick", "--cpu", "--against", f"an equal={ROOT}", "--docs", str(docs))
+    return docs
+
+
+def run_figures(*arguments):
+    command = [sys.executable, "-m", "benchmarks.figures", *arguments]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+
+
+def test_the_page_of_figures_has_what_was_measured(figures):
+    records = json.loads((figures / "performance.json").read_text())
+    page = (figures / "performance.md").read_text()
+    rows = records["releases"]["an equal"]
+    assert "## Beside an equal" in page
+    assert [(row["scene"], row["batch"]) for row in rows] == [
+        ("hanging", 0),
+        ("sphere", 0),
+        ("sphere", 8),
+    ]
+    assert len(records["phases"]) == SCENES
+    for row in rows:
+        assert row["this"]["iterations"] == row["other"]["iterations"] >= 1
+        ratio = row["other"]["forward"] / row["this"]["forward"]
+        cells = [row["scene"], str(row["size"]), str(row["batch"] or 1), "1"]
+        (line,) = (x for x in page.splitlines() if x.startswith(f"| {' | '.join(cells)} |"))
+        assert float(line.split("|")[7]) == pytest.approx(ratio, rel=0.01)  # three digits
+    for row in records["losses"]:
+        assert row["loop"] > 0 < row["once"]
+    shown = {path.name for path in (figures / "images").iterdir()}
+    assert shown == {f"performance_{name}.svg" for name in ("ratio", "size", "phases")}
+    assert all(f"](images/{name})" in page for name in shown)
+
+
+def test_the_page_of_figures_is_that_of_its_records(tmp_path):
+    """Nobody has edited the page, nor forgotten to draw it again."""
+    for name in ("performance.json", "performance.md"):
+        (tmp_path / name).write_bytes((ROOT / "docs" / name).read_bytes())
+    run_figures("--draw", "--docs", str(tmp_path))
+    assert (tmp_path / "performance.md").read_text() == (ROOT / "docs/performance.md").read_text()
+    drawn = {path.name for path in (tmp_path / "images").iterdir()}
+    assert drawn == {path.name for path in (ROOT / "docs/images").glob("performance_*")}
+
+
 def read_tables(*command):
     """Title -> method -> column -> cell, of the tables that a benchmark prints."""
     result = subprocess.run(

@@ -51,6 +51,7 @@ def backward(sim, inputs, out, **changes):
             name: np.ones_like(out[name])
             for name in ("positions", "velocities", "body_forces", "coordinates")
         },
+        "losses": 1,
         "needs": list(inputs),
     }
     return sim._core.backward(*(arguments | changes).values(), 1)
@@ -60,7 +61,7 @@ def test_the_inputs_are_good_ones(sim, inputs, forward):
     assert forward["status"][0] == 0
     gradients = backward(sim, inputs, forward)
     assert {name: a.shape for name, a in gradients.items()} == {
-        name: a.shape for name, a in inputs.items()
+        name: (1, *a.shape) for name, a in inputs.items()
     }
 
 
@@ -133,10 +134,12 @@ def test_a_tape_or_cotangent_of_another_size_is_refused(scheme, kind):
             arguments = {"tape": tape, "kept": out["kept"], "cotangents": cotangents}
             arguments |= {key: table | {name: bad}}
             with pytest.raises(ValueError, match=f"core: `{name}` must have"):
-                sim._core.backward(inputs, *arguments.values(), list(inputs), 1)
+                sim._core.backward(inputs, *arguments.values(), 1, list(inputs), 1)
             without = {other: a for other, a in table.items() if other != name}
             with pytest.raises(KeyError):
-                sim._core.backward(inputs, *(arguments | {key: without}).values(), list(inputs), 1)
+                sim._core.backward(
+                    inputs, *(arguments | {key: without}).values(), 1, list(inputs), 1
+                )
 
 
 @pytest.mark.boundary

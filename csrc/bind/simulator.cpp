@@ -121,6 +121,7 @@ class Simulator {
                     const nb::dict& tape,
                     const KeptSteps& kept,
                     const nb::dict& cotangents,
+                    std::size_t losses,
                     const std::vector<std::string>& needs,
                     int threads);
   nb::dict stored_energy(const nb::dict& inputs) const;
@@ -286,6 +287,7 @@ nb::dict Simulator::backward(const nb::dict& inputs,
                              const nb::dict& tape,
                              const KeptSteps& kept,
                              const nb::dict& cotangents,
+                             std::size_t losses,
                              const std::vector<std::string>& needs,
                              int threads) {
   const Arrays arrays(scene_, inputs, true);
@@ -295,13 +297,15 @@ nb::dict Simulator::backward(const nb::dict& inputs,
   if (kept.tickets.size() != b) {
     throw nb::value_error("core: `kept` must be of as many environments as the inputs");
   }
-  const Saved bars(step::output_fields(scene_), b, "", cotangents);
+  const Saved bars(step::output_fields(scene_), losses * b, "", cotangents);
 
-  // Each environment writes into its own copy; shared inputs are then summed in index order.
+  // [losses, environments or 1, count]. Each environment of a loss writes into its own copy; those of
+  // inputs that environments share are then summed in index order.
   struct Wanted {
     std::size_t input, count, copies;
     double* out;
-    std::vector<double> own;
+    std::vector<double> own;  // empty where nothing is shared
+    double* at(std::size_t row) { return (own.empty() ? out : own.data()) + row * count; }
   };
   nb::dict out;
   std::vector<Wanted> wanted;
@@ -312,33 +316,51 @@ nb::dict Simulator::backward(const nb::dict& inputs,
       throw nb::value_error(("backward: `needs` has an unknown input " + name).c_str());
     }
     const Doubles& array = arrays.array[input];
-    std::vector<std::size_t> shape;
+    std::vector<std::size_t> shape{losses};
     for (std::size_t d = 0; d < array.ndim(); ++d) shape.push_back(array.shape(d));
     Owned<double> owned = make_array<double>(shape);
-    std::fill_n(owned.data, array.size(), 0.0);
+    std::fill_n(owned.data, losses * array.size(), 0.0);
     out[name.c_str()] = owned.array;
-    const std::size_t copies = shape.empty() ? 1 : shape[0];
-    const std::size_t count = copies == 0 ? 0 : array.size() / copies;
+    const std::size_t copies = array.shape(0);
+    const std::size_t count = array.size() / copies;
     wanted.push_back({.input = input,
                       .count = count,
                       .copies = copies,
                       .out = owned.data,
-                      .own = std::vector<double>(b * count, 0.0)});
+                      .own = std::vector<double>(copies < b ? losses * b * count : 0, 0.0)});
   }
 
-  for_environments(b, threads, [&](Index i, const Checkpoint& checkpoint) {
-    const auto e = static_cast<std::size_t>(i);
-    // The loss does not depend on this environment. Its step may even have failed.
-    if (bars.is_zero(e)) return;
-    step::Gradients gradients;
-    for (Wanted& w : wanted) gradients.data[w.input] = w.own.data() + e * w.count;
+  // A loss that does not depend on an environment has zeros there: that step may even have failed.
+  struct Portion {
+    std::size_t environment;
+    std::vector<std::size_t> rows;  // loss * environments + environment
+  };
+  std::vector<Portion> portions;
+  for (std::size_t e = 0; e < b; ++e) {
+    std::vector<std::size_t> rows;
+    for (std::size_t row = e; row < losses * b; row += b) {
+      if (!bars.is_zero(row)) rows.push_back(row);
+      if (rows.size() < step::kLossesAtOnce) continue;
+      portions.push_back({.environment = e, .rows = std::move(rows)});
+      rows.clear();
+    }
+    if (!rows.empty()) portions.push_back({.environment = e, .rows = std::move(rows)});
+  }
+  for_environments(portions.size(), threads, [&](Index i, const Checkpoint& checkpoint) {
+    const auto& [e, rows] = portions[static_cast<std::size_t>(i)];
+    std::vector<step::Loss> of_rows;
+    for (const std::size_t row : rows) {
+      of_rows.push_back({.cotangents = bars.environment(row), .gradients = {}});
+      step::Gradients& gradients = of_rows.back().gradients;
+      for (Wanted& w : wanted) gradients.data[w.input] = w.at(row);
+    }
     step::backward(scene_, arrays.environment(e), tapes.environment(e), *kept.tickets[e]->find(),
-                   bars.environment(e), checkpoint, gradients);
+                   of_rows, checkpoint);
   });
   for (const Wanted& w : wanted) {
-    for (std::size_t e = 0; e < b; ++e) {
-      double* target = w.out + (w.copies > 1 ? e * w.count : 0);
-      for (std::size_t a = 0; a < w.count; ++a) target[a] += w.own[e * w.count + a];
+    for (std::size_t row = 0; row < w.own.size() / std::max<std::size_t>(w.count, 1); ++row) {
+      double* target = w.out + row / b * w.count;
+      for (std::size_t a = 0; a < w.count; ++a) target[a] += w.own[row * w.count + a];
     }
   }
   return out;
@@ -562,6 +584,9 @@ void simulator(nb::module_& m) {
                      {.kind = projective::primitive_kind(kind), .size = row(sizes.data(), i)});
                }
              }
+             if (k.contains("large_factor")) {  // only tests say it
+               description.options.large_factor = nb::cast<std::size_t>(k["large_factor"]);
+             }
              if (k.contains("link_names")) {
                description.link_names = nb::cast<std::vector<std::string>>(k["link_names"]);
              }
@@ -579,7 +604,8 @@ void simulator(nb::module_& m) {
            })
       .def("forward", &Simulator::forward, "inputs"_a, "tape"_a, "threads"_a)
       .def("backward", &Simulator::backward, "inputs"_a, "tape"_a, "kept"_a, "cotangents"_a,
-           "needs"_a, "threads"_a)
+           "losses"_a, "needs"_a, "threads"_a,
+           "Gradients [losses, ...] of the inputs that are needed, from cotangents [losses, ...].")
       .def("stored_energy", &Simulator::stored_energy, "inputs"_a)
       .def("path", &Simulator::path, "inputs"_a,
            "Accepted iterates of the first environment's step [M, N + V, 3].")

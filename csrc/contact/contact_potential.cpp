@@ -95,6 +95,13 @@ void ContactPotential::add_hessian_product(const double* x, const double* z, dou
   model_.add_hessian_product(contacts_, x, z, y);
 }
 
+void ContactPotential::add_held_product(const double* x, const double* z, double* y) const {
+  for (const Contact& k : contacts_) {
+    if (!model_.is_held(k.pair)) continue;
+    add_stencil_product(k.pair.vertices, model_.hessian(k, x, Curvature::kExact), z, y);
+  }
+}
+
 void ContactPotential::add_left_out_product(const double* x,
                                             Curvature curvature,
                                             const double* d,
@@ -106,7 +113,7 @@ void ContactPotential::add_left_out_product(const double* x,
 }
 
 void ContactPotential::accumulate(const double* x, const double* z) {
-  model_.add_mixed(contacts_, x, z, -1.0, *bar_);
+  if (bar_ != nullptr) model_.add_mixed(contacts_, x, z, -1.0, *bar_);
 }
 
 void FrictionPotential::add_couplings(linalg::Couplings& pairs) const {
@@ -120,6 +127,13 @@ void FrictionPotential::add_hessian(const double* x,
                                     linalg::BlockMatrix& A) const {
   for (const FrictionSet::Entry& k : set_.entries()) {
     A.add_stencil(k.lag.pair.vertices, set_.hessian(k, x_start_, x, curvature));
+  }
+}
+
+void FrictionPotential::add_held_product(const double* x, const double* z, double* y) const {
+  for (const FrictionSet::Entry& k : set_.entries()) {
+    if (!set_.model().is_held(k.lag.pair)) continue;
+    add_stencil_product(k.lag.pair.vertices, set_.hessian(k, x_start_, x, Curvature::kExact), z, y);
   }
 }
 

@@ -27,7 +27,7 @@ struct Detection {
 /// potential is asked about any point of it.
 class ContactPotential final : public Potential {
  public:
-  /// @param bar  where accumulate() adds; null where it is never called
+  /// @param bar  where accumulate() adds; null where nobody asks for it
   ContactPotential(const ContactModel& model, Detection& detection, ContactModel::Bar* bar)
       : model_(model), detection_(detection), bar_(bar) {}
 
@@ -68,6 +68,7 @@ class ContactPotential final : public Potential {
   void add_couplings(linalg::Couplings& pairs) const override;
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
   void add_hessian_product(const double* x, const double* z, double* y) const override;
+  void add_held_product(const double* x, const double* z, double* y) const override;
   void add_left_out_product(const double* x,
                             Curvature curvature,
                             const double* d,
@@ -117,6 +118,7 @@ class FrictionPotential final : public Potential {
   void add_hessian_product(const double* x, const double* z, double* y) const override {
     set_.add_hessian_product(x_start_, x, z, y);
   }
+  void add_held_product(const double* x, const double* z, double* y) const override;
   void add_left_out_product(const double* x,
                             Curvature curvature,
                             const double* d,

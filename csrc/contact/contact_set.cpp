@@ -359,6 +359,11 @@ Mat12 ContactModel::hessian(const Contact& k, const double* x, Curvature curvatu
   return scale * h;
 }
 
+bool ContactModel::is_held(const Candidate& pair) const {
+  return std::ranges::any_of(
+      pair.vertices, [&](Index v) { return v >= mesh_.cloth_vertex_count || prescribed_[v] != 0; });
+}
+
 void ContactModel::add_hessian_product(const std::vector<Contact>& contacts,
                                        const double* x,
                                        const double* z,

@@ -124,6 +124,9 @@ class ContactModel {
   /// The contacts at x, in the order of the terms.
   void find(const Near& near, const double* x, std::vector<Contact>& out) const;
 
+  /// Whether a corner of a pair is no free vertex of a cloth.
+  bool is_held(const Candidate& pair) const;
+
   /// g += grad B.
   void add_gradient(const std::vector<Contact>& contacts, const double* x, double* g) const;
 

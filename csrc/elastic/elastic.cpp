@@ -28,6 +28,17 @@ void scatter(const Model& model, Index f, const Mat32& P, double* y) {
   }
 }
 
+/// y += H z of a face.
+void add_face_product(const Model& model, Index f, const double* x, const double* z, double* y) {
+  const Mat32 F = face_gradient(model, f, x);
+  const Mat32 G = face_gradient(model, f, z);
+  Mat32 P = stretch::stress_change(stretch_weight(model, f), F, G);
+  if (is_damped(model, f)) {
+    P += damping::stress_change(damping_weight(model, f), F, face_gradient(model, f, model.x_n), G);
+  }
+  scatter(model, f, P, y);
+}
+
 void add_face_blocks(const std::array<Index, 3>& face,
                      const Index* slots,
                      const std::vector<Index>& place,
@@ -165,6 +176,22 @@ std::vector<std::vector<Index>> cliques(const mesh::Topology& topology,
   for (Index e = 0; e < stencils.size(); ++e) {
     const std::span<const Index> vertices = stencils.element(e);
     result.emplace_back(vertices.begin(), vertices.end());
+  }
+  return result;
+}
+
+Elements elements_at(const mesh::Topology& topology,
+                     const mesh::BendingStencils& stencils,
+                     const std::vector<char>& marked) {
+  const auto is_marked = [&](Index i) { return marked[i] != 0; };
+  Elements result;
+  for (std::size_t f = 0; f < topology.faces.size(); ++f) {
+    if (std::ranges::any_of(topology.faces[f], is_marked)) {
+      result.faces.push_back(static_cast<Index>(f));
+    }
+  }
+  for (Index e = 0; e < stencils.size(); ++e) {
+    if (std::ranges::any_of(stencils.element(e), is_marked)) result.bending.push_back(e);
   }
   return result;
 }
@@ -339,17 +366,16 @@ void add_extrapolation(const Model& model,
 }
 
 void add_hessian_product(const Model& model, const double* x, const double* z, double* y) {
-  for (Index f = 0; f < face_count(model); ++f) {
-    const Mat32 F = face_gradient(model, f, x);
-    const Mat32 G = face_gradient(model, f, z);
-    Mat32 P = stretch::stress_change(stretch_weight(model, f), F, G);
-    if (is_damped(model, f)) {
-      P += damping::stress_change(damping_weight(model, f), F, face_gradient(model, f, model.x_n),
-                                  G);
-    }
-    scatter(model, f, P, y);
-  }
+  for (Index f = 0; f < face_count(model); ++f) add_face_product(model, f, x, z, y);
   for (Index e = 0; e < model.stencils->size(); ++e) {
+    bending::add_hessian_product(bending_element(model, e), x, z, y);
+  }
+}
+
+void add_hessian_product(
+    const Model& model, const Elements& elements, const double* x, const double* z, double* y) {
+  for (const Index f : elements.faces) add_face_product(model, f, x, z, y);
+  for (const Index e : elements.bending) {
     bending::add_hessian_product(bending_element(model, e), x, z, y);
   }
 }

@@ -28,6 +28,19 @@ Slots slots(const mesh::Topology& topology,
             const mesh::BendingStencils& stencils,
             const linalg::BlockPattern& pattern);
 
+/// Some of the elements, ascending.
+struct Elements {
+  std::vector<Index> faces;
+  std::vector<Index> bending;
+};
+
+/// Those with a marked corner.
+///
+/// @param marked  [points], of which the first are the topology's vertices
+Elements elements_at(const mesh::Topology& topology,
+                     const mesh::BendingStencils& stencils,
+                     const std::vector<char>& marked);
+
 /// What prepare() derives from a Model: constant during one step.
 struct Prepared {
   std::vector<double> bending;     ///< [B] D of an element times its area
@@ -47,14 +60,15 @@ struct Model {
   const mesh::Topology* topology = nullptr;
   const mesh::BendingStencils* stencils = nullptr;
   const mesh::RestShape* rest = nullptr;
-  std::vector<double> stretch;  ///< [F] k_s [N/m]
-  std::vector<double> bending;  ///< [F] D [N m]
-  std::vector<double> poisson;  ///< [F] nu [-]
-  std::vector<double> damping;  ///< [F] k_d [s]
-  double h = 0.0;               ///< time step [s]; only damping needs it
-  const double* x_n = nullptr;  ///< [N, 3] start of the step [m]; only damping needs it
-  double least_inertia = 0.0;   ///< smallest M / h^2 of a vertex [N/m]
-  Prepared prepared;            ///< filled by prepare()
+  std::vector<double> stretch;     ///< [F] k_s [N/m]
+  std::vector<double> bending;     ///< [F] D [N m]
+  std::vector<double> poisson;     ///< [F] nu [-]
+  std::vector<double> damping;     ///< [F] k_d [s]
+  double h = 0.0;                  ///< time step [s]; only damping needs it
+  const double* x_n = nullptr;     ///< [N, 3] start of the step [m]; only damping needs it
+  double least_inertia = 0.0;      ///< smallest M / h^2 of a vertex [N/m]
+  const Elements* held = nullptr;  ///< those with a prescribed corner; only backward needs them
+  Prepared prepared;               ///< filled by prepare()
 };
 
 /// Fill model.prepared. To be called whenever anything in the model has changed.
@@ -108,6 +122,10 @@ void add_extrapolation(const Model& model,
 
 /// y += H(x) z over all vertices, with the exact Hessian and without a matrix.
 void add_hessian_product(const Model& model, const double* x, const double* z, double* y);
+
+/// The same of some elements alone.
+void add_hessian_product(
+    const Model& model, const Elements& elements, const double* x, const double* z, double* y);
 
 /// Cotangents of what a Model depends on.
 struct Bar {

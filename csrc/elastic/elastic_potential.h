@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <utility>
 #include <vector>
 
 #include "elastic/anchors.h"
@@ -38,6 +39,9 @@ class ElasticPotential final : public Potential {
   void add_hessian_product(const double* x, const double* z, double* y) const override {
     elastic::add_hessian_product(model_, x, z, y);
   }
+  void add_held_product(const double* x, const double* z, double* y) const override {
+    elastic::add_hessian_product(model_, *model_.held, x, z, y);
+  }
 
   void accumulate(const double* x, const double* z) override;
 
@@ -47,6 +51,9 @@ class ElasticPotential final : public Potential {
 
   /// Zero until something is accumulated.
   Bar& bar();
+
+  /// Swap what has been accumulated; an empty one is zero.
+  void exchange(Bar& other) { std::swap(bar_, other); }
 
  private:
   const Model& model_;

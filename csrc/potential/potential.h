@@ -55,6 +55,12 @@ class Potential {
   /// y += H z over all vertices, exact.
   virtual void add_hessian_product(const double* x, const double* z, double* y) const = 0;
 
+  /// y += the rows of H z at all points but the cloths' free vertices, exact; what those get means
+  /// nothing.
+  virtual void add_held_product(const double* x, const double* z, double* y) const {
+    add_hessian_product(x, z, y);
+  }
+
   /// y += H d, of the pairs with points that move in d, for a motion d of points whose rows
   /// add_hessian() leaves out.
   virtual void add_left_out_product(const double* /*x*/,

@@ -32,8 +32,34 @@ constexpr double kLargestGrowth = 4.0;
 
 }  // namespace
 
+const Factor& Directions::nearby() {
+  if (!factor_ && source_) factor_ = walk_.system.factor(source_->matrix, source_->analysis);
+  return factor_;
+}
+
+void Directions::make_room() {
+  if (source_) factor_ = nullptr;
+}
+
+bool Directions::refactor(const linalg::BlockMatrix& H) {
+  make_room();
+  Factor factor = walk_.system.factor(H);
+  if (!factor) {
+    ++walk_.context.counts->negative_curvature;
+    return false;
+  }
+  ++walk_.context.counts->exact;
+  factor_ = std::move(factor);
+  source_.reset();
+  if (factor_->bytes() > walk_.context.options.large_factor) {
+    source_ = Source{.matrix = H, .analysis = factor_->analysis()};
+  }
+  walk_.system.solve(*factor_, walk_.g(), p_);
+  return true;
+}
+
 bool Directions::chord() {
-  if (!chord_allowed_ || !factor_ || s_ > 0.0) return false;
+  if (!chord_allowed_ || s_ > 0.0 || !nearby()) return false;
   walk_.system.solve(*factor_, walk_.g(), p_);
   if (!(walk_.displacement(p_) <= kChordContraction * last_step_)) return false;
   ++walk_.context.counts->chord;
@@ -41,7 +67,7 @@ bool Directions::chord() {
 }
 
 bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
-  if (!factor_ || s_ > 0.0) return false;
+  if (s_ > 0.0 || !nearby()) return false;
   const linalg::Convergence result =
       walk_.system.solve(H, *factor_, walk_.g(), kForcing, kIterations, p_);
   indefinite = result == linalg::Convergence::kNegativeCurvature;
@@ -51,14 +77,12 @@ bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
 }
 
 bool Directions::certify() {
-  factor_ = walk_.system.certify(walk_.x().data(), walk_.g());
-  if (!factor_) {
-    ++walk_.context.counts->negative_curvature;
-    return false;
-  }
-  ++walk_.context.counts->exact;
-  walk_.system.solve(*factor_, walk_.g(), p_);
-  return true;
+  const linalg::BlockMatrix H =
+      walk_.system.assemble(walk_.x().data(), Curvature::kExact, walk_.g());
+  // Whatever was near is of no use where this is indefinite: it is a saddle.
+  factor_ = nullptr;
+  source_.reset();
+  return refactor(H);
 }
 
 Directions::Direction Directions::next() {
@@ -68,15 +92,11 @@ Directions::Direction Directions::next() {
   if (s_ == 0.0) {
     bool indefinite = false;
     if (iterate(H, indefinite)) return {.kind = Kind::kIterated, .first = 1.0};
-    if (!indefinite) {
-      if (Factor factor = walk_.system.factor(H)) {
-        factor_ = std::move(factor);
-        ++walk_.context.counts->exact;
-        walk_.system.solve(*factor_, walk_.g(), p_);
-        return {.kind = Kind::kFactored, .first = 1.0};
-      }
+    if (indefinite) {
+      ++walk_.context.counts->negative_curvature;
+    } else if (refactor(H)) {
+      return {.kind = Kind::kFactored, .first = 1.0};
     }
-    ++walk_.context.counts->negative_curvature;
     s_ = kFirstShare;
   }
   const std::optional<Direction> damped =
@@ -92,19 +112,14 @@ Directions::Direction Directions::next() {
 std::optional<Directions::Direction> Directions::next_extrapolated() {
   const double* x = walk_.x().data();
   const linalg::BlockMatrix H = walk_.system.assemble_extrapolated(x, Curvature::kExact, walk_.g());
-  if (Factor factor = walk_.system.factor(H)) {
-    factor_ = std::move(factor);
-    ++walk_.context.counts->exact;
-    walk_.system.solve(*factor_, walk_.g(), p_);
-    return Direction{.kind = Kind::kExtrapolated, .first = 1.0};
-  }
-  ++walk_.context.counts->negative_curvature;
+  if (refactor(H)) return Direction{.kind = Kind::kExtrapolated, .first = 1.0};
   if (s_ == 0.0) s_ = kFirstShare;
   return damp(H, walk_.system.assemble_extrapolated(x, Curvature::kPositive, walk_.g()));
 }
 
 std::optional<Directions::Direction> Directions::damp(const linalg::BlockMatrix& H,
                                                       const linalg::BlockMatrix& P) {
+  make_room();
   Factor factor;
   for (;; s_ = std::max(kFirstShare, kFailureGrowth * s_)) {
     walk_.context.checkpoint->check();
@@ -150,6 +165,7 @@ bool Directions::retry(Kind kind) {
     case Kind::kIterated:
     case Kind::kExtrapolated:
       factor_ = nullptr;
+      source_.reset();
       return true;
     case Kind::kFactored:
       s_ = kFirstShare;

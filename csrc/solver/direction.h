@@ -2,6 +2,7 @@
 
 #include <cstdint>
 #include <limits>
+#include <memory>
 #include <optional>
 #include <utility>
 #include <vector>
@@ -47,6 +48,7 @@ class Directions {
   bool certify();
 
   const std::vector<double>& p() const { return p_; }
+  /// Of the exact Hessian that was factored last, if that succeeded.
   const Factor& factor() const { return factor_; }
 
   /// The share of the projection in damped directions.
@@ -68,12 +70,27 @@ class Directions {
   void restart();
 
  private:
+  /// The factor that may be close, or null.
+  const Factor& nearby();
+
+  /// A new factor is about to be made: drop a large one that can be made again.
+  void make_room();
+
+  /// Factor the exact Hessian. Where it is indefinite nearby() stays what it was.
+  bool refactor(const linalg::BlockMatrix& H);
+
   bool chord();
   bool iterate(const linalg::BlockMatrix& H, bool& indefinite);
   std::optional<Direction> damp(const linalg::BlockMatrix& H, const linalg::BlockMatrix& P);
 
   Walk& walk_;
   Factor factor_;
+  /// What factor_ is made of, where that is large and may be dropped.
+  struct Source {
+    linalg::BlockMatrix matrix;
+    std::shared_ptr<const linalg::CholeskyAnalysis> analysis;
+  };
+  std::optional<Source> source_;
   std::vector<double> p_;
   double slope_ = 0.0;
   double last_step_ = std::numeric_limits<double>::infinity();

@@ -28,9 +28,14 @@ Factor LinearSystem::factor(const linalg::BlockMatrix& matrix) {
   const Stopwatch::Scope analysis_scope(watch_, Phase::kAnalysis);
   const Assembly::Found found = assembly_->analysis();
   counts_.analyses += found.is_new ? 1 : 0;
+  return factor(matrix, found.analysis);
+}
+
+Factor LinearSystem::factor(const linalg::BlockMatrix& matrix,
+                            const std::shared_ptr<const linalg::CholeskyAnalysis>& analysis) {
   const Stopwatch::Scope scope(watch_, Phase::kFactorization);
   ++counts_.factorizations;
-  auto factor = std::make_shared<linalg::CholeskyFactor>(found.analysis);
+  auto factor = std::make_shared<linalg::CholeskyFactor>(analysis);
   if (!factor->compute(matrix.blocks(), workspace_)) return nullptr;
   return factor;
 }
@@ -44,6 +49,28 @@ void LinearSystem::solve(const linalg::CholeskyFactor& factor,
   factor.solve(b_.data(), z_.data());
   for (double& value : z_) value = -value;
   f_.coordinates->push_forward(z_, p);
+}
+
+void LinearSystem::solve(const linalg::CholeskyFactor& factor,
+                         const std::vector<std::vector<double>>& b,
+                         std::vector<std::vector<double>>& p) {
+  const Stopwatch::Scope scope(watch_, Phase::kSolve);
+  std::vector<std::vector<double>> right(b.size());
+  std::vector<std::vector<double>> z(b.size());
+  std::vector<const double*> from;
+  std::vector<double*> to;
+  for (std::size_t r = 0; r < b.size(); ++r) {
+    f_.coordinates->pull_back(b[r], right[r]);
+    z[r].assign(right[r].size(), 0.0);
+    from.push_back(right[r].data());
+    to.push_back(z[r].data());
+  }
+  factor.solve(from, to);
+  p.resize(b.size());
+  for (std::size_t r = 0; r < b.size(); ++r) {
+    for (double& value : z[r]) value = -value;
+    f_.coordinates->push_forward(z[r], p[r]);
+  }
 }
 
 linalg::Convergence LinearSystem::solve(const linalg::BlockMatrix& matrix,

@@ -52,12 +52,21 @@ class LinearSystem {
   /// definite.
   Factor factor(const linalg::BlockMatrix& matrix);
 
+  /// The same of a matrix of any point, with the structure that its factor has had.
+  Factor factor(const linalg::BlockMatrix& matrix,
+                const std::shared_ptr<const linalg::CholeskyAnalysis>& analysis);
+
   /// Change p = -factor^-1 (b pulled back to rows) of all points, zero at prescribed ones.
   ///
   /// @param b  at all points
   void solve(const linalg::CholeskyFactor& factor,
              const std::vector<double>& b,
              std::vector<double>& p);
+
+  /// The same for several right sides at once, each with the bits that it has alone.
+  void solve(const linalg::CholeskyFactor& factor,
+             const std::vector<std::vector<double>>& b,
+             std::vector<std::vector<double>>& p);
 
   /// The same for a matrix, by conjugate gradients with a factor of a nearby one.
   linalg::Convergence solve(const linalg::BlockMatrix& matrix,

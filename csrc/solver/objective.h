@@ -70,6 +70,12 @@ struct Objective {
     for_each([&](const Potential& p) { p.add_hessian_product(x, z, y.data()); });
   }
 
+  /// The same at all points but the cloths' free vertices; what those get means nothing.
+  void held_product(const double* x, const double* z, std::vector<double>& y) const {
+    y.assign(3 * static_cast<std::size_t>(coordinates->point_count()), 0.0);
+    for_each([&](const Potential& p) { p.add_held_product(x, z, y.data()); });
+  }
+
   /// What shifts of a Hessian are measured in, one for each number of a row: M / h^2 of vertices, the
   /// diagonal of the metric of coordinates.
   std::vector<double> metric() const;

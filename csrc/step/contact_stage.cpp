@@ -33,6 +33,7 @@
 #include <stdexcept>
 #include <string>
 #include <string_view>
+#include <utility>
 
 #include "solver/newton.h"
 #include "step/motion.h"
@@ -48,14 +49,15 @@ using Array = std::vector<double>;
 /// The potentials of one friction iteration.
 class Sum {
  public:
+  /// @param bar          where friction accumulates; null where it never does
+  /// @param barrier_bar  likewise, the barrier
   Sum(ContactStage& stage,
       Problem& problem,
       contact::Detection& detection,
-      contact::ContactModel::Bar* bar)
+      contact::ContactModel::Bar* bar,
+      contact::ContactModel::Bar* barrier_bar)
       : stage_(stage), problem_(problem), bar_(bar) {
-    if (problem.contact) {
-      contact_.emplace(*problem.contact, detection, bar);
-    }
+    if (problem.contact) contact_.emplace(*problem.contact, detection, barrier_bar);
     objective = problem.objective(stage.inertia, stage.others, stage.assemblies);
     objective.contact = contact_ ? &*contact_ : nullptr;
   }
@@ -183,7 +185,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
   Problem& problem = step.problem;
   const std::size_t size = problem.coordinates.size();
   const int friction_iterations = problem.scene.given.friction_iterations;
-  Sum sum(*this, problem, step.detection, nullptr);
+  Sum sum(*this, problem, step.detection, nullptr, nullptr);
   const Motion motion(problem);
   const auto keep = [&](int k, const std::vector<Contact>& contacts) {
     if (step.tape.empty()) return;
@@ -202,7 +204,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
         solver::minimize(sum.objective, x, motion, solves == 0 ? &first_guess : nullptr,
                          std::move(factor), step.context);
     merge(outcome, step.report);
-    step.kept.factors.push_back(outcome.factor);
+    step.kept.add(outcome.factor);
     factor = outcome.factor;
     if (!step.tape.empty()) {
       Array rows;
@@ -226,9 +228,9 @@ void pull_back_solve(const Backward& step,
                      const solver::Objective& f,
                      const Array& x,
                      solver::Factor factor,
-                     const Array& g,
-                     const Array* force_bar) {
-  Cotangents& bars = step.cotangents;
+                     const std::vector<Array>& g,
+                     bool with_forces,
+                     const Turn::Exchange& exchange) {
   const solver::Coordinates& coordinates = *f.coordinates;
   solver::LinearSystem system(f, *step.context.workspace, *step.context.watch,
                               *step.context.counts);
@@ -237,38 +239,46 @@ void pull_back_solve(const Backward& step,
   if (!factor) factor = system.certify(x.data(), gradient);
   if (!factor) throw std::domain_error("the Hessian is not positive definite at the solution");
 
-  Array b(x.size(), 0.0);
-  coordinates.add_rows(g, b);
-  Array forces(x.size(), 0.0);
+  std::vector<Array> b(g.size(), Array(x.size(), 0.0));
+  std::vector<Array> forces = b;
   Array product;
-  if (force_bar != nullptr) {
-    std::ranges::copy(*force_bar,
-                      forces.begin() + static_cast<std::ptrdiff_t>(step.problem.cloth_size));
-    f.hessian_product(x.data(), forces.data(), product);
-    for (std::size_t a = 0; a < b.size(); ++a) b[a] -= product[a];
+  for (std::size_t l = 0; l < g.size(); ++l) {
+    coordinates.add_rows(g[l], b[l]);
+    const Array& bar = step.losses[l].body_forces;
+    if (!with_forces || std::ranges::all_of(bar, [](double value) { return value == 0.0; }))
+      continue;
+    std::ranges::copy(bar,
+                      forces[l].begin() + static_cast<std::ptrdiff_t>(step.problem.cloth_size));
+    f.hessian_product(x.data(), forces[l].data(), product);
+    for (std::size_t a = 0; a < product.size(); ++a) b[l][a] -= product[a];
   }
   // The factor is that of H itself: nothing is left to polish.
-  Array zhat;
-  system.solve(*factor, b, zhat);
-  for (std::size_t a = 0; a < zhat.size(); ++a) zhat[a] = forces[a] - zhat[a];
+  std::vector<Array> z;
+  system.solve(*factor, b, z);
 
-  f.hessian_product(x.data(), zhat.data(), product);
-  for (double& value : product) value = -value;
-  coordinates.gather(x, product);
-  if (coordinates.is_curved()) {
-    coordinates.subtract_change(x, zhat, gradient, product);
+  for (std::size_t l = 0; l < g.size(); ++l) {
+    step.context.checkpoint->check();
+    Array& zhat = z[l];
+    for (std::size_t a = 0; a < zhat.size(); ++a) zhat[a] = forces[l][a] - zhat[a];
+    f.held_product(x.data(), zhat.data(), product);
+    for (double& value : product) value = -value;
+    coordinates.gather(x, product);
+    if (coordinates.is_curved()) {
+      coordinates.subtract_change(x, zhat, gradient, product);
+    }
+    coordinates.add_rows(g[l], product);
+    Array& ends = step.losses[l].ends;
+    for (Index i = 0; i < coordinates.point_count(); ++i) {
+      if (coordinates.prescribed()[i] == 0) continue;
+      for (Index a = 3 * i; a < 3 * i + 3; ++a) ends[a] += product[a];
+    }
+    const Turn turn(exchange, l);
+    f.for_each([&](Potential& p) { p.accumulate(x.data(), zhat.data()); });
   }
-  coordinates.add_rows(g, product);
-  for (Index i = 0; i < coordinates.point_count(); ++i) {
-    if (coordinates.prescribed()[i] == 0) continue;
-    for (Index a = 3 * i; a < 3 * i + 3; ++a) bars.ends[a] += product[a];
-  }
-  f.for_each([&](Potential& p) { p.accumulate(x.data(), zhat.data()); });
 }
 
-void ContactStage::backward(const Backward& step, Array g) {
+void ContactStage::backward(const Backward& step, std::vector<Array> g) {
   Problem& problem = step.problem;
-  Cotangents& bars = step.cotangents;
   const std::size_t size = problem.coordinates.size();
   // The tape has been in other hands: hooks on saved tensors may return anything.
   if (!(*step.tape["solves"] >= 1.0 &&
@@ -277,7 +287,18 @@ void ContactStage::backward(const Backward& step, Array g) {
         "core: the tape must have one solve or more, and at most one a friction iteration");
   }
   const auto solves = static_cast<std::size_t>(*step.tape["solves"]);
-  Sum sum(*this, problem, step.detection, &bars.contact);
+  // What contact and friction accumulate, of the loss whose turn it is.
+  contact::ContactModel::Bar contact_bar(problem.scene.collision_mesh);
+  Sum sum(*this, problem, step.detection, &contact_bar, step.barrier ? &contact_bar : nullptr);
+  std::vector<Array> start_bars(g.size());
+  std::vector<Array> lag_bars(g.size());
+  const Turn::Exchange exchange_all = [&](std::size_t l) {
+    exchange(l);
+    std::swap(contact_bar, step.losses[l].contact);
+    if (!sum.friction) return;
+    std::swap(sum.friction->start_bar, start_bars[l]);
+    std::swap(sum.friction->lag_bar, lag_bars[l]);
+  };
   const auto at = [&](std::size_t k) { return problem.at(step.tape["iterates"] + k * size); };
   const double* const counts = step.tape["contacts"];
   // Contacts at the start, k = 0, or where solve k has ended.
@@ -300,23 +321,26 @@ void ContactStage::backward(const Backward& step, Array g) {
     const std::size_t place = first_factor + k;
     const auto& factors = step.kept.factors;
     pull_back_solve(step, sum.objective, x, place < factors.size() ? factors[place] : nullptr, g,
-                    k + 1 == solves ? &bars.body_forces : nullptr);
+                    k + 1 == solves, exchange_all);
 
-    std::ranges::fill(g, 0.0);
-    if (!sum.friction) continue;
-    Array& lag_bar = sum.friction->lag_bar;
-    const Array& start_bar = sum.friction->start_bar;
-    for (std::size_t a = 0; a < start_bar.size(); ++a) bars.start[a] += start_bar[a];
-    if (k == 0) {
-      for (std::size_t a = 0; a < lag_bar.size(); ++a) bars.start[a] += lag_bar[a];
-      continue;
+    for (std::size_t l = 0; l < g.size(); ++l) {
+      Cotangents& bars = step.losses[l];
+      std::ranges::fill(g[l], 0.0);
+      if (!sum.friction) continue;
+      Array lag_bar = std::exchange(lag_bars[l], {});
+      const Array start_bar = std::exchange(start_bars[l], {});
+      for (std::size_t a = 0; a < start_bar.size(); ++a) bars.start[a] += start_bar[a];
+      if (k == 0) {
+        for (std::size_t a = 0; a < lag_bar.size(); ++a) bars.start[a] += lag_bar[a];
+        continue;
+      }
+      lag_bar.resize(x.size(), 0.0);
+      problem.coordinates.gather(x_lag, lag_bar);
+      problem.coordinates.take_rows(lag_bar, g[l]);
+      // What is prescribed and no row: bodies and frames.
+      problem.coordinates.clear_rows(lag_bar);
+      for (std::size_t a = 0; a < lag_bar.size(); ++a) bars.ends[a] += lag_bar[a];
     }
-    lag_bar.resize(x.size(), 0.0);
-    problem.coordinates.gather(x_lag, lag_bar);
-    problem.coordinates.take_rows(lag_bar, g);
-    // What is prescribed and no row: bodies and frames.
-    problem.coordinates.clear_rows(lag_bar);
-    for (std::size_t a = 0; a < lag_bar.size(); ++a) bars.ends[a] += lag_bar[a];
   }
 }
 

@@ -16,6 +16,7 @@ struct ContactStage {
   std::vector<Potential*> others;
   solver::AssemblyCache& assemblies;
   std::size_t first_factor;  ///< place of its factors among the scheme's
+  Turn::Exchange exchange;   ///< of what its potentials accumulate; only backward needs it
 
   /// What it keeps on the tape.
   static std::vector<Field> tape(const Scene& scene);
@@ -23,21 +24,25 @@ struct ContactStage {
   /// @param x  in: all points at the start of the step; out: at its end
   void forward(const Forward& step, std::vector<double>& x, double* body_forces);
 
-  /// @param g  cotangent of the rows (cloth positions, coordinates) at the end
-  void backward(const Backward& step, std::vector<double> g);
+  /// @param g  of each loss, cotangent of the rows (cloth positions, coordinates) at the end
+  void backward(const Backward& step, std::vector<std::vector<double>> g);
 };
 
-/// zhat of one solve, and everything it pulls back but the lag: see contact_stage.cpp.
+/// zhat of one solve, and everything it pulls back but the lag: see contact_stage.cpp. All losses are
+/// solved for at once.
 ///
-/// @param x          all points where the objective has been minimized; its potentials stand there
-/// @param factor     of the exact Hessian there, or null to make it
-/// @param force_bar  cotangents of the forces on the bodies' vertices, or null
+/// @param x            all points where the objective has been minimized; its potentials stand there
+/// @param factor       of the exact Hessian there, or null to make it
+/// @param g            of each loss, cotangent of the rows
+/// @param with_forces  whether the forces on the bodies' vertices are those of this solve
+/// @param exchange     of what the potentials of the objective accumulate
 void pull_back_solve(const Backward& step,
                      const solver::Objective& objective,
                      const std::vector<double>& x,
                      solver::Factor factor,
-                     const std::vector<double>& g,
-                     const std::vector<double>* force_bar);
+                     const std::vector<std::vector<double>>& g,
+                     bool with_forces,
+                     const Turn::Exchange& exchange);
 
 /// Fold the outcome of one minimization into the report.
 void merge(const solver::Outcome& outcome, Report& report);

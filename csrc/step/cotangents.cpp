@@ -125,7 +125,32 @@ Cotangents::Cotangents(const Problem& p)
       masses(p.masses.size(), 0.0),
       body_poses(p.inputs[Input::kBodyPoses].count, 0.0),
       body_targets(p.inputs[Input::kBodyTargets].count, 0.0),
-      contact(p.scene.collision_mesh) {}
+      contact(p.scene.collision_mesh),
+      metric_(p.inertia.metric_bar.size(), 0.0),
+      target_(p.inertia.target_bar.size(), 0.0) {
+  if (p.anchors) {
+    anchor_stiffness_.assign(p.anchors->stiffness_bar.size(), 0.0);
+    anchor_target_.assign(p.anchors->target_bar.size(), 0.0);
+  }
+  if (p.chart) {
+    chart_target_.assign(p.chart->target_bar.size(), 0.0);
+    chart_metric_.assign(p.chart->metric_bar.size(), 0.0);
+  }
+}
+
+void Cotangents::exchange(Problem& p) {
+  std::swap(p.inertia.metric_bar, metric_);
+  std::swap(p.inertia.target_bar, target_);
+  p.elasticity.exchange(elastic_);
+  if (p.anchors) {
+    std::swap(p.anchors->stiffness_bar, anchor_stiffness_);
+    std::swap(p.anchors->target_bar, anchor_target_);
+  }
+  if (p.chart) {
+    std::swap(p.chart->target_bar, chart_target_);
+    std::swap(p.chart->metric_bar, chart_metric_);
+  }
+}
 
 void Cotangents::add_predicted(Problem& p, const Gradients& gradients) {
   const double h = p.h;

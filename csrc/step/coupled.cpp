@@ -1,5 +1,8 @@
 #include "step/coupled.h"
 
+#include <cstddef>
+#include <utility>
+
 #include "step/contact_stage.h"
 
 namespace diffcloth::step {
@@ -9,7 +12,8 @@ ContactStage stage(Problem& problem) {
   return {.inertia = problem.inertia,
           .others = problem.elastic_potentials(),
           .assemblies = problem.scene.elastic_assemblies,
-          .first_factor = 0};
+          .first_factor = 0,
+          .exchange = {}};
 }
 
 }  // namespace
@@ -21,7 +25,11 @@ void Coupled::forward(const Forward& step, std::vector<double>& x, double* body_
 }
 
 void Coupled::backward(const Backward& step) const {
-  stage(step.problem).backward(step, step.cotangents.rows);
+  ContactStage contact = stage(step.problem);
+  contact.exchange = [&](std::size_t l) { step.losses[l].exchange(step.problem); };
+  std::vector<std::vector<double>> g;
+  for (const Cotangents& bars : step.losses) g.push_back(bars.rows);
+  contact.backward(step, std::move(g));
 }
 
 }  // namespace diffcloth::step

@@ -45,7 +45,7 @@ void solve_by_newton(Problem& problem,
                                                          nullptr, nullptr, step.context);
   step.context.path = path;
   merge(outcome, step.report);
-  step.kept.factors.push_back(outcome.factor);
+  step.kept.add(outcome.factor);
 }
 
 /// By local/global iterations, from which no factor comes: backward makes it. What they give up Newton's
@@ -84,7 +84,7 @@ void solve_by_projective_dynamics(Problem& problem,
     step.report.result = Result::kNotConverged;
     step.report.message = words(outcome.status);
   }
-  step.kept.factors.push_back(nullptr);
+  step.kept.add(nullptr);
 }
 
 }  // namespace
@@ -103,18 +103,20 @@ std::vector<double> ElasticStage::forward(const Forward& step, double* body_forc
   return x;
 }
 
-void ElasticStage::backward(const Backward& step,
-                            const std::vector<double>& g,
-                            const std::vector<double>& force_bar) const {
+void ElasticStage::backward(const Backward& step, const std::vector<std::vector<double>>& g) const {
   const std::vector<double> x = problem_.predicted(step.tape["elastic"]);
   const solver::Factor factor = step.kept.factors.empty() ? nullptr : step.kept.factors.front();
+  const Turn::Exchange exchange = [&](std::size_t l) { step.losses[l].exchange(problem_); };
   if (nodes_.has_contacts()) {
-    nodes_.backward(step, x, factor, g, force_bar);
+    for (std::size_t l = 0; l < g.size(); ++l) {
+      const Turn turn(exchange, l);
+      nodes_.backward(step, x, factor, g[l], step.losses[l]);
+    }
     return;
   }
   const solver::Objective f = objective(problem_);
   f.stand_at(x.data());
-  pull_back_solve(step, f, x, factor, g, nullptr);
+  pull_back_solve(step, f, x, factor, g, false, exchange);
 }
 
 }  // namespace diffcloth::step

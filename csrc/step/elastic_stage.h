@@ -16,11 +16,8 @@ class ElasticStage {
   /// All points at its end; the contact forces on the bodies' vertices are added to body_forces.
   std::vector<double> forward(const Forward& step, double* body_forces) const;
 
-  /// @param g          cotangent of the rows at its end
-  /// @param force_bar  of the forces on the bodies' vertices
-  void backward(const Backward& step,
-                const std::vector<double>& g,
-                const std::vector<double>& force_bar) const;
+  /// @param g  of each loss, cotangent of the rows at its end
+  void backward(const Backward& step, const std::vector<std::vector<double>>& g) const;
 
  private:
   Problem& problem_;

@@ -14,6 +14,12 @@ std::size_t Kept::bytes() const {
   return sum;
 }
 
+void Kept::add(std::shared_ptr<const linalg::CholeskyFactor> factor) {
+  // One that is too large anyway is not held while the step goes on.
+  if (factor && factor->bytes() > FactorCache::kBytes) factor = nullptr;
+  factors.push_back(std::move(factor));
+}
+
 void FactorCache::Room::shrink(std::size_t largest) {
   const std::lock_guard lock(mutex);
   while (bytes > largest) {

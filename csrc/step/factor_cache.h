@@ -19,6 +19,9 @@ struct Kept {
   std::vector<std::vector<contact::Contact>> contacts;
 
   std::size_t bytes() const;
+
+  /// Add a factor, or null where there is none or the cache has no room for it.
+  void add(std::shared_ptr<const linalg::CholeskyFactor> factor);
 };
 
 /// What is kept of steps whose backward can still be asked for, up to a number of bytes; the oldest go

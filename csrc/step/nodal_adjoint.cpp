@@ -39,8 +39,7 @@ void NodalStage::backward(const Backward& step,
                           const Array& x,
                           solver::Factor factor,
                           const Array& g,
-                          const Array& force_bar) const {
-  Cotangents& bars = step.cotangents;
+                          Cotangents& bars) const {
   const solver::Objective f = objective();
   const NodalSystem system(problem_, contacts_, f);
   solver::LinearSystem linear(f, *step.context.workspace, *step.context.watch,
@@ -56,7 +55,7 @@ void NodalStage::backward(const Backward& step,
   Array eta(f.coordinates->size(), 0.0);
   std::vector<Vec3> surface_point_bar(contacts_.list.size(), Vec3::Zero());
   const bool forces_count =
-      std::ranges::any_of(force_bar, [](double value) { return value != 0.0; });
+      std::ranges::any_of(bars.body_forces, [](double value) { return value != 0.0; });
   for (std::size_t k = 0; forces_count && k < contacts_.list.size(); ++k) {
     const NodalContact& c = contacts_.list[k];
     if (c.obstacle < 0 || at.laws[k].kind == ContactCase::kTakingOff) continue;
@@ -65,7 +64,7 @@ void NodalStage::backward(const Backward& step,
     const Vec3 force = relative(c, at.g.data());
     Vec3 weights_bar;
     for (int a = 0; a < 3; ++a) {
-      const Vec3 bar = row(force_bar.data(), share.corners[a]);
+      const Vec3 bar = row(bars.body_forces.data(), share.corners[a]);
       spread(c, -share.weights[a] * bar, eta.data());
       weights_bar[a] = -bar.dot(force);
     }

@@ -48,14 +48,14 @@ class NodalStage {
 
   /// The adjoint, for a solution x.
   ///
-  /// @param factor     as solve() gave it, or null to make it again
-  /// @param g          cotangent of the rows at the end
-  /// @param force_bar  cotangents of the forces on the bodies' vertices
+  /// @param factor  as solve() gave it, or null to make it again
+  /// @param g       cotangent of the rows at the end
+  /// @param bars    of the loss whose turn it is
   void backward(const Backward& step,
                 const std::vector<double>& x,
                 solver::Factor factor,
                 const std::vector<double>& g,
-                const std::vector<double>& force_bar) const;
+                Cotangents& bars) const;
 
  private:
   /// Inertia, elasticity and anchors.

@@ -129,6 +129,7 @@ elastic::Model elastic_model(const Scene& scene,
   model.damping = spread(in[Input::kDamping], scene.face_cloth);
   model.h = h;
   model.x_n = in.data(Input::kPositions);
+  model.held = &scene.held_elements;
   if (!masses.empty()) model.least_inertia = std::ranges::min(masses) / (h * h);
   elastic::prepare(model, scene.slots);
   return model;

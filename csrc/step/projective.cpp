@@ -20,7 +20,9 @@ void Projective::forward(const Forward& step, std::vector<double>& x, double* bo
 }
 
 void Projective::backward(const Backward& step) const {
-  ElasticStage(step.problem).backward(step, step.cotangents.rows, step.cotangents.body_forces);
+  std::vector<std::vector<double>> g;
+  for (const Cotangents& bars : step.losses) g.push_back(bars.rows);
+  ElasticStage(step.problem).backward(step, g);
 }
 
 }  // namespace diffcloth::step

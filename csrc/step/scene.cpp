@@ -222,6 +222,7 @@ Scene::Scene(Description description)
                         {prescribed.begin(), prescribed.begin() + topology.vertex_count}) {
   given.bodies.pose = surface_poses(mechanisms);
   slots = elastic::slots(topology, stencils, elastic_assemblies.base());
+  held_elements = elastic::elements_at(topology, stencils, prescribed);
 }
 
 contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& rest) {

@@ -84,6 +84,7 @@ struct Scene {
   std::vector<projective::FaceSearch> face_search;  ///< [surfaces of bodies] where nodes touch them
   projective::VertexSpheres vertex_spheres;         ///< where the scheme lets vertices touch
   elastic::Slots slots;
+  elastic::Elements held_elements;  ///< those with a pinned corner
 
   mutable solver::AssemblyCache elastic_assemblies;           ///< over the elastic pattern
   mutable solver::AssemblyCache diagonal_assemblies;          ///< over isolated vertices

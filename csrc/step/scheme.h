@@ -1,5 +1,6 @@
 #pragma once
 
+#include <span>
 #include <string_view>
 #include <vector>
 
@@ -23,14 +24,15 @@ struct Forward {
   Report& report;
 };
 
-/// What it works with going back.
+/// What it works with going back, for several losses side by side.
 struct Backward {
   Problem& problem;
   contact::Detection& detection;
   solver::Context& context;
   const Arrays<const double>& tape;
   const Kept& kept;  ///< empty where it is gone
-  Cotangents& cotangents;
+  std::span<Cotangents> losses;
+  bool barrier;  ///< whether someone asks for the cotangents of what the barrier is made of
 };
 
 /// A way to take a step: what is minimized, in which order, and the adjoint of that.
@@ -54,7 +56,8 @@ class Scheme {
   /// @param x  in: at the start of the step
   virtual void forward(const Forward& step, std::vector<double>& x, double* body_forces) const = 0;
 
-  /// From the cotangents of the end to those of all that the potentials depend on.
+  /// From the cotangents of the end to those of all that the potentials depend on, for each loss as if
+  /// it were alone.
   virtual void backward(const Backward& step) const = 0;
 };
 

@@ -39,7 +39,23 @@ class Nearness {
     return {.inertia = inertial_,
             .others = std::move(others),
             .assemblies = elastic_ ? scene.elastic_assemblies : scene.diagonal_assemblies,
-            .first_factor = 1};
+            .first_factor = 1,
+            .exchange = {}};
+  }
+
+  /// What the potentials accumulate for a loss: nothing yet.
+  struct Bar {
+    Array metric, target, elastic_target;
+  };
+  Bar zero_bar() const {
+    return {.metric = Array(inertial_.metric_bar.size(), 0.0),
+            .target = Array(inertial_.target_bar.size(), 0.0),
+            .elastic_target = Array(elastic_ ? elastic_->target_bar.size() : 0, 0.0)};
+  }
+  void exchange(Bar& bar) {
+    std::swap(inertial_.metric_bar, bar.metric);
+    std::swap(inertial_.target_bar, bar.target);
+    if (elastic_) std::swap(elastic_->target_bar, bar.elastic_target);
   }
 
   /// Cotangent of x^D.
@@ -98,12 +114,23 @@ void Split::backward(const Backward& step) const {
   Problem& problem = step.problem;
   const double* x_d = step.tape["elastic"];
   Nearness nearness(problem, Array(x_d, x_d + problem.cloth_size));
-  nearness.stage().backward(step, step.cotangents.rows);
-  nearness.add_masses_bar(step.cotangents.masses);
+  std::vector<Nearness::Bar> own(step.losses.size(), nearness.zero_bar());
+  ContactStage contact = nearness.stage();
+  contact.exchange = [&](std::size_t l) {
+    step.losses[l].exchange(problem);
+    nearness.exchange(own[l]);
+  };
+  std::vector<Array> g;
+  for (const Cotangents& bars : step.losses) g.push_back(bars.rows);
+  contact.backward(step, g);
 
-  Array g = nearness.target_bar();
-  g.resize(problem.coordinates.size(), 0.0);
-  ElasticStage(problem).backward(step, g, step.cotangents.body_forces);
+  for (std::size_t l = 0; l < g.size(); ++l) {
+    const Turn turn(contact.exchange, l);
+    nearness.add_masses_bar(step.losses[l].masses);
+    g[l] = nearness.target_bar();
+    g[l].resize(problem.coordinates.size(), 0.0);
+  }
+  ElasticStage(problem).backward(step, g);
 }
 
 }  // namespace diffcloth::step

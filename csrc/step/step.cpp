@@ -1,6 +1,7 @@
 #include "step/step.h"
 
 #include <algorithm>
+#include <array>
 #include <utility>
 
 #include "step/scheme.h"
@@ -15,6 +16,33 @@ elastic::Wanted wanted(const Gradients& gradients) {
     if (gradients[input] != nullptr) return kMaterials;
   }
   return kNone;
+}
+
+bool wants_barrier(const Gradients& gradients) {
+  using enum Input;
+  return std::ranges::any_of(
+      std::array{kBarrierStiffness, kBarrierDistance, kThickness, kRestPositions},
+      [&](Input input) { return gradients[input] != nullptr; });
+}
+
+/// From the cotangents of the outputs to those of the points at the end.
+void read_outputs(const Problem& problem,
+                  const Arrays<const double>& cotangents,
+                  Cotangents& bars) {
+  const Scene& scene = problem.scene;
+  const double* const x_bar = cotangents["positions"];
+  const double* const v_bar = cotangents["velocities"];
+  const double* const f_bar = cotangents["body_forces"];
+  bars.rows.assign(problem.coordinates.size(), 0.0);
+  for (std::size_t a = 0; a < problem.cloth_size; ++a) {
+    bars.rows[a] = x_bar[a] + v_bar[a] / problem.h;
+    bars.start[a] -= v_bar[a] / problem.h;
+  }
+  for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
+    bars.rows[problem.cloth_size + scene.mechanisms.slot(c)] = cotangents["coordinates"][c];
+  }
+  bars.body_forces.assign(
+      f_bar, f_bar + (3 * static_cast<std::size_t>(scene.vertex_count()) - problem.cloth_size));
 }
 
 }  // namespace
@@ -106,28 +134,17 @@ void backward(const Scene& scene,
               const Inputs& inputs,
               const Arrays<const double>& tape,
               const Kept& kept,
-              const Arrays<const double>& cotangents,
-              const Checkpoint& checkpoint,
-              const Gradients& gradients) {
+              std::span<const Loss> losses,
+              const Checkpoint& checkpoint) {
   Stopwatch watch;
   solver::Counts counts;
   contact::Detection detection(scene.broad_phase);
-  Problem problem(scene, inputs, wanted(gradients));
-  Cotangents bars(problem);
-
-  const double* const x_bar = cotangents["positions"];
-  const double* const v_bar = cotangents["velocities"];
-  const double* const f_bar = cotangents["body_forces"];
-  bars.rows.assign(problem.coordinates.size(), 0.0);
-  for (std::size_t a = 0; a < problem.cloth_size; ++a) {
-    bars.rows[a] = x_bar[a] + v_bar[a] / problem.h;
-    bars.start[a] -= v_bar[a] / problem.h;
+  Problem problem(scene, inputs, wanted(losses.front().gradients));
+  std::vector<Cotangents> bars;
+  for (const Loss& loss : losses) {
+    bars.emplace_back(problem);
+    read_outputs(problem, loss.cotangents, bars.back());
   }
-  for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
-    bars.rows[problem.cloth_size + scene.mechanisms.slot(c)] = cotangents["coordinates"][c];
-  }
-  bars.body_forces.assign(
-      f_bar, f_bar + (3 * static_cast<std::size_t>(scene.vertex_count()) - problem.cloth_size));
 
   linalg::CholeskyWorkspace workspace;
   solver::Context context{.checkpoint = &checkpoint,
@@ -140,9 +157,14 @@ void backward(const Scene& scene,
                           .context = context,
                           .tape = tape,
                           .kept = kept,
-                          .cotangents = bars});
-  bars.add_predicted(problem, gradients);
-  bars.write(problem, gradients);
+                          .losses = bars,
+                          .barrier = wants_barrier(losses.front().gradients)});
+  const Turn::Exchange exchange = [&](std::size_t l) { bars[l].exchange(problem); };
+  for (std::size_t l = 0; l < losses.size(); ++l) {
+    const Turn turn(exchange, l);
+    bars[l].add_predicted(problem, losses[l].gradients);
+    bars[l].write(problem, losses[l].gradients);
+  }
 }
 
 }  // namespace diffcloth::step

@@ -1,10 +1,13 @@
 #pragma once
 
+#include <cstddef>
 #include <optional>
+#include <span>
 #include <string>
 #include <vector>
 
 #include "common/interrupt.h"
+#include "linalg/dense_kernels.h"
 #include "step/factor_cache.h"
 #include "step/fields.h"
 #include "step/inputs.h"
@@ -34,18 +37,26 @@ Report forward(const Scene& scene,
                Kept& kept,
                std::vector<std::vector<double>>* path);
 
-/// Gradients of a step that forward() took: see contact_stage.cpp for the derivation.
+/// What a loss gives and gets.
+struct Loss {
+  Arrays<const double> cotangents;  ///< of the outputs, by their names
+  Gradients gradients;              ///< the same inputs for all losses
+};
+
+/// How many losses are worth one call of backward(): those that one pass over a factor solves for.
+inline constexpr std::size_t kLossesAtOnce = linalg::kMaxVectors;
+
+/// Gradients of a step that forward() took, of several losses, each with the bits that it has alone: see
+/// contact_stage.cpp for the derivation.
 ///
-/// @param kept        what forward kept, or nothing
-/// @param cotangents  of the outputs, by their names
+/// @param kept  what forward kept, or nothing
 /// @throws std::domain_error when the solution is not a local minimum.
 void backward(const Scene& scene,
               const Inputs& inputs,
               const Arrays<const double>& tape,
               const Kept& kept,
-              const Arrays<const double>& cotangents,
-              const Checkpoint& checkpoint,
-              const Gradients& gradients);
+              std::span<const Loss> losses,
+              const Checkpoint& checkpoint);
 
 /// Where surfaces overlap at the start of the step, or are closer than their thickness; else empty.
 std::string find_overlap(const Scene& scene, const Inputs& inputs);

@@ -19,6 +19,7 @@ backward, refuses a second backward without `retain_graph`, and notices inputs e
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -51,8 +52,9 @@ _OUTPUTS = ("positions", "velocities", "body_forces", "coordinates")
 _TAPE = "tape_"
 _KEPT = "kept"
 _TRANSFORMS = (
-    "step: torch.func transforms, forward-mode derivatives and vectorized Jacobians are not "
-    "supported; use torch.autograd.grad or .backward(), and a loop over the rows of a Jacobian"
+    "step: torch.func transforms and forward-mode derivatives are not supported; use "
+    "torch.autograd.grad or .backward(), for many losses or a Jacobian with is_grads_batched=True, "
+    "or torch.autograd.functional.jacobian(vectorize=True)"
 )
 _SECOND_DERIVATIVES = (
     "step: second derivatives are not available; the gradient of a step cannot be differentiated "
@@ -118,11 +120,6 @@ def as_array(tensor: Tensor) -> NDArray[np.float64]:
     return np.ascontiguousarray(tensor.detach().numpy())
 
 
-def _is_batched_by_vmap(tensor: Tensor) -> bool:
-    functorch = torch._C._functorch  # vectorized Jacobians still use the older of the two
-    return functorch.is_batchedtensor(tensor) or functorch.is_legacy_batchedtensor(tensor)
-
-
 def _forward(core: _core.Simulator, arrays: dict[str, Any], *, tape: bool) -> dict[str, Any]:
     try:
         return core.forward(arrays, tape, torch.get_num_threads())
@@ -163,27 +160,78 @@ class _Step(torch.autograd.Function):
     @staticmethod
     def backward(ctx, *cotangents):
         saved = ctx.saved_tensors  # first: raises torch's own error if the tape was freed
-        if any(map(_is_batched_by_vmap, cotangents)):
+        gradients = dict(zip(_needs(ctx), _pull_back(ctx, saved, cotangents), strict=True))
+        return None, None, None, None, *(gradients.get(name) for name in ctx.names)
+
+
+def _needs(ctx):
+    """Names of the inputs that need a gradient; the first four of forward are not tensors."""
+    needed = zip(ctx.names, ctx.needs_input_grad[4:], strict=True)
+    return [name for name, is_needed in needed if is_needed]
+
+
+def _pull_back(ctx, saved, cotangents):
+    if not any(map(torch._C._functorch.is_legacy_batchedtensor, cotangents)):
+        return _PullBack.apply(ctx, *saved, *cotangents)
+    # `is_grads_batched` and vectorized Jacobians still use the older vmap, which knows no rule of
+    # a Function: take its batch axis off and put it on again.
+    level = torch._C._vmapmode_increment_nesting() - 1
+    torch._C._vmapmode_decrement_nesting()
+    count = next(
+        torch._remove_batch_dim(c, level, 1, 0).shape[0]
+        for c in cotangents
+        if torch._C._functorch.is_legacy_batchedtensor(c)
+    )
+    losses = [torch._remove_batch_dim(c, level, count, 0) for c in cotangents]
+    gradients = _PullBack.apply(ctx, *saved, *losses)
+    return [torch._add_batch_dim(gradient, 0, level) for gradient in gradients]
+
+
+class _PullBack(torch.autograd.Function):
+    """Gradients of a step's inputs from cotangents of its outputs, which may have leading axes.
+
+    A Function of its own, so that all losses of a `vmap` go through one call of the core, and so
+    that torch knows all that a gradient depends on. `once_differentiable` is not enough: where the
+    cotangent has no graph, as for `.sum()`, the gradient would come back as a constant, and a
+    second derivative through it as zero.
+    """
+
+    @staticmethod
+    def forward(step, *tensors):
+        saved, cotangents = tensors[: len(step.shapes)], tensors[len(step.shapes) :]
+        _check_saved(step, saved)
+        axes = cotangents[0].ndim - (3 if step.batched else 2)  # positions: [.., B, N, 3]
+        leading = cotangents[0].shape[:axes]
+        shape = (math.prod(leading), *(() if step.batched else (1,)))
+        losses = [c.reshape(*shape, *c.shape[axes:]) for c in cotangents]
+        _refuse_unconverged(step, losses)
+        gradients = _backward(step, saved, losses)
+        return tuple(g.reshape(*leading, *g.shape[1:]) for g in gradients)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        pass
+
+    @staticmethod
+    def vmap(info, in_dims, step, *tensors):
+        count = len(step.shapes)
+        if any(dim is not None for dim in in_dims[1 : 1 + count]):
             raise NotImplementedError(_TRANSFORMS)
-        _refuse_unconverged(ctx, cotangents)
-        tensors = saved[: len(ctx.names)]
-        # The first four arguments of forward are not tensors.
-        needs = dict(zip(ctx.names, ctx.needs_input_grad[4:], strict=True))
-        gradients = _backward(ctx, saved, cotangents, [name for name in needs if needs[name]])
-        rows = [gradients.get(name) for name in ctx.names]
-        if torch.is_grad_enabled():  # create_graph=True
-            anchors = (*tensors, *cotangents)
-            rows = [None if row is None else _Once.apply(row, *anchors) for row in rows]
-        return None, None, None, None, *rows
+        losses = [
+            c.expand(info.batch_size, *c.shape) if dim is None else c.movedim(dim, 0)
+            for c, dim in zip(tensors[count:], in_dims[1 + count :], strict=True)
+        ]
+        gradients = _PullBack.apply(step, *tensors[:count], *losses)
+        return gradients, (0,) * len(gradients)
+
+    @staticmethod
+    def backward(ctx, *cotangents):
+        raise RuntimeError(_SECOND_DERIVATIVES)
 
 
-def _refuse_unconverged(ctx, cotangents):
-    """Raise if the loss depends on an environment that has no gradient; others do without it."""
-    wanted = [
-        i
-        for i in ctx.unconverged
-        if any((c[i] if ctx.batched else c).count_nonzero() for c in cotangents)
-    ]
+def _refuse_unconverged(step, losses):
+    """Raise if a loss depends on an environment that has no gradient; others do without it."""
+    wanted = [i for i in step.unconverged if any(c[:, i].count_nonzero() for c in losses)]
     if wanted:
         raise NotConverged(
             "backward: a step that did not converge has no gradient; raise max_iterations, or "
@@ -192,9 +240,11 @@ def _refuse_unconverged(ctx, cotangents):
         )
 
 
-def _check_saved(ctx, saved):
+def _check_saved(step, saved):
     """Refuse what hooks on saved tensors return instead of what a step has saved."""
-    for name, shape, tensor in zip((*ctx.names, *ctx.tape_names), ctx.shapes, saved, strict=True):
+    for name, shape, tensor in zip(
+        (*step.names, *step.tape_names), step.shapes, saved, strict=True
+    ):
         if tensor.dtype != torch.float64 or tensor.device.type != "cpu" or not is_dense(tensor):
             raise TypeError(
                 f"backward: saved `{name}` must come back as a dense float64 tensor on the CPU, "
@@ -207,17 +257,16 @@ def _check_saved(ctx, saved):
             )
 
 
-def _backward(ctx, saved, cotangents, needs):
-    _check_saved(ctx, saved)
+def _backward(step, saved, losses):
     arrays = [as_array(t) for t in saved]
-    count = len(ctx.names)
-    seeds = [c if ctx.batched else c.unsqueeze(0) for c in cotangents]
+    count, needs = len(step.names), _needs(step)
     try:
-        gradients = ctx.core.backward(
-            dict(zip(ctx.names, arrays[:count], strict=True)),
-            dict(zip(ctx.tape_names, arrays[count:], strict=True)),
-            ctx.kept,
-            {name: as_array(c) for name, c in zip(_OUTPUTS, seeds, strict=False)},
+        gradients = step.core.backward(
+            dict(zip(step.names, arrays[:count], strict=True)),
+            dict(zip(step.tape_names, arrays[count:], strict=True)),
+            step.kept,
+            {name: as_array(c) for name, c in zip(_OUTPUTS, losses, strict=False)},
+            len(losses[0]),
             needs,
             torch.get_num_threads(),
         )
@@ -225,20 +274,4 @@ def _backward(ctx, saved, cotangents, needs):
         raise SimulationError(f"backward: {error}") from error
     except ValueError as error:  # numbers that hooks on saved tensors have changed
         raise InvalidInput(f"backward: {error}") from error
-    return {name: torch.from_numpy(gradients[name]) for name in needs}
-
-
-class _Once(torch.autograd.Function):
-    """Identity on a gradient, tied to all that it depends on, which refuses to be differentiated.
-
-    `once_differentiable` is not enough: where the cotangent has no graph, as for `.sum()`, the
-    gradient would come back as a constant, and a second derivative through it as zero.
-    """
-
-    @staticmethod
-    def forward(ctx, gradient, *anchors):
-        return gradient.view_as(gradient)
-
-    @staticmethod
-    def backward(ctx, *cotangents):
-        raise RuntimeError(_SECOND_DERIVATIVES)
+    return [torch.from_numpy(gradients[name]) for name in needs]

@@ -138,4 +138,5 @@ class CoreScene:
     def gradients(self, arrays, cotangents):
         result = self.forward(arrays, tape=True)
         tape = {name: array for name, array in result.items() if name.startswith("tape_")}
-        return self.core.backward(arrays, tape, result["kept"], cotangents, list(arrays), 1)
+        found = self.core.backward(arrays, tape, result["kept"], cotangents, 1, list(arrays), 1)
+        return {name: gradient[0] for name, gradient in found.items()}

@@ -255,6 +255,7 @@ QUICK = [
     ("folded", ELASTIC, 2),
     ("folded_thick", COUPLED, 2),
     ("stacked", COUPLED, 2),
+    ("dragged", COUPLED, 2),
     ("poking", COUPLED, 2),
 ]
 ALL = [

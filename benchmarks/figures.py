@@ -1,0 +1,399 @@
+"""Write the page of figures, docs/performance.md, and its plots.
+
+    python -m benchmarks.figures --against "the first version=../first"
+    python -m benchmarks.figures --draw    # the page alone, again
+
+`--against` names another checkout with a built package, and may be repeated: all scenes are timed
+with it and this checkout side by side, as by `benchmarks.compare`. Then this checkout alone is
+timed by phases, as by `benchmarks.step`, and with several losses in one backward. What was measured
+is in docs/performance.json, of which page and plots are made.
+
+`--cpu` counts processor time, on a machine that others use too; then threads are left out, as
+processor time says nothing of them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Iterable
+from dataclasses import asdict
+from datetime import date
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import click
+import torch
+from tqdm import tqdm
+
+import diffcloth_torch as dc
+from benchmarks.compare import BATCH, POOLS, ROOT, Row, time_row
+from benchmarks.measure import time_steps
+from benchmarks.scenes import DT, SCENES, in_regime
+from benchmarks.step import _processor
+
+RECORDS = "performance.json"
+SIZES = (12, 24, 48)
+PHASE_SIZES = (24, 48)
+STEPS = {12: 12, 24: 12, 48: 6}
+BATCH_SCENES = ("hanging", "sphere")
+LOSSES = (1, 8, 64)
+LOSS_SCENES = ("hanging", "sphere", "self-contact")
+REPEATS = 5  # of a backward with several losses
+
+Records = dict[str, Any]
+
+
+@click.command(help=__doc__.replace("\n\n    ", "\n\n\b\n    "))
+@click.option("--against", "others", multiple=True, help="NAME=FOLDER with a built package.")
+@click.option("--cpu", is_flag=True, help="Processor time instead of wall-clock time.")
+@click.option("--quick", is_flag=True, help="Tiny sheets: shows that it runs.")
+@click.option("--draw", is_flag=True, help="Measure nothing: draw what was measured before.")
+@click.option("--docs", default=ROOT / "docs", type=click.Path(path_type=Path, file_okay=False))
+def main(others: tuple[str, ...], cpu: bool, quick: bool, draw: bool, docs: Path) -> None:
+    file = docs / RECORDS
+    if draw:
+        if not file.exists():
+            raise click.UsageError(f"--draw needs {file}, which a run without it writes")
+    else:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(measure(_folders(others), cpu, quick), indent=1) + "\n")
+    records = json.loads(file.read_text())
+    (docs / "images").mkdir(exist_ok=True)
+    plots = draw_all(records, docs / "images")
+    (docs / "performance.md").write_text(page(records, plots))
+    print(docs / "performance.md")
+
+
+def _folders(others: Iterable[str]) -> dict[str, Path]:
+    folders = {}
+    for text in others:
+        name, equals, folder = text.partition("=")
+        if not (name and equals and Path(folder).is_dir()):
+            raise click.UsageError(f"--against must be NAME=FOLDER with a folder, got {text!r}")
+        folders[name] = Path(folder)
+    return folders
+
+
+# ---- measuring ----
+
+
+def measure(others: dict[str, Path], cpu: bool, quick: bool) -> Records:
+    """Everything that the page says, as plain numbers."""
+    sizes, phase_sizes = ((6,), (6,)) if quick else (SIZES, PHASE_SIZES)
+    names = BATCH_SCENES if quick else tuple(SCENES)
+    rows = [Row(name, size, 0, 1) for size in sizes for name in names]
+    pools = POOLS[:1] if cpu else POOLS
+    batched = sizes[0] if quick else 24
+    batch_names = BATCH_SCENES[-1:] if quick else BATCH_SCENES
+    rows += [Row(name, batched, BATCH, n) for name in batch_names for n in pools]
+    start = time.perf_counter()
+    records: Records = {
+        "date": date.today().isoformat(),
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "load": [round(os.getloadavg()[0], 1)],
+        "clock": "processor" if cpu else "wall",
+        "torch": torch.__version__,
+        "core": dc.build_info()["factorization"],
+        "dt": DT,
+        "tolerance": dc.SolverOptions().tolerance,
+        "releases": {},
+    }
+    for release, folder in others.items():
+        records["releases"][release] = []
+        for row in tqdm(rows, desc=release, disable=None, leave=False):
+            steps = 2 if quick else STEPS[row.size]
+            ours, theirs = time_row(row, folder, steps, cpu)
+            records["releases"][release].append(
+                {**asdict(row), "this": asdict(ours), "other": asdict(theirs)}
+            )
+    torch.set_num_threads(1)
+    records["phases"] = [
+        _phases(name, size, 2 if quick else STEPS[size])
+        for size in phase_sizes
+        for name in tqdm(SCENES, desc="phases", disable=None, leave=False)
+    ]
+    counts = (1, 3) if quick else LOSSES
+    records["losses"] = [
+        _time_losses(name, phase_sizes[0], count, cpu) for name in LOSS_SCENES for count in counts
+    ]
+    records["load"].append(round(os.getloadavg()[0], 1))
+    records["minutes"] = round((time.perf_counter() - start) / 60, 1)
+    return records
+
+
+def _phases(name: str, size: int, steps: int) -> Records:
+    timing = time_steps(name, size, 0, 1, steps, SCENES[name](size))
+    return {
+        "scene": name,
+        "size": size,
+        "forward_in_ef": timing.forward_in_ef,
+        "backward_in_ef": timing.backward_in_ef,
+        "iterations": timing.iterations,
+        "contacts": timing.contacts,
+        "residual": timing.residual,
+        "phases": timing.phases,
+    }
+
+
+def _time_losses(name: str, size: int, count: int, cpu: bool) -> Records:
+    """Backward of several losses in a loop and in one call, in turn [ms]."""
+    scene = SCENES[name](size)
+    simulator = dc.Simulator(scene.scene, DT)
+    before = in_regime(simulator, scene, 0).detach()
+    leaves = [before.positions.requires_grad_(), before.velocities.requires_grad_()]
+    after = simulator.step(before, scene.control(before))
+    outputs = [after.positions, after.velocities]
+    g = torch.Generator().manual_seed(1)
+    losses = [torch.randn(count, *y.shape, generator=g, dtype=y.dtype) for y in outputs]
+    clock = time.process_time if cpu else time.perf_counter
+
+    def in_a_loop() -> None:
+        for k in range(count):
+            torch.autograd.grad(outputs, leaves, [c[k] for c in losses], retain_graph=True)
+
+    def at_once() -> None:
+        torch.autograd.grad(outputs, leaves, losses, retain_graph=True, is_grads_batched=True)
+
+    seconds: dict[str, list[float]] = {"loop": [], "once": []}
+    for _ in range(REPEATS):
+        for key, run in (("loop", in_a_loop), ("once", at_once)):
+            start = clock()
+            run()
+            seconds[key].append(clock() - start)
+    times = {key: 1e3 * median(values) for key, values in seconds.items()}
+    return {"scene": name, "size": size, "losses": count, **times}
+
+
+# ---- drawing ----
+
+
+def draw_all(records: Records, folder: Path) -> list[tuple[str, str]]:
+    """Draw the plots; their files and what they show."""
+    import matplotlib as mpl
+
+    mpl.use("svg")
+    mpl.rcParams.update({"svg.hashsalt": "diffcloth_torch", "font.size": 9})
+    plots = []
+    if records["releases"]:
+        _draw_ratios(records, folder / "performance_ratio.svg")
+        _draw_sizes(records, folder / "performance_size.svg")
+        plots += [
+            ("performance_ratio.svg", "How many times faster this release is, by scene and size"),
+            ("performance_size.svg", "Milliseconds a step over the number of vertices"),
+        ]
+    _draw_phases(records, folder / "performance_phases.svg")
+    return [*plots, ("performance_phases.svg", "Shares of the phases in a step forward")]
+
+
+def _draw_ratios(records: Records, file: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True, layout="constrained")
+    for axis, part in zip(axes, ("forward", "backward"), strict=True):
+        bars = [
+            (f"{release}, {size}²", {r["scene"]: _ratio(r, part) for r in rows if _is(r, size)})
+            for release, rows in records["releases"].items()
+            for size in _sizes(rows)
+        ]
+        width = 0.8 / len(bars)
+        for k, (label, ratios) in enumerate(bars):
+            places = [i + (k - (len(bars) - 1) / 2) * width for i in range(len(ratios))]
+            heights = [ratio if ratio else math.nan for ratio in ratios.values()]
+            axis.bar(places, heights, width, label=label)
+            axis.set_xticks(range(len(ratios)), ratios, rotation=30, ha="right")
+        axis.axhline(1.0, color="black", linewidth=0.8)
+        axis.set_title(part)
+    axes[0].set_ylabel("times faster than")
+    axes[0].legend(fontsize=7)
+    _save(figure, file)
+
+
+def _draw_sizes(records: Records, file: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    for axis, part in zip(axes, ("forward", "backward"), strict=True):
+        for k, name in enumerate(SCENES):
+            for release, rows in records["releases"].items():
+                chosen = [r for r in rows if r["scene"] == name and not r["batch"]]
+                vertices = [r["size"] ** 2 for r in chosen]
+                if release == next(iter(records["releases"])):
+                    times = [r["this"][part] or math.nan for r in chosen]
+                    axis.loglog(vertices, times, "o-", color=f"C{k}", label=name, markersize=3)
+                times = [r["other"][part] or math.nan for r in chosen]
+                axis.loglog(vertices, times, "--", color=f"C{k}", linewidth=0.8)
+        axis.set_title(f"{part}, dashed: {', '.join(records['releases'])}")
+        sides = sorted({r["size"] for rows in records["releases"].values() for r in rows})
+        axis.set_xticks([n * n for n in sides], [f"{n} x {n}" for n in sides])
+        axis.minorticks_off()
+        axis.set_xlabel("vertices")
+    axes[0].set_ylabel("ms a step")
+    axes[0].legend(fontsize=7)
+    _save(figure, file)
+
+
+def _draw_phases(records: Records, file: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    sizes = list(dict.fromkeys(r["size"] for r in records["phases"]))
+    phases = list(records["phases"][0]["phases"])
+    figure, axes = plt.subplots(
+        1, len(sizes), figsize=(9, 3.4), sharey=True, layout="constrained", squeeze=False
+    )
+    for axis, size in zip(axes[0], sizes, strict=True):
+        rows = [r for r in records["phases"] if r["size"] == size]
+        below = [0.0] * len(rows)
+        for phase in phases:
+            shares = [r["phases"][phase] / sum(r["phases"].values()) for r in rows]
+            axis.bar([r["scene"] for r in rows], shares, bottom=below, label=phase)
+            below = [a + b for a, b in zip(below, shares, strict=True)]
+        axis.set_title(f"{size} x {size}")
+        axis.tick_params(axis="x", rotation=30)
+    axes[0][0].set_ylabel("share of forward")
+    axes[0][-1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    _save(figure, file)
+
+
+def _save(figure: Any, file: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    figure.savefig(file, metadata={"Date": None})
+    plt.close(figure)
+    # Trailing blanks are what some editors and hooks take away.
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join(line.rstrip() for line in lines) + "\n")
+
+
+# ---- the page ----
+
+
+def page(records: Records, plots: list[tuple[str, str]]) -> str:
+    """The Markdown of the page."""
+    parts = ["# Figures", _preface(records)]
+    parts += [f"![{text}](images/{file})" for file, text in plots]
+    for release, rows in records["releases"].items():
+        parts += [f"## Beside {release}", _release_text(rows, release), _release_table(rows)]
+    parts += ["## By phase", _PHASE_TEXT, _phase_table(records["phases"])]
+    parts += ["## Many losses", _LOSS_TEXT, _loss_table(records["losses"])]
+    return "\n\n".join(parts) + "\n"
+
+
+def _preface(records: Records) -> str:
+    clock = "processor time" if records["clock"] == "processor" else "wall-clock time"
+    before, after = records["load"]
+    return f"""\
+This page is written by `python -m benchmarks.figures`, from `docs/{RECORDS}`: do not edit it.
+
+Measured on {records["date"]} in {records["minutes"]:g} minutes of {clock}, on {records["cores"]}
+cores ({records["processor"]}), with one thread where a table says nothing else.
+The load of the machine was {before:g} before the first measurement, {after:g} after the last. One
+process of this benchmark works at a time: where the load is above 1, others worked there too. Then
+ratios, whose two sides take turns, are worth more than milliseconds, and a second thread finds no
+core. torch {records["torch"]}; {records["core"]}.
+
+Steps are of {records["dt"]:g} s, by the scheme `coupled`, at a tolerance of
+{records["tolerance"]:g} m/s. Scenes are those of `benchmarks.scenes`: sheets of `size` x `size`
+vertices that have been brought into their regime. Times are medians of a few steps."""
+
+
+def _release_text(rows: list[Records], release: str) -> str:
+    parts = []
+    for size in _sizes(rows):
+        text = []
+        for part in ("forward", "backward"):
+            ratios = [ratio for r in rows if _is(r, size) and (ratio := _ratio(r, part))]
+            mean = math.exp(sum(map(math.log, ratios)) / len(ratios))
+            text.append(f"{part} {mean:.1f} ({min(ratios):.1f} to {max(ratios):.1f})")
+        parts.append(f"{size} x {size}: {', '.join(text)}")
+    return (
+        "Both take their steps in turn, each on its own trajectory from the same start. Ratios are "
+        f"the time of {release} over that of this release. Their geometric means over the scenes, "
+        f"and their range: {'; '.join(parts)}."
+    )
+
+
+def _release_table(rows: list[Records]) -> str:
+    head = ["scene", "size", "batch", "threads"]
+    for part in ("forward [ms]", "backward [ms]"):
+        head += [part, "other", "ratio"]
+    head += ["iterations", "other", "unconverged", "other"]
+    lines = []
+    for r in rows:
+        line = [r["scene"], r["size"], r["batch"] or 1, r["threads"]]
+        for part in ("forward", "backward"):
+            line += [_number(r[side][part]) for side in ("this", "other")]
+            line.append(_number(_ratio(r, part)))
+        line += [f"{r[side]['iterations']:.1f}" for side in ("this", "other")]
+        line += [r[side]["unconverged"] for side in ("this", "other")]
+        lines.append(line)
+    return _table(head, lines)
+
+
+_PHASE_TEXT = """\
+Of this release, forward and backward in EF, the time of one factorization of the contact-free
+Hessian of the same state by `Eigen::SimplicialLDLT`, which divides out most of what machines differ
+by; then the phases of forward in milliseconds of wall-clock time."""
+
+
+def _phase_table(rows: list[Records]) -> str:
+    phases = list(rows[0]["phases"])
+    return _table(
+        ["scene", "size", "forward [EF]", "backward [EF]", "iterations", "contacts", *phases],
+        [
+            [r["scene"], r["size"], f"{r['forward_in_ef']:.2f}", f"{r['backward_in_ef']:.2f}"]
+            + [f"{r['iterations']:g}", f"{r['contacts']:g}"]
+            + [_number(r["phases"][phase]) for phase in phases]
+            for r in rows
+        ],
+    )
+
+
+_LOSS_TEXT = """\
+Backward of several losses, to positions and velocities: a loop over `torch.autograd.grad`, and one
+call with `is_grads_batched=True`, in milliseconds."""
+
+
+def _loss_table(rows: list[Records]) -> str:
+    return _table(
+        ["scene", "size", "losses", "loop", "one call", "ratio"],
+        [
+            [r["scene"], r["size"], r["losses"]]
+            + [_number(value) for value in (r["loop"], r["once"], r["loop"] / r["once"])]
+            for r in rows
+        ],
+    )
+
+
+def _table(head: list[str], rows: list[list[Any]]) -> str:
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
+
+
+def _is(row: Records, size: int) -> bool:
+    return row["size"] == size and not row["batch"]
+
+
+def _sizes(rows: list[Records]) -> list[int]:
+    return list(dict.fromkeys(r["size"] for r in rows))
+
+
+def _ratio(row: Records, part: str) -> float | None:
+    """Time of the other over that of this; None where a side has none."""
+    ours, theirs = row["this"][part], row["other"][part]
+    return theirs / ours if ours and theirs else None
+
+
+def _number(value: float | None) -> str:
+    """Three digits, or all those before the point."""
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+
+
+if __name__ == "__main__":
+    main()
