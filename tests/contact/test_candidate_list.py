@@ -59,6 +59,18 @@ def test_no_pair_that_comes_within_reach_is_missed(search, scale, common):
         assert mesh.builds == builds  # too far for a skin: the swept boxes' own
 
 
+def test_what_moves_alone_brings_its_own_pairs_alone(search):
+    """A surface counts as near as its fastest part, but its other pairs do not."""
+    x, mesh, surface, _ = search
+    mover = 0
+    to = x + 0.04 * np.array([0.6, 0.0, 0.8]) * (np.arange(len(x)) == mover)[:, None]
+    still = {tuple(c) for c in mesh.find_kept(x, x, REACH)}
+    found = {tuple(c) for c in mesh.find_kept(x, to, REACH)}
+    assert surface[mover] == 0
+    assert found > still
+    assert all(mover in pair[1:5] for pair in found - still)
+
+
 @pytest.mark.parametrize("scale", [1e-4, 1e-2])
 def test_no_pair_of_bodies_is_missed(scale):
     x, faces, surface = crowd()
