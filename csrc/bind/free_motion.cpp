@@ -42,8 +42,8 @@ void make(FreeMotion* self,
   std::vector<char> placed(count, 0);
   for (const Index l : order) {
     require(l >= 0 && static_cast<std::size_t>(l) < count && placed[l] == 0 &&
-                (parent[l] < 0 || (static_cast<std::size_t>(parent[l]) < count &&
-                                   placed[parent[l]] != 0)),
+                (parent[l] < 0 ||
+                 (static_cast<std::size_t>(parent[l]) < count && placed[parent[l]] != 0)),
             "free motion: `order` must hold every link once, parents before their children");
     placed[l] = 1;
   }

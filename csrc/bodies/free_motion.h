@@ -34,10 +34,10 @@ class FreeMotion {
 
   /// One environment: arrays of the sizes in brackets, matrices row after row.
   struct Given {
-    const double* mass;      ///< [L] kg
-    const double* center;    ///< [L, 3] in the links' frames, m
-    const double* inertia;   ///< [L, 3, 3] about the centers, in the links' axes, kg m^2
-    const double* armature;  ///< [J] kg m^2 or kg
+    const double* mass;           ///< [L] kg
+    const double* center;         ///< [L, 3] in the links' frames, m
+    const double* inertia;        ///< [L, 3, 3] about the centers, in the links' axes, kg m^2
+    const double* armature;       ///< [J] kg m^2 or kg
     const double* root_center;    ///< [3] at the start
     const double* root_rotation;  ///< [3, 3]
     const double* joints;         ///< [J]
