@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <limits>
+#include <ranges>
 #include <utility>
 
 #include <Eigen/LU>
@@ -122,9 +123,9 @@ FreeMotion::Rates FreeMotion::rates(const Given& given,
 
   Rates out{.momentum = VectorXd::Zero(kRoot + joint_count_),
             .slope = VectorXd::Zero(kRoot + joint_count_)};
-  for (auto it = order_.rbegin(); it != order_.rend(); ++it) {
-    const Link& link = links_[*it];
-    const Body& b = bodies[*it];
+  for (const Index l : std::views::reverse(order_)) {
+    const Link& link = links_[l];
+    const Body& b = bodies[l];
     if (link.parent < 0) {
       out.momentum.head<3>() = b.force;
       out.momentum.segment<3>(3) = b.moment - at.center.cross(b.force);
