@@ -1,12 +1,14 @@
 #include "bodies/free_motion.h"
 
-#include <memory>
 #include <string>
+#include <utility>
+#include <vector>
 
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/vector.h>
 
+#include "bind/arrays.h"
 #include "bind/bind.h"
+#include "bind/links.h"
 
 namespace diffcloth::bind {
 namespace {
@@ -14,55 +16,41 @@ namespace {
 using namespace nb::literals;  // NOLINT: the literal suffix of nanobind
 using bodies::FreeMotion;
 
-using Doubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
-using Indices = std::vector<Index>;
-
 void require(bool holds, const char* what) {
   if (!holds) throw nb::value_error(what);
 }
 
 void make(FreeMotion* self,
-          const Indices& parent,
-          const Indices& order,
-          const Indices& kind,
+          const std::vector<Index>& parent,
+          const std::vector<Index>& order,
+          const std::vector<Index>& kind,
           const Doubles& offset,
           const Doubles& axis,
-          const Indices& dof,
+          const std::vector<Index>& dof,
           const Doubles& multiplier,
           const Doubles& constant,
           Index joint_count,
-          Indices solved,
+          std::vector<Index> solved,
           bool root_moves,
           double dt) {
   const std::size_t count = parent.size();
-  require(order.size() == count && kind.size() == count && dof.size() == count &&
-              offset.size() == 16 * count && axis.size() == 3 * count &&
-              multiplier.size() == count && constant.size() == count,
-          "free motion: arrays of links must have one entry a link");
+  std::vector<bodies::Link> links = to_links({.tree = std::vector<Index>(count, 0),
+                                              .parent = parent,
+                                              .kind = kind,
+                                              .offset = to_vector(offset),
+                                              .axis = to_vector(axis),
+                                              .coordinate = dof,
+                                              .multiplier = to_vector(multiplier),
+                                              .constant = to_vector(constant)},
+                                             joint_count);
+  constexpr const char* kOrder =
+      "free motion: `order` must hold every link once, parents before their children";
+  require(order.size() == count, kOrder);
   std::vector<char> placed(count, 0);
   for (const Index l : order) {
-    require(l >= 0 && static_cast<std::size_t>(l) < count && placed[l] == 0 &&
-                (parent[l] < 0 ||
-                 (static_cast<std::size_t>(parent[l]) < count && placed[parent[l]] != 0)),
-            "free motion: `order` must hold every link once, parents before their children");
+    require(l >= 0 && std::cmp_less(l, count) && placed[l] == 0, kOrder);
+    require(parent[l] < 0 || (std::cmp_less(parent[l], count) && placed[parent[l]] != 0), kOrder);
     placed[l] = 1;
-  }
-  std::vector<bodies::Link> links;
-  for (std::size_t l = 0; l < count; ++l) {
-    require(kind[l] >= 0 && kind[l] <= static_cast<Index>(bodies::JointKind::kPrismatic) &&
-                dof[l] < joint_count && (kind[l] == 0 || dof[l] >= 0),
-            "free motion: kinds and joints of links must be in range");
-    const double* t = offset.data() + 16 * l;
-    bodies::Mat34 frame;
-    frame << t[0], t[1], t[2], t[3], t[4], t[5], t[6], t[7], t[8], t[9], t[10], t[11];
-    links.push_back({.tree = 0,
-                     .parent = parent[l],
-                     .kind = static_cast<bodies::JointKind>(kind[l]),
-                     .offset = frame,
-                     .axis = row(axis.data(), static_cast<Index>(l)),
-                     .coordinate = dof[l],
-                     .multiplier = multiplier.data()[l],
-                     .constant = constant.data()[l]});
   }
   for (const Index i : solved) {
     require(i >= 0 && i < 6 + joint_count, "free motion: `solved` must be rows of the velocities");
@@ -113,26 +101,21 @@ nb::object solve(const FreeMotion& self,
   const Rows k("known", known, 6 + j, b);
   const Rows p("momentum", momentum, 6 + j, b);
 
-  auto memory = std::make_unique<double[]>(b * n + 1);
-  auto flags = std::make_unique<bool[]>(b + 1);
+  const Owned<double> velocities = make_array<double>({b, n});
+  const Owned<bool> found = make_array<bool>({b});
   for (std::size_t e = 0; e < b; ++e) {
-    flags[e] = self.solve({.mass = m.of(e),
-                           .center = c.of(e),
-                           .inertia = i.of(e),
-                           .armature = a.of(e),
-                           .root_center = rc.of(e),
-                           .root_rotation = rr.of(e),
-                           .joints = q.of(e),
-                           .known = k.of(e),
-                           .momentum = p.of(e)},
-                          memory.get() + e * n);
+    found.data[e] = self.solve({.mass = m.of(e),
+                                .center = c.of(e),
+                                .inertia = i.of(e),
+                                .armature = a.of(e),
+                                .root_center = rc.of(e),
+                                .root_rotation = rr.of(e),
+                                .joints = q.of(e),
+                                .known = k.of(e),
+                                .momentum = p.of(e)},
+                               velocities.data + e * n);
   }
-  double* const values = memory.release();
-  bool* const found = flags.release();
-  const nb::capsule own_values(values, [](void* x) noexcept { delete[] static_cast<double*>(x); });
-  const nb::capsule own_found(found, [](void* x) noexcept { delete[] static_cast<bool*>(x); });
-  return nb::make_tuple(nb::ndarray<nb::numpy, double>(values, {b, n}, own_values),
-                        nb::ndarray<nb::numpy, bool>(found, {b}, own_found));
+  return nb::make_tuple(velocities.array, found.array);
 }
 
 }  // namespace

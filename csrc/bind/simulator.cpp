@@ -11,9 +11,11 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include "bind/arrays.h"
 #include "bind/bind.h"
 #include "bind/checks.h"
 #include "bind/environments.h"
+#include "bind/links.h"
 #include "contact/nonadjacent_distance.h"
 #include "step/scheme.h"
 #include "step/step.h"
@@ -24,32 +26,6 @@ namespace {
 using namespace nb::literals;  // NOLINT: the literal suffix of nanobind
 using step::Input;
 using step::kInputCount;
-
-using Doubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
-using Integers = nb::ndarray<const std::int64_t, nb::c_contig, nb::device::cpu>;
-using Indices = nb::ndarray<const std::int32_t, nb::c_contig, nb::device::cpu>;
-
-/// A NumPy array that owns its memory.
-template <class T>
-struct Owned {
-  T* data;
-  nb::object array;
-};
-
-template <class T>
-Owned<T> make_array(const std::vector<std::size_t>& shape) {
-  std::size_t size = 1;
-  for (const std::size_t n : shape) size *= n;
-  auto memory = std::make_unique<T[]>(std::max<std::size_t>(size, 1));
-  T* data = memory.get();
-  nb::capsule owner(memory.release(), [](void* p) noexcept { delete[] static_cast<T*>(p); });
-  return {data, nb::cast(nb::ndarray<nb::numpy, T>(data, shape.size(), shape.data(), owner))};
-}
-
-template <class T>
-std::vector<T> to_vector(const nb::ndarray<const T, nb::c_contig, nb::device::cpu>& array) {
-  return {array.data(), array.data() + array.size()};
-}
 
 std::vector<std::array<Index, 3>> to_faces(const Indices& array) {
   if (array.size() % 3 != 0) throw nb::value_error("core: faces must have three vertices each");
@@ -495,42 +471,25 @@ bodies::MechanismsDescription describe_mechanisms(const nb::kwargs& k, Index sur
   m.limit_stiffness = doubles("limit_stiffness");
   m.limit_zone = nb::cast<double>(k["limit_zone"]);
   m.surface_link = indices("surface_link");
-  const std::vector<Index> tree = indices("link_tree");
-  const std::vector<Index> parent = indices("link_parent");
-  const std::vector<Index> kind = indices("link_kind");
-  const std::vector<Index> coordinate = indices("link_coordinate");
-  const std::vector<double> offset = doubles("link_offset");
-  const std::vector<double> axis = doubles("link_axis");
-  const std::vector<double> multiplier = doubles("link_multiplier");
-  const std::vector<double> constant = doubles("link_constant");
+  m.links = to_links({.tree = indices("link_tree"),
+                      .parent = indices("link_parent"),
+                      .kind = indices("link_kind"),
+                      .offset = doubles("link_offset"),
+                      .axis = doubles("link_axis"),
+                      .coordinate = indices("link_coordinate"),
+                      .multiplier = doubles("link_multiplier"),
+                      .constant = doubles("link_constant")},
+                     static_cast<Index>(m.prescribed.size()));
   const std::size_t n = m.prescribed.size();
-  const std::size_t links = tree.size();
-  for (const std::size_t size : {parent.size(), kind.size(), coordinate.size(), offset.size() / 16,
-                                 axis.size() / 3, multiplier.size(), constant.size()}) {
-    if (size != links) throw nb::value_error("trees: arrays of links must have equal lengths");
-  }
   for (const std::size_t size : {m.lower.size(), m.upper.size(), m.limit_stiffness.size()}) {
     if (size != n) throw nb::value_error("trees: arrays of coordinates must have equal lengths");
   }
   m.coordinate_tree.assign(n, -1);
-  for (std::size_t l = 0; l < links; ++l) {
-    const Eigen::Matrix<double, 4, 4, Eigen::RowMajor> frame(offset.data() + 16 * l);
-    if (coordinate[l] >= static_cast<Index>(n) || kind[l] < 0 ||
-        kind[l] > static_cast<Index>(bodies::JointKind::kPrismatic)) {
-      throw nb::value_error("trees: kinds and coordinates of links must be in range");
-    }
-    m.links.push_back({.tree = tree[l],
-                       .parent = parent[l],
-                       .kind = static_cast<bodies::JointKind>(kind[l]),
-                       .offset = frame.topRows<3>(),
-                       .axis = row(axis.data(), static_cast<Index>(l)),
-                       .coordinate = coordinate[l],
-                       .multiplier = multiplier[l],
-                       .constant = constant[l]});
-    if (coordinate[l] >= 0) m.coordinate_tree[coordinate[l]] = tree[l];
+  for (const bodies::Link& link : m.links) {
+    if (link.coordinate >= 0) m.coordinate_tree[link.coordinate] = link.tree;
   }
   for (const Index l : m.surface_link) {
-    if (l < 0 || l >= static_cast<Index>(links)) {
+    if (l < 0 || l >= static_cast<Index>(m.links.size())) {
       throw nb::value_error("trees: `surface_link` must name links");
     }
   }

@@ -6,6 +6,8 @@ The core solves; what the equation is, and how its root depends on everything, s
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,11 +15,9 @@ from torch import Tensor
 from diffcloth_torch import _core
 from diffcloth_torch.dynamics.inertia import Inertia
 from diffcloth_torch.dynamics.kinematics import ROOT
-from diffcloth_torch.model.mechanism import Mechanism
+from diffcloth_torch.model.mechanism import JOINT_KINDS, Mechanism
 
 __all__ = ["body_motion", "robot_motion", "solve_motion"]
-
-_KINDS = {"fixed": 0, "revolute": 1, "prismatic": 2}  # as the core numbers them
 
 
 def robot_motion(mechanism: Mechanism, solved: Tensor, dt: float) -> _core.FreeMotion:
@@ -31,7 +31,7 @@ def robot_motion(mechanism: Mechanism, solved: Tensor, dt: float) -> _core.FreeM
     return _core.FreeMotion(
         parent=mechanism.parent.tolist(),
         order=list(mechanism.order),
-        kind=[_KINDS[kind] for kind in mechanism.kind],
+        kind=[JOINT_KINDS.index(kind) for kind in mechanism.kind],
         offset=np.array(mechanism.offset),
         axis=np.array(mechanism.axis),
         dof=mechanism.dof.tolist(),
@@ -44,6 +44,7 @@ def robot_motion(mechanism: Mechanism, solved: Tensor, dt: float) -> _core.FreeM
     )
 
 
+@lru_cache(maxsize=16)
 def body_motion(dt: float) -> _core.FreeMotion:
     """The equation of the rotation of one body about its center."""
     return _core.FreeMotion(

@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray, IndexArray
 
-__all__ = ["FORCED", "Mechanism"]
+__all__ = ["FORCED", "JOINT_KINDS", "Mechanism"]
 
 FORCED = ("torque", "pd")
 """Actuations that leave a joint's motion to forces."""
+
+JOINT_KINDS = ("fixed", "revolute", "prismatic")
+"""Joints of links to their parents, in the order of their numbers in the core."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,11 +8,11 @@ import numpy as np
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.limits import ZONE
+from diffcloth_torch.model.mechanism import JOINT_KINDS
 from diffcloth_torch.model.scene import Assembly
 
 __all__ = ["tree_arguments"]
 
-_KINDS = {"fixed": 0, "revolute": 1, "prismatic": 2}
 _ROOT = 6  # coordinates of a floating root
 
 
@@ -54,7 +54,7 @@ def tree_arguments(
             dof = int(mechanism.dof[link])
             links["tree"].append(t)
             links["parent"].append(place.get((t, int(mechanism.parent[link])), -1))
-            links["kind"].append(_KINDS[mechanism.kind[link]])
+            links["kind"].append(JOINT_KINDS.index(mechanism.kind[link]))
             links["offset"].append(mechanism.offset[link])
             links["axis"].append(mechanism.axis[link])
             links["coordinate"].append(-1 if dof < 0 else first_joint + dof)
