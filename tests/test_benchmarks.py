@@ -163,6 +163,23 @@ def test_the_page_of_figures_has_what_was_measured(figures):
     assert all(f"](images/{name})" in page for name in shown)
 
 
+@pytest.mark.parametrize("name", ["hanging", "plane", "sphere"])
+def test_our_side_of_a_peer(name):
+    """Gradients of rollouts at 60 Hz are those of their differences, and nothing sinks in."""
+    peers = importlib.import_module("benchmarks.peers")
+    told = peers.scene(name, 6)
+    found = peers.time_ours(told)
+    assert len(found["frames"]) == peers.FRAMES + 1
+    assert peers.gradient_error(found) < 1e-3
+    assert peers.depth(told, found) == 0.0
+    # What judges can say no.
+    wrong = {**found, "slopes": [1.01 * slope for slope in found["slopes"]]}
+    assert peers.gradient_error(wrong) > 5e-3
+    if told["body"] is not None:
+        low = {**found, "frames": [x - [0.0, 0.0, 0.1] for x in found["frames"]]}
+        assert peers.depth(told, low) > 0.02
+
+
 def test_the_page_of_figures_is_that_of_its_records(tmp_path):
     """Nobody has edited the page, nor forgotten to draw it again."""
     for name in ("performance.json", "performance.md"):
