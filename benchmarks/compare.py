@@ -6,7 +6,8 @@
 `--against` is a folder that holds a built package `diffcloth_torch`: another checkout, or the
 site-packages of another environment. The two live in processes of their own, pinned to the same
 core, and take their steps in turn, so that what slows the machine slows both. Each follows its own
-trajectory from the same start, as models of contact may differ between versions.
+trajectory from the same start, where this checkout's approach ends, as models of contact may differ
+between versions.
 
 Times are medians in milliseconds per environment, the ratio is other over this: above 1, this
 checkout is faster. `--cpu` counts processor time instead of wall-clock time. The batch (8
@@ -24,12 +25,13 @@ import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import click
 from tqdm import tqdm
 
-from benchmarks.scenes import SCENES
+from benchmarks.scenes import SCENES, kept_file
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZES = (12, 24, 48)
@@ -79,7 +81,7 @@ class Medians:
 class Side:
     """A process that steps one package."""
 
-    def __init__(self, package: Path, row: Row, processor_time: bool) -> None:
+    def __init__(self, package: Path, row: Row, kept: Path, processor_time: bool) -> None:
         cores = sorted(os.sched_getaffinity(0))[-row.threads :]
         worker = Path(__file__).with_name("worker.py")
         self._process = subprocess.Popen(
@@ -91,6 +93,7 @@ class Side:
         )
         self._name = package
         given = {"package": str(package), "cores": cores, "processor_time": processor_time}
+        given["kept"] = str(kept_file(kept, row.scene, row.size, row.batch))
         self._send(json.dumps({**asdict(row), **given}))
         self.ready = self._receive()
 
@@ -147,7 +150,8 @@ def main(
     results = []
     for row in tqdm(rows, disable=None, leave=False):
         timed = steps or (20 if row.size <= 24 else 10 if row.size <= 48 else 5)
-        ours, theirs = time_row(row, against, timed, cpu)
+        with TemporaryDirectory() as kept:
+            ours, theirs = time_row(row, against, Path(kept), timed, cpu)
         results.append((row, ours, theirs))
         tqdm.write(_line(row, ours, theirs))
     if not cpu:
@@ -160,12 +164,17 @@ def main(
         out.write_text(json.dumps(records, indent=2) + "\n")
 
 
-def time_row(row: Row, against: Path, steps: int, processor_time: bool) -> tuple[Medians, Medians]:
-    """Medians of this checkout and of the other, which take their steps in turn."""
+def time_row(
+    row: Row, against: Path, kept: Path, steps: int, processor_time: bool
+) -> tuple[Medians, Medians]:
+    """Medians of this checkout and of the other, which take their steps in turn.
+
+    Both start where this checkout's approach ends, which the folder `kept` keeps.
+    """
     with contextlib.ExitStack() as stack:
         sides = []
         for package in (ROOT, against):
-            sides.append(Side(package, row, processor_time))
+            sides.append(Side(package, row, kept, processor_time))
             stack.callback(sides[-1].close)
         samples: tuple[list[dict[str, Any]], ...] = ([], [])
         for k in range(WARM_UP + steps):

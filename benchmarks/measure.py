@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -82,16 +83,24 @@ class Timing:
         return {**asdict(self), **in_ef}
 
 
-def time_steps(name: str, size: int, batch: int, threads: int, steps: int, scene: Scene) -> Timing:
+def time_steps(
+    name: str,
+    size: int,
+    batch: int,
+    threads: int,
+    steps: int,
+    scene: Scene,
+    kept: Path | None = None,
+) -> Timing:
     """Bring a scene into its regime and time steps from there on, each with its backward.
 
     The gradient is that of positions and velocities, with respect to those before the step and to
-    the targets of the bodies.
+    the targets of the bodies. The file `kept` is that of `in_regime`.
     """
     simulator = dc.Simulator(scene.scene, DT)
     repeats = 3 if size <= 24 else 1
     torch.set_num_threads(threads)
-    state = in_regime(simulator, scene, batch)
+    state = in_regime(simulator, scene, batch, kept)
     samples: list[dict[str, Any]] = []
     references: list[float] = []
     for k in range(WARM_UP + steps):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -136,9 +137,16 @@ SCENES: dict[str, Callable[[int], Scene]] = {
 }
 
 
-def in_regime(simulator: dc.Simulator, scene: Scene, batch: int) -> dc.State:
-    """The scene in its regime; the environments of a batch differ a little from each other."""
+def in_regime(
+    simulator: dc.Simulator, scene: Scene, batch: int, kept: Path | None = None
+) -> dc.State:
+    """The scene in its regime; the environments of a batch differ a little from each other.
+
+    With `kept`, the state is read from this file, or written to it where there is none.
+    """
     state = simulator.initial_state(batch or None)
+    if kept is not None and kept.exists():
+        return state.replace(**torch.load(kept))
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(state.positions.shape, generator=generator, dtype=torch.float64)
     speed = torch.tensor(scene.speed, dtype=torch.float64)
@@ -146,4 +154,12 @@ def in_regime(simulator: dc.Simulator, scene: Scene, batch: int) -> dc.State:
     with torch.no_grad():
         for _ in range(scene.approach):
             state = simulator.step(state, scene.control(state))
+    if kept is not None:
+        fields = ("positions", "velocities", "body_poses")
+        torch.save({name: getattr(state, name) for name in fields}, kept)
     return state
+
+
+def kept_file(folder: Path, name: str, size: int, batch: int) -> Path:
+    """File in which `in_regime` keeps a state for those who start there, too."""
+    return folder / f"{name}-{size}-{batch}.pt"

@@ -48,7 +48,7 @@ def timed_steps(row: dict[str, Any]) -> Any:
     torch.set_num_threads(row["threads"])
     scene = SCENES[row["scene"]](row["size"])
     simulator = dc.Simulator(scene.scene, DT, solver=dc.SolverOptions(throw=False))
-    state = in_regime(simulator, scene, row["batch"])
+    state = in_regime(simulator, scene, row["batch"], Path(row["kept"]))
     generator = torch.Generator().manual_seed(1)
     yield {"core": dc.build_info()["factorization"]}
 

@@ -93,10 +93,21 @@ fingerprint() {
   } | sha256sum
 }
 
+# requirements EXTRA...: what pyproject.toml says that the package needs, with these extras.
+requirements() {
+  "$venv/bin/python" - "$@" <<'PY'
+import sys
+from setuptools.config.pyprojecttoml import load_file
+project = load_file("pyproject.toml")["project"]
+extras = project["optional-dependencies"]
+print(*project["dependencies"], *(name for e in sys.argv[1:] for name in extras[e]), sep="\n")
+PY
+}
+
 # install_package EXTRA...: the package, editable, unless it is there and nothing has changed; then
 # the extras that are missing, which builds nothing.
 install_package() {
-  local extra now missing=() stale='' switches=${CMAKE_ARGS:-}
+  local extra now missing=() required=() stale='' switches=${CMAKE_ARGS:-}
   now=$(fingerprint)
   [[ $(cat "$venv/installed" 2>/dev/null) == "$now" ]] || stale=yes
   compgen -G 'diffcloth_torch/_core*.so' >/dev/null || stale=yes
@@ -112,6 +123,20 @@ install_package() {
     say "Building the package and installing what it needs: a few minutes the first time"
     # The build's own requirements go into .venv, so that a second build compiles only what changed.
     pip_install setuptools cmake ninja nanobind cmeel-eigen
+    # The compiler needs the cores, pip the network and one core: both at once.
+    mkdir -p build
+    CMAKE_ARGS=$switches PATH=$venv/bin:$PATH \
+      "$venv/bin/python" setup.py --quiet build_ext >build/core.txt 2>&1 &
+    local compiling=$! compiled=0
+    trap 'kill "$compiling" 2>/dev/null || true' EXIT
+    mapfile -t required < <(requirements "$@")
+    pip_install "${required[@]}"
+    wait "$compiling" || compiled=$?
+    trap - EXIT
+    if ((compiled)); then
+      cat build/core.txt >&2
+      return "$compiled"
+    fi
     CMAKE_ARGS=$switches PATH=$venv/bin:$PATH pip_install --no-build-isolation --editable .
     echo "$now" >"$venv/installed"
   fi

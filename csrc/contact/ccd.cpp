@@ -15,7 +15,7 @@ namespace {
 constexpr double kGapLeft = 0.1;
 
 /// Rounding of positions, relative to the largest coordinate, that counts as contact.
-constexpr double kRounding = 1e-12;
+constexpr double kPositionRounding = 1e-12;
 
 /// A search that has not ended by then returns the safe time it has reached.
 constexpr int kMaxIterations = 1000;
@@ -83,7 +83,7 @@ double safe_step(PairKind kind, const Corners& x_t0, const Corners& x_t1, double
     if (!std::isfinite(m.squaredNorm())) return 0;  // nothing can be certified
     lp_sq = std::max(lp_sq, m.squaredNorm());
   }
-  const double touching = xi + kRounding * largest;
+  const double touching = xi + kPositionRounding * largest;
   if (stay_apart(kind, x_t0, x_t1, touching)) return 1;
   Vec3 d_vector = separation(kind, x_t0);
   double d = d_vector.norm();

@@ -44,7 +44,7 @@ bool is_nearer(const NearEdge& a, const NearEdge& b) {
 }
 
 /// Faces whose normals differ by a smaller angle [rad] are parts of one plane.
-constexpr double kFlat = 1e-9;
+constexpr double kCoplanar = 1e-9;
 
 Vec3 normal(const CollisionMesh& mesh, Index f, const double* x) {
   const auto& [i, j, k] = mesh.faces[f];
@@ -62,7 +62,7 @@ bool is_flat(const CollisionMesh& mesh,
   const auto& [f, g] = mesh.edge_faces[edge];
   const Vec3 n = normal(mesh, face, x);
   const Vec3 m = normal(mesh, f == face ? g : f, x);
-  return n.cross(m).squaredNorm() <= kFlat * kFlat * n.squaredNorm() * m.squaredNorm();
+  return n.cross(m).squaredNorm() <= kCoplanar * kCoplanar * n.squaredNorm() * m.squaredNorm();
 }
 
 enum class Projection : std::uint8_t { kOutside, kInside, kOnFlatBorder };

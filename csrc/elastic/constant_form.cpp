@@ -15,7 +15,7 @@ double face_factor(const Model& model, Index f) {
 
 double element_factor(const Model& model, Index e) { return 1.0 + model.prepared.damping[e]; }
 
-void add_face_mixed(
+void add_constant_mixed(
     const Model& model, Index f, const double* u, const double* z, bool with_rest, Bar& bar) {
   const double k_s = model.stretch[f];
   const double area = model.rest->area[f];
@@ -126,7 +126,7 @@ void ConstantForm::add_product(const double* u, double* y) const {
 
 void add_constant_form_mixed(
     const Model& model, const double* u, const double* z, bool with_rest, Bar& bar) {
-  for (Index f = 0; f < face_count(model); ++f) add_face_mixed(model, f, u, z, with_rest, bar);
+  for (Index f = 0; f < face_count(model); ++f) add_constant_mixed(model, f, u, z, with_rest, bar);
   for (Index e = 0; e < model.stencils->size(); ++e) {
     add_element_mixed(model, e, u, z, with_rest, bar);
   }

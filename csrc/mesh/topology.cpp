@@ -9,7 +9,7 @@ namespace diffcloth::mesh {
 namespace {
 
 /// One side of a face, as it is sorted into edges.
-struct Side {
+struct HalfEdge {
   std::array<Index, 2> edge;
   Index face;
   Index corner;
@@ -33,7 +33,7 @@ void check_face(const std::array<Index, 3>& face, std::size_t f, Index vertex_co
 
 Topology::Topology(Index vertex_count, std::vector<std::array<Index, 3>> faces)
     : vertex_count(vertex_count), faces(std::move(faces)) {
-  std::vector<Side> sides;
+  std::vector<HalfEdge> sides;
   sides.reserve(3 * this->faces.size());
   for (std::size_t f = 0; f < this->faces.size(); ++f) {
     const std::array<Index, 3>& face = this->faces[f];
@@ -43,10 +43,10 @@ Topology::Topology(Index vertex_count, std::vector<std::array<Index, 3>> faces)
       sides.push_back({.edge = {v0, v1}, .face = static_cast<Index>(f), .corner = p});
     }
   }
-  std::ranges::stable_sort(sides, {}, &Side::edge);
+  std::ranges::stable_sort(sides, {}, &HalfEdge::edge);
 
   face_edges.resize(this->faces.size());
-  for (const Side& side : sides) {
+  for (const HalfEdge& side : sides) {
     if (edges.empty() || edges.back() != side.edge) {
       edges.push_back(side.edge);
       edge_faces.push_back({side.face, -1});

@@ -15,7 +15,7 @@ constexpr int kShifts = 22;
 constexpr int kInverseIterations = 30;
 /// Share of the mean edge that the first trial moves a vertex by, and its halvings.
 constexpr double kFirstMove = 0.25;
-constexpr int kBacktracks = 40;
+constexpr int kEscapeBacktracks = 40;
 
 /// A fixed start without symmetry.
 std::vector<double> start_vector(const Coordinates& coordinates) {
@@ -57,7 +57,7 @@ bool go_down(Walk& walk, const std::vector<double>& p) {
       walk.watch(p, std::min(length, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
   double best = 0.0;
   double best_alpha = 0.0;
-  for (int k = 0; k < kBacktracks; ++k, alpha *= 0.5) {
+  for (int k = 0; k < kEscapeBacktracks; ++k, alpha *= 0.5) {
     if (k > 0) alpha = walk.watch(p, alpha, to);
     if (!(alpha > 0.0)) break;
     const double change = walk.change(to);
