@@ -326,8 +326,7 @@ void BroadPhase::find(const double* x_t0,
 std::optional<std::pair<Index, Index>> BroadPhase::find_intersection(const double* x,
                                                                      Scratch& scratch) const {
   const std::vector<double> reach(trees_.size(), 0.0);
-  PairList& pairs = scratch.edge_pairs;  // here of an edge and a face
-  pairs.clear();
+  PairList pairs;  // of an edge and a face: many, and not wanted at every step
   visit_surface_pairs({.x_t0 = x, .x_t1 = x, .reach = reach}, scratch, [&](Index s, Index r) {
     const Scratch::Surface& a = scratch.surfaces[s];
     const Scratch::Surface& b = scratch.surfaces[r];

@@ -201,10 +201,18 @@ Slots slots(const mesh::Topology& topology,
             const linalg::BlockPattern& pattern) {
   Slots result;
   result.block_count = pattern.block_count();
+  result.stretch.reserve(6 * topology.faces.size());
   for (const std::array<Index, 3>& face : topology.faces) {
     const std::vector<Index> element = pattern.slots(face);
     result.stretch.insert(result.stretch.end(), element.begin(), element.end());
   }
+  std::size_t count = 0;
+  for (Index e = 0; e < stencils.size(); ++e) {
+    const std::size_t size = stencils.element(e).size();
+    count += size * (size + 1) / 2;
+  }
+  result.bending.reserve(count);
+  result.bending_start.reserve(static_cast<std::size_t>(stencils.size()) + 1);
   result.bending_start.push_back(0);
   for (Index e = 0; e < stencils.size(); ++e) {
     const std::vector<Index> element = pattern.slots(stencils.element(e));

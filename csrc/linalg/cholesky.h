@@ -121,8 +121,6 @@ class CholeskyFactor {
   /// x[r] = A^-1 b[r] for several right-hand sides, with the bits of one at a time.
   void solve(std::span<const double* const> b, std::span<double* const> x) const;
 
-  const std::shared_ptr<const CholeskyAnalysis>& analysis() const { return analysis_; }
-
   /// Memory of the factor, without that of the analysis.
   std::size_t bytes() const;
 

@@ -7,19 +7,54 @@
 
 namespace diffcloth::linalg {
 
-/// Shape of a supernode's dense matrices, in scalars. All are column-major.
+/// Columns that are factored before later ones see them: what they need at a time stays in the cache.
+constexpr int kColumnBlock = 96;
+
+/// How the columns of a lower triangle, and of rows below it, are stored: column-major in blocks of
+/// kColumnBlock columns, each without the rows above its part of the triangle. Always inlined, as
+/// files that are compiled for different instructions share it.
+struct Trapezoid {
+  std::int32_t ld;  ///< leading dimension of the first block
+
+  /// First column of a column's block, and its first row.
+  [[gnu::always_inline]] static constexpr std::int32_t first(std::int32_t column) {
+    return column / kColumnBlock * kColumnBlock;
+  }
+
+  /// Leading dimension of a column's block.
+  [[gnu::always_inline]] constexpr std::ptrdiff_t stride(std::int32_t column) const {
+    return ld - first(column);
+  }
+
+  /// Offset of an entry; of row 0 also where that is not stored, to count from.
+  [[gnu::always_inline]] constexpr std::ptrdiff_t place(std::int32_t row,
+                                                        std::int32_t column) const {
+    const std::ptrdiff_t block = first(column);
+    const std::ptrdiff_t before = block * ld - block * (block - kColumnBlock) / 2;
+    return before + (column - block) * (ld - block) + row - block;
+  }
+
+  /// Size of so many columns.
+  [[gnu::always_inline]] constexpr std::ptrdiff_t size(std::int32_t columns) const {
+    return place(first(columns), columns);
+  }
+};
+
+/// Shape of a supernode's dense matrices, in scalars.
 ///
 /// The panel [ld, columns] holds the supernode's columns of L: the lower triangle of its own rows
 /// first, `top` of them with padding, then the rows below. The update matrix [update_ld, rows] is
-/// what it subtracts from its ancestors; only its lower triangle means anything, as only that of
-/// the panel's first rows does. `top`, ld and update_ld are multiples of 8, and padding in the
-/// panel is zero.
+/// what it subtracts from its ancestors. Both are trapezoids, of which only the lower triangle means
+/// anything. `top`, ld and update_ld are multiples of 8, and padding in the panel is zero.
 struct Front {
   std::int32_t columns;
   std::int32_t rows;
   std::int32_t top;
   std::int32_t ld;
   std::int32_t update_ld;
+
+  [[gnu::always_inline]] constexpr Trapezoid panel() const { return {.ld = ld}; }
+  [[gnu::always_inline]] constexpr Trapezoid update() const { return {.ld = update_ld}; }
 };
 
 /// Consecutive rows of a child's update matrix that are consecutive in its parent, too.
@@ -79,9 +114,6 @@ struct DenseKernels {
   void (*backward)(
       const Front& front, const double* panel, double* c, std::ptrdiff_t stride, int count);
 };
-
-/// Columns that are factored before later ones see them: what they need at a time stays in the cache.
-constexpr int kColumnBlock = 96;
 
 /// Most vectors that one call of forward() or backward() takes.
 constexpr int kMaxVectors = 4;

@@ -236,7 +236,13 @@ void subtract_from(double* to,
 
 /// What a finished block subtracts from rows `row` .. row + 8 packs - 1 of later columns, those of
 /// the panel and those of the update matrix.
-void update_rows(const Block& block, const Front& front, int first, int row, int packs, double* u) {
+void update_rows(const Block& block,
+                 const Front& front,
+                 int first,
+                 int row,
+                 int packs,
+                 double* panel,
+                 double* u) {
   const int end = row + kLanes * packs;
   for (int strip = up_to_pack(block.columns); strip < end; strip += kLanes) {
     const int from = strip < row ? row : strip;  // above are only entries of no meaning
@@ -246,12 +252,13 @@ void update_rows(const Block& block, const Front& front, int first, int row, int
     with_packs((end - from) / kLanes, [&]<int P> {
       if (column < front.top) {
         const int left = front.columns - column;
-        subtract_from<P>(block.panel + from + strip * block.ld, block.ld,
-                         left < kLanes ? left : kLanes, false, a, b, block);
+        subtract_from<P>(panel + front.panel().place(first + from, column),
+                         front.panel().stride(column), left < kLanes ? left : kLanes, false, a, b,
+                         block);
       } else {
-        subtract_from<P>(u + (first + from - front.top) +
-                             static_cast<std::ptrdiff_t>(column - front.top) * front.update_ld,
-                         front.update_ld, kLanes, first == 0, a, b, block);
+        const int u_column = column - front.top;
+        subtract_from<P>(u + front.update().place(first + from - front.top, u_column),
+                         front.update().stride(u_column), kLanes, first == 0, a, b, block);
       }
     });
   }
@@ -262,8 +269,8 @@ bool factor(const Front& front, double* panel, double* u, double* scratch) {
   for (int first = 0; first < front.columns; first += kColumnBlock) {
     const int left = front.columns - first;
     const int columns = left < kColumnBlock ? left : kColumnBlock;
-    const Block block{.panel = panel + first + static_cast<std::ptrdiff_t>(first) * front.ld,
-                      .ld = front.ld,
+    const Block block{.panel = panel + front.panel().place(first, first),
+                      .ld = front.panel().stride(first),
                       .slabs = scratch,
                       .stride = static_cast<std::ptrdiff_t>(kLanes) * columns,
                       .columns = columns};
@@ -274,7 +281,7 @@ bool factor(const Front& front, double* panel, double* u, double* scratch) {
       const int rest = (bound - first - row) / kLanes;
       const int packs = rest < kPacks ? rest : kPacks;
       solve_rows(block, row, packs, 0, columns);
-      update_rows(block, front, first, row, packs, u);
+      update_rows(block, front, first, row, packs, panel, u);
       row += kLanes * packs;
     }
   }
@@ -291,9 +298,8 @@ void add_to_panel(
     const Front& child, const double* u, const ChildMap& map, const Front& front, double* panel) {
   for (int r = 0; r < map.column_runs; ++r) {
     for (int k = 0; k < map.runs[r].count; ++k) {
-      const double* const from =
-          u + static_cast<std::ptrdiff_t>(map.runs[r].from + k) * child.update_ld;
-      double* const to = panel + static_cast<std::ptrdiff_t>(map.runs[r].to + k) * front.ld;
+      const double* const from = u + child.update().place(0, map.runs[r].from + k);
+      double* const to = panel + front.panel().place(0, map.runs[r].to + k);
       add(from + map.runs[r].from + k, map.runs[r].count - k, to + map.runs[r].to + k);
       for (int q = r + 1; q < map.column_runs; ++q) {
         add(from + map.runs[q].from, map.runs[q].count, to + map.runs[q].to);
@@ -312,10 +318,8 @@ void add_to_update(const Front& child,
                    double* parent_u) {
   for (int r = map.column_runs; r < map.run_count; ++r) {
     for (int k = 0; k < map.runs[r].count; ++k) {
-      const double* const from =
-          u + static_cast<std::ptrdiff_t>(map.runs[r].from + k) * child.update_ld;
-      double* const to =
-          parent_u + static_cast<std::ptrdiff_t>(map.runs[r].to + k) * front.update_ld;
+      const double* const from = u + child.update().place(0, map.runs[r].from + k);
+      double* const to = parent_u + front.update().place(0, map.runs[r].to + k);
       add(from + map.runs[r].from + k, map.runs[r].count - k, to + map.runs[r].to + k);
       for (int q = r + 1; q < map.run_count; ++q) {
         add(from + map.runs[q].from, map.runs[q].count, to + map.runs[q].to);
@@ -407,15 +411,16 @@ template <int R>
 void forward(const Front& front, const double* panel, double* c, std::ptrdiff_t stride) {
   for (int column = 0; column < front.columns; column += kLanes) {
     const int width = front.columns - column < kLanes ? front.columns - column : kLanes;
-    const double* const l = panel + static_cast<std::ptrdiff_t>(column) * front.ld;
+    const double* const l = panel + front.panel().place(0, column);
+    const std::ptrdiff_t ld = front.panel().stride(column);
     for (int r = 0; r < R; ++r) {
-      solve_triangle(l + column, front.ld, width, c + r * stride + column);
+      solve_triangle(l + column, ld, width, c + r * stride + column);
     }
     for (int row = column + kLanes; row < front.ld; row += kLanes) {
       Pack sum[R];
       for (int r = 0; r < R; ++r) sum[r] = load(c + r * stride + row);
       for (int j = 0; j < width; ++j) {
-        const Pack l_j = load(l + static_cast<std::ptrdiff_t>(j) * front.ld + row);
+        const Pack l_j = load(l + j * ld + row);
         for (int r = 0; r < R; ++r) {
           sum[r] = subtract_product_of(sum[r], l_j, broadcast(c[r * stride + column + j]));
         }
@@ -452,11 +457,11 @@ void subtract_dots(const double* l,
 
 template <int R>
 void backward(const Front& front, const double* panel, double* c, std::ptrdiff_t stride) {
-  const std::ptrdiff_t ld = front.ld;
   for (int column = down_to_pack(front.columns - 1); column >= 0; column -= kLanes) {
     const int width = front.columns - column < kLanes ? front.columns - column : kLanes;
     const int below = column + kLanes;
-    const double* const l = panel + column * ld;
+    const double* const l = panel + front.panel().place(0, column);
+    const std::ptrdiff_t ld = front.panel().stride(column);
     int j = 0;
     for (; j + 4 <= width; j += 4) {
       subtract_dots<R, 4>(l + j * ld + below, ld, front.ld - below, c + below, c + column + j,

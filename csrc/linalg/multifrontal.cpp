@@ -57,35 +57,46 @@ class MultifrontalFactor final : public FactorBackend {
   std::size_t bytes() const override { return sizeof(*this) + factor_.bytes(); }
 
  private:
-  /// Fill a supernode's columns of L and its update matrix; those of its children are in the arena.
+  /// Finish a supernode's columns of L, which its children have added to, and hand its update matrix
+  /// on.
   bool eliminate(const Supernode& node, const double* blocks, double* arena, Stopwatch& watch) {
-    double* const panel = factor_.data() + node.panel;
-    assemble(node, blocks, panel);
-    watch.lap(&CholeskySeconds::assembly);
-    for_each_child(node, [&](const Supernode& child, const ChildMap& map) {
-      kernels_.add_to_panel(child.front, arena + child.update, map, node.front, panel);
-    });
-    watch.lap(&CholeskySeconds::extend_add);
+    if (node.children_begin == node.children_end) {
+      assemble(node, blocks);
+      watch.lap(&CholeskySeconds::assembly);
+    }
     // The update matrix is written before anything is added to it: it need not be cleared.
     double* const u = arena + node.update;
+    double* const panel = factor_.data() + node.panel;
     if (!kernels_.factor(node.front, panel, u, arena + s_.arena_size)) return false;
     watch.lap(&CholeskySeconds::dense);
-    if (node.front.rows == 0) return true;
-    for_each_child(node, [&](const Supernode& child, const ChildMap& map) {
-      kernels_.add_to_update(child.front, arena + child.update, map, node.front, u);
-    });
+    if (node.parent == -1) return true;
+    for (Index c = node.children_begin; c < node.children_end; ++c) {
+      const Supernode& child = s_.supernodes[s_.children[c].supernode];
+      kernels_.add_to_update(child.front, arena + child.update, map_of(c), node.front, u);
+    }
+    watch.lap(&CholeskySeconds::extend_add);
+    const Supernode& parent = s_.supernodes[node.parent];
+    if (node.as_child == parent.children_begin) {
+      assemble(parent, blocks);
+      watch.lap(&CholeskySeconds::assembly);
+    }
+    kernels_.add_to_panel(node.front, u, map_of(node.as_child), parent.front,
+                          factor_.data() + parent.panel);
     watch.lap(&CholeskySeconds::extend_add);
     return true;
   }
 
-  void assemble(const Supernode& node, const double* blocks, double* panel) const {
-    const std::ptrdiff_t ld = node.front.ld;
-    std::memset(panel, 0, sizeof(double) * static_cast<std::size_t>(ld * node.front.columns));
+  /// Begin a supernode's panel: with the columns of A.
+  void assemble(const Supernode& node, const double* blocks) {
+    double* const panel = factor_.data() + node.panel;
+    const auto size = static_cast<std::size_t>(node.front.panel().size(node.front.columns));
+    std::memset(panel, 0, sizeof(double) * size);
     for (std::size_t k = node.blocks_begin; k < node.blocks_end; ++k) {
       const PlacedBlock& block = s_.blocks[k];
       const double* const a = blocks + 9 * static_cast<std::ptrdiff_t>(block.slot);
       double* const to = panel + block.place;
-      if (block.transposed) {
+      const std::ptrdiff_t ld = block.stride;
+      if (block.transposed != 0) {
         for (int j = 0; j < 3; ++j) {
           for (int i = 0; i < 3; ++i) to[i + j * ld] = a[j + 3 * i];
         }
@@ -97,14 +108,11 @@ class MultifrontalFactor final : public FactorBackend {
     }
   }
 
-  template <class Visit>
-  void for_each_child(const Supernode& node, Visit visit) const {
-    for (Index c = node.children_begin; c < node.children_end; ++c) {
-      const Child& child = s_.children[c];
-      visit(s_.supernodes[child.supernode], ChildMap{.runs = s_.runs.data() + child.runs_begin,
-                                                     .column_runs = child.column_runs,
-                                                     .run_count = child.run_count});
-    }
+  ChildMap map_of(Index c) const {
+    const Child& child = s_.children[c];
+    return {.runs = s_.runs.data() + child.runs_begin,
+            .column_runs = child.column_runs,
+            .run_count = child.run_count};
   }
 
   void solve_some(std::span<const double* const> b, std::span<double* const> x) const {

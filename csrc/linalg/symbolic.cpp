@@ -15,8 +15,8 @@ Index padded(Index n) { return (n + kLanes - 1) / kLanes * kLanes; }
 /// Columns an odd number of cache lines apart lie in different sets of the cache.
 Index leading_dimension(Index n) { return n >= 128 && n % 16 == 0 ? n + kLanes : n; }
 
-std::size_t product(Index a, Index b) {
-  return static_cast<std::size_t>(a) * static_cast<std::size_t>(b);
+std::size_t size(const Trapezoid& matrix, Index columns) {
+  return static_cast<std::size_t>(matrix.size(columns));
 }
 
 /// Builds a Symbolic, one aspect after the other.
@@ -68,7 +68,11 @@ class Analyzer {
     }
     s_.children.resize(start.back());
     for (Index s = 0; s < count; ++s) {
-      if (gathered_.parent[s] != -1) s_.children[start[gathered_.parent[s]]++].supernode = s;
+      Supernode& node = s_.supernodes[s];
+      node.parent = gathered_.parent[s];
+      if (node.parent == -1) continue;
+      node.as_child = start[node.parent]++;
+      s_.children[node.as_child].supernode = s;
     }
   }
 
@@ -108,7 +112,7 @@ class Analyzer {
       front.ld = leading_dimension(front.top + padded(front.rows));
       front.update_ld = leading_dimension(padded(front.rows));
       node.panel = s_.factor_size;
-      s_.factor_size += product(front.ld, front.columns);
+      s_.factor_size += size(front.panel(), front.columns);
       s_.longest = std::max(s_.longest, front.ld);
       for (Index j = 0; j < front.columns; ++j) {
         const double height = front.columns - j + front.rows;
@@ -140,7 +144,7 @@ class Analyzer {
     block_column_.resize(start.back());
     for_each_block([&](Index slot, Index i, Index j) {
       const std::size_t k = start[owner_[std::min(i, j)]]++;
-      s_.blocks[k] = {.slot = slot, .place = std::max(i, j), .transposed = i < j};
+      s_.blocks[k] = {.slot = slot, .place = std::max(i, j), .stride = 0, .transposed = i < j};
       block_column_[k] = std::min(i, j);
     });
   }
@@ -155,9 +159,12 @@ class Analyzer {
       }
       const Index padding = node.front.top - node.front.columns;
       for (std::size_t k = node.blocks_begin; k < node.blocks_end; ++k) {
-        const Index p = position[s_.blocks[k].place];
+        PlacedBlock& block = s_.blocks[k];
+        const Index p = position[block.place];
         const Index row = p < node.columns ? 3 * p : 3 * p + padding;
-        s_.blocks[k].place = row + 3 * (block_column_[k] - node.first) * node.front.ld;
+        const Index column = 3 * (block_column_[k] - node.first);
+        block.place = static_cast<Index>(node.front.panel().place(row, column));
+        block.stride = static_cast<std::uint32_t>(node.front.panel().stride(column));
       }
       for (Index c = node.children_begin; c < node.children_end; ++c) {
         map_child(node, position, s_.children[c]);
@@ -185,24 +192,32 @@ class Analyzer {
     child.run_count = static_cast<Index>(s_.runs.size() - child.runs_begin);
   }
 
-  /// First fit at each supernode's turn, while the matrices of its children are alive.
+  /// First fit at each supernode's turn, while what is left of the matrices of its children is alive.
+  /// From the end of the arena on, as it is the last columns of a matrix that are left.
   void lay_out_arena() {
     struct Extent {
-      std::size_t begin, end;
+      std::size_t begin, end;  // counted from the end of the arena
       Index supernode;
     };
     std::vector<Extent> alive;  // ascending
     for (Index s = 0; s < gathered_.size(); ++s) {
       Supernode& node = s_.supernodes[s];
-      const std::size_t size = product(node.front.update_ld, padded(node.front.rows));
+      const std::size_t wanted = size(node.front.update(), padded(node.front.rows));
       std::size_t begin = 0;
       auto gap = alive.begin();
-      for (; gap != alive.end() && gap->begin < begin + size; ++gap) begin = gap->end;
-      node.update = begin;
-      s_.arena_size = std::max(s_.arena_size, begin + size);
-      if (size > 0) alive.insert(gap, {.begin = begin, .end = begin + size, .supernode = s});
+      for (; gap != alive.end() && gap->begin < begin + wanted; ++gap) begin = gap->end;
+      node.update = begin + wanted;
+      s_.arena_size = std::max(s_.arena_size, node.update);
+      if (node.parent != -1) {
+        // Its first columns are in its parent's panel before the next supernode's turn.
+        const Child& child = s_.children[node.as_child];
+        const Run& last = s_.runs[child.runs_begin + child.column_runs - 1];
+        const std::size_t end = node.update - size(node.front.update(), last.from + last.count);
+        alive.insert(gap, {.begin = begin, .end = end, .supernode = s});
+      }
       std::erase_if(alive, [&](const Extent& e) { return gathered_.parent[e.supernode] == s; });
     }
+    for (Supernode& node : s_.supernodes) node.update = s_.arena_size - node.update;
   }
 
   const BlockPattern& pattern_;

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 #include <vector>
 
 #include "linalg/block_pattern.h"
@@ -23,13 +24,17 @@ struct Supernode {
   std::size_t blocks_end;
   Index children_begin;  ///< its children: Symbolic::children[children_begin .. children_end - 1]
   Index children_end;
+  Index parent;    ///< -1 at a root
+  Index as_child;  ///< which of Symbolic::children it is
 };
 
-/// A block of the matrix: its slot, its place in the panel, and whether it stands transposed there.
+/// A block of the matrix: its slot, its place in the panel, how far columns are apart there, and
+/// whether it stands there transposed.
 struct PlacedBlock {
   Index slot;
   Index place;
-  bool transposed;
+  std::uint32_t stride : 31;
+  std::uint32_t transposed : 1;
 };
 
 /// A child of a supernode: how its update matrix falls into its parent's matrices, in scalars.
@@ -42,9 +47,9 @@ struct Child {
 
 /// All of A = L L^T that does not depend on values, for the multifrontal method.
 ///
-/// Vertices are eliminated in a postorder of the tree of supernodes. A supernode adds the update
-/// matrices of its children to its own; these are alive until their parent has taken them, and share
-/// one arena at offsets that are found here, once.
+/// Vertices are eliminated in a postorder of the tree of supernodes. Of the update matrix of a
+/// supernode its parent's panel takes at once what belongs there; the rest is alive until the parent
+/// has added it to its own. They share one arena at offsets that are found here, once.
 struct Symbolic {
   std::vector<Index> vertex;  ///< [n] vertex eliminated k-th
   std::vector<Supernode> supernodes;

@@ -32,13 +32,9 @@ constexpr double kLargestGrowth = 4.0;
 
 }  // namespace
 
-const Factor& Directions::nearby() {
-  if (!factor_ && source_) factor_ = walk_.system.factor(source_->matrix, source_->analysis);
-  return factor_;
-}
-
 void Directions::make_room() {
-  if (source_) factor_ = nullptr;
+  // It would seldom be of use: where the next one fails, damped steps follow, which lead away.
+  if (factor_ && factor_->bytes() > walk_.context.options.large_factor) factor_ = nullptr;
 }
 
 bool Directions::refactor(const linalg::BlockMatrix& H) {
@@ -50,16 +46,12 @@ bool Directions::refactor(const linalg::BlockMatrix& H) {
   }
   ++walk_.context.counts->exact;
   factor_ = std::move(factor);
-  source_.reset();
-  if (factor_->bytes() > walk_.context.options.large_factor) {
-    source_ = Source{.matrix = H, .analysis = factor_->analysis()};
-  }
   walk_.system.solve(*factor_, walk_.g(), p_);
   return true;
 }
 
 bool Directions::chord() {
-  if (!chord_allowed_ || s_ > 0.0 || !nearby()) return false;
+  if (!chord_allowed_ || s_ > 0.0 || !factor_) return false;
   walk_.system.solve(*factor_, walk_.g(), p_);
   if (!(walk_.displacement(p_) <= kChordContraction * last_step_)) return false;
   ++walk_.context.counts->chord;
@@ -67,7 +59,7 @@ bool Directions::chord() {
 }
 
 bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
-  if (s_ > 0.0 || !nearby()) return false;
+  if (s_ > 0.0 || !factor_) return false;
   const linalg::Convergence result =
       walk_.system.solve(H, *factor_, walk_.g(), kForcing, kIterations, p_);
   indefinite = result == linalg::Convergence::kNegativeCurvature;
@@ -81,7 +73,6 @@ bool Directions::certify() {
       walk_.system.assemble(walk_.x().data(), Curvature::kExact, walk_.g());
   // Whatever was near is of no use where this is indefinite: it is a saddle.
   factor_ = nullptr;
-  source_.reset();
   return refactor(H);
 }
 
@@ -165,7 +156,6 @@ bool Directions::retry(Kind kind) {
     case Kind::kIterated:
     case Kind::kExtrapolated:
       factor_ = nullptr;
-      source_.reset();
       return true;
     case Kind::kFactored:
       s_ = kFirstShare;

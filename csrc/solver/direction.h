@@ -70,13 +70,10 @@ class Directions {
   void restart();
 
  private:
-  /// The factor that may be close, or null.
-  const Factor& nearby();
-
-  /// A new factor is about to be made: drop a large one that can be made again.
+  /// A new factor is about to be made: drop the last one if it is large.
   void make_room();
 
-  /// Factor the exact Hessian. Where it is indefinite nearby() stays what it was.
+  /// Factor the exact Hessian. Where it is indefinite the last factor stays, unless it is large.
   bool refactor(const linalg::BlockMatrix& H);
 
   bool chord();
@@ -85,12 +82,6 @@ class Directions {
 
   Walk& walk_;
   Factor factor_;
-  /// What factor_ is made of, where that is large and may be dropped.
-  struct Source {
-    linalg::BlockMatrix matrix;
-    std::shared_ptr<const linalg::CholeskyAnalysis> analysis;
-  };
-  std::optional<Source> source_;
   std::vector<double> p_;
   double slope_ = 0.0;
   double last_step_ = std::numeric_limits<double>::infinity();

@@ -28,14 +28,9 @@ Factor LinearSystem::factor(const linalg::BlockMatrix& matrix) {
   const Stopwatch::Scope analysis_scope(watch_, Phase::kAnalysis);
   const Assembly::Found found = assembly_->analysis();
   counts_.analyses += found.is_new ? 1 : 0;
-  return factor(matrix, found.analysis);
-}
-
-Factor LinearSystem::factor(const linalg::BlockMatrix& matrix,
-                            const std::shared_ptr<const linalg::CholeskyAnalysis>& analysis) {
   const Stopwatch::Scope scope(watch_, Phase::kFactorization);
   ++counts_.factorizations;
-  auto factor = std::make_shared<linalg::CholeskyFactor>(analysis);
+  auto factor = std::make_shared<linalg::CholeskyFactor>(found.analysis);
   if (!factor->compute(matrix.blocks(), workspace_)) return nullptr;
   return factor;
 }

@@ -52,10 +52,6 @@ class LinearSystem {
   /// definite.
   Factor factor(const linalg::BlockMatrix& matrix);
 
-  /// The same of a matrix of any point, with the structure that its factor has had.
-  Factor factor(const linalg::BlockMatrix& matrix,
-                const std::shared_ptr<const linalg::CholeskyAnalysis>& analysis);
-
   /// Change p = -factor^-1 (b pulled back to rows) of all points, zero at prescribed ones.
   ///
   /// @param b  at all points

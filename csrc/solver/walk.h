@@ -17,8 +17,7 @@ using linalg::dot;
 struct Options {
   double tolerance;    ///< on |p|_inf / h, p the full Newton step [m/s]
   int max_iterations;  ///< of a step, over all its solves
-  /// A factor of more than this is dropped before the next one is made, and made again where it is
-  /// needed after all [bytes].
+  /// A factor of more than this is dropped before the next one is made [bytes].
   std::size_t large_factor = std::size_t{256} << 20;
 };
 

@@ -70,3 +70,36 @@ def test_contacts_that_come_and_go_leave_little_in_memory():
     )
     assert result.returncode == 0, result.stderr
     assert float(result.stdout) < 150  # [MB]
+
+
+LARGE_SHEET = """
+    import resource
+    import torch
+    from benchmarks.scenes import hanging
+    import diffcloth_torch as dc
+
+    torch.set_num_threads(1)
+    scene = hanging(200)
+    sim = dc.Simulator(scene.scene, 0.01)
+    state = sim.initial_state()
+    with torch.no_grad():
+        for _ in range(2):
+            state = sim.step(state)
+    assert state.report.counts["factorizations"] > 1
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="ru_maxrss is in KiB")
+def test_a_large_sheet_takes_little_memory():
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(LARGE_SHEET)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    # 555 of one factor, and 230 of torch.
+    assert float(result.stdout) < 1180  # [MiB]
