@@ -88,8 +88,8 @@ bool may_meet(const Swept& a, const Swept& b, double range) {
   for (int k = 0; k < 3; ++k) {
     const double lo = std::min(a.t0.lo[k] - b.t0.hi[k], a.t1.lo[k] - b.t1.hi[k]);
     const double hi = std::max(a.t0.hi[k] - b.t0.lo[k], a.t1.hi[k] - b.t1.lo[k]);
-    const double apart = std::max(std::max(lo, -hi), 0.0);
-    sum += apart * apart;
+    const double apart = std::max(lo, -hi);
+    sum += apart > 0.0 ? apart * apart : 0.0;
   }
   return sum <= range * range;
 }
@@ -131,8 +131,8 @@ bool RelativeSearch::may_meet(const Part& a, const Part& b, double range, double
     moved_t1 += most_t1 * most_t1;
     const double lo = a.place.lo[k] - b.place.hi[k] + std::min(lo_t0, lo_t1);
     const double hi = a.place.hi[k] - b.place.lo[k] + std::max(hi_t0, hi_t1);
-    const double apart = std::max(std::max(lo, -hi), 0.0);
-    apart_sq += apart * apart;
+    const double apart = std::max(lo, -hi);
+    apart_sq += apart > 0.0 ? apart * apart : 0.0;
   }
   const double least_sq = least * least;
   return ((moved_t0 > least_sq) | (moved_t1 > least_sq)) & (apart_sq <= range * range);
