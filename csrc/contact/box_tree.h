@@ -80,6 +80,9 @@ class BoxTree {
   bool empty() const { return items_.empty(); }
   const std::vector<Index>& items() const { return items_; }
   const std::vector<Node>& nodes() const { return nodes_; }
+  std::span<const Index> items_of(const Node& node) const {
+    return std::span(items_).subspan(node.first, node.last - node.first);
+  }
 
   /// Compute the boxes of all items and nodes from those of the items.
   template <class BoxOf>

@@ -19,14 +19,6 @@ using PairList = BroadPhase::Scratch::PairList;
 /// and of positions interpolated between the ends of the motion.
 constexpr double kOutward = 1e-15;
 
-bool share_vertex(const CollisionMesh::Edge& e, const CollisionMesh::Edge& f) {
-  return (e[0] == f[0]) | (e[0] == f[1]) | (e[1] == f[0]) | (e[1] == f[1]);
-}
-
-bool has_vertex(const CollisionMesh::Face& face, Index v) {
-  return (face[0] == v) | (face[1] == v) | (face[2] == v);
-}
-
 NearBoxes near_boxes_here() {
   static const NearBoxes best = near_boxes(linalg::best_level());
   return best;
@@ -307,20 +299,13 @@ void BroadPhase::find(const double* x_t0,
 
   filter(vertex_faces, [&](const IndexPair& p) { return !has_vertex(mesh_.faces[p[1]], p[0]); });
   sort_pairs(vertex_faces, scratch);
-  for (const auto& [v, f] : scratch.sorted) {
-    const auto& [i, j, k] = mesh_.faces[f];
-    out.push_back({.kind = PairKind::kPointTriangle, .vertices = {v, i, j, k}, .a = v, .b = f});
-  }
+  for (const auto& [v, f] : scratch.sorted) out.push_back(candidate_of_vertex(mesh_, v, f));
 
   filter(edges,
          [&](const IndexPair& p) { return !share_vertex(mesh_.edges[p[0]], mesh_.edges[p[1]]); });
   for (IndexPair& pair : edges) pair = {std::min(pair[0], pair[1]), std::max(pair[0], pair[1])};
   sort_pairs(edges, scratch);
-  for (const auto& [e, f] : scratch.sorted) {
-    const auto& [i, j] = mesh_.edges[e];
-    const auto& [k, l] = mesh_.edges[f];
-    out.push_back({.kind = PairKind::kEdgeEdge, .vertices = {i, j, k, l}, .a = e, .b = f});
-  }
+  for (const auto& [e, f] : scratch.sorted) out.push_back(candidate_of_edges(mesh_, e, f));
 }
 
 std::optional<std::pair<Index, Index>> BroadPhase::find_intersection(const double* x,

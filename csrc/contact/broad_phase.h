@@ -33,6 +33,27 @@ struct Candidate {
   }
 };
 
+inline bool share_vertex(const CollisionMesh::Edge& e, const CollisionMesh::Edge& f) {
+  return (e[0] == f[0]) | (e[0] == f[1]) | (e[1] == f[0]) | (e[1] == f[1]);
+}
+
+inline bool has_vertex(const CollisionMesh::Face& face, Index v) {
+  return (face[0] == v) | (face[1] == v) | (face[2] == v);
+}
+
+/// Vertex v and face f.
+inline Candidate candidate_of_vertex(const CollisionMesh& mesh, Index v, Index f) {
+  const auto& [i, j, k] = mesh.faces[f];
+  return {.kind = PairKind::kPointTriangle, .vertices = {v, i, j, k}, .a = v, .b = f};
+}
+
+/// The edges e < f.
+inline Candidate candidate_of_edges(const CollisionMesh& mesh, Index e, Index f) {
+  const auto& [i, j] = mesh.edges[e];
+  const auto& [k, l] = mesh.edges[f];
+  return {.kind = PairKind::kEdgeEdge, .vertices = {i, j, k, l}, .a = e, .b = f};
+}
+
 /// Which pairs can come close at all, by swept boxes.
 ///
 /// Immutable after construction, and safe to share between threads that each have a Scratch. Pairs
@@ -44,6 +65,14 @@ class BroadPhase {
   BroadPhase(CollisionMesh mesh, const double* x_reference);
 
   const CollisionMesh& mesh() const { return mesh_; }
+
+  struct SurfaceTrees {
+    BoxTree vertices;
+    BoxTree edges;
+    BoxTree faces;
+  };
+
+  const SurfaceTrees& trees(Index surface) const { return trees_[surface]; }
 
   /// Boxes and lists that a search fills; reuse one to search without allocation.
   struct Scratch {
@@ -112,12 +141,6 @@ class BroadPhase {
   std::optional<std::pair<Index, Index>> find_intersection(const double* x, Scratch& scratch) const;
 
  private:
-  struct SurfaceTrees {
-    BoxTree vertices;
-    BoxTree edges;
-    BoxTree faces;
-  };
-
   /// What a search is about.
   struct Sweep {
     const double* x_t0;

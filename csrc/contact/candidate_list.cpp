@@ -9,12 +9,15 @@
 namespace diffcloth::contact {
 namespace {
 
-/// A skin is this many times the motion at hand, but within these shares of the smallest and of the
-/// largest reach: a thin one is soon used up, a thick one holds pairs that never meet. What is
-/// thick itself has enough of these already.
+/// A skin is this many times the motion at hand, but within these shares of the smallest reach: a thin
+/// one is soon used up, a thick one holds pairs that never meet.
 constexpr double kAhead = 2.0;
 constexpr double kThinnest = 0.5;
 constexpr double kThickest = 4.0;
+/// That of a near list is at most this share of it.
+constexpr double kNear = 1.0;
+/// A list is worn when a search beside it looks at one pair of leaves for so many of its pairs.
+constexpr std::size_t kWorn = 4;
 /// Rounding of a distance, relative to the coordinates.
 constexpr double kRounding = 1e-14;
 
@@ -27,7 +30,7 @@ struct Motion {
 
 /// NaN counts as the largest of all.
 void raise(double& largest, double value) {
-  if (!(value <= largest)) largest = value;
+  if (!(value <= largest) && !std::isnan(largest)) largest = value;
 }
 
 std::vector<Motion> motions(const CollisionMesh& mesh, const double* from, const double* to) {
@@ -47,104 +50,164 @@ std::vector<Motion> motions(const CollisionMesh& mesh, const double* from, const
   return result;
 }
 
-}  // namespace
-
-void CandidateList::measure_approach(const double* x_t0,
-                                     const double* x_t1,
-                                     std::vector<double>& out) const {
-  const CollisionMesh& mesh = broad_phase_->mesh();
-  const auto count = static_cast<std::size_t>(mesh.surface_count());
-  out.assign(count * count, 0.0);
-  // Along a straight motion displacements are largest at one of its ends.
-  for (const double* x : {x_t0, x_t1}) {
-    const std::vector<Motion> moved = motions(mesh, reference_.data(), x);
-    for (std::size_t s = 0; s < count; ++s) {
-      for (std::size_t r = 0; r < count; ++r) {
-        if (!mesh.touching.contains(static_cast<Index>(s), static_cast<Index>(r))) continue;
-        const double common =
-            moved[s].around_mean + moved[r].around_mean + (moved[s].mean - moved[r].mean).norm();
-        raise(out[s * count + r], std::min(common, moved[s].largest + moved[r].largest));
-      }
-    }
-  }
-}
-
-/// Square of how much the two primitives of a pair can have come closer since the reference, at most:
+/// Square of how much the two primitives of a pair can have come closer in two displacements, at most:
 /// the largest change of a vector between their corners. That between any two of their points is a
 /// mean of those.
-double CandidateList::pair_approach_sq(const Candidate& pair,
-                                       const double* x_t0,
-                                       const double* x_t1) const {
+double pair_approach_sq(const Candidate& pair, const double* u_t0, const double* u_t1) {
   const int first = pair.kind == PairKind::kPointTriangle ? 1 : 2;  // corner of the second one
   double result = 0.0;
-  for (const double* x : {x_t0, x_t1}) {
-    std::array<Vec3, 4> u;
-    for (int i = 0; i < 4; ++i) {
-      u[i] = row(x, pair.vertices[i]) - row(reference_.data(), pair.vertices[i]);
-    }
+  for (const double* u : {u_t0, u_t1}) {
+    const auto& v = pair.vertices;
+    const Corners at{row(u, v[0]), row(u, v[1]), row(u, v[2]), row(u, v[3])};
     for (int i = 0; i < first; ++i) {
-      for (int j = first; j < 4; ++j) raise(result, (u[i] - u[j]).squaredNorm());
+      for (int j = first; j < 4; ++j) result = std::max(result, (at[i] - at[j]).squaredNorm());
     }
   }
   return result;
 }
 
-/// Whether no pair beyond the skin can have come within reach.
-bool CandidateList::covers(std::span<const double> approach, std::span<const double> reach) const {
-  if (!std::ranges::equal(reach, reach_)) return false;
+}  // namespace
+
+/// How much two surfaces can have come closer since a reference, at most, into approach_; 0 of those
+/// that never touch. Returns the largest.
+double CandidateList::measure_approach(const std::vector<double>& reference,
+                                       const double* x_t0,
+                                       const double* x_t1) {
   const CollisionMesh& mesh = broad_phase_->mesh();
   const auto count = static_cast<std::size_t>(mesh.surface_count());
-  for (std::size_t s = 0; s < count; ++s) {
-    for (std::size_t r = s; r < count; ++r) {
-      if (!(approach[s * count + r] + rounding_ <= 2.0 * skin_)) return false;
+  approach_.assign(count * count, 0.0);
+  double result = 0.0;
+  // Along a straight motion displacements are largest at one of its ends.
+  for (const double* x : {x_t0, x_t1}) {
+    const std::vector<Motion> moved = motions(mesh, reference.data(), x);
+    for (std::size_t s = 0; s < count; ++s) {
+      for (std::size_t r = 0; r < count; ++r) {
+        if (!mesh.touching.contains(static_cast<Index>(s), static_cast<Index>(r))) continue;
+        const double common =
+            moved[s].around_mean + moved[r].around_mean + (moved[s].mean - moved[r].mean).norm();
+        double& approach = approach_[s * count + r];
+        raise(approach, std::min(common, moved[s].largest + moved[r].largest));
+        raise(result, approach);
+      }
     }
   }
-  return true;
+  return result;
 }
 
-/// Make the list at the start of a motion. False where that is so long that its own candidates are
-/// better than a thick skin.
-bool CandidateList::build(const double* x_t0,
+/// Make the wide list at the start of a motion.
+void CandidateList::build(const double* x_t0,
                           const double* x_t1,
                           std::span<const double> reach,
                           BroadPhase::Scratch& scratch) {
-  const CollisionMesh& mesh = broad_phase_->mesh();
-  const auto count = static_cast<std::size_t>(mesh.surface_count());
-  reference_.assign(x_t0, x_t0 + 3 * static_cast<std::size_t>(mesh.vertex_count));
+  const auto size = 3 * static_cast<std::ptrdiff_t>(broad_phase_->mesh().vertex_count);
+  wide_.reference.assign(x_t0, x_t0 + size);
+  near_.reference.clear();
   reach_.assign(reach.begin(), reach.end());
-  double size = 0.0;
-  for (const double value : reference_) size = std::max(size, std::abs(value));
-  rounding_ = kRounding * size;
-  const auto [smallest, largest] = std::ranges::minmax_element(reach);
-  const double least = reach.empty() ? 0.0 : kThinnest * *smallest;
-  const double most = reach.empty() ? 0.0 : kThickest * *largest;
-  measure_approach(x_t0, x_t1, approach_);
-  double approach = 0.0;
-  for (const double value : approach_) raise(approach, value);
-  skin_ = std::clamp(kAhead * 0.5 * approach, least, most);
-  if (!covers(approach_, reach)) {
-    reference_.clear();
-    return false;
-  }
+  double largest = 0.0;
+  for (const double value : wide_.reference) largest = std::max(largest, std::abs(value));
+  rounding_ = kRounding * largest;
+  const double approach = measure_approach(wide_.reference, x_t0, x_t1);
+  const double smallest = reach.empty() ? 0.0 : std::ranges::min(reach);
+  // Also where the motion is not finite.
+  wide_.skin =
+      std::max(kThinnest * smallest, std::min(kThickest * smallest, kAhead * 0.5 * approach));
+  has_parts_ = false;
+  is_worn_ = false;
   ++builds_;
-  std::vector<double> with_skin(reach_);
-  for (double& value : with_skin) value += skin_;
-  broad_phase_->find(x_t0, x_t0, with_skin, scratch, kept_);
-  distance_.clear();
-  surfaces_.clear();
-  std::erase_if(kept_, [&](const Candidate& pair) {
+  with_skin_.clear();
+  for (const double value : reach_) with_skin_.push_back(value + wide_.skin);
+  broad_phase_->find(x_t0, x_t0, with_skin_, scratch, wide_.pairs);
+  keep_near_ones(wide_);
+}
+
+/// Make the near list at the start of a motion with this approach.
+void CandidateList::build_near(const double* x_t0, double approach, BroadPhase::Scratch& scratch) {
+  near_.reference.assign(x_t0, x_t0 + static_cast<std::ptrdiff_t>(wide_.reference.size()));
+  near_.skin = std::clamp(kAhead * 0.5 * approach,
+                          reach_.empty() ? 0.0 : kThinnest * std::ranges::min(reach_), wide_.skin);
+  with_skin_.clear();
+  for (const double value : reach_) with_skin_.push_back(value + near_.skin);
+  find_wide(x_t0, x_t0, with_skin_, near_.skin, scratch, near_.pairs);
+  keep_near_ones(near_);
+}
+
+/// Measure the distances of a list, and drop what is beyond its skins: boxes are near sooner than what
+/// is in them.
+void CandidateList::keep_near_ones(Kept& kept) const {
+  const CollisionMesh& mesh = broad_phase_->mesh();
+  const double* const x = kept.reference.data();
+  kept.distance.clear();
+  kept.surfaces.clear();
+  std::erase_if(kept.pairs, [&](const Candidate& pair) {
     const auto& v = pair.vertices;
-    const Corners corner{row(x_t0, v[0]), row(x_t0, v[1]), row(x_t0, v[2]), row(x_t0, v[3])};
+    const Corners corner{row(x, v[0]), row(x, v[1]), row(x, v[2]), row(x, v[3])};
     const double distance = std::sqrt(distance_sq(pair.kind, corner));
     const Index s = mesh.vertex_surface[v[0]];
     const Index r = mesh.vertex_surface[v[3]];
-    // Boxes are near sooner than what is in them.
-    if (distance > with_skin[s] + with_skin[r] + 2.0 * rounding_) return true;
-    distance_.push_back(distance);
-    surfaces_.push_back(s * static_cast<Index>(count) + r);
+    if (distance > reach_[s] + reach_[r] + 2.0 * (kept.skin + rounding_)) return true;
+    kept.distance.push_back(distance);
+    kept.surfaces.push_back(s * mesh.surface_count() + r);
     return false;
   });
-  return true;
+}
+
+/// Of what is kept, what may come within reach; approach_ is what measure_approach() has found for it.
+void CandidateList::cull(const Kept& kept,
+                         const double* x_t0,
+                         const double* x_t1,
+                         std::span<const double> reach,
+                         std::vector<Candidate>& out) {
+  const Index count = broad_phase_->mesh().surface_count();
+  const std::size_t size = kept.reference.size();
+  u_t0_.resize(size);
+  u_t1_.resize(size);
+  for (std::size_t a = 0; a < size; ++a) {
+    u_t0_[a] = x_t0[a] - kept.reference[a];
+    u_t1_[a] = x_t1[a] - kept.reference[a];
+  }
+  out.clear();
+  for (std::size_t k = 0; k < kept.pairs.size(); ++k) {
+    const Index s = kept.surfaces[k];
+    const double together = reach[s / count] + reach[s % count] + 2.0 * rounding_;
+    const double spare = kept.distance[k] - together;
+    if (spare > approach_[s]) continue;
+    // A surface counts as near as its fastest part; few of its pairs are.
+    if (spare > 0.0 &&
+        spare * spare > pair_approach_sq(kept.pairs[k], u_t0_.data(), u_t1_.data())) {
+      continue;
+    }
+    out.push_back(kept.pairs[k]);
+  }
+}
+
+/// What may come within reach, from the wide list and beside it.
+///
+/// @param widened  how much more each reach is than what the list was made for [m]
+void CandidateList::find_wide(const double* x_t0,
+                              const double* x_t1,
+                              std::span<const double> reach,
+                              double widened,
+                              BroadPhase::Scratch& scratch,
+                              std::vector<Candidate>& out) {
+  const double approach = measure_approach(wide_.reference, x_t0, x_t1);
+  cull(wide_, x_t0, x_t1, reach, out);
+  const double least = 2.0 * (wide_.skin - widened) - rounding_;
+  if (approach <= least) return;
+  if (!has_parts_) relative_search_.start(wide_.reference.data());
+  has_parts_ = true;
+  const auto middle = static_cast<std::ptrdiff_t>(out.size());
+  const std::size_t looked_at =
+      relative_search_.find({.reference = wide_.reference.data(),
+                             .x_t0 = x_t0,
+                             .x_t1 = x_t1,
+                             .reach = reach,
+                             .least = std::max(least, 0.0),
+                             .rounding = 2.0 * (rounding_ + kRounding * approach)},
+                            scratch, out);
+  std::sort(out.begin() + middle, out.end());
+  std::inplace_merge(out.begin(), out.begin() + middle, out.end());
+  out.erase(std::unique(out.begin(), out.end()), out.end());
+  is_worn_ = kWorn * looked_at > wide_.pairs.size();
 }
 
 void CandidateList::find(const double* x_t0,
@@ -152,32 +215,31 @@ void CandidateList::find(const double* x_t0,
                          std::span<const double> reach,
                          BroadPhase::Scratch& scratch,
                          std::vector<Candidate>& out) {
-  bool usable = false;
-  if (!reference_.empty()) {
-    measure_approach(x_t0, x_t1, approach_);
-    usable = covers(approach_, reach);
+  if (is_worn_ || !std::ranges::equal(reach, reach_)) {
+    wide_.reference.clear();
+    near_.reference.clear();
   }
-  if (!usable && !build(x_t0, x_t1, reach, scratch)) {
+  if (!near_.reference.empty() &&
+      measure_approach(near_.reference, x_t0, x_t1) + rounding_ <= 2.0 * near_.skin) {
+    cull(near_, x_t0, x_t1, reach, out);
+    return;
+  }
+  const auto size = 3 * static_cast<std::ptrdiff_t>(broad_phase_->mesh().vertex_count);
+  start_.assign(x_t0, x_t0 + size);
+  const double approach = measure_approach(start_, x_t0, x_t1);
+  if (!std::isfinite(approach)) {
     broad_phase_->find(x_t0, x_t1, reach, scratch, out);
     return;
   }
-  // From here on approach_ is how near pairs may have come.
-  const auto count = static_cast<std::size_t>(broad_phase_->mesh().surface_count());
-  for (std::size_t s = 0; s < count; ++s) {
-    for (std::size_t r = 0; r < count; ++r) {
-      approach_[s * count + r] += reach[s] + reach[r] + 2.0 * rounding_;
-    }
+  if (wide_.reference.empty()) build(x_t0, x_t1, reach, scratch);
+  const double thickest = reach.empty() ? 0.0 : kNear * std::ranges::min(reach);
+  if (!(approach + rounding_ <= 2.0 * std::min(thickest, wide_.skin))) {
+    find_wide(x_t0, x_t1, reach, 0.0, scratch, out);
+    return;
   }
-  out.clear();
-  for (std::size_t k = 0; k < kept_.size(); ++k) {
-    if (distance_[k] > approach_[surfaces_[k]]) continue;
-    // A surface counts as near as its fastest part; few of its pairs are.
-    const Index s = surfaces_[k];
-    const double together = reach[s / count] + reach[s % count] + 2.0 * rounding_;
-    const double spare = distance_[k] - together;
-    if (spare > 0.0 && spare * spare > pair_approach_sq(kept_[k], x_t0, x_t1)) continue;
-    out.push_back(kept_[k]);
-  }
+  build_near(x_t0, approach, scratch);
+  measure_approach(near_.reference, x_t0, x_t1);
+  cull(near_, x_t0, x_t1, reach, out);
 }
 
 }  // namespace diffcloth::contact

@@ -5,24 +5,27 @@
 
 #include "common/types.h"
 #include "contact/broad_phase.h"
+#include "contact/relative_search.h"
 
 namespace diffcloth::contact {
 
 /// Candidates that are kept from one search to the next, with a skin around them.
 ///
-/// A solver searches along one short motion after the other. The list keeps the pairs near one
-/// configuration together with their distances there, and answers from them for as long as no pair
-/// can have come near that is not among them: distances change by no more than the surfaces have
-/// moved towards each other, whatever common motion they share. Of what it keeps it answers with the
-/// pairs whose own corners have moved that far: near the end of a solve the contacts and little else.
+/// A solver searches along one motion after the other. The list keeps the pairs near one configuration
+/// together with their distances there, and answers with those of them whose own corners have moved that
+/// far. Distances change by no more than the surfaces have moved towards each other, whatever common
+/// motion they share, so that for short motions nothing else can have come near. For longer ones,
+/// RelativeSearch finds what has. From such a wide list a near one is made where short motions follow,
+/// as near the end of a solve: it holds the contacts and little else.
 ///
 /// Only a memory: of what it leaves out nothing comes within reach, so that contacts, energies and
 /// collision-free steps are those of BroadPhase::find, to the bit.
 class CandidateList {
  public:
-  explicit CandidateList(const BroadPhase& broad_phase) : broad_phase_(&broad_phase) {}
+  explicit CandidateList(const BroadPhase& broad_phase)
+      : broad_phase_(&broad_phase), relative_search_(broad_phase) {}
 
-  /// Make the list at the start of a motion that will follow, if it is short enough for one.
+  /// Make the list at the start of a motion that will follow.
   void prepare(const double* x_t0,
                const double* x_t1,
                std::span<const double> reach,
@@ -40,29 +43,53 @@ class CandidateList {
             BroadPhase::Scratch& scratch,
             std::vector<Candidate>& out);
 
-  /// How often the list was made anew.
+  /// How often the wide list was made anew.
   Index builds() const { return builds_; }
 
  private:
-  /// [surfaces^2] by how much two surfaces can have come closer since the reference, at most; 0 of
-  /// those that never touch.
-  void measure_approach(const double* x_t0, const double* x_t1, std::vector<double>& out) const;
-  double pair_approach_sq(const Candidate& pair, const double* x_t0, const double* x_t1) const;
-  bool covers(std::span<const double> approach, std::span<const double> reach) const;
-  bool build(const double* x_t0,
+  /// All pairs within the sum of their reaches and two skins at a reference.
+  struct Kept {
+    std::vector<double> reference;  // positions; empty: there is none
+    double skin = 0.0;              // of each surface [m]
+    std::vector<Candidate> pairs;
+    std::vector<double> distance;  // at the reference [m]
+    std::vector<Index> surfaces;   // which pair of surfaces
+  };
+
+  double measure_approach(const std::vector<double>& reference,
+                          const double* x_t0,
+                          const double* x_t1);
+  void build(const double* x_t0,
              const double* x_t1,
              std::span<const double> reach,
              BroadPhase::Scratch& scratch);
+  void build_near(const double* x_t0, double approach, BroadPhase::Scratch& scratch);
+  void keep_near_ones(Kept& kept) const;
+  void cull(const Kept& kept,
+            const double* x_t0,
+            const double* x_t1,
+            std::span<const double> reach,
+            std::vector<Candidate>& out);
+  void find_wide(const double* x_t0,
+                 const double* x_t1,
+                 std::span<const double> reach,
+                 double widened,
+                 BroadPhase::Scratch& scratch,
+                 std::vector<Candidate>& out);
 
   const BroadPhase* broad_phase_;
-  std::vector<double> reference_;  // positions that the list was made at; empty: there is none
-  std::vector<double> reach_;      // for which it was made, without the skin
-  double skin_ = 0.0;              // of each surface [m]
-  double rounding_ = 0.0;          // of distances [m]
-  std::vector<Candidate> kept_;
-  std::vector<double> distance_;  // of kept_ at the reference [m]
-  std::vector<Index> surfaces_;   // of kept_: which pair of surfaces
-  std::vector<double> approach_;
+  RelativeSearch relative_search_;
+  std::vector<double> reach_;  // for which the lists were made, without the skin
+  double rounding_ = 0.0;      // of distances [m]
+  Kept wide_;
+  Kept near_;
+  bool has_parts_ = false;        // relative_search_ has started at the reference of wide_
+  bool is_worn_ = false;          // wide_ is better made anew than used again
+  std::vector<double> approach_;  // [surfaces^2] scratch of measure_approach()
+  std::vector<double> start_;     // scratch: where a motion starts
+  std::vector<double> u_t0_;      // scratch of cull(): displacements since the reference
+  std::vector<double> u_t1_;
+  std::vector<double> with_skin_;  // [surfaces] scratch
   Index builds_ = 0;
 };
 

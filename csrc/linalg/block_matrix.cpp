@@ -1,16 +1,31 @@
 #include "linalg/block_matrix.h"
 
 #include <algorithm>
+#include <numeric>
 
 #include "linalg/dense_kernels.h"
 
 namespace diffcloth::linalg {
 
 void sort_couplings(Couplings& pairs) {
-  std::ranges::sort(pairs, [](const auto& a, const auto& b) {
-    return a.second != b.second ? a.second < b.second : a.first < b.first;
-  });
-  pairs.erase(std::unique(pairs.begin(), pairs.end()), pairs.end());
+  // Counted by column; the few rows of each are then sorted by themselves.
+  Index count = 0;
+  for (const auto& pair : pairs) count = std::max(count, pair.second + 1);
+  std::vector<Index> start(static_cast<std::size_t>(count) + 1, 0);
+  for (const auto& pair : pairs) ++start[pair.second + 1];
+  std::partial_sum(start.begin(), start.end(), start.begin());
+  std::vector<Index> row(pairs.size());
+  for (const auto& pair : pairs) row[start[pair.second]++] = pair.first;
+  pairs.clear();
+  auto first = row.begin();
+  for (Index column = 0; column < count; ++column) {
+    const auto last =
+        row.begin() + start[column];  // moved on to the end of its run by the loop above
+    std::sort(first, last);
+    for (auto end = std::unique(first, last); first != end; ++first)
+      pairs.emplace_back(*first, column);
+    first = last;
+  }
 }
 
 MergedPattern merge(const BlockPattern& base, const Couplings& pairs) {

@@ -1,0 +1,280 @@
+#include "contact/relative_search.h"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+
+#include "contact/distance/separation.h"
+
+namespace diffcloth::contact {
+namespace {
+
+void include(Box& box, const double* p) {
+  for (int k = 0; k < 3; ++k) {
+    box.lo[k] = std::min(box.lo[k], p[k]);
+    box.hi[k] = std::max(box.hi[k], p[k]);
+  }
+}
+
+void include(Box& box, const double* to, const double* from) {
+  const std::array<double, 3> u{to[0] - from[0], to[1] - from[1], to[2] - from[2]};
+  include(box, u.data());
+}
+
+/// Give every node what its leaf holds, or its two children together.
+template <class Parts, class OfLeaf, class United>
+void fit_nodes(const BoxTree& tree, Parts& parts, OfLeaf&& of_leaf, United&& unite) {
+  parts.resize(tree.nodes().size());
+  for (std::size_t k = tree.nodes().size(); k-- > 0;) {
+    const BoxTree::Node& node = tree.nodes()[k];
+    if (node.left > 0) {
+      unite(parts[k], parts[node.left], parts[node.left + 1]);
+    } else {
+      of_leaf(parts[k], tree.items_of(node));
+    }
+  }
+}
+
+/// Call something with the trees of a surface, their boxes, and the corners of their items.
+template <class Surface, class Visit>
+void for_each_tree(const BroadPhase& broad_phase, Index s, Surface& surface, Visit&& visit) {
+  const CollisionMesh& mesh = broad_phase.mesh();
+  const BroadPhase::SurfaceTrees& trees = broad_phase.trees(s);
+  visit(trees.vertices, surface.vertices, [](Index v) { return std::array<Index, 1>{v}; });
+  visit(trees.edges, surface.edges, [&](Index e) { return mesh.edges[e]; });
+  visit(trees.faces, surface.faces, [&](Index f) { return mesh.faces[f]; });
+}
+
+/// Square of how much two primitives have moved against each other since the reference, at most.
+double approach_sq(const Candidate& pair, const RelativeSearch::Wanted& wanted) {
+  const int first = pair.kind == PairKind::kPointTriangle ? 1 : 2;  // corner of the second one
+  double result = 0.0;
+  for (const double* x : {wanted.x_t0, wanted.x_t1}) {
+    std::array<Vec3, 4> u;
+    for (int i = 0; i < 4; ++i) {
+      u[i] = row(x, pair.vertices[i]) - row(wanted.reference, pair.vertices[i]);
+    }
+    for (int i = 0; i < first; ++i) {
+      for (int j = first; j < 4; ++j) result = std::max(result, (u[i] - u[j]).squaredNorm());
+    }
+  }
+  return result;
+}
+
+/// Where an item is at both ends of a motion.
+struct Swept {
+  Box t0 = kEmptyBox;
+  Box t1 = kEmptyBox;
+};
+
+/// Those of the items of a leaf.
+template <class Corners>
+std::array<Swept, kBoxGroup> sweep(std::span<const Index> items,
+                                   Corners&& corners,
+                                   const RelativeSearch::Wanted& wanted) {
+  std::array<Swept, kBoxGroup> result;
+  for (std::size_t k = 0; k < items.size(); ++k) {
+    for (const Index v : corners(items[k])) {
+      include(result[k].t0, wanted.x_t0 + 3 * v);
+      include(result[k].t1, wanted.x_t1 + 3 * v);
+    }
+  }
+  return result;
+}
+
+/// Whether two items come within range of each other as far as their boxes tell, as seen from either.
+bool may_meet(const Swept& a, const Swept& b, double range) {
+  double sum = 0.0;
+  for (int k = 0; k < 3; ++k) {
+    const double lo = std::min(a.t0.lo[k] - b.t0.hi[k], a.t1.lo[k] - b.t1.hi[k]);
+    const double hi = std::max(a.t0.hi[k] - b.t0.lo[k], a.t1.hi[k] - b.t1.lo[k]);
+    const double apart = std::max(lo, -hi);
+    sum += apart > 0.0 ? apart * apart : 0.0;
+  }
+  return sum <= range * range;
+}
+
+/// Visit the pairs of items of two leaves that may come within range.
+template <class CornersA, class CornersB, class Visit>
+void visit_items(std::span<const Index> a,
+                 CornersA&& corners_a,
+                 std::span<const Index> b,
+                 CornersB&& corners_b,
+                 const RelativeSearch::Wanted& wanted,
+                 double range,
+                 Visit&& visit) {
+  const auto swept_a = sweep(a, corners_a, wanted);
+  const auto swept_b = sweep(b, corners_b, wanted);
+  for (std::size_t i = 0; i < a.size(); ++i) {
+    for (std::size_t j = a.data() == b.data() ? i + 1 : 0; j < b.size(); ++j) {
+      if (may_meet(swept_a[i], swept_b[j], range)) visit(a[i], b[j]);
+    }
+  }
+}
+
+}  // namespace
+
+/// Whether anything in two parts has moved by more than `least` against each other, and can come within
+/// range on the motion. Branch-free, as the outcome is as good as random.
+bool RelativeSearch::may_meet(const Part& a, const Part& b, double range, double least) {
+  double moved_t0 = 0.0;
+  double moved_t1 = 0.0;
+  double apart_sq = 0.0;
+  for (int k = 0; k < 3; ++k) {
+    const double lo_t0 = a.u_t0.lo[k] - b.u_t0.hi[k];
+    const double hi_t0 = a.u_t0.hi[k] - b.u_t0.lo[k];
+    const double lo_t1 = a.u_t1.lo[k] - b.u_t1.hi[k];
+    const double hi_t1 = a.u_t1.hi[k] - b.u_t1.lo[k];
+    const double most_t0 = std::max(hi_t0, -lo_t0);
+    const double most_t1 = std::max(hi_t1, -lo_t1);
+    moved_t0 += most_t0 * most_t0;
+    moved_t1 += most_t1 * most_t1;
+    const double lo = a.place.lo[k] - b.place.hi[k] + std::min(lo_t0, lo_t1);
+    const double hi = a.place.hi[k] - b.place.lo[k] + std::max(hi_t0, hi_t1);
+    const double apart = std::max(lo, -hi);
+    apart_sq += apart > 0.0 ? apart * apart : 0.0;
+  }
+  const double least_sq = least * least;
+  return ((moved_t0 > least_sq) | (moved_t1 > least_sq)) & (apart_sq <= range * range);
+}
+
+void RelativeSearch::start(const double* reference) {
+  surfaces_.resize(broad_phase_->mesh().surface_count());
+  for (Index s = 0; s < broad_phase_->mesh().surface_count(); ++s) {
+    Surface& surface = surfaces_[s];
+    surface.moved = true;
+    for_each_tree(*broad_phase_, s, surface, [&](const BoxTree& tree, Parts& parts, auto corners) {
+      fit_nodes(
+          tree, parts,
+          [&](Part& part, std::span<const Index> items) {
+            part.place = kEmptyBox;
+            for (const Index item : items) {
+              for (const Index v : corners(item)) include(part.place, reference + 3 * v);
+            }
+          },
+          [](Part& part, const Part& p, const Part& q) { part.place = united(p.place, q.place); });
+    });
+  }
+}
+
+void RelativeSearch::fit_displacements(const Wanted& wanted, Index s) {
+  const std::vector<Index>& vertices = broad_phase_->trees(s).vertices.items();
+  const bool moves = std::ranges::any_of(vertices, [&](Index v) {
+    return row(wanted.x_t0, v) != row(wanted.reference, v) ||
+           row(wanted.x_t1, v) != row(wanted.reference, v);
+  });
+  Surface& surface = surfaces_[s];
+  if (!moves && !surface.moved) return;
+  surface.moved = moves;
+  for_each_tree(*broad_phase_, s, surface, [&](const BoxTree& tree, Parts& parts, auto corners) {
+    fit_nodes(
+        tree, parts,
+        [&](Part& part, std::span<const Index> items) {
+          part.u_t0 = part.u_t1 = kEmptyBox;
+          for (const Index item : items) {
+            for (const Index v : corners(item)) {
+              include(part.u_t0, wanted.x_t0 + 3 * v, wanted.reference + 3 * v);
+              include(part.u_t1, wanted.x_t1 + 3 * v, wanted.reference + 3 * v);
+            }
+          }
+        },
+        [](Part& part, const Part& p, const Part& q) {
+          part.u_t0 = united(p.u_t0, q.u_t0);
+          part.u_t1 = united(p.u_t1, q.u_t1);
+        });
+  });
+}
+
+/// Visit pairs of leaves that may meet; of one tree with itself each pair once.
+template <class Visit>
+void RelativeSearch::visit_leaves(const BoxTree& tree_a,
+                                  const Parts& a,
+                                  const BoxTree& tree_b,
+                                  const Parts& b,
+                                  double range,
+                                  double least,
+                                  BroadPhase::Scratch::PairList& stack,
+                                  Visit&& visit) const {
+  if (tree_a.empty() || tree_b.empty() || !may_meet(a[0], b[0], range, least)) return;
+  const bool own = &tree_a == &tree_b;
+  const auto push = [&](Index i, Index j) {
+    *stack.room(1) = {i, j};
+    if (may_meet(a[i], b[j], range, least)) stack.end_at(stack.end() + 1);
+  };
+  stack.clear();
+  stack.push({0, 0});
+  while (stack.size() > 0) {
+    const auto [i, j] = stack.pop();
+    const BoxTree::Node& p = tree_a.nodes()[i];
+    const BoxTree::Node& q = tree_b.nodes()[j];
+    if (p.left == 0 && q.left == 0) {
+      visit(tree_a.items_of(p), tree_b.items_of(q));
+    } else if (own && i == j) {
+      push(p.left, p.left);
+      push(p.left + 1, p.left + 1);
+      push(p.left, p.left + 1);
+    } else if (q.left == 0 || (p.left != 0 && p.last - p.first >= q.last - q.first)) {
+      push(p.left, j);
+      push(p.left + 1, j);
+    } else {
+      push(i, q.left);
+      push(i, q.left + 1);
+    }
+  }
+}
+
+std::size_t RelativeSearch::find(const Wanted& wanted,
+                                 BroadPhase::Scratch& scratch,
+                                 std::vector<Candidate>& out) {
+  const CollisionMesh& mesh = broad_phase_->mesh();
+  const double least_sq = wanted.least * wanted.least;
+  for (Index s = 0; s < mesh.surface_count(); ++s) fit_displacements(wanted, s);
+  const auto vertex = [](Index v) { return std::array<Index, 1>{v}; };
+  const auto edge = [&](Index e) { return mesh.edges[e]; };
+  const auto face = [&](Index f) { return mesh.faces[f]; };
+  std::size_t looked_at = 0;
+  for (Index s = 0; s < mesh.surface_count(); ++s) {
+    for (Index r = s; r < mesh.surface_count(); ++r) {
+      if (!mesh.touching.contains(s, r)) continue;
+      const double range = wanted.reach[s] + wanted.reach[r] + wanted.rounding;
+      const auto offer = [&](const Candidate& pair) {
+        const double moved_sq = approach_sq(pair, wanted);
+        if (moved_sq <= least_sq) return;
+        const auto& v = pair.vertices;
+        const Corners corner{row(wanted.reference, v[0]), row(wanted.reference, v[1]),
+                             row(wanted.reference, v[2]), row(wanted.reference, v[3])};
+        const double spare = std::sqrt(distance_sq(pair.kind, corner)) - range - wanted.rounding;
+        if (spare > 0.0 && spare * spare > moved_sq) return;
+        out.push_back(pair);
+      };
+      const auto find_vertices_and_faces = [&](Index p, Index q) {
+        const BoxTree& vertices = broad_phase_->trees(p).vertices;
+        const BoxTree& faces = broad_phase_->trees(q).faces;
+        visit_leaves(vertices, surfaces_[p].vertices, faces, surfaces_[q].faces, range,
+                     wanted.least, scratch.stack,
+                     [&](std::span<const Index> a, std::span<const Index> b) {
+                       ++looked_at;
+                       visit_items(a, vertex, b, face, wanted, range, [&](Index v, Index f) {
+                         if (has_vertex(mesh.faces[f], v)) return;
+                         offer(candidate_of_vertex(mesh, v, f));
+                       });
+                     });
+      };
+      find_vertices_and_faces(s, r);
+      if (s != r) find_vertices_and_faces(r, s);
+      visit_leaves(broad_phase_->trees(s).edges, surfaces_[s].edges, broad_phase_->trees(r).edges,
+                   surfaces_[r].edges, range, wanted.least, scratch.stack,
+                   [&](std::span<const Index> a, std::span<const Index> b) {
+                     ++looked_at;
+                     visit_items(a, edge, b, edge, wanted, range, [&](Index i, Index j) {
+                       const auto [e, f] = std::minmax(i, j);
+                       if (share_vertex(mesh.edges[e], mesh.edges[f])) return;
+                       offer(candidate_of_edges(mesh, e, f));
+                     });
+                   });
+    }
+  }
+  return looked_at;
+}
+
+}  // namespace diffcloth::contact

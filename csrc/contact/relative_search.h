@@ -1,0 +1,69 @@
+#pragma once
+
+#include <span>
+#include <vector>
+
+#include "common/types.h"
+#include "contact/broad_phase.h"
+
+namespace diffcloth::contact {
+
+/// Search for pairs by how their parts have moved against each other since a reference.
+///
+/// What lies side by side moves nearly alike, however far it goes: it is left out with the boxes around
+/// it, by the boxes of positions at the reference and those of displacements since then.
+class RelativeSearch {
+ public:
+  explicit RelativeSearch(const BroadPhase& broad_phase) : broad_phase_(&broad_phase) {}
+
+  /// Begin at a configuration.
+  void start(const double* reference);
+
+  /// What is looked for on a straight motion.
+  struct Wanted {
+    const double* reference;  ///< of start()
+    const double* x_t0;
+    const double* x_t1;
+    std::span<const double> reach;  ///< [surfaces] [m]
+    double least;                   ///< approach since the reference up to which none is wanted [m]
+    double rounding;                ///< of a distance [m]
+  };
+
+  /// Append all pairs of which two corners have moved by more than `least` against each other, and that
+  /// come within the sum of the two reaches at any time of the motion; in any order, and some others.
+  ///
+  /// @return how many pairs of leaves were looked at
+  std::size_t find(const Wanted& wanted, BroadPhase::Scratch& scratch, std::vector<Candidate>& out);
+
+ private:
+  /// Boxes around a part: its positions at the reference, and its displacements at both ends.
+  struct Part {
+    Box place = kEmptyBox;
+    Box u_t0 = kEmptyBox;
+    Box u_t1 = kEmptyBox;
+  };
+  using Parts = std::vector<Part>;  // of the nodes of a tree
+  struct Surface {
+    Parts vertices;
+    Parts edges;
+    Parts faces;
+    bool moved = true;  // displacements are not all zero
+  };
+
+  static bool may_meet(const Part& a, const Part& b, double range, double least);
+  template <class Visit>
+  void visit_leaves(const BoxTree& tree_a,
+                    const Parts& a,
+                    const BoxTree& tree_b,
+                    const Parts& b,
+                    double range,
+                    double least,
+                    BroadPhase::Scratch::PairList& stack,
+                    Visit&& visit) const;
+  void fit_displacements(const Wanted& wanted, Index surface);
+
+  const BroadPhase* broad_phase_;
+  std::vector<Surface> surfaces_;
+};
+
+}  // namespace diffcloth::contact
