@@ -151,7 +151,16 @@ def crumple(n: int) -> Scene:
     """Draw eight points of the rim together, until the sheet lies on itself."""
     vertices, faces = sheet(n)
     half, last = n // 2, n - 1
-    rim = [(0, 0), (0, half), (0, last), (half, 0), (half, last), (last, 0), (last, half), (last, last)]
+    rim = [
+        (0, 0),
+        (0, half),
+        (0, last),
+        (half, 0),
+        (half, last),
+        (last, 0),
+        (last, half),
+        (last, last),
+    ]
     pins = {"rim": [n * i + j for i, j in rim]}
 
     def carry(held: Tensor) -> Tensor:
