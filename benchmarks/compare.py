@@ -31,8 +31,9 @@ from typing import Any
 import click
 from tqdm import tqdm
 
-from benchmarks.scenes import SCENES, kept_file
+from benchmarks.scenes import BUCKLING, SCENES, kept_file
 
+ALL = SCENES | BUCKLING
 ROOT = Path(__file__).resolve().parents[1]
 SIZES = (12, 24, 48)
 BATCH = 8
@@ -126,7 +127,7 @@ class Side:
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     help="Folder with the other package.",
 )
-@click.option("--scene", "scenes", multiple=True, type=click.Choice(list(SCENES)))
+@click.option("--scene", "scenes", multiple=True, type=click.Choice(list(ALL)))
 @click.option("--size", "sizes", multiple=True, type=click.IntRange(min=4), help="Vertices a side.")
 @click.option("--steps", type=click.IntRange(min=1), help="Timed steps; by default fewer if large.")
 @click.option("--batch/--no-batch", default=True, help="Also time batches of 8.")
@@ -141,7 +142,7 @@ def main(
     cpu: bool,
     out: Path | None,
 ) -> None:
-    names, given = scenes or tuple(SCENES), sorted(sizes or SIZES)
+    names, given = scenes or tuple(ALL), sorted(sizes or SIZES)
     rows = [Row(name, size, 0, 1) for name in names for size in given]
     batched = [size for size in given if size <= LARGEST_BATCHED]
     if batch and batched:

@@ -1,7 +1,8 @@
 """The scenes that are timed: a square sheet of 1 m, and what it meets.
 
 Sheets are jittered in their plane, as exact grids sit on kinks of the contact energy. Each scene
-takes steps that bring it into its regime before anything is timed.
+takes steps that bring it into its regime before anything is timed. `SCENES` are the ordinary ones;
+in `BUCKLING` cloth buckles in many places at once, which costs many iterations.
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 import diffcloth_torch as dc
 
 DT = 0.01  # [s]
+TURN = 2 * np.pi  # of the ends of a sheet that is twisted [rad/s]
 
 
 @dataclass(frozen=True)
@@ -27,15 +30,21 @@ class Scene:
         approach: Steps until the regime is reached.
         speed: Of the cloth at the start [m/s].
         body_speed: Of the bodies, throughout [m/s].
+        carry: From the vertices to the velocities [m/s] of those that are pinned; none rest.
     """
 
     scene: dc.Scene
     approach: int
     speed: tuple[float, float, float] = (0.0, 0.0, 0.0)
     body_speed: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    carry: Callable[[Tensor], Tensor] | None = None
 
     def control(self, state: dc.State) -> dc.Control:
-        """Move the bodies on by one step; new leaves, so that gradients stop there."""
+        """Move pins and bodies on by one step; new leaves, so that gradients stop there."""
+        if self.carry is not None:
+            pinned = [v for name in self.scene.cloths[0].pins.values() for v in name]
+            held = state.positions.detach()[..., pinned, :]
+            return dc.Control(pins=held + DT * self.carry(held))
         if state.body_poses.shape[-2] == 0:
             return dc.Control()
         shift = torch.tensor([*self.body_speed, 0, 0, 0, 0], dtype=torch.float64)
@@ -126,6 +135,54 @@ def moving_body(n: int) -> Scene:
     return Scene(dc.Scene([cloth], [box]), approach=22, body_speed=(0.0, 0.5, 0.1))
 
 
+def twist(n: int) -> Scene:
+    """Turn two opposite edges against each other, while they come nearer."""
+    vertices, faces = sheet(n)
+    pins = {"left": range(n), "right": range(n * (n - 1), n * n)}
+
+    def carry(held: Tensor) -> Tensor:
+        x, y, z = held.unbind(-1)
+        turn = TURN * y.sign()
+        return torch.stack([turn * z, -0.4 * y.sign(), -turn * x], dim=-1)
+
+    return Scene(dc.Scene([dc.Cloth(vertices, faces, pins=pins)]), approach=20, carry=carry)
+
+
+def crumple(n: int) -> Scene:
+    """Draw eight points of the rim together, until the sheet lies on itself."""
+    vertices, faces = sheet(n)
+    half, last = n // 2, n - 1
+    rim = [
+        (0, 0),
+        (0, half),
+        (0, last),
+        (half, 0),
+        (half, last),
+        (last, 0),
+        (last, half),
+        (last, last),
+    ]
+    pins = {"rim": [n * i + j for i, j in rim]}
+
+    def carry(held: Tensor) -> Tensor:
+        return -2.0 * held
+
+    return Scene(dc.Scene([dc.Cloth(vertices, faces, pins=pins)]), approach=20, carry=carry)
+
+
+def impact(n: int) -> Scene:
+    """Shoot a sheet at the tip of a cone."""
+    vertices, faces = sheet(n)
+    vertices += (0.02, 0.03, _gap(n))
+    sides = 12
+    angles = 2 * np.pi * np.arange(sides) / sides
+    rim = np.stack([0.1 * np.cos(angles), 0.1 * np.sin(angles), np.full(sides, -0.3)], axis=-1)
+    mantle = [(0, 1 + k, 1 + (k + 1) % sides) for k in range(sides)]
+    base = [(sides + 1, 1 + (k + 1) % sides, 1 + k) for k in range(sides)]
+    cone = dc.RigidBody(np.vstack([[0.0, 0.0, 0.0], rim, [0.0, 0.0, -0.3]]), mantle + base)
+    return Scene(dc.Scene([dc.Cloth(vertices, faces)], [cone]), approach=0, speed=(0.0, 0.0, -30.0))
+
+
 SCENES: dict[str, Callable[[int], Scene]] = {
     "hanging": hanging,
     "stiff": stiff,
@@ -134,6 +191,12 @@ SCENES: dict[str, Callable[[int], Scene]] = {
     "self-contact": self_contact,
     "two-sheets": two_sheets,
     "moving-body": moving_body,
+}
+
+BUCKLING: dict[str, Callable[[int], Scene]] = {
+    "twist": twist,
+    "crumple": crumple,
+    "impact": impact,
 }
 
 

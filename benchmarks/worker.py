@@ -43,10 +43,10 @@ def timed_steps(row: dict[str, Any]) -> Any:
     import torch
 
     import diffcloth_torch as dc
-    from benchmarks.scenes import DT, SCENES, in_regime
+    from benchmarks.scenes import BUCKLING, DT, SCENES, in_regime
 
     torch.set_num_threads(row["threads"])
-    scene = SCENES[row["scene"]](row["size"])
+    scene = (SCENES | BUCKLING)[row["scene"]](row["size"])
     simulator = dc.Simulator(scene.scene, DT, solver=dc.SolverOptions(throw=False))
     state = in_regime(simulator, scene, row["batch"], Path(row["kept"]))
     generator = torch.Generator().manual_seed(1)
