@@ -1,12 +1,14 @@
 """Write the page of figures, docs/performance.md, and its plots.
 
     python -m benchmarks.figures --against "the first version=../first"
+    python -m benchmarks.figures --newton ../peer/bin/python ...    # see benchmarks.peers
     python -m benchmarks.figures --draw    # the page alone, again
 
 `--against` names another checkout with a built package, and may be repeated: all scenes are timed
 with it and this checkout side by side, as by `benchmarks.compare`. Then this checkout alone is
-timed by phases, as by `benchmarks.step`, and with several losses in one backward. What was measured
-is in docs/performance.json, of which page and plots are made.
+timed by phases, as by `benchmarks.step`, and with several losses in one backward. `--newton` is the
+Python of an environment with Newton, which is timed beside us as by `benchmarks.peers`. What was
+measured is in docs/performance.json, of which page and plots are made.
 
 `--cpu` counts processor time, on a machine that others use too; then threads are left out, as
 processor time says nothing of them.
@@ -33,12 +35,14 @@ from tqdm import tqdm
 import diffcloth_torch as dc
 from benchmarks.compare import BATCH, POOLS, ROOT, Row, time_row
 from benchmarks.measure import time_steps
-from benchmarks.scenes import DT, SCENES, in_regime, kept_file
+from benchmarks.peers import time_all
+from benchmarks.scenes import BUCKLING, DT, SCENES, in_regime, kept_file
 from benchmarks.step import _processor
 
 RECORDS = "performance.json"
 SIZES = (12, 24, 48)
 PHASE_SIZES = (24, 48)
+BUCKLING_SIZE = 24
 STEPS = {12: 12, 24: 12, 48: 4}  # timed, after those of the warm-up
 BATCH_SCENES = ("hanging", "sphere")
 LOSSES = (1, 8, 64)
@@ -50,11 +54,18 @@ Records = dict[str, Any]
 
 @click.command(help=__doc__.replace("\n\n    ", "\n\n\b\n    "))
 @click.option("--against", "others", multiple=True, help="NAME=FOLDER with a built package.")
+@click.option(
+    "--newton",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="Python of an environment that has Newton.",
+)
 @click.option("--cpu", is_flag=True, help="Processor time instead of wall-clock time.")
 @click.option("--quick", is_flag=True, help="Tiny sheets: shows that it runs.")
 @click.option("--draw", is_flag=True, help="Measure nothing: draw what was measured before.")
 @click.option("--docs", default=ROOT / "docs", type=click.Path(path_type=Path, file_okay=False))
-def main(others: tuple[str, ...], cpu: bool, quick: bool, draw: bool, docs: Path) -> None:
+def main(
+    others: tuple[str, ...], newton: Path | None, cpu: bool, quick: bool, draw: bool, docs: Path
+) -> None:
     file = docs / RECORDS
     if draw:
         if not file.exists():
@@ -62,7 +73,7 @@ def main(others: tuple[str, ...], cpu: bool, quick: bool, draw: bool, docs: Path
     else:
         file.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory() as kept:
-            measured = measure(_folders(others), cpu, quick, Path(kept))
+            measured = measure(_folders(others), newton, cpu, quick, Path(kept))
         file.write_text(json.dumps(measured, indent=1) + "\n")
     records = json.loads(file.read_text())
     (docs / "images").mkdir(exist_ok=True)
@@ -84,7 +95,9 @@ def _folders(others: Iterable[str]) -> dict[str, Path]:
 # ---- measuring ----
 
 
-def measure(others: dict[str, Path], cpu: bool, quick: bool, kept: Path) -> Records:
+def measure(
+    others: dict[str, Path], newton: Path | None, cpu: bool, quick: bool, kept: Path
+) -> Records:
     """Everything that the page says, as plain numbers.
 
     The folder `kept` keeps each scene's regime, as the way there takes longer than what is timed.
@@ -92,6 +105,8 @@ def measure(others: dict[str, Path], cpu: bool, quick: bool, kept: Path) -> Reco
     sizes, phase_sizes = ((6,), (6,)) if quick else (SIZES, PHASE_SIZES)
     names = BATCH_SCENES if quick else tuple(SCENES)
     rows = [Row(name, size, 0, 1) for size in sizes for name in names]
+    if not quick:
+        rows += [Row(name, BUCKLING_SIZE, 0, 1) for name in BUCKLING]
     steps = dict.fromkeys(sizes, 2) if quick else STEPS
     pools = POOLS[:1] if cpu else POOLS
     batched = sizes[0] if quick else 24
@@ -130,6 +145,7 @@ def measure(others: dict[str, Path], cpu: bool, quick: bool, kept: Path) -> Reco
         for name in LOSS_SCENES
         for count in counts
     ]
+    records["peers"] = list(time_all(newton, phase_sizes[0])) if newton else []
     records["load"].append(round(os.getloadavg()[0], 1))
     records["minutes"] = round((time.perf_counter() - start) / 60, 1)
     return records
@@ -290,6 +306,8 @@ def page(records: Records, plots: list[tuple[str, str]]) -> str:
         parts += [f"## Beside {release}", _release_text(rows, release), _release_table(rows)]
     parts += ["## By phase", _PHASE_TEXT, _phase_table(records["phases"])]
     parts += ["## Many losses", _LOSS_TEXT, _loss_table(records["losses"])]
+    if records["peers"]:
+        parts += ["## Beside Newton", _PEER_TEXT, _peer_table(records["peers"])]
     return "\n\n".join(parts) + "\n"
 
 
@@ -380,13 +398,32 @@ def _loss_table(rows: list[Records]) -> str:
     )
 
 
+_PEER_TEXT = """\
+The differentiable cloth of Newton (`pip install newton`) on the same processor: explicit substeps
+in single precision, with penalties where a vertex meets a body. 15 frames at 60 Hz from the same
+start, by `python -m benchmarks.peers`, which says how, in processor time of a frame. `gradient` is
+how far the gradient of each is from differences of its own loss, `depth` how far the sheet was
+within the body at its deepest."""
+
+
+def _peer_table(rows: list[Records]) -> str:
+    head = ["scene", "size", "by", "substeps", "forward [ms]", "backward [ms]", "gradient"]
+    lines = []
+    for r in rows:
+        line = [r["scene"], r["size"], r["by"], r["substeps"]]
+        line += [_number(r["forward"]), _number(r["backward"])]
+        lines.append([*line, f"{r['gradient_error']:.1e}", f"{r['depth']:.2g}"])
+    return _table([*head, "depth [mm]"], lines)
+
+
 def _table(head: list[str], rows: list[list[Any]]) -> str:
     lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines)
 
 
 def _is(row: Records, size: int) -> bool:
-    return row["size"] == size and not row["batch"]
+    """Whether a row is of one environment in an ordinary scene of this size."""
+    return row["size"] == size and not row["batch"] and row["scene"] in SCENES
 
 
 def _sizes(rows: list[Records]) -> list[int]:
