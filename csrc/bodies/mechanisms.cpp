@@ -63,7 +63,8 @@ Mechanisms::Mechanisms(MechanismsDescription description, const BodySet& bodies)
               .last_coordinate = coordinate,
               .first_node = node_count(),
               .last_node = node_count(),
-              .frame = 0};
+              .frame = 0,
+              .surfaces = {}};
     while (link < static_cast<Index>(given_.links.size()) && given_.links[link].tree == t) ++link;
     while (coordinate < n && given_.coordinate_tree[coordinate] == t) ++coordinate;
     tree.last_link = link;
