@@ -1,6 +1,6 @@
 """What a step says about its time, and what it leaves in memory."""
 
-import os
+import platform
 import subprocess
 import sys
 import textwrap
@@ -34,12 +34,15 @@ def test_the_seconds_of_a_report_are_those_of_the_step():
 
 
 SELF_CONTACT = """
+    import ctypes
     import os
     import torch
     from benchmarks.scenes import self_contact
     import diffcloth_torch as dc
 
     def resident():
+        # What is free in the heap is not left behind, though the C library may hold on to it.
+        ctypes.CDLL(None).malloc_trim(0)
         with open("/proc/self/statm") as file:
             return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
@@ -58,7 +61,7 @@ SELF_CONTACT = """
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="reads /proc")  # noqa: PTH110
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="asks glibc to give memory back")
 def test_contacts_that_come_and_go_leave_little_in_memory():
     # Each new set of contacts is a new pattern of the matrix, whose analysis may be kept.
     result = subprocess.run(
@@ -69,7 +72,7 @@ def test_contacts_that_come_and_go_leave_little_in_memory():
         check=False,
     )
     assert result.returncode == 0, result.stderr
-    assert float(result.stdout) < 150  # [MB]
+    assert float(result.stdout) < 60  # [MB]
 
 
 LARGE_SHEET = """
