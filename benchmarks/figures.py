@@ -402,8 +402,9 @@ _PEER_TEXT = """\
 The differentiable cloth of Newton (`pip install newton`) on the same processor: explicit substeps
 in single precision, with penalties where a vertex meets a body. 15 frames at 60 Hz from the same
 start, by `python -m benchmarks.peers`, which says how, in processor time of a frame. `gradient` is
-how far the gradient of each is from differences of its own loss, `depth` how far the sheet was
-within the body at its deepest."""
+how far the gradient of each is from differences of its own loss; where vertices bounce, differences
+of Newton's loss change with their step, too. `depth` is how far the sheet was within the body at
+its deepest."""
 
 
 def _peer_table(rows: list[Records]) -> str:
