@@ -106,4 +106,41 @@ class BoxTree {
   std::vector<Node> nodes_;
 };
 
+/// Visit the pairs of leaves of two trees, or of one with itself each once, that may hold what is looked
+/// for. Which do is as good as random: every pair is written on the stack, and kept by counting on, which
+/// spares the processor the guess.
+///
+/// @param near  of two nodes, by their numbers: whether anything in them may be what is looked for
+template <class Stack, class Near, class Visit>
+void visit_leaf_pairs(
+    const BoxTree& tree_a, const BoxTree& tree_b, Stack& stack, Near&& near, Visit&& visit) {
+  if (tree_a.empty() || tree_b.empty() || !near(0, 0)) return;
+  const bool own = &tree_a == &tree_b;
+  const auto push = [&](Index i, Index j) {
+    auto* const end = stack.room(1);
+    *end = {i, j};
+    stack.end_at(end + near(i, j));
+  };
+  stack.clear();
+  stack.push({0, 0});
+  while (stack.size() > 0) {
+    const auto [i, j] = stack.pop();
+    const BoxTree::Node& p = tree_a.nodes()[i];
+    const BoxTree::Node& q = tree_b.nodes()[j];
+    if (p.left == 0 && q.left == 0) {
+      visit(p, q);
+    } else if (own && i == j) {
+      push(p.left, p.left);
+      push(p.left + 1, p.left + 1);
+      push(p.left, p.left + 1);
+    } else if (q.left == 0 || (p.left != 0 && p.last - p.first >= q.last - q.first)) {
+      push(p.left, j);
+      push(p.left + 1, j);
+    } else {
+      push(i, q.left);
+      push(i, q.left + 1);
+    }
+  }
+}
+
 }  // namespace diffcloth::contact

@@ -57,28 +57,14 @@ void append_overlaps(const BoxTree& tree_a,
                      PairList& stack,
                      PairList& pairs) {
   const NearBoxes near = near_boxes_here();
-  if (tree_a.empty() || tree_b.empty() || !overlap(a.nodes[0], b.nodes[0])) return;
-  stack.clear();
-  stack.push({0, 0});
-  while (stack.size() > 0) {
-    const auto [i, j] = stack.pop();
-    const BoxTree::Node& p = tree_a.nodes()[i];
-    const BoxTree::Node& q = tree_b.nodes()[j];
-    if (p.left == 0 && q.left == 0) {
-      append_pairs(tree_a, p.first, tree_b, q.first,
-                   near(a.items[p.first / kBoxGroup], b.items[q.first / kBoxGroup], range), pairs);
-      continue;
-    }
-    const bool split_a = q.left == 0 || (p.left != 0 && p.last - p.first >= q.last - q.first);
-    IndexPair* end = stack.room(2);
-    for (Index child = 0; child < 2; ++child) {
-      const Index next_i = split_a ? p.left + child : i;
-      const Index next_j = split_a ? j : q.left + child;
-      *end = {next_i, next_j};
-      end += are_near(a.nodes[next_i], b.nodes[next_j], range);
-    }
-    stack.end_at(end);
-  }
+  visit_leaf_pairs(
+      tree_a, tree_b, stack,
+      [&](Index i, Index j) { return are_near(a.nodes[i], b.nodes[j], range); },
+      [&](const BoxTree::Node& p, const BoxTree::Node& q) {
+        append_pairs(tree_a, p.first, tree_b, q.first,
+                     near(a.items[p.first / kBoxGroup], b.items[q.first / kBoxGroup], range),
+                     pairs);
+      });
 }
 
 /// Append all unordered pairs of different items of one tree whose boxes are within range.
@@ -87,37 +73,16 @@ void append_self_overlaps(const BoxTree& tree,
                           double range,
                           PairList& stack,
                           PairList& pairs) {
-  if (tree.empty()) return;
   constexpr std::uint32_t kAbove = 0b0000'1000'1100'1110;  // bits of l > k
   const NearBoxes near = near_boxes_here();
-  stack.clear();
-  stack.push({0, 0});
-  while (stack.size() > 0) {
-    const auto [i, j] = stack.pop();
-    const BoxTree::Node& p = tree.nodes()[i];
-    const BoxTree::Node& q = tree.nodes()[j];
-    if (p.left == 0 && q.left == 0) {
-      const BoxGroup& group = boxes.items[p.first / kBoxGroup];
-      const std::uint32_t found = near(group, boxes.items[q.first / kBoxGroup], range);
-      append_pairs(tree, p.first, tree, q.first, i == j ? found & kAbove : found, pairs);
-    } else if (i == j) {
-      stack.push({p.left, p.left});
-      stack.push({p.left + 1, p.left + 1});
-      if (overlap(boxes.nodes[p.left], boxes.nodes[p.left + 1])) {
-        stack.push({p.left, p.left + 1});
-      }
-    } else {
-      const bool split_p = q.left == 0 || (p.left != 0 && p.last - p.first >= q.last - q.first);
-      IndexPair* end = stack.room(2);
-      for (Index child = 0; child < 2; ++child) {
-        const Index next_i = split_p ? p.left + child : i;
-        const Index next_j = split_p ? j : q.left + child;
-        *end = {next_i, next_j};
-        end += are_near(boxes.nodes[next_i], boxes.nodes[next_j], range);
-      }
-      stack.end_at(end);
-    }
-  }
+  visit_leaf_pairs(
+      tree, tree, stack,
+      [&](Index i, Index j) { return (i == j) | are_near(boxes.nodes[i], boxes.nodes[j], range); },
+      [&](const BoxTree::Node& p, const BoxTree::Node& q) {
+        const std::uint32_t found =
+            near(boxes.items[p.first / kBoxGroup], boxes.items[q.first / kBoxGroup], range);
+        append_pairs(tree, p.first, tree, q.first, &p == &q ? found & kAbove : found, pairs);
+      });
 }
 
 /// Drop the pairs that do not satisfy `keep`.

@@ -50,27 +50,11 @@ std::vector<Motion> motions(const CollisionMesh& mesh, const double* from, const
   return result;
 }
 
-/// Square of how much the two primitives of a pair can have come closer in two displacements, at most:
-/// the largest change of a vector between their corners. That between any two of their points is a
-/// mean of those.
-double pair_approach_sq(const Candidate& pair, const double* u_t0, const double* u_t1) {
-  const int first = pair.kind == PairKind::kPointTriangle ? 1 : 2;  // corner of the second one
-  double result = 0.0;
-  for (const double* u : {u_t0, u_t1}) {
-    const auto& v = pair.vertices;
-    const Corners at{row(u, v[0]), row(u, v[1]), row(u, v[2]), row(u, v[3])};
-    for (int i = 0; i < first; ++i) {
-      for (int j = first; j < 4; ++j) result = std::max(result, (at[i] - at[j]).squaredNorm());
-    }
-  }
-  return result;
-}
-
 }  // namespace
 
 /// How much two surfaces can have come closer since a reference, at most, into approach_; 0 of those
 /// that never touch. Returns the largest.
-double CandidateList::measure_approach(const std::vector<double>& reference,
+double CandidateList::measure_approach(const double* reference,
                                        const double* x_t0,
                                        const double* x_t1) {
   const CollisionMesh& mesh = broad_phase_->mesh();
@@ -79,7 +63,7 @@ double CandidateList::measure_approach(const std::vector<double>& reference,
   double result = 0.0;
   // Along a straight motion displacements are largest at one of its ends.
   for (const double* x : {x_t0, x_t1}) {
-    const std::vector<Motion> moved = motions(mesh, reference.data(), x);
+    const std::vector<Motion> moved = motions(mesh, reference, x);
     for (std::size_t s = 0; s < count; ++s) {
       for (std::size_t r = 0; r < count; ++r) {
         if (!mesh.touching.contains(static_cast<Index>(s), static_cast<Index>(r))) continue;
@@ -106,7 +90,7 @@ void CandidateList::build(const double* x_t0,
   double largest = 0.0;
   for (const double value : wide_.reference) largest = std::max(largest, std::abs(value));
   rounding_ = kRounding * largest;
-  const double approach = measure_approach(wide_.reference, x_t0, x_t1);
+  const double approach = measure_approach(wide_.reference.data(), x_t0, x_t1);
   const double smallest = reach.empty() ? 0.0 : std::ranges::min(reach);
   // Also where the motion is not finite.
   wide_.skin =
@@ -172,8 +156,7 @@ void CandidateList::cull(const Kept& kept,
     const double spare = kept.distance[k] - together;
     if (spare > approach_[s]) continue;
     // A surface counts as near as its fastest part; few of its pairs are.
-    if (spare > 0.0 &&
-        spare * spare > pair_approach_sq(kept.pairs[k], u_t0_.data(), u_t1_.data())) {
+    if (spare > 0.0 && spare * spare > approach_sq(kept.pairs[k], u_t0_.data(), u_t1_.data())) {
       continue;
     }
     out.push_back(kept.pairs[k]);
@@ -189,7 +172,7 @@ void CandidateList::find_wide(const double* x_t0,
                               double widened,
                               BroadPhase::Scratch& scratch,
                               std::vector<Candidate>& out) {
-  const double approach = measure_approach(wide_.reference, x_t0, x_t1);
+  const double approach = measure_approach(wide_.reference.data(), x_t0, x_t1);
   cull(wide_, x_t0, x_t1, reach, out);
   const double least = 2.0 * (wide_.skin - widened) - rounding_;
   if (approach <= least) return;
@@ -200,6 +183,8 @@ void CandidateList::find_wide(const double* x_t0,
       relative_search_.find({.reference = wide_.reference.data(),
                              .x_t0 = x_t0,
                              .x_t1 = x_t1,
+                             .u_t0 = u_t0_.data(),  // of cull()
+                             .u_t1 = u_t1_.data(),
                              .reach = reach,
                              .least = std::max(least, 0.0),
                              .rounding = 2.0 * (rounding_ + kRounding * approach)},
@@ -220,13 +205,11 @@ void CandidateList::find(const double* x_t0,
     near_.reference.clear();
   }
   if (!near_.reference.empty() &&
-      measure_approach(near_.reference, x_t0, x_t1) + rounding_ <= 2.0 * near_.skin) {
+      measure_approach(near_.reference.data(), x_t0, x_t1) + rounding_ <= 2.0 * near_.skin) {
     cull(near_, x_t0, x_t1, reach, out);
     return;
   }
-  const auto size = 3 * static_cast<std::ptrdiff_t>(broad_phase_->mesh().vertex_count);
-  start_.assign(x_t0, x_t0 + size);
-  const double approach = measure_approach(start_, x_t0, x_t1);
+  const double approach = measure_approach(x_t0, x_t0, x_t1);
   if (!std::isfinite(approach)) {
     broad_phase_->find(x_t0, x_t1, reach, scratch, out);
     return;
@@ -238,7 +221,7 @@ void CandidateList::find(const double* x_t0,
     return;
   }
   build_near(x_t0, approach, scratch);
-  measure_approach(near_.reference, x_t0, x_t1);
+  measure_approach(near_.reference.data(), x_t0, x_t1);
   cull(near_, x_t0, x_t1, reach, out);
 }
 

@@ -56,9 +56,7 @@ class CandidateList {
     std::vector<Index> surfaces;   // which pair of surfaces
   };
 
-  double measure_approach(const std::vector<double>& reference,
-                          const double* x_t0,
-                          const double* x_t1);
+  double measure_approach(const double* reference, const double* x_t0, const double* x_t1);
   void build(const double* x_t0,
              const double* x_t1,
              std::span<const double> reach,
@@ -86,7 +84,6 @@ class CandidateList {
   bool has_parts_ = false;        // relative_search_ has started at the reference of wide_
   bool is_worn_ = false;          // wide_ is better made anew than used again
   std::vector<double> approach_;  // [surfaces^2] scratch of measure_approach()
-  std::vector<double> start_;     // scratch: where a motion starts
   std::vector<double> u_t0_;      // scratch of cull(): displacements since the reference
   std::vector<double> u_t1_;
   std::vector<double> with_skin_;  // [surfaces] scratch

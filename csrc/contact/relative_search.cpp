@@ -16,11 +16,6 @@ void include(Box& box, const double* p) {
   }
 }
 
-void include(Box& box, const double* to, const double* from) {
-  const std::array<double, 3> u{to[0] - from[0], to[1] - from[1], to[2] - from[2]};
-  include(box, u.data());
-}
-
 /// Give every node what its leaf holds, or its two children together.
 template <class Parts, class OfLeaf, class United>
 void fit_nodes(const BoxTree& tree, Parts& parts, OfLeaf&& of_leaf, United&& unite) {
@@ -43,22 +38,6 @@ void for_each_tree(const BroadPhase& broad_phase, Index s, Surface& surface, Vis
   visit(trees.vertices, surface.vertices, [](Index v) { return std::array<Index, 1>{v}; });
   visit(trees.edges, surface.edges, [&](Index e) { return mesh.edges[e]; });
   visit(trees.faces, surface.faces, [&](Index f) { return mesh.faces[f]; });
-}
-
-/// Square of how much two primitives have moved against each other since the reference, at most.
-double approach_sq(const Candidate& pair, const RelativeSearch::Wanted& wanted) {
-  const int first = pair.kind == PairKind::kPointTriangle ? 1 : 2;  // corner of the second one
-  double result = 0.0;
-  for (const double* x : {wanted.x_t0, wanted.x_t1}) {
-    std::array<Vec3, 4> u;
-    for (int i = 0; i < 4; ++i) {
-      u[i] = row(x, pair.vertices[i]) - row(wanted.reference, pair.vertices[i]);
-    }
-    for (int i = 0; i < first; ++i) {
-      for (int j = first; j < 4; ++j) result = std::max(result, (u[i] - u[j]).squaredNorm());
-    }
-  }
-  return result;
 }
 
 /// Where an item is at both ends of a motion.
@@ -114,6 +93,19 @@ void visit_items(std::span<const Index> a,
 
 }  // namespace
 
+double approach_sq(const Candidate& pair, const double* u_t0, const double* u_t1) {
+  const int first = pair.kind == PairKind::kPointTriangle ? 1 : 2;  // corner of the second one
+  double result = 0.0;
+  for (const double* u : {u_t0, u_t1}) {
+    const auto& v = pair.vertices;
+    const Corners at{row(u, v[0]), row(u, v[1]), row(u, v[2]), row(u, v[3])};
+    for (int i = 0; i < first; ++i) {
+      for (int j = first; j < 4; ++j) result = std::max(result, (at[i] - at[j]).squaredNorm());
+    }
+  }
+  return result;
+}
+
 /// Whether anything in two parts has moved by more than `least` against each other, and can come within
 /// range on the motion. Branch-free, as the outcome is as good as random.
 bool RelativeSearch::may_meet(const Part& a, const Part& b, double range, double least) {
@@ -160,8 +152,7 @@ void RelativeSearch::start(const double* reference) {
 void RelativeSearch::fit_displacements(const Wanted& wanted, Index s) {
   const std::vector<Index>& vertices = broad_phase_->trees(s).vertices.items();
   const bool moves = std::ranges::any_of(vertices, [&](Index v) {
-    return row(wanted.x_t0, v) != row(wanted.reference, v) ||
-           row(wanted.x_t1, v) != row(wanted.reference, v);
+    return !row(wanted.u_t0, v).isZero(0.0) || !row(wanted.u_t1, v).isZero(0.0);
   });
   Surface& surface = surfaces_[s];
   if (!moves && !surface.moved) return;
@@ -173,8 +164,8 @@ void RelativeSearch::fit_displacements(const Wanted& wanted, Index s) {
           part.u_t0 = part.u_t1 = kEmptyBox;
           for (const Index item : items) {
             for (const Index v : corners(item)) {
-              include(part.u_t0, wanted.x_t0 + 3 * v, wanted.reference + 3 * v);
-              include(part.u_t1, wanted.x_t1 + 3 * v, wanted.reference + 3 * v);
+              include(part.u_t0, wanted.u_t0 + 3 * v);
+              include(part.u_t1, wanted.u_t1 + 3 * v);
             }
           }
         },
@@ -183,44 +174,6 @@ void RelativeSearch::fit_displacements(const Wanted& wanted, Index s) {
           part.u_t1 = united(p.u_t1, q.u_t1);
         });
   });
-}
-
-/// Visit pairs of leaves that may meet; of one tree with itself each pair once.
-template <class Visit>
-void RelativeSearch::visit_leaves(const BoxTree& tree_a,
-                                  const Parts& a,
-                                  const BoxTree& tree_b,
-                                  const Parts& b,
-                                  double range,
-                                  double least,
-                                  BroadPhase::Scratch::PairList& stack,
-                                  Visit&& visit) const {
-  if (tree_a.empty() || tree_b.empty() || !may_meet(a[0], b[0], range, least)) return;
-  const bool own = &tree_a == &tree_b;
-  const auto push = [&](Index i, Index j) {
-    *stack.room(1) = {i, j};
-    if (may_meet(a[i], b[j], range, least)) stack.end_at(stack.end() + 1);
-  };
-  stack.clear();
-  stack.push({0, 0});
-  while (stack.size() > 0) {
-    const auto [i, j] = stack.pop();
-    const BoxTree::Node& p = tree_a.nodes()[i];
-    const BoxTree::Node& q = tree_b.nodes()[j];
-    if (p.left == 0 && q.left == 0) {
-      visit(tree_a.items_of(p), tree_b.items_of(q));
-    } else if (own && i == j) {
-      push(p.left, p.left);
-      push(p.left + 1, p.left + 1);
-      push(p.left, p.left + 1);
-    } else if (q.left == 0 || (p.left != 0 && p.last - p.first >= q.last - q.first)) {
-      push(p.left, j);
-      push(p.left + 1, j);
-    } else {
-      push(i, q.left);
-      push(i, q.left + 1);
-    }
-  }
 }
 
 std::size_t RelativeSearch::find(const Wanted& wanted,
@@ -238,7 +191,7 @@ std::size_t RelativeSearch::find(const Wanted& wanted,
       if (!mesh.touching.contains(s, r)) continue;
       const double range = wanted.reach[s] + wanted.reach[r] + wanted.rounding;
       const auto offer = [&](const Candidate& pair) {
-        const double moved_sq = approach_sq(pair, wanted);
+        const double moved_sq = approach_sq(pair, wanted.u_t0, wanted.u_t1);
         if (moved_sq <= least_sq) return;
         const auto& v = pair.vertices;
         const Corners corner{row(wanted.reference, v[0]), row(wanted.reference, v[1]),
@@ -247,31 +200,32 @@ std::size_t RelativeSearch::find(const Wanted& wanted,
         if (spare > 0.0 && spare * spare > moved_sq) return;
         out.push_back(pair);
       };
+      const auto visit = [&](const BoxTree& tree_a, const Parts& a, const auto& corners_a,
+                             const BoxTree& tree_b, const Parts& b, const auto& corners_b,
+                             const auto& visit_pair) {
+        visit_leaf_pairs(
+            tree_a, tree_b, scratch.stack,
+            [&](Index i, Index j) { return may_meet(a[i], b[j], range, wanted.least); },
+            [&](const BoxTree::Node& p, const BoxTree::Node& q) {
+              ++looked_at;
+              visit_items(tree_a.items_of(p), corners_a, tree_b.items_of(q), corners_b, wanted,
+                          range, visit_pair);
+            });
+      };
       const auto find_vertices_and_faces = [&](Index p, Index q) {
-        const BoxTree& vertices = broad_phase_->trees(p).vertices;
-        const BoxTree& faces = broad_phase_->trees(q).faces;
-        visit_leaves(vertices, surfaces_[p].vertices, faces, surfaces_[q].faces, range,
-                     wanted.least, scratch.stack,
-                     [&](std::span<const Index> a, std::span<const Index> b) {
-                       ++looked_at;
-                       visit_items(a, vertex, b, face, wanted, range, [&](Index v, Index f) {
-                         if (has_vertex(mesh.faces[f], v)) return;
-                         offer(candidate_of_vertex(mesh, v, f));
-                       });
-                     });
+        visit(broad_phase_->trees(p).vertices, surfaces_[p].vertices, vertex,
+              broad_phase_->trees(q).faces, surfaces_[q].faces, face, [&](Index v, Index f) {
+                if (!has_vertex(mesh.faces[f], v)) offer(candidate_of_vertex(mesh, v, f));
+              });
       };
       find_vertices_and_faces(s, r);
       if (s != r) find_vertices_and_faces(r, s);
-      visit_leaves(broad_phase_->trees(s).edges, surfaces_[s].edges, broad_phase_->trees(r).edges,
-                   surfaces_[r].edges, range, wanted.least, scratch.stack,
-                   [&](std::span<const Index> a, std::span<const Index> b) {
-                     ++looked_at;
-                     visit_items(a, edge, b, edge, wanted, range, [&](Index i, Index j) {
-                       const auto [e, f] = std::minmax(i, j);
-                       if (share_vertex(mesh.edges[e], mesh.edges[f])) return;
-                       offer(candidate_of_edges(mesh, e, f));
-                     });
-                   });
+      visit(broad_phase_->trees(s).edges, surfaces_[s].edges, edge, broad_phase_->trees(r).edges,
+            surfaces_[r].edges, edge, [&](Index i, Index j) {
+              const auto [e, f] = std::minmax(i, j);
+              if (share_vertex(mesh.edges[e], mesh.edges[f])) return;
+              offer(candidate_of_edges(mesh, e, f));
+            });
     }
   }
   return looked_at;

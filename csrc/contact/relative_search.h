@@ -8,6 +8,11 @@
 
 namespace diffcloth::contact {
 
+/// Square of how much the two primitives of a pair can have come closer in two displacements, at most:
+/// the largest change of a vector between their corners. That between any two of their points is a
+/// mean of those.
+double approach_sq(const Candidate& pair, const double* u_t0, const double* u_t1);
+
 /// Search for pairs by how their parts have moved against each other since a reference.
 ///
 /// What lies side by side moves nearly alike, however far it goes: it is left out with the boxes around
@@ -24,6 +29,8 @@ class RelativeSearch {
     const double* reference;  ///< of start()
     const double* x_t0;
     const double* x_t1;
+    const double* u_t0;             ///< displacements since the reference, at x_t0
+    const double* u_t1;             ///< and at x_t1
     std::span<const double> reach;  ///< [surfaces] [m]
     double least;                   ///< approach since the reference up to which none is wanted [m]
     double rounding;                ///< of a distance [m]
@@ -51,15 +58,6 @@ class RelativeSearch {
   };
 
   static bool may_meet(const Part& a, const Part& b, double range, double least);
-  template <class Visit>
-  void visit_leaves(const BoxTree& tree_a,
-                    const Parts& a,
-                    const BoxTree& tree_b,
-                    const Parts& b,
-                    double range,
-                    double least,
-                    BroadPhase::Scratch::PairList& stack,
-                    Visit&& visit) const;
   void fit_displacements(const Wanted& wanted, Index surface);
 
   const BroadPhase* broad_phase_;
