@@ -2,7 +2,8 @@
 
 #include <cstddef>
 #include <memory>
-#include <new>
+
+#include "common/recycled_memory.h"
 
 namespace diffcloth::linalg {
 
@@ -11,24 +12,21 @@ class AlignedBuffer {
  public:
   AlignedBuffer() = default;
   explicit AlignedBuffer(std::size_t size)
-      : size_(size),
-        data_(size == 0 ? nullptr
-                        : static_cast<double*>(::operator new(size * sizeof(double), kAlignment))) {
-  }
+      : data_(size == 0 ? nullptr : static_cast<double*>(take_recycled(size * sizeof(double))),
+              {size}) {}
 
   double* data() { return data_.get(); }
   const double* data() const { return data_.get(); }
-  std::size_t size() const { return size_; }
-  std::size_t bytes() const { return size_ * sizeof(double); }
+  std::size_t size() const { return data_.get_deleter().size; }
+  std::size_t bytes() const { return size() * sizeof(double); }
 
  private:
-  static constexpr std::align_val_t kAlignment{64};
-  struct Delete {
-    void operator()(double* p) const { ::operator delete(p, kAlignment); }
+  struct GiveBack {
+    std::size_t size;
+    void operator()(double* p) const { give_back(p, size * sizeof(double)); }
   };
 
-  std::size_t size_ = 0;
-  std::unique_ptr<double, Delete> data_;
+  std::unique_ptr<double, GiveBack> data_{nullptr, {0}};
 };
 
 }  // namespace diffcloth::linalg

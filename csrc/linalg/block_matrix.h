@@ -5,6 +5,7 @@
 #include <utility>
 #include <vector>
 
+#include "common/recycled_memory.h"
 #include "linalg/attachments.h"
 #include "linalg/block_pattern.h"
 
@@ -99,7 +100,7 @@ class BlockMatrix {
   std::shared_ptr<const MergedPattern> merged_;
   const std::vector<char>* fixed_;
   const Attachments* attachments_;
-  std::vector<double> blocks_;
+  std::vector<double, RecyclingAllocator<double>> blocks_;
   std::vector<Motion> motions_;  // scratch of add_attached
 };
 
