@@ -19,10 +19,11 @@ def simulator(n, scheme="coupled"):
     flat[:, :2] += np.random.default_rng(n).uniform(-0.1, 0.1, (n * n, 2)) * edge
     s = flat[:, 1]  # across the fold, which takes one row of cells
     reach = 0.1 * edge
-    gap, below = 0.8 * reach, s < 0.0
+    # Deeper in the barrier it is 90 iterations that end this step, in place of 50.
+    gap, below = 0.95 * reach, s < 0.0
     placed = np.stack([flat[:, 0], np.where(below, s, -s), np.where(below, 0, gap)], axis=-1)
     cloth = dc.Cloth(placed, sheet.faces, rest_vertices=flat, material=dc.Material(friction=0.3))
-    plate = dc.RigidBody.plane(3.0, pose=[0.01, 0.02, -0.8 * reach, 1, 0, 0, 0])
+    plate = dc.RigidBody.plane(3.0, pose=[0.01, 0.02, -gap, 1, 0, 0, 0])
     contact = dc.ContactOptions(barrier_distance=reach)
     return dc.Simulator(dc.Scene([cloth], [plate]), 0.01, scheme=scheme, contact=contact)
 

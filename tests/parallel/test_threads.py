@@ -93,12 +93,12 @@ def test_an_environment_has_the_same_bits_alone_and_in_a_batch(serial, n):
 @pytest.mark.parametrize("n", SIZES)
 def test_eight_python_threads_on_one_simulator(n, often):
     sim = simulator(n)
-    states = list(batch(n, 8, seed=1))
+    states = list(batch(n, 4, seed=1))
     with threads(1):
-        expected = [step(sim, state)[1] for state in states]
+        expected = 2 * [step(sim, state)[1] for state in states]
         for _ in range(often * max(1, REPEATS[n] // 2)):
             with ThreadPoolExecutor(8) as pool:
-                results = list(pool.map(lambda state: step(sim, state)[1], states))
+                results = list(pool.map(lambda state: step(sim, state)[1], 2 * states))
             assert [differing(a, b) for a, b in zip(results, expected, strict=True)] == [[]] * 8
 
 
