@@ -1,8 +1,10 @@
 #include "mesh/curvature_fit.h"
 
-#include <algorithm>
 #include <cmath>
 #include <limits>
+#include <utility>
+
+#include <Eigen/Jacobi>
 
 namespace diffcloth::mesh {
 namespace {
