@@ -1,5 +1,7 @@
 #include "bind/environments.h"
 
+#include <algorithm>
+
 #include "bind/bind.h"
 #include "common/parallel_for.h"
 
@@ -18,6 +20,12 @@ void for_environments(std::size_t count,
   } catch (const Interrupted&) {
     throw nb::python_error();  // the error that the signal handler has set
   }
+}
+
+int threads_each(std::size_t count, int threads) {
+  // The way from the leaves of an elimination tree to its root is a third of all work.
+  constexpr int kMost = 4;
+  return std::clamp(threads / std::max(static_cast<int>(count), 1), 1, kMost);
 }
 
 }  // namespace diffcloth::bind

@@ -1,7 +1,11 @@
 #include <algorithm>
+#include <atomic>
 #include <chrono>
 #include <cstring>
+#include <mutex>
+#include <vector>
 
+#include "common/team.h"
 #include "linalg/aligned_buffer.h"
 #include "linalg/backend.h"
 #include "linalg/cholesky.h"
@@ -30,6 +34,44 @@ class Stopwatch {
   Clock::time_point last_;
 };
 
+constexpr std::size_t kLine = 8;  // doubles of a cache line
+
+/// Places for the update matrices that tasks leave to others, one at a time the lowest that is free:
+/// few are alive at once, but which ones depends on the threads.
+class Shelf {
+ public:
+  /// @param memory  of the size of all of them
+  Shelf(const std::vector<Task>& tasks, double* memory) : tasks_(tasks), memory_(memory) {
+    begin_.resize(tasks.size());
+    alive_.reserve(tasks.size());
+  }
+
+  void take(Index task) {
+    const std::lock_guard lock(mutex_);
+    std::size_t begin = 0;
+    auto gap = alive_.begin();
+    for (; gap != alive_.end() && begin_[*gap] < begin + tasks_[task].update; ++gap) {
+      begin = begin_[*gap] + tasks_[*gap].update;
+    }
+    begin_[task] = begin;
+    alive_.insert(gap, task);
+  }
+
+  void give_back(Index task) {
+    const std::lock_guard lock(mutex_);
+    std::erase(alive_, task);
+  }
+
+  double* operator[](Index task) const { return memory_ + begin_[task]; }
+
+ private:
+  const std::vector<Task>& tasks_;
+  double* memory_;
+  std::mutex mutex_;
+  std::vector<std::size_t> begin_;
+  std::vector<Index> alive_;  // ascending in memory
+};
+
 /// Multifrontal A = L L^T [Duff and Reid 1983; Liu 1992].
 class MultifrontalFactor final : public FactorBackend {
  public:
@@ -39,43 +81,113 @@ class MultifrontalFactor final : public FactorBackend {
   bool compute(const double* blocks,
                CholeskyWorkspace& workspace,
                CholeskySeconds* seconds) override {
-    double* const arena =
-        workspace.reserve(s_.arena_size + static_cast<std::size_t>(s_.longest) * kColumnBlock);
-    Stopwatch watch(seconds);
-    return std::ranges::all_of(s_.supernodes, [&](const Supernode& node) {
-      return eliminate(node, blocks, arena, watch);
-    });
+    const std::size_t scratch = static_cast<std::size_t>(s_.longest) * kColumnBlock;
+    const std::size_t own = s_.arena_size + scratch;
+    double* const memory =
+        workspace.reserve(s_.left_size + own * static_cast<std::size_t>(workspace.team().size()));
+    Shelf shelf(s_.tasks, memory);
+    std::atomic<bool> positive = true;
+    const auto ready = [&](Index k, const Team::Done& done) { return may_join(k, done); };
+    const auto eliminate_next = [&](Index k, int member) {
+      Stopwatch watch(member == 0 ? seconds : nullptr);
+      shelf.take(k);
+      if (positive && !eliminate(k, blocks, shelf, memory + s_.left_size + own * member, watch)) {
+        positive = false;
+      }
+      for_passing(k, [&](const Child& child) { shelf.give_back(task_of(child)); });
+    };
+    run(workspace, std::ssize(s_.tasks), ready, eliminate_next);
+    return positive;
   }
 
-  void solve(std::span<const double* const> b, std::span<double* const> x) const override {
+  void solve(std::span<const double* const> b,
+             std::span<double* const> x,
+             CholeskyWorkspace& workspace) const override {
     for (std::size_t begin = 0; begin < b.size(); begin += kMaxVectors) {
       const std::size_t count = std::min<std::size_t>(kMaxVectors, b.size() - begin);
-      solve_some(b.subspan(begin, count), x.subspan(begin, count));
+      solve_some(b.subspan(begin, count), x.subspan(begin, count), workspace);
     }
   }
 
   std::size_t bytes() const override { return sizeof(*this) + factor_.bytes(); }
 
  private:
-  /// Finish a supernode's columns of L, which its children have added to, and hand its update matrix
-  /// on.
-  bool eliminate(const Supernode& node, const double* blocks, double* arena, Stopwatch& watch) {
-    if (node.children_begin == node.children_end) {
+  /// Run a loop over tasks: on the team where there is more than one.
+  void run(CholeskyWorkspace& workspace,
+           Index count,
+           const Team::Ready& ready,
+           const Team::Body& body) const {
+    if (s_.tasks.size() > 1) {
+      workspace.team().run(count, ready, body);
+    } else {
+      Team(1).run(count, ready, body);
+    }
+  }
+
+  Index task_of(const Child& child) const { return s_.supernodes[child.supernode].task; }
+
+  /// Call visit(child) for the children of a supernode that joins tasks, in their order.
+  template <class Visit>
+  void for_passing(Index task, Visit visit) const {
+    if (!s_.tasks[task].joins) return;
+    const Supernode& node = s_.supernodes[s_.tasks[task].begin];
+    for (Index c = node.children_begin; c < node.children_end; ++c) visit(s_.children[c]);
+  }
+
+  /// Whether the tasks that a task waits for on the way up are done.
+  bool may_join(Index task, const Team::Done& done) const {
+    bool all = true;
+    for_passing(task, [&](const Child& child) { all = all && done[task_of(child)] != 0; });
+    return all;
+  }
+
+  /// Eliminate the supernodes of a task.
+  ///
+  /// @param own  arena of the thread, and behind it scratch of the kernels
+  bool eliminate(
+      Index task, const double* blocks, const Shelf& shelf, double* own, Stopwatch& watch) {
+    for (Index s = s_.tasks[task].begin; s < s_.tasks[task].end; ++s) {
+      if (!eliminate(s_.supernodes[s], blocks, shelf, own, watch)) return false;
+    }
+    return true;
+  }
+
+  /// Finish a supernode's columns of L, which its children in the same task have added to, and hand
+  /// its update matrix on.
+  bool eliminate(const Supernode& node,
+                 const double* blocks,
+                 const Shelf& shelf,
+                 double* own,
+                 Stopwatch& watch) {
+    const Task& task = s_.tasks[node.task];
+    const auto update_of = [&](const Supernode& of) {
+      const bool is_left = &of == &s_.supernodes[s_.tasks[of.task].end - 1];
+      return is_left ? shelf[of.task] : own + of.update;
+    };
+    double* const panel = factor_.data() + node.panel;
+    if (task.joins || node.children_begin == node.children_end) {
       assemble(node, blocks);
       watch.lap(&CholeskySeconds::assembly);
     }
+    if (task.joins) {
+      for (Index c = node.children_begin; c < node.children_end; ++c) {
+        const Supernode& child = s_.supernodes[s_.children[c].supernode];
+        kernels_.add_to_panel(child.front, update_of(child), map_of(c), node.front, panel);
+      }
+      watch.lap(&CholeskySeconds::extend_add);
+    }
     // The update matrix is written before anything is added to it: it need not be cleared.
-    double* const u = arena + node.update;
-    double* const panel = factor_.data() + node.panel;
-    if (!kernels_.factor(node.front, panel, u, arena + s_.arena_size)) return false;
+    double* const u = update_of(node);
+    if (!kernels_.factor(node.front, panel, u, own + s_.arena_size)) return false;
     watch.lap(&CholeskySeconds::dense);
     if (node.parent == -1) return true;
     for (Index c = node.children_begin; c < node.children_end; ++c) {
       const Supernode& child = s_.supernodes[s_.children[c].supernode];
-      kernels_.add_to_update(child.front, arena + child.update, map_of(c), node.front, u);
+      kernels_.add_to_update(child.front, update_of(child), map_of(c), node.front, u);
     }
     watch.lap(&CholeskySeconds::extend_add);
     const Supernode& parent = s_.supernodes[node.parent];
+    if (parent.task != node.task) return true;
     if (node.as_child == parent.children_begin) {
       assemble(parent, blocks);
       watch.lap(&CholeskySeconds::assembly);
@@ -115,59 +227,119 @@ class MultifrontalFactor final : public FactorBackend {
             .run_count = child.run_count};
   }
 
-  void solve_some(std::span<const double* const> b, std::span<double* const> x) const {
-    const auto count = static_cast<int>(b.size());
-    const std::size_t n = 3 * s_.vertex.size();
-    const std::ptrdiff_t stride = s_.longest;
-    std::vector<double> y(n * b.size());  // in the order of elimination, one vector after another
-    AlignedBuffer front(static_cast<std::size_t>(stride) * b.size());
-    for (std::size_t r = 0; r < b.size(); ++r) {
-      for (std::size_t k = 0; k < s_.vertex.size(); ++k) {
-        std::copy_n(b[r] + 3 * static_cast<std::ptrdiff_t>(s_.vertex[k]), 3, &y[r * n + 3 * k]);
-      }
-    }
+  /// Right-hand sides on their way through the factor, one vector after another.
+  struct Vectors {
+    std::span<const double* const> b;
+    std::span<double* const> x;
+    std::size_t n;          ///< length of y, in the order of elimination
+    std::ptrdiff_t stride;  ///< length of a front
+    double* y;
+    double* passed;  ///< what tasks have to subtract from rows of others
 
-    double* const c = front.data();
-    for (const Supernode& node : s_.supernodes) {  // y := L^-1 y
-      const Front& f = node.front;
-      for (int r = 0; r < count; ++r) {
-        double* const c_r = c + r * stride;
-        std::fill_n(c_r, f.ld, 0.0);
-        std::copy_n(&y[r * n + 3 * node.first], f.columns, c_r);
+    int count() const { return static_cast<int>(b.size()); }
+  };
+
+  void solve_some(std::span<const double* const> b,
+                  std::span<double* const> x,
+                  CholeskyWorkspace& workspace) const {
+    const std::size_t n = 3 * s_.vertex.size();
+    const auto longest = static_cast<std::size_t>(s_.longest);
+    const auto members = static_cast<std::size_t>(workspace.team().size());
+    // Of each thread: vectors of its own, and behind them a front.
+    const std::size_t own = (n + longest + kLine) / kLine * kLine;
+    double* const memory = workspace.reserve(b.size() * (own * members + n + s_.passed_size));
+    double* const y = memory + b.size() * own * members;
+    const Vectors v{.b = b, .x = x, .n = n, .stride = s_.longest, .y = y, .passed = y + b.size() * n};
+    const auto tasks = static_cast<Index>(s_.tasks.size());
+    const auto ready = [&](Index k, const Team::Done& done) {
+      if (k < tasks) return may_join(k, done);
+      const Index task = 2 * tasks - 1 - k;
+      const Index parent = s_.tasks[task].parent;
+      return done[parent == -1 ? task : 2 * tasks - 1 - parent] != 0;
+    };
+    const auto go = [&](Index k, int member) {
+      double* const front = memory + b.size() * own * static_cast<std::size_t>(member);
+      if (k < tasks) {
+        forward(k, v, front + b.size() * longest, front);
+      } else {
+        backward(2 * tasks - 1 - k, v, front);
       }
-      kernels_.forward(f, factor_.data() + node.panel, c, stride, count);
-      for (int r = 0; r < count; ++r) {
-        const double* const c_r = c + r * stride;
-        double* const y_r = y.data() + r * n;
-        std::copy_n(c_r, f.columns, y_r + 3 * node.first);
-        const double* below = c_r + f.top;
-        for (std::size_t k = node.rows_begin; k < node.rows_end; ++k, below += 3) {
-          for (int i = 0; i < 3; ++i) y_r[3 * s_.rows[k] + i] += below[i];
-        }
+    };
+    run(workspace, 2 * tasks, ready, go);
+  }
+
+  /// y := L^-1 y in the columns of a task.
+  ///
+  /// @param z  [n] vectors of the thread: the right side less what has been subtracted from it
+  void forward(Index k, const Vectors& v, double* z, double* c) const {
+    const Task& task = s_.tasks[k];
+    const Supernode& root = s_.supernodes[task.end - 1];
+    for (int r = 0; r < v.count(); ++r) {
+      double* const z_r = z + r * v.n;
+      for (Index i = s_.supernodes[task.begin].first; i < root.first + root.columns; ++i) {
+        std::copy_n(v.b[r] + 3 * static_cast<std::ptrdiff_t>(s_.vertex[i]), 3, z_r + 3 * i);
       }
+      for (std::size_t i = root.rows_begin; i < root.rows_end; ++i) {
+        std::fill_n(z_r + 3 * s_.rows[i], 3, 0.0);
+      }
+      for_passing(k, [&](const Child& child) {
+        const Supernode& from = s_.supernodes[child.supernode];
+        add_rows(from, v.passed + r * s_.passed_size + s_.tasks[from.task].passed, z_r);
+      });
     }
-    for (std::size_t s = s_.supernodes.size(); s-- > 0;) {  // y := L^-T y
+    for (Index s = task.begin; s < task.end; ++s) {
       const Supernode& node = s_.supernodes[s];
       const Front& f = node.front;
-      for (int r = 0; r < count; ++r) {
-        double* const c_r = c + r * stride;
-        const double* const y_r = y.data() + r * n;
+      for (int r = 0; r < v.count(); ++r) {
+        double* const c_r = c + r * v.stride;
+        std::fill_n(c_r, f.ld, 0.0);
+        std::copy_n(z + r * v.n + 3 * node.first, f.columns, c_r);
+      }
+      kernels_.forward(f, factor_.data() + node.panel, c, v.stride, v.count());
+      for (int r = 0; r < v.count(); ++r) {
+        const double* const c_r = c + r * v.stride;
+        std::copy_n(c_r, f.columns, v.y + r * v.n + 3 * node.first);
+        add_rows(node, c_r + f.top, z + r * v.n);
+      }
+    }
+    for (int r = 0; r < v.count(); ++r) {
+      double* to = v.passed + r * s_.passed_size + task.passed;
+      for (std::size_t i = root.rows_begin; i < root.rows_end; ++i, to += 3) {
+        std::copy_n(z + r * v.n + 3 * s_.rows[i], 3, to);
+      }
+    }
+  }
+
+  /// to += values at the rows below a supernode.
+  void add_rows(const Supernode& node, const double* values, double* to) const {
+    for (std::size_t k = node.rows_begin; k < node.rows_end; ++k, values += 3) {
+      for (int i = 0; i < 3; ++i) to[3 * s_.rows[k] + i] += values[i];
+    }
+  }
+
+  /// x := L^-T y in the columns of a task.
+  void backward(Index k, const Vectors& v, double* c) const {
+    const Task& task = s_.tasks[k];
+    for (Index s = task.end; s-- > task.begin;) {
+      const Supernode& node = s_.supernodes[s];
+      const Front& f = node.front;
+      for (int r = 0; r < v.count(); ++r) {
+        double* const c_r = c + r * v.stride;
+        const double* const y_r = v.y + r * v.n;
         std::fill_n(c_r, f.ld, 0.0);
         std::copy_n(y_r + 3 * node.first, f.columns, c_r);
         double* below = c_r + f.top;
-        for (std::size_t k = node.rows_begin; k < node.rows_end; ++k, below += 3) {
-          std::copy_n(y_r + 3 * s_.rows[k], 3, below);
+        for (std::size_t i = node.rows_begin; i < node.rows_end; ++i, below += 3) {
+          std::copy_n(y_r + 3 * s_.rows[i], 3, below);
         }
       }
-      kernels_.backward(f, factor_.data() + node.panel, c, stride, count);
-      for (int r = 0; r < count; ++r) {
-        std::copy_n(c + r * stride, f.columns, &y[r * n + 3 * node.first]);
-      }
-    }
-
-    for (std::size_t r = 0; r < b.size(); ++r) {
-      for (std::size_t k = 0; k < s_.vertex.size(); ++k) {
-        std::copy_n(&y[r * n + 3 * k], 3, x[r] + 3 * static_cast<std::ptrdiff_t>(s_.vertex[k]));
+      kernels_.backward(f, factor_.data() + node.panel, c, v.stride, v.count());
+      for (int r = 0; r < v.count(); ++r) {
+        double* const y_r = v.y + r * v.n;
+        std::copy_n(c + r * v.stride, f.columns, y_r + 3 * node.first);
+        for (Index i = node.first; i < node.first + node.columns; ++i) {
+          std::copy_n(y_r + 3 * i, 3, v.x[r] + 3 * static_cast<std::ptrdiff_t>(s_.vertex[i]));
+        }
       }
     }
   }
