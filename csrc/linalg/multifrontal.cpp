@@ -36,40 +36,50 @@ class Stopwatch {
 
 constexpr std::size_t kLine = 8;  // doubles of a cache line
 
-/// Places for the update matrices that tasks leave to others, one at a time the lowest that is free:
-/// few are alive at once, but which ones depends on the threads.
+/// Places for the update matrices that tasks leave to others, always the lowest that is free: few are
+/// alive at once, but which ones depends on the threads.
 class Shelf {
  public:
   /// @param memory  of the size of all of them
-  Shelf(const std::vector<Task>& tasks, double* memory) : tasks_(tasks), memory_(memory) {
-    begin_.resize(tasks.size());
-    alive_.reserve(tasks.size());
+  Shelf(const std::vector<Task>& tasks, double* memory) : memory_(memory) {
+    place_.reserve(tasks.size());
+    for (const Task& task : tasks) place_.push_back({.begin = 0, .size = task.update});
+    taken_.reserve(tasks.size());
   }
 
   void take(Index task) {
     const std::lock_guard lock(mutex_);
-    std::size_t begin = 0;
-    auto gap = alive_.begin();
-    for (; gap != alive_.end() && begin_[*gap] < begin + tasks_[task].update; ++gap) {
-      begin = begin_[*gap] + tasks_[*gap].update;
+    Place& place = place_[task];
+    auto gap = taken_.begin();
+    for (; gap != taken_.end() && gap->begin < place.begin + place.size; ++gap) {
+      place.begin = gap->end;
     }
-    begin_[task] = begin;
-    alive_.insert(gap, task);
+    taken_.insert(gap, {.begin = place.begin, .end = place.begin + place.size, .task = task});
   }
 
-  void give_back(Index task) {
+  /// Give back all but the last `left` doubles.
+  void give_back(Index task, std::size_t left) {
     const std::lock_guard lock(mutex_);
-    std::erase(alive_, task);
+    const auto extent = std::ranges::find(taken_, task, &Extent::task);
+    extent->begin = extent->end - left;
+    if (left == 0) taken_.erase(extent);
   }
 
-  double* operator[](Index task) const { return memory_ + begin_[task]; }
+  double* operator[](Index task) const { return memory_ + place_[task].begin; }
 
  private:
-  const std::vector<Task>& tasks_;
+  struct Place {
+    std::size_t begin, size;
+  };
+  struct Extent {
+    std::size_t begin, end;
+    Index task;
+  };
+
   double* memory_;
+  std::vector<Place> place_;
   std::mutex mutex_;
-  std::vector<std::size_t> begin_;
-  std::vector<Index> alive_;  // ascending in memory
+  std::vector<Extent> taken_;  // ascending
 };
 
 /// Multifrontal A = L L^T [Duff and Reid 1983; Liu 1992].
@@ -87,16 +97,24 @@ class MultifrontalFactor final : public FactorBackend {
         workspace.reserve(s_.left_size + own * static_cast<std::size_t>(workspace.team().size()));
     Shelf shelf(s_.tasks, memory);
     std::atomic<bool> positive = true;
-    const auto ready = [&](Index k, const Team::Done& done) { return may_join(k, done); };
-    const auto eliminate_next = [&](Index k, int member) {
+    // Work 2 k eliminates task k, work 2 k + 1 hands on what it leaves.
+    const auto ready = [&](Index i, const Team::Done& done) {
+      const Index k = i / 2;
+      if (i % 2 == 0) return has_all(k, [&](Index child) { return done[2 * child + 1] != 0; });
+      const Index before = elder(k);
+      return done[2 * k] != 0 && (before == -1 || done[2 * before + 1] != 0);
+    };
+    const auto go = [&](Index i, int member) {
+      if (!positive) return;
       Stopwatch watch(member == 0 ? seconds : nullptr);
-      shelf.take(k);
-      if (positive && !eliminate(k, blocks, shelf, memory + s_.left_size + own * member, watch)) {
+      double* const arena = memory + s_.left_size + own * static_cast<std::size_t>(member);
+      if (i % 2 == 1) {
+        hand_on(i / 2, blocks, shelf, watch);
+      } else if (!eliminate(i / 2, blocks, shelf, arena, watch)) {
         positive = false;
       }
-      for_passing(k, [&](const Child& child) { shelf.give_back(task_of(child)); });
     };
-    run(workspace, std::ssize(s_.tasks), ready, eliminate_next);
+    run(workspace, 2 * static_cast<Index>(s_.tasks.size()), ready, go);
     return positive;
   }
 
@@ -124,70 +142,91 @@ class MultifrontalFactor final : public FactorBackend {
     }
   }
 
-  Index task_of(const Child& child) const { return s_.supernodes[child.supernode].task; }
+  const Supernode& root_of(Index task) const { return s_.supernodes[s_.tasks[task].end - 1]; }
 
-  /// Call visit(child) for the children of a supernode that joins tasks, in their order.
+  /// Call visit(task) for the tasks whose roots are children of a supernode that joins them, in order.
   template <class Visit>
-  void for_passing(Index task, Visit visit) const {
+  void for_children(Index task, Visit visit) const {
     if (!s_.tasks[task].joins) return;
-    const Supernode& node = s_.supernodes[s_.tasks[task].begin];
-    for (Index c = node.children_begin; c < node.children_end; ++c) visit(s_.children[c]);
+    const Supernode& node = root_of(task);
+    for (Index c = node.children_begin; c < node.children_end; ++c) {
+      visit(s_.supernodes[s_.children[c].supernode].task);
+    }
   }
 
-  /// Whether the tasks that a task waits for on the way up are done.
-  bool may_join(Index task, const Team::Done& done) const {
+  /// Whether all of these tasks fulfill something.
+  template <class Test>
+  bool has_all(Index task, Test test) const {
     bool all = true;
-    for_passing(task, [&](const Child& child) { all = all && done[task_of(child)] != 0; });
+    for_children(task, [&](Index child) { all = all && test(child); });
     return all;
+  }
+
+  /// The task before it among the children of their parent, or -1.
+  Index elder(Index task) const {
+    const Supernode& root = root_of(task);
+    if (root.parent == -1 || root.as_child == s_.supernodes[root.parent].children_begin) return -1;
+    return s_.supernodes[s_.children[root.as_child - 1].supernode].task;
   }
 
   /// Eliminate the supernodes of a task.
   ///
-  /// @param own  arena of the thread, and behind it scratch of the kernels
+  /// @param arena  of the thread; behind it is scratch for the kernels
   bool eliminate(
-      Index task, const double* blocks, const Shelf& shelf, double* own, Stopwatch& watch) {
+      Index task, const double* blocks, Shelf& shelf, double* arena, Stopwatch& watch) {
+    shelf.take(task);
     for (Index s = s_.tasks[task].begin; s < s_.tasks[task].end; ++s) {
-      if (!eliminate(s_.supernodes[s], blocks, shelf, own, watch)) return false;
+      const Supernode& node = s_.supernodes[s];
+      double* const u = &node == &root_of(task) ? shelf[task] : arena + node.update;
+      if (!eliminate(node, blocks, shelf, arena, u, watch)) return false;
+      if (&node != &root_of(task) && node.parent != -1) add_to_parent(node, blocks, u, watch);
     }
+    for_children(task, [&](Index child) {
+      if (left_size(root_of(child)) > 0) shelf.give_back(child, 0);
+    });
     return true;
   }
 
-  /// Finish a supernode's columns of L, which its children in the same task have added to, and hand
-  /// its update matrix on.
+  /// Add to the panel above a task what belongs there of the update matrix that it leaves.
+  void hand_on(Index task, const double* blocks, Shelf& shelf, Stopwatch& watch) {
+    const Supernode& root = root_of(task);
+    if (root.parent == -1) return;
+    add_to_parent(root, blocks, shelf[task], watch);
+    shelf.give_back(task, left_size(root));
+  }
+
+  /// Finish a supernode's columns of L, which its children have added to, and find its update matrix.
   bool eliminate(const Supernode& node,
                  const double* blocks,
                  const Shelf& shelf,
-                 double* own,
+                 double* arena,
+                 double* u,
                  Stopwatch& watch) {
-    const Task& task = s_.tasks[node.task];
-    const auto update_of = [&](const Supernode& of) {
-      const bool is_left = &of == &s_.supernodes[s_.tasks[of.task].end - 1];
-      return is_left ? shelf[of.task] : own + of.update;
-    };
-    double* const panel = factor_.data() + node.panel;
-    if (task.joins || node.children_begin == node.children_end) {
+    if (node.children_begin == node.children_end) {
       assemble(node, blocks);
       watch.lap(&CholeskySeconds::assembly);
     }
-    if (task.joins) {
-      for (Index c = node.children_begin; c < node.children_end; ++c) {
-        const Supernode& child = s_.supernodes[s_.children[c].supernode];
-        kernels_.add_to_panel(child.front, update_of(child), map_of(c), node.front, panel);
-      }
-      watch.lap(&CholeskySeconds::extend_add);
-    }
     // The update matrix is written before anything is added to it: it need not be cleared.
-    double* const u = update_of(node);
-    if (!kernels_.factor(node.front, panel, u, own + s_.arena_size)) return false;
+    double* const panel = factor_.data() + node.panel;
+    if (!kernels_.factor(node.front, panel, u, arena + s_.arena_size)) return false;
     watch.lap(&CholeskySeconds::dense);
     if (node.parent == -1) return true;
     for (Index c = node.children_begin; c < node.children_end; ++c) {
       const Supernode& child = s_.supernodes[s_.children[c].supernode];
-      kernels_.add_to_update(child.front, update_of(child), map_of(c), node.front, u);
+      const double* const of_child =
+          child.task == node.task ? arena + child.update : shelf[child.task];
+      kernels_.add_to_update(child.front, of_child, map_of(c), node.front, u);
     }
     watch.lap(&CholeskySeconds::extend_add);
+    return true;
+  }
+
+  /// Add to the parent's panel what belongs there; the first child begins it.
+  void add_to_parent(const Supernode& node,
+                     const double* blocks,
+                     const double* u,
+                     Stopwatch& watch) {
     const Supernode& parent = s_.supernodes[node.parent];
-    if (parent.task != node.task) return true;
     if (node.as_child == parent.children_begin) {
       assemble(parent, blocks);
       watch.lap(&CholeskySeconds::assembly);
@@ -195,7 +234,11 @@ class MultifrontalFactor final : public FactorBackend {
     kernels_.add_to_panel(node.front, u, map_of(node.as_child), parent.front,
                           factor_.data() + parent.panel);
     watch.lap(&CholeskySeconds::extend_add);
-    return true;
+  }
+
+  /// Size of what is left of the update matrix behind the columns that its parent's panel takes.
+  std::size_t left_size(const Supernode& node) const {
+    return s_.tasks[node.task].update - s_.taken_size(node);
   }
 
   /// Begin a supernode's panel: with the columns of A.
@@ -252,7 +295,7 @@ class MultifrontalFactor final : public FactorBackend {
     const Vectors v{.b = b, .x = x, .n = n, .stride = s_.longest, .y = y, .passed = y + b.size() * n};
     const auto tasks = static_cast<Index>(s_.tasks.size());
     const auto ready = [&](Index k, const Team::Done& done) {
-      if (k < tasks) return may_join(k, done);
+      if (k < tasks) return has_all(k, [&](Index child) { return done[child] != 0; });
       const Index task = 2 * tasks - 1 - k;
       const Index parent = s_.tasks[task].parent;
       return done[parent == -1 ? task : 2 * tasks - 1 - parent] != 0;
@@ -273,7 +316,7 @@ class MultifrontalFactor final : public FactorBackend {
   /// @param z  [n] vectors of the thread: the right side less what has been subtracted from it
   void forward(Index k, const Vectors& v, double* z, double* c) const {
     const Task& task = s_.tasks[k];
-    const Supernode& root = s_.supernodes[task.end - 1];
+    const Supernode& root = root_of(k);
     for (int r = 0; r < v.count(); ++r) {
       double* const z_r = z + r * v.n;
       for (Index i = s_.supernodes[task.begin].first; i < root.first + root.columns; ++i) {
@@ -282,9 +325,8 @@ class MultifrontalFactor final : public FactorBackend {
       for (std::size_t i = root.rows_begin; i < root.rows_end; ++i) {
         std::fill_n(z_r + 3 * s_.rows[i], 3, 0.0);
       }
-      for_passing(k, [&](const Child& child) {
-        const Supernode& from = s_.supernodes[child.supernode];
-        add_rows(from, v.passed + r * s_.passed_size + s_.tasks[from.task].passed, z_r);
+      for_children(k, [&](Index child) {
+        add_rows(root_of(child), v.passed + r * s_.passed_size + s_.tasks[child].passed, z_r);
       });
     }
     for (Index s = task.begin; s < task.end; ++s) {

@@ -276,10 +276,8 @@ class Analyzer {
         s_.arena_size = std::max(s_.arena_size, node.update);
         if (node.parent != -1 && !is_left) {
           // Its first columns are in its parent's panel before the next supernode's turn.
-          const Child& child = s_.children[node.as_child];
-          const Run& last = s_.runs[child.runs_begin + child.column_runs - 1];
-          const std::size_t end = node.update - size(node.front.update(), last.from + last.count);
-          alive.insert(gap, {.begin = begin, .end = end, .supernode = s});
+          alive.insert(gap,
+                       {.begin = begin, .end = node.update - s_.taken_size(node), .supernode = s});
         }
         std::erase_if(alive, [&](const Extent& e) { return gathered_.parent[e.supernode] == s; });
       }
@@ -301,6 +299,12 @@ class Analyzer {
 
 Symbolic analyze(const BlockPattern& pattern, const Graph& graph, const EliminationTree& tree) {
   return Analyzer(pattern, graph, tree).run();
+}
+
+std::size_t Symbolic::taken_size(const Supernode& node) const {
+  const Child& child = children[node.as_child];
+  const Run& last = runs[child.runs_begin + child.column_runs - 1];
+  return size(node.front.update(), last.from + last.count);
 }
 
 std::size_t Symbolic::bytes() const {

@@ -80,6 +80,9 @@ struct Symbolic {
   double flops = 0.0;           ///< of one factorization, for those nonzeros
   Index longest = 0;            ///< largest ld of a panel
 
+  /// Size of the columns of an update matrix that are columns of the parent, the first ones.
+  std::size_t taken_size(const Supernode& node) const;
+
   std::size_t bytes() const;
 };
 
