@@ -14,7 +14,7 @@ constexpr Index kLanes = 8;
 /// Factorizations of fewer operations are one task; larger ones are split into subtrees of at most
 /// this share of the operations, and what is above these.
 constexpr double kWorthSplitting = 2e8;
-constexpr double kLargestShare = 1.0 / 16;
+constexpr double kLargestShare = 1.0 / 64;
 
 Index padded(Index n) { return (n + kLanes - 1) / kLanes * kLanes; }
 
