@@ -15,7 +15,7 @@ Team::~Team() {
 }
 
 void Team::run(Index count, const Ready& ready, const Body& body) {
-  if (size_ <= 1) {
+  if (size_ == 1) {
     for (Index i = 0; i < count; ++i) body(i, 0);
     return;
   }

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <algorithm>
 #include <condition_variable>
 #include <functional>
 #include <mutex>
@@ -17,7 +18,7 @@ namespace diffcloth {
 /// run().
 class Team {
  public:
-  explicit Team(int size) : size_(size) {}
+  explicit Team(int size) : size_(std::max(size, 1)) {}
   ~Team();
   Team(const Team&) = delete;
   Team& operator=(const Team&) = delete;

@@ -93,8 +93,7 @@ class MultifrontalFactor final : public FactorBackend {
                CholeskySeconds* seconds) override {
     const std::size_t scratch = static_cast<std::size_t>(s_.longest) * kColumnBlock;
     const std::size_t own = s_.arena_size + scratch;
-    double* const memory =
-        workspace.reserve(s_.left_size + own * static_cast<std::size_t>(workspace.team().size()));
+    double* const memory = workspace.reserve(s_.left_size + own * members(workspace));
     Shelf shelf(s_.tasks, memory);
     std::atomic<bool> positive = true;
     // Work 2 k eliminates task k, work 2 k + 1 hands on what it leaves.
@@ -130,12 +129,17 @@ class MultifrontalFactor final : public FactorBackend {
   std::size_t bytes() const override { return sizeof(*this) + factor_.bytes(); }
 
  private:
-  /// Run a loop over tasks: on the team where there is more than one.
+  /// Threads that work: one where there is one task.
+  std::size_t members(CholeskyWorkspace& workspace) const {
+    return s_.tasks.size() > 1 ? static_cast<std::size_t>(workspace.team().size()) : 1;
+  }
+
+  /// Run a loop over tasks on as many.
   void run(CholeskyWorkspace& workspace,
            Index count,
            const Team::Ready& ready,
            const Team::Body& body) const {
-    if (s_.tasks.size() > 1) {
+    if (members(workspace) > 1) {
       workspace.team().run(count, ready, body);
     } else {
       Team(1).run(count, ready, body);
@@ -287,11 +291,11 @@ class MultifrontalFactor final : public FactorBackend {
                   CholeskyWorkspace& workspace) const {
     const std::size_t n = 3 * s_.vertex.size();
     const auto longest = static_cast<std::size_t>(s_.longest);
-    const auto members = static_cast<std::size_t>(workspace.team().size());
     // Of each thread: vectors of its own, and behind them a front.
     const std::size_t own = (n + longest + kLine) / kLine * kLine;
-    double* const memory = workspace.reserve(b.size() * (own * members + n + s_.passed_size));
-    double* const y = memory + b.size() * own * members;
+    const std::size_t all = own * members(workspace);
+    double* const memory = workspace.reserve(b.size() * (all + n + s_.passed_size));
+    double* const y = memory + b.size() * all;
     const Vectors v{.b = b, .x = x, .n = n, .stride = s_.longest, .y = y, .passed = y + b.size() * n};
     const auto tasks = static_cast<Index>(s_.tasks.size());
     const auto ready = [&](Index k, const Team::Done& done) {

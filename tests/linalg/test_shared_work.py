@@ -182,9 +182,8 @@ def tree(count: int) -> list[list[int]]:
 
 def at_random(count: int) -> list[list[int]]:
     rng = np.random.default_rng(1)
-    return [
-        [int(j) for j in rng.integers(0, i, rng.integers(0, 3))] if i else [] for i in range(count)
-    ]
+    before = [rng.integers(0, max(i, 1), rng.integers(0, 3) if i else 0) for i in range(count)]
+    return [[int(j) for j in some] for some in before]
 
 
 @pytest.mark.parametrize("threads", [-1, 0, 1, 2, 3, 8])
