@@ -176,8 +176,7 @@ class MultifrontalFactor final : public FactorBackend {
   /// Eliminate the supernodes of a task.
   ///
   /// @param arena  of the thread; behind it is scratch for the kernels
-  bool eliminate(
-      Index task, const double* blocks, Shelf& shelf, double* arena, Stopwatch& watch) {
+  bool eliminate(Index task, const double* blocks, Shelf& shelf, double* arena, Stopwatch& watch) {
     shelf.take(task);
     for (Index s = s_.tasks[task].begin; s < s_.tasks[task].end; ++s) {
       const Supernode& node = s_.supernodes[s];
@@ -296,7 +295,8 @@ class MultifrontalFactor final : public FactorBackend {
     const std::size_t all = own * members(workspace);
     double* const memory = workspace.reserve(b.size() * (all + n + s_.passed_size));
     double* const y = memory + b.size() * all;
-    const Vectors v{.b = b, .x = x, .n = n, .stride = s_.longest, .y = y, .passed = y + b.size() * n};
+    const Vectors v{
+        .b = b, .x = x, .n = n, .stride = s_.longest, .y = y, .passed = y + b.size() * n};
     const auto tasks = static_cast<Index>(s_.tasks.size());
     const auto ready = [&](Index k, const Team::Done& done) {
       if (k < tasks) return has_all(k, [&](Index child) { return done[child] != 0; });

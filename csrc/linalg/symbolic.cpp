@@ -232,9 +232,8 @@ class Analyzer {
       Supernode& node = s_.supernodes[s];
       node.task = static_cast<Index>(s_.tasks.size());
       if (node.parent == -1) trees += flops[s];
-      const bool ends = node.parent == -1
-                            ? s + 1 == count || trees > 0.5 * largest || joins(s + 1)
-                            : joins(node.parent);
+      const bool ends = node.parent == -1 ? s + 1 == count || trees > 0.5 * largest || joins(s + 1)
+                                          : joins(node.parent);
       if (!ends) continue;
       trees = 0.0;
       s_.tasks.push_back({.begin = begin,
@@ -267,8 +266,7 @@ class Analyzer {
       for (Index s = task.begin; s < task.end; ++s) {
         Supernode& node = s_.supernodes[s];
         const bool is_left = s + 1 == task.end;
-        const std::size_t wanted =
-            is_left ? 0 : size(node.front.update(), padded(node.front.rows));
+        const std::size_t wanted = is_left ? 0 : size(node.front.update(), padded(node.front.rows));
         std::size_t begin = 0;
         auto gap = alive.begin();
         for (; gap != alive.end() && gap->begin < begin + wanted; ++gap) begin = gap->end;

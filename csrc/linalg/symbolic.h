@@ -51,10 +51,10 @@ struct Child {
 struct Task {
   Index begin;  ///< its supernodes: Symbolic::supernodes[begin .. end - 1]
   Index end;
-  Index parent;         ///< -1 where it has none
-  bool joins;           ///< a single supernode, whose children are roots of other tasks
-  std::size_t update;   ///< size of the update matrix that it leaves to its parent [doubles]
-  std::size_t passed;   ///< offset of what its rows below get in a solve [doubles]
+  Index parent;        ///< -1 where it has none
+  bool joins;          ///< a single supernode, whose children are roots of other tasks
+  std::size_t update;  ///< size of the update matrix that it leaves to its parent [doubles]
+  std::size_t passed;  ///< offset of what its rows below get in a solve [doubles]
 };
 
 /// All of A = L L^T that does not depend on values, for the multifrontal method.
