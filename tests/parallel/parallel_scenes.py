@@ -11,15 +11,16 @@ F64 = torch.float64
 
 
 @cache
-def simulator(n, scheme="coupled"):
-    """n x n vertices; the lower half rests on a plate, the upper half on the lower."""
+def simulator(n, scheme="coupled", folded=True):
+    """n x n vertices; the lower half rests on a plate, the upper half on the lower. Or all of it rests
+    on the plate."""
     sheet = dc.Cloth.grid(n, n)
     edge = 1.0 / (n - 1)
     flat = np.array(sheet.vertices)
     flat[:, :2] += np.random.default_rng(n).uniform(-0.1, 0.1, (n * n, 2)) * edge
     s = flat[:, 1]  # across the fold, which takes one row of cells
     reach = 0.1 * edge
-    gap, below = 0.8 * reach, s < 0.0
+    gap, below = 0.8 * reach, s < (0.0 if folded else 1.0)
     placed = np.stack([flat[:, 0], np.where(below, s, -s), np.where(below, 0, gap)], axis=-1)
     cloth = dc.Cloth(placed, sheet.faces, rest_vertices=flat, material=dc.Material(friction=0.3))
     plate = dc.RigidBody.plane(3.0, pose=[0.01, 0.02, -0.8 * reach, 1, 0, 0, 0])
@@ -27,9 +28,9 @@ def simulator(n, scheme="coupled"):
     return dc.Simulator(dc.Scene([cloth], [plate]), 0.01, scheme=scheme, contact=contact)
 
 
-def batch(n, environments, seed=0, scheme="coupled"):
+def batch(n, environments, seed=0, scheme="coupled", folded=True):
     """A state whose environments differ in their velocities."""
-    state = simulator(n, scheme).initial_state(environments)
+    state = simulator(n, scheme, folded).initial_state(environments)
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(state.velocities.shape, generator=generator, dtype=F64)
     speed = torch.tensor([0.3, 0.1, -0.05], dtype=F64)

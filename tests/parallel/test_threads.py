@@ -93,11 +93,11 @@ def test_an_environment_has_the_same_bits_alone_and_in_a_batch(serial, n):
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
 def test_threads_that_share_one_environment_change_no_bit(scheme):
     # As large as it takes: see tests/linalg/test_shared_work.py.
-    sim, state = simulator(LARGE, scheme), batch(LARGE, 1, scheme=scheme)
+    sim, state = simulator(LARGE, scheme, False), batch(LARGE, 1, scheme=scheme, folded=False)
     with threads(1):
         after, expected = step(sim, state)
-    assert (after.report.contact_count > LARGE * LARGE // 2).all()
-    for count in (2, 3):
+    assert (after.report.contact_count > 100).all()
+    for count in (2, 3, 2, 3):
         with threads(count):
             _, values = step(sim, state)
         assert differing(values, expected) == []
