@@ -12,8 +12,8 @@ F64 = torch.float64
 
 @cache
 def simulator(n, scheme="coupled", folded=True):
-    """n x n vertices; the lower half rests on a plate, the upper half on the lower one, or on the plate
-    too."""
+    """n x n vertices; the lower half rests on a plate, the upper half on the lower one, or on
+    the plate too."""
     sheet = dc.Cloth.grid(n, n)
     edge = 1.0 / (n - 1)
     flat = np.array(sheet.vertices)
