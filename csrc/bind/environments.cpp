@@ -23,7 +23,8 @@ void for_environments(std::size_t count,
 }
 
 int threads_each(std::size_t count, int threads) {
-  // The way from the leaves of an elimination tree to its root is a third of all work.
+  // The tasks of a factorization of 96 x 96 vertices take a third of the time on four threads: the way
+  // to the root of the elimination tree leaves little to do for more.
   constexpr int kMost = 4;
   return std::clamp(threads / std::max(static_cast<int>(count), 1), 1, kMost);
 }
