@@ -67,7 +67,7 @@ class Trial:
     def run(self) -> None:
         self._time("analysis", self._analyze)
         self._time("factor", self._factorize)
-        self._time("solve", lambda: self.factor.solve(self.b, self.x))
+        self._time("solve", lambda: self.factor.solve(self.b, self.x, self.workspace))
 
     def milliseconds(self, part: str) -> float:
         return 1e3 * median(self.seconds[part])

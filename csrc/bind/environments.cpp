@@ -1,5 +1,7 @@
 #include "bind/environments.h"
 
+#include <algorithm>
+
 #include "bind/bind.h"
 #include "common/parallel_for.h"
 
@@ -18,6 +20,13 @@ void for_environments(std::size_t count,
   } catch (const Interrupted&) {
     throw nb::python_error();  // the error that the signal handler has set
   }
+}
+
+int threads_each(std::size_t count, int threads) {
+  // The tasks of a factorization of 96 x 96 vertices take a third of the time on four threads: the way
+  // to the root of the elimination tree leaves little to do for more.
+  constexpr int kMost = 4;
+  return std::clamp(threads / std::max(static_cast<int>(count), 1), 1, kMost);
 }
 
 }  // namespace diffcloth::bind

@@ -14,4 +14,8 @@ void for_environments(std::size_t count,
                       int threads,
                       const std::function<void(Index, const Checkpoint&)>& body);
 
+/// Threads that each of so many environments has for itself, where there are fewer environments than
+/// threads.
+int threads_each(std::size_t count, int threads);
+
 }  // namespace diffcloth::bind

@@ -251,7 +251,7 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
     const auto e = static_cast<std::size_t>(i);
     step::Kept found;
     reports[e] = step::forward(scene_, arrays.environment(e), checkpoint, outputs.environment(e),
-                               tapes.environment(e), found, nullptr);
+                               tapes.environment(e), found, threads_each(b, threads), nullptr);
     if (tape) kept.tickets[e] = factors_.insert(std::move(found));
   });
   if (tape) out["kept"] = nb::cast(std::move(kept));
@@ -331,7 +331,7 @@ nb::dict Simulator::backward(const nb::dict& inputs,
       for (Wanted& w : wanted) gradients.data[w.input] = w.at(row);
     }
     step::backward(scene_, arrays.environment(e), tapes.environment(e), *kept.tickets[e]->find(),
-                   of_rows, checkpoint);
+                   of_rows, threads_each(portions.size(), threads), checkpoint);
   });
   for (const Wanted& w : wanted) {
     for (std::size_t row = 0; row < w.own.size() / std::max<std::size_t>(w.count, 1); ++row) {
@@ -349,7 +349,7 @@ nb::object Simulator::path(const nb::dict& inputs) {
   std::vector<std::vector<double>> path;
   for_environments(1, 1, [&](Index, const Checkpoint& checkpoint) {
     step::Kept kept;
-    step::forward(scene_, arrays.environment(0), checkpoint, outputs.environment(0), {}, kept,
+    step::forward(scene_, arrays.environment(0), checkpoint, outputs.environment(0), {}, kept, 1,
                   &path);
   });
   const auto all = static_cast<std::size_t>(scene_.vertex_count());

@@ -27,7 +27,9 @@ class FactorBackend {
   virtual bool compute(const double* blocks,
                        CholeskyWorkspace& workspace,
                        CholeskySeconds* seconds) = 0;
-  virtual void solve(std::span<const double* const> b, std::span<double* const> x) const = 0;
+  virtual void solve(std::span<const double* const> b,
+                     std::span<double* const> x,
+                     CholeskyWorkspace& workspace) const = 0;
   virtual std::size_t bytes() const = 0;
 };
 

@@ -110,14 +110,25 @@ bool CholeskyFactor::compute(const double* blocks) {
   return compute(blocks, workspace);
 }
 
+void CholeskyFactor::solve(const double* b, double* x, CholeskyWorkspace& workspace) const {
+  solve(std::span(&b, 1), std::span(&x, 1), workspace);
+}
+
+void CholeskyFactor::solve(std::span<const double* const> b,
+                           std::span<double* const> x,
+                           CholeskyWorkspace& workspace) const {
+  if (!positive_) throw std::logic_error("solve: the matrix has not been factored");
+  if (b.size() != x.size()) throw std::invalid_argument("solve: as many solutions as right sides");
+  backend_->solve(b, x, workspace);
+}
+
 void CholeskyFactor::solve(const double* b, double* x) const {
   solve(std::span(&b, 1), std::span(&x, 1));
 }
 
 void CholeskyFactor::solve(std::span<const double* const> b, std::span<double* const> x) const {
-  if (!positive_) throw std::logic_error("solve: the matrix has not been factored");
-  if (b.size() != x.size()) throw std::invalid_argument("solve: as many solutions as right sides");
-  backend_->solve(b, x);
+  CholeskyWorkspace workspace;
+  solve(b, x, workspace);
 }
 
 std::size_t CholeskyFactor::bytes() const { return sizeof(*this) + backend_->bytes(); }

@@ -7,6 +7,7 @@
 #include <string>
 #include <vector>
 
+#include "common/team.h"
 #include "linalg/aligned_buffer.h"
 #include "linalg/block_pattern.h"
 #include "linalg/dense_kernels.h"
@@ -35,20 +36,27 @@ std::string factorization_name();
 class AnalysisBackend;
 class FactorBackend;
 
-/// Memory that factorizations need while they run. Keep one for each thread and pass it to every
-/// compute(): it grows to what the largest needs and stays so.
+/// Memory and threads that factorizations and solves need while they run. Keep one for each
+/// environment and pass it to every compute() and solve(): it grows to what the largest needs and stays
+/// so.
 class CholeskyWorkspace {
  public:
+  /// @param threads  that large ones are shared by; they do not change a bit
+  explicit CholeskyWorkspace(int threads = 1) : team_(threads) {}
+
   /// At least `size` doubles, of any values.
   double* reserve(std::size_t size);
 
   std::size_t bytes() const { return buffer_.bytes(); }
 
+  Team& team() { return team_; }
+
  private:
   AlignedBuffer buffer_;
+  Team team_;
 };
 
-/// Where the time of multifrontal factorizations went [s].
+/// Where the time of multifrontal factorizations went on the caller's thread [s].
 struct CholeskySeconds {
   double assembly = 0.0;    ///< the matrix into panels
   double extend_add = 0.0;  ///< update matrices of children into their parents
@@ -115,10 +123,16 @@ class CholeskyFactor {
   [[nodiscard]] bool compute(const double* blocks);
 
   /// x = A^-1 b over 3 * vertex_count coordinates; rows of vertices left out stay as they are. May
-  /// be called from any number of threads at once.
-  void solve(const double* b, double* x) const;
+  /// be called from any number of threads at once, each with its workspace.
+  void solve(const double* b, double* x, CholeskyWorkspace& workspace) const;
 
   /// x[r] = A^-1 b[r] for several right-hand sides, with the bits of one at a time.
+  void solve(std::span<const double* const> b,
+             std::span<double* const> x,
+             CholeskyWorkspace& workspace) const;
+
+  /// The same with memory of its own for this call.
+  void solve(const double* b, double* x) const;
   void solve(std::span<const double* const> b, std::span<double* const> x) const;
 
   /// Memory of the factor, without that of the analysis.

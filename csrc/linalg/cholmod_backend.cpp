@@ -169,7 +169,9 @@ class CholmodFactor final : public FactorBackend {
            std::isfinite(trace(*factor_));
   }
 
-  void solve(std::span<const double* const> b, std::span<double* const> x) const override {
+  void solve(std::span<const double* const> b,
+             std::span<double* const> x,
+             CholeskyWorkspace& /*workspace*/) const override {
     if (factor_ == nullptr) return;
     const std::vector<Index>& unknown = structure_.matrix.unknown;
     std::vector<double> permuted(unknown.size());

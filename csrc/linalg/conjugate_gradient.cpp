@@ -11,6 +11,7 @@ Convergence conjugate_gradient(const BlockPattern& pattern,
                                const std::vector<double>& b,
                                double tolerance,
                                int max_iterations,
+                               CholeskyWorkspace& workspace,
                                std::vector<double>& x) {
   const std::size_t size = 3 * static_cast<std::size_t>(pattern.size());
   x.assign(size, 0.0);
@@ -19,7 +20,7 @@ Convergence conjugate_gradient(const BlockPattern& pattern,
     if (fixed[i]) r[3 * i] = r[3 * i + 1] = r[3 * i + 2] = 0.0;
   }
   std::vector<double> z(size, 0.0);
-  preconditioner.solve(r.data(), z.data());
+  preconditioner.solve(r.data(), z.data(), workspace);
   std::vector<double> p = z;
   std::vector<double> q(size);
   double rz = dot(r, z);
@@ -39,7 +40,7 @@ Convergence conjugate_gradient(const BlockPattern& pattern,
       x[k] += alpha * p[k];
       r[k] -= alpha * q[k];
     }
-    preconditioner.solve(r.data(), z.data());
+    preconditioner.solve(r.data(), z.data(), workspace);
     const double next = dot(r, z);
     if (next <= goal) return Convergence::kConverged;
     const double beta = next / rz;

@@ -29,6 +29,7 @@ enum class Convergence : std::uint8_t { kConverged, kIterationLimit, kNegativeCu
                                              const std::vector<double>& b,
                                              double tolerance,
                                              int max_iterations,
+                                             CholeskyWorkspace& workspace,
                                              std::vector<double>& x);
 
 }  // namespace diffcloth::linalg

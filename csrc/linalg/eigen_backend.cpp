@@ -39,7 +39,9 @@ class EigenFactor final : public FactorBackend {
     return solver_.info() == Eigen::Success && std::isfinite(trace());
   }
 
-  void solve(std::span<const double* const> b, std::span<double* const> x) const override {
+  void solve(std::span<const double* const> b,
+             std::span<double* const> x,
+             CholeskyWorkspace& /*workspace*/) const override {
     if (matrix_.dimension() == 0) return;
     Eigen::VectorXd y(matrix_.dimension());
     for (std::size_t r = 0; r < b.size(); ++r) {

@@ -1,6 +1,7 @@
 #include "linalg/symbolic.h"
 
 #include <algorithm>
+#include <limits>
 #include <utility>
 
 #include "linalg/supernodes.h"
@@ -10,6 +11,11 @@ namespace {
 
 constexpr Index kLanes = 8;
 
+/// Factorizations of fewer operations are one task; larger ones are split into subtrees of at most
+/// this share of the operations, and what is above these.
+constexpr double kWorthSplitting = 2e8;
+constexpr double kLargestShare = 1.0 / 64;
+
 Index padded(Index n) { return (n + kLanes - 1) / kLanes * kLanes; }
 
 /// Columns an odd number of cache lines apart lie in different sets of the cache.
@@ -17,6 +23,16 @@ Index leading_dimension(Index n) { return n >= 128 && n % 16 == 0 ? n + kLanes :
 
 std::size_t size(const Trapezoid& matrix, Index columns) {
   return static_cast<std::size_t>(matrix.size(columns));
+}
+
+/// Operations that a supernode takes.
+double front_flops(const Front& front) {
+  double flops = 0.0;
+  for (Index j = 0; j < front.columns; ++j) {
+    const double height = front.columns - j + front.rows;
+    flops += height * height;
+  }
+  return flops;
 }
 
 /// Builds a Symbolic, one aspect after the other.
@@ -32,7 +48,8 @@ class Analyzer {
     lay_out_panels();
     sort_blocks();
     map_into_panels();
-    lay_out_arena();
+    split();
+    lay_out_arenas();
     return std::move(s_);
   }
 
@@ -115,10 +132,9 @@ class Analyzer {
       s_.factor_size += size(front.panel(), front.columns);
       s_.longest = std::max(s_.longest, front.ld);
       for (Index j = 0; j < front.columns; ++j) {
-        const double height = front.columns - j + front.rows;
-        s_.nonzeros += static_cast<std::size_t>(height);
-        s_.flops += height * height;
+        s_.nonzeros += static_cast<std::size_t>(front.columns - j + front.rows);
       }
+      s_.flops += front_flops(front);
     }
   }
 
@@ -192,30 +208,77 @@ class Analyzer {
     child.run_count = static_cast<Index>(s_.runs.size() - child.runs_begin);
   }
 
-  /// First fit at each supernode's turn, while what is left of the matrices of its children is alive.
-  /// From the end of the arena on, as it is the last columns of a matrix that are left.
-  void lay_out_arena() {
+  /// Operations of the subtree of each supernode.
+  std::vector<double> subtree_flops() const {
+    std::vector<double> flops(s_.supernodes.size(), 0.0);
+    for (std::size_t s = 0; s < flops.size(); ++s) {
+      const Supernode& node = s_.supernodes[s];
+      flops[s] += front_flops(node.front);
+      if (node.parent != -1) flops[node.parent] += flops[s];
+    }
+    return flops;
+  }
+
+  /// A task ends at the root of a subtree that is small enough where that of its parent is not. Trees
+  /// of their own share one while they are small.
+  void split() {
+    const auto count = static_cast<Index>(s_.supernodes.size());
+    const std::vector<double> flops = subtree_flops();
+    const double largest = s_.flops < kWorthSplitting ? std::numeric_limits<double>::infinity()
+                                                      : kLargestShare * s_.flops;
+    const auto joins = [&](Index s) { return flops[s] > largest; };
+    double trees = 0.0;  // operations of those in the task so far
+    for (Index s = 0, begin = 0; s < count; ++s) {
+      Supernode& node = s_.supernodes[s];
+      node.task = static_cast<Index>(s_.tasks.size());
+      if (node.parent == -1) trees += flops[s];
+      const bool ends = node.parent == -1 ? s + 1 == count || trees > 0.5 * largest || joins(s + 1)
+                                          : joins(node.parent);
+      if (!ends) continue;
+      trees = 0.0;
+      s_.tasks.push_back({.begin = begin,
+                          .end = s + 1,
+                          .parent = -1,
+                          .joins = joins(s),
+                          .update = size(node.front.update(), padded(node.front.rows)),
+                          .passed = s_.passed_size});
+      s_.left_size += s_.tasks.back().update;
+      s_.passed_size += static_cast<std::size_t>(node.front.rows);
+      begin = s + 1;
+    }
+    for (Task& task : s_.tasks) {
+      const Index parent = s_.supernodes[task.end - 1].parent;
+      if (parent != -1) task.parent = s_.supernodes[parent].task;
+    }
+  }
+
+  /// In each task first fit at each supernode's turn, while what is left of the matrices of its
+  /// children is alive. From the end of the arena on, as it is the last columns of a matrix that are
+  /// left. What the root leaves has a place elsewhere.
+  void lay_out_arenas() {
     struct Extent {
       std::size_t begin, end;  // counted from the end of the arena
       Index supernode;
     };
     std::vector<Extent> alive;  // ascending
-    for (Index s = 0; s < gathered_.size(); ++s) {
-      Supernode& node = s_.supernodes[s];
-      const std::size_t wanted = size(node.front.update(), padded(node.front.rows));
-      std::size_t begin = 0;
-      auto gap = alive.begin();
-      for (; gap != alive.end() && gap->begin < begin + wanted; ++gap) begin = gap->end;
-      node.update = begin + wanted;
-      s_.arena_size = std::max(s_.arena_size, node.update);
-      if (node.parent != -1) {
-        // Its first columns are in its parent's panel before the next supernode's turn.
-        const Child& child = s_.children[node.as_child];
-        const Run& last = s_.runs[child.runs_begin + child.column_runs - 1];
-        const std::size_t end = node.update - size(node.front.update(), last.from + last.count);
-        alive.insert(gap, {.begin = begin, .end = end, .supernode = s});
+    for (const Task& task : s_.tasks) {
+      alive.clear();
+      for (Index s = task.begin; s < task.end; ++s) {
+        Supernode& node = s_.supernodes[s];
+        const bool is_left = s + 1 == task.end;
+        const std::size_t wanted = is_left ? 0 : size(node.front.update(), padded(node.front.rows));
+        std::size_t begin = 0;
+        auto gap = alive.begin();
+        for (; gap != alive.end() && gap->begin < begin + wanted; ++gap) begin = gap->end;
+        node.update = begin + wanted;
+        s_.arena_size = std::max(s_.arena_size, node.update);
+        if (node.parent != -1 && !is_left) {
+          // Its first columns are in its parent's panel before the next supernode's turn.
+          alive.insert(gap,
+                       {.begin = begin, .end = node.update - s_.taken_size(node), .supernode = s});
+        }
+        std::erase_if(alive, [&](const Extent& e) { return gathered_.parent[e.supernode] == s; });
       }
-      std::erase_if(alive, [&](const Extent& e) { return gathered_.parent[e.supernode] == s; });
     }
     for (Supernode& node : s_.supernodes) node.update = s_.arena_size - node.update;
   }
@@ -236,11 +299,17 @@ Symbolic analyze(const BlockPattern& pattern, const Graph& graph, const Eliminat
   return Analyzer(pattern, graph, tree).run();
 }
 
+std::size_t Symbolic::taken_size(const Supernode& node) const {
+  const Child& child = children[node.as_child];
+  const Run& last = runs[child.runs_begin + child.column_runs - 1];
+  return size(node.front.update(), last.from + last.count);
+}
+
 std::size_t Symbolic::bytes() const {
   return sizeof(Symbolic) + vertex.capacity() * sizeof(Index) +
          supernodes.capacity() * sizeof(Supernode) + rows.capacity() * sizeof(Index) +
          blocks.capacity() * sizeof(PlacedBlock) + children.capacity() * sizeof(Child) +
-         runs.capacity() * sizeof(Run);
+         runs.capacity() * sizeof(Run) + tasks.capacity() * sizeof(Task);
 }
 
 }  // namespace diffcloth::linalg

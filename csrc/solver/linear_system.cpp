@@ -41,7 +41,7 @@ void LinearSystem::solve(const linalg::CholeskyFactor& factor,
   const Stopwatch::Scope scope(watch_, Phase::kSolve);
   f_.coordinates->pull_back(b, b_);
   z_.assign(b_.size(), 0.0);
-  factor.solve(b_.data(), z_.data());
+  factor.solve(b_.data(), z_.data(), workspace_);
   for (double& value : z_) value = -value;
   f_.coordinates->push_forward(z_, p);
 }
@@ -60,7 +60,7 @@ void LinearSystem::solve(const linalg::CholeskyFactor& factor,
     from.push_back(right[r].data());
     to.push_back(z[r].data());
   }
-  factor.solve(from, to);
+  factor.solve(from, to, workspace_);
   p.resize(b.size());
   for (std::size_t r = 0; r < b.size(); ++r) {
     for (double& value : z[r]) value = -value;
@@ -78,7 +78,7 @@ linalg::Convergence LinearSystem::solve(const linalg::BlockMatrix& matrix,
   f_.coordinates->pull_back(b, b_);
   const linalg::Convergence result =
       linalg::conjugate_gradient(matrix.pattern(), matrix.blocks(), f_.assemblies->fixed(), nearby,
-                                 b_, tolerance, max_iterations, z_);
+                                 b_, tolerance, max_iterations, workspace_, z_);
   for (double& value : z_) value = -value;
   f_.coordinates->push_forward(z_, p);
   return result;

@@ -78,6 +78,7 @@ Report forward(const Scene& scene,
                const Arrays<double>& outputs,
                const Arrays<double>& tape,
                Kept& kept,
+               int threads,
                std::vector<std::vector<double>>* path) {
   Stopwatch watch;
   Report report;
@@ -102,7 +103,7 @@ Report forward(const Scene& scene,
     }
   }
 
-  linalg::CholeskyWorkspace workspace;
+  linalg::CholeskyWorkspace workspace(threads);
   solver::Context context{.checkpoint = &checkpoint,
                           .options = scene.given.options,
                           .workspace = &workspace,
@@ -135,6 +136,7 @@ void backward(const Scene& scene,
               const Arrays<const double>& tape,
               const Kept& kept,
               std::span<const Loss> losses,
+              int threads,
               const Checkpoint& checkpoint) {
   Stopwatch watch;
   solver::Counts counts;
@@ -146,7 +148,7 @@ void backward(const Scene& scene,
     read_outputs(problem, loss.cotangents, bars.back());
   }
 
-  linalg::CholeskyWorkspace workspace;
+  linalg::CholeskyWorkspace workspace(threads);
   solver::Context context{.checkpoint = &checkpoint,
                           .options = scene.given.options,
                           .workspace = &workspace,

@@ -28,6 +28,7 @@ std::vector<Field> tape_fields(const Scene& scene);
 /// @param outputs  named like output_fields(), zeroed
 /// @param tape     named like tape_fields(), zeroed; empty where no tape is wanted
 /// @param kept     for backward; nothing where it failed
+/// @param threads  that share the work of a large scene; they change no bit
 /// @param path     where the accepted iterates (all vertices) are appended, or null
 Report forward(const Scene& scene,
                const Inputs& inputs,
@@ -35,6 +36,7 @@ Report forward(const Scene& scene,
                const Arrays<double>& outputs,
                const Arrays<double>& tape,
                Kept& kept,
+               int threads,
                std::vector<std::vector<double>>* path);
 
 /// What a loss gives and gets.
@@ -56,6 +58,7 @@ void backward(const Scene& scene,
               const Arrays<const double>& tape,
               const Kept& kept,
               std::span<const Loss> losses,
+              int threads,
               const Checkpoint& checkpoint);
 
 /// Where surfaces overlap at the start of the step, or are closer than their thickness; else empty.

@@ -76,10 +76,10 @@ class BlockMatrix:
         return y
 
 
-def solve(factor, b: np.ndarray, fill: float = 0.0) -> np.ndarray:
+def solve(factor, b: np.ndarray, fill: float = 0.0, threads: int = 1) -> np.ndarray:
     """Solutions for b [count, vertices, 3]; entries of fixed vertices stay as filled."""
     x = np.full_like(b, fill)
-    factor.solve(np.ascontiguousarray(b), x)
+    factor.solve(np.ascontiguousarray(b), x, kernels.CholeskyWorkspace(threads))
     return x
 
 

@@ -67,6 +67,20 @@ def test_a_forked_child_steps_batches(after_a_parallel_region, count):
     assert differing(step(simulator(n), state)[1], expected) == []
 
 
+def test_a_forked_child_shares_the_work_on_one_environment():
+    sim, state = simulator(48, folded=False), batch(48, 1, folded=False)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        begin = time.monotonic()
+        expected = step(sim, state)[1]
+        patience = 30 + 20 * (time.monotonic() - begin)
+        assert in_child(lambda: differing(step(sim, state)[1], expected) == [], patience) == 0
+        assert differing(step(sim, state)[1], expected) == []
+    finally:
+        torch.set_num_threads(before)
+
+
 def work(queue, n, state):
     torch.set_num_threads(2)
     _, values = step(simulator(n), state)

@@ -54,6 +54,8 @@ WITHOUT_THREADS = """
     except ValueError as error:
         print(error)
 
+    print(_kernels.run_team([[], [], [0, 1]], 4, 0.0, 3))
+
     step.torch.get_num_threads = lambda: 4  # torch's own pool needs threads, too
     floor = dc.RigidBody.plane(2, pose=[0, 0, -0.01, 1, 0, 0, 0])
     sim = dc.Simulator(dc.Scene([dc.Cloth.grid(4, 4)], [floor]), 0.01)
@@ -83,7 +85,13 @@ def test_a_batch_runs_on_the_threads_that_there_are():
         env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
     )
     assert result.returncode == 0, result.stderr
-    assert result.stdout.splitlines() == ["no threads", "[5]", "environment 1", "True True"]
+    assert result.stdout.splitlines() == [
+        "no threads",
+        "[5]",
+        "environment 1",
+        "[(0, 0), (0, 1), (0, 2)]",
+        "True True",
+    ]
 
 
 class PressedError(Exception):

@@ -14,6 +14,7 @@ import torch
 from parallel_scenes import batch, differing, simulator, step
 
 SIZES = (12, 16, 24)
+LARGE = 48
 REPEATS = {12: 4, 16: 2, 24: 1}
 SLOW = pytest.param(10, marks=pytest.mark.slow)  # times as often
 ENVIRONMENTS = 4
@@ -87,6 +88,19 @@ def test_an_environment_has_the_same_bits_alone_and_in_a_batch(serial, n):
     for i, after in enumerate(alone):
         assert torch.equal(after.positions, expected[0][i])
         assert torch.equal(after.body_forces, expected[2][i])
+
+
+@pytest.mark.parametrize("scheme", ["coupled", "split"])
+def test_threads_that_share_one_environment_change_no_bit(scheme):
+    # As large as it takes: see tests/linalg/test_shared_work.py.
+    sim, state = simulator(LARGE, scheme, False), batch(LARGE, 1, scheme=scheme, folded=False)
+    with threads(1):
+        after, expected = step(sim, state)
+    assert (after.report.contact_count > 100).all()
+    for count in (2, 3, 2, 3):
+        with threads(count):
+            _, values = step(sim, state)
+        assert differing(values, expected) == []
 
 
 @pytest.mark.parametrize("often", [1, SLOW])

@@ -4,12 +4,15 @@
 #include <stdexcept>
 #include <string>
 #include <thread>
+#include <utility>
 #include <vector>
 
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/vector.h>
 
 #include "bind/environments.h"
 #include "bind/kernels/kernels.h"
+#include "common/team.h"
 
 namespace diffcloth::bind {
 namespace {
@@ -59,9 +62,45 @@ std::vector<int> run_environments(int count,
   return counts;
 }
 
+/// Works as a team does them: which member did each, and in which order they began.
+///
+/// @param before  for each work those that it waits for, of lower indices
+std::vector<std::pair<int, int>> run_team(const std::vector<std::vector<int>>& before,
+                                          int threads,
+                                          double seconds,
+                                          int repeats) {
+  const nb::gil_scoped_release nogil;
+  std::vector<std::pair<int, int>> taken(before.size());
+  Team team(threads);
+  for (int k = 0; k < repeats; ++k) {
+    std::vector<char> ended(before.size(), 0);
+    std::atomic<int> begun{0};
+    std::atomic<bool> early{false};
+    const auto ready = [&](Index i, const Team::Done& done) {
+      return std::ranges::all_of(before[i], [&](int other) { return done[other] != 0; });
+    };
+    const auto body = [&](Index i, int member) {
+      taken[i] = {member, begun.fetch_add(1)};
+      // Not atomic: that what comes before has ended must be known from the team alone.
+      for (const int other : before[i]) early = early || ended[other] == 0;
+      const auto end = Clock::now() + std::chrono::duration<double>(seconds);
+      while (Clock::now() < end) rest();
+      ended[i] = 1;
+    };
+    team.run(static_cast<Index>(before.size()), ready, body);
+    if (early) throw std::logic_error("a work began before one that it waits for had ended");
+    if (std::ranges::count(ended, 1) != std::ssize(before)) {
+      throw std::logic_error("run() came back before all had ended");
+    }
+  }
+  return taken;
+}
+
 }  // namespace
 
 void common_kernels(nb::module_& m) {
+  m.def("run_team", &run_team, "before"_a, "threads"_a, "seconds"_a = 0.0, "repeats"_a = 1,
+        "Run works on a team; returns the member that did each, and its turn.");
   m.def("run_environments", &run_environments, "count"_a, "threads"_a, "seconds"_a,
         "failing"_a = std::vector<int>{},
         "Run bodies that wait; returns how many each thread took, the caller's first.");

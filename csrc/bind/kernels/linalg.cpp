@@ -108,7 +108,9 @@ class Factor {
     return result;
   }
 
-  void solve(const Vectors& b, const MutableVectors& x) const {
+  void solve(const Vectors& b,
+             const MutableVectors& x,
+             linalg::CholeskyWorkspace& workspace) const {
     if (b.shape(0) != x.shape(0) || b.shape(1) != vertices_ || x.shape(1) != vertices_) {
       throw std::invalid_argument("Factor: `b` and `x` must be [count, vertices, 3]");
     }
@@ -119,7 +121,7 @@ class Factor {
       to.push_back(x.data() + 3 * vertices_ * r);
     }
     const nb::gil_scoped_release nogil;
-    factor_.solve(from, to);
+    factor_.solve(from, to, workspace);
   }
 
   std::size_t bytes() const { return factor_.bytes(); }
@@ -158,7 +160,7 @@ void linalg_kernels(nb::module_& m) {
     return names;
   });
   nb::class_<linalg::CholeskyWorkspace>(m, "CholeskyWorkspace")
-      .def(nb::init<>())
+      .def(nb::init<int>(), "threads"_a = 1)
       .def("bytes", &linalg::CholeskyWorkspace::bytes);
   nb::class_<Analysis>(m, "CholeskyAnalysis")
       .def(nb::init<Index, const Pairs&, const Flags&, const std::string&, const std::string&,
@@ -175,7 +177,7 @@ void linalg_kernels(nb::module_& m) {
       .def(nb::init<const Analysis&>(), "analysis"_a)
       .def("compute", &Factor::compute, "blocks"_a.noconvert(), "workspace"_a)
       .def("profile", &Factor::profile, "blocks"_a.noconvert(), "workspace"_a, "repeats"_a)
-      .def("solve", &Factor::solve, "b"_a.noconvert(), "x"_a.noconvert())
+      .def("solve", &Factor::solve, "b"_a.noconvert(), "x"_a.noconvert(), "workspace"_a)
       .def("bytes", &Factor::bytes);
 }
 

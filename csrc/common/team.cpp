@@ -1,0 +1,84 @@
+#include "common/team.h"
+
+#include <cstddef>
+#include <system_error>
+
+namespace diffcloth {
+
+Team::~Team() {
+  {
+    const std::lock_guard lock(mutex_);
+    ends_ = true;
+  }
+  changed_.notify_all();
+  helpers_.clear();  // joined before anything that they use is gone
+}
+
+void Team::run(Index count, const Ready& ready, const Body& body) {
+  if (size_ == 1) {
+    for (Index i = 0; i < count; ++i) body(i, 0);
+    return;
+  }
+  start();
+  std::unique_lock lock(mutex_);
+  taken_.assign(static_cast<std::size_t>(count), 0);
+  done_.assign(static_cast<std::size_t>(count), 0);
+  ready_ = &ready;
+  body_ = &body;
+  first_ = 0;
+  left_ = count;
+  changed_.notify_all();
+  work(lock, 0);
+}
+
+void Team::start() {
+  if (started_) return;
+  started_ = true;
+  helpers_.reserve(static_cast<std::size_t>(size_ - 1));
+  for (int member = 1; member < size_; ++member) {
+    try {
+      helpers_.emplace_back([this, member] { help(member); });
+    } catch (const std::system_error&) {
+      break;  // the system has no more threads to give
+    }
+  }
+}
+
+void Team::help(int member) {
+  std::unique_lock lock(mutex_);
+  while (!ends_) {
+    work(lock, member);
+    changed_.wait(lock, [&] { return ends_ || find_ready() >= 0; });
+  }
+}
+
+/// Take part in a loop until all of it is done.
+void Team::work(std::unique_lock<std::mutex>& lock, int member) {
+  while (left_ > 0) {
+    const Index i = find_ready();
+    if (i < 0) {
+      changed_.wait(lock);
+      continue;
+    }
+    taken_[i] = 1;
+    lock.unlock();
+    (*body_)(i, member);
+    lock.lock();
+    done_[i] = 1;
+    --left_;
+    changed_.notify_all();
+  }
+}
+
+/// The lowest index that may begin, or -1.
+Index Team::find_ready() {
+  if (left_ == 0) return -1;
+  const auto count = static_cast<Index>(taken_.size());
+  while (first_ < count && taken_[first_] != 0) ++first_;
+  for (Index i = first_; i < count; ++i) {
+    if (taken_[i] == 0 && (*ready_)(i, done_)) return i;
+  }
+  return -1;
+}
+
+}  // namespace diffcloth
