@@ -13,13 +13,12 @@ Convergence conjugate_gradient(const BlockPattern& pattern,
                                int max_iterations,
                                std::vector<double>& x) {
   const std::size_t size = 3 * static_cast<std::size_t>(pattern.size());
-  x.assign(size, 0.0);
+  std::vector<double> z(size, 0.0);
+  z.swap(x);
   std::vector<double> r(b.begin(), b.begin() + static_cast<std::ptrdiff_t>(size));
   for (Index i = 0; i < pattern.size(); ++i) {
     if (fixed[i]) r[3 * i] = r[3 * i + 1] = r[3 * i + 2] = 0.0;
   }
-  std::vector<double> z(size, 0.0);
-  preconditioner.solve(r.data(), z.data());
   std::vector<double> p = z;
   std::vector<double> q(size);
   double rz = dot(r, z);
