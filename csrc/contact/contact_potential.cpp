@@ -98,7 +98,7 @@ void ContactPotential::add_hessian_product(const double* x, const double* z, dou
 void ContactPotential::add_held_product(const double* x, const double* z, double* y) const {
   for (const Contact& k : contacts_) {
     if (!model_.is_held(k.pair)) continue;
-    add_stencil_product(k.pair.vertices, model_.hessian(k, x, Curvature::kExact), z, y);
+    add_stencil_product(k.pair.vertices, all_blocks(model_.hessian(k, x, Curvature::kExact)), z, y);
   }
 }
 
@@ -108,7 +108,7 @@ void ContactPotential::add_left_out_product(const double* x,
                                             double* y) const {
   for (const Contact& k : contacts_) {
     if (!moves(k.pair.vertices, d)) continue;
-    add_stencil_product(k.pair.vertices, model_.hessian(k, x, curvature), d, y);
+    add_stencil_product(k.pair.vertices, all_blocks(model_.hessian(k, x, curvature)), d, y);
   }
 }
 
@@ -133,7 +133,8 @@ void FrictionPotential::add_hessian(const double* x,
 void FrictionPotential::add_held_product(const double* x, const double* z, double* y) const {
   for (const FrictionSet::Entry& k : set_.entries()) {
     if (!set_.model().is_held(k.lag.pair)) continue;
-    add_stencil_product(k.lag.pair.vertices, set_.hessian(k, x_start_, x, Curvature::kExact), z, y);
+    add_stencil_product(k.lag.pair.vertices,
+                        all_blocks(set_.hessian(k, x_start_, x, Curvature::kExact)), z, y);
   }
 }
 
@@ -143,7 +144,8 @@ void FrictionPotential::add_left_out_product(const double* x,
                                              double* y) const {
   for (const FrictionSet::Entry& k : set_.entries()) {
     if (!moves(k.lag.pair.vertices, d)) continue;
-    add_stencil_product(k.lag.pair.vertices, set_.hessian(k, x_start_, x, curvature), d, y);
+    add_stencil_product(k.lag.pair.vertices, all_blocks(set_.hessian(k, x_start_, x, curvature)), d,
+                        y);
   }
 }
 

@@ -304,9 +304,9 @@ namespace {
 //
 // with p_k = c (x) s_k orthogonal to q_k = c'_k (x) n. Each k is a 2x2 form with one positive
 // eigenvalue. Without the second line a contact pressed hard slides until it is blocked.
-Mat12 positive_hessian(const Closest& k, double b1, double b2) {
-  const Vec12 gradient = distance_sq_gradient(k);
-  Mat12 h = std::max(b2 + b1 / (2.0 * k.d_sq), 0.0) * gradient * gradient.transpose();
+template <class Add>
+void visit_positive_part(const Closest& k, double b1, double b2, Add&& add) {
+  add(std::max(b2 + b1 / (2.0 * k.d_sq), 0.0), distance_sq_gradient(k));
   const double d = std::sqrt(k.d_sq);
   const Vec3 n = k.t / d;
   const double p_sq = k.c.squaredNorm();
@@ -333,30 +333,48 @@ Mat12 positive_hessian(const Closest& k, double b1, double b2) {
     for (int i = 0; i < 4; ++i) {
       v.segment<3>(3 * i) = along_p * k.c[i] * s.col(a) + along_q * c(i, a) * n;
     }
-    h.noalias() += (2.0 * std::abs(b1) * d * eigenvalue) * v * v.transpose();
+    add(2.0 * std::abs(b1) * d * eigenvalue, v);
   }
-  return h;
 }
 
 }  // namespace
 
-Mat12 ContactModel::hessian(const Contact& k, const double* x, Curvature curvature) const {
+Mat3 ContactHessian::operator()(int p, int q) const {
+  Mat3 h = Mat3::Zero();
+  for (int k = 0; k < count_; ++k) {
+    h += (w_[k] * u_[k].segment<3>(3 * p)) * u_[k].segment<3>(3 * q).transpose();
+  }
+  if (distance_sq_) h += b1_ * (*distance_sq_)(p, q);
+  if (rest_) h += rest_->block<3, 3>(3 * p, 3 * q);
+  return scale_ * h;
+}
+
+ContactHessian ContactModel::hessian(const Contact& k, const double* x, Curvature curvature) const {
+  ContactHessian h;
+  const auto add = [&h](double w, const Vec12& u) {
+    h.w_[h.count_] = w;
+    h.u_[h.count_++] = u;
+  };
   const double scale = parameters_.kappa * k.weight;
   const double b1 = k.barrier.b1;
   const double b2 = k.barrier.b2;
   if (curvature == Curvature::kPositive) {
-    if (scale <= 0.0) return Mat12::Zero();
-    return scale * k.mollifier * positive_hessian(k.closest, b1, b2);
+    if (scale <= 0.0) return h;
+    h.scale_ = scale * k.mollifier;
+    visit_positive_part(k.closest, b1, b2, add);
+    return h;
   }
+  h.scale_ = scale;
+  h.b1_ = k.mollifier * b1;
+  h.distance_sq_.emplace(k.closest);
   const Vec12 d_gradient = distance_sq_gradient(k.closest);
-  Mat12 h = (k.mollifier * b2) * d_gradient * d_gradient.transpose() +
-            (k.mollifier * b1) * distance_sq_hessian(k.closest);
+  add(k.mollifier * b2, d_gradient);
   if (k.mollified) {
     const Mollifier m = mollifier_derivatives(corners(k.pair.vertices, x), k.threshold);
     const Mat12 cross = m.gradient * d_gradient.transpose();
-    h += k.barrier.b * m.hessian + b1 * (cross + cross.transpose());
+    h.rest_ = k.barrier.b * m.hessian + b1 * (cross + cross.transpose());
   }
-  return scale * h;
+  return h;
 }
 
 bool ContactModel::is_held(const Candidate& pair) const {
@@ -369,7 +387,8 @@ void ContactModel::add_hessian_product(const std::vector<Contact>& contacts,
                                        const double* z,
                                        double* y) const {
   for (const Contact& k : contacts) {
-    scatter(k.pair.vertices, hessian(k, x, Curvature::kExact) * stacked(k.pair.vertices, z), y);
+    const Mat12 h = all_blocks(hessian(k, x, Curvature::kExact));
+    scatter(k.pair.vertices, h * stacked(k.pair.vertices, z), y);
   }
 }
 

@@ -1,5 +1,7 @@
 #pragma once
 
+#include <array>
+#include <optional>
 #include <span>
 #include <tuple>
 #include <vector>
@@ -76,6 +78,27 @@ void for_each_energy(const Near& p, const Near& q, Visit&& visit) {
 /// Energy of q minus that of p, pair by pair [J].
 double energy_change(const Near& p, const Near& q);
 
+/// The Hessian of one contact by its 3x3 blocks:
+///
+///   scale (sum_k w_k u_k u_k^T + b1 hess D + rest),
+///
+/// the exact one with u_0 = grad D, the positive one without hess D. The rest is that of mollifiers.
+class ContactHessian {
+ public:
+  Mat3 operator()(int p, int q) const;
+
+ private:
+  friend class ContactModel;
+
+  double scale_ = 0.0;
+  int count_ = 0;  ///< of the u_k
+  std::array<double, 3> w_;
+  std::array<Vec12, 3> u_;
+  double b1_ = 0.0;
+  std::optional<DistanceSqHessian> distance_sq_;
+  std::optional<Mat12> rest_;
+};
+
 /// Barrier contacts of one configuration: sum of kappa w m b(D; xi, d_hat)  [J].
 ///
 /// Between cloths the sum is over all pairs of a vertex p and a face, w = A_p / 4, and of two edges,
@@ -130,9 +153,9 @@ class ContactModel {
   /// g += grad B.
   void add_gradient(const std::vector<Contact>& contacts, const double* x, double* g) const;
 
-  /// 12x12 Hessian of one contact; kPositive is its positive part, up to the mollifier's terms, and
-  /// zero if its weight is negative.
-  Mat12 hessian(const Contact& contact, const double* x, Curvature curvature) const;
+  /// Hessian of one contact; kPositive is its positive part, up to the mollifier's terms, and zero if
+  /// its weight is negative.
+  ContactHessian hessian(const Contact& contact, const double* x, Curvature curvature) const;
 
   /// y += H z over all vertices, exact.
   void add_hessian_product(const std::vector<Contact>& contacts,

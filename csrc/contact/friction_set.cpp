@@ -57,23 +57,18 @@ void FrictionSet::add_gradient(const double* x_start, const double* x, double* g
   }
 }
 
-Mat12 FrictionSet::hessian(const Entry& k,
-                           const double* x_start,
-                           const double* x,
-                           Curvature curvature) const {
-  if (curvature == Curvature::kPositive && k.lambda < 0.0) return Mat12::Zero();
+FrictionSet::Hessian FrictionSet::hessian(const Entry& k,
+                                          const double* x_start,
+                                          const double* x,
+                                          Curvature curvature) const {
+  const Vec4& c = k.lag.closest.c;
+  if (curvature == Curvature::kPositive && k.lambda < 0.0) return {.c = c, .core = Mat3::Zero()};
   const Vec3 w = tangential(displacement(k, x_start, x), k.n);
   const FrictionLaw law = friction_law(w.norm(), model_->parameters().slip);
   const Mat3 projector = Mat3::Identity() - k.n * k.n.transpose();
   const double along = curvature == Curvature::kExact ? law.f2 : 0.0;
-  const Mat3 core = (k.mu * k.lambda) * (law.f1_over_y * projector + along * w * w.transpose());
-  Mat12 h;
-  for (int i = 0; i < 4; ++i) {
-    for (int j = 0; j < 4; ++j) {
-      h.block<3, 3>(3 * i, 3 * j) = (k.lag.closest.c[i] * k.lag.closest.c[j]) * core;
-    }
-  }
-  return h;
+  return {.c = c,
+          .core = (k.mu * k.lambda) * (law.f1_over_y * projector + along * w * w.transpose())};
 }
 
 void FrictionSet::add_hessian_product(const double* x_start,
@@ -81,8 +76,8 @@ void FrictionSet::add_hessian_product(const double* x_start,
                                       const double* z,
                                       double* y) const {
   for (const Entry& k : entries_) {
-    const Vec12 product =
-        hessian(k, x_start, x, Curvature::kExact) * stacked(k.lag.pair.vertices, z);
+    const Mat12 h = all_blocks(hessian(k, x_start, x, Curvature::kExact));
+    const Vec12 product = h * stacked(k.lag.pair.vertices, z);
     for (int i = 0; i < 4; ++i) {
       Eigen::Map<Vec3>(y + 3 * k.lag.pair.vertices[i]) += product.segment<3>(3 * i);
     }

@@ -65,22 +65,6 @@ BlockMatrix::BlockMatrix(std::shared_ptr<const MergedPattern> merged,
       attachments_(attachments),
       blocks_(9 * static_cast<std::size_t>(merged_->pattern.block_count()), 0.0) {}
 
-void BlockMatrix::add_stencil(const std::array<Index, 4>& points, const Mat12& h) {
-  if (std::ranges::any_of(points, [&](Index v) { return is_attached(v); })) {
-    add_attached(points, h);
-    return;
-  }
-  for (int p = 0; p < 4; ++p) {
-    const Index i = points[p];
-    if (!has(i)) continue;
-    for (int q = 0; q < 4; ++q) {
-      const Index j = points[q];
-      if (i < j || !has(j)) continue;
-      add_block(i, j, h.block<3, 3>(3 * p, 3 * q));
-    }
-  }
-}
-
 void BlockMatrix::add_attached(const std::array<Index, 4>& points, const Mat12& h) {
   motions_.clear();
   const auto find = [&](Index r) -> Motion& {

@@ -173,20 +173,14 @@ Vec12 distance_sq_gradient(const Closest& pair) {
   return gradient;
 }
 
-Mat12 distance_sq_hessian(const Closest& pair) {
-  Mat12 hessian = Mat12::Zero();
-  if (pair.parameter_count > 0) {
-    const Eigen::Matrix<double, 12, 2> G = parameter_coupling(pair);
-    const Eigen::Matrix<double, 12, 2> GM = -2 * G * pair.M_inv;
-    hessian = GM.lazyProduct(G.transpose());  // unrolled, where a product would call gemm
-  }
-  for (int i = 0; i < 4; ++i) {
-    for (int j = 0; j < 4; ++j) {
-      hessian.block<3, 3>(3 * i, 3 * j).diagonal().array() += 2 * pair.c[i] * pair.c[j];
-    }
-  }
-  return hessian;
+DistanceSqHessian::DistanceSqHessian(const Closest& pair)
+    : c_(pair.c), curved_(pair.parameter_count > 0) {
+  if (!curved_) return;
+  G_ = parameter_coupling(pair);
+  GM_ = -2 * G_ * pair.M_inv;
 }
+
+Mat12 distance_sq_hessian(const Closest& pair) { return all_blocks(DistanceSqHessian(pair)); }
 
 Eigen::Matrix<double, 2, 12> beta_jacobian(const Closest& pair) {
   return -pair.M_inv * parameter_coupling(pair).transpose();
