@@ -14,8 +14,8 @@ namespace diffcloth::linalg {
 /// Pairs (row, column) of a lower triangle, row > column.
 using Couplings = std::vector<std::pair<Index, Index>>;
 
-/// Sort couplings by (column, row), each once.
-void sort_couplings(Couplings& pairs);
+/// The couplings that a pattern lacks, by (column, row), each once.
+Couplings beyond(const BlockPattern& base, const Couplings& pairs);
 
 /// A base pattern enlarged by further couplings, and where the slots of the base went.
 struct MergedPattern {
