@@ -1,8 +1,16 @@
 #include "linalg/conjugate_gradient.h"
 
+#include <cmath>
+
 #include "linalg/block_matrix.h"
 
 namespace diffcloth::linalg {
+namespace {
+
+/// Residuals seldom shrink more in an iteration: solves in which they would have to are given up.
+constexpr double kFastest = 2.5;
+
+}  // namespace
 
 Convergence conjugate_gradient(const BlockPattern& pattern,
                                const double* blocks,
@@ -41,6 +49,7 @@ Convergence conjugate_gradient(const BlockPattern& pattern,
     preconditioner.solve(r.data(), z.data());
     const double next = dot(r, z);
     if (next <= goal) return Convergence::kConverged;
+    if (next > goal * std::pow(kFastest * kFastest, max_iterations - 1 - iteration)) break;
     const double beta = next / rz;
     rz = next;
     for (std::size_t k = 0; k < size; ++k) p[k] = z[k] + beta * p[k];
