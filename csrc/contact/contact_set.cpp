@@ -340,39 +340,43 @@ void visit_positive_part(const Closest& k, double b1, double b2, Add&& add) {
 }  // namespace
 
 Mat3 ContactHessian::operator()(int p, int q) const {
-  Mat3 h = Mat3::Zero();
+  Mat3 h = (along_ * c_[p] * c_[q]) * Mat3::Identity();
   for (int k = 0; k < count_; ++k) {
-    h += (w_[k] * u_[k].segment<3>(3 * p)) * u_[k].segment<3>(3 * q).transpose();
+    h += left_[k].segment<3>(3 * p) * right_[k].segment<3>(3 * q).transpose();
   }
-  if (distance_sq_) h += b1_ * (*distance_sq_)(p, q);
   if (rest_) h += rest_->block<3, 3>(3 * p, 3 * q);
-  return scale_ * h;
+  return h;
+}
+
+void ContactHessian::add(const Vec12& left, const Vec12& right) {
+  left_[count_] = left;
+  right_[count_++] = right;
 }
 
 ContactHessian ContactModel::hessian(const Contact& k, const double* x, Curvature curvature) const {
   ContactHessian h;
-  const auto add = [&h](double w, const Vec12& u) {
-    h.w_[h.count_] = w;
-    h.u_[h.count_++] = u;
-  };
   const double scale = parameters_.kappa * k.weight;
-  const double b1 = k.barrier.b1;
-  const double b2 = k.barrier.b2;
+  const double b1 = scale * k.mollifier * k.barrier.b1;
+  const double b2 = scale * k.mollifier * k.barrier.b2;
   if (curvature == Curvature::kPositive) {
     if (scale <= 0.0) return h;
-    h.scale_ = scale * k.mollifier;
-    visit_positive_part(k.closest, b1, b2, add);
+    visit_positive_part(k.closest, b1, b2, [&](double w, const Vec12& u) { h.add(w * u, u); });
     return h;
   }
-  h.scale_ = scale;
-  h.b1_ = k.mollifier * b1;
-  h.distance_sq_.emplace(k.closest);
   const Vec12 d_gradient = distance_sq_gradient(k.closest);
-  add(k.mollifier * b2, d_gradient);
+  h.add(b2 * d_gradient, d_gradient);
+  h.c_ = k.closest.c;
+  h.along_ = 2.0 * b1;
+  if (k.closest.parameter_count > 0) {
+    const Sliding part = sliding(k.closest);
+    for (int a = 0; a < k.closest.parameter_count; ++a) {
+      h.add(b1 * part.left.col(a), part.right.col(a));
+    }
+  }
   if (k.mollified) {
     const Mollifier m = mollifier_derivatives(corners(k.pair.vertices, x), k.threshold);
     const Mat12 cross = m.gradient * d_gradient.transpose();
-    h.rest_ = k.barrier.b * m.hessian + b1 * (cross + cross.transpose());
+    h.rest_ = scale * (k.barrier.b * m.hessian + k.barrier.b1 * (cross + cross.transpose()));
   }
   return h;
 }

@@ -78,24 +78,21 @@ void for_each_energy(const Near& p, const Near& q, Visit&& visit) {
 /// Energy of q minus that of p, pair by pair [J].
 double energy_change(const Near& p, const Near& q);
 
-/// The Hessian of one contact by its 3x3 blocks:
-///
-///   scale (sum_k w_k u_k u_k^T + b1 hess D + rest),
-///
-/// the exact one with u_0 = grad D, the positive one without hess D. The rest is that of mollifiers.
+/// The Hessian of one contact by its 3x3 blocks:  sum_k left_k right_k^T + c c^T (x) along I + rest,  the
+/// rest being that of mollifiers.
 class ContactHessian {
  public:
   Mat3 operator()(int p, int q) const;
 
  private:
   friend class ContactModel;
+  void add(const Vec12& left, const Vec12& right);
 
-  double scale_ = 0.0;
-  int count_ = 0;  ///< of the u_k
-  std::array<double, 3> w_;
-  std::array<Vec12, 3> u_;
-  double b1_ = 0.0;
-  std::optional<DistanceSqHessian> distance_sq_;
+  int count_ = 0;  ///< of the products
+  std::array<Vec12, 3> left_;
+  std::array<Vec12, 3> right_;
+  Vec4 c_ = Vec4::Zero();
+  double along_ = 0.0;
   std::optional<Mat12> rest_;
 };
 

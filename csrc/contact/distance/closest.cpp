@@ -173,14 +173,24 @@ Vec12 distance_sq_gradient(const Closest& pair) {
   return gradient;
 }
 
-DistanceSqHessian::DistanceSqHessian(const Closest& pair)
-    : c_(pair.c), curved_(pair.parameter_count > 0) {
-  if (!curved_) return;
-  G_ = parameter_coupling(pair);
-  GM_ = -2 * G_ * pair.M_inv;
+Sliding sliding(const Closest& pair) {
+  const Eigen::Matrix<double, 12, 2> G = parameter_coupling(pair);
+  return {.left = -2 * G * pair.M_inv, .right = G};
 }
 
-Mat12 distance_sq_hessian(const Closest& pair) { return all_blocks(DistanceSqHessian(pair)); }
+Mat12 distance_sq_hessian(const Closest& pair) {
+  Mat12 hessian = Mat12::Zero();
+  if (pair.parameter_count > 0) {
+    const Sliding part = sliding(pair);
+    hessian = part.left.lazyProduct(part.right.transpose());  // unrolled, a product would call gemm
+  }
+  for (int i = 0; i < 4; ++i) {
+    for (int j = 0; j < 4; ++j) {
+      hessian.block<3, 3>(3 * i, 3 * j).diagonal().array() += 2 * pair.c[i] * pair.c[j];
+    }
+  }
+  return hessian;
+}
 
 Eigen::Matrix<double, 2, 12> beta_jacobian(const Closest& pair) {
   return -pair.M_inv * parameter_coupling(pair).transpose();

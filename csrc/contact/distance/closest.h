@@ -45,25 +45,13 @@ Vec12 distance_sq_gradient(const Closest& pair);
 /// Hessian of the squared distance [-]; exact, hence indefinite.
 Mat12 distance_sq_hessian(const Closest& pair);
 
-/// The same by its 3x3 blocks.
-class DistanceSqHessian {
- public:
-  explicit DistanceSqHessian(const Closest& pair);
-
-  Mat3 operator()(int p, int q) const {
-    Mat3 block =
-        curved_ ? Mat3(GM_.middleRows<3>(3 * p).lazyProduct(G_.middleRows<3>(3 * q).transpose()))
-                : Mat3(Mat3::Zero());
-    block.diagonal().array() += 2 * c_[p] * c_[q];
-    return block;
-  }
-
- private:
-  Vec4 c_;
-  bool curved_;                      ///< whether the nearest points slide along the primitives
-  Eigen::Matrix<double, 12, 2> G_;   ///< d(s . t)/dx
-  Eigen::Matrix<double, 12, 2> GM_;  ///< -2 G M^-1
+/// The part of it that comes from how the nearest points slide, left right^T = -2 G M^-1 G^T; the other one
+/// is 2 c c^T (x) I. Columns beyond parameter_count are zero.
+struct Sliding {
+  Eigen::Matrix<double, 12, 2> left;
+  Eigen::Matrix<double, 12, 2> right;
 };
+Sliding sliding(const Closest& pair);
 
 /// Change of the parameters with the corners, dbeta/dx [1/m]; rows beyond parameter_count are zero.
 Eigen::Matrix<double, 2, 12> beta_jacobian(const Closest& pair);
