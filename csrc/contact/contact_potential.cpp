@@ -22,7 +22,8 @@ bool moves(const Stencil& v, const double* d) {
   return std::ranges::any_of(v, [&](Index i) { return !row(d, i).isZero(0.0); });
 }
 
-void add_stencil_product(const Stencil& v, const Mat12& h, const double* d, double* y) {
+template <class Hessian>
+void add_stencil_product(const Stencil& v, const Hessian& h, const double* d, double* y) {
   const Vec12 product = h * stacked(v, d);
   for (int i = 0; i < 4; ++i) Eigen::Map<Vec3>(y + 3 * v[i]) += product.segment<3>(3 * i);
 }
@@ -98,7 +99,7 @@ void ContactPotential::add_hessian_product(const double* x, const double* z, dou
 void ContactPotential::add_held_product(const double* x, const double* z, double* y) const {
   for (const Contact& k : contacts_) {
     if (!model_.is_held(k.pair)) continue;
-    add_stencil_product(k.pair.vertices, all_blocks(model_.hessian(k, x, Curvature::kExact)), z, y);
+    add_stencil_product(k.pair.vertices, model_.hessian(k, x, Curvature::kExact), z, y);
   }
 }
 
@@ -108,7 +109,7 @@ void ContactPotential::add_left_out_product(const double* x,
                                             double* y) const {
   for (const Contact& k : contacts_) {
     if (!moves(k.pair.vertices, d)) continue;
-    add_stencil_product(k.pair.vertices, all_blocks(model_.hessian(k, x, curvature)), d, y);
+    add_stencil_product(k.pair.vertices, model_.hessian(k, x, curvature), d, y);
   }
 }
 
@@ -133,8 +134,7 @@ void FrictionPotential::add_hessian(const double* x,
 void FrictionPotential::add_held_product(const double* x, const double* z, double* y) const {
   for (const FrictionSet::Entry& k : set_.entries()) {
     if (!set_.model().is_held(k.lag.pair)) continue;
-    add_stencil_product(k.lag.pair.vertices,
-                        all_blocks(set_.hessian(k, x_start_, x, Curvature::kExact)), z, y);
+    add_stencil_product(k.lag.pair.vertices, set_.hessian(k, x_start_, x, Curvature::kExact), z, y);
   }
 }
 
@@ -144,8 +144,7 @@ void FrictionPotential::add_left_out_product(const double* x,
                                              double* y) const {
   for (const FrictionSet::Entry& k : set_.entries()) {
     if (!moves(k.lag.pair.vertices, d)) continue;
-    add_stencil_product(k.lag.pair.vertices, all_blocks(set_.hessian(k, x_start_, x, curvature)), d,
-                        y);
+    add_stencil_product(k.lag.pair.vertices, set_.hessian(k, x_start_, x, curvature), d, y);
   }
 }
 

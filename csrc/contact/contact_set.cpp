@@ -348,6 +348,18 @@ Mat3 ContactHessian::operator()(int p, int q) const {
   return h;
 }
 
+Vec12 ContactHessian::operator*(const Vec12& z) const {
+  Vec12 y = Vec12::Zero();
+  if (along_ != 0.0) {
+    Vec3 sum = Vec3::Zero();
+    for (int q = 0; q < 4; ++q) sum += c_[q] * z.segment<3>(3 * q);
+    for (int p = 0; p < 4; ++p) y.segment<3>(3 * p) = (along_ * c_[p]) * sum;
+  }
+  for (int k = 0; k < count_; ++k) y += right_[k].dot(z) * left_[k];
+  if (rest_) y += rest_->lazyProduct(z);
+  return y;
+}
+
 void ContactHessian::add(const Vec12& left, const Vec12& right) {
   left_[count_] = left;
   right_[count_++] = right;
@@ -391,8 +403,7 @@ void ContactModel::add_hessian_product(const std::vector<Contact>& contacts,
                                        const double* z,
                                        double* y) const {
   for (const Contact& k : contacts) {
-    const Mat12 h = all_blocks(hessian(k, x, Curvature::kExact));
-    scatter(k.pair.vertices, h * stacked(k.pair.vertices, z), y);
+    scatter(k.pair.vertices, hessian(k, x, Curvature::kExact) * stacked(k.pair.vertices, z), y);
   }
 }
 

@@ -83,6 +83,7 @@ double energy_change(const Near& p, const Near& q);
 class ContactHessian {
  public:
   Mat3 operator()(int p, int q) const;
+  Vec12 operator*(const Vec12& z) const;
 
  private:
   friend class ContactModel;

@@ -71,13 +71,22 @@ FrictionSet::Hessian FrictionSet::hessian(const Entry& k,
           .core = (k.mu * k.lambda) * (law.f1_over_y * projector + along * w * w.transpose())};
 }
 
+Vec12 FrictionSet::Hessian::operator*(const Vec12& z) const {
+  Vec3 sum = Vec3::Zero();
+  for (int q = 0; q < 4; ++q) sum += c[q] * z.segment<3>(3 * q);
+  const Vec3 force = core * sum;
+  Vec12 y;
+  for (int p = 0; p < 4; ++p) y.segment<3>(3 * p) = c[p] * force;
+  return y;
+}
+
 void FrictionSet::add_hessian_product(const double* x_start,
                                       const double* x,
                                       const double* z,
                                       double* y) const {
   for (const Entry& k : entries_) {
-    const Mat12 h = all_blocks(hessian(k, x_start, x, Curvature::kExact));
-    const Vec12 product = h * stacked(k.lag.pair.vertices, z);
+    const Vec12 product =
+        hessian(k, x_start, x, Curvature::kExact) * stacked(k.lag.pair.vertices, z);
     for (int i = 0; i < 4; ++i) {
       Eigen::Map<Vec3>(y + 3 * k.lag.pair.vertices[i]) += product.segment<3>(3 * i);
     }

@@ -39,6 +39,7 @@ class FrictionSet {
     Mat3 core;
 
     Mat3 operator()(int p, int q) const { return (c[p] * c[q]) * core; }
+    Vec12 operator*(const Vec12& z) const;
   };
 
   /// Hessian of one entry, of the sign of lambda. kPositive is the quadratic majorant (f1/|w|) P,
