@@ -25,4 +25,14 @@ using ConstRows3 = Eigen::Map<const Rows3>;
 /// Vertex i of an array of rows, as a column vector.
 inline Vec3 row(const double* rows, Index i) { return Eigen::Map<const Vec3>(rows + 3 * i); }
 
+/// The 12x12 matrix of four points from its 3x3 blocks.
+template <class Block>
+Mat12 all_blocks(const Block& block) {
+  Mat12 h;
+  for (int p = 0; p < 4; ++p) {
+    for (int q = 0; q < 4; ++q) h.block<3, 3>(3 * p, 3 * q) = block(p, q);
+  }
+  return h;
+}
+
 }  // namespace diffcloth

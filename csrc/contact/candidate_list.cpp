@@ -16,7 +16,9 @@ constexpr double kThinnest = 0.5;
 constexpr double kThickest = 4.0;
 /// That of a near list is at most this share of it.
 constexpr double kNear = 1.0;
-/// A list is worn when a search beside it looks at one pair of leaves for so many of its pairs.
+/// A list is worn when the searches beside it have looked at one pair of leaves for so many of its pairs,
+/// which costs about as much as another one. Surfaces move on from where a step starts to where it ends: from a
+/// list that is made there, short motions are answered without a search.
 constexpr std::size_t kWorn = 4;
 /// Rounding of a distance, relative to the coordinates.
 constexpr double kRounding = 1e-14;
@@ -44,8 +46,12 @@ std::vector<Motion> motions(const CollisionMesh& mesh, const double* from, const
   for (Index v = 0; v < mesh.vertex_count; ++v) {
     Motion& motion = result[mesh.vertex_surface[v]];
     const Vec3 u = row(to, v) - row(from, v);
-    raise(motion.largest, u.norm());
-    raise(motion.around_mean, (u - motion.mean).norm());
+    raise(motion.largest, u.squaredNorm());
+    raise(motion.around_mean, (u - motion.mean).squaredNorm());
+  }
+  for (Motion& motion : result) {  // one root for all, which keeps their order
+    motion.largest = std::sqrt(motion.largest);
+    motion.around_mean = std::sqrt(motion.around_mean);
   }
   return result;
 }
@@ -96,7 +102,7 @@ void CandidateList::build(const double* x_t0,
   wide_.skin =
       std::max(kThinnest * smallest, std::min(kThickest * smallest, kAhead * 0.5 * approach));
   has_parts_ = false;
-  is_worn_ = false;
+  looked_at_ = 0;
   ++builds_;
   with_skin_.clear();
   for (const double value : reach_) with_skin_.push_back(value + wide_.skin);
@@ -179,20 +185,18 @@ void CandidateList::find_wide(const double* x_t0,
   if (!has_parts_) relative_search_.start(wide_.reference.data());
   has_parts_ = true;
   const auto middle = static_cast<std::ptrdiff_t>(out.size());
-  const std::size_t looked_at =
-      relative_search_.find({.reference = wide_.reference.data(),
-                             .x_t0 = x_t0,
-                             .x_t1 = x_t1,
-                             .u_t0 = u_t0_.data(),  // of cull()
-                             .u_t1 = u_t1_.data(),
-                             .reach = reach,
-                             .least = std::max(least, 0.0),
-                             .rounding = 2.0 * (rounding_ + kRounding * approach)},
-                            scratch, out);
+  looked_at_ += relative_search_.find({.reference = wide_.reference.data(),
+                                       .x_t0 = x_t0,
+                                       .x_t1 = x_t1,
+                                       .u_t0 = u_t0_.data(),  // of cull()
+                                       .u_t1 = u_t1_.data(),
+                                       .reach = reach,
+                                       .least = std::max(least, 0.0),
+                                       .rounding = 2.0 * (rounding_ + kRounding * approach)},
+                                      scratch, out);
   std::sort(out.begin() + middle, out.end());
   std::inplace_merge(out.begin(), out.begin() + middle, out.end());
   out.erase(std::unique(out.begin(), out.end()), out.end());
-  is_worn_ = kWorn * looked_at > wide_.pairs.size();
 }
 
 void CandidateList::find(const double* x_t0,
@@ -200,7 +204,7 @@ void CandidateList::find(const double* x_t0,
                          std::span<const double> reach,
                          BroadPhase::Scratch& scratch,
                          std::vector<Candidate>& out) {
-  if (is_worn_ || !std::ranges::equal(reach, reach_)) {
+  if (!std::ranges::equal(reach, reach_)) {
     wide_.reference.clear();
     near_.reference.clear();
   }
@@ -214,7 +218,8 @@ void CandidateList::find(const double* x_t0,
     broad_phase_->find(x_t0, x_t1, reach, scratch, out);
     return;
   }
-  if (wide_.reference.empty()) build(x_t0, x_t1, reach, scratch);
+  const bool is_worn = kWorn * looked_at_ > wide_.pairs.size();
+  if (wide_.reference.empty() || is_worn) build(x_t0, x_t1, reach, scratch);
   const double thickest = reach.empty() ? 0.0 : kNear * std::ranges::min(reach);
   if (!(approach + rounding_ <= 2.0 * std::min(thickest, wide_.skin))) {
     find_wide(x_t0, x_t1, reach, 0.0, scratch, out);

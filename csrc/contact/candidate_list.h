@@ -82,7 +82,7 @@ class CandidateList {
   Kept wide_;
   Kept near_;
   bool has_parts_ = false;        // relative_search_ has started at the reference of wide_
-  bool is_worn_ = false;          // wide_ is better made anew than used again
+  std::size_t looked_at_ = 0;     // by searches beside wide_
   std::vector<double> approach_;  // [surfaces^2] scratch of measure_approach()
   std::vector<double> u_t0_;      // scratch of cull(): displacements since the reference
   std::vector<double> u_t1_;

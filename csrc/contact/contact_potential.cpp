@@ -22,7 +22,8 @@ bool moves(const Stencil& v, const double* d) {
   return std::ranges::any_of(v, [&](Index i) { return !row(d, i).isZero(0.0); });
 }
 
-void add_stencil_product(const Stencil& v, const Mat12& h, const double* d, double* y) {
+template <class Hessian>
+void add_stencil_product(const Stencil& v, const Hessian& h, const double* d, double* y) {
   const Vec12 product = h * stacked(v, d);
   for (int i = 0; i < 4; ++i) Eigen::Map<Vec3>(y + 3 * v[i]) += product.segment<3>(3 * i);
 }

@@ -304,9 +304,9 @@ namespace {
 //
 // with p_k = c (x) s_k orthogonal to q_k = c'_k (x) n. Each k is a 2x2 form with one positive
 // eigenvalue. Without the second line a contact pressed hard slides until it is blocked.
-Mat12 positive_hessian(const Closest& k, double b1, double b2) {
-  const Vec12 gradient = distance_sq_gradient(k);
-  Mat12 h = std::max(b2 + b1 / (2.0 * k.d_sq), 0.0) * gradient * gradient.transpose();
+template <class Add>
+void visit_positive_part(const Closest& k, double b1, double b2, Add&& add) {
+  add(std::max(b2 + b1 / (2.0 * k.d_sq), 0.0), distance_sq_gradient(k));
   const double d = std::sqrt(k.d_sq);
   const Vec3 n = k.t / d;
   const double p_sq = k.c.squaredNorm();
@@ -333,30 +333,64 @@ Mat12 positive_hessian(const Closest& k, double b1, double b2) {
     for (int i = 0; i < 4; ++i) {
       v.segment<3>(3 * i) = along_p * k.c[i] * s.col(a) + along_q * c(i, a) * n;
     }
-    h.noalias() += (2.0 * std::abs(b1) * d * eigenvalue) * v * v.transpose();
+    add(2.0 * std::abs(b1) * d * eigenvalue, v);
   }
-  return h;
 }
 
 }  // namespace
 
-Mat12 ContactModel::hessian(const Contact& k, const double* x, Curvature curvature) const {
+Mat3 ContactHessian::operator()(int p, int q) const {
+  Mat3 h = (along_ * c_[p] * c_[q]) * Mat3::Identity();
+  for (int k = 0; k < count_; ++k) {
+    h += left_[k].segment<3>(3 * p) * right_[k].segment<3>(3 * q).transpose();
+  }
+  if (rest_) h += rest_->block<3, 3>(3 * p, 3 * q);
+  return h;
+}
+
+Vec12 ContactHessian::operator*(const Vec12& z) const {
+  Vec12 y = Vec12::Zero();
+  if (along_ != 0.0) {
+    Vec3 sum = Vec3::Zero();
+    for (int q = 0; q < 4; ++q) sum += c_[q] * z.segment<3>(3 * q);
+    for (int p = 0; p < 4; ++p) y.segment<3>(3 * p) = (along_ * c_[p]) * sum;
+  }
+  for (int k = 0; k < count_; ++k) y += right_[k].dot(z) * left_[k];
+  if (rest_) y += rest_->lazyProduct(z);
+  return y;
+}
+
+void ContactHessian::add(const Vec12& left, const Vec12& right) {
+  left_[count_] = left;
+  right_[count_++] = right;
+}
+
+ContactHessian ContactModel::hessian(const Contact& k, const double* x, Curvature curvature) const {
+  ContactHessian h;
   const double scale = parameters_.kappa * k.weight;
-  const double b1 = k.barrier.b1;
-  const double b2 = k.barrier.b2;
+  const double b1 = scale * k.mollifier * k.barrier.b1;
+  const double b2 = scale * k.mollifier * k.barrier.b2;
   if (curvature == Curvature::kPositive) {
-    if (scale <= 0.0) return Mat12::Zero();
-    return scale * k.mollifier * positive_hessian(k.closest, b1, b2);
+    if (scale <= 0.0) return h;
+    visit_positive_part(k.closest, b1, b2, [&](double w, const Vec12& u) { h.add(w * u, u); });
+    return h;
   }
   const Vec12 d_gradient = distance_sq_gradient(k.closest);
-  Mat12 h = (k.mollifier * b2) * d_gradient * d_gradient.transpose() +
-            (k.mollifier * b1) * distance_sq_hessian(k.closest);
+  h.add(b2 * d_gradient, d_gradient);
+  h.c_ = k.closest.c;
+  h.along_ = 2.0 * b1;
+  if (k.closest.parameter_count > 0) {
+    const Sliding part = sliding(k.closest);
+    for (int a = 0; a < k.closest.parameter_count; ++a) {
+      h.add(b1 * part.left.col(a), part.right.col(a));
+    }
+  }
   if (k.mollified) {
     const Mollifier m = mollifier_derivatives(corners(k.pair.vertices, x), k.threshold);
     const Mat12 cross = m.gradient * d_gradient.transpose();
-    h += k.barrier.b * m.hessian + b1 * (cross + cross.transpose());
+    h.rest_ = scale * (k.barrier.b * m.hessian + k.barrier.b1 * (cross + cross.transpose()));
   }
-  return scale * h;
+  return h;
 }
 
 bool ContactModel::is_held(const Candidate& pair) const {

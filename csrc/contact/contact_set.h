@@ -1,5 +1,7 @@
 #pragma once
 
+#include <array>
+#include <optional>
 #include <span>
 #include <tuple>
 #include <vector>
@@ -76,6 +78,25 @@ void for_each_energy(const Near& p, const Near& q, Visit&& visit) {
 /// Energy of q minus that of p, pair by pair [J].
 double energy_change(const Near& p, const Near& q);
 
+/// The Hessian of one contact by its 3x3 blocks:  sum_k left_k right_k^T + c c^T (x) along I + rest,  the
+/// rest being that of mollifiers.
+class ContactHessian {
+ public:
+  Mat3 operator()(int p, int q) const;
+  Vec12 operator*(const Vec12& z) const;
+
+ private:
+  friend class ContactModel;
+  void add(const Vec12& left, const Vec12& right);
+
+  int count_ = 0;  ///< of the products
+  std::array<Vec12, 3> left_;
+  std::array<Vec12, 3> right_;
+  Vec4 c_ = Vec4::Zero();
+  double along_ = 0.0;
+  std::optional<Mat12> rest_;
+};
+
 /// Barrier contacts of one configuration: sum of kappa w m b(D; xi, d_hat)  [J].
 ///
 /// Between cloths the sum is over all pairs of a vertex p and a face, w = A_p / 4, and of two edges,
@@ -130,9 +151,9 @@ class ContactModel {
   /// g += grad B.
   void add_gradient(const std::vector<Contact>& contacts, const double* x, double* g) const;
 
-  /// 12x12 Hessian of one contact; kPositive is its positive part, up to the mollifier's terms, and
-  /// zero if its weight is negative.
-  Mat12 hessian(const Contact& contact, const double* x, Curvature curvature) const;
+  /// Hessian of one contact; kPositive is its positive part, up to the mollifier's terms, and zero if
+  /// its weight is negative.
+  ContactHessian hessian(const Contact& contact, const double* x, Curvature curvature) const;
 
   /// y += H z over all vertices, exact.
   void add_hessian_product(const std::vector<Contact>& contacts,

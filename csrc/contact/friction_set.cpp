@@ -57,23 +57,27 @@ void FrictionSet::add_gradient(const double* x_start, const double* x, double* g
   }
 }
 
-Mat12 FrictionSet::hessian(const Entry& k,
-                           const double* x_start,
-                           const double* x,
-                           Curvature curvature) const {
-  if (curvature == Curvature::kPositive && k.lambda < 0.0) return Mat12::Zero();
+FrictionSet::Hessian FrictionSet::hessian(const Entry& k,
+                                          const double* x_start,
+                                          const double* x,
+                                          Curvature curvature) const {
+  const Vec4& c = k.lag.closest.c;
+  if (curvature == Curvature::kPositive && k.lambda < 0.0) return {.c = c, .core = Mat3::Zero()};
   const Vec3 w = tangential(displacement(k, x_start, x), k.n);
   const FrictionLaw law = friction_law(w.norm(), model_->parameters().slip);
   const Mat3 projector = Mat3::Identity() - k.n * k.n.transpose();
   const double along = curvature == Curvature::kExact ? law.f2 : 0.0;
-  const Mat3 core = (k.mu * k.lambda) * (law.f1_over_y * projector + along * w * w.transpose());
-  Mat12 h;
-  for (int i = 0; i < 4; ++i) {
-    for (int j = 0; j < 4; ++j) {
-      h.block<3, 3>(3 * i, 3 * j) = (k.lag.closest.c[i] * k.lag.closest.c[j]) * core;
-    }
-  }
-  return h;
+  return {.c = c,
+          .core = (k.mu * k.lambda) * (law.f1_over_y * projector + along * w * w.transpose())};
+}
+
+Vec12 FrictionSet::Hessian::operator*(const Vec12& z) const {
+  Vec3 sum = Vec3::Zero();
+  for (int q = 0; q < 4; ++q) sum += c[q] * z.segment<3>(3 * q);
+  const Vec3 force = core * sum;
+  Vec12 y;
+  for (int p = 0; p < 4; ++p) y.segment<3>(3 * p) = c[p] * force;
+  return y;
 }
 
 void FrictionSet::add_hessian_product(const double* x_start,

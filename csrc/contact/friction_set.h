@@ -33,13 +33,22 @@ class FrictionSet {
   double energy_change(const double* x_start, const double* x0, const double* x1) const;
   void add_gradient(const double* x_start, const double* x, double* g) const;
 
-  /// 12x12 Hessian of one entry, of the sign of lambda. kPositive is the quadratic majorant
-  /// (f1/|w|) P, which does not lose its curvature where a sliding contact would come to rest, and
-  /// zero where lambda is negative.
-  Mat12 hessian(const Entry& entry,
-                const double* x_start,
-                const double* x,
-                Curvature curvature) const;
+  /// A Hessian c c^T (x) core by its 3x3 blocks.
+  struct Hessian {
+    Vec4 c;
+    Mat3 core;
+
+    Mat3 operator()(int p, int q) const { return (c[p] * c[q]) * core; }
+    Vec12 operator*(const Vec12& z) const;
+  };
+
+  /// Hessian of one entry, of the sign of lambda. kPositive is the quadratic majorant (f1/|w|) P,
+  /// which does not lose its curvature where a sliding contact would come to rest, and zero where
+  /// lambda is negative.
+  Hessian hessian(const Entry& entry,
+                  const double* x_start,
+                  const double* x,
+                  Curvature curvature) const;
 
   /// y += H z over all vertices.
   void add_hessian_product(const double* x_start,

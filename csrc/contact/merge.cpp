@@ -19,6 +19,9 @@ using NearEdge = MergeScratch::NearEdge;
 /// rounding.
 constexpr double kBorder = 1e-12;
 
+/// Squared distances that differ by this factor differ by more than rounding.
+constexpr double kClearly = 1.0 + 1e-12;
+
 enum Kind : std::int8_t { kVertex, kEdge, kFace, kMollified };
 
 NearEdge nearest_on_edge(const CollisionMesh& mesh, Index edge, const Vec3& p, const double* x) {
@@ -277,6 +280,9 @@ void add_edge_terms(const CollisionMesh& mesh,
     const auto& v = pair.vertices;
     const Corners corner{row(x, v[0]), row(x, v[1]), row(x, v[2]), row(x, v[3])};
     if (is_beyond(corner, range)) continue;
+    const Closest nearest_points = closest(PairKind::kEdgeEdge, corner);
+    // So are the ends then, and what they would be merged with; but for the rounding of distances.
+    if (nearest_points.d_sq > kClearly * range * range) continue;
     const bool soft = mollified(corner, mollifier_threshold(edge_length_sq[c], edge_length_sq[e]));
     const auto push = [&](std::int8_t end_c, std::int8_t end_e, double coefficient, double d_sq) {
       // An end that is not continued has nothing to merge with.
@@ -292,7 +298,7 @@ void add_edge_terms(const CollisionMesh& mesh,
     const auto push_against_e = [&](std::int8_t end_c, double coefficient) {
       Corners at = corner;
       if (end_c >= 0) at[0] = at[1] = corner[end_c];
-      const Closest whole = closest(PairKind::kEdgeEdge, at);
+      const Closest whole = end_c >= 0 ? closest(PairKind::kEdgeEdge, at) : nearest_points;
       const bool at_0 = whole.c[3] == 0.0;
       const bool at_1 = whole.c[2] == 0.0;
       if (!at_0 && !at_1) {

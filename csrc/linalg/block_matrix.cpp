@@ -2,30 +2,38 @@
 
 #include <algorithm>
 #include <numeric>
+#include <utility>
 
 #include "linalg/dense_kernels.h"
 
 namespace diffcloth::linalg {
 
-void sort_couplings(Couplings& pairs) {
+Couplings beyond(const BlockPattern& base, const Couplings& pairs) {
   // Counted by column; the few rows of each are then sorted by themselves.
-  Index count = 0;
-  for (const auto& pair : pairs) count = std::max(count, pair.second + 1);
-  std::vector<Index> start(static_cast<std::size_t>(count) + 1, 0);
+  const auto size = static_cast<std::size_t>(base.size());
+  std::vector<Index> start(size + 1, 0);
   for (const auto& pair : pairs) ++start[pair.second + 1];
   std::partial_sum(start.begin(), start.end(), start.begin());
   std::vector<Index> row(pairs.size());
   for (const auto& pair : pairs) row[start[pair.second]++] = pair.first;
-  pairs.clear();
-  auto first = row.begin();
-  for (Index column = 0; column < count; ++column) {
-    const auto last =
-        row.begin() + start[column];  // moved on to the end of its run by the loop above
-    std::sort(first, last);
-    for (auto end = std::unique(first, last); first != end; ++first)
-      pairs.emplace_back(*first, column);
-    first = last;
+  Couplings result;
+  std::vector<Index> known_in(size, -1);  // the last column that has this row
+  Index first = 0;
+  for (Index column = 0; column < base.size(); ++column) {
+    const Index last = start[column];  // moved on to the end of its run by the loop above
+    if (first == last) continue;
+    for (Index k = base.column_start()[column]; k < base.column_start()[column + 1]; ++k) {
+      known_in[base.row()[k]] = column;
+    }
+    const auto middle = static_cast<std::ptrdiff_t>(result.size());
+    for (; first < last; ++first) {
+      if (std::exchange(known_in[row[first]], column) != column) {
+        result.emplace_back(row[first], column);
+      }
+    }
+    std::sort(result.begin() + middle, result.end());
   }
+  return result;
 }
 
 MergedPattern merge(const BlockPattern& base, const Couplings& pairs) {
@@ -64,22 +72,6 @@ BlockMatrix::BlockMatrix(std::shared_ptr<const MergedPattern> merged,
       fixed_(&fixed),
       attachments_(attachments),
       blocks_(9 * static_cast<std::size_t>(merged_->pattern.block_count()), 0.0) {}
-
-void BlockMatrix::add_stencil(const std::array<Index, 4>& points, const Mat12& h) {
-  if (std::ranges::any_of(points, [&](Index v) { return is_attached(v); })) {
-    add_attached(points, h);
-    return;
-  }
-  for (int p = 0; p < 4; ++p) {
-    const Index i = points[p];
-    if (!has(i)) continue;
-    for (int q = 0; q < 4; ++q) {
-      const Index j = points[q];
-      if (i < j || !has(j)) continue;
-      add_block(i, j, h.block<3, 3>(3 * p, 3 * q));
-    }
-  }
-}
 
 void BlockMatrix::add_attached(const std::array<Index, 4>& points, const Mat12& h) {
   motions_.clear();

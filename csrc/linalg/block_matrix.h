@@ -1,5 +1,6 @@
 #pragma once
 
+#include <algorithm>
 #include <array>
 #include <memory>
 #include <utility>
@@ -14,8 +15,8 @@ namespace diffcloth::linalg {
 /// Pairs (row, column) of a lower triangle, row > column.
 using Couplings = std::vector<std::pair<Index, Index>>;
 
-/// Sort couplings by (column, row), each once.
-void sort_couplings(Couplings& pairs);
+/// The couplings that a pattern lacks, by (column, row), each once.
+Couplings beyond(const BlockPattern& base, const Couplings& pairs);
 
 /// A base pattern enlarged by further couplings, and where the slots of the base went.
 struct MergedPattern {
@@ -70,7 +71,24 @@ class BlockMatrix {
   }
 
   /// Add the 12x12 matrix of four points, without the rows that are left out.
-  void add_stencil(const std::array<Index, 4>& points, const Mat12& h);
+  ///
+  /// @param block  (p, q) -> its 3x3 block; asked for those alone that are added, of bodies' points often
+  ///               one of sixteen
+  template <class Block>
+  void add_stencil(const std::array<Index, 4>& points, Block&& block) {
+    if (std::ranges::any_of(points, [&](Index v) { return is_attached(v); })) {
+      add_attached(points, all_blocks(block));
+      return;
+    }
+    for (int p = 0; p < 4; ++p) {
+      const Index i = points[p];
+      if (!has(i)) continue;
+      for (int q = 0; q < 4; ++q) {
+        const Index j = points[q];
+        if (i >= j && has(j)) add_block(i, j, block(p, q));
+      }
+    }
+  }
 
   /// this = (this + s other) / (1 + s); both on the same pattern.
   void blend(const BlockMatrix& other, double s);

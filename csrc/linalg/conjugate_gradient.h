@@ -21,7 +21,8 @@ enum class Convergence : std::uint8_t { kConverged, kIterationLimit, kNegativeCu
 ///
 /// @param fixed      [pattern.size()] vertices left out: x is zero there
 /// @param tolerance  on the residual in the preconditioner's norm, relative to b's
-/// @return how it ended; x is the best iterate so far in any case
+/// @param max_iterations  given up before, where it can hardly be enough
+/// @param x          in: what the preconditioner makes of b; out: the best iterate, however it ended
 [[nodiscard]] Convergence conjugate_gradient(const BlockPattern& pattern,
                                              const double* blocks,
                                              const std::vector<char>& fixed,

@@ -1,5 +1,7 @@
 #include "linalg/elimination_tree.h"
 
+#include <utility>
+
 namespace diffcloth::linalg {
 namespace {
 
@@ -57,22 +59,41 @@ std::vector<Index> postorder(const std::vector<Index>& parent) {
   return result;
 }
 
-/// Heights of the columns: row i of L is the part of the tree between i and its neighbors below.
+/// Heights of the columns. Row i of L is the part of the tree between i and its neighbors below it: each
+/// leaf of that part adds a path, of which the columns above where it joins the last one are known. Only
+/// leaves are counted, at both ends of these paths, and summed up the tree (Gilbert, Ng, Peyton 1994).
 std::vector<Index> heights(const Graph& graph, const EliminationTree& tree) {
   const Index n = graph.size();
-  std::vector<Index> height(n, 1);
-  std::vector<Index> last_row(n, -1);
-  for (Index i = 0; i < n; ++i) {
-    last_row[i] = i;
-    const Index node = tree.order[i];
+  std::vector<Index> height(n, 0);
+  std::vector<Index> first(n, -1);  // first column in the subtree of one
+  for (Index k = 0; k < n; ++k) {
+    if (first[k] == -1) height[k] = 1;
+    for (Index j = k; j != -1 && first[j] == -1; j = tree.parent[j]) first[j] = k;
+  }
+  std::vector<Index> highest_first(n, -1);  // of the leaves of a row so far
+  std::vector<Index> last_leaf(n, -1);
+  std::vector<Index> ancestor(n);  // the root of what is counted, with compressed paths
+  for (Index k = 0; k < n; ++k) ancestor[k] = k;
+  for (Index k = 0; k < n; ++k) {
+    const Index parent = tree.parent[k];
+    if (parent != -1) --height[parent];
+    const Index node = tree.order[k];
     for (Index e = graph.start[node]; e < graph.start[node + 1]; ++e) {
-      Index k = tree.rank[graph.neighbor[e]];
-      if (k > i) continue;
-      for (; last_row[k] != i; k = tree.parent[k]) {
-        last_row[k] = i;
-        ++height[k];
-      }
+      const Index i = tree.rank[graph.neighbor[e]];
+      if (i <= k || first[k] <= highest_first[i]) continue;
+      highest_first[i] = first[k];
+      ++height[k];
+      const Index leaf = std::exchange(last_leaf[i], k);
+      if (leaf == -1) continue;
+      Index joint = leaf;
+      while (joint != ancestor[joint]) joint = ancestor[joint];
+      for (Index j = leaf; j != joint;) j = std::exchange(ancestor[j], joint);
+      --height[joint];
     }
+    if (parent != -1) ancestor[k] = parent;
+  }
+  for (Index k = 0; k < n; ++k) {
+    if (tree.parent[k] != -1) height[tree.parent[k]] += height[k];
   }
   return height;
 }

@@ -140,7 +140,14 @@ void Coordinates::add_curvature(const double* x,
       });
 }
 
-linalg::Couplings Coordinates::couplings_of_rows(const linalg::Couplings& points) const {
+linalg::Couplings Coordinates::couplings_of_rows(linalg::Couplings points) const {
+  if (!is_curved()) {
+    std::erase_if(points, [&](const std::pair<Index, Index>& pair) {
+      // The greater one first.
+      return pair.first >= cloth_vertex_count_ || !is_free(pair.first) || !is_free(pair.second);
+    });
+    return points;
+  }
   linalg::Couplings rows;
   rows.reserve(points.size());
   std::vector<Index> of_i;
@@ -149,7 +156,7 @@ linalg::Couplings Coordinates::couplings_of_rows(const linalg::Couplings& points
     out.clear();
     if (v < cloth_vertex_count_) {
       if (is_free(v)) out.push_back(v);
-    } else if (is_curved()) {
+    } else {
       for (const auto* e = attachments_.begin(v); e != attachments_.end(v); ++e) {
         out.push_back(e->row);
       }

@@ -88,7 +88,7 @@ class Coordinates {
   void add_curvature(const double* x, const std::vector<double>& g, linalg::BlockMatrix& A) const;
 
   /// Couplings of points in terms of rows; those that have none are left out. Not sorted.
-  linalg::Couplings couplings_of_rows(const linalg::Couplings& points) const;
+  linalg::Couplings couplings_of_rows(linalg::Couplings points) const;
 
   /// The points at the fraction alpha of a change dx: in one straight line but for what follows free
   /// coordinates.

@@ -51,15 +51,13 @@ bool Directions::refactor(const linalg::BlockMatrix& H) {
 }
 
 bool Directions::chord() {
-  if (!chord_allowed_ || s_ > 0.0 || !factor_) return false;
   walk_.system.solve(*factor_, walk_.g(), p_);
-  if (!(walk_.displacement(p_) <= kChordContraction * last_step_)) return false;
+  if (!chord_allowed_ || !(walk_.displacement(p_) <= kChordContraction * last_step_)) return false;
   ++walk_.context.counts->chord;
   return true;
 }
 
 bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
-  if (s_ > 0.0 || !factor_) return false;
   const linalg::Convergence result =
       walk_.system.solve(H, *factor_, walk_.g(), kForcing, kIterations, p_);
   indefinite = result == linalg::Convergence::kNegativeCurvature;
@@ -77,12 +75,13 @@ bool Directions::certify() {
 }
 
 Directions::Direction Directions::next() {
-  if (chord()) return {.kind = Kind::kChord, .first = 1.0};
+  const bool nearby = s_ == 0.0 && factor_ != nullptr;
+  if (nearby && chord()) return {.kind = Kind::kChord, .first = 1.0};
   const linalg::BlockMatrix H =
       walk_.system.assemble(walk_.x().data(), Curvature::kExact, walk_.g());
   if (s_ == 0.0) {
     bool indefinite = false;
-    if (iterate(H, indefinite)) return {.kind = Kind::kIterated, .first = 1.0};
+    if (nearby && iterate(H, indefinite)) return {.kind = Kind::kIterated, .first = 1.0};
     if (indefinite) {
       ++walk_.context.counts->negative_curvature;
     } else if (refactor(H)) {

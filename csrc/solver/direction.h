@@ -76,7 +76,10 @@ class Directions {
   /// Factor the exact Hessian. Where it is indefinite the last factor stays, unless it is large.
   bool refactor(const linalg::BlockMatrix& H);
 
+  /// Compute the step of the last factor, and whether it does.
   bool chord();
+
+  /// Go on from there to that of the exact Hessian H, by conjugate gradients.
   bool iterate(const linalg::BlockMatrix& H, bool& indefinite);
   std::optional<Direction> damp(const linalg::BlockMatrix& H, const linalg::BlockMatrix& P);
 

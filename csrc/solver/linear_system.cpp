@@ -1,12 +1,18 @@
 #include "solver/linear_system.h"
 
+#include <algorithm>
+
 namespace diffcloth::solver {
 
 linalg::BlockMatrix LinearSystem::assemble(const double* x,
                                            Curvature curvature,
                                            const std::vector<double>& g) {
   const Stopwatch::Scope scope(watch_, Phase::kAssembly);
-  assembly_ = f_.assemblies->find(f_.couplings());
+  const std::size_t size = 3 * static_cast<std::size_t>(f_.coordinates->point_count());
+  if (assembly_ == nullptr || !std::equal(x_.begin(), x_.end(), x)) {
+    assembly_ = f_.assemblies->find(f_.couplings());
+    x_.assign(x, x + size);
+  }
   linalg::BlockMatrix matrix({assembly_, &assembly_->merged}, f_.assemblies->fixed(),
                              &f_.coordinates->attachments());
   f_.for_each([&](const Potential& p) { p.add_hessian(x, curvature, matrix); });
@@ -76,6 +82,8 @@ linalg::Convergence LinearSystem::solve(const linalg::BlockMatrix& matrix,
                                         std::vector<double>& p) {
   const Stopwatch::Scope scope(watch_, Phase::kSolve);
   f_.coordinates->pull_back(b, b_);
+  f_.coordinates->take_rows(p, z_);
+  for (double& value : z_) value = -value;
   const linalg::Convergence result =
       linalg::conjugate_gradient(matrix.pattern(), matrix.blocks(), f_.assemblies->fixed(), nearby,
                                  b_, tolerance, max_iterations, workspace_, z_);

@@ -65,6 +65,8 @@ class LinearSystem {
              std::vector<std::vector<double>>& p);
 
   /// The same for a matrix, by conjugate gradients with a factor of a nearby one.
+  ///
+  /// @param p  in: the change by that factor alone
   linalg::Convergence solve(const linalg::BlockMatrix& matrix,
                             const linalg::CholeskyFactor& nearby,
                             const std::vector<double>& b,
@@ -83,7 +85,8 @@ class LinearSystem {
   linalg::CholeskyWorkspace& workspace_;
   Stopwatch& watch_;
   Counts& counts_;
-  std::shared_ptr<const Assembly> assembly_;
+  std::shared_ptr<const Assembly> assembly_;  ///< of the couplings at x_
+  std::vector<double> x_;                     ///< all points
   std::vector<double> b_;
   std::vector<double> z_;
 };

@@ -15,6 +15,8 @@ namespace {
 /// A Newton step at this share of the tolerance is not worth taking; a larger one makes the solution,
 /// and so its gradient, more exact than the tolerance asks for at the price of a solve.
 constexpr double kSettled = 0.1;
+/// The same of a certified step, whose end would have to be certified again: that is another factorization.
+constexpr double kSettledFactored = 0.25;
 /// Unless it would not shrink by this much: then rounding is all that is left of it.
 constexpr double kShrinks = 0.5;
 /// A step below this share of the coordinates is lost in their rounding.
@@ -210,7 +212,7 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
     if (direction.kind != Kind::kFactored) {
       settling_ = true;
       if (step <= kSettled * goal_) return Next::kGoOn;
-    } else if (step <= kSettled * goal_ || step > kShrinks * settled_step_) {
+    } else if (step <= kSettledFactored * goal_ || step > kShrinks * settled_step_) {
       return stop(Status::kConverged);
     } else {
       settled_step_ = step;

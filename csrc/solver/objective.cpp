@@ -1,5 +1,7 @@
 #include "solver/objective.h"
 
+#include <utility>
+
 namespace diffcloth::solver {
 
 std::vector<double> Objective::metric() const {
@@ -14,15 +16,7 @@ std::vector<double> Objective::metric() const {
 linalg::Couplings Objective::couplings() const {
   linalg::Couplings points;
   for_each([&](const Potential& p) { p.add_couplings(points); });
-  linalg::Couplings all = coordinates->couplings_of_rows(points);
-  linalg::sort_couplings(all);
-  const linalg::BlockPattern& base = assemblies->base();
-  std::erase_if(all, [&](const std::pair<Index, Index>& pair) {
-    const auto [i, j] = pair;
-    const Index k = base.slot(i, j);
-    return k < base.column_start()[j + 1] && base.row()[k] == i;
-  });
-  return all;
+  return linalg::beyond(assemblies->base(), coordinates->couplings_of_rows(std::move(points)));
 }
 
 }  // namespace diffcloth::solver

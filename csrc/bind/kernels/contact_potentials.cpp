@@ -102,7 +102,8 @@ class ContactPotential {
     Eigen::MatrixXd h = Eigen::MatrixXd::Zero(x.size(), x.size());
     for (const contact::Contact& k : find(x)) {
       add_block(k.pair.vertices,
-                model_.hessian(k, x.data(), positive ? Curvature::kPositive : Curvature::kExact),
+                all_blocks(model_.hessian(k, x.data(),
+                                          positive ? Curvature::kPositive : Curvature::kExact)),
                 h);
     }
     return h;
@@ -131,8 +132,8 @@ class ContactPotential {
     Eigen::MatrixXd h = Eigen::MatrixXd::Zero(x.size(), x.size());
     for (const contact::FrictionSet::Entry& k : set.entries()) {
       add_block(k.lag.pair.vertices,
-                set.hessian(k, x_start.data(), x.data(),
-                            positive ? Curvature::kPositive : Curvature::kExact),
+                all_blocks(set.hessian(k, x_start.data(), x.data(),
+                                       positive ? Curvature::kPositive : Curvature::kExact)),
                 h);
     }
     return {set.energy_change(x_start.data(), x_start.data(), x.data()), g, h};

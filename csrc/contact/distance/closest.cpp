@@ -173,12 +173,16 @@ Vec12 distance_sq_gradient(const Closest& pair) {
   return gradient;
 }
 
+Sliding sliding(const Closest& pair) {
+  const Eigen::Matrix<double, 12, 2> G = parameter_coupling(pair);
+  return {.left = -2 * G * pair.M_inv, .right = G};
+}
+
 Mat12 distance_sq_hessian(const Closest& pair) {
   Mat12 hessian = Mat12::Zero();
   if (pair.parameter_count > 0) {
-    const Eigen::Matrix<double, 12, 2> G = parameter_coupling(pair);
-    const Eigen::Matrix<double, 12, 2> GM = -2 * G * pair.M_inv;
-    hessian = GM.lazyProduct(G.transpose());  // unrolled, where a product would call gemm
+    const Sliding part = sliding(pair);
+    hessian = part.left.lazyProduct(part.right.transpose());  // unrolled, a product would call gemm
   }
   for (int i = 0; i < 4; ++i) {
     for (int j = 0; j < 4; ++j) {

@@ -45,6 +45,14 @@ Vec12 distance_sq_gradient(const Closest& pair);
 /// Hessian of the squared distance [-]; exact, hence indefinite.
 Mat12 distance_sq_hessian(const Closest& pair);
 
+/// The part of it that comes from how the nearest points slide, left right^T = -2 G M^-1 G^T; the other one
+/// is 2 c c^T (x) I. Columns beyond parameter_count are zero.
+struct Sliding {
+  Eigen::Matrix<double, 12, 2> left;
+  Eigen::Matrix<double, 12, 2> right;
+};
+Sliding sliding(const Closest& pair);
+
 /// Change of the parameters with the corners, dbeta/dx [1/m]; rows beyond parameter_count are zero.
 Eigen::Matrix<double, 2, 12> beta_jacobian(const Closest& pair);
 
