@@ -137,7 +137,7 @@ Box swept(const Box& t0, const Box& t1, const Vec3& frame, double reach) {
 
 }  // namespace
 
-BroadPhase::BroadPhase(CollisionMesh mesh, const double* x_reference) : mesh_(std::move(mesh)) {
+BroadPhase::BroadPhase(const CollisionMesh& mesh, const double* x_reference) : mesh_(mesh) {
   const auto center = [&](std::span<const Index> corners) -> Vec3 {
     Vec3 sum = Vec3::Zero();
     for (const Index v : corners) sum += row(x_reference, v);

@@ -61,8 +61,9 @@ inline Candidate candidate_of_edges(const CollisionMesh& mesh, Index e, Index f)
 /// left out, as are vertices that belong to no face.
 class BroadPhase {
  public:
+  /// @param mesh         outlives this
   /// @param x_reference  positions that shape the search trees, 3 * vertex_count
-  BroadPhase(CollisionMesh mesh, const double* x_reference);
+  BroadPhase(const CollisionMesh& mesh, const double* x_reference);
 
   const CollisionMesh& mesh() const { return mesh_; }
 
@@ -156,7 +157,7 @@ class BroadPhase {
   template <class Visit>
   void visit_surface_pairs(const Sweep& sweep, Scratch& scratch, Visit&& visit) const;
 
-  CollisionMesh mesh_;
+  const CollisionMesh& mesh_;
   std::vector<SurfaceTrees> trees_;
 };
 

@@ -139,6 +139,7 @@ void CandidateList::keep_near_ones(Kept& kept) const {
     kept.surfaces.push_back(s * mesh.surface_count() + r);
     return false;
   });
+  kept.pairs.shrink_to_fit();  // often to next to nothing
 }
 
 /// Of what is kept, what may come within reach; approach_ is what measure_approach() has found for it.

@@ -1,7 +1,5 @@
 #include "elastic/constant_form.h"
 
-#include <utility>
-
 #include "elastic/bending.h"
 #include "elastic/elements.h"
 
@@ -52,11 +50,6 @@ void add_element_mixed(
 
 }  // namespace
 
-ConstantForm::ConstantForm(const linalg::BlockPattern& pattern,
-                           Index vertices,
-                           std::vector<double> values)
-    : pattern_(&pattern), vertex_count_(vertices), values_(std::move(values)) {}
-
 ConstantForm ConstantForm::of_flat_bending(const Model& model,
                                            const linalg::BlockPattern& pattern) {
   return {pattern, model.topology->vertex_count, model.prepared.constant};
@@ -68,7 +61,8 @@ ConstantForm::ConstantForm(const Model& model,
                            const linalg::BlockPattern& pattern)
     : pattern_(&pattern),
       vertex_count_(model.topology->vertex_count),
-      values_(model.prepared.constant),
+      own_values_(model.prepared.constant),
+      values_(own_values_),
       anchor_vertex_(anchors.vertex.begin(), anchors.vertex.end()),
       anchor_stiffness_(anchors.stiffness.begin(), anchors.stiffness.end()) {
   for (Index f = 0; f < face_count(model); ++f) {
@@ -76,17 +70,17 @@ ConstantForm::ConstantForm(const Model& model,
     const double weight = face_factor(model, f) * stretch_weight(model, f);
     const Index* slot = slots.stretch.data() + 6 * static_cast<std::ptrdiff_t>(f);
     for (int p = 0; p < 3; ++p) {
-      for (int q = 0; q <= p; ++q) values_[*slot++] += weight * g.row(p).dot(g.row(q));
+      for (int q = 0; q <= p; ++q) own_values_[*slot++] += weight * g.row(p).dot(g.row(q));
     }
   }
   for (Index e = 0; e < model.stencils->size(); ++e) {
     bending::Element element = bending_element(model, e);
     if (element.flat) continue;
     element.weight *= element_factor(model, e);
-    bending::add_constant(element, bending_slots(slots, e), values_.data());
+    bending::add_constant(element, bending_slots(slots, e), own_values_.data());
   }
   for (std::size_t a = 0; a < anchor_vertex_.size(); ++a) {
-    values_[pattern.column_start()[anchor_vertex_[a]]] += anchor_stiffness_[a];
+    own_values_[pattern.column_start()[anchor_vertex_[a]]] += anchor_stiffness_[a];
   }
 }
 

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <span>
 #include <vector>
 
 #include "elastic/anchors.h"
@@ -31,11 +32,16 @@ class ConstantForm {
                const Anchors& anchors,
                const linalg::BlockPattern& pattern);
 
-  /// That of flat bending alone, which is its energy.
+  /// That of flat bending alone, which is its energy; the values stay the model's.
   static ConstantForm of_flat_bending(const Model& model, const linalg::BlockPattern& pattern);
 
+  ConstantForm(const ConstantForm&) = delete;
+  ConstantForm& operator=(const ConstantForm&) = delete;
+  ConstantForm(ConstantForm&&) = default;
+  ConstantForm& operator=(ConstantForm&&) = default;
+
   /// L, one value a slot of the pattern [N/m].
-  const std::vector<double>& values() const { return values_; }
+  std::span<const double> values() const { return values_; }
   const linalg::BlockPattern& pattern() const { return *pattern_; }
 
   /// 1/2 (u + s)^T L (u + s) - 1/2 u^T L u  [J].
@@ -45,11 +51,15 @@ class ConstantForm {
   void add_product(const double* u, double* y) const;
 
  private:
-  ConstantForm(const linalg::BlockPattern& pattern, Index vertices, std::vector<double> values);
+  ConstantForm(const linalg::BlockPattern& pattern,
+               Index vertices,
+               std::span<const double> values)
+      : pattern_(&pattern), vertex_count_(vertices), values_(values) {}
 
   const linalg::BlockPattern* pattern_;
   Index vertex_count_;  ///< the pattern may have further rows
-  std::vector<double> values_;
+  std::vector<double> own_values_;
+  std::span<const double> values_;
   std::vector<Index> anchor_vertex_;
   std::vector<double> anchor_stiffness_;
 };

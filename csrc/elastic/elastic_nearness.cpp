@@ -1,5 +1,6 @@
 #include "elastic/elastic_nearness.h"
 
+#include <span>
 #include <utility>
 
 namespace diffcloth::elastic {
@@ -38,7 +39,7 @@ void ElasticNearness::add_gradient(const double* x, double* g) const {
 void ElasticNearness::add_hessian(const double* /*x*/,
                                   Curvature /*curvature*/,
                                   linalg::BlockMatrix& A) const {
-  const std::vector<double>& values = form_.values();
+  const std::span<const double> values = form_.values();
   for (std::size_t k = 0; k < values.size(); ++k) {
     double* block = A.blocks() + 9 * static_cast<std::ptrdiff_t>(A.slot_of_base()[k]);
     for (int a = 0; a < 3; ++a) block[4 * a] += values[k];

@@ -13,10 +13,9 @@ Assembly::Found Assembly::analysis() const {
   return {.analysis = analysis_, .is_new = is_new};
 }
 
-AssemblyCache::AssemblyCache(linalg::BlockPattern base, std::vector<char> fixed)
-    : base_(std::move(base)),
-      fixed_(std::move(fixed)),
-      plain_(std::make_shared<Assembly>(base_, fixed_, linalg::Couplings())) {}
+AssemblyCache::AssemblyCache(const linalg::BlockPattern& base, std::vector<char> fixed)
+    : fixed_(std::move(fixed)),
+      plain_(std::make_shared<Assembly>(base, fixed_, linalg::Couplings())) {}
 
 std::shared_ptr<const Assembly> AssemblyCache::find(const linalg::Couplings& pairs) {
   if (pairs.empty()) return plain_;
@@ -28,7 +27,7 @@ std::shared_ptr<const Assembly> AssemblyCache::find(const linalg::Couplings& pai
       return entry->assembly;
     }
   }
-  const auto assembly = std::make_shared<const Assembly>(base_, fixed_, pairs);
+  const auto assembly = std::make_shared<const Assembly>(base(), fixed_, pairs);
   // The analysis, which may come later, holds about as many indices as the pattern, twice.
   const std::vector<Index>& row = assembly->merged.pattern.row();
   const std::size_t bytes = sizeof(pairs.front()) * pairs.size() + 4 * sizeof(Index) * row.size();

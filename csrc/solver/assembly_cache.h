@@ -40,7 +40,7 @@ class Assembly {
 /// what is in it.
 class AssemblyCache {
  public:
-  AssemblyCache(linalg::BlockPattern base, std::vector<char> fixed);
+  AssemblyCache(const linalg::BlockPattern& base, std::vector<char> fixed);
 
   AssemblyCache(const AssemblyCache&) = delete;
   AssemblyCache& operator=(const AssemblyCache&) = delete;
@@ -48,7 +48,7 @@ class AssemblyCache {
   /// @param pairs  sorted couplings of vertices that are not fixed, none of them in the base
   std::shared_ptr<const Assembly> find(const linalg::Couplings& pairs);
 
-  const linalg::BlockPattern& base() const { return base_; }
+  const linalg::BlockPattern& base() const { return plain_->merged.pattern; }
   const std::vector<char>& fixed() const { return fixed_; }
 
  private:
@@ -59,9 +59,8 @@ class AssemblyCache {
   };
   static constexpr std::size_t kCapacity = std::size_t{32} << 20;  // [bytes]
 
-  linalg::BlockPattern base_;
   std::vector<char> fixed_;
-  std::shared_ptr<const Assembly> plain_;
+  std::shared_ptr<const Assembly> plain_;  ///< on the base pattern
   std::mutex mutex_;
   std::list<Entry> entries_;  // most recent first
   std::size_t bytes_ = 0;

@@ -190,7 +190,7 @@ elastic::ConstantForm Problem::constant_form() const {
 
 std::shared_ptr<const projective::ConstantMatrix> Problem::constant_matrix() const {
   const elastic::ConstantForm form = constant_form();
-  std::vector<double> values = form.values();
+  std::vector<double> values(form.values().begin(), form.values().end());
   for (std::size_t i = 0; i < masses.size(); ++i) {
     values[form.pattern().column_start()[i]] += masses[i] / (h * h);
   }

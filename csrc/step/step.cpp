@@ -101,6 +101,7 @@ Report forward(const Scene& scene,
       report.result = Result::kIntersectingStart;
       return report;
     }
+    detection.scratch = {};  // the list answers from here on, mostly without a search of everything
   }
 
   linalg::CholeskyWorkspace workspace(threads);

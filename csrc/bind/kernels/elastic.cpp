@@ -273,7 +273,7 @@ class Elastic {
     std::vector<double> X_bar(X_.size(), 0.0);
     mesh::rest_shape_vjp(topology_, stencils_, X_.data(), bar.rest, X_bar.data());
     nb::dict result;
-    result["values"] = vector_array(form.values());
+    result["values"] = vector_array({form.values().begin(), form.values().end()});
     result["product"] = rows_array(product);
     result["energy_change"] = form.energy_change(u.data(), positions("s", s).data());
     add_materials(bar, result);
