@@ -48,6 +48,14 @@ BATCH_SCENES = ("hanging", "sphere")
 LOSSES = (1, 8, 64)
 LOSS_SCENES = ("hanging", "sphere", "self-contact")
 REPEATS = 5  # of a backward with several losses
+SHARED = (
+    ("hanging", 48),
+    ("sphere", 48),
+    ("self-contact", 48),
+    ("hanging", 96),
+    ("plane", 96),
+)
+SHARED_STEPS = 3
 
 Records = dict[str, Any]
 
@@ -145,6 +153,8 @@ def measure(
         for name in LOSS_SCENES
         for count in counts
     ]
+    shared = [(BATCH_SCENES[0], sizes[0])] if quick else SHARED
+    records["shared"] = [_time_shared(name, size, kept) for name, size in shared]
     records["peers"] = list(time_all(newton, phase_sizes[0])) if newton else []
     records["load"].append(round(os.getloadavg()[0], 1))
     records["minutes"] = round((time.perf_counter() - start) / 60, 1)
@@ -193,6 +203,24 @@ def _time_losses(name: str, size: int, count: int, cpu: bool, kept: Path) -> Rec
             seconds[key].append(clock() - start)
     times = {key: 1e3 * median(values) for key, values in seconds.items()}
     return {"scene": name, "size": size, "losses": count, **times}
+
+
+def _time_shared(name: str, size: int, kept: Path) -> Records:
+    """A step of one environment on one thread and on two, in turn [ms of wall-clock time]."""
+    scene = SCENES[name](size)
+    simulator = dc.Simulator(scene.scene, DT)
+    state = in_regime(simulator, scene, 0, kept_file(kept, name, size, 0)).detach()
+    seconds: dict[int, list[float]] = {1: [], 2: []}
+    for _ in range(SHARED_STEPS):
+        for threads, taken in seconds.items():
+            torch.set_num_threads(threads)
+            start = time.perf_counter()
+            after = simulator.step(state, scene.control(state))
+            taken.append(time.perf_counter() - start)
+        state = after
+    torch.set_num_threads(1)
+    one, two = (1e3 * median(taken) for taken in seconds.values())
+    return {"scene": name, "size": size, "one": one, "two": two}
 
 
 # ---- drawing ----
@@ -306,6 +334,7 @@ def page(records: Records, plots: list[tuple[str, str]]) -> str:
         parts += [f"## Beside {release}", _release_text(rows, release), _release_table(rows)]
     parts += ["## By phase", _PHASE_TEXT, _phase_table(records["phases"])]
     parts += ["## Many losses", _LOSS_TEXT, _loss_table(records["losses"])]
+    parts += ["## One environment on two threads", _SHARED_TEXT, _shared_table(records["shared"])]
     if records["peers"]:
         parts += ["## Beside Newton", _PEER_TEXT, _peer_table(records["peers"])]
     return "\n\n".join(parts) + "\n"
@@ -393,6 +422,22 @@ def _loss_table(rows: list[Records]) -> str:
         [
             [r["scene"], r["size"], r["losses"]]
             + [_number(value) for value in (r["loop"], r["once"], r["loop"] / r["once"])]
+            for r in rows
+        ],
+    )
+
+
+_SHARED_TEXT = """\
+Forward, in milliseconds of wall-clock time. Where a thread is left, large factorizations and solves
+are shared; the bits are the same."""
+
+
+def _shared_table(rows: list[Records]) -> str:
+    return _table(
+        ["scene", "size", "one thread", "two", "ratio"],
+        [
+            [r["scene"], r["size"]]
+            + [_number(value) for value in (r["one"], r["two"], r["one"] / r["two"])]
             for r in rows
         ],
     )

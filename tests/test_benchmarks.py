@@ -158,6 +158,9 @@ def test_the_page_of_figures_has_what_was_measured(figures):
         assert float(line.split("|")[7]) == pytest.approx(ratio, rel=0.01)  # three digits
     for row in records["losses"]:
         assert row["loop"] > 0 < row["once"]
+    for row in records["shared"]:
+        assert row["one"] > 0 < row["two"]
+        assert f"| {row['scene']} | {row['size']} |" in page.partition("on two threads")[2]
     shown = {path.name for path in (figures / "images").iterdir()}
     assert shown == {f"performance_{name}.svg" for name in ("ratio", "size", "phases")}
     assert all(f"](images/{name})" in page for name in shown)
