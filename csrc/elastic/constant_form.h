@@ -51,9 +51,7 @@ class ConstantForm {
   void add_product(const double* u, double* y) const;
 
  private:
-  ConstantForm(const linalg::BlockPattern& pattern,
-               Index vertices,
-               std::span<const double> values)
+  ConstantForm(const linalg::BlockPattern& pattern, Index vertices, std::span<const double> values)
       : pattern_(&pattern), vertex_count_(vertices), values_(values) {}
 
   const linalg::BlockPattern* pattern_;
