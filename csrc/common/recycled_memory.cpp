@@ -54,7 +54,7 @@ class Unused {
     const std::unique_lock lock(mutex_, std::try_to_lock);
     if (!lock) return false;
     while (bytes_ + bytes > kKept || count_ == blocks_.size()) free(remove(0));
-    blocks_[count_++] = {memory, bytes};
+    blocks_[count_++] = {.memory = memory, .bytes = bytes};
     bytes_ += bytes;
     return true;
   }
