@@ -46,8 +46,9 @@ double stiffness_for_cloths(const Scene& scene, const Inputs& inputs, double bar
   at_rest.views[static_cast<std::size_t>(Input::kPositions)].data =
       scene.given.rest_vertices.data();
   Problem p(scene, at_rest);
-  const linalg::BlockMatrix hessian =
-      contact_free_hessian(p, scene.given.rest_vertices.data(), Curvature::kExact);
+  std::vector<double> x = p.start;  // bodies, too
+  std::copy_n(scene.given.rest_vertices.data(), p.cloth_size, x.begin());
+  const linalg::BlockMatrix hessian = contact_free_hessian(p, x.data(), Curvature::kExact);
   const linalg::BlockPattern& pattern = hessian.pattern();
   const Index n = scene.cloth_vertex_count();
   double trace = 0.0;

@@ -72,7 +72,7 @@ class Problem {
   std::vector<double> predicted(const double* cloth_positions) const;
 };
 
-/// Hessian of inertia, elasticity and anchors at x.
+/// Hessian of inertia, elasticity and anchors at x, all points.
 linalg::BlockMatrix contact_free_hessian(Problem& problem, const double* x, Curvature curvature);
 
 /// Spread a parameter given as one value, one a cloth or one a face (owner) over all faces.
