@@ -4,14 +4,12 @@ import io
 import os
 import pickle
 import re
-import subprocess
-import sys
-import textwrap
 import warnings
 
 import numpy as np
 import pytest
 import torch
+from processes import run_python
 
 import diffcloth_torch as dc
 from diffcloth_torch.config import shapes
@@ -255,12 +253,8 @@ LITTLE_MEMORY = """
 @pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="reads /proc")  # noqa: PTH110
 @pytest.mark.parametrize("threads", [1, 2])
 def test_little_memory_is_a_memory_error_and_no_end(threads):
-    code = textwrap.dedent(LITTLE_MEMORY.replace("{threads}", str(threads)))
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
-    )
-    assert result.returncode == 0, result.stderr
-    assert int(re.fullmatch(r"refused (\d+)\n", result.stdout)[1]) > 5
+    printed = run_python(LITTLE_MEMORY.replace("{threads}", str(threads)), timeout=120)
+    assert int(re.fullmatch(r"refused (\d+)\n", printed)[1]) > 5
 
 
 # --- Where surfaces start ------------------------------------------------------------------------

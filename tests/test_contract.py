@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from processes import threads
 
 import diffcloth_torch as dc
 
@@ -445,14 +446,10 @@ def test_a_batch_gives_the_bits_of_its_environments(sim):
 
 def test_the_number_of_threads_changes_no_bit(sim):
     state = dc.stack([moved(sim, seed) for seed in range(3)])
-    threads = torch.get_num_threads()
-    try:
-        results = []
-        for count in (1, 2, 4):
-            torch.set_num_threads(count)
+    results = []
+    for count in (1, 2, 4):
+        with threads(count):
             results.append(sim.step(state))
-    finally:
-        torch.set_num_threads(threads)
     assert same(results[0], results[1])
     assert same(results[0], results[2])
 

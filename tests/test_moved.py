@@ -2,12 +2,11 @@
 
 import importlib
 import pickle
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
+from processes import run_python
 
 import diffcloth_torch as dc
 from diffcloth_torch._moved import MOVED
@@ -40,10 +39,7 @@ def test_old_paths_stand_in_any_order_of_imports():
         "import diffcloth_torch as dc\n"
         "print(a is c, b is d, mesh.Cloth is dc.Cloth, state.State is dc.State)"
     )
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert result.stdout.split() == ["True"] * 4
+    assert run_python(code).split() == ["True"] * 4
 
 
 def test_importing_the_package_imports_no_old_path():
@@ -51,10 +47,7 @@ def test_importing_the_package_imports_no_old_path():
         "import sys, diffcloth_torch._moved as m; "
         "print([old for old in m.MOVED if old in sys.modules])"
     )
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert result.stdout.strip() == "[]"
+    assert run_python(code).strip() == "[]"
 
 
 def test_a_name_that_never_was_is_refused():

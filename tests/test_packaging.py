@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from processes import run_python
 
 import diffcloth_torch
 from diffcloth_torch import _core
@@ -17,12 +18,9 @@ ROOT = Path(__file__).resolve().parent.parent
 PYPROJECT = (ROOT / "pyproject.toml").read_text()
 
 
-def run_python(code: str) -> str:
+def printed(code: str) -> str:
     # Not from ROOT, where an import would find the sources instead of what is installed.
-    folder = Path(__file__).parent
-    command = [sys.executable, "-c", code]
-    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
-    return result.stdout.strip()
+    return run_python(code, cwd=Path(__file__).parent).strip()
 
 
 def test_the_version_stands_in_one_place():
@@ -44,7 +42,7 @@ spec = importlib.util.spec_from_file_location("_core", {_core.__file__!r})
 spec.loader.exec_module(importlib.util.module_from_spec(spec))
 print(sorted({{"torch", "numpy"}} & set(sys.modules)))
 """
-    assert run_python(code) == "[]"
+    assert printed(code) == "[]"
 
 
 def test_only_tests_have_the_single_kernels():
@@ -81,7 +79,7 @@ end = simulator.step(start.replace(positions=positions))
 end.positions.square().sum().backward()
 print(end.report.converged, bool(torch.isfinite(positions.grad).all()))
 """
-    assert run_python(code) == "True True"
+    assert printed(code) == "True True"
 
 
 def test_sources_without_a_core_say_what_to_do(tmp_path):
@@ -128,7 +126,7 @@ def test_a_blas_is_named_where_cholmod_calls_one():
 
 def test_importing_the_package_warns_of_nothing():
     command = [sys.executable, "-W", "error", "-c", "import diffcloth_torch"]
-    folder = Path(__file__).parent  # as in `run_python`
+    folder = Path(__file__).parent  # as in `printed`
     result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
     assert result.stderr == ""
 
@@ -136,7 +134,7 @@ def test_importing_the_package_warns_of_nothing():
 @pytest.mark.parametrize("module", ["matplotlib", "pytorch_kinematics", "pyvista", "trimesh"])
 def test_importing_the_package_leaves_out(module):
     code = f"import sys, diffcloth_torch; print({module!r} in sys.modules)"
-    assert run_python(code) == "False"
+    assert printed(code) == "False"
 
 
 def test_the_command_is_installed():

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from processes import threads
 from torch.utils.data import DataLoader, Dataset
 
 import diffcloth_torch as dc
@@ -158,14 +159,10 @@ def test_the_number_of_threads_changes_no_bit_in_contact(contact, scheme):
     sim = tent(scheme=scheme)
     noise = torch.randn(5, 36, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
     batch = dc.stack([contact.detach().replace(velocities=0.1 * row) for row in noise])
-    before = torch.get_num_threads()
     results = []
-    try:
-        for threads in (1, 2, 4):
-            torch.set_num_threads(threads)
+    for count in (1, 2, 4):
+        with threads(count):
             results.append(gradient(sim, batch))
-    finally:
-        torch.set_num_threads(before)
     for after, x_bar in results[1:]:
         assert same(after, results[0][0])
         assert torch.equal(x_bar, results[0][1])
@@ -196,15 +193,11 @@ class Rolls(Dataset):
 
 def test_a_forked_worker_steps_after_a_parallel_region(sim, contact):
     state = contact.detach()
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(2)
+    with threads(2):
         expected, x_bar = gradient(sim, dc.stack([state, state]))  # threads have run here
         torch.randn(500, 500) @ torch.randn(500, 500)
         loader = DataLoader(Rolls(sim, state), num_workers=1, multiprocessing_context="fork")
         rows = list(loader)
-    finally:
-        torch.set_num_threads(threads)
     assert len(rows) == 2
     for positions, gradient_row in rows:
         assert torch.equal(positions[0], expected.positions[0])

@@ -9,6 +9,7 @@ import traceback
 import pytest
 import torch
 from parallel_scenes import batch, differing, simulator, step
+from processes import threads
 from torch.utils.data import DataLoader, Dataset
 
 pytestmark = [
@@ -25,17 +26,13 @@ def after_a_parallel_region(request):
     """Size, state, the values of its step on two threads that have run here, and a time to wait."""
     n = request.param
     state = batch(n, 4)
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
+    with threads(2):
         torch.randn(500, 500) @ torch.randn(500, 500)
         begin = time.monotonic()
         expected = step(simulator(n), state)[1]
         # A child that hangs must not hang the tests; a busy machine may be slow.
         patience = 30 + 20 * (time.monotonic() - begin)
         yield n, state, expected, patience
-    finally:
-        torch.set_num_threads(before)
 
 
 def in_child(function, patience):
@@ -69,16 +66,12 @@ def test_a_forked_child_steps_batches(after_a_parallel_region, count):
 
 def test_a_forked_child_shares_the_work_on_one_environment():
     sim, state = simulator(48, folded=False), batch(48, 1, folded=False)
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
+    with threads(2):
         begin = time.monotonic()
         expected = step(sim, state)[1]
         patience = 30 + 20 * (time.monotonic() - begin)
         assert in_child(lambda: differing(step(sim, state)[1], expected) == [], patience) == 0
         assert differing(step(sim, state)[1], expected) == []
-    finally:
-        torch.set_num_threads(before)
 
 
 def work(queue, n, state):

@@ -3,7 +3,7 @@
 import sys
 
 import pytest
-import torch
+from processes import threads
 
 import diffcloth_torch as dc
 
@@ -15,16 +15,12 @@ def test_threads_ask_the_system_for_no_more_pages():
     cloth = dc.Cloth.grid(24, 24, pins={"corners": [0, 23]})
     sim = dc.Simulator(dc.Scene([cloth]), 0.01)
     state = sim.initial_state(8)
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
+    with threads(2):
         for _ in range(3):
             state = sim.step(state)
         faults = getrusage(RUSAGE_SELF).ru_minflt
         for _ in range(5):
             state = sim.step(state)
         faults = getrusage(RUSAGE_SELF).ru_minflt - faults
-    finally:
-        torch.set_num_threads(before)
     # A factor and its matrix alone take up 700 pages, in each of 8 environments and 5 steps.
     assert faults < 8 * 5 * 100

@@ -3,13 +3,12 @@
 import os
 import resource
 import signal
-import subprocess
 import sys
-import textwrap
 import threading
 import time
 
 import pytest
+from processes import run_python
 
 from diffcloth_torch import _kernels
 
@@ -75,17 +74,13 @@ def test_a_batch_runs_on_the_threads_that_there_are():
 
     if resource.getrlimit(resource.RLIMIT_STACK)[1] != resource.RLIM_INFINITY:
         pytest.skip("may not raise the limit of the stack")
-    result = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(WITHOUT_THREADS)],
+    printed = run_python(
+        WITHOUT_THREADS,
         preexec_fn=limit,
-        capture_output=True,
-        text=True,
-        check=False,
         timeout=120,
         env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
     )
-    assert result.returncode == 0, result.stderr
-    assert result.stdout.splitlines() == [
+    assert printed.splitlines() == [
         "no threads",
         "[5]",
         "environment 1",

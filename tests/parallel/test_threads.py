@@ -7,27 +7,17 @@ enough to reach their blocked kernels, and steps are repeated under load.
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 
 import pytest
 import torch
 from parallel_scenes import batch, differing, simulator, step
+from processes import threads
 
 SIZES = (12, 16, 24)
 LARGE = 48
 REPEATS = {12: 4, 16: 2, 24: 1}
 SLOW = pytest.param(10, marks=pytest.mark.slow)  # times as often
 ENVIRONMENTS = 4
-
-
-@contextmanager
-def threads(count):
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module", autouse=True)

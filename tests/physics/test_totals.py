@@ -5,6 +5,7 @@ import pytest
 import scenes
 import torch
 from physics_scenes import F64, WEIGHTLESS, lumped_masses, tensor
+from processes import threads
 
 import diffcloth_torch as dc
 from diffcloth_torch.dynamics.totals import ordered_sum
@@ -257,14 +258,10 @@ def test_drives_of_prescribed_joints_have_no_inertia(sim):
 
 def test_a_sum_has_the_same_bits_in_a_batch_and_on_several_threads():
     values = scenes.tensor_noise((3, 70_000), 1.0, 0)
-    threads = torch.get_num_threads()
     sums = []
-    try:
-        for count in (1, 2):
-            torch.set_num_threads(count)
+    for count in (1, 2):
+        with threads(count):
             sums += [ordered_sum(values), torch.stack([ordered_sum(row) for row in values])]
-    finally:
-        torch.set_num_threads(threads)
     assert all(torch.equal(other, sums[0]) for other in sums[1:])
     torch.testing.assert_close(sums[0], values.sum(-1), rtol=0, atol=1e-9)
 

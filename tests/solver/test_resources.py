@@ -1,14 +1,13 @@
 """What a step says about its time, and what it leaves in memory."""
 
 import platform
-import subprocess
 import sys
-import textwrap
 import time
 from pathlib import Path
 
 import pytest
 import torch
+from processes import run_python
 
 import diffcloth_torch as dc
 
@@ -31,19 +30,6 @@ def test_the_seconds_of_a_report_are_those_of_the_step():
     # The rest is what Python does around the core: about 1.5 of 50 ms and more.
     # The best step is free of whatever else the machine had to do.
     assert min(untold) < 0.06, untold
-
-
-def printed(script):
-    """The number that a script prints, in a process of its own."""
-    result = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
-    return float(result.stdout)
 
 
 SELF_CONTACT = """
@@ -77,7 +63,7 @@ SELF_CONTACT = """
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="asks glibc to give memory back")
 def test_contacts_that_come_and_go_leave_little_in_memory():
     # Each new set of contacts is a new pattern of the matrix, whose analysis may be kept.
-    assert printed(SELF_CONTACT) < 60  # [MB]
+    assert float(run_python(SELF_CONTACT, cwd=ROOT)) < 60  # [MB]
 
 
 LARGE_SHEET = """
@@ -102,4 +88,4 @@ LARGE_SHEET = """
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="ru_maxrss is in KiB")
 def test_a_large_sheet_takes_little_memory():
     # 555 of one factor, and 230 of torch.
-    assert printed(LARGE_SHEET) < 1180  # [MiB]
+    assert float(run_python(LARGE_SHEET, cwd=ROOT)) < 1180  # [MiB]
