@@ -333,8 +333,12 @@ def page(records: Records, plots: list[tuple[str, str]]) -> str:
     for release, rows in records["releases"].items():
         parts += [f"## Beside {release}", _release_text(rows, release), _release_table(rows)]
     parts += ["## By phase", _PHASE_TEXT, _phase_table(records["phases"])]
-    parts += ["## Many losses", _LOSS_TEXT, _loss_table(records["losses"])]
-    parts += ["## One environment on two threads", _SHARED_TEXT, _shared_table(records["shared"])]
+    losses = _pair_table(
+        records["losses"], ["scene", "size", "losses"], {"loop": "loop", "once": "one call"}
+    )
+    parts += ["## Many losses", _LOSS_TEXT, losses]
+    shared = _pair_table(records["shared"], ["scene", "size"], {"one": "one thread", "two": "two"})
+    parts += ["## One environment on two threads", _SHARED_TEXT, shared]
     if records["peers"]:
         parts += ["## Beside Newton", _PEER_TEXT, _peer_table(records["peers"])]
     return "\n\n".join(parts) + "\n"
@@ -416,31 +420,25 @@ Backward of several losses, to positions and velocities: a loop over `torch.auto
 call with `is_grads_batched=True`, in milliseconds."""
 
 
-def _loss_table(rows: list[Records]) -> str:
-    return _table(
-        ["scene", "size", "losses", "loop", "one call", "ratio"],
-        [
-            [r["scene"], r["size"], r["losses"]]
-            + [_number(value) for value in (r["loop"], r["once"], r["loop"] / r["once"])]
-            for r in rows
-        ],
-    )
-
-
 _SHARED_TEXT = """\
 Forward, in milliseconds of wall-clock time. Where a thread is left, large factorizations and solves
 are shared; the bits are the same."""
 
 
-def _shared_table(rows: list[Records]) -> str:
-    return _table(
-        ["scene", "size", "one thread", "two", "ratio"],
-        [
-            [r["scene"], r["size"]]
-            + [_number(value) for value in (r["one"], r["two"], r["one"] / r["two"])]
-            for r in rows
-        ],
-    )
+def _pair_table(rows: list[Records], labels: list[str], pair: dict[str, str]) -> str:
+    """Two times and their ratio.
+
+    Args:
+        rows: Each with the labels, which come first, and the two times.
+        labels: Keys, and what stands above them.
+        pair: Keys of the two, and what stands above them.
+    """
+    lines = []
+    for r in rows:
+        one, other = (r[key] for key in pair)
+        times = [_number(value) for value in (one, other, one / other)]
+        lines.append([*(r[label] for label in labels), *times])
+    return _table([*labels, *pair.values(), "ratio"], lines)
 
 
 _PEER_TEXT = """\
