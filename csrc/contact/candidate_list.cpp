@@ -22,6 +22,8 @@ constexpr double kNear = 1.0;
 constexpr std::size_t kWorn = 4;
 /// Rounding of a distance, relative to the coordinates.
 constexpr double kRounding = 1e-14;
+/// Boxes are asked for this much more than distances are, which round otherwise.
+constexpr double kMore = 1.01;
 
 /// What the vertices of a surface have done since the reference.
 struct Motion {
@@ -29,6 +31,11 @@ struct Motion {
   double around_mean = 0.0;  ///< largest deviation from it
   double largest = 0.0;
 };
+
+double distance_at(const double* x, const Candidate& pair) {
+  const auto& [i, j, k, l] = pair.vertices;
+  return std::sqrt(distance_sq(pair.kind, {row(x, i), row(x, j), row(x, k), row(x, l)}));
+}
 
 /// NaN counts as the largest of all.
 void raise(double& largest, double value) {
@@ -129,11 +136,9 @@ void CandidateList::keep_near_ones(Kept& kept) const {
   kept.distance.clear();
   kept.surfaces.clear();
   std::erase_if(kept.pairs, [&](const Candidate& pair) {
-    const auto& v = pair.vertices;
-    const Corners corner{row(x, v[0]), row(x, v[1]), row(x, v[2]), row(x, v[3])};
-    const double distance = std::sqrt(distance_sq(pair.kind, corner));
-    const Index s = mesh.vertex_surface[v[0]];
-    const Index r = mesh.vertex_surface[v[3]];
+    const double distance = distance_at(x, pair);
+    const Index s = mesh.vertex_surface[pair.vertices[0]];
+    const Index r = mesh.vertex_surface[pair.vertices[3]];
     if (distance > reach_[s] + reach_[r] + 2.0 * (kept.skin + rounding_)) return true;
     kept.distance.push_back(distance);
     kept.surfaces.push_back(s * mesh.surface_count() + r);
@@ -198,6 +203,41 @@ void CandidateList::find_wide(const double* x_t0,
   std::sort(out.begin() + middle, out.end());
   std::inplace_merge(out.begin(), out.begin() + middle, out.end());
   out.erase(std::unique(out.begin(), out.end()), out.end());
+}
+
+void CandidateList::find_at(const double* x,
+                            std::span<const double> reach,
+                            double widened,
+                            std::span<const char> wanted,
+                            BroadPhase::Scratch& scratch,
+                            std::vector<Candidate>& out) {
+  const CollisionMesh& mesh = broad_phase_->mesh();
+  const Index count = mesh.surface_count();
+  // How near the pairs of two surfaces must be; negative where none is wanted.
+  std::vector<double> range;
+  for (Index s = 0; s < count; ++s) {
+    for (Index r = 0; r < count; ++r) {
+      const bool both = wanted[s] != 0 && wanted[r] != 0;
+      range.push_back(both ? reach[s] + reach[r] + 2.0 * widened : -1.0);
+    }
+  }
+  const std::vector<double>& reference = wide_.reference;
+  if (!reference.empty() && kMore * widened <= wide_.skin && std::ranges::equal(reach, reach_) &&
+      std::equal(reference.begin(), reference.end(), x)) {
+    out.clear();
+    for (std::size_t k = 0; k < wide_.pairs.size(); ++k) {
+      if (wide_.distance[k] <= range[wide_.surfaces[k]]) out.push_back(wide_.pairs[k]);
+    }
+    return;
+  }
+  with_skin_.clear();
+  for (const double value : reach) with_skin_.push_back(value + kMore * widened);
+  broad_phase_->find(x, x, with_skin_, scratch, out);
+  std::erase_if(out, [&](const Candidate& pair) {
+    const double limit = range[mesh.vertex_surface[pair.vertices[0]] * count +
+                               mesh.vertex_surface[pair.vertices[3]]];
+    return limit < 0.0 || distance_at(x, pair) > limit;
+  });
 }
 
 void CandidateList::find(const double* x_t0,

@@ -43,6 +43,18 @@ class CandidateList {
             BroadPhase::Scratch& scratch,
             std::vector<Candidate>& out);
 
+  /// The pairs of wanted surfaces whose distance at a point is at most the sum of the two reaches, widened;
+  /// sorted. Quick where the list was made. The list stays as it is.
+  ///
+  /// @param widened  how much more each reach is than that of the list [m]
+  /// @param wanted   [surfaces]
+  void find_at(const double* x,
+               std::span<const double> reach,
+               double widened,
+               std::span<const char> wanted,
+               BroadPhase::Scratch& scratch,
+               std::vector<Candidate>& out);
+
   /// How often the wide list was made anew.
   Index builds() const { return builds_; }
 

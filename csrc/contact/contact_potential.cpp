@@ -8,6 +8,9 @@
 namespace diffcloth::contact {
 namespace {
 
+/// What is nearer than the sum of its reaches and this share of d_hat may be in contact soon.
+constexpr double kSoon = 0.4;
+
 using Stencil = std::array<Index, 4>;
 
 void add_stencil_couplings(const Stencil& v, linalg::Couplings& pairs) {
@@ -82,6 +85,13 @@ void ContactPotential::add_gradient(const double* x, double* g) const {
 
 void ContactPotential::add_couplings(linalg::Couplings& pairs) const {
   for (const Contact& k : contacts_) add_stencil_couplings(k.pair.vertices, pairs);
+}
+
+void ContactPotential::add_couplings_near(const double* x, linalg::Couplings& pairs) const {
+  std::vector<Candidate> near;
+  detection_.candidates.find_at(x, model_.reach(), 0.5 * kSoon * model_.parameters().d_hat,
+                                model_.moves(), detection_.scratch, near);
+  for (const Candidate& pair : near) add_stencil_couplings(pair.vertices, pairs);
 }
 
 void ContactPotential::add_hessian(const double* x,

@@ -48,6 +48,10 @@ class ContactPotential final : public Potential {
     stand_at(x);
   }
 
+  /// Append the couplings of all contacts that there may soon be after a point: of the pairs that are near
+  /// at x, on surfaces that move.
+  void add_couplings_near(const double* x, linalg::Couplings& pairs) const;
+
   /// Stand at a point whose contacts are known.
   void adopt(std::vector<Contact> contacts) {
     candidates_.clear();

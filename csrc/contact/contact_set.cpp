@@ -38,6 +38,10 @@ ContactModel::ContactModel(const CollisionMesh& mesh,
       parameters_(std::move(parameters)),
       prescribed_(prescribed) {
   for (const double t : parameters_.thickness) reach_.push_back(0.5 * (parameters_.d_hat + t));
+  moves_.assign(reach_.size(), 0);
+  for (Index v = 0; v < mesh.vertex_count; ++v) {
+    if (prescribed[v] == 0) moves_[mesh.vertex_surface[v]] = 1;
+  }
 }
 
 double ContactModel::xi(const Candidate& pair) const {

@@ -38,7 +38,8 @@ class LinearSystem {
                Counts& counts)
       : f_(objective), workspace_(workspace), watch_(watch), counts_(counts) {}
 
-  /// The Hessian at x, on the couplings of this point alone: a function of x, not of the way there.
+  /// The Hessian at x, on the couplings of this point and those that the objective expects: a function of x
+  /// and these, not of the way there.
   ///
   /// @param g  the gradient at x
   linalg::BlockMatrix assemble(const double* x, Curvature curvature, const std::vector<double>& g);

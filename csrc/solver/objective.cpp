@@ -1,5 +1,8 @@
 #include "solver/objective.h"
 
+#include <algorithm>
+#include <iterator>
+#include <tuple>
 #include <utility>
 
 namespace diffcloth::solver {
@@ -16,6 +19,20 @@ std::vector<double> Objective::metric() const {
 linalg::Couplings Objective::couplings() const {
   linalg::Couplings points;
   for_each([&](const Potential& p) { p.add_couplings(points); });
+  linalg::Couplings here = beyond_base(std::move(points));
+  if (expected.empty()) return here;
+  linalg::Couplings all;
+  all.reserve(expected.size() + here.size());
+  const auto by_column = [](const auto& a, const auto& b) {
+    return std::tie(a.second, a.first) < std::tie(b.second, b.first);
+  };
+  std::ranges::set_union(expected, here, std::back_inserter(all), by_column);
+  return all;
+}
+
+void Objective::expect(linalg::Couplings points) { expected = beyond_base(std::move(points)); }
+
+linalg::Couplings Objective::beyond_base(linalg::Couplings points) const {
   return linalg::beyond(assemblies->base(), coordinates->couplings_of_rows(std::move(points)));
 }
 

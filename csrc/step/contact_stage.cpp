@@ -85,6 +85,15 @@ class Sum {
     return contact_ ? contact_->contacts() : none;
   }
 
+  /// Let factors have the couplings of all contacts that there may be on the way from a point: patterns
+  /// seldom change then, and remain functions of the point and this one.
+  void expect_contacts_near(const Array& x) {
+    if (!contact_) return;
+    linalg::Couplings points;
+    contact_->add_couplings_near(x.data(), points);
+    objective.expect(std::move(points));
+  }
+
   /// Take friction from the contacts of a configuration.
   void lag(const std::vector<Contact>& contacts) {
     objective.others = stage_.others;
@@ -195,6 +204,10 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
   const std::vector<Contact>& at_start = sum.contacts_at_start(x);
   keep(0, at_start);
   sum.lag(at_start);
+  {
+    const Stopwatch::Scope scope(*step.context.watch, Phase::kAnalysis);
+    sum.expect_contacts_near(problem.start);
+  }
   // Everything at its end, unknowns where inertia alone (or x^D) would put them.
   const Array first_guess = problem.predicted(inertia.target().data());
   solver::Factor factor;
@@ -320,8 +333,9 @@ void ContactStage::backward(const Backward& step, std::vector<Array> g) {
     problem.coordinates.stand_at(x.data());
     const std::size_t place = first_factor + k;
     const auto& factors = step.kept.factors;
-    pull_back_solve(step, sum.objective, x, place < factors.size() ? factors[place] : nullptr, g,
-                    k + 1 == solves, exchange_all);
+    solver::Factor factor = place < factors.size() ? factors[place] : nullptr;
+    if (!factor) sum.expect_contacts_near(problem.start);
+    pull_back_solve(step, sum.objective, x, std::move(factor), g, k + 1 == solves, exchange_all);
 
     for (std::size_t l = 0; l < g.size(); ++l) {
       Cotangents& bars = step.losses[l];

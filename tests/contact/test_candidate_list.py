@@ -144,6 +144,28 @@ def test_another_reach_makes_another_list(search):
         assert close <= {tuple(c) for c in found}
 
 
+def test_what_is_near_a_point_does_not_depend_on_the_list(search):
+    x, _, surface, everything = search
+    _, faces, _ = scene()
+    at = x + 0.003 * np.random.default_rng(2).normal(size=x.shape)
+    reach, widened, wanted = [0.05, 0.07, 0.015, 0.005], 0.001, [True, True, False, True]
+    limit = np.asarray(reach) + widened
+    near = close_pairs(everything, at, at, surface, limit)
+    near = {c for c in near if 2 not in (surface[c[1]], surface[c[4]])}
+    assert 30 < len(near) < 1000
+    by = {
+        name: kernels.BroadPhase(faces, surface, 2, True, x) for name in ("none", "here", "there")
+    }
+    by["here"].find_kept(at, at + 1e-3, reach)
+    by["there"].find_kept(x, at, reach)
+    for mesh in by.values():
+        builds = mesh.builds
+        found = mesh.find_at(at, reach, widened, wanted)
+        assert {tuple(c) for c in found} == near
+        np.testing.assert_array_equal(found, found[np.lexsort(found[:, [6, 5, 0]].T)])
+        assert mesh.builds == builds
+
+
 def test_motions_that_are_not_finite_are_searched_as_such(search):
     """A solver may try them; they must not be answered from a list."""
     x, mesh, _, _ = search

@@ -75,3 +75,17 @@ def test_factors_that_are_gone_change_no_bit(scheme):
     sim._core.forget_factors()
     (made_again,) = torch.autograd.grad(loss, x)
     assert torch.equal(kept, made_again)
+
+
+def test_contacts_that_come_and_go_seldom_cost_an_analysis():
+    sim, state = simulator(16), batch(16, 2)
+    counts = []
+    for _ in range(3):
+        state = sim.step(state)
+        counts.append(state.report.counts)
+    analyses, factorizations = (
+        sum(int(c[name].sum()) for c in counts) for name in ("analyses", "factorizations")
+    )
+    assert factorizations > 100
+    # 6 where patterns are those of the point and the start; 63 of the point alone.
+    assert analyses < 12

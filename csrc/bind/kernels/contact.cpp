@@ -122,6 +122,17 @@ class Search {
     return rows();
   }
 
+  /// What is within reach and a margin at a point.
+  IndexRows find_at(const Positions& x,
+                    const std::vector<double>& reach,
+                    double widened,
+                    const std::vector<bool>& wanted) {
+    check_reach(reach);
+    const std::vector<char> flags(wanted.begin(), wanted.end());
+    list_.find_at(checked("x", x), reach, widened, flags, scratch_, candidates_);
+    return rows();
+  }
+
   Index builds() const { return list_.builds(); }
 
   IndexRows rows() const {
@@ -270,6 +281,7 @@ void collision_kernels(nb::module_& m) {
           },
           "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "radius"_a)
       .def("find_kept", &Search::find_kept, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "reach"_a)
+      .def("find_at", &Search::find_at, "x"_a.noconvert(), "reach"_a, "widened"_a, "wanted"_a)
       .def_prop_ro("builds", &Search::builds)
       .def("find_intersection", &Search::find_intersection, "x"_a.noconvert())
       .def("smallest_nonadjacent_distance", &Search::smallest_nonadjacent_distance,
