@@ -4,7 +4,7 @@ A directional derivative along dense and sparse random directions sees every ent
 a few evaluations instead of one for each entry.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -74,3 +74,17 @@ def mismatch(
         if best <= rtol:
             break
     return best
+
+
+def slope_error(points: Sequence[tuple[float, float, float]]) -> float:
+    """Smallest relative error of the slopes of a function with branches, over every two points.
+
+    A point is (t, value, slope). Where a step has several minima, points as near as rounding may
+    lie on different branches, and a difference across branches says nothing. On one branch it is
+    the mean of the slopes at its ends, up to second order in their distance.
+    """
+    t, value, slope = np.array(points).T
+    a, b = np.triu_indices(len(t), 1)
+    difference = (value[b] - value[a]) / (t[b] - t[a])
+    mean = (slope[a] + slope[b]) / 2
+    return float((abs(mean - difference) / np.maximum(abs(mean), abs(difference))).min())

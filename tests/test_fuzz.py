@@ -5,7 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from differences import slope_error
 
 pytest.importorskip("ipctk")
 
@@ -39,3 +41,37 @@ def test_the_extent_of_a_run_must_be_given():
     result = fuzz()
     assert result.returncode == 2
     assert "--minutes, --scenes or --only" in result.stderr
+
+
+def points_on_branches(factor):
+    """(t, value, slope times a factor), zero alone on its branch, neighbors on different ones."""
+    branches = [lambda t: (np.exp(3 * t), 3), lambda t: (2 + np.sin(t), 1), lambda t: (5 - t, -1)]
+    found = {0.0: 0, 1e-4: 1, 1e-8: 2, -1e-4: 1, 1e-6: 2, -1e-8: 1, -1e-6: 2}
+    return [
+        (t, value, factor * slope)
+        for t, branch in found.items()
+        for value, slope in [branches[branch](t)]
+    ]
+
+
+def test_slopes_are_judged_on_their_own_branch():
+    # A slope of 1 instead of cos(t), and what rounding leaves of differences over 1e-4.
+    assert slope_error(points_on_branches(1.0)) < 1e-7
+
+
+@pytest.mark.parametrize("factor", [1.05, 0.95, 0.0, -1.0])
+def test_wrong_slopes_are_wrong_on_all_branches(factor):
+    assert slope_error(points_on_branches(factor)) > 0.04
+
+
+def test_slopes_that_are_no_numbers_are_not_right():
+    points = points_on_branches(1.0)
+    points[2] = (*points[2][:2], np.nan)
+    assert np.isnan(slope_error(points))
+
+
+def test_a_gradient_where_a_step_has_several_minima_is_not_suspect():
+    """A stiff sheet, thrown without gravity: changes of 1e-9 make it buckle in other ways."""
+    result = fuzz("--seed", "3", "--only", "23")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "suspect gradients 0 of 1 checked" in result.stdout

@@ -9,8 +9,11 @@ step, also of steps that fail. What is wrong is one line of JSON, which names th
 failed in it; steps that do not converge, or whose motion is refused, are counted, and listed with
 `--list`. The exit status is 1 if anything was wrong.
 
-A gradient is compared with central differences along a random direction, on the best of several
-step sizes. A kink between may make them differ in a scene or two: those are listed, not judged.
+A gradient is compared with differences along a random direction. What buckles has several minima,
+and the least change of an input may let a step end in another: so gradients are taken at several
+points, and the two of them that agree best with the difference between them count, on whatever
+branch of minima they are. Suspects are listed, not judged: where there are very many minima, no two
+points may share a branch.
 """
 
 from __future__ import annotations
@@ -26,8 +29,10 @@ import click
 import numpy as np
 import torch
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "physics"))
 
+from differences import slope_error
 from physics_scenes import Judge
 from random_scenes import RandomScene, draw
 
@@ -35,7 +40,7 @@ import diffcloth_torch as dc
 
 WRONG = ("intersection", "path", "report", "momentum", "not finite", "error", "start")
 GRADIENT_SHARE = 0.1  # of the scenes
-SUSPECT = 1e-2  # relative error of a gradient
+SUSPECT = 1e-3  # relative error of a gradient; right ones are below 2e-4
 
 
 class Tally:
@@ -183,14 +188,15 @@ def _check_gradient(
     tally: Tally,
     where: dict[str, Any],
 ) -> None:
-    """Adjoint against differences along a direction in positions, velocities and materials."""
+    """Adjoints against differences along a direction in positions, velocities and materials."""
     sim = scene.simulator
+    # A share of the speed of a fall: what a solve leaves must vanish beside small differences.
     tight = dc.Simulator(
         sim.scene,
         sim.dt,
         scheme=sim.scheme,
         contact=sim.contact,
-        solver=dc.SolverOptions(tolerance=1e-10 * max(1.0, np.sqrt(scene.description["size"]))),
+        solver=dc.SolverOptions(tolerance=1e-10 * np.sqrt(scene.description["size"])),
     )
     edge = scene.description["size"] / 10
     shape = state.positions.shape
@@ -205,7 +211,9 @@ def _check_gradient(
     ]
     stretch = tight.parameters().stretch
 
-    def loss(t: torch.Tensor) -> torch.Tensor:
+    def point(at: float) -> tuple[float, float, float]:
+        """Where, the loss there and its derivative."""
+        t = torch.tensor(at, dtype=torch.float64, requires_grad=True)
         after = tight.step(
             state.replace(
                 positions=state.positions + t * directions[0],
@@ -214,23 +222,21 @@ def _check_gradient(
             control,
             tight.parameters().replace(stretch=stretch * (t * directions[2]).exp()),
         )
-        return (weights * after.positions).sum() / edge
+        loss = (weights * after.positions).sum() / edge
+        (slope,) = torch.autograd.grad(loss, t)
+        return t.item(), loss.item(), slope.item()
 
+    steps = 10.0 ** np.arange(-8, -3)
     try:
-        t = torch.zeros((), dtype=torch.float64, requires_grad=True)
-        (adjoint,) = torch.autograd.grad(loss(t), t)
-        errors = []
-        with torch.no_grad():
-            for step in 10.0 ** np.arange(-8, -3):
-                ahead, behind = loss(t + step), loss(t - step)
-                difference = (ahead - behind) / (2 * step)
-                errors.append(((adjoint - difference) / difference).abs().item())
+        points = [point(at) for at in (0.0, *steps, *-steps)]
     except dc.SimulationError as error:
         tally.failed_step("gradient not checked", where, str(error))
         return
-    tally.gradient_errors.append(min(errors))
-    if min(errors) > SUSPECT:
-        tally.line("suspect gradient", where, f"relative errors {errors}, adjoint {adjoint.item()}")
+    error = slope_error(points)
+    tally.gradient_errors.append(error)
+    if not error <= SUSPECT:  # not a number, too
+        text = f"relative error {error:.3g} of (t, loss, derivative) {points}"
+        tally.line("suspect gradient", where, text)
 
 
 @click.command(help=__doc__.replace("\n\n    ", "\n\n\b\n    "))
