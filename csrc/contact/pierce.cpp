@@ -97,17 +97,8 @@ int quick_orientation(const Vec3& a, const Vec3& b, const Vec3& c, const Vec3& d
   return 0;
 }
 
-/// Whether a plane certainly separates the edge and the triangle: the one across the shortest of
-/// the vectors between their points and edges.
-bool certainly_apart(const std::array<Vec3, 2>& e, const std::array<Vec3, 3>& t) {
-  Vec3 n = separation(PairKind::kPointTriangle, {e[0], t[0], t[1], t[2]});
-  const auto offer = [&n](const Vec3& candidate) {
-    if (candidate.squaredNorm() < n.squaredNorm()) n = candidate;
-  };
-  offer(separation(PairKind::kPointTriangle, {e[1], t[0], t[1], t[2]}));
-  for (int k = 0; k < 3; ++k) {
-    offer(separation(PairKind::kEdgeEdge, {e[0], e[1], t[k], t[(k + 1) % 3]}));
-  }
+/// Whether a plane across n certainly separates the edge and the triangle.
+bool separates(const Vec3& n, const std::array<Vec3, 2>& e, const std::array<Vec3, 3>& t) {
   for (const Vec3& p : e) {
     for (const Vec3& q : t) {
       const Vec3 difference = p - q;
@@ -116,6 +107,21 @@ bool certainly_apart(const std::array<Vec3, 2>& e, const std::array<Vec3, 3>& t)
     }
   }
   return true;
+}
+
+/// Whether some plane certainly does: mostly the one across the vector between their middles does, else
+/// the one across the shortest of the vectors between their points and edges.
+bool certainly_apart(const std::array<Vec3, 2>& e, const std::array<Vec3, 3>& t) {
+  if (separates(3.0 * (e[0] + e[1]) - 2.0 * (t[0] + t[1] + t[2]), e, t)) return true;
+  Vec3 n = separation(PairKind::kPointTriangle, {e[0], t[0], t[1], t[2]});
+  const auto offer = [&n](const Vec3& candidate) {
+    if (candidate.squaredNorm() < n.squaredNorm()) n = candidate;
+  };
+  offer(separation(PairKind::kPointTriangle, {e[1], t[0], t[1], t[2]}));
+  for (int k = 0; k < 3; ++k) {
+    offer(separation(PairKind::kEdgeEdge, {e[0], e[1], t[k], t[(k + 1) % 3]}));
+  }
+  return separates(n, e, t);
 }
 
 }  // namespace

@@ -380,6 +380,16 @@ def test_an_edge_that_pierces_ever_so_little_is_found(depth):
     assert kernels.BroadPhase(faces, surface, 2, True, x).find_intersection(x) is None
 
 
+@pytest.mark.parametrize(("height", "expected"), [(-(2.0**-54), True), (2.0**-53, False)])
+def test_a_tip_next_to_a_face_is_judged_exactly(height, expected):
+    """One unit in the last place above a tilted plane or below, where coordinates are exact."""
+    cloth = np.array([[0.0, 0, 0], [1, 0, 1], [0, 1, 1]]), np.array([[0, 1, 2]])
+    tip = np.array([[0.25, 0.25, 0.5 + height], [0.25, 0.25, 1.5], [0.5, 0.25, 2.5]])
+    x, faces, surface = merged([cloth, (tip, np.array([[0, 1, 2]]))])
+    mesh = kernels.BroadPhase(faces, surface, 2, True, x)
+    assert (mesh.find_intersection(x) is not None) == expected
+
+
 @needs_data
 @pytest.mark.parametrize(
     ("name", "expected"),
