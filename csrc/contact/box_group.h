@@ -20,8 +20,10 @@ struct BoxGroup {
 
 // NOLINTEND(modernize-avoid-c-arrays)
 
-/// Which boxes p and q of two groups are near each other, as by are_near(): bit kBoxGroup p + q. The
-/// outcome of each comparison is as good as random, so that there are no branches.
+/// Which boxes p and q of two groups are near each other: bit kBoxGroup p + q. Near are boxes, each with
+/// a margin of its own around it, that are within the sum of the margins, `range`, as the crow flies
+/// without them; those that overlap only where their margins have corners are not, NaN is. The outcome
+/// of each comparison is as good as random, so that there are no branches.
 using NearBoxes = std::uint32_t (*)(const BoxGroup& a, const BoxGroup& b, double range);
 
 /// The same on every level.

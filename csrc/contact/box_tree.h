@@ -31,18 +31,6 @@ inline bool overlap(const Box& a, const Box& b) {
          (a.lo[2] <= b.hi[2]) & (b.lo[2] <= a.hi[2]);
 }
 
-/// Whether two boxes, each with a margin of its own around it, are within the sum of the margins,
-/// `range`, as the crow flies without them. Boxes that overlap only where their margins have corners
-/// are not. Also branch-free; NaN is near.
-inline bool are_near(const Box& a, const Box& b, double range) {
-  double sum = 0.0;
-  for (int k = 0; k < 3; ++k) {
-    const double apart = std::max(a.lo[k] - b.hi[k], b.lo[k] - a.hi[k]) + range;
-    sum += apart > 0.0 ? apart * apart : 0.0;
-  }
-  return !(sum > range * range) & overlap(a, b);
-}
-
 /// Smallest box around two boxes.
 inline Box united(const Box& a, const Box& b) {
   Box box;
