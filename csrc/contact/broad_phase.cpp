@@ -19,6 +19,9 @@ using PairList = BroadPhase::Scratch::PairList;
 /// and of positions interpolated between the ends of the motion.
 constexpr double kOutward = 1e-15;
 
+/// Rounding of a distance across middles, relative to the coordinates, rounded up.
+constexpr double kAcross = 1e-14;
+
 NearBoxes near_boxes_here() {
   static const NearBoxes best = near_boxes(linalg::best_level());
   return best;
@@ -85,6 +88,17 @@ void append_self_overlaps(const BoxTree& tree,
       });
 }
 
+/// Whether two primitives are certainly farther apart than `range`: across their middles, that is along the
+/// sum of the vectors between their corners.
+template <std::size_t kCount>
+bool are_apart(const std::array<Vec3, kCount>& between, double range) {
+  Vec3 n = between[0];
+  for (std::size_t k = 1; k < kCount; ++k) n += between[k];
+  double least = n.dot(between[0]);
+  for (std::size_t k = 1; k < kCount; ++k) least = std::min(least, n.dot(between[k]));
+  return least > 0.0 && least * least > range * range * n.squaredNorm();
+}
+
 /// Drop the pairs that do not satisfy `keep`.
 template <class Keep>
 void filter(PairList& pairs, Keep&& keep) {
@@ -133,6 +147,17 @@ Box swept(const Box& t0, const Box& t1, const Vec3& frame, double reach) {
     box.hi[k] = hi + margin;
   }
   return box;
+}
+
+/// Of all surfaces, where a search starts.
+double largest_coordinate(const BroadPhase::Scratch& scratch) {
+  double largest = 0.0;
+  for (const BroadPhase::Scratch::Surface& surface : scratch.surfaces) {
+    for (int k = 0; k < 3; ++k) {
+      largest = std::max({largest, -surface.box_t0.lo[k], surface.box_t0.hi[k]});
+    }
+  }
+  return largest;
 }
 
 }  // namespace
@@ -234,22 +259,17 @@ void BroadPhase::visit_surface_pairs(const Sweep& sweep, Scratch& scratch, Visit
   }
 }
 
-void BroadPhase::find(const double* x_t0,
-                      const double* x_t1,
-                      std::span<const double> reach,
-                      Scratch& scratch,
-                      std::vector<Candidate>& out) const {
-  out.clear();
+/// Pairs of indices whose boxes are near each other, in no order, without those that share a vertex.
+void BroadPhase::collect_pairs(const Sweep& sweep, Scratch& scratch) const {
   PairList& vertex_faces = scratch.vertex_face_pairs;
   PairList& edges = scratch.edge_pairs;
   vertex_faces.clear();
   edges.clear();
-  const Sweep sweep{.x_t0 = x_t0, .x_t1 = x_t1, .reach = reach};
   visit_surface_pairs(sweep, scratch, [&](Index s, Index r) {
     const Scratch::Surface& a = scratch.surfaces[s];
     const Scratch::Surface& b = scratch.surfaces[r];
     // Rounded up, as the boxes are rounded outward.
-    const double range = (1.0 + kOutward) * (reach[s] + reach[r]);
+    const double range = (1.0 + kOutward) * (sweep.reach[s] + sweep.reach[r]);
     append_overlaps(trees_[s].vertices, a.vertices, trees_[r].faces, b.faces, range, scratch.stack,
                     vertex_faces);
     if (s == r) {
@@ -261,16 +281,61 @@ void BroadPhase::find(const double* x_t0,
     append_overlaps(trees_[s].edges, a.edges, trees_[r].edges, b.edges, range, scratch.stack,
                     edges);
   });
-
   filter(vertex_faces, [&](const IndexPair& p) { return !has_vertex(mesh_.faces[p[1]], p[0]); });
-  sort_pairs(vertex_faces, scratch);
-  for (const auto& [v, f] : scratch.sorted) out.push_back(candidate_of_vertex(mesh_, v, f));
-
   filter(edges,
          [&](const IndexPair& p) { return !share_vertex(mesh_.edges[p[0]], mesh_.edges[p[1]]); });
+}
+
+/// Drop the collected pairs that are certainly beyond their reaches at x, the start of the sweep.
+void BroadPhase::drop_distant(const double* x,
+                              std::span<const double> reach,
+                              Scratch& scratch) const {
+  const double rounding = kAcross * largest_coordinate(scratch);
+  filter(scratch.vertex_face_pairs, [&](const IndexPair& pair) {
+    const auto& [v, f] = pair;
+    const auto& [i, j, k] = mesh_.faces[f];
+    const Vec3 p = row(x, v);
+    const double range = reach[mesh_.vertex_surface[v]] + reach[mesh_.face_surface[f]] + rounding;
+    return !are_apart<3>({p - row(x, i), p - row(x, j), p - row(x, k)}, range);
+  });
+  filter(scratch.edge_pairs, [&](const IndexPair& pair) {
+    const auto& [e, f] = pair;
+    const auto& [i, j] = mesh_.edges[e];
+    const auto& [k, l] = mesh_.edges[f];
+    const Vec3 p = row(x, i);
+    const Vec3 q = row(x, j);
+    const double range = reach[mesh_.edge_surface[e]] + reach[mesh_.edge_surface[f]] + rounding;
+    return !are_apart<4>({p - row(x, k), p - row(x, l), q - row(x, k), q - row(x, l)}, range);
+  });
+}
+
+/// The collected pairs as candidates, in order.
+void BroadPhase::write_pairs(Scratch& scratch, std::vector<Candidate>& out) const {
+  out.clear();
+  sort_pairs(scratch.vertex_face_pairs, scratch);
+  for (const auto& [v, f] : scratch.sorted) out.push_back(candidate_of_vertex(mesh_, v, f));
+  PairList& edges = scratch.edge_pairs;
   for (IndexPair& pair : edges) pair = {std::min(pair[0], pair[1]), std::max(pair[0], pair[1])};
   sort_pairs(edges, scratch);
   for (const auto& [e, f] : scratch.sorted) out.push_back(candidate_of_edges(mesh_, e, f));
+}
+
+void BroadPhase::find(const double* x_t0,
+                      const double* x_t1,
+                      std::span<const double> reach,
+                      Scratch& scratch,
+                      std::vector<Candidate>& out) const {
+  collect_pairs({.x_t0 = x_t0, .x_t1 = x_t1, .reach = reach}, scratch);
+  write_pairs(scratch, out);
+}
+
+void BroadPhase::find_at_rest(const double* x,
+                              std::span<const double> reach,
+                              Scratch& scratch,
+                              std::vector<Candidate>& out) const {
+  collect_pairs({.x_t0 = x, .x_t1 = x, .reach = reach}, scratch);
+  drop_distant(x, reach, scratch);
+  write_pairs(scratch, out);
 }
 
 std::optional<std::pair<Index, Index>> BroadPhase::find_intersection(const double* x,

@@ -135,6 +135,13 @@ class BroadPhase {
             Scratch& scratch,
             std::vector<Candidate>& out) const;
 
+  /// Of the pairs that find() finds where nothing moves, those within the sum of the two surfaces' reaches
+  /// of each other, and few more: many are near by their boxes alone.
+  void find_at_rest(const double* x,
+                    std::span<const double> reach,
+                    Scratch& scratch,
+                    std::vector<Candidate>& out) const;
+
   /// The lowest (edge, face) that intersect at x, among the pairs of surfaces that may touch.
   ///
   /// An edge that pierces a face is always found (exact arithmetic decides close calls); an edge
@@ -151,6 +158,9 @@ class BroadPhase {
 
   void measure_motion(const Sweep& sweep, Scratch& scratch) const;
   void fit(const Sweep& sweep, Index surface, const Vec3& frame, Scratch& scratch) const;
+  void collect_pairs(const Sweep& sweep, Scratch& scratch) const;
+  void drop_distant(const double* x, std::span<const double> reach, Scratch& scratch) const;
+  void write_pairs(Scratch& scratch, std::vector<Candidate>& out) const;
 
   /// Visit the pairs of surfaces that may touch and whose boxes overlap, the lower first (a surface
   /// with itself included); their trees are fitted by then.

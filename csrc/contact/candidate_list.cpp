@@ -113,7 +113,7 @@ void CandidateList::build(const double* x_t0,
   ++builds_;
   with_skin_.clear();
   for (const double value : reach_) with_skin_.push_back(value + wide_.skin);
-  broad_phase_->find(x_t0, x_t0, with_skin_, scratch, wide_.pairs);
+  broad_phase_->find_at_rest(x_t0, with_skin_, scratch, wide_.pairs);
   keep_near_ones(wide_);
 }
 

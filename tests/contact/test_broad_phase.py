@@ -184,6 +184,31 @@ def test_pairs_that_come_within_the_radius_during_the_motion_are_candidates():
             assert {tuple(c) for c in close} <= found
 
 
+@pytest.mark.parametrize("away", [0.0, 1e6], ids=["near the origin", "far away"])
+def test_at_rest_what_is_within_reach_is_a_candidate(away):
+    """Of those by their boxes all that are as close, and less than half of the others."""
+    x, faces, surface = scene()
+    mesh = kernels.BroadPhase(faces, surface, 2, True, x)
+    at = x + away + 0.003 * np.random.default_rng(12).normal(size=x.shape)
+    reach = [0.01, 0.02, 0.04, 0.03]
+    everything, found = mesh.find(at, at, reach), mesh.find_at_rest(at, reach)
+    by_box = {tuple(c) for c in everything}
+    kept = {tuple(c) for c in found}
+    assert kept <= by_box
+    np.testing.assert_array_equal(found, sorted(found.tolist(), key=lambda c: (c[0], c[5], c[6])))
+    close_count = 0
+    for kind in (0, 1):
+        pairs = everything[everything[:, 0] == kind]
+        corners = np.ascontiguousarray(at[pairs[:, 1:5]])
+        distance = np.sqrt(kernels.distance_sq(bool(kind), corners))
+        within = distance <= np.take(reach, surface[pairs[:, [1, 4]]]).sum(axis=1)
+        close = {tuple(c) for c in pairs[within]}
+        assert len(close) > 50
+        assert close <= kept
+        close_count += len(close)
+    assert len(kept) - close_count < 0.5 * (len(by_box) - close_count)
+
+
 def test_a_reach_is_that_of_its_surface():
     """What is thick does not bring other surfaces together."""
     x, faces, surface = scene()

@@ -113,6 +113,13 @@ class Search {
     return rows();
   }
 
+  /// Likewise, where nothing moves, without most of what only boxes bring near.
+  IndexRows find_at_rest(const Positions& x, const std::vector<double>& reach) {
+    check_reach(reach);
+    broad_phase_.find_at_rest(checked("x", x), reach, scratch_, candidates_);
+    return rows();
+  }
+
   /// Likewise, from the list that is kept between searches.
   IndexRows find_kept(const Positions& x_t0,
                       const Positions& x_t1,
@@ -280,6 +287,7 @@ void collision_kernels(nb::module_& m) {
             return s.find(x_t0, x_t1, std::vector<double>(s.mesh().surface_count(), 0.5 * radius));
           },
           "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "radius"_a)
+      .def("find_at_rest", &Search::find_at_rest, "x"_a.noconvert(), "reach"_a)
       .def("find_kept", &Search::find_kept, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "reach"_a)
       .def("find_at", &Search::find_at, "x"_a.noconvert(), "reach"_a, "widened"_a, "wanted"_a)
       .def_prop_ro("builds", &Search::builds)
