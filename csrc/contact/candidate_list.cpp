@@ -42,23 +42,24 @@ void raise(double& largest, double value) {
   if (!(value <= largest) && !std::isnan(largest)) largest = value;
 }
 
+/// Of each surface, whose vertices come one after another.
 std::vector<Motion> motions(const CollisionMesh& mesh, const double* from, const double* to) {
   std::vector<Motion> result(mesh.surface_count());
-  std::vector<Index> count(result.size(), 0);
-  for (Index v = 0; v < mesh.vertex_count; ++v) {
-    result[mesh.vertex_surface[v]].mean += row(to, v) - row(from, v);
-    ++count[mesh.vertex_surface[v]];
-  }
-  for (std::size_t s = 0; s < result.size(); ++s) result[s].mean /= std::max(count[s], 1);
-  for (Index v = 0; v < mesh.vertex_count; ++v) {
-    Motion& motion = result[mesh.vertex_surface[v]];
-    const Vec3 u = row(to, v) - row(from, v);
-    raise(motion.largest, u.squaredNorm());
-    raise(motion.around_mean, (u - motion.mean).squaredNorm());
-  }
-  for (Motion& motion : result) {  // one root for all, which keeps their order
-    motion.largest = std::sqrt(motion.largest);
+  for (Index first = 0, last = 0; first < mesh.vertex_count; first = last) {
+    const Index surface = mesh.vertex_surface[first];
+    Motion motion;
+    for (; last < mesh.vertex_count && mesh.vertex_surface[last] == surface; ++last) {
+      motion.mean += row(to, last) - row(from, last);
+    }
+    motion.mean /= last - first;
+    for (Index v = first; v < last; ++v) {
+      const Vec3 u = row(to, v) - row(from, v);
+      raise(motion.largest, u.squaredNorm());
+      raise(motion.around_mean, (u - motion.mean).squaredNorm());
+    }
+    motion.largest = std::sqrt(motion.largest);  // one root for all, which keeps their order
     motion.around_mean = std::sqrt(motion.around_mean);
+    result[surface] = motion;
   }
   return result;
 }
@@ -153,7 +154,6 @@ void CandidateList::cull(const Kept& kept,
                          const double* x_t1,
                          std::span<const double> reach,
                          std::vector<Candidate>& out) {
-  const Index count = broad_phase_->mesh().surface_count();
   const std::size_t size = kept.reference.size();
   u_t0_.resize(size);
   u_t1_.resize(size);
@@ -161,11 +161,14 @@ void CandidateList::cull(const Kept& kept,
     u_t0_[a] = x_t0[a] - kept.reference[a];
     u_t1_[a] = x_t1[a] - kept.reference[a];
   }
+  std::vector<double> together;  // of each pair of surfaces
+  for (const double a : reach) {
+    for (const double b : reach) together.push_back(a + b + 2.0 * rounding_);
+  }
   out.clear();
   for (std::size_t k = 0; k < kept.pairs.size(); ++k) {
     const Index s = kept.surfaces[k];
-    const double together = reach[s / count] + reach[s % count] + 2.0 * rounding_;
-    const double spare = kept.distance[k] - together;
+    const double spare = kept.distance[k] - together[s];
     if (spare > approach_[s]) continue;
     // A surface counts as near as its fastest part; few of its pairs are.
     if (spare > 0.0 && spare * spare > approach_sq(kept.pairs[k], u_t0_.data(), u_t1_.data())) {
