@@ -14,11 +14,13 @@ using Mask = long long __attribute__((vector_size(8 * kPack)));
 using Stored = double __attribute__((vector_size(8 * kPack), aligned(8), may_alias));
 
 std::uint32_t find_near_boxes(const BoxGroup& a, const BoxGroup& b, double range) {
-  std::uint32_t result = 0;
-  for (int p = 0; p < kBoxGroup; ++p) {
-    for (int first = 0; first < kBoxGroup; first += kPack) {
+  Mask found = {};  // the bits of each lane; none is in two
+  for (int first = 0; first < kBoxGroup; first += kPack) {
+    Mask bit;
+    for (int l = 0; l < kPack; ++l) bit[l] = 1LL << (first + l);
+    for (int p = 0; p < kBoxGroup; ++p) {
       Pack sum = {};
-      Mask near = Mask{} == Mask{};
+      Mask near = bit << (kBoxGroup * p);
       for (int k = 0; k < 3; ++k) {
         const Pack lo = *reinterpret_cast<const Stored*>(b.lo[k] + first);
         const Pack hi = *reinterpret_cast<const Stored*>(b.hi[k] + first);
@@ -28,12 +30,11 @@ std::uint32_t find_near_boxes(const BoxGroup& a, const BoxGroup& b, double range
         const Pack apart = (over > under ? over : under) + range;
         sum += apart > 0.0 ? apart * apart : Pack{};
       }
-      near &= ~(sum > range * range);
-      for (int l = 0; l < kPack; ++l) {
-        result |= static_cast<std::uint32_t>(near[l] & 1) << (kBoxGroup * p + first + l);
-      }
+      found |= near & ~(sum > range * range);
     }
   }
+  std::uint32_t result = 0;
+  for (int l = 0; l < kPack; ++l) result |= static_cast<std::uint32_t>(found[l]);
   return result;
 }
 
