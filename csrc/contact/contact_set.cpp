@@ -346,7 +346,9 @@ void visit_positive_part(const Closest& k, double b1, double b2, Add&& add) {
 Mat3 ContactHessian::operator()(int p, int q) const {
   Mat3 h = (along_ * c_[p] * c_[q]) * Mat3::Identity();
   for (int k = 0; k < count_; ++k) {
-    h += left_[k].segment<3>(3 * p) * right_[k].segment<3>(3 * q).transpose();
+    // Column by column: of a whole product the compiler makes a copy, which costs more than itself.
+    const auto left = left_[k].segment<3>(3 * p);
+    for (int j = 0; j < 3; ++j) h.col(j) += left * right_[k][3 * q + j];
   }
   if (rest_) h += rest_->block<3, 3>(3 * p, 3 * q);
   return h;
