@@ -42,7 +42,7 @@ Index BlockPattern::slot(Index i, Index j) const {
   const Index* first = row_.data() + column_start_[j];
   for (Index count = column_start_[j + 1] - column_start_[j]; count > 0;) {
     const Index half = (count + 1) / 2;
-    first += first[half - 1] < i ? half : 0;
+    first += half * static_cast<Index>(first[half - 1] < i);
     count -= half;
   }
   return static_cast<Index>(first - row_.data());
