@@ -235,7 +235,7 @@ void CandidateList::find_at(const double* x,
   }
   with_skin_.clear();
   for (const double value : reach) with_skin_.push_back(value + kMore * widened);
-  broad_phase_->find(x, x, with_skin_, scratch, out);
+  broad_phase_->find_at_rest(x, with_skin_, scratch, out);
   std::erase_if(out, [&](const Candidate& pair) {
     const double limit = range[mesh.vertex_surface[pair.vertices[0]] * count +
                                mesh.vertex_surface[pair.vertices[3]]];

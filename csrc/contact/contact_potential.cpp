@@ -90,7 +90,7 @@ void ContactPotential::add_couplings(linalg::Couplings& pairs) const {
 void ContactPotential::add_couplings_near(const double* x, linalg::Couplings& pairs) const {
   std::vector<Candidate> near;
   detection_.candidates.find_at(x, model_.reach(), 0.5 * kSoon * model_.parameters().d_hat,
-                                model_.moves(), detection_.scratch, near);
+                                model_.moving_surfaces(), detection_.scratch, near);
   for (const Candidate& pair : near) add_stencil_couplings(pair.vertices, pairs);
 }
 

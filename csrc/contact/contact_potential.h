@@ -44,7 +44,7 @@ class ContactPotential final : public Potential {
 
   /// Stand at a point that no motion leads from: its pairs alone, without a list for later.
   void look_at(const double* x) {
-    detection_.broad_phase.find(x, x, model_.reach(), detection_.scratch, candidates_);
+    detection_.broad_phase.find_at_rest(x, model_.reach(), detection_.scratch, candidates_);
     stand_at(x);
   }
 

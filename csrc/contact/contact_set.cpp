@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <limits>
 
+#include "common/outer_product.h"
 #include "contact/distance/mollifier.h"
 
 namespace diffcloth::contact {
@@ -38,10 +39,6 @@ ContactModel::ContactModel(const CollisionMesh& mesh,
       parameters_(std::move(parameters)),
       prescribed_(prescribed) {
   for (const double t : parameters_.thickness) reach_.push_back(0.5 * (parameters_.d_hat + t));
-  moves_.assign(reach_.size(), 0);
-  for (Index v = 0; v < mesh.vertex_count; ++v) {
-    if (prescribed[v] == 0) moves_[mesh.vertex_surface[v]] = 1;
-  }
 }
 
 double ContactModel::xi(const Candidate& pair) const {
@@ -346,9 +343,7 @@ void visit_positive_part(const Closest& k, double b1, double b2, Add&& add) {
 Mat3 ContactHessian::operator()(int p, int q) const {
   Mat3 h = (along_ * c_[p] * c_[q]) * Mat3::Identity();
   for (int k = 0; k < count_; ++k) {
-    // Column by column: of a whole product the compiler makes a copy, which costs more than itself.
-    const auto left = left_[k].segment<3>(3 * p);
-    for (int j = 0; j < 3; ++j) h.col(j) += left * right_[k][3 * q + j];
+    add_outer_product(left_[k].segment<3>(3 * p), right_[k].segment<3>(3 * q), h);
   }
   if (rest_) h += rest_->block<3, 3>(3 * p, 3 * q);
   return h;
@@ -397,6 +392,14 @@ ContactHessian ContactModel::hessian(const Contact& k, const double* x, Curvatur
     h.rest_ = scale * (k.barrier.b * m.hessian + k.barrier.b1 * (cross + cross.transpose()));
   }
   return h;
+}
+
+std::vector<char> ContactModel::moving_surfaces() const {
+  std::vector<char> moves(reach_.size(), 0);
+  for (Index v = 0; v < mesh_.vertex_count; ++v) {
+    if (prescribed_[v] == 0) moves[mesh_.vertex_surface[v]] = 1;
+  }
+  return moves;
 }
 
 bool ContactModel::is_held(const Candidate& pair) const {

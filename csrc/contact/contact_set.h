@@ -146,7 +146,7 @@ class ContactModel {
   void find(const Near& near, const double* x, std::vector<Contact>& out) const;
 
   /// Whether a surface has vertices whose motion is not given [surfaces].
-  const std::vector<char>& moves() const { return moves_; }
+  std::vector<char> moving_surfaces() const;
 
   /// Whether a corner of a pair is no free vertex of a cloth.
   bool is_held(const Candidate& pair) const;
@@ -215,7 +215,6 @@ class ContactModel {
   Parameters parameters_;
   const std::vector<char>& prescribed_;
   std::vector<double> reach_;  // [S]
-  std::vector<char> moves_;    // [S]
 };
 
 /// The four corners of a pair.

@@ -2,22 +2,19 @@
 
 #include <array>
 
+#include "common/outer_product.h"
 #include "linalg/block_pattern.h"
 
 namespace diffcloth::elastic::bending {
 namespace {
-
-/// Y += u w^T, column by column: of a whole product the compiler makes a copy, which costs more than itself.
-void add_outer_product(const Vec3& u, const Vec3& w, Mat3& Y) {
-  for (int k = 0; k < 3; ++k) Y.col(k) += w[k] * u;
-}
 
 /// Y_ab = sum_i c_ab,i x_i, one a column. The weights sum to zero: the common offset cancels first.
 Mat3 second_derivatives(const Element& element, const double* x) {
   const Vec3 origin = row(x, element.vertices[0]);
   Mat3 Y = Mat3::Zero();
   for (Index i = 1; i < element.size(); ++i) {
-    add_outer_product(row(x, element.vertices[i]) - origin, element.weights(i), Y);
+    const Vec3 offset = row(x, element.vertices[i]) - origin;
+    add_outer_product(offset, element.weights(i), Y);
   }
   return Y;
 }
@@ -29,7 +26,8 @@ Mat3 second_derivatives_change(const Element& element, const double* x0, const d
   Mat3 Y = Mat3::Zero();
   for (Index i = 1; i < element.size(); ++i) {
     const Index v = element.vertices[i];
-    add_outer_product(row(x1, v) - row(x0, v) - origin, element.weights(i), Y);
+    const Vec3 offset = row(x1, v) - row(x0, v) - origin;
+    add_outer_product(offset, element.weights(i), Y);
   }
   return Y;
 }

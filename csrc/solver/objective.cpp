@@ -6,6 +6,14 @@
 #include <utility>
 
 namespace diffcloth::solver {
+namespace {
+
+/// Couplings of points as sorted ones of rows that the base pattern lacks.
+linalg::Couplings beyond_base(const Objective& f, linalg::Couplings points) {
+  return linalg::beyond(f.assemblies->base(), f.coordinates->couplings_of_rows(std::move(points)));
+}
+
+}  // namespace
 
 std::vector<double> Objective::metric() const {
   std::vector<double> result;
@@ -19,7 +27,7 @@ std::vector<double> Objective::metric() const {
 linalg::Couplings Objective::couplings() const {
   linalg::Couplings points;
   for_each([&](const Potential& p) { p.add_couplings(points); });
-  linalg::Couplings here = beyond_base(std::move(points));
+  linalg::Couplings here = beyond_base(*this, std::move(points));
   if (expected.empty()) return here;
   linalg::Couplings all;
   all.reserve(expected.size() + here.size());
@@ -30,10 +38,8 @@ linalg::Couplings Objective::couplings() const {
   return all;
 }
 
-void Objective::expect(linalg::Couplings points) { expected = beyond_base(std::move(points)); }
-
-linalg::Couplings Objective::beyond_base(linalg::Couplings points) const {
-  return linalg::beyond(assemblies->base(), coordinates->couplings_of_rows(std::move(points)));
+void Objective::expect(linalg::Couplings points) {
+  expected = beyond_base(*this, std::move(points));
 }
 
 }  // namespace diffcloth::solver

@@ -24,8 +24,7 @@ struct Objective {
   contact::ContactPotential* contact = nullptr;  ///< null where nothing can touch
   bodies::CoordinatePotential* chart = nullptr;  ///< of free coordinates; null where there are none
   AssemblyCache* assemblies;
-  linalg::Couplings
-      expected;  ///< of rows beyond the base pattern, sorted: couplings() has them always
+  linalg::Couplings expected;  ///< of rows beyond the base pattern, sorted: always in couplings()
 
   /// Every potential in a fixed order.
   template <class Visit>
@@ -87,9 +86,6 @@ struct Objective {
 
   /// Expect couplings of points, in place of those expected so far.
   void expect(linalg::Couplings points);
-
-  /// Couplings of points as sorted ones of rows that the base pattern lacks.
-  linalg::Couplings beyond_base(linalg::Couplings points) const;
 };
 
 }  // namespace diffcloth::solver

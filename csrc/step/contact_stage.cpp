@@ -334,7 +334,8 @@ void ContactStage::backward(const Backward& step, std::vector<Array> g) {
     const std::size_t place = first_factor + k;
     const auto& factors = step.kept.factors;
     solver::Factor factor = place < factors.size() ? factors[place] : nullptr;
-    if (!factor) sum.expect_contacts_near(problem.start);
+    // Of all solves the same.
+    if (!factor && sum.objective.expected.empty()) sum.expect_contacts_near(problem.start);
     pull_back_solve(step, sum.objective, x, std::move(factor), g, k + 1 == solves, exchange_all);
 
     for (std::size_t l = 0; l < g.size(); ++l) {
