@@ -22,9 +22,10 @@ constexpr double kGrowth = 2.0;
 constexpr double kNoShare = 0.05;
 constexpr double kFullShare = 64.0;
 constexpr double kLargestShare = 1e8;
-/// A step is good that gains this share of what its quadratic model promises, at once; after this
-/// many backtracks the model is poor.
+/// A step is good that gains this share of what its quadratic model promises, at once; the model is poor
+/// where it gains less than the second, as when it has crossed a valley, or after this many backtracks.
 constexpr double kGoodGain = 0.25;
+constexpr double kPoorGain = 0.1;
 constexpr int kManyBacktracks = 3;
 /// Damped steps are lengthened to where the exact curvature along them puts the minimum.
 constexpr double kWorthGrowing = 1.5;
@@ -142,7 +143,8 @@ void Directions::learn(const Direction& direction, const Search& search) {
   if (search.backtracks == 0 && search.gain <= kGoodGain * promised) {
     s_ *= kDecay;
     if (s_ < kNoShare) s_ = 0.0;
-  } else if (search.backtracks >= kManyBacktracks) {
+  } else if (search.backtracks >= kManyBacktracks ||
+             (search.measured && search.gain > kPoorGain * promised)) {
     s_ = std::min(kGrowth * s_, kFullShare);
   }
 }
