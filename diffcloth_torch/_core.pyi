@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 Arrays = dict[str, NDArray[Any]]
 
 input_names: list[str]
+number_names: list[str]
+"""Of the lists "numbers" that a step returns."""
 
 class SimulationError(RuntimeError): ...
 
@@ -37,7 +39,6 @@ class FreeMotion:
 class Kept: ...
 
 class Simulator:
-    phases: list[str]
     largest_factor_bytes: int
     factor_bytes: int
     def __init__(

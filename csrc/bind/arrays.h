@@ -24,6 +24,7 @@ struct Owned {
   nb::object array;
 };
 
+/// An array of zeros.
 template <class T>
 Owned<T> make_array(const std::vector<std::size_t>& shape) {
   std::size_t size = 1;

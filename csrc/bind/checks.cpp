@@ -174,14 +174,14 @@ std::vector<std::size_t> accepted_counts(const step::Scene& scene, Input input) 
 void check_inputs(const step::Scene& scene, const step::Inputs& inputs) {
   for (std::size_t k = 0; k < step::kInputCount; ++k) {
     const auto input = static_cast<Input>(k);
-    const std::string name = std::string("`") + step::kInputNames[k] + "`";
     const step::View& view = inputs[input];
-    if (view.data == nullptr && view.count == 0) {
-      require(!is_needed(scene, inputs, input), name + " is missing");
-      continue;
-    }
+    const bool absent = view.data == nullptr && view.count == 0;
+    if (absent && !is_needed(scene, inputs, input)) continue;
     const std::vector<std::size_t> accepted = accepted_counts(scene, input);
-    if (std::ranges::find(accepted, view.count) != accepted.end()) continue;
+    if (!absent && std::ranges::find(accepted, view.count) != accepted.end()) continue;
+    // Words only for what is wrong: each step comes by here.
+    const std::string name = std::string("`") + step::kInputNames[k] + "`";
+    require(!absent, name + " is missing");
     std::string counts;
     for (const std::size_t count : accepted) {
       counts += (counts.empty() ? "" : " or ") + std::to_string(count);

@@ -4,7 +4,7 @@
 #include <memory>
 #include <stdexcept>
 #include <string>
-#include <type_traits>
+#include <utility>
 
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -60,13 +60,10 @@ struct Arrays {
     environments = array[kPositions].shape(0);
     for (std::size_t k = 0; k < kInputCount; ++k) {
       if (!present[k]) continue;
-      const std::string name = std::string("core: `") + step::kInputNames[k];
       if (array[k].ndim() == 0 || (array[k].shape(0) != 1 && array[k].shape(0) != environments)) {
-        throw nb::value_error((name + "` must have the rows of one environment or of all").c_str());
+        refuse(k, "must have the rows of one environment or of all");
       }
-      if (finite && !is_finite(array[k])) {
-        throw nb::value_error((name + "` must be finite").c_str());
-      }
+      if (finite && !is_finite(array[k])) refuse(k, "must be finite");
     }
     check_inputs(scene, environment(0));
   }
@@ -81,6 +78,12 @@ struct Arrays {
     }
     return inputs;
   }
+
+ private:
+  [[noreturn]] static void refuse(std::size_t k, const char* accepted) {
+    throw nb::value_error(
+        (std::string("core: `") + step::kInputNames[k] + "` " + accepted).c_str());
+  }
 };
 
 /// What a step with a tape keeps for its backward, environment by environment: given up with the tape.
@@ -88,9 +91,42 @@ struct KeptSteps {
   std::vector<std::shared_ptr<step::FactorCache::Ticket>> tickets;
 };
 
+/// Call visit(name, value) for every number of a report, seconds of the phases included.
+template <class Visit>
+void for_each_number(const step::Report& report, Visit&& visit) {
+  report.for_each(visit);
+  for (std::size_t k = 0; k < kPhaseCount; ++k) visit(kPhaseNames[k], report.seconds[k]);
+}
+
+/// What for_each_number() visits, a phase with a prefix.
+std::vector<std::string> number_names() {
+  std::vector<std::string> names;
+  step::Report().for_each([&](const char* name, auto /*value*/) { names.emplace_back(name); });
+  for (const char* const phase : kPhaseNames) names.push_back(std::string("seconds_") + phase);
+  return names;
+}
+
+/// The numbers of all environments' reports, a list of each: cheaper than arrays of one number.
+nb::list to_lists(const std::vector<step::Report>& reports) {
+  std::vector<nb::list> columns;
+  for (const step::Report& report : reports) {
+    std::size_t k = 0;
+    for_each_number(report, [&](const char* /*name*/, auto value) {
+      if (k == columns.size()) columns.emplace_back();
+      columns[k++].append(value);
+    });
+  }
+  nb::list lists;
+  for (const nb::list& column : columns) lists.append(column);
+  return lists;
+}
+
 class Simulator {
  public:
-  explicit Simulator(step::Description description) : scene_(std::move(description)) {}
+  explicit Simulator(step::Description description)
+      : scene_(std::move(description)),
+        outputs_(step::output_fields(scene_)),
+        tape_(step::tape_fields(scene_)) {}
 
   nb::dict forward(const nb::dict& inputs, bool tape, int threads);
   nb::dict backward(const nb::dict& inputs,
@@ -123,6 +159,8 @@ class Simulator {
 
  private:
   step::Scene scene_;
+  std::vector<step::Field> outputs_;
+  std::vector<step::Field> tape_;
   step::FactorCache factors_;
 };
 
@@ -138,7 +176,6 @@ class Outputs {
       std::vector<std::size_t> shape{environments};
       shape.insert(shape.end(), field.shape.begin(), field.shape.end());
       Owned<double> owned = make_array<double>(shape);
-      std::fill_n(owned.data, environments * field.size(), 0.0);
       out[(prefix + field.name).c_str()] = owned.array;
       entries_.push_back({.name = field.name, .data = owned.data, .size = field.size()});
     }
@@ -208,43 +245,12 @@ class Saved {
   std::vector<Entry> entries_;
 };
 
-/// The reports of all environments, one array [environments] a number.
-void add_reports(const std::vector<step::Report>& reports, nb::dict& out) {
-  const std::size_t b = reports.size();
-  std::map<std::string, double*> numbers;
-  std::map<std::string, std::int64_t*> integers;
-  const auto slot = [&]<class T>(std::map<std::string, T*>& arrays, const char* name) {
-    if (!arrays.contains(name)) {
-      Owned<T> owned = make_array<T>({b});
-      out[name] = owned.array;
-      arrays[name] = owned.data;
-    }
-    return arrays[name];
-  };
-  Owned<double> seconds = make_array<double>({b, kPhaseCount});
-  nb::list messages;
-  for (std::size_t e = 0; e < b; ++e) {
-    reports[e].for_each([&](const char* name, auto value) {
-      if constexpr (std::is_same_v<decltype(value), double>) {
-        slot(numbers, name)[e] = value;
-      } else {
-        slot(integers, name)[e] = value;
-      }
-    });
-    std::ranges::copy(reports[e].seconds, seconds.data + e * kPhaseCount);
-    messages.append(reports[e].message);
-  }
-  out["seconds"] = seconds.array;
-  out["message"] = messages;
-}
-
 nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   const Arrays arrays(scene_, inputs);
   const std::size_t b = arrays.environments;
   nb::dict out;
-  const Outputs outputs(step::output_fields(scene_), b, "", out);
-  const Outputs tapes(tape ? step::tape_fields(scene_) : std::vector<step::Field>(), b, "tape_",
-                      out);
+  const Outputs outputs(outputs_, b, "", out);
+  const Outputs tapes(tape ? tape_ : std::vector<step::Field>(), b, "tape_", out);
   std::vector<step::Report> reports(b);
   KeptSteps kept{.tickets = decltype(KeptSteps::tickets)(b)};
   for_environments(b, threads, [&](Index i, const Checkpoint& checkpoint) {
@@ -255,7 +261,10 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
     if (tape) kept.tickets[e] = factors_.insert(std::move(found));
   });
   if (tape) out["kept"] = nb::cast(std::move(kept));
-  add_reports(reports, out);
+  out["numbers"] = to_lists(reports);
+  nb::list messages;
+  for (const step::Report& report : reports) messages.append(report.message);
+  out["message"] = messages;
   return out;
 }
 
@@ -268,12 +277,12 @@ nb::dict Simulator::backward(const nb::dict& inputs,
                              int threads) {
   const Arrays arrays(scene_, inputs, true);
   const std::size_t b = arrays.environments;
-  const Saved tapes(step::tape_fields(scene_), b, "tape_", tape);
+  const Saved tapes(tape_, b, "tape_", tape);
   if (!tapes.is_finite()) throw nb::value_error("core: the tape must be finite");
   if (kept.tickets.size() != b) {
     throw nb::value_error("core: `kept` must be of as many environments as the inputs");
   }
-  const Saved bars(step::output_fields(scene_), losses * b, "", cotangents);
+  const Saved bars(outputs_, losses * b, "", cotangents);
 
   // [losses, environments or 1, count]. Each environment of a loss writes into its own copy; those of
   // inputs that environments share are then summed in index order.
@@ -295,7 +304,6 @@ nb::dict Simulator::backward(const nb::dict& inputs,
     std::vector<std::size_t> shape{losses};
     for (std::size_t d = 0; d < array.ndim(); ++d) shape.push_back(array.shape(d));
     Owned<double> owned = make_array<double>(shape);
-    std::fill_n(owned.data, losses * array.size(), 0.0);
     out[name.c_str()] = owned.array;
     const std::size_t copies = array.shape(0);
     const std::size_t count = array.size() / copies;
@@ -345,7 +353,7 @@ nb::dict Simulator::backward(const nb::dict& inputs,
 nb::object Simulator::path(const nb::dict& inputs) {
   const Arrays arrays(scene_, inputs);
   nb::dict unused;
-  const Outputs outputs(step::output_fields(scene_), 1, "", unused);
+  const Outputs outputs(outputs_, 1, "", unused);
   std::vector<std::vector<double>> path;
   for_environments(1, 1, [&](Index, const Checkpoint& checkpoint) {
     step::Kept kept;
@@ -584,12 +592,10 @@ void simulator(nb::module_& m) {
       .def_prop_ro("factor_bytes", &Simulator::factor_bytes,
                    "What the factors kept for backward take up; at most `largest_factor_bytes`.")
       .def_prop_ro_static("largest_factor_bytes",
-                          [](nb::handle) { return step::FactorCache::kBytes; })
-      .def_prop_ro_static("phases", [](nb::handle) {
-        return std::vector<std::string>(kPhaseNames.begin(), kPhaseNames.end());
-      });
+                          [](nb::handle) { return step::FactorCache::kBytes; });
   m.attr("input_names") =
       std::vector<std::string>(step::kInputNames.begin(), step::kInputNames.end());
+  m.attr("number_names") = number_names();
 }
 
 }  // namespace diffcloth::bind

@@ -21,7 +21,7 @@ from diffcloth_torch.sim.inputs import Fields
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.links import link_poses
 from diffcloth_torch.sim.masses import vertex_masses
-from diffcloth_torch.sim.step import CONVERGED, Outcome, as_array, take_step
+from diffcloth_torch.sim.step import Outcome, as_array, diagnostics_of, take_step, unconverged
 
 __all__ = ["Staggered"]
 
@@ -179,7 +179,7 @@ class Staggered:
     def _require_free_way(self, inputs: dict[str, FloatArray]) -> None:
         """Refuse a motion of bodies and robots through cloths that stand still."""
         result = self._judge.forward(inputs, False, torch.get_num_threads())
-        blocked = np.flatnonzero(result["status"] != CONVERGED).tolist()
+        blocked = unconverged(diagnostics_of(result))
         if blocked:
             raise InfeasibleMotion(
                 f"step: what forces move in the environments {blocked} cannot go on without "
@@ -243,7 +243,7 @@ def _merged(cloth: dict[str, Any], rigid: dict[str, Any]) -> dict[str, Any]:
         "motion_fraction": np.minimum,
     }
     merged = {
-        name: combine.get(name, np.add)(values, rigid[name])
+        name: combine.get(name, np.add)(values, rigid[name]).tolist()
         for name, values in cloth.items()
         if name != "message"
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,32 +14,35 @@ from diffcloth_torch.errors import (
     SimulationError,
 )
 from diffcloth_torch.sim.report import Report
-from diffcloth_torch.sim.step import CONVERGED, INFEASIBLE, INTERSECTING, UNCONVERGED
+from diffcloth_torch.sim.step import CONVERGED, DIAGNOSTICS, INFEASIBLE, INTERSECTING, UNCONVERGED
 
 __all__ = ["make_report", "raise_on_failure"]
 
-_COUNT = "count_"  # opens the names of the core's counters
+
+def _named(prefix: str) -> dict[str, str]:
+    """What the core's numbers under a prefix are called in a report -> their full names."""
+    return {n.removeprefix(prefix): n for n in DIAGNOSTICS if n.startswith(prefix)}
 
 
-def make_report(diagnostics: dict[str, Any], phases: Sequence[str], *, batched: bool) -> Report:
-    """Put the core's arrays [B] into a report."""
+_SECONDS = _named("seconds_")
+_COUNTS = _named("count_")
 
-    def value(array: np.ndarray[Any, Any]) -> Any:
-        return torch.from_numpy(np.array(array)) if batched else array[0].item()
+
+def make_report(diagnostics: dict[str, Any], *, batched: bool) -> Report:
+    """Put the core's numbers into a report."""
+
+    def value(numbers: list[Any]) -> Any:
+        return torch.from_numpy(np.array(numbers)) if batched else numbers[0]
 
     return Report(
-        converged=value(diagnostics["status"] == CONVERGED),
+        converged=value([status == CONVERGED for status in diagnostics["status"]]),
         iterations=value(diagnostics["iterations"]),
         residual=value(diagnostics["residual"]),
         minimum_distance=value(diagnostics["minimum_distance"]),
         contact_count=value(diagnostics["contact_count"]),
         motion_fraction=value(diagnostics["motion_fraction"]),
-        seconds={phase: value(diagnostics["seconds"][:, i]) for i, phase in enumerate(phases)},
-        counts={
-            name.removeprefix(_COUNT): value(array)
-            for name, array in diagnostics.items()
-            if name.startswith(_COUNT)
-        },
+        seconds={phase: value(diagnostics[name]) for phase, name in _SECONDS.items()},
+        counts={what: value(diagnostics[name]) for what, name in _COUNTS.items()},
     )
 
 
@@ -48,9 +50,9 @@ def raise_on_failure(
     diagnostics: dict[str, Any], report: Report, *, throw: bool, batched: bool
 ) -> None:
     """Raise what is most wrong in any environment; `throw` says whether `NotConverged` is."""
-    status = diagnostics["status"]
+    status, reached = (np.array(diagnostics[name]) for name in ("status", "motion_fraction"))
     # Bodies stand at the targets in the new state, so that a motion cut short has no state.
-    unfinished = (status == UNCONVERGED) & (diagnostics["motion_fraction"] < 1)
+    unfinished = (status == UNCONVERGED) & (reached < 1)
     failures: list[tuple[type[SimulationError], np.ndarray[Any, Any], str]] = [
         (
             IntersectingState,

@@ -55,15 +55,15 @@ class Report:
 
     def __post_init__(self) -> None:
         # Reports come back from files, too: what is wrong is said here, not where it is used.
-        for entry in fields(Report):
-            value = self.__dict__.get(entry.name)
-            table = value if entry.name in _TABLES else {None: value}
+        for entry in _FIELDS:
+            value = self.__dict__.get(entry)
+            table = value if entry in _TABLES else {None: value}
             if not isinstance(table, dict):
                 kind = type(table).__name__
-                raise TypeError(f"Report: `{entry.name}` must be a dict of numbers, got {kind}")
+                raise TypeError(f"Report: `{entry}` must be a dict of numbers, got {kind}")
             for name, number in table.items():
-                if not isinstance(number, bool | int | float | Tensor):
-                    label = entry.name if name is None else f"{entry.name}[{name!r}]"
+                if not isinstance(number, _NUMBERS):
+                    label = entry if name is None else f"{entry}[{name!r}]"
                     kind = type(number).__name__
                     raise TypeError(f"Report: `{label}` must be a number or a tensor, got {kind}")
 
@@ -148,6 +148,8 @@ def _range_text(values: Any) -> str:
     return low if low == high else f"{low} .. {high}"
 
 
+_FIELDS = tuple(entry.name for entry in fields(Report))
+_NUMBERS = (bool, int, float, Tensor)
 # Fields that hold several numbers by name.
 _TABLES = ("seconds", "counts")
 

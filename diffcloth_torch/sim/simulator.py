@@ -326,7 +326,7 @@ class Simulator:
             outcome, after = self._step_together(before, wanted, physical, batch)
         else:
             outcome, after = self._step_in_turn(before, wanted, physical, batch)
-        report = make_report(outcome.diagnostics, self._core.phases, batched=batch is not None)
+        report = make_report(outcome.diagnostics, batched=batch is not None)
         after["soft_pin_targets"] = wanted["soft_pins"]
         after["time"] = before["time"] + self.dt
         return State(
@@ -371,10 +371,10 @@ class Simulator:
         return outcome, {**after, "joint_targets": held_targets(self._layout, state, control)}
 
     def _check(self, diagnostics: dict[str, Any], batch: int | None) -> None:
-        if not diagnostics["status"].any():
+        if not any(diagnostics["status"]):
             return
         batched = batch is not None
-        report = make_report(diagnostics, self._core.phases, batched=batched)
+        report = make_report(diagnostics, batched=batched)
         raise_on_failure(diagnostics, report, throw=self.solver.throw, batched=batched)
 
     def rollout(

@@ -35,17 +35,23 @@ from diffcloth_torch.sim.controls import tensors_of
 
 __all__ = [
     "CONVERGED",
+    "DIAGNOSTICS",
     "INFEASIBLE",
     "INTERSECTING",
     "UNCONVERGED",
     "Outcome",
     "as_array",
+    "diagnostics_of",
     "refuse_transforms",
     "take_step",
+    "unconverged",
 ]
 
 # Values of the core's `status`, per environment.
 CONVERGED, UNCONVERGED, INFEASIBLE, INTERSECTING = 0, 1, 2, 3
+
+DIAGNOSTICS = tuple(_core.number_names)
+"""Names of the numbers that the core has for each environment; some open with what they are."""
 
 # The last one only of scenes that have coordinates.
 _OUTPUTS = ("positions", "velocities", "body_forces", "coordinates")
@@ -69,7 +75,7 @@ class Outcome(NamedTuple):
         positions: [B, N, 3], or [N, 3] without a batch axis.
         velocities: Likewise.
         body_forces: [B, V, 3] or [V, 3].
-        diagnostics: Arrays [B] of the core: status, message and the entries of the report.
+        diagnostics: Lists of length B of the core: status, message and the entries of the report.
         coordinates: Of bodies and robots at the end of the step, [B, n] or [n]; None where there
             are none.
     """
@@ -101,7 +107,7 @@ def take_step(core: _core.Simulator, inputs: dict[str, Tensor], *, batched: bool
     needs_tape = torch.is_grad_enabled() and any(t.requires_grad for t in inputs.values())
     if not needs_tape:
         result = _forward(core, {name: as_array(t) for name, t in inputs.items()}, tape=False)
-        return _outcome(_outputs(result, batched), _diagnostics(result))
+        return _outcome(_outputs(result, batched), diagnostics_of(result))
     diagnostics: dict[str, Any] = {}
     outputs = _Step.apply(core, tuple(inputs), batched, diagnostics, *inputs.values())
     return _outcome(outputs, diagnostics)
@@ -137,8 +143,15 @@ def _outcome(outputs: tuple[Tensor, ...], diagnostics: dict[str, Any]) -> Outcom
     return Outcome(positions, velocities, body_forces, diagnostics, *coordinates)
 
 
-def _diagnostics(result: dict[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in result.items() if k not in _OUTPUTS and not k.startswith(_TAPE)}
+def diagnostics_of(result: dict[str, Any]) -> dict[str, Any]:
+    """What a core says of a step: for each name a list of the environments' numbers or texts."""
+    numbers = zip(DIAGNOSTICS, result["numbers"], strict=True)
+    return {**dict(numbers), "message": result["message"]}
+
+
+def unconverged(diagnostics: dict[str, Any]) -> list[int]:
+    """Environments whose solve did not converge."""
+    return [i for i, status in enumerate(diagnostics["status"]) if status != CONVERGED]
 
 
 class _Step(torch.autograd.Function):
@@ -152,9 +165,9 @@ class _Step(torch.autograd.Function):
         ctx.shapes = [t.shape for t in (*tensors, *tape.values())]
         ctx.core, ctx.names, ctx.tape_names, ctx.batched = core, names, tuple(tape), batched
         # Factors and contacts, which the core forgets when the graph goes.
-        ctx.kept = result.pop(_KEPT)
-        diagnostics.update(_diagnostics(result))
-        ctx.unconverged = np.flatnonzero(result["status"] != CONVERGED).tolist()
+        ctx.kept = result[_KEPT]
+        diagnostics.update(diagnostics_of(result))
+        ctx.unconverged = unconverged(diagnostics)
         return _outputs(result, batched)
 
     @staticmethod

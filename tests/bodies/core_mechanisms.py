@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import diffcloth_torch as dc
 from diffcloth_torch import _core
+from diffcloth_torch.sim.step import diagnostics_of
 
 DT = 0.01
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
@@ -132,8 +133,9 @@ class CoreScene:
 
     def forward(self, arrays, *, tape=False):
         result = self.core.forward(arrays, tape, 1)
-        assert result["status"][0] == 0, (result["message"], result["residual"])
-        return result
+        found = diagnostics_of(result)
+        assert found["status"] == [0], (found["message"], found["residual"])
+        return result | found
 
     def gradients(self, arrays, cotangents):
         result = self.forward(arrays, tape=True)

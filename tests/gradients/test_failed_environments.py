@@ -164,10 +164,10 @@ def test_a_motion_that_cannot_be_completed_raises_even_where_nothing_throws(thro
 def test_iterations_that_end_within_a_motion_make_it_infeasible(throw):
     # The bodies of the new state would stand where they did not arrive.
     diagnostics = {
-        "status": np.array([CONVERGED, UNCONVERGED]),
-        "motion_fraction": np.array([1.0, 0.5]),
-        "iterations": np.array([3, 200]),
-        "residual": np.array([0.0, 1.0]),
+        "status": [CONVERGED, UNCONVERGED],
+        "motion_fraction": [1.0, 0.5],
+        "iterations": [3, 200],
+        "residual": [0.0, 1.0],
         "message": ["", ""],
     }
     with pytest.raises(dc.InfeasibleMotion, match=r"environments \[1\].* fraction 0\.5"):
