@@ -133,7 +133,7 @@ def float_tensor(name: str, value: object) -> Tensor:
     _require_dense(name, value)
     if value.dtype not in _PROMOTABLE + _INTEGERS:
         raise TypeError(f"{name} must be a tensor of real numbers, got {value.dtype}")
-    return value.to(torch.float64)
+    return value if value.dtype == torch.float64 else value.to(torch.float64)
 
 
 def is_dense(value: Tensor) -> bool:
@@ -145,7 +145,7 @@ def _require_dense(name: str, value: Tensor) -> None:
     if not is_dense(value):
         kind = "a nested tensor" if value.is_nested else str(value.layout)
         raise TypeError(f"{name} must be a dense tensor, got {kind}; make it dense first")
-    if value.device.type != "cpu":
+    if not value.is_cpu:
         raise TypeError(f"{name} must be on the CPU, got {value.device}; call .cpu() first")
 
 

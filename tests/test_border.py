@@ -173,6 +173,35 @@ def test_hooks_on_saved_tensors_cannot_reach_the_core_with_something_else(sim, c
     assert sim.step(state).report.converged
 
 
+# --- What each step looks at first ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("at", [0, 3, 10])
+@pytest.mark.parametrize(
+    ("value", "is_within"),
+    [(2.0, True), (-2.0, True), (2.1, False), (-2.1, False)]
+    + [(value, False) for value in (np.nan, np.inf, -np.inf)],
+)
+def test_numbers_are_within_a_size(value, at, is_within):
+    numbers = np.ones(11)
+    numbers[at] = value
+    assert _core.are_within([np.ones(3), numbers], 2.0) is is_within
+    assert _core.are_within([np.repeat(numbers, 2)[::2]], 2.0) is is_within
+    assert _core.are_within([], 2.0)
+
+
+@pytest.mark.parametrize("shape", [(7,), (3, 7), (2, 3, 7)])
+@pytest.mark.parametrize("entry", range(3, 7))
+def test_quaternions_have_a_length(shape, entry):
+    poses = np.zeros(shape)
+    poses[..., entry] = -0.5
+    assert _core.have_quaternions(poses, 0.49)
+    assert not _core.have_quaternions(poses, 0.5)
+    poses[..., :3] = 1.0  # positions do not count
+    poses.reshape(-1, 7)[-1, entry] = 0.4
+    assert not _core.have_quaternions(poses, 0.49)
+
+
 # --- What a core is made from --------------------------------------------------------------------
 
 

@@ -39,6 +39,27 @@ bool is_finite(const Doubles& array) {
                      [](double value) { return std::isfinite(value); });
 }
 
+/// Whether all numbers are at most `largest` in size; no NaN is.
+bool are_within(const std::vector<Doubles>& arrays, double largest) {
+  return std::ranges::all_of(arrays, [&](const Doubles& array) {
+    std::int64_t beyond = 0;  // no branch, so that the compiler takes several numbers at once
+    for (std::size_t i = 0; i < array.size(); ++i) {
+      beyond |= static_cast<std::int64_t>(!(std::abs(array.data()[i]) <= largest));
+    }
+    return beyond == 0;
+  });
+}
+
+/// Whether all poses [.., 7] have quaternions longer than this.
+bool have_quaternions(const Doubles& poses, double shortest) {
+  for (std::size_t k = 0; k + 7 <= poses.size(); k += 7) {
+    const double* const q = poses.data() + k + 3;
+    if (!(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3] > shortest * shortest))
+      return false;
+  }
+  return true;
+}
+
 /// The arrays of a call, and what one environment sees of them.
 struct Arrays {
   std::array<Doubles, kInputCount> array;
@@ -595,6 +616,10 @@ void simulator(nb::module_& m) {
                           [](nb::handle) { return step::FactorCache::kBytes; });
   m.attr("input_names") =
       std::vector<std::string>(step::kInputNames.begin(), step::kInputNames.end());
+  m.def("are_within", &are_within, "arrays"_a, "largest"_a,
+        "Whether all numbers are at most `largest` in size; NaN is not.");
+  m.def("have_quaternions", &have_quaternions, "poses"_a, "shortest"_a,
+        "Whether all poses [.., 7] have quaternions longer than `shortest`.");
   m.attr("number_names") = number_names();
 }
 

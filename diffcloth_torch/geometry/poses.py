@@ -7,18 +7,25 @@ import numpy as np
 from diffcloth_torch.checks import FloatArray, check_finite, check_shape, float_array
 from diffcloth_torch.errors import InvalidInput
 
-__all__ = ["IDENTITY", "check_quaternions", "pose_array", "rotation_matrix", "transform"]
+__all__ = [
+    "IDENTITY",
+    "SHORTEST_QUATERNION",
+    "check_quaternions",
+    "pose_array",
+    "rotation_matrix",
+    "transform",
+]
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 # A quaternion shorter than this is taken for an uninitialized row, not for a rotation.
-_SHORTEST_QUATERNION = 1e-6
+SHORTEST_QUATERNION = 1e-6
 
 
 def check_quaternions(name: str, poses: FloatArray) -> None:
     """Require quaternions [..., 3:7] that can be normalized."""
     norms = np.linalg.norm(poses[..., 3:], axis=-1)
-    wrong = norms < _SHORTEST_QUATERNION
+    wrong = norms < SHORTEST_QUATERNION
     if wrong.any():
         at = [int(i) for i in np.argwhere(wrong)[0]]
         where = f" at {at}" if at else ""

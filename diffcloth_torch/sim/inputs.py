@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch.checks import (
+    LARGEST,
     FloatArray,
     check_finite,
     check_range,
@@ -24,12 +25,13 @@ from diffcloth_torch.checks import (
     is_dense,
 )
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.geometry.poses import check_quaternions
+from diffcloth_torch.geometry.poses import SHORTEST_QUATERNION, check_quaternions
 from diffcloth_torch.geometry.surfaces import check_areas
 from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Shape
 from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.step import are_within, have_quaternions
 
 __all__ = [
     "Fields",
@@ -63,27 +65,34 @@ def state_fields(layout: Layout, state: State) -> tuple[Fields, int | None]:
     """Check a state; returns its tensors and its batch size, None without a batch axis."""
     if not isinstance(state, State):
         raise TypeError(f"step: `state` must be a State, got {type(state).__name__}")
-    for name in layout.state_shapes:
-        _check_state_tensor(name, getattr(state, name))
+    tensors = {name: getattr(state, name) for name in layout.state_shapes}
+    for name, tensor in tensors.items():
+        _check_state_tensor(name, tensor)
     batch = state.batch_size
-    fields = {}
-    for name, shape in layout.state_shapes.items():
-        tensor = getattr(state, name)
-        label = f"step: `state.{name}`"
-        if name == "positions":
-            check_shape(label, tensor.shape, [shape, ("B", *shape)])
-        else:
-            check_shape(label, tensor.shape, [shape if batch is None else (batch, *shape)])
-        if tensor.numel():
-            check_finite(label, _numbers(tensor))
-        fields[name] = tensor.unsqueeze(0) if batch is None else tensor
+    environments = () if batch is None else (batch,)
+    fit = all(t.shape == (*environments, *layout.state_shapes[n]) for n, t in tensors.items())
+    numbers = {name: _numbers(tensor) for name, tensor in tensors.items() if tensor.numel()}
+    if not fit or not are_within(list(numbers.values()), LARGEST):
+        _refuse_state(layout, tensors, environments)
     if batch == 0:
         raise InvalidInput("step: `state` must hold at least one environment, got a batch of 0")
     for name in _POSES:
-        check_quaternions(f"step: `state.{name}`", _numbers(getattr(state, name)))
+        if name in numbers:
+            _check_quaternions(f"step: `state.{name}`", numbers[name])
     if layout.joint_names:
-        _check_zones(layout, _numbers(fields["joint_positions"]))
-    return fields, batch
+        _check_zones(layout, numbers["joint_positions"])
+    used = {name: tensors[name] for name in layout.state_fields}
+    return {n: t.unsqueeze(0) for n, t in used.items()} if batch is None else used, batch
+
+
+def _refuse_state(layout: Layout, tensors: Fields, environments: Shape) -> None:
+    """Say which is the first tensor whose shape or values are not accepted."""
+    for name, shape in layout.state_shapes.items():
+        label = f"step: `state.{name}`"
+        of_any_batch: list[tuple[int | str, ...]] = [shape, ("B", *shape)]
+        accepted = of_any_batch if name == "positions" else [(*environments, *shape)]
+        check_shape(label, tensors[name].shape, accepted)
+        check_finite(label, _numbers(tensors[name]))
 
 
 def _check_zones(layout: Layout, positions: FloatArray) -> None:
@@ -110,7 +119,7 @@ def _check_state_tensor(name: str, tensor: object) -> None:
         raise TypeError(
             f"step: `state.{name}` must be a torch tensor, got {type(tensor).__name__}; {remedy}"
         )
-    if tensor.dtype != torch.float64 or tensor.device.type != "cpu" or not is_dense(tensor):
+    if tensor.dtype != torch.float64 or not tensor.is_cpu or not is_dense(tensor):
         layout = "nested" if tensor.is_nested else tensor.layout
         raise TypeError(
             f"step: `state.{name}` must be a dense float64 tensor on the CPU, "
@@ -140,10 +149,18 @@ def _target(field: str, label: str, value: object, shape: Shape) -> Tensor:
     name = f"control: `{label}`"
     tensor = float_tensor(name, value)
     check_shape(name, tensor.shape, [shape, ("B", *shape)])
-    check_finite(name, _numbers(tensor))
+    numbers = _numbers(tensor)
+    if not are_within([numbers], LARGEST):
+        check_finite(name, numbers)
     if field in _POSES:
-        check_quaternions(name, _numbers(tensor))
+        _check_quaternions(name, numbers)
     return tensor
+
+
+def _check_quaternions(name: str, poses: FloatArray) -> None:
+    # Where lengths are near the shortest, that function has the last word.
+    if not have_quaternions(poses, 2 * SHORTEST_QUATERNION):
+        check_quaternions(name, poses)
 
 
 def _named_targets(layout: Layout, field: str, given: Mapping[str, object]) -> dict[str, Tensor]:

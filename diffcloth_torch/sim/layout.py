@@ -35,6 +35,7 @@ class Layout:
     Attributes:
         assembly: Arrays of the scene.
         state_shapes: Shape of each field of a state that a step looks at.
+        state_fields: Those that anything is computed with, beside the time.
         control_shapes: Shape of each field of a control.
         parameter_shapes: Accepted shapes of each parameter.
         pins: Vertices that are pinned, shape [P].
@@ -86,6 +87,9 @@ class Layout:
         kinematic = [k for k, body in enumerate(self.bodies) if body.base == "kinematic"]
         self.kinematic_bodies = torch.tensor(kinematic, dtype=torch.int64)
         self.is_dynamic = any(mechanism.is_dynamic for mechanism in assembly.mechanisms)
+        self.state_fields = tuple(
+            name for name, q in looked_at.items() if self.has_coordinates or q.core is not None
+        )
         self.joint_names = tuple(
             f"{r.name}/{joint}" for r in self.robots for joint in r.joint_names
         )

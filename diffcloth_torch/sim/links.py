@@ -20,6 +20,8 @@ ByName = dict[str, Tensor]
 
 def link_poses(layout: Layout, state: Fields) -> ByName:
     """Frames of all links, "robot/link" -> [B, 4, 4]."""
+    if not layout.robots:  # then the fields lack theirs
+        return {}
     bases = pose_frame(state["base_poses"])
     named: ByName = {}
     for r, (tree, joints) in enumerate(_trees(layout)):
@@ -37,6 +39,8 @@ def link_velocities(layout: Layout, state: Fields, link_centers: Tensor) -> ByNa
         state: Fields of a state.
         link_centers: In the links' frames [m], shape [B or 1, L, 3].
     """
+    if not layout.robots:
+        return {}
     bases = pose_frame(state["base_poses"])
     named: ByName = {}
     first = 0

@@ -328,11 +328,11 @@ class Simulator:
             outcome, after = self._step_in_turn(before, wanted, physical, batch)
         report = make_report(outcome.diagnostics, batched=batch is not None)
         after["soft_pin_targets"] = wanted["soft_pins"]
-        after["time"] = before["time"] + self.dt
         return State(
             positions=outcome.positions,
             velocities=outcome.velocities,
             body_forces=outcome.body_forces,
+            time=state.time + self.dt,
             **{name: _own_copy(values, batch) for name, values in after.items()},
             report=report,
             _surfaces=self._surfaces,

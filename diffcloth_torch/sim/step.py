@@ -40,8 +40,10 @@ __all__ = [
     "INTERSECTING",
     "UNCONVERGED",
     "Outcome",
+    "are_within",
     "as_array",
     "diagnostics_of",
+    "have_quaternions",
     "refuse_transforms",
     "take_step",
     "unconverged",
@@ -115,10 +117,23 @@ def take_step(core: _core.Simulator, inputs: dict[str, Tensor], *, batched: bool
 
 def refuse_transforms(*records: object) -> None:
     """Raise where a gradient would be lost or wrong: under torch.func and forward-mode."""
-    active = torch._C._are_functorch_transforms_active()
-    tensors = (tensor for record in records for tensor in tensors_of(record))
-    if active or any(forward_ad.unpack_dual(t).tangent is not None for t in tensors):
+    if torch._C._are_functorch_transforms_active():
         raise NotImplementedError(_TRANSFORMS)
+    if forward_ad._current_level < 0:  # no tensor has a tangent
+        return
+    tensors = (tensor for record in records for tensor in tensors_of(record))
+    if any(forward_ad.unpack_dual(t).tangent is not None for t in tensors):
+        raise NotImplementedError(_TRANSFORMS)
+
+
+def are_within(arrays: list[NDArray[np.float64]], largest: float) -> bool:
+    """Whether all numbers are at most `largest` in size; NaN is not."""
+    return _core.are_within(arrays, largest)
+
+
+def have_quaternions(poses: NDArray[np.float64], shortest: float) -> bool:
+    """Whether all poses [..., 7] have quaternions longer than `shortest`."""
+    return _core.have_quaternions(poses, shortest)
 
 
 def as_array(tensor: Tensor) -> NDArray[np.float64]:

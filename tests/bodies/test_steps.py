@@ -318,6 +318,18 @@ def test_outputs_share_no_storage(sim):
     assert len(set(places) - {0}) == len([place for place in places if place])
 
 
+@pytest.mark.parametrize("batch_size", [None, 2])
+@pytest.mark.parametrize(
+    "moved", [{}, {"motion": "dynamic", "mass": 1.0}], ids=["static", "dynamic"]
+)
+def test_a_scene_without_robots_has_no_links(moved, batch_size):
+    box = dc.RigidBody.box(0.1, name="box", pose=[0, 0, -1, 1, 0, 0, 0], **moved)
+    sim = dc.Simulator(dc.Scene([dc.Cloth.grid(3, 3)], [box]), DT)
+    state = sim.step(sim.initial_state(batch_size))
+    assert sim.link_poses(state) == sim.link_velocities(state) == {}
+    assert list(sim.contact_wrenches(state)) == ["box"]
+
+
 def test_a_failed_step_leaves_the_state_alone(sim):
     state = moving(sim)
     kept = {name: getattr(state, name).clone() for name in FIELDS}
