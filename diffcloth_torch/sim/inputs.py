@@ -31,12 +31,13 @@ from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Shape
 from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.state import State
-from diffcloth_torch.sim.step import are_within, have_quaternions
+from diffcloth_torch.sim.step import Constant, are_within, have_quaternions
 
 __all__ = [
     "Fields",
     "check_control",
     "check_parameters",
+    "constants",
     "control_fields",
     "core_inputs",
     "default_fields",
@@ -47,18 +48,30 @@ __all__ = [
 Fields = dict[str, Tensor]
 """Values by name, with a leading axis of environments."""
 
+_CORE_NAMES = tuple(
+    tuple((name, quantity.core) for name, quantity in table.items() if quantity.core is not None)
+    for table in (STATE, CONTROL, PARAMETERS)
+)
 _PINS = ("pins", "soft_pins")
 _POSES = ("body_poses", "base_poses")
+# Field of a control -> field of the state that holds where it is not set.
+_HELD = {"soft_pins": "soft_pin_targets", "body_poses": "body_poses", "base_poses": "base_poses"}
 
 
 def core_inputs(state: Fields, control: Fields, parameters: Fields) -> Fields:
     """Fields under the names that the core has for them."""
     return {
-        quantity.core: fields[name]
-        for table, fields in ((STATE, state), (CONTROL, control), (PARAMETERS, parameters))
-        for name, quantity in table.items()
-        if quantity.core is not None and name in fields
+        core: fields[name]
+        for names, fields in zip(_CORE_NAMES, (state, control, parameters), strict=True)
+        for name, core in names
+        if name in fields
     }
+
+
+def constants(layout: Layout, defaults: Fields) -> dict[str, Constant]:
+    """What `core_inputs` has where neither a control nor parameters say otherwise."""
+    fields = core_inputs({}, layout.zeros, defaults)
+    return {name: Constant.of(tensor) for name, tensor in fields.items()}
 
 
 def state_fields(layout: Layout, state: State) -> tuple[Fields, int | None]:
@@ -129,6 +142,11 @@ def _check_state_tensor(name: str, tensor: object) -> None:
 
 def check_control(layout: Layout, control: Control) -> Control:
     """Promote a control to tensors and check everything that does not depend on a state."""
+    return Control(**_targets(layout, control))  # type: ignore[arg-type]
+
+
+def _targets(layout: Layout, control: Control) -> dict[str, Tensor | dict[str, Tensor]]:
+    """The checked fields of a control that it sets."""
     if not isinstance(control, Control):
         raise TypeError(f"step: `control` must be a Control, got {type(control).__name__}")
     checked: dict[str, Tensor | dict[str, Tensor]] = {}
@@ -142,7 +160,7 @@ def check_control(layout: Layout, control: Control) -> Control:
             tensor = _target(field, field, given, shape)
             _check_rows(layout, field, _numbers(tensor))
             checked[field] = tensor
-    return Control(**checked)  # type: ignore[arg-type]
+    return checked
 
 
 def _target(field: str, label: str, value: object, shape: Shape) -> Tensor:
@@ -216,51 +234,43 @@ def control_fields(
     layout: Layout, control: Control | None, state: Fields, batch: int | None
 ) -> Fields:
     """Complete a control: prescribed things and pd targets hold the state's, the rest is zero."""
-    checked = check_control(layout, Control() if control is None else control)
-    unset = {
-        "pins": state["positions"][:, layout.pins],
-        "soft_pins": state["soft_pin_targets"],
-        "body_poses": state["body_poses"],
-        "forces": _zeros(len(layout.assembly.vertices), 3),
-    }
-    if layout.has_coordinates:
-        unset |= {
-            "body_wrenches": _zeros(len(layout.bodies), 6),
-            "joint_positions": torch.where(
-                layout.driven, state["joint_targets"], state["joint_positions"]
-            ),
-            "joint_velocities": _zeros(len(layout.joint_names)),
-            "joint_efforts": _zeros(len(layout.joint_names)),
-            "base_poses": state["base_poses"],
-            "base_wrenches": _zeros(len(layout.robots), 6),
-        }
+    given = {} if control is None else _targets(layout, control)
     return {
-        field: _complete(layout, field, getattr(checked, field), values, batch)
-        for field, values in unset.items()
+        field: _complete(layout, field, given.get(field), state, batch)
+        for field in layout.control_fields
     }
 
 
-def _zeros(*shape: int) -> Tensor:
-    return torch.zeros(1, *shape, dtype=torch.float64)
+def _unset(layout: Layout, field: str, state: Fields) -> Tensor:
+    """What a field of a control is where it says nothing."""
+    if field in _HELD:
+        return state[_HELD[field]]
+    if field == "pins" and layout.pins.numel():
+        return state["positions"][:, layout.pins]
+    if field == "joint_positions":
+        return torch.where(layout.driven, state["joint_targets"], state["joint_positions"])
+    return layout.zeros[field]
 
 
 def _complete(
     layout: Layout,
     field: str,
     given: Tensor | Mapping[str, Tensor] | None,
-    unset: Tensor,
+    state: Fields,
     batch: int | None,
 ) -> Tensor:
     """Fill what a control leaves out of a field."""
     if given is None:
-        return unset
+        return _unset(layout, field, state)
     if isinstance(given, Tensor):
-        values = _with_batch(f"control: `{field}`", given, unset.dim() - 1, batch)
+        dimensions = len(layout.control_shapes[field])
+        values = _with_batch(f"control: `{field}`", given, dimensions, batch)
         if field in layout.settable:
-            values = torch.where(torch.from_numpy(layout.settable[field]), values, unset)
+            sets, unset = torch.from_numpy(layout.settable[field]), _unset(layout, field, state)
+            values = torch.where(sets, values, unset)
     else:
-        values = _complete_by_name(layout, field, given, unset, batch)
-    return _keep(layout, field, values, unset) if field in layout.kept else values
+        values = _complete_by_name(layout, field, given, _unset(layout, field, state), batch)
+    return _keep(layout, field, values, state[field]) if field in layout.kept else values
 
 
 def _complete_by_name(
@@ -300,6 +310,8 @@ def _keep(layout: Layout, field: str, targets: Tensor, poses: Tensor) -> Tensor:
     """Refuse targets of what is not kinematic; a row rounded to float32 stands for the state's."""
     reasons = layout.kept[field]
     still = [k for k, why in enumerate(reasons) if why]
+    if not still or torch.equal(targets, poses):
+        return targets
     given, kept = _numbers(targets)[:, still], _numbers(poses)[:, still]
     rounded = kept.astype(np.float32).astype(np.float64)
     moved = ((given != kept) & (given != rounded)).any(axis=-1)

@@ -37,6 +37,9 @@ class Layout:
         state_shapes: Shape of each field of a state that a step looks at.
         state_fields: Those that anything is computed with, beside the time.
         control_shapes: Shape of each field of a control.
+        control_fields: Likewise.
+        zeros: Field of a control -> what it is where it is not set and always the same, one
+            environment for all. Nobody edits it.
         parameter_shapes: Accepted shapes of each parameter.
         pins: Vertices that are pinned, shape [P].
         bodies: Mechanism of each of the K bodies.
@@ -90,6 +93,14 @@ class Layout:
         self.state_fields = tuple(
             name for name, q in looked_at.items() if self.has_coordinates or q.core is not None
         )
+        self.control_fields = tuple(
+            name for name, q in CONTROL.items() if self.has_coordinates or q.core is not None
+        )
+        self.zeros = {
+            name: torch.zeros(1, *shape, dtype=torch.float64)
+            for name, shape in self.control_shapes.items()
+            if CONTROL[name].source == "zero" or (name == "pins" and 0 in shape)
+        }
         self.joint_names = tuple(
             f"{r.name}/{joint}" for r in self.robots for joint in r.joint_names
         )

@@ -42,6 +42,7 @@ from diffcloth_torch.sim.inputs import (
     Fields,
     check_control,
     check_parameters,
+    constants,
     control_fields,
     core_inputs,
     default_fields,
@@ -200,6 +201,7 @@ class Simulator:
         self._default_fields = default_fields(self._defaults)
         if has_barrier(scene, contact, scheme):
             self._choose_barrier()
+        self._constants = constants(self._layout, self._default_fields)
         self._check_tolerance()
         if scheme != "projective":
             self._check_start()
@@ -344,7 +346,7 @@ class Simulator:
         """One solve for everything; its outcome, and fields of bodies and robots behind it."""
         prediction = self._predict(state, control, parameters)
         inputs = self._core_inputs(state, control, parameters, prediction)
-        outcome = take_step(self._core, inputs, batched=batch is not None)
+        outcome = take_step(self._core, inputs, self._constants, batched=batch is not None)
         self._check(outcome.diagnostics, batch)
         if self._dynamics is None or prediction is None:
             return outcome, prescribed_motion(self._layout, state, control, self.dt)

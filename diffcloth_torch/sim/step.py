@@ -14,12 +14,15 @@ velocities (x - x_n) / h and the contact forces on the bodies are such outputs; 
 iteration adds one solve. The formulas of every term are in the C++ core.
 
 The tape of a step is plain tensors, saved by torch together with the inputs: torch frees them after
-backward, refuses a second backward without `retain_graph`, and notices inputs edited in place.
+backward, refuses a second backward without `retain_graph`, and notices inputs edited in place. What
+a scene holds constant, and nobody can edit, is not among them.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,6 +42,7 @@ __all__ = [
     "INFEASIBLE",
     "INTERSECTING",
     "UNCONVERGED",
+    "Constant",
     "Outcome",
     "are_within",
     "as_array",
@@ -59,6 +63,7 @@ DIAGNOSTICS = tuple(_core.number_names)
 _OUTPUTS = ("positions", "velocities", "body_forces", "coordinates")
 _TAPE = "tape_"
 _KEPT = "kept"
+_NO_CONSTANTS: Mapping[str, Constant] = MappingProxyType({})
 _TRANSFORMS = (
     "step: torch.func transforms and forward-mode derivatives are not supported; use "
     "torch.autograd.grad or .backward(), for many losses or a Jacobian with is_grads_batched=True, "
@@ -97,21 +102,48 @@ class Outcome(NamedTuple):
         )
 
 
-def take_step(core: _core.Simulator, inputs: dict[str, Tensor], *, batched: bool) -> Outcome:
+class Constant(NamedTuple):
+    """An input that nobody outside can edit, and that needs no gradient.
+
+    Attributes:
+        tensor: By which it is known.
+        array: Its numbers.
+    """
+
+    tensor: Tensor
+    array: NDArray[np.float64]
+
+    @staticmethod
+    def of(tensor: Tensor) -> Constant:
+        """Take the numbers from the tensor."""
+        return Constant(tensor, as_array(tensor))
+
+
+def take_step(
+    core: _core.Simulator,
+    inputs: dict[str, Tensor],
+    constants: Mapping[str, Constant] = _NO_CONSTANTS,
+    *,
+    batched: bool,
+) -> Outcome:
     """Take one step; a tape is kept only if a gradient may be asked for.
 
     Args:
         core: The simulator in C++.
         inputs: Float64 tensors, each with a leading axis of environments.
+        constants: Those of the scene: where an input is that very tensor, autograd need not see it.
         batched: Whether the outputs keep that axis.
     """
+    known = {n: c.array for n, c in constants.items() if inputs.get(n) is c.tensor}
+    given = {name: tensor for name, tensor in inputs.items() if name not in known}
     # Inside Function.forward gradients are always off, so this is decided here.
-    needs_tape = torch.is_grad_enabled() and any(t.requires_grad for t in inputs.values())
+    needs_tape = torch.is_grad_enabled() and any(t.requires_grad for t in given.values())
     if not needs_tape:
-        result = _forward(core, {name: as_array(t) for name, t in inputs.items()}, tape=False)
+        arrays = known | {name: as_array(t) for name, t in given.items()}
+        result = _forward(core, arrays, tape=False)
         return _outcome(_outputs(result, batched), diagnostics_of(result))
     diagnostics: dict[str, Any] = {}
-    outputs = _Step.apply(core, tuple(inputs), batched, diagnostics, *inputs.values())
+    outputs = _Step.apply(core, known, tuple(given), batched, diagnostics, *given.values())
     return _outcome(outputs, diagnostics)
 
 
@@ -138,7 +170,7 @@ def have_quaternions(poses: NDArray[np.float64], shortest: float) -> bool:
 
 def as_array(tensor: Tensor) -> NDArray[np.float64]:
     """Contiguous array of a tensor's numbers; shares its memory where it can."""
-    return np.ascontiguousarray(tensor.detach().numpy())
+    return np.ascontiguousarray((tensor.detach() if tensor.requires_grad else tensor).numpy())
 
 
 def _forward(core: _core.Simulator, arrays: dict[str, Any], *, tape: bool) -> dict[str, Any]:
@@ -169,16 +201,20 @@ def unconverged(diagnostics: dict[str, Any]) -> list[int]:
     return [i for i, status in enumerate(diagnostics["status"]) if status != CONVERGED]
 
 
+_PLAIN = 5  # arguments of _Step.forward that are no tensors
+
+
 class _Step(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, core, names, batched, diagnostics, *tensors):
+    def forward(ctx, core, constants, names, batched, diagnostics, *tensors):
         arrays = {name: as_array(t) for name, t in zip(names, tensors, strict=True)}
-        result = _forward(core, arrays, tape=True)
+        result = _forward(core, constants | arrays, tape=True)
         tape = {k: torch.from_numpy(v) for k, v in result.items() if k.startswith(_TAPE)}
         # The inputs themselves, not the arrays: their version counters notice edits in place.
         ctx.save_for_backward(*tensors, *tape.values())
         ctx.shapes = [t.shape for t in (*tensors, *tape.values())]
-        ctx.core, ctx.names, ctx.tape_names, ctx.batched = core, names, tuple(tape), batched
+        ctx.core, ctx.constants, ctx.batched = core, constants, batched
+        ctx.names, ctx.tape_names = names, tuple(tape)
         # Factors and contacts, which the core forgets when the graph goes.
         ctx.kept = result[_KEPT]
         diagnostics.update(diagnostics_of(result))
@@ -189,12 +225,12 @@ class _Step(torch.autograd.Function):
     def backward(ctx, *cotangents):
         saved = ctx.saved_tensors  # first: raises torch's own error if the tape was freed
         gradients = dict(zip(_needs(ctx), _pull_back(ctx, saved, cotangents), strict=True))
-        return None, None, None, None, *(gradients.get(name) for name in ctx.names)
+        return *[None] * _PLAIN, *(gradients.get(name) for name in ctx.names)
 
 
 def _needs(ctx):
-    """Names of the inputs that need a gradient; the first four of forward are not tensors."""
-    needed = zip(ctx.names, ctx.needs_input_grad[4:], strict=True)
+    """Names of the inputs that need a gradient."""
+    needed = zip(ctx.names, ctx.needs_input_grad[_PLAIN:], strict=True)
     return [name for name, is_needed in needed if is_needed]
 
 
@@ -290,7 +326,7 @@ def _backward(step, saved, losses):
     count, needs = len(step.names), _needs(step)
     try:
         gradients = step.core.backward(
-            dict(zip(step.names, arrays[:count], strict=True)),
+            step.constants | dict(zip(step.names, arrays[:count], strict=True)),
             dict(zip(step.tape_names, arrays[count:], strict=True)),
             step.kept,
             {name: as_array(c) for name, c in zip(_OUTPUTS, losses, strict=False)},
