@@ -15,6 +15,8 @@ __all__ = ["held_targets", "prescribed_motion"]
 def prescribed_motion(layout: Layout, state: Fields, control: Fields, dt: float) -> Fields:
     """Fields of the next state where bodies only move on prescribed poses.
 
+    Velocities are left out where nothing moves: a state has zeros then.
+
     Args:
         layout: What the rows stand for.
         state: Fields of the state before the step.
@@ -23,8 +25,9 @@ def prescribed_motion(layout: Layout, state: Fields, control: Fields, dt: float)
     """
     start, end = state["body_poses"], control["body_poses"]
     moving = layout.kinematic_bodies
-    rows = moving[:0] if end is start else moving  # unset targets hold
-    return {"body_poses": end, "body_velocities": row_velocities(start, end, rows, dt)}
+    if end is start or not moving.numel():  # unset targets hold
+        return {"body_poses": end}
+    return {"body_poses": end, "body_velocities": row_velocities(start, end, moving, dt)}
 
 
 def held_targets(layout: Layout, state: Fields, control: Fields) -> Tensor:
