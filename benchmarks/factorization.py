@@ -9,8 +9,9 @@ contacts (`self-contact`). Backends and the levels of our own kernels take turns
 that whatever else the machine does falls on all of them. Times are of the processor, medians, and
 for the factorization also the least [ms]. CHOLMOD is there
 if the core was built with `DIFFCLOTH_CHOLMOD=ON`, and is as fast as the BLAS that it finds:
-OpenBLAS may need `OPENBLAS_CORETYPE` to see a new processor. Below each matrix: the share of each
-phase of our factorization at its best level.
+OpenBLAS may need `OPENBLAS_CORETYPE` to see a new processor. Ours is timed in single precision,
+which the solver uses, and in doubles. Below each matrix: the share of each phase of our
+factorization in doubles at its best level.
 """
 
 from __future__ import annotations
@@ -40,14 +41,20 @@ class Method:
 
     backend: str
     level: str = ""
+    single: bool = False
 
     def __str__(self) -> str:
-        return f"{self.backend} ({self.level})" if self.level else self.backend
+        kind = [self.level] * bool(self.level) + ["single"] * self.single
+        return f"{self.backend} ({', '.join(kind)})" if kind else self.backend
 
 
 def methods() -> list[Method]:
-    """The slowest level of ours first."""
-    ours = [Method("multifrontal", level) for level in _kernels.kernel_levels()]
+    """Ours in single precision, then in doubles, the slowest level of each first."""
+    ours = [
+        Method("multifrontal", level, single)
+        for single in (True, False)
+        for level in _kernels.kernel_levels()
+    ]
     return ours + [Method(b) for b in _kernels.cholesky_backends() if b != "multifrontal"]
 
 
@@ -57,8 +64,7 @@ class Trial:
     def __init__(self, method: Method, matrix: Hessian) -> None:
         self.method = method
         self.matrix = matrix
-        self.analysis = self._analyze()
-        self.factor = _kernels.CholeskyFactor(self.analysis)
+        self.analysis, self.factor = self._analyze()
         self.workspace = _kernels.CholeskyWorkspace()
         self.b = np.random.default_rng(0).normal(size=(1, matrix.size, 3))
         self.x = np.zeros_like(self.b)
@@ -76,10 +82,12 @@ class Trial:
         return self.factor.profile(self.matrix.blocks, self.workspace, repeats)
 
     def _analyze(self):
+        """With an empty factor, for which the analysis is finished."""
         m = self.matrix
-        return _kernels.CholeskyAnalysis(
+        analysis = _kernels.CholeskyAnalysis(
             m.size, m.pairs, m.fixed, self.method.backend, self.method.level
         )
+        return analysis, _kernels.CholeskyFactor(analysis, single=self.method.single)
 
     def _factorize(self) -> None:
         if not self.factor.compute(self.matrix.blocks, self.workspace):
@@ -119,13 +127,13 @@ def _compare(name: str, size: int, matrix: Hessian, seconds: float) -> None:
 
     print(f"\n{name}, {size} x {size}: {trials[0].analysis.dimension()} unknowns")
     print(
-        f"{'':<24}{'analysis':>9}{'factor':>9}{'least':>9}{'solve':>8}{'GFlop/s':>9}{'MFlop':>8}"
+        f"{'':<30}{'analysis':>9}{'factor':>9}{'least':>9}{'solve':>8}{'GFlop/s':>9}{'MFlop':>8}"
         f"{'entries of L':>14}{'MB':>7}"
     )
     for trial in trials:
         analysis, factor = trial.analysis, trial.milliseconds("factor")
         print(
-            f"{trial.method!s:<24}{trial.milliseconds('analysis'):>9.2f}{factor:>9.3f}"
+            f"{trial.method!s:<30}{trial.milliseconds('analysis'):>9.2f}{factor:>9.3f}"
             f"{1e3 * min(trial.seconds['factor']):>9.3f}"
             f"{trial.milliseconds('solve'):>8.3f}{1e-6 * analysis.flops() / factor:>9.1f}"
             f"{1e-6 * analysis.flops():>8.0f}{analysis.nonzeros():>14}"

@@ -7,26 +7,26 @@
 
 namespace diffcloth::linalg {
 
-/// Doubles at an address that is a multiple of a cache line, not initialized.
+/// Numbers at an address that is a multiple of a cache line, not initialized.
+template <class T>
 class AlignedBuffer {
  public:
   AlignedBuffer() = default;
   explicit AlignedBuffer(std::size_t size)
-      : data_(size == 0 ? nullptr : static_cast<double*>(take_recycled(size * sizeof(double))),
-              {size}) {}
+      : data_(size == 0 ? nullptr : static_cast<T*>(take_recycled(size * sizeof(T))), {size}) {}
 
-  double* data() { return data_.get(); }
-  const double* data() const { return data_.get(); }
+  T* data() { return data_.get(); }
+  const T* data() const { return data_.get(); }
   std::size_t size() const { return data_.get_deleter().size; }
-  std::size_t bytes() const { return size() * sizeof(double); }
+  std::size_t bytes() const { return size() * sizeof(T); }
 
  private:
   struct GiveBack {
     std::size_t size;
-    void operator()(double* p) const { give_back(p, size * sizeof(double)); }
+    void operator()(T* p) const { give_back(p, size * sizeof(T)); }
   };
 
-  std::unique_ptr<double, GiveBack> data_{nullptr, {0}};
+  std::unique_ptr<T, GiveBack> data_{nullptr, {0}};
 };
 
 }  // namespace diffcloth::linalg

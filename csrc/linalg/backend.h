@@ -24,12 +24,13 @@ class FactorBackend {
   FactorBackend(const FactorBackend&) = delete;
   FactorBackend& operator=(const FactorBackend&) = delete;
 
-  virtual bool compute(const double* blocks,
-                       CholeskyWorkspace& workspace,
-                       CholeskySeconds* seconds) = 0;
+  virtual Verdict compute(const double* blocks,
+                          CholeskyWorkspace& workspace,
+                          CholeskySeconds* seconds) = 0;
   virtual void solve(std::span<const double* const> b,
                      std::span<double* const> x,
                      CholeskyWorkspace& workspace) const = 0;
+  virtual Precision precision() const { return Precision::kDouble; }
   virtual std::size_t bytes() const = 0;
 };
 
@@ -41,7 +42,8 @@ class AnalysisBackend {
   AnalysisBackend(const AnalysisBackend&) = delete;
   AnalysisBackend& operator=(const AnalysisBackend&) = delete;
 
-  virtual std::unique_ptr<FactorBackend> make_factor() const = 0;
+  /// @param precision  that is asked for; a backend may have doubles only
+  virtual std::unique_ptr<FactorBackend> make_factor(Precision precision) const = 0;
   virtual Index dimension() const = 0;
   virtual std::size_t nonzeros() const = 0;
   virtual double flops() const = 0;
@@ -50,12 +52,12 @@ class AnalysisBackend {
 
 /// A pattern and the order in which its vertices are eliminated.
 struct Elimination {
-  const BlockPattern& pattern;
-  const Graph& graph;
-  const EliminationTree& tree;
+  BlockPattern pattern;
+  Graph graph;
+  EliminationTree tree;
 };
 
-std::unique_ptr<const AnalysisBackend> analyze_multifrontal(const Elimination& elimination,
+std::unique_ptr<const AnalysisBackend> analyze_multifrontal(Elimination elimination,
                                                             KernelLevel level);
 std::unique_ptr<const AnalysisBackend> analyze_eigen(const Elimination& elimination);
 std::unique_ptr<const AnalysisBackend> analyze_cholmod(const Elimination& elimination);

@@ -68,10 +68,7 @@ MergedPattern merge(const BlockPattern& base, const Couplings& pairs) {
 BlockMatrix::BlockMatrix(std::shared_ptr<const MergedPattern> merged,
                          const std::vector<char>& fixed,
                          const Attachments* attachments)
-    : merged_(std::move(merged)),
-      fixed_(&fixed),
-      attachments_(attachments),
-      blocks_(9 * static_cast<std::size_t>(merged_->pattern.block_count()), 0.0) {}
+    : BlockValues(std::move(merged)), fixed_(&fixed), attachments_(attachments) {}
 
 void BlockMatrix::add_attached(const std::array<Index, 4>& points, const Mat12& h) {
   motions_.clear();
@@ -118,7 +115,7 @@ void BlockMatrix::blend(const BlockMatrix& other, double s) {
   }
 }
 
-void BlockMatrix::add_product(const double* x, double* y) const {
+void BlockValues::add_product(const double* x, double* y) const {
   linalg::add_product(merged_->pattern, blocks_.data(), x, y);
 }
 

@@ -27,23 +27,41 @@ struct MergedPattern {
 /// Enlarge a pattern by sorted couplings.
 MergedPattern merge(const BlockPattern& base, const Couplings& pairs);
 
-/// A symmetric matrix on a merged pattern, whose rows are the cloth's vertices and, behind them, nodes
-/// of coordinates.
+/// A symmetric matrix on a merged pattern, by its lower blocks.
+class BlockValues {
+ public:
+  const BlockPattern& pattern() const { return merged_->pattern; }
+  const double* blocks() const { return blocks_.data(); }
+  double* blocks() { return blocks_.data(); }
+
+  /// y += A x.
+  void add_product(const double* x, double* y) const;
+
+  /// Memory of the values, without that of the pattern.
+  std::size_t bytes() const { return blocks_.capacity() * sizeof(double); }
+
+ protected:
+  explicit BlockValues(std::shared_ptr<const MergedPattern> merged)
+      : merged_(std::move(merged)),
+        blocks_(9 * static_cast<std::size_t>(merged_->pattern.block_count()), 0.0) {}
+
+  std::shared_ptr<const MergedPattern> merged_;
+  std::vector<double, RecyclingAllocator<double>> blocks_;
+};
+
+/// Such a matrix while it is assembled, whose rows are the cloth's vertices and, behind them, nodes of
+/// coordinates.
 ///
 /// Potentials with elements that never change add to the base pattern, whose slots they know; the
 /// others add blocks by their points, of which those without rows may be attached to some. Rows of
 /// fixed points exist in the base pattern only.
-class BlockMatrix {
+class BlockMatrix : public BlockValues {
  public:
   /// @param fixed        [pattern size] rows that further couplings leave out
   /// @param attachments  of the points that are no rows; null where every point is one
   BlockMatrix(std::shared_ptr<const MergedPattern> merged,
               const std::vector<char>& fixed,
               const Attachments* attachments = nullptr);
-
-  const BlockPattern& pattern() const { return merged_->pattern; }
-  const double* blocks() const { return blocks_.data(); }
-  double* blocks() { return blocks_.data(); }
 
   /// Where the slots of the base pattern lie in blocks().
   const std::vector<Index>& slot_of_base() const { return merged_->slot_of_base; }
@@ -93,9 +111,6 @@ class BlockMatrix {
   /// this = (this + s other) / (1 + s); both on the same pattern.
   void blend(const BlockMatrix& other, double s);
 
-  /// y += A x.
-  void add_product(const double* x, double* y) const;
-
  private:
   /// Whether a point is a row here that is not fixed.
   bool has(Index point) const {
@@ -115,10 +130,8 @@ class BlockMatrix {
     Eigen::Matrix<double, 12, 3> g;
   };
 
-  std::shared_ptr<const MergedPattern> merged_;
   const std::vector<char>* fixed_;
   const Attachments* attachments_;
-  std::vector<double, RecyclingAllocator<double>> blocks_;
   std::vector<Motion> motions_;  // scratch of add_attached
 };
 

@@ -16,12 +16,12 @@ std::unique_ptr<const AnalysisBackend> analyze(const BlockPattern& pattern,
                                                const std::vector<char>& fixed,
                                                Backend backend,
                                                const CholeskyOptions& options) {
-  const Graph graph = unknown_graph(pattern, fixed);
-  const EliminationTree tree = eliminate(graph, fill_reducing_order(graph, options.ordering));
-  const Elimination elimination{.pattern = pattern, .graph = graph, .tree = tree};
+  Graph graph = unknown_graph(pattern, fixed);
+  EliminationTree tree = eliminate(graph, fill_reducing_order(graph, options.ordering));
+  Elimination elimination{.pattern = pattern, .graph = std::move(graph), .tree = std::move(tree)};
   switch (backend) {
     case Backend::kMultifrontal:
-      return analyze_multifrontal(elimination, options.level);
+      return analyze_multifrontal(std::move(elimination), options.level);
     case Backend::kEigen:
       return analyze_eigen(elimination);
     case Backend::kCholmod:
@@ -71,10 +71,10 @@ std::string factorization_name() {
   return default_backend() == Backend::kMultifrontal ? own + " (" + name(best_level()) + ")" : own;
 }
 
-double* CholeskyWorkspace::reserve(std::size_t size) {
+void* CholeskyWorkspace::reserve_bytes(std::size_t size) {
   if (buffer_.size() < size) {
-    buffer_ = AlignedBuffer();  // never both at once
-    buffer_ = AlignedBuffer(size);
+    buffer_ = {};  // never both at once
+    buffer_ = AlignedBuffer<std::byte>(size);
   }
   return buffer_.data();
 }
@@ -92,20 +92,21 @@ std::size_t CholeskyAnalysis::bytes() const { return sizeof(*this) + backend_->b
 std::size_t CholeskyAnalysis::nonzeros() const { return backend_->nonzeros(); }
 double CholeskyAnalysis::flops() const { return backend_->flops(); }
 
-CholeskyFactor::CholeskyFactor(std::shared_ptr<const CholeskyAnalysis> analysis)
-    : analysis_(std::move(analysis)), backend_(analysis_->backend().make_factor()) {}
+CholeskyFactor::CholeskyFactor(std::shared_ptr<const CholeskyAnalysis> analysis,
+                               Precision precision)
+    : analysis_(std::move(analysis)), backend_(analysis_->backend().make_factor(precision)) {}
 
 CholeskyFactor::~CholeskyFactor() = default;
 
-bool CholeskyFactor::compute(const double* blocks,
-                             CholeskyWorkspace& workspace,
-                             CholeskySeconds* seconds) {
-  positive_ = false;  // also if it throws
-  positive_ = backend_->compute(blocks, workspace, seconds);
-  return positive_;
+Verdict CholeskyFactor::compute(const double* blocks,
+                                CholeskyWorkspace& workspace,
+                                CholeskySeconds* seconds) {
+  verdict_ = Verdict::kUnclear;  // also if it throws
+  verdict_ = backend_->compute(blocks, workspace, seconds);
+  return verdict_;
 }
 
-bool CholeskyFactor::compute(const double* blocks) {
+Verdict CholeskyFactor::compute(const double* blocks) {
   CholeskyWorkspace workspace;
   return compute(blocks, workspace);
 }
@@ -117,7 +118,8 @@ void CholeskyFactor::solve(const double* b, double* x, CholeskyWorkspace& worksp
 void CholeskyFactor::solve(std::span<const double* const> b,
                            std::span<double* const> x,
                            CholeskyWorkspace& workspace) const {
-  if (!positive_) throw std::logic_error("solve: the matrix has not been factored");
+  if (verdict_ != Verdict::kPositive)
+    throw std::logic_error("solve: the matrix has not been factored");
   if (b.size() != x.size()) throw std::invalid_argument("solve: as many solutions as right sides");
   backend_->solve(b, x, workspace);
 }
@@ -131,6 +133,7 @@ void CholeskyFactor::solve(std::span<const double* const> b, std::span<double* c
   solve(b, x, workspace);
 }
 
+Precision CholeskyFactor::precision() const { return backend_->precision(); }
 std::size_t CholeskyFactor::bytes() const { return sizeof(*this) + backend_->bytes(); }
 
 }  // namespace diffcloth::linalg

@@ -44,15 +44,20 @@ class CholeskyWorkspace {
   /// @param threads  that large ones are shared by; they do not change a bit
   explicit CholeskyWorkspace(int threads = 1) : team_(threads) {}
 
-  /// At least `size` doubles, of any values.
-  double* reserve(std::size_t size);
+  /// At least `size` numbers, of any values.
+  template <class Real>
+  Real* reserve(std::size_t size) {
+    return static_cast<Real*>(reserve_bytes(size * sizeof(Real)));
+  }
 
   std::size_t bytes() const { return buffer_.bytes(); }
 
   Team& team() { return team_; }
 
  private:
-  AlignedBuffer buffer_;
+  void* reserve_bytes(std::size_t size);
+
+  AlignedBuffer<std::byte> buffer_;
   Team team_;
 };
 
@@ -103,24 +108,31 @@ class CholeskyAnalysis {
 };
 
 /// A = L L^T, and not L D L^T: only the former reports an indefinite matrix.
+///
+/// In single precision it takes half the time and memory of one in doubles, and solves to the share of
+/// rounding that the condition of the matrix makes of 6e-8: as a preconditioner it is as good. Rows and
+/// columns are scaled by powers of two, so that units change nothing, and numbers below 1e-38 of
+/// those of the diagonal are zero.
 class CholeskyFactor {
  public:
-  explicit CholeskyFactor(std::shared_ptr<const CholeskyAnalysis> analysis);
+  /// @param precision  that is asked for; backends other than ours have doubles only
+  explicit CholeskyFactor(std::shared_ptr<const CholeskyAnalysis> analysis,
+                          Precision precision = Precision::kDouble);
   ~CholeskyFactor();
   CholeskyFactor(const CholeskyFactor&) = delete;
   CholeskyFactor& operator=(const CholeskyFactor&) = delete;
 
   /// Factor the matrix with these block values, of whose diagonal blocks the lower triangles count.
-  /// False, at once, where it turns out not to be positive definite or not finite; the factor must
+  /// It ends at once where that turns out not to be positive definite, or unclear; the factor must
   /// then not be used before another compute() has succeeded.
   ///
   /// @param seconds  if given, times are added to it; backends other than ours leave it alone
-  [[nodiscard]] bool compute(const double* blocks,
-                             CholeskyWorkspace& workspace,
-                             CholeskySeconds* seconds = nullptr);
+  [[nodiscard]] Verdict compute(const double* blocks,
+                                CholeskyWorkspace& workspace,
+                                CholeskySeconds* seconds = nullptr);
 
   /// The same with memory of its own for this call.
-  [[nodiscard]] bool compute(const double* blocks);
+  [[nodiscard]] Verdict compute(const double* blocks);
 
   /// x = A^-1 b over 3 * vertex_count coordinates; rows of vertices left out stay as they are. May
   /// be called from any number of threads at once, each with its workspace.
@@ -135,13 +147,18 @@ class CholeskyFactor {
   void solve(const double* b, double* x) const;
   void solve(std::span<const double* const> b, std::span<double* const> x) const;
 
+  const std::shared_ptr<const CholeskyAnalysis>& analysis() const { return analysis_; }
+
+  /// What it is in: not always what was asked for.
+  Precision precision() const;
+
   /// Memory of the factor, without that of the analysis.
   std::size_t bytes() const;
 
  private:
   std::shared_ptr<const CholeskyAnalysis> analysis_;
   std::unique_ptr<FactorBackend> backend_;
-  bool positive_ = false;
+  Verdict verdict_ = Verdict::kUnclear;
 };
 
 }  // namespace diffcloth::linalg

@@ -154,10 +154,10 @@ class CholmodFactor final : public FactorBackend {
     if (factor_ != nullptr) cholmod_free_factor(&factor_, &common_.c);
   }
 
-  bool compute(const double* blocks,
-               CholeskyWorkspace& /*workspace*/,
-               CholeskySeconds* /*seconds*/) override {
-    if (factor_ == nullptr) return true;
+  Verdict compute(const double* blocks,
+                  CholeskyWorkspace& /*workspace*/,
+                  CholeskySeconds* /*seconds*/) override {
+    if (factor_ == nullptr) return Verdict::kPositive;
     structure_.matrix.gather(blocks, values_);
     const std::lock_guard lock(blas_mutex());
     const SerialOpenMp serial;
@@ -165,8 +165,9 @@ class CholmodFactor final : public FactorBackend {
     cholmod_factorize(&matrix, factor_, &common_.c);
     if (common_.c.status < CHOLMOD_OK) throw std::runtime_error("CHOLMOD: factorization failed");
     // A BLAS may let NaN pass for a pivot; it then stands on the diagonal.
-    return common_.c.status == CHOLMOD_OK && factor_->minor == factor_->n &&
-           std::isfinite(trace(*factor_));
+    const bool positive = common_.c.status == CHOLMOD_OK && factor_->minor == factor_->n &&
+                          std::isfinite(trace(*factor_));
+    return positive ? Verdict::kPositive : Verdict::kIndefinite;
   }
 
   void solve(std::span<const double* const> b,
@@ -230,7 +231,7 @@ class CholmodAnalysis final : public AnalysisBackend {
     });
   }
 
-  std::unique_ptr<FactorBackend> make_factor() const override {
+  std::unique_ptr<FactorBackend> make_factor(Precision /*precision*/) const override {
     return std::make_unique<CholmodFactor>(structure_);
   }
   Index dimension() const override { return structure_.matrix.dimension(); }

@@ -3,7 +3,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "linalg/block_pattern.h"
+#include "linalg/block_matrix.h"
 #include "linalg/cholesky.h"
 
 namespace diffcloth::linalg {
@@ -17,20 +17,51 @@ inline double dot(const std::vector<double>& a, const std::vector<double>& b) {
 
 enum class Convergence : std::uint8_t { kConverged, kIterationLimit, kNegativeCurvature };
 
-/// Solve A x = b at the vertices that are not fixed, preconditioned by a factor of a nearby matrix.
+/// Solve A x = b at the vertices that a factor of a nearby matrix does not leave out, preconditioned by
+/// it.
 ///
-/// @param fixed      [pattern.size()] vertices left out: x is zero there
 /// @param tolerance  on the residual in the preconditioner's norm, relative to b's
 /// @param max_iterations  given up before, where it can hardly be enough
-/// @param x          in: what the preconditioner makes of b; out: the best iterate, however it ended
-[[nodiscard]] Convergence conjugate_gradient(const BlockPattern& pattern,
-                                             const double* blocks,
-                                             const std::vector<char>& fixed,
+/// @param x          in: what the preconditioner makes of b, zero at vertices left out; out: the best
+///                   iterate, however it ended
+[[nodiscard]] Convergence conjugate_gradient(const BlockValues& A,
                                              const CholeskyFactor& preconditioner,
                                              const std::vector<double>& b,
                                              double tolerance,
                                              int max_iterations,
                                              CholeskyWorkspace& workspace,
                                              std::vector<double>& x);
+
+/// What a factor makes of several right sides, each with the bits that it has alone.
+///
+/// @param x  zero at vertices left out
+void solve(const CholeskyFactor& factor,
+           const std::vector<std::vector<double>>& b,
+           CholeskyWorkspace& workspace,
+           std::vector<std::vector<double>>& x);
+
+/// Whether the factor of a matrix in single precision does for it along a right side: x is the solution to a
+/// tenth, and conjugate gradients from there converge in a few iterations, to 1e-4 of the residual. A
+/// direction in which A is negative would keep its share of the residual.
+///
+/// @param x  what the factor makes of b
+[[nodiscard]] bool agrees(const BlockValues& A,
+                          const CholeskyFactor& factor,
+                          const std::vector<double>& b,
+                          const std::vector<double>& x,
+                          CholeskyWorkspace& workspace);
+
+/// Solve A x = b for several right sides, each with the bits that it has alone, with a factor of A itself in
+/// single precision; which of them have converged.
+///
+/// @param tolerance  on the residual in the factor's norm, relative to b's
+/// @param x          zero at vertices left out
+[[nodiscard]] std::vector<char> conjugate_gradients(const BlockValues& A,
+                                                    const CholeskyFactor& factor,
+                                                    const std::vector<std::vector<double>>& b,
+                                                    double tolerance,
+                                                    int max_iterations,
+                                                    CholeskyWorkspace& workspace,
+                                                    std::vector<std::vector<double>>& x);
 
 }  // namespace diffcloth::linalg

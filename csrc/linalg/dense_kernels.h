@@ -45,7 +45,7 @@ struct Trapezoid {
 /// The panel [ld, columns] holds the supernode's columns of L: the lower triangle of its own rows
 /// first, `top` of them with padding, then the rows below. The update matrix [update_ld, rows] is
 /// what it subtracts from its ancestors. Both are trapezoids, of which only the lower triangle means
-/// anything. `top`, ld and update_ld are multiples of 8, and padding in the panel is zero.
+/// anything. `top`, ld and update_ld are multiples of a pack, and padding in the panel is zero.
 struct Front {
   std::int32_t columns;
   std::int32_t rows;
@@ -72,11 +72,49 @@ struct ChildMap {
   std::int32_t run_count;
 };
 
-/// The dense arithmetic of the multifrontal factorization.
+/// Of the numbers of a factor.
+enum class Precision : std::uint8_t { kDouble, kSingle };
+
+/// Whether a matrix is positive definite, as far as its factorization can tell.
+enum class Verdict : std::uint8_t {
+  kPositive,
+  kIndefinite,  ///< or not finite
+  kUnclear,     ///< a pivot in single precision is too small to be told from rounding
+};
+
+/// The dense arithmetic of the multifrontal factorization, in double or single precision.
 ///
 /// Every entry is summed in one order, whatever the level: c_ij -= a_ik b_jk for k = 0, 1, ... with
 /// one rounding each. Levels with fused multiply-add (all but kPortable on x86-64) therefore agree
-/// in every bit.
+/// in every bit. Numbers are taken in packs of a cache line: eight doubles or sixteen floats.
+template <class Real>
+struct FrontKernels {
+  /// L of the panel in place, 1 / l_jj on the diagonal, and U = -L_2 L_2^T, where L_2 are the rows
+  /// below the triangle. It ends at once at a pivot that is not positive and finite, or, in single
+  /// precision, below 2^-16: there the diagonal of the matrix is between 1 and 4.
+  ///
+  /// @param u        [update_ld, rows up to a multiple of a pack], need not be initialized
+  /// @param scratch  [kColumnBlock ld]
+  Verdict (*factor)(const Front& front, Real* panel, Real* u, Real* scratch);
+
+  /// Add the columns of a child's update matrix that are columns of the parent.
+  void (*add_to_panel)(
+      const Front& child, const Real* u, const ChildMap& map, const Front& front, Real* panel);
+
+  /// Add the other columns of a child's update matrix.
+  void (*add_to_update)(
+      const Front& child, const Real* u, const ChildMap& map, const Front& front, Real* parent_u);
+
+  /// c_1 := L_1^-1 c_1, c_2 := c_2 - L_2 c_1 for up to four vectors c, `stride` apart; c_2 begins at
+  /// `top`, entries of padding are zero.
+  void (*forward)(const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride, int count);
+
+  /// c_1 := L_1^-T (c_1 - L_2^T c_2), in the same layout.
+  void (*backward)(
+      const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride, int count);
+};
+
+/// All dense kernels of a level.
 struct DenseKernels {
   /// y += A x for a symmetric matrix given by its lower 3x3 blocks on a BlockPattern. Vectors have four
   /// numbers a row, the last of which means nothing. The same bits on every level.
@@ -86,33 +124,8 @@ struct DenseKernels {
                           const double* blocks,
                           const double* x,
                           double* y);
-
-  /// L of the panel in place, 1 / l_jj on the diagonal, and U = -L_2 L_2^T, where L_2 are the rows
-  /// below the triangle. False, at once, at a pivot that is not positive and finite.
-  ///
-  /// @param u        [update_ld, rows up to a multiple of 8], need not be initialized
-  /// @param scratch  [kColumnBlock ld]
-  bool (*factor)(const Front& front, double* panel, double* u, double* scratch);
-
-  /// Add the columns of a child's update matrix that are columns of the parent.
-  void (*add_to_panel)(
-      const Front& child, const double* u, const ChildMap& map, const Front& front, double* panel);
-
-  /// Add the other columns of a child's update matrix.
-  void (*add_to_update)(const Front& child,
-                        const double* u,
-                        const ChildMap& map,
-                        const Front& front,
-                        double* parent_u);
-
-  /// c_1 := L_1^-1 c_1, c_2 := c_2 - L_2 c_1 for up to four vectors c, `stride` apart; c_2 begins at
-  /// `top`, entries of padding are zero.
-  void (*forward)(
-      const Front& front, const double* panel, double* c, std::ptrdiff_t stride, int count);
-
-  /// c_1 := L_1^-T (c_1 - L_2^T c_2), in the same layout.
-  void (*backward)(
-      const Front& front, const double* panel, double* c, std::ptrdiff_t stride, int count);
+  FrontKernels<double> doubles;
+  FrontKernels<float> floats;
 };
 
 /// Most vectors that one call of forward() or backward() takes.

@@ -1,6 +1,7 @@
-// The dense kernels, written once over packs of eight doubles. A file that compiles them for some
-// instructions defines, in its anonymous namespace and before it includes this one, the type Pack
-// with the operations on it, and
+// The dense kernels, written once over packs of numbers that fill a cache line: eight doubles or sixteen
+// floats. A file that compiles them for some instructions defines, in its anonymous namespace and
+// before it includes this one, the types Doubles and Floats of such packs, with the operations on them,
+// and
 //
 //   kPacks  packs of rows in a block of registers,   kWidth  columns of it, a divisor of eight
 //
@@ -22,487 +23,466 @@
 namespace diffcloth::linalg {
 namespace {
 
-constexpr int kLanes = 8;
-constexpr double kLargest = 1.7976931348623157e308;
+inline double square_root(double a) { return __builtin_sqrt(a); }
+inline float square_root(float a) { return __builtin_sqrtf(a); }
 
-constexpr int up_to_pack(int n) { return (n + kLanes - 1) / kLanes * kLanes; }
-constexpr int down_to_pack(int n) { return n / kLanes * kLanes; }
+/// The factorization of fronts, over packs of either precision.
+template <class Pack>
+struct Fronts {
+  using Real = typename Pack::Real;  // NOLINT(readability-redundant-typename): for older compilers
+  static constexpr int kLanes = 64 / sizeof(Real);
 
-/// A block of 8 P rows and W columns in registers.
-///
-/// Its operands are in slabs: eight rows each, column after column, so that whatever a product reads
-/// is contiguous. Slabs are `stride` apart.
-template <int P, int W>
-struct Tile {
-  Pack c[W][P];
+  static constexpr int up_to_pack(int n) { return (n + kLanes - 1) / kLanes * kLanes; }
+  static constexpr int down_to_pack(int n) { return n / kLanes * kLanes; }
 
-  DIFFCLOTH_INLINE void clear() {
-#pragma GCC unroll 8
-    for (int j = 0; j < W; ++j) {
-#pragma GCC unroll 8
-      for (int p = 0; p < P; ++p) c[j][p] = zero();
-    }
-  }
+  /// A block of P packs of rows and W columns in registers.
+  ///
+  /// Its operands are in slabs: a pack of rows each, column after column, so that whatever a product reads
+  /// is contiguous. Slabs are `stride` apart.
+  template <int P, int W>
+  struct Tile {
+    Pack c[W][P];
 
-  /// The first `columns` of them from a column-major matrix.
-  DIFFCLOTH_INLINE void load_from(const double* from, std::ptrdiff_t ld, int columns = W) {
-#pragma GCC unroll 8
-    for (int j = 0; j < W; ++j) {
-#pragma GCC unroll 8
-      for (int p = 0; p < P; ++p) {
-        c[j][p] = j < columns ? load(from + j * ld + kLanes * p) : zero();
-      }
-    }
-  }
-
-  DIFFCLOTH_INLINE void store_to(double* to, std::ptrdiff_t ld, int columns = W) const {
-#pragma GCC unroll 8
-    for (int j = 0; j < W; ++j) {
-      if (j >= columns) break;
-#pragma GCC unroll 8
-      for (int p = 0; p < P; ++p) store(to + j * ld + kLanes * p, c[j][p]);
-    }
-  }
-
-  DIFFCLOTH_INLINE void store_to_slabs(double* to, std::ptrdiff_t stride) const {
-#pragma GCC unroll 8
-    for (int j = 0; j < W; ++j) {
-#pragma GCC unroll 8
-      for (int p = 0; p < P; ++p) store(to + p * stride + kLanes * j, c[j][p]);
-    }
-  }
-
-  /// C -= A B^T over `depth` columns of the slabs a [P] and of W rows b of a slab.
-  DIFFCLOTH_INLINE void subtract_product(const double* a,
-                                         std::ptrdiff_t stride,
-                                         const double* b,
-                                         int depth) {
-    for (int k = 0; k < depth; ++k) {
-      Pack a_k[P];
-#pragma GCC unroll 8
-      for (int p = 0; p < P; ++p) a_k[p] = load(a + p * stride);
+    DIFFCLOTH_INLINE void clear() {
 #pragma GCC unroll 8
       for (int j = 0; j < W; ++j) {
-        const Pack b_k = broadcast(b[j]);
 #pragma GCC unroll 8
-        for (int p = 0; p < P; ++p) c[j][p] = subtract_product_of(c[j][p], a_k[p], b_k);
-      }
-      a += kLanes;
-      b += kLanes;
-    }
-  }
-
-  /// C := C L^-T for a lower triangle [W, W] in a slab, with its diagonal inverted.
-  DIFFCLOTH_INLINE void solve(const double* l) {
-#pragma GCC unroll 8
-    for (int j = 0; j < W; ++j) {
-      const Pack inverse = broadcast(l[j + kLanes * j]);
-#pragma GCC unroll 8
-      for (int p = 0; p < P; ++p) c[j][p] = c[j][p] * inverse;
-#pragma GCC unroll 8
-      for (int i = j + 1; i < W; ++i) {
-        const Pack l_ij = broadcast(l[i + kLanes * j]);
-#pragma GCC unroll 8
-        for (int p = 0; p < P; ++p) c[i][p] = subtract_product_of(c[i][p], c[j][p], l_ij);
+        for (int p = 0; p < P; ++p) c[j][p] = Pack{};
       }
     }
-  }
-};
 
-/// Call f<W>() for a width of 1 .. kWidth that is known only now.
-template <int W = kWidth, class Call>
-DIFFCLOTH_INLINE void with_width(int width, Call call) {
-  if constexpr (W == 1) {
-    call.template operator()<1>();
-  } else if (width == W) {
-    call.template operator()<W>();
-  } else {
-    with_width<W - 1>(width, call);
-  }
-}
-
-/// The same for a number of packs, 1 .. kPacks.
-template <int P = kPacks, class Call>
-DIFFCLOTH_INLINE void with_packs(int packs, Call call) {
-  if constexpr (P == 1) {
-    call.template operator()<1>();
-  } else if (packs == P) {
-    call.template operator()<P>();
-  } else {
-    with_packs<P - 1>(packs, call);
-  }
-}
-
-/// Some columns of a panel, at most kColumnBlock: the triangle on the diagonal and all rows below.
-/// `slabs` takes what is finished.
-struct Block {
-  double* panel;  ///< where the triangle begins, with leading dimension ld
-  std::ptrdiff_t ld;
-  double* slabs;
-  std::ptrdiff_t stride;
-  int columns;
-};
-
-/// Finish columns begin .. end - 1 in 8 P rows below the triangle.
-template <int P>
-void solve_rows(const Block& block, int row, int begin, int end) {
-  double* const a = block.slabs + row / kLanes * block.stride;
-  for (int c = begin; c < end; c += kWidth) {
-    const double* const strip = block.slabs + c / kLanes * block.stride + c % kLanes;
-    with_width(end - c < kWidth ? end - c : kWidth, [&]<int W> {
-      Tile<P, W> tile;
-      double* const l = block.panel + row + c * block.ld;
-      tile.load_from(l, block.ld);
-      tile.subtract_product(a, block.stride, strip, c);
-      tile.solve(strip + kLanes * c);
-      tile.store_to_slabs(a + kLanes * c, block.stride);
-      tile.store_to(l, block.ld);
-    });
-  }
-}
-
-void solve_rows(const Block& block, int row, int packs, int begin, int end) {
-  with_packs(packs, [&]<int P> { solve_rows<P>(block, row, begin, end); });
-}
-
-/// Cholesky factor of the first rows and columns of a slab's block, 1 / l_jj on the diagonal. What
-/// it leaves above the diagonal means nothing.
-bool factor_corner(double* l, int columns) {
-  for (int j = 0; j < columns; ++j) {
-    double* const l_j = l + kLanes * j;
-    const double pivot = l_j[j];
-    if (!(pivot > 0.0 && pivot <= kLargest)) return false;
-    const double inverse = 1.0 / __builtin_sqrt(pivot);
-    const Pack column = load(l_j) * broadcast(inverse);
-    store(l_j, column);
-    for (int k = j + 1; k < columns; ++k) {
-      double* const l_k = l + kLanes * k;
-      store(l_k, subtract_product_of(load(l_k), column, broadcast(l_j[k])));
-    }
-    l_j[j] = inverse;
-  }
-  return true;
-}
-
-/// The triangle of a block, eight columns at a time.
-bool factor_triangle(const Block& block) {
-  const int columns = block.columns;
-  const int end = up_to_pack(columns);
-  for (int c = 0; c < columns; c += kLanes) {
-    const int width = columns - c < kLanes ? columns - c : kLanes;
-    double* const slab = block.slabs + c / kLanes * block.stride;
-    double* const l = block.panel + c + c * block.ld;
-    for (int j = 0; j < width; j += kWidth) {
-      with_width(width - j < kWidth ? width - j : kWidth, [&]<int W> {
-        Tile<1, W> tile;
-        tile.load_from(l + j * block.ld, block.ld);
-        tile.subtract_product(slab, block.stride, slab + j, c);
-        tile.store_to_slabs(slab + kLanes * (c + j), block.stride);
-      });
-    }
-    double* const corner = slab + kLanes * c;
-    if (!factor_corner(corner, width)) return false;
-    for (int j = 0; j < width; ++j) store(l + j * block.ld, load(corner + kLanes * j));
-    for (int row = c + kLanes; row < end; row += kLanes * kPacks) {
-      const int packs = (end - row) / kLanes;
-      solve_rows(block, row, packs < kPacks ? packs : kPacks, c, c + width);
-    }
-  }
-  return true;
-}
-
-/// C -= A B^T for 8 P rows and the columns that belong to one slab b, as far as they exist; C itself
-/// counts as zero where nothing has been added to it.
-template <int P>
-void subtract_from(double* to,
-                   std::ptrdiff_t ld,
-                   int columns,
-                   bool is_zero,
-                   const double* a,
-                   const double* b,
-                   const Block& block) {
-  for (int j = 0; j < columns; j += kWidth) {
-    Tile<P, kWidth> tile;
-    double* const c = to + j * ld;
-    if (is_zero) {
-      tile.clear();
-    } else {
-      tile.load_from(c, ld, columns - j);
-    }
-    tile.subtract_product(a, block.stride, b + j, block.columns);
-    tile.store_to(c, ld, columns - j);
-  }
-}
-
-/// What a finished block subtracts from rows `row` .. row + 8 packs - 1 of later columns, those of
-/// the panel and those of the update matrix.
-void update_rows(const Block& block,
-                 const Front& front,
-                 int first,
-                 int row,
-                 int packs,
-                 double* panel,
-                 double* u) {
-  const int end = row + kLanes * packs;
-  for (int strip = up_to_pack(block.columns); strip < end; strip += kLanes) {
-    const int from = strip < row ? row : strip;  // above are only entries of no meaning
-    const double* const a = block.slabs + from / kLanes * block.stride;
-    const double* const b = block.slabs + strip / kLanes * block.stride;
-    const int column = first + strip;
-    with_packs((end - from) / kLanes, [&]<int P> {
-      if (column < front.top) {
-        const int left = front.columns - column;
-        subtract_from<P>(panel + front.panel().place(first + from, column),
-                         front.panel().stride(column), left < kLanes ? left : kLanes, false, a, b,
-                         block);
-      } else {
-        const int u_column = column - front.top;
-        subtract_from<P>(u + front.update().place(first + from - front.top, u_column),
-                         front.update().stride(u_column), kLanes, first == 0, a, b, block);
-      }
-    });
-  }
-}
-
-bool factor(const Front& front, double* panel, double* u, double* scratch) {
-  const int end = front.top + up_to_pack(front.rows);
-  for (int first = 0; first < front.columns; first += kColumnBlock) {
-    const int left = front.columns - first;
-    const int columns = left < kColumnBlock ? left : kColumnBlock;
-    const Block block{.panel = panel + front.panel().place(first, first),
-                      .ld = front.panel().stride(first),
-                      .slabs = scratch,
-                      .stride = static_cast<std::ptrdiff_t>(kLanes) * columns,
-                      .columns = columns};
-    if (!factor_triangle(block)) return false;
-    // A few rows at a time, which stay in the cache: first those of later columns, then the others.
-    for (int row = up_to_pack(columns); first + row < end;) {
-      const int bound = first + row < front.top ? front.top : end;
-      const int rest = (bound - first - row) / kLanes;
-      const int packs = rest < kPacks ? rest : kPacks;
-      solve_rows(block, row, packs, 0, columns);
-      update_rows(block, front, first, row, packs, panel, u);
-      row += kLanes * packs;
-    }
-  }
-  return true;
-}
-
-DIFFCLOTH_INLINE void add(const double* from, int count, double* to) {
-  int i = 0;
-  for (; i + kLanes <= count; i += kLanes) store(to + i, load(to + i) + load(from + i));
-  if (i < count) add_some(from + i, count - i, to + i);
-}
-
-void add_to_panel(
-    const Front& child, const double* u, const ChildMap& map, const Front& front, double* panel) {
-  for (int r = 0; r < map.column_runs; ++r) {
-    for (int k = 0; k < map.runs[r].count; ++k) {
-      const double* const from = u + child.update().place(0, map.runs[r].from + k);
-      double* const to = panel + front.panel().place(0, map.runs[r].to + k);
-      add(from + map.runs[r].from + k, map.runs[r].count - k, to + map.runs[r].to + k);
-      for (int q = r + 1; q < map.column_runs; ++q) {
-        add(from + map.runs[q].from, map.runs[q].count, to + map.runs[q].to);
-      }
-      for (int q = map.column_runs; q < map.run_count; ++q) {
-        add(from + map.runs[q].from, map.runs[q].count, to + front.top + map.runs[q].to);
-      }
-    }
-  }
-}
-
-void add_to_update(const Front& child,
-                   const double* u,
-                   const ChildMap& map,
-                   const Front& front,
-                   double* parent_u) {
-  for (int r = map.column_runs; r < map.run_count; ++r) {
-    for (int k = 0; k < map.runs[r].count; ++k) {
-      const double* const from = u + child.update().place(0, map.runs[r].from + k);
-      double* const to = parent_u + front.update().place(0, map.runs[r].to + k);
-      add(from + map.runs[r].from + k, map.runs[r].count - k, to + map.runs[r].to + k);
-      for (int q = r + 1; q < map.run_count; ++q) {
-        add(from + map.runs[q].from, map.runs[q].count, to + map.runs[q].to);
-      }
-    }
-  }
-}
-
-/// y := L^-1 y for `width` columns l of a panel from their diagonal on, in registers.
-template <int Width>
-DIFFCLOTH_INLINE void solve_triangle(const double* l, std::ptrdiff_t ld, double* y) {
-  double t[Width];
+    /// The first `columns` of them from a column-major matrix.
+    DIFFCLOTH_INLINE void load_from(const Real* from, std::ptrdiff_t ld, int columns = W) {
 #pragma GCC unroll 8
-  for (int i = 0; i < Width; ++i) t[i] = y[i];
+      for (int j = 0; j < W; ++j) {
 #pragma GCC unroll 8
-  for (int j = 0; j < Width; ++j) {
-    t[j] *= l[j * ld + j];
-#pragma GCC unroll 8
-    for (int i = j + 1; i < Width; ++i) t[i] = subtract_product_of(t[i], l[j * ld + i], t[j]);
-  }
-#pragma GCC unroll 8
-  for (int i = 0; i < Width; ++i) y[i] = t[i];
-}
-
-/// y := L^-T y, likewise.
-template <int Width>
-DIFFCLOTH_INLINE void solve_transposed_triangle(const double* l, std::ptrdiff_t ld, double* y) {
-  double t[Width];
-#pragma GCC unroll 8
-  for (int i = 0; i < Width; ++i) t[i] = y[i];
-#pragma GCC unroll 8
-  for (int j = Width - 1; j >= 0; --j) {
-    t[j] *= l[j * ld + j];
-#pragma GCC unroll 8
-    for (int i = 0; i < j; ++i) t[i] = subtract_product_of(t[i], l[i * ld + j], t[j]);
-  }
-#pragma GCC unroll 8
-  for (int i = 0; i < Width; ++i) y[i] = t[i];
-}
-
-/// The same for a width of up to kLanes; supernodes are made of vertices of three columns each, and
-/// widths of the rest are what is left of those.
-DIFFCLOTH_INLINE void solve_triangle(const double* l, std::ptrdiff_t ld, int width, double* y) {
-  switch (width) {
-    case 1:
-      return solve_triangle<1>(l, ld, y);
-    case 2:
-      return solve_triangle<2>(l, ld, y);
-    case 3:
-      return solve_triangle<3>(l, ld, y);
-    case 4:
-      return solve_triangle<4>(l, ld, y);
-    case 5:
-      return solve_triangle<5>(l, ld, y);
-    case 6:
-      return solve_triangle<6>(l, ld, y);
-    case 7:
-      return solve_triangle<7>(l, ld, y);
-    default:
-      return solve_triangle<8>(l, ld, y);
-  }
-}
-
-DIFFCLOTH_INLINE void solve_transposed_triangle(const double* l,
-                                                std::ptrdiff_t ld,
-                                                int width,
-                                                double* y) {
-  switch (width) {
-    case 1:
-      return solve_transposed_triangle<1>(l, ld, y);
-    case 2:
-      return solve_transposed_triangle<2>(l, ld, y);
-    case 3:
-      return solve_transposed_triangle<3>(l, ld, y);
-    case 4:
-      return solve_transposed_triangle<4>(l, ld, y);
-    case 5:
-      return solve_transposed_triangle<5>(l, ld, y);
-    case 6:
-      return solve_transposed_triangle<6>(l, ld, y);
-    case 7:
-      return solve_transposed_triangle<7>(l, ld, y);
-    default:
-      return solve_transposed_triangle<8>(l, ld, y);
-  }
-}
-
-template <int R>
-void forward(const Front& front, const double* panel, double* c, std::ptrdiff_t stride) {
-  for (int column = 0; column < front.columns; column += kLanes) {
-    const int width = front.columns - column < kLanes ? front.columns - column : kLanes;
-    const double* const l = panel + front.panel().place(0, column);
-    const std::ptrdiff_t ld = front.panel().stride(column);
-    for (int r = 0; r < R; ++r) {
-      solve_triangle(l + column, ld, width, c + r * stride + column);
-    }
-    for (int row = column + kLanes; row < front.ld; row += kLanes) {
-      Pack sum[R];
-      for (int r = 0; r < R; ++r) sum[r] = load(c + r * stride + row);
-      for (int j = 0; j < width; ++j) {
-        const Pack l_j = load(l + j * ld + row);
-        for (int r = 0; r < R; ++r) {
-          sum[r] = subtract_product_of(sum[r], l_j, broadcast(c[r * stride + column + j]));
+        for (int p = 0; p < P; ++p) {
+          c[j][p] = j < columns ? load(from + j * ld + kLanes * p) : Pack{};
         }
       }
-      for (int r = 0; r < R; ++r) store(c + r * stride + row, sum[r]);
+    }
+
+    DIFFCLOTH_INLINE void store_to(Real* to, std::ptrdiff_t ld, int columns = W) const {
+#pragma GCC unroll 8
+      for (int j = 0; j < W; ++j) {
+        if (j >= columns) break;
+#pragma GCC unroll 8
+        for (int p = 0; p < P; ++p) store(to + j * ld + kLanes * p, c[j][p]);
+      }
+    }
+
+    DIFFCLOTH_INLINE void store_to_slabs(Real* to, std::ptrdiff_t stride) const {
+#pragma GCC unroll 8
+      for (int j = 0; j < W; ++j) {
+#pragma GCC unroll 8
+        for (int p = 0; p < P; ++p) store(to + p * stride + kLanes * j, c[j][p]);
+      }
+    }
+
+    /// C -= A B^T over `depth` columns of the slabs a [P] and of W rows b of a slab.
+    DIFFCLOTH_INLINE void subtract_product(const Real* a,
+                                           std::ptrdiff_t stride,
+                                           const Real* b,
+                                           int depth) {
+      for (int k = 0; k < depth; ++k) {
+        Pack a_k[P];
+#pragma GCC unroll 8
+        for (int p = 0; p < P; ++p) a_k[p] = load(a + p * stride);
+#pragma GCC unroll 8
+        for (int j = 0; j < W; ++j) {
+          const Pack b_k = broadcast(b[j]);
+#pragma GCC unroll 8
+          for (int p = 0; p < P; ++p) c[j][p] = subtract_product_of(c[j][p], a_k[p], b_k);
+        }
+        a += kLanes;
+        b += kLanes;
+      }
+    }
+
+    /// C := C L^-T for a lower triangle [W, W] in a slab, with its diagonal inverted.
+    DIFFCLOTH_INLINE void solve(const Real* l) {
+#pragma GCC unroll 8
+      for (int j = 0; j < W; ++j) {
+        const Pack inverse = broadcast(l[j + kLanes * j]);
+#pragma GCC unroll 8
+        for (int p = 0; p < P; ++p) c[j][p] = c[j][p] * inverse;
+#pragma GCC unroll 8
+        for (int i = j + 1; i < W; ++i) {
+          const Pack l_ij = broadcast(l[i + kLanes * j]);
+#pragma GCC unroll 8
+          for (int p = 0; p < P; ++p) c[i][p] = subtract_product_of(c[i][p], c[j][p], l_ij);
+        }
+      }
+    }
+  };
+
+  /// Call f<W>() for a width of 1 .. kWidth that is known only now.
+  template <int W = kWidth, class Call>
+  static DIFFCLOTH_INLINE void with_width(int width, Call call) {
+    if constexpr (W == 1) {
+      call.template operator()<1>();
+    } else if (width == W) {
+      call.template operator()<W>();
+    } else {
+      with_width<W - 1>(width, call);
     }
   }
-}
 
-/// Subtract from y[0 .. W - 1] the products of W columns, `ld` apart, with the vectors c.
-template <int R, int W>
-void subtract_dots(const double* l,
-                   std::ptrdiff_t ld,
-                   int length,
-                   const double* c,
-                   double* y,
-                   std::ptrdiff_t stride) {
-  Pack sum[R][W];
-  for (int r = 0; r < R; ++r) {
-    for (int j = 0; j < W; ++j) sum[r][j] = zero();
+  /// The same for a number of packs, 1 .. kPacks.
+  template <int P = kPacks, class Call>
+  static DIFFCLOTH_INLINE void with_packs(int packs, Call call) {
+    if constexpr (P == 1) {
+      call.template operator()<1>();
+    } else if (packs == P) {
+      call.template operator()<P>();
+    } else {
+      with_packs<P - 1>(packs, call);
+    }
   }
-  for (int row = 0; row < length; row += kLanes) {
-    Pack l_j[W];
-    for (int j = 0; j < W; ++j) l_j[j] = load(l + j * ld + row);
+
+  /// Some columns of a panel, at most kColumnBlock: the triangle on the diagonal and all rows below.
+  /// `slabs` takes what is finished.
+  struct Block {
+    Real* panel;  ///< where the triangle begins, with leading dimension ld
+    std::ptrdiff_t ld;
+    Real* slabs;
+    std::ptrdiff_t stride;
+    int columns;
+  };
+
+  /// Finish columns begin .. end - 1 in P packs of rows below the triangle.
+  template <int P>
+  static void solve_rows(const Block& block, int row, int begin, int end) {
+    Real* const a = block.slabs + row / kLanes * block.stride;
+    for (int c = begin; c < end; c += kWidth) {
+      const Real* const strip = block.slabs + c / kLanes * block.stride + c % kLanes;
+      with_width(end - c < kWidth ? end - c : kWidth, [&]<int W> {
+        Tile<P, W> tile;
+        Real* const l = block.panel + row + c * block.ld;
+        tile.load_from(l, block.ld);
+        tile.subtract_product(a, block.stride, strip, c);
+        tile.solve(strip + kLanes * c);
+        tile.store_to_slabs(a + kLanes * c, block.stride);
+        tile.store_to(l, block.ld);
+      });
+    }
+  }
+
+  static void solve_rows(const Block& block, int row, int packs, int begin, int end) {
+    with_packs(packs, [&]<int P> { solve_rows<P>(block, row, begin, end); });
+  }
+
+  /// Cholesky factor of the first rows and columns of a slab's block, 1 / l_jj on the diagonal. What
+  /// it leaves above the diagonal means nothing.
+  static Verdict factor_corner(Real* l, int columns) {
+    for (int j = 0; j < columns; ++j) {
+      Real* const l_j = l + kLanes * j;
+      const Real pivot = l_j[j];
+      if (!(pivot > Pack::kLeastPivot && pivot <= Pack::kLargest)) {
+        return pivot < -Pack::kLeastPivot || Pack::kLeastPivot == 0 ? Verdict::kIndefinite
+                                                                    : Verdict::kUnclear;
+      }
+      const Real inverse = 1 / square_root(pivot);
+      const Pack column = load(l_j) * broadcast(inverse);
+      store(l_j, column);
+      for (int k = j + 1; k < columns; ++k) {
+        Real* const l_k = l + kLanes * k;
+        store(l_k, subtract_product_of(load(l_k), column, broadcast(l_j[k])));
+      }
+      l_j[j] = inverse;
+    }
+    return Verdict::kPositive;
+  }
+
+  /// The triangle of a block, a pack of columns at a time.
+  static Verdict factor_triangle(const Block& block) {
+    const int columns = block.columns;
+    const int end = up_to_pack(columns);
+    for (int c = 0; c < columns; c += kLanes) {
+      const int width = columns - c < kLanes ? columns - c : kLanes;
+      Real* const slab = block.slabs + c / kLanes * block.stride;
+      Real* const l = block.panel + c + c * block.ld;
+      for (int j = 0; j < width; j += kWidth) {
+        with_width(width - j < kWidth ? width - j : kWidth, [&]<int W> {
+          Tile<1, W> tile;
+          tile.load_from(l + j * block.ld, block.ld);
+          tile.subtract_product(slab, block.stride, slab + j, c);
+          tile.store_to_slabs(slab + kLanes * (c + j), block.stride);
+        });
+      }
+      Real* const corner = slab + kLanes * c;
+      const Verdict verdict = factor_corner(corner, width);
+      if (verdict != Verdict::kPositive) return verdict;
+      for (int j = 0; j < width; ++j) store(l + j * block.ld, load(corner + kLanes * j));
+      for (int row = c + kLanes; row < end; row += kLanes * kPacks) {
+        const int packs = (end - row) / kLanes;
+        solve_rows(block, row, packs < kPacks ? packs : kPacks, c, c + width);
+      }
+    }
+    return Verdict::kPositive;
+  }
+
+  /// C -= A B^T for P packs of rows and the columns that belong to one slab b, as far as they exist; C itself
+  /// counts as zero where nothing has been added to it.
+  template <int P>
+  static void subtract_from(Real* to,
+                            std::ptrdiff_t ld,
+                            int columns,
+                            bool is_zero,
+                            const Real* a,
+                            const Real* b,
+                            const Block& block) {
+    for (int j = 0; j < columns; j += kWidth) {
+      Tile<P, kWidth> tile;
+      Real* const c = to + j * ld;
+      if (is_zero) {
+        tile.clear();
+      } else {
+        tile.load_from(c, ld, columns - j);
+      }
+      tile.subtract_product(a, block.stride, b + j, block.columns);
+      tile.store_to(c, ld, columns - j);
+    }
+  }
+
+  /// What a finished block subtracts from `packs` packs of rows from `row` on of later columns, those of
+  /// the panel and those of the update matrix.
+  static void update_rows(
+      const Block& block, const Front& front, int first, int row, int packs, Real* panel, Real* u) {
+    const int end = row + kLanes * packs;
+    for (int strip = up_to_pack(block.columns); strip < end; strip += kLanes) {
+      const int from = strip < row ? row : strip;  // above are only entries of no meaning
+      const Real* const a = block.slabs + from / kLanes * block.stride;
+      const Real* const b = block.slabs + strip / kLanes * block.stride;
+      const int column = first + strip;
+      with_packs((end - from) / kLanes, [&]<int P> {
+        if (column < front.top) {
+          const int left = front.columns - column;
+          subtract_from<P>(panel + front.panel().place(first + from, column),
+                           front.panel().stride(column), left < kLanes ? left : kLanes, false, a, b,
+                           block);
+        } else {
+          const int u_column = column - front.top;
+          subtract_from<P>(u + front.update().place(first + from - front.top, u_column),
+                           front.update().stride(u_column), kLanes, first == 0, a, b, block);
+        }
+      });
+    }
+  }
+
+  static Verdict factor(const Front& front, Real* panel, Real* u, Real* scratch) {
+    const int end = front.top + up_to_pack(front.rows);
+    for (int first = 0; first < front.columns; first += kColumnBlock) {
+      const int left = front.columns - first;
+      const int columns = left < kColumnBlock ? left : kColumnBlock;
+      const Block block{.panel = panel + front.panel().place(first, first),
+                        .ld = front.panel().stride(first),
+                        .slabs = scratch,
+                        .stride = static_cast<std::ptrdiff_t>(kLanes) * columns,
+                        .columns = columns};
+      const Verdict verdict = factor_triangle(block);
+      if (verdict != Verdict::kPositive) return verdict;
+      // A few rows at a time, which stay in the cache: first those of later columns, then the others.
+      for (int row = up_to_pack(columns); first + row < end;) {
+        const int bound = first + row < front.top ? front.top : end;
+        const int rest = (bound - first - row) / kLanes;
+        const int packs = rest < kPacks ? rest : kPacks;
+        solve_rows(block, row, packs, 0, columns);
+        update_rows(block, front, first, row, packs, panel, u);
+        row += kLanes * packs;
+      }
+    }
+    return Verdict::kPositive;
+  }
+
+  static DIFFCLOTH_INLINE void add(const Real* from, int count, Real* to) {
+    int i = 0;
+    for (; i + kLanes <= count; i += kLanes) store(to + i, load(to + i) + load(from + i));
+    if (i < count) add_some(from + i, count - i, to + i);
+  }
+
+  static void add_to_panel(
+      const Front& child, const Real* u, const ChildMap& map, const Front& front, Real* panel) {
+    for (int r = 0; r < map.column_runs; ++r) {
+      for (int k = 0; k < map.runs[r].count; ++k) {
+        const Real* const from = u + child.update().place(0, map.runs[r].from + k);
+        Real* const to = panel + front.panel().place(0, map.runs[r].to + k);
+        add(from + map.runs[r].from + k, map.runs[r].count - k, to + map.runs[r].to + k);
+        for (int q = r + 1; q < map.column_runs; ++q) {
+          add(from + map.runs[q].from, map.runs[q].count, to + map.runs[q].to);
+        }
+        for (int q = map.column_runs; q < map.run_count; ++q) {
+          add(from + map.runs[q].from, map.runs[q].count, to + front.top + map.runs[q].to);
+        }
+      }
+    }
+  }
+
+  static void add_to_update(
+      const Front& child, const Real* u, const ChildMap& map, const Front& front, Real* parent_u) {
+    for (int r = map.column_runs; r < map.run_count; ++r) {
+      for (int k = 0; k < map.runs[r].count; ++k) {
+        const Real* const from = u + child.update().place(0, map.runs[r].from + k);
+        Real* const to = parent_u + front.update().place(0, map.runs[r].to + k);
+        add(from + map.runs[r].from + k, map.runs[r].count - k, to + map.runs[r].to + k);
+        for (int q = r + 1; q < map.run_count; ++q) {
+          add(from + map.runs[q].from, map.runs[q].count, to + map.runs[q].to);
+        }
+      }
+    }
+  }
+
+  /// y := L^-1 y for `width` columns l of a panel from their diagonal on, in registers.
+  template <int Width>
+  static DIFFCLOTH_INLINE void solve_triangle(const Real* l, std::ptrdiff_t ld, Real* y) {
+    Real t[Width];
+#pragma GCC unroll 16
+    for (int i = 0; i < Width; ++i) t[i] = y[i];
+#pragma GCC unroll 16
+    for (int j = 0; j < Width; ++j) {
+      t[j] *= l[j * ld + j];
+#pragma GCC unroll 16
+      for (int i = j + 1; i < Width; ++i) t[i] = subtract_product_of(t[i], l[j * ld + i], t[j]);
+    }
+#pragma GCC unroll 16
+    for (int i = 0; i < Width; ++i) y[i] = t[i];
+  }
+
+  /// y := L^-T y, likewise.
+  template <int Width>
+  static DIFFCLOTH_INLINE void solve_transposed_triangle(const Real* l,
+                                                         std::ptrdiff_t ld,
+                                                         Real* y) {
+    Real t[Width];
+#pragma GCC unroll 16
+    for (int i = 0; i < Width; ++i) t[i] = y[i];
+#pragma GCC unroll 16
+    for (int j = Width - 1; j >= 0; --j) {
+      t[j] *= l[j * ld + j];
+#pragma GCC unroll 16
+      for (int i = 0; i < j; ++i) t[i] = subtract_product_of(t[i], l[i * ld + j], t[j]);
+    }
+#pragma GCC unroll 16
+    for (int i = 0; i < Width; ++i) y[i] = t[i];
+  }
+
+  /// Call f<Width>() for the width of a triangle; supernodes are made of vertices of three columns each,
+  /// and widths below kLanes are what is left of those.
+  template <int Width = 1, class Call>
+  static DIFFCLOTH_INLINE void with_triangle(int width, Call call) {
+    if constexpr (Width < kLanes) {
+      if (width > Width) {
+        with_triangle<Width + 1>(width, call);
+        return;
+      }
+    }
+    call.template operator()<Width>();
+  }
+
+  template <int R>
+  static void forward(const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride) {
+    for (int column = 0; column < front.columns; column += kLanes) {
+      const int width = front.columns - column < kLanes ? front.columns - column : kLanes;
+      const Real* const l = panel + front.panel().place(0, column);
+      const std::ptrdiff_t ld = front.panel().stride(column);
+      for (int r = 0; r < R; ++r) {
+        with_triangle(width, [&]<int Width> {
+          solve_triangle<Width>(l + column, ld, c + r * stride + column);
+        });
+      }
+      for (int row = column + kLanes; row < front.ld; row += kLanes) {
+        Pack sum[R];
+        for (int r = 0; r < R; ++r) sum[r] = load(c + r * stride + row);
+        for (int j = 0; j < width; ++j) {
+          const Pack l_j = load(l + j * ld + row);
+          for (int r = 0; r < R; ++r) {
+            sum[r] = subtract_product_of(sum[r], l_j, broadcast(c[r * stride + column + j]));
+          }
+        }
+        for (int r = 0; r < R; ++r) store(c + r * stride + row, sum[r]);
+      }
+    }
+  }
+
+  /// Subtract from y[0 .. W - 1] the products of W columns, `ld` apart, with the vectors c.
+  template <int R, int W>
+  static void subtract_dots(
+      const Real* l, std::ptrdiff_t ld, int length, const Real* c, Real* y, std::ptrdiff_t stride) {
+    Pack sum[R][W];
     for (int r = 0; r < R; ++r) {
-      const Pack c_r = load(c + r * stride + row);
-      for (int j = 0; j < W; ++j) sum[r][j] = subtract_product_of(sum[r][j], l_j[j], c_r);
+      for (int j = 0; j < W; ++j) sum[r][j] = Pack{};
     }
-  }
-  for (int r = 0; r < R; ++r) {
-    for (int j = 0; j < W; ++j) y[r * stride + j] += total(sum[r][j]);
-  }
-}
-
-template <int R>
-void backward(const Front& front, const double* panel, double* c, std::ptrdiff_t stride) {
-  for (int column = down_to_pack(front.columns - 1); column >= 0; column -= kLanes) {
-    const int width = front.columns - column < kLanes ? front.columns - column : kLanes;
-    const int below = column + kLanes;
-    const double* const l = panel + front.panel().place(0, column);
-    const std::ptrdiff_t ld = front.panel().stride(column);
-    int j = 0;
-    for (; j + 4 <= width; j += 4) {
-      subtract_dots<R, 4>(l + j * ld + below, ld, front.ld - below, c + below, c + column + j,
-                          stride);
-    }
-    for (; j < width; ++j) {
-      subtract_dots<R, 1>(l + j * ld + below, ld, front.ld - below, c + below, c + column + j,
-                          stride);
+    for (int row = 0; row < length; row += kLanes) {
+      Pack l_j[W];
+      for (int j = 0; j < W; ++j) l_j[j] = load(l + j * ld + row);
+      for (int r = 0; r < R; ++r) {
+        const Pack c_r = load(c + r * stride + row);
+        for (int j = 0; j < W; ++j) sum[r][j] = subtract_product_of(sum[r][j], l_j[j], c_r);
+      }
     }
     for (int r = 0; r < R; ++r) {
-      solve_transposed_triangle(l + column, ld, width, c + r * stride + column);
+      for (int j = 0; j < W; ++j) y[r * stride + j] += total(sum[r][j]);
     }
   }
-}
 
-void forward(const Front& front, const double* panel, double* c, std::ptrdiff_t stride, int count) {
-  switch (count) {
-    case 1:
-      return forward<1>(front, panel, c, stride);
-    case 2:
-      return forward<2>(front, panel, c, stride);
-    case 3:
-      return forward<3>(front, panel, c, stride);
-    default:
-      return forward<4>(front, panel, c, stride);
+  template <int R>
+  static void backward(const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride) {
+    for (int column = down_to_pack(front.columns - 1); column >= 0; column -= kLanes) {
+      const int width = front.columns - column < kLanes ? front.columns - column : kLanes;
+      const int below = column + kLanes;
+      const Real* const l = panel + front.panel().place(0, column);
+      const std::ptrdiff_t ld = front.panel().stride(column);
+      int j = 0;
+      for (; j + 4 <= width; j += 4) {
+        subtract_dots<R, 4>(l + j * ld + below, ld, front.ld - below, c + below, c + column + j,
+                            stride);
+      }
+      for (; j < width; ++j) {
+        subtract_dots<R, 1>(l + j * ld + below, ld, front.ld - below, c + below, c + column + j,
+                            stride);
+      }
+      for (int r = 0; r < R; ++r) {
+        with_triangle(width, [&]<int Width> {
+          solve_transposed_triangle<Width>(l + column, ld, c + r * stride + column);
+        });
+      }
+    }
   }
-}
 
-void backward(
-    const Front& front, const double* panel, double* c, std::ptrdiff_t stride, int count) {
-  switch (count) {
-    case 1:
-      return backward<1>(front, panel, c, stride);
-    case 2:
-      return backward<2>(front, panel, c, stride);
-    case 3:
-      return backward<3>(front, panel, c, stride);
-    default:
-      return backward<4>(front, panel, c, stride);
+  static void forward(
+      const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride, int count) {
+    switch (count) {
+      case 1:
+        return forward<1>(front, panel, c, stride);
+      case 2:
+        return forward<2>(front, panel, c, stride);
+      case 3:
+        return forward<3>(front, panel, c, stride);
+      default:
+        return forward<4>(front, panel, c, stride);
+    }
   }
-}
+
+  static void backward(
+      const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride, int count) {
+    switch (count) {
+      case 1:
+        return backward<1>(front, panel, c, stride);
+      case 2:
+        return backward<2>(front, panel, c, stride);
+      case 3:
+        return backward<3>(front, panel, c, stride);
+      default:
+        return backward<4>(front, panel, c, stride);
+    }
+  }
+
+  static constexpr FrontKernels<Real> kKernels{.factor = factor,
+                                               .add_to_panel = add_to_panel,
+                                               .add_to_update = add_to_update,
+                                               .forward = forward,
+                                               .backward = backward};
+};
 
 using Four = double __attribute__((vector_size(32)));
 using UnalignedFour = double __attribute__((vector_size(32), aligned(8), may_alias));
@@ -555,11 +535,8 @@ void multiply_blocks(const std::int32_t* column_start,
 }
 
 constexpr DenseKernels kKernels{.multiply_blocks = multiply_blocks,
-                                .factor = factor,
-                                .add_to_panel = add_to_panel,
-                                .add_to_update = add_to_update,
-                                .forward = forward,
-                                .backward = backward};
+                                .doubles = Fronts<Doubles>::kKernels,
+                                .floats = Fronts<Floats>::kKernels};
 
 }  // namespace
 }  // namespace diffcloth::linalg

@@ -29,14 +29,15 @@ class EigenFactor final : public FactorBackend {
     if (matrix.dimension() > 0) solver_.analyzePattern(view(matrix_, values_.data()));
   }
 
-  bool compute(const double* blocks,
-               CholeskyWorkspace& /*workspace*/,
-               CholeskySeconds* /*seconds*/) override {
-    if (matrix_.dimension() == 0) return true;
+  Verdict compute(const double* blocks,
+                  CholeskyWorkspace& /*workspace*/,
+                  CholeskySeconds* /*seconds*/) override {
+    if (matrix_.dimension() == 0) return Verdict::kPositive;
     matrix_.gather(blocks, values_);
     solver_.factorize(view(matrix_, values_.data()));
     // Eigen compares pivots with zero, which NaN passes; a later NaN then stands on the diagonal.
-    return solver_.info() == Eigen::Success && std::isfinite(trace());
+    const bool positive = solver_.info() == Eigen::Success && std::isfinite(trace());
+    return positive ? Verdict::kPositive : Verdict::kIndefinite;
   }
 
   void solve(std::span<const double* const> b,
@@ -95,7 +96,7 @@ class EigenAnalysis final : public AnalysisBackend {
     flops_ = factor.flops();
   }
 
-  std::unique_ptr<FactorBackend> make_factor() const override {
+  std::unique_ptr<FactorBackend> make_factor(Precision /*precision*/) const override {
     return std::make_unique<EigenFactor>(matrix_);
   }
   Index dimension() const override { return matrix_.dimension(); }

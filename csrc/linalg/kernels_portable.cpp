@@ -6,28 +6,53 @@ namespace {
 
 using Two = double __attribute__((vector_size(16)));
 using UnalignedTwo = double __attribute__((vector_size(16), aligned(8), may_alias));
+using FourFloats = float __attribute__((vector_size(16)));
+using UnalignedFourFloats = float __attribute__((vector_size(16), aligned(4), may_alias));
 
-struct Pack {
+struct Doubles {
+  using Real = double;
+  static constexpr Real kLeastPivot = 0.0;
+  static constexpr Real kLargest = 1.7976931348623157e308;
   Two v[4];  // NOLINT(modernize-avoid-c-arrays): see dense_kernels_impl.h
 };
 
-inline Pack zero() { return {}; }
-inline Pack load(const double* from) {
+struct Floats {
+  using Real = float;
+  static constexpr Real kLeastPivot = 0x1p-16F;
+  static constexpr Real kLargest = 3.402823466e38F;
+  FourFloats v[4];  // NOLINT(modernize-avoid-c-arrays): see dense_kernels_impl.h
+};
+
+inline Doubles load(const double* from) {
   const auto* const lanes = reinterpret_cast<const UnalignedTwo*>(from);
   return {{lanes[0], lanes[1], lanes[2], lanes[3]}};
 }
-inline void store(double* to, Pack a) {
+inline Floats load(const float* from) {
+  const auto* const lanes = reinterpret_cast<const UnalignedFourFloats*>(from);
+  return {{lanes[0], lanes[1], lanes[2], lanes[3]}};
+}
+inline void store(double* to, Doubles a) {
   auto* const lanes = reinterpret_cast<UnalignedTwo*>(to);
   for (int i = 0; i < 4; ++i) lanes[i] = a.v[i];
 }
-inline Pack broadcast(double a) {
+inline void store(float* to, Floats a) {
+  auto* const lanes = reinterpret_cast<UnalignedFourFloats*>(to);
+  for (int i = 0; i < 4; ++i) lanes[i] = a.v[i];
+}
+inline Doubles broadcast(double a) {
   const Two lanes = {a, a};
   return {{lanes, lanes, lanes, lanes}};
 }
+inline Floats broadcast(float a) {
+  const FourFloats lanes = {a, a, a, a};
+  return {{lanes, lanes, lanes, lanes}};
+}
+template <class Pack>
 inline Pack operator+(Pack a, Pack b) {
   for (int i = 0; i < 4; ++i) a.v[i] += b.v[i];
   return a;
 }
+template <class Pack>
 inline Pack operator*(Pack a, Pack b) {
   for (int i = 0; i < 4; ++i) a.v[i] *= b.v[i];
   return a;
@@ -41,11 +66,20 @@ inline double subtract_product_of(double c, double a, double b) {
   return c - a * b;
 #endif
 }
+inline float subtract_product_of(float c, float a, float b) {
+#ifdef __FP_FAST_FMAF
+  return __builtin_fmaf(-a, b, c);
+#else
+  return c - a * b;
+#endif
+}
+template <class Pack>
 inline Pack subtract_product_of(Pack c, Pack a, Pack b) {
 #ifdef __FP_FAST_FMA
   for (int i = 0; i < 4; ++i) {
-    c.v[i][0] = __builtin_fma(-a.v[i][0], b.v[i][0], c.v[i][0]);
-    c.v[i][1] = __builtin_fma(-a.v[i][1], b.v[i][1], c.v[i][1]);
+    for (unsigned lane = 0; lane < 16 / sizeof(typename Pack::Real); ++lane) {
+      c.v[i][lane] = subtract_product_of(c.v[i][lane], a.v[i][lane], b.v[i][lane]);
+    }
   }
 #else
   for (int i = 0; i < 4; ++i) c.v[i] -= a.v[i] * b.v[i];
@@ -54,13 +88,18 @@ inline Pack subtract_product_of(Pack c, Pack a, Pack b) {
 }
 
 /// The sum of the lanes, in the one order that all levels have.
-inline double total(Pack a) {
+inline double total(Doubles a) {
   const Two two = (a.v[0] + a.v[2]) + (a.v[1] + a.v[3]);
   return two[0] + two[1];
 }
+inline float total(Floats a) {
+  const FourFloats four = (a.v[0] + a.v[2]) + (a.v[1] + a.v[3]);
+  return (four[0] + four[2]) + (four[1] + four[3]);
+}
 
-/// to += from for fewer than eight entries.
-inline void add_some(const double* from, int count, double* to) {
+/// to += from for less than a pack.
+template <class Real>
+inline void add_some(const Real* from, int count, Real* to) {
   for (int i = 0; i < count; ++i) to[i] += from[i];
 }
 

@@ -1,10 +1,17 @@
 #include <algorithm>
+#include <array>
 #include <atomic>
+#include <bit>
 #include <chrono>
+#include <cmath>
 #include <cstring>
+#include <limits>
 #include <mutex>
+#include <type_traits>
+#include <utility>
 #include <vector>
 
+#include "common/flush_subnormals.h"
 #include "common/team.h"
 #include "linalg/aligned_buffer.h"
 #include "linalg/backend.h"
@@ -13,6 +20,21 @@
 
 namespace diffcloth::linalg {
 namespace {
+
+constexpr int kMantissa = 52;
+constexpr std::int64_t kBias = 1023;
+
+/// The power of two s with 1 <= s^2 a < 4, for a normal a > 0.
+double inverse_root_scale(double a) {
+  const auto bits = std::bit_cast<std::int64_t>(a);
+  const std::int64_t half = ((bits >> kMantissa) - kBias) >> 1;
+  return std::bit_cast<double>((kBias - half) << kMantissa);
+}
+
+/// The largest power of two up to a normal a > 0.
+double leading_power(double a) {
+  return std::bit_cast<double>(std::bit_cast<std::int64_t>(a) >> kMantissa << kMantissa);
+}
 
 /// Adds the time since the last call to a phase; does nothing without a record.
 class Stopwatch {
@@ -34,14 +56,17 @@ class Stopwatch {
   Clock::time_point last_;
 };
 
-constexpr std::size_t kLine = 8;  // doubles of a cache line
+/// Numbers of a cache line.
+template <class Real>
+constexpr Index kLine = 64 / sizeof(Real);
 
 /// Places for the update matrices that tasks leave to others, always the lowest that is free: few are
 /// alive at once, but which ones depends on the threads.
+template <class Real>
 class Shelf {
  public:
   /// @param memory  of the size of all of them
-  Shelf(const std::vector<Task>& tasks, double* memory) : memory_(memory) {
+  Shelf(const std::vector<Task>& tasks, Real* memory) : memory_(memory) {
     place_.reserve(tasks.size());
     for (const Task& task : tasks) place_.push_back({.begin = 0, .size = task.update});
     taken_.reserve(tasks.size());
@@ -57,7 +82,7 @@ class Shelf {
     taken_.insert(gap, {.begin = place.begin, .end = place.begin + place.size, .task = task});
   }
 
-  /// Give back all but the last `left` doubles.
+  /// Give back all but the last `left` numbers.
   void give_back(Index task, std::size_t left) {
     const std::lock_guard lock(mutex_);
     const auto extent = std::ranges::find(taken_, task, &Extent::task);
@@ -65,7 +90,7 @@ class Shelf {
     if (left == 0) taken_.erase(extent);
   }
 
-  double* operator[](Index task) const { return memory_ + place_[task].begin; }
+  Real* operator[](Index task) const { return memory_ + place_[task].begin; }
 
  private:
   struct Place {
@@ -76,26 +101,41 @@ class Shelf {
     Index task;
   };
 
-  double* memory_;
+  Real* memory_;
   std::vector<Place> place_;
   std::mutex mutex_;
   std::vector<Extent> taken_;  // ascending
 };
 
-/// Multifrontal A = L L^T [Duff and Reid 1983; Liu 1992].
+const FrontKernels<double>& fronts(const DenseKernels& kernels, double /*precision*/) {
+  return kernels.doubles;
+}
+const FrontKernels<float>& fronts(const DenseKernels& kernels, float /*precision*/) {
+  return kernels.floats;
+}
+
+/// Multifrontal A = L L^T [Duff and Reid 1983; Liu 1992], in double or single precision.
+///
+/// The latter has its own range: what is factored is S A S, with powers of two S that bring the
+/// diagonal between 1 and 4.
+template <class Real>
 class MultifrontalFactor final : public FactorBackend {
  public:
   MultifrontalFactor(const Symbolic& symbolic, const DenseKernels& kernels)
-      : s_(symbolic), kernels_(kernels), factor_(symbolic.factor_size) {}
+      : s_(symbolic), kernels_(fronts(kernels, Real{})), factor_(symbolic.factor_size) {}
 
-  bool compute(const double* blocks,
-               CholeskyWorkspace& workspace,
-               CholeskySeconds* seconds) override {
+  Verdict compute(const double* blocks,
+                  CholeskyWorkspace& workspace,
+                  CholeskySeconds* seconds) override {
+    if (kIsScaled && !find_scale(blocks)) return Verdict::kIndefinite;
     const std::size_t scratch = static_cast<std::size_t>(s_.longest) * kColumnBlock;
     const std::size_t own = s_.arena_size + scratch;
-    double* const memory = workspace.reserve(s_.left_size + own * members(workspace));
-    Shelf shelf(s_.tasks, memory);
-    std::atomic<bool> positive = true;
+    Real* const memory = workspace.reserve<Real>(s_.left_size + own * members(workspace));
+    Shelf<Real> shelf(s_.tasks, memory);
+    const auto tasks = static_cast<Index>(s_.tasks.size());
+    // The first work that fails decides, whatever others that run beside it find.
+    std::atomic<Index> failed = 2 * tasks;
+    std::vector<Verdict> verdicts(s_.tasks.size(), Verdict::kPositive);
     // Work 2 k eliminates task k, work 2 k + 1 hands on what it leaves.
     const auto ready = [&](Index i, const Team::Done& done) {
       const Index k = i / 2;
@@ -104,17 +144,22 @@ class MultifrontalFactor final : public FactorBackend {
       return done[2 * k] != 0 && (before == -1 || done[2 * before + 1] != 0);
     };
     const auto go = [&](Index i, int member) {
-      if (!positive) return;
+      if (i > failed) return;
+      const Mode mode;
       Stopwatch watch(member == 0 ? seconds : nullptr);
-      double* const arena = memory + s_.left_size + own * static_cast<std::size_t>(member);
+      Real* const arena = memory + s_.left_size + own * static_cast<std::size_t>(member);
       if (i % 2 == 1) {
         hand_on(i / 2, blocks, shelf, watch);
-      } else if (!eliminate(i / 2, blocks, shelf, arena, watch)) {
-        positive = false;
+        return;
+      }
+      verdicts[i / 2] = eliminate(i / 2, blocks, shelf, arena, watch);
+      if (verdicts[i / 2] == Verdict::kPositive) return;
+      Index first = failed;
+      while (i < first && !failed.compare_exchange_weak(first, i)) {
       }
     };
-    run(workspace, 2 * static_cast<Index>(s_.tasks.size()), ready, go);
-    return positive;
+    run(workspace, 2 * tasks, ready, go);
+    return failed == 2 * tasks ? Verdict::kPositive : verdicts[failed / 2];
   }
 
   void solve(std::span<const double* const> b,
@@ -126,9 +171,35 @@ class MultifrontalFactor final : public FactorBackend {
     }
   }
 
-  std::size_t bytes() const override { return sizeof(*this) + factor_.bytes(); }
+  Precision precision() const override {
+    return kIsScaled ? Precision::kSingle : Precision::kDouble;
+  }
+  std::size_t bytes() const override {
+    return sizeof(*this) + factor_.bytes() + scale_.capacity() * sizeof(double);
+  }
 
  private:
+  static constexpr bool kIsScaled = std::is_same_v<Real, float>;
+
+  /// Of the processor: numbers decay with the distance in the sheet, in single precision to nothing.
+  struct Ordinary {
+    Ordinary() {}  // NOLINT(modernize-use-equals-default): or the variable would count as unused
+  };
+  using Mode = std::conditional_t<kIsScaled, FlushSubnormals, Ordinary>;
+
+  /// Find the scale of each unknown. False where the diagonal is not positive and finite.
+  bool find_scale(const double* blocks) {
+    scale_.resize(3 * s_.vertex.size());
+    for (std::size_t k = 0; k < s_.vertex.size(); ++k) {
+      for (std::size_t i = 0; i < 3; ++i) {
+        const double value = blocks[9 * static_cast<std::size_t>(s_.diagonal[k]) + 4 * i];
+        if (!(value > 0.0 && value <= std::numeric_limits<double>::max())) return false;
+        scale_[3 * k + i] = inverse_root_scale(value);
+      }
+    }
+    return true;
+  }
+
   /// Threads that work: one where there is one task.
   std::size_t members(CholeskyWorkspace& workspace) const {
     return s_.tasks.size() > 1 ? static_cast<std::size_t>(workspace.team().size()) : 1;
@@ -176,22 +247,24 @@ class MultifrontalFactor final : public FactorBackend {
   /// Eliminate the supernodes of a task.
   ///
   /// @param arena  of the thread; behind it is scratch for the kernels
-  bool eliminate(Index task, const double* blocks, Shelf& shelf, double* arena, Stopwatch& watch) {
+  Verdict eliminate(
+      Index task, const double* blocks, Shelf<Real>& shelf, Real* arena, Stopwatch& watch) {
     shelf.take(task);
     for (Index s = s_.tasks[task].begin; s < s_.tasks[task].end; ++s) {
       const Supernode& node = s_.supernodes[s];
-      double* const u = &node == &root_of(task) ? shelf[task] : arena + node.update;
-      if (!eliminate(node, blocks, shelf, arena, u, watch)) return false;
+      Real* const u = &node == &root_of(task) ? shelf[task] : arena + node.update;
+      const Verdict verdict = eliminate(node, blocks, shelf, arena, u, watch);
+      if (verdict != Verdict::kPositive) return verdict;
       if (&node != &root_of(task) && node.parent != -1) add_to_parent(node, blocks, u, watch);
     }
     for_children(task, [&](Index child) {
       if (left_size(root_of(child)) > 0) shelf.give_back(child, 0);
     });
-    return true;
+    return Verdict::kPositive;
   }
 
   /// Add to the panel above a task what belongs there of the update matrix that it leaves.
-  void hand_on(Index task, const double* blocks, Shelf& shelf, Stopwatch& watch) {
+  void hand_on(Index task, const double* blocks, Shelf<Real>& shelf, Stopwatch& watch) {
     const Supernode& root = root_of(task);
     if (root.parent == -1) return;
     add_to_parent(root, blocks, shelf[task], watch);
@@ -199,36 +272,33 @@ class MultifrontalFactor final : public FactorBackend {
   }
 
   /// Finish a supernode's columns of L, which its children have added to, and find its update matrix.
-  bool eliminate(const Supernode& node,
-                 const double* blocks,
-                 const Shelf& shelf,
-                 double* arena,
-                 double* u,
-                 Stopwatch& watch) {
+  Verdict eliminate(const Supernode& node,
+                    const double* blocks,
+                    const Shelf<Real>& shelf,
+                    Real* arena,
+                    Real* u,
+                    Stopwatch& watch) {
     if (node.children_begin == node.children_end) {
       assemble(node, blocks);
       watch.lap(&CholeskySeconds::assembly);
     }
     // The update matrix is written before anything is added to it: it need not be cleared.
-    double* const panel = factor_.data() + node.panel;
-    if (!kernels_.factor(node.front, panel, u, arena + s_.arena_size)) return false;
+    Real* const panel = factor_.data() + node.panel;
+    const Verdict verdict = kernels_.factor(node.front, panel, u, arena + s_.arena_size);
     watch.lap(&CholeskySeconds::dense);
-    if (node.parent == -1) return true;
+    if (verdict != Verdict::kPositive || node.parent == -1) return verdict;
     for (Index c = node.children_begin; c < node.children_end; ++c) {
       const Supernode& child = s_.supernodes[s_.children[c].supernode];
-      const double* const of_child =
+      const Real* const of_child =
           child.task == node.task ? arena + child.update : shelf[child.task];
       kernels_.add_to_update(child.front, of_child, map_of(c), node.front, u);
     }
     watch.lap(&CholeskySeconds::extend_add);
-    return true;
+    return Verdict::kPositive;
   }
 
   /// Add to the parent's panel what belongs there; the first child begins it.
-  void add_to_parent(const Supernode& node,
-                     const double* blocks,
-                     const double* u,
-                     Stopwatch& watch) {
+  void add_to_parent(const Supernode& node, const double* blocks, const Real* u, Stopwatch& watch) {
     const Supernode& parent = s_.supernodes[node.parent];
     if (node.as_child == parent.children_begin) {
       assemble(parent, blocks);
@@ -246,19 +316,29 @@ class MultifrontalFactor final : public FactorBackend {
 
   /// Begin a supernode's panel: with the columns of A.
   void assemble(const Supernode& node, const double* blocks) {
-    double* const panel = factor_.data() + node.panel;
+    Real* const panel = factor_.data() + node.panel;
     const auto size = static_cast<std::size_t>(node.front.panel().size(node.front.columns));
-    std::memset(panel, 0, sizeof(double) * size);
+    std::memset(panel, 0, sizeof(Real) * size);
     for (std::size_t k = node.blocks_begin; k < node.blocks_end; ++k) {
       const PlacedBlock& block = s_.blocks[k];
       const double* const a = blocks + 9 * static_cast<std::ptrdiff_t>(block.slot);
-      double* const to = panel + block.place;
+      Real* const to = panel + block.place;
       const std::ptrdiff_t ld = block.stride;
       // Which are transposed is as good as random: no branch.
       const std::ptrdiff_t down = block.transposed != 0 ? 3 : 1;
       const std::ptrdiff_t across = 4 - down;
-      for (int j = 0; j < 3; ++j) {
-        for (int i = 0; i < 3; ++i) to[i + j * ld] = a[i * down + j * across];
+      if constexpr (kIsScaled) {
+        const double* const row = scale_.data() + 3 * static_cast<std::ptrdiff_t>(block.row);
+        const double* const column = scale_.data() + 3 * static_cast<std::ptrdiff_t>(block.column);
+        for (int j = 0; j < 3; ++j) {
+          for (int i = 0; i < 3; ++i) {
+            to[i + j * ld] = static_cast<Real>(a[i * down + j * across] * (row[i] * column[j]));
+          }
+        }
+      } else {
+        for (int j = 0; j < 3; ++j) {
+          for (int i = 0; i < 3; ++i) to[i + j * ld] = a[i * down + j * across];
+        }
       }
     }
   }
@@ -276,8 +356,11 @@ class MultifrontalFactor final : public FactorBackend {
     std::span<double* const> x;
     std::size_t n;          ///< length of y, in the order of elimination
     std::ptrdiff_t stride;  ///< length of a front
-    double* y;
-    double* passed;  ///< what tasks have to subtract from rows of others
+    Real* y;
+    Real* passed;  ///< what tasks have to subtract from rows of others
+
+    /// Powers of two that the scaled right sides are divided by, so that they have the range of a Real.
+    std::array<double, kMaxVectors> unit;
 
     int count() const { return static_cast<int>(b.size()); }
   };
@@ -288,12 +371,18 @@ class MultifrontalFactor final : public FactorBackend {
     const std::size_t n = 3 * s_.vertex.size();
     const auto longest = static_cast<std::size_t>(s_.longest);
     // Of each thread: vectors of its own, and behind them a front.
-    const std::size_t own = (n + longest + kLine) / kLine * kLine;
+    constexpr std::size_t kPadding = kLine<Real>;
+    const std::size_t own = (n + longest + kPadding) / kPadding * kPadding;
     const std::size_t all = own * members(workspace);
-    double* const memory = workspace.reserve(b.size() * (all + n + s_.passed_size));
-    double* const y = memory + b.size() * all;
-    const Vectors v{
-        .b = b, .x = x, .n = n, .stride = s_.longest, .y = y, .passed = y + b.size() * n};
+    Real* const memory = workspace.reserve<Real>(b.size() * (all + n + s_.passed_size));
+    Real* const y = memory + b.size() * all;
+    const Vectors v{.b = b,
+                    .x = x,
+                    .n = n,
+                    .stride = s_.longest,
+                    .y = y,
+                    .passed = y + b.size() * n,
+                    .unit = units(b)};
     const auto tasks = static_cast<Index>(s_.tasks.size());
     const auto ready = [&](Index k, const Team::Done& done) {
       if (k < tasks) return has_all(k, [&](Index child) { return done[child] != 0; });
@@ -302,7 +391,8 @@ class MultifrontalFactor final : public FactorBackend {
       return done[parent == -1 ? task : 2 * tasks - 1 - parent] != 0;
     };
     const auto go = [&](Index k, int member) {
-      double* const front = memory + b.size() * own * static_cast<std::size_t>(member);
+      const Mode mode;
+      Real* const front = memory + b.size() * own * static_cast<std::size_t>(member);
       if (k < tasks) {
         forward(k, v, front + b.size() * longest, front);
       } else {
@@ -312,19 +402,61 @@ class MultifrontalFactor final : public FactorBackend {
     run(workspace, 2 * tasks, ready, go);
   }
 
+  std::array<double, kMaxVectors> units(std::span<const double* const> b) const {
+    std::array<double, kMaxVectors> result;
+    result.fill(1.0);
+    if (!kIsScaled) return result;
+    for (std::size_t r = 0; r < b.size(); ++r) {
+      double largest = 0.0;
+      for (std::size_t k = 0; k < s_.vertex.size(); ++k) {
+        for (std::size_t i = 0; i < 3; ++i) {
+          const double value = b[r][3 * static_cast<std::size_t>(s_.vertex[k]) + i];
+          largest = std::max(largest, std::abs(value * scale_[3 * k + i]));
+        }
+      }
+      if (largest >= std::numeric_limits<double>::min() &&
+          largest <= std::numeric_limits<double>::max()) {
+        result[r] = leading_power(largest);
+      }
+    }
+    return result;
+  }
+
+  /// Rows of a vertex on their way in.
+  void take(const double* b, Index k, double unit, Real* to) const {
+    const double* const from = b + 3 * static_cast<std::ptrdiff_t>(s_.vertex[k]);
+    if constexpr (kIsScaled) {
+      const double* const scale = scale_.data() + 3 * static_cast<std::ptrdiff_t>(k);
+      for (int i = 0; i < 3; ++i) to[i] = static_cast<Real>(from[i] * scale[i] / unit);
+    } else {
+      std::copy_n(from, 3, to);
+    }
+  }
+
+  /// The same on their way out.
+  void give(const Real* from, Index k, double unit, double* x) const {
+    double* const to = x + 3 * static_cast<std::ptrdiff_t>(s_.vertex[k]);
+    if constexpr (kIsScaled) {
+      const double* const scale = scale_.data() + 3 * static_cast<std::ptrdiff_t>(k);
+      for (int i = 0; i < 3; ++i) to[i] = static_cast<double>(from[i]) * scale[i] * unit;
+    } else {
+      std::copy_n(from, 3, to);
+    }
+  }
+
   /// y := L^-1 y in the columns of a task.
   ///
   /// @param z  [n] vectors of the thread: the right side less what has been subtracted from it
-  void forward(Index k, const Vectors& v, double* z, double* c) const {
+  void forward(Index k, const Vectors& v, Real* z, Real* c) const {
     const Task& task = s_.tasks[k];
     const Supernode& root = root_of(k);
     for (int r = 0; r < v.count(); ++r) {
-      double* const z_r = z + r * v.n;
+      Real* const z_r = z + r * v.n;
       for (Index i = s_.supernodes[task.begin].first; i < root.first + root.columns; ++i) {
-        std::copy_n(v.b[r] + 3 * static_cast<std::ptrdiff_t>(s_.vertex[i]), 3, z_r + 3 * i);
+        take(v.b[r], i, v.unit[r], z_r + 3 * static_cast<std::ptrdiff_t>(i));
       }
       for (std::size_t i = root.rows_begin; i < root.rows_end; ++i) {
-        std::fill_n(z_r + 3 * s_.rows[i], 3, 0.0);
+        std::fill_n(z_r + 3 * s_.rows[i], 3, Real{});
       }
       for_children(k, [&](Index child) {
         add_rows(root_of(child), v.passed + r * s_.passed_size + s_.tasks[child].passed, z_r);
@@ -334,19 +466,19 @@ class MultifrontalFactor final : public FactorBackend {
       const Supernode& node = s_.supernodes[s];
       const Front& f = node.front;
       for (int r = 0; r < v.count(); ++r) {
-        double* const c_r = c + r * v.stride;
-        std::fill_n(c_r, f.ld, 0.0);
+        Real* const c_r = c + r * v.stride;
+        std::fill_n(c_r, f.ld, Real{});
         std::copy_n(z + r * v.n + 3 * node.first, f.columns, c_r);
       }
       kernels_.forward(f, factor_.data() + node.panel, c, v.stride, v.count());
       for (int r = 0; r < v.count(); ++r) {
-        const double* const c_r = c + r * v.stride;
+        const Real* const c_r = c + r * v.stride;
         std::copy_n(c_r, f.columns, v.y + r * v.n + 3 * node.first);
         add_rows(node, c_r + f.top, z + r * v.n);
       }
     }
     for (int r = 0; r < v.count(); ++r) {
-      double* to = v.passed + r * s_.passed_size + task.passed;
+      Real* to = v.passed + r * s_.passed_size + task.passed;
       for (std::size_t i = root.rows_begin; i < root.rows_end; ++i, to += 3) {
         std::copy_n(z + r * v.n + 3 * s_.rows[i], 3, to);
       }
@@ -354,68 +486,101 @@ class MultifrontalFactor final : public FactorBackend {
   }
 
   /// to += values at the rows below a supernode.
-  void add_rows(const Supernode& node, const double* values, double* to) const {
+  void add_rows(const Supernode& node, const Real* values, Real* to) const {
     for (std::size_t k = node.rows_begin; k < node.rows_end; ++k, values += 3) {
       for (int i = 0; i < 3; ++i) to[3 * s_.rows[k] + i] += values[i];
     }
   }
 
   /// x := L^-T y in the columns of a task.
-  void backward(Index k, const Vectors& v, double* c) const {
+  void backward(Index k, const Vectors& v, Real* c) const {
     const Task& task = s_.tasks[k];
     for (Index s = task.end; s-- > task.begin;) {
       const Supernode& node = s_.supernodes[s];
       const Front& f = node.front;
       for (int r = 0; r < v.count(); ++r) {
-        double* const c_r = c + r * v.stride;
-        const double* const y_r = v.y + r * v.n;
-        std::fill_n(c_r, f.ld, 0.0);
+        Real* const c_r = c + r * v.stride;
+        const Real* const y_r = v.y + r * v.n;
+        std::fill_n(c_r, f.ld, Real{});
         std::copy_n(y_r + 3 * node.first, f.columns, c_r);
-        double* below = c_r + f.top;
+        Real* below = c_r + f.top;
         for (std::size_t i = node.rows_begin; i < node.rows_end; ++i, below += 3) {
           std::copy_n(y_r + 3 * s_.rows[i], 3, below);
         }
       }
       kernels_.backward(f, factor_.data() + node.panel, c, v.stride, v.count());
       for (int r = 0; r < v.count(); ++r) {
-        double* const y_r = v.y + r * v.n;
+        Real* const y_r = v.y + r * v.n;
         std::copy_n(c + r * v.stride, f.columns, y_r + 3 * node.first);
         for (Index i = node.first; i < node.first + node.columns; ++i) {
-          std::copy_n(y_r + 3 * i, 3, v.x[r] + 3 * static_cast<std::ptrdiff_t>(s_.vertex[i]));
+          give(y_r + 3 * static_cast<std::ptrdiff_t>(i), i, v.unit[r], v.x[r]);
         }
       }
     }
   }
 
   const Symbolic& s_;
-  const DenseKernels& kernels_;
-  AlignedBuffer factor_;
+  const FrontKernels<Real>& kernels_;
+  AlignedBuffer<Real> factor_;
+  std::vector<double> scale_;  // [3 n] in the order of elimination; empty for doubles
 };
 
+/// The layouts of both precisions, each made when the first factor needs it.
 class MultifrontalAnalysis final : public AnalysisBackend {
  public:
-  MultifrontalAnalysis(Symbolic symbolic, KernelLevel level)
-      : symbolic_(std::move(symbolic)), kernels_(dense_kernels(level)) {}
+  MultifrontalAnalysis(Elimination elimination, KernelLevel level)
+      : elimination_(std::move(elimination)), kernels_(dense_kernels(level)) {}
 
-  std::unique_ptr<FactorBackend> make_factor() const override {
-    return std::make_unique<MultifrontalFactor>(symbolic_, kernels_);
+  std::unique_ptr<FactorBackend> make_factor(Precision precision) const override {
+    if (precision == Precision::kSingle) {
+      return std::make_unique<MultifrontalFactor<float>>(singles_.get<float>(elimination_),
+                                                         kernels_);
+    }
+    return std::make_unique<MultifrontalFactor<double>>(doubles_.get<double>(elimination_),
+                                                        kernels_);
   }
-  Index dimension() const override { return 3 * static_cast<Index>(symbolic_.vertex.size()); }
-  std::size_t nonzeros() const override { return symbolic_.nonzeros; }
-  double flops() const override { return symbolic_.flops; }
-  std::size_t bytes() const override { return sizeof(*this) + symbolic_.bytes(); }
+  Index dimension() const override { return 3 * elimination_.graph.size(); }
+  std::size_t nonzeros() const override { return doubles_.get<double>(elimination_).nonzeros; }
+  double flops() const override { return doubles_.get<double>(elimination_).flops; }
+  std::size_t bytes() const override {
+    const Graph& graph = elimination_.graph;
+    const EliminationTree& tree = elimination_.tree;
+    const std::size_t indices = elimination_.pattern.row().size() +
+                                elimination_.pattern.column_start().size() + graph.start.size() +
+                                graph.neighbor.size() + graph.vertex.size() + 4 * tree.order.size();
+    return sizeof(*this) + sizeof(Index) * indices + singles_.bytes() + doubles_.bytes();
+  }
 
  private:
-  Symbolic symbolic_;
+  class Layout {
+   public:
+    template <class Real>
+    const Symbolic& get(const Elimination& e) const {
+      std::call_once(once_, [&] {
+        symbolic_ = analyze(e.pattern, e.graph, e.tree, kLine<Real>);
+        bytes_ = symbolic_.bytes();
+      });
+      return symbolic_;
+    }
+    std::size_t bytes() const { return bytes_; }
+
+   private:
+    mutable std::once_flag once_;
+    mutable Symbolic symbolic_;
+    mutable std::atomic<std::size_t> bytes_ = 0;
+  };
+
+  Elimination elimination_;
   const DenseKernels& kernels_;
+  Layout singles_;
+  Layout doubles_;
 };
 
 }  // namespace
 
-std::unique_ptr<const AnalysisBackend> analyze_multifrontal(const Elimination& elimination,
+std::unique_ptr<const AnalysisBackend> analyze_multifrontal(Elimination elimination,
                                                             KernelLevel level) {
-  return std::make_unique<MultifrontalAnalysis>(
-      analyze(elimination.pattern, elimination.graph, elimination.tree), level);
+  return std::make_unique<MultifrontalAnalysis>(std::move(elimination), level);
 }
 
 }  // namespace diffcloth::linalg

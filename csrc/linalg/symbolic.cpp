@@ -9,17 +9,13 @@
 namespace diffcloth::linalg {
 namespace {
 
-constexpr Index kLanes = 8;
-
 /// Factorizations of fewer operations are one task; larger ones are split into subtrees of at most
 /// this share of the operations, and what is above these.
 constexpr double kWorthSplitting = 2e8;
 constexpr double kLargestShare = 1.0 / 64;
 
-Index padded(Index n) { return (n + kLanes - 1) / kLanes * kLanes; }
-
-/// Columns an odd number of cache lines apart lie in different sets of the cache.
-Index leading_dimension(Index n) { return n >= 128 && n % 16 == 0 ? n + kLanes : n; }
+/// Columns that are longer lie an odd number of cache lines apart, in different sets of the cache.
+constexpr Index kLongColumn = 128;
 
 std::size_t size(const Trapezoid& matrix, Index columns) {
   return static_cast<std::size_t>(matrix.size(columns));
@@ -38,8 +34,15 @@ double front_flops(const Front& front) {
 /// Builds a Symbolic, one aspect after the other.
 class Analyzer {
  public:
-  Analyzer(const BlockPattern& pattern, const Graph& graph, const EliminationTree& tree)
-      : pattern_(pattern), graph_(graph), tree_(tree), gathered_(gather_supernodes(tree)) {}
+  Analyzer(const BlockPattern& pattern,
+           const Graph& graph,
+           const EliminationTree& tree,
+           Index lanes)
+      : pattern_(pattern),
+        graph_(graph),
+        tree_(tree),
+        lanes_(lanes),
+        gathered_(gather_supernodes(tree)) {}
 
   Symbolic run() {
     place_columns();
@@ -54,13 +57,21 @@ class Analyzer {
   }
 
  private:
+  Index padded(Index n) const { return (n + lanes_ - 1) / lanes_ * lanes_; }
+
+  Index leading_dimension(Index n) const {
+    return n >= kLongColumn && n % (2 * lanes_) == 0 ? n + lanes_ : n;
+  }
+
   void place_columns() {
     const Index n = graph_.size();
     s_.vertex.resize(n);
+    s_.diagonal.resize(n);
     rank_.assign(pattern_.size(), -1);
     for (Index k = 0; k < n; ++k) {
       s_.vertex[k] = graph_.vertex[tree_.order[gathered_.column[k]]];
       rank_[s_.vertex[k]] = k;
+      s_.diagonal[k] = pattern_.column_start()[s_.vertex[k]];
     }
     s_.supernodes.resize(gathered_.size());
     owner_.resize(n);
@@ -138,7 +149,7 @@ class Analyzer {
     }
   }
 
-  /// Slots by supernode: counted, then filled in. The places are those of row and column so far.
+  /// Slots by supernode: counted, then filled in.
   void sort_blocks() {
     std::vector<std::size_t> start(s_.supernodes.size() + 1, 0);
     const auto for_each_block = [&](auto visit) {
@@ -157,11 +168,14 @@ class Analyzer {
       s_.supernodes[s].blocks_end = start[s + 1];
     }
     s_.blocks.resize(start.back());
-    block_column_.resize(start.back());
     for_each_block([&](Index slot, Index i, Index j) {
       const std::size_t k = start[owner_[std::min(i, j)]]++;
-      s_.blocks[k] = {.slot = slot, .place = std::max(i, j), .stride = 0, .transposed = i < j};
-      block_column_[k] = std::min(i, j);
+      s_.blocks[k] = {.slot = slot,
+                      .row = std::max(i, j),
+                      .column = std::min(i, j),
+                      .place = 0,
+                      .stride = 0,
+                      .transposed = i < j};
     });
   }
 
@@ -176,9 +190,9 @@ class Analyzer {
       const Index padding = node.front.top - node.front.columns;
       for (std::size_t k = node.blocks_begin; k < node.blocks_end; ++k) {
         PlacedBlock& block = s_.blocks[k];
-        const Index p = position[block.place];
+        const Index p = position[block.row];
         const Index row = p < node.columns ? 3 * p : 3 * p + padding;
-        const Index column = 3 * (block_column_[k] - node.first);
+        const Index column = 3 * (block.column - node.first);
         block.place = static_cast<Index>(node.front.panel().place(row, column));
         block.stride = static_cast<std::uint32_t>(node.front.panel().stride(column));
       }
@@ -286,17 +300,20 @@ class Analyzer {
   const BlockPattern& pattern_;
   const Graph& graph_;
   const EliminationTree& tree_;
+  Index lanes_;
   SupernodeTree gathered_;
   std::vector<Index> rank_;   // [pattern.size()] place in the order of elimination, -1 if fixed
   std::vector<Index> owner_;  // [n] supernode of a column
-  std::vector<Index> block_column_;  // [blocks] place of its column in the order of elimination
   Symbolic s_;
 };
 
 }  // namespace
 
-Symbolic analyze(const BlockPattern& pattern, const Graph& graph, const EliminationTree& tree) {
-  return Analyzer(pattern, graph, tree).run();
+Symbolic analyze(const BlockPattern& pattern,
+                 const Graph& graph,
+                 const EliminationTree& tree,
+                 Index lanes) {
+  return Analyzer(pattern, graph, tree, lanes).run();
 }
 
 std::size_t Symbolic::taken_size(const Supernode& node) const {
@@ -306,7 +323,7 @@ std::size_t Symbolic::taken_size(const Supernode& node) const {
 }
 
 std::size_t Symbolic::bytes() const {
-  return sizeof(Symbolic) + vertex.capacity() * sizeof(Index) +
+  return sizeof(Symbolic) + (vertex.capacity() + diagonal.capacity()) * sizeof(Index) +
          supernodes.capacity() * sizeof(Supernode) + rows.capacity() * sizeof(Index) +
          blocks.capacity() * sizeof(PlacedBlock) + children.capacity() * sizeof(Child) +
          runs.capacity() * sizeof(Run) + tasks.capacity() * sizeof(Task);

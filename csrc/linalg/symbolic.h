@@ -18,8 +18,8 @@ struct Supernode {
   Index columns;             ///< vertices
   std::size_t rows_begin;    ///< its rows below: Symbolic::rows[rows_begin .. rows_end - 1]
   std::size_t rows_end;      ///<
-  std::size_t panel;         ///< offset in the factor [doubles]
-  std::size_t update;        ///< offset of its update matrix in its task's arena [doubles]
+  std::size_t panel;         ///< offset in the factor
+  std::size_t update;        ///< offset of its update matrix in its task's arena
   std::size_t blocks_begin;  ///< its blocks of A: Symbolic::blocks[blocks_begin .. blocks_end - 1]
   std::size_t blocks_end;
   Index children_begin;  ///< its children: Symbolic::children[children_begin .. children_end - 1]
@@ -29,10 +29,12 @@ struct Supernode {
   Index task;      ///< which of Symbolic::tasks it belongs to
 };
 
-/// A block of the matrix: its slot, its place in the panel, how far columns are apart there, and
-/// whether it stands there transposed.
+/// A block of the matrix: its slot, its row and column in the order of elimination, its place in the
+/// panel, how far columns are apart there, and whether it stands there transposed.
 struct PlacedBlock {
   Index slot;
+  Index row;
+  Index column;
   Index place;
   std::uint32_t stride : 31;
   std::uint32_t transposed : 1;
@@ -53,11 +55,12 @@ struct Task {
   Index end;
   Index parent;        ///< -1 where it has none
   bool joins;          ///< a single supernode, whose children are roots of other tasks
-  std::size_t update;  ///< size of the update matrix that it leaves to its parent [doubles]
-  std::size_t passed;  ///< offset of what its rows below get in a solve [doubles]
+  std::size_t update;  ///< size of the update matrix that it leaves to its parent
+  std::size_t passed;  ///< offset of what its rows below get in a solve
 };
 
-/// All of A = L L^T that does not depend on values, for the multifrontal method.
+/// All of A = L L^T that does not depend on values, for the multifrontal method. Sizes and offsets count
+/// numbers, of whose precision the layout depends.
 ///
 /// Vertices are eliminated in a postorder of the tree of supernodes. Of the update matrix of a
 /// supernode its parent's panel takes at once what belongs there; the rest is alive until the parent
@@ -65,17 +68,18 @@ struct Task {
 /// root of a task leaves all of it to another task. Each entry is summed in the order of the children,
 /// whatever thread does it.
 struct Symbolic {
-  std::vector<Index> vertex;  ///< [n] vertex eliminated k-th
+  std::vector<Index> vertex;    ///< [n] vertex eliminated k-th
+  std::vector<Index> diagonal;  ///< [n] slot of its diagonal block
   std::vector<Supernode> supernodes;
   std::vector<Index> rows;  ///< vertices in the order of elimination, ascending in each supernode
   std::vector<PlacedBlock> blocks;
   std::vector<Child> children;
   std::vector<Run> runs;
   std::vector<Task> tasks;      ///< children before their parents
-  std::size_t factor_size = 0;  ///< [doubles]
-  std::size_t arena_size = 0;   ///< that of the largest task [doubles]
-  std::size_t left_size = 0;    ///< of all update matrices that tasks leave [doubles]
-  std::size_t passed_size = 0;  ///< of what tasks pass on in a solve [doubles]
+  std::size_t factor_size = 0;  ///< of all panels
+  std::size_t arena_size = 0;   ///< that of the largest task
+  std::size_t left_size = 0;    ///< of all update matrices that tasks leave
+  std::size_t passed_size = 0;  ///< of what tasks pass on in a solve
   std::size_t nonzeros = 0;     ///< of L, zeros that supernodes store included, padding not
   double flops = 0.0;           ///< of one factorization, for those nonzeros
   Index longest = 0;            ///< largest ld of a panel
@@ -86,6 +90,10 @@ struct Symbolic {
   std::size_t bytes() const;
 };
 
-Symbolic analyze(const BlockPattern& pattern, const Graph& graph, const EliminationTree& tree);
+/// @param lanes  numbers in a cache line, which rows are padded to
+Symbolic analyze(const BlockPattern& pattern,
+                 const Graph& graph,
+                 const EliminationTree& tree,
+                 Index lanes);
 
 }  // namespace diffcloth::linalg

@@ -28,9 +28,9 @@ std::shared_ptr<const Assembly> AssemblyCache::find(const linalg::Couplings& pai
     }
   }
   const auto assembly = std::make_shared<const Assembly>(base(), fixed_, pairs);
-  // The analysis, which may come later, holds about as many indices as the pattern, twice.
+  // The analysis, which may come later, holds about five times as many indices as the pattern.
   const std::vector<Index>& row = assembly->merged.pattern.row();
-  const std::size_t bytes = sizeof(pairs.front()) * pairs.size() + 4 * sizeof(Index) * row.size();
+  const std::size_t bytes = sizeof(pairs.front()) * pairs.size() + 12 * sizeof(Index) * row.size();
   const std::lock_guard lock(mutex_);
   entries_.push_front({.key = pairs, .assembly = assembly, .bytes = bytes});
   bytes_ += bytes;

@@ -35,24 +35,39 @@ constexpr double kLargestGrowth = 4.0;
 
 void Directions::make_room() {
   // It would seldom be of use: where the next one fails, damped steps follow, which lead away.
-  if (factor_ && factor_->bytes() > walk_.context.options.large_factor) factor_ = nullptr;
+  if (last_.factor && last_.factor->bytes() > walk_.context.options.large_factor) last_ = {};
 }
 
-bool Directions::refactor(const linalg::BlockMatrix& H) {
+Factor Directions::factor(const linalg::BlockValues& A, bool doubts) {
+  SinglePrecision& seen = walk_.context.single;
+  linalg::Verdict verdict = linalg::Verdict::kUnclear;
+  Factor single = walk_.system.factor(A, linalg::Precision::kSingle, verdict);
+  const bool believed = seen.was_right && !seen.was_wrong && !doubts;
+  if (single || (verdict == linalg::Verdict::kIndefinite && believed)) return single;
+  Factor result = walk_.system.factor_in_doubles(A);
+  seen.was_wrong = seen.was_wrong || result != nullptr;
+  seen.was_right = seen.was_right || (verdict == linalg::Verdict::kIndefinite && !result);
+  return result;
+}
+
+bool Directions::refactor(linalg::BlockMatrix& H) {
   make_room();
-  Factor factor = walk_.system.factor(H);
+  Factor factor = this->factor(H, false);
   if (!factor) {
     ++walk_.context.counts->negative_curvature;
     return false;
   }
   ++walk_.context.counts->exact;
-  factor_ = std::move(factor);
-  walk_.system.solve(*factor_, walk_.g(), p_);
+  confirmed_ = factor->precision() == linalg::Precision::kDouble;
+  last_ = {
+      .factor = std::move(factor),
+      .hessian = confirmed_ ? nullptr : std::make_shared<const linalg::BlockValues>(std::move(H))};
+  walk_.system.solve(*last_.factor, walk_.g(), p_);
   return true;
 }
 
 bool Directions::chord() {
-  walk_.system.solve(*factor_, walk_.g(), p_);
+  walk_.system.solve(*last_.factor, walk_.g(), p_);
   if (!chord_allowed_ || !(walk_.displacement(p_) <= kChordContraction * last_step_)) return false;
   ++walk_.context.counts->chord;
   return true;
@@ -60,7 +75,7 @@ bool Directions::chord() {
 
 bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
   const linalg::Convergence result =
-      walk_.system.solve(H, *factor_, walk_.g(), kForcing, kIterations, p_);
+      walk_.system.solve(H, *last_.factor, walk_.g(), kForcing, kIterations, p_);
   indefinite = result == linalg::Convergence::kNegativeCurvature;
   if (result != linalg::Convergence::kConverged) return false;
   ++walk_.context.counts->exact;
@@ -68,18 +83,33 @@ bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
 }
 
 bool Directions::certify() {
-  const linalg::BlockMatrix H =
-      walk_.system.assemble(walk_.x().data(), Curvature::kExact, walk_.g());
   // Whatever was near is of no use where this is indefinite: it is a saddle.
-  factor_ = nullptr;
-  return refactor(H);
+  last_ = {};
+  last_ = walk_.system.certify(walk_.x().data(), walk_.g(), p_);
+  confirmed_ = true;
+  if (last_.factor && last_.hessian == nullptr) walk_.context.single.was_wrong = true;
+  ++(last_.factor ? walk_.context.counts->exact : walk_.context.counts->negative_curvature);
+  return last_.factor != nullptr;
+}
+
+bool Directions::confirm() {
+  if (confirmed_ || walk_.system.confirm(last_, walk_.g(), p_)) return confirmed_ = true;
+  walk_.context.single.was_wrong = true;
+  last_.factor = nullptr;  // never two at once
+  last_ = {.factor = walk_.system.factor_in_doubles(*last_.hessian), .hessian = nullptr};
+  if (!last_.factor) {
+    ++walk_.context.counts->negative_curvature;
+    return false;
+  }
+  walk_.system.solve(*last_.factor, walk_.g(), p_);
+  return confirmed_ = true;
 }
 
 Directions::Direction Directions::next() {
-  const bool nearby = s_ == 0.0 && factor_ != nullptr;
+  last_.hessian = nullptr;
+  const bool nearby = s_ == 0.0 && last_.factor != nullptr;
   if (nearby && chord()) return {.kind = Kind::kChord, .first = 1.0};
-  const linalg::BlockMatrix H =
-      walk_.system.assemble(walk_.x().data(), Curvature::kExact, walk_.g());
+  linalg::BlockMatrix H = walk_.system.assemble(walk_.x().data(), Curvature::kExact, walk_.g());
   if (s_ == 0.0) {
     bool indefinite = false;
     if (nearby && iterate(H, indefinite)) return {.kind = Kind::kIterated, .first = 1.0};
@@ -102,7 +132,8 @@ Directions::Direction Directions::next() {
 
 std::optional<Directions::Direction> Directions::next_extrapolated() {
   const double* x = walk_.x().data();
-  const linalg::BlockMatrix H = walk_.system.assemble_extrapolated(x, Curvature::kExact, walk_.g());
+  last_.hessian = nullptr;
+  linalg::BlockMatrix H = walk_.system.assemble_extrapolated(x, Curvature::kExact, walk_.g());
   if (refactor(H)) return Direction{.kind = Kind::kExtrapolated, .first = 1.0};
   if (s_ == 0.0) s_ = kFirstShare;
   return damp(H, walk_.system.assemble_extrapolated(x, Curvature::kPositive, walk_.g()));
@@ -116,7 +147,7 @@ std::optional<Directions::Direction> Directions::damp(const linalg::BlockMatrix&
     walk_.context.checkpoint->check();
     linalg::BlockMatrix A = H;
     A.blend(P, s_);
-    factor = walk_.system.factor(A);
+    factor = this->factor(A, s_ > kFirstShare);
     if (factor) break;
     if (s_ > kLargestShare) return std::nullopt;
   }
@@ -156,7 +187,7 @@ bool Directions::retry(Kind kind) {
     case Kind::kChord:
     case Kind::kIterated:
     case Kind::kExtrapolated:
-      factor_ = nullptr;
+      last_ = {};
       return true;
     case Kind::kFactored:
       s_ = kFirstShare;

@@ -30,7 +30,8 @@ enum class Kind : std::uint8_t {
 class Directions {
  public:
   /// @param nearby  factor of an exact Hessian that may be close; may be null
-  Directions(Walk& walk, Factor nearby) : walk_(walk), factor_(std::move(nearby)) {}
+  Directions(Walk& walk, Factor nearby)
+      : walk_(walk), last_{.factor = std::move(nearby), .hessian = nullptr} {}
 
   struct Direction {
     Kind kind;
@@ -47,9 +48,16 @@ class Directions {
   /// Compute the direction of the exact Hessian, factored here. False where it is indefinite.
   bool certify();
 
+  /// After a step of a new factor: make that a certificate, which is a function of the point alone. False
+  /// where the Hessian is indefinite.
+  bool confirm();
+
   const std::vector<double>& p() const { return p_; }
-  /// Of the exact Hessian that was factored last, if that succeeded.
-  const Factor& factor() const { return factor_; }
+  /// Whether there is a certificate of the point where the walk stands.
+  bool is_certified() const { return confirmed_ && last_.factor != nullptr; }
+
+  /// Of the point where certify() or confirm() was true last.
+  const Certificate& certificate() const { return last_; }
 
   /// The share of the projection in damped directions.
   double share() const { return s_; }
@@ -58,6 +66,7 @@ class Directions {
   void resume(const std::vector<double>& p, double share) {
     p_ = p;
     s_ = share;
+    confirmed_ = false;
   }
 
   /// Learn from how the last direction was walked.
@@ -73,8 +82,16 @@ class Directions {
   /// A new factor is about to be made: drop the last one if it is large.
   void make_room();
 
+  /// Factor a matrix in single precision, or in doubles where that fails.
+  ///
+  /// @param doubts  whether it may be definite where single precision finds it indefinite; that is
+  ///                believed once it was right in this step, and until it was wrong
+  Factor factor(const linalg::BlockValues& A, bool doubts);
+
   /// Factor the exact Hessian. Where it is indefinite the last factor stays, unless it is large.
-  bool refactor(const linalg::BlockMatrix& H);
+  ///
+  /// @param H  taken where it is definite
+  bool refactor(linalg::BlockMatrix& H);
 
   /// Compute the step of the last factor, and whether it does.
   bool chord();
@@ -84,7 +101,8 @@ class Directions {
   std::optional<Direction> damp(const linalg::BlockMatrix& H, const linalg::BlockMatrix& P);
 
   Walk& walk_;
-  Factor factor_;
+  bool confirmed_ = false;  // that the last one is a certificate
+  Certificate last_;  // of the exact Hessian that was factored last; without that once it is left
   std::vector<double> p_;
   double slope_ = 0.0;
   double last_step_ = std::numeric_limits<double>::infinity();

@@ -1,8 +1,38 @@
 #include "solver/linear_system.h"
 
 #include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <stdexcept>
+#include <utility>
 
 namespace diffcloth::solver {
+namespace {
+
+/// Relative residual of a solve to rounding, and in how many iterations a factor in single precision must
+/// reach it. A good one takes three.
+constexpr double kRounding = 1e-12;
+constexpr int kManyIterations = 30;
+
+/// A fixed right side without symmetry, with numbers of the size of the diagonal's root.
+std::vector<double> probe(const linalg::BlockValues& matrix) {
+  const linalg::BlockPattern& pattern = matrix.pattern();
+  std::vector<double> b(3 * static_cast<std::size_t>(pattern.size()));
+  std::uint32_t seed = 1;
+  for (std::size_t a = 0; a < b.size(); ++a) {
+    seed = seed * 1664525U + 1013904223U;
+    const double number = static_cast<double>(seed >> 8) / (1U << 24) - 0.5;
+    const auto slot = static_cast<std::size_t>(pattern.column_start()[a / 3]);
+    b[a] = number * std::sqrt(std::abs(matrix.blocks()[9 * slot + 4 * (a % 3)]));
+  }
+  return b;
+}
+
+}  // namespace
+
+std::size_t Certificate::bytes() const {
+  return (factor ? factor->bytes() : 0) + (hessian ? hessian->bytes() : 0);
+}
 
 linalg::BlockMatrix LinearSystem::assemble(const double* x,
                                            Curvature curvature,
@@ -30,15 +60,58 @@ linalg::BlockMatrix LinearSystem::assemble_extrapolated(const double* x,
   return matrix;
 }
 
-Factor LinearSystem::factor(const linalg::BlockMatrix& matrix) {
-  const Stopwatch::Scope analysis_scope(watch_, Phase::kAnalysis);
-  const Assembly::Found found = assembly_->analysis();
-  counts_.analyses += found.is_new ? 1 : 0;
+Factor LinearSystem::factor(const linalg::BlockValues& matrix,
+                            linalg::Precision precision,
+                            linalg::Verdict& verdict) {
+  std::shared_ptr<linalg::CholeskyFactor> factor;
+  {
+    const Stopwatch::Scope scope(watch_, Phase::kAnalysis);
+    const Assembly::Found found = assembly_->analysis();
+    counts_.analyses += found.is_new ? 1 : 0;
+    factor = std::make_shared<linalg::CholeskyFactor>(found.analysis, precision);
+  }
   const Stopwatch::Scope scope(watch_, Phase::kFactorization);
   ++counts_.factorizations;
-  auto factor = std::make_shared<linalg::CholeskyFactor>(found.analysis);
-  if (!factor->compute(matrix.blocks(), workspace_)) return nullptr;
-  return factor;
+  counts_.in_doubles += factor->precision() == linalg::Precision::kDouble ? 1 : 0;
+  verdict = factor->compute(matrix.blocks(), workspace_);
+  return verdict == linalg::Verdict::kPositive ? factor : nullptr;
+}
+
+Certificate LinearSystem::certify(const double* x,
+                                  const std::vector<double>& g,
+                                  std::vector<double>& p) {
+  linalg::BlockMatrix matrix = assemble(x, Curvature::kExact, g);
+  Certificate result;
+  result.factor = factor(matrix);
+  if (!result.factor) return result;
+  solve(*result.factor, g, p);
+  if (result.factor->precision() == linalg::Precision::kDouble) return result;
+  result.hessian = std::make_shared<const linalg::BlockValues>(std::move(matrix));
+  if (confirm(result, g, p)) return result;
+  result.factor = nullptr;  // never two at once
+  result.factor = factor_in_doubles(*result.hessian);
+  result.hessian = nullptr;
+  if (result.factor) solve(*result.factor, g, p);
+  return result;
+}
+
+bool LinearSystem::confirm(const Certificate& certificate,
+                           const std::vector<double>& g,
+                           const std::vector<double>& p) {
+  const Stopwatch::Scope scope(watch_, Phase::kSolve);
+  std::vector<double> b = probe(*certificate.hessian);
+  std::vector<double> z(b.size(), 0.0);
+  certificate.factor->solve(b.data(), z.data(), workspace_);
+  // The gradient with as much weight, and the step that the factor has made of it.
+  f_.coordinates->pull_back(g, b_);
+  f_.coordinates->take_rows(p, z_);
+  const double own = -linalg::dot(z_, b_);
+  const double weight = own > 0.0 ? std::sqrt(linalg::dot(z, b) / own) : 0.0;
+  for (std::size_t a = 0; a < b.size(); ++a) {
+    b[a] += weight * b_[a];
+    z[a] -= weight * z_[a];
+  }
+  return linalg::agrees(*certificate.hessian, *certificate.factor, b, z, workspace_);
 }
 
 void LinearSystem::solve(const linalg::CholeskyFactor& factor,
@@ -52,21 +125,34 @@ void LinearSystem::solve(const linalg::CholeskyFactor& factor,
   f_.coordinates->push_forward(z_, p);
 }
 
-void LinearSystem::solve(const linalg::CholeskyFactor& factor,
+void LinearSystem::solve(const Certificate& certificate,
                          const std::vector<std::vector<double>>& b,
                          std::vector<std::vector<double>>& p) {
   const Stopwatch::Scope scope(watch_, Phase::kSolve);
   std::vector<std::vector<double>> right(b.size());
   std::vector<std::vector<double>> z(b.size());
-  std::vector<const double*> from;
-  std::vector<double*> to;
   for (std::size_t r = 0; r < b.size(); ++r) {
     f_.coordinates->pull_back(b[r], right[r]);
     z[r].assign(right[r].size(), 0.0);
-    from.push_back(right[r].data());
-    to.push_back(z[r].data());
   }
-  factor.solve(from, to, workspace_);
+  const linalg::CholeskyFactor& factor = *certificate.factor;
+  if (factor.precision() == linalg::Precision::kDouble) {
+    linalg::solve(factor, right, workspace_, z);
+  } else {
+    const std::vector<char> converged = linalg::conjugate_gradients(
+        *certificate.hessian, factor, right, kRounding, kManyIterations, workspace_, z);
+    if (std::ranges::count(converged, 0) > 0) {
+      linalg::CholeskyFactor exact(factor.analysis());
+      if (exact.compute(certificate.hessian->blocks(), workspace_) != linalg::Verdict::kPositive) {
+        throw std::domain_error("the Hessian is not positive definite at the solution");
+      }
+      for (std::size_t r = 0; r < b.size(); ++r) {
+        if (converged[r] != 0) continue;
+        std::ranges::fill(z[r], 0.0);
+        exact.solve(right[r].data(), z[r].data(), workspace_);
+      }
+    }
+  }
   p.resize(b.size());
   for (std::size_t r = 0; r < b.size(); ++r) {
     for (double& value : z[r]) value = -value;
@@ -74,7 +160,7 @@ void LinearSystem::solve(const linalg::CholeskyFactor& factor,
   }
 }
 
-linalg::Convergence LinearSystem::solve(const linalg::BlockMatrix& matrix,
+linalg::Convergence LinearSystem::solve(const linalg::BlockValues& matrix,
                                         const linalg::CholeskyFactor& nearby,
                                         const std::vector<double>& b,
                                         double tolerance,
@@ -85,8 +171,7 @@ linalg::Convergence LinearSystem::solve(const linalg::BlockMatrix& matrix,
   f_.coordinates->take_rows(p, z_);
   for (double& value : z_) value = -value;
   const linalg::Convergence result =
-      linalg::conjugate_gradient(matrix.pattern(), matrix.blocks(), f_.assemblies->fixed(), nearby,
-                                 b_, tolerance, max_iterations, workspace_, z_);
+      linalg::conjugate_gradient(matrix, nearby, b_, tolerance, max_iterations, workspace_, z_);
   for (double& value : z_) value = -value;
   f_.coordinates->push_forward(z_, p);
   return result;

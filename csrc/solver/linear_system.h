@@ -14,6 +14,15 @@ namespace diffcloth::solver {
 
 using Factor = std::shared_ptr<const linalg::CholeskyFactor>;
 
+/// A factor of a Hessian, and that Hessian itself where the factor is in single precision: to solve to
+/// rounding takes both.
+struct Certificate {
+  Factor factor;  ///< null: there is none
+  std::shared_ptr<const linalg::BlockValues> hessian;
+
+  std::size_t bytes() const;
+};
+
 /// What a step did, for the report.
 struct Counts {
   int exact = 0;                  ///< Newton steps with the exact Hessian, factored or by CG
@@ -23,6 +32,7 @@ struct Counts {
   std::int64_t local_global = 0;  ///< iterations of Projective Dynamics
   int left_to_newton = 0;         ///< solves that these have given up
   int factorizations = 0;         ///< numeric ones, those that failed included
+  int in_doubles = 0;             ///< of these, those in double precision
   int analyses = 0;               ///< symbolic ones
 };
 
@@ -49,37 +59,63 @@ class LinearSystem {
                                             Curvature curvature,
                                             const std::vector<double>& g);
 
-  /// L L^T of a matrix that assemble() has made at the last point; null where it is not positive
-  /// definite.
-  Factor factor(const linalg::BlockMatrix& matrix);
+  /// L L^T of a matrix that assemble() has made at the last point; null where the verdict is not positive.
+  ///
+  /// @param precision  single is enough for directions, and takes half the time
+  Factor factor(const linalg::BlockValues& matrix,
+                linalg::Precision precision,
+                linalg::Verdict& verdict);
 
-  /// Change p = -factor^-1 (b pulled back to rows) of all points, zero at prescribed ones.
+  /// The same in doubles.
+  Factor factor_in_doubles(const linalg::BlockValues& matrix) {
+    linalg::Verdict verdict = linalg::Verdict::kUnclear;
+    return factor(matrix, linalg::Precision::kDouble, verdict);
+  }
+
+  /// The same in single precision, or in doubles where that fails.
+  Factor factor(const linalg::BlockValues& matrix) {
+    linalg::Verdict verdict = linalg::Verdict::kUnclear;
+    Factor single = factor(matrix, linalg::Precision::kSingle, verdict);
+    return single ? single : factor_in_doubles(matrix);
+  }
+
+  /// Change p = -factor^-1 (b pulled back to rows) of all points, zero at prescribed ones, as exact as
+  /// the factor.
   ///
   /// @param b  at all points
   void solve(const linalg::CholeskyFactor& factor,
              const std::vector<double>& b,
              std::vector<double>& p);
 
-  /// The same for several right sides at once, each with the bits that it has alone.
-  void solve(const linalg::CholeskyFactor& factor,
+  /// The same to rounding, for several right sides at once, each with the bits that it has alone.
+  void solve(const Certificate& certificate,
              const std::vector<std::vector<double>>& b,
              std::vector<std::vector<double>>& p);
 
   /// The same for a matrix, by conjugate gradients with a factor of a nearby one.
   ///
   /// @param p  in: the change by that factor alone
-  linalg::Convergence solve(const linalg::BlockMatrix& matrix,
+  linalg::Convergence solve(const linalg::BlockValues& matrix,
                             const linalg::CholeskyFactor& nearby,
                             const std::vector<double>& b,
                             double tolerance,
                             int max_iterations,
                             std::vector<double>& p);
 
-  /// Factor of the exact Hessian at x: the certificate that a point where the gradient vanishes is a
-  /// minimum. Null where it is none.
-  Factor certify(const double* x, const std::vector<double>& g) {
-    return factor(assemble(x, Curvature::kExact, g));
-  }
+  /// Factor the exact Hessian at x: the certificate that a point where the gradient vanishes is a
+  /// minimum. None where it is none.
+  ///
+  /// @param p  out: the Newton step
+  Certificate certify(const double* x, const std::vector<double>& g, std::vector<double>& p);
+
+  /// Whether a factor in single precision can certify: whether it agrees with its Hessian along the gradient
+  /// and a right side without symmetry together. So the step is right to a tenth, and the Hessian itself
+  /// definite: a negative direction that rounding hides is the softest of all, with a large share.
+  ///
+  /// @param p  the step that the factor makes of the gradient
+  bool confirm(const Certificate& certificate,
+               const std::vector<double>& g,
+               const std::vector<double>& p);
 
  private:
   const Objective& f_;

@@ -47,7 +47,7 @@ class Descent {
   Status run();
 
   double residual() const { return residual_; }
-  const Factor& factor() const { return directions_.factor(); }
+  const Certificate& certificate() const { return directions_.certificate(); }
 
  private:
   enum class Next : std::uint8_t { kGoOn, kStop };
@@ -134,7 +134,7 @@ Descent::Next Descent::no_way(const Directions::Direction& direction,
                               SearchResult result) {
   const bool exact = direction.kind != Kind::kDamped;
   if (exact && result == SearchResult::kNoGain) {
-    if (direction.kind == Kind::kFactored) {
+    if (direction.kind == Kind::kFactored && (step >= goal_ || directions_.is_certified())) {
       return stop(step < goal_ ? Status::kConverged : Status::kRoundingFloor);
     }
     if (step < goal_) {
@@ -198,7 +198,12 @@ Descent::Next Descent::come_back() {
 }
 
 Descent::Next Descent::take(const Directions::Direction& direction) {
-  const double step = walk_.displacement(directions_.p());
+  double step = walk_.displacement(directions_.p());
+  if (direction.kind == Kind::kFactored && step < goal_ && !directions_.is_certified()) {
+    residual_ = step / walk_.f.h;
+    if (!directions_.confirm()) return escape();
+    step = walk_.displacement(directions_.p());  // of doubles, perhaps
+  }
   const bool is_lost = !(step > kResolution * walk_.f.coordinates->extent(walk_.x()));
   // A minimum above the start of an excursion is none to end in.
   if (away_ && (step < goal_ || is_lost)) return come_back();
@@ -318,7 +323,7 @@ Outcome minimize(const Objective& objective,
   Descent descent(walk, std::move(nearby));
   outcome.status = descent.run();
   outcome.residual = descent.residual();
-  if (outcome.status == Status::kConverged) outcome.factor = descent.factor();
+  if (outcome.status == Status::kConverged) outcome.certificate = descent.certificate();
   return outcome;
 }
 

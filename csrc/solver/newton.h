@@ -21,7 +21,7 @@ struct Outcome {
   Status status = Status::kIterationLimit;
   double residual = 0.0;         ///< |p|_inf / h of the last Newton step [m/s]
   double motion_fraction = 1.0;  ///< of the prescribed motion that was reached
-  Factor factor;                 ///< of the exact Hessian at the solution, where converged
+  Certificate certificate;       ///< at the solution, where converged
 };
 
 /// Find a local minimum of the objective near x, moving the prescribed vertices to their ends.

@@ -44,7 +44,7 @@ Factor shifted_factor(const std::vector<double>& metric,
       H.add_to_diagonal(i, (shift - added) * row(metric.data(), i));
     }
     added = shift;
-    if (Factor factor = system.factor(H)) return factor;
+    if (Factor factor = system.factor_in_doubles(H)) return factor;
   }
   return nullptr;
 }

@@ -18,7 +18,13 @@ struct Options {
   double tolerance;    ///< on |p|_inf / h, p the full Newton step [m/s]
   int max_iterations;  ///< of a step, over all its solves
   /// A factor of more than this is dropped before the next one is made [bytes].
-  std::size_t large_factor = std::size_t{256} << 20;
+  std::size_t large_factor = std::size_t{64} << 20;
+};
+
+/// What a step has seen of factorizations in single precision that fail.
+struct SinglePrecision {
+  bool was_right = false;  ///< doubles have found a matrix indefinite, too
+  bool was_wrong = false;  ///< doubles have factored one
 };
 
 /// What the solves of one step share.
@@ -28,6 +34,7 @@ struct Context {
   linalg::CholeskyWorkspace* workspace;
   Stopwatch* watch;
   Counts* counts;
+  SinglePrecision single = {};
   int iterations = 0;                                ///< taken by all solves so far
   std::vector<std::vector<double>>* path = nullptr;  ///< accepted iterates, where wanted
 };

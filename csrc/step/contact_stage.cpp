@@ -217,8 +217,8 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
         solver::minimize(sum.objective, x, motion, solves == 0 ? &first_guess : nullptr,
                          std::move(factor), step.context);
     merge(outcome, step.report);
-    step.kept.add(outcome.factor);
-    factor = outcome.factor;
+    step.kept.add(outcome.certificate);
+    factor = outcome.certificate.factor;
     if (!step.tape.empty()) {
       Array rows;
       problem.coordinates.take_rows(x, rows);
@@ -240,7 +240,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
 void pull_back_solve(const Backward& step,
                      const solver::Objective& f,
                      const Array& x,
-                     solver::Factor factor,
+                     solver::Certificate certificate,
                      const std::vector<Array>& g,
                      bool with_forces,
                      const Turn::Exchange& exchange) {
@@ -248,9 +248,12 @@ void pull_back_solve(const Backward& step,
   solver::LinearSystem system(f, *step.context.workspace, *step.context.watch,
                               *step.context.counts);
   Array gradient;
-  if (!factor || coordinates.is_curved()) f.gradient(x.data(), gradient);
-  if (!factor) factor = system.certify(x.data(), gradient);
-  if (!factor) throw std::domain_error("the Hessian is not positive definite at the solution");
+  const bool is_kept = certificate.factor != nullptr;
+  if (!is_kept || coordinates.is_curved()) f.gradient(x.data(), gradient);
+  Array p;
+  if (!is_kept) certificate = system.certify(x.data(), gradient, p);
+  if (!certificate.factor)
+    throw std::domain_error("the Hessian is not positive definite at the solution");
 
   std::vector<Array> b(g.size(), Array(x.size(), 0.0));
   std::vector<Array> forces = b;
@@ -265,9 +268,8 @@ void pull_back_solve(const Backward& step,
     f.hessian_product(x.data(), forces[l].data(), product);
     for (std::size_t a = 0; a < product.size(); ++a) b[l][a] -= product[a];
   }
-  // The factor is that of H itself: nothing is left to polish.
   std::vector<Array> z;
-  system.solve(*factor, b, z);
+  system.solve(certificate, b, z);
 
   for (std::size_t l = 0; l < g.size(); ++l) {
     step.context.checkpoint->check();
@@ -332,11 +334,13 @@ void ContactStage::backward(const Backward& step, std::vector<Array> g) {
     sum.adopt(std::move(contacts));
     problem.coordinates.stand_at(x.data());
     const std::size_t place = first_factor + k;
-    const auto& factors = step.kept.factors;
-    solver::Factor factor = place < factors.size() ? factors[place] : nullptr;
+    const auto& kept = step.kept.certificates;
+    solver::Certificate certificate = place < kept.size() ? kept[place] : solver::Certificate{};
     // Of all solves the same.
-    if (!factor && sum.objective.expected.empty()) sum.expect_contacts_near(problem.start);
-    pull_back_solve(step, sum.objective, x, std::move(factor), g, k + 1 == solves, exchange_all);
+    if (!certificate.factor && sum.objective.expected.empty())
+      sum.expect_contacts_near(problem.start);
+    pull_back_solve(step, sum.objective, x, std::move(certificate), g, k + 1 == solves,
+                    exchange_all);
 
     for (std::size_t l = 0; l < g.size(); ++l) {
       Cotangents& bars = step.losses[l];

@@ -39,7 +39,7 @@ struct ContactStage {
 void pull_back_solve(const Backward& step,
                      const solver::Objective& objective,
                      const std::vector<double>& x,
-                     solver::Factor factor,
+                     solver::Certificate certificate,
                      const std::vector<std::vector<double>>& g,
                      bool with_forces,
                      const Turn::Exchange& exchange);

@@ -45,7 +45,7 @@ void solve_by_newton(Problem& problem,
                                                          nullptr, nullptr, step.context);
   step.context.path = path;
   merge(outcome, step.report);
-  step.kept.add(outcome.factor);
+  step.kept.add(outcome.certificate);
 }
 
 /// By local/global iterations, from which no factor comes: backward makes it. What they give up Newton's
@@ -84,7 +84,7 @@ void solve_by_projective_dynamics(Problem& problem,
     step.report.result = Result::kNotConverged;
     step.report.message = words(outcome.status);
   }
-  step.kept.add(nullptr);
+  step.kept.add({});
 }
 
 }  // namespace
@@ -105,18 +105,19 @@ std::vector<double> ElasticStage::forward(const Forward& step, double* body_forc
 
 void ElasticStage::backward(const Backward& step, const std::vector<std::vector<double>>& g) const {
   const std::vector<double> x = problem_.predicted(step.tape["elastic"]);
-  const solver::Factor factor = step.kept.factors.empty() ? nullptr : step.kept.factors.front();
+  const solver::Certificate certificate =
+      step.kept.certificates.empty() ? solver::Certificate{} : step.kept.certificates.front();
   const Turn::Exchange exchange = [&](std::size_t l) { step.losses[l].exchange(problem_); };
   if (nodes_.has_contacts()) {
     for (std::size_t l = 0; l < g.size(); ++l) {
       const Turn turn(exchange, l);
-      nodes_.backward(step, x, factor, g[l], step.losses[l]);
+      nodes_.backward(step, x, certificate.factor, g[l], step.losses[l]);
     }
     return;
   }
   const solver::Objective f = objective(problem_);
   f.stand_at(x.data());
-  pull_back_solve(step, f, x, factor, g, false, exchange);
+  pull_back_solve(step, f, x, certificate, g, false, exchange);
 }
 
 }  // namespace diffcloth::step

@@ -7,17 +7,15 @@ namespace diffcloth::step {
 
 std::size_t Kept::bytes() const {
   std::size_t sum = 0;
-  for (const auto& factor : factors) {
-    if (factor) sum += factor->bytes();
-  }
+  for (const auto& certificate : certificates) sum += certificate.bytes();
   for (const auto& list : contacts) sum += list.size() * sizeof(contact::Contact);
   return sum;
 }
 
-void Kept::add(std::shared_ptr<const linalg::CholeskyFactor> factor) {
+void Kept::add(solver::Certificate certificate) {
   // One that is too large anyway is not held while the step goes on.
-  if (factor && factor->bytes() > FactorCache::kBytes) factor = nullptr;
-  factors.push_back(std::move(factor));
+  if (certificate.bytes() > FactorCache::kBytes) certificate = {};
+  certificates.push_back(std::move(certificate));
 }
 
 void FactorCache::Room::shrink(std::size_t largest) {

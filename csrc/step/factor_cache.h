@@ -7,7 +7,7 @@
 #include <vector>
 
 #include "contact/contact_set.h"
-#include "linalg/cholesky.h"
+#include "solver/linear_system.h"
 
 namespace diffcloth::step {
 
@@ -15,13 +15,13 @@ namespace diffcloth::step {
 /// backward finds what is gone again, with the same bits.
 struct Kept {
   /// Of one step, each in its scheme's own order.
-  std::vector<std::shared_ptr<const linalg::CholeskyFactor>> factors;
+  std::vector<solver::Certificate> certificates;
   std::vector<std::vector<contact::Contact>> contacts;
 
   std::size_t bytes() const;
 
-  /// Add a factor, or null where there is none or the cache has no room for it.
-  void add(std::shared_ptr<const linalg::CholeskyFactor> factor);
+  /// Add a certificate, or none where the cache has no room for it.
+  void add(solver::Certificate certificate);
 };
 
 /// What is kept of steps whose backward can still be asked for, up to a number of bytes; the oldest go

@@ -48,7 +48,7 @@ void NodalStage::backward(const Backward& step,
   at.x = x;
   system.look(at);
   const linalg::BlockMatrix H = linear.assemble(x.data(), Curvature::kExact, at.g);
-  if (!factor) factor = linear.factor(system.without_coupling(at, H));
+  if (!factor) factor = linear.factor_in_doubles(system.without_coupling(at, H));
   if (!factor) throw std::domain_error("the Hessian is not positive definite at the solution");
 
   // The bodies' forces: minus E g, shared.

@@ -91,7 +91,7 @@ class NodalSolve {
       context_.checkpoint->check();
       assemble();
       S_ = std::make_unique<const linalg::BlockMatrix>(system_.without_coupling(here_, *H_));
-      factor_ = linear_.factor(*S_);
+      factor_ = linear_.factor_in_doubles(*S_);
       if (!factor_) ++context_.counts->negative_curvature;
       constraint_step_ = system_.constraint_step(here_);
       const Newton newton = factor_ ? try_newton() : Newton::kNoStep;
@@ -116,7 +116,7 @@ class NodalSolve {
 
   solver::Outcome finish(solver::Status status) {
     outcome_.status = status;
-    if (status == solver::Status::kConverged) outcome_.factor = factor_;
+    if (status == solver::Status::kConverged) outcome_.certificate.factor = factor_;
     x_ = std::move(here_.x);
     return outcome_;
   }
@@ -174,7 +174,7 @@ class NodalSolve {
     for (blend_ = std::max(kLeastBlend, blend_ / 4.0); blend_ < kMostBlend; blend_ *= 4.0) {
       linalg::BlockMatrix matrix = *H_;
       matrix.blend(positive, blend_);
-      if (solver::Factor factor = linear_.factor(form(matrix))) return factor;
+      if (solver::Factor factor = linear_.factor_in_doubles(form(matrix))) return factor;
     }
     return nullptr;
   }
@@ -228,7 +228,7 @@ class NodalSolve {
       system_.look(here_);
       assemble();
     }
-    solver::Factor factor = linear_.factor(*H_);
+    solver::Factor factor = linear_.factor_in_doubles(*H_);
     if (!factor) factor = damped([](const linalg::BlockMatrix& matrix) { return matrix; });
     if (!factor) return false;
     const NodalSystem::Linearized solution = system_.solve_linearized(here_, *factor);

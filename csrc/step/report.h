@@ -47,6 +47,7 @@ struct Report {
     visit("count_local_global", counts.local_global);
     visit("count_left_to_newton", static_cast<std::int64_t>(counts.left_to_newton));
     visit("count_factorizations", static_cast<std::int64_t>(counts.factorizations));
+    visit("count_in_doubles", static_cast<std::int64_t>(counts.in_doubles));
     visit("count_analyses", static_cast<std::int64_t>(counts.analyses));
     visit("count_taking_off", static_cast<std::int64_t>(taking_off));
     visit("count_sticking", static_cast<std::int64_t>(sticking));

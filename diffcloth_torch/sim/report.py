@@ -39,9 +39,9 @@ class Report:
         counts: What was done -> how often: steps with the `exact` Hessian, `chord` steps with an
             older factor, steps with a `projected` Hessian, Hessians of `negative_curvature`,
             `local_global` iterations of Projective Dynamics, solves that these have
-            `left_to_newton`, numeric `factorizations`, failed ones included, and symbolic
-            `analyses`; vertices in dry frictional contact that are `taking_off`, `sticking` and
-            `slipping`.
+            `left_to_newton`, numeric `factorizations`, failed ones included, of these those
+            `in_doubles`, and symbolic `analyses`; vertices in dry frictional contact that are
+            `taking_off`, `sticking` and `slipping`.
     """
 
     converged: bool | Tensor

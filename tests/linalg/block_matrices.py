@@ -9,6 +9,7 @@ import numpy as np
 from diffcloth_torch import _kernels as kernels
 
 STEP = 0.01  # of the cloth's Hessians [s]
+SINGLE = "multifrontal, single precision"  # our own backend, asked for such factors
 
 
 @dataclass(frozen=True)
@@ -52,17 +53,25 @@ class BlockMatrix:
         return BlockMatrix(self.size, self.pairs, self.blocks, fixed)
 
     def analysis(self, backend: str = "multifrontal", level: str = "", ordering: str = "automatic"):
+        if backend == SINGLE:
+            backend = "multifrontal"
         return kernels.CholeskyAnalysis(self.size, self.pairs, self.fixed, backend, level, ordering)
+
+    def empty_factor(
+        self, backend: str = "multifrontal", level: str = "", ordering: str = "automatic"
+    ):
+        """A factor on the pattern; nothing is factored yet."""
+        analysis = self.analysis(backend, level, ordering)
+        return kernels.CholeskyFactor(analysis, single=backend == SINGLE)
 
     def factor(self, backend: str = "multifrontal", level: str = "", ordering: str = "automatic"):
         """A factor, which must come out positive definite."""
-        factor = kernels.CholeskyFactor(self.analysis(backend, level, ordering))
+        factor = self.empty_factor(backend, level, ordering)
         assert factor.compute(self.blocks, kernels.CholeskyWorkspace())
         return factor
 
     def is_positive(self, backend: str = "multifrontal", level: str = "") -> bool:
-        factor = kernels.CholeskyFactor(self.analysis(backend, level))
-        return factor.compute(self.blocks, kernels.CholeskyWorkspace())
+        return self.empty_factor(backend, level).compute(self.blocks, kernels.CholeskyWorkspace())
 
     def product(self, x: np.ndarray) -> np.ndarray:
         """A x for x [vertices, 3], without forming A densely; no vertex may be fixed."""

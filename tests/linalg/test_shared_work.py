@@ -51,9 +51,9 @@ def matrix(name: str):
     return made, made.analysis()
 
 
-def factored(name: str, threads: int, level: str = ""):
+def factored(name: str, threads: int, level: str = "", single: bool = False):
     made, analysis = matrix(name)
-    factor = kernels.CholeskyFactor(made.analysis(level=level) if level else analysis)
+    factor = kernels.CholeskyFactor(made.analysis(level=level) if level else analysis, single)
     assert factor.compute(made.blocks, kernels.CholeskyWorkspace(threads))
     return made, factor
 
@@ -65,13 +65,14 @@ def thread_count() -> int:
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="counts threads in /proc")
 
 
+@pytest.mark.parametrize("single", [False, True])
 @pytest.mark.parametrize("name", MATRICES)
-def test_any_number_of_threads_has_the_bits_of_one(name):
-    made, alone = factored(name, 1)
+def test_any_number_of_threads_has_the_bits_of_one(name, single):
+    made, alone = factored(name, 1, single=single)
     b = np.random.default_rng(5).normal(size=(5, made.size, 3))
     expected = solve(alone, b)
     for threads in THREADS:
-        _, factor = factored(name, threads)
+        _, factor = factored(name, threads, single=single)
         assert np.array_equal(solve(factor, b), expected)
         assert np.array_equal(solve(alone, b, threads=threads), expected)
         assert np.array_equal(solve(alone, b[:1], threads=threads), expected[:1])
@@ -90,10 +91,11 @@ def test_shared_solutions_have_a_residual_of_rounding(name):
     assert (np.abs(made.product(x) - b)[free] <= 1e-13 * bound[free]).all()
 
 
+@pytest.mark.parametrize("single", [False, True])
 @pytest.mark.parametrize("level", kernels.kernel_levels())
-def test_levels_share_their_work_too(level):
-    made, alone = factored("cloth", 1, level)
-    _, factor = factored("cloth", 2, level)
+def test_levels_share_their_work_too(level, single):
+    made, alone = factored("cloth", 1, level, single)
+    _, factor = factored("cloth", 2, level, single)
     b = np.random.default_rng(7).normal(size=(1, made.size, 3))
     assert np.array_equal(solve(factor, b, threads=2), solve(alone, b))
 

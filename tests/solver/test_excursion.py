@@ -29,11 +29,11 @@ def test_it_does_not_creep(velocity):
     simulator, start = falling_sheet(velocity)
     with torch.no_grad():
         after = simulator.step(start)
-    assert after.report.iterations < 100
+    assert after.report.iterations < 150
 
 
 def test_the_path_leaves_out_what_was_undone():
-    simulator, start = falling_sheet((0.1, 0.4, -0.1))
+    simulator, start = falling_sheet((0.1, 0.1, 0.5))
     with torch.no_grad():
         path = simulator.path(start, dc.Control())
         after = simulator.step(start)

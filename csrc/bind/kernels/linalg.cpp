@@ -1,3 +1,4 @@
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <memory>
@@ -12,7 +13,9 @@
 #include <nanobind/stl/vector.h>
 
 #include "bind/kernels/kernels.h"
+#include "linalg/block_matrix.h"
 #include "linalg/cholesky.h"
+#include "linalg/conjugate_gradient.h"
 
 namespace diffcloth::bind {
 namespace {
@@ -82,15 +85,16 @@ struct Analysis {
 
 class Factor {
  public:
-  explicit Factor(const Analysis& analysis)
+  Factor(const Analysis& analysis, bool single)
       : blocks_(static_cast<std::size_t>(analysis.pattern.block_count())),
         vertices_(static_cast<std::size_t>(analysis.pattern.size())),
-        factor_(analysis.analysis) {}
+        factor_(analysis.analysis,
+                single ? linalg::Precision::kSingle : linalg::Precision::kDouble) {}
 
   bool compute(const Blocks& blocks, linalg::CholeskyWorkspace& workspace) {
     check(blocks);
     const nb::gil_scoped_release nogil;
-    return factor_.compute(blocks.data(), workspace);
+    return factor_.compute(blocks.data(), workspace) == linalg::Verdict::kPositive;
   }
 
   nb::dict profile(const Blocks& blocks, linalg::CholeskyWorkspace& workspace, int repeats) {
@@ -98,7 +102,8 @@ class Factor {
     linalg::CholeskySeconds seconds;
     bool positive = true;
     for (int k = 0; k < repeats; ++k) {
-      positive = factor_.compute(blocks.data(), workspace, &seconds) && positive;
+      positive = positive &&
+                 factor_.compute(blocks.data(), workspace, &seconds) == linalg::Verdict::kPositive;
     }
     if (!positive) throw std::invalid_argument("Factor: the matrix is not positive definite");
     nb::dict result;
@@ -111,9 +116,7 @@ class Factor {
   void solve(const Vectors& b,
              const MutableVectors& x,
              linalg::CholeskyWorkspace& workspace) const {
-    if (b.shape(0) != x.shape(0) || b.shape(1) != vertices_ || x.shape(1) != vertices_) {
-      throw std::invalid_argument("Factor: `b` and `x` must be [count, vertices, 3]");
-    }
+    check(b, x);
     std::vector<const double*> from;
     std::vector<double*> to;
     for (std::size_t r = 0; r < b.shape(0); ++r) {
@@ -124,9 +127,71 @@ class Factor {
     factor_.solve(from, to, workspace);
   }
 
+  const char* verdict(const Blocks& blocks, linalg::CholeskyWorkspace& workspace) {
+    check(blocks);
+    switch (factor_.compute(blocks.data(), workspace)) {
+      case linalg::Verdict::kPositive:
+        return "positive";
+      case linalg::Verdict::kIndefinite:
+        return "indefinite";
+      case linalg::Verdict::kUnclear:
+        return "unclear";
+    }
+    throw std::logic_error("unknown verdict");
+  }
+
+  std::vector<bool> conjugate_gradients(const Analysis& analysis,
+                                        const Blocks& blocks,
+                                        const Vectors& b,
+                                        const MutableVectors& x,
+                                        double tolerance,
+                                        int max_iterations,
+                                        linalg::CholeskyWorkspace& workspace) const {
+    check(blocks);
+    check(b, x);
+    const linalg::BlockMatrix A = matrix(analysis, blocks);
+    std::vector<std::vector<double>> right;
+    for (std::size_t r = 0; r < b.shape(0); ++r) {
+      const double* const from = b.data() + 3 * vertices_ * r;
+      right.emplace_back(from, from + 3 * vertices_);
+    }
+    std::vector<std::vector<double>> solution(right.size(), std::vector<double>(3 * vertices_));
+    const std::vector<char> converged = linalg::conjugate_gradients(
+        A, factor_, right, tolerance, max_iterations, workspace, solution);
+    for (std::size_t r = 0; r < b.shape(0); ++r) {
+      std::ranges::copy(solution[r], x.data() + 3 * vertices_ * r);
+    }
+    return {converged.begin(), converged.end()};
+  }
+
+  bool agrees(const Analysis& analysis,
+              const Blocks& blocks,
+              const Vectors& b,
+              linalg::CholeskyWorkspace& workspace) const {
+    check(blocks);
+    const std::vector<double> right(b.data(), b.data() + 3 * vertices_);
+    std::vector<double> x(right.size(), 0.0);
+    factor_.solve(right.data(), x.data(), workspace);
+    return linalg::agrees(matrix(analysis, blocks), factor_, right, x, workspace);
+  }
+
   std::size_t bytes() const { return factor_.bytes(); }
 
  private:
+  static linalg::BlockMatrix matrix(const Analysis& analysis, const Blocks& blocks) {
+    static const std::vector<char> none;  // only couplings beyond the pattern ask for it
+    linalg::BlockMatrix result(
+        std::make_shared<const linalg::MergedPattern>(linalg::merge(analysis.pattern, {})), none);
+    std::copy_n(blocks.data(), 9 * blocks.shape(0), result.blocks());
+    return result;
+  }
+
+  void check(const Vectors& b, const MutableVectors& x) const {
+    if (b.shape(0) != x.shape(0) || b.shape(1) != vertices_ || x.shape(1) != vertices_) {
+      throw std::invalid_argument("Factor: `b` and `x` must be [count, vertices, 3]");
+    }
+  }
+
   void check(const Blocks& blocks) const {
     if (blocks.shape(0) != blocks_) {
       throw std::invalid_argument("Factor: `blocks` must have one row for each block");
@@ -174,8 +239,14 @@ void linalg_kernels(nb::module_& m) {
       .def("nonzeros", [](const Analysis& a) { return a.analysis->nonzeros(); })
       .def("flops", [](const Analysis& a) { return a.analysis->flops(); });
   nb::class_<Factor>(m, "CholeskyFactor")
-      .def(nb::init<const Analysis&>(), "analysis"_a)
+      .def(nb::init<const Analysis&, bool>(), "analysis"_a, "single"_a = false)
       .def("compute", &Factor::compute, "blocks"_a.noconvert(), "workspace"_a)
+      .def("verdict", &Factor::verdict, "blocks"_a.noconvert(), "workspace"_a)
+      .def("agrees", &Factor::agrees, "analysis"_a, "blocks"_a.noconvert(), "b"_a.noconvert(),
+           "workspace"_a)
+      .def("conjugate_gradients", &Factor::conjugate_gradients, "analysis"_a,
+           "blocks"_a.noconvert(), "b"_a.noconvert(), "x"_a.noconvert(), "tolerance"_a,
+           "max_iterations"_a, "workspace"_a)
       .def("profile", &Factor::profile, "blocks"_a.noconvert(), "workspace"_a, "repeats"_a)
       .def("solve", &Factor::solve, "b"_a.noconvert(), "x"_a.noconvert(), "workspace"_a)
       .def("bytes", &Factor::bytes);
