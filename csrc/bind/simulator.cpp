@@ -1,5 +1,6 @@
 #include <algorithm>
 #include <cmath>
+#include <limits>
 #include <map>
 #include <memory>
 #include <stdexcept>
@@ -34,20 +35,22 @@ std::vector<std::array<Index, 3>> to_faces(const Indices& array) {
   return faces;
 }
 
-bool is_finite(const Doubles& array) {
-  return std::all_of(array.data(), array.data() + array.size(),
-                     [](double value) { return std::isfinite(value); });
+/// Whether all numbers are at most `largest` in size; no NaN is.
+bool is_within(const Doubles& array, double largest) {
+  std::int64_t beyond = 0;  // no branch, so that the compiler takes several numbers at once
+  for (std::size_t i = 0; i < array.size(); ++i) {
+    beyond |= static_cast<std::int64_t>(!(std::abs(array.data()[i]) <= largest));
+  }
+  return beyond == 0;
 }
 
-/// Whether all numbers are at most `largest` in size; no NaN is.
 bool are_within(const std::vector<Doubles>& arrays, double largest) {
-  return std::ranges::all_of(arrays, [&](const Doubles& array) {
-    std::int64_t beyond = 0;  // no branch, so that the compiler takes several numbers at once
-    for (std::size_t i = 0; i < array.size(); ++i) {
-      beyond |= static_cast<std::int64_t>(!(std::abs(array.data()[i]) <= largest));
-    }
-    return beyond == 0;
-  });
+  return std::ranges::all_of(arrays,
+                             [&](const Doubles& array) { return is_within(array, largest); });
+}
+
+bool is_finite(const Doubles& array) {
+  return is_within(array, std::numeric_limits<double>::max());
 }
 
 /// Whether all poses [.., 7] have quaternions longer than this.

@@ -4,6 +4,8 @@
 #include <cmath>
 #include <utility>
 
+#include "common/leading_power.h"
+
 namespace diffcloth::linalg {
 namespace {
 
@@ -129,7 +131,7 @@ std::vector<char> conjugate_gradients(const BlockValues& A,
   for (std::vector<double>& values : right) {
     double largest = 0.0;
     for (const double value : values) largest = std::max(largest, std::abs(value));
-    units.push_back(largest > 0.0 && std::isfinite(largest) ? std::exp2(std::ilogb(largest)) : 1.0);
+    units.push_back(leading_power(largest));
     for (double& value : values) value /= units.back();
   }
   solve(factor, right, workspace, x);
@@ -140,7 +142,12 @@ std::vector<char> conjugate_gradients(const BlockValues& A,
   for (std::size_t k = 0; k < b.size(); ++k) {
     descents.emplace_back(right[k], x[k]);
     goals.push_back(tolerance * tolerance * descents[k].rz);
-    if (descents[k].rz != 0.0) left.push_back(k);
+    if (descents[k].rz != 0.0) {
+      left.push_back(k);
+    } else {
+      // Nothing to do; but a product that underflows, beside huge numbers of vertices left out, is no zero.
+      converged[k] = std::ranges::all_of(x[k], [](double value) { return value == 0.0; }) ? 1 : 0;
+    }
   }
   for (int iteration = 0; iteration < max_iterations && !left.empty(); ++iteration) {
     std::erase_if(left, [&](std::size_t k) {

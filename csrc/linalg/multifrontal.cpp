@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "common/flush_subnormals.h"
+#include "common/leading_power.h"
 #include "common/team.h"
 #include "linalg/aligned_buffer.h"
 #include "linalg/backend.h"
@@ -29,11 +30,6 @@ double inverse_root_scale(double a) {
   const auto bits = std::bit_cast<std::int64_t>(a);
   const std::int64_t half = ((bits >> kMantissa) - kBias) >> 1;
   return std::bit_cast<double>((kBias - half) << kMantissa);
-}
-
-/// The largest power of two up to a normal a > 0.
-double leading_power(double a) {
-  return std::bit_cast<double>(std::bit_cast<std::int64_t>(a) >> kMantissa << kMantissa);
 }
 
 /// Adds the time since the last call to a phase; does nothing without a record.
@@ -414,10 +410,7 @@ class MultifrontalFactor final : public FactorBackend {
           largest = std::max(largest, std::abs(value * scale_[3 * k + i]));
         }
       }
-      if (largest >= std::numeric_limits<double>::min() &&
-          largest <= std::numeric_limits<double>::max()) {
-        result[r] = leading_power(largest);
-      }
+      result[r] = leading_power(largest);
     }
     return result;
   }

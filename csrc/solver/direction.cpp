@@ -93,20 +93,22 @@ bool Directions::certify() {
 }
 
 bool Directions::confirm() {
-  if (confirmed_ || walk_.system.confirm(last_, walk_.g(), p_)) return confirmed_ = true;
-  walk_.context.single.was_wrong = true;
-  last_.factor = nullptr;  // never two at once
-  last_ = {.factor = walk_.system.factor_in_doubles(*last_.hessian), .hessian = nullptr};
-  if (!last_.factor) {
-    ++walk_.context.counts->negative_curvature;
-    return false;
+  if (!confirmed_) {
+    walk_.system.confirm(last_, walk_.g(), p_);
+    confirmed_ = true;
+    if (last_.hessian == nullptr) walk_.context.single.was_wrong = true;
+    if (!last_.factor) ++walk_.context.counts->negative_curvature;
   }
-  walk_.system.solve(*last_.factor, walk_.g(), p_);
-  return confirmed_ = true;
+  return last_.factor != nullptr;
+}
+
+void Directions::leave() {
+  last_.hessian = nullptr;
+  confirmed_ = false;
 }
 
 Directions::Direction Directions::next() {
-  last_.hessian = nullptr;
+  leave();
   const bool nearby = s_ == 0.0 && last_.factor != nullptr;
   if (nearby && chord()) return {.kind = Kind::kChord, .first = 1.0};
   linalg::BlockMatrix H = walk_.system.assemble(walk_.x().data(), Curvature::kExact, walk_.g());
@@ -131,8 +133,8 @@ Directions::Direction Directions::next() {
 }
 
 std::optional<Directions::Direction> Directions::next_extrapolated() {
+  leave();
   const double* x = walk_.x().data();
-  last_.hessian = nullptr;
   linalg::BlockMatrix H = walk_.system.assemble_extrapolated(x, Curvature::kExact, walk_.g());
   if (refactor(H)) return Direction{.kind = Kind::kExtrapolated, .first = 1.0};
   if (s_ == 0.0) s_ = kFirstShare;

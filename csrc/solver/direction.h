@@ -79,6 +79,9 @@ class Directions {
   void restart();
 
  private:
+  /// The last factor is no longer that of the point where the walk stands.
+  void leave();
+
   /// A new factor is about to be made: drop the last one if it is large.
   void make_room();
 

@@ -2,9 +2,10 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstdint>
 #include <stdexcept>
 #include <utility>
+
+#include "common/fixed_noise.h"
 
 namespace diffcloth::solver {
 namespace {
@@ -18,12 +19,10 @@ constexpr int kManyIterations = 30;
 std::vector<double> probe(const linalg::BlockValues& matrix) {
   const linalg::BlockPattern& pattern = matrix.pattern();
   std::vector<double> b(3 * static_cast<std::size_t>(pattern.size()));
-  std::uint32_t seed = 1;
+  FixedNoise noise;
   for (std::size_t a = 0; a < b.size(); ++a) {
-    seed = seed * 1664525U + 1013904223U;
-    const double number = static_cast<double>(seed >> 8) / (1U << 24) - 0.5;
     const auto slot = static_cast<std::size_t>(pattern.column_start()[a / 3]);
-    b[a] = number * std::sqrt(std::abs(matrix.blocks()[9 * slot + 4 * (a % 3)]));
+    b[a] = noise() * std::sqrt(std::abs(matrix.blocks()[9 * slot + 4 * (a % 3)]));
   }
   return b;
 }
@@ -87,17 +86,23 @@ Certificate LinearSystem::certify(const double* x,
   solve(*result.factor, g, p);
   if (result.factor->precision() == linalg::Precision::kDouble) return result;
   result.hessian = std::make_shared<const linalg::BlockValues>(std::move(matrix));
-  if (confirm(result, g, p)) return result;
-  result.factor = nullptr;  // never two at once
-  result.factor = factor_in_doubles(*result.hessian);
-  result.hessian = nullptr;
-  if (result.factor) solve(*result.factor, g, p);
+  confirm(result, g, p);
   return result;
 }
 
-bool LinearSystem::confirm(const Certificate& certificate,
+void LinearSystem::confirm(Certificate& certificate,
                            const std::vector<double>& g,
-                           const std::vector<double>& p) {
+                           std::vector<double>& p) {
+  if (agrees(certificate, g, p)) return;
+  certificate.factor = nullptr;  // never two at once
+  certificate.factor = factor_in_doubles(*certificate.hessian);
+  certificate.hessian = nullptr;
+  if (certificate.factor) solve(*certificate.factor, g, p);
+}
+
+bool LinearSystem::agrees(const Certificate& certificate,
+                          const std::vector<double>& g,
+                          const std::vector<double>& p) {
   const Stopwatch::Scope scope(watch_, Phase::kSolve);
   std::vector<double> b = probe(*certificate.hessian);
   std::vector<double> z(b.size(), 0.0);

@@ -108,16 +108,19 @@ class LinearSystem {
   /// @param p  out: the Newton step
   Certificate certify(const double* x, const std::vector<double>& g, std::vector<double>& p);
 
-  /// Whether a factor in single precision can certify: whether it agrees with its Hessian along the gradient
-  /// and a right side without symmetry together. So the step is right to a tenth, and the Hessian itself
-  /// definite: a negative direction that rounding hides is the softest of all, with a large share.
+  /// Make sure that a factor in single precision can certify: replaced by one in doubles, or none, where it
+  /// does not agree with its Hessian along the gradient and a right side without symmetry together. Where it
+  /// does, the step is right to a tenth, and the Hessian itself definite: a negative direction that
+  /// rounding hides is the softest of all, with a large share.
   ///
   /// @param p  the step that the factor makes of the gradient
-  bool confirm(const Certificate& certificate,
-               const std::vector<double>& g,
-               const std::vector<double>& p);
+  void confirm(Certificate& certificate, const std::vector<double>& g, std::vector<double>& p);
 
  private:
+  bool agrees(const Certificate& certificate,
+              const std::vector<double>& g,
+              const std::vector<double>& p);
+
   const Objective& f_;
   linalg::CholeskyWorkspace& workspace_;
   Stopwatch& watch_;

@@ -2,7 +2,8 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstdint>
+
+#include "common/fixed_noise.h"
 
 namespace diffcloth::solver {
 namespace {
@@ -20,13 +21,10 @@ constexpr int kEscapeBacktracks = 40;
 /// A fixed start without symmetry.
 std::vector<double> start_vector(const Coordinates& coordinates) {
   std::vector<double> d(coordinates.size(), 0.0);
-  std::uint32_t seed = 1;
+  FixedNoise noise;
   for (Index i = 0; i < coordinates.row_count(); ++i) {
     if (!coordinates.is_free(i)) continue;
-    for (Index a = 3 * i; a < 3 * i + 3; ++a) {
-      seed = seed * 1664525U + 1013904223U;
-      d[a] = static_cast<double>(seed >> 8) / (1U << 24) - 0.5;
-    }
+    for (Index a = 3 * i; a < 3 * i + 3; ++a) d[a] = noise();
   }
   return d;
 }

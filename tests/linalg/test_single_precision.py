@@ -115,35 +115,47 @@ def test_a_verdict_is_right_or_none(name, level):
     assert {"positive", "indefinite"} <= verdicts
 
 
-def test_small_pivots_are_left_to_doubles():
+def tied_pair() -> BlockMatrix:
     """Two vertices that a stiff spring ties together; what holds them is 1e-6 of it."""
     blocks = np.zeros((3, 9))
     blocks[:, [0, 4, 8]] = np.array([1.0 + 1e-6, -1.0, 1.0 + 1e-6])[:, None]
-    matrix = BlockMatrix(2, np.array([[0, 0], [1, 0], [1, 1]], np.int32), blocks, np.zeros(2, bool))
+    pairs = np.array([[0, 0], [1, 0], [1, 1]], np.int32)
+    return BlockMatrix(2, pairs, blocks, np.zeros(2, bool))
+
+
+def test_small_pivots_are_left_to_doubles():
+    matrix = tied_pair()
     assert verdict(matrix) == "unclear"
     assert matrix.is_positive()
     assert verdict(matrix.shifted(1e-3)) == "positive"
     assert verdict(matrix.shifted(-1e-3)) == "indefinite"
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3])
-def test_the_first_pivot_that_fails_decides_for_any_number_of_threads(threads):
-    matrix = cloth_matrix(44)
-    diagonal = np.flatnonzero(matrix.pairs[:, 0] == matrix.pairs[:, 1])
-    rng = np.random.default_rng(3)
-    seen = set()
-    for _ in range(12):
-        blocks = matrix.blocks.copy()
-        for slot, share in zip(
-            rng.choice(diagonal, 8, replace=False), [0.3, 1e-7] * 4, strict=True
+def beside(first: BlockMatrix, second: BlockMatrix) -> BlockMatrix:
+    """Both, uncoupled; eliminated in this order."""
+    pairs = np.concatenate([first.pairs, second.pairs + first.size]).astype(np.int32)
+    blocks = np.concatenate([first.blocks, second.blocks])
+    return BlockMatrix(
+        first.size + second.size, pairs, blocks, np.concatenate([first.fixed, second.fixed])
+    )
+
+
+def test_the_first_pivot_that_fails_decides_for_any_number_of_threads():
+    """A large sheet fails late, while another thread has long been at the pair behind it."""
+    sheet = cloth_matrix(44)
+    diagonal = np.flatnonzero(sheet.pairs[:, 0] == sheet.pairs[:, 1])
+    workspaces = {threads: kernels.CholeskyWorkspace(threads) for threads in (1, 2, 3)}
+    for slot in np.random.default_rng(3).choice(diagonal, 12, replace=False):
+        blocks = sheet.blocks.copy()
+        blocks[slot, [0, 4, 8]] *= 0.3
+        broken = BlockMatrix(sheet.size, sheet.pairs, blocks, sheet.fixed)
+        for matrix, expected in (
+            (beside(broken, tied_pair()), "indefinite"),
+            (beside(tied_pair(), broken), "unclear"),
         ):
-            blocks[slot, [0, 4, 8]] *= share  # indefinite with its neighbors, or all but zero
-        broken = BlockMatrix(matrix.size, matrix.pairs, blocks, matrix.fixed)
-        expected = verdict(broken)
-        seen.add(expected)
-        for _ in range(3):
-            assert verdict(broken, threads=threads) == expected
-    assert "positive" not in seen
+            factor = matrix.empty_factor(SINGLE)
+            for threads in (1, 2, 3) * 6:
+                assert factor.verdict(matrix.blocks, workspaces[threads]) == expected
 
 
 def test_subnormal_numbers_are_zero_inside_and_come_back():
@@ -202,6 +214,19 @@ def test_a_factor_of_another_matrix_is_found_out():
     far = matrix.shifted(1e7).factor(SINGLE)
     assert not any(iterate(matrix, far, b)[1])
     assert not any(iterate(matrix.shifted(-1e3), matrix.factor(SINGLE), b)[1])
+
+
+def test_huge_numbers_of_vertices_left_out_make_no_solution_zero():
+    """They scale the others to where products underflow: no solution is better than zero."""
+    matrix = cloth_matrix(10).with_fixed([0])
+    b = np.ones((2, matrix.size, 3))
+    b[0, 0] = 1e300
+    x, converged = iterate(matrix, matrix.factor(SINGLE), b)
+    assert converged == [False, True]
+    b[:, 1:] = 0.0
+    x, converged = iterate(matrix, matrix.factor(SINGLE), b)
+    assert converged == [True, True]
+    assert (x == 0.0).all()
 
 
 def test_right_sides_that_do_not_converge_leave_the_others_alone():
