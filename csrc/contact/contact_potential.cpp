@@ -1,6 +1,7 @@
 #include "contact/contact_potential.h"
 
 #include <algorithm>
+#include <span>
 #include <utility>
 
 #include "contact/ccd.h"
@@ -13,7 +14,7 @@ constexpr double kSoon = 0.4;
 
 using Stencil = std::array<Index, 4>;
 
-void add_stencil_couplings(const Stencil& v, linalg::Couplings& pairs) {
+void add_stencil_couplings(std::span<const Index> v, linalg::Couplings& pairs) {
   for (const Index i : v) {
     for (const Index j : v) {
       if (i > j) pairs.emplace_back(i, j);
@@ -21,7 +22,7 @@ void add_stencil_couplings(const Stencil& v, linalg::Couplings& pairs) {
   }
 }
 
-bool moves(const Stencil& v, const double* d) {
+bool moves(std::span<const Index> v, const double* d) {
   return std::ranges::any_of(v, [&](Index i) { return !row(d, i).isZero(0.0); });
 }
 
@@ -91,7 +92,13 @@ void ContactPotential::add_couplings_near(const double* x, linalg::Couplings& pa
   std::vector<Candidate> near;
   detection_.candidates.find_at(x, model_.reach(), 0.5 * kSoon * model_.parameters().d_hat,
                                 model_.moving_surfaces(), detection_.scratch, near);
-  for (const Candidate& pair : near) add_stencil_couplings(pair.vertices, pairs);
+  for (const Candidate& pair : near) {
+    add_stencil_couplings(pair.vertices, pairs);
+    // Friction between edges of cloths turns with a face of one.
+    if (pair.kind != PairKind::kEdgeEdge || !model_.between_cloths(pair)) continue;
+    const Index third = model_.frame(pair)[2];
+    for (const Index v : pair.vertices) pairs.emplace_back(std::max(v, third), std::min(v, third));
+  }
 }
 
 void ContactPotential::add_hessian(const double* x,
@@ -108,7 +115,7 @@ void ContactPotential::add_hessian_product(const double* x, const double* z, dou
 
 void ContactPotential::add_held_product(const double* x, const double* z, double* y) const {
   for (const Contact& k : contacts_) {
-    if (!model_.is_held(k.pair)) continue;
+    if (!model_.is_held(k.pair.vertices)) continue;
     add_stencil_product(k.pair.vertices, model_.hessian(k, x, Curvature::kExact), z, y);
   }
 }
@@ -128,23 +135,19 @@ void ContactPotential::accumulate(const double* x, const double* z) {
 }
 
 void FrictionPotential::add_couplings(linalg::Couplings& pairs) const {
-  for (const FrictionSet::Entry& k : set_.entries()) {
-    add_stencil_couplings(k.lag.pair.vertices, pairs);
-  }
+  for (const FrictionSet::Entry& k : set_.entries()) add_stencil_couplings(k.points, pairs);
 }
 
 void FrictionPotential::add_hessian(const double* x,
                                     Curvature curvature,
                                     linalg::BlockMatrix& A) const {
-  for (const FrictionSet::Entry& k : set_.entries()) {
-    A.add_stencil(k.lag.pair.vertices, set_.hessian(k, x_start_, x, curvature));
-  }
+  for (const FrictionSet::Entry& k : set_.entries()) set_.hessian(k, x, curvature).add_to(A);
 }
 
 void FrictionPotential::add_held_product(const double* x, const double* z, double* y) const {
   for (const FrictionSet::Entry& k : set_.entries()) {
-    if (!set_.model().is_held(k.lag.pair)) continue;
-    add_stencil_product(k.lag.pair.vertices, set_.hessian(k, x_start_, x, Curvature::kExact), z, y);
+    if (!set_.model().is_held(k.points)) continue;
+    set_.hessian(k, x, Curvature::kExact).add_product(z, y);
   }
 }
 
@@ -153,8 +156,7 @@ void FrictionPotential::add_left_out_product(const double* x,
                                              const double* d,
                                              double* y) const {
   for (const FrictionSet::Entry& k : set_.entries()) {
-    if (!moves(k.lag.pair.vertices, d)) continue;
-    add_stencil_product(k.lag.pair.vertices, set_.hessian(k, x_start_, x, curvature), d, y);
+    if (moves(k.points, d)) set_.hessian(k, x, curvature).add_product(d, y);
   }
 }
 
@@ -162,8 +164,7 @@ void FrictionPotential::accumulate(const double* x, const double* z) {
   const std::size_t size = 3 * static_cast<std::size_t>(set_.model().mesh().vertex_count);
   start_bar.resize(size, 0.0);
   lag_bar.resize(size, 0.0);
-  set_.add_hessian_product(x_start_, x, z, start_bar.data());
-  set_.add_mixed(x_start_, x, z, x_lag_, -1.0, *bar_, lag_bar.data());
+  set_.add_mixed(x, z, x_lag_, -1.0, *bar_, start_bar.data(), lag_bar.data());
 }
 
 }  // namespace diffcloth::contact

@@ -108,19 +108,17 @@ class FrictionPotential final : public Potential {
                     const std::vector<Contact>& contacts,
                     const double* x_start,
                     ContactModel::Bar* bar)
-      : set_(model, contacts), x_start_(x_start), bar_(bar) {}
+      : set_(model, contacts, x_start), bar_(bar) {}
 
   double energy(const double* /*x*/) const override { return 0.0; }
   double energy_change(const double* x, const double* to) const override {
-    return set_.energy_change(x_start_, x, to);
+    return set_.energy_change(x, to);
   }
-  void add_gradient(const double* x, double* g) const override {
-    set_.add_gradient(x_start_, x, g);
-  }
+  void add_gradient(const double* x, double* g) const override { set_.add_gradient(x, g); }
   void add_couplings(linalg::Couplings& pairs) const override;
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
   void add_hessian_product(const double* x, const double* z, double* y) const override {
-    set_.add_hessian_product(x_start_, x, z, y);
+    set_.add_hessian_product(x, z, y);
   }
   void add_held_product(const double* x, const double* z, double* y) const override;
   void add_left_out_product(const double* x,
@@ -137,7 +135,6 @@ class FrictionPotential final : public Potential {
 
  private:
   FrictionSet set_;
-  const double* x_start_;
   const double* x_lag_ = nullptr;
   ContactModel::Bar* bar_;
 };

@@ -172,19 +172,22 @@ void ContactModel::find_terms(std::span<const Candidate> group,
   }
   const double range = parameters_.d_hat + xi(head);
   const Index a = head.vertices[0];
-  if (between_bodies(head) && prescribed_[a] != 0 && prescribed_[head.vertices[3]] != 0) return;
-  if (head.kind == PairKind::kEdgeEdge) {
-    if (!between_bodies(head) && prescribed_[a] != 0 && prescribed_[head.vertices[1]] != 0) return;
+  // Of a body all vertices are prescribed, or none.
+  const bool edges = head.kind == PairKind::kEdgeEdge;
+  const bool prescribed_a = prescribed_[a] != 0 && (!edges || prescribed_[head.vertices[1]] != 0);
+  const bool body_b = surface_b(head) >= mesh_.cloth_count;
+  if (prescribed_a && body_b && prescribed_[head.vertices[3]] != 0) return;
+  if (edges) {
     add_edge_terms(mesh_, weights_, group, rest_.edge_length_sq, x, range, 0.5, scratch, out);
-  } else if (a < mesh_.cloth_vertex_count) {
-    if (prescribed_[a] != 0) return;
-    add_point_terms(mesh_, weights_, group, x, range, 0.25, scratch, out);
-  } else {
-    const double w = between_bodies(head) ? weights_.vertex_area(a, surface_b(head))
-                                          : weights_.vertex_sharpness(surface_b(head), a);
-    if (w == 0.0) return;
-    add_point_terms(mesh_, weights_, group, x, range, 0.25 * w, scratch, out);
+    return;
   }
+  double w = 1.0;
+  if (a >= mesh_.cloth_vertex_count) {
+    w = body_b ? weights_.vertex_area(a, surface_b(head))
+               : weights_.vertex_sharpness(surface_b(head), a);
+  }
+  if (w == 0.0) return;
+  add_point_terms(mesh_, weights_.features(prescribed_a), group, x, range, 0.25 * w, scratch, out);
 }
 
 Contact ContactModel::contact(const Term& term, const double* x) const {
@@ -402,9 +405,23 @@ std::vector<char> ContactModel::moving_surfaces() const {
   return moves;
 }
 
-bool ContactModel::is_held(const Candidate& pair) const {
+bool ContactModel::is_held(std::span<const Index> points) const {
   return std::ranges::any_of(
-      pair.vertices, [&](Index v) { return v >= mesh_.cloth_vertex_count || prescribed_[v] != 0; });
+      points, [&](Index v) { return v >= mesh_.cloth_vertex_count || prescribed_[v] != 0; });
+}
+
+std::array<Index, 3> ContactModel::frame(const Candidate& pair) const {
+  const auto& v = pair.vertices;
+  if (between_cloths(pair)) {
+    if (pair.kind == PairKind::kPointTriangle) return {v[1], v[2], v[3]};
+    const CollisionMesh::Face& face = mesh_.faces[mesh_.edge_faces[pair.b][0]];
+    const auto third = std::ranges::find_if(face, [&](Index i) { return i != v[2] && i != v[3]; });
+    return {v[2], v[3], *third};
+  }
+  const Index a = surface_a(pair);
+  const Index b = surface_b(pair);
+  const bool takes_a = b < mesh_.cloth_count || (between_bodies(pair) && prescribed_[v[0]] != 0);
+  return weights_.carriers(takes_a ? a : b);
 }
 
 void ContactModel::add_hessian_product(const std::vector<Contact>& contacts,

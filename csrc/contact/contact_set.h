@@ -148,8 +148,14 @@ class ContactModel {
   /// Whether a surface has vertices whose motion is not given [surfaces].
   std::vector<char> moving_surfaces() const;
 
-  /// Whether a corner of a pair is no free vertex of a cloth.
-  bool is_held(const Candidate& pair) const;
+  /// Whether one of some points is no free vertex of a cloth.
+  bool is_held(std::span<const Index> points) const;
+
+  bool between_cloths(const Candidate& pair) const;
+
+  /// Three vertices of one of a pair's surfaces, with which the gap between both turns: of a body, at rest
+  /// rather than moving; between cloths of the triangle, or of a face at the second edge.
+  std::array<Index, 3> frame(const Candidate& pair) const;
 
   /// g += grad B.
   void add_gradient(const std::vector<Contact>& contacts, const double* x, double* g) const;
@@ -194,7 +200,6 @@ class ContactModel {
  private:
   /// Candidates that act together: one, or those of a point or an edge and a body.
   std::size_t group_end(const std::vector<Candidate>& candidates, std::size_t first) const;
-  bool between_cloths(const Candidate& pair) const;
   bool between_bodies(const Candidate& pair) const;
   void find_terms(std::span<const Candidate> group,
                   const double* x,

@@ -67,16 +67,70 @@ std::vector<std::array<float, 2>> continuations(const CollisionMesh& mesh,
   return result;
 }
 
+/// Weights of the features of all faces but those of the cloths whose corners are all left out.
+FeatureWeights::Features count_features(const CollisionMesh& mesh,
+                                        const std::vector<char>& left_out) {
+  FeatureWeights::Features w{.counts = std::vector<char>(mesh.faces.size(), 1),
+                             .edge = std::vector<Index>(mesh.edges.size(), 1),
+                             .vertex = std::vector<Index>(mesh.vertex_count, 1)};
+  for (std::size_t f = 0; f < mesh.faces.size(); ++f) {
+    const CollisionMesh::Face& face = mesh.faces[f];
+    if (static_cast<Index>(f) < mesh.cloth_face_count) {
+      w.counts[f] = std::ranges::any_of(face, [&](Index v) { return left_out[v] == 0; });
+    }
+    if (w.counts[f] == 0) continue;
+    for (const Index e : mesh.face_edges[f]) --w.edge[e];
+    for (const Index v : face) --w.vertex[v];
+  }
+  // n_f - 1 of every edge that has faces is -edge.
+  for (std::size_t e = 0; e < mesh.edges.size(); ++e) {
+    if (w.edge[e] == 1) continue;
+    for (const Index v : mesh.edges[e]) w.vertex[v] -= w.edge[e];
+  }
+  return w;
+}
+
+/// For every body a vertex, the one farthest from it, and the one farthest from the line of both.
+std::vector<std::array<Index, 3>> carriers_of_bodies(const CollisionMesh& mesh, const double* X) {
+  std::vector<std::array<Index, 3>> result;
+  // Of vertices at one distance the first, whatever the rounding of a frame or unit.
+  constexpr double kClearly = 1.0 + 1e-9;
+  const auto farthest = [](Index first, Index last, auto&& distance_sq) {
+    Index best = first;
+    for (Index v = first + 1; v < last; ++v) {
+      if (distance_sq(v) > kClearly * distance_sq(best)) best = v;
+    }
+    return best;
+  };
+  Index first = mesh.cloth_vertex_count;
+  for (Index surface = mesh.cloth_count; surface < mesh.surface_count(); ++surface) {
+    Index last = first;
+    while (last < mesh.vertex_count && mesh.vertex_surface[last] == surface) ++last;
+    const Vec3 a = row(X, first);
+    const Index second =
+        farthest(first, last, [&](Index v) { return (row(X, v) - a).squaredNorm(); });
+    const Vec3 along = row(X, second) - a;
+    const Index third =
+        farthest(first, last, [&](Index v) { return along.cross(row(X, v) - a).squaredNorm(); });
+    result.push_back({first, second, third});
+    first = last;
+  }
+  return result;
+}
+
 }  // namespace
 
 FeatureWeights::FeatureWeights(const CollisionMesh& mesh,
                                const double* X,
                                const std::vector<char>& prescribed)
-    : cloth_edge_count_(mesh.cloth_edge_count),
+    : cloth_count_(mesh.cloth_count),
+      cloth_edge_count_(mesh.cloth_edge_count),
       cloth_vertex_count_(mesh.cloth_vertex_count),
       body_edge_count_(static_cast<Index>(mesh.edges.size()) - mesh.cloth_edge_count),
-      body_vertex_count_(mesh.vertex_count - mesh.cloth_vertex_count) {
-  count_faces(mesh, prescribed);
+      body_vertex_count_(mesh.vertex_count - mesh.cloth_vertex_count),
+      all_features_(count_features(mesh, std::vector<char>(mesh.vertex_count, 0))),
+      free_features_(count_features(mesh, prescribed)),
+      carriers_(carriers_of_bodies(mesh, X)) {
   const RestMeasures rest = measure(mesh, X);
   const Bulge angles = bulge(mesh, X);
   continuation_ = continuations(mesh, X, angles.edge);
@@ -99,27 +153,6 @@ FeatureWeights::FeatureWeights(const CollisionMesh& mesh,
       vertex_sharpness_.push_back(sharpness(std::sqrt(omega), 2.0 * omega / std::numbers::pi,
                                             length / std::sqrt(rest.vertex_area[v])));
     }
-  }
-}
-
-void FeatureWeights::count_faces(const CollisionMesh& mesh, const std::vector<char>& prescribed) {
-  face_counts_.assign(mesh.faces.size(), 1);
-  edge_.assign(mesh.edges.size(), 1);
-  vertex_.assign(mesh.vertex_count, 1);
-  for (std::size_t f = 0; f < mesh.faces.size(); ++f) {
-    const CollisionMesh::Face& face = mesh.faces[f];
-    // Bodies are prescribed as a whole, and count.
-    if (static_cast<Index>(f) < mesh.cloth_face_count) {
-      face_counts_[f] = std::ranges::any_of(face, [&](Index v) { return prescribed[v] == 0; });
-    }
-    if (face_counts_[f] == 0) continue;
-    for (const Index e : mesh.face_edges[f]) --edge_[e];
-    for (const Index v : face) --vertex_[v];
-  }
-  // n_f - 1 of every edge that has faces is -edge_.
-  for (std::size_t e = 0; e < mesh.edges.size(); ++e) {
-    if (edge_[e] == 1) continue;
-    for (const Index v : mesh.edges[e]) vertex_[v] -= edge_[e];
   }
 }
 

@@ -44,13 +44,27 @@ namespace diffcloth::contact {
 /// precision, so that sums of a few of their products are exact, and cancel exactly.
 class FeatureWeights {
  public:
+  /// The weights w of the features that take part in a sum.
+  struct Features {
+    std::vector<char> counts;   ///< [faces] whether a face takes part
+    std::vector<Index> edge;    ///< [edges] 1 - n_f
+    std::vector<Index> vertex;  ///< [vertices] 1 - n_f + sum_e (n_f(e) - 1)
+  };
+
   /// @param X           rest positions, 3 * vertex_count; each surface may be in its own frame
-  /// @param prescribed  [vertices] cloth faces with prescribed corners only do not count
+  /// @param prescribed  [vertices] whose motion is given
   FeatureWeights(const CollisionMesh& mesh, const double* X, const std::vector<char>& prescribed);
 
-  bool counts(Index face) const { return face_counts_[face] != 0; }
-  Index edge(Index e) const { return edge_[e]; }
-  Index vertex(Index v) const { return vertex_[v]; }
+  /// What a point sees whose own motion is given, or not. Cloth faces with prescribed corners only bear
+  /// what moves; to what does not they do nothing.
+  const Features& features(bool prescribed_point) const {
+    return prescribed_point ? free_features_ : all_features_;
+  }
+
+  /// Three vertices of a body, far from each other, that say how it turns.
+  const std::array<Index, 3>& carriers(Index surface) const {
+    return carriers_[surface - cloth_count_];
+  }
 
   /// s_e of a body's edge, as a cloth sees it.
   double edge_sharpness(Index cloth, Index e) const {
@@ -84,15 +98,14 @@ class FeatureWeights {
     float area;  ///< [m^2]
   };
 
-  void count_faces(const CollisionMesh& mesh, const std::vector<char>& prescribed);
-
+  Index cloth_count_;
   Index cloth_edge_count_;
   Index cloth_vertex_count_;
   Index body_edge_count_;
   Index body_vertex_count_;
-  std::vector<char> face_counts_;                   // [faces]
-  std::vector<Index> edge_;                         // [edges]
-  std::vector<Index> vertex_;                       // [vertices]
+  Features all_features_;
+  Features free_features_;                          // without cloth faces that are prescribed
+  std::vector<std::array<Index, 3>> carriers_;      // [bodies]
   std::vector<float> edge_sharpness_;               // [cloths * body edges]
   std::vector<float> vertex_sharpness_;             // [cloths * body vertices]
   std::vector<std::array<float, 2>> continuation_;  // [body edges]

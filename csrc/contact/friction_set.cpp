@@ -6,123 +6,220 @@
 #include "contact/friction.h"
 
 namespace diffcloth::contact {
+namespace {
 
-FrictionSet::FrictionSet(const ContactModel& model, const std::vector<Contact>& contacts)
-    : model_(&model) {
+using Points = FrictionSet::Points;
+
+/// Which of an entry's points are the frame's: its first, second and third.
+constexpr int kFrame = 4;
+
+/// A frame is a line where its edges are parallel but for rounding: |m|^2 over |e1|^2 |e2|^2.
+constexpr double kLine = 1e-24;
+
+Vec3 tangential(const Vec3& u, const Vec3& n) { return u - n.dot(u) * n; }
+
+/// sum_i c_i x_i of a few points, which no translation changes: from the first, as that cancels less.
+Vec3 gap(const FrictionSet::Entry& k, const double* x) {
+  const Vec3 origin = row(x, k.points[0]);
+  Vec3 r = Vec3::Zero();
+  for (int i = 1; i < 4; ++i) r += k.lag.closest.c[i] * (row(x, k.points[i]) - origin);
+  return r;
+}
+
+/// e1, e2 and m = e1 x e2 of an entry's frame.
+struct Frame {
+  Frame(const Points& points, const double* x)
+      : e1(row(x, points[kFrame + 1]) - row(x, points[kFrame])),
+        e2(row(x, points[kFrame + 2]) - row(x, points[kFrame])),
+        m(e1.cross(e2)) {}
+
+  bool is_line() const { return !(m.squaredNorm() > kLine * e1.squaredNorm() * e2.squaredNorm()); }
+  Vec3 operator*(const Vec3& a) const { return a[0] * e1 + a[1] * e2 + a[2] * m; }
+  /// The coordinates of a vector.
+  Vec3 coordinates(const Vec3& r) const {
+    return Vec3(e2.cross(m).dot(r), m.cross(e1).dot(r), m.dot(r)) / m.squaredNorm();
+  }
+  /// sum_k a_k of the dual vectors.
+  Vec3 dual(const Vec3& a) const {
+    return (a[0] * e2.cross(m) + a[1] * m.cross(e1) + a[2] * m) / m.squaredNorm();
+  }
+  /// Cotangents of e1 and e2 where f is that of this * a.
+  std::array<Vec3, 2> pull_back(const Vec3& a, const Vec3& f) const {
+    return {a[0] * f + a[2] * e2.cross(f), a[1] * f + a[2] * f.cross(e1)};
+  }
+
+  Vec3 e1;
+  Vec3 e2;
+  Vec3 m;
+};
+
+/// Add cotangents of e1 and e2 to those of the frame's vertices.
+void add_edges(const Points& points, const std::array<Vec3, 2>& bar, double* x_bar) {
+  for (int k = 0; k < 2; ++k) {
+    Eigen::Map<Vec3>(x_bar + 3 * points[kFrame + 1 + k]) += bar[k];
+    Eigen::Map<Vec3>(x_bar + 3 * points[kFrame]) -= bar[k];
+  }
+}
+
+/// The matrix of v -> u x v.
+Mat3 cross_matrix(const Vec3& u) {
+  return Mat3{{0.0, -u[2], u[1]}, {u[2], 0.0, -u[0]}, {-u[1], u[0], 0.0}};
+}
+
+}  // namespace
+
+FrictionSet::FrictionSet(const ContactModel& model,
+                         const std::vector<Contact>& contacts,
+                         const double* x_start)
+    : model_(&model), x_start_(x_start) {
   entries_.reserve(contacts.size());
   const double kappa = model.parameters().kappa;
   for (const Contact& k : contacts) {
     const double d = std::sqrt(k.closest.d_sq);
-    entries_.push_back({.lag = k,
-                        .n = k.closest.t / d,
-                        .lambda = -kappa * k.weight * k.mollifier * k.barrier.b1 * 2.0 * d,
-                        .mu = model.mu(k.pair)});
+    const auto& v = k.pair.vertices;
+    const auto [first, second, third] = model.frame(k.pair);
+    Entry entry{.lag = k,
+                .n = k.closest.t / d,
+                .lambda = -kappa * k.weight * k.mollifier * k.barrier.b1 * 2.0 * d,
+                .mu = model.mu(k.pair),
+                .points = {v[0], v[1], v[2], v[3], first, second, third},
+                .turns = false,
+                .a = Vec3::Zero()};
+    const Frame frame(entry.points, x_start);
+    entry.turns = !frame.is_line();
+    if (entry.turns) entry.a = frame.coordinates(gap(entry, x_start));
+    entries_.push_back(entry);
   }
 }
 
-Vec3 FrictionSet::displacement(const Entry& entry, const double* x_start, const double* x) {
-  Vec3 u = Vec3::Zero();
-  for (int i = 0; i < 4; ++i) {
-    const Index v = entry.lag.pair.vertices[i];
-    u += entry.lag.closest.c[i] * (row(x, v) - row(x_start, v));
+struct FrictionSet::Slip {
+  Frame frame;
+  Vec3 s;
+  Vec3 w;
+  FrictionLaw law;
+};
+
+FrictionSet::Slip FrictionSet::slip(const Entry& k, const double* x) const {
+  const Frame frame(k.points, x);
+  // By displacements, of which little is lost: sum_i c_i delta_i less the change of E a.
+  const auto displacement = [&](Index v) -> Vec3 { return row(x, v) - row(x_start_, v); };
+  Vec3 s = Vec3::Zero();
+  for (int i = 0; i < 4; ++i) s += k.lag.closest.c[i] * displacement(k.points[i]);
+  if (k.turns) {
+    const Vec3 first = displacement(k.points[kFrame]);
+    const Vec3 change_1 = displacement(k.points[kFrame + 1]) - first;
+    const Vec3 change_2 = displacement(k.points[kFrame + 2]) - first;
+    const Vec3 e1_start = row(x_start_, k.points[kFrame + 1]) - row(x_start_, k.points[kFrame]);
+    s -= k.a[0] * change_1 + k.a[1] * change_2 +
+         k.a[2] * (change_1.cross(frame.e2) + e1_start.cross(change_2));
   }
-  return u;
+  const Vec3 w = tangential(s, k.n);
+  return {.frame = frame, .s = s, .w = w, .law = friction_law(w.norm(), model_->parameters().slip)};
 }
 
-namespace {
-
-Vec3 tangential(const Vec3& u, const Vec3& n) { return u - n.dot(u) * n; }
-
-}  // namespace
-
-double FrictionSet::energy_change(const double* x_start, const double* x0, const double* x1) const {
-  const double e = entries_.empty() ? 1.0 : model_->parameters().slip;
+double FrictionSet::energy_change(const double* x0, const double* x1) const {
   double change = 0.0;
   for (const Entry& k : entries_) {
-    const double y0 = tangential(displacement(k, x_start, x0), k.n).norm();
-    const double y1 = tangential(displacement(k, x_start, x1), k.n).norm();
-    change += k.mu * k.lambda * (friction_law(y1, e).f0 - friction_law(y0, e).f0);
+    change += k.mu * k.lambda * (slip(k, x1).law.f0 - slip(k, x0).law.f0);
   }
   return change;
 }
 
-void FrictionSet::add_gradient(const double* x_start, const double* x, double* g) const {
+void FrictionSet::add_gradient(const double* x, double* g) const {
   for (const Entry& k : entries_) {
-    const Vec3 w = tangential(displacement(k, x_start, x), k.n);
-    const FrictionLaw law = friction_law(w.norm(), model_->parameters().slip);
-    const Vec3 force = (k.mu * k.lambda * law.f1_over_y) * w;
+    const Slip at = slip(k, x);
+    const Vec3 force = (k.mu * k.lambda * at.law.f1_over_y) * at.w;
     for (int i = 0; i < 4; ++i) {
-      Eigen::Map<Vec3>(g + 3 * k.lag.pair.vertices[i]) += k.lag.closest.c[i] * force;
+      Eigen::Map<Vec3>(g + 3 * k.points[i]) += k.lag.closest.c[i] * force;
     }
+    add_edges(k.points, at.frame.pull_back(-k.a, force), g);
   }
 }
 
 FrictionSet::Hessian FrictionSet::hessian(const Entry& k,
-                                          const double* x_start,
                                           const double* x,
                                           Curvature curvature) const {
-  const Vec4& c = k.lag.closest.c;
-  if (curvature == Curvature::kPositive && k.lambda < 0.0) return {.c = c, .core = Mat3::Zero()};
-  const Vec3 w = tangential(displacement(k, x_start, x), k.n);
-  const FrictionLaw law = friction_law(w.norm(), model_->parameters().slip);
+  Hessian h{.points = &k.points, .B = {}, .core = Mat3::Zero(), .turn = Vec3::Zero()};
+  const Slip at = slip(k, x);
+  for (int i = 0; i < 4; ++i) h.B[i] = k.lag.closest.c[i] * Mat3::Identity();
+  h.B[kFrame + 1] = k.a[2] * cross_matrix(at.frame.e2) - k.a[0] * Mat3::Identity();
+  h.B[kFrame + 2] = -k.a[2] * cross_matrix(at.frame.e1) - k.a[1] * Mat3::Identity();
+  h.B[kFrame] = -h.B[kFrame + 1] - h.B[kFrame + 2];
+  if (curvature == Curvature::kPositive && k.lambda < 0.0) return h;
+  const double strength = k.mu * k.lambda;
   const Mat3 projector = Mat3::Identity() - k.n * k.n.transpose();
-  const double along = curvature == Curvature::kExact ? law.f2 : 0.0;
-  return {.c = c,
-          .core = (k.mu * k.lambda) * (law.f1_over_y * projector + along * w * w.transpose())};
-}
-
-Vec12 FrictionSet::Hessian::operator*(const Vec12& z) const {
-  Vec3 sum = Vec3::Zero();
-  for (int q = 0; q < 4; ++q) sum += c[q] * z.segment<3>(3 * q);
-  const Vec3 force = core * sum;
-  Vec12 y;
-  for (int p = 0; p < 4; ++p) y.segment<3>(3 * p) = c[p] * force;
-  return y;
-}
-
-void FrictionSet::add_hessian_product(const double* x_start,
-                                      const double* x,
-                                      const double* z,
-                                      double* y) const {
-  for (const Entry& k : entries_) {
-    const Vec12 product =
-        hessian(k, x_start, x, Curvature::kExact) * stacked(k.lag.pair.vertices, z);
-    for (int i = 0; i < 4; ++i) {
-      Eigen::Map<Vec3>(y + 3 * k.lag.pair.vertices[i]) += product.segment<3>(3 * i);
-    }
+  h.core = (strength * at.law.f1_over_y) * projector;
+  if (curvature == Curvature::kExact) {
+    h.core += (strength * at.law.f2) * at.w * at.w.transpose();
+    h.turn = (k.a[2] * strength * at.law.f1_over_y) * at.w;
   }
+  return h;
 }
 
-// phi = mu lambda q(|w|) w . zeta,  q = f1/y,  w = P u,  u = sum c_i delta_i,  zeta = sum c_i z_i.
+void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
+  A.add_congruence(*points, B, core);
+  if (turn.isZero(0.0)) return;
+  // Between a vertex of the frame and the next one, turn x; with the one before, the opposite.
+  const Index first = (*points)[kFrame];
+  const Mat3 block = cross_matrix(turn);
+  A.add_stencil({first, (*points)[kFrame + 1], (*points)[kFrame + 2], first},
+                [&](int p, int q) -> Mat3 {
+                  if (p == q || p == 3 || q == 3) return Mat3::Zero();
+                  return q == (p + 1) % 3 ? block : -block;
+                });
+}
+
+void FrictionSet::Hessian::add_product(const double* z, double* y) const {
+  Vec3 change = Vec3::Zero();
+  for (std::size_t p = 0; p < B.size(); ++p) change += B[p] * row(z, (*points)[p]);
+  const Vec3 force = core * change;
+  for (std::size_t p = 0; p < B.size(); ++p) {
+    Eigen::Map<Vec3>(y + 3 * (*points)[p]) += B[p].transpose() * force;
+  }
+  const Frame turned(*points, z);
+  add_edges(*points, {turn.cross(turned.e2), turned.e1.cross(turn)}, y);
+}
+
+void FrictionSet::add_hessian_product(const double* x, const double* z, double* y) const {
+  for (const Entry& k : entries_) hessian(k, x, Curvature::kExact).add_product(z, y);
+}
+
+// phi = mu lambda q(|w|) w . zeta,  q = f1/y,  w = P s,  s = r(x) - E(x) a,  zeta = r(z) - E'(z) a,
+// with E = (e1, e2, m), its change E' with z, and a = E(x_start)^-1 r(x_start).
 //
 //   dphi/dw    = mu lambda (q zeta + f2 (w . zeta) w) =: omega      (f2 = q'/y)
-//   dphi/du    = P omega,   dphi/dn = -(n.u) omega - (n.omega) u,   dphi/dzeta = mu lambda q w
-//   dphi/dc_i  = (P omega) . delta_i + mu lambda q w . z_i
+//   dphi/ds    = P omega,   dphi/dn = -(n.s) omega - (n.omega) s,   dphi/dzeta = mu lambda q w =: eta
+//   dphi/da    = -E^T P omega - E'^T eta,   g = E(x_start)^-T dphi/da
+//   dphi/dc_i  = (P omega) . x_i + eta . z_i + g . x_start_i
+//   dphi/dx_start = c_i g, less what the frame's edges have in E(x_start) a
 //
 // and the lag configuration moves c through d(beta) = J dx, n through dn = P dt / d with
 // dt = sum c_i dx_i + s d(beta), and lambda through
 //   d(lambda) = -kappa w (2 d b' dm + m (2 d b'' + b'/d) dD).
-void FrictionSet::add_mixed(const double* x_start,
-                            const double* x,
+// Where the frame was a line, Q is the identity.
+void FrictionSet::add_mixed(const double* x,
                             const double* z,
                             const double* x_lag,
                             double scale,
                             ContactModel::Bar& bar,
+                            double* start_bar,
                             double* lag_bar) const {
   for (const Entry& k : entries_) {
     const Contact& lag = k.lag;
     const Closest& geometry = lag.closest;
     const auto& v = lag.pair.vertices;
     const double kappa = model_->parameters().kappa;
-    const double e = model_->parameters().slip;
     const double d = std::sqrt(geometry.d_sq);
 
-    const Vec3 u = displacement(k, x_start, x);
-    const Vec3 w = tangential(u, k.n);
-    const FrictionLaw law = friction_law(w.norm(), e);
-    Vec3 zeta = Vec3::Zero();
-    for (int i = 0; i < 4; ++i) zeta += geometry.c[i] * row(z, v[i]);
-    const double w_zeta = w.dot(zeta);
+    const Slip at = slip(k, x);
+    const FrictionLaw& law = at.law;
+    const Frame change(k.points, z);
+    const auto turned = [&](const Vec3& a) -> Vec3 {
+      return a[0] * change.e1 + a[1] * change.e2 +
+             a[2] * (change.e1.cross(at.frame.e2) + at.frame.e1.cross(change.e2));
+    };
+    const Vec3 zeta = gap(k, z) - turned(k.a);
+    const double w_zeta = at.w.dot(zeta);
 
     const double mu_bar = k.lambda * law.f1_over_y * w_zeta;
     const double lambda_bar = k.mu * law.f1_over_y * w_zeta;
@@ -148,17 +245,31 @@ void FrictionSet::add_mixed(const double* x_start,
     model_->pull_back(lag, scale * per_lambda * kappa * m * b1, scale * threshold_bar,
                       scale * xi_bar, bar);
 
-    // c and n.
+    // The frame at the start, c and n.
     const double strength = k.mu * k.lambda;
-    const Vec3 omega = strength * (law.f1_over_y * zeta + law.f2 * w_zeta * w);
-    const Vec3 u_bar = tangential(omega, k.n);
-    const Vec3 n_bar = -k.n.dot(u) * omega - k.n.dot(omega) * u;
+    const Vec3 omega = strength * (law.f1_over_y * zeta + law.f2 * w_zeta * at.w);
+    const Vec3 eta = (strength * law.f1_over_y) * at.w;
+    const Vec3 s_bar = tangential(omega, k.n);
+    Vec3 g = -s_bar;
+    if (k.turns) {
+      Vec3 a_bar;
+      for (int a = 0; a < 3; ++a) {
+        a_bar[a] = -(at.frame * Vec3::Unit(a)).dot(s_bar) - turned(Vec3::Unit(a)).dot(eta);
+      }
+      const Frame frame(k.points, x_start_);
+      g = frame.dual(a_bar);
+      add_edges(k.points, frame.pull_back(-scale * k.a, g), start_bar);
+    }
+    const Vec3 n_bar = -k.n.dot(at.s) * omega - k.n.dot(omega) * at.s;
     const Vec3 t_bar = tangential(n_bar, k.n) / d;
     Vec4 c_bar;
     for (int i = 0; i < 4; ++i) {
-      c_bar[i] = u_bar.dot(row(x, v[i]) - row(x_start, v[i])) +
-                 strength * law.f1_over_y * w.dot(row(z, v[i]));
+      const auto from_first = [&](const double* rows) -> Vec3 {
+        return row(rows, v[i]) - row(rows, v[0]);
+      };
+      c_bar[i] = s_bar.dot(from_first(x)) + eta.dot(from_first(z)) + g.dot(from_first(x_start_));
       x_bar.segment<3>(3 * i) += geometry.c[i] * t_bar;
+      Eigen::Map<Vec3>(start_bar + 3 * v[i]) += scale * geometry.c[i] * g;
     }
     if (geometry.parameter_count > 0) {
       Vec2 beta_bar = geometry.s.transpose() * t_bar + geometry.c_beta.transpose() * c_bar;

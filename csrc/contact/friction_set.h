@@ -1,5 +1,6 @@
 #pragma once
 
+#include <array>
 #include <vector>
 
 #include "contact/contact_set.h"
@@ -8,70 +9,84 @@ namespace diffcloth::contact {
 
 /// Lagged friction: sum over contacts of mu lambda f0(|w|; e)  [J],
 ///
-///   w = (I - n n^T) sum_i c_i delta_i,   delta_i = x_i - x_start_i,   e = eps_v h,
+///   w = (I - n n^T) s,   s = r(x) - Q r(x_start),   r(x) = sum_i c_i x_i,   e = eps_v h,
 ///
 /// with c, n and the normal force lambda = -kappa w m b'(D) 2 d [N] of the lag configuration held
-/// fixed. Obstacle vertices take part in delta, so that a moving body drags the cloth.
+/// fixed. r is the vector from one contact point to the other, and Q turns it as the surface turns
+/// that its `frame` belongs to: what turns as one does not slide, and friction has no couple about the
+/// gap. Obstacle vertices take part, so that a moving body drags the cloth.
+///
+/// Q comes from three vertices of that surface. With e1 and e2 from the first of them to the others and
+/// m = e1 x e2,
+///
+///   Q r(x_start) = a1 e1(x) + a2 e2(x) + a3 m(x),   where a makes it r(x_start) at x_start.
 class FrictionSet {
  public:
   FrictionSet() = default;
 
   /// @param contacts  the contacts of the lag configuration
-  FrictionSet(const ContactModel& model, const std::vector<Contact>& contacts);
+  /// @param x_start   positions at the start of the step; they outlive this object
+  FrictionSet(const ContactModel& model,
+              const std::vector<Contact>& contacts,
+              const double* x_start);
 
   const ContactModel& model() const { return *model_; }
   bool empty() const { return entries_.empty(); }
+
+  /// The four corners of a contact, then the vertices of its frame; some of them twice.
+  using Points = std::array<Index, 7>;
 
   struct Entry {
     Contact lag;
     Vec3 n;         ///< unit normal at the lag configuration
     double lambda;  ///< normal force at the lag configuration [N]
     double mu;
+    Points points;
+    bool turns;  ///< false where the frame was a line at the start: Q is the identity
+    Vec3 a;      ///< the gap at the start in the frame there; zero where the frame was a line
   };
   const std::vector<Entry>& entries() const { return entries_; }
 
-  double energy_change(const double* x_start, const double* x0, const double* x1) const;
-  void add_gradient(const double* x_start, const double* x, double* g) const;
+  double energy_change(const double* x0, const double* x1) const;
+  void add_gradient(const double* x, double* g) const;
 
-  /// A Hessian c c^T (x) core by its 3x3 blocks.
+  /// Hessian of one entry: sum_p B_p dx_p is the change of s, B^T core B the Hessian, but for what the
+  /// frame's own turning adds, the cross product with `turn` between its vertices.
   struct Hessian {
-    Vec4 c;
+    const Points* points;
+    std::array<Mat3, 7> B;
     Mat3 core;
+    Vec3 turn;
 
-    Mat3 operator()(int p, int q) const { return (c[p] * c[q]) * core; }
-    Vec12 operator*(const Vec12& z) const;
+    void add_to(linalg::BlockMatrix& A) const;
+    void add_product(const double* z, double* y) const;
   };
 
-  /// Hessian of one entry, of the sign of lambda. kPositive is the quadratic majorant (f1/|w|) P,
-  /// which does not lose its curvature where a sliding contact would come to rest, and zero where
-  /// lambda is negative.
-  Hessian hessian(const Entry& entry,
-                  const double* x_start,
-                  const double* x,
-                  Curvature curvature) const;
+  /// Of the sign of lambda. kPositive is the quadratic majorant (f1/|w|) P, which does not lose its
+  /// curvature where a sliding contact would come to rest, and zero where lambda is negative.
+  Hessian hessian(const Entry& entry, const double* x, Curvature curvature) const;
 
   /// y += H z over all vertices.
-  void add_hessian_product(const double* x_start,
-                           const double* x,
-                           const double* z,
-                           double* y) const;
+  void add_hessian_product(const double* x, const double* z, double* y) const;
 
   /// d/d(theta) of phi = z . grad D, times scale: into `bar` for the parameters (friction, slip,
-  /// and, through lambda, kappa, d_hat, thickness, rest shape), and into `lag_bar` for the lag
-  /// configuration's positions `x_lag`.
-  void add_mixed(const double* x_start,
-                 const double* x,
+  /// and, through lambda, kappa, d_hat, thickness, rest shape), into `start_bar` for x_start, and into
+  /// `lag_bar` for the lag configuration's positions `x_lag`.
+  void add_mixed(const double* x,
                  const double* z,
                  const double* x_lag,
                  double scale,
                  ContactModel::Bar& bar,
+                 double* start_bar,
                  double* lag_bar) const;
 
  private:
-  /// sum_i c_i (x_i - x_start_i), before projection.
-  static Vec3 displacement(const Entry& entry, const double* x_start, const double* x);
+  /// The projected displacement w and the law there.
+  struct Slip;
+  Slip slip(const Entry& entry, const double* x) const;
 
   const ContactModel* model_ = nullptr;
+  const double* x_start_ = nullptr;
   std::vector<Entry> entries_;
 };
 

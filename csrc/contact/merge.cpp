@@ -56,12 +56,12 @@ Vec3 normal(const CollisionMesh& mesh, Index f, const double* x) {
 
 /// Whether a face and its only neighbor at an edge lie in one plane.
 bool is_flat(const CollisionMesh& mesh,
-             const FeatureWeights& weights,
+             const FeatureWeights::Features& features,
              Index face,
              Index edge,
              const double* x) {
   constexpr Index kTwoFaces = -1;
-  if (weights.edge(edge) != kTwoFaces) return false;
+  if (features.edge[edge] != kTwoFaces) return false;
   const auto& [f, g] = mesh.edge_faces[edge];
   const Vec3 n = normal(mesh, face, x);
   const Vec3 m = normal(mesh, f == face ? g : f, x);
@@ -75,7 +75,7 @@ enum class Projection : std::uint8_t { kOutside, kInside, kOnFlatBorder };
 /// On a border that runs through a plane the point is above the plane, and no edge: the second
 /// derivatives of the distance from that edge are none of this surface.
 Projection project(const CollisionMesh& mesh,
-                   const FeatureWeights& weights,
+                   const FeatureWeights::Features& features,
                    Index face,
                    const Vec3& p,
                    const double* x,
@@ -95,7 +95,8 @@ Projection project(const CollisionMesh& mesh,
   Projection result = Projection::kInside;
   for (int side = 0; side < 3; ++side) {
     if (from_side[side] > least) continue;
-    if (from_side[side] < -least || !is_flat(mesh, weights, face, mesh.face_edges[face][side], x)) {
+    if (from_side[side] < -least ||
+        !is_flat(mesh, features, face, mesh.face_edges[face][side], x)) {
       return Projection::kOutside;
     }
     result = Projection::kOnFlatBorder;
@@ -163,7 +164,7 @@ void sort_unique(Values& values) {
 }  // namespace
 
 void add_point_terms(const CollisionMesh& mesh,
-                     const FeatureWeights& weights,
+                     const FeatureWeights::Features& features,
                      std::span<const Candidate> group,
                      const double* x,
                      double range,
@@ -176,7 +177,8 @@ void add_point_terms(const CollisionMesh& mesh,
   faces.clear();
   for (const Candidate& pair : group) {
     const auto& [self, i, j, k] = pair.vertices;
-    if (!weights.counts(pair.b) || is_beyond(p, row(x, i), row(x, j), row(x, k), range)) continue;
+    if (features.counts[pair.b] == 0 || is_beyond(p, row(x, i), row(x, j), row(x, k), range))
+      continue;
     faces.push_back(pair.b);
   }
   if (faces.empty()) return;
@@ -209,7 +211,7 @@ void add_point_terms(const CollisionMesh& mesh,
   };
   for (const Index f : faces) {
     double d_sq = 0.0;
-    if (project(mesh, weights, f, p, x, d_sq) == Projection::kInside) {
+    if (project(mesh, features, f, p, x, d_sq) == Projection::kInside) {
       parts.push_back({.kind = kFace, .ends = {-1, -1}, .id = f, .coefficient = 1.0, .d_sq = d_sq});
       continue;
     }
@@ -220,12 +222,12 @@ void add_point_terms(const CollisionMesh& mesh,
     }
     push_on_edge(*nearest, 1);
   }
-  for (const NearEdge& near : edges) push_on_edge(near, weights.edge(near.edge));
+  for (const NearEdge& near : edges) push_on_edge(near, features.edge[near.edge]);
   for (const Index v : vertices) {
     parts.push_back({.kind = kVertex,
                      .ends = {-1, -1},
                      .id = v,
-                     .coefficient = static_cast<double>(weights.vertex(v)),
+                     .coefficient = static_cast<double>(features.vertex[v]),
                      .d_sq = (p - row(x, v)).squaredNorm()});
   }
   merge(parts, range);
@@ -240,7 +242,7 @@ void add_point_terms(const CollisionMesh& mesh,
               : std::ranges::find(mesh.faces[f], part.id) != mesh.faces[f].end();
       if (!has) continue;
       double d_sq = 0.0;
-      if (project(mesh, weights, f, p, x, d_sq) != Projection::kOnFlatBorder) continue;
+      if (project(mesh, features, f, p, x, d_sq) != Projection::kOnFlatBorder) continue;
       part.kind = kFace;
       part.id = f;
       part.d_sq = d_sq;

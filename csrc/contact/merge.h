@@ -48,11 +48,12 @@ struct MergeScratch {
 /// Terms of a point against a surface, those with the same nearest feature merged and those with
 /// coefficient zero dropped: see FeatureWeights.
 ///
-/// @param group  the candidates of one point and one surface
-/// @param range  terms of a larger distance are left out [m]
-/// @param out    appended to, in the order of the features
+/// @param features  those of the surface that the point sees
+/// @param group     the candidates of one point and one surface
+/// @param range     terms of a larger distance are left out [m]
+/// @param out       appended to, in the order of the features
 void add_point_terms(const CollisionMesh& mesh,
-                     const FeatureWeights& weights,
+                     const FeatureWeights::Features& features,
                      std::span<const Candidate> group,
                      const double* x,
                      double range,

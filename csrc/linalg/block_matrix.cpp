@@ -107,6 +107,35 @@ void BlockMatrix::add_attached(const std::array<Index, 4>& points, const Mat12& 
   }
 }
 
+void BlockMatrix::add_congruence(std::span<const Index> points,
+                                 std::span<const Mat3> jacobians,
+                                 const Mat3& core) {
+  changes_.clear();
+  const auto add = [&](Index r, const Mat3& change) {
+    for (auto& [known, sum] : changes_) {
+      if (known != r) continue;
+      sum += change;
+      return;
+    }
+    changes_.emplace_back(r, change);
+  };
+  for (std::size_t p = 0; p < points.size(); ++p) {
+    if (has(points[p])) {
+      add(points[p], jacobians[p]);
+    } else if (is_attached(points[p])) {
+      for (const auto* e = attachments_->begin(points[p]); e != attachments_->end(points[p]); ++e) {
+        add(e->row, jacobians[p].lazyProduct(e->jacobian));
+      }
+    }
+  }
+  for (const auto& [s, change_s] : changes_) {
+    const Mat3 column = core.lazyProduct(change_s);
+    for (const auto& [r, change_r] : changes_) {
+      if (r >= s) add_block(r, s, change_r.transpose().lazyProduct(column));
+    }
+  }
+}
+
 void BlockMatrix::blend(const BlockMatrix& other, double s) {
   const double own = 1.0 / (1.0 + s);
   const double others = s / (1.0 + s);

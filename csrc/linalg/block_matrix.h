@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <memory>
+#include <span>
 #include <utility>
 #include <vector>
 
@@ -108,6 +109,12 @@ class BlockMatrix : public BlockValues {
     }
   }
 
+  /// Add B^T core B, without the rows that are left out, where B dx is the sum of jacobian dx over a few
+  /// points.
+  void add_congruence(std::span<const Index> points,
+                      std::span<const Mat3> jacobians,
+                      const Mat3& core);
+
   /// this = (this + s other) / (1 + s); both on the same pattern.
   void blend(const BlockMatrix& other, double s);
 
@@ -132,7 +139,8 @@ class BlockMatrix : public BlockValues {
 
   const std::vector<char>* fixed_;
   const Attachments* attachments_;
-  std::vector<Motion> motions_;  // scratch of add_attached
+  std::vector<Motion> motions_;                  // scratch of add_attached
+  std::vector<std::pair<Index, Mat3>> changes_;  // scratch of add_congruence: B, row by row
 };
 
 /// y += A x for a symmetric matrix given by its lower blocks on the pattern.

@@ -60,7 +60,7 @@ def simulator(coupling, base, **options):
         DT,
         coupling=coupling,
         contact=dc.ContactOptions(**{**given, **options}),
-        solver=dc.SolverOptions(tolerance=1e-12, max_iterations=1000),
+        solver=dc.SolverOptions(tolerance=1e-12, max_iterations=2000),
     )
 
 

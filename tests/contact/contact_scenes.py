@@ -100,6 +100,15 @@ def pinned(rng):
     return scene
 
 
+def pinned_under_a_body(rng):
+    """The same sheet, a border of it pinned, under a box that moves."""
+    scene = on_a_corner(rng)
+    scene.prescribed[:] = False
+    scene.prescribed[6:24] = True
+    scene.body_dynamic = [True]
+    return scene
+
+
 def thick(rng):
     scene = stack(
         [cloth(5, 0.6, 0.1, rng, 0.01), cloth(5, 0.6, 0.2, rng, 0.01)],
@@ -195,6 +204,7 @@ SCENES = {
         two_cloths,
         crumpled,
         pinned,
+        pinned_under_a_body,
         thick,
         two_lumps,
         box_on_relief,

@@ -312,12 +312,14 @@ def test_a_star_is_sharp_at_its_tips_only():
     assert edge[(0, 12)] > 0 == edge[(1, 12)]
 
 
-def test_pinned_faces_of_a_cloth_do_not_count():
+def test_pinned_faces_of_a_cloth_bear_what_moves_alone():
     scene = contact_scenes.make("pinned")
-    _, _, counts = scene.potential().feature_weights()
+    _, _, counts = scene.potential().feature_weights(prescribed_point=True)
     expected = [not scene.prescribed[f].all() or scene.surface[f[0]] > 0 for f in scene.faces]
     assert counts == expected
     assert not all(counts)
+    _, _, counts = scene.potential().feature_weights(prescribed_point=False)
+    assert all(counts)
 
 
 def test_a_thick_body_costs_what_a_thin_one_does():

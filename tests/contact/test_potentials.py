@@ -3,6 +3,7 @@
 import contact_scenes
 import numpy as np
 import pytest
+import trimesh
 from oracles.feature_sum import FeatureSum
 
 NAMES = list(contact_scenes.SCENES)
@@ -178,6 +179,45 @@ def test_mixed_derivatives_of_friction(name, amount):
         slope = difference(lambda lag: value(scene.potential(), lag), scene.x, d, 1e-7)
         expected = found["x_lag"] @ d.ravel()
         assert slope == pytest.approx(expected, abs=2e-6 * np.linalg.norm(found["x_lag"]))
+        slope = difference(
+            lambda at: scene.potential().friction(scene.x, at, x)[1] @ z.ravel(), start, d, 1e-7
+        )
+        expected = found["x_start"] @ d.ravel()
+        assert slope == pytest.approx(expected, abs=2e-6 * np.linalg.norm(found["x_start"]))
+
+
+def rotation(angle, seed):
+    axis = np.random.default_rng(seed).normal(size=3)
+    return trimesh.transformations.rotation_matrix(angle, axis)[:3, :3]
+
+
+@pytest.mark.parametrize("angle", [1e-3, 0.1, 1.0])
+@pytest.mark.parametrize("name", NAMES)
+def test_what_moves_as_one_has_no_friction(name, angle):
+    """Rigid motion of all, bodies and cloths: whatever the slip velocity and the lag."""
+    scene = contact_scenes.make(name)
+    potential = scene.potential(slip=1e-9)
+    start = moved(scene, 0.003)
+    end = start @ rotation(angle, 1).T + [0.3, -0.2, 0.5]
+    energy, g, _ = potential.friction(scene.x, start, end)
+    _, sliding, _ = potential.friction(scene.x, start, moved(scene, 0.003, 6))
+    # Rounding of positions over the slip, as a part of full friction.
+    assert np.abs(g).max() < 1e-5 * np.abs(sliding).max()
+    assert abs(energy) < 1e-13
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_friction_has_no_couple(name):
+    """Where the slip is tangential: friction adds no angular momentum, the gap notwithstanding."""
+    scene = contact_scenes.make(name)
+    potential = scene.potential()
+    x = moved(scene, 0.003)
+    g = potential.friction(scene.x, scene.x, x)[1].reshape(-1, 3)
+    assert np.abs(g).max() > 1e-6
+    np.testing.assert_allclose(g.sum(axis=0), 0, atol=1e-13)
+    couple = np.linalg.norm(np.cross(x, g).sum(axis=0))
+    # A gap of .05 between surfaces, against a slip of .005 that is not all tangential.
+    assert couple < 1e-3 * np.abs(g).sum()
 
 
 @pytest.mark.parametrize("name", NAMES)

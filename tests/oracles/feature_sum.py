@@ -133,15 +133,19 @@ class FeatureSum:
         xi = 0.5 * (self.thickness[s] + self.thickness[r])
         return kernels.barrier(d_sq, xi, self.scene.d_hat)
 
-    def counted_faces(self, s):
-        """Those that a point sees: of a cloth, with a vertex that is free."""
-        if s >= self.scene.cloth_count:
+    def counted_faces(self, s, p):
+        """Those that point p sees: where it is prescribed, of a cloth those with a vertex that is free."""
+        if s >= self.scene.cloth_count or not self.scene.prescribed[p]:
             return self.faces[s]
         return [f for f in self.faces[s] if not self.scene.prescribed[list(f)].all()]
 
+    def is_still(self, s):
+        """Whether a body is prescribed."""
+        return self.scene.prescribed[self.faces[s][0][0]]
+
     def point_against(self, x, p, s, r):
         """Sum over the features of surface r of w b(D)."""
-        faces = self.counted_faces(r)
+        faces = self.counted_faces(r, p)
         of_edge = collections.Counter(e for f in faces for e in edges_of([f]))
         of_vertex = collections.Counter(v for f in faces for v in f)
         total = sum(
@@ -185,10 +189,10 @@ class FeatureSum:
                 if [s, r] in scene.ignored_pairs:
                     continue
                 for p in points:
-                    if not scene.prescribed[p]:
+                    if not scene.prescribed[p] or not self.is_still(r):
                         total += 0.25 * self.vertex_area[p] * self.point_against(x, p, s, r)
                 for c in edges_of(self.faces[s]):
-                    if not scene.prescribed[list(c)].all():
+                    if not scene.prescribed[list(c)].all() or not self.is_still(r):
                         total += 0.5 * self.edge_area[c] * self.edge_against(x, c, s, r)
                 mean_area = np.mean([area(*scene.X[list(f)]) for f in self.faces[s]])
                 for v in np.unique(self.faces[r]):
@@ -200,7 +204,7 @@ class FeatureSum:
                 total += self.between_cloths(x, s, r)
         bodies = range(scene.cloth_count, len(self.faces))
         for s, r in itertools.combinations(bodies, 2):
-            still = all(scene.prescribed[self.faces[k][0][0]] for k in (s, r))
+            still = self.is_still(s) and self.is_still(r)
             if not still and [s, r] not in scene.ignored_pairs:
                 total += self.between_bodies(x, s, r)
         return scene.kappa * total

@@ -1,4 +1,5 @@
 #include <array>
+#include <set>
 #include <string>
 #include <tuple>
 #include <utility>
@@ -126,17 +127,22 @@ class ContactPotential {
                                                        const Positions& x_start,
                                                        const Positions& x,
                                                        bool positive) {
-    const contact::FrictionSet set(model_, find(x_lag));
+    const contact::FrictionSet set(model_, find(x_lag), x_start.data());
     Values g = Values::Zero(x.size());
-    set.add_gradient(x_start.data(), x.data(), g.data());
+    set.add_gradient(x.data(), g.data());
     Eigen::MatrixXd h = Eigen::MatrixXd::Zero(x.size(), x.size());
+    const Eigen::MatrixXd unit = Eigen::MatrixXd::Identity(x.size(), x.size());
     for (const contact::FrictionSet::Entry& k : set.entries()) {
-      add_block(k.lag.pair.vertices,
-                all_blocks(set.hessian(k, x_start.data(), x.data(),
-                                       positive ? Curvature::kPositive : Curvature::kExact)),
-                h);
+      const auto hessian =
+          set.hessian(k, x.data(), positive ? Curvature::kPositive : Curvature::kExact);
+      std::set<Index> points(k.points.begin(), k.points.end());
+      for (const Index v : points) {
+        for (Index a = 3 * v; a < 3 * v + 3; ++a) {
+          hessian.add_product(unit.col(a).data(), h.col(a).data());
+        }
+      }
     }
-    return {set.energy_change(x_start.data(), x_start.data(), x.data()), g, h};
+    return {set.energy_change(x_start.data(), x.data()), g, h};
   }
 
   nb::dict friction_mixed(const Positions& x_lag,
@@ -144,11 +150,13 @@ class ContactPotential {
                           const Positions& x,
                           const Positions& z,
                           double scale) {
-    const contact::FrictionSet set(model_, find(x_lag));
+    const contact::FrictionSet set(model_, find(x_lag), x_start.data());
     contact::ContactModel::Bar bar(mesh_);
+    Values start_bar = Values::Zero(x.size());
     Values lag_bar = Values::Zero(x.size());
-    set.add_mixed(x_start.data(), x.data(), z.data(), x_lag.data(), scale, bar, lag_bar.data());
+    set.add_mixed(x.data(), z.data(), x_lag.data(), scale, bar, start_bar.data(), lag_bar.data());
     nb::dict result = to_dict(bar);
+    result["x_start"] = start_bar;
     result["x_lag"] = lag_bar;
     return result;
   }
@@ -194,19 +202,12 @@ class ContactPotential {
             to_values(areas.surface)};
   }
 
-  /// Weights of a sum over all features: of edges, of vertices, and whether a face counts.
-  std::tuple<std::vector<Index>, std::vector<Index>, std::vector<bool>> feature_weights() const {
-    std::vector<Index> edge;
-    std::vector<Index> vertex;
-    std::vector<bool> counts;
-    for (Index e = 0; e < static_cast<Index>(mesh_.edges.size()); ++e) {
-      edge.push_back(weights_.edge(e));
-    }
-    for (Index v = 0; v < mesh_.vertex_count; ++v) vertex.push_back(weights_.vertex(v));
-    for (Index f = 0; f < static_cast<Index>(mesh_.faces.size()); ++f) {
-      counts.push_back(weights_.counts(f));
-    }
-    return {edge, vertex, counts};
+  /// Weights of a sum over features: of edges, of vertices, and whether a face counts; as a point sees
+  /// them whose motion is given, or not.
+  std::tuple<std::vector<Index>, std::vector<Index>, std::vector<bool>> feature_weights(
+      bool prescribed_point) const {
+    const contact::FeatureWeights::Features& w = weights_.features(prescribed_point);
+    return {w.edge, w.vertex, {w.counts.begin(), w.counts.end()}};
   }
 
   Eigen::Matrix<Index, Eigen::Dynamic, 2, Eigen::RowMajor> edges() const {
@@ -317,7 +318,7 @@ void contact_potentials(nb::module_& m) {
       .def("sharpness", &ContactPotential::sharpness, "cloth"_a = 0)
       .def("body_areas", &ContactPotential::body_areas)
       .def("continuation", &ContactPotential::continuation)
-      .def("feature_weights", &ContactPotential::feature_weights)
+      .def("feature_weights", &ContactPotential::feature_weights, "prescribed_point"_a)
       .def("edges", &ContactPotential::edges);
 }
 
