@@ -135,7 +135,7 @@ void ContactPotential::accumulate(const double* x, const double* z) {
 }
 
 void FrictionPotential::add_couplings(linalg::Couplings& pairs) const {
-  for (const FrictionSet::Entry& k : set_.entries()) add_stencil_couplings(k.points, pairs);
+  for (const FrictionSet::Entry& k : set_.entries()) add_stencil_couplings(k.all_points(), pairs);
 }
 
 void FrictionPotential::add_hessian(const double* x,
@@ -146,7 +146,7 @@ void FrictionPotential::add_hessian(const double* x,
 
 void FrictionPotential::add_held_product(const double* x, const double* z, double* y) const {
   for (const FrictionSet::Entry& k : set_.entries()) {
-    if (!set_.model().is_held(k.points)) continue;
+    if (!set_.model().is_held(k.all_points())) continue;
     set_.hessian(k, x, Curvature::kExact).add_product(z, y);
   }
 }
@@ -156,7 +156,7 @@ void FrictionPotential::add_left_out_product(const double* x,
                                              const double* d,
                                              double* y) const {
   for (const FrictionSet::Entry& k : set_.entries()) {
-    if (moves(k.points, d)) set_.hessian(k, x, curvature).add_product(d, y);
+    if (moves(k.all_points(), d)) set_.hessian(k, x, curvature).add_product(d, y);
   }
 }
 

@@ -1,5 +1,6 @@
 #include "contact/friction_set.h"
 
+#include <algorithm>
 #include <cmath>
 
 #include "contact/distance/mollifier.h"
@@ -8,29 +9,28 @@
 namespace diffcloth::contact {
 namespace {
 
-using Points = FrictionSet::Points;
-
-/// Which of an entry's points are the frame's: its first, second and third.
-constexpr int kFrame = 4;
+using Entry = FrictionSet::Entry;
 
 /// A frame is a line where its edges are parallel but for rounding: |m|^2 over |e1|^2 |e2|^2.
 constexpr double kLine = 1e-24;
 
 Vec3 tangential(const Vec3& u, const Vec3& n) { return u - n.dot(u) * n; }
 
-/// sum_i c_i x_i of a few points, which no translation changes: from the first, as that cancels less.
-Vec3 gap(const FrictionSet::Entry& k, const double* x) {
+/// sum_i c_i x_i, which no translation changes: from the first point, as that cancels less.
+Vec3 gap(const Entry& k, const double* x) {
   const Vec3 origin = row(x, k.points[0]);
   Vec3 r = Vec3::Zero();
-  for (int i = 1; i < 4; ++i) r += k.lag.closest.c[i] * (row(x, k.points[i]) - origin);
+  for (int i = 1; i < k.frame + 3; ++i) {
+    if (k.c[i] != 0.0) r += k.c[i] * (row(x, k.points[i]) - origin);
+  }
   return r;
 }
 
 /// e1, e2 and m = e1 x e2 of an entry's frame.
 struct Frame {
-  Frame(const Points& points, const double* x)
-      : e1(row(x, points[kFrame + 1]) - row(x, points[kFrame])),
-        e2(row(x, points[kFrame + 2]) - row(x, points[kFrame])),
+  Frame(const Entry& k, const double* x)
+      : e1(row(x, k.points[k.frame + 1]) - row(x, k.points[k.frame])),
+        e2(row(x, k.points[k.frame + 2]) - row(x, k.points[k.frame])),
         m(e1.cross(e2)) {}
 
   bool is_line() const { return !(m.squaredNorm() > kLine * e1.squaredNorm() * e2.squaredNorm()); }
@@ -54,10 +54,10 @@ struct Frame {
 };
 
 /// Add cotangents of e1 and e2 to those of the frame's vertices.
-void add_edges(const Points& points, const std::array<Vec3, 2>& bar, double* x_bar) {
-  for (int k = 0; k < 2; ++k) {
-    Eigen::Map<Vec3>(x_bar + 3 * points[kFrame + 1 + k]) += bar[k];
-    Eigen::Map<Vec3>(x_bar + 3 * points[kFrame]) -= bar[k];
+void add_edges(const Entry& k, const std::array<Vec3, 2>& bar, double* x_bar) {
+  for (int e = 0; e < 2; ++e) {
+    Eigen::Map<Vec3>(x_bar + 3 * k.points[k.frame + 1 + e]) += bar[e];
+    Eigen::Map<Vec3>(x_bar + 3 * k.points[k.frame]) -= bar[e];
   }
 }
 
@@ -77,17 +77,31 @@ FrictionSet::FrictionSet(const ContactModel& model,
   for (const Contact& k : contacts) {
     const double d = std::sqrt(k.closest.d_sq);
     const auto& v = k.pair.vertices;
-    const auto [first, second, third] = model.frame(k.pair);
+    const std::array<Index, 3> frame = model.frame(k.pair);
     Entry entry{.lag = k,
                 .n = k.closest.t / d,
                 .lambda = -kappa * k.weight * k.mollifier * k.barrier.b1 * 2.0 * d,
                 .mu = model.mu(k.pair),
-                .points = {v[0], v[1], v[2], v[3], first, second, third},
+                .points = {},
+                .c = {},
+                .frame = 0,
                 .turns = false,
                 .a = Vec3::Zero()};
-    const Frame frame(entry.points, x_start);
-    entry.turns = !frame.is_line();
-    if (entry.turns) entry.a = frame.coordinates(gap(entry, x_start));
+    for (int i = 0; i < 4; ++i) {
+      if (std::ranges::find(frame, v[i]) != frame.end()) continue;
+      entry.points[entry.frame] = v[i];
+      entry.c[entry.frame++] = k.closest.c[i];
+    }
+    for (int e = 0; e < 3; ++e) {
+      const int p = entry.frame + e;
+      entry.points[p] = frame[e];
+      for (int i = 0; i < 4; ++i) {
+        if (v[i] == frame[e]) entry.c[p] += k.closest.c[i];
+      }
+    }
+    const Frame at_start(entry, x_start);
+    entry.turns = !at_start.is_line();
+    if (entry.turns) entry.a = at_start.coordinates(gap(entry, x_start));
     entries_.push_back(entry);
   }
 }
@@ -100,16 +114,18 @@ struct FrictionSet::Slip {
 };
 
 FrictionSet::Slip FrictionSet::slip(const Entry& k, const double* x) const {
-  const Frame frame(k.points, x);
+  const Frame frame(k, x);
   // By displacements, of which little is lost: sum_i c_i delta_i less the change of E a.
-  const auto displacement = [&](Index v) -> Vec3 { return row(x, v) - row(x_start_, v); };
+  std::array<Vec3, 7> delta;
   Vec3 s = Vec3::Zero();
-  for (int i = 0; i < 4; ++i) s += k.lag.closest.c[i] * displacement(k.points[i]);
+  for (int i = 0; i < k.frame + 3; ++i) {
+    delta[i] = row(x, k.points[i]) - row(x_start_, k.points[i]);
+    s += k.c[i] * delta[i];
+  }
   if (k.turns) {
-    const Vec3 first = displacement(k.points[kFrame]);
-    const Vec3 change_1 = displacement(k.points[kFrame + 1]) - first;
-    const Vec3 change_2 = displacement(k.points[kFrame + 2]) - first;
-    const Vec3 e1_start = row(x_start_, k.points[kFrame + 1]) - row(x_start_, k.points[kFrame]);
+    const Vec3 change_1 = delta[k.frame + 1] - delta[k.frame];
+    const Vec3 change_2 = delta[k.frame + 2] - delta[k.frame];
+    const Vec3 e1_start = row(x_start_, k.points[k.frame + 1]) - row(x_start_, k.points[k.frame]);
     s -= k.a[0] * change_1 + k.a[1] * change_2 +
          k.a[2] * (change_1.cross(frame.e2) + e1_start.cross(change_2));
   }
@@ -129,55 +145,77 @@ void FrictionSet::add_gradient(const double* x, double* g) const {
   for (const Entry& k : entries_) {
     const Slip at = slip(k, x);
     const Vec3 force = (k.mu * k.lambda * at.law.f1_over_y) * at.w;
-    for (int i = 0; i < 4; ++i) {
-      Eigen::Map<Vec3>(g + 3 * k.points[i]) += k.lag.closest.c[i] * force;
+    for (int i = 0; i < k.frame + 3; ++i) {
+      Eigen::Map<Vec3>(g + 3 * k.points[i]) += k.c[i] * force;
     }
-    add_edges(k.points, at.frame.pull_back(-k.a, force), g);
+    add_edges(k, at.frame.pull_back(-k.a, force), g);
   }
 }
 
 FrictionSet::Hessian FrictionSet::hessian(const Entry& k,
                                           const double* x,
                                           Curvature curvature) const {
-  Hessian h{.points = &k.points, .B = {}, .core = Mat3::Zero(), .turn = Vec3::Zero()};
+  Hessian h(k);
   const Slip at = slip(k, x);
-  for (int i = 0; i < 4; ++i) h.B[i] = k.lag.closest.c[i] * Mat3::Identity();
-  h.B[kFrame + 1] = k.a[2] * cross_matrix(at.frame.e2) - k.a[0] * Mat3::Identity();
-  h.B[kFrame + 2] = -k.a[2] * cross_matrix(at.frame.e1) - k.a[1] * Mat3::Identity();
-  h.B[kFrame] = -h.B[kFrame + 1] - h.B[kFrame + 2];
+  const Mat3 identity = Mat3::Identity();
+  const Mat3 of_e1 = k.a[2] * cross_matrix(at.frame.e2) - k.a[0] * identity;
+  const Mat3 of_e2 = -k.a[2] * cross_matrix(at.frame.e1) - k.a[1] * identity;
+  h.B_[0] = k.c[k.frame] * identity - of_e1 - of_e2;
+  h.B_[1] = k.c[k.frame + 1] * identity + of_e1;
+  h.B_[2] = k.c[k.frame + 2] * identity + of_e2;
   if (curvature == Curvature::kPositive && k.lambda < 0.0) return h;
   const double strength = k.mu * k.lambda;
-  const Mat3 projector = Mat3::Identity() - k.n * k.n.transpose();
-  h.core = (strength * at.law.f1_over_y) * projector;
+  h.core_ = (strength * at.law.f1_over_y) * (identity - k.n * k.n.transpose());
   if (curvature == Curvature::kExact) {
-    h.core += (strength * at.law.f2) * at.w * at.w.transpose();
-    h.turn = (k.a[2] * strength * at.law.f1_over_y) * at.w;
+    h.core_ += (strength * at.law.f2) * at.w * at.w.transpose();
+    h.turn_ = (k.a[2] * strength * at.law.f1_over_y) * at.w;
   }
   return h;
 }
 
 void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
-  A.add_congruence(*points, B, core);
-  if (turn.isZero(0.0)) return;
+  const Entry& k = *entry_;
+  const int first = k.frame;
+  const Mat3 cross = cross_matrix(turn_);
   // Between a vertex of the frame and the next one, turn x; with the one before, the opposite.
-  const Index first = (*points)[kFrame];
-  const Mat3 block = cross_matrix(turn);
-  A.add_stencil({first, (*points)[kFrame + 1], (*points)[kFrame + 2], first},
-                [&](int p, int q) -> Mat3 {
-                  if (p == q || p == 3 || q == 3) return Mat3::Zero();
-                  return q == (p + 1) % 3 ? block : -block;
-                });
+  const auto turning = [&](int p, int q) -> Mat3 {
+    if (p == q) return Mat3::Zero();
+    return q == (p + 1) % 3 ? cross : -cross;
+  };
+  if (A.any_attached(k.all_points())) {
+    std::array<Mat3, 7> jacobians;
+    for (int p = 0; p < first; ++p) jacobians[p] = k.c[p] * Mat3::Identity();
+    std::ranges::copy(B_, jacobians.begin() + first);
+    A.add_congruence(k.all_points(), jacobians, core_);
+    if (turn_.isZero(0.0)) return;
+    const Index last = k.points[first + 2];
+    A.add_stencil({k.points[first], k.points[first + 1], last, last}, [&](int p, int q) -> Mat3 {
+      return p == 3 || q == 3 ? Mat3::Zero() : turning(p, q);
+    });
+    return;
+  }
+  std::array<Mat3, 3> core_B;
+  for (int e = 0; e < 3; ++e) core_B[e] = core_.lazyProduct(B_[e]);
+  A.add_rows(k.all_points(), [&](int p, int q) -> Mat3 {
+    if (p < first && q < first) return (k.c[p] * k.c[q]) * core_;
+    if (p < first) return k.c[p] * core_B[q - first];
+    if (q < first) return k.c[q] * core_B[p - first].transpose();
+    return B_[p - first].transpose().lazyProduct(core_B[q - first]) + turning(p - first, q - first);
+  });
 }
 
 void FrictionSet::Hessian::add_product(const double* z, double* y) const {
+  const Entry& k = *entry_;
   Vec3 change = Vec3::Zero();
-  for (std::size_t p = 0; p < B.size(); ++p) change += B[p] * row(z, (*points)[p]);
-  const Vec3 force = core * change;
-  for (std::size_t p = 0; p < B.size(); ++p) {
-    Eigen::Map<Vec3>(y + 3 * (*points)[p]) += B[p].transpose() * force;
+  for (int p = 0; p < k.frame; ++p) change += k.c[p] * row(z, k.points[p]);
+  for (int e = 0; e < 3; ++e) change += B_[e] * row(z, k.points[k.frame + e]);
+  const Vec3 force = core_ * change;
+  for (int p = 0; p < k.frame; ++p) Eigen::Map<Vec3>(y + 3 * k.points[p]) += k.c[p] * force;
+  for (int e = 0; e < 3; ++e) {
+    Eigen::Map<Vec3>(y + 3 * k.points[k.frame + e]) += B_[e].transpose() * force;
   }
-  const Frame turned(*points, z);
-  add_edges(*points, {turn.cross(turned.e2), turned.e1.cross(turn)}, y);
+  const Frame turned(k, z);
+  add_edges(k, {turn_.cross(turned.e2), turned.e1.cross(turn_)}, y);
 }
 
 void FrictionSet::add_hessian_product(const double* x, const double* z, double* y) const {
@@ -213,7 +251,7 @@ void FrictionSet::add_mixed(const double* x,
 
     const Slip at = slip(k, x);
     const FrictionLaw& law = at.law;
-    const Frame change(k.points, z);
+    const Frame change(k, z);
     const auto turned = [&](const Vec3& a) -> Vec3 {
       return a[0] * change.e1 + a[1] * change.e2 +
              a[2] * (change.e1.cross(at.frame.e2) + at.frame.e1.cross(change.e2));
@@ -256,9 +294,9 @@ void FrictionSet::add_mixed(const double* x,
       for (int a = 0; a < 3; ++a) {
         a_bar[a] = -(at.frame * Vec3::Unit(a)).dot(s_bar) - turned(Vec3::Unit(a)).dot(eta);
       }
-      const Frame frame(k.points, x_start_);
+      const Frame frame(k, x_start_);
       g = frame.dual(a_bar);
-      add_edges(k.points, frame.pull_back(-scale * k.a, g), start_bar);
+      add_edges(k, frame.pull_back(-scale * k.a, g), start_bar);
     }
     const Vec3 n_bar = -k.n.dot(at.s) * omega - k.n.dot(omega) * at.s;
     const Vec3 t_bar = tangential(n_bar, k.n) / d;

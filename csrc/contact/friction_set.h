@@ -1,6 +1,7 @@
 #pragma once
 
 #include <array>
+#include <span>
 #include <vector>
 
 #include "contact/contact_set.h"
@@ -33,33 +34,42 @@ class FrictionSet {
   const ContactModel& model() const { return *model_; }
   bool empty() const { return entries_.empty(); }
 
-  /// The four corners of a contact, then the vertices of its frame; some of them twice.
-  using Points = std::array<Index, 7>;
-
   struct Entry {
     Contact lag;
     Vec3 n;         ///< unit normal at the lag configuration
     double lambda;  ///< normal force at the lag configuration [N]
     double mu;
-    Points points;
-    bool turns;  ///< false where the frame was a line at the start: Q is the identity
-    Vec3 a;      ///< the gap at the start in the frame there; zero where the frame was a line
+    /// Corners of the contact, then the three vertices of the frame, which between cloths are corners too.
+    std::array<Index, 7> points;
+    std::array<double, 7> c;  ///< of the points
+    int frame;                ///< where the frame's vertices begin: they are the last
+    bool turns;               ///< false where the frame was a line at the start: Q is the identity
+    Vec3 a;                   ///< the gap at the start in the frame there; zero if it does not turn
+
+    std::span<const Index> all_points() const {
+      return {points.data(), static_cast<std::size_t>(frame) + 3};
+    }
   };
   const std::vector<Entry>& entries() const { return entries_; }
 
   double energy_change(const double* x0, const double* x1) const;
   void add_gradient(const double* x, double* g) const;
 
-  /// Hessian of one entry: sum_p B_p dx_p is the change of s, B^T core B the Hessian, but for what the
-  /// frame's own turning adds, the cross product with `turn` between its vertices.
-  struct Hessian {
-    const Points* points;
-    std::array<Mat3, 7> B;
-    Mat3 core;
-    Vec3 turn;
-
+  /// Hessian of one entry: B^T core B, where B dx is the change of s, and what the frame's own turning
+  /// adds: the cross product with `turn` between its vertices.
+  class Hessian {
+   public:
     void add_to(linalg::BlockMatrix& A) const;
     void add_product(const double* z, double* y) const;
+
+   private:
+    friend class FrictionSet;
+    explicit Hessian(const Entry& entry) : entry_(&entry) {}
+
+    const Entry* entry_;
+    std::array<Mat3, 3> B_;  // of the frame's vertices; of all others c I
+    Mat3 core_ = Mat3::Zero();
+    Vec3 turn_ = Vec3::Zero();
   };
 
   /// Of the sign of lambda. kPositive is the quadratic majorant (f1/|w|) P, which does not lose its

@@ -89,31 +89,43 @@ class BlockMatrix : public BlockValues {
                      9 * static_cast<std::ptrdiff_t>(merged_->pattern.slot(i, j))) += block;
   }
 
-  /// Add the 12x12 matrix of four points, without the rows that are left out.
+  /// Add the matrix of a few points, each of them a row or none, without the rows that are left out.
   ///
   /// @param block  (p, q) -> its 3x3 block; asked for those alone that are added, of bodies' points often
   ///               one of sixteen
   template <class Block>
-  void add_stencil(const std::array<Index, 4>& points, Block&& block) {
-    if (std::ranges::any_of(points, [&](Index v) { return is_attached(v); })) {
-      add_attached(points, all_blocks(block));
-      return;
-    }
-    for (int p = 0; p < 4; ++p) {
+  void add_rows(std::span<const Index> points, Block&& block) {
+    const auto count = static_cast<int>(points.size());
+    for (int p = 0; p < count; ++p) {
       const Index i = points[p];
       if (!has(i)) continue;
-      for (int q = 0; q < 4; ++q) {
+      for (int q = 0; q < count; ++q) {
         const Index j = points[q];
         if (i >= j && has(j)) add_block(i, j, block(p, q));
       }
     }
   }
 
-  /// Add B^T core B, without the rows that are left out, where B dx is the sum of jacobian dx over a few
-  /// points.
+  /// Add the 12x12 matrix of four points, some of which may be attached.
+  template <class Block>
+  void add_stencil(const std::array<Index, 4>& points, Block&& block) {
+    if (any_attached(points)) {
+      add_attached(points, all_blocks(block));
+    } else {
+      add_rows(points, block);
+    }
+  }
+
+  /// Add B^T core B, where B dx is the sum of jacobian dx over a few points.
   void add_congruence(std::span<const Index> points,
                       std::span<const Mat3> jacobians,
                       const Mat3& core);
+
+  /// Whether one of some points is attached to rows.
+  bool any_attached(std::span<const Index> points) const {
+    return attachments_ != nullptr &&
+           std::ranges::any_of(points, [&](Index v) { return is_attached(v); });
+  }
 
   /// this = (this + s other) / (1 + s); both on the same pattern.
   void blend(const BlockMatrix& other, double s);

@@ -135,7 +135,8 @@ class ContactPotential {
     for (const contact::FrictionSet::Entry& k : set.entries()) {
       const auto hessian =
           set.hessian(k, x.data(), positive ? Curvature::kPositive : Curvature::kExact);
-      std::set<Index> points(k.points.begin(), k.points.end());
+      const auto all = k.all_points();
+      const std::set<Index> points(all.begin(), all.end());
       for (const Index v : points) {
         for (Index a = 3 * v; a < 3 * v + 3; ++a) {
           hessian.add_product(unit.col(a).data(), h.col(a).data());
