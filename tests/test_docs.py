@@ -146,3 +146,16 @@ def test_every_block_of_python_runs_alone(page, line, code):
             pytest.skip(str(error))
     # Lines as in the page.
     exec(compile("\n" * line + code, str(page), "exec"), {"__name__": "__main__"})
+
+
+def test_one_sheet_takes_one_amount_of_memory():
+    """Of the sheet of a slow test in tests/solver, wherever it is told, to a digit."""
+    told = []
+    for page in PAGES:
+        text = " ".join(page.read_text().split())
+        for amount, unit in re.findall(
+            r"hanging sheet of 200 x 200 vertices (?:takes |is )?([\d.]+) (Gi?B)", text
+        ):
+            told.append(float(amount) * (2**30 / 1e9 if unit == "GiB" else 1.0))
+    assert len(told) == 3
+    assert [round(gigabytes, 1) for gigabytes in told] == [0.9] * 3

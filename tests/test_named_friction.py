@@ -123,7 +123,7 @@ ACCEPTED = r"must name pairs \(a, b\) of the surfaces 'mat', 'floor', 'far'; got
 @pytest.mark.parametrize(
     ("friction", "error", "message"),
     [
-        pytest.param({("mat", "flor"): 0.1}, dc.InvalidInput, ACCEPTED, id="unknown"),
+        pytest.param({("mat", "mats"): 0.1}, dc.InvalidInput, ACCEPTED, id="unknown"),
         pytest.param({"mat": 0.1}, dc.InvalidInput, ACCEPTED + "'mat'", id="one name"),
         pytest.param({("mat",) * 3: 0.1}, dc.InvalidInput, ACCEPTED, id="three names"),
         pytest.param({(0, 1): 0.1}, dc.InvalidInput, ACCEPTED + r"\(0, 1\)", id="numbers"),
