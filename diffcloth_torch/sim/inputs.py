@@ -430,20 +430,27 @@ def _check_values(layout: Layout, name: str, values: FloatArray, default: FloatA
             for shape in values:
                 check_areas("parameters", name, shape, layout.assembly.faces)
         return
-    label = f"parameters: `{name}`"
     if name in ("body_mass", "link_mass"):
-        wrong = (values == 0.0) & layout.massive[name[:4]]
-        _refuse_row(label, wrong, "> 0")
+        _refuse_row(layout, name, values == 0.0, "> 0")
     elif name in ("body_inertia", "link_inertia"):
         symmetric = (values + np.swapaxes(values, -1, -2)) / 2
         wrong = np.linalg.eigvalsh(symmetric)[..., 0] <= 0.0
-        _refuse_row(label, wrong & layout.massive[name[:4]], "positive definite")
+        _refuse_row(layout, name, wrong, "positive definite")
 
 
-def _refuse_row(label: str, wrong: NDArray[np.bool_], accepted: str) -> None:
-    if wrong.any():
-        row = int(np.argwhere(wrong)[0][-1])
-        raise InvalidInput(f"{label} must be {accepted} in the row [{row}], of what forces move")
+def _refuse_row(layout: Layout, name: str, wrong: NDArray[np.bool_], accepted: str) -> None:
+    """Refuse a quantity of bodies or links where it is wrong and matters."""
+    owner = name.partition("_")[0]
+    wrong = wrong & layout.massive[owner]
+    if not wrong.any():
+        return
+    row = int(np.argwhere(wrong)[0][-1])
+    links = [f"{robot.name}/{link}" for robot in layout.robots for link in robot.link_names]
+    moved = links[row] if owner == "link" else layout.bodies[row].name
+    raise InvalidInput(
+        f"parameters: `{name}` must be {accepted} in the row [{row}], that of {moved!r}, which "
+        "forces move"
+    )
 
 
 def _environments(
