@@ -243,8 +243,7 @@ namespace {
 
 std::string quoted(const std::string& name) { return "'" + name + "'"; }
 
-}  // namespace
-
+/// "cloth 'shirt'", "body 'table'", "link 'hand/palm'": a surface in messages.
 std::string describe_surface(const Scene& scene, Index surface) {
   const std::vector<std::string>& names = scene.given.surface_names;
   const bool is_cloth = surface < scene.cloth_count();
@@ -258,9 +257,7 @@ std::string describe_surface(const Scene& scene, Index surface) {
   return kind + quoted(names[surface]);
 }
 
-namespace {
-
-/// "cloth 0 edge (3, 8)": a primitive by its surface and that surface's own vertex numbers.
+/// "cloth 'shirt' edge (3, 8)": a primitive by its surface and that surface's own vertex numbers.
 std::string describe(const Scene& scene, const char* kind, std::initializer_list<Index> vertices) {
   const Index surface = scene.collision_mesh.vertex_surface[*vertices.begin()];
   const bool is_cloth = surface < scene.cloth_count();

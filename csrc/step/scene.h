@@ -95,9 +95,6 @@ struct Scene {
 /// Rest quantities that weigh contacts, for a rest shape of the cloths.
 contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& rest);
 
-/// "cloth 'shirt'", "body 'table'", "link 'hand/palm'": a surface in messages.
-std::string describe_surface(const Scene& scene, Index surface);
-
 /// Two primitives near each other, and how far they must be apart at least [m].
 struct ClosePair {
   double distance;
