@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import ipctk
 import numpy as np
 from numpy.typing import NDArray
 
 import diffcloth_torch as dc
+from benchmarks.extra import require
 from diffcloth_torch.geometry.poses import transform
+
+ipctk = require("ipctk")
 
 
 class Crossings:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
 
+from benchmarks.extra import require
 from benchmarks.scenes import DT, sheet
-from diffcloth_torch import _kernels
+
+KDTree = require("scipy.spatial").KDTree
+_kernels = require("diffcloth_torch._kernels")
 
 STRETCH, BENDING, POISSON, DENSITY = 300.0, 1e-4, 0.3, 0.2  # [N/m], [N m], [-], [kg/m^2]
 BARRIER = 1e4  # stiffness of a contact [N/m]

@@ -8,14 +8,16 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import ipctk
 import numpy as np
 import torch
 
 import diffcloth_torch as dc
+from benchmarks.extra import require
 from benchmarks.scenes import DT, Scene, in_regime
 from diffcloth_torch.poses import transform  # paths that the first version has, too
 from diffcloth_torch.step import as_array
+
+ipctk = require("ipctk")
 
 BLOCK = 5  # steps between two reference factorizations
 WARM_UP = 2  # steps with backward whose times are dropped: caches fill

@@ -7,16 +7,20 @@ import time
 import zipfile
 from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.lib import format as npy
+from numpy.typing import NDArray
 
 from diffcloth_torch import build_info
 from diffcloth_torch.config.documents import set_values
 from diffcloth_torch.config.viewers import open_viewers
 from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.optimization import Actions, Optimization
@@ -37,12 +41,16 @@ __all__ = ["info", "optimize", "resume", "run"]
 # What a run or its pictures need beyond Python; `info` says which of them are there.
 _PACKAGES = ("torch", "numpy", "trimesh", "matplotlib", "pyvista", "imageio", "imageio-ffmpeg")
 
-# Files in a folder of results; meshes and frames are replaced by the viewers that write them.
+# Files in a folder of results, and folders, which the viewers that write into them clear.
 _METRICS, _RESUME = "metrics.json", "resume.pt"
 _RESULTS = (
     *(_METRICS, _RESUME, "actions.pt", "actions.npz", "loss.png"),
     *("animation.mp4", "animation.gif", "animation.png"),
+    *("metrics.part", "resume.part"),
 )
+_FOLDERS = ("meshes", "animation_frames")
+
+_LARGEST_ACTIONS = 256 << 20  # bytes of a file of actions: no run of this code writes a tenth
 
 # What may change when an optimization goes on; the rest decides what was found so far.
 _RESUMABLE = ("optimizer", "output")
@@ -158,6 +166,7 @@ def resume(folder: Path, assignments: Iterable[str] = ()) -> str:
         raise InvalidInput(
             f"--resume: {folder} must hold what `diffcloth optimize` wrote: no {file}"
         )
+    _check_places(folder)
     try:
         saved = torch.load(file, weights_only=True)
         document, source = saved["config"], Path(saved["source"])
@@ -248,7 +257,7 @@ def _values_used(task: Task) -> dict[str, Any]:
     parameters = simulator.parameters()
     values = {name: getattr(parameters, name) for name in PARAMETERS if name != "rest_positions"}
     given = {name: value.tolist() for name, value in values.items() if value is not None}
-    chosen = {name: given[name] for name in ("barrier_distance", "barrier_stiffness")}
+    chosen = {name: given.get(name) for name in ("barrier_distance", "barrier_stiffness")}
     return {
         "config": task.config.model_dump(mode="json"),
         "used": {
@@ -271,7 +280,22 @@ def _check_folder(config: Path, out: Path | None, overwrite: bool) -> Path:
             f"--out: {folder} holds results already: --overwrite replaces them{going_on}, and "
             "--out names another folder"
         )
+    _check_places(folder)
     return folder
+
+
+def _check_places(folder: Path) -> None:
+    """Refuse, before the work, what stands where its results will be written."""
+    for name in _RESULTS:
+        if (folder / name).is_dir():
+            raise InvalidInput(
+                f"{folder / name} is a folder, in the place of a file of results: move it away"
+            )
+    for name in _FOLDERS:
+        if (folder / name).exists() and not (folder / name).is_dir():
+            raise InvalidInput(
+                f"{folder / name} must be a folder, as results are written into it: move it away"
+            )
 
 
 def _clear(folder: Path) -> None:
@@ -287,19 +311,39 @@ def _read_actions(task: Task, file: Path | None) -> Actions:
         return actions
     if not actions:
         raise InvalidInput(f"--actions: the task {task.config.task!r} has no actions")
-    try:
-        with np.load(file, allow_pickle=False) as arrays:
-            given = {name: arrays[name] for name in arrays.files}
-    except (ValueError, AttributeError, EOFError, zipfile.BadZipFile) as error:
-        raise InvalidInput(f"--actions: {file} is not an `actions.npz` of a run") from error
+    content = BytesIO(read_regular_file(file, _LARGEST_ACTIONS))
     wanted = {name: list(tensor.shape) for name, tensor in actions.items()}
-    got = {name: list(array.shape) for name, array in given.items()}
+    given: dict[str, NDArray[Any]] = {}
+    try:
+        claims = _claims(content)
+        got = {name: shape for name, (shape, _) in claims.items()}
+        exact = all(dtype == np.float64 for _, dtype in claims.values())
+        if got == wanted and exact:
+            content.seek(0)
+            with np.load(content, allow_pickle=False) as arrays:
+                given = {name: arrays[name] for name in wanted}
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever zipfile and NumPy make of bytes that are no such file
+        raise InvalidInput(f"--actions: {file} is not an `actions.npz` of a run") from error
     if got != wanted:
         raise InvalidInput(f"--actions: {file} must hold {_shapes(wanted)}, got {_shapes(got)}")
-    for name, array in given.items():
-        if array.dtype != np.float64 or not np.isfinite(array).all():
-            raise InvalidInput(f"--actions: {name!r} of {file} must be finite and float64")
+    if not exact or not all(np.isfinite(array).all() for array in given.values()):
+        raise InvalidInput(f"--actions: the arrays of {file} must be finite and float64")
     return {name: torch.from_numpy(given[name]).requires_grad_() for name in actions}
+
+
+def _claims(file: BytesIO) -> dict[str, tuple[list[int], np.dtype[Any]]]:
+    """Shapes and types that the arrays of an .npz claim; their numbers take no memory yet."""
+    claims = {}
+    with zipfile.ZipFile(file) as entries:
+        for entry in entries.namelist():
+            with entries.open(entry) as array:
+                major, _ = npy.read_magic(array)
+                read = npy.read_array_header_1_0 if major == 1 else npy.read_array_header_2_0
+                shape, _, dtype = read(array)
+                claims[entry.removesuffix(".npy")] = (list(shape), dtype)
+    return claims
 
 
 def _shapes(shapes: dict[str, list[int]]) -> str:

@@ -17,7 +17,7 @@ import diffcloth_torch as dc
 @click.argument("body_path", type=click.Path(exists=True, path_type=Path))
 @click.option("--height", default=0.0, help="How far to lift the cloth before it falls [m].")
 @click.option("--steps", default=100, help="Steps of 0.01 s.")
-@click.option("--out", default="draped.obj", type=click.Path(path_type=Path))
+@click.option("--out", default="draped.obj", type=click.Path(path_type=Path, dir_okay=False))
 def main(cloth_path: Path, body_path: Path, height: float, steps: int, out: Path) -> None:
     """Let CLOTH_PATH fall on BODY_PATH and write where it comes to lie."""
     cloth = dc.Cloth.load(cloth_path, pose=[0, 0, height, 1, 0, 0, 0])

@@ -267,7 +267,9 @@ def two_sheets(*position):
 
 @pytest.mark.parametrize("position", [(0, 0, 0), (0.3, 0.1, 0), (1, 0, 0), (0.5, 0.5, 0)])
 def test_surfaces_that_touch_name_their_elements(position):
-    message = r"overlap: cloth 0 (vertex|edge) \(.*\) and cloth 1 (face|edge) \(.*\) touch"
+    message = (
+        r"overlap: cloth 'cloth0' (vertex|edge) \(.*\) and cloth 'cloth1' (face|edge) \(.*\) touch"
+    )
     with pytest.raises(dc.IntersectingState, match=message) as raised:
         two_sheets(*position)
     assert "thickness" not in str(raised.value)
@@ -284,7 +286,9 @@ def test_a_start_deep_inside_the_barrier_warns_with_the_gap_at_rest():
     with pytest.warns(UserWarning, match="throw surfaces apart") as warned:
         sheet_on_a_floor(0.001, **contact)
     text = str(warned[0].message)
-    assert re.search(r"cloth 0 vertex \(\d+\) and body 0 face \(.*\) start 0.001 m apart", text)
+    assert re.search(
+        r"cloth 'cloth0' vertex \(\d+\) and body 'body0' face \(.*\) start 0.001 m apart", text
+    )
     assert warned[0].filename == __file__
     # Where the sheet comes to rest says whether that gap is the right one.
     sim = sheet_on_a_floor(0.018, **contact)

@@ -305,3 +305,26 @@ def test_the_baseline_is_timed_with_both_elastic_solvers():
     rows = [line.split() for line in result.stdout.splitlines()]
     assert [row[0] for row in rows[1:]] == 2 * ["newton", "projective"]
     assert all(int(row[2]) > 0 for row in rows[1:])  # vertices in contact
+
+
+@pytest.mark.parametrize(
+    ("benchmark", "module", "sentence"),
+    [
+        ("step", "ipctk", "needs ipctk: run  pip install 'diffcloth-torch[test]'"),
+        ("schemes", "ipctk", "needs ipctk: run  pip install 'diffcloth-torch[test]'"),
+        ("factorization", "scipy", "needs scipy.spatial: run  pip install 'diffcloth-torch[test]'"),
+        ("factorization", "diffcloth_torch._kernels", "CMAKE_ARGS=-DDIFFCLOTH_KERNELS=ON"),
+    ],
+)
+def test_a_missing_extra_is_named_in_a_sentence(benchmark, module, sentence):
+    """None in sys.modules is how Python itself marks a module that is not to be found."""
+    code = (
+        f"import runpy, sys; sys.modules[{module!r}] = None; "
+        f"runpy.run_module('benchmarks.{benchmark}', run_name='__main__')"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 1
+    assert sentence in result.stderr
+    assert len(result.stderr.splitlines()) == 1

@@ -289,7 +289,9 @@ def test_an_array_of_another_length_is_refused(arguments, name):
         ("ignored_pairs", np.array([[-1, 0]], dtype=np.int32)),
         ("bending_models", ["patch", "patch"]),
         ("bending_models", []),
-        ("link_names", ["a"] * 99),
+        ("surface_names", ["a"] * 99),
+        ("surface_names", ["a"]),
+        ("pin_names", ["a"] * 2),
         ("scheme", "none"),
         ("metric", "none"),
     ],
@@ -297,3 +299,17 @@ def test_an_array_of_another_length_is_refused(arguments, name):
 def test_another_value_out_of_range_is_refused(arguments, name, value):
     with pytest.raises(ValueError, match=r"core: |scheme must|metric must"):
         _core.Simulator(**(arguments | {name: value}))
+
+
+@pytest.mark.parametrize("rounded", [torch.tensor(0.01), np.float32(0.02), torch.tensor(1).half()])
+def test_a_time_step_in_single_precision_is_refused(rounded):
+    """0.01 becomes 0.009999999776482582 there, in silence."""
+    scene = dc.Scene([dc.Cloth.grid(3, 3)])
+    message = r"Simulator: `dt` must be a plain number or one in float64, got \S*float\d+, which"
+    with pytest.raises(TypeError, match=message):
+        dc.Simulator(scene, rounded)
+
+
+@pytest.mark.parametrize("exact", [torch.tensor(0.01, dtype=torch.float64), np.float64(0.01), 1])
+def test_a_time_step_in_double_precision_is_taken_as_it_is(exact):
+    assert dc.Simulator(dc.Scene([dc.Cloth.grid(3, 3)]), exact).dt == float(exact)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -392,3 +394,94 @@ def test_actions_need_a_task_that_has_some(call, tmp_path):
     np.savez(tmp_path / "a.npz", linear=np.zeros((1, 3)))
     result = call("run", "sheet.yaml", "--actions", "a.npz")
     assert "the task 'drape' has no actions" in one_sentence(result)
+
+
+def pretend(file, shape, dtype="<f8"):
+    """Write an .npz whose arrays claim a shape and hold nothing."""
+    header = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}, }}".encode()
+    header += b" " * (63 - (10 + len(header)) % 64) + b"\n"
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as entries:
+        for name in ("linear", "angular"):
+            data = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+            entries.writestr(f"{name}.npy", data)
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "message"),
+    [
+        pytest.param("(10**9, 3)", "<f8", "is not an", id="expression"),
+        pytest.param("(1000000000000, 3)", "<f8", "got linear [1000000000000, 3]", id="shape"),
+        pytest.param("(1, 3)", "|S2000000000", "must be finite and float64", id="dtype"),
+        pytest.param("(1, 3)", "<f8", "is not an `actions.npz`", id="empty"),
+    ],
+)
+def test_actions_that_claim_more_than_there_is_take_no_memory(
+    call, tmp_path, shape, dtype, message
+):
+    pretend(tmp_path / "a.npz", shape, dtype)
+    arguments = [CONFIGS / "hit_cloth.yaml", *SMALL_HIT, "--actions", "a.npz", "--out", "out"]
+    assert message in one_sentence(call("optimize", *arguments))
+
+
+@pytest.mark.parametrize("command", ["run", "optimize"])
+def test_actions_on_a_pipe_are_refused(call, tmp_path, command):
+    """Nobody writes to it: reading it would wait without end."""
+    os.mkfifo(tmp_path / "pipe.npz")
+    arguments = [CONFIGS / "hit_cloth.yaml", *SMALL_HIT, "--actions", "pipe.npz", "--out", "out"]
+    result = call(command, *arguments)
+    assert result.exit_code == 2
+    assert "pipe.npz: must be a regular file" in one_sentence(result)
+
+
+# --- what stands where results go -----------------------------------------------------------------
+
+
+@pytest.fixture
+def no_work(monkeypatch):
+    def fail(*arguments, **keywords):
+        pytest.fail("a step was taken before the refusal")
+
+    monkeypatch.setattr(Simulator, "step", fail)
+
+
+@pytest.mark.parametrize("name", ["metrics.json", "actions.npz", "loss.png", "resume.part"])
+@pytest.mark.usefixtures("no_work")
+def test_a_folder_named_like_a_result_is_refused_before_the_work(call, tmp_path, name):
+    (tmp_path / "out" / name).mkdir(parents=True)
+    for command in ("run", "optimize"):
+        arguments = [CONFIGS / "hit_cloth.yaml", *SMALL_HIT, "--out", "out", "--overwrite"]
+        result = call(command, *arguments)
+        assert result.exit_code == 2
+        assert f"out/{name} is a folder, in the place of a file" in one_sentence(result)
+
+
+@pytest.mark.parametrize("name", ["meshes", "animation_frames"])
+@pytest.mark.usefixtures("no_work")
+def test_a_file_named_like_a_folder_of_results_is_refused_before_the_work(call, tmp_path, name):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("mine")
+    result = call("run", "sheet.yaml", "--out", "out", "--overwrite")
+    assert result.exit_code == 2
+    assert f"out/{name} must be a folder" in one_sentence(result)
+    assert (tmp_path / "out" / name).read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["actions.pt", "loss.png", "metrics.json"])
+def test_a_folder_in_what_is_resumed_is_refused_before_the_work(call, tmp_path, name, monkeypatch):
+    arguments = [CONFIGS / "hit_cloth.yaml", *SMALL_HIT, "--set=optimizer.iterations=1"]
+    assert call("optimize", *arguments, "--out", "out").exit_code == 0
+    (tmp_path / "out" / name).unlink()
+    (tmp_path / "out" / name).mkdir()
+    monkeypatch.setattr(Simulator, "step", lambda *_: pytest.fail("it went on"))
+    result = call("optimize", "--resume", "out", "--set", "optimizer.iterations=2")
+    assert result.exit_code == 2
+    assert f"out/{name} is a folder" in one_sentence(result)
+
+
+@pytest.mark.parametrize("scheme", ["projective", "coupled"])
+def test_metrics_are_written_where_there_is_no_barrier(call, tmp_path, scheme):
+    arguments = [f"--set=simulation.scheme={scheme}", "--set=simulation.contact.self_contact=false"]
+    result = call("run", "sheet.yaml", *arguments, "--out", "out")
+    assert result.exit_code == 0, result.output
+    used = json.loads((tmp_path / "out/metrics.json").read_text())["used"]
+    assert used["contact"]["barrier_distance"] is None

@@ -111,3 +111,51 @@ def test_the_example_of_a_potential_fits_the_code():
     )
     overridden = re.findall(r"(\w+)\([^)]*\)(?: const)? override", text)
     assert set(required) == set(overridden)
+
+
+def python_blocks():
+    for page in PAGES:
+        text = page.read_text()
+        for found in re.finditer(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE):
+            line = text[: found.start()].count("\n") + 1
+            yield pytest.param(page, line, found[1], id=f"{page.stem}-{line}")
+
+
+@pytest.fixture
+def as_a_reader(tmp_path, monkeypatch):
+    """A folder with a mesh of the reader's own, and the configurations as they are in a clone."""
+    sheet = dc.Cloth.grid(6, 7, (0.3, 0.35), name="shirt")
+    dc.Simulator(dc.Scene([sheet]), 0.01).initial_state().export(tmp_path / "shirt.obj")
+    (tmp_path / "configs").symlink_to(ROOT / "configs")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize(("page", "line", "code"), list(python_blocks()))
+# The Panda has limits that are not applied, as a warning says.
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.IgnoredLimitsWarning")
+@pytest.mark.usefixtures("as_a_reader")
+def test_every_block_of_python_runs_alone(page, line, code):
+    """Pasted into a fresh interpreter: it imports what it uses."""
+    if "dc.render" in code:
+        pytest.importorskip("pyvista")
+        pytest.importorskip("imageio_ffmpeg")
+    if "robots.panda()" in code:
+        try:
+            dc.robots.panda()
+        except ImportError as error:
+            pytest.skip(str(error))
+    # Lines as in the page.
+    exec(compile("\n" * line + code, str(page), "exec"), {"__name__": "__main__"})
+
+
+def test_one_sheet_takes_one_amount_of_memory():
+    """Of the sheet of a slow test in tests/solver, wherever it is told, to a digit."""
+    told = []
+    for page in PAGES:
+        text = " ".join(page.read_text().split())
+        for amount, unit in re.findall(
+            r"hanging sheet of 200 x 200 vertices (?:takes |is )?([\d.]+) (Gi?B)", text
+        ):
+            told.append(float(amount) * (2**30 / 1e9 if unit == "GiB" else 1.0))
+    assert len(told) == 3
+    assert [round(gigabytes, 1) for gigabytes in told] == [0.9] * 3

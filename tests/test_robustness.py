@@ -72,7 +72,9 @@ def test_a_cloth_that_intersects_itself_is_refused():
     x = np.array(cloth.vertices)
     x[8] = x[0] + [0.1, 0.12, -0.05]  # folded through the opposite corner
     x[5] = x[1] + [0.03, 0.1, 0.3]
-    with pytest.raises(dc.IntersectingState, match=r"cloth 0 edge .* intersects cloth 0 face"):
+    with pytest.raises(
+        dc.IntersectingState, match=r"cloth 'cloth0' edge .* intersects cloth 'cloth0' face"
+    ):
         dc.Simulator(dc.Scene([dc.Cloth(x, cloth.faces, rest_vertices=cloth.vertices)]), DT)
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
+import runpy
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ import torch
 
 import diffcloth_torch as dc
 from diffcloth_torch.config import shapes
+from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.geometry.rotation import (
     integrate_poses,
     interpolate_poses,
@@ -29,7 +31,6 @@ from diffcloth_torch.tasks.registry import load_task
 from diffcloth_torch.tasks.simulation import simulate
 
 CONFIGS = Path(__file__).parent.parent / "configs"
-SHARED_DATA = Path(__file__).parent.parent.parent / "shared" / "data"
 
 
 @pytest.fixture
@@ -897,23 +898,34 @@ def test_learning_rates_must_name_the_actions():
 # --- shipped drapes -----------------------------------------------------------------------------
 
 
-def require_shared_data():
-    if not SHARED_DATA.is_dir():
-        if os.environ.get("CI"):
-            pytest.fail(f"the test data is absent: {SHARED_DATA}")
-        pytest.skip("the test data is absent: ../shared/data")
-
-
 def test_the_tablecloth_starts_above_the_chair():
     task = load_task(CONFIGS / "drape.yaml")
     chair = task.scene.bodies[0]
     assert task.scene.cloths[0].vertices[:, 2].min() > chair.vertices[:, 2].max()
 
 
-def test_own_meshes_are_draped_by_the_shipped_configuration():
-    require_shared_data()
-    task = load_task(CONFIGS / "drape_own.yaml", ["simulation.steps=2"])
-    assert len(task.scene.cloths[0].vertices) == 482
-    assert len(task.scene.bodies[0].vertices) == 2930
+def test_the_meshes_of_the_configurations_are_what_their_script_makes():
+    made = runpy.run_path(str(CONFIGS.parent / "scripts" / "make_meshes.py"))["texts"]()
+    files = {path.name: path for path in (CONFIGS / "meshes").iterdir()}
+    assert set(files) == set(made)
+    for name, path in files.items():
+        assert path.read_text() == made[name]
+
+
+def test_own_meshes_are_draped_by_a_plain_clone(tmp_path):
+    """The configurations alone, with nothing beside them: a bell over a skittle that stands."""
+    shutil.copytree(CONFIGS, tmp_path / "configs")
+    task = load_task(tmp_path / "configs/drape_own.yaml", ["simulation.steps=24"])
+    bell, (skittle, _) = task.scene.cloths[0], task.scene.bodies
+    placed = transform(skittle.vertices, skittle.pose)
+    assert np.ptp(placed[:, 2]) == pytest.approx(0.38)
+    assert placed[:, 2].min() == pytest.approx(0, abs=1e-9)
+    triangles = skittle.vertices[skittle.faces]
+    assert np.linalg.det(triangles).sum() > 0  # it faces outward
+    lengths = np.linalg.norm(np.diff(bell.vertices[bell.faces], axis=1), axis=-1)
+    assert lengths.max() < 2.5 * lengths.min()
     states = list(simulate(task))
     assert states[-1].report.converged
+    assert states[-1].report.contact_count > 0
+    # The fall has ended on the skittle's head.
+    assert states[-1].positions[:, 2].max() > 0.38

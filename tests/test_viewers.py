@@ -17,7 +17,8 @@ from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.tasks.registry import load_task
 from diffcloth_torch.tasks.simulation import simulate
 from diffcloth_torch.viewers.curves import draw_loss_curve
-from diffcloth_torch.viewers.look import Camera, Goal, Paint, Pictures
+from diffcloth_torch.viewers.floor import BACKGROUND
+from diffcloth_torch.viewers.look import FORCE_COLOR, GOAL_COLOR, Camera, Goal, Paint, Pictures
 from diffcloth_torch.viewers.meshes import MeshSequence
 from diffcloth_torch.viewers.record import Record
 from diffcloth_torch.viewers.several import Viewers
@@ -393,3 +394,81 @@ def test_a_loss_curve_is_a_picture(tmp_path):
     image = read_image(tmp_path / "loss.png")
     assert (image < 128).any()
     assert image.shape == (600, 960, 3)
+
+
+# --- Scenes without a cloth, and with many bodies -------------------------------------------------
+
+FALLING = {"motion": "dynamic", "mass": 1.0}
+BARRIER = dc.ContactOptions(barrier_distance=0.003)
+
+
+def scenes_without_cloth():
+    ball = dc.RigidBody.sphere(0.2, subdivisions=1, pose=[0, 0, 1, 1, 0, 0, 0], **FALLING)
+    hand = dc.Robot.load(dc.robots.GRIPPER, base="floating", actuation="position")
+    return {
+        "body": dc.Scene([], [ball]),
+        "body and floor": dc.Scene([], [ball, dc.RigidBody.plane(3.0)]),
+        "robot": dc.Scene([], robots=[hand]),
+        "both": dc.Scene([], [ball], [hand]),
+    }
+
+
+@pytest.mark.parametrize("name", scenes_without_cloth())
+@pytest.mark.parametrize(("file", "moments"), [("one.png", 1), ("few.png", 3), ("film.gif", 1)])
+@pytest.mark.usefixtures("pictures")
+def test_scenes_without_a_cloth_are_drawn(name, file, moments, tmp_path):
+    simulator = dc.Simulator(scenes_without_cloth()[name], 0.01, contact=BARRIER)
+    start = simulator.initial_state()
+    states = [start, *simulator.rollout(start, steps=2)]
+    path = tmp_path / file
+    options = {"size": (160, 120), "labels": False, "moments": moments, "contact_forces": True}
+    dc.render(simulator.scene, states, path, **options)
+    image = read_image(path)
+    # Something stands before the floor and the background, which are much lighter.
+    assert (image[..., :3].max(axis=-1) < 170).mean() > 0.01
+
+
+@pytest.mark.usefixtures("pictures")
+def test_a_scene_without_any_surface_is_refused(tmp_path):
+    file = tmp_path / "bare.urdf"
+    file.write_text(
+        '<robot name="bare"><link name="stone"><inertial><mass value="1"/>'
+        '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
+    )
+    robot = dc.Robot.load(file, base="floating")
+    simulator = dc.Simulator(dc.Scene([], robots=[robot]), 0.01)
+    with pytest.raises(dc.InvalidInput, match="the scene must have a surface"):
+        dc.render(simulator.scene, simulator.initial_state(), tmp_path / "x.png")
+
+
+@pytest.mark.parametrize("kind", ["png", "gif", "mp4"])
+@pytest.mark.usefixtures("pictures")
+def test_a_folder_in_the_place_of_a_picture_is_refused_before_the_work(tmp_path, kind):
+    scene = dc.Scene([dc.Cloth.grid(3, 3)])
+    state = dc.Simulator(scene, 0.01).initial_state()
+    (tmp_path / f"x.{kind}").mkdir()
+    with pytest.raises(dc.InvalidInput, match=rf"x\.{kind} must be no folder"):
+        dc.render(scene, state, tmp_path / f"x.{kind}")
+    other = "gif" if kind == "png" else "png"
+    dc.render(scene, state, tmp_path / f"x.{other}", size=(64, 64))
+
+
+def lab(color):
+    """CIELAB of "#rrggbb" in daylight: equal distances look about equally different."""
+    srgb = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]] @ linear
+    ratio = xyz / [0.9505, 1.0, 1.089]
+    f = np.where(ratio > 0.008856, np.cbrt(ratio), 7.787 * ratio + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def test_the_palette_tells_ten_bodies_apart():
+    """Some 2 is what eyes can tell side by side, 10 are different at a glance."""
+    bodies = [Paint().for_body(i).color for i in range(10)]
+    cloths = [Paint().for_cloth(i) for i in range(4)]
+    others = [color for paint in cloths for color in (paint.color, paint.back_color)]
+    others += [GOAL_COLOR, FORCE_COLOR, BACKGROUND]
+    for i, color in enumerate(bodies):
+        for other in [*bodies[:i], *others]:
+            assert np.linalg.norm(lab(color) - lab(other)) > 20, (color, other)

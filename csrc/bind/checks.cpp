@@ -101,7 +101,10 @@ void check_description(const step::Description& d) {
   for (const auto& pair : d.ignored_pairs) {
     check_indices("ignored_pairs", {pair.begin(), pair.end()}, static_cast<Index>(cloths + bodies));
   }
-  require(d.link_names.size() <= bodies, "`link_names` must not be more than there are bodies");
+  require(d.surface_names.empty() || d.surface_names.size() == cloths + bodies,
+          "`surface_names` must be as many as there are surfaces");
+  require(d.pin_names.empty() || d.pin_names.size() == d.pins.size(),
+          "`pin_names` must be as many as there are pins");
   require(std::isfinite(d.dt) && d.dt > 0.0, "`dt` must be finite and > 0");
   require(d.friction_iterations >= 1 && d.options.max_iterations >= 1,
           "`friction_iterations` and `max_iterations` must be at least 1");

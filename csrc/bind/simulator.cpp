@@ -578,8 +578,11 @@ void simulator(nb::module_& m) {
              if (k.contains("large_factor")) {  // only tests say it
                description.options.large_factor = nb::cast<std::size_t>(k["large_factor"]);
              }
-             if (k.contains("link_names")) {
-               description.link_names = nb::cast<std::vector<std::string>>(k["link_names"]);
+             if (k.contains("surface_names")) {
+               description.surface_names = nb::cast<std::vector<std::string>>(k["surface_names"]);
+             }
+             if (k.contains("pin_names")) {
+               description.pin_names = nb::cast<std::vector<std::string>>(k["pin_names"]);
              }
              if (k.contains("ignored_pairs")) {
                const std::vector<Index> pairs = to_vector(indices("ignored_pairs"));

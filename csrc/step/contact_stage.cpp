@@ -114,28 +114,33 @@ class Sum {
   std::optional<ContactPotential> contact_;
 };
 
-/// The bodies and cloths in contact, which block a motion.
-std::string blockers(const Scene& scene, const std::vector<Contact>& contacts) {
-  std::vector<char> involved(static_cast<std::size_t>(scene.surface_count()), 0);
-  for (const Contact& k : contacts) {
-    for (const Index v : k.pair.vertices) involved[scene.collision_mesh.vertex_surface[v]] = 1;
-  }
-  std::string text;
-  for (Index s = 0; s < scene.surface_count(); ++s) {
-    if (!involved[s]) continue;
-    text += (text.empty() ? "" : ", ") + describe_surface(scene, s);
-  }
-  return text;
-}
-
-void report_contacts(const Scene& scene, const std::vector<Contact>& contacts, Report& report) {
+void report_contacts(const std::vector<Contact>& contacts, Report& report) {
   report.contact_count = static_cast<Index>(contacts.size());
   report.minimum_distance = std::numeric_limits<double>::infinity();
   for (const Contact& k : contacts) {
     report.minimum_distance = std::min(report.minimum_distance, std::sqrt(k.closest.d_sq));
   }
-  if (report.result == Result::kInfeasibleMotion) {
-    report.message = "in contact: " + blockers(scene, contacts);
+}
+
+/// Name what is near each other where a step could not go on. Contacts do not tell: two surfaces that
+/// are both prescribed have none, and block each other all the same.
+void report_blockers(const Problem& problem,
+                     const Array& x,
+                     solver::Status status,
+                     Report& report) {
+  const bool is_infeasible = status == solver::Status::kInfeasibleMotion;
+  if (!is_infeasible && status != solver::Status::kBlocked) return;
+  std::string names;
+  if (problem.contact) {
+    const contact::Parameters& parameters = problem.contact->parameters();
+    names = describe_near(problem.scene, x.data(), parameters.thickness, parameters.d_hat);
+  }
+  if (!is_infeasible) {
+    report.message += ": " + names;
+  } else if (names.empty()) {
+    report.message = "nothing is in the way yet, but the iterations of the step are used up";
+  } else {
+    report.message = "in contact: " + names;
   }
 }
 
@@ -212,10 +217,12 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
   const Array first_guess = problem.predicted(inertia.target().data());
   solver::Factor factor;
   int solves = 0;
+  solver::Status status = solver::Status::kConverged;
   while (solves < friction_iterations) {
     const solver::Outcome outcome =
         solver::minimize(sum.objective, x, motion, solves == 0 ? &first_guess : nullptr,
                          std::move(factor), step.context);
+    status = outcome.status;
     merge(outcome, step.report);
     step.kept.add(outcome.certificate);
     factor = outcome.certificate.factor;
@@ -232,7 +239,8 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
     if (!sum.friction && contacts.empty()) break;
     if (solves < friction_iterations) sum.lag(contacts);
   }
-  report_contacts(problem.scene, sum.contacts(), step.report);
+  report_contacts(sum.contacts(), step.report);
+  report_blockers(problem, x, status, step.report);
   if (!step.tape.empty()) *step.tape["solves"] = solves;
   write_body_forces(problem, sum, x, body_forces);
 }

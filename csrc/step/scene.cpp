@@ -239,17 +239,25 @@ contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& r
   return m;
 }
 
-std::string describe_surface(const Scene& scene, Index surface) {
-  if (surface < scene.cloth_count()) return "cloth " + std::to_string(surface);
-  const Index body = surface - scene.cloth_count();
-  const std::vector<std::string>& links = scene.given.link_names;
-  const Index link = body - (scene.given.bodies.count() - static_cast<Index>(links.size()));
-  return link < 0 ? "body " + std::to_string(body) : "link " + links[link];
-}
-
 namespace {
 
-/// "cloth 0 edge (3, 8)": a primitive by its surface and that surface's own vertex numbers.
+std::string quoted(const std::string& name) { return "'" + name + "'"; }
+
+/// "cloth 'shirt'", "body 'table'", "link 'hand/palm'": a surface in messages.
+std::string describe_surface(const Scene& scene, Index surface) {
+  const std::vector<std::string>& names = scene.given.surface_names;
+  const bool is_cloth = surface < scene.cloth_count();
+  if (names.empty()) {
+    return is_cloth ? "cloth " + std::to_string(surface)
+                    : "body " + std::to_string(surface - scene.cloth_count());
+  }
+  // No other names have a slash.
+  const bool is_link = names[surface].find('/') != std::string::npos;
+  const char* const kind = is_cloth ? "cloth " : is_link ? "link " : "body ";
+  return kind + quoted(names[surface]);
+}
+
+/// "cloth 'shirt' edge (3, 8)": a primitive by its surface and that surface's own vertex numbers.
 std::string describe(const Scene& scene, const char* kind, std::initializer_list<Index> vertices) {
   const Index surface = scene.collision_mesh.vertex_surface[*vertices.begin()];
   const bool is_cloth = surface < scene.cloth_count();
@@ -303,6 +311,40 @@ std::string describe_pair(const Scene& scene, const contact::Candidate& pair) {
            describe(scene, "face", {v[1], v[2], v[3]});
   }
   return describe(scene, "edge", {v[0], v[1]}) + " and " + describe(scene, "edge", {v[2], v[3]});
+}
+
+std::string describe_near(const Scene& scene,
+                          const double* x,
+                          const std::vector<double>& thickness,
+                          double reach) {
+  const std::vector<Index>& surface = scene.collision_mesh.vertex_surface;
+  std::vector<char> involved(static_cast<std::size_t>(scene.vertex_count()), 0);
+  std::vector<char> near(static_cast<std::size_t>(scene.surface_count()), 0);
+  contact::BroadPhase::Scratch scratch;
+  for (const contact::Candidate& pair : find_near(scene, x, thickness, reach, scratch)) {
+    if (!find_closest(scene, x, thickness, reach, {pair})) continue;
+    for (const Index v : pair.vertices) {
+      involved[v] = 1;
+      near[surface[v]] = 1;
+    }
+  }
+  std::vector<std::string> pins(near.size());
+  const std::string* last = nullptr;
+  for (std::size_t p = 0; p < scene.given.pin_names.size(); ++p) {
+    const Index v = scene.given.pins[p];
+    const std::string& name = scene.given.pin_names[p];
+    if (!involved[v] || (last != nullptr && *last == name)) continue;
+    last = &name;
+    std::string& text = pins[surface[v]];
+    text += (text.empty() ? " (pins " : ", ") + quoted(name.substr(name.find('/') + 1));
+  }
+  std::string text;
+  for (Index s = 0; s < scene.surface_count(); ++s) {
+    if (!near[s]) continue;
+    text += (text.empty() ? "" : ", ") + describe_surface(scene, s);
+    if (!pins[s].empty()) text += pins[s] + ")";
+  }
+  return text;
 }
 
 std::string find_overlap(const Scene& scene,

@@ -47,7 +47,8 @@ struct Description {
   /// [surfaces of bodies] of those that cloths touch at their nodes, instead of by the barrier;
   /// empty: none
   std::vector<projective::Primitive> primitives;
-  std::vector<std::string> link_names;  ///< of the last surfaces; before come bodies
+  std::vector<std::string> surface_names;  ///< in messages; empty: surfaces have numbers
+  std::vector<std::string> pin_names;      ///< [P] that of the group of each pin; empty: none
   bool self_contact = true;
   double dt = 0.01;
   std::string scheme = "coupled";
@@ -94,9 +95,6 @@ struct Scene {
 /// Rest quantities that weigh contacts, for a rest shape of the cloths.
 contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& rest);
 
-/// "cloth 0", "body 2", "link hand/palm": a surface in messages.
-std::string describe_surface(const Scene& scene, Index surface);
-
 /// Two primitives near each other, and how far they must be apart at least [m].
 struct ClosePair {
   double distance;
@@ -120,8 +118,15 @@ std::optional<ClosePair> find_closest(const Scene& scene,
                                       double reach,
                                       const std::vector<contact::Candidate>& candidates);
 
-/// "cloth 0 vertex (4) and body 1 face (0, 1, 3)".
+/// "cloth 'shirt' vertex (4) and body 'table' face (0, 1, 3)".
 std::string describe_pair(const Scene& scene, const contact::Candidate& pair);
+
+/// "cloth 'shirt' (pins 'collar'), body 'table'": surfaces within `reach` beyond their thickness of
+/// another primitive, those that are prescribed as well, and the pins among their vertices.
+std::string describe_near(const Scene& scene,
+                          const double* x,
+                          const std::vector<double>& thickness,
+                          double reach);
 
 /// Where two surfaces overlap or are closer than their thickness; empty where they are not.
 ///

@@ -78,7 +78,9 @@ class Parameters:
         poisson: Poisson ratio of bending [-], between -1 and 0.5; shape [], [C] or [F].
         density: Mass per rest area [kg/m^2], > 0; shape [], [C] or [F].
         damping: Time over which strain rates are damped [s], >= 0; shape [], [C] or [F].
-        friction: Friction coefficient [-], >= 0; shape [] or [S, S].
+        friction: Friction coefficient [-], >= 0; shape [] or [S, S], or pair of names of surfaces
+            -> number, as {("cloth", "table"): 0.4}, in one order or the other; pairs that are not
+            named keep what the scene has.
         thickness: Full thickness of each surface [m], >= 0; shape [S].
         barrier_stiffness: [Pa], > 0; shape [].
         barrier_distance: [m], > 0; shape [].
@@ -106,7 +108,7 @@ class Parameters:
     poisson: Tensor | None = None
     density: Tensor | None = None
     damping: Tensor | None = None
-    friction: Tensor | None = None
+    friction: Tensor | Mapping[tuple[str, str], Tensor] | None = None
     thickness: Tensor | None = None
     barrier_stiffness: Tensor | None = None
     barrier_distance: Tensor | None = None

@@ -80,7 +80,10 @@ def make_core(
         primitive_sizes=np.array(
             [p.size if p is not None else (0.0, 0.0, 0.0) for p in assembly.primitives]
         ).reshape(-1, 3),
-        link_names=list(assembly.surface_names[assembly.cloth_count + assembly.body_count :]),
+        surface_names=list(assembly.surface_names),
+        pin_names=[
+            name for name, rows in assembly.pin_groups.items() for _ in range(rows.start, rows.stop)
+        ],
         **trees,
     )
 
@@ -111,4 +114,6 @@ def with_all_pinned(assembly: Assembly) -> Assembly:
         assembly,
         pins=np.arange(len(assembly.vertices), dtype=np.int32),
         soft_pins=np.empty(0, dtype=np.int32),
+        pin_groups={},
+        soft_pin_groups={},
     )

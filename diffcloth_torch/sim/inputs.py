@@ -23,6 +23,7 @@ from diffcloth_torch.checks import (
     check_shape,
     float_tensor,
     is_dense,
+    texts,
 )
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.poses import SHORTEST_QUATERNION, check_quaternions
@@ -31,7 +32,7 @@ from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Shape
 from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.state import State
-from diffcloth_torch.sim.step import Constant, are_within, have_quaternions
+from diffcloth_torch.sim.step import Constant, are_within, have_quaternions, refuse_transforms
 
 __all__ = [
     "Fields",
@@ -78,6 +79,7 @@ def state_fields(layout: Layout, state: State) -> tuple[Fields, int | None]:
     """Check a state; returns its tensors and its batch size, None without a batch axis."""
     if not isinstance(state, State):
         raise TypeError(f"step: `state` must be a State, got {type(state).__name__}")
+    refuse_transforms("step")
     tensors = {name: getattr(state, name) for name in layout.state_shapes}
     for name, tensor in tensors.items():
         _check_state_tensor(name, tensor)
@@ -149,6 +151,7 @@ def _targets(layout: Layout, control: Control) -> dict[str, Tensor | dict[str, T
     """The checked fields of a control that it sets."""
     if not isinstance(control, Control):
         raise TypeError(f"step: `control` must be a Control, got {type(control).__name__}")
+    refuse_transforms("control")
     checked: dict[str, Tensor | dict[str, Tensor]] = {}
     for field, shape in layout.control_shapes.items():
         given = getattr(control, field)
@@ -333,12 +336,21 @@ def check_parameters(parameters: Parameters) -> Parameters:
     """Promote parameters to tensors; their values are checked in each step."""
     if not isinstance(parameters, Parameters):
         raise TypeError(f"step: `parameters` must be Parameters, got {type(parameters).__name__}")
+    refuse_transforms("parameters")
     given = {name: getattr(parameters, name) for name in PARAMETERS}
-    tensors = {
-        name: None if value is None else float_tensor(f"parameters: `{name}`", value)
-        for name, value in given.items()
-    }
-    return Parameters(**tensors, _unbatched=parameters._unbatched)
+    checked = {name: _promoted(name, value) for name, value in given.items() if value is not None}
+    return Parameters(**checked, _unbatched=parameters._unbatched)  # type: ignore[arg-type]
+
+
+def _promoted(name: str, value: object) -> Tensor | dict[object, Tensor]:
+    """A parameter as a tensor; of pairs of surfaces that are named, one tensor each."""
+    if isinstance(value, Mapping) and _is_of_pairs(name):
+        return {k: float_tensor(f"parameters: `{name}[{k!r}]`", v) for k, v in value.items()}
+    return float_tensor(f"parameters: `{name}`", value)
+
+
+def _is_of_pairs(name: str) -> bool:
+    return PARAMETERS[name].axes[-1] == ("S", "S")
 
 
 def parameter_fields(
@@ -357,6 +369,9 @@ def parameter_fields(
         label = f"parameters: `{name}`"
         if name not in defaults:
             raise InvalidInput(f"{label} must be None: it has no meaning in this scene")
+        if isinstance(given, Mapping):
+            fields[name] = _named_pairs(layout, name, given, defaults[name], batch)
+            continue
         check_range(label, _numbers(given), quantity.accepted)
         shared = layout.parameter_shapes[name]
         unbatched = name in parameters._unbatched
@@ -364,6 +379,38 @@ def parameter_fields(
         fields[name] = _rows(given, environments, quantity.row_shape)
         _check_values(layout, name, _numbers(fields[name]), _numbers(defaults[name]))
     return fields
+
+
+def _named_pairs(
+    layout: Layout,
+    name: str,
+    given: Mapping[object, Tensor],
+    default: Tensor,
+    batch: int | None,
+) -> Tensor:
+    """A parameter of pairs of surfaces, [nb, S S], of which some are named; the rest is default."""
+    label, surfaces = f"parameters: `{name}`", layout.assembly.surface_names
+    entries: dict[int, Tensor] = {}
+    for key, value in given.items():
+        if not isinstance(key, tuple) or len(key) != 2 or any(s not in surfaces for s in key):
+            raise InvalidInput(
+                f"{label} must name pairs (a, b) of the surfaces {texts(surfaces)}; got {key!r}"
+            )
+        i, j = sorted(surfaces.index(surface) for surface in key)
+        if i * len(surfaces) + j in entries:
+            raise InvalidInput(f"{label} must name the pair {key!r} once, got it twice")
+        entry = f"parameters: `{name}[{key!r}]`"
+        check_shape(entry, value.shape, [(), ("B",)])
+        check_range(entry, _numbers(value), PARAMETERS[name].accepted)
+        values = _with_batch(entry, value, 0, batch)
+        # Both entries of a pair, whose mean is meant.
+        entries |= dict.fromkeys((i * len(surfaces) + j, j * len(surfaces) + i), values)
+    if not entries:
+        return default
+    environments = max(map(len, entries.values()))
+    columns = [values.expand(environments) for values in entries.values()]
+    rows = default.expand(environments, len(surfaces) ** 2)
+    return rows.index_copy(1, torch.tensor(list(entries)), torch.stack(columns, dim=1))
 
 
 def default_fields(defaults: Mapping[str, Tensor]) -> Fields:
@@ -383,20 +430,27 @@ def _check_values(layout: Layout, name: str, values: FloatArray, default: FloatA
             for shape in values:
                 check_areas("parameters", name, shape, layout.assembly.faces)
         return
-    label = f"parameters: `{name}`"
     if name in ("body_mass", "link_mass"):
-        wrong = (values == 0.0) & layout.massive[name[:4]]
-        _refuse_row(label, wrong, "> 0")
+        _refuse_row(layout, name, values == 0.0, "> 0")
     elif name in ("body_inertia", "link_inertia"):
         symmetric = (values + np.swapaxes(values, -1, -2)) / 2
         wrong = np.linalg.eigvalsh(symmetric)[..., 0] <= 0.0
-        _refuse_row(label, wrong & layout.massive[name[:4]], "positive definite")
+        _refuse_row(layout, name, wrong, "positive definite")
 
 
-def _refuse_row(label: str, wrong: NDArray[np.bool_], accepted: str) -> None:
-    if wrong.any():
-        row = int(np.argwhere(wrong)[0][-1])
-        raise InvalidInput(f"{label} must be {accepted} in the row [{row}], of what forces move")
+def _refuse_row(layout: Layout, name: str, wrong: NDArray[np.bool_], accepted: str) -> None:
+    """Refuse a quantity of bodies or links where it is wrong and matters."""
+    owner = name.partition("_")[0]
+    wrong = wrong & layout.massive[owner]
+    if not wrong.any():
+        return
+    row = int(np.argwhere(wrong)[0][-1])
+    links = [f"{robot.name}/{link}" for robot in layout.robots for link in robot.link_names]
+    moved = links[row] if owner == "link" else layout.bodies[row].name
+    raise InvalidInput(
+        f"parameters: `{name}` must be {accepted} in the row [{row}], that of {moved!r}, which "
+        "forces move"
+    )
 
 
 def _environments(

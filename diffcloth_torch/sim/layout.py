@@ -112,8 +112,8 @@ class Layout:
         self.farthest = np.where(
             assembly.forced, [self.lower - reach, self.upper + reach], [[-np.inf], [np.inf]]
         )
-        body_motions = [f"that body is {_MOTIONS[body.base]}" for body in self.bodies]
-        base_motions = [f"that robot's base is {robot.base}" for robot in self.robots]
+        body_motions = [f"the body {b.name!r} is {_MOTIONS[b.base]}" for b in self.bodies]
+        base_motions = [f"the base of the robot {r.name!r} is {r.base}" for r in self.robots]
         self.kept = {
             "body_poses": _unless("kinematic", self.bodies, body_motions),
             "base_poses": _unless("kinematic", self.robots, base_motions),

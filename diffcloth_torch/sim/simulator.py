@@ -134,7 +134,7 @@ class Simulator:
 
         Args:
             scene: What is simulated.
-            dt: Time step [s], > 0.
+            dt: Time step [s], > 0; a plain number, or one in float64.
             scheme: "coupled" solves elasticity and contact together; "split" solves elasticity
                 first and then contact, near its result. It takes what forces move only with the
                 staggered couplings. "projective" solves elasticity with dry friction at the
@@ -164,8 +164,7 @@ class Simulator:
                     f"Simulator: `{name}` must be a {kind.__name__}, got {type(value).__name__}"
                 )
         self.scene, self.contact, self.solver = scene, contact, solver
-        instead = "pass a plain number; no gradient with respect to the time step exists: use one"
-        self.dt = check_number("Simulator: `dt`", dt, POSITIVE, instead=instead)
+        self.dt = _check_time_step(dt)
         self.scheme = check_choice("Simulator: `scheme`", scheme, SCHEMES)
         self.coupling = check_choice("Simulator: `coupling`", coupling, COUPLINGS)
         self._assembly = assemble(scene, all_nodal=scheme == "projective")
@@ -313,7 +312,9 @@ class Simulator:
             parameters: Physical parameters; None takes those of the scene.
 
         Returns:
-            The state after `dt`. Its `positions`, `velocities` and `body_forces` carry gradients.
+            The state after `dt`. All of its tensors but `time` carry gradients: `positions`,
+            `velocities`, `body_forces`, `soft_pin_targets`, and poses, positions, velocities,
+            targets and efforts of bodies, joints and bases.
 
         Raises:
             IntersectingState: If surfaces intersect in `state`.
@@ -628,7 +629,7 @@ class Simulator:
         self, state: State, control: Control | None, parameters: Parameters | None
     ) -> tuple[tuple[Fields, Fields, Fields], int | None]:
         """Check everything and give every tensor its leading axis of environments."""
-        refuse_transforms(state, control, parameters)
+        refuse_transforms("step", state, control, parameters)
         before, batch = state_fields(self._layout, state)
         wanted = control_fields(self._layout, control, before, batch)
         physical = self._physical(parameters, batch)
@@ -729,6 +730,19 @@ def _restore(
     coupling: str = "monolithic",  # pickles of the first version end before it
 ) -> Simulator:
     return Simulator(scene, dt, scheme=scheme, coupling=coupling, contact=contact, solver=solver)
+
+
+def _check_time_step(dt: object) -> float:
+    instead = "pass a plain number; no gradient with respect to the time step exists: use one"
+    number = check_number("Simulator: `dt`", dt, POSITIVE, instead=instead)
+    # Other numbers are widened as they are. This one is added up, step by step.
+    dtype = str(getattr(dt, "dtype", ""))
+    if dtype.endswith(("float32", "float16")):
+        raise TypeError(
+            f"Simulator: `dt` must be a plain number or one in float64, got {dtype}, "
+            f"which makes it {number!r}"
+        )
+    return number
 
 
 def _check_gains(layout: Layout) -> None:

@@ -15,7 +15,11 @@ __all__ = ["FORCE_COLOR", "GOAL_COLOR", "Camera", "Goal", "Paint", "Pictures", "
 
 _FRONT_COLORS = ("#2a6f97", "#c8553d", "#5b7f4b", "#7d5a8c")
 _BACK_COLORS = ("#f2c078", "#f3dcc0", "#e3dcae", "#e0cfe8")
-_BODY_COLORS = ("#8d99ae", "#a39b8b", "#7f9183")
+# Any two of them, and each beside those of cloths, differ by more than 20 in CIELAB.
+_BODY_COLORS = (
+    *("#8d99ae", "#8c7864", "#a3c48c", "#d987a2", "#ac9c58"),
+    *("#b59ad4", "#406c68", "#e0957c", "#6fcfcb", "#55aed6"),
+)
 GOAL_COLOR = "#2f9e78"
 FORCE_COLOR = "#b3123f"
 _MARKER_SUBDIVISIONS = 2

@@ -79,11 +79,20 @@ class Record:
             InvalidInput: If a package is missing; the message says how to install it.
         """
         require_pyvista()
+        for kind in (pictures.video, "png" if pictures.sheet else "none"):
+            file = folder / f"{name}.{kind}"
+            if kind != "none" and file.is_dir():
+                raise InvalidInput(f"pictures: {file} must be no folder")
         self._options = pictures
         _require_writer(self._options.video)
         self._folder, self._scene, self._name = folder, scene, name
         self._goals = goals
         self._rigid = _rigid_surfaces(scene)
+        if not scene.cloths and not any(surface.shown for surface in self._rigid):
+            raise InvalidInput(
+                "pictures: the scene must have a surface: its robots have no collision shapes, and "
+                "a level plane is only the floor of what stands on it"
+            )
         shown = dict.fromkeys(surface.owner for surface in self._rigid if surface.shown)
         self._paints = {
             name: paints.get(name, Paint()).for_cloth(i) for i, name in enumerate(scene.cloth_names)
@@ -184,7 +193,8 @@ class Record:
 
     def _cloth_starts(self) -> list[int]:
         counts = [len(cloth.vertices) for cloth in self._scene.cloths]
-        return [0, *np.cumsum(counts[:-1]).tolist()]
+        starts: list[int] = np.cumsum([0, *counts])[:-1].tolist()
+        return starts
 
     def _placed_frames(self, state: State) -> FloatArray:
         """Frames [n, 4, 4] of the surfaces that are shown."""

@@ -178,8 +178,8 @@ MOVED = [[0, 0, 0.1, 1, 0, 0, 0], [0, 1, 1, 1, 0, 0, 0], [0, -1, 1, 1, 0, 0, 0]]
         ({"body_wrenches": [[0.0] * 6, [0.0] * 6, [1.0]]}, "rectangular"),
         ({"body_wrenches": {"hand": [0, 0, 1, 0, 0, 0]}}, r"zero in the row \[1\]: .*kinematic"),
         ({"body_wrenches": {"floor": [0, 0, 1, 0, 0, 0]}}, r"zero in the row \[0\]: .*static"),
-        ({"base_wrenches": [[1.0] * 6, [0.0] * 6]}, r"zero in the row \[0\]: .*base is fixed"),
-        ({"body_poses": MOVED}, r"keep the row \[0\] of the state: that body is static"),
+        ({"base_wrenches": [[1.0] * 6, [0.0] * 6]}, r"zero in the row \[0\]: .*'arm' is fixed"),
+        ({"body_poses": MOVED}, r"keep the row \[0\] of the state: the body 'floor' is static"),
         (
             {"body_poses": {"brick": [0, -1, 1.1, 1, 0, 0, 0]}},
             r"keep the row \[2\] .*dynamic; make it motion=\"kinematic\"",
@@ -286,11 +286,16 @@ def with_row(tensor, row, value):
 @pytest.mark.parametrize(
     ("name", "row", "value", "message"),
     [
-        ("body_mass", 2, 0.0, r"`body_mass` must be > 0 in the row \[2\]"),
+        ("body_mass", 2, 0.0, r"`body_mass` must be > 0 in the row \[2\], that of 'brick', "),
         ("body_mass", 0, -1.0, r"`body_mass` must be finite and >= 0, got -1 at \[0\]"),
         ("link_mass", 1, 0.0, r"`link_mass` must be > 0 in the row \[1\]"),
         ("body_inertia", 2, -1.0, r"`body_inertia` must be positive definite in the row \[2\]"),
-        ("link_inertia", 3, 0.0, r"`link_inertia` must be positive definite in the row \[3\]"),
+        (
+            "link_inertia",
+            3,
+            0.0,
+            r"`link_inertia` must be positive definite in the row \[3\], that of 'arm/",
+        ),
         ("link_center", 0, np.inf, r"`link_center` must be finite, got inf at \[0, 0\]"),
         ("joint_stiffness", 1, -1.0, r"`joint_stiffness` .*got -1 at \[1\]"),
         ("joint_armature", 4, np.nan, r"`joint_armature` .*got nan at \[4\]"),
