@@ -9,6 +9,7 @@ import torch
 from body_scenes import load_arm
 
 import diffcloth_torch as dc
+from diffcloth_torch.robots import GRIPPER
 
 F64 = torch.float64
 DT = 0.01
@@ -102,6 +103,135 @@ def test_a_box_dropped_into_a_pinned_cloth_settles_on_it():
     assert force[2] == pytest.approx(weight, rel=1e-4)
     assert force[:2].abs().max() < 1e-4 * weight
     assert force[3:].abs().max() < 1e-4 * weight * 0.1
+
+
+def laid(pins, *bodies):
+    """Bodies on a level sheet of 11 x 11 that is pinned where `pins(x, y)` says so."""
+    cloth = dc.Cloth.grid(
+        11,
+        11,
+        size=(0.5, 0.5),
+        material=dc.Material(stretch=300.0, bending=1e-4, damping=0.05),
+        name="sheet",
+    )
+    x, y, _ = cloth.vertices.T
+    pinned = np.flatnonzero(pins(x - x.mean(), y - y.mean()))
+    cloth = dc.Cloth(
+        cloth.vertices - cloth.vertices.mean(axis=0),
+        cloth.faces,
+        material=cloth.material,
+        pins={"held": pinned},
+        name="sheet",
+    )
+    return dc.Simulator(
+        dc.Scene([cloth], bodies), DT, solver=dc.SolverOptions(tolerance=1e-9, max_iterations=500)
+    )
+
+
+def on_sheet(shape, **keywords):
+    place = [0.013, 0.007, 0.053]
+    if shape == "box":
+        return dc.RigidBody.box(
+            0.1, motion="dynamic", mass=0.2, pose=[*place, 1, 0, 0, 0], **keywords
+        )
+    lying = [math.sqrt(0.5), 0, math.sqrt(0.5), 0]
+    return dc.RigidBody.capsule(
+        0.05, 0.1, motion="dynamic", mass=0.2, pose=[*place, *lying], **keywords
+    )
+
+
+WAYS_TO_PIN = {
+    "all over": lambda x, y: np.full(x.shape, fill_value=True),
+    "along a border": lambda x, y: np.abs(x) < 0.08,
+    "in spots": lambda x, y: (np.abs(x) > 0.2) | (np.hypot(x, y) < 0.06),
+}
+
+
+@pytest.mark.parametrize("pins", WAYS_TO_PIN)
+@pytest.mark.parametrize("shape", ["box", "capsule"])
+def test_pinned_cloth_bears_what_lies_on_it(shape, pins):
+    """Triangles whose corners are all pinned among them; also where the pins are moved up."""
+    sim = laid(WAYS_TO_PIN[pins], on_sheet(shape))
+    state = sim.initial_state()
+    with torch.no_grad():
+        for _ in range(100):
+            state = sim.step(state)
+            # What swings comes to rest.
+            state = state.replace(
+                velocities=0.7 * state.velocities, body_velocities=0.7 * state.body_velocities
+            )
+        assert state.report.contact_count > 0
+        still = sim.step(state.replace(velocities=0 * state.velocities))
+        weight = 0.2 * G
+        # Where a part is free it still swings a little, and the capsule rolls.
+        rel = (1e-6 if shape == "box" else 1e-3) if pins == "all over" else 1e-2
+        assert still.body_forces[:, 2].sum() == pytest.approx(weight, rel=rel)
+        height = still.body_poses[0, 2]
+        rows = torch.tensor(sim.scene.cloths[0].pins["held"])
+        for _ in range(5):
+            target = still.positions[rows] + torch.tensor([0, 0, 1e-3], dtype=F64)
+            still = sim.step(still, sim.control(pins=target))
+        assert still.body_poses[0, 2] - height == pytest.approx(5e-3, abs=1e-3)
+
+
+def test_fingers_grip_cloth_that_is_pinned_all_over():
+    """As hard as their drives press, on both sides."""
+    sheet = dc.Cloth.grid(9, 9, size=(0.2, 0.2), name="sheet")
+    cloth = dc.Cloth(sheet.vertices, sheet.faces, pins={"all": range(81)}, name="sheet")
+    edge = cloth.vertices[:, 0].max()
+    hand = dc.Robot.load(
+        GRIPPER,
+        pose=[edge + 0.061, cloth.vertices[:, 1].mean(), 0, 0.5, -0.5, -0.5, 0.5],
+        joint_positions=0.035,
+        actuation="pd",
+        stiffness=400.0,
+        damping=30.0,
+        name="hand",
+    )
+    sim = dc.Simulator(dc.Scene([cloth], [], [hand], gravity=(0, 0, 0)), DT)
+    state = sim.initial_state()
+    closed = torch.full_like(state.joint_positions, 0.0394)
+    with torch.no_grad():
+        for _ in range(60):
+            state = sim.step(state, sim.control(joint_positions=closed))
+    presses = 400.0 * (closed - state.joint_positions)
+    assert (presses > 0.05).all()
+    forces = [w[2] for w in sim.contact_wrenches(state).values() if w[2] != 0]
+    assert len(forces) == 2
+    for force, press in zip(forces, presses, strict=True):
+        assert abs(force) == pytest.approx(press.item(), rel=1e-4)
+
+
+def test_gradients_of_what_lies_on_pinned_cloth_are_those_of_differences():
+    """Of how it moves in two steps, by the pins that carry it, its mass and the thickness."""
+    sim = laid(lambda x, y: np.abs(x) < 0.25, on_sheet("box"))
+    with torch.no_grad():
+        start = sim.rollout(sim.initial_state(), steps=20)[-1]
+    rows = torch.tensor(np.asarray(sim.scene.cloths[0].pins["held"], dtype=np.int64))
+    shape = torch.linspace(0, 1, 3 * len(rows), dtype=F64).reshape(-1, 3)
+
+    def end(theta):
+        given = sim.parameters()
+        thickness = torch.stack([1e-3 * theta[2], 0 * theta[2]])
+        given = given.replace(body_mass=theta[1:2], thickness=thickness)
+        pins = start.positions[rows] + 1e-4 * theta[0] * shape
+        states = sim.rollout(start, [sim.control(pins=pins)] * 2, given)
+        after = states[-1]
+        return (
+            after.body_poses[0, :3].sum()
+            + after.body_velocities.sum()
+            + after.body_forces[:, 2].sum()
+        )
+
+    theta = torch.tensor([0.3, 0.2, 0.02], dtype=F64, requires_grad=True)
+    (found,) = torch.autograd.grad(end(theta), theta)
+    for i, step in enumerate((1e-4, 1e-5, 1e-4)):
+        d = torch.zeros(3, dtype=F64)
+        d[i] = step
+        with torch.no_grad():
+            slope = (end(theta + d) - end(theta - d)) / (2 * step)
+        assert slope.item() == pytest.approx(found[i].item(), rel=1e-4)
+        assert found[i] != 0
 
 
 # --- Robots --------------------------------------------------------------------------------------
