@@ -129,15 +129,12 @@ def laid(pins, *bodies):
 
 
 def on_sheet(shape, **keywords):
-    place = [0.013, 0.007, 0.053]
-    if shape == "box":
-        return dc.RigidBody.box(
-            0.1, motion="dynamic", mass=0.2, pose=[*place, 1, 0, 0, 0], **keywords
-        )
     lying = [math.sqrt(0.5), 0, math.sqrt(0.5), 0]
-    return dc.RigidBody.capsule(
-        0.05, 0.1, motion="dynamic", mass=0.2, pose=[*place, *lying], **keywords
-    )
+    turn = [1, 0, 0, 0] if shape == "box" else lying
+    given = {"motion": "dynamic", "mass": 0.2, "pose": [0.013, 0.007, 0.053, *turn], **keywords}
+    if shape == "box":
+        return dc.RigidBody.box(0.1, **given)
+    return dc.RigidBody.capsule(0.05, 0.1, **given)
 
 
 WAYS_TO_PIN = {

@@ -134,7 +134,7 @@ class FeatureSum:
         return kernels.barrier(d_sq, xi, self.scene.d_hat)
 
     def counted_faces(self, s, p):
-        """Those that point p sees: where it is prescribed, of a cloth those with a vertex that is free."""
+        """Those that point p sees; if it is prescribed, of a cloth those with a free vertex."""
         if s >= self.scene.cloth_count or not self.scene.prescribed[p]:
             return self.faces[s]
         return [f for f in self.faces[s] if not self.scene.prescribed[list(f)].all()]

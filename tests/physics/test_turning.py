@@ -165,7 +165,7 @@ def test_two_boxes_that_spin_as_one_keep_their_spin(barrier_distance):
             state.body_poses[:, :3], sim.contact_wrenches(state).values(), strict=True
         ):
             impulse += dt * (wrench[3:] + torch.linalg.cross(place, wrench[:3]))
-    # What contact has done to their angular momentum: nothing but for how the gap changes in a step.
+    # What contact has done to their angular momentum: what the gap changes by in a step.
     assert impulse.norm() < 1e-3 * momentum
     rates = state.body_velocities[:, 3]
     assert rates[0] == pytest.approx(rates[1].item(), abs=1e-3)
