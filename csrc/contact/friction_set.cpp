@@ -70,8 +70,12 @@ Mat3 cross_matrix(const Vec3& u) {
 
 FrictionSet::FrictionSet(const ContactModel& model,
                          const std::vector<Contact>& contacts,
-                         const double* x_start)
-    : model_(&model), x_start_(x_start) {
+                         const double* x_start,
+                         double widening)
+    : model_(&model),
+      x_start_(x_start),
+      widening_(widening),
+      e_(widening * model.parameters().slip) {
   entries_.reserve(contacts.size());
   const double kappa = model.parameters().kappa;
   for (const Contact& k : contacts) {
@@ -130,7 +134,7 @@ FrictionSet::Slip FrictionSet::slip(const Entry& k, const double* x) const {
          k.a[2] * (change_1.cross(frame.e2) + e1_start.cross(change_2));
   }
   const Vec3 w = tangential(s, k.n);
-  return {.frame = frame, .s = s, .w = w, .law = friction_law(w.norm(), model_->parameters().slip)};
+  return {.frame = frame, .s = s, .w = w, .law = friction_law(w.norm(), e_)};
 }
 
 double FrictionSet::energy_change(const double* x0, const double* x1) const {
@@ -261,7 +265,7 @@ void FrictionSet::add_mixed(const double* x,
 
     const double mu_bar = k.lambda * law.f1_over_y * w_zeta;
     const double lambda_bar = k.mu * law.f1_over_y * w_zeta;
-    bar.slip += scale * k.mu * k.lambda * law.f1_over_y_e * w_zeta;
+    bar.slip += scale * widening_ * k.mu * k.lambda * law.f1_over_y_e * w_zeta;
     model_->pull_back_mu(lag.pair, scale * mu_bar, bar);
 
     // lambda's parameters.

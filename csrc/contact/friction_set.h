@@ -27,9 +27,11 @@ class FrictionSet {
 
   /// @param contacts  the contacts of the lag configuration
   /// @param x_start   positions at the start of the step; they outlive this object
+  /// @param widening  factor of the model's slip: 1, or more where sticking may be approximate
   FrictionSet(const ContactModel& model,
               const std::vector<Contact>& contacts,
-              const double* x_start);
+              const double* x_start,
+              double widening = 1.0);
 
   const ContactModel& model() const { return *model_; }
   bool empty() const { return entries_.empty(); }
@@ -97,6 +99,8 @@ class FrictionSet {
 
   const ContactModel* model_ = nullptr;
   const double* x_start_ = nullptr;
+  double widening_ = 1.0;
+  double e_ = 0.0;  // widening times the slip [m]
   std::vector<Entry> entries_;
 };
 
