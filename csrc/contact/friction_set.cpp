@@ -10,12 +10,11 @@ namespace diffcloth::contact {
 FrictionSet::FrictionSet(const ContactModel& model, const std::vector<Contact>& contacts)
     : model_(&model) {
   entries_.reserve(contacts.size());
-  const double kappa = model.parameters().kappa;
   for (const Contact& k : contacts) {
     const double d = std::sqrt(k.closest.d_sq);
     entries_.push_back({.lag = k,
                         .n = k.closest.t / d,
-                        .lambda = -kappa * k.weight * k.mollifier * k.barrier.b1 * 2.0 * d,
+                        .lambda = -k.kappa * k.weight * k.mollifier * k.barrier.b1 * 2.0 * d,
                         .mu = model.mu(k.pair)});
   }
 }
@@ -113,7 +112,7 @@ void FrictionSet::add_mixed(const double* x_start,
     const Contact& lag = k.lag;
     const Closest& geometry = lag.closest;
     const auto& v = lag.pair.vertices;
-    const double kappa = model_->parameters().kappa;
+    const double kappa = lag.kappa;
     const double e = model_->parameters().slip;
     const double d = std::sqrt(geometry.d_sq);
 
@@ -134,7 +133,7 @@ void FrictionSet::add_mixed(const double* x_start,
     const double m = lag.mollifier;
     const double b1 = lag.barrier.b1;
     const double per_lambda = -2.0 * d * lambda_bar;
-    bar.kappa += scale * per_lambda * area * m * b1;
+    model_->pull_back_kappa(lag.pair, scale * per_lambda * area * m * b1, bar);
     bar.d_hat += scale * per_lambda * kappa * area * m * lag.barrier.b1_d_hat;
     const double xi_bar = per_lambda * kappa * area * m * lag.barrier.b1_xi;
     Vec12 x_bar = (lambda_bar * -kappa * area * m * (2.0 * d * lag.barrier.b2 + b1 / d)) *

@@ -69,8 +69,8 @@ class Control:
 class Parameters:
     """Physical parameters, by default those of the scene. None where the scene has no such thing.
 
-    Each may have a leading batch axis [B]. With the friction of a pair of surfaces (i, j) the mean
-    of its two entries is meant.
+    Each may have a leading batch axis [B]. With the friction and the barrier stiffness of a pair of
+    surfaces (i, j) the mean of its two entries is meant.
 
     Attributes:
         stretch: Membrane stiffness [N/m], > 0; shape [], [C] or [F].
@@ -80,7 +80,7 @@ class Parameters:
         damping: Time over which strain rates are damped [s], >= 0; shape [], [C] or [F].
         friction: Friction coefficient [-], >= 0; shape [] or [S, S].
         thickness: Full thickness of each surface [m], >= 0; shape [S].
-        barrier_stiffness: [Pa], > 0; shape [].
+        barrier_stiffness: [Pa], > 0; shape [] or [S, S].
         barrier_distance: [m], > 0; shape [].
         slip_velocity: Where sticking turns into sliding [m/s], > 0; shape [].
         pin_stiffness: Springs of the soft pins [N/m], > 0; shape [] or [C].
