@@ -75,11 +75,10 @@ PAIRS = {"free body": body, "gripper": gripper}
 
 
 def same_barrier(simulators: list[dc.Simulator]) -> list[dc.Simulator]:
-    """Give the second the barrier of the first, which heavy bodies stiffen."""
-    first, second = simulators
-    stiffness = float(first.parameters().barrier_stiffness)
+    """Give both the stiffest barrier that a pair of the first has, for its free bodies."""
+    stiffness = float(simulators[0].parameters().barrier_stiffness.max())
     contact = dc.ContactOptions(barrier_stiffness=stiffness)
-    return [first, dc.Simulator(second.scene, DT, contact=contact)]
+    return [dc.Simulator(simulator.scene, DT, contact=contact) for simulator in simulators]
 
 
 def timed(

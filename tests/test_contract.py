@@ -170,7 +170,10 @@ def test_parameters_are_as_small_as_the_scene_allows(sim):
     assert parameters.thickness.shape == (4,)
     assert parameters.pin_stiffness.item() == 1e4
     assert parameters.gravity.tolist() == [0, 0, -9.81]
-    assert parameters.barrier_distance.shape == parameters.barrier_stiffness.shape == ()
+    assert parameters.barrier_distance.shape == ()
+    assert parameters.barrier_stiffness.shape == (4, 4)  # of two cloths that differ
+    alone = dc.Simulator(dc.Scene(sim.scene.cloths[:1]), DT)
+    assert alone.parameters().barrier_stiffness.shape == ()
     assert parameters.slip_velocity.item() == 1e-3
     mixed = dc.Scene(
         [
@@ -314,6 +317,7 @@ def test_a_bad_control_is_refused(sim, field, value, error, message):
         ("thickness", 0.0, r"shape \[4\]"),
         ("thickness", [0.0, 0.0, 0.0, -1.0], r">= 0, got -1 at \[3\]"),
         ("barrier_stiffness", 0.0, "> 0"),
+        ("barrier_stiffness", [100.0] * 4, r"\[\] or \[4, 4\]"),
         ("barrier_distance", -1.0, "> 0"),
         ("barrier_distance", 1.0, "below half the smallest distance"),
         ("slip_velocity", 0.0, "> 0"),

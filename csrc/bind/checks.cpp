@@ -155,10 +155,10 @@ std::vector<std::size_t> accepted_counts(const step::Scene& scene, Input input) 
     case Input::kDamping:
       return {1, cloths, faces};
     case Input::kFriction:
+    case Input::kBarrierStiffness:
       return {1, surfaces * surfaces};
     case Input::kThickness:
       return {surfaces};
-    case Input::kBarrierStiffness:
     case Input::kBarrierDistance:
     case Input::kSlipVelocity:
       return {1};

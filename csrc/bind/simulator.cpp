@@ -163,13 +163,7 @@ class Simulator {
   nb::dict stored_energy(const nb::dict& inputs) const;
   nb::object path(const nb::dict& inputs);
   double smallest_nonadjacent_distance() const;
-  double default_barrier_stiffness(const nb::dict& inputs, double barrier_distance) const {
-    const Arrays arrays(scene_, inputs);
-    if (!arrays.present[static_cast<std::size_t>(Input::kThickness)]) {
-      throw nb::value_error("core: `thickness` is missing");
-    }
-    return step::default_barrier_stiffness(scene_, arrays.environment(0), barrier_distance);
-  }
+  nb::object default_barrier_stiffness(const nb::dict& inputs, double barrier_distance) const;
   nb::object find_overlap(const nb::dict& inputs) const;
   nb::object find_close_start(const nb::dict& inputs) const;
   double reference_factorization_seconds(const nb::dict& inputs, int repeats) const {
@@ -418,6 +412,19 @@ double Simulator::smallest_nonadjacent_distance() const {
   return contact::smallest_nonadjacent_distance(scene_.collision_mesh, x.data());
 }
 
+nb::object Simulator::default_barrier_stiffness(const nb::dict& inputs,
+                                                double barrier_distance) const {
+  const Arrays arrays(scene_, inputs);
+  if (!arrays.present[static_cast<std::size_t>(Input::kThickness)]) {
+    throw nb::value_error("core: `thickness` is missing");
+  }
+  const auto surfaces = static_cast<std::size_t>(scene_.surface_count());
+  const Owned<double> owned = make_array<double>({surfaces, surfaces});
+  std::ranges::copy(
+      step::default_barrier_stiffness(scene_, arrays.environment(0), barrier_distance), owned.data);
+  return owned.array;
+}
+
 nb::object Simulator::find_overlap(const nb::dict& inputs) const {
   const Arrays arrays(scene_, inputs);
   const std::string text = step::find_overlap(scene_, arrays.environment(0));
@@ -605,7 +612,7 @@ void simulator(nb::module_& m) {
            "Accepted iterates of the first environment's step [M, N + V, 3].")
       .def("smallest_nonadjacent_distance", &Simulator::smallest_nonadjacent_distance)
       .def("default_barrier_stiffness", &Simulator::default_barrier_stiffness, "inputs"_a,
-           "barrier_distance"_a)
+           "barrier_distance"_a, "Barrier stiffness of each pair of surfaces [S, S].")
       .def("reference_factorization_seconds", &Simulator::reference_factorization_seconds,
            "inputs"_a, "repeats"_a,
            "Seconds of one factorization of the contact-free Hessian by Eigen, for benchmarks.")

@@ -45,11 +45,21 @@ double ContactModel::xi(const Candidate& pair) const {
   return 0.5 * (parameters_.thickness[surface_a(pair)] + parameters_.thickness[surface_b(pair)]);
 }
 
-double ContactModel::mu(const Candidate& pair) const {
-  const auto surfaces = static_cast<Index>(parameters_.thickness.size());
+double ContactModel::mean_entry(const std::vector<double>& values, const Candidate& pair) const {
+  const Index surfaces = mesh_.surface_count();
   const Index a = surface_a(pair);
   const Index b = surface_b(pair);
-  return 0.5 * (parameters_.friction[a * surfaces + b] + parameters_.friction[b * surfaces + a]);
+  return 0.5 * (values[a * surfaces + b] + values[b * surfaces + a]);
+}
+
+void ContactModel::pull_back_mean_entry(const Candidate& pair,
+                                        double mean_bar,
+                                        std::vector<double>& bar) const {
+  const Index surfaces = mesh_.surface_count();
+  const Index a = surface_a(pair);
+  const Index b = surface_b(pair);
+  bar[a * surfaces + b] += 0.5 * mean_bar;
+  bar[b * surfaces + a] += 0.5 * mean_bar;
 }
 
 bool ContactModel::between_cloths(const Candidate& pair) const {
@@ -106,17 +116,10 @@ void ContactModel::pull_back(
   rest.edge_length_sq[pair.b] += threshold_bar * k.threshold / rest_.edge_length_sq[pair.b];
 }
 
-void ContactModel::pull_back_mu(const Candidate& pair, double mu_bar, Bar& bar) const {
-  const auto surfaces = static_cast<Index>(parameters_.thickness.size());
-  const Index a = surface_a(pair);
-  const Index b = surface_b(pair);
-  bar.friction[a * surfaces + b] += 0.5 * mu_bar;
-  bar.friction[b * surfaces + a] += 0.5 * mu_bar;
-}
-
 ContactModel::Bar::Bar(const CollisionMesh& mesh) : rest(RestMeasures::zero(mesh)) {
   const auto surfaces = static_cast<std::size_t>(mesh.surface_count());
   thickness.assign(surfaces, 0.0);
+  kappa.assign(surfaces * surfaces, 0.0);
   friction.assign(surfaces * surfaces, 0.0);
 }
 
@@ -199,6 +202,7 @@ Contact ContactModel::contact(const Term& term, const double* x) const {
             .weight = term.coefficient * area(pair),
             .threshold = threshold(pair),
             .xi = xi_pair,
+            .kappa = kappa(pair),
             .closest = {},
             .barrier = {},
             .mollifier = 1.0,
@@ -233,6 +237,7 @@ void ContactModel::measure(const std::vector<Candidate>& candidates,
   for (std::size_t first = 0, last = 0; first < candidates.size(); first = last) {
     last = group_end(candidates, first);
     const std::size_t begin = out.terms.size();
+    const double stiffness = kappa(candidates[first]);  // of one pair of surfaces
     find_terms({candidates.data() + first, last - first}, x, scratch, out.terms);
     double sum = 0.0;
     for (std::size_t k = begin; k < out.terms.size(); ++k) {
@@ -245,7 +250,7 @@ void ContactModel::measure(const std::vector<Candidate>& candidates,
       }
       const double eps = threshold(term.pair);
       const double m = eps > 0.0 ? mollifier(corners(term.pair.vertices, x), eps) : 1.0;
-      sum += parameters_.kappa * (term.coefficient * area(term.pair)) * m * b;
+      sum += stiffness * (term.coefficient * area(term.pair)) * m * b;
     }
     if (sum == 0.0) continue;
     const Candidate& head = candidates[first];
@@ -281,7 +286,7 @@ void ContactModel::add_gradient(const std::vector<Contact>& contacts,
                                 const double* x,
                                 double* g) const {
   for (const Contact& k : contacts) {
-    const double scale = parameters_.kappa * k.weight;
+    const double scale = k.kappa * k.weight;
     if (k.mollified) {
       const Mollifier m = mollifier_derivatives(corners(k.pair.vertices, x), k.threshold);
       const Vec12 gradient =
@@ -371,7 +376,7 @@ void ContactHessian::add(const Vec12& left, const Vec12& right) {
 
 ContactHessian ContactModel::hessian(const Contact& k, const double* x, Curvature curvature) const {
   ContactHessian h;
-  const double scale = parameters_.kappa * k.weight;
+  const double scale = k.kappa * k.weight;
   const double b1 = scale * k.mollifier * k.barrier.b1;
   const double b2 = scale * k.mollifier * k.barrier.b2;
   if (curvature == Curvature::kPositive) {
@@ -439,8 +444,8 @@ void ContactModel::add_mixed(const std::vector<Contact>& contacts,
                              const double* z,
                              double scale,
                              Bar& bar) const {
-  const double kappa = parameters_.kappa;
   for (const Contact& k : contacts) {
+    const double kappa = k.kappa;
     const Vec12 z_pair = stacked(k.pair.vertices, z);
     const double d_z = distance_sq_gradient(k.closest).dot(z_pair);
     double m_z = 0.0;
@@ -453,7 +458,7 @@ void ContactModel::add_mixed(const std::vector<Contact>& contacts,
     }
     const double m = k.mollifier;
     const double per_weight = k.barrier.b * m_z + m * k.barrier.b1 * d_z;
-    bar.kappa += scale * k.weight * per_weight;
+    pull_back_kappa(k.pair, scale * k.weight * per_weight, bar);
     bar.d_hat +=
         scale * kappa * k.weight * (k.barrier.b_d_hat * m_z + m * k.barrier.b1_d_hat * d_z);
     const double xi_bar = kappa * k.weight * (k.barrier.b_xi * m_z + m * k.barrier.b1_xi * d_z);

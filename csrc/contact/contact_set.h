@@ -20,11 +20,11 @@ namespace diffcloth::contact {
 
 /// What a contact's energy depends on besides positions and rest shape.
 struct Parameters {
-  double kappa;                   ///< barrier stiffness [Pa]
   double d_hat;                   ///< barrier distance [m]
   double slip;                    ///< eps_v h: displacement over a step where sliding begins [m]
   std::vector<double> thickness;  ///< [S] full thickness of each surface [m]
-  std::vector<double> friction;   ///< [S * S]; a pair uses the mean of its two entries
+  std::vector<double> kappa;      ///< [S * S] barrier stiffness [Pa]
+  std::vector<double> friction;   ///< [S * S]; of both, a pair uses the mean of its two entries
 };
 
 /// A pair of primitives within reach, with everything its barrier needs.
@@ -34,6 +34,7 @@ struct Contact {
   double weight;       ///< w: coefficient times area [m^2]
   double threshold;    ///< eps of the edge-edge mollifier [m^4]; 0 where there is none
   double xi;           ///< half the sum of the two thicknesses [m]
+  double kappa;        ///< barrier stiffness of the two surfaces [Pa]
   Closest closest;
   Barrier barrier;
   double mollifier;  ///< m
@@ -134,8 +135,11 @@ class ContactModel {
   /// Half the sum of the thicknesses of a pair's surfaces [m].
   double xi(const Candidate& pair) const;
 
+  /// Barrier stiffness of a pair's surfaces [Pa].
+  double kappa(const Candidate& pair) const { return mean_entry(parameters_.kappa, pair); }
+
   /// Friction coefficient of a pair.
-  double mu(const Candidate& pair) const;
+  double mu(const Candidate& pair) const { return mean_entry(parameters_.friction, pair); }
 
   /// What is within reach at x.
   ///
@@ -172,10 +176,10 @@ class ContactModel {
 
   /// Cotangents of what the energy depends on.
   struct Bar {
-    double kappa = 0.0;
     double d_hat = 0.0;
     double slip = 0.0;
     std::vector<double> thickness;  ///< [S]
+    std::vector<double> kappa;      ///< [S * S]
     std::vector<double> friction;   ///< [S * S]
     RestMeasures rest;
 
@@ -195,7 +199,12 @@ class ContactModel {
                  double threshold_bar,
                  double xi_bar,
                  Bar& bar) const;
-  void pull_back_mu(const Candidate& pair, double mu_bar, Bar& bar) const;
+  void pull_back_kappa(const Candidate& pair, double kappa_bar, Bar& bar) const {
+    pull_back_mean_entry(pair, kappa_bar, bar.kappa);
+  }
+  void pull_back_mu(const Candidate& pair, double mu_bar, Bar& bar) const {
+    pull_back_mean_entry(pair, mu_bar, bar.friction);
+  }
 
  private:
   /// Candidates that act together: one, or those of a point or an edge and a body.
@@ -206,6 +215,9 @@ class ContactModel {
                   MergeScratch& scratch,
                   std::vector<Term>& out) const;
   void add_cloth_term(const Candidate& pair, const double* x, std::vector<Term>& out) const;
+  /// Mean of the two entries that a pair's surfaces have among values [S * S].
+  double mean_entry(const std::vector<double>& values, const Candidate& pair) const;
+  void pull_back_mean_entry(const Candidate& pair, double mean_bar, std::vector<double>& bar) const;
   double area(const Candidate& pair) const;
   void pull_back_area(const Contact& contact, double area_bar, RestMeasures& rest) const;
   double threshold(const Candidate& pair) const;

@@ -77,14 +77,13 @@ FrictionSet::FrictionSet(const ContactModel& model,
       widening_(widening),
       e_(widening * model.parameters().slip) {
   entries_.reserve(contacts.size());
-  const double kappa = model.parameters().kappa;
   for (const Contact& k : contacts) {
     const double d = std::sqrt(k.closest.d_sq);
     const auto& v = k.pair.vertices;
     const std::array<Index, 3> frame = model.frame(k.pair);
     Entry entry{.lag = k,
                 .n = k.closest.t / d,
-                .lambda = -kappa * k.weight * k.mollifier * k.barrier.b1 * 2.0 * d,
+                .lambda = -k.kappa * k.weight * k.mollifier * k.barrier.b1 * 2.0 * d,
                 .mu = model.mu(k.pair),
                 .points = {},
                 .c = {},
@@ -273,7 +272,7 @@ void FrictionSet::add_mixed(const double* x,
     const double m = lag.mollifier;
     const double b1 = lag.barrier.b1;
     const double per_lambda = -2.0 * d * lambda_bar;
-    bar.kappa += scale * per_lambda * area * m * b1;
+    model_->pull_back_kappa(lag.pair, scale * per_lambda * area * m * b1, bar);
     bar.d_hat += scale * per_lambda * kappa * area * m * lag.barrier.b1_d_hat;
     const double xi_bar = per_lambda * kappa * area * m * lag.barrier.b1_xi;
     Vec12 x_bar = (lambda_bar * -kappa * area * m * (2.0 * d * lag.barrier.b2 + b1 / d)) *

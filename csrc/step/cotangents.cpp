@@ -13,6 +13,12 @@ void add_to(double* out, const Array& bar) {
   for (std::size_t a = 0; a < bar.size(); ++a) out[a] += bar[a];
 }
 
+/// Like add_to(), of an input that has one value for all pairs of surfaces, or one for each.
+void add_pairs_to(double* out, const View& input, const Array& bar) {
+  if (out == nullptr) return;
+  for (std::size_t k = 0; k < bar.size(); ++k) out[input.count == 1 ? 0 : k] += bar[k];
+}
+
 void write_surfaces(const Problem& p, const Cotangents& bars, const Gradients& gradients) {
   const bodies::BodySet& bodies = p.scene.given.bodies;
   const bodies::Mechanisms& mechanisms = p.scene.mechanisms;
@@ -42,16 +48,12 @@ void write_surfaces(const Problem& p, const Cotangents& bars, const Gradients& g
     add_to(gradients[Input::kCoordinateTargets], p.chart->target_bar);
     add_to(gradients[Input::kCoordinateMetric], p.chart->metric_bar);
   }
-  if (double* out = gradients[Input::kBarrierStiffness]) *out += bars.contact.kappa;
   if (double* out = gradients[Input::kBarrierDistance]) *out += bars.contact.d_hat;
   if (double* out = gradients[Input::kSlipVelocity]) *out += p.h * bars.contact.slip;
   add_to(gradients[Input::kThickness], bars.contact.thickness);
-  if (double* out = gradients[Input::kFriction]) {
-    const bool one = p.inputs[Input::kFriction].count == 1;
-    for (std::size_t k = 0; k < bars.contact.friction.size(); ++k) {
-      out[one ? 0 : k] += bars.contact.friction[k];
-    }
-  }
+  add_pairs_to(gradients[Input::kBarrierStiffness], p.inputs[Input::kBarrierStiffness],
+               bars.contact.kappa);
+  add_pairs_to(gradients[Input::kFriction], p.inputs[Input::kFriction], bars.contact.friction);
 }
 
 /// Sum over the corners of each face of their masses' cotangents.

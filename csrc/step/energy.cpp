@@ -1,5 +1,4 @@
 #include <algorithm>
-#include <numeric>
 
 #include "step/problem.h"
 #include "step/step.h"
@@ -39,9 +38,14 @@ HalfGap at_half_gap(double xi, double barrier_distance) {
   return {.slope = -2.0 * d * b.b1, .stiffness = 4.0 * d * d * b.b2 + 2.0 * b.b1};
 }
 
-/// kappa = c d_hat mean(H_ii) / (eta w_mean), c = 5; eta = d_hat b''(gap) at a gap of d_hat / 2.
-double stiffness_for_cloths(const Scene& scene, const Inputs& inputs, double barrier_distance) {
+/// kappa = c d_hat mean(H_ii) / (eta w_mean) of each cloth, c = 5; eta = d_hat b''(gap) at a gap of
+/// d_hat / 2 between surfaces as thick as the cloth.
+std::vector<double> stiffness_of_cloths(const Scene& scene,
+                                        const Inputs& inputs,
+                                        double barrier_distance) {
   constexpr double kFactor = 5.0;
+  std::vector<double> result;
+  if (scene.cloth_count() == 0) return result;
   Inputs at_rest = inputs;
   at_rest.views[static_cast<std::size_t>(Input::kPositions)].data =
       scene.given.rest_vertices.data();
@@ -50,23 +54,31 @@ double stiffness_for_cloths(const Scene& scene, const Inputs& inputs, double bar
   std::copy_n(scene.given.rest_vertices.data(), p.cloth_size, x.begin());
   const linalg::BlockMatrix hessian = contact_free_hessian(p, x.data(), Curvature::kExact);
   const linalg::BlockPattern& pattern = hessian.pattern();
-  const Index n = scene.cloth_vertex_count();
-  double trace = 0.0;
-  for (Index i = 0; i < n; ++i) {
-    trace += Eigen::Map<const Mat3>(hessian.blocks() +
-                                    9 * static_cast<std::ptrdiff_t>(pattern.column_start()[i]))
-                 .trace();
-  }
-  const double mean_diagonal = trace / (3.0 * n);
-  const std::vector<double>& area = p.rest->vertex_area;
-  const double mean_weight =
-      0.25 * std::accumulate(area.begin(), area.end(), 0.0) / static_cast<double>(area.size());
-
-  double xi = 0.0;
   const double* thickness = inputs.data(Input::kThickness);
-  for (Index c = 0; c < scene.cloth_count(); ++c) xi = std::max(xi, thickness[c]);
-  const double eta = barrier_distance * at_half_gap(xi, barrier_distance).stiffness;
-  return kFactor * barrier_distance * mean_diagonal / (eta * mean_weight);
+  const std::vector<Index>& start = scene.given.cloth_vertex_start;
+  for (Index c = 0; c < scene.cloth_count(); ++c) {
+    double trace = 0.0;
+    double area = 0.0;
+    for (Index i = start[c]; i < start[c + 1]; ++i) {
+      trace += Eigen::Map<const Mat3>(hessian.blocks() +
+                                      9 * static_cast<std::ptrdiff_t>(pattern.column_start()[i]))
+                   .trace();
+      area += p.rest->vertex_area[i];
+    }
+    const Index n = start[c + 1] - start[c];
+    const double mean_diagonal = trace / (3.0 * n);
+    const double mean_weight = 0.25 * area / n;
+    const double eta = barrier_distance * at_half_gap(thickness[c], barrier_distance).stiffness;
+    result.push_back(kFactor * barrier_distance * mean_diagonal / (eta * mean_weight));
+  }
+  return result;
+}
+
+/// The tree that moves a surface of a body or link.
+std::size_t tree_of(const Scene& scene, Index surface) {
+  const bodies::MechanismsDescription& given = scene.mechanisms.given();
+  return static_cast<std::size_t>(
+      given.links[given.surface_link[surface - scene.cloth_count()]].tree);
 }
 
 /// Mass that a contact with a tree feels [kg]: all of a free root's; of joints the most that one of
@@ -88,41 +100,34 @@ double felt_mass(const Scene& scene, const double* metric, Index first, Index co
   return result;
 }
 
-/// kappa at which the heaviest tree, resting on one of six sides, stays d_hat / 2 away. Without gravity,
-/// where it crosses the gap from rest in a time step.
-///
-/// @param with_joints  whether trees count whose roots are prescribed
-double stiffness_for_bodies(const Scene& scene,
-                            const Inputs& inputs,
-                            double barrier_distance,
-                            bool with_joints) {
+/// kappa at which each tree, resting on one of six sides, stays d_hat / 2 away; zero of what no force
+/// moves. Without gravity, where it crosses the gap from rest in a time step.
+std::vector<double> stiffness_of_trees(const Scene& scene,
+                                       const Inputs& inputs,
+                                       double barrier_distance) {
   const bodies::MechanismsDescription& given = scene.mechanisms.given();
+  std::vector<double> result(given.tree_free.size(), 0.0);
+  if (!scene.mechanisms.has_free()) return result;
   const double* metric = inputs.data(Input::kCoordinateMetric);
   const double h = scene.given.dt;
   const double gravity = row(inputs.data(Input::kGravity), 0).norm();
   const double acceleration = gravity > 0.0 ? gravity : barrier_distance / (h * h);
-  double result = 0.0;
   Index first = 0;
-  for (std::size_t t = 0; t < given.tree_free.size(); ++t) {
+  for (std::size_t t = 0; t < result.size(); ++t) {
     const auto n =
         static_cast<Index>(std::ranges::count(given.coordinate_tree, static_cast<Index>(t)));
-    if (given.tree_free[t] != 0 || with_joints) {
-      double area = 0.0;
-      double xi = 0.0;
-      for (Index v = scene.cloth_vertex_count(); v < scene.vertex_count(); ++v) {
-        const Index surface = scene.collision_mesh.vertex_surface[v];
-        if (given.links[given.surface_link[surface - scene.cloth_count()]].tree !=
-            static_cast<Index>(t)) {
-          continue;
-        }
-        area += scene.measures.vertex_area[v];
-        xi = std::max(xi, inputs.data(Input::kThickness)[surface]);
-      }
-      const double weight = 0.25 * area / 6.0;
-      const double slope = at_half_gap(xi, barrier_distance).slope;
-      const double mass = felt_mass(scene, metric, first, n);
-      if (weight > 0.0) result = std::max(result, mass * acceleration / (weight * slope));
+    double area = 0.0;
+    double xi = 0.0;
+    for (Index v = scene.cloth_vertex_count(); v < scene.vertex_count(); ++v) {
+      const Index surface = scene.collision_mesh.vertex_surface[v];
+      if (tree_of(scene, surface) != t) continue;
+      area += scene.measures.vertex_area[v];
+      xi = std::max(xi, inputs.data(Input::kThickness)[surface]);
     }
+    const double weight = 0.25 * area / 6.0;
+    const double slope = at_half_gap(xi, barrier_distance).slope;
+    const double mass = felt_mass(scene, metric, first, n);
+    if (weight > 0.0) result[t] = mass * acceleration / (weight * slope);
     metric += static_cast<std::ptrdiff_t>(n) * n;
     first += n;
   }
@@ -147,8 +152,7 @@ double gap_under(double pressure, double kappa, double xi, double barrier_distan
 }  // namespace
 
 std::optional<CloseStart> find_close_start(const Scene& scene, const Inputs& inputs) {
-  const double* kappa = inputs.data(Input::kBarrierStiffness);
-  if (kappa == nullptr || scene.cloth_count() == 0) return {};
+  if (inputs.data(Input::kBarrierStiffness) == nullptr || scene.cloth_count() == 0) return {};
   const double reach = inputs.data(Input::kBarrierDistance)[0];
   const double* first = inputs.data(Input::kThickness);
   const std::vector<double> thickness(first, first + scene.surface_count());
@@ -163,21 +167,40 @@ std::optional<CloseStart> find_close_start(const Scene& scene, const Inputs& inp
   return CloseStart{
       .elements = describe_pair(scene, closest->pair),
       .gap = closest->distance - closest->thickness,
-      .rest_gap = gap_under(pressure, *kappa, closest->thickness, reach),
+      .rest_gap =
+          gap_under(pressure, problem.contact->kappa(closest->pair), closest->thickness, reach),
   };
 }
 
-double default_barrier_stiffness(const Scene& scene,
-                                 const Inputs& inputs,
-                                 double barrier_distance) {
-  double kappa = 0.0;
-  if (scene.cloth_count() > 0) kappa = stiffness_for_cloths(scene, inputs, barrier_distance);
-  if (scene.mechanisms.has_free()) {
-    kappa = std::max(kappa, stiffness_for_bodies(scene, inputs, barrier_distance, false));
-    // Where nothing else gives a scale, joints do.
-    if (kappa == 0.0) kappa = stiffness_for_bodies(scene, inputs, barrier_distance, true);
+std::vector<double> default_barrier_stiffness(const Scene& scene,
+                                              const Inputs& inputs,
+                                              double barrier_distance) {
+  const Index surfaces = scene.surface_count();
+  // What cloths and free bodies need; and joints, which count where neither is there.
+  std::vector<double> own = stiffness_of_cloths(scene, inputs, barrier_distance);
+  std::vector<double> of_joints(own.size(), 0.0);
+  const std::vector<double> of_trees = stiffness_of_trees(scene, inputs, barrier_distance);
+  for (Index s = scene.cloth_count(); s < surfaces; ++s) {
+    const std::size_t tree = tree_of(scene, s);
+    const bool is_free = scene.mechanisms.given().tree_free[tree] != 0;
+    own.push_back(is_free ? of_trees[tree] : 0.0);
+    of_joints.push_back(is_free ? 0.0 : of_trees[tree]);
   }
-  return kappa;
+  std::vector<double> result;
+  for (Index a = 0; a < surfaces; ++a) {
+    for (Index b = 0; b < surfaces; ++b) {
+      double kappa = 0.0;
+      if (scene.collision_mesh.touching.contains(a, b)) {
+        kappa = std::max(own[a], own[b]);
+        if (kappa == 0.0) kappa = std::max(of_joints[a], of_joints[b]);
+      }
+      result.push_back(kappa);
+    }
+  }
+  // What never touches has no number of its own, and any that is positive will do.
+  const auto first = std::ranges::find_if(result, [](double kappa) { return kappa > 0.0; });
+  if (first != result.end()) std::ranges::replace(result, 0.0, double{*first});
+  return result;
 }
 
 }  // namespace diffcloth::step

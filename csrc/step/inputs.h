@@ -25,7 +25,7 @@ enum class Input : std::uint8_t {
   kDamping,            ///< k_d, likewise [s]
   kFriction,           ///< mu, one value or [S, S] [-]
   kThickness,          ///< [S] m
-  kBarrierStiffness,   ///< kappa [Pa]
+  kBarrierStiffness,   ///< kappa, one value or [S, S] [Pa]
   kBarrierDistance,    ///< d_hat [m]
   kSlipVelocity,       ///< eps_v [m/s]
   kPinStiffness,       ///< k_a, one value or one a cloth [N/m]

@@ -28,17 +28,22 @@ void gather(const std::vector<double>& bar,
 
 namespace {
 
+/// One value, or one for each pair of surfaces, for each pair.
+std::vector<double> spread_pairs(const View& view, std::size_t surfaces) {
+  const std::size_t pairs = surfaces * surfaces;
+  if (view.count == 1) return std::vector<double>(pairs, view.data[0]);
+  return {view.data, view.data + pairs};
+}
+
 contact::Parameters contact_parameters(const Scene& scene, const Inputs& in) {
   const auto surfaces = static_cast<std::size_t>(scene.surface_count());
   contact::Parameters p;
-  p.kappa = in.data(Input::kBarrierStiffness)[0];
   p.d_hat = in.data(Input::kBarrierDistance)[0];
   p.slip = in.data(Input::kSlipVelocity)[0] * scene.given.dt;
   const double* thickness = in.data(Input::kThickness);
   p.thickness.assign(thickness, thickness + surfaces);
-  const View friction = in[Input::kFriction];
-  p.friction.assign(surfaces * surfaces, friction.data[0]);
-  if (friction.count > 1) std::copy_n(friction.data, surfaces * surfaces, p.friction.begin());
+  p.kappa = spread_pairs(in[Input::kBarrierStiffness], surfaces);
+  p.friction = spread_pairs(in[Input::kFriction], surfaces);
   return p;
 }
 

@@ -98,7 +98,11 @@ StoredEnergy stored_energy(const Scene& scene, const Inputs& inputs);
 /// median of several.
 double reference_factorization_seconds(const Scene& scene, const Inputs& inputs, int repeats);
 
-/// kappa that balances the barrier with the contact-free Hessian at rest (3-contact, 3.3) [Pa].
-double default_barrier_stiffness(const Scene& scene, const Inputs& inputs, double barrier_distance);
+/// kappa of each pair of surfaces, from these two alone [surfaces^2], [Pa]: the larger of what balances
+/// a cloth's contact-free Hessian at rest and what carries a free body; of joints where a pair has
+/// neither. Pairs that never touch have the number of the first that may; zero where none may.
+std::vector<double> default_barrier_stiffness(const Scene& scene,
+                                              const Inputs& inputs,
+                                              double barrier_distance);
 
 }  // namespace diffcloth::step

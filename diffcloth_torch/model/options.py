@@ -22,7 +22,8 @@ class ContactOptions:
     Attributes:
         barrier_distance: Gap below which surfaces repel each other [m], > 0; None chooses it from
             the cloths when the simulator is made.
-        barrier_stiffness: Stiffness of the barrier [Pa], > 0; None chooses it likewise.
+        barrier_stiffness: Stiffness of the barrier of all pairs of surfaces [Pa], > 0; None chooses
+            each pair's from its cloths and from what is heavy of the two.
         friction_iterations: Solves per step in which the friction force is updated, >= 1.
         slip_velocity: Velocity at which sticking turns into sliding [m/s], > 0.
         self_contact: Whether a cloth collides with itself.

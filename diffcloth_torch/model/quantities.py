@@ -109,7 +109,7 @@ _TAKEN_BY_THE_CORE = (
     Quantity("damping", "s", _PER_FACE, "Material.damping", NON_NEGATIVE),
     Quantity("friction", "-", _PAIRS, _OF_SURFACES.format("friction"), NON_NEGATIVE),
     Quantity("thickness", "m", (("S",),), _OF_SURFACES.format("thickness"), NON_NEGATIVE),
-    Quantity("barrier_stiffness", "Pa", _ONE, "ContactOptions.barrier_stiffness", POSITIVE),
+    Quantity("barrier_stiffness", "Pa", _PAIRS, "ContactOptions.barrier_stiffness", POSITIVE),
     Quantity("barrier_distance", "m", _ONE, "ContactOptions.barrier_distance", POSITIVE),
     Quantity("slip_velocity", "m/s", _ONE, "ContactOptions.slip_velocity", POSITIVE),
     Quantity("pin_stiffness", "N/m", ((), ("C",)), "Cloth.pin_stiffness", POSITIVE),

@@ -69,8 +69,8 @@ class Control:
 class Parameters:
     """Physical parameters, by default those of the scene. None where the scene has no such thing.
 
-    Each may have a leading batch axis [B]. With the friction of a pair of surfaces (i, j) the mean
-    of its two entries is meant.
+    Each may have a leading batch axis [B]. With the friction and the barrier stiffness of a pair of
+    surfaces (i, j) the mean of its two entries is meant.
 
     Attributes:
         stretch: Membrane stiffness [N/m], > 0; shape [], [C] or [F].
@@ -82,7 +82,7 @@ class Parameters:
             -> number, as {("cloth", "table"): 0.4}, in one order or the other; pairs that are not
             named keep what the scene has.
         thickness: Full thickness of each surface [m], >= 0; shape [S].
-        barrier_stiffness: [Pa], > 0; shape [].
+        barrier_stiffness: [Pa], > 0; shape [] or [S, S].
         barrier_distance: [m], > 0; shape [].
         slip_velocity: Where sticking turns into sliding [m/s], > 0; shape [].
         pin_stiffness: Springs of the soft pins [N/m], > 0; shape [] or [C].

@@ -156,15 +156,17 @@ class Staggered:
         cloths, surfaces = assembly.cloth_count, assembly.surface_count
         none = torch.zeros(len(inputs["positions"]), 0, 3, dtype=torch.float64)
         names = ("positions", "velocities", "pin_targets", "soft_pin_targets", "forces")
-        kept = ("gravity", "barrier_stiffness", "barrier_distance", "slip_velocity")
+        kept = ("gravity", "barrier_distance", "slip_velocity")
         rigid = dict.fromkeys(names, none) | {k: inputs[k] for k in kept if k in inputs}
         if "thickness" in inputs:
             rigid["thickness"] = inputs["thickness"][:, cloths:]
-            friction = inputs["friction"]
-            if friction.shape[1] > 1:  # of pairs
-                pairs = friction.reshape(-1, surfaces, surfaces)
-                friction = pairs[:, cloths:, cloths:].reshape(len(pairs), -1)
-            rigid["friction"] = friction
+        for name in ("friction", "barrier_stiffness"):
+            if name not in inputs:
+                continue
+            rigid[name] = inputs[name]
+            if rigid[name].shape[1] > 1:  # of pairs
+                pairs = rigid[name].reshape(-1, surfaces, surfaces)
+                rigid[name] = pairs[:, cloths:, cloths:].reshape(len(pairs), -1)
         return rigid
 
     def _standing_still(self, inputs: Fields, positions: Tensor) -> Fields:

@@ -670,13 +670,14 @@ class Simulator:
         slip_velocity = self.contact.slip_velocity
         self._add_defaults(slip_velocity=slip_velocity, barrier_distance=distance)
         self._check_barrier("Simulator", self._default_fields)
-        stiffness = self.contact.barrier_stiffness
+        stiffness: float | NDArray[np.float64] | None = self.contact.barrier_stiffness
         if stiffness is None:
             inputs, _ = self._inputs(self.initial_state(), None, None)
-            stiffness = self._core.default_barrier_stiffness(_arrays(inputs), distance)
+            pairs = self._core.default_barrier_stiffness(_arrays(inputs), distance)
+            stiffness = pairs if (pairs != pairs[0, 0]).any() else float(pairs[0, 0])
         self._add_defaults(barrier_stiffness=stiffness)
 
-    def _add_defaults(self, **values: float) -> None:
+    def _add_defaults(self, **values: float | NDArray[np.float64]) -> None:
         tensors = {n: torch.tensor(v, dtype=torch.float64) for n, v in values.items()}
         self._defaults |= tensors
         self._default_fields |= default_fields(tensors)

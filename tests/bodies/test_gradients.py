@@ -176,6 +176,30 @@ def test_the_gradient_by_each_input_is_that_of_differences(coupling, base, kind)
     assert not {name: error for name, error in errors.items() if not error < 1e-5}
 
 
+@pytest.mark.parametrize(("coupling", "base"), [(c, "fixed") for c in COUPLINGS])
+def test_the_stiffness_of_each_pair_has_its_gradient(coupling, base):
+    chain = Chain(coupling, base, 3)
+    given = chain.given["cloth"]
+    count = len(chain.sim.surfaces)
+    steps = torch.arange(count**2, dtype=F64).reshape(count, count) / count**2
+    stiffness = given.barrier_stiffness * (0.9 + 0.2 * steps)
+    chain.given["cloth"] = given.replace(barrier_stiffness=stiffness)
+    inputs = {"barrier_stiffness": stiffness}
+    leaf = stiffness.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(chain.loss("cloth", {"barrier_stiffness": leaf}), leaf)
+    names = chain.sim.surfaces
+    touching = {(names[i], names[j]) for i, j in gradient.nonzero().tolist() if i < j}
+    fingers = "hand/left_finger", "hand/right_finger"
+    assert touching == {fingers, *(("cloth0", other) for other in ("box", *fingers))}
+    assert torch.equal(gradient, gradient.T)
+    # Along directions in what touches alone, where every term counts.
+    chain.direction = lambda kind, name, x, g: (
+        0.05 * x * (gradient != 0) * torch.randn(x.shape, dtype=F64, generator=g)
+    )
+    for seed in range(3):
+        assert chain.mismatch("cloth", inputs, list(inputs), seed) < 1e-5
+
+
 @pytest.mark.parametrize(("coupling", "base"), CASES)
 def test_everything_touches_and_rubs_along_the_whole_chain(coupling, base):
     """Otherwise the other tests would prove little."""

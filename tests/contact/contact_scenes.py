@@ -216,4 +216,7 @@ SCENES = {
 
 
 def make(name, seed=0):
-    return SCENES[name](np.random.default_rng(seed))
+    scene = SCENES[name](np.random.default_rng(seed))
+    count = scene.surface_count
+    scene.kappa = 2.0 + 3.0 * np.arange(count**2).reshape(count, count) / count**2
+    return scene

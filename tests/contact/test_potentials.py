@@ -88,7 +88,9 @@ def test_the_projected_hessian_is_positive(name):
 
 
 def parameter_of(scene, name):
-    count = int(scene.surface.max()) + 1
+    count = scene.surface_count
+    if name == "kappa":
+        return scene.kappa.ravel()
     if name == "thickness":
         return np.array(scene.thickness or [1e-3] * count)
     if name == "friction":

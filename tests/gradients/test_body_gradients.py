@@ -134,10 +134,10 @@ def test_some_contacts_have_negative_weights():
         True,
         np.concatenate([cloth.rest_vertices, body.vertices]),
         [False] * count + [True] * len(body.vertices),
-        20.0,
         0.01,
         2e-4,
         [0.0, 0.0],
+        [20.0] * 4,
         [0.4] * 4,
     )
     weight = potential.contacts(x)[2]

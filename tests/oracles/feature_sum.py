@@ -24,18 +24,22 @@ class ContactScene:
     cloth_count: int
     prescribed: np.ndarray
     d_hat: float = 0.1
-    kappa: float = 3.0
+    kappa: float | np.ndarray = 3.0  # of all pairs of surfaces, or of each
     slip: float = 0.02
     thickness: list = field(default_factory=list)
     self_contact: bool = True
     body_dynamic: list = field(default_factory=list)
     ignored_pairs: list = field(default_factory=list)
 
+    @property
+    def surface_count(self):
+        return int(self.surface.max()) + 1
+
     def potential(self, **changes):
-        count = int(self.surface.max()) + 1
+        count = self.surface_count
         friction = 0.1 + np.arange(count**2) / count**2
         values = {
-            "kappa": self.kappa,
+            "kappa": np.broadcast_to(self.kappa, (count, count)).ravel().tolist(),
             "d_hat": self.d_hat,
             "slip": self.slip,
             "thickness": self.thickness or [0.0] * count,
@@ -99,8 +103,10 @@ class FeatureSum:
     def __init__(self, scene):
         self.scene = scene
         potential = scene.potential()
-        count = int(scene.surface.max()) + 1
+        count = scene.surface_count
         self.thickness = scene.thickness or [0.0] * count
+        kappa = np.broadcast_to(scene.kappa, (count, count))
+        self.kappa = 0.5 * (kappa + kappa.T)
         self.faces = [
             [tuple(map(int, f)) for f in scene.faces if scene.surface[f[0]] == s]
             for s in range(count)
@@ -131,7 +137,7 @@ class FeatureSum:
 
     def barrier(self, d_sq, s, r):
         xi = 0.5 * (self.thickness[s] + self.thickness[r])
-        return kernels.barrier(d_sq, xi, self.scene.d_hat)
+        return self.kappa[s, r] * kernels.barrier(d_sq, xi, self.scene.d_hat)
 
     def counted_faces(self, s, p):
         """Those that point p sees; if it is prescribed, of a cloth those with a free vertex."""
@@ -207,7 +213,7 @@ class FeatureSum:
             still = self.is_still(s) and self.is_still(r)
             if not still and [s, r] not in scene.ignored_pairs:
                 total += self.between_bodies(x, s, r)
-        return scene.kappa * total
+        return total
 
     def between_bodies(self, x, s, r):
         total = 0.0

@@ -247,10 +247,10 @@ class ContactPotential {
 
   static nb::dict to_dict(const contact::ContactModel::Bar& bar) {
     nb::dict result;
-    result["kappa"] = bar.kappa;
     result["d_hat"] = bar.d_hat;
     result["slip"] = bar.slip;
     result["thickness"] = to_values(bar.thickness);
+    result["kappa"] = to_values(bar.kappa);
     result["friction"] = to_values(bar.friction);
     result["vertex_area"] = to_values(bar.rest.vertex_area);
     result["edge_area"] = to_values(bar.rest.edge_area);
@@ -277,22 +277,22 @@ void contact_potentials(nb::module_& m) {
           "__init__",
           [](ContactPotential* self, const FaceRows& faces, std::vector<Index> vertex_surface,
              Index cloth_count, bool self_contact, const Positions& X,
-             const std::vector<bool>& prescribed, double kappa, double d_hat, double slip,
-             std::vector<double> thickness, std::vector<double> friction,
+             const std::vector<bool>& prescribed, double d_hat, double slip,
+             std::vector<double> thickness, std::vector<double> kappa, std::vector<double> friction,
              const std::vector<bool>& body_dynamic,
              const std::vector<std::array<Index, 2>>& ignored_pairs) {
             contact::SurfacePairs touching = touching_surfaces(
                 vertex_surface, cloth_count, self_contact, body_dynamic, ignored_pairs);
             new (self) ContactPotential(faces, std::move(vertex_surface), cloth_count,
                                         std::move(touching), X, prescribed,
-                                        {.kappa = kappa,
-                                         .d_hat = d_hat,
+                                        {.d_hat = d_hat,
                                          .slip = slip,
                                          .thickness = std::move(thickness),
+                                         .kappa = std::move(kappa),
                                          .friction = std::move(friction)});
           },
           "faces"_a, "vertex_surface"_a, "cloth_count"_a, "self_contact"_a, "X"_a, "prescribed"_a,
-          "kappa"_a, "d_hat"_a, "slip"_a, "thickness"_a, "friction"_a,
+          "d_hat"_a, "slip"_a, "thickness"_a, "kappa"_a, "friction"_a,
           "body_dynamic"_a = std::vector<bool>{},
           "ignored_pairs"_a = std::vector<std::array<Index, 2>>{})
       .def("candidate_count", &ContactPotential::candidate_count, "x"_a)

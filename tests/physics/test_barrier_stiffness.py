@@ -1,0 +1,327 @@
+"""The barrier's stiffness: that of a pair of surfaces by default follows from these two alone."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import diffcloth_torch as dc
+from diffcloth_torch.robots import GRIPPER
+
+F64 = torch.float64
+DT = 0.01
+G = 9.81
+FLOOR = dc.RigidBody.plane(2.0, name="floor")
+
+
+def sheet(points=8, height=0.05, **material):
+    return dc.Cloth.grid(
+        points,
+        points,
+        size=(0.05 * (points - 1),) * 2,
+        material=dc.Material(**material),
+        pose=[0, 0, height, 1, 0, 0, 0],
+    )
+
+
+def box(mass, *place, side=0.1, name=None):
+    pose = [*place, 1, 0, 0, 0]
+    return dc.RigidBody.box(side, motion="dynamic", mass=mass, pose=pose, name=name)
+
+
+def simulator(cloths, bodies=(), robots=(), dt=DT, coupling="monolithic", scheme="coupled", **o):
+    scene = dc.Scene(cloths, bodies, robots)
+    contact = dc.ContactOptions(**o)
+    return dc.Simulator(scene, dt, contact=contact, coupling=coupling, scheme=scheme)
+
+
+def pairs(sim):
+    """The default of each pair of surfaces by their names."""
+    count = len(sim.surfaces)
+    values = sim.parameters().barrier_stiffness.expand(count, count)
+    return {
+        (a, b): values[i, j].item()
+        for i, a in enumerate(sim.surfaces)
+        for j, b in enumerate(sim.surfaces)
+    }
+
+
+def arm():
+    return dc.Robot.load(
+        GRIPPER, name="hand", pose=[0, 0, 0.9, 1, 0, 0, 0], stiffness=200.0, damping=5.0
+    )
+
+
+SCENES = {
+    "sheet": ([sheet()], [], []),
+    "sheet and floor": ([sheet()], [FLOOR], []),
+    "two sheets": ([sheet(), sheet(6, 0.1, stretch=90.0, density=0.4)], [FLOOR], []),
+    "sheet, box and floor": ([sheet()], [FLOOR, box(0.7, 0, 0, 0.2)], []),
+    "boxes": ([], [FLOOR, box(0.7, 0, 0, 0.2), box(3.0, 0, 0, 0.4)], []),
+    "sheet and hand": ([sheet()], [FLOOR], [arm()]),
+    "hand alone": ([], [FLOOR], [arm()]),
+}
+
+
+def may_touch(a, b):
+    """Whether two surfaces of these scenes do; the base of the hand stands still."""
+    still = ("floor", "hand/palm")
+    if a.startswith("cloth") or b.startswith("cloth"):
+        return True
+    return a != b and not (a in still and b in still) and {a[:5], b[:5]} != {"hand/"}
+
+
+@pytest.mark.parametrize("mass", [1e-3, 95.0, 2e4])
+@pytest.mark.parametrize("name", SCENES)
+def test_a_body_far_away_changes_no_default(name, mass):
+    cloths, bodies, robots = SCENES[name]
+    options = {} if cloths else {"barrier_distance": 4e-3}
+    alone = pairs(simulator(cloths, bodies, robots, **options))
+    far = box(mass, 30.0, 0.0, 1.0, side=0.4, name="far")
+    joined = pairs(simulator(cloths, [*bodies, far], robots, **options))
+    # Beside a cloth nothing changes at all; else what never touches has another's number.
+    compared = {pair: value for pair, value in alone.items() if cloths or may_touch(*pair)}
+    assert compared
+    assert {pair: joined[pair] for pair in compared} == compared
+    assert all(value > 0 for value in joined.values())
+
+
+def test_the_default_of_one_cloth_is_one_number_as_before():
+    """Of the second version, to the last digit that rounding leaves."""
+    sim = simulator([sheet(8, density=0.2, stretch=700.0, bending=2e-5)], [FLOOR])
+    stiffness = sim.parameters().barrier_stiffness
+    assert stiffness.shape == ()
+    assert stiffness.item() == pytest.approx(3718.890855637206, rel=1e-12)
+
+
+def test_a_pair_takes_what_the_larger_of_its_two_surfaces_needs():
+    soft, stiff = sheet(8), sheet(8, 0.1, stretch=9e3)
+    light, heavy = box(0.2, 0, 0, 0.3, name="light"), box(80.0, 0, 0, 0.5, name="heavy")
+    found = pairs(simulator([soft, stiff], [FLOOR, light, heavy]))
+    for own, other in (("cloth0", "floor"), ("cloth0", "light"), ("heavy", "floor")):
+        assert found[own, other] == found[other, own]
+    # Each with the floor is what it needs itself.
+    needs = {name: found[name, "floor"] for name in ("cloth0", "cloth1", "light", "heavy")}
+    assert needs["light"] < needs["cloth0"] < needs["cloth1"] < needs["heavy"]
+    assert needs["heavy"] == pytest.approx(400 * needs["light"], rel=1e-12)
+    assert found["cloth0", "cloth0"] == needs["cloth0"]
+    for a in needs:
+        for b in needs:
+            if a != b:
+                assert found[a, b] == max(needs[a], needs[b])
+
+
+def test_what_a_cloth_needs_is_that_of_the_cloth_alone():
+    options = {"barrier_distance": 3e-3}
+    cloths = [sheet(8, thickness=1e-3), sheet(6, 0.1, stretch=90.0, density=0.4)]
+    found = pairs(simulator(cloths, [FLOOR], **options))
+    for k, cloth in enumerate(cloths):
+        alone = pairs(simulator([cloth], **options))
+        assert found[f"cloth{k}", "floor"] == alone["cloth0", "cloth0"]
+
+
+def test_joints_count_where_nothing_else_does():
+    found = pairs(simulator([sheet()], [FLOOR, box(0.7, 1, 0, 0.2, name="box")], [arm()]))
+    finger = "hand/left_finger"
+    alone = pairs(simulator([], [FLOOR], [arm()], barrier_distance=0.005))
+    assert found[finger, "cloth0"] == found["cloth0", "cloth0"]
+    assert found[finger, "box"] == found["box", "floor"]
+    assert found[finger, "floor"] == pytest.approx(alone[finger, "floor"], rel=1e-12)
+    assert found[finger, "floor"] < found["box", "floor"]
+
+
+def rolled(sim, steps, state=None):
+    with torch.no_grad():
+        return sim.rollout(sim.initial_state() if state is None else state, steps=steps)
+
+
+def test_a_body_far_away_does_not_change_how_a_cloth_lands():
+    near = [sheet(9, 0.02)], [FLOOR]
+    alone = rolled(simulator(*near), 25)
+    far = box(95.0, 30.0, 0.0, 1.0)
+    joined = rolled(simulator(near[0], [*near[1], far]), 25)
+    # One solve moves both, to a tolerance of 1e-6 m/s.
+    for a, b in zip(alone, joined, strict=True):
+        assert (a.positions - b.positions).abs().max() < 1e-8
+    assert alone[-1].report.contact_count > 50
+
+
+def test_a_heavy_box_lands_beside_a_cloth():
+    """It rests at half the barrier distance, and the cloth where it does without the box."""
+    cloth = sheet(9, 0.004)
+    alone = rolled(simulator([cloth], [FLOOR]), 60)[-1]
+    sim = simulator([cloth], [FLOOR, box(100.0, 0.5, 0.0, 0.2, name="box")])
+    state = rolled(sim, 60)[-1]
+    assert (state.positions - alone.positions).abs().max() < 1e-6
+    reach = sim.parameters().barrier_distance.item()
+    # Corners and the ridges between them share the weight: a little above one half.
+    assert 0.45 * reach < state.body_poses[1, 2] - 0.05 < 0.8 * reach
+    wrenches = sim.contact_wrenches(state)
+    assert wrenches["box"][2] == pytest.approx(100.0 * G, rel=1e-5)
+
+
+@pytest.mark.parametrize("masses", [(0.5, 60.0), (60.0, 0.5)], ids=["light below", "heavy below"])
+def test_boxes_of_different_mass_stand_on_each_other(masses):
+    below, above = masses
+    bodies = [FLOOR, box(below, 0, 0, 0.0533, name="below"), box(above, 0, 0, 0.157, name="above")]
+    sim = simulator([], bodies, barrier_distance=4e-3)
+    *_, before, state = rolled(sim, 80)
+    assert (state.body_poses - before.body_poses).abs().max() < 1e-7
+    wrenches = sim.contact_wrenches(state)
+    assert wrenches["above"][2] == pytest.approx(above * G, rel=1e-5)
+    assert wrenches["floor"][2] == pytest.approx(-sum(masses) * G, rel=1e-5)
+
+
+@pytest.mark.parametrize("mass", [0.5, 10.0, 100.0])
+def test_a_cloth_lies_between_a_floor_and_a_box(mass):
+    """The floor and the cloth do not know what lies on it: the gap shrinks, and holds."""
+    sim = simulator([sheet(9, 0.01)], [FLOOR, box(mass, 0, 0, 0.08, name="box")])
+    state = rolled(sim, 80)[-1]
+    assert state.positions[:, 2].min() > 0.01 * sim.parameters().barrier_distance
+    wrenches = sim.contact_wrenches(state)
+    cloth = sim.vertex_masses().sum().item()
+    assert wrenches["box"][2] == pytest.approx(mass * G, rel=1e-3)
+    assert wrenches["floor"][2] == pytest.approx(-(mass + cloth) * G, rel=1e-3)
+
+
+def test_a_start_is_deep_by_the_stiffness_of_its_own_pair():
+    """A body that is elsewhere does not decide which starts a simulator warns of."""
+    far = box(95.0, 30.0, 0.0, 1.0)
+
+    def soft(height):
+        return sheet(4, height, density=2.0, stretch=20.0, bending=1e-7)
+
+    def warns(height, *bodies):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            simulator([soft(height)], [FLOOR, *bodies], dt=0.03, barrier_distance=4e-3)
+        return ["m apart, while at rest" in str(warning.message) for warning in caught] == [True]
+
+    heights = np.linspace(6e-4, 1e-3, 15)
+    alone = [warns(height) for height in heights]
+    assert any(alone)
+    assert not all(alone)
+    assert [warns(height, far) for height in heights] == alone
+
+
+# --- One number and many -------------------------------------------------------------------------
+
+
+def several(scheme="coupled", coupling="monolithic", **options):
+    """Two sheets on a floor, and a box on them where the scheme takes one."""
+    bodies = [FLOOR] if scheme == "split" else [FLOOR, box(0.4, 0.03, 0.02, 0.086, name="box")]
+    cloths = [sheet(6, 0.01, friction=0.3), sheet(5, 0.022, stretch=300.0)]
+    dt = 0.002 if coupling == "cloth_to_rigid" else DT
+    return simulator(cloths, bodies, dt=dt, scheme=scheme, coupling=coupling, **options)
+
+
+WAYS = [
+    ("coupled", "monolithic"),
+    ("split", "monolithic"),
+    ("coupled", "rigid_to_cloth"),
+    ("coupled", "cloth_to_rigid"),
+]
+
+
+def gradient_and_end(sim, state, parameters):
+    x = state.positions.detach().requires_grad_()
+    end = sim.step(state.replace(positions=x), None, parameters)
+    weights = torch.sin(torch.arange(end.positions.numel(), dtype=F64)).reshape(x.shape)
+    value = (weights * end.positions).sum() + end.body_forces.sum()
+    return torch.autograd.grad(value, [x, parameters.barrier_stiffness]), end
+
+
+@pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
+@pytest.mark.parametrize(("scheme", "coupling"), WAYS)
+def test_one_number_is_the_same_for_every_pair(scheme, coupling):
+    """Bit for bit, and its gradient is the sum of theirs."""
+    sim = several(scheme, coupling, barrier_stiffness=1500.0)
+    count = len(sim.surfaces)
+    given = sim.parameters()
+    assert given.barrier_stiffness.shape == ()
+    state = rolled(sim, round(0.06 / sim.dt))[-1]
+    found = [
+        gradient_and_end(
+            sim,
+            state,
+            given.replace(
+                barrier_stiffness=torch.full(shape, 1500.0, dtype=F64, requires_grad=True)
+            ),
+        )
+        for shape in ((), (count, count))
+    ]
+    (one, by_one), (many, by_many) = found
+    assert by_one.report.contact_count > 20
+    for name in ("positions", "velocities", "body_poses", "body_forces", "body_velocities"):
+        assert torch.equal(getattr(by_one, name), getattr(by_many, name))
+    assert torch.equal(one[0], many[0])
+    torch.testing.assert_close(one[1], many[1].sum(), rtol=1e-9, atol=0)
+    assert torch.equal(many[1], many[1].T)
+
+
+def test_a_batch_has_a_number_or_numbers_for_each_environment():
+    sim = several()
+    count = len(sim.surfaces)
+    default = sim.parameters().barrier_stiffness
+    state = rolled(sim, 6)[-1]
+    batch = dc.stack([state, state])
+    numbers = torch.tensor([700.0, 4e3], dtype=F64)
+    matrices = torch.stack([default, 2.0 * default])
+    for values in (numbers, matrices):
+        end = sim.step(batch, None, sim.parameters().replace(barrier_stiffness=values))
+        for k in range(2):
+            parameters = sim.parameters().replace(barrier_stiffness=values[k])
+            assert torch.equal(end.positions[k], sim.step(state, None, parameters).positions)
+    assert default.shape == (count, count)
+    wrong = sim.parameters().replace(barrier_stiffness=torch.ones(count, dtype=F64))
+    with pytest.raises(dc.InvalidInput, match=rf"\[\] or \[{count}, {count}\]"):
+        sim.step(state, None, wrong)
+    wrong = default.clone()
+    wrong[1, 2] = 0.0
+    with pytest.raises(dc.InvalidInput, match=r"`barrier_stiffness` must be .*> 0, got 0 at"):
+        sim.step(state, None, sim.parameters().replace(barrier_stiffness=wrong))
+
+
+def test_a_pair_uses_the_mean_of_its_two_entries_and_no_other():
+    sim = several()
+    state = rolled(sim, 6)[-1]
+    default = sim.parameters().barrier_stiffness
+    surfaces = list(sim.surfaces)
+
+    def end(values):
+        return sim.step(state, None, sim.parameters().replace(barrier_stiffness=values)).positions
+
+    a, b = surfaces.index("cloth0"), surfaces.index("cloth1")
+    one_sided = default.clone()
+    one_sided[a, b], one_sided[b, a] = 0.5 * default[a, b], 1.5 * default[a, b]
+    assert torch.equal(end(default), end(one_sided))
+    assert not torch.equal(end(default), end(one_sided + one_sided.T))
+    # The floor and the box are apart by the sheets.
+    a, b = surfaces.index("floor"), surfaces.index("box")
+    other = default.clone()
+    other[a, b] *= 50.0
+    assert torch.equal(end(default), end(other))
+
+
+@pytest.mark.parametrize("unit", [2.0**-10, 2.0**12])
+def test_defaults_do_not_know_the_unit_of_length(unit):
+    """Powers of two scale every number without rounding."""
+
+    def scene(m):
+        material = dc.Material(stretch=550.0, bending=1e-5 * m**2, density=0.124 / m**2)
+        grid = dc.Cloth.grid(7, 7, size=(0.3 * m, 0.3 * m), material=material)
+        bodies = [
+            dc.RigidBody.plane(2.0 * m, pose=[0, 0, -0.1 * m, 1, 0, 0, 0]),
+            box(40.0, 0, 0, 0.2 * m, side=0.1 * m),
+        ]
+        solver = dc.SolverOptions(tolerance=1e-6 * m)
+        gravity = np.array([0, 0, -9.81]) * m
+        contact = dc.ContactOptions(slip_velocity=1e-3 * m)
+        return dc.Simulator(
+            dc.Scene([grid], bodies, gravity=gravity), DT, solver=solver, contact=contact
+        )
+
+    # Of N/m^2, of which N has one length: 1/length.
+    expected, found = scene(1.0).parameters(), scene(unit).parameters()
+    assert torch.equal(found.barrier_stiffness * unit, expected.barrier_stiffness)
