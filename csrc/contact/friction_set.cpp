@@ -249,7 +249,7 @@ void FrictionSet::add_mixed(const double* x,
     const Contact& lag = k.lag;
     const Closest& geometry = lag.closest;
     const auto& v = lag.pair.vertices;
-    const double kappa = model_->parameters().kappa;
+    const double kappa = lag.kappa;
     const double d = std::sqrt(geometry.d_sq);
 
     const Slip at = slip(k, x);
