@@ -172,10 +172,10 @@ def advance_bodies(
 def _midpoint_spin(inertia: Tensor, momentum: Tensor, dt: float) -> Tensor:
     """Omega [B, K, 3] with r = J Omega - exp(-h Omega / 2) momentum = 0, all in body axes."""
 
-    def residual(spin: Tensor) -> Tensor:
+    def residual(spin: Tensor, inertia: Tensor, momentum: Tensor) -> Tensor:
         return times(inertia, spin) - times(rotation_exp(-dt / 2 * spin), momentum)
 
-    def slope(spin: Tensor) -> Tensor:
+    def slope(spin: Tensor, inertia: Tensor, momentum: Tensor) -> Tensor:
         # d(exp(-x) v) = y x (D dx) with y = exp(-x) v and the left Jacobian D of the exponential.
         x = dt / 2 * spin
         angle = x.norm(dim=-1)[..., None, None] + _NO_ANGLE

@@ -383,25 +383,26 @@ class Chain:
         """Velocities over the step without contact, and the efforts on prescribed joints."""
         h, solved = self._dt, self._solved
 
-        def residual(velocity: Tensor) -> Tensor:
-            middle = self._motion(inertia, self._moved(start, velocity, h / 2))
-            ahead = momentum(middle, inertia, velocity)
-            return ahead - h / 2 * slope(self._tree, middle, velocity) - given
+        def residual(velocity: Tensor, *inputs: Tensor) -> Tensor:
+            weights, begin, wanted = Inertia(*inputs[:4]), _Configuration(*inputs[4:7]), inputs[-1]
+            middle = self._motion(weights, self._moved(begin, velocity, h / 2))
+            ahead = momentum(middle, weights, velocity)
+            return ahead - h / 2 * slope(self._tree, middle, velocity) - wanted
 
-        def complete(x: Tensor) -> Tensor:
+        def complete(x: Tensor, known: Tensor) -> Tensor:
             return known.expand(*x.shape[:-1], known.shape[-1]).index_copy(-1, solved, x)
 
-        def of_solved(x: Tensor) -> Tensor:
-            return residual(complete(x))[..., solved]
+        def of_solved(x: Tensor, *inputs: Tensor) -> Tensor:
+            return residual(complete(x, inputs[-2]), *inputs)[..., solved]
 
-        velocity = known
+        velocity, inputs = known, (*inertia, *start, known, given)
         if len(solved):
             x, found = solve_motion(self._free_motion, inertia, start, known, given)
             self._check(found)
-            velocity = complete(attach_root(of_solved, x, (*inertia, *start, known, given)))
+            velocity = complete(attach_root(of_solved, x, inputs), known)
         constraint = torch.zeros_like(start.joints)
         if self._prescribed.any():
-            constraint = self._prescribed * self._at_joints(residual(velocity)) / h
+            constraint = self._prescribed * self._at_joints(residual(velocity, *inputs)) / h
         return velocity, constraint
 
     def _check(self, found: Tensor) -> None:
