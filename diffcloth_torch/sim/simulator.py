@@ -57,7 +57,13 @@ from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.rollout import roll_out
 from diffcloth_torch.sim.schemes import check_scheme
 from diffcloth_torch.sim.state import State, Surfaces
-from diffcloth_torch.sim.step import Outcome, as_array, refuse_transforms, take_step
+from diffcloth_torch.sim.step import (
+    Outcome,
+    as_array,
+    refuse_functions,
+    refuse_transforms,
+    take_step,
+)
 
 __all__ = ["Simulator"]
 
@@ -279,6 +285,7 @@ class Simulator:
             InvalidInput: If a name, shape or value is not accepted.
             TypeError: If something is no array of numbers on the CPU.
         """
+        refuse_functions("control")
         control = Control(
             pins=pins,
             soft_pins=soft_pins,
@@ -427,6 +434,7 @@ class Simulator:
             "robot/link" -> homogeneous matrix from the link to the world, shape [4, 4], or
             [B, 4, 4] in a batch.
         """
+        refuse_functions("link_poses")
         fields, batch = state_fields(self._layout, state)
         return _unbatched(link_poses(self._layout, fields), batch)
 
@@ -445,6 +453,7 @@ class Simulator:
             the robot is not dynamic), then its angular velocity, in world axes [m/s, rad/s], shape
             [6], or [B, 6] in a batch.
         """
+        refuse_functions("link_velocities")
         fields, batch = state_fields(self._layout, state)
         centers = self._centers("link", parameters, batch)
         return _unbatched(link_velocities(self._layout, fields, centers), batch)
@@ -464,6 +473,7 @@ class Simulator:
             the origin of its frame where it is not dynamic), in world axes [N, N m], shape [6], or
             [B, 6] in a batch.
         """
+        refuse_functions("contact_wrenches")
         fields, batch = state_fields(self._layout, state)
         forces = state.body_forces if batch is not None else state.body_forces.unsqueeze(0)
         shape = (len(fields["positions"]), *self._assembly.body_vertices.shape)
@@ -496,6 +506,7 @@ class Simulator:
         Returns:
             A third of the mass of each face around a vertex [kg], shape [N], or [B, N] in a batch.
         """
+        refuse_functions("vertex_masses")
         if batch_size is not None:
             check_count("vertex_masses: `batch_size`", batch_size, 1)
         masses = vertex_masses(self._assembly, self._physical(parameters, batch_size))
@@ -515,6 +526,7 @@ class Simulator:
             Linear momentum, then angular momentum about the origin of the world [kg m/s,
             kg m^2/s], shape [6], or [B, 6] in a batch.
         """
+        refuse_functions("momentum")
         fields, batch = state_fields(self._layout, state)
         result = self._totals(fields, self._physical(parameters, batch)).momentum
         return result if batch is not None else result[0]
@@ -531,6 +543,7 @@ class Simulator:
         Returns:
             Energy [J], shape [], or [B] in a batch.
         """
+        refuse_functions("kinetic_energy")
         fields, batch = state_fields(self._layout, state)
         result = self._totals(fields, self._physical(parameters, batch)).kinetic_energy
         return result if batch is not None else result[0]

@@ -48,6 +48,7 @@ __all__ = [
     "as_array",
     "diagnostics_of",
     "have_quaternions",
+    "refuse_functions",
     "refuse_transforms",
     "take_step",
     "unconverged",
@@ -65,7 +66,7 @@ _TAPE = "tape_"
 _KEPT = "kept"
 _NO_CONSTANTS: Mapping[str, Constant] = MappingProxyType({})
 _TRANSFORMS = (
-    "step: torch.func transforms and forward-mode derivatives are not supported; use "
+    "torch.func transforms and forward-mode derivatives are not supported; use "
     "torch.autograd.grad or .backward(), for many losses or a Jacobian with is_grads_batched=True, "
     "or torch.autograd.functional.jacobian(vectorize=True)"
 )
@@ -149,13 +150,18 @@ def take_step(
 
 def refuse_transforms(*records: object) -> None:
     """Raise where a gradient would be lost or wrong: under torch.func and forward-mode."""
-    if torch._C._are_functorch_transforms_active():
-        raise NotImplementedError(_TRANSFORMS)
+    refuse_functions("step")
     if forward_ad._current_level < 0:  # no tensor has a tangent
         return
     tensors = (tensor for record in records for tensor in tensors_of(record))
     if any(forward_ad.unpack_dual(t).tangent is not None for t in tensors):
-        raise NotImplementedError(_TRANSFORMS)
+        raise NotImplementedError(f"step: {_TRANSFORMS}")
+
+
+def refuse_functions(name: str) -> None:
+    """Raise under torch.func, whose tensors have no numbers to be checked."""
+    if torch._C._are_functorch_transforms_active():
+        raise NotImplementedError(f"{name}: {_TRANSFORMS}")
 
 
 def are_within(arrays: list[NDArray[np.float64]], largest: float) -> bool:
@@ -280,7 +286,7 @@ class _PullBack(torch.autograd.Function):
     def vmap(info, in_dims, step, *tensors):
         count = len(step.shapes)
         if any(dim is not None for dim in in_dims[1 : 1 + count]):
-            raise NotImplementedError(_TRANSFORMS)
+            raise NotImplementedError(f"step: {_TRANSFORMS}")
         losses = [
             c.expand(info.batch_size, *c.shape) if dim is None else c.movedim(dim, 0)
             for c, dim in zip(tensors[count:], in_dims[1 + count :], strict=True)
