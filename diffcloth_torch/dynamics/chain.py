@@ -45,6 +45,7 @@ from diffcloth_torch.dynamics.kinematics import ROOT, Tree, root_frame
 from diffcloth_torch.dynamics.linear import solve, times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.errors import SimulationError
+from diffcloth_torch.geometry.products import product
 from diffcloth_torch.geometry.rotation import (
     nearer_quaternion,
     pose_velocities,
@@ -446,7 +447,7 @@ class Chain:
             return start._replace(joints=joints)
         turn = rotation_exp(time * velocity[..., 3:ROOT])
         return _Configuration(
-            start.center + time * velocity[..., :3], turn @ start.rotation, joints
+            start.center + time * velocity[..., :3], product(turn, start.rotation), joints
         )
 
     def _motion(self, inertia: Inertia, at: _Configuration) -> Motion:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 
-from diffcloth_torch.dynamics.linear import solve
+from diffcloth_torch.dynamics.linear import inverse, times
 
 __all__ = ["attach_root", "jacobian_of"]
 
@@ -41,7 +41,7 @@ def attach_root(
     numbers = [u.detach() for u in inputs]
     with torch.no_grad():
         K = (slope or jacobian_of(residual))(root, *numbers)
-    step = solve(K, value)
+    step = times(inverse(K), value)
     return root - (step - step.detach())
 
 

@@ -91,7 +91,7 @@ def far_away():
 
 
 def error(path, h, *, base, actuation, start, amplitude, seconds=0.24, **options):
-    """Largest difference over a swing, and the largest effort, at the joints that are prescribed."""
+    """Largest difference over a swing, and the largest effort, at prescribed joints."""
     robot = dc.Robot.load(
         path,
         base=base,
