@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from torch import Tensor, broadcast_shapes, cat
+import numpy as np
+from torch import Tensor, cat, split
 
 __all__ = ["product"]
 
@@ -19,13 +20,15 @@ def product(a: Tensor, b: Tensor) -> Tensor:
     and whether one requires a gradient. Here each number is a sum of its own, and no operation is
     large.
     """
-    shape = broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    shape = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
     rows = math.prod(a.shape[-2:]) * b.shape[-1] * math.prod(shape[1:])
     if not shape or shape[0] * rows <= _MOST_NUMBERS:
         return _product(a, b)
     few = max(1, _MOST_NUMBERS // rows)
     parts = [
-        t.split(few) if t.ndim == len(shape) + 2 and len(t) > 1 else [t] * math.ceil(shape[0] / few)
+        split(t, few)
+        if t.ndim == len(shape) + 2 and len(t) > 1
+        else [t] * math.ceil(shape[0] / few)
         for t in (a, b)
     ]
     return cat([_product(*pair) for pair in zip(*parts, strict=True)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -83,13 +84,26 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
+_UNCOMPILED: dict[Callable[..., Any], Callable[..., Any]] = {}
+
+
+def _uncompiled(method: Callable[P, T]) -> Callable[P, T]:
+    """The method as `torch.compile` leaves it alone: there is nothing to fuse in a step."""
+    # Importing the compiler takes longer than all the rest; nobody compiles without it.
+    if not hasattr(sys.modules.get("torch._dynamo"), "disable"):
+        return method
+    if method not in _UNCOMPILED:
+        _UNCOMPILED[method] = torch.compiler.disable(method)  # type: ignore[no-untyped-call]
+    return _UNCOMPILED[method]
+
+
 def _memory_errors(method: Callable[P, T]) -> Callable[P, T]:
     """Let torch's lack of memory be the error that NumPy and the core raise for theirs."""
 
     @wraps(method)
     def guarded(*args: P.args, **keywords: P.kwargs) -> T:
         try:
-            return method(*args, **keywords)
+            return _uncompiled(method)(*args, **keywords)
         except RuntimeError as error:
             if "can't allocate memory" in str(error):
                 raise MemoryError(f"{method.__name__}: {error}") from error

@@ -40,3 +40,18 @@ def test_controls_and_masses_refuse_transforms(sim):
         )
     with pytest.raises(NotImplementedError, match=r"^vertex_masses: torch.func"):
         torch.func.grad(lambda x: sim.vertex_masses().sum() + x)(torch.zeros(()))
+
+
+def test_the_compiler_leaves_a_step_alone(sim):
+    """It sees the few lines around it."""
+
+    def run(state):
+        return sim.step(state).joint_positions * 2
+
+    state = sim.initial_state()
+    torch._dynamo.reset()
+    torch._dynamo.utils.counters.clear()
+    found = torch.compile(run, backend="eager")(state)
+    assert torch.equal(found, run(state))
+    assert torch._dynamo.utils.counters["frames"]["total"] < 12
+    torch._dynamo.reset()
