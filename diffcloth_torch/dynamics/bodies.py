@@ -27,6 +27,7 @@ from diffcloth_torch.dynamics.kinematics import CROSS
 from diffcloth_torch.dynamics.linear import solve, times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.errors import SimulationError
+from diffcloth_torch.geometry.products import product
 from diffcloth_torch.geometry.rotation import (
     nearer_quaternion,
     quaternion_exp,
@@ -105,7 +106,7 @@ def predict_bodies(
 
     predicted = quaternion_multiply(quaternion_exp(dt * omega), quaternion)
     turned = quaternion_matrix(predicted)
-    moments = turned @ inertia.inertia @ turned.transpose(-1, -2)
+    moments = product(product(turned, inertia.inertia), turned.transpose(-1, -2))
     zeros = torch.zeros_like(omega)
     mass = inertia.mass[..., None, None] * torch.eye(3, dtype=moments.dtype)
     mass, none = mass.expand_as(moments), torch.zeros_like(moments)
@@ -172,18 +173,18 @@ def advance_bodies(
 def _midpoint_spin(inertia: Tensor, momentum: Tensor, dt: float) -> Tensor:
     """Omega [B, K, 3] with r = J Omega - exp(-h Omega / 2) momentum = 0, all in body axes."""
 
-    def residual(spin: Tensor) -> Tensor:
+    def residual(spin: Tensor, inertia: Tensor, momentum: Tensor) -> Tensor:
         return times(inertia, spin) - times(rotation_exp(-dt / 2 * spin), momentum)
 
-    def slope(spin: Tensor) -> Tensor:
+    def slope(spin: Tensor, inertia: Tensor, momentum: Tensor) -> Tensor:
         # d(exp(-x) v) = y x (D dx) with y = exp(-x) v and the left Jacobian D of the exponential.
         x = dt / 2 * spin
         angle = x.norm(dim=-1)[..., None, None] + _NO_ANGLE
         X = _cross(x)
         first = 2 * (torch.sin(angle / 2) / angle) ** 2
         second = (angle - torch.sin(angle)) / angle**3
-        D = torch.eye(3, dtype=x.dtype) - first * X + second * (X @ X)
-        K: Tensor = inertia - dt / 2 * _cross(times(rotation_exp(-x), momentum)) @ D
+        D = torch.eye(3, dtype=x.dtype) - first * X + second * product(X, X)
+        K: Tensor = inertia - dt / 2 * product(_cross(times(rotation_exp(-x), momentum)), D)
         return K
 
     spin, found = _solve_spin(inertia, momentum, dt)
@@ -216,5 +217,5 @@ _EYE = torch.eye(3, dtype=torch.float64)[None]
 
 
 def _cross(vectors: Tensor) -> Tensor:
-    matrices: Tensor = (vectors @ CROSS).reshape(*vectors.shape, 3)
+    matrices: Tensor = times(CROSS, vectors).reshape(*vectors.shape, 3)
     return matrices

@@ -10,16 +10,21 @@ constant velocities nu along it. With the momentum p(q, nu) = M nu and the slope
 where tau are gravity, wrenches and efforts. Velocity products are thus implicit, and the scheme is
 symplectic: by itself a robot neither gains nor loses energy in the long run. The first line is
 solved by iterations that start at nu_n and M(q_n). Where the motion of the base or of a joint is
-prescribed its velocity is known, and the residual is its effort.
+prescribed its velocity is known.
 
 **Advance.** After the step the velocities nu over it are those between its two ends; the second
-line makes them nu_n+1. A robot that did not move has no velocity, whatever holds it.
+line makes them nu_n+1. A robot that did not move has no velocity, whatever holds it. Where motion
+is prescribed nu_n+1 is nu, and an effort tau_c is missing in tau. It is what the momentum of the
+step's own motion asks for, both lines together, with the forces f of contact:
+
+    M(q_n+1) nu_n+1 - M(q_n) nu_n = h (s(q_mid, nu) + tau(q_n) + f(q_n+1) + tau_c).
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -40,6 +45,7 @@ from diffcloth_torch.dynamics.kinematics import ROOT, Tree, root_frame
 from diffcloth_torch.dynamics.linear import solve, times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.errors import SimulationError
+from diffcloth_torch.geometry.products import product
 from diffcloth_torch.geometry.rotation import (
     nearer_quaternion,
     pose_velocities,
@@ -49,7 +55,7 @@ from diffcloth_torch.geometry.rotation import (
     quaternion_multiply,
     rotation_exp,
 )
-from diffcloth_torch.model.kinematics import pose_frame
+from diffcloth_torch.model.kinematics import constant, pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
 
 __all__ = ["Chain", "ChainControl", "ChainPrediction", "ChainState"]
@@ -104,9 +110,7 @@ class ChainPrediction(NamedTuple):
         start: Where the robot is at the start.
         pose: Frame of its root then, [B, 7].
         known: nu where it is prescribed, zero elsewhere; [B, 6 + J].
-        free: q^, [B, n].
-        inertial: M(q^)/h^2, [B, n, n].
-        constraint: Efforts that keep to what is prescribed on the way to q^, [B, J].
+        given: M(q_n) nu_n + h tau(q_n), [B, 6 + J].
     """
 
     root_start: Tensor
@@ -120,9 +124,7 @@ class ChainPrediction(NamedTuple):
     start: _Configuration
     pose: Tensor
     known: Tensor
-    free: Tensor
-    inertial: Tensor
-    constraint: Tensor
+    given: Tensor
 
 
 class _Configuration(NamedTuple):
@@ -171,6 +173,9 @@ class Chain:
         self._solved = torch.tensor([i for i in solved if i >= first], dtype=torch.long)
         self._unknown = self._solved - first
         self._free_motion = robot_motion(mechanism, self._solved, dt)
+        # Without joints nobody asks for what a prescribed base must give.
+        self._has_dynamics = mechanism.is_dynamic or joints > 0
+        self._own_inertia = None if mechanism.is_dynamic else _inertia_of_prescribed(mechanism)
 
     def predict(
         self,
@@ -192,18 +197,18 @@ class Chain:
             contact: Forces on the vertices that act like the others, [B, V, 3] N.
         """
         drives = self._drives(gains, control)
-        inertia = self._with_forced_armature(inertia)
+        inertia = self._acting(inertia)
         local = inertia.center[..., self._tree.root, :]
         quaternion = torch.nn.functional.normalize(state.pose[..., 3:], dim=-1)
         start = _Configuration(*_placed(state.pose[..., :3], quaternion, local), state.joints)
         known, ends = self._prescribed_motion(start, quaternion, control, local)
 
-        # Of a robot that no force moves only the motion counts.
-        velocity, constraint = known, torch.zeros_like(start.joints)
-        if self.mechanism.is_dynamic:
+        velocity = given = known
+        if self._has_dynamics:
             here = self._motion(inertia, start)
             given = self._given(inertia, here, state, control, drives, gravity, contact)
-            velocity, constraint = self._solve(inertia, start, known, given)
+        if len(self._solved):
+            velocity = self._solve(inertia, start, known, given)
         end = self._moved(start, velocity, self._dt)
         joints = torch.where(self._prescribed, ends, end.joints)
         coordinates, free = state.joints, joints
@@ -232,9 +237,7 @@ class Chain:
             start=start,
             pose=state.pose,
             known=known,
-            free=free,
-            inertial=inertial,
-            constraint=constraint,
+            given=given,
         )
 
     def advance(
@@ -272,17 +275,11 @@ class Chain:
             end = self._moved(start, known, self._dt)._replace(joints=joints)
         over = torch.cat([root_rate, (joints - start.joints) / self._dt], dim=-1)
 
-        placed = self._motion(inertia, end)
-        forces = contact if kick is None else contact + kick
         efforts = prediction.drives.applied_efforts(start.joints, joints, self._dt)
-        if self._prescribed.any():
-            inertial = times(prediction.inertial, coordinates - prediction.free)
-            load = self._generalized(placed, forces)[..., ROOT:]
-            held = prediction.constraint + self._at_joints(inertial) - load
-            efforts = torch.where(self._prescribed, held, efforts)
         velocity = over
-        if len(self._solved):
-            velocity = self._end_velocity(inertia, start, placed, over, kick)
+        if self._has_dynamics:
+            velocity, held = self._end(prediction, end, over, contact, kick)
+            efforts = torch.where(self._prescribed, held, efforts)
         root_velocity, rates = torch.split(velocity, [ROOT, velocity.shape[-1] - ROOT], dim=-1)
         return ChainState(pose, root_velocity, joints, rates), efforts
 
@@ -296,7 +293,7 @@ class Chain:
         """
         if not self.mechanism.is_dynamic:
             return Totals.zero(len(state.pose))
-        inertia = self._with_forced_armature(inertia)
+        inertia = self._acting(inertia)
         motion = Motion.at(self._tree, inertia, pose_frame(state.pose), state.joints)
         velocity = self._velocity(state)
         # T = p . nu / 2
@@ -306,8 +303,13 @@ class Chain:
 
     # Constituents
 
-    def _with_forced_armature(self, inertia: Inertia) -> Inertia:
-        """Drives of prescribed joints are part of what prescribes them."""
+    def _acting(self, inertia: Inertia) -> Inertia:
+        """Inertia that counts: drives of prescribed joints are part of what prescribes them.
+
+        Parameters have no masses of robots that forces do not move.
+        """
+        if self._own_inertia is not None:
+            return self._own_inertia
         return inertia._replace(armature=~self._prescribed * inertia.armature)
 
     def _velocity(self, state: ChainState) -> Tensor:
@@ -379,30 +381,25 @@ class Chain:
         start: _Configuration,
         known: Tensor,
         given: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """Velocities over the step without contact, and the efforts on prescribed joints."""
+    ) -> Tensor:
+        """Velocities nu over the step without contact."""
         h, solved = self._dt, self._solved
 
-        def residual(velocity: Tensor) -> Tensor:
-            middle = self._motion(inertia, self._moved(start, velocity, h / 2))
-            ahead = momentum(middle, inertia, velocity)
-            return ahead - h / 2 * slope(self._tree, middle, velocity) - given
+        def residual(velocity: Tensor, *inputs: Tensor) -> Tensor:
+            weights, begin, wanted = Inertia(*inputs[:4]), _Configuration(*inputs[4:7]), inputs[-1]
+            middle = self._motion(weights, self._moved(begin, velocity, h / 2))
+            ahead = momentum(middle, weights, velocity)
+            return ahead - h / 2 * slope(self._tree, middle, velocity) - wanted
 
-        def complete(x: Tensor) -> Tensor:
+        def complete(x: Tensor, known: Tensor) -> Tensor:
             return known.expand(*x.shape[:-1], known.shape[-1]).index_copy(-1, solved, x)
 
-        def of_solved(x: Tensor) -> Tensor:
-            return residual(complete(x))[..., solved]
+        def of_solved(x: Tensor, *inputs: Tensor) -> Tensor:
+            return residual(complete(x, inputs[-2]), *inputs)[..., solved]
 
-        velocity = known
-        if len(solved):
-            x, found = solve_motion(self._free_motion, inertia, start, known, given)
-            self._check(found)
-            velocity = complete(attach_root(of_solved, x, (*inertia, *start, known, given)))
-        constraint = torch.zeros_like(start.joints)
-        if self._prescribed.any():
-            constraint = self._prescribed * self._at_joints(residual(velocity)) / h
-        return velocity, constraint
+        x, found = solve_motion(self._free_motion, inertia, start, known, given)
+        self._check(found)
+        return complete(attach_root(of_solved, x, (*inertia, *start, known, given)), known)
 
     def _check(self, found: Tensor) -> None:
         lost = torch.nonzero(~found)[:, 0].tolist()
@@ -413,23 +410,35 @@ class Chain:
                 environments=lost,
             )
 
-    def _end_velocity(
+    def _end(
         self,
-        inertia: Inertia,
-        start: _Configuration,
-        placed: Motion,
+        prediction: ChainPrediction,
+        end: _Configuration,
         over: Tensor,
+        contact: Tensor,
         kick: Tensor | None,
-    ) -> Tensor:
-        """Velocities nu at the end of a step from those over it."""
-        h, solved = self._dt, self._solved
-        middle = self._motion(inertia, self._moved(start, over, h / 2))
-        ahead = momentum(middle, inertia, over) + h / 2 * slope(self._tree, middle, over)
-        if kick is not None:
-            ahead = ahead + h * self._generalized(placed, kick)
-        change = (ahead - momentum(placed, inertia, over))[..., solved]
-        mass = mass_matrix(placed, inertia)[..., solved[:, None], solved]
-        return over.index_add(-1, solved, solve(mass, change))
+    ) -> tuple[Tensor, Tensor]:
+        """Velocities nu at the end of a step from those over it, and efforts that held joints."""
+        h, solved, inertia = self._dt, self._solved, prediction.inertia
+        placed = self._motion(inertia, end)
+        middle = self._motion(inertia, self._moved(prediction.start, over, h / 2))
+        rate = slope(self._tree, middle, over)
+        impulse = None if kick is None else h * self._generalized(placed, kick)
+        velocity = over
+        if len(solved):
+            ahead = momentum(middle, inertia, over) + h / 2 * rate
+            if impulse is not None:
+                ahead = ahead + impulse
+            change = (ahead - momentum(placed, inertia, over))[..., solved]
+            mass = mass_matrix(placed, inertia)[..., solved[:, None], solved]
+            velocity = over.index_add(-1, solved, solve(mass, change))
+        if not self._prescribed.any():
+            return velocity, over.new_zeros(())
+        missing = momentum(placed, inertia, velocity) - prediction.given
+        if impulse is not None:
+            missing = missing - impulse
+        held = missing / h - rate - self._generalized(placed, contact)
+        return velocity, self._at_joints(held)
 
     def _moved(self, start: _Configuration, velocity: Tensor, time: float) -> _Configuration:
         """Where constant velocities lead."""
@@ -438,7 +447,7 @@ class Chain:
             return start._replace(joints=joints)
         turn = rotation_exp(time * velocity[..., 3:ROOT])
         return _Configuration(
-            start.center + time * velocity[..., :3], turn @ start.rotation, joints
+            start.center + time * velocity[..., :3], product(turn, start.rotation), joints
         )
 
     def _motion(self, inertia: Inertia, at: _Configuration) -> Motion:
@@ -452,6 +461,19 @@ class Chain:
 
     def _at_joints(self, values: Tensor) -> Tensor:
         return values[..., values.shape[-1] - self.mechanism.joint_count :]
+
+
+def _inertia_of_prescribed(mechanism: Mechanism) -> Inertia:
+    """What efforts of prescribed joints feel of a robot that forces do not move.
+
+    No joint carries the root link. Without a mass there, the velocities of such a root are those of
+    its frame's origin.
+    """
+    center = np.where(
+        np.arange(mechanism.link_count)[:, None] == mechanism.root, 0, mechanism.center
+    )
+    arrays = (mechanism.mass, center, mechanism.inertia, np.zeros(mechanism.joint_count))
+    return Inertia(*(constant(array)[None] for array in arrays))
 
 
 def _placed(position: Tensor, quaternion: Tensor, local: Tensor) -> tuple[Tensor, Tensor]:

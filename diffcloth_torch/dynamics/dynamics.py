@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
@@ -30,6 +31,17 @@ from diffcloth_torch.model.scene import Assembly
 __all__ = ["Dynamics", "Fields", "Prediction"]
 
 Fields = Mapping[str, Tensor]
+
+_forked = False
+
+
+def _note_fork() -> None:
+    global _forked
+    _forked = True
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_note_fork)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +159,9 @@ class Dynamics:
             contact: Forces on the vertices of bodies and links [N] that act over the step like
                 gravity, shape [B, V, 3].
         """
+        if _forked and torch.get_num_threads() > 1:
+            # Threads of torch and MKL do not outlive a fork: an operation would wait for them.
+            torch.set_num_threads(1)
         batch = len(state["body_poses"])
         now = {name: values.expand(batch, *values.shape[1:]) for name, values in state.items()}
         acting = {name: values.expand(batch, *values.shape[1:]) for name, values in control.items()}

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
+from torch.autograd.graph import saved_tensors_hooks
 
-from diffcloth_torch.dynamics.linear import solve
+from diffcloth_torch.dynamics.linear import inverse, times
 
-__all__ = ["attach_root", "jacobian"]
+__all__ = ["attach_root", "jacobian_of"]
 
-Residual = Callable[[Tensor], Tensor]
+Residual = Callable[..., Tensor]
 
 
 def attach_root(
-    residual: Residual, root: Tensor, inputs: Iterable[Tensor], slope: Residual | None = None
+    residual: Residual, root: Tensor, inputs: Sequence[Tensor], slope: Residual | None = None
 ) -> Tensor:
     """Give a root its first derivative with respect to what r depends on.
 
@@ -23,28 +24,44 @@ def attach_root(
     constant K, however the root was found. There is no second derivative.
 
     Args:
-        residual: r, [..., n] -> [..., n] for any leading axes; no environment sees another.
+        residual: r(x, *inputs), [..., n] -> [..., n] for any leading axes of x; no environment sees
+            another.
         root: x without a graph, shape [..., n].
-        inputs: All that r depends on; it has a graph where one of them has.
-        slope: Gives K [..., row, column] at x; None differentiates r.
+        inputs: All that r depends on; the root has a graph where one of them has.
+        slope: Gives K [..., row, column] from the same arguments; None differentiates r.
 
     Returns:
         The root, to the same bits, with a graph where r has one.
     """
     if not (torch.is_grad_enabled() and any(u.requires_grad for u in inputs)):
         return root
-    value = residual(root)
+    value = residual(root, *inputs)
+    # Nothing behind these numbers: a search of the whole graph of a rollout, in each of its steps,
+    # would make its cost quadratic.
+    numbers = [u.detach() for u in inputs]
     with torch.no_grad():
-        K = jacobian(residual, root) if slope is None else slope(root)
-    step = solve(K, value)
+        K = (slope or jacobian_of(residual))(root, *numbers)
+    step = times(inverse(K), value)
     return root - (step - step.detach())
 
 
-def jacobian(residual: Residual, x: Tensor) -> Tensor:
-    """dr/dx, [..., row, column]: n copies of x, each of which gives one row, in one backward."""
-    n = x.shape[-1]
-    with torch.enable_grad():
-        copies = x.detach().expand(n, *x.shape).clone().requires_grad_()
-        rows = residual(copies).diagonal(dim1=0, dim2=-1).sum()
-        (gradient,) = torch.autograd.grad(rows, copies)
-    return gradient.movedim(0, -2)
+def jacobian_of(residual: Residual) -> Residual:
+    """Function that gives dr/dx, [..., row, column], from the arguments of r(x, *inputs).
+
+    It has no graph, and inputs must have none: n copies of x each give one row, in one backward.
+    """
+
+    def jacobian(x: Tensor, *inputs: Tensor) -> Tensor:
+        n = x.shape[-1]
+        # What this saves is used at once; hooks of a checkpoint would repeat its steps for it.
+        with torch.enable_grad(), saved_tensors_hooks(_same, _same):
+            copies = x.detach().expand(n, *x.shape).clone().requires_grad_()
+            rows = residual(copies, *inputs).diagonal(dim1=0, dim2=-1).sum()
+            (gradient,) = torch.autograd.grad(rows, copies)
+        return gradient.movedim(0, -2)
+
+    return jacobian
+
+
+def _same(tensor: Tensor) -> Tensor:
+    return tensor

@@ -26,6 +26,7 @@ from torch import Tensor
 from diffcloth_torch.dynamics.kinematics import Frames, Tree
 from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.dynamics.totals import about_origin
+from diffcloth_torch.geometry.products import product
 
 __all__ = [
     "Inertia",
@@ -75,14 +76,14 @@ class Motion(NamedTuple):
         jacobian = tree.jacobian(frames)
         rotation = frames.poses[..., :3, :3]
         linear = inertia.mass[..., None, None] * jacobian[..., :3, :]
-        local = inertia.inertia @ (rotation.transpose(-1, -2) @ jacobian[..., 3:, :])
-        return Motion(frames, jacobian, torch.cat([linear, rotation @ local], dim=-2))
+        local = product(inertia.inertia, product(rotation.transpose(-1, -2), jacobian[..., 3:, :]))
+        return Motion(frames, jacobian, torch.cat([linear, product(rotation, local)], dim=-2))
 
 
 def mass_matrix(motion: Motion, inertia: Inertia) -> Tensor:
     """M with the armature on its diagonal, shape [B, 6 + J, 6 + J]."""
     columns = motion.jacobian.flatten(-3, -2)
-    matrix = columns.transpose(-1, -2) @ motion.weighted.flatten(-3, -2)
+    matrix = product(columns.transpose(-1, -2), motion.weighted.flatten(-3, -2))
     return matrix + torch.diag_embed(_at_joints(inertia.armature))
 
 
@@ -111,7 +112,7 @@ def slope(tree: Tree, motion: Motion, velocity: Tensor) -> Tensor:
     linear = momenta[..., :3]
     carried = about_origin(frames.centers, momenta)
     # Of all that hangs on each joint, first about the origin, then about the pivot.
-    F, N = torch.split(tree.hanging @ carried, 3, dim=-1)
+    F, N = torch.split(product(tree.hanging, carried), 3, dim=-1)
     N = N - torch.linalg.cross(frames.pivots, F)
     rate, omega = torch.split(twists[..., tree.moving, :], 3, dim=-1)
     arms = frames.pivots - frames.centers[..., tree.moving, :]
@@ -120,7 +121,7 @@ def slope(tree: Tree, motion: Motion, velocity: Tensor) -> Tensor:
     turning = (axis_rate * N + frames.axes * torch.linalg.cross(F, pivot_rate)).sum(-1)
     sliding = (axis_rate * F).sum(-1)
     rows = torch.lerp(sliding, turning, tree.revolute[:, 0]).unsqueeze(-2)
-    joints = (rows @ tree.leaders)[..., 0, :]
+    joints = product(rows, tree.leaders)[..., 0, :]
     root_rate = velocity[..., :3]
     root = torch.linalg.cross(linear.sum(-2), root_rate)
     return torch.cat([torch.zeros_like(root_rate), root, joints], dim=-1)
@@ -129,7 +130,7 @@ def slope(tree: Tree, motion: Motion, velocity: Tensor) -> Tensor:
 def generalized_force(motion: Motion, wrenches: Tensor) -> Tensor:
     """sum_l J_l^T f_l of forces at the links' centers and torques, [B, L, 6] -> [B, 6 + J]."""
     columns = motion.jacobian.flatten(-3, -2)
-    return (wrenches.flatten(-2).unsqueeze(-2) @ columns).squeeze(-2)
+    return product(wrenches.flatten(-2).unsqueeze(-2), columns).squeeze(-2)
 
 
 def wrenches_of_forces(frames: Frames, links: Tensor, points: Tensor, forces: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.dynamics.linear import times
+from diffcloth_torch.geometry.products import product
 from diffcloth_torch.model.kinematics import Kinematics, constant, joined_frame
 from diffcloth_torch.model.mechanism import Mechanism
 
@@ -101,7 +102,8 @@ class Tree:
         reach = self.reach[..., None]
         linear = reach * torch.lerp(axes, turned, self.revolute)
         angular = reach * self.revolute * axes
-        joints = torch.cat([linear, angular], dim=-1).transpose(-1, -2) @ self.leaders
+        columns = torch.cat([linear, angular], dim=-1).transpose(-1, -2)
+        joints = product(columns, self.leaders)
         return torch.cat([_rigid(frames.centers - root[..., None, :]), joints], dim=-1)
 
 
@@ -112,12 +114,12 @@ def root_frame(center: Tensor, rotation: Tensor, local_center: Tensor) -> Tensor
 
 def _rigid(arms: Tensor) -> Tensor:
     """Velocities of points at `arms` [B, L, 3] from a body's center, by its own; [B, L, 6, 6]."""
-    cross = (arms @ CROSS).reshape(*arms.shape, 3)  # omega x arm = -arm x omega
+    cross = times(CROSS, arms).reshape(*arms.shape, 3)  # omega x arm = -arm x omega
     upper = torch.cat([_EYE.expand_as(cross), -cross], dim=-1)
     return torch.cat([upper, _LOWER.expand_as(upper)], dim=-2)
 
 
 _EYE = torch.eye(3, dtype=torch.float64)
 _LOWER = torch.eye(6, dtype=torch.float64)[3:]
-# a @ CROSS is the matrix of the cross product a x, row after row.
-CROSS = torch.linalg.cross(_EYE[:, None, :], _EYE[None, :, :]).transpose(1, 2).reshape(1, 3, 9)
+# CROSS a is the matrix of the cross product a x, row after row.
+CROSS = torch.linalg.cross(_EYE[:, None, :], _EYE[None, :, :]).permute(2, 1, 0).reshape(9, 3)

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["solve", "times"]
+__all__ = ["inverse", "solve", "times"]
+
+
+def inverse(matrices: Tensor) -> Tensor:
+    """M^-1 without a graph, from M [.., n, n].
+
+    NumPy takes matrix after matrix; torch shares a few among threads, which do not outlive a fork.
+    """
+    inverses: Tensor = torch.from_numpy(np.linalg.inv(matrices.detach().numpy()))
+    return inverses
 
 
 def solve(matrices: Tensor, vectors: Tensor) -> Tensor:
-    """The x with M x = v, from M [.., n, n] and v [.., n].
+    """The x with M x = v, from M [.., n, n] and v [.., n]; it has a first derivative.
 
-    torch 2.4 factors M or its transpose, whichever lies better in memory, and rounds accordingly.
-    What indexing, `expand` and `movedim` return does not lie alike in a batch of one and in one of
-    several; here all lie row by row.
+    That is dx = M^-1 (dv - dM x), and so is that of -M^-1 (M x - v) with a constant M^-1.
     """
-    solutions: Tensor = torch.linalg.solve(matrices.contiguous(), vectors[..., None])[..., 0]
-    return solutions
+    numbers = matrices.detach().numpy(), vectors.detach().numpy()[..., None]
+    x: Tensor = torch.from_numpy(np.linalg.solve(*numbers)[..., 0])
+    if not (torch.is_grad_enabled() and (matrices.requires_grad or vectors.requires_grad)):
+        return x
+    step = times(inverse(matrices), times(matrices, x) - vectors)
+    return x - (step - step.detach())
 
 
 def times(matrices: Tensor, vectors: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.geometry.products import product
 from diffcloth_torch.geometry.rotation import quaternion_matrix
 from diffcloth_torch.model.mechanism import Mechanism
 
@@ -57,14 +58,14 @@ class Kinematics:
         shape = np.broadcast_shapes(root.shape[:-2], joints.shape[:-1])
         count = math.prod(shape)
         rows = joints.expand(*shape, joints.shape[-1]).reshape(count, 1, joints.shape[-1])
-        values = (rows @ self._leaders)[:, 0]
+        values = product(rows, self._leaders)[:, 0]
         values = (values + self._constants)[..., None, None]
         motions = torch.sin(values) * self._cross + (1 - torch.cos(values)) * self._cross_sq
-        steps = self._offsets + self._offsets @ (motions + values * self._shift)
+        steps = self._offsets + product(self._offsets, motions + values * self._shift)
         local = steps.unbind(-3)
         placed = {self._root: root.expand(*shape, 4, 4).reshape(count, 4, 4)}
         for link, parent in self._parents:
-            placed[link] = torch.bmm(placed[parent], local[link])
+            placed[link] = product(placed[parent], local[link])
         frames = torch.stack([placed[link] for link in range(len(placed))], dim=1)
         return frames.reshape(*shape, len(placed), 4, 4)
 

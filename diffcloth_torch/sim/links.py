@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.dynamics.kinematics import Tree
+from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.model.kinematics import link_frames, pose_frame
 from diffcloth_torch.sim.inputs import Fields
 from diffcloth_torch.sim.layout import Layout
@@ -51,7 +52,7 @@ def link_velocities(layout: Layout, state: Fields, link_centers: Tensor) -> ByNa
         rates = torch.cat(
             [state["base_velocities"][:, r], state["joint_velocities"][:, joints]], -1
         )
-        twists = (tree.jacobian(frames) @ rates[:, None, :, None])[..., 0]
+        twists = times(tree.jacobian(frames), rates[:, None])
         named |= _by_link(tree, twists)
     return named
 
@@ -78,7 +79,7 @@ def contact_wrenches(
     for i, (name, frame) in enumerate(frames.items()):
         rows = layout.rigid_vertices.get(name, slice(0, 0))
         vertices = torch.from_numpy(layout.assembly.body_vertices[rows])
-        arms = (vertices - centers[:, i, None]) @ frame[:, :3, :3].mT
+        arms = times(frame[:, None, :3, :3], vertices - centers[:, i, None])
         torques = torch.linalg.cross(arms, forces[:, rows])
         named[name] = torch.cat([forces[:, rows].sum(1), torques.sum(1)], dim=-1)
     return named

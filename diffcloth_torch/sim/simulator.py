@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -57,7 +58,12 @@ from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.rollout import roll_out
 from diffcloth_torch.sim.schemes import check_scheme
 from diffcloth_torch.sim.state import State, Surfaces
-from diffcloth_torch.sim.step import Outcome, as_array, refuse_transforms, take_step
+from diffcloth_torch.sim.step import (
+    Outcome,
+    as_array,
+    refuse_transforms,
+    take_step,
+)
 
 __all__ = ["Simulator"]
 
@@ -77,13 +83,26 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
+_UNCOMPILED: dict[Callable[..., Any], Callable[..., Any]] = {}
+
+
+def _uncompiled(method: Callable[P, T]) -> Callable[P, T]:
+    """The method as `torch.compile` leaves it alone: there is nothing to fuse in a step."""
+    # Importing the compiler takes longer than all the rest; nobody compiles without it.
+    if not hasattr(sys.modules.get("torch._dynamo"), "disable"):
+        return method
+    if method not in _UNCOMPILED:
+        _UNCOMPILED[method] = torch.compiler.disable(method)  # type: ignore[no-untyped-call]
+    return _UNCOMPILED[method]
+
+
 def _memory_errors(method: Callable[P, T]) -> Callable[P, T]:
     """Let torch's lack of memory be the error that NumPy and the core raise for theirs."""
 
     @wraps(method)
     def guarded(*args: P.args, **keywords: P.kwargs) -> T:
         try:
-            return method(*args, **keywords)
+            return _uncompiled(method)(*args, **keywords)
         except RuntimeError as error:
             if "can't allocate memory" in str(error):
                 raise MemoryError(f"{method.__name__}: {error}") from error
@@ -278,6 +297,7 @@ class Simulator:
             InvalidInput: If a name, shape or value is not accepted.
             TypeError: If something is no array of numbers on the CPU.
         """
+        refuse_transforms("control")
         control = Control(
             pins=pins,
             soft_pins=soft_pins,
@@ -428,6 +448,7 @@ class Simulator:
             "robot/link" -> homogeneous matrix from the link to the world, shape [4, 4], or
             [B, 4, 4] in a batch.
         """
+        refuse_transforms("link_poses")
         fields, batch = state_fields(self._layout, state)
         return _unbatched(link_poses(self._layout, fields), batch)
 
@@ -446,6 +467,7 @@ class Simulator:
             the robot is not dynamic), then its angular velocity, in world axes [m/s, rad/s], shape
             [6], or [B, 6] in a batch.
         """
+        refuse_transforms("link_velocities")
         fields, batch = state_fields(self._layout, state)
         centers = self._centers("link", parameters, batch)
         return _unbatched(link_velocities(self._layout, fields, centers), batch)
@@ -465,6 +487,7 @@ class Simulator:
             the origin of its frame where it is not dynamic), in world axes [N, N m], shape [6], or
             [B, 6] in a batch.
         """
+        refuse_transforms("contact_wrenches")
         fields, batch = state_fields(self._layout, state)
         forces = state.body_forces if batch is not None else state.body_forces.unsqueeze(0)
         shape = (len(fields["positions"]), *self._assembly.body_vertices.shape)
@@ -497,6 +520,7 @@ class Simulator:
         Returns:
             A third of the mass of each face around a vertex [kg], shape [N], or [B, N] in a batch.
         """
+        refuse_transforms("vertex_masses")
         if batch_size is not None:
             check_count("vertex_masses: `batch_size`", batch_size, 1)
         masses = vertex_masses(self._assembly, self._physical(parameters, batch_size))
@@ -516,6 +540,7 @@ class Simulator:
             Linear momentum, then angular momentum about the origin of the world [kg m/s,
             kg m^2/s], shape [6], or [B, 6] in a batch.
         """
+        refuse_transforms("momentum")
         fields, batch = state_fields(self._layout, state)
         result = self._totals(fields, self._physical(parameters, batch)).momentum
         return result if batch is not None else result[0]
@@ -532,6 +557,7 @@ class Simulator:
         Returns:
             Energy [J], shape [], or [B] in a batch.
         """
+        refuse_transforms("kinetic_energy")
         fields, batch = state_fields(self._layout, state)
         result = self._totals(fields, self._physical(parameters, batch)).kinetic_energy
         return result if batch is not None else result[0]

@@ -136,8 +136,9 @@ class State:
         joint_positions: Values of the joints [rad or m], shape [J].
         joint_velocities: Their rates [rad/s or m/s], shape [J].
         joint_targets: What pd drives pull to until a control says otherwise [rad or m], shape [J].
-        joint_efforts: What the drive, or where the joint is prescribed the constraint, applied
-            during the step that led here [N m or N], shape [J].
+        joint_efforts: What the drive applied during the step that led here, or where the joint is
+            prescribed what a motor there had to give: for inertia, weights and contact, without
+            the joint's viscosity and the armature of its drive [N m or N], shape [J].
         base_poses: Frame of each robot's root link, as in `body_poses`, shape [R, 7].
         base_velocities: Velocity of its center of mass, then its angular velocity, in world axes
             [m/s, rad/s], shape [R, 6].

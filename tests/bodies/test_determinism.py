@@ -6,6 +6,7 @@ import torch
 from coupled_scenes import BASES, COUPLINGS
 
 import diffcloth_torch as dc
+from diffcloth_torch.robots import GRIPPER
 
 pytestmark = pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
 
@@ -122,3 +123,22 @@ def test_a_checkpointed_rollout_has_the_same_gradients(coupling, base):
         assert same(end, found[0][0])
         assert all(map(torch.equal, gradients, found[0][1]))
     assert all(gradient.any() for gradient in found[0][1])
+
+
+@pytest.mark.parametrize("names", [("gravity",), ("link_mass", "link_inertia")])
+def test_a_robot_in_the_air_has_the_same_bits_with_any_gradient(names):
+    """In every batch, and without a graph."""
+    hand = dc.Robot.load(GRIPPER, base="floating", actuation="torque")
+    contact = dc.ContactOptions(barrier_distance=1e-3)
+    sim = dc.Simulator(dc.Scene([], robots=[hand]), 0.01, contact=contact)
+    batch = sim.initial_state(4)
+    spin = torch.linspace(-2, 3, 24, dtype=torch.float64).reshape(4, 1, 6)
+    batch = batch.replace(base_velocities=spin)
+    parameters = sim.parameters()
+    leaves = {name: getattr(parameters, name).clone().requires_grad_() for name in names}
+    for given in (parameters, parameters.replace(**leaves)):
+        alone = [sim.step(batch[i], None, given) for i in range(4)]
+        for count in (2, 3, 4):
+            together = sim.step(dc.stack([batch[i] for i in range(count)]), None, given)
+            assert all(same(together[i], alone[i]) for i in range(count))
+    assert all(same(sim.step(batch[i]), alone[i]) for i in range(4))

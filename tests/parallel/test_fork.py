@@ -12,6 +12,9 @@ from parallel_scenes import batch, differing, simulator, step
 from processes import threads
 from torch.utils.data import DataLoader, Dataset
 
+import diffcloth_torch as dc
+from diffcloth_torch.robots import GRIPPER
+
 pytestmark = [
     pytest.mark.skipif(not hasattr(os, "fork"), reason="forks"),
     # Python 3.12 warns of every fork of a process with threads; that it works is tested here.
@@ -72,6 +75,45 @@ def test_a_forked_child_shares_the_work_on_one_environment():
         patience = 30 + 20 * (time.monotonic() - begin)
         assert in_child(lambda: differing(step(sim, state)[1], expected) == [], patience) == 0
         assert differing(step(sim, state)[1], expected) == []
+
+
+def robots(environments):
+    """A state, and a function that steps it; all that a gripper and a box in the air end with."""
+    hand = dc.Robot.load(GRIPPER, base="floating", actuation="pd", stiffness=50.0, damping=1.0)
+    box = dc.RigidBody.box(0.1, motion="dynamic", mass=0.5, pose=[2, 0, 0, 1, 0.1, 0.2, 0.3])
+    contact = dc.ContactOptions(barrier_distance=1e-3)
+    sim = dc.Simulator(dc.Scene([], [box], [hand]), 0.01, contact=contact)
+
+    def take():
+        generator = torch.Generator().manual_seed(0)
+        state = sim.initial_state(environments)
+        spin = torch.randn(environments, 1, 6, generator=generator, dtype=torch.float64)
+        spin.requires_grad_()
+        state = state.replace(base_velocities=spin, body_velocities=2 * spin)
+        states = sim.rollout(state, steps=2)
+        loss = states[-1].joint_velocities.sum() + states[-1].body_poses.square().sum()
+        loss.backward()
+        return [states[-1].base_poses, states[-1].body_velocities, spin.grad]
+
+    return take
+
+
+@pytest.mark.parametrize("environments", [1, 3, 17])
+@pytest.mark.parametrize("count", [None, 2])
+def test_a_forked_child_steps_bodies_and_robots(environments, count):
+    take = robots(environments)
+    with threads(2):
+        torch.randn(500, 500) @ torch.randn(500, 500)
+        begin = time.monotonic()
+        expected = take()
+        patience = 30 + 20 * (time.monotonic() - begin)
+
+        def repeat():
+            if count is not None:
+                torch.set_num_threads(count)
+            return all(torch.equal(*pair) for pair in zip(take(), expected, strict=True))
+
+        assert in_child(repeat, patience) == 0
 
 
 def work(queue, n, state):

@@ -1,0 +1,41 @@
+"""Products of small matrices, of many environments at once, without threads and without a BLAS."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from torch import Tensor, cat, split
+
+__all__ = ["product"]
+
+# From more on torch shares an operation among its threads, which do not outlive a fork.
+_MOST_NUMBERS = 2**15 - 1
+
+
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """A B, [.., m, n], from A [.., m, k] and B [.., k, n] with as many leading axes, or none.
+
+    `matmul` would start threads, and round by how many matrices there are, how they lie in memory
+    and whether one requires a gradient. Here each number is a sum of its own, and no operation is
+    large.
+    """
+    shape = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    rows = math.prod(a.shape[-2:]) * b.shape[-1] * math.prod(shape[1:])
+    if not shape or shape[0] * rows <= _MOST_NUMBERS:
+        return _product(a, b)
+    few = max(1, _MOST_NUMBERS // rows)
+    parts = [
+        split(t, few)
+        if t.ndim == len(shape) + 2 and len(t) > 1
+        else [t] * math.ceil(shape[0] / few)
+        for t in (a, b)
+    ]
+    return cat([_product(*pair) for pair in zip(*parts, strict=True)])
+
+
+def _product(a: Tensor, b: Tensor) -> Tensor:
+    # The order of a sum depends on strides too.
+    terms = a.contiguous().unsqueeze(-1) * b.contiguous().unsqueeze(-3)
+    total: Tensor = terms.sum(-2)
+    return total

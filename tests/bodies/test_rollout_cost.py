@@ -1,0 +1,58 @@
+"""A step of a robot costs the same however long the rollout before it, with a graph too."""
+
+import statistics
+import time
+
+import pytest
+import torch
+
+import diffcloth_torch as dc
+from diffcloth_torch.robots import GRIPPER
+from diffcloth_torch.sim import simulator
+
+STEPS = 200
+WINDOW = 20
+
+
+def rollout(base, steps, **options):
+    """A gripper whose fingers swing in the air, and the states of a rollout with a graph."""
+    hand = dc.Robot.load(GRIPPER, base=base, actuation="pd", stiffness=50.0, damping=0.5)
+    contact = dc.ContactOptions(barrier_distance=1e-3)
+    sim = dc.Simulator(dc.Scene([], robots=[hand]), 0.01, contact=contact)
+    parameters = sim.parameters()
+    parameters = parameters.replace(link_mass=parameters.link_mass.requires_grad_())
+    control = sim.control(joint_positions=[0.03, 0.02])
+    states = sim.rollout(sim.initial_state(), [control] * steps, parameters, **options)
+    return parameters.link_mass, states
+
+
+@pytest.fixture
+def solves(monkeypatch):
+    """Times at which the core was called, in order."""
+    times, solve = [], simulator.take_step
+
+    def timed(*args, **keywords):
+        times.append(time.perf_counter())
+        return solve(*args, **keywords)
+
+    monkeypatch.setattr(simulator, "take_step", timed)
+    return times
+
+
+@pytest.mark.parametrize("base", ["fixed", "floating"])
+@pytest.mark.parametrize("checkpoint_every", [None, STEPS, 30])
+def test_the_last_step_of_a_rollout_takes_the_time_of_the_first(base, checkpoint_every, solves):
+    rollout(base, WINDOW, checkpoint_every=checkpoint_every)  # what torch does once
+    solves.clear()
+    rollout(base, STEPS, checkpoint_every=checkpoint_every)
+    assert len(solves) == STEPS
+    steps = torch.tensor(solves, dtype=torch.float64).diff().tolist()
+    first, last = statistics.median(steps[:WINDOW]), statistics.median(steps[-WINDOW:])
+    assert last < 2 * first
+
+
+def test_backward_repeats_a_step_with_a_checkpoint_once(solves):
+    mass, states = rollout("fixed", WINDOW, checkpoint_every=7)
+    states[-1].joint_velocities.sum().backward()
+    assert mass.grad.any()
+    assert len(solves) == 2 * WINDOW
