@@ -145,6 +145,19 @@ nb::list to_lists(const std::vector<step::Report>& reports) {
   return lists;
 }
 
+/// Environments whose prescribed motion has ended before its end -> poses of all roots there [T, 7].
+nb::dict ended_poses(const std::vector<step::Report>& reports) {
+  nb::dict ended;
+  for (std::size_t e = 0; e < reports.size(); ++e) {
+    const std::vector<double>& poses = reports[e].root_poses;
+    if (poses.empty()) continue;
+    Owned<double> owned = make_array<double>({poses.size() / 7, 7});
+    std::ranges::copy(poses, owned.data);
+    ended[nb::int_(e)] = owned.array;
+  }
+  return ended;
+}
+
 class Simulator {
  public:
   explicit Simulator(step::Description description)
@@ -289,6 +302,7 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   nb::list messages;
   for (const step::Report& report : reports) messages.append(report.message);
   out["message"] = messages;
+  out["ended"] = ended_poses(reports);
   return out;
 }
 

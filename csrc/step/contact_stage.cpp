@@ -232,6 +232,8 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
     if (!sum.friction && contacts.empty()) break;
     if (solves < friction_iterations) sum.lag(contacts);
   }
+  const double reached = step.report.motion_fraction;
+  if (reached < 1.0) step.report.root_poses = motion.root_poses(reached);
   report_contacts(problem.scene, sum.contacts(), step.report);
   if (!step.tape.empty()) *step.tape["solves"] = solves;
   write_body_forces(problem, sum, x, body_forces);

@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.geometry.rotation import row_velocities
 from diffcloth_torch.sim.inputs import Fields
 from diffcloth_torch.sim.layout import Layout
 
-__all__ = ["held_targets", "prescribed_motion"]
+__all__ = ["ended_poses", "held_targets", "prescribed_motion"]
+
+
+def ended_poses(targets: Tensor, ended: Mapping[int, FloatArray], environments: int) -> Tensor:
+    """Poses at the end of a step, where the motion of some environments has ended early.
+
+    Args:
+        targets: Where it should have led, [B or 1, T, 7].
+        ended: Environment -> poses there, [T, 7].
+        environments: B.
+    """
+    arrived = torch.ones(environments, 1, 1, dtype=torch.bool)
+    arrived[list(ended)] = False
+    poses = torch.zeros(environments, *targets.shape[1:], dtype=targets.dtype)
+    poses[list(ended)] = torch.from_numpy(np.stack(list(ended.values())))
+    return torch.where(arrived, targets, poses)
 
 
 def prescribed_motion(layout: Layout, state: Fields, control: Fields, dt: float) -> Fields:
