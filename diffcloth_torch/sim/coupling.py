@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Container
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ from diffcloth_torch.sim.inputs import Fields
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.links import link_poses
 from diffcloth_torch.sim.masses import vertex_masses
+from diffcloth_torch.sim.motion import with_rows
 from diffcloth_torch.sim.step import (
     CONVERGED,
     DIAGNOSTICS,
@@ -139,9 +140,9 @@ class Staggered:
             outcome = take_step(self._cloth, given, batched=True)
             look_at(outcome)
             if blocked:  # what is squeezed may push too hard to find a motion
-                forces = outcome.body_forces
-                squeezed = _per_environment(forces, blocked)
-                outcome = outcome._replace(body_forces=torch.where(squeezed, 0.0, forces))
+                forces = {"body_forces": outcome.body_forces}
+                none = {"body_forces": torch.zeros_like(outcome.body_forces)}
+                outcome = outcome._replace(**with_rows(forces, none, blocked))
             paths.append(partial(self._cloth.path, _arrays(given)))
             return _Solved(outcome, ends)
 
@@ -170,7 +171,7 @@ class Staggered:
             "body_forces": solved.body_forces,
         }
         if blocked:
-            tensors = _at_start(state, tensors, blocked)
+            tensors = with_rows(tensors, _at_start(state, tensors), blocked)
             for i, message in blocked.items():
                 diagnostics["status"][i] = INFEASIBLE
                 diagnostics["motion_fraction"][i] = 0.0
@@ -291,22 +292,14 @@ def _blocked(diagnostics: dict[str, Any]) -> dict[int, str]:
     return {i: message for i, (status, message) in messages if status == INFEASIBLE}
 
 
-def _per_environment(like: Tensor, environments: Iterable[int]) -> Tensor:
-    """Whether a row [B, ...] is of one of these environments; the axes behind have length 1."""
-    mask = torch.zeros(len(like), *[1] * (like.ndim - 1), dtype=torch.bool)
-    mask[list(environments)] = True
-    return mask
-
-
-def _at_start(state: Fields, tensors: Fields, environments: Iterable[int]) -> Fields:
-    """Fields behind a step that did not take place in some environments: nothing has moved.
+def _at_start(state: Fields, tensors: Fields) -> Fields:
+    """Fields behind a step that did not take place: nothing has moved.
 
     The solves that move bodies and cloths in turn have no other point in common.
     """
-    starts = {name: state[name].detach() for name in _PLACES if name in state}
     return {
-        name: torch.where(_per_environment(values, environments), starts.get(name, 0.0), values)
-        for name, values in tensors.items()
+        name: state[name].detach() if name in _PLACES and name in state else torch.zeros_like(old)
+        for name, old in tensors.items()
     }
 
 

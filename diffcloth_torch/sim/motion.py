@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,7 +12,7 @@ from diffcloth_torch.geometry.rotation import row_velocities
 from diffcloth_torch.sim.inputs import Fields
 from diffcloth_torch.sim.layout import Layout
 
-__all__ = ["ended_poses", "held_targets", "prescribed_motion"]
+__all__ = ["ended_poses", "held_targets", "prescribed_motion", "with_rows"]
 
 
 def ended_poses(targets: Tensor, ended: Mapping[int, FloatArray], environments: int) -> Tensor:
@@ -24,11 +23,24 @@ def ended_poses(targets: Tensor, ended: Mapping[int, FloatArray], environments: 
         ended: Environment -> poses there, [T, 7].
         environments: B.
     """
-    arrived = torch.ones(environments, 1, 1, dtype=torch.bool)
-    arrived[list(ended)] = False
-    poses = torch.zeros(environments, *targets.shape[1:], dtype=targets.dtype)
-    poses[list(ended)] = torch.from_numpy(np.stack(list(ended.values())))
-    return torch.where(arrived, targets, poses)
+    poses = targets.detach().expand(environments, *targets.shape[1:]).clone()
+    for i, there in ended.items():
+        poses[i] = torch.from_numpy(there)
+    return poses
+
+
+def with_rows(fields: Fields, others: Fields, environments: Iterable[int]) -> Fields:
+    """Fields [B or 1, ...] that have the rows of other ones in some environments.
+
+    The others are to have no graph: the rest then keeps the gradients, to the bit, that it has
+    where there is nothing to replace.
+    """
+    mixed = {}
+    for name, other in others.items():
+        mask = torch.zeros(len(other), *[1] * (other.ndim - 1), dtype=torch.bool)
+        mask[list(environments)] = True
+        mixed[name] = torch.where(mask, other, fields.get(name, torch.zeros_like(other)))
+    return fields | mixed
 
 
 def prescribed_motion(layout: Layout, state: Fields, control: Fields, dt: float) -> Fields:

@@ -53,7 +53,12 @@ from diffcloth_torch.sim.inputs import (
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.links import contact_wrenches, link_poses, link_velocities
 from diffcloth_torch.sim.masses import cloth_totals, vertex_masses
-from diffcloth_torch.sim.motion import ended_poses, held_targets, prescribed_motion
+from diffcloth_torch.sim.motion import (
+    ended_poses,
+    held_targets,
+    prescribed_motion,
+    with_rows,
+)
 from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.rollout import roll_out
 from diffcloth_torch.sim.schemes import check_scheme
@@ -354,15 +359,16 @@ class Simulator:
         inputs = self._core_inputs(state, control, parameters, prediction)
         outcome = take_step(self._core, inputs, self._constants, batched=batch is not None)
         self._check(outcome.diagnostics, batch)
-        ended, environments = outcome.diagnostics["ended"], len(state["positions"])
+        ended = outcome.diagnostics["ended"]
         if self._dynamics is None or prediction is None:
-            targets = control["body_poses"]
-            if ended and targets is not state["body_poses"]:
-                control = control | {"body_poses": ended_poses(targets, ended, environments)}
-            return outcome, prescribed_motion(self._layout, state, control, self.dt)
-        if ended:
-            poses = ended_poses(prediction.body_targets, ended, environments)
-            prediction = self._dynamics.end_at(prediction, poses)
+            after = prescribed_motion(self._layout, state, control, self.dt)
+            if ended:
+                poses = ended_poses(control["body_poses"], ended, len(state["positions"]))
+                with torch.no_grad():
+                    reached = control | {"body_poses": poses}
+                    there = prescribed_motion(self._layout, state, reached, self.dt)
+                after = with_rows(after, there, ended)
+            return outcome, after
         forces = outcome.body_forces if batch is not None else outcome.body_forces.unsqueeze(0)
         coordinates = outcome.coordinates
         if coordinates is None:  # robots without a joint that moves
@@ -370,6 +376,12 @@ class Simulator:
         elif batch is None:
             coordinates = coordinates.unsqueeze(0)
         after = self._dynamics.advance(prediction, coordinates, forces)
+        if ended:
+            poses = ended_poses(prediction.body_targets, ended, len(forces))
+            with torch.no_grad():
+                stopped = self._dynamics.end_at(prediction, poses)
+                there = self._dynamics.advance(stopped, coordinates, forces)
+            after = with_rows(after, there, ended)
         return outcome, {**after, "joint_targets": held_targets(self._layout, state, control)}
 
     def _step_in_turn(
