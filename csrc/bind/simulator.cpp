@@ -17,6 +17,7 @@
 #include "bind/checks.h"
 #include "bind/environments.h"
 #include "bind/links.h"
+#include "bind/without_gil.h"
 #include "contact/nonadjacent_distance.h"
 #include "step/scheme.h"
 #include "step/step.h"
@@ -188,7 +189,7 @@ class Simulator {
   double reference_factorization_seconds(const nb::dict& inputs, int repeats) const {
     const Arrays arrays(scene_, inputs);
     if (repeats < 1) throw nb::value_error("core: `repeats` must be at least 1");
-    const nb::gil_scoped_release nogil;
+    const WithoutGil nogil;
     return step::reference_factorization_seconds(scene_, arrays.environment(0), repeats);
   }
   void forget_factors() { factors_.clear(); }

@@ -32,6 +32,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from diffcloth_torch import _core
+from diffcloth_torch._exit import note_caller
 from diffcloth_torch.checks import is_dense
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.sim.controls import tensors_of
@@ -176,6 +177,7 @@ def as_array(tensor: Tensor) -> NDArray[np.float64]:
 
 
 def _forward(core: _core.Simulator, arrays: dict[str, Any], *, tape: bool) -> dict[str, Any]:
+    note_caller()
     try:
         return core.forward(arrays, tape, torch.get_num_threads())
     except _core.SimulationError as error:
@@ -314,6 +316,7 @@ def _check_saved(step, saved):
 def _backward(step, saved, losses):
     arrays = [as_array(t) for t in saved]
     count, needs = len(step.names), _needs(step)
+    note_caller()
     try:
         gradients = step.core.backward(
             step.constants | dict(zip(step.names, arrays[:count], strict=True)),

@@ -181,7 +181,8 @@ def test_rollouts_with_and_without_checkpoints_agree(kind, scheme, coupling):
         wanted = targets(kind, sim).requires_grad_()
         x = sim.initial_state(B).positions.clone().requires_grad_()
         state, states = sim.initial_state(B).replace(positions=x), []
-        controls = [None, control(kind, wanted), None, None]
+        after = [None, None] if kind == "pins" else []  # what is squeezed is slow to solve
+        controls = [None, control(kind, wanted), *after]
         states = sim.rollout(state, controls, checkpoint_every=every)
         assert states[1].report.status == STATUS
         healthy = torch.tensor([s == "converged" for s in STATUS])
