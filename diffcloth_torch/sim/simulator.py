@@ -423,7 +423,7 @@ class Simulator:
             steps: Number of steps; needed unless `controls` is a sequence.
             checkpoint_every: Keep tapes of this many steps at a time: backward repeats the steps
                 from the state before them. A function `controls` is then called again and must
-                return the same.
+                return the same: backward raises `InvalidInput` otherwise.
 
         Returns:
             The states after each step.
