@@ -26,7 +26,7 @@ struct Report {
   Index contact_count = 0;
   double motion_fraction = 1.0;
   std::vector<double> root_poses;  ///< where the motion has ended before its end [T, 7]; else empty
-  Index taking_off = 0;  ///< nodes in dry frictional contact, by the cases of its law
+  Index taking_off = 0;            ///< nodes in dry frictional contact, by the cases of its law
   Index sticking = 0;
   Index slipping = 0;
   solver::Counts counts;

@@ -140,9 +140,9 @@ class Staggered:
             outcome = take_step(self._cloth, given, batched=True)
             look_at(outcome)
             if blocked:  # what is squeezed may push too hard to find a motion
-                forces = {"body_forces": outcome.body_forces}
-                none = {"body_forces": torch.zeros_like(outcome.body_forces)}
-                outcome = outcome._replace(**with_rows(forces, none, blocked))
+                forces = {"": outcome.body_forces}
+                none = {"": torch.zeros_like(outcome.body_forces)}
+                outcome = outcome._replace(body_forces=with_rows(forces, none, blocked)[""])
             paths.append(partial(self._cloth.path, _arrays(given)))
             return _Solved(outcome, ends)
 

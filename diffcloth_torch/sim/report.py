@@ -72,7 +72,8 @@ class Report:
                     raise TypeError(f"Report: `{label}` must be a number or a tensor, got {kind}")
         if self.status == ():
             object.__setattr__(self, "status", _status_by(self.converged))
-        names = (self.status,) if isinstance(self.status, str) else self.status
+        status: Any = self.status
+        names = (status,) if isinstance(status, str) else status
         if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
             raise TypeError(f"Report: `status` must be a str or a tuple of them, got {names!r}")
 

@@ -94,7 +94,7 @@ def _digests(control: Control | None) -> dict[str, bytes]:
         for key, entry in entries.items():
             if entry is not None:
                 numbers = torch.as_tensor(entry).detach().to(torch.float64).contiguous().numpy()
-                content = hashlib.blake2b(numbers, digest_size=16).digest()
+                content = hashlib.blake2b(numbers.tobytes(), digest_size=16).digest()
                 name = field if key is None else f"{field}[{key!r}]"
                 digests[name] = repr(numbers.shape).encode() + content
     return digests

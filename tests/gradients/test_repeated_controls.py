@@ -67,12 +67,12 @@ def test_any_other_control_is_noticed(sim, first, again, field):
     asked = []
 
     def controls(k, state):
-        make = first if k not in asked or k < 3 else again
+        make = first if k not in asked or k < 4 else again
         asked.append(k)
         return make(shifted(sim, 0.0))
 
     loss, x = rolled(sim, controls)
-    with pytest.raises(dc.InvalidInput, match=rf"`{field}` for the step \[3\]"):
+    with pytest.raises(dc.InvalidInput, match=rf"`{field}` for the step \[4\]"):
         torch.autograd.grad(loss, x)
 
 
