@@ -1,7 +1,8 @@
-"""Scenes in which the prescribed motion of one of eight environments cannot be completed.
+"""Scenes in which one of eight environments fails, mostly as its motion cannot be completed.
 
 A loose or pinned sheet gets between something that moves and something that stands still; a ball
-that falls beside it gives every coupling something to do.
+that falls beside it gives every coupling something to do. Or forces crumple the sheet in more
+iterations than there are.
 """
 
 import math
@@ -22,7 +23,19 @@ KINDS = {
     "turning body": "body_poses",
     "joint": "joint_positions",
     "base": "base_poses",
+    "forces": "forces",
 }
+BLOCKED = [kind for kind in KINDS if kind != "forces"]
+
+
+def status(kind, scheme="coupled"):
+    """What the report says of each environment."""
+    # The elastic stage of "split" leaves no iteration to move the ball with.
+    is_blocked = kind in BLOCKED or scheme == "split"
+    failure = "infeasible_motion" if is_blocked else "not_converged"
+    return tuple(failure if i == FAILED else "converged" for i in range(B))
+
+
 # Scheme and coupling.
 SOLVES = [
     ("coupled", "monolithic"),
@@ -71,6 +84,8 @@ def simulator(kind, scheme="coupled", coupling="monolithic", **solver):
                 [0.4, 0.2, 0.02], motion="kinematic", pose=[0, 0, 0.07, *FLAT], name="plate"
             )
         )
+    if kind == "forces":
+        solver = {"max_iterations": 8} | solver
     scene = dc.Scene([sheet], bodies, robots, gravity=gravity)
     return dc.Simulator(
         scene,
@@ -91,6 +106,12 @@ def targets(kind, sim):
         pins[..., 2] -= small[:, None]
         pins[FAILED, :, 2] = -0.2
         return pins
+    if kind == "forces":
+        forces = torch.zeros_like(state.positions)
+        forces[..., 2] = small[:, None]
+        noise = torch.randn(forces[0].shape, generator=torch.Generator().manual_seed(2), dtype=F64)
+        forces[FAILED] = 2.0 * noise
+        return forces
     if kind == "joint":
         joints = state.joint_positions.clone()
         joints[:, 0] = small
