@@ -41,11 +41,17 @@ class IntersectingState(SimulationError):  # noqa: N818
 
 
 class InfeasibleMotion(SimulationError):  # noqa: N818
-    """The prescribed motion of bodies and pins cannot be completed without an intersection."""
+    """The prescribed motion of bodies, joints and pins cannot be completed without an intersection.
+
+    Raised by a step, or by a backward through one whose failure was passed on as a value.
+    """
 
 
 class NotConverged(SimulationError):  # noqa: N818
-    """The iteration limit was reached before the residual fell below the tolerance."""
+    """The solver stopped above its tolerance; the message says why.
+
+    Raised by a step, or by a backward through one whose failure was passed on as a value.
+    """
 
 
 class IgnoredLimitsWarning(UserWarning):

@@ -518,10 +518,12 @@ def test_reports_are_numbers_or_tensors(sim):
     assert isinstance(single.contact_count, int)
     assert single.motion_fraction == 1.0
     assert all(isinstance(seconds, float) for seconds in single.seconds.values())
+    assert single.status == "converged"
     batch = sim.step(moved(sim, batch_size=2)).report
     assert batch.converged.tolist() == [True, True]
     assert batch.residual.shape == batch.minimum_distance.shape == (2,)
     assert all(seconds.shape == (2,) for seconds in batch.seconds.values())
+    assert batch.status == ("converged", "converged")
 
 
 # --- Purity --------------------------------------------------------------------------------------

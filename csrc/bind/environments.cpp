@@ -3,6 +3,7 @@
 #include <algorithm>
 
 #include "bind/bind.h"
+#include "bind/without_gil.h"
 #include "common/parallel_for.h"
 
 namespace diffcloth::bind {
@@ -11,11 +12,12 @@ void for_environments(std::size_t count,
                       int threads,
                       const std::function<void(Index, const Checkpoint&)>& body) {
   Interrupt interrupt([] {
+    if (is_abandoned()) return true;
     const nb::gil_scoped_acquire gil;
     return PyErr_CheckSignals() != 0;
   });
   try {
-    const nb::gil_scoped_release nogil;
+    const WithoutGil nogil;
     parallel_for(static_cast<Index>(count), threads, interrupt, body);
   } catch (const Interrupted&) {
     throw nb::python_error();  // the error that the signal handler has set

@@ -1,4 +1,7 @@
+#include <nanobind/stl/vector.h>
+
 #include "bind/bind.h"
+#include "bind/without_gil.h"
 
 NB_MODULE(_core, m) {
   namespace nb = nanobind;
@@ -10,4 +13,8 @@ NB_MODULE(_core, m) {
   diffcloth::bind::build_info(m);
   diffcloth::bind::free_motion(m);
   diffcloth::bind::simulator(m);
+  m.def("abandon_calls", &diffcloth::bind::abandon_calls,
+        "From now on no call comes back to Python, but in this thread.");
+  m.def("parked_threads", &diffcloth::bind::parked_threads,
+        "Identifiers of the threads whose calls do not come back.");
 }

@@ -17,6 +17,7 @@
 #include "bind/checks.h"
 #include "bind/environments.h"
 #include "bind/links.h"
+#include "bind/without_gil.h"
 #include "contact/nonadjacent_distance.h"
 #include "step/scheme.h"
 #include "step/step.h"
@@ -145,6 +146,19 @@ nb::list to_lists(const std::vector<step::Report>& reports) {
   return lists;
 }
 
+/// Environments whose prescribed motion has ended before its end -> poses of all roots there [T, 7].
+nb::dict ended_poses(const std::vector<step::Report>& reports) {
+  nb::dict ended;
+  for (std::size_t e = 0; e < reports.size(); ++e) {
+    const std::vector<double>& poses = reports[e].root_poses;
+    if (poses.empty()) continue;
+    Owned<double> owned = make_array<double>({poses.size() / 7, 7});
+    std::ranges::copy(poses, owned.data);
+    ended[nb::int_(e)] = owned.array;
+  }
+  return ended;
+}
+
 class Simulator {
  public:
   explicit Simulator(step::Description description)
@@ -169,7 +183,7 @@ class Simulator {
   double reference_factorization_seconds(const nb::dict& inputs, int repeats) const {
     const Arrays arrays(scene_, inputs);
     if (repeats < 1) throw nb::value_error("core: `repeats` must be at least 1");
-    const nb::gil_scoped_release nogil;
+    const WithoutGil nogil;
     return step::reference_factorization_seconds(scene_, arrays.environment(0), repeats);
   }
   void forget_factors() { factors_.clear(); }
@@ -283,6 +297,7 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   nb::list messages;
   for (const step::Report& report : reports) messages.append(report.message);
   out["message"] = messages;
+  out["ended"] = ended_poses(reports);
   return out;
 }
 

@@ -1,6 +1,7 @@
 #include "solver/motion.h"
 
 #include <algorithm>
+#include <ranges>
 
 #include "solver/line_search.h"
 
@@ -91,23 +92,44 @@ bool has_arrived(const Walk& walk, const std::vector<double>& ends) {
   return true;
 }
 
+/// A point on the way, and the fraction of the whole motion there.
+struct Stop {
+  Walk::Place place;
+  double fraction;
+};
+
+/// Go back to the last of these at which what is prescribed can have the place that its motion gives it.
+double halt(Walk& walk, const PrescribedMotion& motion, const std::vector<Stop>& way) {
+  for (const Stop& stop : std::views::reverse(way)) {
+    walk.back(stop.place);
+    std::vector<double> to = walk.x();
+    motion.at(stop.fraction, to.data());
+    if (walk.watch(to) < 1.0) continue;
+    walk.go(to);
+    walk.refresh();
+    return stop.fraction;
+  }
+  return way.front().fraction;
+}
+
 }  // namespace
 
 double arrive(Walk& walk, const PrescribedMotion& motion) {
   const int portions = motion.portions();
   std::vector<double> ends(walk.x());
   for (int k = 0; k < portions; ++k) {
-    motion.end_of_portion(k, ends.data());
+    motion.at((k + 1.0) / portions, ends.data());
     if (has_arrived(walk, ends)) continue;
     double remaining = 1.0;
     double checked = 1.0;
+    std::vector<Stop> way;  // in this portion
     for (int iteration = 1; remaining > 0.0; ++iteration) {
-      const double reached = (k + 1.0 - remaining) / portions;
-      if (!walk.spend()) return reached;
+      way.push_back({.place = walk.place(), .fraction = (k + 1.0 - remaining) / portions});
+      if (!walk.spend()) return halt(walk, motion, way);
       const double alpha = joint_step(walk, ends);
       remaining *= 1.0 - alpha;
       if (iteration % kStuckIterations == 0) {
-        if (checked - remaining < kStuckProgress) return reached;
+        if (checked - remaining < kStuckProgress) return halt(walk, motion, way);
         checked = remaining;
       }
       if (alpha < kStopped) relax(walk);

@@ -247,6 +247,8 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
   }
   report_contacts(sum.contacts(), step.report);
   report_blockers(problem, x, status, step.report);
+  const double reached = step.report.motion_fraction;
+  if (reached < 1.0) step.report.root_poses = motion.root_poses(reached);
   if (!step.tape.empty()) *step.tape["solves"] = solves;
   write_body_forces(problem, sum, x, body_forces);
 }

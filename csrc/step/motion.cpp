@@ -30,29 +30,35 @@ Motion::Motion(const Problem& problem) : problem_(problem) {
   portions_ = std::max(1, static_cast<int>(std::ceil(turn / kLargestTurn)));
 }
 
-void Motion::end_of_portion(int k, double* x) const {
+std::vector<double> Motion::root_poses(double fraction) const {
+  const double* from = problem_.inputs.data(Input::kBodyPoses);
+  const double* to = problem_.inputs.data(Input::kBodyTargets);
+  const Index count = tree_count(problem_.scene);
+  std::vector<double> poses(from, from + 7 * static_cast<std::ptrdiff_t>(count));
+  for (Index b = 0; fraction > 0.0 && b < count; ++b) {
+    const Eigen::Map<const bodies::Pose> start(from + 7 * b);
+    const Eigen::Map<const bodies::Pose> end(to + 7 * b);
+    if (start == end) continue;  // to the bit
+    Eigen::Map<bodies::Pose>(poses.data() + 7 * b) = bodies::interpolate(start, end, fraction);
+  }
+  return poses;
+}
+
+void Motion::at(double fraction, double* x) const {
   const Scene& scene = problem_.scene;
   const std::size_t cloth = 3 * static_cast<std::size_t>(scene.cloth_vertex_count());
-  const double s = (k + 1.0) / portions_;
-  const bool last = k + 1 == portions_;
+  const bool is_end = fraction == 1.0;
   for (const Index i : scene.given.pins) {
     const Vec3 from = row(problem_.start.data(), i);
     const Vec3 to = row(problem_.ends.data(), i);
-    Eigen::Map<Vec3>(x + 3 * i) = last ? to : Vec3(from + s * (to - from));
+    Eigen::Map<Vec3>(x + 3 * i) = is_end ? to : Vec3(from + fraction * (to - from));
   }
-  if (last) {
+  if (is_end) {
     std::copy(problem_.ends.begin() + static_cast<std::ptrdiff_t>(cloth), problem_.ends.end(),
               x + cloth);
     return;
   }
-  const double* from = problem_.inputs.data(Input::kBodyPoses);
-  const double* to = problem_.inputs.data(Input::kBodyTargets);
-  std::vector<double> poses(7 * static_cast<std::size_t>(tree_count(scene)));
-  for (Index b = 0; b < tree_count(scene); ++b) {
-    Eigen::Map<bodies::Pose>(poses.data() + 7 * b) =
-        bodies::interpolate(Eigen::Map<const bodies::Pose>(from + 7 * b),
-                            Eigen::Map<const bodies::Pose>(to + 7 * b), s);
-  }
+  const std::vector<double> poses = root_poses(fraction);
   scene.given.bodies.place(poses.data(), x + cloth);
   if (scene.mechanisms.empty()) return;
   double* const nodes = x + 3 * static_cast<std::ptrdiff_t>(scene.vertex_count());
@@ -60,7 +66,7 @@ void Motion::end_of_portion(int k, double* x) const {
     if (scene.mechanisms.given().prescribed[c] == 0) continue;
     const Index slot = scene.mechanisms.slot(c);
     const double start = problem_.coordinates.nodes(problem_.start)[slot];
-    nodes[slot] = start + s * (problem_.coordinates.nodes(problem_.ends)[slot] - start);
+    nodes[slot] = start + fraction * (problem_.coordinates.nodes(problem_.ends)[slot] - start);
   }
   scene.mechanisms.set_frames(poses.data(), nodes);
   scene.mechanisms.place(nodes, x + cloth);

@@ -1,5 +1,7 @@
 #pragma once
 
+#include <vector>
+
 #include "solver/motion.h"
 #include "step/problem.h"
 
@@ -11,7 +13,10 @@ class Motion final : public solver::PrescribedMotion {
   explicit Motion(const Problem& problem);
 
   int portions() const override { return portions_; }
-  void end_of_portion(int k, double* x) const override;
+  void at(double fraction, double* x) const override;
+
+  /// Poses of all roots at a fraction of the motion, [T, 7].
+  std::vector<double> root_poses(double fraction) const;
 
  private:
   const Problem& problem_;

@@ -2,6 +2,7 @@
 
 #include <cstdint>
 #include <string>
+#include <vector>
 
 #include "common/stopwatch.h"
 #include "common/types.h"
@@ -24,7 +25,8 @@ struct Report {
   double minimum_distance = 0.0;  ///< of the pairs in contact; infinite without contact [m]
   Index contact_count = 0;
   double motion_fraction = 1.0;
-  Index taking_off = 0;  ///< nodes in dry frictional contact, by the cases of its law
+  std::vector<double> root_poses;  ///< where the motion has ended before its end [T, 7]; else empty
+  Index taking_off = 0;            ///< nodes in dry frictional contact, by the cases of its law
   Index sticking = 0;
   Index slipping = 0;
   solver::Counts counts;

@@ -240,6 +240,16 @@ class Chain:
             given=given,
         )
 
+    def end_at(self, prediction: ChainPrediction, pose: Tensor) -> ChainPrediction:
+        """The prediction of a step in which a prescribed base has ended at another pose, [B, 7]."""
+        if self.mechanism.base != "kinematic":
+            return prediction
+        quaternion = torch.nn.functional.normalize(prediction.pose[..., 3:], dim=-1)
+        local = prediction.inertia.center[..., self._tree.root, :]
+        root = self._base_rates(prediction.start, quaternion, pose, local)
+        known = torch.cat([root, prediction.known[..., ROOT:]], dim=-1)
+        return prediction._replace(root_end=pose, known=known)
+
     def advance(
         self,
         prediction: ChainPrediction,
@@ -342,11 +352,17 @@ class Chain:
         ends = torch.where(position > 0, control.joints, joints + h * rates)
         root = torch.zeros_like(start.center).repeat(1, 2)
         if self.mechanism.base == "kinematic":
-            target = torch.nn.functional.normalize(control.pose[..., 3:], dim=-1)
-            center, _ = _placed(control.pose[..., :3], target, local)
-            between = torch.cat([start.center, quaternion], -1), torch.cat([center, target], -1)
-            root = pose_velocities(*between, h)
+            root = self._base_rates(start, quaternion, control.pose, local)
         return torch.cat([root, rates], dim=-1), ends
+
+    def _base_rates(
+        self, start: _Configuration, quaternion: Tensor, end: Tensor, local: Tensor
+    ) -> Tensor:
+        """Velocities [B, 6] of the root that lead to a pose of its frame."""
+        target = torch.nn.functional.normalize(end[..., 3:], dim=-1)
+        center, _ = _placed(end[..., :3], target, local)
+        between = torch.cat([start.center, quaternion], -1), torch.cat([center, target], -1)
+        return pose_velocities(*between, self._dt)
 
     def _given(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -197,6 +197,23 @@ class Dynamics:
             chains=chains,
             held_poses=held,
             held_velocities=velocities,
+        )
+
+    def end_at(self, prediction: Prediction, poses: Tensor) -> Prediction:
+        """The prediction of a step in which what is prescribed has ended at other poses.
+
+        Args:
+            prediction: Of the step.
+            poses: Of all roots at its end, [B, T, 7]; those of free ones do not count.
+        """
+        moved, bodies = self._moved, prediction.held_poses.shape[1]
+        start, end = prediction.body_poses[:, :bodies], poses[:, :bodies]
+        chains = zip(self._chains, prediction.chains, poses[:, bodies:].unbind(1), strict=True)
+        return replace(
+            prediction,
+            held_poses=prediction.held_poses.index_copy(1, moved, end[:, moved]),
+            held_velocities=row_velocities(start, end, moved, self.dt),
+            chains=tuple(chain.end_at(own, pose) for chain, own, pose in chains),
         )
 
     def advance(

@@ -59,8 +59,10 @@ class SolverOptions:
             force gives a vertex in a time step.
         max_iterations: Newton iterations that a step may take over all its solves, >= 1. Projective
             Dynamics may take 50 times as many of its own, which cost about as much less.
-        throw: Whether a step that does not converge raises `NotConverged`; otherwise the last
-            feasible iterate comes back with `report.converged` False.
+        throw: Whether a step that fails in any environment raises `NotConverged` or
+            `InfeasibleMotion`. Otherwise `report.status` says which failed, and their state is the
+            last feasible iterate: bodies, joints and pins are where the motion ended (in staggered
+            couplings, where it began). Backward raises the error where a loss depends on them.
         metric: Norm of the contact stage of the scheme "split": "elastic" (the masses plus h^2
             times the constant matrix of Projective Dynamics), "mass", or "identity" (the paper's
             Eq. 22). None means "elastic" for "split"; the others have no choice.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,7 +21,16 @@ from diffcloth_torch.sim.inputs import Fields
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.links import link_poses
 from diffcloth_torch.sim.masses import vertex_masses
-from diffcloth_torch.sim.step import Outcome, as_array, diagnostics_of, take_step, unconverged
+from diffcloth_torch.sim.motion import with_rows
+from diffcloth_torch.sim.step import (
+    CONVERGED,
+    DIAGNOSTICS,
+    INFEASIBLE,
+    Outcome,
+    as_array,
+    diagnostics_of,
+    take_step,
+)
 
 __all__ = ["Staggered"]
 
@@ -29,6 +38,9 @@ Check = Callable[[dict[str, Any]], None]
 """Raises where the diagnostics of a solve say that it failed."""
 
 _LARGEST_ADDED_MASS = 0.5
+
+# What a state has besides velocities, forces and efforts.
+_PLACES = ("positions", "body_poses", "joint_positions", "base_poses")
 
 
 class _Solved(NamedTuple):
@@ -69,7 +81,7 @@ class Staggered:
             limit_stiffness: Of the barriers at the limits of coordinates, shape [n].
         """
         self._coupling, self._layout, self._dynamics = coupling, layout, dynamics
-        self._dt = options.dt
+        self._dt, self._throw = options.dt, options.solver.throw
         assembly = layout.assembly
         coupled = options._replace(scheme="coupled")
         alone = coupled._replace(bending_models=())
@@ -107,6 +119,11 @@ class Staggered:
     ) -> tuple[Outcome, Fields, list[Callable[[], FloatArray]]]:
         """Outcome, fields behind the step, and the polylines of what is solved with the cloths."""
         paths: list[Callable[[], FloatArray]] = []
+        blocked: dict[int, str] = {}  # environments whose motion cannot be completed -> why
+
+        def look_at(outcome: Outcome) -> None:
+            check(outcome.diagnostics)
+            blocked.update(_blocked(outcome.diagnostics))
 
         def predict(contact: Tensor | None) -> Prediction:
             return self._dynamics.predict(state, control, parameters, contact)
@@ -114,14 +131,18 @@ class Staggered:
         def solve_rigid(prediction: Prediction) -> _Solved:
             given = self._without_cloths(inputs) | prediction.core_inputs()
             outcome = take_step(self._rigid, given, batched=True)
-            check(outcome.diagnostics)
+            look_at(outcome)
             ends = outcome.coordinates
             return _Solved(outcome, prediction.coordinates if ends is None else ends)
 
         def solve_cloth(prediction: Prediction, ends: Tensor) -> _Solved:
             given = inputs | prediction.core_inputs() | {"coordinate_ends": ends}
             outcome = take_step(self._cloth, given, batched=True)
-            check(outcome.diagnostics)
+            look_at(outcome)
+            if blocked:  # what is squeezed may push too hard to find a motion
+                forces = {"": outcome.body_forces}
+                none = {"": torch.zeros_like(outcome.body_forces)}
+                outcome = outcome._replace(body_forces=with_rows(forces, none, blocked)[""])
             paths.append(partial(self._cloth.path, _arrays(given)))
             return _Solved(outcome, ends)
 
@@ -133,7 +154,7 @@ class Staggered:
                 "coordinate_ends": end,
             }
             arrays = _arrays(given)
-            self._require_free_way(arrays)
+            blocked.update(self._blocked_ways(arrays, blocked))
             paths.append(partial(self._judge.path, arrays))
 
         if self._coupling == "rigid_to_cloth":
@@ -142,13 +163,22 @@ class Staggered:
             solved = cloth_to_rigid(self._dynamics, predict, solve_rigid, solve_cloth, check_path)
         cloth = solved.cloth.outcome
         self._warn(cloth, solved.fields, parameters)
-        outcome = Outcome(
-            positions=cloth.positions,
-            velocities=cloth.velocities,
-            body_forces=solved.body_forces,
-            diagnostics=_merged(cloth.diagnostics, solved.rigid.outcome.diagnostics),
-        )
-        return outcome, solved.fields, paths
+        diagnostics = _merged(cloth.diagnostics, solved.rigid.outcome.diagnostics)
+        tensors = {
+            **solved.fields,
+            "positions": cloth.positions,
+            "velocities": cloth.velocities,
+            "body_forces": solved.body_forces,
+        }
+        if blocked:
+            tensors = with_rows(tensors, _at_start(state, tensors), blocked)
+            for i, message in blocked.items():
+                diagnostics["status"][i] = INFEASIBLE
+                diagnostics["motion_fraction"][i] = 0.0
+                diagnostics["message"][i] = message
+        names = ("positions", "velocities", "body_forces")
+        outcome = Outcome(**{n: tensors.pop(n) for n in names}, diagnostics=diagnostics)
+        return outcome, tensors, paths
 
     def _without_cloths(self, inputs: Fields) -> Fields:
         """What concerns bodies and links alone."""
@@ -178,16 +208,23 @@ class Staggered:
             "soft_pin_targets": positions[:, :0],
         }
 
-    def _require_free_way(self, inputs: dict[str, FloatArray]) -> None:
-        """Refuse a motion of bodies and robots through cloths that stand still."""
+    def _blocked_ways(self, inputs: dict[str, FloatArray], known: Container[int]) -> dict[int, str]:
+        """Refuse motions of bodies and robots through cloths that stand still.
+
+        Returns:
+            Where that is so, besides what is known, and what to do; where nothing is raised.
+        """
         result = self._judge.forward(inputs, False, torch.get_num_threads())
-        blocked = unconverged(diagnostics_of(result))
-        if blocked:
+        status = diagnostics_of(result)["status"]
+        blocked = [i for i, s in enumerate(status) if s != CONVERGED and i not in known]
+        remedy = 'passing through a cloth; lower dt, or use coupling="monolithic"'
+        if blocked and self._throw:
             raise InfeasibleMotion(
                 f"step: what forces move in the environments {blocked} cannot go on without "
-                'passing through a cloth; lower dt, or use coupling="monolithic"',
+                f"{remedy}",
                 environments=blocked,
             )
+        return dict.fromkeys(blocked, f"what forces move cannot go on without {remedy}")
 
     def _warn(self, cloth: Outcome, after: Fields, parameters: Fields) -> None:
         """Warn once where the cloth that a body touches is not light against it."""
@@ -245,12 +282,27 @@ def _merged(cloth: dict[str, Any], rigid: dict[str, Any]) -> dict[str, Any]:
         "motion_fraction": np.minimum,
     }
     merged = {
-        name: combine.get(name, np.add)(values, rigid[name]).tolist()
-        for name, values in cloth.items()
-        if name != "message"
+        name: combine.get(name, np.add)(cloth[name], rigid[name]).tolist() for name in DIAGNOSTICS
     }
     pairs = zip(cloth["message"], rigid["message"], strict=True)
     return {**merged, "message": ["; ".join(filter(None, pair)) for pair in pairs]}
+
+
+def _blocked(diagnostics: dict[str, Any]) -> dict[int, str]:
+    """Environments in which a solve did not complete its motion -> what it says."""
+    messages = enumerate(zip(diagnostics["status"], diagnostics["message"], strict=True))
+    return {i: message for i, (status, message) in messages if status == INFEASIBLE}
+
+
+def _at_start(state: Fields, tensors: Fields) -> Fields:
+    """Fields behind a step that did not take place: nothing has moved.
+
+    The solves that move bodies and cloths in turn have no other point in common.
+    """
+    return {
+        name: state[name].detach() if name in _PLACES and name in state else torch.zeros_like(old)
+        for name, old in tensors.items()
+    }
 
 
 def _arrays(inputs: Fields) -> dict[str, FloatArray]:

@@ -24,6 +24,13 @@ def _named(prefix: str) -> dict[str, str]:
     return {n.removeprefix(prefix): n for n in DIAGNOSTICS if n.startswith(prefix)}
 
 
+# What a report says of the core's `status`.
+_NAMES = {
+    CONVERGED: "converged",
+    UNCONVERGED: "not_converged",
+    INFEASIBLE: "infeasible_motion",
+    INTERSECTING: "intersecting_state",
+}
 _SECONDS = _named("seconds_")
 _COUNTS = _named("count_")
 
@@ -34,6 +41,7 @@ def make_report(diagnostics: dict[str, Any], *, batched: bool) -> Report:
     def value(numbers: list[Any]) -> Any:
         return torch.from_numpy(np.array(numbers)) if batched else numbers[0]
 
+    names = tuple(_NAMES[status] for status in diagnostics["status"])
     return Report(
         converged=value([status == CONVERGED for status in diagnostics["status"]]),
         iterations=value(diagnostics["iterations"]),
@@ -43,16 +51,15 @@ def make_report(diagnostics: dict[str, Any], *, batched: bool) -> Report:
         motion_fraction=value(diagnostics["motion_fraction"]),
         seconds={phase: value(diagnostics[name]) for phase, name in _SECONDS.items()},
         counts={what: value(diagnostics[name]) for what, name in _COUNTS.items()},
+        status=names if batched else names[0],
     )
 
 
 def raise_on_failure(
     diagnostics: dict[str, Any], report: Report, *, throw: bool, batched: bool
 ) -> None:
-    """Raise what is most wrong in any environment; `throw` says whether `NotConverged` is."""
-    status, reached = (np.array(diagnostics[name]) for name in ("status", "motion_fraction"))
-    # Bodies stand at the targets in the new state, so that a motion cut short has no state.
-    unfinished = (status == UNCONVERGED) & (reached < 1)
+    """Raise what is most wrong in any environment; without `throw` only what has no state."""
+    status = np.array(diagnostics["status"])
     failures: list[tuple[type[SimulationError], np.ndarray[Any, Any], str]] = [
         (
             IntersectingState,
@@ -61,7 +68,7 @@ def raise_on_failure(
         ),
         (
             InfeasibleMotion,
-            (status == INFEASIBLE) | unfinished,
+            (status == INFEASIBLE) & throw,
             "the prescribed motion cannot be completed without an intersection; move bodies and "
             "pins less far in a step, or make room for the cloth",
         ),

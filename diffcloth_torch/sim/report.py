@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -42,6 +43,8 @@ class Report:
             `left_to_newton`, numeric `factorizations`, failed ones included, of these those
             `in_doubles`, and symbolic `analyses`; vertices in dry frictional contact that are
             `taking_off`, `sticking` and `slipping`.
+        status: "converged", "not_converged" or "infeasible_motion"; in a batch a tuple of B of
+            them. The report of an `IntersectingState` has "intersecting_state" where that is so.
     """
 
     converged: bool | Tensor
@@ -52,10 +55,11 @@ class Report:
     motion_fraction: float | Tensor
     seconds: dict[str, float | Tensor]
     counts: dict[str, int | Tensor] = field(default_factory=dict)
+    status: str | tuple[str, ...] = ()  # left out, what `converged` says
 
     def __post_init__(self) -> None:
         # Reports come back from files, too: what is wrong is said here, not where it is used.
-        for entry in _FIELDS:
+        for entry in _NUMERIC:
             value = self.__dict__.get(entry)
             table = value if entry in _TABLES else {None: value}
             if not isinstance(table, dict):
@@ -66,18 +70,24 @@ class Report:
                     label = entry if name is None else f"{entry}[{name!r}]"
                     kind = type(number).__name__
                     raise TypeError(f"Report: `{label}` must be a number or a tensor, got {kind}")
+        if self.status == ():
+            object.__setattr__(self, "status", _status_by(self.converged))
+        status: Any = self.status
+        names = (status,) if isinstance(status, str) else status
+        if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
+            raise TypeError(f"Report: `status` must be a str or a tuple of them, got {names!r}")
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Reports that the first version saved count nothing.
-        self.__dict__.update({"counts": {}} | state)
+        # Reports that the first version saved count nothing, and have no status.
+        self.__dict__.update({"counts": {}, "status": ()} | state)
         self.__post_init__()
 
     def __repr__(self) -> str:
         parts = [
-            f"{entry.name}={_range_text(getattr(self, entry.name))}"
-            for entry in fields(Report)
-            if entry.name not in _TABLES
+            f"{name}={_range_text(getattr(self, name))}" for name in _NUMERIC if name not in _TABLES
         ]
+        if self.status != _status_by(self.converged):
+            parts.append(f"status={_status_text(self.status)}")
         for table in _TABLES:
             # What never happened is left out.
             texts = {name: _range_text(number) for name, number in getattr(self, table).items()}
@@ -90,12 +100,12 @@ class Report:
     def check_environments(self, owner: str, count: int | None) -> None:
         """Require tensors of shape [count], or numbers where there is no batch axis."""
         shape = [] if count is None else [count]
-        for entry in fields(Report):
-            value = getattr(self, entry.name)
-            for number in value.values() if entry.name in _TABLES else [value]:
+        for name in _FIELDS:
+            value = getattr(self, name)
+            for number in value.values() if name in _TABLES else [value]:
                 if list(np.shape(number)) != shape:
                     raise InvalidInput(
-                        f"{owner}: `report.{entry.name}` must have shape {shape}, as the state "
+                        f"{owner}: `report.{name}` must have shape {shape}, as the state "
                         f"has environments, got {list(np.shape(number))}"
                     )
 
@@ -105,7 +115,7 @@ class Report:
         def pick(values: Any) -> Any:
             return values[index].item() if isinstance(index, int) else values[index]
 
-        return _combine(pick, [self])
+        return _combine(pick, [self], self.status[index])
 
     @staticmethod
     def stack(reports: Sequence[Report | None]) -> Report | None:
@@ -113,14 +123,17 @@ class Report:
         present = [report for report in reports if report is not None]
         if len(present) < len(reports) or len({_names(r) for r in present}) > 1:
             return None
-        return _combine(lambda *values: torch.stack([_tensor(v) for v in values]), present)
+        status = tuple(str(report.status) for report in present)
+        return _combine(lambda *values: torch.stack([_tensor(v) for v in values]), present, status)
 
     @staticmethod
     def where(mask: Tensor, a: Report | None, b: Report | None) -> Report | None:
         """Report that takes the environments of `a` where `mask` is true; None if one has none."""
         if a is None or b is None or _names(a) != _names(b):
             return None
-        return _combine(lambda x, y: torch.where(mask, _tensor(x), _tensor(y)), [a, b])
+        names = [(r.status,) * len(mask) if isinstance(r.status, str) else r.status for r in (a, b)]
+        status = tuple(x if m else y for m, x, y in zip(mask.tolist(), *names, strict=True))
+        return _combine(lambda x, y: torch.where(mask, _tensor(x), _tensor(y)), [a, b], status)
 
 
 def _tensor(value: Any) -> Tensor:
@@ -148,7 +161,23 @@ def _range_text(values: Any) -> str:
     return low if low == high else f"{low} .. {high}"
 
 
+def _status_text(status: str | tuple[str, ...]) -> str:
+    """A status, or how many environments have which."""
+    if isinstance(status, str):
+        return repr(status)
+    return f"{{{', '.join(f'{name}: {n}' for name, n in Counter(status).items())}}}"
+
+
+def _status_by(converged: bool | Tensor) -> str | tuple[str, ...]:
+    """The status of steps of which only that is known."""
+    names = ("not_converged", "converged")
+    if isinstance(converged, Tensor) and converged.dim() > 0:
+        return tuple(names[is_true] for is_true in converged.bool().flatten().tolist())
+    return names[bool(converged)]
+
+
 _FIELDS = tuple(entry.name for entry in fields(Report))
+_NUMERIC = tuple(name for name in _FIELDS if name != "status")
 _NUMBERS = (bool, int, float, Tensor)
 # Fields that hold several numbers by name.
 _TABLES = ("seconds", "counts")
@@ -158,12 +187,14 @@ def _names(report: Report) -> tuple[tuple[str, ...], ...]:
     return tuple(tuple(getattr(report, table)) for table in _TABLES)
 
 
-def _combine(function: Callable[..., Any], reports: Sequence[Report]) -> Report:
+def _combine(
+    function: Callable[..., Any], reports: Sequence[Report], status: str | tuple[str, ...]
+) -> Report:
     """Apply a function to each number of some reports."""
     plain = {
-        entry.name: function(*(getattr(report, entry.name) for report in reports))
-        for entry in fields(Report)
-        if entry.name not in _TABLES
+        name: function(*(getattr(report, name) for report in reports))
+        for name in _NUMERIC
+        if name not in _TABLES
     }
     tables: dict[str, Any] = {
         table: {
@@ -172,7 +203,7 @@ def _combine(function: Callable[..., Any], reports: Sequence[Report]) -> Report:
         }
         for table in _TABLES
     }
-    return Report(**plain, **tables)
+    return Report(**plain, **tables, status=status)
 
 
 allow_loading(Report)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -29,10 +31,17 @@ def roll_out(
     """Take steps one after the other; see `Simulator.rollout`."""
     count = _step_count(controls, steps)
 
-    def advance(before: State, first: int, last: int) -> list[State]:
+    asked: dict[int, dict[str, bytes]] = {}  # what a function has returned, by digests
+
+    def advance(before: State, first: int, last: int, remember: bool = False) -> list[State]:
         states = []
         for k in range(first, last):
-            before = step(before, _control_at(controls, k, before))
+            control = _control_at(controls, k, before)
+            if k in asked:
+                _require_same(k, _digests(control), asked[k])
+            before = step(before, control)
+            if remember:
+                asked[k] = _digests(control)
             states.append(before)
         return states
 
@@ -47,7 +56,8 @@ def roll_out(
             watched = [*tensors_of(before), *tensors_of(parameters)]
             if isinstance(controls, Sequence):
                 watched += [t for control in controls[first:last] for t in tensors_of(control)]
-            states += _checkpointed(advance, before, first, last, watched)
+            own = partial(advance, remember=callable(controls))
+            states += _checkpointed(own, before, first, last, watched)
         else:
             states += advance(before, first, last)
     return states
@@ -74,6 +84,32 @@ def _control_at(controls: Controls, k: int, state: State) -> Control | None:
     if controls is None:
         return None
     return controls(k, state) if callable(controls) else controls[k]
+
+
+def _digests(control: Control | None) -> dict[str, bytes]:
+    """What a control sets, by the names of its fields and entries."""
+    digests = {}
+    for field, value in ({} if control is None else vars(control)).items():
+        entries = value if isinstance(value, Mapping) else {None: value}
+        for key, entry in entries.items():
+            if entry is not None:
+                numbers = torch.as_tensor(entry).detach().to(torch.float64).contiguous().numpy()
+                content = hashlib.blake2b(numbers.tobytes(), digest_size=16).digest()
+                name = field if key is None else f"{field}[{key!r}]"
+                digests[name] = repr(numbers.shape).encode() + content
+    return digests
+
+
+def _require_same(k: int, digests: dict[str, bytes], first: dict[str, bytes]) -> None:
+    """Refuse a control that is not the one of the rollout: its gradients would be of another."""
+    other = [n for n in {**first, **digests} if digests.get(n) != first.get(n)]
+    if other:
+        raise InvalidInput(
+            "rollout: `controls` must return what it returned before when backward repeats a step "
+            f"from a checkpoint, got another `{other[0]}` for the step [{k}]; what it depends on, "
+            "as the weights of a policy, must not be edited before backward, and nothing in it may "
+            "be random or count its calls"
+        )
 
 
 def _checkpointed(

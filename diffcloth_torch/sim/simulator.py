@@ -39,6 +39,7 @@ from diffcloth_torch.model.scene import Scene, assemble
 from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.cores import CoreOptions, make_core
 from diffcloth_torch.sim.coupling import Staggered
+from diffcloth_torch.sim.failures import failures_of, refuse_gradients
 from diffcloth_torch.sim.inputs import (
     Fields,
     check_control,
@@ -53,7 +54,12 @@ from diffcloth_torch.sim.inputs import (
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.links import contact_wrenches, link_poses, link_velocities
 from diffcloth_torch.sim.masses import cloth_totals, vertex_masses
-from diffcloth_torch.sim.motion import held_targets, prescribed_motion
+from diffcloth_torch.sim.motion import (
+    ended_poses,
+    held_targets,
+    prescribed_motion,
+    with_rows,
+)
 from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.rollout import roll_out
 from diffcloth_torch.sim.schemes import check_scheme
@@ -338,9 +344,10 @@ class Simulator:
 
         Raises:
             IntersectingState: If surfaces intersect in `state`.
-            InfeasibleMotion: If bodies or pins cannot reach their targets without an intersection.
-            NotConverged: If the solver stops early; with `SolverOptions(throw=False)` the last
-                feasible iterate is returned instead.
+            InfeasibleMotion: If bodies, joints or pins cannot reach their targets without an
+                intersection.
+            NotConverged: If the solver stops early. With `SolverOptions(throw=False)` neither
+                of these is raised: see there.
             InvalidInput: If a shape or value is not accepted.
             TypeError: If a tensor of the state is not float64 on the CPU.
         """
@@ -351,12 +358,16 @@ class Simulator:
             outcome, after = self._step_in_turn(before, wanted, physical, batch)
         report = make_report(outcome.diagnostics, batched=batch is not None)
         after["soft_pin_targets"] = wanted["soft_pins"]
-        return State(
-            positions=outcome.positions,
-            velocities=outcome.velocities,
-            body_forces=outcome.body_forces,
-            time=state.time + self.dt,
+        tensors = {
+            "positions": outcome.positions,
+            "velocities": outcome.velocities,
+            "body_forces": outcome.body_forces,
             **{name: _own_copy(values, batch) for name, values in after.items()},
+        }
+        failures = failures_of(outcome.diagnostics)
+        return State(
+            **refuse_gradients(tensors, failures, batched=batch is not None),
+            time=state.time + self.dt,
             report=report,
             _surfaces=self._surfaces,
         )
@@ -369,8 +380,16 @@ class Simulator:
         inputs = self._core_inputs(state, control, parameters, prediction)
         outcome = take_step(self._core, inputs, self._constants, batched=batch is not None)
         self._check(outcome.diagnostics, batch)
+        ended = outcome.diagnostics["ended"]
         if self._dynamics is None or prediction is None:
-            return outcome, prescribed_motion(self._layout, state, control, self.dt)
+            after = prescribed_motion(self._layout, state, control, self.dt)
+            if ended:
+                poses = ended_poses(control["body_poses"], ended, len(state["positions"]))
+                with torch.no_grad():
+                    reached = control | {"body_poses": poses}
+                    there = prescribed_motion(self._layout, state, reached, self.dt)
+                after = with_rows(after, there, ended)
+            return outcome, after
         forces = outcome.body_forces if batch is not None else outcome.body_forces.unsqueeze(0)
         coordinates = outcome.coordinates
         if coordinates is None:  # robots without a joint that moves
@@ -378,6 +397,12 @@ class Simulator:
         elif batch is None:
             coordinates = coordinates.unsqueeze(0)
         after = self._dynamics.advance(prediction, coordinates, forces)
+        if ended:
+            poses = ended_poses(prediction.body_targets, ended, len(forces))
+            with torch.no_grad():
+                stopped = self._dynamics.end_at(prediction, poses)
+                there = self._dynamics.advance(stopped, coordinates, forces)
+            after = with_rows(after, there, ended)
         return outcome, {**after, "joint_targets": held_targets(self._layout, state, control)}
 
     def _step_in_turn(
@@ -419,7 +444,7 @@ class Simulator:
             steps: Number of steps; needed unless `controls` is a sequence.
             checkpoint_every: Keep tapes of this many steps at a time: backward repeats the steps
                 from the state before them. A function `controls` is then called again and must
-                return the same.
+                return the same: backward raises `InvalidInput` otherwise.
 
         Returns:
             The states after each step.

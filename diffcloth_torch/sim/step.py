@@ -32,8 +32,9 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from diffcloth_torch import _core
+from diffcloth_torch._exit import note_caller
 from diffcloth_torch.checks import is_dense
-from diffcloth_torch.errors import InvalidInput, NotConverged, SimulationError
+from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.sim.controls import tensors_of
 
 __all__ = [
@@ -50,7 +51,7 @@ __all__ = [
     "have_quaternions",
     "refuse_transforms",
     "take_step",
-    "unconverged",
+    "vmap_level",
 ]
 
 # Values of the core's `status`, per environment.
@@ -82,7 +83,9 @@ class Outcome(NamedTuple):
         positions: [B, N, 3], or [N, 3] without a batch axis.
         velocities: Likewise.
         body_forces: [B, V, 3] or [V, 3].
-        diagnostics: Lists of length B of the core: status, message and the entries of the report.
+        diagnostics: Lists of length B of the core: status, message and the entries of the report;
+            and "ended": environment -> poses of all roots where its motion has ended before its
+            end, [T, 7].
         coordinates: Of bodies and robots at the end of the step, [B, n] or [n]; None where there
             are none.
     """
@@ -174,6 +177,7 @@ def as_array(tensor: Tensor) -> NDArray[np.float64]:
 
 
 def _forward(core: _core.Simulator, arrays: dict[str, Any], *, tape: bool) -> dict[str, Any]:
+    note_caller()
     try:
         return core.forward(arrays, tape, torch.get_num_threads())
     except _core.SimulationError as error:
@@ -193,12 +197,7 @@ def _outcome(outputs: tuple[Tensor, ...], diagnostics: dict[str, Any]) -> Outcom
 def diagnostics_of(result: dict[str, Any]) -> dict[str, Any]:
     """What a core says of a step: for each name a list of the environments' numbers or texts."""
     numbers = zip(DIAGNOSTICS, result["numbers"], strict=True)
-    return {**dict(numbers), "message": result["message"]}
-
-
-def unconverged(diagnostics: dict[str, Any]) -> list[int]:
-    """Environments whose solve did not converge."""
-    return [i for i, status in enumerate(diagnostics["status"]) if status != CONVERGED]
+    return {**dict(numbers), "message": result["message"], "ended": result["ended"]}
 
 
 _PLAIN = 5  # arguments of _Step.forward that are no tensors
@@ -218,7 +217,6 @@ class _Step(torch.autograd.Function):
         # Factors and contacts, which the core forgets when the graph goes.
         ctx.kept = result[_KEPT]
         diagnostics.update(diagnostics_of(result))
-        ctx.unconverged = unconverged(diagnostics)
         return _outputs(result, batched)
 
     @staticmethod
@@ -239,8 +237,7 @@ def _pull_back(ctx, saved, cotangents):
         return _PullBack.apply(ctx, *saved, *cotangents)
     # `is_grads_batched` and vectorized Jacobians still use the older vmap, which knows no rule of
     # a Function: take its batch axis off and put it on again.
-    level = torch._C._vmapmode_increment_nesting() - 1
-    torch._C._vmapmode_decrement_nesting()
+    level = vmap_level()
     count = next(
         torch._remove_batch_dim(c, level, 1, 0).shape[0]
         for c in cotangents
@@ -249,6 +246,13 @@ def _pull_back(ctx, saved, cotangents):
     losses = [torch._remove_batch_dim(c, level, count, 0) for c in cotangents]
     gradients = _PullBack.apply(ctx, *saved, *losses)
     return [torch._add_batch_dim(gradient, 0, level) for gradient in gradients]
+
+
+def vmap_level() -> int:
+    """Level of the older vmap that is active."""
+    level: int = torch._C._vmapmode_increment_nesting() - 1
+    torch._C._vmapmode_decrement_nesting()
+    return level
 
 
 class _PullBack(torch.autograd.Function):
@@ -268,7 +272,6 @@ class _PullBack(torch.autograd.Function):
         leading = cotangents[0].shape[:axes]
         shape = (math.prod(leading), *(() if step.batched else (1,)))
         losses = [c.reshape(*shape, *c.shape[axes:]) for c in cotangents]
-        _refuse_unconverged(step, losses)
         gradients = _backward(step, saved, losses)
         return tuple(g.reshape(*leading, *g.shape[1:]) for g in gradients)
 
@@ -293,17 +296,6 @@ class _PullBack(torch.autograd.Function):
         raise RuntimeError(_SECOND_DERIVATIVES)
 
 
-def _refuse_unconverged(step, losses):
-    """Raise if a loss depends on an environment that has no gradient; others do without it."""
-    wanted = [i for i in step.unconverged if any(c[:, i].count_nonzero() for c in losses)]
-    if wanted:
-        raise NotConverged(
-            "backward: a step that did not converge has no gradient; raise max_iterations, or "
-            f"leave environments {wanted} out of the loss with diffcloth_torch.where",
-            environments=wanted,
-        )
-
-
 def _check_saved(step, saved):
     """Refuse what hooks on saved tensors return instead of what a step has saved."""
     for name, shape, tensor in zip(
@@ -324,6 +316,7 @@ def _check_saved(step, saved):
 def _backward(step, saved, losses):
     arrays = [as_array(t) for t in saved]
     count, needs = len(step.names), _needs(step)
+    note_caller()
     try:
         gradients = step.core.backward(
             step.constants | dict(zip(step.names, arrays[:count], strict=True)),
