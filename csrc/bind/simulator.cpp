@@ -432,11 +432,12 @@ nb::object Simulator::find_close_start(const nb::dict& inputs) const {
 }
 
 step::Metric to_metric(const std::string& name) {
+  if (name == "energy") return step::Metric::kEnergy;
   if (name == "elastic") return step::Metric::kElastic;
   if (name == "mass") return step::Metric::kMass;
   if (name == "identity") return step::Metric::kIdentity;
   throw nb::value_error(
-      ("metric must be one of 'elastic', 'mass', 'identity', got '" + name + "'").c_str());
+      ("metric must be one of 'energy', 'elastic', 'mass', 'identity', got '" + name + "'").c_str());
 }
 
 step::ElasticSolver to_elastic_solver(const std::string& name) {

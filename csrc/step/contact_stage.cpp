@@ -209,7 +209,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
     sum.expect_contacts_near(problem.start);
   }
   // Everything at its end, unknowns where inertia alone (or x^D) would put them.
-  const Array first_guess = problem.predicted(inertia.target().data());
+  const Array first_guess = problem.predicted(guess);
   solver::Factor factor;
   int solves = 0;
   while (solves < friction_iterations) {
