@@ -23,6 +23,7 @@ class Cotangents {
 
   std::vector<double> rows;          ///< of the outputs x_{n+1}, v_{n+1} / h included, and q_{n+1}
   std::vector<double> start;         ///< x_n and o_n: all points
+  std::vector<double> origins;       ///< what friction counts motion from, where it is not the start
   std::vector<double> ends;          ///< what is prescribed, at its end: all points
   std::vector<double> velocities;    ///< v_n
   std::vector<double> masses;        ///< [N]

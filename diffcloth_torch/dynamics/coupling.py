@@ -99,23 +99,27 @@ def rigid_to_cloth(
 def cloth_to_rigid(
     dynamics: Dynamics,
     predict: Callable[[Tensor | None], Prediction],
+    last_coordinates: Callable[[Prediction], Tensor],
     solve_rigid: Callable[[Prediction], Rigid],
-    solve_cloth: Callable[[Prediction, Tensor], Cloth],
+    solve_cloth: Callable[[Prediction, Tensor, Tensor], Cloth],
     check_path: Callable[[Cloth, Prediction, Tensor, Tensor], None],
 ) -> Staggered[Cloth, Rigid]:
     """Move the cloth while what forces move stands still, then that by the forces of the cloth.
 
+    Friction sees what stands still move as it did in the step before.
+
     Args:
         dynamics: Of the bodies and robots.
         predict: Predicts the step, with forces [B, V, 3] that act on the vertices.
+        last_coordinates: Coordinates a step before the start, [B, n].
         solve_rigid: As for `rigid_to_cloth`.
-        solve_cloth: Likewise.
+        solve_cloth: Likewise, with the coordinates that friction counts motion from, [B, n].
         check_path: Raises where bodies and robots, on their straight way between two rows of
             coordinates of the prediction, meet the cloth that has been solved.
     """
     still = predict(None)
     held = torch.where(dynamics.prescribed, still.coordinate_ends, still.coordinates)
-    cloth = solve_cloth(still, held)
+    cloth = solve_cloth(still, held, last_coordinates(still))
     prediction = predict(cloth.body_forces)
     rigid = solve_rigid(prediction)
     start = torch.where(dynamics.prescribed, prediction.coordinate_ends, prediction.coordinates)

@@ -118,8 +118,12 @@ class Staggered:
             ends = outcome.coordinates
             return _Solved(outcome, prediction.coordinates if ends is None else ends)
 
-        def solve_cloth(prediction: Prediction, ends: Tensor) -> _Solved:
+        def solve_cloth(
+            prediction: Prediction, ends: Tensor, origins: Tensor | None = None
+        ) -> _Solved:
             given = inputs | prediction.core_inputs() | {"coordinate_ends": ends}
+            if origins is not None:
+                given["coordinate_origins"] = origins
             outcome = take_step(self._cloth, given, batched=True)
             check(outcome.diagnostics)
             paths.append(partial(self._cloth.path, _arrays(given)))
@@ -139,7 +143,10 @@ class Staggered:
         if self._coupling == "rigid_to_cloth":
             solved = rigid_to_cloth(self._dynamics, predict(None), solve_rigid, solve_cloth)
         else:
-            solved = cloth_to_rigid(self._dynamics, predict, solve_rigid, solve_cloth, check_path)
+            last = partial(self._dynamics.last_coordinates, state=state)
+            solved = cloth_to_rigid(
+                self._dynamics, predict, last, solve_rigid, solve_cloth, check_path
+            )
         cloth = solved.cloth.outcome
         self._warn(cloth, solved.fields, parameters)
         outcome = Outcome(
