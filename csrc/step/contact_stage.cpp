@@ -135,7 +135,9 @@ void report_contacts(const Scene& scene, const std::vector<Contact>& contacts, R
     report.minimum_distance = std::min(report.minimum_distance, std::sqrt(k.closest.d_sq));
   }
   if (report.result == Result::kInfeasibleMotion) {
-    report.message = "in contact: " + blockers(scene, contacts);
+    // Bodies that stand still for this solve hold each other up without a contact.
+    const std::string names = blockers(scene, contacts);
+    if (!names.empty()) report.message = "in contact: " + names;
   }
 }
 
