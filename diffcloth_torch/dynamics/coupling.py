@@ -60,12 +60,14 @@ class Staggered(Generic[Cloth, Rigid]):
     Attributes:
         cloth: The solve of the cloths.
         rigid: That of bodies and robots.
+        prediction: That the solve of bodies and robots began with.
         fields: Of the new state, for bodies and robots.
         body_forces: Of both solves, [B, V, 3] N.
     """
 
     cloth: Cloth
     rigid: Rigid
+    prediction: Prediction
     fields: dict[str, Tensor]
     body_forces: Tensor
 
@@ -93,7 +95,7 @@ def rigid_to_cloth(
     fields = dynamics.advance(
         prediction, rigid.coordinates, rigid.body_forces, kick=cloth.body_forces
     )
-    return Staggered(cloth, rigid, fields, rigid.body_forces + cloth.body_forces)
+    return Staggered(cloth, rigid, prediction, fields, rigid.body_forces + cloth.body_forces)
 
 
 def cloth_to_rigid(
@@ -125,7 +127,7 @@ def cloth_to_rigid(
     start = torch.where(dynamics.prescribed, prediction.coordinate_ends, prediction.coordinates)
     check_path(cloth, prediction, start, rigid.coordinates)
     fields = dynamics.advance(prediction, rigid.coordinates, rigid.body_forces)
-    return Staggered(cloth, rigid, fields, rigid.body_forces + cloth.body_forces)
+    return Staggered(cloth, rigid, prediction, fields, rigid.body_forces + cloth.body_forces)
 
 
 def added_mass_numbers(
