@@ -437,7 +437,8 @@ step::Metric to_metric(const std::string& name) {
   if (name == "mass") return step::Metric::kMass;
   if (name == "identity") return step::Metric::kIdentity;
   throw nb::value_error(
-      ("metric must be one of 'energy', 'elastic', 'mass', 'identity', got '" + name + "'").c_str());
+      ("metric must be one of 'energy', 'elastic', 'mass', 'identity', got '" + name + "'")
+          .c_str());
 }
 
 step::ElasticSolver to_elastic_solver(const std::string& name) {
@@ -516,7 +517,8 @@ bodies::MechanismsDescription describe_mechanisms(const nb::kwargs& k, Index sur
                      static_cast<Index>(m.prescribed.size()));
   const std::size_t n = m.prescribed.size();
   for (const std::size_t size : {m.lower.size(), m.upper.size(), m.limit_stiffness.size()}) {
-    if (size != n || m.held.size() != n) throw nb::value_error("trees: arrays of coordinates must have equal lengths");
+    if (size != n || m.held.size() != n)
+      throw nb::value_error("trees: arrays of coordinates must have equal lengths");
   }
   m.coordinate_tree.assign(n, -1);
   for (const bodies::Link& link : m.links) {

@@ -111,8 +111,8 @@ Mechanisms::Mechanisms(MechanismsDescription description, const BodySet& bodies)
     const auto moves_with_any = [&](auto&& counts) {
       return (surface.tree >= 0 && trees_[surface.tree].free &&
               counts(trees_[surface.tree].first_coordinate)) ||
-             std::ranges::any_of(path_[l],
-                                 [&](Index joint) { return counts(given_.links[joint].coordinate); });
+             std::ranges::any_of(
+                 path_[l], [&](Index joint) { return counts(given_.links[joint].coordinate); });
     };
     surface.dynamic = moves_with_any([&](Index c) { return given_.prescribed[c] == 0; });
     surface.collides =

@@ -11,7 +11,8 @@ namespace diffcloth {
 class Tilt final : public Potential {
  public:
   /// @param force  f [N], [3 N]
-  explicit Tilt(std::vector<double> force) : force_bar(force.size(), 0.0), force_(std::move(force)) {}
+  explicit Tilt(std::vector<double> force)
+      : force_bar(force.size(), 0.0), force_(std::move(force)) {}
 
   double energy(const double* x) const override {
     const std::vector<double> origin(force_.size(), 0.0);
@@ -28,10 +29,12 @@ class Tilt final : public Potential {
     for (std::size_t a = 0; a < force_.size(); ++a) g[a] -= force_[a];
   }
 
-  void add_hessian(const double* /*x*/, Curvature /*c*/, linalg::BlockMatrix& /*A*/) const override {
-  }
+  void add_hessian(const double* /*x*/,
+                   Curvature /*c*/,
+                   linalg::BlockMatrix& /*A*/) const override {}
 
-  void add_hessian_product(const double* /*x*/, const double* /*z*/, double* /*y*/) const override {}
+  void add_hessian_product(const double* /*x*/, const double* /*z*/, double* /*y*/) const override {
+  }
 
   void accumulate(const double* /*x*/, const double* z) override {
     for (std::size_t a = 0; a < force_.size(); ++a) force_bar[a] += z[a];

@@ -5,8 +5,8 @@ as it was or will be, so that an error of the first passes back and forth; the a
 
     N = (mass of the cloth in contact + h^2 stiffness of the contact) / mass of the body
 
-says by how much it grows or falls each time. From about 1 on results are wrong, from 3 or 4 on they
-gain energy.
+says by how much it grows or falls each time. Energy is gained long before it is 1, where a body
+bounces: the barrier is softest for its force at a third of its reach, and stiffer elsewhere.
 """
 
 from __future__ import annotations

@@ -204,7 +204,7 @@ class Dynamics:
         for i, (chain, rows) in enumerate(zip(self._chains, chains, strict=True)):
             joints = self._chain_rows[i][0]
             count = joints.stop - joints.start
-            root, values = rows.split([chain.coordinate_count - count, count], dim=1)
+            root, values = torch.split(rows, [chain.coordinate_count - count, count], dim=1)
             if root.shape[1]:
                 root = self._moved_back(root, state["base_velocities"][:, i])
             last += [root, values - self.dt * state["joint_velocities"][:, joints]]
