@@ -246,6 +246,7 @@ ARRAYS = [
     "link_axis",
     "link_constant",
     "coordinate_prescribed",
+    "coordinate_held",
     "tree_free",
 ]
 
