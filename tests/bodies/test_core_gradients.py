@@ -108,7 +108,7 @@ STEPS = {
     "body_poses": 1e-7,
     "body_targets": 1e-7,
     "pin_targets": 1e-7,
-    "forces": 1e-4,
+    "forces": 1e-5,
     "gravity": 1e-4,
     "stretch": 1e-2,
     "density": 1e-6,
