@@ -72,7 +72,7 @@ EXPERIMENTS = {
 
 METHODS: dict[str, tuple[str, ...]] = {
     "projective": ("simulation.scheme=projective",),
-    "split": ("simulation.scheme=split",),
+    "split": ("simulation.scheme=split", "simulation.solver.metric=elastic"),
     "coupled, frictionless": (),
     "coupled": (),
 }

@@ -33,6 +33,7 @@ def inputs(sim):
     parameters = sim.parameters()
     stretched = parameters.replace(rest_positions=1.01 * parameters.rest_positions)
     tensors, _ = sim._inputs(sim.initial_state(), None, stretched)
+    tensors["coordinate_origins"] = tensors["coordinates"]
     assert set(tensors) == set(_core.input_names)
     return {name: as_array(tensor) for name, tensor in tensors.items()}
 
@@ -79,7 +80,7 @@ def wrong(array):
 
 
 KINDS = list(wrong(np.zeros((1, 2))))
-OPTIONAL = {"poisson", "rest_positions", "barrier_stiffness"}
+OPTIONAL = {"poisson", "rest_positions", "barrier_stiffness", "coordinate_origins"}
 
 
 @pytest.mark.boundary
@@ -246,6 +247,7 @@ ARRAYS = [
     "link_axis",
     "link_constant",
     "coordinate_prescribed",
+    "coordinate_held",
     "tree_free",
 ]
 

@@ -68,8 +68,8 @@ def test_the_core_takes_what_the_tables_say():
 
 def test_the_core_gets_no_other_names(sim):
     inputs, _ = sim._inputs(sim.initial_state(), None, None)
-    # The core has prepared the rest shape of the scene.
-    assert set(inputs) | {"rest_positions"} == set(_core.input_names)
+    # The core has prepared the rest shape of the scene; origins are for a staggered coupling.
+    assert set(inputs) | {"rest_positions", "coordinate_origins"} == set(_core.input_names)
 
 
 def test_shapes_are_those_of_the_tables(sim):

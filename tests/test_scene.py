@@ -86,7 +86,7 @@ def test_a_bad_scene_is_refused(arguments, keywords, error, message):
         (lambda: dc.SolverOptions(tolerance="1e-3"), TypeError, "real numbers"),
         (lambda: dc.SolverOptions(max_iterations=0), dc.InvalidInput, "at least 1"),
         (lambda: dc.SolverOptions(elastic="pd"), dc.InvalidInput, "'newton', 'projective'"),
-        (lambda: dc.SolverOptions(metric="norm"), dc.InvalidInput, "'elastic', 'mass', 'identity'"),
+        (lambda: dc.SolverOptions(metric="norm"), dc.InvalidInput, "'energy', 'elastic', 'mass'"),
     ],
 )
 def test_bad_options_are_refused(make, error, message):

@@ -59,6 +59,7 @@ bool is_needed(const step::Scene& scene, const step::Inputs& inputs, Input input
     case Input::kPoisson:
     case Input::kRestPositions:
     case Input::kBarrierStiffness:
+    case Input::kCoordinateOrigins:
       return false;
     case Input::kFriction:
     case Input::kThickness:
@@ -166,6 +167,7 @@ std::vector<std::size_t> accepted_counts(const step::Scene& scene, Input input) 
       return {1, cloths};
     case Input::kCoordinates:
     case Input::kCoordinateEnds:
+    case Input::kCoordinateOrigins:
     case Input::kCoordinateTargets:
       return {static_cast<std::size_t>(scene.mechanisms.coordinate_count())};
     case Input::kCoordinateMetric:

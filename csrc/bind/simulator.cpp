@@ -454,11 +454,13 @@ nb::object Simulator::find_close_start(const nb::dict& inputs) const {
 }
 
 step::Metric to_metric(const std::string& name) {
+  if (name == "energy") return step::Metric::kEnergy;
   if (name == "elastic") return step::Metric::kElastic;
   if (name == "mass") return step::Metric::kMass;
   if (name == "identity") return step::Metric::kIdentity;
   throw nb::value_error(
-      ("metric must be one of 'elastic', 'mass', 'identity', got '" + name + "'").c_str());
+      ("metric must be one of 'energy', 'elastic', 'mass', 'identity', got '" + name + "'")
+          .c_str());
 }
 
 step::ElasticSolver to_elastic_solver(const std::string& name) {
@@ -520,6 +522,7 @@ bodies::MechanismsDescription describe_mechanisms(const nb::kwargs& k, Index sur
   for (const Index given : indices("coordinate_prescribed")) {
     m.prescribed.push_back(given != 0 ? 1 : 0);
   }
+  for (const Index held : indices("coordinate_held")) m.held.push_back(held != 0 ? 1 : 0);
   m.lower = doubles("coordinate_lower");
   m.upper = doubles("coordinate_upper");
   m.limit_stiffness = doubles("limit_stiffness");
@@ -536,7 +539,8 @@ bodies::MechanismsDescription describe_mechanisms(const nb::kwargs& k, Index sur
                      static_cast<Index>(m.prescribed.size()));
   const std::size_t n = m.prescribed.size();
   for (const std::size_t size : {m.lower.size(), m.upper.size(), m.limit_stiffness.size()}) {
-    if (size != n) throw nb::value_error("trees: arrays of coordinates must have equal lengths");
+    if (size != n || m.held.size() != n)
+      throw nb::value_error("trees: arrays of coordinates must have equal lengths");
   }
   m.coordinate_tree.assign(n, -1);
   for (const bodies::Link& link : m.links) {

@@ -103,15 +103,20 @@ Mechanisms::Mechanisms(MechanismsDescription description, const BodySet& bodies)
     Surface surface{.tree = tree_of[given_.links[l].tree],
                     .link = l,
                     .dynamic = false,
+                    .collides = false,
                     .first = bodies.vertex_start[s],
                     .last = bodies.vertex_start[s + 1]};
-    // The six coordinates of a free root may be prescribed too, all of them.
-    const bool root_moves = surface.tree >= 0 && trees_[surface.tree].free &&
-                            given_.prescribed[trees_[surface.tree].first_coordinate] == 0;
     if (surface.tree >= 0) trees_[surface.tree].surfaces.push_back(static_cast<Index>(s));
-    surface.dynamic = root_moves || std::ranges::any_of(path_[l], [&](Index joint) {
-                        return given_.prescribed[given_.links[joint].coordinate] == 0;
-                      });
+    // The six coordinates of a free root may be prescribed too, all of them.
+    const auto moves_with_any = [&](auto&& counts) {
+      return (surface.tree >= 0 && trees_[surface.tree].free &&
+              counts(trees_[surface.tree].first_coordinate)) ||
+             std::ranges::any_of(
+                 path_[l], [&](Index joint) { return counts(given_.links[joint].coordinate); });
+    };
+    surface.dynamic = moves_with_any([&](Index c) { return given_.prescribed[c] == 0; });
+    surface.collides =
+        moves_with_any([&](Index c) { return given_.prescribed[c] == 0 || given_.held[c] != 0; });
     surface_.push_back(surface);
   }
   find_levers();

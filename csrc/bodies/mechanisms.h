@@ -34,6 +34,7 @@ struct MechanismsDescription {
   std::vector<Link> links;      ///< tree after tree
   std::vector<Index> coordinate_tree;  ///< [n] those of a free root first, tree after tree
   std::vector<char> prescribed;        ///< [n] coordinates whose values at the end are given
+  std::vector<char> held;              ///< [n] those that forces move, prescribed in this solve
   std::vector<double> lower;           ///< [n] limits of free joints; infinite where there are none
   std::vector<double> upper;
   std::vector<double> limit_stiffness;  ///< [n]
@@ -80,6 +81,8 @@ class Mechanisms {
   /// Whether a surface belongs to these trees, and whether it moves with free coordinates.
   bool has_surface(Index surface) const { return surface_[surface].tree >= 0; }
   bool is_dynamic(Index surface) const { return surface_[surface].dynamic; }
+  /// Whether it moves with free coordinates or with held ones: collisions with it count.
+  bool collides(Index surface) const { return surface_[surface].collides; }
 
   /// Frames S of the trees from the poses of all roots, into their nodes.
   void set_frames(const double* poses, double* points) const;
@@ -141,6 +144,7 @@ class Mechanisms {
     Index tree = -1;  // among trees_; -1: not of these
     Index link = -1;
     bool dynamic = false;
+    bool collides = false;
     Index first = 0, last = 0;  // vertices
   };
   struct Eval;

@@ -16,7 +16,7 @@
 //
 // which each potential adds up for its own inputs; in particular prescribed positions (pins c, bodies
 // o) get  -(H zhat) at their rows, and pins also the direct g_k. Friction's displacement x - x_start
-// gives  x_start_bar += H_D zhat. The lag configuration of k is x_{k-1} (x_n for k = 1): its
+// gives  x_start_bar += H_D zhat, for bodies at their origins where these are given. The lag configuration of k is x_{k-1} (x_n for k = 1): its
 // cotangent becomes g_{k-1}, and the sweep goes on from K to 1.
 //
 // Where vertices y(q, s) of links follow coordinates q and frames s, x stands for all of z = (cloth, q),
@@ -100,7 +100,7 @@ class Sum {
     friction.reset();
     // Where nothing can touch there are no contacts either.
     if (!problem_.contact || contacts.empty()) return;
-    friction.emplace(*problem_.contact, contacts, problem_.start.data(), widening, bar_);
+    friction.emplace(*problem_.contact, contacts, problem_.moved_from().data(), widening, bar_);
     objective.others.push_back(&*friction);
   }
 
@@ -220,7 +220,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
     sum.expect_contacts_near(problem.start);
   }
   // Everything at its end, unknowns where inertia alone (or x^D) would put them.
-  const Array first_guess = problem.predicted(inertia.target().data());
+  const Array first_guess = problem.predicted(guess);
   solver::Factor factor;
   int solves = 0;
   solver::Status status = solver::Status::kConverged;
@@ -364,7 +364,10 @@ void ContactStage::backward(const Backward& step, std::vector<Array> g) {
       if (!sum.friction) continue;
       Array lag_bar = std::exchange(lag_bars[l], {});
       const Array start_bar = std::exchange(start_bars[l], {});
-      for (std::size_t a = 0; a < start_bar.size(); ++a) bars.start[a] += start_bar[a];
+      for (std::size_t a = 0; a < start_bar.size(); ++a) {
+        const bool is_moved = a >= problem.cloth_size && !bars.origins.empty();
+        (is_moved ? bars.origins : bars.start)[a] += start_bar[a];
+      }
       if (k == 0) {
         for (std::size_t a = 0; a < lag_bar.size(); ++a) bars.start[a] += lag_bar[a];
         continue;

@@ -13,6 +13,7 @@ namespace diffcloth::step {
 /// friction, minimized once for each friction iteration, with friction lagged at the solution before.
 struct ContactStage {
   Proximity& inertia;
+  const double* guess;  ///< where the cloths begin if the way there is free: all [N, 3] of them
   std::vector<Potential*> others;
   solver::AssemblyCache& assemblies;
   std::size_t first_factor;  ///< place of its factors among the scheme's

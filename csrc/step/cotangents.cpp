@@ -24,6 +24,17 @@ void write_surfaces(const Problem& p, const Cotangents& bars, const Gradients& g
   const bodies::Mechanisms& mechanisms = p.scene.mechanisms;
   Array start = bars.start;
   p.coordinates.gather(p.start, start);
+  if (!bars.origins.empty()) {
+    Array origins = bars.origins;
+    p.coordinates.gather(p.origins, origins);
+    for (Index c = 0; c < mechanisms.coordinate_count(); ++c) {
+      double& bar = p.coordinates.nodes(origins)[mechanisms.slot(c)];
+      if (double* out = gradients[Input::kCoordinateOrigins]) out[c] += bar;
+      bar = 0.0;
+    }
+    // Frames, and bodies without coordinates, are where they start.
+    for (std::size_t a = 0; a < start.size(); ++a) start[a] += origins[a];
+  }
   if (double* out = gradients[Input::kBodyPoses]) {
     const double* poses = p.inputs.data(Input::kBodyPoses);
     bodies.place_vjp(poses, start.data() + p.cloth_size, out);
@@ -122,6 +133,7 @@ void write_rest(Problem& p, const Cotangents& bars, const Gradients& gradients) 
 
 Cotangents::Cotangents(const Problem& p)
     : start(p.start.size(), 0.0),
+      origins(p.origins.size(), 0.0),
       ends(p.start.size(), 0.0),
       velocities(p.cloth_size, 0.0),
       masses(p.masses.size(), 0.0),

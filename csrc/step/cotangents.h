@@ -21,13 +21,14 @@ class Cotangents {
   /// Write everything into the gradients of the inputs.
   void write(Problem& problem, const Gradients& gradients);
 
-  std::vector<double> rows;          ///< of the outputs x_{n+1}, v_{n+1} / h included, and q_{n+1}
-  std::vector<double> start;         ///< x_n and o_n: all points
-  std::vector<double> ends;          ///< what is prescribed, at its end: all points
-  std::vector<double> velocities;    ///< v_n
-  std::vector<double> masses;        ///< [N]
-  std::vector<double> body_forces;   ///< of the output [3 V]
-  std::vector<double> body_poses;    ///< of the poses at the start, beyond what `start` pulls back
+  std::vector<double> rows;         ///< of the outputs x_{n+1}, v_{n+1} / h included, and q_{n+1}
+  std::vector<double> start;        ///< x_n and o_n: all points
+  std::vector<double> origins;      ///< what friction counts motion from, where it is not the start
+  std::vector<double> ends;         ///< what is prescribed, at its end: all points
+  std::vector<double> velocities;   ///< v_n
+  std::vector<double> masses;       ///< [N]
+  std::vector<double> body_forces;  ///< of the output [3 V]
+  std::vector<double> body_poses;   ///< of the poses at the start, beyond what `start` pulls back
   std::vector<double> body_targets;  ///< likewise, at the end
   contact::ContactModel::Bar contact;
 

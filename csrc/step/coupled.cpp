@@ -10,6 +10,7 @@ namespace {
 
 ContactStage stage(Problem& problem) {
   return {.inertia = problem.inertia,
+          .guess = problem.inertia.target().data(),
           .others = problem.elastic_potentials(),
           .assemblies = problem.scene.elastic_assemblies,
           .first_factor = 0,

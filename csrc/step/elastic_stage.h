@@ -13,6 +13,8 @@ class ElasticStage {
  public:
   explicit ElasticStage(Problem& problem) : problem_(problem), nodes_(problem) {}
 
+  bool has_contacts() const { return nodes_.has_contacts(); }
+
   /// All points at its end; the contact forces on the bodies' vertices are added to body_forces.
   std::vector<double> forward(const Forward& step, double* body_forces) const;
 

@@ -34,8 +34,9 @@ enum class Input : std::uint8_t {
   kCoordinateEnds,     ///< at its end, where prescribed [n]
   kCoordinateTargets,  ///< t [n], see bodies::CoordinatePotential
   kCoordinateMetric,   ///< A [sum n_t^2]
+  kCoordinateOrigins,  ///< where friction counts their motion from [n]; absent: at the start
 };
-inline constexpr std::size_t kInputCount = 24;
+inline constexpr std::size_t kInputCount = 25;
 // clang-format off
 inline constexpr std::array<const char*, kInputCount> kInputNames{
     "positions", "velocities", "body_poses", "body_targets",
@@ -44,6 +45,7 @@ inline constexpr std::array<const char*, kInputCount> kInputNames{
     "damping", "friction", "thickness", "barrier_stiffness",
     "barrier_distance", "slip_velocity", "pin_stiffness", "rest_positions",
     "coordinates", "coordinate_ends", "coordinate_targets", "coordinate_metric",
+    "coordinate_origins",
 };
 // clang-format on
 

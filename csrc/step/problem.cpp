@@ -82,6 +82,17 @@ std::vector<double> start_positions(const Scene& scene, const Inputs& in) {
   return x;
 }
 
+std::vector<double> origin_positions(const Scene& scene, const Inputs& in, std::vector<double> x) {
+  if (in.data(Input::kCoordinateOrigins) == nullptr || scene.mechanisms.empty()) return {};
+  double* const nodes = x.data() + 3 * static_cast<std::ptrdiff_t>(scene.vertex_count());
+  for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
+    nodes[scene.mechanisms.slot(c)] = in.data(Input::kCoordinateOrigins)[c];
+  }
+  scene.mechanisms.place(nodes,
+                         x.data() + 3 * static_cast<std::ptrdiff_t>(scene.cloth_vertex_count()));
+  return x;
+}
+
 std::vector<double> end_positions(const Scene& scene, const Inputs& in, std::vector<double> x) {
   double* const bodies = x.data() + 3 * static_cast<std::ptrdiff_t>(scene.cloth_vertex_count());
   if (scene.given.bodies.count() > 0) {
@@ -158,6 +169,7 @@ Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, elastic::Wanted
       masses(lumped_masses(scene, *rest, density)),
       start(start_positions(scene, inputs)),
       ends(end_positions(scene, inputs, start)),
+      origins(origin_positions(scene, inputs, start)),
       inertia(masses, predicted_positions(inputs, masses, h), h),
       model(elastic_model(scene, inputs, *rest, masses, h)),
       elasticity(model, scene.slots, scene.elastic_assemblies.base(), wanted) {

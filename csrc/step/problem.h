@@ -41,6 +41,7 @@ class Problem {
   std::vector<double> masses;   ///< [N] lumped [kg]
   std::vector<double> start;    ///< x_n and o_n: all points at the start of the step
   std::vector<double> ends;     ///< like start, what is prescribed at its targets
+  std::vector<double> origins;  ///< like start, coordinates at their origins; empty: they have none
 
   Proximity inertia;  ///< metric M, target xhat = x_n + h v_n + h^2 (gravity + M^-1 f)
   elastic::Model model;
@@ -49,6 +50,9 @@ class Problem {
   std::optional<elastic::AnchorPotential> anchors;
   std::optional<bodies::CoordinatePotential> chart;  ///< absent without free coordinates
   std::optional<contact::ContactModel> contact;      ///< absent where nothing can touch
+
+  /// Where friction counts motion from.
+  const std::vector<double>& moved_from() const { return origins.empty() ? start : origins; }
 
   /// Elasticity and anchors.
   std::vector<Potential*> elastic_potentials();

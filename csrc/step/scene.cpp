@@ -32,7 +32,7 @@ contact::CollisionMesh make_collision_mesh(const Description& d,
   }
   std::vector<char> dynamic;
   for (Index k = 0; k < d.bodies.count(); ++k) {
-    dynamic.push_back(mechanisms.is_dynamic(k) ? 1 : 0);
+    dynamic.push_back(mechanisms.collides(k) ? 1 : 0);
     std::fill(surface.begin() + cloth_vertices + d.bodies.vertex_start[k],
               surface.begin() + cloth_vertices + d.bodies.vertex_start[k + 1], cloths + k);
   }

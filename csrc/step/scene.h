@@ -24,8 +24,8 @@ namespace diffcloth::step {
 
 class Scheme;
 
-/// Norm of the contact stage of `split`.
-enum class Metric : std::uint8_t { kElastic, kMass, kIdentity };
+/// What the contact stage of `split` measures nearness in.
+enum class Metric : std::uint8_t { kEnergy, kElastic, kMass, kIdentity };
 
 /// How the elastic stage of `split` and `projective` is solved.
 enum class ElasticSolver : std::uint8_t { kNewton, kProjective };
@@ -52,7 +52,7 @@ struct Description {
   bool self_contact = true;
   double dt = 0.01;
   std::string scheme = "coupled";
-  Metric metric = Metric::kElastic;
+  Metric metric = Metric::kEnergy;
   ElasticSolver elastic = ElasticSolver::kNewton;
   int friction_iterations = 2;
   solver::Options options{};

@@ -1,6 +1,6 @@
 // The adjoint of `split` is that of its contact stage (contact_stage.cpp), whose target is x^D; the
 // cotangent of x^D is the g of one more adjoint of the same form, that of the elastic stage: the
-// paper's Eqs. 8 and 29 with all explicit terms.
+// paper's Eqs. 8 and 29 with all explicit terms. In the metric `energy` it is zero, unless nodes touch.
 
 #include "step/split.h"
 
@@ -9,6 +9,7 @@
 #include <utility>
 
 #include "elastic/elastic_nearness.h"
+#include "potential/tilt.h"
 #include "step/contact_stage.h"
 #include "step/elastic_stage.h"
 
@@ -17,81 +18,135 @@ namespace {
 
 using Array = std::vector<double>;
 
-/// Nearness to x^D, in the metric G of the contact stage.
+/// Nearness to x^D: what the contact stage minimizes beside barrier and friction.
 ///
-/// `elastic` is G = h^2 A with A = M/h^2 + L the constant matrix of the whole elastic stage, soft pins
-/// and damping included: what contact pushes then pulls along what it hangs on, as it would in one
-/// solve with that matrix for a Hessian. L annihilates constants, so that a free cloth keeps its
-/// momentum as it does in the masses alone.
+/// `energy` is  P(x) - P(x^D) - grad P(x^D) (x - x^D),  P inertia and elasticity, soft pins and damping
+/// included: what the state lacks of being the elastic stage's minimum, in joules. The others are
+/// 1/2 |x - x^D|^2 in a matrix G / h^2: the masses, the identity, or, in `elastic`, h^2 A with
+/// A = M/h^2 + L the constant matrix of the whole elastic stage. L annihilates constants, so that a free
+/// cloth keeps its momentum as it does in the masses alone; but it resists turns by k_s |R - R^D|^2 / 2.
+/// Let an element turn by b over the step, and by a from x^D: these forces then do work -k_s a b on it. It is
+/// a gain wherever x^D is ahead, and more than all else where a stiff sheet turns far in a step. No constant
+/// matrix does without: one that lets turns be, to first order, strains by a^2 / 2.
 class Nearness {
  public:
-  Nearness(Problem& problem, const Array& x_d)
-      : problem_(problem), inertial_(diagonal(problem), x_d, problem.h) {
-    if (problem.scene.given.metric != Metric::kElastic) return;
-    elastic_.emplace(problem.constant_form(), problem.elasticity,
-                     problem.anchors ? &*problem.anchors : nullptr, x_d);
+  /// @param tilted  whether x^D leaves forces that P does not have, those at nodes in contact; else
+  ///                grad P(x^D) is zero but for what the elastic stage's tolerance leaves
+  Nearness(Problem& problem, Array x_d, bool tilted) : problem_(problem), x_d_(std::move(x_d)) {
+    switch (problem.scene.given.metric) {
+      case Metric::kEnergy:
+        if (tilted) tilt_.emplace(gradient_at_target());
+        return;
+      case Metric::kElastic:
+        elastic_.emplace(problem.constant_form(), problem.elasticity,
+                         problem.anchors ? &*problem.anchors : nullptr, x_d_);
+        inertial_.emplace(problem.masses, x_d_, problem.h);
+        return;
+      case Metric::kMass:
+        inertial_.emplace(problem.masses, x_d_, problem.h);
+        return;
+      case Metric::kIdentity:
+        inertial_.emplace(Array(problem.masses.size(), mean(problem.masses)), x_d_, problem.h);
+        return;
+    }
+    __builtin_unreachable();
   }
+
+  /// Whether it changes with x^D.
+  bool follows_target() const { return inertial_ || tilt_; }
 
   ContactStage stage() {
     const Scene& scene = problem_.scene;
     std::vector<Potential*> others;
+    if (!inertial_) others = problem_.elastic_potentials();
     if (elastic_) others.push_back(&*elastic_);
-    return {.inertia = inertial_,
+    if (tilt_) others.push_back(&*tilt_);
+    const bool is_diagonal = inertial_ && !elastic_;
+    return {.inertia = inertial_ ? *inertial_ : problem_.inertia,
+            .guess = x_d_.data(),
             .others = std::move(others),
-            .assemblies = elastic_ ? scene.elastic_assemblies : scene.diagonal_assemblies,
+            .assemblies = is_diagonal ? scene.diagonal_assemblies : scene.elastic_assemblies,
             .first_factor = 1,
             .exchange = {}};
   }
 
   /// What the potentials accumulate for a loss: nothing yet.
   struct Bar {
-    Array metric, target, elastic_target;
+    Array metric, target, elastic_target, tilt;
   };
   Bar zero_bar() const {
-    return {.metric = Array(inertial_.metric_bar.size(), 0.0),
-            .target = Array(inertial_.target_bar.size(), 0.0),
-            .elastic_target = Array(elastic_ ? elastic_->target_bar.size() : 0, 0.0)};
+    const std::size_t size = problem_.cloth_size;
+    return {.metric = Array(inertial_ ? size / 3 : 0, 0.0),
+            .target = Array(inertial_ ? size : 0, 0.0),
+            .elastic_target = Array(elastic_ ? size : 0, 0.0),
+            .tilt = Array(tilt_ ? size : 0, 0.0)};
   }
   void exchange(Bar& bar) {
-    std::swap(inertial_.metric_bar, bar.metric);
-    std::swap(inertial_.target_bar, bar.target);
+    if (inertial_) {
+      std::swap(inertial_->metric_bar, bar.metric);
+      std::swap(inertial_->target_bar, bar.target);
+    }
     if (elastic_) std::swap(elastic_->target_bar, bar.elastic_target);
+    if (tilt_) std::swap(tilt_->force_bar, bar.tilt);
   }
 
-  /// Cotangent of x^D.
-  Array target_bar() const {
-    Array bar = inertial_.target_bar;
-    if (!elastic_) return bar;
-    for (std::size_t a = 0; a < bar.size(); ++a) bar[a] += elastic_->target_bar[a];
+  /// Cotangent of x^D; those of what else the nearness is made of go where they belong.
+  Array pull_back(Cotangents& bars) {
+    Array bar(problem_.cloth_size, 0.0);
+    if (inertial_) {
+      add_masses_bar(bars.masses);
+      bar = inertial_->target_bar;
+    }
+    if (elastic_) {
+      for (std::size_t a = 0; a < bar.size(); ++a) bar[a] += elastic_->target_bar[a];
+    }
+    if (tilt_) pull_back_tilt(bar);
     return bar;
+  }
+
+ private:
+  static double mean(const Array& values) {
+    double sum = 0.0;
+    for (const double value : values) sum += value;
+    return sum / static_cast<double>(values.size());
+  }
+
+  template <class Visit>
+  void for_each_of_energy(Visit&& visit) const {
+    visit(static_cast<Potential&>(problem_.inertia));
+    for (Potential* p : problem_.elastic_potentials()) visit(*p);
+  }
+
+  Array gradient_at_target() const {
+    Array g(x_d_.size(), 0.0);
+    for_each_of_energy([&](const Potential& p) { p.add_gradient(x_d_.data(), g.data()); });
+    return g;
+  }
+
+  // f = grad P(x^D):  x^D gets H f_bar, and what P is made of  d/d theta (f_bar . grad P).
+  void pull_back_tilt(Array& target_bar) {
+    Array minus = tilt_->force_bar;
+    for (double& value : minus) value = -value;
+    for_each_of_energy([&](Potential& p) {
+      p.add_hessian_product(x_d_.data(), tilt_->force_bar.data(), target_bar.data());
+      p.accumulate(x_d_.data(), minus.data());
+    });
   }
 
   /// Into the cotangents of the masses that G is made of.
   void add_masses_bar(Array& masses_bar) const {
-    const Array& bar = inertial_.metric_bar;
-    double mean = 0.0;
-    for (const double value : bar) mean += value;
-    mean /= static_cast<double>(bar.size());
-    for (std::size_t i = 0; i < bar.size(); ++i) {
-      masses_bar[i] += problem_.scene.given.metric == Metric::kIdentity ? mean : bar[i];
-    }
-  }
-
- private:
-  /// G less h^2 L, which is diagonal [kg].
-  static Array diagonal(const Problem& p) {
-    if (p.scene.given.metric != Metric::kIdentity) return p.masses;
-    // The literal metric weighs all vertices alike; the mean mass keeps the energy in joules.
-    double mean = 0.0;
-    for (const double m : p.masses) mean += m;
-    mean /= static_cast<double>(p.masses.size());
-    Array metric(p.masses.size(), mean);
-    return metric;
+    const Array& bar = inertial_->metric_bar;
+    const bool is_uniform = problem_.scene.given.metric == Metric::kIdentity;
+    const double shared = is_uniform ? mean(bar) : 0.0;
+    for (std::size_t i = 0; i < bar.size(); ++i) masses_bar[i] += is_uniform ? shared : bar[i];
   }
 
   Problem& problem_;
-  Proximity inertial_;
+  Array x_d_;
+  // The literal metric weighs all vertices alike; the mean mass keeps the energy in joules.
+  std::optional<Proximity> inertial_;  ///< in G less h^2 L, which is diagonal [kg]
   std::optional<elastic::ElasticNearness> elastic_;
+  std::optional<Tilt> tilt_;
 };
 
 }  // namespace
@@ -105,15 +160,17 @@ std::vector<Field> Split::tape(const Scene& scene) const {
 
 void Split::forward(const Forward& step, Array& x, double* body_forces) const {
   Problem& problem = step.problem;
-  Array x_d = ElasticStage(problem).forward(step, body_forces);
+  const ElasticStage elastic(problem);
+  Array x_d = elastic.forward(step, body_forces);
   x_d.resize(problem.cloth_size);
-  Nearness(problem, x_d).stage().forward(step, x, body_forces);
+  Nearness(problem, std::move(x_d), elastic.has_contacts()).stage().forward(step, x, body_forces);
 }
 
 void Split::backward(const Backward& step) const {
   Problem& problem = step.problem;
   const double* x_d = step.tape["elastic"];
-  Nearness nearness(problem, Array(x_d, x_d + problem.cloth_size));
+  const ElasticStage elastic(problem);
+  Nearness nearness(problem, Array(x_d, x_d + problem.cloth_size), elastic.has_contacts());
   std::vector<Nearness::Bar> own(step.losses.size(), nearness.zero_bar());
   ContactStage contact = nearness.stage();
   contact.exchange = [&](std::size_t l) {
@@ -123,14 +180,14 @@ void Split::backward(const Backward& step) const {
   std::vector<Array> g;
   for (const Cotangents& bars : step.losses) g.push_back(bars.rows);
   contact.backward(step, g);
+  if (!nearness.follows_target()) return;
 
   for (std::size_t l = 0; l < g.size(); ++l) {
     const Turn turn(contact.exchange, l);
-    nearness.add_masses_bar(step.losses[l].masses);
-    g[l] = nearness.target_bar();
+    g[l] = nearness.pull_back(step.losses[l]);
     g[l].resize(problem.coordinates.size(), 0.0);
   }
-  ElasticStage(problem).backward(step, g);
+  elastic.backward(step, g);
 }
 
 }  // namespace diffcloth::step

@@ -411,7 +411,7 @@ class SolverSection(Section):
     tolerance: Positive | None = None
     max_iterations: Annotated[int, Ge(1)] | None = None
     throw: bool | None = None
-    metric: Literal["elastic", "mass", "identity"] | None = None
+    metric: Literal["energy", "elastic", "mass", "identity"] | None = None
     elastic: Literal["newton", "projective"] | None = None
 
 

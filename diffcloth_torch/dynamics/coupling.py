@@ -5,8 +5,8 @@ as it was or will be, so that an error of the first passes back and forth; the a
 
     N = (mass of the cloth in contact + h^2 stiffness of the contact) / mass of the body
 
-says by how much it grows or falls each time. From about 1 on results are wrong, from 3 or 4 on they
-gain energy.
+says by how much it grows or falls each time. Energy is gained long before it is 1, where a body
+bounces: the barrier is softest for its force at a third of its reach, and stiffer elsewhere.
 """
 
 from __future__ import annotations
@@ -60,12 +60,14 @@ class Staggered(Generic[Cloth, Rigid]):
     Attributes:
         cloth: The solve of the cloths.
         rigid: That of bodies and robots.
+        prediction: That the solve of bodies and robots began with.
         fields: Of the new state, for bodies and robots.
         body_forces: Of both solves, [B, V, 3] N.
     """
 
     cloth: Cloth
     rigid: Rigid
+    prediction: Prediction
     fields: dict[str, Tensor]
     body_forces: Tensor
 
@@ -93,35 +95,39 @@ def rigid_to_cloth(
     fields = dynamics.advance(
         prediction, rigid.coordinates, rigid.body_forces, kick=cloth.body_forces
     )
-    return Staggered(cloth, rigid, fields, rigid.body_forces + cloth.body_forces)
+    return Staggered(cloth, rigid, prediction, fields, rigid.body_forces + cloth.body_forces)
 
 
 def cloth_to_rigid(
     dynamics: Dynamics,
     predict: Callable[[Tensor | None], Prediction],
+    last_coordinates: Callable[[Prediction], Tensor],
     solve_rigid: Callable[[Prediction], Rigid],
-    solve_cloth: Callable[[Prediction, Tensor], Cloth],
+    solve_cloth: Callable[[Prediction, Tensor, Tensor], Cloth],
     check_path: Callable[[Cloth, Prediction, Tensor, Tensor], None],
 ) -> Staggered[Cloth, Rigid]:
     """Move the cloth while what forces move stands still, then that by the forces of the cloth.
 
+    Friction sees what stands still move as it did in the step before.
+
     Args:
         dynamics: Of the bodies and robots.
         predict: Predicts the step, with forces [B, V, 3] that act on the vertices.
+        last_coordinates: Coordinates a step before the start, [B, n].
         solve_rigid: As for `rigid_to_cloth`.
-        solve_cloth: Likewise.
+        solve_cloth: Likewise, with the coordinates that friction counts motion from, [B, n].
         check_path: Raises where bodies and robots, on their straight way between two rows of
             coordinates of the prediction, meet the cloth that has been solved.
     """
     still = predict(None)
     held = torch.where(dynamics.prescribed, still.coordinate_ends, still.coordinates)
-    cloth = solve_cloth(still, held)
+    cloth = solve_cloth(still, held, last_coordinates(still))
     prediction = predict(cloth.body_forces)
     rigid = solve_rigid(prediction)
     start = torch.where(dynamics.prescribed, prediction.coordinate_ends, prediction.coordinates)
     check_path(cloth, prediction, start, rigid.coordinates)
     fields = dynamics.advance(prediction, rigid.coordinates, rigid.body_forces)
-    return Staggered(cloth, rigid, fields, rigid.body_forces + cloth.body_forces)
+    return Staggered(cloth, rigid, prediction, fields, rigid.body_forces + cloth.body_forces)
 
 
 def added_mass_numbers(

@@ -22,6 +22,7 @@ from diffcloth_torch.dynamics.inertia import Inertia
 from diffcloth_torch.dynamics.totals import Totals
 from diffcloth_torch.geometry.rotation import (
     quaternion_exp,
+    quaternion_log,
     quaternion_multiply,
     rotate,
     row_velocities,
@@ -215,6 +216,38 @@ class Dynamics:
             held_velocities=row_velocities(start, end, moved, self.dt),
             chains=tuple(chain.end_at(own, pose) for chain, own, pose in chains),
         )
+
+    def last_coordinates(self, prediction: Prediction, state: Fields) -> Tensor:
+        """Coordinates a step before the start, by the velocities there, [B, n].
+
+        Those that are prescribed are at the start.
+
+        Args:
+            prediction: Of the step.
+            state: As for `predict`.
+        """
+        here = prediction.coordinates
+        own, *chains = torch.split(here, self._widths, dim=1)
+        last = []
+        if prediction.bodies is not None:
+            rates = state["body_velocities"][:, self._free]
+            root = self._moved_back(own.reshape(len(own), -1, 6), rates)
+            last.append(root.flatten(1))
+        for i, (chain, rows) in enumerate(zip(self._chains, chains, strict=True)):
+            joints = self._chain_rows[i][0]
+            count = joints.stop - joints.start
+            root, values = torch.split(rows, [chain.coordinate_count - count, count], dim=1)
+            if root.shape[1]:
+                root = self._moved_back(root, state["base_velocities"][:, i])
+            last += [root, values - self.dt * state["joint_velocities"][:, joints]]
+        return torch.where(self.prescribed, here, torch.cat([here[:, :0], *last], dim=1))
+
+    def _moved_back(self, roots: Tensor, velocities: Tensor) -> Tensor:
+        """Coordinates of free roots a step before, [.., 6]."""
+        shift, turn = torch.split(self.dt * velocities, 3, dim=-1)
+        center, vector = torch.split(roots, 3, dim=-1)
+        back = quaternion_multiply(quaternion_exp(-turn), quaternion_exp(vector))
+        return torch.cat([center - shift, quaternion_log(back)], dim=-1)
 
     def advance(
         self,

@@ -10,7 +10,7 @@ from diffcloth_torch.model.quantities import check_parameter
 __all__ = ["COUPLINGS", "ELASTIC_SOLVERS", "METRICS", "SCHEMES", "ContactOptions", "SolverOptions"]
 
 SCHEMES = ("coupled", "split", "projective")
-METRICS = ("elastic", "mass", "identity")
+METRICS = ("energy", "elastic", "mass", "identity")
 ELASTIC_SOLVERS = ("newton", "projective")
 COUPLINGS = ("monolithic", "rigid_to_cloth", "cloth_to_rigid")
 
@@ -63,9 +63,10 @@ class SolverOptions:
             `InfeasibleMotion`. Otherwise `report.status` says which failed, and their state is the
             last feasible iterate: bodies, joints and pins are where the motion ended (in staggered
             couplings, where it began). Backward raises the error where a loss depends on them.
-        metric: Norm of the contact stage of the scheme "split": "elastic" (the masses plus h^2
-            times the constant matrix of Projective Dynamics), "mass", or "identity" (the paper's
-            Eq. 22). None means "elastic" for "split"; the others have no choice.
+        metric: What "nearest" means in the contact stage of the scheme "split": "energy" (inertia
+            and elasticity, as they are), or a norm: "elastic" (the masses plus h^2 times the
+            constant matrix of Projective Dynamics), "mass", or "identity" (the paper's Eq. 22).
+            None means "energy" for "split"; the others have no choice.
         elastic: What solves the elastic stage of the schemes "split" and "projective": "newton", or
             "projective", the local/global iterations of Projective Dynamics. Both find the same
             positions.

@@ -129,7 +129,13 @@ PARAMETERS = _table(
     Quantity("joint_viscosity", "N m s/rad or N s/m", _JOINTS, "Robot.viscosity", NON_NEGATIVE),
     Quantity("joint_armature", "kg m^2 or kg", _JOINTS, "zero", NON_NEGATIVE),
 )
-DERIVED = ("coordinates", "coordinate_ends", "coordinate_targets", "coordinate_metric")
+DERIVED = (
+    "coordinates",
+    "coordinate_ends",
+    "coordinate_targets",
+    "coordinate_metric",
+    "coordinate_origins",
+)
 """Inputs of the core that follow from several fields: what drives the coordinates of bodies."""
 FACE_QUANTITIES = tuple(name for name, quantity in PARAMETERS.items() if quantity.axes == _PER_FACE)
 """Names of the parameters that may differ from face to face."""

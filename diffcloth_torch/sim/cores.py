@@ -70,7 +70,7 @@ def make_core(
         self_contact=options.contact.self_contact,
         dt=options.dt,
         scheme=options.scheme,
-        metric=options.solver.metric or "elastic",
+        metric=options.solver.metric or "energy",
         elastic=options.solver.elastic,
         friction_iterations=options.contact.friction_iterations,
         tolerance=options.solver.tolerance,

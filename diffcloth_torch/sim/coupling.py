@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.dynamics.coupling import Staggered as StaggeredSolution
 from diffcloth_torch.dynamics.coupling import added_mass_numbers, cloth_to_rigid, rigid_to_cloth
 from diffcloth_torch.dynamics.dynamics import Dynamics, Prediction
 from diffcloth_torch.errors import AddedMassWarning, InfeasibleMotion
@@ -20,7 +21,7 @@ from diffcloth_torch.sim.cores import CoreOptions, make_core, with_all_pinned, w
 from diffcloth_torch.sim.inputs import Fields
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.links import link_poses
-from diffcloth_torch.sim.masses import vertex_masses
+from diffcloth_torch.sim.masses import cloth_totals, vertex_masses
 from diffcloth_torch.sim.motion import with_rows
 from diffcloth_torch.sim.step import (
     CONVERGED,
@@ -38,6 +39,17 @@ Check = Callable[[dict[str, Any]], None]
 """Raises where the diagnostics of a solve say that it failed."""
 
 _LARGEST_ADDED_MASS = 0.5
+_LARGEST_GAIN = 0.01  # of what moves and presses, in a step
+
+# What the core takes of bodies and links.
+_PLACED = (
+    "body_poses",
+    "body_targets",
+    "coordinates",
+    "coordinate_ends",
+    "coordinate_targets",
+    "coordinate_metric",
+)
 
 # What a state has besides velocities, forces and efforts.
 _PLACES = ("positions", "body_poses", "joint_positions", "base_poses")
@@ -135,8 +147,12 @@ class Staggered:
             ends = outcome.coordinates
             return _Solved(outcome, prediction.coordinates if ends is None else ends)
 
-        def solve_cloth(prediction: Prediction, ends: Tensor) -> _Solved:
+        def solve_cloth(
+            prediction: Prediction, ends: Tensor, origins: Tensor | None = None
+        ) -> _Solved:
             given = inputs | prediction.core_inputs() | {"coordinate_ends": ends}
+            if origins is not None:
+                given["coordinate_origins"] = origins
             outcome = take_step(self._cloth, given, batched=True)
             look_at(outcome)
             if blocked:  # what is squeezed may push too hard to find a motion
@@ -160,9 +176,16 @@ class Staggered:
         if self._coupling == "rigid_to_cloth":
             solved = rigid_to_cloth(self._dynamics, predict(None), solve_rigid, solve_cloth)
         else:
-            solved = cloth_to_rigid(self._dynamics, predict, solve_rigid, solve_cloth, check_path)
+            last = partial(self._dynamics.last_coordinates, state=state)
+            solved = cloth_to_rigid(
+                self._dynamics, predict, last, solve_rigid, solve_cloth, check_path
+            )
         cloth = solved.cloth.outcome
-        self._warn(cloth, solved.fields, parameters)
+        if not self._warned and cloth.body_forces.any():
+            with torch.no_grad():
+                passive = not blocked and self._is_passive(state, control)
+                gain = self._gain(state, solved, parameters, inputs) if passive else 0.0
+                self._warn(cloth, solved.fields, parameters, gain)
         diagnostics = _merged(cloth.diagnostics, solved.rigid.outcome.diagnostics)
         tensors = {
             **solved.fields,
@@ -226,30 +249,84 @@ class Staggered:
             )
         return dict.fromkeys(blocked, f"what forces move cannot go on without {remedy}")
 
-    def _warn(self, cloth: Outcome, after: Fields, parameters: Fields) -> None:
-        """Warn once where the cloth that a body touches is not light against it."""
-        if self._warned or not cloth.body_forces.detach().any():
-            return
+    def _is_passive(self, state: Fields, control: Fields) -> bool:
+        """Whether only gravity does work: nothing else pushes, and what is prescribed rests."""
+        if self._layout.robots or any(control[name].any() for name in ("forces", "body_wrenches")):
+            return False
+        pins = state["positions"][:, self._layout.pins]
+        held = {"pins": pins, "soft_pins": state["soft_pin_targets"]}
+        held["body_poses"] = state["body_poses"]
+        return all(torch.equal(control[n].expand_as(rests), rests) for n, rests in held.items())
+
+    def _gain(
+        self,
+        state: Fields,
+        solved: StaggeredSolution[_Solved, _Solved],
+        parameters: Fields,
+        inputs: Fields,
+    ) -> float:
+        """Rise of the energy over a step as a share of what moves and presses, the largest."""
+        cloth, moved = solved.cloth.outcome, solved.prediction
+        after = {"positions": cloth.positions, "velocities": cloth.velocities, **solved.fields}
+        here = inputs | moved.core_inputs()
+        there = here | {
+            "positions": cloth.positions,
+            "body_poses": moved.body_targets,
+            "coordinates": solved.rigid.coordinates,
+        }
+        before, (kinetic, contact, rest) = (
+            self._energies(at, fields, parameters) for at, fields in ((here, state), (there, after))
+        )
+        rise = kinetic + contact + rest - sum(before)
+        return float((rise / (kinetic + contact)).amax())
+
+    def _energies(
+        self, inputs: Fields, state: Fields, parameters: Fields
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Kinetic energy, that of contact, and all other, [B] J."""
+        stored = self._cloth.stored_energy(_arrays(inputs))
+        placed = {name: inputs[name] for name in _PLACED}
+        alone = self._rigid.stored_energy(_arrays(self._without_cloths(inputs) | placed))
+        totals = cloth_totals(self._layout.assembly, state, parameters)
+        totals = totals.plus(self._dynamics.totals(state, parameters))
+        contact = torch.from_numpy(stored.pop("contact") + alone["contact"])
+        rest = totals.gravity_energy + sum(torch.from_numpy(part) for part in stored.values())
+        return totals.kinetic_energy, contact, rest
+
+    def _warn(self, cloth: Outcome, after: Fields, parameters: Fields, gain: float) -> None:
+        """Warn once where the cloth that a body touches is not light against it.
+
+        Args:
+            cloth: What the cloths' solve has found.
+            after: Fields of bodies and robots behind the step.
+            parameters: Checked parameters.
+            gain: Share of the energy that the step has made from nothing.
+        """
         assembly = self._layout.assembly
-        with torch.no_grad():
-            numbers = added_mass_numbers(
-                assembly,
-                self._surface_frames(after),
-                self._surface_masses(parameters),
-                cloth.positions,
-                vertex_masses(assembly, parameters),
-                cloth.body_forces,
-                parameters["barrier_distance"].reshape(-1),
-                self._dt,
-            ).amax(0)
+        numbers = added_mass_numbers(
+            assembly,
+            self._surface_frames(after),
+            self._surface_masses(parameters),
+            cloth.positions,
+            vertex_masses(assembly, parameters),
+            cloth.body_forces,
+            parameters["barrier_distance"].reshape(-1),
+            self._dt,
+        ).amax(0)
         worst = int(numbers.argmax())
-        if numbers[worst] > _LARGEST_ADDED_MASS:
+        if numbers[worst] > _LARGEST_ADDED_MASS or gain > _LARGEST_GAIN:
             self._warned = True
             name = assembly.surface_names[assembly.cloth_count + worst]
+            if gain > _LARGEST_GAIN:
+                sign = f"a step near {name!r} gained {gain:.2g} of the energy of motion and contact"
+            else:
+                sign = (
+                    f"the added-mass number of {name!r} is about {float(numbers[worst]):.2g}, "
+                    f"above {_LARGEST_ADDED_MASS:g}"
+                )
             warnings.warn(
                 f"step: the coupling {self._coupling!r} gets inaccurate, and then unstable, where "
-                "what a body touches is heavy or stiff against it: the added-mass number of "
-                f"{name!r} is about {float(numbers[worst]):.2g}, above {_LARGEST_ADDED_MASS:g}; "
+                f"what a body touches is heavy or stiff against it: {sign}; "
                 'use coupling="monolithic", or a smaller dt',
                 AddedMassWarning,
                 stacklevel=5,

@@ -76,6 +76,7 @@ def tree_arguments(
         "link_constant": np.array(links["constant"], dtype=np.float64),
         "surface_link": _indices([place[owner] for owner in owners]),
         "coordinate_prescribed": _indices([all_prescribed or given for given in prescribed]),
+        "coordinate_held": _indices([all_prescribed and not given for given in prescribed]),
         "coordinate_lower": np.array(lower, dtype=np.float64),
         "coordinate_upper": np.array(upper, dtype=np.float64),
         "limit_stiffness": limit_stiffness,

@@ -75,6 +75,7 @@ def trees(
         "link_multiplier": np.array(multiplier, float),
         "link_constant": np.array(constant, float),
         "coordinate_prescribed": np.array([0] * root + list(prescribed), np.int32),
+        "coordinate_held": np.zeros(root + len(prescribed), np.int32),
         "coordinate_lower": np.array([-np.inf] * root + list(lower)),
         "coordinate_upper": np.array([np.inf] * root + list(upper)),
         "limit_stiffness": np.array([0.0] * root + list(limit_stiffness)),

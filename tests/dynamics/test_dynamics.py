@@ -1,5 +1,6 @@
 """Bodies and robots of a scene together: rows, limits, and couplings in two solves."""
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -110,6 +111,39 @@ def test_rows_of_a_prediction(world):
         torch.testing.assert_close(got, pose[:3] + rotate(unit, v), rtol=0, atol=1e-14)
 
 
+def test_the_last_coordinates_are_where_the_velocities_come_from(world):
+    _, dynamics, parameters, state, control = world
+    p = dynamics.predict(state, control, parameters)
+    last = dynamics.last_coordinates(p, state)
+    v = tensor([[0.1, 0.2, -0.3]])
+    moved = {0: (1, state["body_velocities"][0, 1]), 6: (3, state["body_velocities"][0, 3])}
+    moved[12] = (4, state["base_velocities"][0, 0])
+    for first, (row, twist) in moved.items():
+        S = p.body_poses[0, row]
+        points = []
+        for rows in (p.coordinates, last):
+            c, w = rows[0, first : first + 3], rows[0, first + 3 : first + 6]
+            points.append((c, rotate(quaternion_exp(w), rotate(S[3:], v) + S[:3])))
+        (center, arm), (center_before, arm_before) = points
+        back = rotate(quaternion_exp(-H * twist[3:]), arm)
+        torch.testing.assert_close(center_before, center - H * twist[:3], rtol=0, atol=1e-15)
+        torch.testing.assert_close(arm_before, back, rtol=0, atol=1e-14)
+    joints = p.coordinates[:, 18:] - H * state["joint_velocities"]
+    torch.testing.assert_close(last[:, 18:], joints, rtol=0, atol=1e-15)
+
+
+def test_the_last_coordinates_of_what_is_prescribed_are_those_of_the_start():
+    scene = make_scene(actuation=("position", "pd"), base="fixed")
+    assembly = assemble(scene)
+    dynamics = Dynamics(assembly, H)
+    state, control = fields(assembly, 2)
+    p = dynamics.predict(state, control, parameters_of(scene, assembly))
+    last = dynamics.last_coordinates(p, state)
+    assert dynamics.prescribed[12:].tolist() == [True, False]
+    assert torch.equal(last[:, 12], p.coordinates[:, 12])
+    assert not torch.equal(last[:, 13], p.coordinates[:, 13])
+
+
 def test_fields_of_the_state_after(world):
     assembly, dynamics, parameters, state, control = world
     p = dynamics.predict(state, control, parameters)
@@ -218,9 +252,10 @@ def solvers(assembly, seen):
         none = torch.zeros(1, len(assembly.body_vertices), 3, dtype=F64)
         return Solution(prediction.coordinate_targets, none)
 
-    def solve_cloth(prediction, coordinates):
+    def solve_cloth(prediction, coordinates, origins=None):
         seen.append(("cloth", coordinates))
-        return Solution(coordinates, spring_forces(assembly, coordinates))
+        pushed = coordinates if origins is None else 2 * coordinates - origins
+        return Solution(coordinates, spring_forces(assembly, pushed))
 
     return solve_rigid, solve_cloth
 
@@ -251,10 +286,13 @@ def test_cloth_to_rigid_lets_the_cloth_go_first(world):
     def predict(contact):
         return dynamics.predict(state, control, parameters, contact)
 
+    def last(prediction):
+        return dynamics.last_coordinates(prediction, state)
+
     def check_path(cloth, prediction, start, end):
         checked.append((start, end))
 
-    result = cloth_to_rigid(dynamics, predict, *solvers(assembly, seen), check_path)
+    result = cloth_to_rigid(dynamics, predict, last, *solvers(assembly, seen), check_path)
     assert [name for name, _ in seen] == ["cloth", "rigid"]
     p = predict(None)
     assert torch.equal(seen[0][1], p.coordinates)  # nothing is prescribed: all is still
@@ -288,7 +326,8 @@ def test_gradients_through_couplings(world, order):
         if order == "rigid_to_cloth":
             result = rigid_to_cloth(dynamics, predict(None), *solve)
         else:
-            result = cloth_to_rigid(dynamics, predict, *solve, lambda *_: None)
+            last = partial(dynamics.last_coordinates, state=now)
+            result = cloth_to_rigid(dynamics, predict, last, *solve, lambda *_: None)
         return (*result.fields.values(), result.body_forces)
 
     inputs = [state[name] for name in names] + [parameters["body_mass"], parameters["link_mass"]]

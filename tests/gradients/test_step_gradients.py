@@ -236,6 +236,7 @@ def test_some_edges_in_contact_are_nearly_parallel(name):
 
 COUPLED, ELASTIC = ("coupled", None), ("split", "elastic")
 MASS, IDENTITY = ("split", "mass"), ("split", "identity")
+ENERGY = ("split", "energy")
 QUICK = [
     ("hanging", COUPLED, 2),
     ("curved", ELASTIC, 2),
@@ -244,6 +245,7 @@ QUICK = [
     ("sliding", COUPLED, 1),
     ("sliding", IDENTITY, 2),
     ("sliding", ELASTIC, 2),
+    ("sliding", ENERGY, 2),
     ("separating", MASS, 1),
     ("landing", COUPLED, 2),
     ("leaving", COUPLED, 1),
@@ -253,6 +255,7 @@ QUICK = [
     ("pinned", ELASTIC, 2),
     ("held", COUPLED, 2),
     ("folded", ELASTIC, 2),
+    ("folded", ENERGY, 2),
     ("folded_thick", COUPLED, 2),
     ("stacked", COUPLED, 2),
     ("dragged", COUPLED, 2),
@@ -261,7 +264,7 @@ QUICK = [
 ALL = [
     (name, scheme, iterations)
     for name in scenes.REGIMES
-    for scheme in (COUPLED, ELASTIC, MASS, IDENTITY)
+    for scheme in (COUPLED, ENERGY, ELASTIC, MASS, IDENTITY)
     for iterations in (1, 2)
     # Where nothing touches at the end, only the friction of the first solve is left.
     if name != "leaving" or (scheme, iterations) == (COUPLED, 1)

@@ -218,3 +218,52 @@ def test_split_leaves_nodal_bodies_out_of_the_barrier():
     assert counts(after)[2] > 0
     assert after.report.contact_count == 0
     assert step.sim.parameters().barrier_distance is None
+
+
+@pytest.mark.parametrize("metric", ["energy", "elastic"])
+def test_gradients_of_nodes_and_barrier_in_one_step_are_those_of_differences(metric):
+    """What nodes feel in the first stage of split lasts in the second, where a ball presses."""
+    step = on_body("plane", "slipping", scheme="split", moving=False)
+    (cloth,), (floor,) = step.sim.scene.cloths, step.sim.scene.bodies
+    at = step.state.positions.mean(0) + torch.tensor([0.01, 0.02, 0.0335], dtype=F64)
+    ball = dc.RigidBody.sphere(
+        0.03, subdivisions=1, motion="kinematic", pose=[*at.tolist(), 1, 0.1, 0, 0.2]
+    )
+    sim = dc.Simulator(
+        dc.Scene([cloth], [floor, ball], gravity=(0.4, -0.3, -9.81)),
+        DT,
+        scheme="split",
+        contact=dc.ContactOptions(
+            self_contact=False, barrier_distance=4e-3, barrier_stiffness=20.0, slip_velocity=0.05
+        ),
+        solver=dc.SolverOptions(tolerance=1e-11, metric=metric),
+    )
+    start = sim.initial_state()
+    state = start.replace(
+        positions=step.state.positions,
+        velocities=step.state.velocities,
+        soft_pin_targets=step.state.soft_pin_targets,
+    )
+    parameters = sim.parameters()
+    after = sim.step(state)
+    assert sum(counts(after)) > 0
+    assert after.report.contact_count > 0
+    inputs = {"velocities": state.velocities, "body_poses": start.body_poses}
+    inputs |= {n: getattr(parameters, n) for n in ("stretch", "bending", "density", "friction")}
+    generator = torch.Generator().manual_seed(1)
+    weights = {
+        name: torch.randn(getattr(after, name).shape, dtype=F64, generator=generator) * scale
+        for name, scale in (("positions", 1.0), ("velocities", DT), ("body_forces", 1e-2))
+    }
+
+    def value(changes):
+        fields = {n: changes[n] for n in ("velocities", "body_poses") if n in changes}
+        physical = {n: v for n, v in changes.items() if n not in fields}
+        control = dc.Control(body_poses=changes.get("body_poses", start.body_poses))
+        fields.pop("body_poses", None)
+        end = sim.step(state.replace(**fields), control, parameters.replace(**physical))
+        return sum((w * getattr(end, n)).sum() for n, w in weights.items())
+
+    sizes = {n: 1e-5 * max(1.0, float(v.abs().max())) for n, v in inputs.items()}
+    sizes["body_poses"] = 1e-6
+    assert_gradients_are_those_of_differences(value, inputs, sizes, generator)
