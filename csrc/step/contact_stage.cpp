@@ -15,9 +15,9 @@
 //   theta_bar -= d/d(theta) ( zhat . grad E_k ),
 //
 // which each potential adds up for its own inputs; in particular prescribed positions (pins c, bodies
-// o) get  -(H zhat) at their rows, and pins also the direct g_k. Friction's displacement x - x_start
-// gives  x_start_bar += H_D zhat, for bodies at their origins where these are given. The lag configuration of k is x_{k-1} (x_n for k = 1): its
-// cotangent becomes g_{k-1}, and the sweep goes on from K to 1.
+// o) get  -(H zhat) at their rows, and pins also the direct g_k. Friction's displacement from x_start gives
+// x_start_bar, of bodies that of their origins where these are given. The lag configuration of k is x_{k-1}
+// (x_n for k = 1): its cotangent becomes g_{k-1}, and the sweep goes on from K to 1.
 //
 // Where vertices y(q, s) of links follow coordinates q and frames s, x stands for all of z = (cloth, q),
 // dy = J dz, H includes the second derivative of  y . grad_y E_k  by q, and zhat has J z_k at those
