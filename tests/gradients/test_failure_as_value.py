@@ -249,7 +249,7 @@ def test_an_intersecting_state_raises_in_any_case():
 
 def test_each_environment_has_its_own_error():
     """One runs out of iterations, another is squeezed, the rest is free."""
-    sim = failing_scenes.simulator("body", max_iterations=45)
+    sim = failing_scenes.simulator("body", max_iterations=30)
     state = sim.initial_state(B)
     poses = targets("body", sim)
     velocities = state.velocities.clone()
