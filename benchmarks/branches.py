@@ -91,7 +91,9 @@ TRIALS: dict[str, Trial] = {
 }
 
 
-@click.command(help=__doc__.replace("\n\n    ", "\n\n\b\n    ").replace("\n\njumps", "\n\n\b\njumps"))
+@click.command(
+    help=__doc__.replace("\n\n    ", "\n\n\b\n    ").replace("\n\njumps", "\n\n\b\njumps")
+)
 @click.option("--scene", "scenes", multiple=True, type=click.Choice(list(TRIALS)))
 @click.option("--size", "sizes", multiple=True, type=click.IntRange(min=4), help="Vertices a side.")
 @click.option("--steps", type=click.IntRange(min=1), help="States of a trajectory; 20.")
@@ -191,7 +193,7 @@ def count_jumps(
         jumps=jumps,
         starts=starts * steps,
         failed=failed,
-        growth=median(growths) if growths else float("nan"),
+        growth=float(median(growths)) if growths else float("nan"),
         iterations=float(np.mean(iterations)),
         time=1e3 * float(np.mean(seconds)),
     )

@@ -305,3 +305,27 @@ def test_the_baseline_is_timed_with_both_elastic_solvers():
     rows = [line.split() for line in result.stdout.splitlines()]
     assert [row[0] for row in rows[1:]] == 2 * ["newton", "projective"]
     assert all(int(row[2]) > 0 for row in rows[1:])  # vertices in contact
+
+
+def test_jumps_are_counted():
+    command = [sys.executable, "-m", "benchmarks.branches", "--quick"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    rows = [line.split() for line in result.stdout.splitlines()[1:]]
+    assert [row[0] for row in rows] == ["thrown", "crumple"]
+    for row in rows:
+        jumps, starts, failed, growth, iterations, milliseconds = map(float, row[2:])
+        assert 0 <= jumps <= starts == 6
+        assert failed == 0
+        assert growth > 0
+        assert iterations > 1
+        assert milliseconds > 0
+
+
+def test_an_end_that_is_elsewhere_is_a_jump(monkeypatch):
+    """With a threshold below what starts differ by, every start jumps."""
+    monkeypatch.syspath_prepend(ROOT)
+    branches = importlib.import_module("benchmarks.branches")
+    monkeypatch.setattr(branches, "JUMP", 1e-13)
+    count = branches.count_jumps("crumple", 8, 2, 2, (1e-9, 1e-7))
+    assert (count.jumps, count.starts, count.failed) == (4, 4, 0)
