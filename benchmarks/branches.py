@@ -7,11 +7,11 @@
     python -m benchmarks.branches --quick                               # seconds
 
 Where cloth buckles a step has several minima. Which one it ends in shall be a function of its start
-that does not flip with the last bits: gradients, optimizers and differences all rest on that. So the
-states of a trajectory are recorded, and each is stepped again from starts whose vertices differ at
-random, all by the same size, which is drawn between `--least` and `--most` for each start. A jump is
-an end with a vertex more than 0.1 mm away from where the recorded start ends. Ordinary ends differ
-by a few times what their starts do (`growth`, the median).
+that does not flip with the last bits: gradients, optimizers and differences all rest on that. So
+the states of a trajectory are recorded, and each is stepped again from starts whose vertices differ
+at random, all by the same size, which is drawn between `--least` and `--most` for each start. A
+jump is an end with a vertex more than 0.1 mm away from where the recorded start ends. Ordinary ends
+differ by a few times what their starts do (`growth`, the median).
 
 jumps       starts that end elsewhere, of all
 failed      of these and of the recorded states, those whose step does not converge; none is a jump
@@ -25,7 +25,7 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 
 import click
 import numpy as np
@@ -141,7 +141,7 @@ def main(
 
 
 def record(simulator: dc.Simulator, scene: Scene, steps: int, kept: Path | None) -> list[dc.State]:
-    """The states of a trajectory, from its regime on: read from the file `kept`, or written to it."""
+    """The states of a trajectory, from its regime on: of the file `kept`, or written to it."""
     start = simulator.initial_state()
     if kept is not None and kept.exists():
         return [start.replace(**fields) for fields in torch.load(kept)]
@@ -172,8 +172,8 @@ def count_jumps(
         for state in record(simulator, scene, steps, kept):
             control = scene.control(state)
             end = simulator.step(state, control)
-            iterations.append(end.report.iterations)
-            seconds.append(sum(end.report.seconds.values()))
+            iterations.append(float(end.report.iterations))
+            seconds.append(float(sum(end.report.seconds.values())))
             failed += not end.report.converged
             for _ in range(starts):
                 # All that a start draws, whatever becomes of it: others do not depend on that.
@@ -194,8 +194,8 @@ def count_jumps(
         starts=starts * steps,
         failed=failed,
         growth=float(median(growths)) if growths else float("nan"),
-        iterations=float(np.mean(iterations)),
-        time=1e3 * float(np.mean(seconds)),
+        iterations=mean(iterations),
+        time=1e3 * mean(seconds),
     )
 
 

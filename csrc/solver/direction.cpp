@@ -31,7 +31,7 @@ constexpr double kGoodGain = 0.25;
 constexpr double kPoorGain = 0.1;
 constexpr int kManyBacktracks = 3;
 /// A blend holds a direction along which it has this share of the projection's curvature.
-constexpr double kHeld = 0.6;
+constexpr double kHeld = 0.5;
 /// Damped steps are lengthened to where the exact curvature along them puts the minimum.
 constexpr double kWorthGrowing = 1.5;
 constexpr double kLargestGrowth = 4.0;

@@ -109,7 +109,7 @@ def test_motions_that_clear_each_other_are_not_stopped(edge_edge):
 @pytest.mark.parametrize("xi", [0.0, 0.02])
 @pytest.mark.parametrize("edge_edge", KINDS)
 def test_motions_are_stopped_where_a_tenth_of_the_gap_is_left(edge_edge, xi, d_hat):
-    """Not where a search happens to end: that would jump when the motion changes in its last bits."""
+    """Not where a search happens to end, which jumps when a motion changes in its last bits."""
     x_t0, x_t1, _ = meeting_motions(edge_edge, 3000, np.random.default_rng(7))
     t = kernels.safe_step(edge_edge, x_t0, x_t1, xi, d_hat)
     x = x_t0 + t[:, None, None] * (x_t1 - x_t0)

@@ -1,7 +1,7 @@
 """One input, one output: starts that differ by next to nothing end in the same minimum.
 
-Where a sheet that is thrown on a sphere buckles, a step has several. Each of these scenes has states
-from which a fifth of the starts and more ended elsewhere.
+Where a sheet that is thrown on a sphere buckles, a step has several. Each of these scenes has
+states from which a fifth of the starts and more ended elsewhere.
 """
 
 import importlib
