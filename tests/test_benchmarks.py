@@ -328,3 +328,38 @@ def test_a_missing_extra_is_named_in_a_sentence(benchmark, module, sentence):
     assert result.returncode == 1
     assert sentence in result.stderr
     assert len(result.stderr.splitlines()) == 1
+
+
+def test_jumps_are_counted():
+    command = [sys.executable, "-m", "benchmarks.branches", "--quick"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    rows = [line.split() for line in result.stdout.splitlines()[1:]]
+    assert [row[0] for row in rows] == ["thrown", "crumple"]
+    for row in rows:
+        jumps, starts, failed, growth, iterations, milliseconds = map(float, row[2:])
+        assert 0 <= jumps <= starts == 6
+        assert failed == 0
+        assert growth > 0
+        assert iterations > 1
+        assert milliseconds > 0
+
+
+def test_an_end_that_is_elsewhere_is_a_jump(monkeypatch):
+    """With a threshold below what starts differ by, every start jumps."""
+    monkeypatch.syspath_prepend(ROOT)
+    branches = importlib.import_module("benchmarks.branches")
+    monkeypatch.setattr(branches, "JUMP", 1e-13)
+    count = branches.count_jumps("crumple", 8, 2, 2, (1e-9, 1e-7))
+    assert (count.jumps, count.starts, count.failed) == (4, 4, 0)
+
+
+def test_creep_is_measured():
+    command = [sys.executable, "-m", "benchmarks.sticking", "--quick"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    held = [line for line in result.stdout.splitlines() if "of its friction" in line]
+    assert len(held) == 4
+    for line in held:
+        way, law = map(float, line.rpartition(":")[2].split(","))
+        assert way == pytest.approx(law, abs=2e-3)

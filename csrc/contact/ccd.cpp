@@ -11,8 +11,11 @@
 namespace diffcloth::contact {
 namespace {
 
-/// Share of the initial gap at which the search stops, and of the present gap that a step leaves.
+/// Share of the initial gap, and of the barrier distance if that is less, that a motion leaves.
 constexpr double kGapLeft = 0.1;
+
+/// A search ends where it goes on by less than this share of the time.
+constexpr double kSettled = 1e-12;
 
 /// Rounding of positions, relative to the largest coordinate, that counts as contact.
 constexpr double kPositionRounding = 1e-12;
@@ -70,7 +73,12 @@ double certified_time(
 
 }  // namespace
 
-double safe_step(PairKind kind, const Corners& x_t0, const Corners& x_t1, double xi) {
+double safe_step(PairKind kind,
+                 const Corners& x_t0,
+                 const Corners& x_t1,
+                 double xi,
+                 double d_hat,
+                 double limit) {
   double largest = 0;
   Corners U;
   for (int i = 0; i < 4; ++i) {
@@ -84,25 +92,26 @@ double safe_step(PairKind kind, const Corners& x_t0, const Corners& x_t1, double
     lp_sq = std::max(lp_sq, m.squaredNorm());
   }
   const double touching = xi + kPositionRounding * largest;
-  if (stay_apart(kind, x_t0, x_t1, touching)) return 1;
+  const double most = kGapLeft * d_hat;
+  if (stay_apart(kind, x_t0, x_t1, touching + most)) return limit;
   Vec3 d_vector = separation(kind, x_t0);
   double d = d_vector.norm();
   if (!(d > touching)) return 0;
   const Differences start = between(kind, x_t0);
   const double lp = std::sqrt(lp_sq);
 
-  const double g = kGapLeft * (d - xi);
+  const double g = std::min(kGapLeft * (d - xi), most);
   double t = 0;
   for (int iteration = 0; iteration < kMaxIterations; ++iteration) {
-    const double reach = std::max(t + (1 - kGapLeft) * (d - xi) / lp,
-                                  certified_time(d_vector / d, start, motion, t, xi + g));
-    if (reach >= 1) return 1;
-    t = reach;
+    const double next =
+        std::max(t + (d - xi - g) / lp, certified_time(d_vector / d, start, motion, t, xi + g));
+    if (next >= limit) return limit;
+    if (!(next > t + kSettled * t)) break;
+    t = next;
     Corners x;
     for (int i = 0; i < 4; ++i) x[i] = x_t0[i] + t * U[i];
     d_vector = separation(kind, x);
     d = d_vector.norm();
-    if (!(d - xi >= g)) break;
   }
   return t;
 }

@@ -37,8 +37,8 @@ void add_stencil_product(const Stencil& v, const Hessian& h, const double* d, do
 double ContactPotential::safe_fraction(const double* x, const double* to) const {
   double alpha = 1.0;
   for (const Candidate& pair : candidates_) {
-    alpha = std::min(alpha, safe_step(pair.kind, corners(pair.vertices, x),
-                                      corners(pair.vertices, to), model_.xi(pair)));
+    alpha = safe_step(pair.kind, corners(pair.vertices, x), corners(pair.vertices, to),
+                      model_.xi(pair), model_.parameters().d_hat, alpha);
     if (alpha == 0.0) break;
   }
   return alpha;

@@ -1,6 +1,7 @@
 #include "solver/direction.h"
 
 #include <algorithm>
+#include <cmath>
 #include <stdexcept>
 
 namespace diffcloth::solver {
@@ -12,6 +13,8 @@ constexpr double kChordContraction = 0.1;
 /// new factor would be cheaper.
 constexpr int kIterations = 8;
 constexpr double kForcing = 0.03;
+/// Near a solution full steps with the exact Hessian move nothing by more than this share of an edge.
+constexpr double kNear = 0.03;
 /// Share s of the projection after an indefinite Hessian; its growth while the blend is indefinite;
 /// its fall and growth with what steps gain; below which it counts as none; to which poor steps let
 /// it grow, as little else is left then; beyond which nothing more is to be had from it.
@@ -27,6 +30,8 @@ constexpr double kLargestShare = 1e8;
 constexpr double kGoodGain = 0.25;
 constexpr double kPoorGain = 0.1;
 constexpr int kManyBacktracks = 3;
+/// A blend holds a direction along which it has this share of the projection's curvature.
+constexpr double kHeld = 0.5;
 /// Damped steps are lengthened to where the exact curvature along them puts the minimum.
 constexpr double kWorthGrowing = 1.5;
 constexpr double kLargestGrowth = 4.0;
@@ -62,8 +67,15 @@ bool Directions::refactor(linalg::BlockMatrix& H) {
   last_ = {
       .factor = std::move(factor),
       .hessian = confirmed_ ? nullptr : std::make_shared<const linalg::BlockValues>(std::move(H))};
-  walk_.system.solve(*last_.factor, walk_.g(), p_);
+  solve(*last_.factor, confirmed_ ? H : *last_.hessian);
   return true;
+}
+
+void Directions::solve(const linalg::CholeskyFactor& factor, const linalg::BlockValues& A) {
+  walk_.system.solve(factor, walk_.g(), p_);
+  if (factor.precision() == linalg::Precision::kSingle && is_far()) {
+    walk_.system.refine(factor, A, walk_.g(), p_);
+  }
 }
 
 bool Directions::chord() {
@@ -71,6 +83,21 @@ bool Directions::chord() {
   if (!chord_allowed_ || !(walk_.displacement(p_) <= kChordContraction * last_step_)) return false;
   ++walk_.context.counts->chord;
   return true;
+}
+
+bool Directions::is_near() const {
+  if (std::isinf(last_step_)) return true;
+  return chord_allowed_ && last_step_ <= kNear * walk_.f.length;
+}
+
+bool Directions::is_far() const { return walk_.displacement(p_) > kNear * walk_.f.length; }
+
+double Directions::curvature_along(const linalg::BlockMatrix& H) const {
+  std::vector<double> z;
+  walk_.f.coordinates->take_rows(p_, z);
+  std::vector<double> Hz(z.size(), 0.0);
+  H.add_product(z.data(), Hz.data());
+  return dot(z, Hz);
 }
 
 bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
@@ -114,7 +141,8 @@ Directions::Direction Directions::next() {
   linalg::BlockMatrix H = walk_.system.assemble(walk_.x().data(), Curvature::kExact, walk_.g());
   if (s_ == 0.0) {
     bool indefinite = false;
-    if (nearby && iterate(H, indefinite)) return {.kind = Kind::kIterated, .first = 1.0};
+    if (nearby && is_near() && iterate(H, indefinite))
+      return {.kind = Kind::kIterated, .first = 1.0};
     if (indefinite) {
       ++walk_.context.counts->negative_curvature;
     } else if (refactor(H)) {
@@ -144,25 +172,26 @@ std::optional<Directions::Direction> Directions::next_extrapolated() {
 std::optional<Directions::Direction> Directions::damp(const linalg::BlockMatrix& H,
                                                       const linalg::BlockMatrix& P) {
   make_room();
-  Factor factor;
-  for (;; s_ = std::max(kFirstShare, kFailureGrowth * s_)) {
+  double curvature = 0.0;  // of the exact quadratic along p
+  for (;;) {
     walk_.context.checkpoint->check();
     linalg::BlockMatrix A = H;
     A.blend(P, s_);
-    factor = this->factor(A, s_ > kFirstShare);
-    if (factor) break;
-    if (s_ > kLargestShare) return std::nullopt;
+    const Factor factor = this->factor(A, s_ > kFirstShare);
+    if (factor) {
+      solve(*factor, A);
+      slope_ = dot(walk_.g(), p_);
+      curvature = curvature_along(H);
+      const double positive = (-(1.0 + s_) * slope_ - curvature) / s_;
+      if (-slope_ >= kHeld * positive || !is_far()) break;
+      s_ *= kFailureGrowth;
+    } else {
+      if (s_ > kLargestShare) return std::nullopt;
+      s_ = std::max(kFirstShare, kFailureGrowth * s_);
+    }
   }
   ++walk_.context.counts->projected;
-  walk_.system.solve(*factor, walk_.g(), p_);
-  slope_ = dot(walk_.g(), p_);
-
-  // The minimum of the exact quadratic along p; beyond any bound where its curvature is negative.
-  std::vector<double> z;
-  walk_.f.coordinates->take_rows(p_, z);
-  std::vector<double> Hz(z.size(), 0.0);
-  H.add_product(z.data(), Hz.data());
-  const double curvature = dot(z, Hz);
+  // The minimum of that quadratic; beyond any bound where its curvature is negative.
   const double best = curvature > 0.0 ? -slope_ / curvature : kLargestGrowth;
   return Direction{.kind = Kind::kDamped,
                    .first = best > kWorthGrowing ? std::min(best, kLargestGrowth) : 1.0};

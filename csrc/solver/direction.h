@@ -23,10 +23,14 @@ enum class Kind : std::uint8_t {
 
 /// The next direction of a minimization, as cheap as what the last ones have shown allows.
 ///
-/// In this order: a chord step with the last exact factor while that contracts; conjugate gradients
-/// on the exact Hessian with that factor; a new factor. Where the exact Hessian H is not positive
-/// definite, A(s) = (H + s P) / (1 + s) with its projection P; s falls while steps gain what they
-/// promise. All constants are free of units.
+/// In this order: a chord step with the last exact factor while that contracts; near the solution
+/// conjugate gradients on the exact Hessian with that factor; a new factor. Where the exact Hessian H is
+/// not positive definite, A(s) = (H + s P) / (1 + s) with its projection P; s falls while steps gain what
+/// they promise. All constants are free of units.
+///
+/// Of several minima a step shall end in one that does not flip with the last bits of its start, so that no
+/// direction may amplify those: not an inexact one far from the solution, whose error depends on where
+/// iterations end, nor one along which A(s) is barely definite, so that the step is long and any length.
 class Directions {
  public:
   /// @param nearby  factor of an exact Hessian that may be close; may be null
@@ -96,8 +100,23 @@ class Directions {
   /// @param H  taken where it is definite
   bool refactor(linalg::BlockMatrix& H);
 
+  /// Compute the step of a factor. Far from the solution also without the rounding of single precision,
+  /// which would be as good as another start.
+  ///
+  /// @param A  what it is the factor of
+  void solve(const linalg::CholeskyFactor& factor, const linalg::BlockValues& A);
+
   /// Compute the step of the last factor, and whether it does.
   bool chord();
+
+  /// Whether this is near a solution, or the solve has just begun, with the factor of the one before.
+  bool is_near() const;
+
+  /// Whether p() leads away from here.
+  bool is_far() const;
+
+  /// p^T H p.
+  double curvature_along(const linalg::BlockMatrix& H) const;
 
   /// Go on from there to that of the exact Hessian H, by conjugate gradients.
   bool iterate(const linalg::BlockMatrix& H, bool& indefinite);

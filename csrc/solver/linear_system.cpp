@@ -130,6 +130,20 @@ void LinearSystem::solve(const linalg::CholeskyFactor& factor,
   f_.coordinates->push_forward(z_, p);
 }
 
+void LinearSystem::refine(const linalg::CholeskyFactor& factor,
+                          const linalg::BlockValues& matrix,
+                          const std::vector<double>& b,
+                          std::vector<double>& p) {
+  const Stopwatch::Scope scope(watch_, Phase::kSolve);
+  f_.coordinates->pull_back(b, b_);
+  f_.coordinates->take_rows(p, z_);
+  matrix.add_product(z_.data(), b_.data());  // b + A p: what is left
+  std::vector<double> change(z_.size(), 0.0);
+  factor.solve(b_.data(), change.data(), workspace_);
+  for (std::size_t a = 0; a < z_.size(); ++a) z_[a] -= change[a];
+  f_.coordinates->push_forward(z_, p);
+}
+
 void LinearSystem::solve(const Certificate& certificate,
                          const std::vector<std::vector<double>>& b,
                          std::vector<std::vector<double>>& p) {

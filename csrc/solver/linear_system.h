@@ -87,6 +87,13 @@ class LinearSystem {
              const std::vector<double>& b,
              std::vector<double>& p);
 
+  /// Improve what the factor of a matrix in single precision has made of b: its error shrinks to about the
+  /// square.
+  void refine(const linalg::CholeskyFactor& factor,
+              const linalg::BlockValues& matrix,
+              const std::vector<double>& b,
+              std::vector<double>& p);
+
   /// The same to rounding, for several right sides at once, each with the bits that it has alone.
   void solve(const Certificate& certificate,
              const std::vector<std::vector<double>>& b,

@@ -105,6 +105,23 @@ def test_motions_that_clear_each_other_are_not_stopped(edge_edge):
     assert (t[clear] == 1).all()
 
 
+@pytest.mark.parametrize("d_hat", [np.inf, 0.05])
+@pytest.mark.parametrize("xi", [0.0, 0.02])
+@pytest.mark.parametrize("edge_edge", KINDS)
+def test_motions_are_stopped_where_a_tenth_of_the_gap_is_left(edge_edge, xi, d_hat):
+    """Not where a search happens to end, which jumps when a motion changes in its last bits."""
+    x_t0, x_t1, _ = meeting_motions(edge_edge, 3000, np.random.default_rng(7))
+    t = kernels.safe_step(edge_edge, x_t0, x_t1, xi, d_hat)
+    x = x_t0 + t[:, None, None] * (x_t1 - x_t0)
+    gap, left = (np.sqrt(kernels.distance_sq(edge_edge, x_)) - xi for x_ in (x_t0, x))
+    apart = gap > 1e-3
+    assert (t[apart] < 1).all()
+    np.testing.assert_allclose(left[apart], 0.1 * np.minimum(gap, d_hat)[apart], rtol=1e-3)
+    until = (1 - 1e-6) * t[apart]
+    closest = smallest_distance(edge_edge, x_t0[apart], x_t1[apart], until)
+    assert (closest - xi > (1 - 1e-3) * left[apart]).all()  # there for the first time
+
+
 def one(edge_edge, x_t0, x_t1, xi=0.0):
     (t,) = kernels.safe_step(edge_edge, np.array([x_t0], float), np.array([x_t1], float), xi)
     return t

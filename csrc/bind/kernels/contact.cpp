@@ -1,6 +1,7 @@
 #include <algorithm>
 #include <array>
 #include <cstddef>
+#include <limits>
 #include <optional>
 #include <string>
 #include <tuple>
@@ -245,18 +246,19 @@ void law_kernels(nb::module_& m) {
 void collision_kernels(nb::module_& m) {
   m.def(
       "safe_step",
-      [](bool edge_edge, const Pairs& x_t0, const Pairs& x_t1, double xi) {
+      [](bool edge_edge, const Pairs& x_t0, const Pairs& x_t1, double xi, double d_hat) {
         if (x_t0.shape(0) != x_t1.shape(0)) {
           throw nb::value_error("safe_step: `x_t0` and `x_t1` must have as many pairs");
         }
         Eigen::VectorXd out(x_t0.shape(0));
         for (std::size_t i = 0; i < x_t0.shape(0); ++i) {
           out[i] = contact::safe_step(kind_of(edge_edge), corners(x_t0.data() + 12 * i),
-                                      corners(x_t1.data() + 12 * i), xi);
+                                      corners(x_t1.data() + 12 * i), xi, d_hat);
         }
         return out;
       },
-      "edge_edge"_a, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "xi"_a);
+      "edge_edge"_a, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "xi"_a,
+      "d_hat"_a = std::numeric_limits<double>::infinity());
 
   m.def(
       "near_boxes",
