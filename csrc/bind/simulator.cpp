@@ -287,8 +287,13 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   if (tape) out["kept"] = nb::cast(std::move(kept));
   out["numbers"] = to_lists(reports);
   nb::list messages;
-  for (const step::Report& report : reports) messages.append(report.message);
+  nb::list groups;
+  for (const step::Report& report : reports) {
+    messages.append(report.message);
+    groups.append(nb::cast(report.groups));
+  }
   out["message"] = messages;
+  out["groups"] = groups;
   return out;
 }
 

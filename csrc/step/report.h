@@ -2,6 +2,7 @@
 
 #include <cstdint>
 #include <string>
+#include <vector>
 
 #include "common/stopwatch.h"
 #include "common/types.h"
@@ -30,6 +31,7 @@ struct Report {
   solver::Counts counts;
   Seconds seconds{};
   std::string message;
+  std::vector<Index> groups;  ///< by surface; empty of a scene without coordinates
 
   /// Call visit(name, value) for every number but the seconds.
   template <class Visit>

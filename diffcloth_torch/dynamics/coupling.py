@@ -48,6 +48,10 @@ class RigidSolution(Protocol):
     def body_forces(self) -> Tensor:
         """Contact forces among them, on their vertices, [B, V, 3] N."""
 
+    @property
+    def groups(self) -> Tensor | None:
+        """Which surfaces contacts connect, as `Dynamics.advance` takes it."""
+
 
 Cloth = TypeVar("Cloth", bound=ClothSolution)
 Rigid = TypeVar("Rigid", bound=RigidSolution)
@@ -91,7 +95,11 @@ def rigid_to_cloth(
     rigid = solve_rigid(prediction)
     cloth = solve_cloth(prediction, rigid.coordinates)
     fields = dynamics.advance(
-        prediction, rigid.coordinates, rigid.body_forces, kick=cloth.body_forces
+        prediction,
+        rigid.coordinates,
+        rigid.body_forces,
+        kick=cloth.body_forces,
+        groups=rigid.groups,
     )
     return Staggered(cloth, rigid, fields, rigid.body_forces + cloth.body_forces)
 
@@ -120,7 +128,7 @@ def cloth_to_rigid(
     rigid = solve_rigid(prediction)
     start = torch.where(dynamics.prescribed, prediction.coordinate_ends, prediction.coordinates)
     check_path(cloth, prediction, start, rigid.coordinates)
-    fields = dynamics.advance(prediction, rigid.coordinates, rigid.body_forces)
+    fields = dynamics.advance(prediction, rigid.coordinates, rigid.body_forces, groups=rigid.groups)
     return Staggered(cloth, rigid, fields, rigid.body_forces + cloth.body_forces)
 
 

@@ -14,9 +14,7 @@ __all__ = ["attach_root", "jacobian"]
 Residual = Callable[[Tensor], Tensor]
 
 
-def attach_root(
-    residual: Residual, root: Tensor, inputs: Iterable[Tensor], slope: Residual | None = None
-) -> Tensor:
+def attach_root(residual: Residual, root: Tensor, inputs: Iterable[Tensor]) -> Tensor:
     """Give a root its first derivative with respect to what r depends on.
 
     Along du the root moves by dx = -K^-1 (dr/du) du with K = dr/dx, and so does -K^-1 r with a
@@ -26,7 +24,6 @@ def attach_root(
         residual: r, [..., n] -> [..., n] for any leading axes; no environment sees another.
         root: x without a graph, shape [..., n].
         inputs: All that r depends on; it has a graph where one of them has.
-        slope: Gives K [..., row, column] at x; None differentiates r.
 
     Returns:
         The root, to the same bits, with a graph where r has one.
@@ -35,7 +32,7 @@ def attach_root(
         return root
     value = residual(root)
     with torch.no_grad():
-        K = jacobian(residual, root) if slope is None else slope(root)
+        K = jacobian(residual, root)
     step = solve(K, value)
     return root - (step - step.detach())
 

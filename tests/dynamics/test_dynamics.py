@@ -23,6 +23,7 @@ H = 0.01
 class Solution(NamedTuple):
     coordinates: Tensor
     body_forces: Tensor
+    groups: None = None
 
 
 def make_scene(actuation="pd", gravity=(0, 0, -9.81), base="floating"):
