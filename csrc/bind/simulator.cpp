@@ -287,13 +287,8 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   if (tape) out["kept"] = nb::cast(std::move(kept));
   out["numbers"] = to_lists(reports);
   nb::list messages;
-  nb::list groups;
-  for (const step::Report& report : reports) {
-    messages.append(report.message);
-    groups.append(nb::cast(report.groups));
-  }
+  for (const step::Report& report : reports) messages.append(report.message);
   out["message"] = messages;
-  out["groups"] = groups;
   return out;
 }
 

@@ -37,7 +37,6 @@
 
 #include "solver/newton.h"
 #include "step/motion.h"
-#include "step/surface_groups.h"
 
 namespace diffcloth::step {
 namespace {
@@ -204,9 +203,6 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
   };
   const std::vector<Contact>& at_start = sum.contacts_at_start(x);
   keep(0, at_start);
-  // Those that friction remembers, too.
-  SurfaceGroups groups(problem.scene);
-  groups.connect(at_start);
   sum.lag(at_start);
   {
     const Stopwatch::Scope scope(*step.context.watch, Phase::kAnalysis);
@@ -232,15 +228,11 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
     if (step.report.result != Result::kConverged) break;
     const std::vector<Contact>& contacts = sum.contacts();
     keep(solves, contacts);
-    groups.connect(contacts);
     // Without contact before and after, another solve would be the same one.
     if (!sum.friction && contacts.empty()) break;
     if (solves < friction_iterations) sum.lag(contacts);
   }
   report_contacts(problem.scene, sum.contacts(), step.report);
-  if (problem.scene.mechanisms.coordinate_count() > 0) {
-    step.report.groups = groups.numbers();
-  }
   if (!step.tape.empty()) *step.tape["solves"] = solves;
   write_body_forces(problem, sum, x, body_forces);
 }

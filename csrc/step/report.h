@@ -2,7 +2,6 @@
 
 #include <cstdint>
 #include <string>
-#include <vector>
 
 #include "common/stopwatch.h"
 #include "common/types.h"
@@ -31,7 +30,6 @@ struct Report {
   solver::Counts counts;
   Seconds seconds{};
   std::string message;
-  std::vector<Index> groups;  ///< by surface; empty of a scene without coordinates
 
   /// Call visit(name, value) for every number but the seconds.
   template <class Visit>

@@ -5,7 +5,6 @@
 #include <utility>
 
 #include "step/scheme.h"
-#include "step/surface_groups.h"
 
 namespace diffcloth::step {
 namespace {
@@ -85,9 +84,6 @@ Report forward(const Scene& scene,
   Report report;
   contact::Detection detection(scene.broad_phase);
   Problem problem(scene, inputs);
-  if (scene.mechanisms.coordinate_count() > 0) {
-    report.groups = SurfaceGroups(scene).numbers();
-  }
   double* const positions = outputs["positions"];
   std::copy_n(problem.start.begin(), problem.cloth_size, positions);
   if (problem.contact) {

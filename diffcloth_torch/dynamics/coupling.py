@@ -48,10 +48,6 @@ class RigidSolution(Protocol):
     def body_forces(self) -> Tensor:
         """Contact forces among them, on their vertices, [B, V, 3] N."""
 
-    @property
-    def groups(self) -> Tensor | None:
-        """Which surfaces contacts connect, as `Dynamics.advance` takes it."""
-
 
 Cloth = TypeVar("Cloth", bound=ClothSolution)
 Rigid = TypeVar("Rigid", bound=RigidSolution)
@@ -95,11 +91,7 @@ def rigid_to_cloth(
     rigid = solve_rigid(prediction)
     cloth = solve_cloth(prediction, rigid.coordinates)
     fields = dynamics.advance(
-        prediction,
-        rigid.coordinates,
-        rigid.body_forces,
-        kick=cloth.body_forces,
-        groups=rigid.groups,
+        prediction, rigid.coordinates, rigid.body_forces, kick=cloth.body_forces
     )
     return Staggered(cloth, rigid, fields, rigid.body_forces + cloth.body_forces)
 
@@ -128,7 +120,7 @@ def cloth_to_rigid(
     rigid = solve_rigid(prediction)
     start = torch.where(dynamics.prescribed, prediction.coordinate_ends, prediction.coordinates)
     check_path(cloth, prediction, start, rigid.coordinates)
-    fields = dynamics.advance(prediction, rigid.coordinates, rigid.body_forces, groups=rigid.groups)
+    fields = dynamics.advance(prediction, rigid.coordinates, rigid.body_forces)
     return Staggered(cloth, rigid, fields, rigid.body_forces + cloth.body_forces)
 
 

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from diffcloth_torch.dynamics.bodies import (
     MOST_TURN_IN_CONTACT,
-    BodyContact,
     BodyInertia,
     BodyPrediction,
     advance_bodies,
@@ -21,11 +20,9 @@ from diffcloth_torch.dynamics.bodies import (
 from diffcloth_torch.dynamics.chain import Chain, ChainControl, ChainPrediction, ChainState
 from diffcloth_torch.dynamics.drives import Gains
 from diffcloth_torch.dynamics.inertia import Inertia
-from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.dynamics.totals import Totals
 from diffcloth_torch.geometry.rotation import (
     quaternion_exp,
-    quaternion_matrix,
     quaternion_multiply,
     rotate,
     row_velocities,
@@ -57,7 +54,6 @@ class Prediction:
         chains: Details of the robots.
         held_poses: Poses of all bodies, dynamic ones as at the start, [B, K, 7].
         held_velocities: Velocities of kinematic bodies, zero elsewhere, [B, K, 6].
-        reach: Distance at which contact begins, [B or 1] m.
     """
 
     body_poses: Tensor
@@ -70,7 +66,6 @@ class Prediction:
     chains: tuple[ChainPrediction, ...]
     held_poses: Tensor
     held_velocities: Tensor
-    reach: Tensor
 
     def core_inputs(self) -> dict[str, Tensor]:
         """The inputs of the core, by its names."""
@@ -119,12 +114,6 @@ class Dynamics:
         self._on_free = torch.nonzero(row >= 0)[:, 0]
         self._body_of_vertex = row[self._on_free]
         self._body_points = vertices[self._on_free]
-
-        # Surfaces of the dynamic bodies among all bodies and links, and those that share no bound.
-        mechanism_of = torch.from_numpy(assembly.surface_mechanism).long()
-        self._surface_of_free = torch.searchsorted(mechanism_of, self._free)
-        self._links = torch.nonzero(mechanism_of >= K)[:, 0]
-        self._surfaces = len(mechanism_of)
 
         self._chains: list[Chain] = []
         self._chain_rows: list[tuple[slice, slice, Tensor]] = []  # joints, links, vertices
@@ -196,7 +185,6 @@ class Dynamics:
             chains=chains,
             held_poses=held,
             held_velocities=velocities,
-            reach=parameters.get("barrier_distance", gravity.new_zeros(1)).reshape(-1),
         )
 
     def advance(
@@ -205,7 +193,6 @@ class Dynamics:
         coordinates: Tensor,
         contact: Tensor,
         kick: Tensor | None = None,
-        groups: Tensor | None = None,
     ) -> dict[str, Tensor]:
         """Fields of the state after the step.
 
@@ -215,13 +202,13 @@ class Dynamics:
             contact: Forces on the vertices of bodies and links that it was solved with [N], shape
                 [B, V, 3].
             kick: More forces on them, which change velocities only.
-            groups: For each surface of that solve, cloths, bodies and links, the number of those
-                that contacts connect with it, below zero where something prescribed touches one
-                of them, [B, surfaces]; None leaves unbounded what contact gives to bodies.
 
         Returns:
             `body_poses`, `body_velocities`, `joint_positions`, `joint_velocities`, `joint_efforts`,
             `base_poses` and `base_velocities`.
+
+        Raises:
+            SimulationError: Where a dynamic body turns too far in a step that touches it.
         """
         poses, velocities = prediction.held_poses, prediction.held_velocities
         batch = len(poses)
@@ -229,14 +216,13 @@ class Dynamics:
         bodies = prediction.bodies
         if bodies is not None:
             own = parts[0].reshape(batch, -1, 6)
+            self._require_slow(bodies, contact)
             wrenches = None
             if kick is not None:
+                self._require_slow(bodies, kick)
                 turned = quaternion_multiply(quaternion_exp(own[..., 3:]), bodies.frames[..., 3:])
                 wrenches = self._wrenches(turned, bodies.inertia.center, kick)
-            bound = None
-            if groups is not None and groups.shape[1]:
-                bound = self._body_contact(bodies, own, contact, groups, prediction.reach)
-            moved, rates = advance_bodies(bodies, own, wrenches, self.dt, bound)
+            moved, rates = advance_bodies(bodies, own, wrenches, self.dt)
             poses = poses.index_copy(1, self._free, moved)
             velocities = velocities.index_copy(1, self._free, rates)
         states, efforts = [], []
@@ -325,9 +311,12 @@ class Dynamics:
         if contact is not None:
             turned = torch.nn.functional.normalize(poses[..., 3:], dim=-1)
             wrenches = wrenches + self._wrenches(turned, inertia.center, contact)
-        return predict_bodies(
+        prediction = predict_bodies(
             poses, velocities, inertia, wrenches, gravity, self.dt, self._free_names
         )
+        if contact is not None:
+            self._require_slow(prediction, contact)
+        return prediction
 
     def _predict_chain(
         self,
@@ -359,50 +348,14 @@ class Dynamics:
             None if contact is None else contact[:, vertices],
         )
 
-    def _body_contact(
-        self,
-        bodies: BodyPrediction,
-        coordinates: Tensor,
-        forces: Tensor,
-        groups: Tensor,
-        reach: Tensor,
-    ) -> BodyContact | None:
-        """What bounds the energy that contact gives; None where nothing touches."""
-        own = forces[:, self._on_free]
-        if not own.any():
-            return None
-        body = self._body_of_vertex
-        touched = own.detach().abs().sum(-1)
-        touched = torch.zeros_like(bodies.speed).index_add(1, body, touched) > 0
+    def _require_slow(self, bodies: BodyPrediction, forces: Tensor) -> None:
+        """Refuse bodies that turn too far while forces act on their vertices [B, V, 3]."""
+        on_vertex = forces.detach()[:, self._on_free].abs().sum(-1)
+        touched = torch.zeros_like(bodies.speed).index_add(1, self._body_of_vertex, on_vertex) > 0
         lost = touched & (self.dt * bodies.speed > MOST_TURN_IN_CONTACT)
         if lost.any():
             how = "touches something and may"
             refuse_turns(lost, bodies.speed, self.dt, MOST_TURN_IN_CONTACT, how, self._free_names)
-        # One group of bodies, and no cloth and no link in it: those take the impulse that is given.
-        cloths = groups.shape[1] - self._surfaces
-        labels = groups[:, cloths:]
-        firsts = labels[:, self._surface_of_free]
-        given = torch.cat([groups[:, :cloths], labels[:, self._links]], dim=1)
-        alone = (firsts[:, :, None] != given[:, None, :]).all(-1)
-        together = (firsts[:, :, None] == firsts[:, None, :]) & alone[:, :, None]
-
-        start = torch.nn.functional.normalize(bodies.poses[..., 3:], dim=-1)
-        end = quaternion_multiply(quaternion_exp(coordinates[..., 3:]), bodies.frames[..., 3:])
-        change = quaternion_matrix(end) - quaternion_matrix(start)
-        local = self._body_points - bodies.inertia.center[:, body]
-        moved = (coordinates - bodies.coordinates)[:, body, :3]
-        chords = moved + times(change[:, body], local)
-        squares = own.square().sum(-1)
-        pushed = squares > 0
-        sizes = torch.where(pushed, squares, 1.0).sqrt() * pushed
-        none = own.new_zeros(len(own), len(self._free))
-        return BodyContact(
-            work=none.index_add(1, body, (own * chords).sum(-1)),
-            pressure=none.index_add(1, body, sizes),
-            reach=reach[:, None],
-            groups=together.to(torch.float64),
-            held=firsts < 0,
-        )
 
     def _wrenches(self, quaternions: Tensor, centers: Tensor, forces: Tensor) -> Tensor:
         """Of forces on all vertices, about the centers of the dynamic bodies; [B, Kd, 6]."""

@@ -47,11 +47,6 @@ class _Solved(NamedTuple):
         """On the vertices of bodies and links, [B, V, 3] N."""
         return self.outcome.body_forces
 
-    @property
-    def groups(self) -> Tensor:
-        """Which surfaces contacts connect, [B, surfaces]."""
-        return self.outcome.groups
-
 
 class Staggered:
     """Steps a scene by "rigid_to_cloth" or "cloth_to_rigid"."""
@@ -250,7 +245,7 @@ def _merged(cloth: dict[str, Any], rigid: dict[str, Any]) -> dict[str, Any]:
     merged = {
         name: combine.get(name, np.add)(values, rigid[name]).tolist()
         for name, values in cloth.items()
-        if name not in ("message", "groups")
+        if name != "message"
     }
     pairs = zip(cloth["message"], rigid["message"], strict=True)
     return {**merged, "message": ["; ".join(filter(None, pair)) for pair in pairs]}

@@ -356,7 +356,7 @@ class Simulator:
             coordinates = forces.new_zeros(len(forces), 0)
         elif batch is None:
             coordinates = coordinates.unsqueeze(0)
-        after = self._dynamics.advance(prediction, coordinates, forces, groups=outcome.groups)
+        after = self._dynamics.advance(prediction, coordinates, forces)
         return outcome, {**after, "joint_targets": held_targets(self._layout, state, control)}
 
     def _step_in_turn(

@@ -82,8 +82,7 @@ class Outcome(NamedTuple):
         positions: [B, N, 3], or [N, 3] without a batch axis.
         velocities: Likewise.
         body_forces: [B, V, 3] or [V, 3].
-        diagnostics: Lists of length B of the core: status, message, groups, and the entries of the
-            report.
+        diagnostics: Lists of length B of the core: status, message and the entries of the report.
         coordinates: Of bodies and robots at the end of the step, [B, n] or [n]; None where there
             are none.
     """
@@ -93,11 +92,6 @@ class Outcome(NamedTuple):
     body_forces: Tensor
     diagnostics: dict[str, Any]
     coordinates: Tensor | None = None
-
-    @property
-    def groups(self) -> Tensor:
-        """Which surfaces contacts connect, [B, surfaces]: see `Dynamics.advance`."""
-        return torch.tensor(self.diagnostics["groups"])
 
     def first(self) -> Outcome:
         """The first environment, without its axis; the diagnostics stay."""
@@ -199,7 +193,7 @@ def _outcome(outputs: tuple[Tensor, ...], diagnostics: dict[str, Any]) -> Outcom
 def diagnostics_of(result: dict[str, Any]) -> dict[str, Any]:
     """What a core says of a step: for each name a list of the environments' numbers or texts."""
     numbers = zip(DIAGNOSTICS, result["numbers"], strict=True)
-    return {**dict(numbers), "message": result["message"], "groups": result["groups"]}
+    return {**dict(numbers), "message": result["message"]}
 
 
 def unconverged(diagnostics: dict[str, Any]) -> list[int]:
