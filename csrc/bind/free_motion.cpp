@@ -1,5 +1,7 @@
 #include "bodies/free_motion.h"
 
+#include <algorithm>
+#include <array>
 #include <string>
 #include <utility>
 #include <vector>
@@ -9,6 +11,7 @@
 #include "bind/arrays.h"
 #include "bind/bind.h"
 #include "bind/links.h"
+#include "bodies/free_turn.h"
 
 namespace diffcloth::bind {
 namespace {
@@ -118,9 +121,34 @@ nb::object solve(const FreeMotion& self,
   return nb::make_tuple(velocities.array, found.array);
 }
 
+nb::object turns(const Doubles& inertia, const Doubles& momentum, double time, bool with_rates) {
+  const std::size_t n = momentum.size() / 3;
+  require(momentum.size() == 3 * n, "free turns: `momentum` must have 3 numbers a body");
+  require(inertia.size() == 9 * n, "free turns: `inertia` must have 9 numbers a body");
+  const Owned<double> turn = make_array<double>({n, 4});
+  const Owned<double> rate = make_array<double>({with_rates ? n : 0, 4, 12});
+  const Owned<bool> found = make_array<bool>({n});
+  bodies::Turn q{};
+  bodies::TurnRate dq{};
+  for (std::size_t k = 0; k < n; ++k) {
+    found.data[k] = bodies::free_turn(inertia.data() + 9 * k, momentum.data() + 3 * k, time, q,
+                                      with_rates ? &dq : nullptr);
+    if (!found.data[k]) continue;
+    std::ranges::copy(q, turn.data + 4 * k);
+    for (std::size_t i = 0; with_rates && i < 4; ++i) {
+      std::ranges::copy(dq[i], rate.data + 12 * (4 * k + i));
+    }
+  }
+  return nb::make_tuple(turn.array, rate.array, found.array);
+}
+
 }  // namespace
 
 void free_motion(nb::module_& m) {
+  m.def(
+      "free_turns", &turns, "inertia"_a, "momentum"_a, "time"_a, "with_rates"_a,
+      "Quaternions [n, 4] by which free bodies turn in their own axes, their derivatives by J and "
+      "l [n, 4, 12], and whether they were found [n].");
   nb::class_<FreeMotion>(m, "FreeMotion")
       .def("__init__", &make, "parent"_a, "order"_a, "kind"_a, "offset"_a, "axis"_a, "dof"_a,
            "multiplier"_a, "constant"_a, "joint_count"_a, "solved"_a, "root_moves"_a, "dt"_a)

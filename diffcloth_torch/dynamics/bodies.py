@@ -1,29 +1,22 @@
 """Free rigid bodies over one step, all of them at once.
 
-With the angular momentum L about the center, in world axes, and the inertia J in body axes, the
-orientation moves by the midpoint rule,
-
-    R_pred = exp(h omega) R_n,  R_mid = exp(h omega/2) R_n,
-    omega = R_mid J^-1 R_mid^T (L + h torque).
-
-A body by itself keeps L to rounding, and its energy up to oscillations. Its coordinates are the
-center c and the rotation vector w with R = exp(w) R_pred; the core adds the inertia
-1/(2h^2) (m |c - c^|^2 + w^T I w) about the prediction to what it minimizes. The gradient of that at
-the solution is the contact force, which gives the body its momentum after the step: what contact
-takes from others arrives here.
+A body by itself moves as Euler's equations say, to rounding: with the angular momentum L about the
+center, in world axes, and the inertia J in body axes, it keeps L + h torque and turns by a Q that
+the core finds, R_pred = R_n Q. Its coordinates are the center c and the rotation vector w with
+R = exp(w) R_pred; the core adds the inertia 1/(2h^2) (m |c - c^|^2 + w^T I w) about the prediction
+to what it minimizes. The gradient of that at the solution is the contact force, which gives the
+body its momentum after the step: what contact takes from others arrives here.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from diffcloth_torch.dynamics.free_motion import body_motion, solve_motion
-from diffcloth_torch.dynamics.implicit import attach_root
-from diffcloth_torch.dynamics.inertia import Inertia
-from diffcloth_torch.dynamics.kinematics import CROSS
+from diffcloth_torch.dynamics.free_motion import free_turns
 from diffcloth_torch.dynamics.linear import solve, times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.errors import SimulationError
@@ -31,17 +24,27 @@ from diffcloth_torch.geometry.products import product
 from diffcloth_torch.geometry.rotation import (
     nearer_quaternion,
     quaternion_exp,
+    quaternion_log,
     quaternion_matrix,
     quaternion_multiply,
-    rotation_exp,
     torque_from_moment,
 )
 from diffcloth_torch.model.kinematics import pose_frame
 
-__all__ = ["BodyInertia", "BodyPrediction", "advance_bodies", "body_totals", "predict_bodies"]
+__all__ = [
+    "MOST_TURN_IN_CONTACT",
+    "BodyInertia",
+    "BodyPrediction",
+    "advance_bodies",
+    "body_totals",
+    "predict_bodies",
+    "refuse_turns",
+]
 
-# Added to angles that something is divided by; its third power is still a number.
-_NO_ANGLE = 1e-100
+# The turn [rad] that a body may make in a step: by itself, where the core's series would get long,
+# and while it touches something, where what touches at the end says nothing of the way there.
+_MOST_TURN = 1e3
+MOST_TURN_IN_CONTACT = 1.5
 
 
 class BodyInertia(NamedTuple):
@@ -63,6 +66,7 @@ class BodyPrediction(NamedTuple):
         inertia: What the bodies weigh.
         poses: At the start, [B, K, 7].
         momentum: Angular momentum without contact, [B, K, 3].
+        speed: Of rotation at the start, with it, [B, K] rad/s.
     """
 
     frames: Tensor
@@ -72,6 +76,7 @@ class BodyPrediction(NamedTuple):
     inertia: BodyInertia
     poses: Tensor
     momentum: Tensor
+    speed: Tensor
 
 
 def predict_bodies(
@@ -81,6 +86,7 @@ def predict_bodies(
     wrenches: Tensor,
     gravity: Tensor,
     dt: float,
+    names: Sequence[str] = (),
 ) -> BodyPrediction:
     """Take a step without contact.
 
@@ -91,6 +97,7 @@ def predict_bodies(
         wrenches: Forces at the centers and torques, in world axes; [B, K, 6].
         gravity: [B or 1, 3] m/s^2.
         dt: h [s].
+        names: Of the bodies, for messages.
     """
     quaternion = torch.nn.functional.normalize(poses[..., 3:], dim=-1)
     rotation = quaternion_matrix(quaternion)
@@ -102,23 +109,54 @@ def predict_bodies(
     # In body axes at the start.
     spin = times(back, velocities[..., 3:])
     momentum = times(inertia.inertia, spin) + dt * times(back, wrenches[..., 3:])
-    omega = times(rotation, _midpoint_spin(inertia.inertia, momentum, dt))
-
-    predicted = quaternion_multiply(quaternion_exp(dt * omega), quaternion)
+    turn, is_found = free_turns(inertia.inertia, momentum, dt)
+    omega = solve(inertia.inertia.expand(*spin.shape, 3), momentum)
+    if not is_found.all():
+        refuse_turns(~is_found, omega.detach().norm(dim=-1), dt, _MOST_TURN, "may", names)
+    predicted = quaternion_multiply(quaternion, turn)
     turned = quaternion_matrix(predicted)
     moments = product(product(turned, inertia.inertia), turned.transpose(-1, -2))
-    zeros = torch.zeros_like(omega)
+    zeros = torch.zeros_like(spin)
     mass = inertia.mass[..., None, None] * torch.eye(3, dtype=moments.dtype)
     mass, none = mass.expand_as(moments), torch.zeros_like(moments)
     metric = torch.cat([torch.cat([mass, none], -1), torch.cat([none, moments], -1)], dim=-2)
     return BodyPrediction(
         frames=torch.cat([-times(turned, inertia.center), predicted], dim=-1),
-        coordinates=torch.cat([center, -dt * omega], dim=-1),
+        coordinates=torch.cat([center, -times(rotation, quaternion_log(turn))], dim=-1),
         target=torch.cat([center + dt * speed, zeros], dim=-1),
         metric=metric / dt**2,
         inertia=inertia,
         poses=poses,
         momentum=times(rotation, momentum),
+        speed=omega.detach().norm(dim=-1),
+    )
+
+
+def refuse_turns(
+    lost: Tensor, speed: Tensor, dt: float, most: float, how: str, names: Sequence[str]
+) -> None:
+    """Say which bodies turn too far in a step.
+
+    Args:
+        lost: Which, [B, K]; at least one.
+        speed: Of rotation, [B, K] rad/s.
+        dt: h [s].
+        most: Largest turn in a step [rad].
+        how: When that holds.
+        names: Of the bodies.
+
+    Raises:
+        SimulationError: With all environments, and the first body.
+    """
+    environments = lost.any(-1).nonzero()[:, 0].tolist()
+    first, body = lost.nonzero()[0].tolist()
+    name = f"body {names[body]!r}" if names else f"body {body}"
+    rate = float(speed[first, body])
+    enough = 0.99 * most / rate  # what rounding in the message leaves below the limit
+    raise SimulationError(
+        f"step: {name} turns at {rate:.3g} rad/s, too fast for a time step of {dt:g} s: it {how} "
+        f"turn by {most:g} rad in a step; take a time step of at most {enough:.3g} s",
+        environments=environments,
     )
 
 
@@ -168,54 +206,3 @@ def advance_bodies(
     sign = nearer_quaternion(quaternion, prediction.poses[..., 3:])
     poses = torch.cat([center - times(rotation, inertia.center), sign], dim=-1)
     return poses, torch.cat([rate, times(rotation, spin)], dim=-1)
-
-
-def _midpoint_spin(inertia: Tensor, momentum: Tensor, dt: float) -> Tensor:
-    """Omega [B, K, 3] with r = J Omega - exp(-h Omega / 2) momentum = 0, all in body axes."""
-
-    def residual(spin: Tensor, inertia: Tensor, momentum: Tensor) -> Tensor:
-        return times(inertia, spin) - times(rotation_exp(-dt / 2 * spin), momentum)
-
-    def slope(spin: Tensor, inertia: Tensor, momentum: Tensor) -> Tensor:
-        # d(exp(-x) v) = y x (D dx) with y = exp(-x) v and the left Jacobian D of the exponential.
-        x = dt / 2 * spin
-        angle = x.norm(dim=-1)[..., None, None] + _NO_ANGLE
-        X = _cross(x)
-        first = 2 * (torch.sin(angle / 2) / angle) ** 2
-        second = (angle - torch.sin(angle)) / angle**3
-        D = torch.eye(3, dtype=x.dtype) - first * X + second * product(X, X)
-        K: Tensor = inertia - dt / 2 * product(_cross(times(rotation_exp(-x), momentum)), D)
-        return K
-
-    spin, found = _solve_spin(inertia, momentum, dt)
-    lost = torch.nonzero(~found.all(-1))[:, 0].tolist()
-    if lost:
-        raise SimulationError(
-            f"step: a rigid body turns too fast for a time step of {dt:g} s; it may turn by about "
-            "a radian in it",
-            environments=lost,
-        )
-    return attach_root(residual, spin, (inertia, momentum), slope)
-
-
-def _solve_spin(inertia: Tensor, momentum: Tensor, dt: float) -> tuple[Tensor, Tensor]:
-    """Omega [B, K, 3] without a graph, and where it was found [B, K]."""
-    batch, count = momentum.shape[:2]
-    # To the core each body is an environment of its own.
-    none = momentum.new_zeros(batch * count, 0)
-    zeros = momentum.new_zeros(batch * count, 3)
-    given = torch.cat([zeros, momentum.reshape(-1, 3)], dim=-1)
-    matrices = inertia.expand(batch, count, 3, 3).reshape(-1, 1, 3, 3)
-    body = Inertia(mass=_ONE, center=zeros[:1, None], inertia=matrices, armature=none[:1])
-    start = (zeros[:1], _EYE, none[:1])
-    spin, found = solve_motion(body_motion(dt), body, start, torch.zeros_like(given[:1]), given)
-    return spin.reshape(batch, count, 3), found.reshape(batch, count)
-
-
-_ONE = torch.ones(1, 1, dtype=torch.float64)
-_EYE = torch.eye(3, dtype=torch.float64)[None]
-
-
-def _cross(vectors: Tensor) -> Tensor:
-    matrices: Tensor = times(CROSS, vectors).reshape(*vectors.shape, 3)
-    return matrices

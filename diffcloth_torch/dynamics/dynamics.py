@@ -10,11 +10,13 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.dynamics.bodies import (
+    MOST_TURN_IN_CONTACT,
     BodyInertia,
     BodyPrediction,
     advance_bodies,
     body_totals,
     predict_bodies,
+    refuse_turns,
 )
 from diffcloth_torch.dynamics.chain import Chain, ChainControl, ChainPrediction, ChainState
 from diffcloth_torch.dynamics.drives import Gains
@@ -111,6 +113,7 @@ class Dynamics:
         mechanisms = assembly.mechanisms
         self._free = _indices(k for k in range(K) if mechanisms[k].base == "floating")
         self._moved = _indices(k for k in range(K) if mechanisms[k].base == "kinematic")
+        self._free_names = [mechanisms[k].name for k in self._free]
         surface_of_vertex = torch.repeat_interleave(
             torch.tensor(assembly.body_vertex_start.tolist()).diff()
         )
@@ -268,6 +271,9 @@ class Dynamics:
         Returns:
             `body_poses`, `body_velocities`, `joint_positions`, `joint_velocities`, `joint_efforts`,
             `base_poses` and `base_velocities`.
+
+        Raises:
+            SimulationError: Where a dynamic body turns too far in a step that touches it.
         """
         poses, velocities = prediction.held_poses, prediction.held_velocities
         batch = len(poses)
@@ -275,8 +281,10 @@ class Dynamics:
         bodies = prediction.bodies
         if bodies is not None:
             own = parts[0].reshape(batch, -1, 6)
+            self._require_slow(bodies, contact)
             wrenches = None
             if kick is not None:
+                self._require_slow(bodies, kick)
                 turned = quaternion_multiply(quaternion_exp(own[..., 3:]), bodies.frames[..., 3:])
                 wrenches = self._wrenches(turned, bodies.inertia.center, kick)
             moved, rates = advance_bodies(bodies, own, wrenches, self.dt)
@@ -368,7 +376,12 @@ class Dynamics:
         if contact is not None:
             turned = torch.nn.functional.normalize(poses[..., 3:], dim=-1)
             wrenches = wrenches + self._wrenches(turned, inertia.center, contact)
-        return predict_bodies(poses, velocities, inertia, wrenches, gravity, self.dt)
+        prediction = predict_bodies(
+            poses, velocities, inertia, wrenches, gravity, self.dt, self._free_names
+        )
+        if contact is not None:
+            self._require_slow(prediction, contact)
+        return prediction
 
     def _predict_chain(
         self,
@@ -399,6 +412,15 @@ class Dynamics:
             gravity,
             None if contact is None else contact[:, vertices],
         )
+
+    def _require_slow(self, bodies: BodyPrediction, forces: Tensor) -> None:
+        """Refuse bodies that turn too far while forces act on their vertices [B, V, 3]."""
+        on_vertex = forces.detach()[:, self._on_free].abs().sum(-1)
+        touched = torch.zeros_like(bodies.speed).index_add(1, self._body_of_vertex, on_vertex) > 0
+        lost = touched & (self.dt * bodies.speed > MOST_TURN_IN_CONTACT)
+        if lost.any():
+            how = "touches something and may"
+            refuse_turns(lost, bodies.speed, self.dt, MOST_TURN_IN_CONTACT, how, self._free_names)
 
     def _wrenches(self, quaternions: Tensor, centers: Tensor, forces: Tensor) -> Tensor:
         """Of forces on all vertices, about the centers of the dynamic bodies; [B, Kd, 6]."""

@@ -1,12 +1,10 @@
 """Velocities over a step without contact, found by the core.
 
-The core solves; what the equation is, and how its root depends on everything, stands in `chain` and
-`bodies`, which give the root its derivative.
+The core solves; what the equation is, and how its root depends on everything, stands in `chain`,
+which gives the root its derivative. Bodies turn by a series, which comes with its own.
 """
 
 from __future__ import annotations
-
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -14,10 +12,10 @@ from torch import Tensor
 
 from diffcloth_torch import _core
 from diffcloth_torch.dynamics.inertia import Inertia
-from diffcloth_torch.dynamics.kinematics import ROOT
+from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.model.mechanism import JOINT_KINDS, Mechanism
 
-__all__ = ["body_motion", "robot_motion", "solve_motion"]
+__all__ = ["free_turns", "robot_motion", "solve_motion"]
 
 
 def robot_motion(mechanism: Mechanism, solved: Tensor, dt: float) -> _core.FreeMotion:
@@ -44,23 +42,31 @@ def robot_motion(mechanism: Mechanism, solved: Tensor, dt: float) -> _core.FreeM
     )
 
 
-@lru_cache(maxsize=16)
-def body_motion(dt: float) -> _core.FreeMotion:
-    """The equation of the rotation of one body about its center."""
-    return _core.FreeMotion(
-        parent=[-1],
-        order=[0],
-        kind=[0],
-        offset=np.eye(4),
-        axis=np.zeros(3),
-        dof=[-1],
-        multiplier=np.ones(1),
-        constant=np.zeros(1),
-        joint_count=0,
-        solved=list(range(3, ROOT)),
-        root_moves=True,
-        dt=dt,
-    )
+def free_turns(inertia: Tensor, momentum: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+    """How bodies by themselves turn over a step, by Euler's equations to rounding.
+
+    There is no second derivative.
+
+    Args:
+        inertia: J in the bodies' axes, [B or 1, K, 3, 3] kg m^2.
+        momentum: Angular momentum in the axes at the start, [B, K, 3] kg m^2/s.
+        dt: h [s].
+
+    Returns:
+        Quaternions of Q in R Q, in the bodies' axes, [B, K, 4]; and which bodies have a finite
+        speed that is no nonsense, [B, K].
+    """
+    shape = momentum.shape[:-1]
+    given = torch.cat([inertia.expand(*shape, 3, 3).flatten(-2), momentum], dim=-1)
+    numbers = given.detach()
+    with_rates = torch.is_grad_enabled() and given.requires_grad
+    J, l = (np.ascontiguousarray(t.numpy()) for t in (numbers[..., :9], numbers[..., 9:]))
+    turns, rates, found = _core.free_turns(J, l, dt, with_rates)
+    turn = torch.from_numpy(turns).reshape(*shape, 4)
+    if with_rates:
+        # A change of zero, whose derivative is the core's.
+        turn = turn + times(torch.from_numpy(rates).reshape(*shape, 4, 12), given - numbers)
+    return turn, torch.from_numpy(found).reshape(shape)
 
 
 def solve_motion(

@@ -15,9 +15,7 @@ __all__ = ["attach_root", "jacobian_of"]
 Residual = Callable[..., Tensor]
 
 
-def attach_root(
-    residual: Residual, root: Tensor, inputs: Sequence[Tensor], slope: Residual | None = None
-) -> Tensor:
+def attach_root(residual: Residual, root: Tensor, inputs: Sequence[Tensor]) -> Tensor:
     """Give a root its first derivative with respect to what r depends on.
 
     Along du the root moves by dx = -K^-1 (dr/du) du with K = dr/dx, and so does -K^-1 r with a
@@ -28,7 +26,6 @@ def attach_root(
             another.
         root: x without a graph, shape [..., n].
         inputs: All that r depends on; the root has a graph where one of them has.
-        slope: Gives K [..., row, column] from the same arguments; None differentiates r.
 
     Returns:
         The root, to the same bits, with a graph where r has one.
@@ -40,7 +37,7 @@ def attach_root(
     # would make its cost quadratic.
     numbers = [u.detach() for u in inputs]
     with torch.no_grad():
-        K = (slope or jacobian_of(residual))(root, *numbers)
+        K = jacobian_of(residual)(root, *numbers)
     step = times(inverse(K), value)
     return root - (step - step.detach())
 

@@ -617,7 +617,15 @@ class Simulator:
         """
         check_bool("energy: `parts`", parts)
         fields, batch = self._fields(state, None, parameters)
-        inputs = self._core_inputs(*fields, self._predict(*fields))
+        before, control, physical = fields
+        # Energy is that of where things are: no speed is too high for it.
+        still = before | {
+            n: torch.zeros_like(t) for n, t in before.items() if n.endswith("velocities")
+        }
+        weightless = physical | {"gravity": torch.zeros_like(physical["gravity"])}
+        inputs = self._core_inputs(
+            before, control, physical, self._predict(still, control, weightless)
+        )
         if torch.is_grad_enabled():
             for name, tensor in inputs.items():
                 if tensor.requires_grad:
@@ -627,7 +635,6 @@ class Simulator:
                     )
         stored = self._core.stored_energy(_arrays(inputs))
         energies = {name: torch.from_numpy(values) for name, values in stored.items()}
-        before, _, physical = fields
         with torch.no_grad():
             energies["gravity"] = self._totals(before, physical).gravity_energy
         energies = _unbatched(energies, batch)

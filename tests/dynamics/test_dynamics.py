@@ -162,6 +162,27 @@ def test_fields_of_the_state_after(world):
         torch.testing.assert_close(after["body_velocities"][0, k, :3], expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("by", ["contact", "kick", "prediction"])
+def test_what_turns_fast_may_not_be_touched(world, by):
+    """By forces of the solve, by those that change velocities only, by those of a cloth before."""
+    assembly, dynamics, parameters, state, control = world
+    fast = tensor([0, 0, 0, 1.8 / H, 0, 0]) * tensor([0, 1, 0, 0])[:, None]
+    state = {**state, "body_velocities": fast[None]}
+    none = torch.zeros(1, len(assembly.body_vertices), 3, dtype=F64)
+    on = [int(assembly.body_vertex_start[k]) for k in (1, 3)]
+
+    def step(forces):
+        p = dynamics.predict(state, control, parameters, forces if by == "prediction" else None)
+        contact, kick = (forces if by == name else none for name in ("contact", "kick"))
+        dynamics.advance(p, p.coordinate_targets, contact, kick)
+
+    step(none)
+    step(none.index_fill(1, torch.tensor([on[1]]), 0.01))  # on another body
+    with pytest.raises(dc.SimulationError, match=r"'a' turns at .* touches something") as error:
+        step(none.index_fill(1, torch.tensor([on[0]]), 0.01))
+    assert error.value.environments == (0,)
+
+
 def test_a_scene_of_static_and_kinematic_bodies_passes_through():
     bodies = [
         dc.RigidBody.plane(4.0),

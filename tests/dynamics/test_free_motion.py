@@ -126,3 +126,11 @@ def test_the_core_refuses_arrays_of_other_sizes():
     for name, size in sizes.items():
         with pytest.raises(ValueError, match=f"`{name}` must have {size} numbers"):
             free_motion().solve(**{**arrays, name: np.ones((1, size + 1))})
+
+
+@pytest.mark.boundary
+def test_the_core_refuses_bodies_without_an_inertia():
+    with pytest.raises(ValueError, match="`inertia` must have 9 numbers a body"):
+        _core.free_turns(np.ones((1, 3, 3)), np.ones((2, 3)), H, False)
+    with pytest.raises(ValueError, match="`momentum` must have 3 numbers a body"):
+        _core.free_turns(np.ones((1, 3, 3)), np.ones(4), H, False)

@@ -296,11 +296,12 @@ def test_one_link_on_a_floating_base_moves_like_a_body():
     args = (pose[None], nu[None, :, :6], as_body, torch.zeros(1, 1, 6, dtype=F64), GRAVITY, H)
     body = predict_bodies(*args)
     p, after, _ = step(chain, at_rest(chain, pose=pose, velocity=nu))
+    # The robot moves by the midpoint rule, of third order in a step; the body exactly.
     torch.testing.assert_close(p.target, body.target[0], rtol=0, atol=1e-9)
-    torch.testing.assert_close(p.metric, body.metric[0], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(p.metric, body.metric[0], rtol=1e-5, atol=1e-5)
     poses, velocities = advance_bodies(body, body.target, None, H)
-    torch.testing.assert_close(after.pose, poses[0], rtol=0, atol=1e-9)
-    torch.testing.assert_close(after.velocity, velocities[0], rtol=0, atol=1e-7)
+    torch.testing.assert_close(after.pose, poses[0], rtol=0, atol=3e-6)
+    torch.testing.assert_close(after.velocity, velocities[0], rtol=0, atol=3e-4)
 
 
 def test_motion_converges_to_that_of_an_accelerated_pivot():
@@ -447,7 +448,7 @@ def test_a_body_that_turns_too_fast_is_refused():
     pose = tensor([0, 0, 0, 1, 0, 0, 0]).expand(2, 1, 7)
     none = torch.zeros(2, 1, 6, dtype=F64)
     predict_bodies(pose[:1], spins[:1], inertia, none[:1], GRAVITY, H)
-    with pytest.raises(SimulationError, match=r"turns too fast for a time step of 0.01") as error:
+    with pytest.raises(SimulationError, match=r"body 0 turns at .* time step of 0.01") as error:
         predict_bodies(pose, spins, inertia, none, GRAVITY, H)
     assert error.value.environments == (1,)
 

@@ -1,0 +1,170 @@
+"""Bodies that turn far in a step: by themselves, and in contact."""
+
+import numpy as np
+import pytest
+import torch
+from coupled_scenes import F64
+
+import diffcloth_torch as dc
+from diffcloth_torch.dynamics.free_motion import free_turns
+from diffcloth_torch.geometry.rotation import quaternion_matrix
+
+H = 0.008
+SIZES = [(0.06, 0.06, 0.06), (0.05, 0.08, 0.13), (0.01, 0.02, 0.2)]
+
+
+def thrown(size, turn, seed, height=None):
+    """A box above a floor that turns by `turn` rad a step, and reaches the floor soon."""
+    rng = np.random.default_rng(seed)
+    pose, axis = rng.normal(size=4), rng.normal(size=3)
+    reach = np.linalg.norm(size) / 2
+    drawn = 0.8 + 0.25 * rng.random()
+    height = reach * (drawn if height is None else height)
+    box = dc.RigidBody.box(
+        size, motion="dynamic", density=400, pose=[0, 0, height, *pose], name="stick",
+    )  # fmt: skip
+    sim = dc.Simulator(
+        dc.Scene([], [dc.RigidBody.plane(3.0), box], gravity=(0, 0, 0)),
+        H,
+        contact=dc.ContactOptions(barrier_distance=reach / 60),
+    )
+    speed = turn / H
+    velocities = torch.zeros(2, 6, dtype=F64)
+    velocities[1, 2] = -0.3 * speed * reach
+    velocities[1, 3:] = torch.tensor(axis / np.linalg.norm(axis) * speed)
+    return sim, sim.initial_state().replace(body_velocities=velocities)
+
+
+def contact_steps(size, turn, seed, steps):
+    """The simulator, and states before and after each step in which a thrown box touches."""
+    try:
+        sim, state = thrown(size, turn, seed)
+        for _ in range(steps):
+            with torch.no_grad():
+                after = sim.step(state)
+            if after.body_forces.any():
+                yield sim, state, after
+            state = after
+    except dc.IntersectingState:
+        pass  # a throw that starts in the floor
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_contact_gives_no_energy_to_what_turns_by_a_tenth_of_a_radian(size):
+    touched = 0
+    for seed in range(6):
+        for sim, before, after in contact_steps(size, 0.1, seed, 20):
+            assert sim.kinetic_energy(after) + sim.energy(after) < sim.kinetic_energy(
+                before
+            ) + sim.energy(before)
+            touched += 1
+    assert touched > 5
+
+
+def momentum(sim, state):
+    """Of the box; angular about its center."""
+    linear, angular = sim.momentum(state).split(3)
+    return torch.cat([linear, angular - torch.linalg.cross(state.body_poses[1, :3], linear)])
+
+
+@pytest.mark.parametrize("turn", [0.4, 1.0])
+def test_contact_gives_the_momentum_of_its_forces(turn):
+    """And nothing takes a part of it, however fast the box turns."""
+    touched = 0
+    for seed in range(6):
+        for sim, before, after in contact_steps(SIZES[1], turn, seed, 8):
+            gained = momentum(sim, after) - momentum(sim, before)
+            wrench = sim.contact_wrenches(after)["stick"]
+            assert (gained - H * wrench)[:3].norm() < 1e-4 * gained[:3].norm()
+            assert (gained - H * wrench)[3:].norm() < 1e-4 * gained[3:].norm()
+            touched += 1
+    assert touched > 5
+
+
+@pytest.mark.parametrize("turn", [0.4, 1.0])
+def test_gradients_of_a_step_that_touches_while_it_turns_fast(turn):
+    sim, before, _ = next(
+        found for seed in range(40) for found in contact_steps(SIZES[1], turn, seed, 8)
+    )
+    tight = dc.SolverOptions(tolerance=1e-9)
+    sim = dc.Simulator(sim.scene, H, contact=sim.contact, solver=tight)
+    base = before.body_velocities.detach()
+    weights = torch.tensor([0.3, -0.7, 1.1, 0.02, 0.05, -0.03], dtype=F64)
+
+    def loss(velocities):
+        return sim.step(before.replace(body_velocities=velocities)).body_velocities[1] @ weights
+
+    given = base.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(given), given)
+    for i in range(6):
+        change = torch.zeros_like(base)
+        change[1, i] = 1e-5 * (1 if i < 3 else 30)
+        with torch.no_grad():
+            slope = (loss(base + change) - loss(base - change)) / (2 * change[1, i])
+        assert gradient[1, i] == pytest.approx(float(slope), rel=1e-3, abs=1e-4)
+
+
+def test_a_body_by_itself_turns_exactly():
+    """At 3 rad a step as in many small steps; with what it keeps."""
+    J = torch.diag(torch.tensor([0.2, 1.0, 1.1], dtype=F64))[None, None]
+    spin = torch.tensor([2.0, 1.5, -1.7], dtype=F64)
+    momentum = (J[0, 0] @ spin).expand(1, 1, 3)
+    once, _ = free_turns(J, momentum, 1.0)
+    turn = torch.eye(3, dtype=F64)
+    for _ in range(50):
+        part, _ = free_turns(J, (turn.T @ momentum[0, 0]).expand(1, 1, 3), 0.02)
+        turn = turn @ quaternion_matrix(part)[0, 0]
+    whole = quaternion_matrix(once)[0, 0]
+    torch.testing.assert_close(whole, turn, rtol=0, atol=1e-13)
+    local = whole.T @ momentum[0, 0]
+    energy = local @ torch.linalg.solve(J[0, 0], local) / 2
+    assert float(energy) == pytest.approx(float(spin @ momentum[0, 0] / 2), rel=1e-13)
+
+
+def test_derivatives_of_a_free_turn():
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(2, 3, 3))
+    J = torch.tensor(root @ root.transpose(0, 2, 1) + np.eye(3))[None].requires_grad_()
+    momentum = torch.tensor(rng.normal(size=(1, 2, 3)) * 4).requires_grad_()
+    assert torch.autograd.gradcheck(lambda *given: free_turns(*given, 0.7)[0], (J, momentum))
+
+
+@pytest.mark.parametrize("turn", [1.8, 4.0])
+def test_energy_and_momentum_of_a_state_know_no_speed_limit(turn):
+    sim, state = thrown((0.01, 0.02, 0.2), turn, 2, height=1.1)
+    still = state.replace(body_velocities=torch.zeros_like(state.body_velocities))
+    assert sim.energy(state) == sim.energy(still)
+    assert sim.momentum(state).isfinite().all()
+
+
+def rolling(turn):
+    """A ball on a floor, and its state when it rolls by `turn` rad a step."""
+    ball = dc.RigidBody.sphere(
+        0.004, subdivisions=2, motion="dynamic", density=300, pose=[0, 0, 0.00406, 1, 0, 0, 0],
+        friction=0.5, name="marble",
+    )  # fmt: skip
+    sim = dc.Simulator(
+        dc.Scene([], [dc.RigidBody.plane(9.0, friction=0.5), ball]),
+        H,
+        contact=dc.ContactOptions(barrier_distance=1e-4),
+    )
+    velocities = torch.zeros(2, 6, dtype=F64)
+    velocities[1, 0], velocities[1, 4] = turn / H * 0.004, turn / H
+    return sim, sim.initial_state().replace(body_velocities=velocities)
+
+
+def test_a_ball_that_rolls_too_fast_is_refused_by_name():
+    sim, state = rolling(2.0)
+    with pytest.raises(
+        dc.SimulationError, match=r"'marble' turns at 250 rad/s.* time step of at most 0.00594 s"
+    ) as error:
+        sim.step(state)
+    assert error.value.environments == (0,)
+
+
+def test_the_environment_that_turns_too_fast_is_named():
+    sim, slow = rolling(0.1)
+    fast = rolling(2.0)[1]
+    with pytest.raises(dc.SimulationError, match="'marble' turns") as error:
+        sim.step(dc.stack([slow, fast]))
+    assert error.value.environments == (1,)
