@@ -114,7 +114,7 @@ def in_contact(coupling, base):
     """A simulator, and a state in which the box slides on the cloth and the gripper holds it."""
     sim = simulator(coupling, base)
     state = sim.initial_state()
-    slide = torch.tensor([[0.2, 0.07, -0.02, 0.5, 0.0, 1.0]], dtype=F64)
+    slide = torch.tensor([[0.18, 0.063, -0.018, 0.45, 0.0, 0.9]], dtype=F64)
     state = state.replace(body_velocities=slide)
     with torch.no_grad():
         given = controls(sim, control(sim), WARM_UP), parameters(sim)
