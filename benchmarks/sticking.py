@@ -5,8 +5,8 @@
 
 First the scenes of `benchmarks/scenes.py` in contact, at each slip velocity: Newton iterations and
 processor time of a step, medians of `--steps` steps from where the scene is in its regime. Then a
-cloth and a box that two fingers hold against gravity for `--seconds`: how far they sink, beside what
-the law says, v = e (1 - sqrt(1 - T / (mu N))) with the load T and the normal forces N.
+cloth and a box that two plates hold against gravity for `--seconds`: how far they sink, beside
+what the law says, v = e (1 - sqrt(1 - T / (mu N))) with the load T and the normal forces N.
 """
 
 from __future__ import annotations

@@ -57,8 +57,8 @@ class SolverOptions:
         tolerance: Largest step with the exact Hessian that counts as converged, as a velocity
             [m/s], > 0. Of Projective Dynamics the largest change of velocity that the residual
             force gives a vertex in a time step.
-        max_iterations: Newton iterations that a step may take over all its solves, >= 1. Common are 5
-            to 40; single steps of a sheet that whips take some hundreds. Projective Dynamics may
+        max_iterations: Newton iterations that a step may take over all its solves, >= 1. Common are
+            5 to 40; single steps of a sheet that whips take some hundreds. Projective Dynamics may
             take 50 times as many of its own, which cost about as much less.
         throw: Whether a step that fails in any environment raises `NotConverged` or
             `InfeasibleMotion`. Otherwise `report.status` says which failed, and their state is the
