@@ -155,7 +155,7 @@ void write_body_forces(const Problem& problem, const Sum& sum, const Array& x, d
 
 /// How much farther sticking may creep in all solves but the last: where friction lags then is found in
 /// fewer iterations, and ends as near.
-constexpr double kWidening = 10.0;
+constexpr double kWidening = 100.0;
 
 double widening(int solve, int solves) { return solve + 1 < solves ? kWidening : 1.0; }
 
