@@ -161,7 +161,7 @@ std::optional<CloseStart> find_close_start(const Scene& scene, const Inputs& inp
   const double* const x = problem.start.data();
   const auto candidates = find_near(scene, x, thickness, reach, scratch);
   const auto closest = find_closest(scene, x, thickness, reach, candidates);
-  if (!closest) return {};
+  if (!closest || !problem.contact) return {};
   const double gravity = row(inputs.data(Input::kGravity), 0).norm();
   const double pressure = std::ranges::max(problem.density) * gravity;
   return CloseStart{

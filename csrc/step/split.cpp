@@ -100,7 +100,7 @@ class Nearness {
     if (elastic_) {
       for (std::size_t a = 0; a < bar.size(); ++a) bar[a] += elastic_->target_bar[a];
     }
-    if (tilt_) pull_back_tilt(bar);
+    if (tilt_) pull_back_tilt(tilt_->force_bar, bar);
     return bar;
   }
 
@@ -124,11 +124,11 @@ class Nearness {
   }
 
   // f = grad P(x^D):  x^D gets H f_bar, and what P is made of  d/d theta (f_bar . grad P).
-  void pull_back_tilt(Array& target_bar) {
-    Array minus = tilt_->force_bar;
+  void pull_back_tilt(const Array& force_bar, Array& target_bar) {
+    Array minus = force_bar;
     for (double& value : minus) value = -value;
     for_each_of_energy([&](Potential& p) {
-      p.add_hessian_product(x_d_.data(), tilt_->force_bar.data(), target_bar.data());
+      p.add_hessian_product(x_d_.data(), force_bar.data(), target_bar.data());
       p.accumulate(x_d_.data(), minus.data());
     });
   }
