@@ -63,11 +63,11 @@ bool Directions::refactor(linalg::BlockMatrix& H) {
     return false;
   }
   ++walk_.context.counts->exact;
+  solve(*factor, H);
   confirmed_ = factor->precision() == linalg::Precision::kDouble;
   last_ = {
       .factor = std::move(factor),
       .hessian = confirmed_ ? nullptr : std::make_shared<const linalg::BlockValues>(std::move(H))};
-  solve(*last_.factor, confirmed_ ? H : *last_.hessian);
   return true;
 }
 
