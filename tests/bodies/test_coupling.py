@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+import scenes
 import torch
 from body_scenes import F64, make_scene
 from differences import directions, mismatch
@@ -91,6 +92,58 @@ def test_cloth_to_rigid_solves_the_cloth_against_frozen_bodies():
     assert after.body_forces.any()
     torch.testing.assert_close(after.positions, expected.positions, rtol=0, atol=1e-11)
     torch.testing.assert_close(after.body_forces, expected.body_forces, rtol=1e-7, atol=1e-7)
+
+
+def resting(coupling, *, with_cloth, with_bodies=True):
+    """A box that slides on a floor, far below a cloth of other thickness and friction."""
+    thick = dc.Material(stretch=200.0, density=0.3, thickness=0.02, friction=0.9)
+    cloth = dc.Cloth.grid(3, 3, 0.2, material=thick, pins={"edge": [0, 1]}, pose=[0, 0, 3, 1, 0, 0, 0])
+    floor = dc.RigidBody.plane(1.0, thickness=0.002, friction=0.3, name="floor")
+    pose = [0.01, 0.02, 0.0562, 1, 0, 0, 0.1]
+    box = dc.RigidBody.box(
+        0.1, motion="dynamic", mass=0.5, pose=pose, thickness=0.006, friction=0.2, name="box"
+    )
+    bodies = [floor, box] if with_bodies else []
+    contact = dc.ContactOptions(
+        barrier_distance=0.004, barrier_stiffness=4e3, slip_velocity=1e-2
+    )
+    sim = dc.Simulator(
+        dc.Scene([cloth] if with_cloth else [], bodies), DT, coupling=coupling, contact=contact
+    )
+    state = sim.initial_state()
+    if with_cloth:
+        moving = scenes.tensor_noise(state.velocities.shape, 0.3, 1)
+        state = state.replace(velocities=moving.index_fill(0, torch.tensor([0, 1]), 0.0))
+    if with_bodies:
+        slide = torch.tensor([[0.0] * 6, [0.2, 0.05, -0.2, 0, 0, 0.3]], dtype=F64)
+        state = state.replace(body_velocities=slide)
+    return sim, state
+
+
+@STAGGERED
+def test_bodies_touch_each_other_as_if_there_were_no_cloth(coupling):
+    """Frictions and thicknesses are their own, and so are the forces between them."""
+    sim, state = resting(coupling, with_cloth=True)
+    alone, other = resting("monolithic", with_cloth=False)
+    for _ in range(4):
+        state, other = sim.step(state), alone.step(other)
+        for name in ("body_poses", "body_velocities", "body_forces"):
+            a, b = getattr(state, name), getattr(other, name)
+            torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12, msg=name)
+    pushed = other.body_forces[sim.slices["box"]].sum(0)
+    assert pushed[2] > 1
+    assert pushed[0] < -0.1
+
+
+@STAGGERED
+def test_the_report_is_that_of_the_worse_of_two_solves(coupling):
+    sims = [resting(coupling, with_cloth=True)]
+    sims += [resting("monolithic", with_cloth=c, with_bodies=not c) for c in (True, False)]
+    state = [sim.step(start) for sim, start in sims]
+    both, cloth, bodies = (end.report for end in state)
+    assert cloth.residual != bodies.residual
+    assert both.residual == pytest.approx(max(cloth.residual, bodies.residual), rel=1e-6)
+    assert both.minimum_distance == pytest.approx(bodies.minimum_distance, rel=1e-9)
 
 
 def test_all_couplings_agree_where_the_body_is_heavy():
