@@ -97,16 +97,16 @@ def test_cloth_to_rigid_solves_the_cloth_against_frozen_bodies():
 def resting(coupling, *, with_cloth, with_bodies=True):
     """A box that slides on a floor, far below a cloth of other thickness and friction."""
     thick = dc.Material(stretch=200.0, density=0.3, thickness=0.02, friction=0.9)
-    cloth = dc.Cloth.grid(3, 3, 0.2, material=thick, pins={"edge": [0, 1]}, pose=[0, 0, 3, 1, 0, 0, 0])
+    cloth = dc.Cloth.grid(
+        3, 3, 0.2, material=thick, pins={"edge": [0, 1]}, pose=[0, 0, 3, 1, 0, 0, 0]
+    )
     floor = dc.RigidBody.plane(1.0, thickness=0.002, friction=0.3, name="floor")
     pose = [0.01, 0.02, 0.0562, 1, 0, 0, 0.1]
     box = dc.RigidBody.box(
         0.1, motion="dynamic", mass=0.5, pose=pose, thickness=0.006, friction=0.2, name="box"
     )
     bodies = [floor, box] if with_bodies else []
-    contact = dc.ContactOptions(
-        barrier_distance=0.004, barrier_stiffness=4e3, slip_velocity=1e-2
-    )
+    contact = dc.ContactOptions(barrier_distance=0.004, barrier_stiffness=4e3, slip_velocity=1e-2)
     sim = dc.Simulator(
         dc.Scene([cloth] if with_cloth else [], bodies), DT, coupling=coupling, contact=contact
     )
@@ -167,6 +167,62 @@ def test_a_light_body_warns_once(coupling):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sim.step(state)
+
+
+# A heavy carriage without a shape, which a light plate hangs on.
+PLATE = """<robot name="plate">
+  <link name="rail"><inertial><mass value="1"/>{moments}</inertial></link>
+  <link name="carriage"><inertial><mass value="9"/>{moments}</inertial></link>
+  <link name="plate"><inertial><mass value="0.002"/>{moments}</inertial>
+    <collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <joint name="ride" type="prismatic"><parent link="rail"/><child link="carriage"/>
+    <axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="0" velocity="0"/></joint>
+  <joint name="fall" type="prismatic"><parent link="carriage"/><child link="plate"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="0" velocity="0"/></joint>
+</robot>"""
+MOMENTS = '<inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/>'
+
+
+@STAGGERED
+def test_a_light_link_is_warned_of_by_its_name(coupling, tmp_path):
+    path = tmp_path / "plate.urdf"
+    path.write_text(PLATE.format(moments=MOMENTS))
+    pose = [0.013, 0.021, 0.0535, 1, 0, 0, 0]
+    robot = dc.Robot.load(path, base="fixed", pose=pose, actuation="torque", name="arm")
+    sim, _ = trampoline(coupling)
+    away = dc.RigidBody.box(0.1, motion="dynamic", mass=2.0, pose=[3, 0, 0, 1, 0, 0, 0], name="far")
+    scene = dc.Scene(sim.scene.cloths, [away], [robot])
+    sim = dc.Simulator(scene, DT, coupling=coupling, contact=sim.contact)
+    # Of the sheet, 13 times as heavy as the plate, counts what is in the plate's box.
+    words = r"the added-mass number of 'arm/plate' is about \d(\.\d)?, above 0\.5"
+    with pytest.warns(dc.AddedMassWarning, match=words):
+        sim.rollout(sim.initial_state(), steps=3)
+
+
+@pytest.mark.parametrize(("way", "speed"), [(-0.004, 0.0), (0.006, 3.0)])
+def test_cloth_to_rigid_moves_what_is_prescribed_with_the_cloth(way, speed):
+    """Only what forces move stands still meanwhile; there is nothing to wait for here."""
+    sheet = trampoline("monolithic")[0].scene.cloths
+    mover = dc.RigidBody.box(0.1, motion="kinematic", pose=[0.013, 0.021, 0.052, 1, 0, 0, 0])
+    far = dc.RigidBody.box(0.1, motion="dynamic", mass=2.0, pose=[3, 0, 0, 1, 0, 0, 0])
+    ends = []
+    for coupling in ("monolithic", "cloth_to_rigid"):
+        contact = dc.ContactOptions(barrier_distance=0.004)
+        solver = dc.SolverOptions(tolerance=1e-10)
+        scene = dc.Scene(sheet, [mover, far])
+        sim = dc.Simulator(scene, DT, coupling=coupling, contact=contact, solver=solver)
+        state = sim.initial_state()
+        state.velocities[12, 2] = speed
+        poses = state.body_poses.clone()
+        poses[0, 2] += way
+        ends.append(sim.step(state, dc.Control(body_poses=poses)))
+    # Through where the sheet was, or the sheet through where the body was.
+    level = 0.002 if way > 0 else 0.0
+    assert (float(ends[0].positions[12, 2]) - level) * way > 0
+    assert ends[0].body_forces[:8, 2].sum() > 0.2
+    for name in ("positions", "velocities", "body_poses", "body_velocities", "body_forces"):
+        one, other = (getattr(end, name) for end in ends)
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-8)
 
 
 def test_cloth_to_rigid_refuses_a_motion_through_a_sheet():
