@@ -150,6 +150,15 @@ def test_gradients_agree_with_differences(case, name):
     assert (gradients[name] * direction).sum() == pytest.approx(quotient, rel=1e-5, abs=1e-6)
 
 
+def test_the_gradient_by_a_metric_is_symmetric(case):
+    """As the metric is: so no half of it has a gradient of its own."""
+    _, arrays, _, gradients = case
+    n = arrays["coordinates"].shape[1]
+    gradient = gradients["coordinate_metric"].reshape(n, n)
+    assert abs(gradient - gradient.T).max() <= 1e-12 * abs(gradient).max()
+    assert gradient.any()
+
+
 def test_a_body_prescribed_where_a_free_one_went_leaves_the_cloth_where_it_was():
     # Without friction: its lag would be at where the body was in the iteration before.
     scene, arrays = body_in_contact()
