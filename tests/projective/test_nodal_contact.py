@@ -144,6 +144,20 @@ def test_a_slide_accelerates_as_coulomb_says():
     assert (state.velocities @ down).mean().item() / 0.1 == pytest.approx(0.087743, rel=1e-5)
 
 
+@pytest.mark.parametrize("excess", [1e-2, 1e-5, 1e-7])
+def test_what_hardly_slips_is_hardly_moved_across(excess):
+    """Friction turns with the slip: v_y = (1 - mu g_z / g_x) h g_y, for a small g_y."""
+    h, mu = 0.01, 0.5
+    sim, state, _ = patch(mu, dt=h)
+    given = sim.parameters()
+    pull = mu / (1 - excess) * 5.0
+    gravity = torch.tensor([pull, 0.0, -5.0], dtype=F64, requires_grad=True)
+    after = sim.step(state, None, given.replace(gravity=gravity))
+    assert counts(after) == (0, 0, 9)
+    (gradient,) = torch.autograd.grad(after.velocities[:, 1].mean(), gravity)
+    assert gradient[1].item() == pytest.approx(h * excess, rel=1e-4)
+
+
 @pytest.mark.parametrize(("v_0", "mu"), [(2.0, 0.5), (10.0, 0.8)])
 def test_stopping_distance_and_its_gradients(v_0, mu):
     # Implicit Euler of a = -mu g: v_k = v_0 - k mu g h until it stops in the last, shorter step.
@@ -200,6 +214,38 @@ def test_an_obstacle_carries_what_sticks_to_it():
     torch.testing.assert_close(
         moved, torch.tensor([5e-4, 0, 0], dtype=F64).expand_as(moved), rtol=0, atol=1e-10
     )
+
+
+def test_a_body_touches_halfway_whatever_the_sign_of_its_quaternion():
+    """A box passes by and turns: only halfway is it at the sheet."""
+    sheet = dc.Cloth.grid(3, 3, size=(0.1, 0.1), pose=[0, 0, 0.045, 1, 0, 0, 0])
+    start = [-0.5, 0.01, -0.01, 1.0, 0.02, -0.03, 0.3]
+    box = dc.RigidBody.box(
+        (0.4, 0.3, 0.1), motion="kinematic", pose=start, friction=0.3, nodal_contact=True
+    )
+    sim = dc.Simulator(
+        dc.Scene([sheet], [box]),
+        DT,
+        scheme="projective",
+        contact=dc.ContactOptions(self_contact=False),
+        solver=dc.SolverOptions(tolerance=1e-10),
+    )
+    state = sim.initial_state()
+    assert counts(sim.step(state)) == (0, 0, 0)
+    found = []
+    for sign in (1.0, -1.0):
+        end = torch.tensor([[0.5, -0.01, 0.01, 1.0, 0.07, 0.1, -0.4]], dtype=F64)
+        end[0, 3:] *= sign
+        end.requires_grad_()
+        after = sim.step(state, dc.Control(body_poses=end))
+        (gradient,) = torch.autograd.grad((after.positions[:, 2] ** 2).sum(), end)
+        gradient[0, 3:] *= sign
+        found.append((after.positions.detach(), gradient))
+    assert counts(after)[2] > 4
+    (one, by_one), (other, by_other) = found
+    torch.testing.assert_close(other, one, rtol=0, atol=1e-14)
+    torch.testing.assert_close(by_other, by_one, rtol=1e-9, atol=1e-15)
+    assert by_one[0, 3:].abs().max() > 1e-3 * by_one.abs().max()
 
 
 def test_contacts_of_a_batch_are_those_of_its_environments():
