@@ -206,6 +206,49 @@ def test_a_floor_bears_the_weight_and_no_more():
     )
 
 
+@pytest.mark.parametrize("x", [30.0, -1.5, 0.8])
+def test_a_floor_bears_what_lies_beyond_its_mesh_where_that_is_nearest(x):
+    """A plane is infinite."""
+    floor = dc.RigidBody.plane(1.0, thickness=2e-3, nodal_contact=True)
+    sheet = dc.Cloth.grid(3, 3, size=(0.1, 0.1), pose=[x, 0.3, 9.9e-4, 1, 0, 0, 0])
+    sim = dc.Simulator(dc.Scene([sheet], [floor]), DT, scheme="projective")
+    state = sim.step(sim.initial_state())
+    assert counts(state)[1] == 9
+    weight = sim.parameters().density * 0.1 * 0.1 * G
+    force = state.body_forces[:, 2]
+    torch.testing.assert_close(force.sum(), -weight, rtol=1e-6, atol=0)
+    points = state.positions.clamp(-0.5, 0.5)
+    center = force @ torch.tensor(floor.vertices) / force.sum()
+    # Vertices of the sheet weigh unlike each other.
+    torch.testing.assert_close(center[:2], points.mean(0)[:2], rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("thick", [0, 1])
+def test_each_cloth_touches_at_its_own_thickness_and_friction(thick):
+    """One of two sheets that glide low over a floor is thick and rough."""
+    sheets = [
+        dc.Cloth.grid(
+            3,
+            3,
+            size=(0.1, 0.1),
+            pose=[0.3 * i, 0, 0.006, 1, 0, 0, 0],
+            material=dc.Material(thickness=0.012 if i == thick else 0.002, friction=0.1 + 0.3 * i),
+        )
+        for i in range(2)
+    ]
+    floor = dc.RigidBody.plane(1.0, thickness=2e-3, friction=0.4, nodal_contact=True)
+    sim = dc.Simulator(dc.Scene(sheets, [floor]), DT, scheme="projective")
+    state = sim.initial_state()
+    glide = torch.tensor([1.0, 0.0, -0.1], dtype=F64).expand_as(state.positions)
+    after = sim.step(state.replace(velocities=glide))
+    assert counts(after) == (0, 0, 9)
+    one, other = after.velocities[9 * thick :][:9], after.velocities[9 * (1 - thick) :][:9]
+    assert one[:, 2].abs().max() < 1e-9
+    torch.testing.assert_close(other[:, 2], torch.full((9,), -0.1 - DT * G, dtype=F64))
+    friction = sim.parameters().friction[thick, 2]
+    torch.testing.assert_close(one[:, 0], (1.0 - friction * (0.1 + DT * G)).expand(9))
+
+
 def test_an_obstacle_carries_what_sticks_to_it():
     sim, state, _ = patch(0.8)
     body = sim.scene.bodies[0]
