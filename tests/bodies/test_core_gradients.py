@@ -39,13 +39,21 @@ def body_in_contact():
         q = result["coordinates"][0]
 
 
-def chain_in_contact(*, free):
-    """A chain that comes down on the cloth, its hinge beyond its limit, its slide prescribed."""
+def chain_in_contact(*, free, light=False):
+    """A chain that comes down on the cloth, its hinge beyond its limit, its slide prescribed.
+
+    One that is `light` has no limit: what its joints do to their own leverage then counts.
+    """
     rng = np.random.default_rng(1)
-    scene = CoreScene(chain(free=free), BOXES, cells=6)
+    trees = chain(free=free)
+    if light:
+        trees["coordinate_upper"] = np.full_like(trees["coordinate_upper"], np.inf)
+    scene = CoreScene(trees, BOXES, cells=6)
     n = 8 if free else 2
     factor = rng.standard_normal((n, n))
     metric = (0.01 * factor @ factor.T + 0.05 * np.eye(n)) / DT**2
+    if light:
+        metric *= 0.02
     q = np.array([0.198, 0.01])
     frame = np.array([-0.05, 0, 0.27, *TURNED])
     if free:
@@ -75,7 +83,7 @@ def chain_in_contact(*, free):
         result = scene.forward(arrays)
         touching += int(result["contact_count"][0] > 0)
         if touching == 3:
-            assert result["coordinates"][0][-2] > 0.2  # beyond the limit, within its zone
+            assert light or result["coordinates"][0][-2] > 0.2  # beyond it, within its zone
             return scene, arrays
         speed = 0.9 * (result["coordinates"][0] - q) / DT
         speed[-2] += 0.5
@@ -85,6 +93,7 @@ def chain_in_contact(*, free):
 CASES = {
     "body": body_in_contact,
     "chain": lambda: chain_in_contact(free=False),
+    "light": lambda: chain_in_contact(free=False, light=True),
     "floating": lambda: chain_in_contact(free=True),
 }
 
@@ -148,6 +157,15 @@ def test_gradients_agree_with_differences(case, name):
 
     quotient = (loss(1) - loss(-1)) / (2 * STEPS[name])
     assert (gradients[name] * direction).sum() == pytest.approx(quotient, rel=1e-5, abs=1e-6)
+
+
+def test_the_gradient_by_a_metric_is_symmetric(case):
+    """As the metric is: so no half of it has a gradient of its own."""
+    _, arrays, _, gradients = case
+    n = arrays["coordinates"].shape[1]
+    gradient = gradients["coordinate_metric"].reshape(n, n)
+    assert abs(gradient - gradient.T).max() <= 1e-12 * abs(gradient).max()
+    assert gradient.any()
 
 
 def test_a_body_prescribed_where_a_free_one_went_leaves_the_cloth_where_it_was():

@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+import scenes
 import torch
 from body_scenes import F64, make_scene
 from differences import directions, mismatch
@@ -93,6 +94,58 @@ def test_cloth_to_rigid_solves_the_cloth_against_frozen_bodies():
     torch.testing.assert_close(after.body_forces, expected.body_forces, rtol=1e-7, atol=1e-7)
 
 
+def resting(coupling, *, with_cloth, with_bodies=True):
+    """A box that slides on a floor, far below a cloth of other thickness and friction."""
+    thick = dc.Material(stretch=200.0, density=0.3, thickness=0.02, friction=0.9)
+    cloth = dc.Cloth.grid(
+        3, 3, 0.2, material=thick, pins={"edge": [0, 1]}, pose=[0, 0, 3, 1, 0, 0, 0]
+    )
+    floor = dc.RigidBody.plane(1.0, thickness=0.002, friction=0.3, name="floor")
+    pose = [0.01, 0.02, 0.0562, 1, 0, 0, 0.1]
+    box = dc.RigidBody.box(
+        0.1, motion="dynamic", mass=0.5, pose=pose, thickness=0.006, friction=0.2, name="box"
+    )
+    bodies = [floor, box] if with_bodies else []
+    contact = dc.ContactOptions(barrier_distance=0.004, barrier_stiffness=4e3, slip_velocity=1e-2)
+    sim = dc.Simulator(
+        dc.Scene([cloth] if with_cloth else [], bodies), DT, coupling=coupling, contact=contact
+    )
+    state = sim.initial_state()
+    if with_cloth:
+        moving = scenes.tensor_noise(state.velocities.shape, 0.3, 1)
+        state = state.replace(velocities=moving.index_fill(0, torch.tensor([0, 1]), 0.0))
+    if with_bodies:
+        slide = torch.tensor([[0.0] * 6, [0.2, 0.05, -0.2, 0, 0, 0.3]], dtype=F64)
+        state = state.replace(body_velocities=slide)
+    return sim, state
+
+
+@STAGGERED
+def test_bodies_touch_each_other_as_if_there_were_no_cloth(coupling):
+    """Frictions and thicknesses are their own, and so are the forces between them."""
+    sim, state = resting(coupling, with_cloth=True)
+    alone, other = resting("monolithic", with_cloth=False)
+    for _ in range(4):
+        state, other = sim.step(state), alone.step(other)
+        for name in ("body_poses", "body_velocities", "body_forces"):
+            a, b = getattr(state, name), getattr(other, name)
+            torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12, msg=name)
+    pushed = other.body_forces[sim.slices["box"]].sum(0)
+    assert pushed[2] > 1
+    assert pushed[0] < -0.1
+
+
+@STAGGERED
+def test_the_report_is_that_of_the_worse_of_two_solves(coupling):
+    sims = [resting(coupling, with_cloth=True)]
+    sims += [resting("monolithic", with_cloth=c, with_bodies=not c) for c in (True, False)]
+    state = [sim.step(start) for sim, start in sims]
+    both, cloth, bodies = (end.report for end in state)
+    assert cloth.residual != bodies.residual
+    assert both.residual == pytest.approx(max(cloth.residual, bodies.residual), rel=1e-6)
+    assert both.minimum_distance == pytest.approx(bodies.minimum_distance, rel=1e-9)
+
+
 def test_all_couplings_agree_where_the_body_is_heavy():
     ends = []
     for coupling in ("monolithic", *COUPLINGS):
@@ -114,6 +167,62 @@ def test_a_light_body_warns_once(coupling):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         sim.step(state)
+
+
+# A heavy carriage without a shape, which a light plate hangs on.
+PLATE = """<robot name="plate">
+  <link name="rail"><inertial><mass value="1"/>{moments}</inertial></link>
+  <link name="carriage"><inertial><mass value="9"/>{moments}</inertial></link>
+  <link name="plate"><inertial><mass value="0.002"/>{moments}</inertial>
+    <collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <joint name="ride" type="prismatic"><parent link="rail"/><child link="carriage"/>
+    <axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="0" velocity="0"/></joint>
+  <joint name="fall" type="prismatic"><parent link="carriage"/><child link="plate"/>
+    <axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="0" velocity="0"/></joint>
+</robot>"""
+MOMENTS = '<inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/>'
+
+
+@STAGGERED
+def test_a_light_link_is_warned_of_by_its_name(coupling, tmp_path):
+    path = tmp_path / "plate.urdf"
+    path.write_text(PLATE.format(moments=MOMENTS))
+    pose = [0.013, 0.021, 0.0535, 1, 0, 0, 0]
+    robot = dc.Robot.load(path, base="fixed", pose=pose, actuation="torque", name="arm")
+    sim, _ = trampoline(coupling)
+    away = dc.RigidBody.box(0.1, motion="dynamic", mass=2.0, pose=[3, 0, 0, 1, 0, 0, 0], name="far")
+    scene = dc.Scene(sim.scene.cloths, [away], [robot])
+    sim = dc.Simulator(scene, DT, coupling=coupling, contact=sim.contact)
+    # Of the sheet, 13 times as heavy as the plate, counts what is in the plate's box.
+    words = r"the added-mass number of 'arm/plate' is about \d(\.\d)?, above 0\.5"
+    with pytest.warns(dc.AddedMassWarning, match=words):
+        sim.rollout(sim.initial_state(), steps=3)
+
+
+@pytest.mark.parametrize(("way", "speed"), [(-0.004, 0.0), (0.006, 3.0)])
+def test_cloth_to_rigid_moves_what_is_prescribed_with_the_cloth(way, speed):
+    """Only what forces move stands still meanwhile; there is nothing to wait for here."""
+    sheet = trampoline("monolithic")[0].scene.cloths
+    mover = dc.RigidBody.box(0.1, motion="kinematic", pose=[0.013, 0.021, 0.052, 1, 0, 0, 0])
+    far = dc.RigidBody.box(0.1, motion="dynamic", mass=2.0, pose=[3, 0, 0, 1, 0, 0, 0])
+    ends = []
+    for coupling in ("monolithic", "cloth_to_rigid"):
+        contact = dc.ContactOptions(barrier_distance=0.004)
+        solver = dc.SolverOptions(tolerance=1e-10)
+        scene = dc.Scene(sheet, [mover, far])
+        sim = dc.Simulator(scene, DT, coupling=coupling, contact=contact, solver=solver)
+        state = sim.initial_state()
+        state.velocities[12, 2] = speed
+        poses = state.body_poses.clone()
+        poses[0, 2] += way
+        ends.append(sim.step(state, dc.Control(body_poses=poses)))
+    # Through where the sheet was, or the sheet through where the body was.
+    level = 0.002 if way > 0 else 0.0
+    assert (float(ends[0].positions[12, 2]) - level) * way > 0
+    assert ends[0].body_forces[:8, 2].sum() > 0.2
+    for name in ("positions", "velocities", "body_poses", "body_velocities", "body_forces"):
+        one, other = (getattr(end, name) for end in ends)
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-8)
 
 
 def test_cloth_to_rigid_refuses_a_motion_through_a_sheet():

@@ -1,5 +1,6 @@
 """Bodies and robots of a scene together: rows, limits, and couplings in two solves."""
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -183,6 +184,52 @@ def test_what_turns_fast_may_not_be_touched(world, by):
     assert error.value.environments == (0,)
 
 
+@pytest.mark.parametrize("by", ["kick", "prediction"])
+def test_forces_turn_a_body_about_its_center_of_mass(world, by):
+    """Its angular momentum about the origin grows by h times the moments of the forces there.
+
+    Where the forces act: on its points at the end of the step, or at the start.
+    """
+    assembly, dynamics, parameters, state, control = world
+    rng = np.random.default_rng(11)
+    parameters |= {"body_center": tensor(rng.uniform(-0.1, 0.1, (1, 4, 3)))}
+    parameters |= {"gravity": torch.zeros(1, 1, 3, dtype=F64)}
+    control |= {"body_wrenches": torch.zeros(1, 4, 6, dtype=F64)}
+    forces = torch.zeros(1, len(assembly.body_vertices), 3, dtype=F64)
+    rows = slice(*assembly.body_vertex_start[[1, 2]].tolist())
+    forces[0, rows] = tensor(rng.normal(size=(rows.stop - rows.start, 3)))
+
+    def step(acting, kick):
+        p = dynamics.predict(state, control, parameters, acting)
+        after = dynamics.advance(p, p.coordinate_targets, 0 * forces, kick)
+        return after, dynamics.totals(after, parameters).momentum[0]
+
+    after, momentum = step(*((None, forces) if by == "kick" else (forces, None)))
+    pose = (after if by == "kick" else state)["body_poses"][0, 1]
+    unit = torch.nn.functional.normalize(pose[3:], dim=0)
+    points = pose[:3] + rotate(unit, tensor(assembly.body_vertices[rows]))
+    moments = torch.linalg.cross(points, forces[0, rows])
+    expected = H * torch.cat([forces[0, rows], moments], dim=-1).sum(0)
+    torch.testing.assert_close(momentum - step(None, None)[1], expected, rtol=0, atol=1e-12)
+
+
+def test_inertias_mean_their_symmetric_part(world):
+    assembly, dynamics, parameters, state, control = world
+    names = ("body_inertia", "link_inertia")
+    skew = tensor([[0, 0.1, -0.2], [-0.1, 0, 0.3], [0.2, -0.3, 0]])
+    size = {name: parameters[name].abs().amax((-1, -2), keepdim=True) for name in names}
+    other = parameters | {name: parameters[name] + size[name] * skew for name in names}
+    forces = torch.zeros(1, len(assembly.body_vertices), 3, dtype=F64)
+
+    def results(given):
+        p = dynamics.predict(state, control, given)
+        after = dynamics.advance(p, p.coordinate_targets, forces)
+        return p.coordinate_metric, *after.values(), *dynamics.totals(after, given)
+
+    for got, expected in zip(results(other), results(parameters), strict=True):
+        torch.testing.assert_close(got, expected, rtol=1e-10, atol=1e-12)
+
+
 def test_a_scene_of_static_and_kinematic_bodies_passes_through():
     bodies = [
         dc.RigidBody.plane(4.0),
@@ -251,6 +298,17 @@ def test_a_joint_rests_on_its_limit_near_its_beginning():
         assert share < 0.12
 
 
+@pytest.mark.parametrize("dt", [0.01, 0.002])
+def test_a_limit_without_weight_is_as_stiff_as_its_joint_is_heavy(dt):
+    """k = M_jj / h^2: a joint that meets it in a step is turned back by its own inertia."""
+    assembly = assemble(make_scene(actuation="torque", base="fixed"))
+    (hand,) = assembly.mechanisms[-1:]
+    heavy = replace(assembly, joint_armature=np.array([0.02, 0.05]))
+    k = limit_stiffness(heavy, dt, np.zeros(3))
+    fingers = [hand.mass[hand.dof == j].sum() for j in range(2)]  # they slide
+    np.testing.assert_allclose(k[12:], (fingers + heavy.joint_armature) / dt**2, rtol=1e-12)
+
+
 def test_joints_without_a_limit_to_keep_have_no_barrier():
     assembly = assemble(make_scene(actuation="position", base="fixed"))
     assert not limit_stiffness(assembly, H, np.zeros(3)).any()
@@ -267,11 +325,14 @@ def spring_forces(assembly, coordinates):
     return (coordinates @ matrix).reshape(len(coordinates), -1, 3)
 
 
-def solvers(assembly, seen):
+def solvers(assembly, seen, among=0.0):
+    """Solves without contact, but with these forces `among` bodies and robots."""
+
     def solve_rigid(prediction):
         seen.append(("rigid", prediction))
-        none = torch.zeros(1, len(assembly.body_vertices), 3, dtype=F64)
-        return Solution(prediction.coordinate_targets, none)
+        forces = torch.zeros(1, len(assembly.body_vertices), 3, dtype=F64) + among
+        ends = prediction.coordinate_targets
+        return Solution(ends, forces)
 
     def solve_cloth(prediction, coordinates, origins=None):
         seen.append(("cloth", coordinates))
@@ -329,6 +390,61 @@ def test_cloth_to_rigid_lets_the_cloth_go_first(world):
         shift = (result.fields["body_poses"] - free["body_poses"])[0, k, :3]
         assert shift.norm() > 0
     assert (result.fields["joint_velocities"] != free["joint_velocities"]).all()
+
+
+def test_the_cloth_sees_what_is_prescribed_at_its_end_and_the_rest_still():
+    """With `cloth_to_rigid`; from there the rest moves, after the cloth."""
+    scene = make_scene(actuation=("position", "pd"), base="fixed")
+    assembly = assemble(scene)
+    dynamics, parameters = Dynamics(assembly, H), parameters_of(scene, assembly)
+    state, control = fields(assembly, 2)
+    seen, ways = [], []
+
+    def predict(contact):
+        return dynamics.predict(state, control, parameters, contact)
+
+    last = partial(dynamics.last_coordinates, state=state)
+    solve = solvers(assembly, seen)
+    cloth_to_rigid(dynamics, predict, last, *solve, lambda *way: ways.append(way[2:]))
+    ((_, held), (_, moved)), ((start, end),) = seen, ways
+    assert torch.equal(held[:, 12], control["joint_positions"][:, 0])
+    others = [i for i in range(14) if i != 12]
+    assert torch.equal(held[:, others], predict(None).coordinates[:, others])
+    assert torch.equal(start[:, 12], end[:, 12])
+    assert torch.equal(start[:, 12], control["joint_positions"][:, 0])
+    assert torch.equal(start[:, others], moved.coordinates[:, others])
+    assert (end != start)[:, others].all()
+
+
+@pytest.mark.parametrize("order", ["rigid_to_cloth", "cloth_to_rigid"])
+def test_forces_among_bodies_are_in_the_result_and_held(order):
+    """A step's forces are those of both solves, and what holds a joint holds against both."""
+    scene = make_scene(actuation="position", base="fixed")
+    assembly = assemble(scene)
+    dynamics, parameters = Dynamics(assembly, H), parameters_of(scene, assembly)
+    state, control = fields(assembly, 2)
+    forces = np.random.default_rng(4).normal(size=(1, len(assembly.body_vertices), 3))
+
+    def solved(among):
+        seen = []
+        solve_rigid, solve_cloth = solvers(assembly, seen, among)
+        predict = partial(dynamics.predict, state, control, parameters)
+        if order == "rigid_to_cloth":
+            return rigid_to_cloth(dynamics, predict(None), solve_rigid, solve_cloth)
+        last = partial(dynamics.last_coordinates, state=state)
+        return cloth_to_rigid(dynamics, predict, last, solve_rigid, solve_cloth, lambda *_: None)
+
+    one, other = solved(tensor(forces)), solved(0.0)
+    assert one.cloth.body_forces.any()
+    torch.testing.assert_close(
+        one.body_forces - other.body_forces, tensor(forces), rtol=0, atol=1e-12
+    )
+    efforts = (one.fields["joint_efforts"] - other.fields["joint_efforts"])[0]
+    rows = assembly.surface_names[1:]
+    for j, finger in enumerate(("left_finger", "right_finger")):
+        push = total_force(assembly, tensor(forces), rows.index(f"grip/{finger}"))
+        axis = finger_axis(dynamics, one.prediction, state, j)
+        torch.testing.assert_close(efforts[j], -(push @ axis), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("order", ["rigid_to_cloth", "cloth_to_rigid"])

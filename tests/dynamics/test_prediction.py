@@ -334,6 +334,21 @@ def test_prescribed_joints_arrive_exactly():
     assert efforts[0, 1] == 0
 
 
+def test_a_position_target_is_reached_to_the_last_bit():
+    """Not up to the rounding of the velocity that leads there."""
+    rng = np.random.default_rng(9)
+    mechanism = make(*TREES["chain"], rng=rng, actuation=("position", "torque", "position"))
+    chain = make_chain(mechanism)
+    joints, targets = tensor(rng.uniform(-1.5, 1.5, (2, 40, 3)))
+    state = ChainState(AT_ORIGIN.expand(40, 7), torch.zeros(40, 6, dtype=F64), joints, 0 * joints)
+    given = (inertia_of(mechanism), gains(chain), GRAVITY)
+    p = chain.predict(state, controls(chain, joints=targets), *given)
+    held = [0, 2]
+    assert torch.equal(p.ends[:, held], targets[:, held])
+    assert torch.equal(p.target[:, held], targets[:, held])
+    assert not torch.equal(joints + H * ((targets - joints) / H), targets)
+
+
 def test_efforts_of_prescribed_joints_move_a_free_chain_alike():
     """Up to a part that falls with the time step."""
 

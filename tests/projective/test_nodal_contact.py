@@ -11,7 +11,7 @@ from nodal_scenes import (
     counts,
     on_body,
 )
-from scenes import F64
+from scenes import F64, tensor_noise
 
 import diffcloth_torch as dc
 
@@ -48,6 +48,18 @@ def test_gradients_of_a_step_are_those_of_differences(kind, case):
         largest = float(tensor.abs().max()) if name.startswith("parameters") else 1.0
         sizes[name] = size * max(1.0, largest)
     assert_gradients_are_those_of_differences(loss(step, generator), step.inputs, sizes, generator)
+
+
+@pytest.mark.parametrize(("kind", "share"), [("plane", 0.3), ("box", 0.1)])
+def test_gradients_of_losses_add_up(kind, share):
+    """Each is solved for by itself, and as precisely as the equations of the step are."""
+    step = on_body(kind, "slipping")
+    v = (share * step.inputs["state.velocities"]).requires_grad_()
+    positions = step({"state.velocities": v}).positions
+    weights = tensor_noise((6, *positions.shape), 1.0, 1)
+    losses = [*(positions * weights).sum((-1, -2)), (positions * weights.sum(0)).sum()]
+    *parts, whole = (torch.autograd.grad(loss, v, retain_graph=True)[0] for loss in losses)
+    assert (sum(parts) - whole).abs().max() < 8e-12 * whole.abs().max()
 
 
 def test_the_normal_turns_with_the_vertex():
@@ -144,6 +156,23 @@ def test_a_slide_accelerates_as_coulomb_says():
     assert (state.velocities @ down).mean().item() / 0.1 == pytest.approx(0.087743, rel=1e-5)
 
 
+@pytest.mark.parametrize("excess", [1e-2, 1e-5, 1e-7])
+def test_what_hardly_slips_is_hardly_moved_across(excess):
+    """Friction turns with the slip: v_y = (1 - mu g_z / g_x) h g_y, for a small g_y."""
+    h, mu = 0.01, 0.5
+    sim, state, _ = patch(mu, dt=h)
+    # Soft: the size of a slip is then told by masses alone.
+    given = sim.parameters().replace(
+        stretch=torch.tensor(0.01, dtype=F64), bending=torch.tensor(1e-8, dtype=F64)
+    )
+    pull = mu / (1 - excess) * 5.0
+    gravity = torch.tensor([pull, 0.0, -5.0], dtype=F64, requires_grad=True)
+    after = sim.step(state, None, given.replace(gravity=gravity))
+    assert counts(after) == (0, 0, 9)
+    (gradient,) = torch.autograd.grad(after.velocities[:, 1].mean(), gravity)
+    assert gradient[1].item() == pytest.approx(h * excess, rel=1e-6)
+
+
 @pytest.mark.parametrize(("v_0", "mu"), [(2.0, 0.5), (10.0, 0.8)])
 def test_stopping_distance_and_its_gradients(v_0, mu):
     # Implicit Euler of a = -mu g: v_k = v_0 - k mu g h until it stops in the last, shorter step.
@@ -177,6 +206,49 @@ def test_a_floor_bears_the_weight_and_no_more():
     )
 
 
+@pytest.mark.parametrize("x", [30.0, -1.5, 0.8])
+def test_a_floor_bears_what_lies_beyond_its_mesh_where_that_is_nearest(x):
+    """A plane is infinite."""
+    floor = dc.RigidBody.plane(1.0, thickness=2e-3, nodal_contact=True)
+    sheet = dc.Cloth.grid(3, 3, size=(0.1, 0.1), pose=[x, 0.3, 9.9e-4, 1, 0, 0, 0])
+    sim = dc.Simulator(dc.Scene([sheet], [floor]), DT, scheme="projective")
+    state = sim.step(sim.initial_state())
+    assert counts(state)[1] == 9
+    weight = sim.parameters().density * 0.1 * 0.1 * G
+    force = state.body_forces[:, 2]
+    torch.testing.assert_close(force.sum(), -weight, rtol=1e-6, atol=0)
+    points = state.positions.clamp(-0.5, 0.5)
+    center = force @ torch.tensor(floor.vertices) / force.sum()
+    # Vertices of the sheet weigh unlike each other.
+    torch.testing.assert_close(center[:2], points.mean(0)[:2], rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("thick", [0, 1])
+def test_each_cloth_touches_at_its_own_thickness_and_friction(thick):
+    """One of two sheets that glide low over a floor is thick and rough."""
+    sheets = [
+        dc.Cloth.grid(
+            3,
+            3,
+            size=(0.1, 0.1),
+            pose=[0.3 * i, 0, 0.006, 1, 0, 0, 0],
+            material=dc.Material(thickness=0.012 if i == thick else 0.002, friction=0.1 + 0.3 * i),
+        )
+        for i in range(2)
+    ]
+    floor = dc.RigidBody.plane(1.0, thickness=2e-3, friction=0.4, nodal_contact=True)
+    sim = dc.Simulator(dc.Scene(sheets, [floor]), DT, scheme="projective")
+    state = sim.initial_state()
+    glide = torch.tensor([1.0, 0.0, -0.1], dtype=F64).expand_as(state.positions)
+    after = sim.step(state.replace(velocities=glide))
+    assert counts(after) == (0, 0, 9)
+    one, other = after.velocities[9 * thick :][:9], after.velocities[9 * (1 - thick) :][:9]
+    assert one[:, 2].abs().max() < 1e-9
+    torch.testing.assert_close(other[:, 2], torch.full((9,), -0.1 - DT * G, dtype=F64))
+    friction = sim.parameters().friction[thick, 2]
+    torch.testing.assert_close(one[:, 0], (1.0 - friction * (0.1 + DT * G)).expand(9))
+
+
 def test_an_obstacle_carries_what_sticks_to_it():
     sim, state, _ = patch(0.8)
     body = sim.scene.bodies[0]
@@ -200,6 +272,38 @@ def test_an_obstacle_carries_what_sticks_to_it():
     torch.testing.assert_close(
         moved, torch.tensor([5e-4, 0, 0], dtype=F64).expand_as(moved), rtol=0, atol=1e-10
     )
+
+
+def test_a_body_touches_halfway_whatever_the_sign_of_its_quaternion():
+    """A box passes by and turns: only halfway is it at the sheet."""
+    sheet = dc.Cloth.grid(3, 3, size=(0.1, 0.1), pose=[0, 0, 0.045, 1, 0, 0, 0])
+    start = [-0.5, 0.01, -0.01, 1.0, 0.02, -0.03, 0.3]
+    box = dc.RigidBody.box(
+        (0.4, 0.3, 0.1), motion="kinematic", pose=start, friction=0.3, nodal_contact=True
+    )
+    sim = dc.Simulator(
+        dc.Scene([sheet], [box]),
+        DT,
+        scheme="projective",
+        contact=dc.ContactOptions(self_contact=False),
+        solver=dc.SolverOptions(tolerance=1e-10),
+    )
+    state = sim.initial_state()
+    assert counts(sim.step(state)) == (0, 0, 0)
+    found = []
+    for sign in (1.0, -1.0):
+        end = torch.tensor([[0.5, -0.01, 0.01, 1.0, 0.07, 0.1, -0.4]], dtype=F64)
+        end[0, 3:] *= sign
+        end.requires_grad_()
+        after = sim.step(state, dc.Control(body_poses=end))
+        (gradient,) = torch.autograd.grad((after.positions[:, 2] ** 2).sum(), end)
+        gradient[0, 3:] *= sign
+        found.append((after.positions.detach(), gradient))
+    assert counts(after)[2] > 4
+    (one, by_one), (other, by_other) = found
+    torch.testing.assert_close(other, one, rtol=0, atol=1e-14)
+    torch.testing.assert_close(by_other, by_one, rtol=1e-9, atol=1e-15)
+    assert by_one[0, 3:].abs().max() > 1e-3 * by_one.abs().max()
 
 
 def test_contacts_of_a_batch_are_those_of_its_environments():
