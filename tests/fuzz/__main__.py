@@ -6,11 +6,11 @@
 
 A scene is a function of the seed and its index, and of `--draw`: scenes of odd indices throw cloths
 at bodies whose motion is given, those of even ones draw bodies, robots, couplings and schemes.
-ipctk judges every state and the polyline of every
+ipctk judge every state and the polyline of every
 step, also of steps that fail. What is wrong is one line of JSON, which names the scene and what
 failed in it; steps that do not converge, or that are refused (an infeasible motion, a turn too fast
 for the time step), are counted, and listed with `--list`. The exit status is 1 if anything was
-wrong. Of the scheme `projective`, whose surfaces may cross, ipctk judges nothing.
+wrong. Of the scheme `projective`, whose surfaces may cross, ipctk judge nothing.
 
 A gradient is compared with differences along a random direction. What buckles has several minima,
 and the least change of an input may let a step end in another: so gradients are taken at several
@@ -22,7 +22,6 @@ points may share a branch.
 from __future__ import annotations
 
 import collections
-import itertools
 import json
 import sys
 import time
@@ -75,30 +74,23 @@ class Tally:
         self.line(kind, where, text, show=self._show_failures)
 
 
-class Judges:
-    """Of the states of a scene, and of the ways between them."""
+class SchemeJudge:
+    """Of states and paths, where the scheme promises that nothing crosses."""
 
     def __init__(self, scene: RandomScene) -> None:
         sim = scene.simulator
-        # The baseline of the paper lets surfaces cross between vertices.
         self.silent = sim.scheme == "projective"
-        free, joined = free_links(sim.scene), joined_links(sim.scene)
-        self._states = self._ways = Judge(sim, free, joined)
-        if sim.coupling != "monolithic" and sim.scene.cloths:
-            # Beside the cloths, what is rigid goes straight to where its own solve took it by
-            # another way, on which nothing met.
-            rigid = sim.surfaces[len(sim.scene.cloths) :]
-            self._ways = Judge(sim, free, list(itertools.combinations(rigid, 2)))
+        self._judge = Judge(sim, free_links(sim.scene), joined_links(sim.scene))
 
     def is_free(self, state: dc.State) -> bool:
-        return self.silent or self._states.is_free(state)
+        return self.silent or self._judge.is_free(state)
 
     def is_free_path(self, path: np.ndarray) -> bool:
-        return self.silent or self._ways.is_free_path(path)
+        return self.silent or self._judge.is_free_path(path)
 
     def points(self, state: dc.State) -> np.ndarray:
         """Of all surfaces, as a path has them."""
-        return self._states.points(state)
+        return self._judge.points(state)
 
 
 def run_scene(seed: int, index: int, tally: Tally, drawing: str) -> None:
@@ -119,7 +111,7 @@ def _run_scene(seed: int, index: int, tally: Tally, drawing: str, where: dict[st
     where["drawn"] = scene.description
     rng = np.random.default_rng([seed, index, 1])
     check_gradient = rng.random() < GRADIENT_SHARE
-    judges = Judges(scene)
+    judge = SchemeJudge(scene)
     state = scene.start
     tally.counts["scenes"] += 1
     tally.counts[f"scenes: {_kind(scene)}"] += 1
@@ -127,12 +119,12 @@ def _run_scene(seed: int, index: int, tally: Tally, drawing: str, where: dict[st
         where["step"] = k
         control = scene.control(state, k)
         path = _path(scene, state, control)
-        if path is not None and not judges.is_free_path(path):
+        if path is not None and not judge.is_free_path(path):
             tally.line("path", where, "a segment of the path is not free")
         before, state = state, _step(scene, state, control, rng, tally, where)
         if state is None:
             return
-        _judge(scene, judges, before, state, path, tally, where)
+        _judge(scene, judge, before, state, path, tally, where)
         if check_gradient and k == 1:
             _check_gradient(scene, before, control, rng, tally, where)
 
@@ -211,7 +203,7 @@ def _reason(scene: RandomScene, report: Any) -> str:
 
 def _judge(
     scene: RandomScene,
-    judges: Judges,
+    judge: SchemeJudge,
     before: dc.State,
     after: dc.State,
     path: np.ndarray | None,
@@ -223,20 +215,21 @@ def _judge(
     if infinite:
         tally.line("not finite", where, f"state: {', '.join(infinite)}")
         return
-    if not judges.is_free(after):
+    if not judge.is_free(after):
         tally.line("intersection", where, "state")
     if path is None:
         tally.line("path", where, "refused, while the step is not")
-    elif not judges.silent:
+    elif not judge.silent:
         size = np.abs(path).max()
         for end, state in ((path[0], before), (path[-1], after)):
-            if np.abs(end - judges.points(state)).max() > 1e-9 * size:
+            if np.abs(end - judge.points(state)).max() > 1e-9 * size:
                 tally.line("path", where, "does not go from state to state")
     report = after.report
     solver = scene.simulator.solver
-    most = solver.max_iterations * (50 if solver.elastic == "projective" else 1)
+    local = report.counts.get("local_global", 0)  # which has 50 times as many
     sane = report.converged and 0 <= report.residual <= solver.tolerance
-    sane = sane and report.status == "converged" and 1 <= report.iterations <= most
+    sane = sane and report.status == "converged" and report.iterations + local >= 1
+    sane = sane and report.iterations <= solver.max_iterations >= local / 50
     if not (sane and report.motion_fraction == 1):
         tally.line("report", where, repr(report))
     _check_joints(scene, after, tally, where)
@@ -246,16 +239,18 @@ def _judge(
 
 
 def _check_joints(scene: RandomScene, after: dc.State, tally: Tally, where: dict[str, Any]) -> None:
-    """Prescribed joints are where they shall be, the others within their limits."""
+    """Prescribed joints are where they shall be, others not 1 % of their range beyond limits."""
     if scene.drives is None:
         return
-    (robot,) = scene.simulator.scene.robots
+    mechanism = scene.simulator.scene.robots[0].mechanism
     done = (where["step"] + 1) / scene.steps
     wanted = scene.drives.start + done * (scene.drives.ends - scene.drives.start)
-    for j, mode in enumerate(robot.mechanism.actuation):
+    zone = 0.01 * (mechanism.upper - mechanism.lower)
+    for j, mode in enumerate(mechanism.actuation):
         found = float(after.joint_positions[j])
-        low, high = 0.0, 0.0395  # of both fingers
-        right = low < found < high if mode in ("pd", "torque") else abs(found - wanted[j]) < 1e-12
+        right = abs(found - wanted[j]) < 1e-12
+        if mode in ("pd", "torque"):
+            right = mechanism.lower[j] - zone[j] < found < mechanism.upper[j] + zone[j]
         if not right:
             tally.line("report", where, f"joint {j} ({mode}) at {found}, wanted {wanted[j]}")
 
