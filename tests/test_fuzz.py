@@ -1,5 +1,6 @@
 """A few random scenes in the tests; `scripts/fuzz` runs more of them for as long as one likes."""
 
+import importlib.util
 import re
 import subprocess
 import sys
@@ -7,11 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from differences import slope_error
 
 pytest.importorskip("ipctk")
 
 ROOT = Path(__file__).resolve().parents[1]
+FUZZ = ROOT / "tests" / "fuzz"
+sys.path.insert(0, str(FUZZ))
+_spec = importlib.util.spec_from_file_location("fuzz_main", FUZZ / "__main__.py")
+fuzz_main = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(fuzz_main)
+draw_tower = fuzz_main.draw_tower
 
 
 def fuzz(*arguments):
@@ -29,6 +37,52 @@ def test_nothing_is_wrong_with_a_few_random_scenes():
     assert result.returncode == 0, result.stdout + result.stderr
     assert result.stdout.startswith("4 scenes, ")
     assert "intersection 0, path 0, report 0, momentum 0, not finite 0, error 0" in result.stdout
+
+
+def test_every_second_scene_is_a_tower():
+    """The others are what they were when cloths alone moved."""
+    drawings = fuzz_main.DRAWINGS
+    for index, name in enumerate(("towers", "cloths", "towers", "cloths")):
+        drawn = drawings["all"](6, index).description
+        assert drawn == drawings[name](6, index).description
+        assert ("coupling" in drawn) == (name == "towers")
+
+
+def test_towers_are_of_every_kind():
+    scenes = [draw_tower(1, index) for index in range(60)]
+    simulators = [scene.simulator for scene in scenes]
+    assert {sim.scheme for sim in simulators} == {"coupled", "split", "projective"}
+    assert {sim.coupling for sim in simulators} == {
+        "monolithic", "rigid_to_cloth", "cloth_to_rigid",
+    }  # fmt: skip
+    robots = [robot for sim in simulators for robot in sim.scene.robots]
+    assert {robot.mechanism.base for robot in robots} == {"fixed", "kinematic", "floating"}
+    modes = {mode for robot in robots for mode in robot.mechanism.actuation}
+    assert modes == {"pd", "position", "velocity", "torque"}
+    assert any(not sim.scene.cloths for sim in simulators)
+    again = draw_tower(1, 7)
+    assert torch.equal(again.start.body_poses, scenes[7].start.body_poses)
+    assert again.description == scenes[7].description
+
+
+def test_the_fuzz_sees_what_is_wrong():
+    """Its judges are of use only where they say what is wrong."""
+    scene = next(s for s in (draw_tower(1, i) for i in range(60)) if s.drives is not None)
+    tally = fuzz_main.Tally(show_failures=False)
+    before, where = scene.start, {"step": 0}
+    after = scene.simulator.step(before, scene.control(before, 0))
+    judge = fuzz_main.SchemeJudge(scene)
+    path = scene.simulator.path(before, scene.control(before, 0)).numpy()
+    fuzz_main._judge(scene, judge, before, after, path, tally, where)
+    assert not tally.counts
+    faster = after.replace(body_velocities=1.1 * after.body_velocities + 0.1)
+    elsewhere = after.replace(joint_positions=after.joint_positions + 1.0)
+    fuzz_main._check_bodies(scene, before, faster, tally, where)
+    fuzz_main._check_joints(scene, elsewhere, tally, where)
+    assert tally.counts["momentum"] >= 1
+    assert tally.counts["report"] == 2
+    assert judge.is_free_path(path)
+    assert not judge.is_free_path(np.stack([path[0], -path[0]]))  # all through one point
 
 
 def test_a_scene_is_a_function_of_its_seed_and_index():

@@ -4,10 +4,13 @@
     python tests/fuzz --scenes 100 --seed 3   # always the same hundred
     python tests/fuzz --seed 3 --only 17      # one of them again
 
-A scene is a function of the seed and its index. ipctk judges every state and the polyline of every
+A scene is a function of the seed and its index, and of `--draw`: scenes of odd indices throw cloths
+at bodies whose motion is given, those of even ones draw bodies, robots, couplings and schemes.
+ipctk judge every state and the polyline of every
 step, also of steps that fail. What is wrong is one line of JSON, which names the scene and what
-failed in it; steps that do not converge, or whose motion is refused, are counted, and listed with
-`--list`. The exit status is 1 if anything was wrong.
+failed in it; steps that do not converge, or that are refused (an infeasible motion, a turn too fast
+for the time step), are counted, and listed with `--list`. The exit status is 1 if anything was
+wrong. Of the scheme `projective`, whose surfaces may cross, ipctk judge nothing.
 
 A gradient is compared with differences along a random direction. What buckles has several minima,
 and the least change of an input may let a step end in another: so gradients are taken at several
@@ -22,6 +25,8 @@ import collections
 import json
 import sys
 import time
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +38,22 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "physics"))
 
 from differences import slope_error
-from physics_scenes import Judge
-from random_scenes import RandomScene, draw
+from physics_scenes import Judge, free_links, joined_links
+from random_scenes import RandomScene, draw_cloth_scene
+from random_towers import draw_tower
 
 import diffcloth_torch as dc
 
+DRAWINGS = {
+    "all": lambda seed, index: (draw_cloth_scene if index % 2 else draw_tower)(seed, index),
+    "cloths": draw_cloth_scene,
+    "towers": draw_tower,
+}
 WRONG = ("intersection", "path", "report", "momentum", "not finite", "error", "start")
 GRADIENT_SHARE = 0.1  # of the scenes
+MOVING = ("body_velocities", "joint_velocities", "base_velocities")  # fields of a state
+OUTPUTS = ("positions", "body_poses", "joint_positions", "base_poses")
+ROUNDING = 1e-10  # of momentum, a thousandth of which is seen
 SUSPECT = 1e-3  # relative error of a gradient; right ones are below 2e-4
 
 
@@ -60,30 +74,75 @@ class Tally:
         self.line(kind, where, text, show=self._show_failures)
 
 
-def run_scene(seed: int, index: int, tally: Tally) -> None:
+class SchemeJudge:
+    """Of states and paths, where the scheme promises that nothing crosses."""
+
+    def __init__(self, scene: RandomScene) -> None:
+        sim = scene.simulator
+        self.silent = sim.scheme == "projective"
+        self._judge = Judge(sim, free_links(sim.scene), joined_links(sim.scene))
+
+    def is_free(self, state: dc.State) -> bool:
+        return self.silent or self._judge.is_free(state)
+
+    def is_free_path(self, path: np.ndarray) -> bool:
+        return self.silent or self._judge.is_free_path(path)
+
+    def points(self, state: dc.State) -> np.ndarray:
+        """Of all surfaces, as a path has them."""
+        return self._judge.points(state)
+
+
+def run_scene(seed: int, index: int, tally: Tally, drawing: str) -> None:
     where: dict[str, Any] = {"seed": seed, "scene": index}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        _run_scene(seed, index, tally, drawing, where)
+    for kind in {warning.category.__name__ for warning in caught}:
+        tally.counts[f"warned: {kind}"] += 1
+
+
+def _run_scene(seed: int, index: int, tally: Tally, drawing: str, where: dict[str, Any]) -> None:
     try:
-        scene = draw(seed, index)
+        scene = DRAWINGS[drawing](seed, index)
     except dc.SimulationError as error:
         tally.line("start", where, str(error))
         return
     where["drawn"] = scene.description
     rng = np.random.default_rng([seed, index, 1])
     check_gradient = rng.random() < GRADIENT_SHARE
-    judge = Judge(scene.simulator)
+    judge = SchemeJudge(scene)
     state = scene.start
     tally.counts["scenes"] += 1
+    tally.counts[f"scenes: {_kind(scene)}"] += 1
     for k in range(scene.steps):
         where["step"] = k
-        control = scene.control(state)
-        if not judge.is_free_path(scene.simulator.path(state, control).numpy()):
+        control = scene.control(state, k)
+        path = _path(scene, state, control)
+        if path is not None and not judge.is_free_path(path):
             tally.line("path", where, "a segment of the path is not free")
         before, state = state, _step(scene, state, control, rng, tally, where)
         if state is None:
             return
-        _judge(scene, judge, before, state, tally, where)
+        _judge(scene, judge, before, state, path, tally, where)
         if check_gradient and k == 1:
             _check_gradient(scene, before, control, rng, tally, where)
+
+
+def _kind(scene: RandomScene) -> str:
+    """Scheme and coupling, where something that is no cloth moves by forces."""
+    sim = scene.simulator
+    if sim._layout.is_dynamic:
+        return f"{sim.scheme} {sim.coupling}" if sim.scene.cloths else "no cloths"
+    return f"{sim.scheme} cloths"
+
+
+def _path(scene: RandomScene, state: dc.State, control: dc.Control) -> np.ndarray | None:
+    """The way of a step; None where it is refused, which the step itself is then asked for."""
+    try:
+        return scene.simulator.path(state, control).numpy()
+    except dc.SimulationError:
+        return None
 
 
 def _step(
@@ -96,9 +155,11 @@ def _step(
 ) -> dc.State | None:
     """The state after a step, with a backward through some; None where it failed."""
     tally.counts["steps"] += 1
-    start = state.positions.clone().requires_grad_(rng.random() < 0.3)
+    names = ("positions", *(n for n in MOVING if getattr(state, n).numel()))
+    wanted = rng.random() < 0.3
+    starts = {name: getattr(state, name).clone().requires_grad_(wanted) for name in names}
     try:
-        after = scene.simulator.step(state.replace(positions=start), control)
+        after = scene.simulator.step(state.replace(**starts), control)
     except dc.InfeasibleMotion as error:
         tally.failed_step("InfeasibleMotion", where, str(error))
         return None
@@ -107,22 +168,28 @@ def _step(
         if reason.startswith("residual"):
             tally.line("report", where, str(error))
         tally.counts["NotConverged"] += 1
+        tally.counts[f"NotConverged in: {_kind(scene)}"] += 1
         tally.failed_step(f"NotConverged: {reason}", where, str(error))
         return None
     except Exception as error:
+        if type(error) is dc.SimulationError and "too fast for a time step" in str(error):
+            tally.failed_step("TooFast", where, str(error))
+            return None
         tally.line("error", where, f"{type(error).__name__}: {error}")
         return None
     tally.counts["converged"] += 1
     tally.counts["iterations"] += after.report.iterations
-    if start.requires_grad:
+    if wanted:
         tally.counts["backward"] += 1
+        loss = sum((getattr(after, name) ** 2).sum() for name in OUTPUTS)
         try:
-            (gradient,) = torch.autograd.grad((after.positions**2).sum(), start)
+            gradients = torch.autograd.grad(loss, list(starts.values()), allow_unused=True)
         except Exception as error:
             tally.line("error", where, f"backward: {type(error).__name__}: {error}")
         else:
-            if not gradient.isfinite().all():
-                tally.line("not finite", where, "gradient")
+            for name, gradient in zip(names, gradients, strict=True):
+                if gradient is not None and not gradient.isfinite().all():
+                    tally.line("not finite", where, f"gradient of {name}")
     return after.detach()
 
 
@@ -136,25 +203,56 @@ def _reason(scene: RandomScene, report: Any) -> str:
 
 def _judge(
     scene: RandomScene,
-    judge: Judge,
+    judge: SchemeJudge,
     before: dc.State,
     after: dc.State,
+    path: np.ndarray | None,
     tally: Tally,
     where: dict[str, Any],
 ) -> None:
-    if not (after.positions.isfinite().all() and after.velocities.isfinite().all()):
-        tally.line("not finite", where, "state")
+    fields = ("positions", "velocities", "body_poses", "body_forces", "joint_positions", *MOVING)
+    infinite = [name for name in fields if not getattr(after, name).isfinite().all()]
+    if infinite:
+        tally.line("not finite", where, f"state: {', '.join(infinite)}")
         return
     if not judge.is_free(after):
         tally.line("intersection", where, "state")
+    if path is None:
+        tally.line("path", where, "refused, while the step is not")
+    elif not judge.silent:
+        size = np.abs(path).max()
+        for end, state in ((path[0], before), (path[-1], after)):
+            if np.abs(end - judge.points(state)).max() > 1e-9 * size:
+                tally.line("path", where, "does not go from state to state")
     report = after.report
     solver = scene.simulator.solver
+    local = report.counts.get("local_global", 0)  # which has 50 times as many
     sane = report.converged and 0 <= report.residual <= solver.tolerance
-    sane = sane and 1 <= report.iterations <= solver.max_iterations
+    sane = sane and report.status == "converged" and report.iterations + local >= 1
+    sane = sane and report.iterations <= solver.max_iterations >= local / 50
     if not (sane and report.motion_fraction == 1):
         tally.line("report", where, repr(report))
-    if len(scene.simulator._assembly.pins) == 0:
+    _check_joints(scene, after, tally, where)
+    if len(scene.simulator._assembly.pins) == 0 and solver.metric != "identity":
         _check_momentum(scene, before, after, tally, where)
+    _check_bodies(scene, before, after, tally, where)
+
+
+def _check_joints(scene: RandomScene, after: dc.State, tally: Tally, where: dict[str, Any]) -> None:
+    """Prescribed joints are where they shall be, others not 1 % of their range beyond limits."""
+    if scene.drives is None:
+        return
+    mechanism = scene.simulator.scene.robots[0].mechanism
+    done = (where["step"] + 1) / scene.steps
+    wanted = scene.drives.start + done * (scene.drives.ends - scene.drives.start)
+    zone = 0.01 * (mechanism.upper - mechanism.lower)
+    for j, mode in enumerate(mechanism.actuation):
+        found = float(after.joint_positions[j])
+        right = abs(found - wanted[j]) < 1e-12
+        if mode in ("pd", "torque"):
+            right = mechanism.lower[j] - zone[j] < found < mechanism.upper[j] + zone[j]
+        if not right:
+            tally.line("report", where, f"joint {j} ({mode}) at {found}, wanted {wanted[j]}")
 
 
 def _check_momentum(
@@ -165,19 +263,51 @@ def _check_momentum(
     where: dict[str, Any],
 ) -> None:
     """Internal forces cancel: momentum changes by gravity and what the bodies push back."""
+    if not len(scene.masses):
+        return
     m = scene.masses[:, None]
-    change = (m * (after.velocities - before.velocities).numpy()).sum(axis=0) / scene.simulator.dt
-    weight = np.array([0.0, 0.0, -scene.description["gravity"]]) * m.sum()
-    push = -after.body_forces.numpy().sum(axis=0)
-    size = (
-        np.abs(m * (after.velocities - before.velocities).numpy()).sum() / scene.simulator.dt
-        + after.body_forces.abs().sum().item()
-        + np.abs(weight).sum()
-    )
+    had, has = (m * state.velocities.numpy() / scene.simulator.dt for state in (before, after))
+    weight = m * np.array([0.0, 0.0, -scene.description["gravity"]])
+    _compare(had, has, [weight, -after.body_forces.numpy()], "cloths", tally, where)
+
+
+def _check_bodies(
+    scene: RandomScene,
+    before: dc.State,
+    after: dc.State,
+    tally: Tally,
+    where: dict[str, Any],
+) -> None:
+    """The momentum of each body that forces move changes by gravity and the forces on it."""
+    sim = scene.simulator
+    gravity = np.array([[0.0, 0.0, -scene.description["gravity"]]])
+    for row, (name, body) in enumerate(zip(sim.scene.body_names, sim.scene.bodies, strict=True)):
+        if body.motion == "dynamic":
+            states = (before, after)
+            had, has = (
+                body.mass * state.body_velocities[[row], :3].numpy() / sim.dt for state in states
+            )
+            forces = after.body_forces.numpy()[sim.slices[name]]
+            _compare(had, has, [body.mass * gravity, forces], name, tally, where)
+
+
+def _compare(
+    had: np.ndarray,
+    has: np.ndarray,
+    forces: list[np.ndarray],
+    what: str,
+    tally: Tally,
+    where: dict[str, Any],
+) -> None:
+    """Momentum before and after, over the time step, against forces; relative to all of them."""
+    gain = has - had
+    size = sum(np.abs(part).sum() for part in (gain, *forces))
+    size += ROUNDING * (np.abs(had) + np.abs(has)).sum()  # for what flies on as it did
+    rest = gain.sum(axis=0) - sum(part.sum(axis=0) for part in forces)
     # Solves end within the tolerance of 1e-6 m/s; a contact's stiffness may exceed M/h^2 greatly.
-    error = np.abs(change - weight - push).max() / max(size, 1e-300)
+    error = np.abs(rest).max() / max(size, 1e-300)
     if error > 1e-3:
-        tally.line("momentum", where, f"relative error {error:.3g}")
+        tally.line("momentum", where, f"{what}: relative error {error:.3g}")
 
 
 def _check_gradient(
@@ -188,15 +318,17 @@ def _check_gradient(
     tally: Tally,
     where: dict[str, Any],
 ) -> None:
-    """Adjoints against differences along a direction in positions, velocities and materials."""
+    """Adjoints against differences along a direction in places, velocities and materials."""
     sim = scene.simulator
     # A share of the speed of a fall: what a solve leaves must vanish beside small differences.
+    tolerance = 1e-10 * np.sqrt(scene.description["size"])
     tight = dc.Simulator(
         sim.scene,
         sim.dt,
         scheme=sim.scheme,
+        coupling=sim.coupling,
         contact=sim.contact,
-        solver=dc.SolverOptions(tolerance=1e-10 * np.sqrt(scene.description["size"])),
+        solver=replace(sim.solver, tolerance=tolerance),
     )
     edge = scene.description["size"] / 10
     shape = state.positions.shape
@@ -204,25 +336,34 @@ def _check_gradient(
     free = torch.ones(shape[0], 1, dtype=torch.float64)
     free[torch.from_numpy(sim._assembly.pins.astype(np.int64))] = 0.0
     # Changes of comparable size: an edge, an edge a step, a factor e of the stiffness.
-    directions = [
-        free * edge * torch.from_numpy(rng.normal(size=shape)),
-        edge / sim.dt * torch.from_numpy(rng.normal(size=shape)),
-        torch.from_numpy(rng.normal(size=())),
-    ]
-    stretch = tight.parameters().stretch
+    changes = {
+        "positions": free * edge * torch.from_numpy(rng.normal(size=shape)),
+        "velocities": edge / sim.dt * torch.from_numpy(rng.normal(size=shape)),
+    }
+    factor = torch.from_numpy(rng.normal(size=()))
+    given = tight.parameters()
+    stretch, mass = given.stretch, given.body_mass
+    bodies = torch.zeros_like(state.body_poses)
+    moves = [body.motion == "dynamic" for body in sim.scene.bodies]
+    if any(moves):
+        # And a tenth of a radian, a step; a factor e of the masses.
+        turn = torch.tensor([edge] * 3 + [0.1] * 3, dtype=torch.float64) / sim.dt
+        noise = torch.from_numpy(rng.normal(size=(len(moves), 6)))
+        changes["body_velocities"] = turn * noise * torch.tensor(moves)[:, None]
+        bodies = torch.from_numpy(rng.normal(size=bodies.shape))
+        bodies[:, 3:] *= edge
 
     def point(at: float) -> tuple[float, float, float]:
         """Where, the loss there and its derivative."""
         t = torch.tensor(at, dtype=torch.float64, requires_grad=True)
-        after = tight.step(
-            state.replace(
-                positions=state.positions + t * directions[0],
-                velocities=state.velocities + t * directions[1],
-            ),
-            control,
-            tight.parameters().replace(stretch=stretch * (t * directions[2]).exp()),
-        )
-        loss = (weights * after.positions).sum() / edge
+        moved = {name: getattr(state, name) + t * change for name, change in changes.items()}
+        physical = {}
+        if len(shape) and shape[0]:
+            physical["stretch"] = stretch * (t * factor).exp()
+        if any(moves):
+            physical["body_mass"] = mass * (t * factor).exp()
+        after = tight.step(state.replace(**moved), control, given.replace(**physical))
+        loss = ((weights * after.positions).sum() + (bodies * after.body_poses).sum()) / edge
         (slope,) = torch.autograd.grad(loss, t)
         return t.item(), loss.item(), slope.item()
 
@@ -244,9 +385,15 @@ def _check_gradient(
 @click.option("--scenes", "count", type=click.IntRange(min=1), help="How many at most.")
 @click.option("--seed", default=0, type=click.IntRange(min=0))
 @click.option("--only", type=click.IntRange(min=0), help="Index of the only scene.")
+@click.option("--draw", "drawing", type=click.Choice(list(DRAWINGS)), default="all")
 @click.option("--list", "show_failures", is_flag=True, help="A line for each step that failed.")
 def main(
-    minutes: float | None, count: int | None, seed: int, only: int | None, show_failures: bool
+    minutes: float | None,
+    count: int | None,
+    seed: int,
+    only: int | None,
+    drawing: str,
+    show_failures: bool,
 ) -> None:
     if minutes is None and count is None and only is None:
         raise click.UsageError("give --minutes, --scenes or --only")
@@ -255,7 +402,7 @@ def main(
     begin = time.monotonic()
     index = only or 0
     while True:
-        run_scene(seed, index, tally)
+        run_scene(seed, index, tally, drawing)
         index += 1
         late = minutes is not None and time.monotonic() - begin > 60 * minutes
         if only is not None or late or (count is not None and index >= count):
@@ -275,7 +422,13 @@ def _summarize(tally: Tally, seconds: float) -> None:
     )
     for kind in sorted(kind for kind in c if kind.startswith("NotConverged: ")):
         print(f"  {kind.removeprefix('NotConverged: ')} {c[kind]}")
-    print(f"InfeasibleMotion {c['InfeasibleMotion']}")
+    for kind in sorted(kind for kind in c if kind.startswith("scenes: ")):
+        name = kind.removeprefix("scenes: ")
+        print(f"  {name}: {c[f'NotConverged in: {name}']} of {c[kind]} scenes")
+    print(f"InfeasibleMotion {c['InfeasibleMotion']}, turns too fast {c['TooFast']}", end="")
+    for kind in sorted(kind for kind in c if kind.startswith("warned: ")):
+        print(f", {kind.removeprefix('warned: ')} {c[kind]}", end="")
+    print()
     print(", ".join(f"{kind} {c[kind]}" for kind in WRONG))
     print(f"backward {c['backward']}, suspect gradients {c['suspect gradient']}", end="")
     if tally.gradient_errors:

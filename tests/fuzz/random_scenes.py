@@ -1,11 +1,14 @@
 """Random scenes: sizes, materials, bodies, pins and motions over the range that the package is for.
 
+All that moves by forces here is cloth; see `random_towers` for the rest.
+
 A scene is a function of two integers. What is drawn is plain numbers in a description, from which
 the simulator, the start and the controls are made.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +21,32 @@ F64 = torch.float64
 G = 9.81
 LAYOUTS = ("drop", "hang", "fold", "stack")
 BODIES = ("box", "sphere", "capsule", "plane")
+PINS = ("none", "corner", "corners", "edge")
+SHAPES: dict[str, Callable[..., dc.RigidBody]] = {
+    "box": dc.RigidBody.box,
+    "sphere": lambda s, **k: dc.RigidBody.sphere(0.5 * s, subdivisions=2, **k),
+    "capsule": lambda s, **k: dc.RigidBody.capsule(0.3 * s, s, **k),
+    "plane": dc.RigidBody.plane,
+}
+
+
+@dataclass(frozen=True)
+class Drives:
+    """What the joints and the base of the only robot shall do.
+
+    Attributes:
+        start: Joint positions at the start [m], shape [J].
+        ends: Where they shall be at the end, shape [J].
+        efforts: At torque and pd joints [N], shape [J].
+        base_velocity: Of a kinematic base, linear [m/s] and angular [rad/s], shape [6].
+        base_wrench: At a floating one [N, N m], shape [6].
+    """
+
+    start: np.ndarray
+    ends: np.ndarray
+    efforts: np.ndarray
+    base_velocity: np.ndarray
+    base_wrench: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -32,6 +61,7 @@ class RandomScene:
         body_velocities: Linear [m/s] and angular [rad/s] velocity of each body, shape [K, 6].
         pin_velocity: Of the pins [m/s], shape [3].
         masses: Of the cloth vertices [kg].
+        drives: Of the robot, if there is one.
     """
 
     description: dict[str, Any]
@@ -41,18 +71,44 @@ class RandomScene:
     body_velocities: np.ndarray
     pin_velocity: np.ndarray
     masses: np.ndarray
+    drives: Drives | None = None
 
-    def control(self, state: dc.State) -> dc.Control:
+    def control(self, state: dc.State, k: int) -> dc.Control:
+        """Of step k."""
         dt = self.simulator.dt
         poses = state.body_poses.detach().clone()
-        for k, velocity in enumerate(self.body_velocities):
-            if not velocity.any():
-                continue
-            poses[k, :3] += dt * torch.from_numpy(velocity[:3])
-            poses[k, 3:] = torch.from_numpy(turned(poses[k, 3:].numpy(), dt * velocity[3:]))
+        for pose, velocity in zip(poses, self.body_velocities, strict=True):
+            pose[:] = _moved(pose, dt * velocity)
         pins = self.simulator._assembly.pins
         held = state.positions.detach()[torch.from_numpy(pins.astype(np.int64))]
-        return dc.Control(body_poses=poses, pins=held + dt * torch.from_numpy(self.pin_velocity))
+        control = dc.Control(body_poses=poses, pins=held + dt * torch.from_numpy(self.pin_velocity))
+        return control if self.drives is None else self._driven(control, self.drives, state, k)
+
+    def _driven(self, control: dc.Control, drives: Drives, state: dc.State, k: int) -> dc.Control:
+        dt = self.simulator.dt
+        way = drives.ends - drives.start
+        base = self.simulator.scene.robots[0].mechanism.base
+        bases = state.base_poses.detach().clone()
+        bases[0] = _moved(bases[0], dt * drives.base_velocity)
+        return control.replace(
+            joint_positions=torch.from_numpy(drives.start + (k + 1) / self.steps * way),
+            joint_velocities=torch.from_numpy(way / (self.steps * dt)),
+            joint_efforts=torch.from_numpy(drives.efforts),
+            base_poses=bases if base == "kinematic" else None,
+            base_wrenches=torch.from_numpy(drives.base_wrench[None])
+            if base == "floating"
+            else None,
+        )
+
+
+def _moved(pose: torch.Tensor, way: np.ndarray) -> torch.Tensor:
+    """A pose [7] after a shift and a turn in the world [6]; the same bits where there is none."""
+    if not way.any():
+        return pose
+    moved = pose.clone()
+    moved[:3] += torch.from_numpy(way[:3])
+    moved[3:] = torch.from_numpy(turned(pose[3:].numpy(), way[3:]))
+    return moved
 
 
 def turned(q: np.ndarray, rotation: np.ndarray) -> np.ndarray:
@@ -74,7 +130,7 @@ def maybe(rng: np.random.Generator, probability: float, value: float) -> float:
     return value if rng.random() < probability else 0.0
 
 
-def draw(seed: int, index: int) -> RandomScene:
+def draw_cloth_scene(seed: int, index: int) -> RandomScene:
     rng = np.random.default_rng([seed, index])
     d: dict[str, Any] = {
         "size": log_uniform(rng, 5e-3, 10.0),
@@ -88,8 +144,8 @@ def draw(seed: int, index: int) -> RandomScene:
         "gravity": maybe(rng, 0.9, G),
         "steps": int(rng.integers(3, 7)),
     }
-    cloths, clearance = _cloths(rng, d)
-    bodies, velocities = _bodies(rng, d, clearance)
+    cloths, clearance = draw_cloths(rng, d)
+    bodies, velocities = draw_bodies(rng, d, clearance)
     simulator = dc.Simulator(
         dc.Scene(cloths, bodies, gravity=(0.0, 0.0, -d["gravity"])),
         d["dt"],
@@ -97,23 +153,31 @@ def draw(seed: int, index: int) -> RandomScene:
         contact=dc.ContactOptions(friction_iterations=d["friction_iterations"]),
     )
     start = simulator.initial_state()
-    speed = np.sqrt(G * d["size"])  # of a fall through the cloth's own size
+    start, speed = draw_throw(rng, d, start)
+    pinned = bool(len(simulator._assembly.pins))
+    return RandomScene(
+        description=d,
+        simulator=simulator,
+        start=start,
+        steps=d["steps"],
+        body_velocities=velocities,
+        pin_velocity=speed * rng.normal(size=3) * maybe(rng, 0.5, 0.5) * pinned,
+        masses=sheet_masses(cloths),
+    )
+
+
+def draw_throw(
+    rng: np.random.Generator, d: dict[str, Any], start: dc.State
+) -> tuple[dc.State, float]:
+    """The start with random velocities of the cloths, and the speed that they are made of."""
+    speed = float(np.sqrt(G * d["size"]))  # of a fall through the cloth's own size
     d["speed"] = speed * rng.uniform(0, 2)
     d["noise"] = speed * log_uniform(rng, 1e-3, 1.0)
     drift = rng.normal(size=3)
     v = d["speed"] * drift / np.linalg.norm(drift) + d["noise"] * rng.normal(
         size=start.positions.shape
     )
-    pinned = bool(len(simulator._assembly.pins))
-    return RandomScene(
-        description=d,
-        simulator=simulator,
-        start=start.replace(velocities=torch.from_numpy(v)),
-        steps=d["steps"],
-        body_velocities=velocities,
-        pin_velocity=speed * rng.normal(size=3) * maybe(rng, 0.5, 0.5) * pinned,
-        masses=_masses(cloths),
-    )
+    return start.replace(velocities=torch.from_numpy(v)), speed
 
 
 def _material(rng: np.random.Generator, edge: float) -> dc.Material:
@@ -128,7 +192,9 @@ def _material(rng: np.random.Generator, edge: float) -> dc.Material:
     )
 
 
-def _cloths(rng: np.random.Generator, d: dict[str, Any]) -> tuple[list[dc.Cloth], float]:
+def draw_cloths(
+    rng: np.random.Generator, d: dict[str, Any], pins: tuple[str, ...] = PINS
+) -> tuple[list[dc.Cloth], float]:
     """The cloths, all above z = 0 by the clearance that is returned."""
     rows, columns, size = d["rows"], d["columns"], d["size"]
     edge = size / (max(rows, columns) - 1)
@@ -147,7 +213,7 @@ def _cloths(rng: np.random.Generator, d: dict[str, Any]) -> tuple[list[dc.Cloth]
         if d["layout"] == "hang":
             placed = placed[:, [0, 2, 1]]
     placed[:, 2] += clearance - placed[:, 2].min()
-    d["pins"] = _pins(rng, d["layout"], placed, rows, columns)
+    d["pins"] = _pins(rng, d["layout"], pins, rows, columns)
     if d["pins"]:
         keywords["pins"] = {"held": d["pins"]}
     cloths = [dc.Cloth(placed, grid.faces, rest_vertices=flat, **keywords)]
@@ -162,9 +228,9 @@ def _cloths(rng: np.random.Generator, d: dict[str, Any]) -> tuple[list[dc.Cloth]
 
 
 def _pins(
-    rng: np.random.Generator, layout: str, placed: np.ndarray, rows: int, columns: int
+    rng: np.random.Generator, layout: str, kinds: tuple[str, ...], rows: int, columns: int
 ) -> list[int]:
-    kind = rng.choice(["none", "corner", "corners", "edge"])
+    kind = rng.choice(kinds)
     if layout == "hang":
         kind = rng.choice(["corners", "edge"])
     last = rows * columns - columns
@@ -173,6 +239,11 @@ def _pins(
         "corner": [last],
         "corners": [last, rows * columns - 1],
         "edge": list(range(last, rows * columns)),
+        "rim": [
+            i
+            for i in range(rows * columns)
+            if i // columns in (0, rows - 1) or i % columns in (0, columns - 1)
+        ],
     }[str(kind)]
 
 
@@ -193,7 +264,7 @@ def _tilted(flat: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
     return flat @ (np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k).T
 
 
-def _bodies(
+def draw_bodies(
     rng: np.random.Generator, d: dict[str, Any], clearance: float
 ) -> tuple[list[dc.RigidBody], np.ndarray]:
     """One or two bodies below z = 0, standing still or moving."""
@@ -211,15 +282,11 @@ def _bodies(
             "thickness": maybe(rng, 0.2, 0.3 * clearance),
         }
         q = rng.normal(size=4) if kind != "plane" else np.array([1.0, 0.0, 0.0, 0.0])
-        top, make = {
-            "box": (0.87 * s, lambda **k: dc.RigidBody.box(s, **k)),  # noqa: B023 - called below
-            "sphere": (0.5 * s, lambda **k: dc.RigidBody.sphere(0.5 * s, subdivisions=2, **k)),  # noqa: B023
-            "capsule": (0.8 * s, lambda **k: dc.RigidBody.capsule(0.3 * s, s, **k)),  # noqa: B023
-            "plane": (0.0, lambda **k: dc.RigidBody.plane(3 * size, **k)),
-        }[kind]
+        top = {"box": 0.87 * s, "sphere": 0.5 * s, "capsule": 0.8 * s, "plane": 0.0}[kind]
+        extent = 3 * size if kind == "plane" else s
         shift = 0.2 * size * rng.uniform(-1, 1, 2)
         pose = [*shift, -depth - top, *q]
-        bodies.append(make(pose=pose, **surface))
+        bodies.append(SHAPES[kind](extent, pose=pose, **surface))
         speed = np.sqrt(G * size)
         linear = speed * rng.uniform(0, 1) * rng.normal(size=3)
         angular = rng.uniform(0, 1) * rng.normal(size=3) * speed / size
@@ -229,8 +296,8 @@ def _bodies(
     return bodies, np.array(velocities)
 
 
-def _masses(cloths: list[dc.Cloth]) -> np.ndarray:
-    parts = []
+def sheet_masses(cloths: list[dc.Cloth]) -> np.ndarray:
+    parts = [np.zeros(0)]
     for cloth in cloths:
         a, b, c = (cloth.rest_vertices[cloth.faces[:, k]] for k in range(3))
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
