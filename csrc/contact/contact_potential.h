@@ -103,14 +103,12 @@ class FrictionPotential final : public Potential {
  public:
   /// @param contacts  of the lag configuration
   /// @param x_start   positions at the start of the step
-  /// @param widening  factor of the slip: see FrictionSet
   /// @param bar       where accumulate() adds; null where it is never called
   FrictionPotential(const ContactModel& model,
                     const std::vector<Contact>& contacts,
                     const double* x_start,
-                    double widening,
                     ContactModel::Bar* bar)
-      : set_(model, contacts, x_start, widening), bar_(bar) {}
+      : set_(model, contacts, x_start), bar_(bar) {}
 
   double energy(const double* /*x*/) const override { return 0.0; }
   double energy_change(const double* x, const double* to) const override {

@@ -70,12 +70,8 @@ Mat3 cross_matrix(const Vec3& u) {
 
 FrictionSet::FrictionSet(const ContactModel& model,
                          const std::vector<Contact>& contacts,
-                         const double* x_start,
-                         double widening)
-    : model_(&model),
-      x_start_(x_start),
-      widening_(widening),
-      e_(widening * model.parameters().slip) {
+                         const double* x_start)
+    : model_(&model), x_start_(x_start) {
   entries_.reserve(contacts.size());
   for (const Contact& k : contacts) {
     const double d = std::sqrt(k.closest.d_sq);
@@ -133,7 +129,7 @@ FrictionSet::Slip FrictionSet::slip(const Entry& k, const double* x) const {
          k.a[2] * (change_1.cross(frame.e2) + e1_start.cross(change_2));
   }
   const Vec3 w = tangential(s, k.n);
-  return {.frame = frame, .s = s, .w = w, .law = friction_law(w.norm(), e_)};
+  return {.frame = frame, .s = s, .w = w, .law = friction_law(w.norm(), model_->parameters().slip)};
 }
 
 double FrictionSet::energy_change(const double* x0, const double* x1) const {
@@ -197,13 +193,13 @@ void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
     });
     return;
   }
-  std::array<Mat3, 3> core_B;
-  for (int e = 0; e < 3; ++e) core_B[e] = core_.lazyProduct(B_[e]);
+  std::array<Mat3, 3> core_b;
+  for (int e = 0; e < 3; ++e) core_b[e] = core_.lazyProduct(B_[e]);
   A.add_rows(k.all_points(), [&](int p, int q) -> Mat3 {
     if (p < first && q < first) return (k.c[p] * k.c[q]) * core_;
-    if (p < first) return k.c[p] * core_B[q - first];
-    if (q < first) return k.c[q] * core_B[p - first].transpose();
-    return B_[p - first].transpose().lazyProduct(core_B[q - first]) + turning(p - first, q - first);
+    if (p < first) return k.c[p] * core_b[q - first];
+    if (q < first) return k.c[q] * core_b[p - first].transpose();
+    return B_[p - first].transpose().lazyProduct(core_b[q - first]) + turning(p - first, q - first);
   });
 }
 
@@ -264,7 +260,7 @@ void FrictionSet::add_mixed(const double* x,
 
     const double mu_bar = k.lambda * law.f1_over_y * w_zeta;
     const double lambda_bar = k.mu * law.f1_over_y * w_zeta;
-    bar.slip += scale * widening_ * k.mu * k.lambda * law.f1_over_y_e * w_zeta;
+    bar.slip += scale * k.mu * k.lambda * law.f1_over_y_e * w_zeta;
     model_->pull_back_mu(lag.pair, scale * mu_bar, bar);
 
     // lambda's parameters.

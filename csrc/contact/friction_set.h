@@ -27,11 +27,9 @@ class FrictionSet {
 
   /// @param contacts  the contacts of the lag configuration
   /// @param x_start   positions at the start of the step; they outlive this object
-  /// @param widening  factor of the model's slip: 1, or more where sticking may be approximate
   FrictionSet(const ContactModel& model,
               const std::vector<Contact>& contacts,
-              const double* x_start,
-              double widening = 1.0);
+              const double* x_start);
 
   const ContactModel& model() const { return *model_; }
   bool empty() const { return entries_.empty(); }
@@ -99,8 +97,6 @@ class FrictionSet {
 
   const ContactModel* model_ = nullptr;
   const double* x_start_ = nullptr;
-  double widening_ = 1.0;
-  double e_ = 0.0;  // widening times the slip [m]
   std::vector<Entry> entries_;
 };
 

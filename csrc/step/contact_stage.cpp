@@ -95,12 +95,12 @@ class Sum {
   }
 
   /// Take friction from the contacts of a configuration.
-  void lag(const std::vector<Contact>& contacts, double widening) {
+  void lag(const std::vector<Contact>& contacts) {
     objective.others = stage_.others;
     friction.reset();
     // Where nothing can touch there are no contacts either.
     if (!problem_.contact || contacts.empty()) return;
-    friction.emplace(*problem_.contact, contacts, problem_.moved_from().data(), widening, bar_);
+    friction.emplace(*problem_.contact, contacts, problem_.moved_from().data(), bar_);
     objective.others.push_back(&*friction);
   }
 
@@ -152,12 +152,6 @@ void write_body_forces(const Problem& problem, const Sum& sum, const Array& x, d
   const std::size_t end = 3 * static_cast<std::size_t>(problem.scene.vertex_count());
   for (std::size_t a = problem.cloth_size; a < end; ++a) out[a - problem.cloth_size] -= g[a];
 }
-
-/// How much farther sticking may creep in all solves but the last: where friction lags then is found in
-/// fewer iterations, and ends as near.
-constexpr double kWidening = 100.0;
-
-double widening(int solve, int solves) { return solve + 1 < solves ? kWidening : 1.0; }
 
 std::string_view words(solver::Status status) {
   switch (status) {
@@ -214,7 +208,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
   };
   const std::vector<Contact>& at_start = sum.contacts_at_start(x);
   keep(0, at_start);
-  sum.lag(at_start, widening(0, friction_iterations));
+  sum.lag(at_start);
   {
     const Stopwatch::Scope scope(*step.context.watch, Phase::kAnalysis);
     sum.expect_contacts_near(problem.start);
@@ -243,7 +237,7 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
     keep(solves, contacts);
     // Without contact before and after, another solve would be the same one.
     if (!sum.friction && contacts.empty()) break;
-    if (solves < friction_iterations) sum.lag(contacts, widening(solves, friction_iterations));
+    if (solves < friction_iterations) sum.lag(contacts);
   }
   report_contacts(sum.contacts(), step.report);
   report_blockers(problem, x, status, step.report);
@@ -345,7 +339,7 @@ void ContactStage::backward(const Backward& step, std::vector<Array> g) {
     std::vector<Contact> contacts = std::move(lag);
     x_lag = k == 0 ? problem.start : at(k - 1);
     lag = contacts_at(k, x_lag);
-    sum.lag(lag, widening(static_cast<int>(k), problem.scene.given.friction_iterations));
+    sum.lag(lag);
     if (sum.friction) sum.friction->set_lag(x_lag.data());
     sum.adopt(std::move(contacts));
     problem.coordinates.stand_at(x.data());
