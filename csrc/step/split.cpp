@@ -94,7 +94,7 @@ class Nearness {
   Array pull_back(Cotangents& bars) {
     Array bar(problem_.cloth_size, 0.0);
     if (inertial_) {
-      add_masses_bar(bars.masses);
+      add_masses_bar(inertial_->metric_bar, bars.masses);
       bar = inertial_->target_bar;
     }
     if (elastic_) {
@@ -134,8 +134,7 @@ class Nearness {
   }
 
   /// Into the cotangents of the masses that G is made of.
-  void add_masses_bar(Array& masses_bar) const {
-    const Array& bar = inertial_->metric_bar;
+  void add_masses_bar(const Array& bar, Array& masses_bar) const {
     const bool is_uniform = problem_.scene.given.metric == Metric::kIdentity;
     const double shared = is_uniform ? mean(bar) : 0.0;
     for (std::size_t i = 0; i < bar.size(); ++i) masses_bar[i] += is_uniform ? shared : bar[i];
