@@ -77,8 +77,8 @@ def tumbling_boxes(speed, dt=DT):
     return sim, sim.initial_state().replace(body_velocities=velocities)
 
 
-# What hits the floor at 30 m/s is spun to 400 rad/s, which a step of DT refuses.
-@pytest.mark.parametrize(("speed", "dt"), [(1.0, DT), (10.0, DT), (30.0, DT / 10)])
+# What hits the floor at 30 m/s is spun so fast that a step of DT refuses it.
+@pytest.mark.parametrize(("speed", "dt"), [(1.0, DT), (10.0, DT), (30.0, DT / 20)])
 def test_tumbling_boxes_never_meet(speed, dt):
     sim, state = tumbling_boxes(speed, dt)
     states, refused = roll(sim, state, 40)
