@@ -168,7 +168,7 @@ def test_a_gripper_settles_at_once():
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
 def test_a_staggered_gripper_is_thrown_open():
     """Why the monolithic coupling is the default."""
-    # With more friction the second step, at kinks of a squeezed sheet, takes thousands of iterations.
+    # With more friction the second step, at kinks of a squeezed sheet, takes 1000s of iterations.
     gaps, _ = gripped("cloth_to_rigid", 3, friction=0.2)
     assert gaps.max() > 0.01
 
