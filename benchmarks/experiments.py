@@ -157,7 +157,7 @@ def stretch(scene: dc.Scene, state: dc.State) -> float:
         ends = cloth.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         lengths = [
             np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)
-            for points in (state.positions.numpy()[first:], cloth.rest_vertices)
+            for points in (state.positions.numpy()[first:], cloth.rest_positions)
         ]
         largest = max(largest, float((lengths[0] / lengths[1]).max()))
         first += len(cloth.vertices)

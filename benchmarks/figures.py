@@ -1,4 +1,4 @@
-"""Write the page of figures, docs/performance.md, and its plots.
+"""Write the page of measurements, docs/performance.md, and its plots.
 
     python -m benchmarks.figures --against "the first version=../first"
     python -m benchmarks.figures --newton ../peer/bin/python ...    # see benchmarks.peers
@@ -328,10 +328,10 @@ def _save(figure: Any, file: Path) -> None:
 
 def page(records: Records, plots: list[tuple[str, str]]) -> str:
     """The Markdown of the page."""
-    parts = ["# Figures", _preface(records)]
+    parts = ["# Performance", _preface(records)]
     parts += [f"![{text}](images/{file})" for file, text in plots]
     for release, rows in records["releases"].items():
-        parts += [f"## Beside {release}", _release_text(rows, release), _release_table(rows)]
+        parts += [f"## Compared with {release}", _release_text(rows, release), _release_table(rows)]
     parts += ["## By phase", _PHASE_TEXT, _phase_table(records["phases"])]
     losses = _pair_table(
         records["losses"], ["scene", "size", "losses"], {"loop": "loop", "once": "one call"}
@@ -340,7 +340,7 @@ def page(records: Records, plots: list[tuple[str, str]]) -> str:
     shared = _pair_table(records["shared"], ["scene", "size"], {"one": "one thread", "two": "two"})
     parts += ["## One environment on two threads", _SHARED_TEXT, shared]
     if records["peers"]:
-        parts += ["## Beside Newton", _PEER_TEXT, _peer_table(records["peers"])]
+        parts += ["## Compared with Newton", _PEER_TEXT, _peer_table(records["peers"])]
     return "\n\n".join(parts) + "\n"
 
 
@@ -349,18 +349,19 @@ def _preface(records: Records) -> str:
     before, after = records["load"]
     steps = ", ".join(f"{n} steps at {k} x {k}" for k, n in records["steps"].items())
     return f"""\
-This page is written by `python -m benchmarks.figures`, from `docs/{RECORDS}`: do not edit it.
+`python -m benchmarks.figures` writes this page from `docs/{RECORDS}`: do not edit it.
 
 Measured on {records["date"]} in {records["minutes"]:g} minutes of {clock}, on {records["cores"]}
-cores ({records["processor"]}), with one thread where a table says nothing else.
-The load of the machine was {before:g} before the first measurement, {after:g} after the last. One
-process of this benchmark works at a time: where the load is above 1, others worked there too. Then
-ratios, whose two sides take turns, are worth more than milliseconds, and a second thread finds no
-core. torch {records["torch"]}; {records["core"]}.
+cores ({records["processor"]}), with one thread unless a table says otherwise.
+The load of the machine was {before:g} before the first measurement and {after:g} after the last.
+The benchmark runs one process at a time, so a load above 1 comes from other jobs. Then ratios,
+whose two sides run in turn, are more reliable than milliseconds, and a second thread finds no free
+core.
+torch {records["torch"]}; {records["core"]}.
 
-Steps are of {records["dt"]:g} s, by the scheme `coupled`, at a tolerance of
+A step is {records["dt"]:g} s long and uses the scheme `coupled` at a tolerance of
 {records["tolerance"]:g} m/s. Scenes are those of `benchmarks.scenes`: sheets of `size` x `size`
-vertices that have been brought into their regime. Times are medians of {steps}."""
+vertices that have reached their regime. Times are medians of {steps}."""
 
 
 def _release_text(rows: list[Records], release: str) -> str:
@@ -373,9 +374,9 @@ def _release_text(rows: list[Records], release: str) -> str:
             text.append(f"{part} {mean:.1f} ({min(ratios):.1f} to {max(ratios):.1f})")
         parts.append(f"{size} x {size}: {', '.join(text)}")
     return (
-        "Both take their steps in turn, each on its own trajectory from the same start. Ratios are "
-        f"the time of {release} over that of this release. Their geometric means over the scenes, "
-        f"and their range: {'; '.join(parts)}."
+        "Both take steps in turn, each on its own trajectory from the same start. A ratio is the "
+        f"time of {release} over that of this release. The geometric means of the ratios over the "
+        f"scenes, and their ranges, are {'; '.join(parts)}."
     )
 
 
@@ -397,9 +398,9 @@ def _release_table(rows: list[Records]) -> str:
 
 
 _PHASE_TEXT = """\
-Of this release, forward and backward in EF, the time of one factorization of the contact-free
-Hessian of the same state by `Eigen::SimplicialLDLT`, which divides out most of what machines differ
-by; then the phases of forward in milliseconds of wall-clock time."""
+This table shows forward and backward of this release in EF, and the phases of forward in
+milliseconds of wall-clock time. One EF is the time in which `Eigen::SimplicialLDLT` factors the
+contact-free Hessian of the same state. Times in EF vary less from machine to machine."""
 
 
 def _phase_table(rows: list[Records]) -> str:
@@ -421,8 +422,8 @@ call with `is_grads_batched=True`, in milliseconds."""
 
 
 _SHARED_TEXT = """\
-Forward, in milliseconds of wall-clock time. Where a thread is left, large factorizations and solves
-are shared; the bits are the same."""
+Forward, in milliseconds of wall-clock time. Threads without an environment share large
+factorizations and solves; the bits are the same."""
 
 
 def _pair_table(rows: list[Records], labels: list[str], pair: dict[str, str]) -> str:
@@ -442,12 +443,12 @@ def _pair_table(rows: list[Records], labels: list[str], pair: dict[str, str]) ->
 
 
 _PEER_TEXT = """\
-The differentiable cloth of Newton (`pip install newton`) on the same processor: explicit substeps
-in single precision, with penalties where a vertex meets a body. 15 frames at 60 Hz from the same
-start, by `python -m benchmarks.peers`, which says how, in processor time of a frame. `gradient` is
-how far the gradient of each is from differences of its own loss; where vertices bounce, differences
-of Newton's loss change with their step, too. `depth` is how far the sheet was within the body at
-its deepest."""
+The differentiable cloth of Newton (`pip install newton`) on the same processor uses explicit
+substeps in single precision, with penalties where a vertex meets a body. Both simulate 15 frames at
+60 Hz from the same start; `python -m benchmarks.peers` describes how. Times are processor times of
+a frame. `gradient` is the error of each gradient against differences of its own loss; where
+vertices bounce, differences of Newton's loss depend on their step. `depth` is the largest depth of
+the sheet inside the body."""
 
 
 def _peer_table(rows: list[Records]) -> str:

@@ -14,8 +14,13 @@ import torch
 import diffcloth_torch as dc
 from benchmarks.extra import require
 from benchmarks.scenes import DT, Scene, in_regime
-from diffcloth_torch.poses import transform  # paths that the first version has, too
-from diffcloth_torch.step import as_array
+
+try:
+    from diffcloth_torch.geometry.poses import transform
+    from diffcloth_torch.sim.step import as_array
+except ModuleNotFoundError:  # in the first version, which we compare with
+    from diffcloth_torch.poses import transform
+    from diffcloth_torch.step import as_array
 
 ipctk = require("ipctk")
 

@@ -86,6 +86,7 @@ SCENES = {
 
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "coupled": ("coupled", {}),
+    "split, energy": ("split", {"metric": "energy"}),
     "split, mass": ("split", {"metric": "mass"}),
     "split, identity": ("split", {"metric": "identity"}),
     "split, elastic": ("split", {"metric": "elastic"}),

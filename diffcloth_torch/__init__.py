@@ -9,9 +9,9 @@
 Units are SI, z is up, quaternions are (w, x, y, z), and everything is float64 on the CPU.
 """
 
-from collections.abc import Iterable
+from __future__ import annotations
+
 from importlib import import_module
-from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,38 +25,49 @@ if find_spec("diffcloth_torch._core") is None:
         "or run  pip install -e .  where the sources are"
     )
 
-from diffcloth_torch import robots
-from diffcloth_torch._moved import MOVED, find_old_modules
-from diffcloth_torch.errors import (
-    AddedMassWarning,
-    IgnoredLimitsWarning,
-    InfeasibleMotion,
-    IntersectingState,
-    InvalidInput,
-    NotConverged,
-    SimulationError,
-)
-from diffcloth_torch.files import as_path
-from diffcloth_torch.model.cloth import Cloth
-from diffcloth_torch.model.materials import Material
-from diffcloth_torch.model.options import ContactOptions, SolverOptions
-from diffcloth_torch.model.rigid_body import RigidBody
-from diffcloth_torch.model.robot import Robot
-from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.sim.controls import Control, Parameters
-from diffcloth_torch.sim.report import Report
-from diffcloth_torch.sim.simulator import Simulator
-from diffcloth_torch.sim.state import State, stack, where
-from diffcloth_torch.viewers.render import render
+from diffcloth_torch._saved import let_saved_states_load, register_classes
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from diffcloth_torch import robots
+    from diffcloth_torch.errors import (
+        AddedMassWarning,
+        IgnoredLimitsWarning,
+        InfeasibleMotion,
+        IntersectingState,
+        InvalidInput,
+        NotConverged,
+        SimulationError,
+        TurnedTooFar,
+    )
+    from diffcloth_torch.model.attachment import Attachment
+    from diffcloth_torch.model.cloth import Cloth
+    from diffcloth_torch.model.materials import Material
+    from diffcloth_torch.model.options import ContactOptions, SolverOptions
+    from diffcloth_torch.model.rigid_body import RigidBody
+    from diffcloth_torch.model.robot import Robot
+    from diffcloth_torch.model.scene import Scene
+    from diffcloth_torch.optimize.descent import Descent, descend
+    from diffcloth_torch.optimize.evaluation import Evaluation
+    from diffcloth_torch.sim.controls import Control, Parameters
+    from diffcloth_torch.sim.report import Report
+    from diffcloth_torch.sim.simulator import Simulator
+    from diffcloth_torch.sim.state import State, stack, where
+    from diffcloth_torch.sim.trajectory import Trajectory
     from diffcloth_torch.tasks.task import LoadedConfig
+    from diffcloth_torch.viewers.look import Camera
+    from diffcloth_torch.viewers.render import render
 
 __all__ = [
     "AddedMassWarning",
+    "Attachment",
+    "Camera",
     "Cloth",
     "ContactOptions",
     "Control",
+    "Descent",
+    "Evaluation",
     "IgnoredLimitsWarning",
     "InfeasibleMotion",
     "IntersectingState",
@@ -72,7 +83,10 @@ __all__ = [
     "Simulator",
     "SolverOptions",
     "State",
+    "Trajectory",
+    "TurnedTooFar",
     "build_info",
+    "descend",
     "load_config",
     "render",
     "robots",
@@ -81,15 +95,47 @@ __all__ = [
 ]
 
 
+# Imported on first use: torch takes seconds to import, which `diffcloth --help` need not wait for.
+_HOMES = {
+    "errors": (
+        "AddedMassWarning",
+        "IgnoredLimitsWarning",
+        "InfeasibleMotion",
+        "IntersectingState",
+        "InvalidInput",
+        "NotConverged",
+        "SimulationError",
+        "TurnedTooFar",
+    ),
+    "model.attachment": ("Attachment",),
+    "model.cloth": ("Cloth",),
+    "model.materials": ("Material",),
+    "model.options": ("ContactOptions", "SolverOptions"),
+    "model.rigid_body": ("RigidBody",),
+    "model.robot": ("Robot",),
+    "model.scene": ("Scene",),
+    "optimize.descent": ("Descent", "descend"),
+    "optimize.evaluation": ("Evaluation",),
+    "sim.controls": ("Control", "Parameters"),
+    "sim.report": ("Report",),
+    "sim.simulator": ("Simulator",),
+    "sim.state": ("State", "stack", "where"),
+    "sim.trajectory": ("Trajectory",),
+    "viewers.look": ("Camera",),
+    "viewers.render": ("render",),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+
 def build_info() -> dict[str, Any]:
-    """Say what the C++ core was built with: libraries, compiler and options."""
+    """Describe the build of the C++ core: libraries, compiler and options."""
     from diffcloth_torch import _core
 
     return dict(_core.build_info())
 
 
-def load_config(path: str | Path, assignments: Iterable[str] = ()) -> "LoadedConfig":
-    """Read a configuration of the command line, and build what it describes.
+def load_config(path: str | Path, assignments: Iterable[str] = ()) -> LoadedConfig:
+    """Read a configuration of the command line, and build its scene, simulator and task.
 
     >>> scene, simulator, task = dc.load_config("configs/drape.yaml", ["simulation.steps=50"])
     >>> controller = task.controller(task.actions())
@@ -100,12 +146,13 @@ def load_config(path: str | Path, assignments: Iterable[str] = ()) -> "LoadedCon
         assignments: "key=value" each, as after `--set`.
 
     Returns:
-        What is simulated, its simulator, and the task.
+        The scene, its simulator and the task.
 
     Raises:
         InvalidInput: If the file, a key or a value is not accepted.
         IntersectingState: If surfaces of the scene intersect or touch.
     """
+    from diffcloth_torch.files import as_path
     from diffcloth_torch.tasks.registry import load_task
     from diffcloth_torch.tasks.task import LoadedConfig
 
@@ -123,12 +170,19 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
-    # The version stands in the package's metadata alone, which is read when it is asked for.
     if name == "__version__":
+        # Only the package's metadata has it, which is read on first use.
+        from importlib.metadata import version
+
         return version("diffcloth-torch")
-    if f"{__name__}.{name}" in MOVED:
-        return import_module(f"{__name__}.{name}")
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "robots":
+        return import_module("diffcloth_torch.robots")
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    register_classes()
+    value = getattr(import_module(f"diffcloth_torch.{_HOME_OF[name]}"), name)
+    globals()[name] = value  # later uses bypass this function
+    return value
 
 
-find_old_modules()
+let_saved_states_load()

@@ -1,4 +1,5 @@
-# The C++ extension. What the package uses is typed here.
+# The C++ extension. What the package uses is typed here. docs/core_stub.py takes the place of the
+# core where the site is built, and needs the names that defaults are checked against.
 
 from typing import Any
 
@@ -7,6 +8,19 @@ from numpy.typing import NDArray
 
 Arrays = dict[str, NDArray[Any]]
 
+schemes: dict[str, dict[str, bool]] = {
+    "coupled": {"barrier": True, "moves_bodies": True, "elastic_stage": False, "metrics": False},
+    "split": {"barrier": True, "moves_bodies": False, "elastic_stage": True, "metrics": True},
+    "projective": {
+        "barrier": False,
+        "moves_bodies": False,
+        "elastic_stage": True,
+        "metrics": False,
+    },
+}
+"""What each is able to: "barrier", "moves_bodies", "elastic_stage", "metrics"; default first."""
+metrics: list[str] = ["energy", "elastic", "mass", "identity"]
+elastic_solvers: list[str] = ["newton", "projective"]
 input_names: list[str]
 number_names: list[str]
 """Of the lists "numbers" that a step returns."""
@@ -52,17 +66,21 @@ class Simulator:
         self,
         *,
         vertices: NDArray[np.float64],
-        rest_vertices: NDArray[np.float64],
+        rest_positions: NDArray[np.float64],
         faces: NDArray[np.int32],
         cloth_vertex_start: NDArray[np.int32],
         cloth_face_start: NDArray[np.int32],
         bending_models: list[str],
         pins: NDArray[np.int32],
         soft_pins: NDArray[np.int32],
+        attachment_start: NDArray[np.int32],
+        attachment_points: NDArray[np.int32],
+        attachment_coefficients: NDArray[np.float64],
+        attachment_rest_lengths: NDArray[np.float64],
+        attachment_targets: NDArray[np.int32],
         body_vertices: NDArray[np.float64],
         body_faces: NDArray[np.int32],
         body_vertex_start: NDArray[np.int32],
-        body_face_start: NDArray[np.int32],
         self_contact: bool,
         dt: float,
         scheme: str,
@@ -85,6 +103,9 @@ class Simulator:
     def find_overlap(self, inputs: Arrays) -> str | None: ...
     def find_close_start(self, inputs: Arrays) -> tuple[str, float, float] | None: ...
     def stored_energy(self, inputs: Arrays) -> dict[str, NDArray[np.float64]]: ...
+    def energy_backward(
+        self, inputs: Arrays, cotangents: Arrays, losses: int, needs: list[str], threads: int
+    ) -> Arrays: ...
     def path(self, inputs: Arrays) -> NDArray[np.float64]: ...
     def reference_factorization_seconds(self, inputs: Arrays, repeats: int) -> float: ...
     def forget_factors(self) -> None: ...

@@ -22,7 +22,7 @@ __all__ = ["note_caller"]
 
 _LONGEST_WAIT = 5.0  # [s]
 _PAUSE = 0.005  # [s]
-_QUIET = 3  # looks in a row that find no thread at work: one may be between two steps
+_QUIET = 3  # successive looks without a thread at work: one may be between two steps
 _OURS = str(Path(__file__).parent)
 _BACKWARD = (str(Path(torch.autograd.__file__).parent), torch.Tensor.backward.__code__.co_filename)
 
@@ -30,7 +30,7 @@ _callers: set[int] = set()
 
 
 def note_caller() -> None:
-    """Remember that the core works for this thread."""
+    """Note that the core works for this thread."""
     _callers.add(threading.get_ident())
 
 

@@ -72,7 +72,7 @@ class Range(NamedTuple):
         return ~inside
 
     def holds(self, least: float, greatest: float) -> bool:
-        """Whether numbers between two are inside; NaN is not."""
+        """Whether all numbers between two are inside; false for NaN."""
         if self.closed:
             return self.low <= least and greatest <= self.high
         return self.low < least and greatest < self.high
@@ -97,6 +97,7 @@ ANY_NUMBER = Range()
 POSITIVE = Range(0.0)
 NON_NEGATIVE = Range(0.0, closed=True)
 POISSON = Range(-1.0, 0.5)
+UNIT_INTERVAL = Range(0.0, 1.0, closed=True)
 
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:
@@ -150,7 +151,7 @@ def _require_dense(name: str, value: Tensor) -> None:
 
 
 def _array(name: str, value: object, content: str) -> NDArray[Any]:
-    """Take what NumPy reads as an array, and refuse what would lose a part of its meaning."""
+    """Convert what NumPy reads as an array; refuse values that would lose information."""
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError(
             f"{name} must not be a masked array, as its mask would be lost; fill it first"
@@ -205,7 +206,7 @@ def check_range(name: str, values: FloatArray, accepted: Range) -> None:
     smallest = SMALLEST if accepted.low == 0.0 and not accepted.closed else -LARGEST
     if values.size == 0:
         return
-    # Each step checks all it is given: where nothing is wrong, two numbers tell.
+    # Each step checks all of its inputs: if nothing is wrong, two numbers show it.
     least, greatest = float(values.min()), float(values.max())
     if accepted.holds(least, greatest) and smallest <= least and greatest <= LARGEST:
         return
@@ -273,7 +274,7 @@ def check_name(name: str, value: object) -> str | None:
 
 
 def check_pairs(name: str, value: Any, accepted: Sequence[str]) -> tuple[tuple[str, str], ...]:
-    """Require an iterable of pairs of two different names of those that are accepted."""
+    """Require an iterable of pairs of two different accepted names."""
     pairs = []
     if not isinstance(value, Iterable) or getattr(value, "ndim", 1) == 0:
         raise TypeError(f"{name} must be a list of pairs of names, got {type(value).__name__}")

@@ -1,4 +1,4 @@
-"""What the commands of the command line do; each returns the sentence to say at the end."""
+"""The commands of the command line; each returns its closing message."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ from diffcloth_torch.config.viewers import open_viewers
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.model.quantities import PARAMETERS
+from diffcloth_torch.optimize.descent import Descent
+from diffcloth_torch.optimize.statistics import rollout_statistics
 from diffcloth_torch.sim.state import State
-from diffcloth_torch.tasks.optimization import Actions, Optimization
+from diffcloth_torch.tasks.optimization import Actions
 from diffcloth_torch.tasks.optimization import optimize as run_optimization
 from diffcloth_torch.tasks.registry import TASKS, check_document, load_task, make_task
 from diffcloth_torch.tasks.simulation import simulate
 from diffcloth_torch.tasks.statistics import (
     replace_file,
-    rollout_statistics,
     step_records,
     write_metrics,
 )
@@ -38,10 +39,10 @@ from diffcloth_torch.viewers.curves import draw_loss_curve
 
 __all__ = ["info", "optimize", "resume", "run"]
 
-# What a run or its pictures need beyond Python; `info` says which of them are there.
+# Packages that a run or its pictures need; `info` lists which of them are installed.
 _PACKAGES = ("torch", "numpy", "trimesh", "matplotlib", "pyvista", "imageio", "imageio-ffmpeg")
 
-# Files in a folder of results, and folders, which the viewers that write into them clear.
+# Files in a folder of results, and folders, which are cleared by the viewers that write into them.
 _METRICS, _RESUME = "metrics.json", "resume.pt"
 _RESULTS = (
     *(_METRICS, _RESUME, "actions.pt", "actions.npz", "loss.png"),
@@ -52,7 +53,7 @@ _FOLDERS = ("meshes", "animation_frames")
 
 _LARGEST_ACTIONS = 256 << 20  # bytes of a file of actions: no run of this code writes a tenth
 
-# What may change when an optimization goes on; the rest decides what was found so far.
+# Sections that may change when an optimization continues; others would change earlier results.
 _RESUMABLE = ("optimizer", "output")
 
 
@@ -70,13 +71,13 @@ def run(
         config: YAML file.
         assignments: "key=value" each, see `set_values`.
         out: Folder for the results; by default results/ and the name of `config`.
-        overwrite: Whether results that are there already are replaced.
+        overwrite: Whether to replace existing results.
         actions: File `actions.npz` of a run whose actions are used instead of the initial ones.
 
     Raises:
         InvalidInput: If an argument or the configuration is not accepted.
-        SimulationError: If a step fails; what came before it is kept.
-        KeyboardInterrupt: If the user ends it; the message says what is kept.
+        SimulationError: If a step fails; earlier results are kept.
+        KeyboardInterrupt: If the user ends the run; the message says what is kept.
     """
     out = _check_folder(config, out, overwrite)
     task = load_task(config, assignments)
@@ -149,17 +150,17 @@ def optimize(
 
 
 def resume(folder: Path, assignments: Iterable[str] = ()) -> str:
-    """Go on with an optimization that was interrupted, or has more iterations now.
+    """Continue an optimization that was interrupted, or now has more iterations.
 
-    It continues with the bits that it would have had without the interruption, if the build and
-    the type of machine are the same.
+    The result has the same bits as without the interruption, if the build and the type of machine
+    are the same.
 
     Args:
-        folder: Its results.
+        folder: Folder of its results.
         assignments: "key=value" each, of the sections `optimizer` and `output`.
 
     Raises:
-        InvalidInput: If the folder has no such results, or another section is changed.
+        InvalidInput: If the folder has no such results, or an assignment changes another section.
     """
     file = folder / _RESUME
     if not file.is_file():
@@ -172,7 +173,7 @@ def resume(folder: Path, assignments: Iterable[str] = ()) -> str:
         document, source = saved["config"], Path(saved["source"])
         start = {name: tensor.requires_grad_() for name, tensor in saved["start"].items()}
         record = saved["found"]
-        found = None if record is None else Optimization.restore(record)
+        found = None if record is None else Descent.restore(record)
     except (OSError, MemoryError):
         raise
     except Exception as error:  # whatever unpickling makes of bytes that are not its own
@@ -189,13 +190,13 @@ def resume(folder: Path, assignments: Iterable[str] = ()) -> str:
 
 
 def _optimize(
-    task: Optimizable, source: Path, out: Path, start: Actions, found: Optimization | None
+    task: Optimizable, source: Path, out: Path, start: Actions, found: Descent | None
 ) -> str:
-    # Before the long part: a package may be missing.
+    # Before the long computation, because a package may be missing.
     viewers = open_viewers(task.config, task.scene, out, task.goals())
 
-    # After every iteration, so that one that is interrupted loses only itself.
-    def keep(sofar: Optimization) -> None:
+    # After every iteration, so that an interruption loses only the current one.
+    def keep(sofar: Descent) -> None:
         nonlocal found
         found = sofar
         _write_optimization(task, sofar, out)
@@ -221,7 +222,7 @@ def _optimize(
     )
 
 
-def _write_optimization(task: Task, found: Optimization, out: Path) -> None:
+def _write_optimization(task: Task, found: Descent, out: Path) -> None:
     metrics = {
         "task": task.config.task,
         **found.metrics(),
@@ -229,13 +230,13 @@ def _write_optimization(task: Task, found: Optimization, out: Path) -> None:
         **_values_used(task),
     }
     write_metrics(out / _METRICS, metrics)
-    torch.save({"best": found.best.actions, "initial": found.first.actions}, out / "actions.pt")
-    arrays: dict[str, Any] = {name: a.numpy() for name, a in found.best.actions.items()}
+    torch.save({"best": found.best.variables, "initial": found.first.variables}, out / "actions.pt")
+    arrays: dict[str, Any] = {name: a.numpy() for name, a in found.best.variables.items()}
     np.savez(out / "actions.npz", **arrays)
 
 
 def _write_resume(
-    task: Task, source: Path, start: Actions, found: Optimization | None, out: Path
+    task: Task, source: Path, start: Actions, found: Descent | None, out: Path
 ) -> None:
     saved = {
         "config": task.config.model_dump(mode="json"),
@@ -248,10 +249,10 @@ def _write_resume(
 
 
 def _values_used(task: Task) -> dict[str, Any]:
-    """The configuration, and what stood for each value that it leaves to a default.
+    """The configuration, and the values that it leaves at their defaults.
 
     `used` has the options of contact and solver, the bending model of each cloth, and all
-    parameters but the rest positions, which are those of the mesh.
+    parameters except the rest positions, which are those of the mesh.
     """
     simulator = task.simulator
     parameters = simulator.parameters()
@@ -285,7 +286,7 @@ def _check_folder(config: Path, out: Path | None, overwrite: bool) -> Path:
 
 
 def _check_places(folder: Path) -> None:
-    """Refuse, before the work, what stands where its results will be written."""
+    """Refuse, before the work, anything in the way of its results."""
     for name in _RESULTS:
         if (folder / name).is_dir():
             raise InvalidInput(
@@ -324,7 +325,7 @@ def _read_actions(task: Task, file: Path | None) -> Actions:
                 given = {name: arrays[name] for name in wanted}
     except MemoryError:
         raise
-    except Exception as error:  # whatever zipfile and NumPy make of bytes that are no such file
+    except Exception as error:  # whatever zipfile and NumPy raise for other bytes
         raise InvalidInput(f"--actions: {file} is not an `actions.npz` of a run") from error
     if got != wanted:
         raise InvalidInput(f"--actions: {file} must hold {_shapes(wanted)}, got {_shapes(got)}")
@@ -334,7 +335,7 @@ def _read_actions(task: Task, file: Path | None) -> Actions:
 
 
 def _claims(file: BytesIO) -> dict[str, tuple[list[int], np.dtype[Any]]]:
-    """Shapes and types that the arrays of an .npz claim; their numbers take no memory yet."""
+    """Shapes and types that the headers of an .npz claim, without reading its numbers."""
     claims = {}
     with zipfile.ZipFile(file) as entries:
         for entry in entries.namelist():
@@ -351,7 +352,7 @@ def _shapes(shapes: dict[str, list[int]]) -> str:
 
 
 def info() -> str:
-    """Say what was built in, and which packages are there."""
+    """Describe the build and the installed packages."""
     rows: dict[str, Any] = {
         "diffcloth-torch": _version("diffcloth-torch"),
         "python": platform.python_version(),

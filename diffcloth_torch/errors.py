@@ -13,18 +13,19 @@ __all__ = [
     "InvalidInput",
     "NotConverged",
     "SimulationError",
+    "TurnedTooFar",
 ]
 
 
 class InvalidInput(ValueError):  # noqa: N818 - names of the public contract
-    """An argument has a wrong shape, value or name; the message says which and what is accepted."""
+    """An argument has a wrong shape, value or name; the message names it and what is accepted."""
 
 
 class SimulationError(RuntimeError):
-    """The simulation itself failed; the state that it was given is untouched.
+    """The simulation itself failed; the state that it was given is unchanged.
 
     Attributes:
-        report: Report of the failed step, or None where no step was taken.
+        report: Report of the failed step, or None if no step was taken.
         environments: Indices of the environments that failed; (0,) without a batch axis.
     """
 
@@ -43,20 +44,27 @@ class IntersectingState(SimulationError):  # noqa: N818
 class InfeasibleMotion(SimulationError):  # noqa: N818
     """The prescribed motion of bodies, joints and pins cannot be completed without an intersection.
 
-    Raised by a step, or by a backward through one whose failure was passed on as a value.
+    Raised by a step, or by backward through a step whose failure was returned as a value.
     """
 
 
 class NotConverged(SimulationError):  # noqa: N818
-    """The solver stopped above its tolerance; the message says why.
+    """The solver stopped above its tolerance; the message gives the reason.
 
-    Raised by a step, or by a backward through one whose failure was passed on as a value.
+    Raised by a step, or by backward through a step whose failure was returned as a value.
+    """
+
+
+class TurnedTooFar(SimulationError):  # noqa: N818
+    """A dynamic body turns further in a step than contact resolves; the message names it.
+
+    Raised by a step, or by backward through a step whose failure was returned as a value.
     """
 
 
 class IgnoredLimitsWarning(UserWarning):
-    """A robot's file has effort or velocity limits, or dry joint friction: none is applied."""
+    """The file of a robot has limits of effort or velocity, or dry friction, which are ignored."""
 
 
 class AddedMassWarning(UserWarning):
-    """A staggered coupling moves something that is too light for the cloth that it touches."""
+    """In a staggered coupling, a body or a link is too light for the cloth that it touches."""

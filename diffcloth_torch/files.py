@@ -28,22 +28,22 @@ def as_path(name: str, value: object) -> Path:
 def read_regular_file(path: Path, largest: int) -> bytes:
     """Read a file whole.
 
-    A pipe or a device, also behind a link, would be waited for without end.
+    Reading a pipe or a device, also behind a link, could wait forever.
 
     Args:
         path: The file.
-        largest: Most bytes that it may have.
+        largest: Largest accepted size [bytes].
 
     Raises:
-        InvalidInput: If it is no regular file, or larger.
-        OSError: If there is no such file, or it cannot be read.
+        InvalidInput: If it is not a regular file, or larger.
+        OSError: If it does not exist or cannot be read.
     """
     try:
         regular = stat.S_ISREG(path.stat().st_mode)
     except ValueError as error:  # a NUL in the path
         raise InvalidInput(f"{str(path)!r} is no path: {error}") from error
     if regular:
-        # What stands at the path may have changed since: to open it must not wait either.
+        # The file at the path may have changed since: opening it must not wait either.
         with open(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb") as file:  # noqa: PTH123
             status = os.fstat(file.fileno())
             regular = stat.S_ISREG(status.st_mode)

@@ -1,4 +1,4 @@
-"""Records in a few lines: numbers where there are few, else dtype and shape."""
+"""Short texts of records: numbers if there are few, else dtype and shape."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def field_text(name: str, value: object) -> str:
 
 
 def record_text(kind: str, parts: Iterable[str]) -> str:
-    """What a record holds, broken between its parts into lines."""
+    """Text of a record, with line breaks between its parts."""
     first, *rest = [*parts, ""]
     lines = [f"{kind}({first}"]
     for part in rest[:-1]:

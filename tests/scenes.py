@@ -154,7 +154,7 @@ def hanging(curved=False, model="patch", **options):
     cloth = dc.Cloth(
         placed,
         faces,
-        rest_vertices=rest,
+        rest_positions=rest,
         material=material(faces),
         pins={"corner": [0, 5]},
         soft_pins={"row": [30, 32, 35]},
@@ -262,7 +262,7 @@ def poking(**options):
     cloth = dc.Cloth(
         vertices + corner + [0.013, 0.017, 0.007],
         faces,
-        rest_vertices=vertices,
+        rest_positions=vertices,
         material=material(faces, friction=0.5),
         pins={"rim": [0, 5, 30, 35]},
         soft_pins={"free": [14]},
@@ -303,7 +303,7 @@ def folded(thickness=0.0, **options):
     cloth = dc.Cloth(
         placed,
         faces,
-        rest_vertices=vertices,
+        rest_positions=vertices,
         material=material(faces, friction=0.5, thickness=thickness),
         pins={"end": [0, 11, 22, 33, 44]},
         soft_pins={"middle": [29]},
@@ -369,7 +369,7 @@ def on_sphere(friction=0.4, rows=6, body_friction=None, **options):
     cloth = dc.Cloth(
         turned(vertices, (0.2, 1, 0), 0.05) + np.array([0.05, 0.02, 0.207]),
         faces,
-        rest_vertices=vertices,
+        rest_positions=vertices,
         material=material(faces, friction=friction),
     )
     sim = simulator([cloth], [ball], **options)

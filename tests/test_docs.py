@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+import importlib.util
 import re
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
+from diffcloth_torch import _core
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
@@ -38,6 +41,25 @@ def test_the_reference_has_every_public_name():
     assert sorted(named) == sorted(dc.__all__)
 
 
+def test_the_stand_in_of_the_core_is_like_the_core():
+    """The site is built with what `_core.pyi` declares in its place."""
+    declarations = ROOT / "diffcloth_torch" / "_core.pyi"
+    found = importlib.util.spec_from_file_location("core_stub", ROOT / "docs" / "core_stub.py")
+    core_stub = importlib.util.module_from_spec(found)
+    found.loader.exec_module(core_stub)
+    stub = core_stub.read(declarations)
+    variables = [
+        node for node in ast.parse(declarations.read_text()).body if isinstance(node, ast.AnnAssign)
+    ]
+    assert variables
+    for node in variables:
+        ours, theirs = (getattr(core, node.target.id) for core in (_core, stub))
+        assert type(ours) is type(theirs), node.target.id
+        if node.value is not None:
+            assert theirs == ours, node.target.id
+            assert [*theirs] == [*ours], node.target.id  # in this order
+
+
 def test_the_gallery_shows_every_picture_that_a_configuration_makes():
     text = (ROOT / "docs/gallery.md").read_text()
     shown = set(re.findall(r"\]\(images/(\w+\.png)\)", text))
@@ -60,7 +82,7 @@ def test_resting_gap_is_that_of_the_guide():
     rest = np.array(grid.vertices)
     rest[:, :2] += np.random.default_rng(0).uniform(-0.005, 0.005, (49, 2))
     above = rest + np.array([0, 0, 0.004])
-    cloth = dc.Cloth(above, grid.faces, rest_vertices=rest, material=dc.Material(bending=1e-2))
+    cloth = dc.Cloth(above, grid.faces, rest_positions=rest, material=dc.Material(bending=1e-2))
     contact = dc.ContactOptions(barrier_distance=0.005, barrier_stiffness=20.0)
     # Off its diagonal, whose contacts with edges of the sheet would carry a part.
     floor = dc.RigidBody.plane(50.0, pose=[9, 0, 0, 1, 0, 0, 0])
@@ -97,7 +119,7 @@ def test_creep_is_that_of_the_guide(load):
 
 def test_the_example_of_a_potential_fits_the_code():
     """What it changes stands in the files that it names; it has what a potential must have."""
-    text = (ROOT / "CONTRIBUTING.md").read_text()
+    text = (ROOT / "docs/extending.md").read_text()
     parts = re.split(
         r"^--- (.+)\n", re.search(r"```diff\n(.*?)```", text, re.DOTALL)[1], flags=re.M
     )
@@ -106,9 +128,11 @@ def test_the_example_of_a_potential_fits_the_code():
         code = (ROOT / path).read_text()
         for line in lines.splitlines():
             assert line[0] == "+" or f"\n{line[1:]}" in code, (path, line)
-    required = re.findall(
-        r"(\w+)\([^)]*\)(?: const)? = 0;", (ROOT / "csrc/potential/potential.h").read_text()
-    )
+    required = [
+        name
+        for path in ("csrc/potential/potential.h", "csrc/step/step_potential.h")
+        for name in re.findall(r"(\w+)\([^)]*\)(?: const)? = 0;", (ROOT / path).read_text())
+    ]
     overridden = re.findall(r"(\w+)\([^)]*\)(?: const)? override", text)
     assert set(required) == set(overridden)
 

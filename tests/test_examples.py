@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from click.testing import CliRunner
 
 import diffcloth_torch as dc
@@ -42,6 +43,12 @@ def check_throw(names):
     assert all(map(math.isfinite, gradient))
     assert gradient[0] > 0.01
     assert gradient[-1] < -0.01
+
+
+def test_a_picker_folds_a_sheet():
+    distances = runpy.run_path(str(ROOT / "examples/pick_and_place.py"))["distances"]
+    assert distances[0] > 0.05
+    assert distances[-1] < 0.2 * distances[0]
 
 
 def test_own_mesh(own_mesh, monkeypatch, capsys):
@@ -98,6 +105,53 @@ def test_optimize_push(capsys):
     names = runpy.run_path(str(ROOT / "examples/optimize_push.py"))
     assert abs(names["error"].item()) < 1e-3  # [m], from 44 mm
     assert capsys.readouterr().out.count("speed") == 8
+
+
+def test_fit_friction():
+    names = runpy.run_path(str(ROOT / "examples/fit_friction.py"))
+    # Of the data, but for the time step; the first guess is 0.1.
+    assert names["friction"] == pytest.approx(names["FRICTION"], rel=0.1)
+    assert names["found"].best.loss < 1e-3 * names["found"].first.loss
+
+
+def test_optimize_batch():
+    found = runpy.run_path(str(ROOT / "examples/optimize_batch.py"))["found"]
+    assert found.best_losses.max() < 5e-3  # [m], each from its own guess
+    first = found.history[0]["environment_losses"]
+    assert min(first) > 0.03
+
+
+@pytest.fixture
+def plan_grasp():
+    try:
+        dc.robots.panda()
+    except ImportError:
+        pytest.skip("the Panda is in the extra `robots`")
+    return ROOT / "examples/plan_grasp.py"
+
+
+def test_gradients_flow_through_a_plan_and_what_it_does(plan_grasp):
+    names = runpy.run_path(str(plan_grasp))
+    way = torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64, requires_grad=True)
+    states = names["carry_out"]({"way": way})
+    names["distance"](states).backward()
+    assert states[-1].positions[:, 2].max() > 0.64  # lifted
+    direction = torch.tensor([0.5, 0.7, -0.5], dtype=torch.float64)
+    losses = []
+    for step in (1e-5, -1e-5):
+        with torch.no_grad():
+            moved = names["carry_out"]({"way": way.detach() + step * direction})
+            losses.append(names["distance"](moved).item())
+    difference = (losses[0] - losses[1]) / 2e-5
+    assert abs(difference) > 0.05
+    assert (way.grad @ direction).item() == pytest.approx(difference, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_plan_grasp(plan_grasp, capsys):
+    losses = runpy.run_path(str(plan_grasp), run_name="__main__")["found"].metrics()["losses"]
+    assert min(losses) < 0.5 * losses[0]
+    assert capsys.readouterr().out.count("mm from the goal") == len(losses)
 
 
 def test_drape_own_mesh(own_mesh, tmp_path):

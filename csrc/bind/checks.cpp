@@ -9,7 +9,7 @@
 namespace diffcloth::bind {
 namespace {
 
-using step::Input;
+using step::Extent;
 
 void require(bool holds, const std::string& what) {
   if (!holds) throw std::invalid_argument("core: " + what);
@@ -41,6 +41,20 @@ void check_faces(const char* name,
   }
 }
 
+void check_attachments(const step::AttachmentDescription& d, std::size_t points) {
+  const std::size_t count = d.rest_length.size();
+  check_starts("attachment_start", d.start, count, d.point.size());
+  require(std::ranges::adjacent_find(d.start) == d.start.end(),
+          "`attachment_start` must give every attachment a point");
+  check_indices("attachment_points", d.point, static_cast<Index>(points));
+  require(d.coefficient.size() == d.point.size() && d.target_row.size() == count,
+          "`attachment_coefficients` must be as many as `attachment_points`, and "
+          "`attachment_targets` as many as attachments");
+  for (const Index target : d.target_row) {
+    require(target >= -1 && target < d.target_count, "`attachment_targets` must name their rows");
+  }
+}
+
 std::size_t squares_of_coordinates(const step::Scene& scene) {
   const std::vector<Index>& tree = scene.mechanisms.given().coordinate_tree;
   std::size_t result = 0;
@@ -53,32 +67,24 @@ std::size_t squares_of_coordinates(const step::Scene& scene) {
   return result;
 }
 
-/// Whether a step of the scene reads an input, given which others there are.
-bool is_needed(const step::Scene& scene, const step::Inputs& inputs, Input input) {
-  switch (input) {
-    case Input::kPoisson:
-    case Input::kRestPositions:
-    case Input::kBarrierStiffness:
-    case Input::kCoordinateOrigins:
+/// Whether a step of the scene needs an input, given which others there are.
+bool is_needed(const step::Scene& scene, const step::Inputs& inputs, const step::InputRow& row) {
+  switch (row.need) {
+    case step::Need::kExtent:
+      if (row.extent == Extent::kPerFace || row.extent == Extent::kPerCloth) {
+        return scene.cloth_count() > 0;
+      }
+      return std::ranges::max(accepted_counts(scene, row.extent)) > 0;
+    case step::Need::kNowhere:
       return false;
-    case Input::kFriction:
-    case Input::kThickness:
-    case Input::kBarrierDistance:
-    case Input::kSlipVelocity:
-      return inputs.data(Input::kBarrierStiffness) != nullptr;
-    case Input::kStretch:
-    case Input::kBending:
-    case Input::kDensity:
-    case Input::kDamping:
-      return scene.cloth_count() > 0;
-    case Input::kPinStiffness:
+    case step::Need::kBarrier:
+      return inputs.data(step::Input::kBarrierStiffness) != nullptr;
+    case step::Need::kSoftPins:
       return !scene.given.soft_pins.empty();
-    case Input::kCoordinateTargets:
-    case Input::kCoordinateMetric:
+    case step::Need::kFreeCoordinates:
       return scene.mechanisms.has_free();
-    default:
-      return std::ranges::max(accepted_counts(scene, input)) > 0;
   }
+  __builtin_unreachable();
 }
 
 }  // namespace
@@ -86,8 +92,8 @@ bool is_needed(const step::Scene& scene, const step::Inputs& inputs, Input input
 void check_description(const step::Description& d) {
   const std::size_t vertices = d.vertices.size() / 3;
   const std::size_t cloths = d.bending_models.size();
-  require(d.vertices.size() % 3 == 0 && d.rest_vertices.size() == d.vertices.size(),
-          "`vertices` and `rest_vertices` must have one shape, [N, 3]");
+  require(d.vertices.size() % 3 == 0 && d.rest_positions.size() == d.vertices.size(),
+          "`vertices` and `rest_positions` must have one shape, [N, 3]");
   check_faces("faces", d.faces, vertices);
   check_starts("cloth_vertex_start", d.cloth_vertex_start, cloths, vertices);
   check_starts("cloth_face_start", d.cloth_face_start, cloths, d.faces.size());
@@ -102,6 +108,7 @@ void check_description(const step::Description& d) {
   for (const auto& pair : d.ignored_pairs) {
     check_indices("ignored_pairs", {pair.begin(), pair.end()}, static_cast<Index>(cloths + bodies));
   }
+  check_attachments(d.attachments, vertices + body_vertices);
   require(d.surface_names.empty() || d.surface_names.size() == cloths + bodies,
           "`surface_names` must be as many as there are surfaces");
   require(d.pin_names.empty() || d.pin_names.size() == d.pins.size(),
@@ -129,63 +136,52 @@ void check_mechanisms(const bodies::MechanismsDescription& m, Index surfaces) {
   require(roots == trees, "every tree must have a root, and a root its tree");
 }
 
-std::vector<std::size_t> accepted_counts(const step::Scene& scene, Input input) {
-  const auto n = static_cast<std::size_t>(scene.cloth_vertex_count());
-  const std::size_t faces = scene.topology.faces.size();
-  const auto cloths = static_cast<std::size_t>(scene.cloth_count());
+std::vector<std::size_t> accepted_counts(const step::Scene& scene, Extent extent) {
   const auto surfaces = static_cast<std::size_t>(scene.surface_count());
-  switch (input) {
-    case Input::kPositions:
-    case Input::kVelocities:
-    case Input::kForces:
-    case Input::kRestPositions:
-      return {3 * n};
-    case Input::kBodyPoses:
-    case Input::kBodyTargets:
-      return {7 * scene.mechanisms.given().tree_free.size()};
-    case Input::kPinTargets:
-      return {3 * scene.given.pins.size()};
-    case Input::kSoftPinTargets:
-      return {3 * scene.given.soft_pins.size()};
-    case Input::kGravity:
-      return {3};
-    case Input::kStretch:
-    case Input::kBending:
-    case Input::kPoisson:
-    case Input::kDensity:
-    case Input::kDamping:
-      return {1, cloths, faces};
-    case Input::kFriction:
-    case Input::kBarrierStiffness:
-      return {1, surfaces * surfaces};
-    case Input::kThickness:
-      return {surfaces};
-    case Input::kBarrierDistance:
-    case Input::kSlipVelocity:
+  switch (extent) {
+    case Extent::kOne:
       return {1};
-    case Input::kPinStiffness:
-      return {1, cloths};
-    case Input::kCoordinates:
-    case Input::kCoordinateEnds:
-    case Input::kCoordinateOrigins:
-    case Input::kCoordinateTargets:
+    case Extent::kVector:
+      return {3};
+    case Extent::kVertices:
+      return {3 * static_cast<std::size_t>(scene.cloth_vertex_count())};
+    case Extent::kAllVertices:
+      return {3 * static_cast<std::size_t>(scene.vertex_count())};
+    case Extent::kPins:
+      return {3 * scene.given.pins.size()};
+    case Extent::kSoftPins:
+      return {3 * scene.given.soft_pins.size()};
+    case Extent::kAttachments:
+      return {scene.given.attachments.rest_length.size()};
+    case Extent::kTargets:
+      return {3 * static_cast<std::size_t>(scene.given.attachments.target_count)};
+    case Extent::kPerFace:
+      return {1, static_cast<std::size_t>(scene.cloth_count()), scene.topology.faces.size()};
+    case Extent::kPerCloth:
+      return {1, static_cast<std::size_t>(scene.cloth_count())};
+    case Extent::kTrees:
+      return {7 * scene.mechanisms.given().tree_free.size()};
+    case Extent::kSurfaces:
+      return {surfaces};
+    case Extent::kPairs:
+      return {1, surfaces * surfaces};
+    case Extent::kCoordinates:
       return {static_cast<std::size_t>(scene.mechanisms.coordinate_count())};
-    case Input::kCoordinateMetric:
+    case Extent::kBlocks:
       return {squares_of_coordinates(scene)};
   }
-  return {};
+  __builtin_unreachable();
 }
 
 void check_inputs(const step::Scene& scene, const step::Inputs& inputs) {
-  for (std::size_t k = 0; k < step::kInputCount; ++k) {
-    const auto input = static_cast<Input>(k);
-    const step::View& view = inputs[input];
+  for (const step::InputRow& row : step::kInputTable) {
+    const step::View& view = inputs[row.input];
     const bool absent = view.data == nullptr && view.count == 0;
-    if (absent && !is_needed(scene, inputs, input)) continue;
-    const std::vector<std::size_t> accepted = accepted_counts(scene, input);
+    if (absent && !is_needed(scene, inputs, row)) continue;
+    const std::vector<std::size_t> accepted = accepted_counts(scene, row.extent);
     if (!absent && std::ranges::find(accepted, view.count) != accepted.end()) continue;
     // Words only for what is wrong: each step comes by here.
-    const std::string name = std::string("`") + step::kInputNames[k] + "`";
+    const std::string name = std::string("`") + row.name + "`";
     require(!absent, name + " is missing");
     std::string counts;
     for (const std::size_t count : accepted) {

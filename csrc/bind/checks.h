@@ -16,9 +16,9 @@ void check_description(const step::Description& description);
 /// Likewise trees of links, which a description may leave out.
 void check_mechanisms(const bodies::MechanismsDescription& mechanisms, Index surfaces);
 
-/// Numbers that one environment may have of an input of this scene; several counts where it may be
-/// given in several ways.
-std::vector<std::size_t> accepted_counts(const step::Scene& scene, step::Input input);
+/// Numbers that one environment may have of an input of this extent in this scene; several counts where
+/// it may be given in several ways.
+std::vector<std::size_t> accepted_counts(const step::Scene& scene, step::Extent extent);
 
 /// Require that one environment's inputs have all that a step of the scene reads, of accepted counts.
 ///

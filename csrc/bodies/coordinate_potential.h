@@ -33,6 +33,10 @@ class CoordinatePotential final : public Potential {
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
   void add_hessian_product(const double* x, const double* z, double* y) const override;
   void accumulate(const double* x, const double* z) override;
+  void swap_cotangents(CotangentStore& store) override {
+    store.exchange(target_bar);
+    store.exchange(metric_bar);
+  }
 
   /// Append the diagonal of A for each number of the nodes.
   void append_diagonal(std::vector<double>& out) const;

@@ -25,6 +25,39 @@ Mat3 matrix(const double* rows) {
 
 double largest(const VectorXd& x) { return x.size() == 0 ? 0.0 : x.cwiseAbs().maxCoeff(); }
 
+/// A link, where it is and how it moves.
+struct Body {
+  Mat3 rotation;
+  Vec3 origin;  // of the link's frame; its joint's axis goes through it
+  Vec3 axis;
+  Vec3 velocity;  // of the origin
+  Vec3 omega;
+  Vec3 force;   // momentum of all that hangs on it,
+  Vec3 moment;  // and their angular momentum about the world's origin
+};
+
+/// Place and velocity of a link behind its parent.
+void follow(
+    const Body& parent, const Link& link, const VectorXd& joints, const VectorXd& rates, Body& b) {
+  b.rotation = parent.rotation * link.offset.leftCols<3>();
+  b.origin = parent.origin + parent.rotation * link.offset.col(3);
+  b.axis = b.rotation * link.axis;
+  b.omega = parent.omega;
+  Vec3 slide = Vec3::Zero();
+  if (link.kind != JointKind::kFixed) {
+    const double value = link.multiplier * joints[link.coordinate] + link.constant;
+    const double rate = link.multiplier * rates[link.coordinate];
+    if (link.kind == JointKind::kRevolute) {
+      b.rotation *= Eigen::AngleAxisd(value, link.axis).toRotationMatrix();
+      b.omega += rate * b.axis;
+    } else {
+      b.origin += value * b.axis;
+      slide = rate * b.axis;
+    }
+  }
+  b.velocity = parent.velocity + parent.omega.cross(b.origin - parent.origin) + slide;
+}
+
 }  // namespace
 
 /// Where the root and the joints are.
@@ -74,15 +107,7 @@ FreeMotion::Configuration FreeMotion::middle(const Given& given, const VectorXd&
 FreeMotion::Rates FreeMotion::rates(const Given& given,
                                     const Configuration& at,
                                     const VectorXd& nu) const {
-  struct Body {
-    Mat3 rotation;
-    Vec3 origin;  // of the link's frame; its joint's axis goes through it
-    Vec3 axis;
-    Vec3 velocity;  // of the origin
-    Vec3 omega;
-    Vec3 force;   // momentum of all that hangs on it,
-    Vec3 moment;  // and their angular momentum about the world's origin
-  };
+  const VectorXd joint_rates = nu.tail(joint_count_);
   std::vector<Body> bodies(links_.size());
   for (const Index l : order_) {
     const Link& link = links_[l];
@@ -95,24 +120,7 @@ FreeMotion::Rates FreeMotion::rates(const Given& given,
       b.omega = nu.segment<3>(3);
       b.velocity = nu.head<3>() + b.omega.cross(b.origin - at.center);
     } else {
-      const Body& parent = bodies[link.parent];
-      b.rotation = parent.rotation * link.offset.leftCols<3>();
-      b.origin = parent.origin + parent.rotation * link.offset.col(3);
-      b.axis = b.rotation * link.axis;
-      b.omega = parent.omega;
-      Vec3 slide = Vec3::Zero();
-      if (link.kind != JointKind::kFixed) {
-        const double value = link.multiplier * at.joints[link.coordinate] + link.constant;
-        const double rate = link.multiplier * nu[kRoot + link.coordinate];
-        if (link.kind == JointKind::kRevolute) {
-          b.rotation *= Eigen::AngleAxisd(value, link.axis).toRotationMatrix();
-          b.omega += rate * b.axis;
-        } else {
-          b.origin += value * b.axis;
-          slide = rate * b.axis;
-        }
-      }
-      b.velocity = parent.velocity + parent.omega.cross(b.origin - parent.origin) + slide;
+      follow(bodies[link.parent], link, at.joints, joint_rates, b);
     }
     const Vec3 arm = b.rotation * center;
     b.force = given.mass[l] * (b.velocity + b.omega.cross(arm));

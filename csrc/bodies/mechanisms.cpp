@@ -49,6 +49,13 @@ struct Mechanisms::Eval {
 
 Mechanisms::Mechanisms(MechanismsDescription description, const BodySet& bodies)
     : given_(std::move(description)), vertices_(bodies.vertices) {
+  const std::vector<Index> tree_of = make_trees();
+  make_paths();
+  make_surfaces(bodies, tree_of);
+  find_levers();
+}
+
+std::vector<Index> Mechanisms::make_trees() {
   const auto n = static_cast<Index>(given_.coordinate_tree.size());
   slot_.assign(static_cast<std::size_t>(n), -1);
   std::vector<Index> tree_of(given_.tree_free.size(), -1);
@@ -72,18 +79,7 @@ Mechanisms::Mechanisms(MechanismsDescription description, const BodySet& bodies)
     const bool is_obstacle =
         tree.last_coordinate == tree.first_coordinate && tree.last_link == tree.first_link + 1;
     if (is_obstacle) continue;
-    for (const char prescribed : {char{0}, char{1}}) {
-      Index in_node = 3;
-      for (Index c = tree.first_coordinate; c < tree.last_coordinate; ++c) {
-        if (given_.prescribed[c] != prescribed) continue;
-        if (in_node == 3) {
-          node_prescribed_.push_back(prescribed);
-          in_node = 0;
-        }
-        slot_[c] = 3 * (node_count() - 1) + in_node++;
-        has_free_ = has_free_ || prescribed == 0;
-      }
-    }
+    assign_slots(tree);
     tree.last_node = node_count();
     tree_of[t] = tree_count();
     trees_.push_back(tree);
@@ -91,13 +87,34 @@ Mechanisms::Mechanisms(MechanismsDescription description, const BodySet& bodies)
   for (std::size_t t = 0; t < trees_.size(); ++t) {
     trees_[t].frame = node_count() + 4 * static_cast<Index>(t);
   }
+  return tree_of;
+}
 
+void Mechanisms::assign_slots(const Tree& tree) {
+  for (const char prescribed : {char{0}, char{1}}) {
+    Index in_node = 3;
+    for (Index c = tree.first_coordinate; c < tree.last_coordinate; ++c) {
+      if (given_.prescribed[c] != prescribed) continue;
+      if (in_node == 3) {
+        node_prescribed_.push_back(prescribed);
+        in_node = 0;
+      }
+      slot_[c] = 3 * (node_count() - 1) + in_node++;
+      has_free_ = has_free_ || prescribed == 0;
+    }
+  }
+}
+
+void Mechanisms::make_paths() {
   path_.resize(given_.links.size());
   for (std::size_t l = 0; l < given_.links.size(); ++l) {
     const Link& own = given_.links[l];
     if (own.parent >= 0) path_[l] = path_[own.parent];
     if (own.kind != JointKind::kFixed) path_[l].push_back(static_cast<Index>(l));
   }
+}
+
+void Mechanisms::make_surfaces(const BodySet& bodies, const std::vector<Index>& tree_of) {
   for (std::size_t s = 0; s < given_.surface_link.size(); ++s) {
     const Index l = given_.surface_link[s];
     Surface surface{.tree = tree_of[given_.links[l].tree],
@@ -119,7 +136,6 @@ Mechanisms::Mechanisms(MechanismsDescription description, const BodySet& bodies)
         moves_with_any([&](Index c) { return given_.prescribed[c] == 0 || given_.held[c] != 0; });
     surface_.push_back(surface);
   }
-  find_levers();
 }
 
 std::vector<std::vector<Index>> Mechanisms::cliques() const {

@@ -158,6 +158,12 @@ class Mechanisms {
                             const Eval& at,
                             const std::vector<Mat34>& moment) const;
   Eigen::MatrixXd curvature(const Tree& tree, const double* points, const double* g) const;
+
+  /// What the constructor fills, in this order; the first gives the tree here of each given one, or -1.
+  std::vector<Index> make_trees();
+  void assign_slots(const Tree& tree);
+  void make_paths();
+  void make_surfaces(const BodySet& bodies, const std::vector<Index>& tree_of);
   void find_levers();
 
   MechanismsDescription given_;

@@ -26,7 +26,7 @@ constexpr double kRounding = 1e-14;
 constexpr double kMore = 1.01;
 
 /// What the vertices of a surface have done since the reference.
-struct Motion {
+struct Travel {
   Vec3 mean = Vec3::Zero();
   double around_mean = 0.0;  ///< largest deviation from it
   double largest = 0.0;
@@ -43,11 +43,11 @@ void raise(double& largest, double value) {
 }
 
 /// Of each surface, whose vertices come one after another.
-std::vector<Motion> motions(const CollisionMesh& mesh, const double* from, const double* to) {
-  std::vector<Motion> result(mesh.surface_count());
+std::vector<Travel> motions(const CollisionMesh& mesh, const double* from, const double* to) {
+  std::vector<Travel> result(mesh.surface_count());
   for (Index first = 0, last = 0; first < mesh.vertex_count; first = last) {
     const Index surface = mesh.vertex_surface[first];
-    Motion motion;
+    Travel motion;
     for (; last < mesh.vertex_count && mesh.vertex_surface[last] == surface; ++last) {
       motion.mean += row(to, last) - row(from, last);
     }
@@ -77,7 +77,7 @@ double CandidateList::measure_approach(const double* reference,
   double result = 0.0;
   // Along a straight motion displacements are largest at one of its ends.
   for (const double* x : {x_t0, x_t1}) {
-    const std::vector<Motion> moved = motions(mesh, reference, x);
+    const std::vector<Travel> moved = motions(mesh, reference, x);
     for (std::size_t s = 0; s < count; ++s) {
       for (std::size_t r = 0; r < count; ++r) {
         if (!mesh.touching.contains(static_cast<Index>(s), static_cast<Index>(r))) continue;

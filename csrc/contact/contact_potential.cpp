@@ -94,8 +94,9 @@ void ContactPotential::add_couplings_near(const double* x, linalg::Couplings& pa
                                 model_.moving_surfaces(), detection_.scratch, near);
   for (const Candidate& pair : near) {
     add_stencil_couplings(pair.vertices, pairs);
-    // Friction between edges of cloths turns with a face of one.
+    // Friction between edges of cloths that do not cross turns with a face of one.
     if (pair.kind != PairKind::kEdgeEdge || !model_.between_cloths(pair)) continue;
+    if (crosses(pair, x)) continue;
     const Index third = model_.frame(pair)[2];
     for (const Index v : pair.vertices) pairs.emplace_back(std::max(v, third), std::min(v, third));
   }
@@ -141,13 +142,15 @@ void FrictionPotential::add_couplings(linalg::Couplings& pairs) const {
 void FrictionPotential::add_hessian(const double* x,
                                     Curvature curvature,
                                     linalg::BlockMatrix& A) const {
-  for (const FrictionSet::Entry& k : set_.entries()) set_.hessian(k, x, curvature).add_to(A);
+  const FrictionSet::Slips& at = set_.slips(x);
+  for (const FrictionSet::Entry& k : set_.entries()) set_.hessian(k, at, curvature).add_to(A);
 }
 
 void FrictionPotential::add_held_product(const double* x, const double* z, double* y) const {
+  const FrictionSet::Slips& at = set_.slips(x);
   for (const FrictionSet::Entry& k : set_.entries()) {
     if (!set_.model().is_held(k.all_points())) continue;
-    set_.hessian(k, x, Curvature::kExact).add_product(z, y);
+    set_.hessian(k, at, Curvature::kExact).add_product(z, y);
   }
 }
 
@@ -155,8 +158,9 @@ void FrictionPotential::add_left_out_product(const double* x,
                                              Curvature curvature,
                                              const double* d,
                                              double* y) const {
+  const FrictionSet::Slips& at = set_.slips(x);
   for (const FrictionSet::Entry& k : set_.entries()) {
-    if (moves(k.all_points(), d)) set_.hessian(k, x, curvature).add_product(d, y);
+    if (moves(k.all_points(), d)) set_.hessian(k, at, curvature).add_product(d, y);
   }
 }
 

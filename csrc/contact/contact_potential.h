@@ -78,6 +78,7 @@ class ContactPotential final : public Potential {
                             const double* d,
                             double* y) const override;
   void accumulate(const double* x, const double* z) override;
+  void swap_cotangents(CotangentStore& /*store*/) override {}  // they are the caller's
 
  private:
   /// What is near at a point.
@@ -125,7 +126,12 @@ class FrictionPotential final : public Potential {
                             Curvature curvature,
                             const double* d,
                             double* y) const override;
+  void update_duals(const double* x, const double* p, double alpha, const double* to) override {
+    set_.update_duals(x, p, alpha, to);
+  }
+  bool has_duals(const double* x) const override { return set_.has_duals(x); }
   void accumulate(const double* x, const double* z) override;
+  void swap_cotangents(CotangentStore& /*store*/) override {}  // the caller takes and swaps them
 
   /// Where the lag configuration lies: accumulate() needs it.
   void set_lag(const double* x_lag) { x_lag_ = x_lag; }

@@ -5,6 +5,8 @@
 #include <cstdint>
 #include <limits>
 
+#include <Eigen/Eigenvalues>
+
 #include "common/outer_product.h"
 #include "contact/distance/mollifier.h"
 
@@ -346,6 +348,13 @@ void visit_positive_part(const Closest& k, double b1, double b2, Add&& add) {
   }
 }
 
+/// A symmetric matrix without its negative eigenvalues.
+Mat12 positive_part(const Mat12& h) {
+  const Eigen::SelfAdjointEigenSolver<Mat12> eigen(h);
+  const Mat12& vectors = eigen.eigenvectors();
+  return vectors * eigen.eigenvalues().cwiseMax(0.0).asDiagonal() * vectors.transpose();
+}
+
 }  // namespace
 
 Mat3 ContactHessian::operator()(int p, int q) const {
@@ -354,6 +363,14 @@ Mat3 ContactHessian::operator()(int p, int q) const {
     add_outer_product(left_[k].segment<3>(3 * p), right_[k].segment<3>(3 * q), h);
   }
   if (rest_) h += rest_->block<3, 3>(3 * p, 3 * q);
+  return h;
+}
+
+Mat12 ContactHessian::dense() const {
+  Mat12 h;
+  for (int p = 0; p < 4; ++p) {
+    for (int q = 0; q < 4; ++q) h.block<3, 3>(3 * p, 3 * q) = (*this)(p, q);
+  }
   return h;
 }
 
@@ -381,6 +398,10 @@ ContactHessian ContactModel::hessian(const Contact& k, const double* x, Curvatur
   const double b2 = scale * k.mollifier * k.barrier.b2;
   if (curvature == Curvature::kPositive) {
     if (scale <= 0.0) return h;
+    if (k.mollified) {
+      h.rest_ = positive_part(hessian(k, x, Curvature::kExact).dense());
+      return h;
+    }
     visit_positive_part(k.closest, b1, b2, [&](double w, const Vec12& u) { h.add(w * u, u); });
     return h;
   }
@@ -435,6 +456,25 @@ void ContactModel::add_hessian_product(const std::vector<Contact>& contacts,
                                        double* y) const {
   for (const Contact& k : contacts) {
     scatter(k.pair.vertices, hessian(k, x, Curvature::kExact) * stacked(k.pair.vertices, z), y);
+  }
+}
+
+// B = kappa w m b, contact by contact. Bodies' shares of areas are constant where features do not change.
+void ContactModel::add_energy_bars(const std::vector<Contact>& contacts,
+                                   const double* x,
+                                   double scale,
+                                   Bar& bar) const {
+  for (const Contact& k : contacts) {
+    const double m = k.mollifier;
+    const double per_b = scale * k.kappa * k.weight * m;
+    double threshold_bar = 0.0;
+    if (k.mollified) {
+      const Mollifier by = mollifier_derivatives(corners(k.pair.vertices, x), k.threshold);
+      threshold_bar = scale * k.kappa * k.weight * by.m_eps * k.barrier.b;
+    }
+    pull_back_kappa(k.pair, scale * k.weight * m * k.barrier.b, bar);
+    bar.d_hat += per_b * k.barrier.b_d_hat;
+    pull_back(k, scale * k.kappa * m * k.barrier.b, threshold_bar, per_b * k.barrier.b_xi, bar);
   }
 }
 

@@ -88,6 +88,7 @@ class ContactHessian {
 
  private:
   friend class ContactModel;
+  Mat12 dense() const;
   void add(const Vec12& left, const Vec12& right);
 
   int count_ = 0;  ///< of the products
@@ -158,14 +159,14 @@ class ContactModel {
   bool between_cloths(const Candidate& pair) const;
 
   /// Three vertices of one of a pair's surfaces, with which the gap between both turns: of a body, at rest
-  /// rather than moving; between cloths of the triangle, or of a face at the second edge.
+  /// rather than moving; between cloths of the triangle, or, of edges that do not cross, of a face at the
+  /// second one.
   std::array<Index, 3> frame(const Candidate& pair) const;
 
   /// g += grad B.
   void add_gradient(const std::vector<Contact>& contacts, const double* x, double* g) const;
 
-  /// Hessian of one contact; kPositive is its positive part, up to the mollifier's terms, and zero if
-  /// its weight is negative.
+  /// Hessian of one contact; kPositive is its positive part, and zero if its weight is negative.
   ContactHessian hessian(const Contact& contact, const double* x, Curvature curvature) const;
 
   /// y += H z over all vertices, exact.
@@ -185,6 +186,12 @@ class ContactModel {
 
     explicit Bar(const CollisionMesh& mesh);
   };
+
+  /// bar += scale * dB/d(theta), for every theta of Bar.
+  void add_energy_bars(const std::vector<Contact>& contacts,
+                       const double* x,
+                       double scale,
+                       Bar& bar) const;
 
   /// bar += scale * d/d(theta) of z . grad B, for every theta of Bar.
   void add_mixed(const std::vector<Contact>& contacts,

@@ -4,15 +4,19 @@
 #include <cmath>
 
 #include "contact/distance/mollifier.h"
-#include "contact/friction.h"
 
 namespace diffcloth::contact {
 namespace {
 
 using Entry = FrictionSet::Entry;
+using Frame = FrictionSet::Frame;
 
 /// A frame is a line where its edges are parallel but for rounding: |m|^2 over |e1|^2 |e2|^2.
 constexpr double kLine = 1e-24;
+/// Duals that are all this close to the forces at the point are of no further use: Newton's method converges.
+constexpr double kClose = 0.1;
+/// Squared sine of the angle from which on two edges cross.
+constexpr double kCrossing = 0.2;
 
 Vec3 tangential(const Vec3& u, const Vec3& n) { return u - n.dot(u) * n; }
 
@@ -20,45 +24,49 @@ Vec3 tangential(const Vec3& u, const Vec3& n) { return u - n.dot(u) * n; }
 Vec3 gap(const Entry& k, const double* x) {
   const Vec3 origin = row(x, k.points[0]);
   Vec3 r = Vec3::Zero();
-  for (int i = 1; i < k.frame + 3; ++i) {
+  for (int i = 1; i < k.count; ++i) {
     if (k.c[i] != 0.0) r += k.c[i] * (row(x, k.points[i]) - origin);
   }
   return r;
 }
 
-/// e1, e2 and m = e1 x e2 of an entry's frame.
-struct Frame {
-  Frame(const Entry& k, const double* x)
-      : e1(row(x, k.points[k.frame + 1]) - row(x, k.points[k.frame])),
-        e2(row(x, k.points[k.frame + 2]) - row(x, k.points[k.frame])),
-        m(e1.cross(e2)) {}
-
-  bool is_line() const { return !(m.squaredNorm() > kLine * e1.squaredNorm() * e2.squaredNorm()); }
-  Vec3 operator*(const Vec3& a) const { return a[0] * e1 + a[1] * e2 + a[2] * m; }
-  /// The coordinates of a vector.
-  Vec3 coordinates(const Vec3& r) const {
-    return Vec3(e2.cross(m).dot(r), m.cross(e1).dot(r), m.dot(r)) / m.squaredNorm();
-  }
-  /// sum_k a_k of the dual vectors.
-  Vec3 dual(const Vec3& a) const {
-    return (a[0] * e2.cross(m) + a[1] * m.cross(e1) + a[2] * m) / m.squaredNorm();
-  }
-  /// Cotangents of e1 and e2 where f is that of this * a.
-  std::array<Vec3, 2> pull_back(const Vec3& a, const Vec3& f) const {
-    return {a[0] * f + a[2] * e2.cross(f), a[1] * f + a[2] * f.cross(e1)};
-  }
-
-  Vec3 e1;
-  Vec3 e2;
-  Vec3 m;
-};
-
 /// Add cotangents of e1 and e2 to those of the frame's vertices.
 void add_edges(const Entry& k, const std::array<Vec3, 2>& bar, double* x_bar) {
   for (int e = 0; e < 2; ++e) {
-    Eigen::Map<Vec3>(x_bar + 3 * k.points[k.frame + 1 + e]) += bar[e];
-    Eigen::Map<Vec3>(x_bar + 3 * k.points[k.frame]) -= bar[e];
+    Eigen::Map<Vec3>(x_bar + 3 * k.points[k.edges[2 * e + 1]]) += bar[e];
+    Eigen::Map<Vec3>(x_bar + 3 * k.points[k.edges[2 * e]]) -= bar[e];
   }
+}
+
+/// Let the edges of a pair be the frame.
+void turn_with_edges(Entry& entry) {
+  const auto& v = entry.lag.pair.vertices;
+  const Vec4& c = entry.lag.closest.c;
+  entry.points = {v[2], v[3], v[0], v[1]};
+  entry.c = {c[2], c[3], c[0], c[1]};
+  entry.frame = 0;
+  entry.count = 4;
+  entry.edges = {0, 1, 2, 3};
+}
+
+/// Let three vertices be the frame.
+void turn_with(const std::array<Index, 3>& frame, Entry& entry) {
+  const auto& v = entry.lag.pair.vertices;
+  const Vec4& c = entry.lag.closest.c;
+  for (int i = 0; i < 4; ++i) {
+    if (std::ranges::find(frame, v[i]) != frame.end()) continue;
+    entry.points[entry.frame] = v[i];
+    entry.c[entry.frame++] = c[i];
+  }
+  entry.count = entry.frame + 3;
+  for (int e = 0; e < 3; ++e) {
+    const int p = entry.frame + e;
+    entry.points[p] = frame[e];
+    for (int i = 0; i < 4; ++i) {
+      if (v[i] == frame[e]) entry.c[p] += c[i];
+    }
+  }
+  entry.edges = {entry.frame, entry.frame + 1, entry.frame, entry.frame + 2};
 }
 
 /// The matrix of v -> u x v.
@@ -68,6 +76,33 @@ Mat3 cross_matrix(const Vec3& u) {
 
 }  // namespace
 
+bool crosses(const Candidate& pair, const double* x) {
+  if (pair.kind != PairKind::kEdgeEdge) return false;
+  const auto& v = pair.vertices;
+  const Vec3 a = row(x, v[1]) - row(x, v[0]);
+  const Vec3 b = row(x, v[3]) - row(x, v[2]);
+  return a.cross(b).squaredNorm() > kCrossing * a.squaredNorm() * b.squaredNorm();
+}
+
+FrictionSet::Frame::Frame(const Entry& k, const double* x)
+    : e1(k.edge(0, x)), e2(k.edge(1, x)), m(e1.cross(e2)) {}
+
+bool FrictionSet::Frame::is_line() const {
+  return !(m.squaredNorm() > kLine * e1.squaredNorm() * e2.squaredNorm());
+}
+
+Vec3 FrictionSet::Frame::coordinates(const Vec3& r) const {
+  return Vec3(e2.cross(m).dot(r), m.cross(e1).dot(r), m.dot(r)) / m.squaredNorm();
+}
+
+Vec3 FrictionSet::Frame::dual(const Vec3& a) const {
+  return (a[0] * e2.cross(m) + a[1] * m.cross(e1) + a[2] * m) / m.squaredNorm();
+}
+
+std::array<Vec3, 2> FrictionSet::Frame::pull_back(const Vec3& a, const Vec3& f) const {
+  return {a[0] * f + a[2] * e2.cross(f), a[1] * f + a[2] * f.cross(e1)};
+}
+
 FrictionSet::FrictionSet(const ContactModel& model,
                          const std::vector<Contact>& contacts,
                          const double* x_start)
@@ -75,8 +110,6 @@ FrictionSet::FrictionSet(const ContactModel& model,
   entries_.reserve(contacts.size());
   for (const Contact& k : contacts) {
     const double d = std::sqrt(k.closest.d_sq);
-    const auto& v = k.pair.vertices;
-    const std::array<Index, 3> frame = model.frame(k.pair);
     Entry entry{.lag = k,
                 .n = k.closest.t / d,
                 .lambda = -k.kappa * k.weight * k.mollifier * k.barrier.b1 * 2.0 * d,
@@ -84,19 +117,14 @@ FrictionSet::FrictionSet(const ContactModel& model,
                 .points = {},
                 .c = {},
                 .frame = 0,
+                .count = 0,
+                .edges = {},
                 .turns = false,
                 .a = Vec3::Zero()};
-    for (int i = 0; i < 4; ++i) {
-      if (std::ranges::find(frame, v[i]) != frame.end()) continue;
-      entry.points[entry.frame] = v[i];
-      entry.c[entry.frame++] = k.closest.c[i];
-    }
-    for (int e = 0; e < 3; ++e) {
-      const int p = entry.frame + e;
-      entry.points[p] = frame[e];
-      for (int i = 0; i < 4; ++i) {
-        if (v[i] == frame[e]) entry.c[p] += k.closest.c[i];
-      }
+    if (model.between_cloths(k.pair) && crosses(k.pair, x_start)) {
+      turn_with_edges(entry);
+    } else {
+      turn_with(model.frame(k.pair), entry);
     }
     const Frame at_start(entry, x_start);
     entry.turns = !at_start.is_line();
@@ -105,26 +133,35 @@ FrictionSet::FrictionSet(const ContactModel& model,
   }
 }
 
-struct FrictionSet::Slip {
-  Frame frame;
-  Vec3 s;
-  Vec3 w;
-  FrictionLaw law;
-};
+bool FrictionSet::is_at(const std::vector<double>& point, const double* x) const {
+  return !point.empty() && std::equal(point.begin(), point.end(), x);
+}
+
+const FrictionSet::Slips& FrictionSet::slips(const double* x) const {
+  if (is_at(kept_[last_].x, x)) return kept_[last_].slips;
+  last_ = 1 - last_;
+  Kept& here = kept_[last_];
+  if (is_at(here.x, x)) return here.slips;
+  here.x.assign(x, x + 3 * static_cast<std::ptrdiff_t>(model_->mesh().vertex_count));
+  here.slips.clear();
+  here.slips.reserve(entries_.size());
+  for (const Entry& k : entries_) here.slips.push_back(slip(k, x));
+  return here.slips;
+}
 
 FrictionSet::Slip FrictionSet::slip(const Entry& k, const double* x) const {
   const Frame frame(k, x);
   // By displacements, of which little is lost: sum_i c_i delta_i less the change of E a.
   std::array<Vec3, 7> delta;
   Vec3 s = Vec3::Zero();
-  for (int i = 0; i < k.frame + 3; ++i) {
+  for (int i = 0; i < k.count; ++i) {
     delta[i] = row(x, k.points[i]) - row(x_start_, k.points[i]);
     s += k.c[i] * delta[i];
   }
   if (k.turns) {
-    const Vec3 change_1 = delta[k.frame + 1] - delta[k.frame];
-    const Vec3 change_2 = delta[k.frame + 2] - delta[k.frame];
-    const Vec3 e1_start = row(x_start_, k.points[k.frame + 1]) - row(x_start_, k.points[k.frame]);
+    const Vec3 change_1 = delta[k.edges[1]] - delta[k.edges[0]];
+    const Vec3 change_2 = delta[k.edges[3]] - delta[k.edges[2]];
+    const Vec3 e1_start = k.edge(0, x_start_);
     s -= k.a[0] * change_1 + k.a[1] * change_2 +
          k.a[2] * (change_1.cross(frame.e2) + e1_start.cross(change_2));
   }
@@ -133,42 +170,78 @@ FrictionSet::Slip FrictionSet::slip(const Entry& k, const double* x) const {
 }
 
 double FrictionSet::energy_change(const double* x0, const double* x1) const {
+  const Slips& end = slips(x1);
+  const Slips& start = slips(x0);  // both are kept
   double change = 0.0;
-  for (const Entry& k : entries_) {
-    change += k.mu * k.lambda * (slip(k, x1).law.f0 - slip(k, x0).law.f0);
+  for (std::size_t i = 0; i < entries_.size(); ++i) {
+    change += entries_[i].mu * entries_[i].lambda * (end[i].law.f0 - start[i].law.f0);
   }
   return change;
 }
 
 void FrictionSet::add_gradient(const double* x, double* g) const {
-  for (const Entry& k : entries_) {
-    const Slip at = slip(k, x);
-    const Vec3 force = (k.mu * k.lambda * at.law.f1_over_y) * at.w;
-    for (int i = 0; i < k.frame + 3; ++i) {
+  const Slips& here = slips(x);
+  for (std::size_t e = 0; e < entries_.size(); ++e) {
+    const Entry& k = entries_[e];
+    const Slip& at = here[e];
+    const Vec3 force = (k.mu * k.lambda) * at.force();
+    for (int i = 0; i < k.count; ++i) {
       Eigen::Map<Vec3>(g + 3 * k.points[i]) += k.c[i] * force;
     }
     add_edges(k, at.frame.pull_back(-k.a, force), g);
   }
 }
 
+void FrictionSet::update_duals(const double* x, const double* p, double alpha, const double* to) {
+  const Slips& end = slips(to);
+  const Slips& start = slips(x);  // both are kept
+  const bool go_on = has_duals(x);
+  std::vector<Vec3> duals(entries_.size());
+  bool any = false;
+  for (std::size_t i = 0; i < entries_.size(); ++i) {
+    const FrictionLaw& law = start[i].law;
+    const Vec3& w = start[i].w;
+    const Vec3 v = go_on ? duals_[i] : start[i].force();
+    const Hessian h = hessian(entries_[i], start, Curvature::kExact);
+    const Vec3 dw = tangential(h.change(p), entries_[i].n);
+    const Vec3 linear = law.f1_over_y * (w + dw) + (law.f2 / law.f1_over_y * w.dot(dw)) * v;
+    duals[i] = v + std::min(alpha, 1.0) * (linear - v);
+    duals[i] /= std::max(duals[i].norm(), 1.0);
+    if (entries_[i].lambda < 0.0) duals[i] = end[i].force();
+    any = any || (duals[i] - end[i].force()).norm() > kClose;
+  }
+  duals_at_.clear();
+  if (!any) return;
+  duals_ = std::move(duals);
+  duals_at_.assign(to, to + 3 * static_cast<std::ptrdiff_t>(model_->mesh().vertex_count));
+}
+
+bool FrictionSet::has_duals(const double* x) const { return is_at(duals_at_, x); }
+
 FrictionSet::Hessian FrictionSet::hessian(const Entry& k,
-                                          const double* x,
+                                          const Slips& slips,
                                           Curvature curvature) const {
   Hessian h(k);
-  const Slip at = slip(k, x);
+  const auto i = static_cast<std::size_t>(&k - entries_.data());
+  const Slip& at = slips[i];
   const Mat3 identity = Mat3::Identity();
   const Mat3 of_e1 = k.a[2] * cross_matrix(at.frame.e2) - k.a[0] * identity;
   const Mat3 of_e2 = -k.a[2] * cross_matrix(at.frame.e1) - k.a[1] * identity;
-  h.B_[0] = k.c[k.frame] * identity - of_e1 - of_e2;
-  h.B_[1] = k.c[k.frame + 1] * identity + of_e1;
-  h.B_[2] = k.c[k.frame + 2] * identity + of_e2;
+  for (int p = k.frame; p < k.count; ++p) {
+    h.B_[p - k.frame] = k.c[p] * identity + k.sign(0, p) * of_e1 + k.sign(1, p) * of_e2;
+  }
   if (curvature == Curvature::kPositive && k.lambda < 0.0) return h;
   const double strength = k.mu * k.lambda;
   h.core_ = (strength * at.law.f1_over_y) * (identity - k.n * k.n.transpose());
-  if (curvature == Curvature::kExact) {
-    h.core_ += (strength * at.law.f2) * at.w * at.w.transpose();
-    h.turn_ = (k.a[2] * strength * at.law.f1_over_y) * at.w;
+  if (curvature == Curvature::kPositive) return h;
+  if (curvature == Curvature::kPrimalDual && !duals_at_.empty()) {
+    const Mat3 outer = duals_[i] * at.w.transpose();
+    h.core_ += (0.5 * strength * at.law.f2 / at.law.f1_over_y) * (outer + outer.transpose());
+    h.turn_ = (k.a[2] * strength) * duals_[i];
+    return h;
   }
+  h.core_ += (strength * at.law.f2) * at.w * at.w.transpose();
+  h.turn_ = (k.a[2] * strength) * at.force();
   return h;
 }
 
@@ -176,49 +249,56 @@ void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
   const Entry& k = *entry_;
   const int first = k.frame;
   const Mat3 cross = cross_matrix(turn_);
-  // Between a vertex of the frame and the next one, turn x; with the one before, the opposite.
+  // Between e1 and e2 turn x, between e2 and e1 the opposite.
   const auto turning = [&](int p, int q) -> Mat3 {
-    if (p == q) return Mat3::Zero();
-    return q == (p + 1) % 3 ? cross : -cross;
+    return (k.sign(0, p) * k.sign(1, q) - k.sign(1, p) * k.sign(0, q)) * cross;
   };
   if (A.any_attached(k.all_points())) {
     std::array<Mat3, 7> jacobians;
     for (int p = 0; p < first; ++p) jacobians[p] = k.c[p] * Mat3::Identity();
-    std::ranges::copy(B_, jacobians.begin() + first);
+    std::copy_n(B_.begin(), k.count - first, jacobians.begin() + first);
     A.add_congruence(k.all_points(), jacobians, core_);
     if (turn_.isZero(0.0)) return;
-    const Index last = k.points[first + 2];
-    A.add_stencil({k.points[first], k.points[first + 1], last, last}, [&](int p, int q) -> Mat3 {
-      return p == 3 || q == 3 ? Mat3::Zero() : turning(p, q);
+    std::array<Index, 4> frame{};
+    for (int e = 0; e < 4; ++e) frame[e] = k.points[std::min(first + e, k.count - 1)];
+    const int vertices = k.count - first;
+    A.add_stencil(frame, [&](int p, int q) -> Mat3 {
+      return p >= vertices || q >= vertices ? Mat3::Zero() : turning(first + p, first + q);
     });
     return;
   }
-  std::array<Mat3, 3> core_b;
-  for (int e = 0; e < 3; ++e) core_b[e] = core_.lazyProduct(B_[e]);
+  std::array<Mat3, 4> core_b;
+  for (int e = 0; e < k.count - first; ++e) core_b[e] = core_.lazyProduct(B_[e]);
   A.add_rows(k.all_points(), [&](int p, int q) -> Mat3 {
     if (p < first && q < first) return (k.c[p] * k.c[q]) * core_;
     if (p < first) return k.c[p] * core_b[q - first];
     if (q < first) return k.c[q] * core_b[p - first].transpose();
-    return B_[p - first].transpose().lazyProduct(core_b[q - first]) + turning(p - first, q - first);
+    return B_[p - first].transpose().lazyProduct(core_b[q - first]) + turning(p, q);
   });
+}
+
+Vec3 FrictionSet::Hessian::change(const double* z) const {
+  const Entry& k = *entry_;
+  Vec3 result = Vec3::Zero();
+  for (int p = 0; p < k.frame; ++p) result += k.c[p] * row(z, k.points[p]);
+  for (int p = k.frame; p < k.count; ++p) result += B_[p - k.frame] * row(z, k.points[p]);
+  return result;
 }
 
 void FrictionSet::Hessian::add_product(const double* z, double* y) const {
   const Entry& k = *entry_;
-  Vec3 change = Vec3::Zero();
-  for (int p = 0; p < k.frame; ++p) change += k.c[p] * row(z, k.points[p]);
-  for (int e = 0; e < 3; ++e) change += B_[e] * row(z, k.points[k.frame + e]);
-  const Vec3 force = core_ * change;
+  const Vec3 force = core_ * change(z);
   for (int p = 0; p < k.frame; ++p) Eigen::Map<Vec3>(y + 3 * k.points[p]) += k.c[p] * force;
-  for (int e = 0; e < 3; ++e) {
-    Eigen::Map<Vec3>(y + 3 * k.points[k.frame + e]) += B_[e].transpose() * force;
+  for (int p = k.frame; p < k.count; ++p) {
+    Eigen::Map<Vec3>(y + 3 * k.points[p]) += B_[p - k.frame].transpose() * force;
   }
   const Frame turned(k, z);
   add_edges(k, {turn_.cross(turned.e2), turned.e1.cross(turn_)}, y);
 }
 
 void FrictionSet::add_hessian_product(const double* x, const double* z, double* y) const {
-  for (const Entry& k : entries_) hessian(k, x, Curvature::kExact).add_product(z, y);
+  const Slips& at = slips(x);
+  for (const Entry& k : entries_) hessian(k, at, Curvature::kExact).add_product(z, y);
 }
 
 // phi = mu lambda q(|w|) w . zeta,  q = f1/y,  w = P s,  s = r(x) - E(x) a,  zeta = r(z) - E'(z) a,
@@ -241,14 +321,16 @@ void FrictionSet::add_mixed(const double* x,
                             ContactModel::Bar& bar,
                             double* start_bar,
                             double* lag_bar) const {
-  for (const Entry& k : entries_) {
+  const Slips& here = slips(x);
+  for (std::size_t e = 0; e < entries_.size(); ++e) {
+    const Entry& k = entries_[e];
     const Contact& lag = k.lag;
     const Closest& geometry = lag.closest;
     const auto& v = lag.pair.vertices;
     const double kappa = lag.kappa;
     const double d = std::sqrt(geometry.d_sq);
 
-    const Slip at = slip(k, x);
+    const Slip& at = here[e];
     const FrictionLaw& law = at.law;
     const Frame change(k, z);
     const auto turned = [&](const Vec3& a) -> Vec3 {

@@ -5,8 +5,12 @@
 #include <vector>
 
 #include "contact/contact_set.h"
+#include "contact/friction.h"
 
 namespace diffcloth::contact {
+
+/// Whether the edges of a pair between cloths cross at an angle at x, so that they say how it turns.
+bool crosses(const Candidate& pair, const double* x);
 
 /// Lagged friction: sum over contacts of mu lambda f0(|w|; e)  [J],
 ///
@@ -17,8 +21,8 @@ namespace diffcloth::contact {
 /// that its `frame` belongs to: what turns as one does not slide, and friction has no couple about the
 /// gap. Obstacle vertices take part, so that a moving body drags the cloth.
 ///
-/// Q comes from three vertices of that surface. With e1 and e2 from the first of them to the others and
-/// m = e1 x e2,
+/// Q comes from two edges e1 and e2: of three vertices of that surface, or, where the edges of two cloths
+/// cross at an angle, these. With m = e1 x e2,
 ///
 ///   Q r(x_start) = a1 e1(x) + a2 e2(x) + a3 m(x),   where a makes it r(x_start) at x_start.
 class FrictionSet {
@@ -39,18 +43,64 @@ class FrictionSet {
     Vec3 n;         ///< unit normal at the lag configuration
     double lambda;  ///< normal force at the lag configuration [N]
     double mu;
-    /// Corners of the contact, then the three vertices of the frame, which between cloths are corners too.
+    /// Corners of the contact, then the vertices of the frame, which between cloths are corners too.
     std::array<Index, 7> points;
-    std::array<double, 7> c;  ///< of the points
-    int frame;                ///< where the frame's vertices begin: they are the last
-    bool turns;               ///< false where the frame was a line at the start: Q is the identity
-    Vec3 a;                   ///< the gap at the start in the frame there; zero if it does not turn
+    std::array<double, 7> c;   ///< of the points
+    int frame;                 ///< where the frame's vertices begin
+    int count;                 ///< of the points: the frame's three or four are the last
+    std::array<int, 4> edges;  ///< start and end of e1, then of e2, among the points
+    bool turns;                ///< false where the frame was a line at the start: Q is the identity
+    Vec3 a;  ///< the gap at the start in the frame there; zero if it does not turn
 
     std::span<const Index> all_points() const {
-      return {points.data(), static_cast<std::size_t>(frame) + 3};
+      return {points.data(), static_cast<std::size_t>(count)};
+    }
+
+    /// e1 or e2 of some rows.
+    Vec3 edge(int e, const double* rows) const {
+      return row(rows, points[edges[2 * e + 1]]) - row(rows, points[edges[2 * e]]);
+    }
+
+    /// How often a point counts in e1 or e2: 1 at the end, -1 at the start.
+    int sign(int e, int point) const {
+      return static_cast<int>(point == edges[2 * e + 1]) - static_cast<int>(point == edges[2 * e]);
     }
   };
   const std::vector<Entry>& entries() const { return entries_; }
+
+  /// e1, e2 and m of an entry's frame.
+  struct Frame {
+    Frame(const Entry& k, const double* x);
+
+    bool is_line() const;
+    Vec3 operator*(const Vec3& a) const { return a[0] * e1 + a[1] * e2 + a[2] * m; }
+    /// The coordinates of a vector.
+    Vec3 coordinates(const Vec3& r) const;
+    /// sum_k a_k of the dual vectors.
+    Vec3 dual(const Vec3& a) const;
+    /// Cotangents of e1 and e2 where f is that of this * a.
+    std::array<Vec3, 2> pull_back(const Vec3& a, const Vec3& f) const;
+
+    Vec3 e1;
+    Vec3 e2;
+    Vec3 m;
+  };
+
+  /// The displacement s of an entry, its projection w and the law there.
+  struct Slip {
+    Frame frame;
+    Vec3 s;
+    Vec3 w;
+    FrictionLaw law;
+
+    /// Share of the largest force, as a vector: f1 w / |w|.
+    Vec3 force() const { return law.f1_over_y * w; }
+  };
+  /// Those of all entries at one point.
+  using Slips = std::vector<Slip>;
+
+  /// The slips at x, which last until those of two other points are asked for.
+  const Slips& slips(const double* x) const;
 
   double energy_change(const double* x0, const double* x1) const;
   void add_gradient(const double* x, double* g) const;
@@ -62,19 +112,38 @@ class FrictionSet {
     void add_to(linalg::BlockMatrix& A) const;
     void add_product(const double* z, double* y) const;
 
+    /// The change of s with z.
+    Vec3 change(const double* z) const;
+
    private:
     friend class FrictionSet;
     explicit Hessian(const Entry& entry) : entry_(&entry) {}
 
     const Entry* entry_;
-    std::array<Mat3, 3> B_;  // of the frame's vertices; of all others c I
+    std::array<Mat3, 4> B_;  // of the frame's vertices; of all others c I
     Mat3 core_ = Mat3::Zero();
     Vec3 turn_ = Vec3::Zero();
   };
 
   /// Of the sign of lambda. kPositive is the quadratic majorant (f1/|w|) P, which does not lose its
   /// curvature where a sliding contact would come to rest, and zero where lambda is negative.
-  Hessian hessian(const Entry& entry, const double* x, Curvature curvature) const;
+  ///
+  /// kPrimalDual has the dual v in the place of one f1 w / |w|:  q (P + f2 / q^2 (v w^T + w v^T) / 2)  with
+  /// q = f1 / |w|. Newton's method crosses the kink of |w| to and fro, as the curvature along w is zero on
+  /// both sides; where v still has the direction from before, there is some. It is positive, as |v| <= 1
+  /// (Chan, Golub and Mulet, 1999, for images; ours has the slip of Coulomb's law).
+  ///
+  /// @param at  slips(x); duals are those of has_duals(x)
+  Hessian hessian(const Entry& entry, const Slips& at, Curvature curvature) const;
+
+  /// Keep the duals of a step: v + min(alpha, 1) (q (w + dw) + f2 / q (w . dw) v - v), no longer than 1. None
+  /// where all are close to the forces at its end.
+  ///
+  /// @param p   direction of the step, by the fraction alpha of it
+  /// @param to  its end
+  void update_duals(const double* x, const double* p, double alpha, const double* to);
+
+  bool has_duals(const double* x) const;
 
   /// y += H z over all vertices.
   void add_hessian_product(const double* x, const double* z, double* y) const;
@@ -91,13 +160,21 @@ class FrictionSet {
                  double* lag_bar) const;
 
  private:
-  /// The projected displacement w and the law there.
-  struct Slip;
+  /// What is kept of a point.
+  struct Kept {
+    std::vector<double> x;  ///< all vertices; empty where nothing is known
+    Slips slips;
+  };
+  bool is_at(const std::vector<double>& point, const double* x) const;
   Slip slip(const Entry& entry, const double* x) const;
 
   const ContactModel* model_ = nullptr;
   const double* x_start_ = nullptr;
   std::vector<Entry> entries_;
+  mutable std::array<Kept, 2> kept_;
+  mutable std::size_t last_ = 0;  // of these
+  std::vector<double> duals_at_;  // all vertices; empty where there are none
+  std::vector<Vec3> duals_;       // of the entries
 };
 
 }  // namespace diffcloth::contact

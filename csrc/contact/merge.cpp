@@ -161,18 +161,33 @@ void sort_unique(Values& values) {
   values.erase(std::unique(values.begin(), values.end()), values.end());
 }
 
-}  // namespace
+// How parts merge, in a section across two faces f and g that meet in an edge e. Each face gives what is
+// nearest to p on it, and each edge and vertex itself, with the weights of FeatureWeights:
+//
+//           p                      p above f                       p above e
+//           .                      face f    +1 f                  face f    +1 e
+//           .                      face g    +1 e                  face g    +1 e
+//     ------+------e               edge e    -1 e   (1 - 2 faces)  edge e    -1 e
+//        f          \              ------------------              ------------------
+//                  g \ .           sum       +1 f                  sum       +1 e
+//
+// Likewise the edges c and c' of a body that continue each other in a vertex v, against an edge e to which v
+// is nearest. Each counts as a whole, less half of each end that is continued:
+//
+//     ====c=====v=====c'====       c,  whole  +1 (v, e)   its end  -1/2 (v, e)
+//               .                  c', whole  +1 (v, e)   its end  -1/2 (v, e)
+//               e                  sum        +1 (v, e)
+//
+// So the nearest feature counts once, however a surface is cut into triangles; all others cancel.
 
-void add_point_terms(const CollisionMesh& mesh,
-                     const FeatureWeights::Features& features,
-                     std::span<const Candidate> group,
-                     const double* x,
-                     double range,
-                     double scale,
-                     MergeScratch& scratch,
-                     std::vector<Term>& out) {
-  const Index point = group.front().a;
-  const Vec3 p = row(x, point);
+/// The faces of a group that are within range of a point, and their edges and vertices.
+void find_features(const CollisionMesh& mesh,
+                   const FeatureWeights::Features& features,
+                   std::span<const Candidate> group,
+                   const double* x,
+                   double range,
+                   MergeScratch& scratch) {
+  const Vec3 p = row(x, group.front().a);
   auto& [faces, edges, vertices, parts] = scratch;
   faces.clear();
   for (const Candidate& pair : group) {
@@ -181,8 +196,6 @@ void add_point_terms(const CollisionMesh& mesh,
       continue;
     faces.push_back(pair.b);
   }
-  if (faces.empty()) return;
-
   // What comes within range has all of its faces within range: their features are all.
   vertices.clear();
   for (const Index f : faces) {
@@ -196,7 +209,15 @@ void add_point_terms(const CollisionMesh& mesh,
     vertices.insert(vertices.end(), mesh.faces[f].begin(), mesh.faces[f].end());
   }
   sort_unique(vertices);
+}
 
+/// What a point has against each of the features that find_features() has found.
+void list_point_parts(const CollisionMesh& mesh,
+                      const FeatureWeights::Features& features,
+                      const Vec3& p,
+                      const double* x,
+                      MergeScratch& scratch) {
+  auto& [faces, edges, vertices, parts] = scratch;
   parts.clear();
   const auto push_on_edge = [&parts](const NearEdge& near, Index weight) {
     const bool inside = near.vertex < 0;
@@ -230,36 +251,163 @@ void add_point_terms(const CollisionMesh& mesh,
                      .coefficient = static_cast<double>(features.vertex[v]),
                      .d_sq = (p - row(x, v)).squaredNorm()});
   }
-  merge(parts, range);
+}
 
-  for (Part& part : parts) {
-    // What remains of a border in a plane is of the first face there that has the point above it.
-    for (const Index f : faces) {
-      if (part.kind == kFace) break;
-      const bool has =
-          part.kind == kEdge
-              ? std::ranges::find(mesh.face_edges[f], part.id) != mesh.face_edges[f].end()
-              : std::ranges::find(mesh.faces[f], part.id) != mesh.faces[f].end();
-      if (!has) continue;
-      double d_sq = 0.0;
-      if (project(mesh, features, f, p, x, d_sq) != Projection::kOnFlatBorder) continue;
-      part.kind = kFace;
-      part.id = f;
-      part.d_sq = d_sq;
+/// What remains of a border in a plane is of the first face there that has the point above it.
+void move_to_plane(const CollisionMesh& mesh,
+                   const FeatureWeights::Features& features,
+                   const std::vector<Index>& faces,
+                   const Vec3& p,
+                   const double* x,
+                   Part& part) {
+  for (const Index f : faces) {
+    if (part.kind == kFace) break;
+    const bool has =
+        part.kind == kEdge
+            ? std::ranges::find(mesh.face_edges[f], part.id) != mesh.face_edges[f].end()
+            : std::ranges::find(mesh.faces[f], part.id) != mesh.faces[f].end();
+    if (!has) continue;
+    double d_sq = 0.0;
+    if (project(mesh, features, f, p, x, d_sq) != Projection::kOnFlatBorder) continue;
+    part.kind = kFace;
+    part.id = f;
+    part.d_sq = d_sq;
+  }
+}
+
+/// A point against the feature of a part.
+Candidate point_pair(const CollisionMesh& mesh, Index point, const Part& part) {
+  Candidate pair{.kind = PairKind::kPointTriangle,
+                 .vertices = {point, part.id, part.id, part.id},
+                 .a = point,
+                 .b = -1};
+  if (part.kind == kFace) {
+    const auto& [i, j, k] = mesh.faces[part.id];
+    pair.vertices = {point, i, j, k};
+    pair.b = part.id;
+  } else if (part.kind == kEdge) {
+    const auto& [i, j] = mesh.edges[part.id];
+    pair.vertices = {point, i, j, j};
+  }
+  return pair;
+}
+
+/// One edge c against one edge e of a body, and the parts that they have.
+class EdgePair {
+ public:
+  EdgePair(const CollisionMesh& mesh,
+           const FeatureWeights& weights,
+           const Candidate& pair,
+           const Closest& nearest_points,
+           const Corners& corner,
+           bool soft,
+           const double* x,
+           std::vector<Part>& parts)
+      : mesh_(mesh),
+        weights_(weights),
+        pair_(pair),
+        nearest_points_(nearest_points),
+        corner_(corner),
+        soft_(soft),
+        x_(x),
+        parts_(parts) {}
+
+  void list_parts(double w) {
+    push_against_e(-1, w);
+    for (const std::int8_t end : {std::int8_t{0}, std::int8_t{1}}) {
+      const double share = 0.5 * weights_.continuation(pair_.a, end);
+      if (share != 0.0) push_against_e(end, -share * w);
     }
-    Candidate pair{.kind = PairKind::kPointTriangle,
-                   .vertices = {point, part.id, part.id, part.id},
-                   .a = point,
-                   .b = -1};
-    if (part.kind == kFace) {
-      const auto& [i, j, k] = mesh.faces[part.id];
-      pair.vertices = {point, i, j, k};
-      pair.b = part.id;
-    } else if (part.kind == kEdge) {
-      const auto& [i, j] = mesh.edges[part.id];
-      pair.vertices = {point, i, j, j};
+  }
+
+ private:
+  void push(std::int8_t end_c, std::int8_t end_e, double coefficient, double d_sq) {
+    // An end that is not continued has nothing to merge with.
+    if (end_c >= 0 && weights_.continuation(pair_.a, end_c) == 0.0) end_c = -1;
+    const bool shared = end_e >= 0 && !soft_;
+    parts_.push_back({.kind = soft_ ? kMollified : (shared ? kVertex : kEdge),
+                      .ends = {end_c, shared ? std::int8_t{-1} : end_e},
+                      .id = shared ? pair_.vertices[2 + end_e] : pair_.b,
+                      .coefficient = coefficient,
+                      .d_sq = d_sq});
+  }
+
+  /// What c as a whole, or its end, does to e and to its ends.
+  void push_against_e(std::int8_t end_c, double coefficient) {
+    Corners at = corner_;
+    if (end_c >= 0) at[0] = at[1] = corner_[end_c];
+    const Closest whole = end_c >= 0 ? closest(PairKind::kEdgeEdge, at) : nearest_points_;
+    const bool at_0 = whole.c[3] == 0.0;
+    const bool at_1 = whole.c[2] == 0.0;
+    if (!at_0 && !at_1) {
+      const std::int8_t nearest = end_c >= 0 ? end_c : end_of(whole.c[0], whole.c[1]);
+      push(nearest, -1, coefficient, whole.d_sq);
     }
-    out.push_back({.pair = pair, .coefficient = scale * part.coefficient, .d_sq = part.d_sq});
+    for (const std::int8_t end : {std::int8_t{0}, std::int8_t{1}}) {
+      const bool nearest = end == 0 ? at_0 : at_1;
+      const double share = (nearest ? 1.0 : 0.0) - 0.5 * weights_.continuation(pair_.b, end);
+      if (share == 0.0) continue;
+      if (end_c >= 0) {
+        push(end_c, end, coefficient * share, (at[0] - corner_[2 + end]).squaredNorm());
+        continue;
+      }
+      const NearEdge near = nearest_on_edge(mesh_, pair_.a, corner_[2 + end], x_);
+      const bool inside = near.vertex < 0;
+      push(inside ? std::int8_t{-1} : std::int8_t{near.vertex == pair_.vertices[1]}, end,
+           coefficient * share, near.d_sq);
+    }
+  }
+
+  const CollisionMesh& mesh_;
+  const FeatureWeights& weights_;
+  const Candidate& pair_;
+  const Closest& nearest_points_;
+  const Corners& corner_;
+  bool soft_;
+  const double* x_;
+  std::vector<Part>& parts_;
+};
+
+/// Edge c against the feature of a part.
+Term edge_term(const CollisionMesh& mesh, Index c, const Part& part, double scale) {
+  const auto& [i, j] = mesh.edges[c];
+  Candidate pair{
+      .kind = PairKind::kEdgeEdge, .vertices = {i, j, part.id, part.id}, .a = c, .b = -1};
+  std::array<std::int8_t, 2> ends = part.ends;
+  if (part.kind != kVertex) {
+    pair.vertices[2] = mesh.edges[part.id][0];
+    pair.vertices[3] = mesh.edges[part.id][1];
+    pair.b = part.id;
+  }
+  if (part.kind != kMollified && ends[0] >= 0) {
+    pair.vertices[0] = pair.vertices[1] = mesh.edges[c][ends[0]];
+    pair.b = -1;
+    ends[0] = -1;
+  }
+  return {.pair = pair, .coefficient = scale * part.coefficient, .d_sq = part.d_sq, .ends = ends};
+}
+
+}  // namespace
+
+void add_point_terms(const CollisionMesh& mesh,
+                     const FeatureWeights::Features& features,
+                     std::span<const Candidate> group,
+                     const double* x,
+                     double range,
+                     double scale,
+                     MergeScratch& scratch,
+                     std::vector<Term>& out) {
+  const Index point = group.front().a;
+  const Vec3 p = row(x, point);
+  find_features(mesh, features, group, x, range, scratch);
+  if (scratch.faces.empty()) return;
+  list_point_parts(mesh, features, p, x, scratch);
+  merge(scratch.parts, range);
+  for (Part& part : scratch.parts) {
+    move_to_plane(mesh, features, scratch.faces, p, x, part);
+    out.push_back({.pair = point_pair(mesh, point, part),
+                   .coefficient = scale * part.coefficient,
+                   .d_sq = part.d_sq});
   }
 }
 
@@ -273,8 +421,7 @@ void add_edge_terms(const CollisionMesh& mesh,
                     MergeScratch& scratch,
                     std::vector<Term>& out) {
   const Index c = group.front().a;
-  std::vector<Part>& parts = scratch.parts;
-  parts.clear();
+  scratch.parts.clear();
   for (const Candidate& pair : group) {
     const Index e = pair.b;
     const double w = weight(mesh, weights, c, e);
@@ -286,67 +433,10 @@ void add_edge_terms(const CollisionMesh& mesh,
     // So are the ends then, and what they would be merged with; but for the rounding of distances.
     if (nearest_points.d_sq > kClearly * range * range) continue;
     const bool soft = mollified(corner, mollifier_threshold(edge_length_sq[c], edge_length_sq[e]));
-    const auto push = [&](std::int8_t end_c, std::int8_t end_e, double coefficient, double d_sq) {
-      // An end that is not continued has nothing to merge with.
-      if (end_c >= 0 && weights.continuation(c, end_c) == 0.0) end_c = -1;
-      const bool shared = end_e >= 0 && !soft;
-      parts.push_back({.kind = soft ? kMollified : (shared ? kVertex : kEdge),
-                       .ends = {end_c, shared ? std::int8_t{-1} : end_e},
-                       .id = shared ? v[2 + end_e] : e,
-                       .coefficient = coefficient,
-                       .d_sq = d_sq});
-    };
-    // What c as a whole, or its end, does to e and to its ends.
-    const auto push_against_e = [&](std::int8_t end_c, double coefficient) {
-      Corners at = corner;
-      if (end_c >= 0) at[0] = at[1] = corner[end_c];
-      const Closest whole = end_c >= 0 ? closest(PairKind::kEdgeEdge, at) : nearest_points;
-      const bool at_0 = whole.c[3] == 0.0;
-      const bool at_1 = whole.c[2] == 0.0;
-      if (!at_0 && !at_1) {
-        const std::int8_t nearest = end_c >= 0 ? end_c : end_of(whole.c[0], whole.c[1]);
-        push(nearest, -1, coefficient, whole.d_sq);
-      }
-      for (const std::int8_t end : {std::int8_t{0}, std::int8_t{1}}) {
-        const bool nearest = end == 0 ? at_0 : at_1;
-        const double share = (nearest ? 1.0 : 0.0) - 0.5 * weights.continuation(e, end);
-        if (share == 0.0) continue;
-        if (end_c >= 0) {
-          push(end_c, end, coefficient * share, (at[0] - corner[2 + end]).squaredNorm());
-          continue;
-        }
-        const NearEdge near = nearest_on_edge(mesh, c, corner[2 + end], x);
-        const bool inside = near.vertex < 0;
-        push(inside ? std::int8_t{-1} : std::int8_t{near.vertex == v[1]}, end, coefficient * share,
-             near.d_sq);
-      }
-    };
-    push_against_e(-1, w);
-    for (const std::int8_t end : {std::int8_t{0}, std::int8_t{1}}) {
-      const double share = 0.5 * weights.continuation(c, end);
-      if (share != 0.0) push_against_e(end, -share * w);
-    }
+    EdgePair(mesh, weights, pair, nearest_points, corner, soft, x, scratch.parts).list_parts(w);
   }
-  merge(parts, range);
-
-  for (const Part& part : parts) {
-    const auto& [i, j] = mesh.edges[c];
-    Candidate pair{
-        .kind = PairKind::kEdgeEdge, .vertices = {i, j, part.id, part.id}, .a = c, .b = -1};
-    std::array<std::int8_t, 2> ends = part.ends;
-    if (part.kind != kVertex) {
-      pair.vertices[2] = mesh.edges[part.id][0];
-      pair.vertices[3] = mesh.edges[part.id][1];
-      pair.b = part.id;
-    }
-    if (part.kind != kMollified && ends[0] >= 0) {
-      pair.vertices[0] = pair.vertices[1] = mesh.edges[c][ends[0]];
-      pair.b = -1;
-      ends[0] = -1;
-    }
-    out.push_back(
-        {.pair = pair, .coefficient = scale * part.coefficient, .d_sq = part.d_sq, .ends = ends});
-  }
+  merge(scratch.parts, range);
+  for (const Part& part : scratch.parts) out.push_back(edge_term(mesh, c, part, scale));
 }
 
 void merge_shared_ends(std::vector<Term>& terms) {

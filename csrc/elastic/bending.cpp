@@ -308,6 +308,26 @@ ScalarBars constant_mixed(const Element& element, const double* u, const double*
           .poisson = element.weight * (Y_u * form_derivative()).cwiseProduct(Y_z).sum()};
 }
 
+// By body_state(), d phi = <q, R^T dY - db> - tau . w. Where b = 0 the frame drops out, as it does in
+// energy(), but not of the derivative by b.
+ScalarBars energy_bars(
+    Element element, const double* x, double seed, const GeometryBars& bars, double* x_bar) {
+  element.weight *= seed;
+  element.damping = 0.0;
+  const BodyState state = body_state(element, x);
+  const Mat3& R = state.frame.R;
+  const Mat3 s = element.flat ? second_derivatives(element, x) : Mat3(state.curvature - *element.b);
+  const Mat3 Y_bar = element.flat ? Mat3(s * state.Q) : Mat3(R * state.q);
+  const Mat32 F_bar = R * frame_stress(state);
+  scatter(element, Y_bar, F_bar, x_bar);
+  if (bars.c != nullptr) {
+    *bars.b -= state.q;
+    scatter_geometry(element, Y_bar, F_bar, x, bars);
+  }
+  return {.weight = 0.5 * seed * (s * form(element.poisson)).cwiseProduct(s).sum(),
+          .poisson = 0.5 * element.weight * (s * form_derivative()).cwiseProduct(s).sum()};
+}
+
 // phi = z . grad E = weight [ <s Q, ds> + damping <s_n Q, ds_n> ] with ds the change of s along z:
 // ds = R^T Y(z) - w x b. By symmetry of second derivatives, the gradient of phi with respect to
 // (Y, F) is the change of (dE/dY, dE/dF) along z, and that with respect to (Y(z), F(z)) is

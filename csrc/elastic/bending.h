@@ -80,6 +80,12 @@ struct GeometryBars {
   double* x_n = nullptr;  ///< [N, 3]
 };
 
+/// Cotangents for phi = seed E, without damping; bars.x_n stays as it is.
+///
+/// @param x_bar  += d phi / dx, [N, 3]
+ScalarBars energy_bars(
+    Element element, const double* x, double seed, const GeometryBars& bars, double* x_bar);
+
 /// @param x_n  start of the step, or null where there is none (then element.b_n is not read)
 ScalarBars mixed(const Element& element,
                  const double* x,

@@ -57,14 +57,12 @@ ConstantForm ConstantForm::of_flat_bending(const Model& model,
 
 ConstantForm::ConstantForm(const Model& model,
                            const Slots& slots,
-                           const Anchors& anchors,
+                           std::span<const Springs> springs,
                            const linalg::BlockPattern& pattern)
     : pattern_(&pattern),
       vertex_count_(model.topology->vertex_count),
       own_values_(model.prepared.constant),
-      values_(own_values_),
-      anchor_vertex_(anchors.vertex.begin(), anchors.vertex.end()),
-      anchor_stiffness_(anchors.stiffness.begin(), anchors.stiffness.end()) {
+      values_(own_values_) {
   for (Index f = 0; f < face_count(model); ++f) {
     const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
     const double weight = face_factor(model, f) * stretch_weight(model, f);
@@ -79,8 +77,36 @@ ConstantForm::ConstantForm(const Model& model,
     element.weight *= element_factor(model, e);
     bending::add_constant(element, bending_slots(slots, e), own_values_.data());
   }
-  for (std::size_t a = 0; a < anchor_vertex_.size(); ++a) {
-    own_values_[pattern.column_start()[anchor_vertex_[a]]] += anchor_stiffness_[a];
+  for (const Springs& kind : springs) {
+    for (Index a = 0; a < kind.size(); ++a) add_spring(kind, a);
+  }
+}
+
+void ConstantForm::add_spring(const Springs& springs, Index a) {
+  const auto points = springs.points(a);
+  const auto b = springs.coefficients(a);
+  const double k = springs.stiffness[a];
+  double sum = 0.0;
+  bool is_anchored = springs.target_row[a] >= 0;
+  for (std::size_t p = 0; p < points.size(); ++p) {
+    if (points[p] < vertex_count_) {
+      sum += b[p];
+    } else {
+      is_anchored = true;
+    }
+  }
+  for (std::size_t p = 0; p < points.size(); ++p) {
+    if (points[p] >= vertex_count_) continue;
+    for (std::size_t q = 0; q < points.size(); ++q) {
+      if (points[q] > points[p] || points[q] >= vertex_count_) continue;
+      if (points[p] == points[q] && q > p) continue;
+      const double twice = points[p] == points[q] && p != q ? 2.0 : 1.0;
+      own_values_[pattern_->slot(points[p], points[q])] += twice * k * b[p] * b[q];
+    }
+    // What a row of L sums to: nothing between two points of cloths.
+    if (!is_anchored) continue;
+    anchor_vertex_.push_back(points[p]);
+    anchor_stiffness_.push_back(k * b[p] * sum);
   }
 }
 

@@ -3,8 +3,8 @@
 #include <span>
 #include <vector>
 
-#include "elastic/anchors.h"
 #include "elastic/elastic.h"
+#include "elastic/springs.h"
 #include "linalg/block_pattern.h"
 
 namespace diffcloth::elastic {
@@ -14,14 +14,16 @@ namespace diffcloth::elastic {
 ///
 ///   1/2 u^T L u = sum_faces    k_s A / 2 (1 + k_d/h) |F(u)|^2
 ///               + sum_elements D A / 2 (1 + k_d/h) <Y(u) Q, Y(u)>
-///               + sum_anchors  k_a / 2 |u_i|^2,
+///               + sum_springs  k_a / 2 |sum_p b_p u_p|^2,
 ///
 /// F(u) the gradient of a displacement u and Y(u) its second derivatives. It is the Hessian of the
 /// energy of all cloths less what depends on how triangles turn: no smaller than the Hessian of the
-/// stretch, equal to it in flat bending and anchors. For damping and for curved rest shapes it is a
+/// stretch, equal to it in flat bending and springs without a rest length, and no smaller in others. For
+/// damping and for curved rest shapes it is a
 /// positive matrix of the right size, which is all that a solve with it needs.
 ///
-/// Without anchors L annihilates constants. Entries act on differences of displacements, so that a
+/// The points of springs are those of the cloths alone: bodies stay where they are. Without springs to
+/// targets or bodies L annihilates constants. Entries act on differences of displacements, so that a
 /// force on one vertex is minus that on another to the last bit.
 class ConstantForm {
  public:
@@ -29,7 +31,7 @@ class ConstantForm {
   /// @param pattern  that of the slots; outlives the form
   ConstantForm(const Model& model,
                const Slots& slots,
-               const Anchors& anchors,
+               std::span<const Springs> springs,
                const linalg::BlockPattern& pattern);
 
   /// That of flat bending alone, which is its energy; the values stay the model's.
@@ -58,11 +60,13 @@ class ConstantForm {
   Index vertex_count_;  ///< the pattern may have further rows
   std::vector<double> own_values_;
   std::span<const double> values_;
-  std::vector<Index> anchor_vertex_;
-  std::vector<double> anchor_stiffness_;
+  void add_spring(const Springs& springs, Index a);
+
+  std::vector<Index> anchor_vertex_;      ///< what is held against the ground
+  std::vector<double> anchor_stiffness_;  ///< likewise
 };
 
-/// bar += d/d theta (z . L u) for each theta of the model. Anchors get z_i . u_i.
+/// bar += d/d theta (z . L u) for each theta of the model, springs not included.
 ///
 /// @param with_rest  whether the cotangents of the rest shape are wanted
 void add_constant_form_mixed(

@@ -140,6 +140,28 @@ void add_face_damping_mixed(
   }
 }
 
+/// Where the cotangents of the geometry of a bending element are added.
+bending::GeometryBars geometry_bars(const Model& model, Index e, bool with_rest, Bar& bar) {
+  bending::GeometryBars geometry;
+  geometry.x_n = bar.x_n.data();
+  if (with_rest) {
+    geometry.c = bar.rest.curvature_operator.data() + 3 * model.stencils->start[e];
+    geometry.g = &bar.rest.shape_gradient[model.stencils->faces[e][0]];
+    geometry.b = &bar.rest.curvature[e];
+  }
+  return geometry;
+}
+
+/// Pull the cotangents of the weight and nu of a bending element back to the faces.
+void add_weight_bars(
+    const Model& model, Index e, const bending::ScalarBars& scalar, bool with_rest, Bar& bar) {
+  add_to_faces(model, e, scalar.weight * model.rest->bending_area[e], bar.bending);
+  add_to_faces(model, e, scalar.poisson, bar.poisson);
+  if (with_rest) {
+    bar.rest.bending_area[e] += scalar.weight * element_mean(model, e, model.bending);
+  }
+}
+
 void add_bending_mixed(
     const Model& model, Index e, const double* x, const double* z, bool with_rest, Bar& bar) {
   bending::Element element = bending_element(model, e);
@@ -148,20 +170,41 @@ void add_bending_mixed(
     curvature_n = bending::body_curvature(element, model.x_n);
     element.b_n = &curvature_n;
   }
-  bending::GeometryBars geometry;
-  geometry.x_n = bar.x_n.data();
-  if (with_rest) {
-    geometry.c = bar.rest.curvature_operator.data() + 3 * model.stencils->start[e];
-    geometry.g = &bar.rest.shape_gradient[model.stencils->faces[e][0]];
-    geometry.b = &bar.rest.curvature[e];
-  }
-  const bending::ScalarBars scalar = bending::mixed(element, x, model.x_n, z, geometry);
-  add_to_faces(model, e, scalar.weight * model.rest->bending_area[e], bar.bending);
-  add_to_faces(model, e, scalar.poisson, bar.poisson);
+  const bending::ScalarBars scalar =
+      bending::mixed(element, x, model.x_n, z, geometry_bars(model, e, with_rest, bar));
+  add_weight_bars(model, e, scalar, with_rest, bar);
   if (model.x_n != nullptr) add_to_faces(model, e, scalar.damping / model.h, bar.damping);
+}
+
+// E = k_s A W(F), with dW/dF the stress of unit weight.
+void add_face_energy_bars(const Model& model,
+                          Index f,
+                          const double* x,
+                          double seed,
+                          bool with_rest,
+                          Bar& bar,
+                          double* x_bar) {
+  const Mat32 F = face_gradient(model, f, x);
+  const Mat32 F_bar = stretch::stress(seed * stretch_weight(model, f), F);
+  const double unit = seed * stretch::energy(1.0, F);
+  scatter(model, f, F_bar, x_bar);
+  bar.stretch[f] += model.rest->area[f] * unit;
   if (with_rest) {
-    bar.rest.bending_area[e] += scalar.weight * element_mean(model, e, model.bending);
+    bar.rest.area[f] += model.stretch[f] * unit;
+    scatter_gradient_bar(model, f, F_bar, x, bar.rest.shape_gradient[f]);
   }
+}
+
+void add_bending_energy_bars(const Model& model,
+                             Index e,
+                             const double* x,
+                             double seed,
+                             bool with_rest,
+                             Bar& bar,
+                             double* x_bar) {
+  const bending::ScalarBars scalar = bending::energy_bars(
+      bending_element(model, e), x, seed, geometry_bars(model, e, with_rest, bar), x_bar);
+  add_weight_bars(model, e, scalar, with_rest, bar);
 }
 
 }  // namespace
@@ -403,6 +446,20 @@ void add_mixed(const Model& model, const double* x, const double* z, bool with_r
   }
   for (Index e = 0; e < model.stencils->size(); ++e) {
     add_bending_mixed(model, e, x, z, with_rest, bar);
+  }
+}
+
+void add_energy_bars(const Model& model,
+                     const double* x,
+                     const Energies& seed,
+                     bool with_rest,
+                     Bar& bar,
+                     double* x_bar) {
+  for (Index f = 0; seed.stretch != 0.0 && f < face_count(model); ++f) {
+    add_face_energy_bars(model, f, x, seed.stretch, with_rest, bar, x_bar);
+  }
+  for (Index e = 0; seed.bending != 0.0 && e < model.stencils->size(); ++e) {
+    add_bending_energy_bars(model, e, x, seed.bending, with_rest, bar, x_bar);
   }
 }
 

@@ -146,4 +146,19 @@ struct Bar {
 /// @param with_rest  whether the cotangents of the rest shape are wanted
 void add_mixed(const Model& model, const double* x, const double* z, bool with_rest, Bar& bar);
 
+/// A number for each of the energies.
+struct Energies {
+  double stretch;
+  double bending;
+};
+
+/// bar += d/d theta of  seed.stretch stretch_energy() + seed.bending bending_energy()  for each theta of
+/// the model, and x_bar += d/dx of it [N, 3]: all elements, no damping.
+void add_energy_bars(const Model& model,
+                     const double* x,
+                     const Energies& seed,
+                     bool with_rest,
+                     Bar& bar,
+                     double* x_bar);
+
 }  // namespace diffcloth::elastic

@@ -7,12 +7,12 @@ namespace diffcloth::elastic {
 
 ElasticNearness::ElasticNearness(ConstantForm form,
                                  ElasticPotential& elasticity,
-                                 AnchorPotential* anchors,
+                                 std::vector<SpringPotential*> springs,
                                  std::vector<double> target)
     : target_bar(target.size(), 0.0),
       form_(std::move(form)),
       elasticity_(elasticity),
-      anchors_(anchors),
+      springs_(std::move(springs)),
       target_(std::move(target)) {}
 
 std::vector<double> ElasticNearness::offset(const double* x) const {
@@ -60,11 +60,11 @@ void ElasticNearness::accumulate(const double* x, const double* z) {
     add_constant_form_mixed(elasticity_.model(), minus_u.data(), z,
                             elasticity_.wanted() == Wanted::kMaterialsAndRest, elasticity_.bar());
   }
-  if (anchors_ == nullptr) return;
-  const Anchors& anchors = anchors_->anchors();
-  for (std::size_t a = 0; a < anchors.vertex.size(); ++a) {
-    const Index i = anchors.vertex[a];
-    anchors_->stiffness_bar[a] -= row(z, i).dot(row(u.data(), i));
+  for (SpringPotential* const kind : springs_) {
+    const Springs& springs = kind->springs();
+    for (Index a = 0; a < springs.size(); ++a) {
+      kind->stiffness_bar[a] -= difference(springs, a, z).dot(difference(springs, a, u.data()));
+    }
   }
 }
 

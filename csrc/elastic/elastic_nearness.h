@@ -13,12 +13,11 @@ namespace diffcloth::elastic {
 /// what the elastic potentials are made of: they keep the cotangents for both.
 class ElasticNearness final : public Potential {
  public:
-  /// @param elasticity  of the cloths; outlives this potential, like the anchors
-  /// @param anchors     may be null
+  /// @param elasticity  of the cloths; outlives this potential, like the springs
   /// @param target      y [3 N]
   ElasticNearness(ConstantForm form,
                   ElasticPotential& elasticity,
-                  AnchorPotential* anchors,
+                  std::vector<SpringPotential*> springs,
                   std::vector<double> target);
 
   double energy(const double* x) const override;
@@ -27,6 +26,7 @@ class ElasticNearness final : public Potential {
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
   void add_hessian_product(const double* x, const double* z, double* y) const override;
   void accumulate(const double* x, const double* z) override;
+  void swap_cotangents(CotangentStore& store) override { store.exchange(target_bar); }
 
   std::vector<double> target_bar;  ///< [3 N], zero until accumulate()
 
@@ -36,7 +36,7 @@ class ElasticNearness final : public Potential {
 
   ConstantForm form_;
   ElasticPotential& elasticity_;
-  AnchorPotential* anchors_;
+  std::vector<SpringPotential*> springs_;
   std::vector<double> target_;
 };
 

@@ -57,24 +57,56 @@ Bar& ElasticPotential::bar() {
   return bar_;
 }
 
-AnchorPotential::AnchorPotential(Anchors anchors)
-    : stiffness_bar(anchors.vertex.size(), 0.0),
-      target_bar(3 * anchors.vertex.size(), 0.0),
-      anchors_(anchors) {}
+SpringPotential::SpringPotential(Springs springs, Index first_body, Index target_count)
+    : stiffness_bar(static_cast<std::size_t>(springs.size()), 0.0),
+      target_bar(3 * static_cast<std::size_t>(target_count), 0.0),
+      springs_(springs),
+      first_body_(first_body) {}
 
-void AnchorPotential::add_hessian(const double* /*x*/,
-                                  Curvature /*curvature*/,
-                                  linalg::BlockMatrix& A) const {
-  for (std::size_t a = 0; a < anchors_.vertex.size(); ++a) {
-    A.add_to_diagonal(anchors_.vertex[a], anchors_.stiffness[a]);
+void SpringPotential::add_couplings(std::vector<std::pair<Index, Index>>& pairs) const {
+  // The base pattern has those between vertices of cloths.
+  for (Index a = 0; a < springs_.size(); ++a) {
+    for (const Index i : springs_.points(a)) {
+      if (i < first_body_) continue;
+      for (const Index j : springs_.points(a)) {
+        if (i != j && (j < first_body_ || j < i)) pairs.emplace_back(i, j);
+      }
+    }
   }
 }
 
-void AnchorPotential::accumulate(const double* x, const double* z) {
-  // Few of the vertices have a soft pin: turn the sign of what is added instead.
+void SpringPotential::add_hessian(const double* x,
+                                  Curvature curvature,
+                                  linalg::BlockMatrix& A) const {
+  std::vector<Mat3> changes;
+  for (Index a = 0; a < springs_.size(); ++a) {
+    changes.clear();
+    for (const double b : springs_.coefficients(a)) changes.emplace_back(b * Mat3::Identity());
+    A.add_congruence(springs_.points(a), changes,
+                     hessian(springs_, a, x, curvature == Curvature::kPositive));
+  }
+}
+
+void SpringPotential::add_left_out_product(const double* x,
+                                           Curvature curvature,
+                                           const double* d,
+                                           double* y) const {
+  for (Index a = 0; a < springs_.size(); ++a) {
+    const Vec3 change = difference(springs_, a, d);
+    if (change.isZero(0.0)) continue;
+    const Vec3 force = hessian(springs_, a, x, curvature == Curvature::kPositive) * change;
+    const auto points = springs_.points(a);
+    for (std::size_t p = 0; p < points.size(); ++p) {
+      Eigen::Map<Vec3>(y + 3 * points[p]) += springs_.coefficients(a)[p] * force;
+    }
+  }
+}
+
+void SpringPotential::accumulate(const double* x, const double* z) {
+  // Few points have a spring: turn the sign of what is added instead.
   std::vector<double> stiffness(stiffness_bar.size(), 0.0);
   std::vector<double> target(target_bar.size(), 0.0);
-  add_mixed(anchors_, x, z, stiffness.data(), target.data());
+  add_mixed(springs_, x, z, stiffness.data(), target.data());
   for (std::size_t a = 0; a < stiffness.size(); ++a) stiffness_bar[a] -= stiffness[a];
   for (std::size_t a = 0; a < target.size(); ++a) target_bar[a] -= target[a];
 }

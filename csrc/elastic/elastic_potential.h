@@ -4,9 +4,9 @@
 #include <utility>
 #include <vector>
 
-#include "elastic/anchors.h"
 #include "elastic/constant_form.h"
 #include "elastic/elastic.h"
+#include "elastic/springs.h"
 #include "potential/potential.h"
 
 namespace diffcloth::elastic {
@@ -44,6 +44,7 @@ class ElasticPotential final : public Potential {
   }
 
   void accumulate(const double* x, const double* z) override;
+  void swap_cotangents(CotangentStore& store) override { store.exchange(bar_); }
 
   const Model& model() const { return model_; }
   const Slots& slots() const { return slots_; }
@@ -52,44 +53,54 @@ class ElasticPotential final : public Potential {
   /// Zero until something is accumulated.
   Bar& bar();
 
-  /// Swap what has been accumulated; an empty one is zero.
-  void exchange(Bar& other) { std::swap(bar_, other); }
-
  private:
   const Model& model_;
   const Slots& slots_;
   Wanted wanted_;
   ConstantForm flat_bending_;
   mutable std::vector<double> change_;  ///< scratch
-  Bar bar_;
-  std::vector<Mat2> extrapolated_;  ///< [F] second stresses
+  Bar bar_;                             ///< empty where it is zero
+  std::vector<Mat2> extrapolated_;      ///< [F] second stresses
 };
 
-/// Soft pins as a potential. See anchors.h.
-class AnchorPotential final : public Potential {
+/// Springs between points as a potential. See springs.h.
+class SpringPotential final : public Potential {
  public:
-  explicit AnchorPotential(Anchors anchors);
+  /// @param springs       views of arrays that outlive the potential
+  /// @param first_body    the first point that is no vertex of a cloth
+  /// @param target_count  rows of targets
+  SpringPotential(Springs springs, Index first_body, Index target_count);
 
-  double energy(const double* x) const override { return elastic::energy(anchors_, x); }
+  double energy(const double* x) const override { return elastic::energy(springs_, x); }
   double energy_change(const double* x, const double* to) const override {
-    return elastic::energy_change(anchors_, x, to);
+    return elastic::energy_change(springs_, x, to);
   }
   void add_gradient(const double* x, double* g) const override {
-    elastic::add_gradient(anchors_, x, g);
+    elastic::add_gradient(springs_, x, g);
   }
+  void add_couplings(std::vector<std::pair<Index, Index>>& pairs) const override;
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
-  void add_hessian_product(const double* /*x*/, const double* z, double* y) const override {
-    elastic::add_hessian_product(anchors_, z, y);
+  void add_hessian_product(const double* x, const double* z, double* y) const override {
+    elastic::add_hessian_product(springs_, x, z, y);
   }
+  void add_left_out_product(const double* x,
+                            Curvature curvature,
+                            const double* d,
+                            double* y) const override;
   void accumulate(const double* x, const double* z) override;
+  void swap_cotangents(CotangentStore& store) override {
+    store.exchange(stiffness_bar);
+    store.exchange(target_bar);
+  }
 
-  const Anchors& anchors() const { return anchors_; }
+  const Springs& springs() const { return springs_; }
 
-  std::vector<double> stiffness_bar;  ///< [A]
-  std::vector<double> target_bar;     ///< [3 A]
+  std::vector<double> stiffness_bar;  ///< [A], of what the weight is in
+  std::vector<double> target_bar;     ///< [rows of targets, 3]
 
  private:
-  Anchors anchors_;
+  Springs springs_;
+  Index first_body_;
 };
 
 }  // namespace diffcloth::elastic

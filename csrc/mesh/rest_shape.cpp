@@ -343,6 +343,21 @@ RestShapeBar::RestShapeBar(const Topology& topology, const BendingStencils& sten
       edge_area(topology.edges.size(), 0.0),
       edge_length_sq(topology.edges.size(), 0.0) {}
 
+RestShapeBar& RestShapeBar::operator+=(const RestShapeBar& other) {
+  const auto add = [](auto& to, const auto& from) {
+    for (std::size_t k = 0; k < from.size(); ++k) to[k] += from[k];
+  };
+  add(area, other.area);
+  add(shape_gradient, other.shape_gradient);
+  add(curvature_operator, other.curvature_operator);
+  add(curvature, other.curvature);
+  add(bending_area, other.bending_area);
+  add(vertex_area, other.vertex_area);
+  add(edge_area, other.edge_area);
+  add(edge_length_sq, other.edge_length_sq);
+  return *this;
+}
+
 void rest_shape_vjp(const Topology& topology,
                     const BendingStencils& stencils,
                     const double* X,

@@ -105,6 +105,8 @@ struct RestShapeBar {
   RestShapeBar() = default;
   /// All zero.
   RestShapeBar(const Topology& topology, const BendingStencils& stencils);
+
+  RestShapeBar& operator+=(const RestShapeBar& other);
 };
 
 /// X_bar += (d rest_shape / dX)^T bar.

@@ -6,11 +6,13 @@
 
 #include "common/types.h"
 #include "linalg/block_matrix.h"
+#include "potential/cotangent_store.h"
 
 namespace diffcloth {
 
-/// The exact Hessian, or a positive semi-definite stand-in for it far from the minimum.
-enum class Curvature : std::uint8_t { kExact, kPositive };
+/// The exact Hessian; a positive semi-definite stand-in for it far from the minimum; or the exact one with
+/// duals in the place of forces, where a potential keeps some.
+enum class Curvature : std::uint8_t { kExact, kPositive, kPrimalDual };
 
 /// One term of what a step minimizes: an energy of all points, 3 doubles each: vertices, cloth first,
 /// then bodies, and behind them the nodes of coordinates.
@@ -52,6 +54,16 @@ class Potential {
                                  Curvature /*curvature*/,
                                  linalg::BlockMatrix& /*A*/) const {}
 
+  /// A step has led from x along p, by the fraction alpha, to a point: keep the forces that the linear model
+  /// of the step has there, its duals, if they differ from those of the point.
+  virtual void update_duals(const double* /*x*/,
+                            const double* /*p*/,
+                            double /*alpha*/,
+                            const double* /*to*/) {}
+
+  /// Whether there are duals of this point.
+  virtual bool has_duals(const double* /*x*/) const { return false; }
+
   /// y += H z over all vertices, exact.
   virtual void add_hessian_product(const double* x, const double* z, double* y) const = 0;
 
@@ -70,6 +82,10 @@ class Potential {
 
   /// Add -d/d(theta) (z . grad P) to the cotangents that the potential keeps for its inputs theta.
   virtual void accumulate(const double* x, const double* z) = 0;
+
+  /// Call store.exchange() for each of these cotangents: several losses take turns with one potential. A
+  /// potential that keeps none, or whose owner swaps them, has none to show.
+  virtual void swap_cotangents(CotangentStore& store) = 0;
 };
 
 }  // namespace diffcloth

@@ -24,6 +24,10 @@ class Proximity final : public Potential {
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
   void add_hessian_product(const double* x, const double* z, double* y) const override;
   void accumulate(const double* x, const double* z) override;
+  void swap_cotangents(CotangentStore& store) override {
+    store.exchange(metric_bar);
+    store.exchange(target_bar);
+  }
 
   std::vector<double> metric_bar;  ///< [N], zero until accumulate()
   std::vector<double> target_bar;  ///< [3 N]

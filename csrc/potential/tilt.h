@@ -40,6 +40,8 @@ class Tilt final : public Potential {
     for (std::size_t a = 0; a < force_.size(); ++a) force_bar[a] += z[a];
   }
 
+  void swap_cotangents(CotangentStore& store) override { store.exchange(force_bar); }
+
   std::vector<double> force_bar;  ///< [3 N], zero until accumulate()
 
  private:

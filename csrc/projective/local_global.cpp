@@ -26,7 +26,7 @@ constexpr int kHalvings = 40;
 /// The iterate, the gradient there and the next step. What is allocated is so once.
 class Iteration {
  public:
-  Iteration(const Objective& objective, std::vector<double>& x)
+  Iteration(const LocalGlobalObjective& objective, std::vector<double>& x)
       : f_(objective),
         x_(x),
         size_(3 * objective.masses->size()),
@@ -114,7 +114,7 @@ class Iteration {
     residual_ = f_.largest_rate(g_);
   }
 
-  const Objective& f_;
+  const LocalGlobalObjective& f_;
   std::vector<double>& x_;
   std::size_t size_;
   std::vector<double> g_, g_to_, p_, q_, to_;
@@ -130,12 +130,12 @@ class Iteration {
 
 }  // namespace
 
-void Objective::gradient(const std::vector<double>& x, std::vector<double>& g) const {
+void LocalGlobalObjective::gradient(const std::vector<double>& x, std::vector<double>& g) const {
   std::ranges::fill(g, 0.0);
   for (const Potential* p : potentials) p->add_gradient(x.data(), g.data());
 }
 
-double Objective::largest_rate(const std::vector<double>& force) const {
+double LocalGlobalObjective::largest_rate(const std::vector<double>& force) const {
   double largest = 0.0;
   for (const Index i : matrix->vertices()) {
     const double rate = h * row(force.data(), i).norm() / (*masses)[i];
@@ -145,13 +145,13 @@ double Objective::largest_rate(const std::vector<double>& force) const {
   return largest;
 }
 
-Outcome minimize(const Objective& objective,
-                 std::vector<double>& x,
-                 const Options& options,
-                 const Checkpoint& checkpoint) {
+LocalGlobalOutcome minimize(const LocalGlobalObjective& objective,
+                            std::vector<double>& x,
+                            const LocalGlobalOptions& options,
+                            const Checkpoint& checkpoint) {
   Iteration iteration(objective, x);
-  Outcome outcome;
-  const auto end = [&](Status status) {
+  LocalGlobalOutcome outcome;
+  const auto end = [&](LocalGlobalStatus status) {
     outcome.status = status;
     outcome.residual = iteration.residual();
     return outcome;
@@ -160,11 +160,12 @@ Outcome minimize(const Objective& objective,
     checkpoint.check();
     if (!std::isfinite(iteration.residual())) {
       if (outcome.iterations > 0) iteration.go_back();
-      return end(Status::kOverflow);
+      return end(LocalGlobalStatus::kOverflow);
     }
-    if (iteration.residual() < options.tolerance) return end(Status::kConverged);
-    if (outcome.iterations == options.max_iterations) return end(Status::kIterationLimit);
-    if (!iteration.advance()) return end(Status::kRoundingFloor);
+    if (iteration.residual() < options.tolerance) return end(LocalGlobalStatus::kConverged);
+    if (outcome.iterations == options.max_iterations)
+      return end(LocalGlobalStatus::kIterationLimit);
+    if (!iteration.advance()) return end(LocalGlobalStatus::kRoundingFloor);
     ++outcome.iterations;
   }
 }

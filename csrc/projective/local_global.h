@@ -10,7 +10,7 @@
 namespace diffcloth::projective {
 
 /// What local/global iterations minimize: a sum of potentials over the cloths' vertices.
-struct Objective {
+struct LocalGlobalObjective {
   std::vector<const Potential*> potentials;
   const ConstantMatrix* matrix;       ///< A: no smaller than their Hessian, or of its size
   const std::vector<double>* masses;  ///< [N] [kg]
@@ -27,12 +27,12 @@ struct Objective {
 /// converge linearly.
 inline constexpr std::int64_t kIterationsPerNewton = 50;
 
-struct Options {
+struct LocalGlobalOptions {
   double tolerance;             ///< on max_i h |g_i| / m_i over the free vertices [m/s]
   std::int64_t max_iterations;  ///< of this solve
 };
 
-enum class Status : std::uint8_t {
+enum class LocalGlobalStatus : std::uint8_t {
   kConverged,
   kIterationLimit,
   kRoundingFloor,  ///< steps are lost in the rounding of positions, or raise the energy
@@ -40,8 +40,8 @@ enum class Status : std::uint8_t {
   kOverflow,       ///< forces are not finite
 };
 
-struct Outcome {
-  Status status = Status::kIterationLimit;
+struct LocalGlobalOutcome {
+  LocalGlobalStatus status = LocalGlobalStatus::kIterationLimit;
   double residual = 0.0;        ///< max_i h |g_i| / m_i where x is [m/s]
   std::int64_t iterations = 0;  ///< global solves
 };
@@ -59,9 +59,9 @@ struct Outcome {
 ///
 /// @param x  in: a start, [N, 3] and whatever else potentials look at; out: the solution, or the last
 ///           iterate whose gradient was finite. Pins stay.
-Outcome minimize(const Objective& objective,
-                 std::vector<double>& x,
-                 const Options& options,
-                 const Checkpoint& checkpoint);
+LocalGlobalOutcome minimize(const LocalGlobalObjective& objective,
+                            std::vector<double>& x,
+                            const LocalGlobalOptions& options,
+                            const Checkpoint& checkpoint);
 
 }  // namespace diffcloth::projective

@@ -137,8 +137,11 @@ void Directions::leave() {
 Directions::Direction Directions::next() {
   leave();
   const bool nearby = s_ == 0.0 && last_.factor != nullptr;
-  if (nearby && chord()) return {.kind = Kind::kChord, .first = 1.0};
-  linalg::BlockMatrix H = walk_.system.assemble(walk_.x().data(), Curvature::kExact, walk_.g());
+  const double* x = walk_.x().data();
+  const bool has_duals = walk_.f.has_duals(x);
+  if (nearby && !has_duals && chord()) return {.kind = Kind::kChord, .first = 1.0};
+  const Curvature curvature = has_duals ? Curvature::kPrimalDual : Curvature::kExact;
+  linalg::BlockMatrix H = walk_.system.assemble(x, curvature, walk_.g());
   if (s_ == 0.0) {
     bool indefinite = false;
     if (nearby && is_near() && iterate(H, indefinite))
@@ -146,12 +149,14 @@ Directions::Direction Directions::next() {
     if (indefinite) {
       ++walk_.context.counts->negative_curvature;
     } else if (refactor(H)) {
-      return {.kind = Kind::kFactored, .first = 1.0};
+      if (!has_duals) return {.kind = Kind::kFactored, .first = 1.0};
+      leave();  // it says nothing of the exact one
+      return {.kind = Kind::kPrimalDual, .first = 1.0};
     }
     s_ = kFirstShare;
   }
   const std::optional<Direction> damped =
-      damp(H, walk_.system.assemble(walk_.x().data(), Curvature::kPositive, walk_.g()));
+      damp(H, walk_.system.assemble(x, Curvature::kPositive, walk_.g()));
   if (!damped) {
     throw std::domain_error(
         "the projected Hessian is not positive definite: the stiffnesses of "
@@ -221,6 +226,7 @@ bool Directions::retry(Kind kind) {
       last_ = {};
       return true;
     case Kind::kFactored:
+    case Kind::kPrimalDual:
       s_ = kFirstShare;
       return true;
     case Kind::kDamped:

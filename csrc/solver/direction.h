@@ -16,8 +16,9 @@ namespace diffcloth::solver {
 enum class Kind : std::uint8_t {
   kFactored,  ///< the exact Hessian, factored here: where it succeeds, the certificate of a minimum
   kIterated,  ///< the exact Hessian, by conjugate gradients
-  kChord,     ///< a factor of the exact Hessian at an earlier point
-  kDamped,    ///< the exact Hessian blended with its projection
+  kPrimalDual,    ///< the same with duals of friction, factored here
+  kChord,         ///< a factor of either at an earlier point
+  kDamped,        ///< the exact Hessian blended with its projection
   kExtrapolated,  ///< the exact Hessian with extrapolated stresses
 };
 
@@ -26,7 +27,8 @@ enum class Kind : std::uint8_t {
 /// In this order: a chord step with the last exact factor while that contracts; near the solution
 /// conjugate gradients on the exact Hessian with that factor; a new factor. Where the exact Hessian H is
 /// not positive definite, A(s) = (H + s P) / (1 + s) with its projection P; s falls while steps gain what
-/// they promise. All constants are free of units.
+/// they promise. After a step across a kink of friction H is the primal-dual Hessian, which remembers the
+/// other side; it certifies nothing. All constants are free of units.
 ///
 /// Of several minima a step shall end in one that does not flip with the last bits of its start, so that no
 /// direction may amplify those: not an inexact one far from the solution, whose error depends on where

@@ -55,6 +55,7 @@ Search search(Walk& walk, const std::vector<double>& p, Trial trial) {
       if (!(std::abs(trial.gain) <= smallest)) continue;
     }
     if (decreased) {
+      walk.f.update_duals(start.data(), p.data(), trial.alpha, trial.to.data());
       walk.go(trial.to);
       walk.refresh();
     } else if (!walk.go_if_flat(trial.to, p, kWolfeSlope * std::abs(slope))) {

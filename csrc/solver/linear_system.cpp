@@ -38,15 +38,15 @@ linalg::BlockMatrix LinearSystem::assemble(const double* x,
                                            const std::vector<double>& g) {
   const Stopwatch::Scope scope(watch_, Phase::kAssembly);
   const std::size_t size = 3 * static_cast<std::size_t>(f_.coordinates->point_count());
-  if (assembly_ == nullptr || !std::equal(x_.begin(), x_.end(), x)) {
-    assembly_ = f_.assemblies->find(f_.couplings());
+  if (pattern_ == nullptr || !std::equal(x_.begin(), x_.end(), x)) {
+    pattern_ = f_.patterns->find(f_.couplings());
     x_.assign(x, x + size);
   }
-  linalg::BlockMatrix matrix({assembly_, &assembly_->merged}, f_.assemblies->fixed(),
+  linalg::BlockMatrix matrix({pattern_, &pattern_->merged}, f_.patterns->fixed(),
                              &f_.coordinates->attachments());
   f_.for_each([&](const Potential& p) { p.add_hessian(x, curvature, matrix); });
   // The positive one does without: what points do along their curves may be of any sign.
-  if (curvature == Curvature::kExact) f_.coordinates->add_curvature(x, g, matrix);
+  if (curvature != Curvature::kPositive) f_.coordinates->add_curvature(x, g, matrix);
   return matrix;
 }
 
@@ -65,7 +65,7 @@ Factor LinearSystem::factor(const linalg::BlockValues& matrix,
   std::shared_ptr<linalg::CholeskyFactor> factor;
   {
     const Stopwatch::Scope scope(watch_, Phase::kAnalysis);
-    const Assembly::Found found = assembly_->analysis();
+    const AnalyzedPattern::Found found = pattern_->analysis();
     counts_.analyses += found.is_new ? 1 : 0;
     factor = std::make_shared<linalg::CholeskyFactor>(found.analysis, precision);
   }

@@ -132,8 +132,8 @@ class LinearSystem {
   linalg::CholeskyWorkspace& workspace_;
   Stopwatch& watch_;
   Counts& counts_;
-  std::shared_ptr<const Assembly> assembly_;  ///< of the couplings at x_
-  std::vector<double> x_;                     ///< all points
+  std::shared_ptr<const AnalyzedPattern> pattern_;  ///< of the couplings at x_
+  std::vector<double> x_;                           ///< all points
   std::vector<double> b_;
   std::vector<double> z_;
 };

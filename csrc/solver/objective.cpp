@@ -10,7 +10,7 @@ namespace {
 
 /// Couplings of points as sorted ones of rows that the base pattern lacks.
 linalg::Couplings beyond_base(const Objective& f, linalg::Couplings points) {
-  return linalg::beyond(f.assemblies->base(), f.coordinates->couplings_of_rows(std::move(points)));
+  return linalg::beyond(f.patterns->base(), f.coordinates->couplings_of_rows(std::move(points)));
 }
 
 }  // namespace

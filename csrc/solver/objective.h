@@ -6,8 +6,8 @@
 #include "contact/contact_potential.h"
 #include "potential/potential.h"
 #include "potential/proximity.h"
-#include "solver/assembly_cache.h"
 #include "solver/coordinates.h"
+#include "solver/pattern_cache.h"
 
 namespace diffcloth::solver {
 
@@ -23,7 +23,7 @@ struct Objective {
   std::vector<Potential*> others;                ///< everything but inertia and contact
   contact::ContactPotential* contact = nullptr;  ///< null where nothing can touch
   bodies::CoordinatePotential* chart = nullptr;  ///< of free coordinates; null where there are none
-  AssemblyCache* assemblies;
+  PatternCache* patterns;
   linalg::Couplings expected;  ///< of rows beyond the base pattern, sorted: always in couplings()
 
   /// Every potential in a fixed order.
@@ -57,6 +57,17 @@ struct Objective {
     double change = 0.0;
     for_each([&](const Potential& p) { change += p.energy_change(x, to); });
     return change;
+  }
+
+  void update_duals(const double* x, const double* p, double alpha, const double* to) const {
+    for_each([&](Potential& q) { q.update_duals(x, p, alpha, to); });
+  }
+
+  /// Whether a potential has duals of this point, so that the Hessian kPrimalDual is not the exact one.
+  bool has_duals(const double* x) const {
+    bool any = false;
+    for_each([&](const Potential& p) { any = any || p.has_duals(x); });
+    return any;
   }
 
   /// grad P at all points, prescribed ones included.

@@ -3,7 +3,8 @@
 // Let E_k be the objective of friction iteration k = 1..K, x_k its minimizer over the free vertices,
 // and grad the gradient over *all* vertices: free, pinned and bodies'. The outputs are x_K,
 // v = (x_K - x_n)/h and the forces f_o = -grad_o E_K at fixed x_K (bodies' rows). For cotangents
-// x_bar, v_bar, f_bar:
+// x_bar, v_bar, f_bar (forces on pins, grad_p E_K, have rows of zhat likewise, with the other sign; to
+// those on the cloths' vertices, -grad of barrier and friction alone, the last lines come back):
 //
 //   g_K   = x_bar + v_bar / h
 //   z_k   = H_k^-1 (g_k - H_xo f_bar [k = K])      at the free vertices
@@ -16,7 +17,9 @@
 //
 // which each potential adds up for its own inputs; in particular prescribed positions (pins c, bodies
 // o) get  -(H zhat) at their rows, and pins also the direct g_k. Friction's displacement from x_start gives
-// x_start_bar, of bodies that of their origins where these are given. The lag configuration of k is x_{k-1}
+// x_start_bar, or that of the origins where these are given. Contact forces with cotangent c_bar on
+// the cloths' vertices are like another f_bar of the objective C = barrier + friction: g_K loses H_C c_bar,
+// and C is pulled back at zhat + c_bar. The lag configuration of k is x_{k-1}
 // (x_n for k = 1): its cotangent becomes g_{k-1}, and the sweep goes on from K to 1.
 //
 // Where vertices y(q, s) of links follow coordinates q and frames s, x stands for all of z = (cloth, q),
@@ -36,6 +39,7 @@
 #include <utility>
 
 #include "solver/newton.h"
+#include "step/attachments.h"
 #include "step/motion.h"
 
 namespace diffcloth::step {
@@ -58,7 +62,7 @@ class Sum {
       contact::ContactModel::Bar* barrier_bar)
       : stage_(stage), problem_(problem), bar_(bar) {
     if (problem.contact) contact_.emplace(*problem.contact, detection, barrier_bar);
-    objective = problem.objective(stage.inertia, stage.others, stage.assemblies);
+    objective = problem.objective(stage.inertia, stage.others, stage.patterns);
     objective.contact = contact_ ? &*contact_ : nullptr;
   }
 
@@ -85,6 +89,17 @@ class Sum {
     return contact_ ? contact_->contacts() : none;
   }
 
+  /// The potentials that contact forces are of.
+  std::vector<Potential*> touching() {
+    std::vector<Potential*> potentials;
+    if (objective.contact != nullptr) potentials.push_back(objective.contact);
+    if (friction) potentials.push_back(&*friction);
+    return potentials;
+  }
+
+  /// Contacts that friction is taken from.
+  const std::vector<Contact>& lagged() const { return lagged_; }
+
   /// Let factors have the couplings of all contacts that there may be on the way from a point: patterns
   /// seldom change then, and remain functions of the point and this one.
   void expect_contacts_near(const Array& x) {
@@ -98,10 +113,12 @@ class Sum {
   void lag(const std::vector<Contact>& contacts) {
     objective.others = stage_.others;
     friction.reset();
+    lagged_.clear();
     // Where nothing can touch there are no contacts either.
     if (!problem_.contact || contacts.empty()) return;
     friction.emplace(*problem_.contact, contacts, problem_.moved_from().data(), bar_);
     objective.others.push_back(&*friction);
+    lagged_ = contacts;
   }
 
   solver::Objective objective;
@@ -112,6 +129,7 @@ class Sum {
   Problem& problem_;
   contact::ContactModel::Bar* bar_;
   std::optional<ContactPotential> contact_;
+  std::vector<Contact> lagged_;
 };
 
 void report_contacts(const std::vector<Contact>& contacts, Report& report) {
@@ -144,13 +162,20 @@ void report_blockers(const Problem& problem,
   }
 }
 
-/// Contact forces on the bodies' vertices: minus the partial derivative of the contact energy.
-void write_body_forces(const Problem& problem, const Sum& sum, const Array& x, double* out) {
+/// Forces of contact on all vertices, minus the partial derivative of its energy, with those of
+/// attachments on bodies, and forces on pins.
+void add_forces(const Problem& problem, Sum& sum, const Array& x, const Forces& forces) {
   Array g(x.size(), 0.0);
-  if (sum.objective.contact != nullptr) sum.objective.contact->add_gradient(x.data(), g.data());
-  if (sum.friction) sum.friction->add_gradient(x.data(), g.data());
+  for (const Potential* p : sum.touching()) p->add_gradient(x.data(), g.data());
   const std::size_t end = 3 * static_cast<std::size_t>(problem.scene.vertex_count());
-  for (std::size_t a = problem.cloth_size; a < end; ++a) out[a - problem.cloth_size] -= g[a];
+  for (std::size_t a = 0; a < problem.cloth_size; ++a) forces.contact[a] -= g[a];
+  if (problem.scene.has_attached_bodies()) {
+    problem.find<Attachments>().potential().add_gradient(x.data(), g.data());
+  }
+  for (std::size_t a = problem.cloth_size; a < end; ++a) {
+    forces.bodies[a - problem.cloth_size] -= g[a];
+  }
+  add_pin_forces(problem, sum.objective, x, forces.pins);
 }
 
 std::string_view words(solver::Status status) {
@@ -195,12 +220,12 @@ std::vector<Field> ContactStage::tape(const Scene& scene) {
           {.name = "contacts", .shape = {k + 1}}};
 }
 
-void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
+void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) {
   Problem& problem = step.problem;
   const std::size_t size = problem.coordinates.size();
   const int friction_iterations = problem.scene.given.friction_iterations;
   Sum sum(*this, problem, step.detection, nullptr, nullptr);
-  const Motion motion(problem);
+  const GeodesicMotion motion(problem);
   const auto keep = [&](int k, const std::vector<Contact>& contacts) {
     if (step.tape.empty()) return;
     step.tape["contacts"][k] = static_cast<double>(contacts.size());
@@ -244,8 +269,37 @@ void ContactStage::forward(const Forward& step, Array& x, double* body_forces) {
   const double reached = step.report.motion_fraction;
   if (reached < 1.0) step.report.root_poses = motion.root_poses(reached);
   if (!step.tape.empty()) *step.tape["solves"] = solves;
-  write_body_forces(problem, sum, x, body_forces);
+  add_forces(problem, sum, x, forces);
+  PairTally(problem, step.report).add(sum.contacts(), sum.lagged(), x);
 }
+
+namespace {
+
+bool is_zero(const Array& bar) {
+  return std::ranges::all_of(bar, [](double value) { return value == 0.0; });
+}
+
+/// Cotangents of the forces that are a gradient of the whole objective, whose sign bodies feel turned.
+///
+/// @param with_bodies  whether the forces on bodies are among them
+/// @param out          [points, 3], zero
+/// @return whether there are any
+bool read_held_forces(const Backward& step, std::size_t l, bool with_bodies, Array& out) {
+  const Cotangents& bars = step.losses[l];
+  const bool bodies = with_bodies && !is_zero(bars.body_forces);
+  if (bodies) {
+    std::ranges::copy(bars.body_forces,
+                      out.begin() + static_cast<std::ptrdiff_t>(step.problem.cloth_size));
+  }
+  if (is_zero(bars.pin_forces)) return bodies;
+  const std::vector<Index>& pins = step.problem.scene.given.pins;
+  for (std::size_t p = 0; p < pins.size(); ++p) {
+    for (std::size_t k = 0; k < 3; ++k) out[3 * pins[p] + k] = -bars.pin_forces[3 * p + k];
+  }
+  return true;
+}
+
+}  // namespace
 
 void pull_back_solve(const Backward& step,
                      const solver::Objective& f,
@@ -253,8 +307,10 @@ void pull_back_solve(const Backward& step,
                      solver::Certificate certificate,
                      const std::vector<Array>& g,
                      bool with_forces,
+                     const std::vector<Potential*>& touching,
                      const Turn::Exchange& exchange) {
   const solver::Coordinates& coordinates = *f.coordinates;
+  const bool with_bodies = !touching.empty() || step.problem.scene.has_attached_bodies();
   solver::LinearSystem system(f, *step.context.workspace, *step.context.watch,
                               *step.context.counts);
   Array gradient;
@@ -267,15 +323,23 @@ void pull_back_solve(const Backward& step,
 
   std::vector<Array> b(g.size(), Array(x.size(), 0.0));
   std::vector<Array> forces = b;
+  std::vector<Array> touched(g.size());
   Array product;
   for (std::size_t l = 0; l < g.size(); ++l) {
     coordinates.add_rows(g[l], b[l]);
-    const Array& bar = step.losses[l].body_forces;
-    if (!with_forces || std::ranges::all_of(bar, [](double value) { return value == 0.0; }))
-      continue;
-    std::ranges::copy(bar,
-                      forces[l].begin() + static_cast<std::ptrdiff_t>(step.problem.cloth_size));
-    f.hessian_product(x.data(), forces[l].data(), product);
+    if (!with_forces) continue;
+    if (read_held_forces(step, l, with_bodies, forces[l])) {
+      f.hessian_product(x.data(), forces[l].data(), product);
+      for (std::size_t a = 0; a < product.size(); ++a) b[l][a] -= product[a];
+    }
+    const Array& bar = step.losses[l].contact_forces;
+    if (touching.empty() || is_zero(bar)) continue;
+    touched[l] = bar;
+    touched[l].resize(x.size(), 0.0);
+    product.assign(x.size(), 0.0);
+    for (const Potential* p : touching) {
+      p->add_hessian_product(x.data(), touched[l].data(), product.data());
+    }
     for (std::size_t a = 0; a < product.size(); ++a) b[l][a] -= product[a];
   }
   std::vector<Array> z;
@@ -286,6 +350,13 @@ void pull_back_solve(const Backward& step,
     Array& zhat = z[l];
     for (std::size_t a = 0; a < zhat.size(); ++a) zhat[a] = forces[l][a] - zhat[a];
     f.held_product(x.data(), zhat.data(), product);
+    Array with_touched = zhat;
+    if (!touched[l].empty()) {
+      for (const Potential* p : touching) {
+        p->add_held_product(x.data(), touched[l].data(), product.data());
+      }
+      for (std::size_t a = 0; a < zhat.size(); ++a) with_touched[a] += touched[l][a];
+    }
     for (double& value : product) value = -value;
     coordinates.gather(x, product);
     if (coordinates.is_curved()) {
@@ -298,9 +369,41 @@ void pull_back_solve(const Backward& step,
       for (Index a = 3 * i; a < 3 * i + 3; ++a) ends[a] += product[a];
     }
     const Turn turn(exchange, l);
-    f.for_each([&](Potential& p) { p.accumulate(x.data(), zhat.data()); });
+    f.for_each([&](Potential& p) {
+      const bool touches = std::ranges::find(touching, &p) != touching.end();
+      p.accumulate(x.data(), (touches ? with_touched : zhat).data());
+    });
   }
 }
+
+namespace {
+
+/// The cotangent of where friction counts motion from.
+void add_start(const Array& start_bar, Cotangents& bars) {
+  Array& bar = bars.origins.empty() ? bars.start : bars.origins;
+  for (std::size_t a = 0; a < start_bar.size(); ++a) bar[a] += start_bar[a];
+}
+
+/// The cotangent of the lag configuration: of the start, or of the rows g of the solve before.
+void add_lag(const Problem& problem,
+             const Array& x_lag,
+             bool is_start,
+             Array lag_bar,
+             Cotangents& bars,
+             Array& g) {
+  if (is_start) {
+    for (std::size_t a = 0; a < lag_bar.size(); ++a) bars.start[a] += lag_bar[a];
+    return;
+  }
+  lag_bar.resize(x_lag.size(), 0.0);
+  problem.coordinates.gather(x_lag, lag_bar);
+  problem.coordinates.take_rows(lag_bar, g);
+  // What is prescribed and no row: bodies and frames.
+  problem.coordinates.clear_rows(lag_bar);
+  for (std::size_t a = 0; a < lag_bar.size(); ++a) bars.ends[a] += lag_bar[a];
+}
+
+}  // namespace
 
 void ContactStage::backward(const Backward& step, std::vector<Array> g) {
   Problem& problem = step.problem;
@@ -350,28 +453,14 @@ void ContactStage::backward(const Backward& step, std::vector<Array> g) {
     if (!certificate.factor && sum.objective.expected.empty())
       sum.expect_contacts_near(problem.start);
     pull_back_solve(step, sum.objective, x, std::move(certificate), g, k + 1 == solves,
-                    exchange_all);
+                    sum.touching(), exchange_all);
 
     for (std::size_t l = 0; l < g.size(); ++l) {
-      Cotangents& bars = step.losses[l];
       std::ranges::fill(g[l], 0.0);
       if (!sum.friction) continue;
-      Array lag_bar = std::exchange(lag_bars[l], {});
       const Array start_bar = std::exchange(start_bars[l], {});
-      for (std::size_t a = 0; a < start_bar.size(); ++a) {
-        const bool is_moved = a >= problem.cloth_size && !bars.origins.empty();
-        (is_moved ? bars.origins : bars.start)[a] += start_bar[a];
-      }
-      if (k == 0) {
-        for (std::size_t a = 0; a < lag_bar.size(); ++a) bars.start[a] += lag_bar[a];
-        continue;
-      }
-      lag_bar.resize(x.size(), 0.0);
-      problem.coordinates.gather(x_lag, lag_bar);
-      problem.coordinates.take_rows(lag_bar, g[l]);
-      // What is prescribed and no row: bodies and frames.
-      problem.coordinates.clear_rows(lag_bar);
-      for (std::size_t a = 0; a < lag_bar.size(); ++a) bars.ends[a] += lag_bar[a];
+      add_start(start_bar, step.losses[l]);
+      add_lag(problem, x_lag, k == 0, std::exchange(lag_bars[l], {}), step.losses[l], g[l]);
     }
   }
 }

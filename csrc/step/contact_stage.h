@@ -15,7 +15,7 @@ struct ContactStage {
   Proximity& inertia;
   const double* guess;  ///< where the cloths begin if the way there is free: all [N, 3] of them
   std::vector<Potential*> others;
-  solver::AssemblyCache& assemblies;
+  solver::PatternCache& patterns;
   std::size_t first_factor;  ///< place of its factors among the scheme's
   Turn::Exchange exchange;   ///< of what its potentials accumulate; only backward needs it
 
@@ -23,7 +23,7 @@ struct ContactStage {
   static std::vector<Field> tape(const Scene& scene);
 
   /// @param x  in: all points at the start of the step; out: at its end
-  void forward(const Forward& step, std::vector<double>& x, double* body_forces);
+  void forward(const Forward& step, std::vector<double>& x, const Forces& forces);
 
   /// @param g  of each loss, cotangent of the rows (cloth positions, coordinates) at the end
   void backward(const Backward& step, std::vector<std::vector<double>> g);
@@ -35,7 +35,8 @@ struct ContactStage {
 /// @param x            all points where the objective has been minimized; its potentials stand there
 /// @param factor       of the exact Hessian there, or null to make it
 /// @param g            of each loss, cotangent of the rows
-/// @param with_forces  whether the forces on the bodies' vertices are those of this solve
+/// @param with_forces  whether the forces that the step gives back are those of this solve
+/// @param touching     the potentials of the objective that contact forces are of
 /// @param exchange     of what the potentials of the objective accumulate
 void pull_back_solve(const Backward& step,
                      const solver::Objective& objective,
@@ -43,6 +44,7 @@ void pull_back_solve(const Backward& step,
                      solver::Certificate certificate,
                      const std::vector<std::vector<double>>& g,
                      bool with_forces,
+                     const std::vector<Potential*>& touching,
                      const Turn::Exchange& exchange);
 
 /// Fold the outcome of one minimization into the report.

@@ -8,11 +8,6 @@ namespace {
 
 using Array = std::vector<double>;
 
-void add_to(double* out, const Array& bar) {
-  if (out == nullptr) return;
-  for (std::size_t a = 0; a < bar.size(); ++a) out[a] += bar[a];
-}
-
 /// Like add_to(), of an input that has one value for all pairs of surfaces, or one for each.
 void add_pairs_to(double* out, const View& input, const Array& bar) {
   if (out == nullptr) return;
@@ -24,16 +19,10 @@ void write_surfaces(const Problem& p, const Cotangents& bars, const Gradients& g
   const bodies::Mechanisms& mechanisms = p.scene.mechanisms;
   Array start = bars.start;
   p.coordinates.gather(p.start, start);
-  if (!bars.origins.empty()) {
-    Array origins = bars.origins;
-    p.coordinates.gather(p.origins, origins);
-    for (Index c = 0; c < mechanisms.coordinate_count(); ++c) {
-      double& bar = p.coordinates.nodes(origins)[mechanisms.slot(c)];
-      if (double* out = gradients[Input::kCoordinateOrigins]) out[c] += bar;
-      bar = 0.0;
+  if (double* out = gradients[Input::kFrictionOrigins]) {
+    for (std::size_t a = 0; a < p.inputs[Input::kFrictionOrigins].count; ++a) {
+      out[a] += bars.origins[a];
     }
-    // Frames, and bodies without coordinates, are where they start.
-    for (std::size_t a = 0; a < start.size(); ++a) start[a] += origins[a];
   }
   if (double* out = gradients[Input::kBodyPoses]) {
     const double* poses = p.inputs.data(Input::kBodyPoses);
@@ -67,51 +56,12 @@ void write_surfaces(const Problem& p, const Cotangents& bars, const Gradients& g
   add_pairs_to(gradients[Input::kFriction], p.inputs[Input::kFriction], bars.contact.friction);
 }
 
-/// Sum over the corners of each face of their masses' cotangents.
-Array face_sums(const Problem& p, const Array& masses) {
-  const auto& faces = p.scene.topology.faces;
-  Array sums(faces.size(), 0.0);
-  for (std::size_t f = 0; f < faces.size(); ++f) {
-    for (const Index i : faces[f]) sums[f] += masses[i];
-  }
-  return sums;
-}
-
-void write_materials(Problem& p, const Cotangents& bars, const Gradients& gradients) {
-  const auto write_per_face = [&](Input input, const Array& bar) {
-    if (gradients[input] == nullptr) return;
-    gather(bar, p.scene.face_cloth, p.inputs[input], gradients[input]);
-  };
-  const elastic::Bar& elastic = p.elasticity.bar();
-  write_per_face(Input::kStretch, elastic.stretch);
-  write_per_face(Input::kBending, elastic.bending);
-  write_per_face(Input::kPoisson, elastic.poisson);
-  write_per_face(Input::kDamping, elastic.damping);
-
-  Array density_bar = face_sums(p, bars.masses);
-  for (std::size_t f = 0; f < density_bar.size(); ++f) density_bar[f] *= p.rest->area[f] / 3.0;
-  write_per_face(Input::kDensity, density_bar);
-
-  if (!p.anchors) return;
-  add_to(gradients[Input::kSoftPinTargets], p.anchors->target_bar);
-  if (double* out = gradients[Input::kPinStiffness]) {
-    const bool one = p.inputs[Input::kPinStiffness].count == 1;
-    const std::vector<Index>& soft = p.scene.given.soft_pins;
-    for (std::size_t k = 0; k < soft.size(); ++k) {
-      out[one ? 0 : p.scene.vertex_cloth[soft[k]]] += p.anchors->stiffness_bar[k];
-    }
-  }
-}
-
-/// The rest shape acts through elasticity, masses and the contacts' weights and mollifiers.
-void write_rest(Problem& p, const Cotangents& bars, const Gradients& gradients) {
+/// The rest shape acts through the potentials of the cloths, masses and the contacts' weights and
+/// mollifiers.
+void write_rest(const Problem& p, Cotangents& bars, const Gradients& gradients) {
   double* out = gradients[Input::kRestPositions];
   if (out == nullptr) return;
-  mesh::RestShapeBar& rest = p.elasticity.bar().rest;
-  const Array sums = face_sums(p, bars.masses);
-  for (std::size_t f = 0; f < sums.size(); ++f) {
-    rest.area[f] += sums[f] * p.density[f] / 3.0;
-  }
+  mesh::RestShapeBar& rest = bars.rest;
   const std::vector<Index>& start = p.scene.given.cloth_face_start;
   for (Index c = 0; c < p.scene.cloth_count(); ++c) {
     const double share = bars.contact.rest.mean_face_area[c] / (start[c + 1] - start[c]);
@@ -126,12 +76,35 @@ void write_rest(Problem& p, const Cotangents& bars, const Gradients& gradients) 
   }
   const double* X = p.inputs.data(Input::kRestPositions);
   mesh::rest_shape_vjp(p.scene.topology, p.scene.stencils,
-                       X != nullptr ? X : p.scene.given.rest_vertices.data(), rest, out);
+                       X != nullptr ? X : p.scene.given.rest_positions.data(), rest, out);
 }
 
 }  // namespace
 
-Cotangents::Cotangents(const Problem& p)
+void add_to(double* out, const Array& bar) {
+  if (out == nullptr) return;
+  for (std::size_t a = 0; a < bar.size(); ++a) out[a] += bar[a];
+}
+
+void pull_back_lumped(const Problem& p,
+                      Input input,
+                      const Array& bar,
+                      const Array& per_face,
+                      Cotangents& bars,
+                      const Gradients& gradients) {
+  const auto& faces = p.scene.topology.faces;
+  Array sums(faces.size(), 0.0);
+  for (std::size_t f = 0; f < faces.size(); ++f) {
+    for (const Index i : faces[f]) sums[f] += bar[i];
+  }
+  for (std::size_t f = 0; f < bars.rest.area.size(); ++f) {
+    bars.rest.area[f] += sums[f] * per_face[f] / 3.0;
+  }
+  for (std::size_t f = 0; f < faces.size(); ++f) sums[f] *= p.rest->area[f] / 3.0;
+  add_per_face(p, input, sums, gradients);
+}
+
+Cotangents::Cotangents(const Problem& p, const Gradients& gradients)
     : start(p.start.size(), 0.0),
       origins(p.origins.size(), 0.0),
       ends(p.start.size(), 0.0),
@@ -139,31 +112,17 @@ Cotangents::Cotangents(const Problem& p)
       masses(p.masses.size(), 0.0),
       body_poses(p.inputs[Input::kBodyPoses].count, 0.0),
       body_targets(p.inputs[Input::kBodyTargets].count, 0.0),
-      contact(p.scene.collision_mesh),
-      metric_(p.inertia.metric_bar.size(), 0.0),
-      target_(p.inertia.target_bar.size(), 0.0) {
-  if (p.anchors) {
-    anchor_stiffness_.assign(p.anchors->stiffness_bar.size(), 0.0);
-    anchor_target_.assign(p.anchors->target_bar.size(), 0.0);
-  }
-  if (p.chart) {
-    chart_target_.assign(p.chart->target_bar.size(), 0.0);
-    chart_metric_.assign(p.chart->metric_bar.size(), 0.0);
+      contact(p.scene.collision_mesh) {
+  if (gradients[Input::kRestPositions] != nullptr) {
+    rest = mesh::RestShapeBar(p.scene.topology, p.scene.stencils);
   }
 }
 
 void Cotangents::exchange(Problem& p) {
-  std::swap(p.inertia.metric_bar, metric_);
-  std::swap(p.inertia.target_bar, target_);
-  p.elasticity.exchange(elastic_);
-  if (p.anchors) {
-    std::swap(p.anchors->stiffness_bar, anchor_stiffness_);
-    std::swap(p.anchors->target_bar, anchor_target_);
-  }
-  if (p.chart) {
-    std::swap(p.chart->target_bar, chart_target_);
-    std::swap(p.chart->metric_bar, chart_metric_);
-  }
+  store_.begin();
+  p.inertia.swap_cotangents(store_);
+  for (Potential* potential : p.cloth_potentials()) potential->swap_cotangents(store_);
+  if (p.chart) p.chart->swap_cotangents(store_);
 }
 
 void Cotangents::add_predicted(Problem& p, const Gradients& gradients) {
@@ -184,9 +143,10 @@ void Cotangents::add_predicted(Problem& p, const Gradients& gradients) {
 }
 
 void Cotangents::write(Problem& p, const Gradients& gradients) {
-  const Array& damping_bar = p.elasticity.bar().x_n;
+  for (const auto& potential : p.potentials) potential->pull_back(p, *this, gradients);
+  pull_back_lumped(p, Input::kDensity, masses, p.density, *this, gradients);
   if (double* out = gradients[Input::kPositions]) {
-    for (std::size_t a = 0; a < damping_bar.size(); ++a) out[a] += start[a] + damping_bar[a];
+    for (std::size_t a = 0; a < p.cloth_size; ++a) out[a] += start[a];
   }
   add_to(gradients[Input::kVelocities], velocities);
   if (double* out = gradients[Input::kPinTargets]) {
@@ -195,7 +155,6 @@ void Cotangents::write(Problem& p, const Gradients& gradients) {
     }
   }
   write_surfaces(p, *this, gradients);
-  write_materials(p, *this, gradients);
   write_rest(p, *this, gradients);
 }
 

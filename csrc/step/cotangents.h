@@ -13,7 +13,10 @@ namespace diffcloth::step {
 /// The potentials of a problem keep those of their own parameters, of one loss at a time: see Turn.
 class Cotangents {
  public:
-  explicit Cotangents(const Problem& problem);
+  /// All zero.
+  ///
+  /// @param gradients  which of them someone asks for
+  Cotangents(const Problem& problem, const Gradients& gradients);
 
   /// y = xhat = x_n + h v_n + h^2 (gravity + f / m): pull the inertia's target and metric back.
   void add_predicted(Problem& problem, const Gradients& gradients);
@@ -28,18 +31,19 @@ class Cotangents {
   std::vector<double> velocities;   ///< v_n
   std::vector<double> masses;       ///< [N]
   std::vector<double> body_forces;  ///< of the output [3 V]
-  std::vector<double> body_poses;   ///< of the poses at the start, beyond what `start` pulls back
+  std::vector<double> contact_forces;  ///< likewise [3 N]
+  std::vector<double> pin_forces;      ///< likewise [3 P]
+  std::vector<double> body_poses;    ///< of the poses at the start, beyond what `start` pulls back
   std::vector<double> body_targets;  ///< likewise, at the end
   contact::ContactModel::Bar contact;
+
+  mesh::RestShapeBar rest;  ///< of the cloths' rest shape; empty where nobody asks for it
 
   /// Swap what the problem's potentials have accumulated with what they have for this loss.
   void exchange(Problem& problem);
 
  private:
-  std::vector<double> metric_, target_;                   // of inertia
-  elastic::Bar elastic_;                                  // empty where it is zero
-  std::vector<double> anchor_stiffness_, anchor_target_;  // of soft pins
-  std::vector<double> chart_target_, chart_metric_;       // of coordinates
+  CotangentStore store_;
 };
 
 /// What potentials accumulate, and what is read from them, belongs to this loss while it lasts.
@@ -58,5 +62,19 @@ class Turn {
   const Exchange& exchange_;
   std::size_t loss_;
 };
+
+/// out += bar, where wanted.
+void add_to(double* out, const std::vector<double>& bar);
+
+/// Adjoint of lumped(): into the gradient of the input that is given per face, and into the rest shape.
+///
+/// @param bar       of what is lumped [N]
+/// @param per_face  the values of the input
+void pull_back_lumped(const Problem& problem,
+                      Input input,
+                      const std::vector<double>& bar,
+                      const std::vector<double>& per_face,
+                      Cotangents& bars,
+                      const Gradients& gradients);
 
 }  // namespace diffcloth::step

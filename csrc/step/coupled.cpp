@@ -11,8 +11,8 @@ namespace {
 ContactStage stage(Problem& problem) {
   return {.inertia = problem.inertia,
           .guess = problem.inertia.target().data(),
-          .others = problem.elastic_potentials(),
-          .assemblies = problem.scene.elastic_assemblies,
+          .others = problem.cloth_potentials(),
+          .patterns = problem.scene.elastic_patterns,
           .first_factor = 0,
           .exchange = {}};
 }
@@ -21,8 +21,8 @@ ContactStage stage(Problem& problem) {
 
 std::vector<Field> Coupled::tape(const Scene& scene) const { return ContactStage::tape(scene); }
 
-void Coupled::forward(const Forward& step, std::vector<double>& x, double* body_forces) const {
-  stage(step.problem).forward(step, x, body_forces);
+void Coupled::forward(const Forward& step, std::vector<double>& x, const Forces& forces) const {
+  stage(step.problem).forward(step, x, forces);
 }
 
 void Coupled::backward(const Backward& step) const {

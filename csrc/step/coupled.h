@@ -4,13 +4,14 @@
 
 namespace diffcloth::step {
 
-/// Inertia + elasticity + anchors + barrier + friction, minimized together: one exact implicit Euler
+/// Inertia, all potentials of the cloths, barrier and friction, minimized together: one exact implicit Euler
 /// step in contact.
 class Coupled final : public Scheme {
  public:
   std::string_view name() const override { return "coupled"; }
+  bool moves_bodies() const override { return true; }
   std::vector<Field> tape(const Scene& scene) const override;
-  void forward(const Forward& step, std::vector<double>& x, double* body_forces) const override;
+  void forward(const Forward& step, std::vector<double>& x, const Forces& forces) const override;
   void backward(const Backward& step) const override;
 };
 

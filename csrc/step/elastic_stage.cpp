@@ -12,25 +12,25 @@
 namespace diffcloth::step {
 namespace {
 
-std::string_view words(projective::Status status) {
+std::string_view words(projective::LocalGlobalStatus status) {
   switch (status) {
-    case projective::Status::kConverged:
+    case projective::LocalGlobalStatus::kConverged:
       return {};
-    case projective::Status::kIterationLimit:
+    case projective::LocalGlobalStatus::kIterationLimit:
       return "the local/global iterations of the step are used up";
-    case projective::Status::kRoundingFloor:
+    case projective::LocalGlobalStatus::kRoundingFloor:
       return "rounding hides any further decrease of the elastic stage";
-    case projective::Status::kStalled:
+    case projective::LocalGlobalStatus::kStalled:
       return "the local/global iterations of the step have stalled";
-    case projective::Status::kOverflow:
+    case projective::LocalGlobalStatus::kOverflow:
       return "the forces of the elastic stage are not finite";
   }
   __builtin_unreachable();
 }
 
 solver::Objective objective(Problem& problem) {
-  return problem.objective(problem.inertia, problem.elastic_potentials(),
-                           problem.scene.elastic_assemblies);
+  return problem.objective(problem.inertia, problem.cloth_potentials(),
+                           problem.scene.elastic_patterns);
 }
 
 void solve_by_newton(Problem& problem,
@@ -39,10 +39,10 @@ void solve_by_newton(Problem& problem,
                      std::vector<double>& x) {
   // Its way is no motion of the cloth.
   auto* const path = std::exchange(step.context.path, nullptr);
-  const solver::Outcome outcome = nodes.has_contacts()
-                                      ? nodes.solve(step.context, x)
-                                      : solver::minimize(objective(problem), x, Motion(problem),
-                                                         nullptr, nullptr, step.context);
+  const solver::Outcome outcome =
+      nodes.has_contacts() ? nodes.solve(step.context, x)
+                           : solver::minimize(objective(problem), x, GeodesicMotion(problem),
+                                              nullptr, nullptr, step.context);
   step.context.path = path;
   merge(outcome, step.report);
   step.kept.add(outcome.certificate);
@@ -55,32 +55,32 @@ void solve_by_projective_dynamics(Problem& problem,
                                   const NodalStage& nodes,
                                   std::vector<double>& x) {
   const solver::Options& given = step.context.options;
-  const projective::Options options{
+  const projective::LocalGlobalOptions options{
       .tolerance = given.tolerance,
       .max_iterations = projective::kIterationsPerNewton * given.max_iterations};
   const Checkpoint& checkpoint = *step.context.checkpoint;
   const std::vector<double> start = x;
-  projective::Outcome outcome;
+  projective::LocalGlobalOutcome outcome;
   {
     const Stopwatch::Scope scope(*step.context.watch, Phase::kSolve);
     const auto matrix = problem.constant_matrix();
-    projective::Objective f{.potentials = {&problem.inertia, &problem.elasticity},
-                            .matrix = matrix.get(),
-                            .masses = &problem.masses,
-                            .h = problem.h};
-    if (problem.anchors) f.potentials.push_back(&*problem.anchors);
+    projective::LocalGlobalObjective f{.potentials = {&problem.inertia},
+                                       .matrix = matrix.get(),
+                                       .masses = &problem.masses,
+                                       .h = problem.h};
+    for (const Potential* p : problem.cloth_potentials()) f.potentials.push_back(p);
     outcome = nodes.has_contacts() ? nodes.iterate(f, options, checkpoint, x)
                                    : projective::minimize(f, x, options, checkpoint);
   }
   step.report.counts.local_global += outcome.iterations;
-  if (outcome.status == projective::Status::kStalled) {
+  if (outcome.status == projective::LocalGlobalStatus::kStalled) {
     ++step.report.counts.left_to_newton;
     x = start;
     solve_by_newton(problem, step, nodes, x);
     return;
   }
   step.report.residual = std::max(step.report.residual, outcome.residual);
-  if (outcome.status != projective::Status::kConverged) {
+  if (outcome.status != projective::LocalGlobalStatus::kConverged) {
     step.report.result = Result::kNotConverged;
     step.report.message = words(outcome.status);
   }
@@ -89,7 +89,7 @@ void solve_by_projective_dynamics(Problem& problem,
 
 }  // namespace
 
-std::vector<double> ElasticStage::forward(const Forward& step, double* body_forces) const {
+std::vector<double> ElasticStage::forward(const Forward& step, const Forces& forces) const {
   // Pins are at their targets, and so are the bodies.
   std::vector<double> x = problem_.predicted(problem_.inertia.target().data());
   if (nodes_.has_contacts()) nodes_.start(x);
@@ -98,7 +98,13 @@ std::vector<double> ElasticStage::forward(const Forward& step, double* body_forc
   } else {
     solve_by_newton(problem_, step, nodes_, x);
   }
-  if (nodes_.has_contacts()) nodes_.finish(x, step.report, body_forces);
+  if (nodes_.has_contacts()) {
+    nodes_.finish(x, step.report, forces);
+  } else if (!problem_.scene.given.pins.empty()) {
+    const solver::Objective f = objective(problem_);
+    f.stand_at(x.data());
+    add_pin_forces(problem_, f, x, forces.pins);
+  }
   if (!step.tape.empty()) std::copy_n(x.begin(), problem_.cloth_size, step.tape["elastic"]);
   return x;
 }
@@ -117,7 +123,7 @@ void ElasticStage::backward(const Backward& step, const std::vector<std::vector<
   }
   const solver::Objective f = objective(problem_);
   f.stand_at(x.data());
-  pull_back_solve(step, f, x, certificate, g, false, exchange);
+  pull_back_solve(step, f, x, certificate, g, true, {}, exchange);
 }
 
 }  // namespace diffcloth::step

@@ -7,7 +7,7 @@
 
 namespace diffcloth::step {
 
-/// The stage of a scheme that comes without the barrier: inertia, elasticity and anchors, with dry
+/// The stage of a scheme that comes without the barrier: inertia and all potentials of the cloths, with dry
 /// frictional contact at nodes where there is any. It is on the tape as "elastic": its positions.
 class ElasticStage {
  public:
@@ -15,8 +15,8 @@ class ElasticStage {
 
   bool has_contacts() const { return nodes_.has_contacts(); }
 
-  /// All points at its end; the contact forces on the bodies' vertices are added to body_forces.
-  std::vector<double> forward(const Forward& step, double* body_forces) const;
+  /// All points at its end; the forces there are added.
+  std::vector<double> forward(const Forward& step, const Forces& forces) const;
 
   /// @param g  of each loss, cotangent of the rows at its end
   void backward(const Backward& step, const std::vector<std::vector<double>>& g) const;

@@ -1,27 +1,88 @@
 #include <algorithm>
+#include <cmath>
+#include <stdexcept>
 
+#include "step/cotangents.h"
 #include "step/problem.h"
 #include "step/step.h"
 
 namespace diffcloth::step {
 
-StoredEnergy stored_energy(const Scene& scene, const Inputs& inputs) {
-  Problem p(scene, inputs);
-  const double* x = p.start.data();
-  StoredEnergy energy{
-      .stretch = elastic::stretch_energy(p.model, x),
-      .bending = elastic::bending_energy(p.model, x),
-  };
-  if (p.anchors) energy.soft_pins = p.anchors->energy(x);
-  if (p.contact) {
-    contact::BroadPhase::Scratch scratch;
-    std::vector<contact::Candidate> candidates;
-    scene.broad_phase.find(x, x, p.contact->reach(), scratch, candidates);
-    contact::Near near;
-    p.contact->measure(candidates, x, near);
-    energy.contact = near.energy();
+namespace {
+
+/// What the barrier, that of the problem, has within reach at the start.
+contact::Near near_at_start(const Problem& p, const contact::ContactModel& barrier) {
+  const double* const x = p.start.data();
+  contact::BroadPhase::Scratch scratch;
+  std::vector<contact::Candidate> candidates;
+  p.scene.broad_phase.find(x, x, barrier.reach(), scratch, candidates);
+  contact::Near near;
+  barrier.measure(candidates, x, near);
+  return near;
+}
+
+/// @throws std::domain_error where surfaces overlap
+std::vector<contact::Contact> contacts_at_start(const Problem& p,
+                                                const contact::ContactModel& barrier) {
+  const contact::Near near = near_at_start(p, barrier);
+  if (!std::isfinite(near.energy())) {
+    throw std::domain_error("contact stores an infinite energy, which has no gradient: " +
+                            find_overlap(p.scene, p.inputs));
   }
-  return energy;
+  std::vector<contact::Contact> contacts;
+  barrier.find(near, p.start.data(), contacts);
+  return contacts;
+}
+
+/// Add the derivatives of seed times the barrier's energy.
+void accumulate_contact(const Problem& p,
+                        const contact::ContactModel& barrier,
+                        const std::vector<contact::Contact>& contacts,
+                        double seed,
+                        Cotangents& bars) {
+  const double* const x = p.start.data();
+  std::vector<double> gradient(p.start.size(), 0.0);
+  barrier.add_gradient(contacts, x, gradient.data());
+  for (std::size_t a = 0; a < gradient.size(); ++a) bars.start[a] += seed * gradient[a];
+  barrier.add_energy_bars(contacts, x, seed, bars.contact);
+}
+
+}  // namespace
+
+Energies stored_energy(const Scene& scene, const Inputs& inputs) {
+  const Problem p(scene, inputs);
+  Energies energies;
+  for (const auto& potential : p.potentials) {
+    potential->visit_energy(p.start.data(), [&](const char* name, double value) {
+      energies.emplace_back(name, value);
+    });
+  }
+  energies.emplace_back("contact", p.contact ? near_at_start(p, *p.contact).energy() : 0.0);
+  return energies;
+}
+
+void pull_back_energy(const Scene& scene, const Inputs& inputs, std::span<const Loss> losses) {
+  const Gradients& wanted = losses.front().gradients;
+  Problem p(scene, inputs, &wanted);
+  const auto of_contact = [](const Loss& loss) { return *loss.cotangents["contact"]; };
+  std::vector<contact::Contact> contacts;
+  if (p.contact && std::ranges::any_of(losses, [&](auto& l) { return of_contact(l) != 0.0; })) {
+    contacts = contacts_at_start(p, *p.contact);
+  }
+  for (const Loss& loss : losses) {
+    Cotangents bars(p, wanted);
+    const Turn::Exchange exchange = [&](std::size_t /*loss*/) { bars.exchange(p); };
+    const Turn turn(exchange, 0);
+    for (const auto& potential : p.potentials) {
+      potential->accumulate_energy(
+          p.start.data(), [&](const char* name) { return *loss.cotangents[name]; },
+          bars.start.data());
+    }
+    if (p.contact && !contacts.empty()) {
+      accumulate_contact(p, *p.contact, contacts, of_contact(loss), bars);
+    }
+    bars.write(p, loss.gradients);
+  }
 }
 
 namespace {
@@ -48,10 +109,10 @@ std::vector<double> stiffness_of_cloths(const Scene& scene,
   if (scene.cloth_count() == 0) return result;
   Inputs at_rest = inputs;
   at_rest.views[static_cast<std::size_t>(Input::kPositions)].data =
-      scene.given.rest_vertices.data();
+      scene.given.rest_positions.data();
   Problem p(scene, at_rest);
   std::vector<double> x = p.start;  // bodies, too
-  std::copy_n(scene.given.rest_vertices.data(), p.cloth_size, x.begin());
+  std::copy_n(scene.given.rest_positions.data(), p.cloth_size, x.begin());
   const linalg::BlockMatrix hessian = contact_free_hessian(p, x.data(), Curvature::kExact);
   const linalg::BlockPattern& pattern = hessian.pattern();
   const double* thickness = inputs.data(Input::kThickness);

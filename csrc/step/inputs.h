@@ -10,44 +10,119 @@ namespace diffcloth::step {
 
 /// Every continuous input of a step. All but dt are differentiable.
 enum class Input : std::uint8_t {
-  kPositions,          ///< x_n [N, 3] m
-  kVelocities,         ///< v_n [N, 3] m/s
-  kBodyPoses,          ///< frames of the roots of all trees at the start of the step [T, 7]
-  kBodyTargets,        ///< at its end [T, 7]
-  kPinTargets,         ///< [P, 3] m
-  kSoftPinTargets,     ///< [Q, 3] m
-  kForces,             ///< [N, 3] N
-  kGravity,            ///< [3] m/s^2
-  kStretch,            ///< k_s, one value, one a cloth or one a face [N/m]
-  kBending,            ///< D, likewise [N m]
-  kPoisson,            ///< nu, likewise [-]
-  kDensity,            ///< rho, likewise [kg/m^2]
-  kDamping,            ///< k_d, likewise [s]
-  kFriction,           ///< mu, one value or [S, S] [-]
-  kThickness,          ///< [S] m
-  kBarrierStiffness,   ///< kappa, one value or [S, S] [Pa]
+  kPositions,          ///< x_n [m]
+  kVelocities,         ///< v_n [m/s]
+  kBodyPoses,          ///< frames of the roots of all trees at the start of the step
+  kBodyTargets,        ///< at its end
+  kPinTargets,         ///< [m]
+  kSoftPinTargets,     ///< [m]
+  kForces,             ///< [N]
+  kGravity,            ///< [m/s^2]
+  kStretch,            ///< k_s [N/m]
+  kBending,            ///< D [N m]
+  kPoisson,            ///< nu [-]
+  kDensity,            ///< rho [kg/m^2]
+  kDamping,            ///< k_d [s]
+  kFriction,           ///< mu [-]
+  kThickness,          ///< [m]
+  kBarrierStiffness,   ///< kappa [Pa]
   kBarrierDistance,    ///< d_hat [m]
   kSlipVelocity,       ///< eps_v [m/s]
-  kPinStiffness,       ///< k_a, one value or one a cloth [N/m]
-  kRestPositions,      ///< X [N, 3] m
-  kCoordinates,        ///< of mechanisms, at the start of the step [n]
-  kCoordinateEnds,     ///< at its end, where prescribed [n]
-  kCoordinateTargets,  ///< t [n], see bodies::CoordinatePotential
-  kCoordinateMetric,   ///< A [sum n_t^2]
-  kCoordinateOrigins,  ///< where friction counts their motion from [n]; absent: at the start
+  kPinStiffness,       ///< k_a [N/m]
+  kSpringTargets,      ///< [m]
+  kSpringWeights,      ///< w [-]
+  kSpringStiffness,    ///< k [N/m]
+  kRestPositions,      ///< X [m]
+  kCoordinates,        ///< of mechanisms, at the start of the step
+  kCoordinateEnds,     ///< at its end, where prescribed
+  kCoordinateTargets,  ///< t, see bodies::CoordinatePotential
+  kCoordinateMetric,   ///< A
+  kFrictionOrigins,    ///< where friction counts motion from [m]; absent: at the start
 };
-inline constexpr std::size_t kInputCount = 25;
-// clang-format off
-inline constexpr std::array<const char*, kInputCount> kInputNames{
-    "positions", "velocities", "body_poses", "body_targets",
-    "pin_targets", "soft_pin_targets", "forces", "gravity",
-    "stretch", "bending", "poisson", "density",
-    "damping", "friction", "thickness", "barrier_stiffness",
-    "barrier_distance", "slip_velocity", "pin_stiffness", "rest_positions",
-    "coordinates", "coordinate_ends", "coordinate_targets", "coordinate_metric",
-    "coordinate_origins",
+
+/// What an input has a value for. N vertices, F faces and C cloths; T trees and n coordinates of
+/// mechanisms; S surfaces.
+enum class Extent : std::uint8_t {
+  kOne,          ///< []
+  kVector,       ///< [3]
+  kVertices,     ///< [N, 3]
+  kAllVertices,  ///< [N + V, 3], those of bodies and links too
+  kPins,         ///< [P, 3]
+  kSoftPins,     ///< [Q, 3]
+  kAttachments,  ///< [A]
+  kTargets,      ///< [U, 3], of attachments to targets
+  kPerFace,      ///< one value, one a cloth or one a face
+  kPerCloth,     ///< one value or one a cloth
+  kTrees,        ///< [T, 7]
+  kSurfaces,     ///< [S]
+  kPairs,        ///< one value or [S, S]
+  kCoordinates,  ///< [n]
+  kBlocks,       ///< [sum n_t^2], tree after tree
 };
-// clang-format on
+
+/// Where a step needs an input; elsewhere it may be absent.
+enum class Need : std::uint8_t {
+  kExtent,           ///< where the scene has anything of its extent
+  kNowhere,          ///< what stands in for it is known
+  kBarrier,          ///< where there is a barrier
+  kSoftPins,         ///< where there are soft pins
+  kFreeCoordinates,  ///< where forces move coordinates
+};
+
+struct InputRow {
+  constexpr InputRow(Input input_in,
+                     const char* name_in,
+                     Extent extent_in,
+                     Need need_in = Need::kExtent)
+      : input(input_in), name(name_in), extent(extent_in), need(need_in) {}
+
+  Input input;
+  const char* name;
+  Extent extent;
+  Need need;
+};
+
+/// The inputs by their names, in the order of Input.
+inline constexpr std::array kInputTable{
+    InputRow{Input::kPositions, "positions", Extent::kVertices},
+    InputRow{Input::kVelocities, "velocities", Extent::kVertices},
+    InputRow{Input::kBodyPoses, "body_poses", Extent::kTrees},
+    InputRow{Input::kBodyTargets, "body_targets", Extent::kTrees},
+    InputRow{Input::kPinTargets, "pin_targets", Extent::kPins},
+    InputRow{Input::kSoftPinTargets, "soft_pin_targets", Extent::kSoftPins},
+    InputRow{Input::kForces, "forces", Extent::kVertices},
+    InputRow{Input::kGravity, "gravity", Extent::kVector},
+    InputRow{Input::kStretch, "stretch", Extent::kPerFace},
+    InputRow{Input::kBending, "bending", Extent::kPerFace},
+    InputRow{Input::kPoisson, "poisson", Extent::kPerFace, Need::kNowhere},
+    InputRow{Input::kDensity, "density", Extent::kPerFace},
+    InputRow{Input::kDamping, "damping", Extent::kPerFace},
+    InputRow{Input::kFriction, "friction", Extent::kPairs, Need::kBarrier},
+    InputRow{Input::kThickness, "thickness", Extent::kSurfaces, Need::kBarrier},
+    InputRow{Input::kBarrierStiffness, "barrier_stiffness", Extent::kPairs, Need::kNowhere},
+    InputRow{Input::kBarrierDistance, "barrier_distance", Extent::kOne, Need::kBarrier},
+    InputRow{Input::kSlipVelocity, "slip_velocity", Extent::kOne, Need::kBarrier},
+    InputRow{Input::kPinStiffness, "pin_stiffness", Extent::kPerCloth, Need::kSoftPins},
+    InputRow{Input::kSpringTargets, "attachment_targets", Extent::kTargets},
+    InputRow{Input::kSpringWeights, "attachment_weights", Extent::kAttachments},
+    InputRow{Input::kSpringStiffness, "attachment_stiffness", Extent::kAttachments},
+    InputRow{Input::kRestPositions, "rest_positions", Extent::kVertices, Need::kNowhere},
+    InputRow{Input::kCoordinates, "coordinates", Extent::kCoordinates},
+    InputRow{Input::kCoordinateEnds, "coordinate_ends", Extent::kCoordinates},
+    InputRow{Input::kCoordinateTargets, "coordinate_targets", Extent::kCoordinates,
+             Need::kFreeCoordinates},
+    InputRow{Input::kCoordinateMetric, "coordinate_metric", Extent::kBlocks,
+             Need::kFreeCoordinates},
+    InputRow{Input::kFrictionOrigins, "friction_origins", Extent::kAllVertices, Need::kNowhere},
+};
+inline constexpr std::size_t kInputCount = kInputTable.size();
+
+static_assert([] {
+  for (std::size_t k = 0; k < kInputCount; ++k) {
+    if (static_cast<std::size_t>(kInputTable[k].input) != k) return false;
+  }
+  return true;
+}());
 
 /// One environment's input: a flat array, absent where data is null.
 struct View {

@@ -17,7 +17,7 @@ Index tree_count(const Scene& scene) {
 
 }  // namespace
 
-Motion::Motion(const Problem& problem) : problem_(problem) {
+GeodesicMotion::GeodesicMotion(const Problem& problem) : problem_(problem) {
   const double* from = problem.inputs.data(Input::kBodyPoses);
   const double* to = problem.inputs.data(Input::kBodyTargets);
   const solver::Coordinates& coordinates = problem.coordinates;
@@ -30,7 +30,7 @@ Motion::Motion(const Problem& problem) : problem_(problem) {
   portions_ = std::max(1, static_cast<int>(std::ceil(turn / kLargestTurn)));
 }
 
-std::vector<double> Motion::root_poses(double fraction) const {
+std::vector<double> GeodesicMotion::root_poses(double fraction) const {
   const double* from = problem_.inputs.data(Input::kBodyPoses);
   const double* to = problem_.inputs.data(Input::kBodyTargets);
   const Index count = tree_count(problem_.scene);
@@ -44,7 +44,7 @@ std::vector<double> Motion::root_poses(double fraction) const {
   return poses;
 }
 
-void Motion::at(double fraction, double* x) const {
+void GeodesicMotion::at(double fraction, double* x) const {
   const Scene& scene = problem_.scene;
   const std::size_t cloth = 3 * static_cast<std::size_t>(scene.cloth_vertex_count());
   const bool is_end = fraction == 1.0;

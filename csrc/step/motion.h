@@ -8,9 +8,9 @@
 namespace diffcloth::step {
 
 /// The motion of pins, on straight lines, and bodies, along the geodesics of their poses.
-class Motion final : public solver::PrescribedMotion {
+class GeodesicMotion final : public solver::PrescribedMotion {
  public:
-  explicit Motion(const Problem& problem);
+  explicit GeodesicMotion(const Problem& problem);
 
   int portions() const override { return portions_; }
   void at(double fraction, double* x) const override;

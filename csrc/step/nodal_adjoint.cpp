@@ -1,7 +1,7 @@
 // The adjoint of dry frictional contact at nodes, in the terms of nodal_system.cpp.
 //
 // For the cotangent g_x of x, let lambda = Z lambda solve  K^T lambda = Z (g_x + H eta), with eta
-// those of the forces E g at nodes, which the bodies feel. Then z = L^T lambda - eta goes through the
+// those of the forces g at nodes, which cloths, bodies and pins feel. Then z = L^T lambda - eta goes through the
 // potentials as in contact_stage.cpp. The cotangent of E (x - x_n) - h s v_out at fixed g is minus
 //
 //   q = (I - P) E (g_x - H z)  +  F lambda            (the first term without P where it sticks)
@@ -33,6 +33,132 @@ constexpr double kAdjointTolerance = 1e-12;
 /// What rounding may leave of it on a badly conditioned mesh.
 constexpr double kLargestAdjointError = 1e-8;
 
+/// What the forces pull back to: on nodes E^T E g, on the bodies minus E g, shared by the corners of the
+/// nearest faces, on pins g.
+struct ForcesBar {
+  Array eta;                            ///< of the rows
+  std::vector<Vec3> surface_point_bar;  ///< of each contact
+  bool any;                             ///< whether someone asks for it
+};
+
+ForcesBar pull_back_forces(const Problem& problem,
+                           const NodalContacts& contacts,
+                           const NodalSystem::Point& at,
+                           std::size_t size,
+                           const Cotangents& bars) {
+  const auto is_zero = [](const Array& bar) {
+    return std::ranges::all_of(bar, [](double value) { return value == 0.0; });
+  };
+  ForcesBar result{.eta = Array(size, 0.0),
+                   .surface_point_bar = std::vector<Vec3>(contacts.list.size(), Vec3::Zero()),
+                   .any = !is_zero(bars.body_forces) || !is_zero(bars.contact_forces) ||
+                          !is_zero(bars.pin_forces)};
+  const std::vector<Index>& pins = problem.scene.given.pins;
+  for (std::size_t p = 0; p < pins.size(); ++p) {
+    Eigen::Map<Vec3>(result.eta.data() + 3 * pins[p]) +=
+        row(bars.pin_forces.data(), static_cast<Index>(p));
+  }
+  for (std::size_t k = 0; result.any && k < contacts.list.size(); ++k) {
+    const NodalContact& c = contacts.list[k];
+    if (at.laws[k].kind == ContactCase::kTakingOff) continue;
+    spread(c, relative(c, bars.contact_forces.data()), result.eta.data());
+    if (c.obstacle < 0) continue;
+    const Index body = contacts.obstacles[c.obstacle].body;
+    const auto share = problem.scene.face_search[body].share(c.surface_point);
+    const Vec3 force = relative(c, at.g.data());
+    Vec3 weights_bar;
+    for (int a = 0; a < 3; ++a) {
+      const Vec3 bar = row(bars.body_forces.data(), share.corners[a]);
+      spread(c, -share.weights[a] * bar, result.eta.data());
+      weights_bar[a] = -bar.dot(force);
+    }
+    result.surface_point_bar[k] = share.weights_by_point.transpose() * weights_bar;
+  }
+  return result;
+}
+
+/// lambda.
+Array solve_adjoint(const NodalSystem& system,
+                    const NodalSystem::Point& at,
+                    const linalg::BlockMatrix& H,
+                    const linalg::CholeskyFactor& factor,
+                    const Array& b) {
+  Array lambda;
+  const auto solved = system.solve(at, H, factor, true, b, kAdjointTolerance, lambda);
+  if (!solved.converged) {
+    // The floor of rounding may lie above the tolerance: then what has been found must do.
+    Array again;
+    if (!system.solve(at, H, factor, true, b, kLargestAdjointError, again).converged) {
+      throw std::domain_error("the adjoint of nodal friction did not converge");
+    }
+  }
+  return lambda;
+}
+
+/// The cotangent of the normal of a slipping contact; that of its friction goes into `bars`.
+Vec3 pull_back_slipping(const Problem& problem,
+                        const NodalContacts& contacts,
+                        const NodalSystem::Point& at,
+                        std::size_t k,
+                        const Vec3& lambda_e,
+                        const Vec3& q_held,
+                        Cotangents& bars) {
+  const NodalContact& c = contacts.list[k];
+  const Index surfaces = problem.scene.surface_count();
+  const Vec3 force = relative(c, at.g.data());
+  const double normal_force = c.normal.dot(force);
+  const double along = at.laws[k].direction.dot(lambda_e);
+  const Index a = problem.scene.vertex_cloth[c.vertex];
+  const Index other = c.partner >= 0
+                          ? problem.scene.vertex_cloth[c.partner]
+                          : problem.scene.cloth_count() + contacts.obstacles[c.obstacle].body;
+  const double friction_bar = normal_force * along;
+  bars.contact.friction[a * surfaces + other] += 0.5 * friction_bar;
+  bars.contact.friction[other * surfaces + a] += 0.5 * friction_bar;
+  return normal_force * lambda_e + c.friction * along * force -
+         c.normal.dot(q_held) * (problem.h * scale(c)) * at.u[k];
+}
+
+/// The cotangents of the contacts' frames, and of what moves against them.
+void pull_back_frames(Problem& problem,
+                      const NodalContacts& contacts,
+                      const NodalSystem& system,
+                      const NodalSystem::Point& at,
+                      const Array& lambda,
+                      const Array& q,
+                      const std::vector<Vec3>& surface_point_bar,
+                      Cotangents& bars) {
+  const projective::Swept cloths = swept(problem);
+  for (std::size_t k = 0; k < contacts.list.size(); ++k) {
+    const NodalContact& c = contacts.list[k];
+    const Coulomb& law = at.laws[k];
+    if (law.kind == ContactCase::kTakingOff) continue;
+    const double h_s = problem.h * scale(c);
+    const Vec3 lambda_e = relative(c, lambda.data());
+    const Vec3 q_held = NodalSystem::held(c, law, relative(c, q.data()));
+    const Vec3 q_e = q_held + system.turning(c, law, lambda_e);
+    spread(c, q_e, bars.start.data());
+    Vec3 normal_bar = Vec3::Zero();
+    if (law.kind == ContactCase::kSlipping) {
+      normal_bar = pull_back_slipping(problem, contacts, at, k, lambda_e, q_held, bars);
+    }
+    const projective::FrameBar frame = projective::pull_back(
+        c, cloths, contacts.obstacles, normal_bar, h_s * q_e, surface_point_bar[k]);
+    const auto add_vertex = [&](Index i, const Vec3& bar) {
+      Eigen::Map<Vec3>(bars.start.data() + 3 * i) += (1.0 - c.fraction) * bar;
+      Eigen::Map<Vec3>(problem.inertia.target_bar.data() + 3 * i) += c.fraction * bar;
+    };
+    add_vertex(c.vertex, frame.vertex);
+    if (c.partner >= 0) {
+      add_vertex(c.partner, frame.partner);
+    } else {
+      const Index pose = problem.scene.given.bodies.pose[contacts.obstacles[c.obstacle].body];
+      Eigen::Map<bodies::Pose>(bars.body_poses.data() + 7 * pose) += frame.start;
+      Eigen::Map<bodies::Pose>(bars.body_targets.data() + 7 * pose) += frame.end;
+    }
+  }
+}
+
 }  // namespace
 
 void NodalStage::backward(const Backward& step,
@@ -51,42 +177,16 @@ void NodalStage::backward(const Backward& step,
   if (!factor) factor = linear.factor_in_doubles(system.without_coupling(at, H));
   if (!factor) throw std::domain_error("the Hessian is not positive definite at the solution");
 
-  // The bodies' forces: minus E g, shared.
-  Array eta(f.coordinates->size(), 0.0);
-  std::vector<Vec3> surface_point_bar(contacts_.list.size(), Vec3::Zero());
-  const bool forces_count =
-      std::ranges::any_of(bars.body_forces, [](double value) { return value != 0.0; });
-  for (std::size_t k = 0; forces_count && k < contacts_.list.size(); ++k) {
-    const NodalContact& c = contacts_.list[k];
-    if (c.obstacle < 0 || at.laws[k].kind == ContactCase::kTakingOff) continue;
-    const Index body = contacts_.obstacles[c.obstacle].body;
-    const auto share = problem_.scene.face_search[body].share(c.surface_point);
-    const Vec3 force = relative(c, at.g.data());
-    Vec3 weights_bar;
-    for (int a = 0; a < 3; ++a) {
-      const Vec3 bar = row(bars.body_forces.data(), share.corners[a]);
-      spread(c, -share.weights[a] * bar, eta.data());
-      weights_bar[a] = -bar.dot(force);
-    }
-    surface_point_bar[k] = share.weights_by_point.transpose() * weights_bar;
-  }
+  const ForcesBar forces = pull_back_forces(problem_, contacts_, at, f.coordinates->size(), bars);
   Array b = g;
   system.clear_fixed(b);
-  if (forces_count) H.add_product(eta.data(), b.data());
+  if (forces.any) H.add_product(forces.eta.data(), b.data());
   system.project(at, b);
-  Array lambda;
-  const auto solved = system.solve(at, H, *factor, true, b, kAdjointTolerance, lambda);
-  if (!solved.converged) {
-    // The floor of rounding may lie above the tolerance: then what has been found must do.
-    Array again;
-    if (!system.solve(at, H, *factor, true, b, kLargestAdjointError, again).converged) {
-      throw std::domain_error("the adjoint of nodal friction did not converge");
-    }
-  }
+  const Array lambda = solve_adjoint(system, at, H, *factor, b);
 
   Array z = lambda;
   system.couple_transposed(at, z);
-  for (std::size_t a = 0; a < z.size(); ++a) z[a] -= eta[a];
+  for (std::size_t a = 0; a < z.size(); ++a) z[a] -= forces.eta[a];
   Array z_points(x.size(), 0.0);
   f.coordinates->add_rows(z, z_points);
   Array change(z.size(), 0.0);
@@ -99,48 +199,7 @@ void NodalStage::backward(const Backward& step,
     for (Index a = 3 * i; a < 3 * i + 3; ++a) bars.ends[a] += q[a];
   }
   f.for_each([&](Potential& p) { p.accumulate(x.data(), z_points.data()); });
-
-  const projective::Swept cloths = swept(problem_);
-  const Index surfaces = problem_.scene.surface_count();
-  for (std::size_t k = 0; k < contacts_.list.size(); ++k) {
-    const NodalContact& c = contacts_.list[k];
-    const Coulomb& law = at.laws[k];
-    if (law.kind == ContactCase::kTakingOff) continue;
-    const double h_s = problem_.h * scale(c);
-    const Vec3 lambda_e = relative(c, lambda.data());
-    const Vec3 q_held = NodalSystem::held(c, law, relative(c, q.data()));
-    const Vec3 q_e = q_held + system.turning(c, law, lambda_e);
-    spread(c, q_e, bars.start.data());
-    Vec3 normal_bar = Vec3::Zero();
-    if (law.kind == ContactCase::kSlipping) {
-      const Vec3 force = relative(c, at.g.data());
-      const double normal_force = c.normal.dot(force);
-      const double along = law.direction.dot(lambda_e);
-      normal_bar = normal_force * lambda_e + c.friction * along * force -
-                   c.normal.dot(q_held) * h_s * at.u[k];
-      const Index a = problem_.scene.vertex_cloth[c.vertex];
-      const Index other = c.partner >= 0
-                              ? problem_.scene.vertex_cloth[c.partner]
-                              : problem_.scene.cloth_count() + contacts_.obstacles[c.obstacle].body;
-      const double friction_bar = normal_force * along;
-      bars.contact.friction[a * surfaces + other] += 0.5 * friction_bar;
-      bars.contact.friction[other * surfaces + a] += 0.5 * friction_bar;
-    }
-    const projective::FrameBar frame = projective::pull_back(
-        c, cloths, contacts_.obstacles, normal_bar, h_s * q_e, surface_point_bar[k]);
-    const auto add_vertex = [&](Index i, const Vec3& bar) {
-      Eigen::Map<Vec3>(bars.start.data() + 3 * i) += (1.0 - c.fraction) * bar;
-      Eigen::Map<Vec3>(problem_.inertia.target_bar.data() + 3 * i) += c.fraction * bar;
-    };
-    add_vertex(c.vertex, frame.vertex);
-    if (c.partner >= 0) {
-      add_vertex(c.partner, frame.partner);
-    } else {
-      const Index pose = problem_.scene.given.bodies.pose[contacts_.obstacles[c.obstacle].body];
-      Eigen::Map<bodies::Pose>(bars.body_poses.data() + 7 * pose) += frame.start;
-      Eigen::Map<bodies::Pose>(bars.body_targets.data() + 7 * pose) += frame.end;
-    }
-  }
+  pull_back_frames(problem_, contacts_, system, at, lambda, q, forces.surface_point_bar, bars);
 }
 
 }  // namespace diffcloth::step

@@ -50,6 +50,7 @@ class PairPattern final : public Potential {
   void add_hessian_product(const double* /*x*/, const double* /*z*/, double* /*y*/) const override {
   }
   void accumulate(const double* /*x*/, const double* /*z*/) override {}
+  void swap_cotangents(CotangentStore& /*store*/) override {}
 
  private:
   std::vector<std::pair<Index, Index>> pairs_;
@@ -94,7 +95,7 @@ std::vector<Obstacle> make_obstacles(const Problem& p) {
 /// How the vertices of cloths touch each other; absent where none may.
 std::optional<projective::Touching> make_touching(const Problem& p) {
   const Scene& scene = p.scene;
-  if (!scene.scheme->vertices_touch()) return {};
+  if (scene.scheme->has_barrier()) return {};
   projective::Touching touching{.spheres = &scene.vertex_spheres, .friction = {}, .may_touch = {}};
   for (Index a = 0; a < scene.cloth_count(); ++a) {
     for (Index b = 0; b < scene.cloth_count(); ++b) {
@@ -138,7 +139,7 @@ NodalContacts::NodalContacts(Problem& problem) : obstacles(make_obstacles(proble
   }
   if (pairs) {
     couplings =
-        std::make_unique<PairPattern>(scene.elastic_assemblies.base(), partner, scene.prescribed);
+        std::make_unique<PairPattern>(scene.elastic_patterns.base(), partner, scene.prescribed);
   }
 }
 

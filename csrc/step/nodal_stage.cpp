@@ -15,17 +15,49 @@ namespace {
 /// it must grow on the way down, which they do not follow.
 constexpr int kIdle = 100;
 
-}  // namespace
-
 using Array = std::vector<double>;
 using projective::ContactCase;
-using projective::Coulomb;
 using projective::NodalContact;
 
+/// Whether residuals still halve now and then.
+class Progress {
+ public:
+  bool has_ended(double residual) {
+    ++idle_;
+    if (residual < 0.5 * best_) {
+      best_ = residual;
+      idle_ = 0;
+    }
+    return idle_ == kIdle;
+  }
+
+ private:
+  double best_ = std::numeric_limits<double>::infinity();
+  int idle_ = 0;
+};
+
+/// From the gradient of the smooth potentials to the force that the impulses leave.
+void subtract_impulses(const Problem& problem,
+                       const NodalContacts& contacts,
+                       const NodalSystem& system,
+                       const Array& x,
+                       const Array& g,
+                       Array& force) {
+  for (const NodalContact& c : contacts.list) {
+    const double h_s = problem.h * scale(c);
+    const Vec3 r = h_s * relative(c, g.data());
+    // With the true masses for rho the iteration contracts wherever the cloth is taut.
+    const Vec3 s = r - reduced(problem.masses, c) * system.velocity(c, x);
+    spread(c, -projective::coulomb(s, c.normal, c.friction).impulse / h_s, force.data());
+  }
+}
+
+}  // namespace
+
 solver::Objective NodalStage::objective() const {
-  std::vector<Potential*> others = problem_.elastic_potentials();
+  std::vector<Potential*> others = problem_.cloth_potentials();
   if (contacts_.couplings) others.push_back(contacts_.couplings.get());
-  return problem_.objective(problem_.inertia, std::move(others), problem_.scene.elastic_assemblies);
+  return problem_.objective(problem_.inertia, std::move(others), problem_.scene.elastic_patterns);
 }
 
 void NodalStage::start(Array& x) const {
@@ -43,15 +75,15 @@ void NodalStage::start(Array& x) const {
   if (f.energy_change(x.data(), held.data()) < 0.0) x = std::move(held);
 }
 
-projective::Outcome NodalStage::iterate(const projective::Objective& smooth,
-                                        const projective::Options& options,
-                                        const Checkpoint& checkpoint,
-                                        Array& x) const {
+projective::LocalGlobalOutcome NodalStage::iterate(const projective::LocalGlobalObjective& smooth,
+                                                   const projective::LocalGlobalOptions& options,
+                                                   const Checkpoint& checkpoint,
+                                                   Array& x) const {
   const solver::Objective f = objective();
   const NodalSystem system(problem_, contacts_, f);
   projective::ConstantMatrix::Scratch scratch;
   projective::Anderson anderson(problem_.cloth_size);
-  projective::Outcome outcome;
+  projective::LocalGlobalOutcome outcome;
   Array g(problem_.cloth_size);
   Array force(problem_.cloth_size);
   Array p(problem_.cloth_size);
@@ -59,37 +91,25 @@ projective::Outcome NodalStage::iterate(const projective::Objective& smooth,
   Array plain(problem_.cloth_size);  // where the last iteration leads without acceleration
   Array to = x;
   double last = std::numeric_limits<double>::infinity();
-  double best = std::numeric_limits<double>::infinity();
-  int idle = 0;
+  Progress progress;
   bool accelerated = false;
   for (;; ++outcome.iterations) {
     checkpoint.check();
     smooth.gradient(x, g);
     force = g;
-    for (const NodalContact& c : contacts_.list) {
-      const double h_s = problem_.h * scale(c);
-      const Vec3 r = h_s * relative(c, g.data());
-      // With the true masses for rho the iteration contracts wherever the cloth is taut.
-      const Vec3 s = r - reduced(problem_.masses, c) * system.velocity(c, x);
-      spread(c, -projective::coulomb(s, c.normal, c.friction).impulse / h_s, force.data());
-    }
+    subtract_impulses(problem_, contacts_, system, x, g, force);
     outcome.residual = smooth.largest_rate(force);
     if (!std::isfinite(outcome.residual)) {
-      outcome.status = projective::Status::kOverflow;
+      outcome.status = projective::LocalGlobalStatus::kOverflow;
       return outcome;
     }
     if (outcome.residual < options.tolerance) {
-      outcome.status = projective::Status::kConverged;
+      outcome.status = projective::LocalGlobalStatus::kConverged;
       return outcome;
     }
     if (outcome.iterations == options.max_iterations) return outcome;
-    ++idle;
-    if (outcome.residual < 0.5 * best) {
-      best = outcome.residual;
-      idle = 0;
-    }
-    if (idle == kIdle) {
-      outcome.status = projective::Status::kStalled;
+    if (progress.has_ended(outcome.residual)) {
+      outcome.status = projective::LocalGlobalStatus::kStalled;
       return outcome;
     }
     smooth.matrix->solve(force.data(), p.data(), scratch);
@@ -114,12 +134,14 @@ projective::Outcome NodalStage::iterate(const projective::Objective& smooth,
   }
 }
 
-void NodalStage::finish(const Array& x, Report& report, double* body_forces) const {
+void NodalStage::finish(const Array& x, Report& report, const Forces& forces) const {
   const solver::Objective f = objective();
   const NodalSystem system(problem_, contacts_, f);
   NodalSystem::Point at;
   at.x = x;
   system.look(at);
+  add_pin_forces(problem_, f, x, forces.pins);
+  PairTally tally(problem_, report);
   for (std::size_t k = 0; k < contacts_.list.size(); ++k) {
     const NodalContact& c = contacts_.list[k];
     switch (at.laws[k].kind) {
@@ -133,12 +155,18 @@ void NodalStage::finish(const Array& x, Report& report, double* body_forces) con
         ++report.slipping;
         break;
     }
-    if (c.obstacle < 0) continue;
-    const Index body = contacts_.obstacles[c.obstacle].body;
-    const auto share = problem_.scene.face_search[body].share(c.surface_point);
     const Vec3 force = relative(c, at.g.data());
+    spread(c, force, forces.contact);
+    const Index cloth = problem_.scene.vertex_cloth[c.vertex];
+    if (c.obstacle < 0) {
+      tally.add(cloth, problem_.scene.vertex_cloth[c.partner], -scale(c) * force);
+      continue;
+    }
+    const Index body = contacts_.obstacles[c.obstacle].body;
+    tally.add(cloth, problem_.scene.cloth_count() + body, -force);
+    const auto share = problem_.scene.face_search[body].share(c.surface_point);
     for (int a = 0; a < 3; ++a) {
-      Eigen::Map<Vec3>(body_forces + 3 * share.corners[a]) -= share.weights[a] * force;
+      Eigen::Map<Vec3>(forces.bodies + 3 * share.corners[a]) -= share.weights[a] * force;
     }
   }
 }

@@ -37,14 +37,14 @@ class NodalStage {
   ///
   /// @param smooth  what is minimized where nothing touches
   /// @param x  in: a start; out: the solution
-  projective::Outcome iterate(const projective::Objective& smooth,
-                              const projective::Options& options,
-                              const Checkpoint& checkpoint,
-                              std::vector<double>& x) const;
+  projective::LocalGlobalOutcome iterate(const projective::LocalGlobalObjective& smooth,
+                                         const projective::LocalGlobalOptions& options,
+                                         const Checkpoint& checkpoint,
+                                         std::vector<double>& x) const;
 
-  /// Count the cases of the law at a solution, and add the forces on the bodies' vertices there: minus
-  /// the forces on the nodes, shared by the corners of the nearest faces.
-  void finish(const std::vector<double>& x, Report& report, double* body_forces) const;
+  /// Count the cases of the law at a solution, and add the forces there; those on the bodies' vertices
+  /// are minus the forces on the nodes, shared by the corners of the nearest faces.
+  void finish(const std::vector<double>& x, Report& report, const Forces& forces) const;
 
   /// The adjoint, for a solution x.
   ///

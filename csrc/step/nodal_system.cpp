@@ -318,81 +318,117 @@ double NodalSystem::frozen_energy_change(const Point& at,
   return change;
 }
 
-linalg::BlockMatrix NodalSystem::without_coupling(const Point& at,
-                                                  const linalg::BlockMatrix& H) const {
-  // Z_pp and, in pairs, Z_p'p of each vertex p.
-  struct Projection {
+namespace {
+
+/// Z by blocks: Z_pp and, in pairs, Z_p'p of each vertex p; it is the identity where no contact is.
+class Projections {
+ public:
+  Projections(const std::vector<NodalContact>& contacts,
+              const std::vector<Index>& partner,
+              const std::vector<Coulomb>& laws)
+      : partner_(partner), place_(partner.size(), -1) {
+    for (std::size_t k = 0; k < contacts.size(); ++k) {
+      const NodalContact& c = contacts[k];
+      if (laws[k].kind == ContactCase::kTakingOff) continue;
+      Mat3 I_minus_P = Mat3::Identity();
+      if (laws[k].kind == ContactCase::kSlipping) I_minus_P = c.normal * c.normal.transpose();
+      const double s = scale(c);
+      const Mat3 own = Mat3::Identity() - s * s * I_minus_P;
+      const Mat3 other = s * s * I_minus_P;
+      place_[c.vertex] = static_cast<Index>(blocks_.size());
+      blocks_.push_back({.own = own, .other = other});
+      if (c.partner >= 0) {
+        place_[c.partner] = static_cast<Index>(blocks_.size());
+        blocks_.push_back({.own = own, .other = other});
+      }
+    }
+  }
+
+  bool holds(Index p) const { return place_[p] >= 0; }
+  const Mat3& own(Index p) const { return blocks_[place_[p]].own; }
+
+  /// Rows that Z takes a vertex to: itself, and its partner; -1 where there is none.
+  std::array<std::pair<Index, Mat3>, 2> images(Index p) const {
+    std::array<std::pair<Index, Mat3>, 2> rows{std::pair{p, Mat3(Mat3::Identity())},
+                                               std::pair{Index{-1}, Mat3(Mat3::Zero())}};
+    if (!holds(p)) return rows;
+    rows[0].second = own(p);
+    if (partner_[p] >= 0) rows[1] = {partner_[p], blocks_[place_[p]].other};
+    return rows;
+  }
+
+ private:
+  struct Block {
     Mat3 own;
     Mat3 other;
   };
-  const auto n = static_cast<Index>(p_.masses.size());
-  std::vector<Index> place(static_cast<std::size_t>(n), -1);
-  std::vector<Projection> projections;
-  linalg::BlockMatrix S = H;
-  const linalg::BlockPattern& pattern = H.pattern();
-  for (std::size_t k = 0; k < contacts_.size(); ++k) {
-    const NodalContact& c = contacts_[k];
-    if (at.laws[k].kind == ContactCase::kTakingOff) continue;
-    Mat3 I_minus_P = Mat3::Identity();
-    if (at.laws[k].kind == ContactCase::kSlipping) I_minus_P = c.normal * c.normal.transpose();
-    const double s = scale(c);
-    const Mat3 own = Mat3::Identity() - s * s * I_minus_P;
-    const Mat3 other = s * s * I_minus_P;
-    place[c.vertex] = static_cast<Index>(projections.size());
-    projections.push_back({.own = own, .other = other});
-    if (c.partner >= 0) {
-      place[c.partner] = static_cast<Index>(projections.size());
-      projections.push_back({.own = own, .other = other});
-    }
-  }
-  // Blocks of pairs leave their place, and come back projected where both vertices are.
-  struct Moved {
-    Index p, q;
-    Mat3 block;
-  };
+  const std::vector<Index>& partner_;
+  std::vector<Index> place_;  // of each vertex among the blocks
+  std::vector<Block> blocks_;
+};
+
+/// A block of H that has left its place.
+struct Moved {
+  Index p, q;
+  Mat3 block;
+};
+
+/// Project the blocks of vertices against obstacles in place; those of pairs leave.
+std::vector<Moved> project_in_place(const Projections& Z,
+                                    const std::vector<Index>& partner,
+                                    linalg::BlockMatrix& S) {
+  const auto n = static_cast<Index>(partner.size());
+  const linalg::BlockPattern& pattern = S.pattern();
   std::vector<Moved> moved;
   for (Index q = 0; q < n; ++q) {
     for (Index k = pattern.column_start()[q]; k < pattern.column_start()[q + 1]; ++k) {
       const Index p = pattern.row()[k];
-      if (p >= n || (place[p] < 0 && place[q] < 0)) continue;
+      if (p >= n || (!Z.holds(p) && !Z.holds(q))) continue;
       Eigen::Map<Mat3> block(S.blocks() + 9 * static_cast<std::ptrdiff_t>(k));
-      if (partner_[p] < 0 && partner_[q] < 0) {
-        if (place[p] >= 0) block = projections[place[p]].own * block;
-        if (place[q] >= 0) block = block * projections[place[q]].own.transpose();
+      if (partner[p] < 0 && partner[q] < 0) {
+        if (Z.holds(p)) block = Z.own(p) * block;
+        if (Z.holds(q)) block = block * Z.own(q).transpose();
         continue;
       }
       moved.push_back({.p = p, .q = q, .block = block});
       block.setZero();
     }
   }
-  // Rows that Z takes a vertex to: itself, and its partner.
-  const auto images = [&](Index p) {
-    std::array<std::pair<Index, Mat3>, 2> rows{std::pair{p, Mat3(Mat3::Identity())},
-                                               std::pair{Index{-1}, Mat3(Mat3::Zero())}};
-    if (place[p] < 0) return rows;
-    rows[0].second = projections[place[p]].own;
-    if (partner_[p] >= 0) rows[1] = {partner_[p], projections[place[p]].other};
-    return rows;
-  };
-  const std::vector<char>& fixed = p_.scene.prescribed;
-  for (const Moved& m : moved) {
-    for (const auto& [a, Z_a] : images(m.p)) {
-      for (const auto& [b, Z_b] : images(m.q)) {
-        if (a < 0 || b < 0) continue;
-        // Rows of fixed points are no part of the matrix, nor in its pattern beyond the base.
-        if ((fixed[a] != 0 || fixed[b] != 0) && (a != m.p || b != m.q)) continue;
-        const Mat3 block = Z_a * m.block * Z_b.transpose();
-        if (m.p == m.q) {
-          if (a >= b) S.add_block(a, b, block);
-        } else if (a == b) {
-          S.add_block(a, b, block + block.transpose());
-        } else if (a > b) {
-          S.add_block(a, b, block);
-        } else {
-          S.add_block(b, a, block.transpose());
-        }
+  return moved;
+}
+
+/// Bring a block back, projected, where both of its vertices are taken to.
+void add_projected(const Projections& Z,
+                   const std::vector<char>& fixed,
+                   const Moved& m,
+                   linalg::BlockMatrix& S) {
+  for (const auto& [a, Z_a] : Z.images(m.p)) {
+    for (const auto& [b, Z_b] : Z.images(m.q)) {
+      if (a < 0 || b < 0) continue;
+      // Rows of fixed points are no part of the matrix, nor in its pattern beyond the base.
+      if ((fixed[a] != 0 || fixed[b] != 0) && (a != m.p || b != m.q)) continue;
+      const Mat3 block = Z_a * m.block * Z_b.transpose();
+      if (m.p == m.q) {
+        if (a >= b) S.add_block(a, b, block);
+      } else if (a == b) {
+        S.add_block(a, b, block + block.transpose());
+      } else if (a > b) {
+        S.add_block(a, b, block);
+      } else {
+        S.add_block(b, a, block.transpose());
       }
     }
+  }
+}
+
+}  // namespace
+
+linalg::BlockMatrix NodalSystem::without_coupling(const Point& at,
+                                                  const linalg::BlockMatrix& H) const {
+  linalg::BlockMatrix S = H;
+  const Projections Z(contacts_, partner_, at.laws);
+  for (const Moved& moved : project_in_place(Z, partner_, S)) {
+    add_projected(Z, p_.scene.prescribed, moved, S);
   }
   for (std::size_t k = 0; k < contacts_.size(); ++k) {
     const NodalContact& c = contacts_[k];

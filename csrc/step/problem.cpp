@@ -4,32 +4,17 @@
 #include <utility>
 
 #include "solver/linear_system.h"
+#include "step/attachments.h"
+#include "step/elasticity.h"
+#include "step/potentials.h"
+#include "step/soft_pins.h"
 
 namespace diffcloth::step {
-
-std::vector<double> spread(const View& view, const std::vector<Index>& owner) {
-  std::vector<double> result(owner.size());
-  for (std::size_t f = 0; f < owner.size(); ++f) {
-    result[f] = view.count == 1              ? view.data[0]
-                : view.count == owner.size() ? view.data[f]
-                                             : view.data[owner[f]];
-  }
-  return result;
-}
-
-void gather(const std::vector<double>& bar,
-            const std::vector<Index>& owner,
-            View view,
-            double* out) {
-  for (std::size_t f = 0; f < owner.size(); ++f) {
-    out[view.count == 1 ? 0 : view.count == owner.size() ? f : owner[f]] += bar[f];
-  }
-}
 
 namespace {
 
 /// One value, or one for each pair of surfaces, for each pair.
-std::vector<double> spread_pairs(const View& view, std::size_t surfaces) {
+std::vector<double> values_per_pair(const View& view, std::size_t surfaces) {
   const std::size_t pairs = surfaces * surfaces;
   if (view.count == 1) return std::vector<double>(pairs, view.data[0]);
   return {view.data, view.data + pairs};
@@ -42,8 +27,8 @@ contact::Parameters contact_parameters(const Scene& scene, const Inputs& in) {
   p.slip = in.data(Input::kSlipVelocity)[0] * scene.given.dt;
   const double* thickness = in.data(Input::kThickness);
   p.thickness.assign(thickness, thickness + surfaces);
-  p.kappa = spread_pairs(in[Input::kBarrierStiffness], surfaces);
-  p.friction = spread_pairs(in[Input::kFriction], surfaces);
+  p.kappa = values_per_pair(in[Input::kBarrierStiffness], surfaces);
+  p.friction = values_per_pair(in[Input::kFriction], surfaces);
   return p;
 }
 
@@ -51,16 +36,6 @@ contact::Parameters contact_parameters(const Scene& scene, const Inputs& in) {
 mesh::RestShape own_rest_shape(const Scene& scene, const Inputs& in) {
   const double* X = in.data(Input::kRestPositions);
   return X == nullptr ? mesh::RestShape() : mesh::rest_shape(scene.topology, scene.stencils, X);
-}
-
-std::vector<double> lumped_masses(const Scene& scene,
-                                  const mesh::RestShape& rest,
-                                  const std::vector<double>& density) {
-  std::vector<double> masses(static_cast<std::size_t>(scene.cloth_vertex_count()), 0.0);
-  for (std::size_t f = 0; f < density.size(); ++f) {
-    for (const Index i : scene.topology.faces[f]) masses[i] += density[f] * rest.area[f] / 3.0;
-  }
-  return masses;
 }
 
 std::vector<double> start_positions(const Scene& scene, const Inputs& in) {
@@ -82,14 +57,10 @@ std::vector<double> start_positions(const Scene& scene, const Inputs& in) {
   return x;
 }
 
-std::vector<double> origin_positions(const Scene& scene, const Inputs& in, std::vector<double> x) {
-  if (in.data(Input::kCoordinateOrigins) == nullptr || scene.mechanisms.empty()) return {};
-  double* const nodes = x.data() + 3 * static_cast<std::ptrdiff_t>(scene.vertex_count());
-  for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
-    nodes[scene.mechanisms.slot(c)] = in.data(Input::kCoordinateOrigins)[c];
-  }
-  scene.mechanisms.place(nodes,
-                         x.data() + 3 * static_cast<std::ptrdiff_t>(scene.cloth_vertex_count()));
+std::vector<double> origin_positions(const Inputs& in, std::vector<double> x) {
+  const View origins = in[Input::kFrictionOrigins];
+  if (origins.data == nullptr) return {};
+  std::copy_n(origins.data, origins.count, x.data());
   return x;
 }
 
@@ -128,32 +99,44 @@ std::vector<double> predicted_positions(const Inputs& in,
   return xhat;
 }
 
-elastic::Model elastic_model(const Scene& scene,
-                             const Inputs& in,
-                             const mesh::RestShape& rest,
-                             const std::vector<double>& masses,
-                             double h) {
-  elastic::Model model;
-  model.topology = &scene.topology;
-  model.stencils = &scene.stencils;
-  model.rest = &rest;
-  model.stretch = spread(in[Input::kStretch], scene.face_cloth);
-  model.bending = spread(in[Input::kBending], scene.face_cloth);
-  model.poisson = in.data(Input::kPoisson) != nullptr
-                      ? spread(in[Input::kPoisson], scene.face_cloth)
-                      : std::vector<double>(scene.face_cloth.size(), 0.0);
-  model.damping = spread(in[Input::kDamping], scene.face_cloth);
-  model.h = h;
-  model.x_n = in.data(Input::kPositions);
-  model.held = &scene.held_elements;
-  if (!masses.empty()) model.least_inertia = std::ranges::min(masses) / (h * h);
-  elastic::prepare(model, scene.slots);
-  return model;
-}
-
 }  // namespace
 
-Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, elastic::Wanted wanted)
+std::vector<double> values_per_face(const Problem& problem, Input input) {
+  const View& view = problem.inputs[input];
+  const std::vector<Index>& owner = problem.scene.face_cloth;
+  std::vector<double> result(owner.size());
+  for (std::size_t f = 0; f < owner.size(); ++f) {
+    result[f] = view.count == 1              ? view.data[0]
+                : view.count == owner.size() ? view.data[f]
+                                             : view.data[owner[f]];
+  }
+  return result;
+}
+
+void add_per_face(const Problem& problem,
+                  Input input,
+                  const std::vector<double>& bar,
+                  const Gradients& gradients) {
+  double* const out = gradients[input];
+  if (out == nullptr) return;
+  const std::size_t count = problem.inputs[input].count;
+  const std::vector<Index>& owner = problem.scene.face_cloth;
+  for (std::size_t f = 0; f < owner.size(); ++f) {
+    out[count == 1 ? 0 : count == owner.size() ? f : owner[f]] += bar[f];
+  }
+}
+
+std::vector<double> lumped(const Problem& problem, const std::vector<double>& per_face) {
+  std::vector<double> result(static_cast<std::size_t>(problem.scene.cloth_vertex_count()), 0.0);
+  for (std::size_t f = 0; f < per_face.size(); ++f) {
+    for (const Index i : problem.scene.topology.faces[f]) {
+      result[i] += per_face[f] * problem.rest->area[f] / 3.0;
+    }
+  }
+  return result;
+}
+
+Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, const Gradients* wanted)
     : scene(scene_in),
       inputs(inputs_in),
       h(scene_in.given.dt),
@@ -165,25 +148,13 @@ Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, elastic::Wanted
       own_rest_(own_rest_shape(scene, inputs)),
       rest(own_rest_.area.empty() ? &scene.rest : &own_rest_),
       measures(rest_measures(scene, *rest)),
-      density(spread(inputs[Input::kDensity], scene.face_cloth)),
-      masses(lumped_masses(scene, *rest, density)),
+      density(values_per_face(*this, Input::kDensity)),
+      masses(lumped(*this, density)),
       start(start_positions(scene, inputs)),
       ends(end_positions(scene, inputs, start)),
-      origins(origin_positions(scene, inputs, start)),
+      origins(origin_positions(inputs, start)),
       inertia(masses, predicted_positions(inputs, masses, h), h),
-      model(elastic_model(scene, inputs, *rest, masses, h)),
-      elasticity(model, scene.slots, scene.elastic_assemblies.base(), wanted) {
-  const std::vector<Index>& soft = scene.given.soft_pins;
-  if (!soft.empty()) {
-    const View stiffness = inputs[Input::kPinStiffness];
-    for (const Index i : soft) {
-      anchor_stiffness.push_back(stiffness.data[stiffness.count == 1 ? 0 : scene.vertex_cloth[i]]);
-    }
-    anchors.emplace(
-        elastic::Anchors{.vertex = soft,
-                         .stiffness = anchor_stiffness,
-                         .target = {inputs.data(Input::kSoftPinTargets), 3 * soft.size()}});
-  }
+      potentials(make_potentials(*this, wanted)) {
   if (scene.mechanisms.has_free()) {
     chart.emplace(scene.mechanisms, scene.vertex_count(), scene.cloth_vertex_count(),
                   inputs.data(Input::kCoordinateTargets), inputs.data(Input::kCoordinateMetric));
@@ -194,15 +165,21 @@ Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, elastic::Wanted
   }
 }
 
-std::vector<Potential*> Problem::elastic_potentials() {
-  std::vector<Potential*> result{&elasticity};
-  if (anchors) result.push_back(&*anchors);
+std::vector<Potential*> Problem::cloth_potentials() const {
+  std::vector<Potential*> result;
+  result.reserve(potentials.size());
+  for (const auto& potential : potentials) result.push_back(&potential->potential());
   return result;
 }
 
+std::vector<elastic::SpringPotential*> Problem::springs() const {
+  return {&find<SoftPins>().potential(), &find<Attachments>().potential()};
+}
+
 elastic::ConstantForm Problem::constant_form() const {
-  return {model, scene.slots, anchors ? anchors->anchors() : elastic::Anchors{},
-          scene.elastic_assemblies.base()};
+  std::vector<elastic::Springs> kinds;
+  for (const elastic::SpringPotential* const kind : springs()) kinds.push_back(kind->springs());
+  return {find<Elasticity>().model(), scene.slots, kinds, scene.elastic_patterns.base()};
 }
 
 std::shared_ptr<const projective::ConstantMatrix> Problem::constant_matrix() const {
@@ -216,19 +193,19 @@ std::shared_ptr<const projective::ConstantMatrix> Problem::constant_matrix() con
 
 solver::Objective Problem::objective(Proximity& inertia_or_nearness,
                                      std::vector<Potential*> others,
-                                     solver::AssemblyCache& assemblies) {
+                                     solver::PatternCache& patterns) {
   return {.coordinates = &coordinates,
           .h = h,
           .length = scene.mean_edge,
           .inertia = &inertia_or_nearness,
           .others = std::move(others),
           .chart = chart ? &*chart : nullptr,
-          .assemblies = &assemblies};
+          .patterns = &patterns};
 }
 
 linalg::BlockMatrix contact_free_hessian(Problem& p, const double* x, Curvature curvature) {
   const solver::Objective f =
-      p.objective(p.inertia, p.elastic_potentials(), p.scene.elastic_assemblies);
+      p.objective(p.inertia, p.cloth_potentials(), p.scene.elastic_patterns);
   Stopwatch watch;
   solver::Counts counts;
   linalg::CholeskyWorkspace workspace;

@@ -2,14 +2,21 @@
 
 #include <memory>
 #include <optional>
+#include <stdexcept>
 #include <vector>
 
+#include "bodies/coordinate_potential.h"
+#include "contact/contact_set.h"
 #include "elastic/constant_form.h"
 #include "elastic/elastic_potential.h"
 #include "potential/proximity.h"
 #include "projective/constant_matrix.h"
+#include "solver/coordinates.h"
+#include "solver/objective.h"
+#include "solver/pattern_cache.h"
 #include "step/inputs.h"
 #include "step/scene.h"
+#include "step/step_potential.h"
 
 namespace diffcloth::step {
 
@@ -18,10 +25,8 @@ namespace diffcloth::step {
 /// Forward and backward build the same one, so that both see the same bits.
 class Problem {
  public:
-  /// @param wanted  which cotangents of materials and the rest shape will be
-  Problem(const Scene& scene,
-          const Inputs& inputs,
-          elastic::Wanted wanted = elastic::Wanted::kNone);
+  /// @param wanted  whose cotangents are wanted; null: nobody's
+  Problem(const Scene& scene, const Inputs& inputs, const Gradients* wanted = nullptr);
   Problem(const Problem&) = delete;
   Problem& operator=(const Problem&) = delete;
 
@@ -41,23 +46,32 @@ class Problem {
   std::vector<double> masses;   ///< [N] lumped [kg]
   std::vector<double> start;    ///< x_n and o_n: all points at the start of the step
   std::vector<double> ends;     ///< like start, what is prescribed at its targets
-  std::vector<double> origins;  ///< like start, coordinates at their origins; empty: they have none
+  std::vector<double> origins;  ///< like start, vertices at friction_origins; empty: at the start
 
   Proximity inertia;  ///< metric M, target xhat = x_n + h v_n + h^2 (gravity + M^-1 f)
-  elastic::Model model;
-  elastic::ElasticPotential elasticity;
-  std::vector<double> anchor_stiffness;  ///< [Q]
-  std::optional<elastic::AnchorPotential> anchors;
-  std::optional<bodies::CoordinatePotential> chart;  ///< absent without free coordinates
-  std::optional<contact::ContactModel> contact;      ///< absent where nothing can touch
+  std::vector<std::unique_ptr<StepPotential>> potentials;  ///< see potentials.cpp
+  std::optional<bodies::CoordinatePotential> chart;        ///< absent without free coordinates
+  std::optional<contact::ContactModel> contact;            ///< absent where nothing can touch
 
   /// Where friction counts motion from.
   const std::vector<double>& moved_from() const { return origins.empty() ? start : origins; }
 
-  /// Elasticity and anchors.
-  std::vector<Potential*> elastic_potentials();
+  /// All of `potentials`.
+  std::vector<Potential*> cloth_potentials() const;
 
-  /// L of elasticity and anchors.
+  /// The potential of this kind among them.
+  template <class Kind>
+  Kind& find() const {
+    for (const auto& potential : potentials) {
+      if (auto* const found = dynamic_cast<Kind*>(potential.get())) return *found;
+    }
+    throw std::logic_error("step: no such potential");
+  }
+
+  /// Those of them that are springs: soft pins and attachments.
+  std::vector<elastic::SpringPotential*> springs() const;
+
+  /// L of elasticity and springs.
   elastic::ConstantForm constant_form() const;
 
   /// A = M/h^2 + L over the cloths' free vertices, factored.
@@ -66,7 +80,7 @@ class Problem {
   /// A sum of potentials over the cloths' vertices, without contact.
   solver::Objective objective(Proximity& inertia,
                               std::vector<Potential*> others,
-                              solver::AssemblyCache& assemblies);
+                              solver::PatternCache& patterns);
 
   /// All points, with these rows and everything prescribed at its targets.
   std::vector<double> at(const double* rows) const;
@@ -76,16 +90,19 @@ class Problem {
   std::vector<double> predicted(const double* cloth_positions) const;
 };
 
-/// Hessian of inertia, elasticity and anchors at x, all points.
+/// Hessian of inertia and the potentials of the cloths at x, all points.
 linalg::BlockMatrix contact_free_hessian(Problem& problem, const double* x, Curvature curvature);
 
-/// Spread a parameter given as one value, one a cloth or one a face (owner) over all faces.
-std::vector<double> spread(const View& view, const std::vector<Index>& owner);
+/// A parameter given as one value, one a cloth or one a face, for each face.
+std::vector<double> values_per_face(const Problem& problem, Input input);
 
-/// Adjoint of spread(): out += the sums, in order.
-void gather(const std::vector<double>& bar,
-            const std::vector<Index>& owner,
-            View view,
-            double* out);
+/// Adjoint of values_per_face(): the gradient of the input, if wanted, gets the sums, in order.
+void add_per_face(const Problem& problem,
+                  Input input,
+                  const std::vector<double>& bar,
+                  const Gradients& gradients);
+
+/// What faces have per area, lumped at vertices: a third of each face goes to each corner [N].
+std::vector<double> lumped(const Problem& problem, const std::vector<double>& per_face);
 
 }  // namespace diffcloth::step

@@ -11,10 +11,10 @@ std::vector<Field> Projective::tape(const Scene& scene) const {
   return {{.name = "elastic", .shape = {static_cast<std::size_t>(scene.cloth_vertex_count()), 3}}};
 }
 
-void Projective::forward(const Forward& step, std::vector<double>& x, double* body_forces) const {
+void Projective::forward(const Forward& step, std::vector<double>& x, const Forces& forces) const {
   step.report.minimum_distance = std::numeric_limits<double>::infinity();
   if (step.context.path != nullptr) step.context.path->push_back(x);
-  x = ElasticStage(step.problem).forward(step, body_forces);
+  x = ElasticStage(step.problem).forward(step, forces);
   if (step.context.path != nullptr) step.context.path->push_back(x);
   step.report.contact_count = step.report.sticking + step.report.slipping;
 }

@@ -18,6 +18,14 @@ enum class Result : std::int32_t {
   kIntersectingStart = 3,
 };
 
+/// Contacts of two surfaces, of which the first has the smaller index.
+struct PairContacts {
+  Index first = 0;
+  Index second = 0;
+  Index count = 0;
+  Vec3 force = Vec3::Zero();  ///< of the first on the second, barrier and friction [N]
+};
+
 struct Report {
   Result result = Result::kConverged;
   Index iterations = 0;
@@ -32,6 +40,7 @@ struct Report {
   solver::Counts counts;
   Seconds seconds{};
   std::string message;
+  std::vector<PairContacts> pairs;  ///< in ascending order
 
   /// Call visit(name, value) for every number but the seconds.
   template <class Visit>

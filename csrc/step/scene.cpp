@@ -53,7 +53,7 @@ std::vector<double> reference_positions(const Description& d) {
 
 /// All surfaces at rest, bodies in their own frames.
 std::vector<double> all_rest_positions(const Description& d) {
-  std::vector<double> x = d.rest_vertices;
+  std::vector<double> x = d.rest_positions;
   x.insert(x.end(), d.bodies.vertices.begin(), d.bodies.vertices.end());
   return x;
 }
@@ -155,8 +155,8 @@ std::vector<projective::FaceSearch> face_searches(const Description& d) {
 /// Spheres half as large as the shortest edge at their vertex at rest; those of an edge never touch.
 projective::VertexSpheres make_vertex_spheres(const Description& d,
                                               const contact::CollisionMesh& mesh) {
-  const double* const X = d.rest_vertices.data();
-  const std::size_t n = d.rest_vertices.size() / 3;
+  const double* const X = d.rest_positions.data();
+  const std::size_t n = d.rest_positions.size() / 3;
   projective::VertexSpheres spheres;
   spheres.radius.assign(n, std::numeric_limits<double>::infinity());
   spheres.apart.resize(n);
@@ -182,6 +182,22 @@ std::vector<char> fixed_rows(const std::vector<char>& prescribed,
   return fixed;
 }
 
+/// Those of elements, and of the cloths' vertices that one spring is attached to.
+std::vector<std::vector<Index>> cloth_cliques(const Description& d,
+                                              const mesh::Topology& topology,
+                                              const mesh::BendingStencils& stencils) {
+  std::vector<std::vector<Index>> cliques = elastic::cliques(topology, stencils);
+  const AttachmentDescription& attached = d.attachments;
+  for (std::size_t a = 0; a + 1 < attached.start.size(); ++a) {
+    std::vector<Index> clique;
+    for (Index k = attached.start[a]; k < attached.start[a + 1]; ++k) {
+      if (attached.point[k] < topology.vertex_count) clique.push_back(attached.point[k]);
+    }
+    if (clique.size() > 1) cliques.push_back(std::move(clique));
+  }
+  return cliques;
+}
+
 /// A pattern of the cloths with the nodes of coordinates behind it.
 linalg::BlockPattern with_nodes(Index cloth_vertex_count,
                                 std::vector<std::vector<Index>> cliques,
@@ -201,8 +217,8 @@ Scene::Scene(Description description)
       topology(static_cast<Index>(given.vertices.size() / 3), given.faces),
       face_cloth(owners(given.cloth_face_start)),
       vertex_cloth(owners(given.cloth_vertex_start)),
-      stencils(mesh::choose_stencils(topology, given.rest_vertices.data(), face_models(given))),
-      rest(mesh::rest_shape(topology, stencils, given.rest_vertices.data())),
+      stencils(mesh::choose_stencils(topology, given.rest_positions.data(), face_models(given))),
+      rest(mesh::rest_shape(topology, stencils, given.rest_positions.data())),
       mechanisms(complete(given), given.bodies),
       collision_mesh(make_collision_mesh(given, mechanisms)),
       mean_edge(mean_length(rest, collision_mesh, given.bodies)),
@@ -211,18 +227,23 @@ Scene::Scene(Description description)
       feature_weights(collision_mesh, all_rest_positions(given).data(), prescribed),
       broad_phase(collision_mesh, reference_positions(given).data()),
       face_search(face_searches(given)),
-      vertex_spheres(scheme->vertices_touch() ? make_vertex_spheres(given, collision_mesh)
-                                              : projective::VertexSpheres()),
-      elastic_assemblies(
-          with_nodes(topology.vertex_count, elastic::cliques(topology, stencils), mechanisms),
+      vertex_spheres(scheme->has_barrier() ? projective::VertexSpheres()
+                                           : make_vertex_spheres(given, collision_mesh)),
+      elastic_patterns(
+          with_nodes(topology.vertex_count, cloth_cliques(given, topology, stencils), mechanisms),
           fixed_rows(prescribed, topology.vertex_count, mechanisms)),
-      diagonal_assemblies(with_nodes(topology.vertex_count, {}, mechanisms),
-                          fixed_rows(prescribed, topology.vertex_count, mechanisms)),
-      constant_matrices(elastic_assemblies.base(),
+      diagonal_patterns(with_nodes(topology.vertex_count, {}, mechanisms),
+                        fixed_rows(prescribed, topology.vertex_count, mechanisms)),
+      constant_matrices(elastic_patterns.base(),
                         {prescribed.begin(), prescribed.begin() + topology.vertex_count}) {
   given.bodies.pose = surface_poses(mechanisms);
-  slots = elastic::slots(topology, stencils, elastic_assemblies.base());
+  slots = elastic::slots(topology, stencils, elastic_patterns.base());
   held_elements = elastic::elements_at(topology, stencils, prescribed);
+}
+
+bool Scene::has_attached_bodies() const {
+  return std::ranges::any_of(given.attachments.point,
+                             [&](Index i) { return i >= cloth_vertex_count(); });
 }
 
 contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& rest) {

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <array>
 #include <cstdint>
 #include <optional>
 #include <string>
@@ -17,7 +18,7 @@
 #include "mesh/topology.h"
 #include "projective/constant_matrix.h"
 #include "projective/nodal_contact.h"
-#include "solver/assembly_cache.h"
+#include "solver/pattern_cache.h"
 #include "solver/walk.h"
 
 namespace diffcloth::step {
@@ -30,16 +31,48 @@ enum class Metric : std::uint8_t { kEnergy, kElastic, kMass, kIdentity };
 /// How the elastic stage of `split` and `projective` is solved.
 enum class ElasticSolver : std::uint8_t { kNewton, kProjective };
 
+/// A value that has a name in Python.
+template <class Value>
+struct Named {
+  constexpr Named(const char* name_in, Value value_in) : name(name_in), value(value_in) {}
+
+  const char* name;
+  Value value;
+};
+
+/// All of them, the default first.
+inline constexpr std::array kMetrics{
+    Named<Metric>{"energy", Metric::kEnergy},
+    Named<Metric>{"elastic", Metric::kElastic},
+    Named<Metric>{"mass", Metric::kMass},
+    Named<Metric>{"identity", Metric::kIdentity},
+};
+inline constexpr std::array kElasticSolvers{
+    Named<ElasticSolver>{"newton", ElasticSolver::kNewton},
+    Named<ElasticSolver>{"projective", ElasticSolver::kProjective},
+};
+
+/// Springs between points of cloths and bodies, or to targets: see elastic/springs.h.
+struct AttachmentDescription {
+  std::vector<Index> start{0};      ///< [A + 1] of the points of each
+  std::vector<Index> point;         ///< of cloths, then of bodies
+  std::vector<double> coefficient;  ///< of the points
+  std::vector<double> rest_length;  ///< [A] [m]
+  std::vector<Index> target_row;    ///< [A] row among the targets, -1: none
+  Index target_count = 0;
+};
+
 /// What a simulator is made from.
 struct Description {
-  std::vector<double> vertices;       ///< [3 N] initial positions [m]
-  std::vector<double> rest_vertices;  ///< [3 N] rest positions [m]
+  std::vector<double> vertices;        ///< [3 N] initial positions [m]
+  std::vector<double> rest_positions;  ///< [3 N] rest positions [m]
   std::vector<std::array<Index, 3>> faces;
   std::vector<Index> cloth_vertex_start;           ///< [C + 1]
   std::vector<Index> cloth_face_start;             ///< [C + 1]
   std::vector<mesh::BendingModel> bending_models;  ///< [C]
   std::vector<Index> pins;                         ///< [P]
   std::vector<Index> soft_pins;                    ///< [Q]
+  AttachmentDescription attachments;
   bodies::BodySet bodies;
   bodies::MechanismsDescription mechanisms;         ///< empty: every body is a tree of one link
   std::vector<std::array<Index, 3>> body_faces;     ///< indices into the bodies' vertices
@@ -68,18 +101,21 @@ struct Scene {
   Index surface_count() const { return cloth_count() + given.bodies.count(); }
   Index point_count() const { return static_cast<Index>(prescribed.size()); }
 
+  /// Whether something is attached to a body.
+  bool has_attached_bodies() const;
+
   Description given;
   const Scheme* scheme;
   mesh::Topology topology;
   std::vector<Index> face_cloth;    ///< [F]
   std::vector<Index> vertex_cloth;  ///< [N]
   mesh::BendingStencils stencils;
-  mesh::RestShape rest;  ///< of given.rest_vertices
+  mesh::RestShape rest;  ///< of given.rest_positions
   bodies::Mechanisms mechanisms;
   contact::CollisionMesh collision_mesh;
   double mean_edge;                         ///< of the cloths at rest, else of the bodies [m]
   std::vector<char> prescribed;             ///< [points] pins, bodies, ...: see solver::Coordinates
-  contact::RestMeasures measures;           ///< of given.rest_vertices and the bodies
+  contact::RestMeasures measures;           ///< of given.rest_positions and the bodies
   contact::FeatureWeights feature_weights;  ///< likewise
   contact::BroadPhase broad_phase;
   std::vector<projective::FaceSearch> face_search;  ///< [surfaces of bodies] where nodes touch them
@@ -87,8 +123,8 @@ struct Scene {
   elastic::Slots slots;
   elastic::Elements held_elements;  ///< those with a pinned corner
 
-  mutable solver::AssemblyCache elastic_assemblies;           ///< over the elastic pattern
-  mutable solver::AssemblyCache diagonal_assemblies;          ///< over isolated vertices
+  mutable solver::PatternCache elastic_patterns;              ///< over the elastic pattern
+  mutable solver::PatternCache diagonal_patterns;             ///< over isolated vertices
   mutable projective::ConstantMatrixCache constant_matrices;  ///< over the elastic pattern
 };
 

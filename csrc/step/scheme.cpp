@@ -9,17 +9,14 @@
 #include "step/split.h"
 
 namespace diffcloth::step {
-namespace {
 
-/// All schemes: a new one is a line here.
-std::array<const Scheme*, 3> schemes() {
+std::span<const Scheme* const> schemes() {
   static const Coupled coupled;
   static const Split split;
   static const Projective projective;
-  return {&coupled, &split, &projective};
+  static const std::array<const Scheme*, 3> all{&coupled, &split, &projective};
+  return all;
 }
-
-}  // namespace
 
 const Scheme& find_scheme(std::string_view name) {
   std::string names;
@@ -29,12 +26,6 @@ const Scheme& find_scheme(std::string_view name) {
   }
   throw std::invalid_argument("scheme must be one of " + names + ", got '" + std::string(name) +
                               "'");
-}
-
-std::vector<std::string_view> scheme_names() {
-  std::vector<std::string_view> names;
-  for (const Scheme* scheme : schemes()) names.push_back(scheme->name());
-  return names;
 }
 
 }  // namespace diffcloth::step

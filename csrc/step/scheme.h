@@ -7,6 +7,7 @@
 #include "step/cotangents.h"
 #include "step/factor_cache.h"
 #include "step/fields.h"
+#include "step/forces.h"
 #include "step/problem.h"
 #include "step/report.h"
 
@@ -45,16 +46,25 @@ class Scheme {
 
   virtual std::string_view name() const = 0;
 
-  /// Whether vertices of cloths are in contact with each other.
-  virtual bool vertices_touch() const { return false; }
+  /// Whether a barrier keeps surfaces apart; else cloths touch all bodies and each other at their nodes.
+  virtual bool has_barrier() const { return true; }
+
+  /// Whether cloths and what forces move are solved for together.
+  virtual bool moves_bodies() const { return false; }
+
+  /// Whether elasticity is solved for on its own first, by one of kElasticSolvers.
+  virtual bool has_elastic_stage() const { return false; }
+
+  /// Whether it can measure nearness in each of kMetrics.
+  virtual bool has_metrics() const { return false; }
 
   /// What backward needs of forward beyond the inputs: positions, no contacts and no matrices.
   virtual std::vector<Field> tape(const Scene& scene) const = 0;
 
-  /// Find all points at the end of the step, and the contact forces on the bodies' vertices.
+  /// Find all points at the end of the step, and the forces there.
   ///
   /// @param x  in: at the start of the step
-  virtual void forward(const Forward& step, std::vector<double>& x, double* body_forces) const = 0;
+  virtual void forward(const Forward& step, std::vector<double>& x, const Forces& forces) const = 0;
 
   /// From the cotangents of the end to those of all that the potentials depend on, for each loss as if
   /// it were alone.
@@ -65,7 +75,7 @@ class Scheme {
 /// @throws std::invalid_argument with the names that there are
 const Scheme& find_scheme(std::string_view name);
 
-/// Names of all schemes, the default first.
-std::vector<std::string_view> scheme_names();
+/// All schemes, the default first.
+std::span<const Scheme* const> schemes();
 
 }  // namespace diffcloth::step

@@ -12,6 +12,7 @@
 #include "potential/tilt.h"
 #include "step/contact_stage.h"
 #include "step/elastic_stage.h"
+#include "step/elasticity.h"
 
 namespace diffcloth::step {
 namespace {
@@ -38,8 +39,8 @@ class Nearness {
         if (tilted) tilt_.emplace(gradient_at_target());
         return;
       case Metric::kElastic:
-        elastic_.emplace(problem.constant_form(), problem.elasticity,
-                         problem.anchors ? &*problem.anchors : nullptr, x_d_);
+        elastic_.emplace(problem.constant_form(), problem.find<Elasticity>().potential(),
+                         problem.springs(), x_d_);
         inertial_.emplace(problem.masses, x_d_, problem.h);
         return;
       case Metric::kMass:
@@ -53,41 +54,31 @@ class Nearness {
   }
 
   /// Whether it changes with x^D.
-  bool follows_target() const { return inertial_ || tilt_; }
+  static bool follows_target(const Problem& problem, bool tilted) {
+    return tilted || problem.scene.given.metric != Metric::kEnergy;
+  }
 
   ContactStage stage() {
     const Scene& scene = problem_.scene;
     std::vector<Potential*> others;
-    if (!inertial_) others = problem_.elastic_potentials();
+    if (!inertial_) others = problem_.cloth_potentials();
     if (elastic_) others.push_back(&*elastic_);
     if (tilt_) others.push_back(&*tilt_);
     const bool is_diagonal = inertial_ && !elastic_;
     return {.inertia = inertial_ ? *inertial_ : problem_.inertia,
             .guess = x_d_.data(),
             .others = std::move(others),
-            .assemblies = is_diagonal ? scene.diagonal_assemblies : scene.elastic_assemblies,
+            .patterns = is_diagonal ? scene.diagonal_patterns : scene.elastic_patterns,
             .first_factor = 1,
             .exchange = {}};
   }
 
-  /// What the potentials accumulate for a loss: nothing yet.
-  struct Bar {
-    Array metric, target, elastic_target, tilt;
-  };
-  Bar zero_bar() const {
-    const std::size_t size = problem_.cloth_size;
-    return {.metric = Array(inertial_ ? size / 3 : 0, 0.0),
-            .target = Array(inertial_ ? size : 0, 0.0),
-            .elastic_target = Array(elastic_ ? size : 0, 0.0),
-            .tilt = Array(tilt_ ? size : 0, 0.0)};
-  }
-  void exchange(Bar& bar) {
-    if (inertial_) {
-      std::swap(inertial_->metric_bar, bar.metric);
-      std::swap(inertial_->target_bar, bar.target);
-    }
-    if (elastic_) std::swap(elastic_->target_bar, bar.elastic_target);
-    if (tilt_) std::swap(tilt_->force_bar, bar.tilt);
+  /// Swap what its own potentials have accumulated.
+  void swap_cotangents(CotangentStore& store) {
+    store.begin();
+    if (inertial_) inertial_->swap_cotangents(store);
+    if (elastic_) elastic_->swap_cotangents(store);
+    if (tilt_) tilt_->swap_cotangents(store);
   }
 
   /// Cotangent of x^D; those of what else the nearness is made of go where they belong.
@@ -114,7 +105,7 @@ class Nearness {
   template <class Visit>
   void for_each_of_energy(Visit&& visit) const {
     visit(static_cast<Potential&>(problem_.inertia));
-    for (Potential* p : problem_.elastic_potentials()) visit(*p);
+    for (Potential* p : problem_.cloth_potentials()) visit(*p);
   }
 
   Array gradient_at_target() const {
@@ -157,12 +148,17 @@ std::vector<Field> Split::tape(const Scene& scene) const {
   return fields;
 }
 
-void Split::forward(const Forward& step, Array& x, double* body_forces) const {
+void Split::forward(const Forward& step, Array& x, const Forces& forces) const {
   Problem& problem = step.problem;
   const ElasticStage elastic(problem);
-  Array x_d = elastic.forward(step, body_forces);
+  // What is near x^D in energy holds its pins against all that the elastic stage has.
+  Array unused(3 * problem.scene.given.pins.size());
+  Forces elastic_forces = forces;
+  if (!Nearness::follows_target(problem, elastic.has_contacts()))
+    elastic_forces.pins = unused.data();
+  Array x_d = elastic.forward(step, elastic_forces);
   x_d.resize(problem.cloth_size);
-  Nearness(problem, std::move(x_d), elastic.has_contacts()).stage().forward(step, x, body_forces);
+  Nearness(problem, std::move(x_d), elastic.has_contacts()).stage().forward(step, x, forces);
 }
 
 void Split::backward(const Backward& step) const {
@@ -170,16 +166,16 @@ void Split::backward(const Backward& step) const {
   const double* x_d = step.tape["elastic"];
   const ElasticStage elastic(problem);
   Nearness nearness(problem, Array(x_d, x_d + problem.cloth_size), elastic.has_contacts());
-  std::vector<Nearness::Bar> own(step.losses.size(), nearness.zero_bar());
+  std::vector<CotangentStore> own(step.losses.size());
   ContactStage contact = nearness.stage();
   contact.exchange = [&](std::size_t l) {
     step.losses[l].exchange(problem);
-    nearness.exchange(own[l]);
+    nearness.swap_cotangents(own[l]);
   };
   std::vector<Array> g;
   for (const Cotangents& bars : step.losses) g.push_back(bars.rows);
   contact.backward(step, g);
-  if (!nearness.follows_target()) return;
+  if (!Nearness::follows_target(problem, elastic.has_contacts())) return;
 
   for (std::size_t l = 0; l < g.size(); ++l) {
     const Turn turn(contact.exchange, l);

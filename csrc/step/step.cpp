@@ -9,15 +9,6 @@
 namespace diffcloth::step {
 namespace {
 
-elastic::Wanted wanted(const Gradients& gradients) {
-  using enum elastic::Wanted;
-  if (gradients[Input::kRestPositions] != nullptr) return kMaterialsAndRest;
-  for (const Input input : {Input::kStretch, Input::kBending, Input::kPoisson, Input::kDamping}) {
-    if (gradients[input] != nullptr) return kMaterials;
-  }
-  return kNone;
-}
-
 bool wants_barrier(const Gradients& gradients) {
   using enum Input;
   return std::ranges::any_of(
@@ -43,6 +34,10 @@ void read_outputs(const Problem& problem,
   }
   bars.body_forces.assign(
       f_bar, f_bar + (3 * static_cast<std::size_t>(scene.vertex_count()) - problem.cloth_size));
+  const double* const contact_bar = cotangents["contact_forces"];
+  bars.contact_forces.assign(contact_bar, contact_bar + problem.cloth_size);
+  const double* const pin_bar = cotangents["pin_forces"];
+  bars.pin_forces.assign(pin_bar, pin_bar + 3 * scene.given.pins.size());
 }
 
 }  // namespace
@@ -53,7 +48,9 @@ std::vector<Field> output_fields(const Scene& scene) {
   const auto q = static_cast<std::size_t>(scene.mechanisms.coordinate_count());
   std::vector<Field> fields{{.name = "positions", .shape = {n, 3}},
                             {.name = "velocities", .shape = {n, 3}},
-                            {.name = "body_forces", .shape = {v, 3}}};
+                            {.name = "body_forces", .shape = {v, 3}},
+                            {.name = "contact_forces", .shape = {n, 3}},
+                            {.name = "pin_forces", .shape = {scene.given.pins.size(), 3}}};
   if (q > 0) fields.push_back({.name = "coordinates", .shape = {q}});
   return fields;
 }
@@ -118,7 +115,10 @@ Report forward(const Scene& scene,
                          .tape = tape,
                          .kept = kept,
                          .report = report},
-                        x, outputs["body_forces"]);
+                        x,
+                        {.bodies = outputs["body_forces"],
+                         .contact = outputs["contact_forces"],
+                         .pins = outputs["pin_forces"]});
   std::copy_n(x.begin(), problem.cloth_size, positions);
   for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
     outputs["coordinates"][c] = problem.coordinates.nodes(x)[scene.mechanisms.slot(c)];
@@ -142,10 +142,11 @@ void backward(const Scene& scene,
   Stopwatch watch;
   solver::Counts counts;
   contact::Detection detection(scene.broad_phase);
-  Problem problem(scene, inputs, wanted(losses.front().gradients));
+  const Gradients& wanted = losses.front().gradients;
+  Problem problem(scene, inputs, &wanted);
   std::vector<Cotangents> bars;
   for (const Loss& loss : losses) {
-    bars.emplace_back(problem);
+    bars.emplace_back(problem, wanted);
     read_outputs(problem, loss.cotangents, bars.back());
   }
 
@@ -161,7 +162,7 @@ void backward(const Scene& scene,
                           .tape = tape,
                           .kept = kept,
                           .losses = bars,
-                          .barrier = wants_barrier(losses.front().gradients)});
+                          .barrier = wants_barrier(wanted)});
   const Turn::Exchange exchange = [&](std::size_t l) { bars[l].exchange(problem); };
   for (std::size_t l = 0; l < losses.size(); ++l) {
     const Turn turn(exchange, l);

@@ -4,6 +4,7 @@
 #include <optional>
 #include <span>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "common/interrupt.h"
@@ -16,8 +17,8 @@
 
 namespace diffcloth::step {
 
-/// What a step gives back: "positions" and "velocities" [N, 3], "body_forces" [V, 3], and, where there
-/// are any, "coordinates" [n].
+/// What a step gives back: "positions" and "velocities" [N, 3], "body_forces" [V, 3], "contact_forces"
+/// [N, 3], "pin_forces" [P, 3], and, where there are any, "coordinates" [n].
 std::vector<Field> output_fields(const Scene& scene);
 
 /// What backward needs of forward beyond the inputs: the fields of the scheme.
@@ -74,24 +75,19 @@ struct CloseStart {
 /// Absent where nothing is within the barrier's reach, or nothing can touch.
 std::optional<CloseStart> find_close_start(const Scene& scene, const Inputs& inputs);
 
-/// What cloths and contact store at the positions of the inputs [J]. Of weights, Python knows.
-struct StoredEnergy {
-  double stretch = 0.0;
-  double bending = 0.0;
-  double soft_pins = 0.0;
-  double contact = 0.0;  ///< of the barrier
+/// Parts of an energy by their names [J].
+using Energies = std::vector<std::pair<const char*, double>>;
 
-  /// Call visit(name, value) for every part.
-  template <class Visit>
-  void for_each(Visit&& visit) const {
-    visit("stretch", stretch);
-    visit("bending", bending);
-    visit("soft_pins", soft_pins);
-    visit("contact", contact);
-  }
-};
+/// What the potentials of the cloths and the barrier store at the positions of the inputs. Of weights,
+/// Python knows.
+Energies stored_energy(const Scene& scene, const Inputs& inputs);
 
-StoredEnergy stored_energy(const Scene& scene, const Inputs& inputs);
+/// Gradients of these parts, of several losses, whose cotangents are numbers by the names of the parts.
+///
+/// Inputs that only motion and what dissipates depend on get zero.
+///
+/// @throws std::domain_error where surfaces overlap, if the barrier's part has a cotangent
+void pull_back_energy(const Scene& scene, const Inputs& inputs, std::span<const Loss> losses);
 
 /// The unit EF that speeds are stated in: seconds of one numeric factorization of the contact-free
 /// Hessian at the inputs' positions by Eigen's SimplicialLDLT, minimum degree order, no BLAS; the

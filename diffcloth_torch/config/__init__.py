@@ -1,1 +1,1 @@
-"""Configurations: the schema of YAML files, and what is built from them."""
+"""Configurations: the schema of YAML files, and the objects built from them."""

@@ -1,4 +1,4 @@
-"""Configuration files: YAML, read safely, its values changed, and the files that it names."""
+"""Configuration files: reading YAML safely, changing values, and resolving file names."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ __all__ = ["Document", "read_document", "resolve_path", "set_values"]
 
 Document = dict[str, Any]
 
-# A configuration is a page of text. These bounds are far beyond one; what exceeds them is a
-# mistake, or would fill the memory.
+# A configuration is a page of text. A file that exceeds these generous bounds is a mistake, or
+# would fill the memory.
 _LARGEST_CONFIG_BYTES = 1 << 20
 _MOST_VALUES = 100_000  # aliases written out
 _DEEPEST = 50
@@ -46,7 +46,7 @@ def read_document(path: str | Path) -> Document:
 
 
 def _parse(text: str) -> Any:
-    """Read YAML 1.2; raises ValueError where that fails."""
+    """Read YAML 1.2; raise ValueError if that fails."""
     reader = YAML(typ="safe", pure=True)
     try:
         _check_extent(reader.parse(text))
@@ -63,7 +63,7 @@ def _parse(text: str) -> Any:
 
 
 def _check_extent(events: Iterable[Any]) -> None:
-    """Bound depth and size of a document with its aliases written out, before they are."""
+    """Bound depth and size of a document as if its aliases were written out."""
     sizes: dict[str, int] = {}  # of anchored values
     anchors: set[str] = set()
     opened: list[tuple[str | None, int]] = []  # anchor of a collection, and values before it
@@ -96,7 +96,7 @@ def _check_extent(events: Iterable[Any]) -> None:
 
 
 def _check_plain(value: Any, place: str) -> None:
-    """Refuse what YAML knows and a configuration does not: dates, sets, keys that are no text."""
+    """Refuse YAML values that no configuration has: dates, sets, keys that are not text."""
     if isinstance(value, dict):
         for key, entry in value.items():
             if not isinstance(key, str):
@@ -117,7 +117,7 @@ def set_values(document: Document, assignments: Iterable[str]) -> Document:
     """Copy a document with values changed.
 
     Args:
-        document: What a configuration file holds.
+        document: Contents of a configuration file.
         assignments: "key=value" each; the key is dotted, an item of a list is addressed by its
             number or its `name`, and the value is YAML.
 
@@ -156,7 +156,7 @@ def _descend(key: str, place: Any, part: str) -> Any:
     if isinstance(place, list):
         return place[_item(key, place, part)]
     if isinstance(place, dict):
-        return place.setdefault(part, {})  # a section that the file leaves to its defaults
+        return place.setdefault(part, {})  # a section that the file leaves at its defaults
     raise InvalidInput(f"--set {key}: `{part}` lies below a plain value")
 
 
@@ -172,7 +172,7 @@ def _item(key: str, items: list[Any], part: str) -> int:
 
 
 def resolve_path(config: Path, root: str, given: str) -> Path:
-    """File that a configuration names, relative to the configuration and under its root.
+    """Resolve a file name relative to its configuration, and require it to be under the root.
 
     Raises:
         InvalidInput: If it lies elsewhere or does not exist.

@@ -1,10 +1,10 @@
-"""From a configuration to a scene, a simulator and the motion that the configuration prescribes."""
+"""From a configuration to its scene, its simulator and its prescribed motion."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -13,24 +13,22 @@ from torch import Tensor
 
 from diffcloth_torch import robots
 from diffcloth_torch.config import shapes
+from diffcloth_torch.config.attachments import attachment, attachment_motions
 from diffcloth_torch.config.documents import resolve_path
+from diffcloth_torch.config.keyframes import moved, quaternion, select_vertices, values_at
 from diffcloth_torch.config.schema import (
     BodySection,
     ClothSection,
-    JointKeyframe,
-    PinKeyframe,
     PoseSection,
     RobotSection,
-    RotationSection,
     RunConfig,
     Section,
-    Selection,
     SimulationSection,
 )
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import transform
-from diffcloth_torch.geometry.rotation import interpolate_poses, rotate
+from diffcloth_torch.geometry.rotation import interpolate_poses
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
@@ -42,6 +40,8 @@ from diffcloth_torch.sim.simulator import Simulator
 
 __all__ = [
     "Motions",
+    "PerStep",
+    "Trajectories",
     "build_scene",
     "build_simulator",
     "pose_array",
@@ -49,7 +49,7 @@ __all__ = [
     "prescribed_poses",
     "quaternion",
     "select_vertices",
-    "step_controls",
+    "step_control",
 ]
 
 
@@ -60,11 +60,12 @@ def build_scene(config: RunConfig, source: Path) -> Scene:
     bodies = [_body(section, config.root, source) for section in config.scene.bodies]
     robots = [_robot(section, config.root, source) for section in config.scene.robots]
     options = config.scene.model_dump(include={"gravity", "ignore_contact"}, exclude_none=True)
-    return Scene(cloths, bodies, robots, **options)
+    attachments = [attachment(section, cloths) for section in config.scene.attachments]
+    return Scene(cloths, bodies, robots, attachments=attachments, **options)
 
 
 def build_simulator(scene: Scene, section: SimulationSection) -> Simulator:
-    """Make the simulator of a scene; what the configuration leaves out takes its default."""
+    """Make the simulator of a scene; options that the configuration leaves out take defaults."""
     return Simulator(
         scene,
         section.dt,
@@ -86,17 +87,6 @@ def _require_unique_names(config: RunConfig) -> None:
     for name in names:
         if names.count(name) > 1:
             raise InvalidInput(f"`scene`: the name {name!r} must be given once, got it twice")
-
-
-def quaternion(section: RotationSection) -> NDArray[np.float64]:
-    """Unit quaternion (w, x, y, z) of a rotation."""
-    if section.axis is not None and section.degrees is not None:
-        half = np.radians(section.degrees) / 2
-        axis = np.array(section.axis) / np.linalg.norm(section.axis)
-        return np.concatenate([[np.cos(half)], np.sin(half) * axis])
-    given = np.array(section.quaternion or [1.0, 0.0, 0.0, 0.0])
-    unit: NDArray[np.float64] = given / np.linalg.norm(given)
-    return unit
 
 
 def pose_array(section: PoseSection) -> NDArray[np.float64]:
@@ -135,7 +125,7 @@ def _cloth(section: ClothSection, root: str, source: Path) -> Cloth:
         vertices,
         faces,
         material=Material(**_given(section.material)),
-        rest_vertices=rest,
+        rest_positions=rest,
         name=section.name,
         **options,
     )
@@ -147,29 +137,6 @@ def _generated(name: str, generate: Any, arguments: dict[str, Any]) -> Any:
         return generate(**arguments)
     except ValueError as error:
         raise InvalidInput(f"`scene`: the shape of {name!r} cannot be made: {error}") from error
-
-
-def select_vertices(
-    name: str, selection: Selection, vertices: NDArray[np.float64]
-) -> NDArray[np.int64]:
-    """Vertices that a selection names, in increasing order but for a list, which keeps its own."""
-    if selection.vertices is not None:
-        return np.array(selection.vertices)
-    if selection.nearest is not None:
-        points = np.array(selection.nearest)
-        distances = np.linalg.norm(vertices[None] - points[:, None], axis=-1)
-        return np.unique(distances.argmin(axis=1))
-    box = selection.box
-    assert box is not None  # the schema requires one of the three
-    inside = (vertices >= box.lower) & (vertices <= box.upper)
-    chosen = np.flatnonzero(inside.all(axis=1))
-    if chosen.size == 0:
-        low, high = vertices.min(axis=0).round(4), vertices.max(axis=0).round(4)
-        raise InvalidInput(
-            f"the box of {name} must hold a vertex; the cloth lies between "
-            f"{low.tolist()} and {high.tolist()}"
-        )
-    return chosen
 
 
 def _body(section: BodySection, root: str, source: Path) -> RigidBody:
@@ -219,7 +186,7 @@ def _robot(section: RobotSection, root: str, source: Path) -> Robot:
 
 
 def _robot_file(section: RobotSection, root: str, source: Path) -> tuple[Path, Path | None]:
-    """The file that describes a robot, and the folder of its meshes, None for that of the file."""
+    """The file of a robot, and the folder of its meshes, None for that of the file."""
     if section.model is not None:
         return robots.panda() if section.model == "panda" else (robots.GRIPPER, None)
     assert section.path is not None  # the schema requires one of the two
@@ -265,14 +232,26 @@ def prescribed_poses(section: BodySection | RobotSection, dt: float, steps: int)
     )
 
 
-Motions = dict[str, dict[str, Tensor]]
+class PerStep(Protocol):
+    """Values after each step: a tensor of all of them, or an object that makes them on request."""
+
+    def __getitem__(self, k: int, /) -> Tensor:
+        """Give the values of the step k."""
+        ...
+
+
+Motions = dict[str, dict[str, PerStep]]
 """Field of a control -> name -> values after each step."""
 
 
-def prescribed_motions(config: RunConfig, scene: Scene, steps: int) -> Motions:
-    """What pins, bodies, bases and joints that have trajectories do."""
+Trajectories = dict[str, dict[str, Tensor]]
+"""Motions that are known from the start, shape [steps, ..]."""
+
+
+def prescribed_motions(config: RunConfig, scene: Scene, steps: int) -> Trajectories:
+    """What pins, bodies, bases, joints and attachments that have trajectories do."""
     dt = config.simulation.dt
-    poses: Motions = {"body_poses": {}, "base_poses": {}}
+    poses: Trajectories = {"body_poses": {}, "base_poses": {}}
     for body in config.scene.bodies:
         if body.trajectory:
             poses["body_poses"][body.name] = prescribed_poses(body, dt, steps)
@@ -280,38 +259,36 @@ def prescribed_motions(config: RunConfig, scene: Scene, steps: int) -> Motions:
         if robot.trajectory:
             poses["base_poses"][robot.name] = prescribed_poses(robot, dt, steps)
     times = _step_times(dt, steps)
-    return _pin_motions(config, scene, times) | poses | _joint_motions(config, scene, times)
+    motions = _pin_motions(config, scene, times) | poses | _joint_motions(config, scene, times)
+    return motions | attachment_motions(config.scene.attachments, scene, times)
 
 
-def step_controls(motions: Motions, steps: int) -> list[Control]:
-    """Controls of each step from what is moved throughout."""
-    controls = []
-    for k in range(steps):
-        fields: dict[str, Any] = {
-            field: {name: values[k] for name, values in named.items()}
-            for field, named in motions.items()
-            if named
-        }
-        controls.append(Control(**fields))
-    return controls
+def step_control(motions: Mapping[str, Mapping[str, PerStep]], k: int) -> Control:
+    """Control of the step k from motions of all steps."""
+    fields: dict[str, Any] = {
+        field: {name: values[k] for name, values in named.items()}
+        for field, named in motions.items()
+        if named
+    }
+    return Control(**fields)
 
 
-def _pin_motions(config: RunConfig, scene: Scene, times: Tensor) -> Motions:
-    motions: Motions = {"pins": {}, "soft_pins": {}}
+def _pin_motions(config: RunConfig, scene: Scene, times: Tensor) -> Trajectories:
+    motions: Trajectories = {"pins": {}, "soft_pins": {}}
     for section, cloth in zip(config.scene.cloths, scene.cloths, strict=True):
         for name, keyframes in section.pin_trajectories.items():
             field = "pins" if name in cloth.pins else "soft_pins"
             start = torch.tensor(cloth.vertices[getattr(cloth, field)[name]])
-            motions[field][f"{section.name}/{name}"] = _moved(start, keyframes, times)
+            motions[field][f"{section.name}/{name}"] = moved(start, keyframes, times)
     return motions
 
 
-def _joint_motions(config: RunConfig, scene: Scene, times: Tensor) -> Motions:
-    motions: Motions = {field: {} for field in _JOINT_FIELDS.values()}
+def _joint_motions(config: RunConfig, scene: Scene, times: Tensor) -> Trajectories:
+    motions: Trajectories = {field: {} for field in _JOINT_FIELDS.values()}
     for section, robot in zip(config.scene.robots, scene.robots, strict=True):
         for name, keyframes in section.joint_trajectories.items():
             field, start = _joint_field(section.name, name, robot)
-            values = _joint_values(keyframes, start, times)
+            values = values_at(keyframes, start, times)
             motions[field][f"{section.name}/{name}"] = values
     return motions
 
@@ -337,29 +314,5 @@ def _joint_field(robot_name: str, joint: str, robot: Robot) -> tuple[str, float]
     return field, float(robot.joint_positions[index]) if field == "joint_positions" else 0.0
 
 
-def _joint_values(keyframes: Sequence[JointKeyframe], start: float, times: Tensor) -> Tensor:
-    """Values [n] at some times, on straight lines between keyframes."""
-    given = [(frame.time, frame.value) for frame in keyframes]
-    given = given if given[0][0] == 0 else [(0.0, start), *given]
-    at, values = np.array(given).T
-    return torch.from_numpy(np.interp(times.numpy(), at, values))
-
-
 def _step_times(dt: float, steps: int) -> Tensor:
     return dt * torch.arange(1, steps + 1, dtype=torch.float64)
-
-
-def _moved(start: Tensor, keyframes: Sequence[PinKeyframe], times: Tensor) -> Tensor:
-    """Positions [n, p, 3] of pins [p, 3] at some times: turned about their mean and displaced."""
-    frames = [(0.0, [0.0, 0.0, 0.0], np.array([1.0, 0.0, 0.0, 0.0]))]
-    if keyframes[0].time == 0:
-        frames = []
-    frames += [(frame.time, frame.displacement, quaternion(frame)) for frame in keyframes]
-    poses = interpolate_poses(
-        torch.tensor([time for time, _, _ in frames], dtype=torch.float64),
-        torch.tensor(np.array([[*move, *turn] for _, move, turn in frames])),
-        times,
-    )
-    center = start.mean(dim=0)
-    turned = rotate(poses[:, None, 3:], (start - center).expand(len(times), -1, 3))
-    return turned + center + poses[:, None, :3]

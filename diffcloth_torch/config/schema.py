@@ -1,4 +1,4 @@
-"""The schema of configurations: what a file may hold, checked before anything runs."""
+"""The schema of configurations, against which files are checked before anything runs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeAlias
 
 from annotated_types import Ge, Gt, Interval, Le, Len, Lt
 from pydantic import (
@@ -20,6 +20,7 @@ from pydantic import (
 )
 
 from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.options import COUPLINGS, ELASTIC_SOLVERS, METRICS, SCHEMES
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.viewers.look import Camera, Pictures
 
@@ -50,6 +51,14 @@ Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 Vector3 = Annotated[list[float], Len(3, 3)]
 Actuation = Literal["position", "velocity", "torque", "pd"]
+if TYPE_CHECKING:
+    Scheme: TypeAlias = str
+    Metric: TypeAlias = str
+    ElasticSolver: TypeAlias = str
+    Coupling: TypeAlias = str
+else:
+    Scheme, Metric = Literal[SCHEMES], Literal[METRICS]
+    ElasticSolver, Coupling = Literal[ELASTIC_SOLVERS], Literal[COUPLINGS]
 Lengths2 = Positive | Annotated[list[Positive], Len(2, 2)]
 Lengths3 = Positive | Annotated[list[Positive], Len(3, 3)]
 
@@ -67,7 +76,7 @@ Color = Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]
 
 
 class Section(BaseModel):
-    """A mapping of a configuration; keys that it does not know are refused."""
+    """A mapping of a configuration; unknown keys are refused."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
         extra="forbid", strict=True, frozen=True, allow_inf_nan=False, protected_namespaces=()
@@ -111,7 +120,7 @@ class RotationSection(Section):
 
 
 class PoseSection(RotationSection):
-    """Where something is: turned about its origin, then moved to `position` [m]."""
+    """A pose: a rotation about the origin, then a translation to `position` [m]."""
 
     position: Vector3 = [0.0, 0.0, 0.0]
 
@@ -123,9 +132,9 @@ class PoseKeyframe(PoseSection):
 
 
 class PinKeyframe(RotationSection):
-    """How far pins are at a time [s] from where they start.
+    """Motion of pins at a time [s], relative to their start.
 
-    They are turned about the mean of their starting positions, then moved by `displacement` [m].
+    A rotation about the mean of their starting positions, then a translation by `displacement` [m].
     """
 
     time: NonNegative
@@ -166,8 +175,8 @@ class Disk(Section):
 class Strip(Section):
     """Strip along x, bent downwards by `bend` degrees about an axis along y, at the origin.
 
-    Its `width` [m] is one, or those of its two ends. The middle of the bend is at the share
-    `middle` of its length.
+    Its `width` [m] is one number, or one for each of its two ends. The middle of the bend is at the
+    fraction `middle` of its length.
     """
 
     kind: Literal["strip"]
@@ -260,7 +269,7 @@ _MaterialFields: Any = create_model("_MaterialFields", __base__=Section, **_LIMI
 
 
 class MaterialSection(_MaterialFields):  # type: ignore[misc]  # its fields are those of Material
-    """Properties of a cloth, in the units of `Material`; what is not given takes its default."""
+    """Properties of a cloth, in the units of `Material`, with its defaults."""
 
 
 class ClothSection(Section):
@@ -294,7 +303,7 @@ class ClothSection(Section):
 class BodySection(Section):
     """A rigid body. With a `trajectory` it is kinematic and starts at `pose` at time 0.
 
-    One that is dynamic has a `density` [kg/m^3] or a `mass` [kg].
+    A dynamic body has a `density` [kg/m^3] or a `mass` [kg].
     """
 
     name: str
@@ -323,10 +332,10 @@ class BodySection(Section):
 
 
 class JointKeyframe(Section):
-    """What a joint is told at a time [s].
+    """Target or effort of a joint at a time [s].
 
-    The `value` is a position target where the joint's actuation is position or pd, a velocity
-    target where it is velocity, an effort where it is torque.
+    The `value` is a position target under position or pd actuation, a velocity target under
+    velocity actuation, and an effort under torque actuation.
     """
 
     time: NonNegative
@@ -339,10 +348,10 @@ ForAll = float | dict[str, float]
 
 
 class RobotSection(Section):
-    """A robot, from the URDF file at `path` or one that is known by its name as `model`.
+    """A robot, from the URDF file at `path`, or a known one by its name `model`.
 
     Its fields are those of `Robot.load`. With a `trajectory` its base is kinematic and starts at
-    `pose` at time 0. Joints that have no trajectory hold.
+    `pose` at time 0. Joints without a trajectory hold.
     """
 
     name: str
@@ -376,13 +385,68 @@ class RobotSection(Section):
         return self
 
 
+class EndSection(Section):
+    """Points of an attachment: selected vertices of a cloth, or `points` in a body's frame [m].
+
+    The `surface` is the name of a cloth or body, or robot/link.
+    """
+
+    surface: str
+    vertices: Annotated[list[Annotated[int, Ge(0)]], Len(1)] | None = None
+    box: BoxSelection | None = None
+    nearest: Annotated[list[Vector3], Len(1)] | None = None
+    points: Annotated[list[Vector3], Len(1)] | None = None
+
+    @model_validator(mode="after")
+    def _check_one(self) -> EndSection:
+        _require_one(self, ("vertices", "box", "nearest", "points"))
+        return self
+
+    def selection(self) -> Selection:
+        """What is selected of a cloth."""
+        return Selection(vertices=self.vertices, box=self.box, nearest=self.nearest)
+
+
+class WeightKeyframe(JointKeyframe):
+    """Weight of an attachment at a time [s], between 0 (released) and 1."""
+
+    value: Annotated[float, Ge(0), Le(1)]
+
+
+class AttachmentSection(Section):
+    """Springs between two ends, or between `a` and targets, as in `Attachment`.
+
+    Without `b` there are targets; they start where `a` is and move by `target_trajectory`. Weights
+    are one where `weight_trajectory` says nothing.
+    """
+
+    name: str
+    a: EndSection
+    b: EndSection | None = None
+    stiffness: Positive
+    rest_length: NonNegative = 0.0
+    target_trajectory: list[PinKeyframe] = []
+    weight_trajectory: list[WeightKeyframe] = []
+
+    @model_validator(mode="after")
+    def _check_trajectories(self) -> AttachmentSection:
+        if self.b is not None and self.target_trajectory:
+            raise ValueError("has `b` and must have no `target_trajectory`")
+        if self.b is None and "/" in self.a.surface:
+            raise ValueError("must have `b`, as `a` is on a link")
+        _require_increasing("target_trajectory", self.target_trajectory)
+        _require_increasing("weight_trajectory", self.weight_trajectory)
+        return self
+
+
 class SceneSection(Section):
-    """What is simulated. Without cloths something must be dynamic."""
+    """Cloths, bodies, robots and gravity. Without cloths, a body or a robot must be dynamic."""
 
     gravity: Vector3 | None = None
     cloths: list[ClothSection] = []
     bodies: list[BodySection] = []
     robots: list[RobotSection] = []
+    attachments: list[AttachmentSection] = []
     ignore_contact: list[Names] = []
 
     @model_validator(mode="after")
@@ -411,8 +475,8 @@ class SolverSection(Section):
     tolerance: Positive | None = None
     max_iterations: Annotated[int, Ge(1)] | None = None
     throw: bool | None = None
-    metric: Literal["energy", "elastic", "mass", "identity"] | None = None
-    elastic: Literal["newton", "projective"] | None = None
+    metric: Metric | None = None
+    elastic: ElasticSolver | None = None
 
 
 class SimulationSection(Section):
@@ -420,20 +484,23 @@ class SimulationSection(Section):
 
     dt: Positive
     steps: Annotated[int, Ge(1)]
-    scheme: Literal["coupled", "split", "projective"] = "coupled"
-    coupling: Literal["monolithic", "rigid_to_cloth", "cloth_to_rigid"] = "monolithic"
+    scheme: Scheme = SCHEMES[0]
+    coupling: Coupling = COUPLINGS[0]
     contact: ContactSection = ContactSection()
     solver: SolverSection = SolverSection()
 
 
 class CameraSection(Section):
-    """Where pictures are taken from, as in `Camera`."""
+    """View of the pictures, as in `Camera`."""
 
     azimuth: float = Camera.azimuth
     elevation: Annotated[float, Gt(-90), Lt(90)] = Camera.elevation
     zoom: Positive = Camera.zoom
     target: Vector3 | None = None
     distance: Positive | None = None
+    position: Vector3 | None = None
+    up: Vector3 = list(Camera.up)
+    field_of_view: Annotated[float, Gt(0), Lt(180)] = Camera.field_of_view
 
 
 class PictureSection(Section):
@@ -457,7 +524,7 @@ class PictureSection(Section):
 
 
 class OutputSection(Section):
-    """What a run leaves behind: `every` so many steps a frame, for each of the `viewers`."""
+    """Output of a run: a frame for each of the `viewers` after `every` so many steps."""
 
     viewers: list[Literal["record", "meshes"]] = ["record", "meshes"]
     every: Annotated[int, Ge(1)] = 1

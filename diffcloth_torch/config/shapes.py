@@ -14,18 +14,18 @@ __all__ = ["chair", "disk", "strip"]
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 
-# Edges across a disk: fewer make no round sheet, more no sheet that anyone could simulate.
+# Edges across a disk: fewer do not make a round sheet, more are too many to simulate.
 _FEWEST_EDGES = 2
 _MOST_EDGES = 100
 
 # Cells between the planes of boxes, filled or not.
 _MOST_CELLS = 1_000_000
 
-# Rounds in which each point moves to the mean of its neighbors. After ten the smallest angle no
-# longer grows; the mesh stays irregular.
+# Rounds of smoothing, in which each point moves to the mean of its neighbors. After ten the
+# smallest angle no longer grows; the mesh stays irregular.
 _SMOOTHING_ROUNDS = 10
 
-# How far points are thrown off a regular lattice, in edge lengths, and from which seed.
+# Largest random displacement of points from a regular lattice, in edge lengths, and the seed.
 _JITTER = 0.25
 _SEED = 0
 
@@ -33,12 +33,12 @@ _SEED = 0
 def disk(radius: float, edge_length: float) -> Mesh:
     """Round sheet in the xy-plane that faces up, on an unstructured mesh.
 
-    Points of a disturbed lattice inside a ring of evenly spaced ones, joined by Delaunay
-    triangulation and smoothed. The same arguments give the same mesh.
+    A Delaunay triangulation joins the points of a disturbed lattice inside a ring of evenly spaced
+    points, and is smoothed. The same arguments give the same mesh.
 
     Args:
         radius: Radius of the ring [m].
-        edge_length: About how long the edges are [m].
+        edge_length: Approximate length of the edges [m].
 
     Returns:
         Vertices [n, 3], the ring first, and faces [f, 3].
@@ -104,16 +104,17 @@ def strip(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Strip along x, bent downwards about an axis along y: up to a U that opens downwards.
 
-    The bend is one of the plane: all lengths along and across the strip stay what they are.
+    The bend preserves all lengths along and across the strip.
 
     Args:
-        length: Along the strip [m].
-        width: Across it [m]; one, or those of its two ends, between which it is straight.
-        rows: Vertices across.
-        columns: Vertices along.
-        bend: How far its two ends are turned against each other [degrees], 0 to 180.
-        radius: Of the bend, whose axis passes the origin [m].
-        middle: Where along the strip the middle of the bend is, as a share of the length.
+        length: Length of the strip [m].
+        width: Width of the strip [m]; one number, or one for each end, with straight sides between
+            them.
+        rows: Number of vertices across.
+        columns: Number of vertices along.
+        bend: Angle between the directions of its two ends [degrees], 0 to 180.
+        radius: Radius of the bend, whose axis passes through the origin [m].
+        middle: Position of the middle of the bend, as a fraction of the length.
 
     Returns:
         Flat vertices [n, 3], bent vertices [n, 3], and faces [f, 3].
@@ -128,7 +129,7 @@ def strip(
     along = np.linspace(0, length, columns)
     ends = np.broadcast_to(width, 2)
     flat[:, 1] *= np.tile(np.interp(along, [0, length], ends), rows)
-    # Each cell is turned as the arc is in its middle, so that it keeps its length.
+    # Each cell is turned like the middle of its arc, so that it keeps its length.
     cells = (along[1:] + along[:-1]) / 2 - middle * length
     turned = np.clip(cells / radius, -np.radians(bend) / 2, np.radians(bend) / 2)
     steps = np.diff(along) * np.stack([np.cos(turned), -np.sin(turned)])
@@ -149,15 +150,15 @@ def chair(
 ) -> Mesh:
     """Chair: one closed surface around a seat, a back and four legs.
 
-    It stands on z = 0, centered in x and y, its back at +y.
+    It stands on z = 0, centered in x and y, with its back at +y.
 
     Args:
-        width: Along x [m].
-        depth: Along y [m].
-        height: Of the top of the seat [m].
-        back_height: Of the back above the seat [m].
-        thickness: Of the seat, the back and the legs [m].
-        edge_length: Longest side of the rectangles that are split in two triangles [m].
+        width: Width along x [m].
+        depth: Depth along y [m].
+        height: Height of the top of the seat [m].
+        back_height: Height of the back above the seat [m].
+        thickness: Thickness of the seat, the back and the legs [m].
+        edge_length: Longest side of the rectangles that are split into two triangles [m].
 
     Returns:
         Vertices [n, 3] and outward-facing faces [f, 3].
@@ -181,7 +182,7 @@ Interval = tuple[float, float]
 def union_of_boxes(boxes: list[tuple[Interval, Interval, Interval]], edge_length: float) -> Mesh:
     """Surface of a union of boxes: that of the cells they fill between the planes of their sides.
 
-    No face lies inside or twice, so boxes may touch and overlap.
+    No face lies inside or occurs twice, so boxes may touch and overlap.
 
     Args:
         boxes: Intervals along x, y and z of each box [m].

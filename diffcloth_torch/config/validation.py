@@ -1,4 +1,4 @@
-"""A document against a schema, and what is wrong with it in sentences of the file's own words."""
+"""The check of a document against a schema, with errors in the words of the file."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _message(problem: Any) -> str:
 
 
 def _key_text(document: Document, location: tuple[int | str, ...], *, missing: bool) -> str:
-    """Write a place as in the file: pydantic's also names the member of a union that was tried."""
+    """Write a location as in the file; pydantic's also names the tried member of a union."""
     text = ""
     place: Any = document
     for i, part in enumerate(location):

@@ -1,4 +1,4 @@
-"""From a configuration to the viewers that it asks for."""
+"""From a configuration to its viewers."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def open_viewers(
     """Make the viewers of a configuration.
 
     Args:
-        config: What is run.
+        config: The configuration.
         scene: The scene that was built from it.
-        folder: Where their files go; it must exist.
+        folder: Existing folder for their files.
         goals: Shapes to show beside the scene.
     """
     output = config.output

@@ -1,1 +1,1 @@
-"""How bodies and robots move by themselves, in torch: before a step of the core, and after it."""
+"""Motion of bodies and robots by themselves, in torch: before a step of the core and after it."""

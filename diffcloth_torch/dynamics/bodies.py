@@ -1,11 +1,11 @@
 """Free rigid bodies over one step, all of them at once.
 
-A body by itself moves as Euler's equations say, to rounding: with the angular momentum L about the
-center, in world axes, and the inertia J in body axes, it keeps L + h torque and turns by a Q that
-the core finds, R_pred = R_n Q. Its coordinates are the center c and the rotation vector w with
-R = exp(w) R_pred; the core adds the inertia 1/(2h^2) (m |c - c^|^2 + w^T I w) about the prediction
-to what it minimizes. The gradient of that at the solution is the contact force, which gives the
-body its momentum after the step: what contact takes from others arrives here.
+A body by itself follows Euler's equations to rounding. With the angular momentum L about the
+center, in world axes, and the inertia J in body axes, it keeps L + h torque and turns by a rotation
+Q that the core finds, R_pred = R_n Q. Its coordinates are the center c and the rotation vector w
+with R = exp(w) R_pred; the core adds the inertia 1/(2h^2) (m |c - c^|^2 + w^T I w) about the
+prediction to the objective that it minimizes. At the solution its gradient balances the contact
+force, which gives the body its momentum after the step: contact conserves the total momentum.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 from diffcloth_torch.dynamics.free_motion import free_turns
 from diffcloth_torch.dynamics.linear import solve, times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
-from diffcloth_torch.errors import SimulationError
+from diffcloth_torch.errors import TurnedTooFar
 from diffcloth_torch.geometry.products import product
 from diffcloth_torch.geometry.rotation import (
     nearer_quaternion,
@@ -38,13 +38,14 @@ __all__ = [
     "advance_bodies",
     "body_totals",
     "predict_bodies",
-    "refuse_turns",
+    "turn_sentence",
 ]
 
-# The turn [rad] that a body may make in a step: by itself, where the core's series would get long,
-# and while it touches something, where what touches at the end says nothing of the way there.
+# Largest turn [rad] of a body in a step: by itself, because the core's series would get long; and
+# in contact before or after the step, because contact at its end does not describe the way there
+# and gives energy to a body that turns further.
 _MOST_TURN = 1e3
-MOST_TURN_IN_CONTACT = 1.5
+MOST_TURN_IN_CONTACT = 1.0
 
 
 class BodyInertia(NamedTuple):
@@ -56,17 +57,17 @@ class BodyInertia(NamedTuple):
 
 
 class BodyPrediction(NamedTuple):
-    """What the core needs, and what `advance_bodies` does.
+    """The prediction of bodies, for the core and for `advance_bodies`.
 
     Attributes:
-        frames: Of the core, which turns and shifts them by the coordinates; poses [B, K, 7].
-        coordinates: Of the start, [B, K, 6].
+        frames: Frames that the core turns and shifts by the coordinates; poses [B, K, 7].
+        coordinates: Coordinates at the start, [B, K, 6].
         target: t, [B, K, 6].
         metric: A, [B, K, 6, 6].
-        inertia: What the bodies weigh.
-        poses: At the start, [B, K, 7].
+        inertia: Masses, centers and inertias of the bodies.
+        poses: Poses at the start, [B, K, 7].
         momentum: Angular momentum without contact, [B, K, 3].
-        speed: Of rotation at the start, with it, [B, K] rad/s.
+        speed: Speed of rotation at the start with that momentum, [B, K] rad/s.
     """
 
     frames: Tensor
@@ -88,16 +89,16 @@ def predict_bodies(
     dt: float,
     names: Sequence[str] = (),
 ) -> BodyPrediction:
-    """Take a step without contact.
+    """Predict a step without contact.
 
     Args:
-        poses: Of the body frames, [B, K, 7].
-        velocities: Of the centers, then of rotation, in world axes; [B, K, 6].
-        inertia: What the bodies weigh.
+        poses: Poses of the body frames, [B, K, 7].
+        velocities: Velocities of the centers, then angular ones, in world axes; [B, K, 6].
+        inertia: Masses, centers and inertias of the bodies.
         wrenches: Forces at the centers and torques, in world axes; [B, K, 6].
         gravity: [B or 1, 3] m/s^2.
         dt: h [s].
-        names: Of the bodies, for messages.
+        names: Names of the bodies, for messages.
     """
     quaternion = torch.nn.functional.normalize(poses[..., 3:], dim=-1)
     rotation = quaternion_matrix(quaternion)
@@ -112,7 +113,7 @@ def predict_bodies(
     turn, is_found = free_turns(inertia.inertia, momentum, dt)
     omega = solve(inertia.inertia.expand(*spin.shape, 3), momentum)
     if not is_found.all():
-        refuse_turns(~is_found, omega.detach().norm(dim=-1), dt, _MOST_TURN, "may", names)
+        _refuse_turns(~is_found, omega.detach().norm(dim=-1), dt, names)
     predicted = quaternion_multiply(quaternion, turn)
     turned = quaternion_matrix(predicted)
     moments = product(product(turned, inertia.inertia), turned.transpose(-1, -2))
@@ -132,41 +133,39 @@ def predict_bodies(
     )
 
 
-def refuse_turns(
-    lost: Tensor, speed: Tensor, dt: float, most: float, how: str, names: Sequence[str]
-) -> None:
-    """Say which bodies turn too far in a step.
+def turn_sentence(name: str, speed: float, dt: float, most: float, how: str) -> str:
+    """Make a sentence about a body that turns too far in a step.
 
     Args:
-        lost: Which, [B, K]; at least one.
-        speed: Of rotation, [B, K] rad/s.
+        name: Name of the body.
+        speed: Speed of rotation [rad/s].
         dt: h [s].
         most: Largest turn in a step [rad].
-        how: When that holds.
-        names: Of the bodies.
-
-    Raises:
-        SimulationError: With all environments, and the first body.
+        how: Condition under which that limit applies.
     """
-    environments = lost.any(-1).nonzero()[:, 0].tolist()
+    enough = 0.99 * most / speed  # stays below the limit when rounded in the message
+    return (
+        f"{name} turns at {speed:.3g} rad/s, too fast for a time step of {dt:g} s: it {how} "
+        f"turn by {most:g} rad in a step; take a time step of at most {enough:.3g} s"
+    )
+
+
+def _refuse_turns(lost: Tensor, speed: Tensor, dt: float, names: Sequence[str]) -> None:
+    """Raise for bodies whose free turn has no solution, [B, K]; at least one must be true."""
     first, body = lost.nonzero()[0].tolist()
     name = f"body {names[body]!r}" if names else f"body {body}"
-    rate = float(speed[first, body])
-    enough = 0.99 * most / rate  # what rounding in the message leaves below the limit
-    raise SimulationError(
-        f"step: {name} turns at {rate:.3g} rad/s, too fast for a time step of {dt:g} s: it {how} "
-        f"turn by {most:g} rad in a step; take a time step of at most {enough:.3g} s",
-        environments=environments,
-    )
+    sentence = turn_sentence(name, float(speed[first, body]), dt, _MOST_TURN, "may")
+    environments = lost.any(-1).nonzero()[:, 0].tolist()
+    raise TurnedTooFar(f"step: {sentence}", environments=environments)
 
 
 def body_totals(poses: Tensor, velocities: Tensor, inertia: BodyInertia, gravity: Tensor) -> Totals:
     """Momentum and energy of all bodies.
 
     Args:
-        poses: Of the body frames, [B, K, 7].
-        velocities: Of the centers, then of rotation, in world axes; [B, K, 6].
-        inertia: What the bodies weigh.
+        poses: Poses of the body frames, [B, K, 7].
+        velocities: Velocities of the centers, then angular ones, in world axes; [B, K, 6].
+        inertia: Masses, centers and inertias of the bodies.
         gravity: [B or 1, 3] m/s^2.
     """
     frames = pose_frame(poses)
@@ -185,8 +184,8 @@ def advance_bodies(
     """Poses [B, K, 7] and velocities [B, K, 6] after a step.
 
     Args:
-        prediction: Of the step.
-        coordinates: At its end, [B, K, 6].
+        prediction: Prediction of the step.
+        coordinates: Coordinates at its end, [B, K, 6].
         kick: Forces at the centers and torques that change velocities only, [B, K, 6].
         dt: h [s].
     """

@@ -1,11 +1,11 @@
-"""What drives the joints, as quadratic terms of the sum that a step minimizes.
+"""The drives of the joints, as quadratic terms of the objective that a step minimizes.
 
 A joint under `pd` adds, with q_n its value at the start of the step of length h,
 
     1/2 kp (q - q_t)^2 + kd/(2h) (q - q_n - h qd_t)^2 + d/(2h) (q - q_n)^2,
 
-so that its drive acts at the end of the step: implicitly, and without a bound on the gains. Under
-`torque` only the last term, of the joint's own viscosity, is there.
+so its drive acts at the end of the step, implicitly and without a bound on the gains. Under
+`torque` there is only the last term, the joint's own viscosity.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ __all__ = ["Drives", "Gains", "fold"]
 
 
 class Gains(NamedTuple):
-    """Of each joint, [B or 1, J].
+    """Gains of each joint, [B or 1, J].
 
     Attributes:
         stiffness: kp [N m/rad or N/m].
         damping: kd [N m s/rad or N s/m].
-        viscosity: d of the joint itself, likewise.
+        viscosity: d of the joint itself, in the same unit.
     """
 
     stiffness: Tensor
@@ -35,7 +35,7 @@ class Gains(NamedTuple):
 
 
 class Drives(NamedTuple):
-    """Gains and targets, zero where the actuation does not use them; [B or 1, J].
+    """Gains and targets of each joint, zero if its actuation does not use them; [B or 1, J].
 
     Attributes:
         stiffness: As in `Gains`.
@@ -43,7 +43,7 @@ class Drives(NamedTuple):
         viscosity: Likewise.
         positions: q_t [rad or m].
         velocities: qd_t [rad/s or m/s].
-        efforts: Applied over the whole step as they are [N m or N].
+        efforts: Constant efforts over the whole step [N m or N].
     """
 
     stiffness: Tensor
@@ -62,15 +62,15 @@ class Drives(NamedTuple):
 def fold(
     drives: Drives, inertial: Tensor, predicted: Tensor, start: Tensor, dt: float, unknown: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Add drives and viscosity to 1/2 (q - q^)^T M/h^2 (q - q^); again 1/2 (q - t)^T A (q - t).
+    """Add drives and viscosity to 1/2 (q - q^)^T M/h^2 (q - q^), giving 1/2 (q - t)^T A (q - t).
 
     Args:
-        drives: Of the last J of n coordinates.
+        drives: Drives of the last J of n coordinates.
         inertial: M/h^2, shape [B, n, n].
         predicted: q^, shape [B, n].
         start: q_n of the joints, shape [B, J].
         dt: h [s].
-        unknown: Indices of the coordinates that are not prescribed; t is q^ in the others.
+        unknown: Indices of the coordinates that are not prescribed; t equals q^ for the others.
 
     Returns:
         A [B, n, n] and t [B, n].

@@ -1,9 +1,9 @@
-"""Bodies and robots of a scene over one step: before the core, and after it."""
+"""Bodies and robots of a scene over one step: before the core and after it."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -16,24 +16,22 @@ from diffcloth_torch.dynamics.bodies import (
     advance_bodies,
     body_totals,
     predict_bodies,
-    refuse_turns,
+    turn_sentence,
 )
-from diffcloth_torch.dynamics.chain import Chain, ChainControl, ChainPrediction, ChainState
 from diffcloth_torch.dynamics.drives import Gains
 from diffcloth_torch.dynamics.inertia import Inertia
+from diffcloth_torch.dynamics.robots import RobotControl, RobotDynamics, RobotPrediction, RobotState
 from diffcloth_torch.dynamics.totals import Totals
 from diffcloth_torch.geometry.rotation import (
     quaternion_exp,
-    quaternion_log,
     quaternion_multiply,
     rotate,
     row_velocities,
 )
-from diffcloth_torch.model.scene import Assembly
+from diffcloth_torch.model.assembly import Assembly
+from diffcloth_torch.model.quantities import Fields
 
-__all__ = ["Dynamics", "Fields", "Prediction"]
-
-Fields = Mapping[str, Tensor]
+__all__ = ["Dynamics", "Prediction"]
 
 _forked = False
 
@@ -49,23 +47,23 @@ if hasattr(os, "register_at_fork"):
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """A step without contact and limits: what the core starts from.
+    """A step without contact and limits, from which the core starts.
 
-    T trees: K bodies, then R robots. n coordinates: for each dynamic body its center of mass c [m]
-    and the rotation vector w about its predicted orientation; for each robot the same of a base
-    that floats, then its joints.
+    There are T mechanisms: K bodies, then R robots. There are n coordinates: for each dynamic body
+    the center of mass c [m] and the rotation vector w about its predicted orientation; for each
+    robot the same for a floating base, then the values of its joints.
 
     Attributes:
-        body_poses: Frames of the roots at the start of the step, [B, T, 7]. That of a free root
-            takes points to where they are predicted about the center of mass.
-        body_targets: Likewise at the end.
-        coordinates: At the start, [B, n].
-        coordinate_ends: At the end where they are prescribed, [B, n].
-        coordinate_targets: t of the term (q - t)^T A (q - t) / 2 that the step minimizes, [B, n].
-        coordinate_metric: A, row by row, tree after tree, [B, sum n_t^2].
-        bodies: Details of the dynamic bodies, None where there are none.
-        chains: Details of the robots.
-        held_poses: Poses of all bodies, dynamic ones as at the start, [B, K, 7].
+        body_poses: Frames of the roots at the start of the step, [B, T, 7]. The frame of a free
+            root maps points to their predicted positions about the center of mass.
+        body_targets: Frames of the roots at the end, likewise.
+        coordinates: Coordinates at the start, [B, n].
+        coordinate_ends: Coordinates at the end if they are prescribed, [B, n].
+        coordinate_targets: t of the term (q - t)^T A (q - t) / 2 of the objective, [B, n].
+        coordinate_metric: A, row by row, mechanism after mechanism, [B, sum n_t^2].
+        bodies: Details of the dynamic bodies, None if there are none.
+        robots: Details of the robots.
+        held_poses: Poses of all bodies, for dynamic ones those at the start, [B, K, 7].
         held_velocities: Velocities of kinematic bodies, zero elsewhere, [B, K, 6].
     """
 
@@ -76,7 +74,7 @@ class Prediction:
     coordinate_targets: Tensor
     coordinate_metric: Tensor
     bodies: BodyPrediction | None
-    chains: tuple[ChainPrediction, ...]
+    robots: tuple[RobotPrediction, ...]
     held_poses: Tensor
     held_velocities: Tensor
 
@@ -128,21 +126,21 @@ class Dynamics:
         self._body_of_vertex = row[self._on_free]
         self._body_points = vertices[self._on_free]
 
-        self._chains: list[Chain] = []
-        self._chain_rows: list[tuple[slice, slice, Tensor]] = []  # joints, links, vertices
-        self._widths = [6 * len(self._free)]  # of the parts of the coordinates
+        self._robots: list[RobotDynamics] = []
+        self._robot_rows: list[tuple[slice, slice, Tensor]] = []  # joints, links, vertices
+        self._widths = [6 * len(self._free)]  # lengths of the parts of the coordinates
         held = [torch.zeros(6 * len(self._free), dtype=torch.bool)]
         joints = links = 0
         for t in range(K, len(mechanisms)):
             mechanism = mechanisms[t]
             rows = torch.nonzero(owner == t)[:, 0]
-            chain = Chain(mechanism, dt, link[rows], vertices[rows])
+            robot = RobotDynamics(mechanism, dt, link[rows], vertices[rows])
             joint_rows = slice(joints, joints := joints + mechanism.joint_count)
             link_rows = slice(links, links := links + mechanism.link_count)
-            self._chains.append(chain)
-            self._chain_rows.append((joint_rows, link_rows, rows))
-            self._widths.append(chain.coordinate_count)
-            held.append(chain.prescribed)
+            self._robots.append(robot)
+            self._robot_rows.append((joint_rows, link_rows, rows))
+            self._widths.append(robot.coordinate_count)
+            held.append(robot.prescribed)
         self.prescribed = torch.cat(held)
         self.coordinate_count = len(self.prescribed)
 
@@ -153,18 +151,19 @@ class Dynamics:
         parameters: Fields,
         contact: Tensor | None = None,
     ) -> Prediction:
-        """Take the step without contact and limits.
+        """Predict the step without contact and limits.
 
         Args:
             state: Fields of a state, each with a leading axis B.
             control: Fields of a control, complete, each with a leading axis B or 1.
-            parameters: `gravity`, and masses, gains and so on where the scene has them; with
-                leading axes B or 1.
+            parameters: `gravity`, and the masses, gains and so on that the scene has; with leading
+                axes B or 1.
             contact: Forces on the vertices of bodies and links [N] that act over the step like
                 gravity, shape [B, V, 3].
         """
         if _forked and torch.get_num_threads() > 1:
-            # Threads of torch and MKL do not outlive a fork: an operation would wait for them.
+            # Threads of torch and MKL do not survive a fork: an operation would wait for them
+            # forever.
             torch.set_num_threads(1)
         batch = len(state["body_poses"])
         now = {name: values.expand(batch, *values.shape[1:]) for name, values in state.items()}
@@ -179,78 +178,89 @@ class Dynamics:
             held = end.index_copy(1, self._free, start[:, self._free])
             start = start.index_copy(1, self._free, bodies.frames)
             end = end.index_copy(1, self._free, bodies.frames)
-        chains = tuple(
-            self._predict_chain(i, now, acting, parameters, gravity, contact)
-            for i in range(len(self._chains))
+        robots = tuple(
+            self._predict_robot(i, now, acting, parameters, gravity, contact)
+            for i in range(len(self._robots))
         )
         none = start.new_zeros(batch, 0)
 
-        def rows(of_bodies: Tensor | None, of_chains: Iterable[Tensor]) -> Tensor:
+        def rows(of_bodies: Tensor | None, of_robots: Iterable[Tensor]) -> Tensor:
             first = none if of_bodies is None else of_bodies.flatten(1)
-            return torch.cat([first, *(t.flatten(1) for t in of_chains)], dim=1)
+            return torch.cat([first, *(t.flatten(1) for t in of_robots)], dim=1)
 
         b = bodies
         return Prediction(
-            body_poses=torch.cat([start, *(c.root_start[:, None] for c in chains)], dim=1),
-            body_targets=torch.cat([end, *(c.root_end[:, None] for c in chains)], dim=1),
-            coordinates=rows(b and b.coordinates, (c.coordinates for c in chains)),
-            coordinate_ends=rows(b and b.coordinates, (c.ends for c in chains)),
-            coordinate_targets=rows(b and b.target, (c.target for c in chains)),
-            coordinate_metric=rows(b and b.metric, (c.metric for c in chains)),
+            body_poses=torch.cat([start, *(c.root_start[:, None] for c in robots)], dim=1),
+            body_targets=torch.cat([end, *(c.root_end[:, None] for c in robots)], dim=1),
+            coordinates=rows(b and b.coordinates, (c.coordinates for c in robots)),
+            coordinate_ends=rows(b and b.coordinates, (c.ends for c in robots)),
+            coordinate_targets=rows(b and b.target, (c.target for c in robots)),
+            coordinate_metric=rows(b and b.metric, (c.metric for c in robots)),
             bodies=bodies,
-            chains=chains,
+            robots=robots,
             held_poses=held,
             held_velocities=velocities,
         )
 
     def end_at(self, prediction: Prediction, poses: Tensor) -> Prediction:
-        """The prediction of a step in which what is prescribed has ended at other poses.
+        """Change a prediction so that prescribed motion ends at other poses.
 
         Args:
-            prediction: Of the step.
-            poses: Of all roots at its end, [B, T, 7]; those of free ones do not count.
+            prediction: Prediction of the step.
+            poses: Poses of all roots at its end, [B, T, 7]; those of free roots are ignored.
         """
         moved, bodies = self._moved, prediction.held_poses.shape[1]
         start, end = prediction.body_poses[:, :bodies], poses[:, :bodies]
-        chains = zip(self._chains, prediction.chains, poses[:, bodies:].unbind(1), strict=True)
+        robots = zip(self._robots, prediction.robots, poses[:, bodies:].unbind(1), strict=True)
         return replace(
             prediction,
             held_poses=prediction.held_poses.index_copy(1, moved, end[:, moved]),
             held_velocities=row_velocities(start, end, moved, self.dt),
-            chains=tuple(chain.end_at(own, pose) for chain, own, pose in chains),
+            robots=tuple(robot.end_at(own, pose) for robot, own, pose in robots),
         )
 
-    def last_coordinates(self, prediction: Prediction, state: Fields) -> Tensor:
-        """Coordinates a step before the start, by the velocities there, [B, n].
+    def last_places(self, state: Fields, parameters: Fields) -> Fields:
+        """Positions of bodies and robots one step before the state, by the velocities in it.
 
-        Those that are prescribed are at the start.
+        Prescribed bodies, joints and bases keep their positions.
 
         Args:
-            prediction: Of the step.
             state: As for `predict`.
-        """
-        here = prediction.coordinates
-        own, *chains = torch.split(here, self._widths, dim=1)
-        last = []
-        if prediction.bodies is not None:
-            rates = state["body_velocities"][:, self._free]
-            root = self._moved_back(own.reshape(len(own), -1, 6), rates)
-            last.append(root.flatten(1))
-        for i, (chain, rows) in enumerate(zip(self._chains, chains, strict=True)):
-            joints = self._chain_rows[i][0]
-            count = joints.stop - joints.start
-            root, values = torch.split(rows, [chain.coordinate_count - count, count], dim=1)
-            if root.shape[1]:
-                root = self._moved_back(root, state["base_velocities"][:, i])
-            last += [root, values - self.dt * state["joint_velocities"][:, joints]]
-        return torch.where(self.prescribed, here, torch.cat([here[:, :0], *last], dim=1))
+            parameters: As for `predict`.
 
-    def _moved_back(self, roots: Tensor, velocities: Tensor) -> Tensor:
-        """Coordinates of free roots a step before, [.., 6]."""
+        Returns:
+            `body_poses`, `joint_positions` and `base_poses`.
+        """
+        poses, free = state["body_poses"], self._free
+        if len(free):
+            centers = self._body_inertia(parameters).center
+            rates = state["body_velocities"][:, free]
+            poses = poses.index_copy(1, free, self._last_pose(poses[:, free], centers, rates))
+        last = {"body_poses": poses}
+        if not self._robots:
+            return last
+        joints, bases = [state["joint_positions"][:, :0]], []
+        for i, robot in enumerate(self._robots):
+            rows, links, _ = self._robot_rows[i]
+            roots = robot.coordinate_count - (rows.stop - rows.start)
+            here = state["joint_positions"][:, rows]
+            before = here - self.dt * state["joint_velocities"][:, rows]
+            joints.append(torch.where(robot.prescribed[roots:], here, before))
+            base = state["base_poses"][:, i]
+            if roots:
+                center = parameters["link_center"][:, links][:, robot.root]
+                base = self._last_pose(base, center, state["base_velocities"][:, i])
+            bases.append(base[:, None])
+        return last | {"joint_positions": torch.cat(joints, 1), "base_poses": torch.cat(bases, 1)}
+
+    def _last_pose(self, poses: Tensor, centers: Tensor, velocities: Tensor) -> Tensor:
+        """Poses [.., 7] one step earlier, by velocities [.., 6]; centers are in local frames."""
         shift, turn = torch.split(self.dt * velocities, 3, dim=-1)
-        center, vector = torch.split(roots, 3, dim=-1)
-        back = quaternion_multiply(quaternion_exp(-turn), quaternion_exp(vector))
-        return torch.cat([center - shift, quaternion_log(back)], dim=-1)
+        here = torch.nn.functional.normalize(poses[..., 3:], dim=-1)
+        centers = centers.expand_as(here[..., :3])
+        last = quaternion_multiply(quaternion_exp(-turn), here)
+        middle = poses[..., :3] + rotate(here, centers) - shift
+        return torch.cat([middle - rotate(last, centers), last], dim=-1)
 
     def advance(
         self,
@@ -262,18 +272,16 @@ class Dynamics:
         """Fields of the state after the step.
 
         Args:
-            prediction: Of this step.
-            coordinates: At its end, as the core found them, [B, n].
-            contact: Forces on the vertices of bodies and links that it was solved with [N], shape
+            prediction: Prediction of this step.
+            coordinates: Coordinates at its end, as the core found them, [B, n].
+            contact: Forces on the vertices of bodies and links in its solution [N], shape
                 [B, V, 3].
-            kick: More forces on them, which change velocities only.
+            kick: Further forces on these vertices, which change velocities only.
 
         Returns:
             `body_poses`, `body_velocities`, `joint_positions`, `joint_velocities`, `joint_efforts`,
             `base_poses` and `base_velocities`.
 
-        Raises:
-            SimulationError: Where a dynamic body turns too far in a step that touches it.
         """
         poses, velocities = prediction.held_poses, prediction.held_velocities
         batch = len(poses)
@@ -281,21 +289,19 @@ class Dynamics:
         bodies = prediction.bodies
         if bodies is not None:
             own = parts[0].reshape(batch, -1, 6)
-            self._require_slow(bodies, contact)
             wrenches = None
             if kick is not None:
-                self._require_slow(bodies, kick)
                 turned = quaternion_multiply(quaternion_exp(own[..., 3:]), bodies.frames[..., 3:])
                 wrenches = self._wrenches(turned, bodies.inertia.center, kick)
             moved, rates = advance_bodies(bodies, own, wrenches, self.dt)
             poses = poses.index_copy(1, self._free, moved)
             velocities = velocities.index_copy(1, self._free, rates)
         states, efforts = [], []
-        for i, chain in enumerate(self._chains):
-            rows = self._chain_rows[i][2]
+        for i, robot in enumerate(self._robots):
+            rows = self._robot_rows[i][2]
             pushed = None if kick is None else kick[:, rows]
-            after, effort = chain.advance(
-                prediction.chains[i], parts[1 + i], contact[:, rows], pushed
+            after, effort = robot.advance(
+                prediction.robots[i], parts[1 + i], contact[:, rows], pushed
             )
             states.append(after)
             efforts.append(effort)
@@ -313,8 +319,41 @@ class Dynamics:
             ),
         }
 
+    def turned_too_far(
+        self, prediction: Prediction, after: Fields, forces: Tensor
+    ) -> dict[int, str]:
+        """Dynamic bodies that turn further in a step than contact resolves.
+
+        Args:
+            prediction: Prediction of the step.
+            after: Result of `advance`.
+            forces: Contact forces on the vertices of bodies and links, [B, V, 3] N.
+
+        Returns:
+            Environment -> a sentence with its first such body, the speed, and a sufficient time
+            step.
+        """
+        bodies = prediction.bodies
+        if bodies is None:
+            return {}
+        on_vertex = forces.detach()[:, self._on_free].abs().sum(-1)
+        touched = torch.zeros_like(bodies.speed).index_add(1, self._body_of_vertex, on_vertex) > 0
+        end = after["body_velocities"].detach()[:, self._free, 3:].norm(dim=-1)
+        speed = torch.maximum(bodies.speed, end)
+        lost = touched & ~(self.dt * speed <= MOST_TURN_IN_CONTACT)
+        how, found = "touches something and may", {}
+        for environment, body in reversed(lost.nonzero().tolist()):
+            found[environment] = turn_sentence(
+                f"body {self._free_names[body]!r}",
+                float(speed[environment, body]),
+                self.dt,
+                MOST_TURN_IN_CONTACT,
+                how,
+            )
+        return found
+
     def totals(self, state: Fields, parameters: Fields) -> Totals:
-        """Momentum and energy of what forces move, bodies and robots.
+        """Momentum and energy of dynamic bodies and robots.
 
         Args:
             state: Fields of a state, each with a leading axis B.
@@ -326,11 +365,11 @@ class Dynamics:
         if len(free):
             poses, velocities = state["body_poses"][:, free], state["body_velocities"][:, free]
             result = body_totals(poses, velocities, self._body_inertia(parameters), gravity)
-        for i, chain in enumerate(self._chains):
-            of_chain = chain.totals(
-                self._chain_state(i, state), self._chain_inertia(i, parameters), gravity
+        for i, robot in enumerate(self._robots):
+            of_robot = robot.totals(
+                self._robot_state(i, state), self._robot_inertia(i, parameters), gravity
             )
-            result = result.plus(of_chain)
+            result = result.plus(of_robot)
         return result
 
     def _body_inertia(self, parameters: Fields) -> BodyInertia:
@@ -341,8 +380,8 @@ class Dynamics:
             inertia=_symmetric(parameters["body_inertia"][:, free]),
         )
 
-    def _chain_inertia(self, i: int, parameters: Fields) -> Inertia:
-        joints, links, _ = self._chain_rows[i]
+    def _robot_inertia(self, i: int, parameters: Fields) -> Inertia:
+        joints, links, _ = self._robot_rows[i]
         return Inertia(
             mass=_rows(parameters, "link_mass", links),
             center=_rows(parameters, "link_center", links, 3),
@@ -350,9 +389,9 @@ class Dynamics:
             armature=_rows(parameters, "joint_armature", joints),
         )
 
-    def _chain_state(self, i: int, state: Fields) -> ChainState:
-        joints = self._chain_rows[i][0]
-        return ChainState(
+    def _robot_state(self, i: int, state: Fields) -> RobotState:
+        joints = self._robot_rows[i][0]
+        return RobotState(
             pose=state["base_poses"][:, i],
             velocity=state["base_velocities"][:, i],
             joints=state["joint_positions"][:, joints],
@@ -376,14 +415,11 @@ class Dynamics:
         if contact is not None:
             turned = torch.nn.functional.normalize(poses[..., 3:], dim=-1)
             wrenches = wrenches + self._wrenches(turned, inertia.center, contact)
-        prediction = predict_bodies(
+        return predict_bodies(
             poses, velocities, inertia, wrenches, gravity, self.dt, self._free_names
         )
-        if contact is not None:
-            self._require_slow(prediction, contact)
-        return prediction
 
-    def _predict_chain(
+    def _predict_robot(
         self,
         i: int,
         state: Fields,
@@ -391,39 +427,30 @@ class Dynamics:
         parameters: Fields,
         gravity: Tensor,
         contact: Tensor | None,
-    ) -> ChainPrediction:
-        joints, _, vertices = self._chain_rows[i]
+    ) -> RobotPrediction:
+        joints, _, vertices = self._robot_rows[i]
         gains = Gains(
             stiffness=_rows(parameters, "joint_stiffness", joints),
             damping=_rows(parameters, "joint_damping", joints),
             viscosity=_rows(parameters, "joint_viscosity", joints),
         )
-        return self._chains[i].predict(
-            self._chain_state(i, state),
-            ChainControl(
+        return self._robots[i].predict(
+            self._robot_state(i, state),
+            RobotControl(
                 pose=control["base_poses"][:, i],
                 wrench=control["base_wrenches"][:, i],
                 joints=control["joint_positions"][:, joints],
                 rates=control["joint_velocities"][:, joints],
                 efforts=control["joint_efforts"][:, joints],
             ),
-            self._chain_inertia(i, parameters),
+            self._robot_inertia(i, parameters),
             gains,
             gravity,
             None if contact is None else contact[:, vertices],
         )
 
-    def _require_slow(self, bodies: BodyPrediction, forces: Tensor) -> None:
-        """Refuse bodies that turn too far while forces act on their vertices [B, V, 3]."""
-        on_vertex = forces.detach()[:, self._on_free].abs().sum(-1)
-        touched = torch.zeros_like(bodies.speed).index_add(1, self._body_of_vertex, on_vertex) > 0
-        lost = touched & (self.dt * bodies.speed > MOST_TURN_IN_CONTACT)
-        if lost.any():
-            how = "touches something and may"
-            refuse_turns(lost, bodies.speed, self.dt, MOST_TURN_IN_CONTACT, how, self._free_names)
-
     def _wrenches(self, quaternions: Tensor, centers: Tensor, forces: Tensor) -> Tensor:
-        """Of forces on all vertices, about the centers of the dynamic bodies; [B, Kd, 6]."""
+        """Wrenches of forces on all vertices about the dynamic bodies' centers; [B, Kd, 6]."""
         body, own = self._body_of_vertex, forces[:, self._on_free]
         arms = (self._body_points - centers[:, body]).expand_as(own)
         arms = rotate(quaternions[:, body], arms)
@@ -436,7 +463,7 @@ def _indices(values: Iterable[int]) -> Tensor:
 
 
 def _rows(parameters: Fields, name: str, rows: slice, *shape: int) -> Tensor:
-    """Rows of a parameter; zeros where the scene has none because nothing of it is dynamic."""
+    """Rows of a parameter; zeros if the scene lacks it because nothing with it is dynamic."""
     if name in parameters:
         return parameters[name][:, rows]
     return torch.zeros(1, rows.stop - rows.start, *shape, dtype=torch.float64)

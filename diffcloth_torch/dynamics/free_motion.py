@@ -1,7 +1,7 @@
 """Velocities over a step without contact, found by the core.
 
-The core solves; what the equation is, and how its root depends on everything, stands in `chain`,
-which gives the root its derivative. Bodies turn by a series, which comes with its own.
+The equation of a robot is in `robots`, which gives the root its derivative. Bodies turn by a
+series, which has a derivative of its own.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def robot_motion(mechanism: Mechanism, solved: Tensor, dt: float) -> _core.FreeM
     """The equation of a robot.
 
     Args:
-        mechanism: Its links and joints.
+        mechanism: Links and joints of the robot.
         solved: Indices of the unknown velocities among nu.
         dt: h [s].
     """
@@ -43,7 +43,7 @@ def robot_motion(mechanism: Mechanism, solved: Tensor, dt: float) -> _core.FreeM
 
 
 def free_turns(inertia: Tensor, momentum: Tensor, dt: float) -> tuple[Tensor, Tensor]:
-    """How bodies by themselves turn over a step, by Euler's equations to rounding.
+    """Turns of free bodies over a step, by Euler's equations to rounding.
 
     There is no second derivative.
 
@@ -53,8 +53,8 @@ def free_turns(inertia: Tensor, momentum: Tensor, dt: float) -> tuple[Tensor, Te
         dt: h [s].
 
     Returns:
-        Quaternions of Q in R Q, in the bodies' axes, [B, K, 4]; and which bodies have a finite
-        speed that is no nonsense, [B, K].
+        Quaternions of Q in R Q, in the bodies' axes, [B, K, 4]; and which bodies have a finite and
+        plausible speed, [B, K].
     """
     shape = momentum.shape[:-1]
     given = torch.cat([inertia.expand(*shape, 3, 3).flatten(-2), momentum], dim=-1)
@@ -64,7 +64,7 @@ def free_turns(inertia: Tensor, momentum: Tensor, dt: float) -> tuple[Tensor, Te
     turns, rates, found = _core.free_turns(J, l, dt, with_rates)
     turn = torch.from_numpy(turns).reshape(*shape, 4)
     if with_rates:
-        # A change of zero, whose derivative is the core's.
+        # Adds zero, with the derivative from the core.
         turn = turn + times(torch.from_numpy(rates).reshape(*shape, 4, 12), given - numbers)
     return turn, torch.from_numpy(found).reshape(shape)
 
@@ -80,13 +80,13 @@ def solve_motion(
 
     Args:
         motion: The equation.
-        inertia: What links and joints weigh.
+        inertia: Masses and inertias of links and joints.
         start: Center of mass [B, 3] and orientation [B, 3, 3] of the root link, joints [B, J].
-        known: nu where it is prescribed, zero elsewhere; [B, 6 + J].
-        given: Shape [B, 6 + J].
+        known: nu if it is prescribed, zero elsewhere; [B, 6 + J].
+        given: Right side of the equation, shape [B, 6 + J].
 
     Returns:
-        The unknown velocities [B, n], and which environments have found theirs [B].
+        The unknown velocities [B, n], and which environments have converged [B].
     """
     values = (np.ascontiguousarray(t.detach().numpy()) for t in (*inertia, *start, known, given))
     velocities, found = motion.solve(*values)

@@ -16,25 +16,25 @@ Residual = Callable[..., Tensor]
 
 
 def attach_root(residual: Residual, root: Tensor, inputs: Sequence[Tensor]) -> Tensor:
-    """Give a root its first derivative with respect to what r depends on.
+    """Give a root its first derivative with respect to the inputs of r.
 
-    Along du the root moves by dx = -K^-1 (dr/du) du with K = dr/dx, and so does -K^-1 r with a
-    constant K, however the root was found. There is no second derivative.
+    Along du the root moves by dx = -K^-1 (dr/du) du with K = dr/dx. So does -K^-1 r with a constant
+    K, however the root was found. There is no second derivative.
 
     Args:
-        residual: r(x, *inputs), [..., n] -> [..., n] for any leading axes of x; no environment sees
-            another.
+        residual: r(x, *inputs), [..., n] -> [..., n] for any leading axes of x; environments are
+            independent.
         root: x without a graph, shape [..., n].
-        inputs: All that r depends on; the root has a graph where one of them has.
+        inputs: All inputs of r; the root has a graph if one of them has.
 
     Returns:
-        The root, to the same bits, with a graph where r has one.
+        The root, to the same bits, with a graph if r has one.
     """
     if not (torch.is_grad_enabled() and any(u.requires_grad for u in inputs)):
         return root
     value = residual(root, *inputs)
-    # Nothing behind these numbers: a search of the whole graph of a rollout, in each of its steps,
-    # would make its cost quadratic.
+    # Detached: searching the whole graph of a rollout in each of its steps would make its cost
+    # quadratic.
     numbers = [u.detach() for u in inputs]
     with torch.no_grad():
         K = jacobian_of(residual)(root, *numbers)
@@ -45,12 +45,14 @@ def attach_root(residual: Residual, root: Tensor, inputs: Sequence[Tensor]) -> T
 def jacobian_of(residual: Residual) -> Residual:
     """Function that gives dr/dx, [..., row, column], from the arguments of r(x, *inputs).
 
-    It has no graph, and inputs must have none: n copies of x each give one row, in one backward.
+    Neither the result nor the inputs have a graph: n copies of x each give one row, in one
+    backward.
     """
 
     def jacobian(x: Tensor, *inputs: Tensor) -> Tensor:
         n = x.shape[-1]
-        # What this saves is used at once; hooks of a checkpoint would repeat its steps for it.
+        # Tensors saved here are used at once; hooks of a checkpoint would repeat its steps for
+        # them.
         with torch.enable_grad(), saved_tensors_hooks(_same, _same):
             copies = x.detach().expand(n, *x.shape).clone().requires_grad_()
             rows = residual(copies, *inputs).diagonal(dim1=0, dim2=-1).sum()

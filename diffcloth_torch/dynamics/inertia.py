@@ -6,9 +6,9 @@ and inertia in world axes W_l = diag(m 1, R I R^T):
     M = sum_l J_l^T W_l J_l,   p = M nu = sum_l J_l^T h_l,   h_l = W_l V_l.
 
 Let joint j turn about the axis z through the point o, and let F and N be the momentum and the
-angular momentum about o of all links that hang on it. Then p_j = z . N (z . F where it slides), and
-since a turn of the joint carries all of these with it, but not what it hangs on, the kinetic energy
-T = p . nu / 2 grows with its value at constant rates by
+angular momentum about o of all links that it carries. Then p_j = z . N (z . F if it slides). A turn
+of the joint moves all links that it carries and no others, so the kinetic energy T = p . nu / 2
+grows with its value, at constant rates, by
 
     dT/dq_j = dz/dt . N + z . (F x do/dt),   dz/dt = omega x z      (dz/dt . F where it slides).
 
@@ -23,7 +23,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffcloth_torch.dynamics.kinematics import Frames, Tree
+from diffcloth_torch.dynamics.jacobians import DifferentialKinematics, Frames
 from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.dynamics.totals import about_origin
 from diffcloth_torch.geometry.products import product
@@ -41,13 +41,13 @@ __all__ = [
 
 
 class Inertia(NamedTuple):
-    """What the links and joints weigh.
+    """Masses and inertias of links and joints.
 
     Attributes:
-        mass: [B or 1, L] kg.
-        center: In the links' frames, [B or 1, L, 3] m.
-        inertia: About the centers, in the links' axes, [B or 1, L, 3, 3] kg m^2.
-        armature: Inertia of the joints' drives, [B or 1, J] kg m^2, or kg where they slide.
+        mass: Masses of the links, [B or 1, L] kg.
+        center: Centers of mass in the links' frames, [B or 1, L, 3] m.
+        inertia: Inertias about the centers, in the links' axes, [B or 1, L, 3, 3] kg m^2.
+        armature: Inertia of the joints' drives, [B or 1, J] kg m^2, or kg for sliding joints.
     """
 
     mass: Tensor
@@ -60,7 +60,7 @@ class Motion(NamedTuple):
     """Links in a configuration, ready for any velocity.
 
     Attributes:
-        frames: Where they are.
+        frames: Frames of the links.
         jacobian: J_l, shape [B, L, 6, 6 + J].
         weighted: W_l J_l, likewise.
     """
@@ -70,10 +70,12 @@ class Motion(NamedTuple):
     weighted: Tensor
 
     @staticmethod
-    def at(tree: Tree, inertia: Inertia, root: Tensor, joints: Tensor) -> Motion:
+    def at(
+        kinematics: DifferentialKinematics, inertia: Inertia, root: Tensor, joints: Tensor
+    ) -> Motion:
         """Place the links; `root` is the frame [B, 4, 4] of the root link, `joints` [B, J]."""
-        frames = tree.frames(root, joints, inertia.center)
-        jacobian = tree.jacobian(frames)
+        frames = kinematics.frames(root, joints, inertia.center)
+        jacobian = kinematics.jacobian(frames)
         rotation = frames.poses[..., :3, :3]
         linear = inertia.mass[..., None, None] * jacobian[..., :3, :]
         local = product(inertia.inertia, product(rotation.transpose(-1, -2), jacobian[..., 3:, :]))
@@ -98,12 +100,12 @@ def momentum(motion: Motion, inertia: Inertia, velocity: Tensor) -> Tensor:
     return generalized_force(motion, of_links) + _at_joints(inertia.armature) * velocity
 
 
-def slope(tree: Tree, motion: Motion, velocity: Tensor) -> Tensor:
+def slope(kinematics: DifferentialKinematics, motion: Motion, velocity: Tensor) -> Tensor:
     """dT/dq of the kinetic energy at constant velocities nu [B, 6 + J], likewise.
 
     Args:
-        tree: The mechanism.
-        motion: Its links.
+        kinematics: The mechanism.
+        motion: Configuration of its links.
         velocity: nu.
     """
     frames = motion.frames
@@ -111,17 +113,17 @@ def slope(tree: Tree, motion: Motion, velocity: Tensor) -> Tensor:
     momenta = link_momenta(motion, velocity)
     linear = momenta[..., :3]
     carried = about_origin(frames.centers, momenta)
-    # Of all that hangs on each joint, first about the origin, then about the pivot.
-    F, N = torch.split(product(tree.hanging, carried), 3, dim=-1)
+    # Of all links that each joint carries, first about the origin, then about the pivot.
+    F, N = torch.split(product(kinematics.hanging, carried), 3, dim=-1)
     N = N - torch.linalg.cross(frames.pivots, F)
-    rate, omega = torch.split(twists[..., tree.moving, :], 3, dim=-1)
-    arms = frames.pivots - frames.centers[..., tree.moving, :]
+    rate, omega = torch.split(twists[..., kinematics.moving, :], 3, dim=-1)
+    arms = frames.pivots - frames.centers[..., kinematics.moving, :]
     pivot_rate = rate + torch.linalg.cross(omega, arms)
     axis_rate = torch.linalg.cross(omega, frames.axes)
     turning = (axis_rate * N + frames.axes * torch.linalg.cross(F, pivot_rate)).sum(-1)
     sliding = (axis_rate * F).sum(-1)
-    rows = torch.lerp(sliding, turning, tree.revolute[:, 0]).unsqueeze(-2)
-    joints = product(rows, tree.leaders)[..., 0, :]
+    rows = torch.lerp(sliding, turning, kinematics.revolute[:, 0]).unsqueeze(-2)
+    joints = product(rows, kinematics.leaders)[..., 0, :]
     root_rate = velocity[..., :3]
     root = torch.linalg.cross(linear.sum(-2), root_rate)
     return torch.cat([torch.zeros_like(root_rate), root, joints], dim=-1)
@@ -137,13 +139,13 @@ def wrenches_of_forces(frames: Frames, links: Tensor, points: Tensor, forces: Te
     """Force and torque about the center of each link, from forces at points on them.
 
     Args:
-        frames: The links.
-        links: Of which link each point is, shape [V].
-        points: In the frames of their links [m], shape [V, 3].
-        forces: In the world [N], shape [B, V, 3].
+        frames: Frames of the links.
+        links: Index of each point's link, shape [V].
+        points: Points in the frames of their links [m], shape [V, 3].
+        forces: Forces in world axes [N], shape [B, V, 3].
 
     Returns:
-        Shape [B, L, 6], N and N m.
+        Wrenches in N and N m, shape [B, L, 6].
     """
     poses = frames.poses[..., links, :, :]
     placed = times(poses[..., :3, :3], points) + poses[..., :3, 3]
@@ -154,5 +156,5 @@ def wrenches_of_forces(frames: Frames, links: Tensor, points: Tensor, forces: Te
 
 
 def _at_joints(values: Tensor) -> Tensor:
-    """Zeros for the root before values [B, J] of the joints."""
+    """Put zeros for the root before values [B, J] of the joints."""
     return torch.nn.functional.pad(values, (6, 0))

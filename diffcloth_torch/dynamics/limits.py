@@ -1,4 +1,4 @@
-"""How stiff the barriers at the limits of joints are."""
+"""Stiffness of the barriers at the limits of joints."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import torch
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.inertia import Inertia, Motion, mass_matrix
-from diffcloth_torch.dynamics.kinematics import ROOT, Tree
+from diffcloth_torch.dynamics.jacobians import ROOT, DifferentialKinematics
+from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.mechanism import Mechanism
-from diffcloth_torch.model.scene import Assembly
 
 __all__ = ["ZONE", "limit_stiffness"]
 
@@ -28,9 +28,9 @@ def limit_stiffness(assembly: Assembly, dt: float, gravity: FloatArray) -> Float
 
         k = M_jj / h^2 + 30 Q_j / w
 
-    a limit is felt like the joint's own inertia, and its weight, a generalized force Q_j at most,
-    brings it to a tenth of the zone. M and Q are those of the scene at its start, where gravity may
-    point anywhere.
+    a limit is about as stiff as the joint's own inertia, and the joint's weight, a generalized
+    force of at most Q_j, pushes it a tenth of the zone beyond the limit. M and Q are those of the
+    scene at its start, for any direction of gravity.
 
     Args:
         assembly: Arrays of the scene.
@@ -38,7 +38,7 @@ def limit_stiffness(assembly: Assembly, dt: float, gravity: FloatArray) -> Float
         gravity: [3] m/s^2.
 
     Returns:
-        k [N m/rad^2 or N/m], shape [n]; zero where there is no limit to keep.
+        k [N m/rad^2 or N/m], shape [n]; zero for coordinates without a limit to keep.
     """
     parts = [np.empty(0)]
     first = 0
@@ -59,11 +59,11 @@ def _of_joints(
     limited = np.isfinite(width) & mechanism.forced
     if not limited.any():
         return np.zeros(mechanism.joint_count)
-    tree = Tree(mechanism)
+    kinematics = DifferentialKinematics(mechanism)
     arrays = (mechanism.mass, mechanism.center, mechanism.inertia, armature)
     inertia = Inertia(*(torch.from_numpy(np.array(a))[None] for a in arrays))
     joints = torch.from_numpy(np.array(start))[None]
-    motion = Motion.at(tree, inertia, torch.eye(4, dtype=torch.float64)[None], joints)
+    motion = Motion.at(kinematics, inertia, torch.eye(4, dtype=torch.float64)[None], joints)
     mass = mass_matrix(motion, inertia)[0].diagonal()[ROOT:].numpy()
     pull = motion.weighted[0, :, :3, ROOT:].norm(dim=1).sum(0).numpy()  # m |dc/dq| of all links
     stiffness = mass / dt**2

@@ -12,7 +12,8 @@ __all__ = ["inverse", "solve", "times"]
 def inverse(matrices: Tensor) -> Tensor:
     """M^-1 without a graph, from M [.., n, n].
 
-    NumPy takes matrix after matrix; torch shares a few among threads, which do not outlive a fork.
+    NumPy inverts one matrix after the other; torch distributes a few among threads, which do not
+    survive a fork.
     """
     inverses: Tensor = torch.from_numpy(np.linalg.inv(matrices.detach().numpy()))
     return inverses
@@ -21,7 +22,7 @@ def inverse(matrices: Tensor) -> Tensor:
 def solve(matrices: Tensor, vectors: Tensor) -> Tensor:
     """The x with M x = v, from M [.., n, n] and v [.., n]; it has a first derivative.
 
-    That is dx = M^-1 (dv - dM x), and so is that of -M^-1 (M x - v) with a constant M^-1.
+    The derivative is dx = M^-1 (dv - dM x), which -M^-1 (M x - v) with a constant M^-1 also has.
     """
     numbers = matrices.detach().numpy(), vectors.detach().numpy()[..., None]
     x: Tensor = torch.from_numpy(np.linalg.solve(*numbers)[..., 0])
@@ -34,6 +35,6 @@ def solve(matrices: Tensor, vectors: Tensor) -> Tensor:
 def times(matrices: Tensor, vectors: Tensor) -> Tensor:
     """M v, [.., m], from M [.., m, n] and v [.., n].
 
-    As a sum half as dear as a product of small matrices, which is mostly preparation.
+    A sum costs half as much as a product of small matrices, which is mostly preparation.
     """
     return (matrices * vectors.unsqueeze(-2)).sum(-1)

@@ -11,12 +11,12 @@ __all__ = ["Totals", "about_origin", "ordered_sum"]
 
 
 class Totals(NamedTuple):
-    """Of each environment.
+    """Totals of each environment.
 
     Attributes:
-        momentum: Linear, then angular about the origin of the world [kg m/s, kg m^2/s], [B, 6].
-        kinetic_energy: [B] J.
-        gravity_energy: Of weights, zero at the origin of the world, [B] J.
+        momentum: Linear momentum, then angular about the world's origin [kg m/s, kg m^2/s], [B, 6].
+        kinetic_energy: Kinetic energy, [B] J.
+        gravity_energy: Energy of weights, zero at the origin of the world, [B] J.
     """
 
     momentum: Tensor
@@ -32,7 +32,7 @@ class Totals(NamedTuple):
         Args:
             centers: [B, n, 3] m.
             momenta: Linear, then angular about the centers, [B, n, 6].
-            kinetic_energy: Of all, [B] J.
+            kinetic_energy: Kinetic energy of all, [B] J.
             masses: [B or 1, n] kg.
             gravity: [B or 1, 3] m/s^2.
         """
@@ -45,19 +45,19 @@ class Totals(NamedTuple):
 
     @staticmethod
     def zero(environments: int) -> Totals:
-        """Where nothing moves."""
+        """Make the totals of a scene in which nothing moves."""
         zeros = torch.zeros(environments, 6, dtype=torch.float64)
         return Totals(zeros, zeros[:, 0], zeros[:, 0])
 
     def plus(self, other: Totals) -> Totals:
-        """Of both."""
+        """Add other totals."""
         return Totals(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 def ordered_sum(values: Tensor) -> Tensor:
     """Sum over the last axis, one number after the other.
 
-    `sum` would round by how many environments and threads there are.
+    With `sum`, rounding would depend on the number of environments and threads.
     """
     return values.cumsum(-1)[..., -1]
 

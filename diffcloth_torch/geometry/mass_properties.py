@@ -1,4 +1,4 @@
-"""Volume, center and inertia of a closed mesh, and what an inertia must satisfy."""
+"""Volume, center and inertia of a closed mesh, and the conditions on an inertia."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SMALLEST_MOMENT = 1e-12
 
 
 def is_closed(faces: IndexArray) -> bool:
-    """Whether each edge is run through as often in one direction as in the other."""
+    """Whether faces traverse each edge equally often in both directions."""
     a, b = faces[:, [0, 1, 2]].reshape(-1), faces[:, [1, 2, 0]].reshape(-1)
     edges, inverse = np.unique(
         np.stack([np.minimum(a, b), np.maximum(a, b)], axis=-1), axis=0, return_inverse=True
@@ -30,7 +30,7 @@ def is_closed(faces: IndexArray) -> bool:
 def mass_properties(
     vertices: FloatArray, faces: IndexArray
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Integrate over the inside of a closed mesh, exactly but for rounding.
+    """Integrate over the inside of a closed mesh, exactly except for rounding.
 
     With the tetrahedra of an apex and the corners a, b, c of each face, D = det(a, b, c), s = a + b
     + c and all points relative to the apex:
@@ -41,7 +41,8 @@ def mass_properties(
 
     Args:
         vertices: Positions [m], shape [n, 3].
-        faces: Triangles of a closed mesh, shape [f, 3]. Where they face inward all is negative.
+        faces: Triangles of a closed mesh, shape [f, 3]. If they point inward, all
+            results are negative.
 
     Returns:
         Volume [m^3], its center [m], shape [3], and the inertia about that for a density of one
@@ -63,7 +64,7 @@ def mass_properties(
 
 
 def check_inertia(name: str, inertia: FloatArray) -> FloatArray:
-    """Require a symmetric inertia [3, 3] that some body has; returns its symmetric part.
+    """Require a symmetric inertia [3, 3] that a body can have; returns its symmetric part.
 
     Its principal moments are positive, and none is larger than the sum of the others.
     """

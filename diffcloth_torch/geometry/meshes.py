@@ -1,8 +1,8 @@
-"""Triangle meshes from and to files, with the order of vertices and faces kept.
+"""Reading and writing of triangle meshes; the order of vertices and faces is kept.
 
-OBJ and PLY have readers of our own: common loaders triangulate polygons, reorder faces and drop
-unreferenced vertices without a word, after which a pin index means another vertex. STL holds no
-indices; its corners are merged where they are equal to the last bit.
+OBJ and PLY have readers of our own: common loaders silently triangulate polygons, reorder faces and
+drop unreferenced vertices, so that a pin index refers to another vertex. STL files have no
+indices; corners that agree to the last bit are merged.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ def read_mesh(path: str | Path) -> tuple[FloatArray, Indices]:
     """Read vertices [n, 3] and triangles [f, 3] of an .obj, .ply or .stl file.
 
     Raises:
-        InvalidInput: If the file is empty, malformed, of another format, larger than 1 GiB, no
-            regular file, or has numbers that are not finite or other polygons than triangles. The
-            message names the line, the vertex or the face.
-        TypeError: If the path is none.
+        InvalidInput: If the file is empty, malformed, of another format, larger than 1 GiB or not a
+            regular file, or if it has numbers that are not finite or polygons other than triangles.
+            The message names the line, the vertex or the face.
+        TypeError: If `path` is not a path.
         OSError: If the file cannot be read.
     """
     path = as_path("mesh file: `path`", path)

@@ -1,7 +1,7 @@
-"""PLY files: a reader that keeps every vertex in its place and refuses polygons, and a writer.
+"""PLY files: a reader that keeps the order of vertices and refuses polygons, and a writer.
 
-Readers of others that a package under this license can stand on triangulate polygons, round indices
-that are no integers, or wait for the end of a header that never comes.
+Existing readers with a compatible license triangulate polygons, round indices that are not
+integers, or hang on a header without an end.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ def read_ply(path: Path, data: bytes) -> tuple[FloatArray, NDArray[np.int64]]:
     """Read vertices [n, 3] and triangles [f, 3] of an ASCII or binary PLY file.
 
     Args:
-        path: Opens the messages.
-        data: What the file holds.
+        path: File, for messages.
+        data: Content of the file.
 
     Raises:
-        InvalidInput: If the file is malformed, has other polygons than triangles, or an index that
-            is none of a vertex.
+        InvalidInput: If the file is malformed, or has polygons other than triangles or an index of
+            no vertex.
     """
     order, elements, body = _read_header(path, data)
     vertices = np.empty((0, 3))

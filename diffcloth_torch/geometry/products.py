@@ -16,9 +16,9 @@ _MOST_NUMBERS = 2**15 - 1
 def product(a: Tensor, b: Tensor) -> Tensor:
     """A B, [.., m, n], from A [.., m, k] and B [.., k, n] with as many leading axes, or none.
 
-    `matmul` would start threads, and round by how many matrices there are, how they lie in memory
-    and whether one requires a gradient. Here each number is a sum of its own, and no operation is
-    large.
+    `matmul` would start threads, and its rounding depends on the number of matrices, on their
+    memory layout and on whether one requires a gradient. Here each number is a sum of its own, and
+    no operation is large.
     """
     shape = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
     rows = math.prod(a.shape[-2:]) * b.shape[-1] * math.prod(shape[1:])

@@ -1,6 +1,7 @@
 """Rotations as quaternions (w, x, y, z), and poses [px, py, pz, qw, qx, qy, qz], in torch.
 
-A rotation vector w turns by |w| radians about w / |w|. Everything is differentiable, at zero too.
+A rotation vector w rotates by |w| radians about w / |w|. All functions are differentiable,
+even at zero.
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ def quaternion_multiply(a: Tensor, b: Tensor) -> Tensor:
 
 
 def rotate(quaternion: Tensor, points: Tensor) -> Tensor:
-    """Turn points [..., 3] by unit quaternions [..., 4]."""
+    """Rotate points [..., 3] by unit quaternions [..., 4]."""
     w, v = quaternion[..., :1], quaternion[..., 1:]
     v = v.expand_as(points)
     twice = 2 * torch.linalg.cross(v, points)
@@ -136,11 +137,11 @@ def integrate_poses(pose: Tensor, twists: Tensor, dt: float) -> Tensor:
 
 
 def pose_velocities(start: Tensor, end: Tensor, dt: float) -> Tensor:
-    """Constant velocities that lead from poses to others, as `integrate_poses` does.
+    """Constant velocities that lead from poses to others by `integrate_poses`.
 
     Args:
         start: Poses with quaternions of any length, shape [..., 7].
-        end: Poses that are turned by less than pi from them, likewise.
+        end: Poses, rotated by less than pi relative to `start`; shape [..., 7].
         dt: Time between them [s].
 
     Returns:
@@ -156,11 +157,11 @@ def pose_velocities(start: Tensor, end: Tensor, dt: float) -> Tensor:
 
 
 def row_velocities(start: Tensor, end: Tensor, rows: Tensor, dt: float) -> Tensor:
-    """Velocities of some rows of poses, zero in the others: see `pose_velocities`.
+    """Velocities of some rows of poses, zero for the others: see `pose_velocities`.
 
     Args:
         start: Poses, shape [B, K, 7].
-        end: Likewise; either may have one environment for all.
+        end: Poses, shape [B, K, 7]; `start` or `end` may have one environment for all.
         rows: Indices of the rows that move.
         dt: Time between them [s].
 
@@ -175,12 +176,12 @@ def row_velocities(start: Tensor, end: Tensor, rows: Tensor, dt: float) -> Tenso
 
 
 def interpolate_poses(times: Tensor, poses: Tensor, at: Tensor) -> Tensor:
-    """Poses between keyframes: straight paths, turns about one axis at constant speed.
+    """Poses between keyframes: straight paths, rotations about one axis at constant speed.
 
     Args:
         times: Increasing times of the keyframes [s], shape [k].
         poses: Their poses, shape [k, 7].
-        at: Times [s], shape [n]; before the first and after the last keyframe the pose is theirs.
+        at: Times [s], shape [n]; before the first and after the last keyframe, their pose.
 
     Returns:
         Poses, shape [n, 7].
@@ -213,8 +214,8 @@ def rotation_exp(rotation_vector: Tensor) -> Tensor:
 def torque_from_moment(rotation_vector: Tensor, moment: Tensor) -> Tensor:
     """Torque that does the work of a generalized force on a rotation vector.
 
-    Where R = exp(w) R_0 changes by dw, it turns in the world by J(w) dw, J the left Jacobian of the
-    exponential. A force Q with the work Q . dw is thus the torque
+    Where w changes by dw, R = exp(w) R_0 rotates in the world by J(w) dw, with the left Jacobian J
+    of the exponential. A force Q with the work Q . dw is thus the torque
 
         J(w)^-T Q = Q + w x Q / 2 + b w x (w x Q),    b = (1 - (a/2) cot(a/2)) / a^2,  a = |w|.
 
@@ -239,6 +240,6 @@ def torque_from_moment(rotation_vector: Tensor, moment: Tensor) -> Tensor:
 
 
 def nearer_quaternion(quaternion: Tensor, other: Tensor) -> Tensor:
-    """Of q and -q, one rotation, the one nearer to `other`; shapes [..., 4]."""
+    """Return q or -q, which are one rotation: the one nearer to `other`; shapes [..., 4]."""
     opposite = (quaternion * other).sum(-1, keepdim=True) < 0
     return torch.where(opposite, -quaternion, quaternion)

@@ -86,7 +86,7 @@ def _cut_box(
 
 
 def sphere(radius: float, subdivisions: int) -> Mesh:
-    """Icosahedron whose faces are split in four `subdivisions` times; vertices on the sphere."""
+    """Icosahedron whose faces are split into four `subdivisions` times; vertices on the sphere."""
     golden = (1 + 5**0.5) / 2
     points = [
         vertex
@@ -144,8 +144,8 @@ def cylinder(radius: float, length: float, rings: int = _CYLINDER_RINGS, rows: i
         radius: Radius [m].
         length: Length [m].
         rings: Rings on each end, around its center; six times as many segments on its rim.
-        rows: Of quadrilaterals along its side; 0 makes them no longer than the radius, but not more
-            than 32 of them.
+        rows: Rows of quadrilaterals along its side; 0 makes them no longer than the radius, with at
+            most 32 rows.
     """
     rows = rows or int(np.ceil(min(length / radius, _CYLINDER_ROWS)))
     disk, disk_faces = _disk(rings)

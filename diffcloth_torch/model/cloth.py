@@ -26,9 +26,9 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry import shapes
+from diffcloth_torch.geometry.mesh_checks import check_areas, check_manifold, surface_arrays
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import pose_array, transform
-from diffcloth_torch.geometry.surfaces import check_areas, check_manifold, surface_arrays
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.quantities import FACE_QUANTITIES, check_parameter
 
@@ -51,7 +51,7 @@ class Cloth:
         pins: Name -> indices of vertices whose motion is prescribed.
         soft_pins: Name -> indices of vertices that springs pull to targets.
         pin_stiffness: Stiffness of each of these springs [N/m].
-        rest_vertices: Positions in which the cloth is free of stress [m], shape [n, 3].
+        rest_positions: Where the cloth is free of stress [m], shape [n, 3].
         bending_model: "patch" (six-point patches, isotropic on any mesh) or "hinge".
         name: Name in the scene; None lets the scene choose one.
     """
@@ -62,7 +62,7 @@ class Cloth:
     pins: Mapping[str, IndexArray]
     soft_pins: Mapping[str, IndexArray]
     pin_stiffness: float
-    rest_vertices: FloatArray
+    rest_positions: FloatArray
     bending_model: str
     name: str | None
 
@@ -75,9 +75,10 @@ class Cloth:
         pins: Mapping[str, object] | None = None,
         soft_pins: Mapping[str, object] | None = None,
         pin_stiffness: float = 1e4,
-        rest_vertices: object = None,
+        rest_positions: object = None,
         bending_model: str = "patch",
         name: str | None = None,
+        rest_vertices: object = None,
     ) -> None:
         """Check and copy the arguments.
 
@@ -88,18 +89,19 @@ class Cloth:
             pins: Name -> indices of vertices whose motion is prescribed.
             soft_pins: Name -> indices of vertices that springs pull to targets.
             pin_stiffness: Stiffness of each of these springs [N/m], > 0.
-            rest_vertices: Stress-free positions [m], shape [n, 3]; `vertices` by default.
+            rest_positions: Stress-free positions [m], shape [n, 3]; `vertices` by default.
             bending_model: "patch" or "hinge".
             name: Name in the scene.
+            rest_vertices: Earlier name of `rest_positions`; give one of them.
 
         Raises:
             InvalidInput: If a shape, an index or a value is not accepted.
-            TypeError: If something has a wrong type.
+            TypeError: If an argument has a wrong type.
         """
         points, triangles = surface_arrays("Cloth", vertices, faces, instead=_POSITIONS)
         check_manifold("Cloth", len(points), triangles)
         self.vertices, self.faces = points, triangles
-        self.rest_vertices = _rest(rest_vertices, points, triangles)
+        self.rest_positions = _rest(rest_positions, rest_vertices, points, triangles)
         self.material = _material(material, len(triangles))
         self.pins, self.soft_pins = _pin_groups(pins, soft_pins, len(points))
         self.pin_stiffness = check_parameter("Cloth", "pin_stiffness", pin_stiffness)
@@ -115,8 +117,8 @@ class Cloth:
         Args:
             path: Mesh file of triangles.
             scale: Meters per unit of the file, > 0.
-            pose: Where to put it: [px, py, pz, qw, qx, qy, qz]; as in the file by default.
-            **keywords: As for `Cloth`; `rest_vertices` is in meters, `scale` and `pose` do not
+            pose: Pose [px, py, pz, qw, qx, qy, qz]; as in the file by default.
+            **keywords: As for `Cloth`; `rest_positions` is in meters, `scale` and `pose` do not
                 apply to it.
         """
         vertices, faces = read_mesh(path)
@@ -136,13 +138,13 @@ class Cloth:
         """Make a rectangular sheet in the xy-plane, centered at the origin.
 
         Vertex `row * columns + column` lies at x = (column / (columns - 1) - 1/2) * size[0] and
-        y = (row / (rows - 1) - 1/2) * size[1]. The faces look up.
+        y = (row / (rows - 1) - 1/2) * size[1]. The faces point up.
 
         Args:
             rows: Vertices along y, >= 2.
             columns: Vertices along x, >= 2.
             size: Lengths along x and y [m], or one length for both.
-            pose: Where to put it: [px, py, pz, qw, qx, qy, qz].
+            pose: Pose [px, py, pz, qw, qx, qy, qz]; the identity by default.
             **keywords: As for `Cloth`.
         """
         rows = check_count("Cloth.grid: `rows`", rows, 2)
@@ -168,8 +170,14 @@ class Cloth:
             return cls(vertices, faces, **keywords)
         placed = transform(vertices, pose_array(f"{owner}: `pose`", pose, instead=_POSITIONS))
         # The rest shape does not depend on the pose, and unrotated coordinates are exact.
-        keywords.setdefault("rest_vertices", vertices)
+        if keywords.get("rest_positions") is None and keywords.get("rest_vertices") is None:
+            keywords = {**keywords, "rest_positions": vertices}
         return cls(placed, faces, **keywords)
+
+    @property
+    def rest_vertices(self) -> FloatArray:
+        """Earlier name of `rest_positions`."""
+        return self.rest_positions
 
     def __repr__(self) -> str:
         name = "" if self.name is None else f"{self.name!r}, "
@@ -181,7 +189,8 @@ class Cloth:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         for name, value in state.items():
-            setattr(self, name, value)
+            # Pickles of earlier versions have that name.
+            setattr(self, "rest_positions" if name == "rest_vertices" else name, value)
         self.pins, self.soft_pins = MappingProxyType(self.pins), MappingProxyType(self.soft_pins)
 
 
@@ -193,13 +202,21 @@ def plane_size(name: str, size: object) -> FloatArray:
     return np.broadcast_to(lengths, 2)
 
 
-def _rest(rest_vertices: object, vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    if rest_vertices is None:
+def _rest(given: object, earlier: object, vertices: FloatArray, faces: IndexArray) -> FloatArray:
+    """Check the rest shape, under the name by which it was given."""
+    if given is not None and earlier is not None:
+        raise InvalidInput(
+            "Cloth: `rest_vertices` must be None beside `rest_positions`, of which it is the "
+            "earlier name"
+        )
+    name = "rest_positions" if earlier is None else "rest_vertices"
+    positions = given if earlier is None else earlier
+    if positions is None:
         return vertices
-    rest = float_array("Cloth: `rest_vertices`", rest_vertices, instead=_REST)
-    check_shape("Cloth: `rest_vertices`", rest.shape, [vertices.shape])
-    check_finite("Cloth: `rest_vertices`", rest)
-    check_areas("Cloth", "rest_vertices", rest, faces)
+    rest = float_array(f"Cloth: `{name}`", positions, instead=_REST)
+    check_shape(f"Cloth: `{name}`", rest.shape, [vertices.shape])
+    check_finite(f"Cloth: `{name}`", rest)
+    check_areas("Cloth", name, rest, faces)
     frozen(rest)
     return rest
 

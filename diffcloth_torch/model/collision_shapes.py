@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from diffcloth_torch.checks import FloatArray, check_finite
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry import shapes
+from diffcloth_torch.geometry.mesh_checks import Surface, surface_arrays
 from diffcloth_torch.geometry.meshes import read_mesh
-from diffcloth_torch.geometry.surfaces import Surface, surface_arrays
 from diffcloth_torch.model.urdf import Link, Shape
 
 __all__ = ["find_mesh", "link_surface"]
 
-# Triangles of a box, cylinder or sphere beyond which an edge length is taken for a mistake.
+# An edge length that gives a box, cylinder or sphere more triangles is taken for a mistake.
 _MOST_FACES = 200_000
 
 _DEFAULT_SUBDIVISIONS = 3  # of a sphere, as for `RigidBody.sphere`
@@ -28,13 +28,13 @@ _DETACHED = "pass a detached tensor"
 def link_surface(
     link: Link, file: Path, mesh_root: Path, edge_length: float | None
 ) -> Surface | None:
-    """Surface of all collision shapes of a link in its frame, or None where it has none.
+    """Surface of all collision shapes of a link in its frame, or None without shapes.
 
     Args:
         link: The link.
-        file: URDF file that it stands in.
-        mesh_root: Folder outside of which no mesh file is read.
-        edge_length: Longest edge of boxes, cylinders and spheres [m]; None leaves it to the shape.
+        file: URDF file of the link.
+        mesh_root: Folder that mesh files must lie in.
+        edge_length: Longest edge of boxes, cylinders and spheres [m]; None lets the shape choose.
     """
     if not link.shapes:
         return None
@@ -108,14 +108,14 @@ def _longest_edge(vertices: FloatArray, faces: NDArray[np.int64]) -> float:
 def find_mesh(owner: str, filename: str, file: Path, mesh_root: Path) -> Path:
     """Path of a mesh file that a URDF file names.
 
-    "package://name/x" means x or name/x in `mesh_root`; another path is relative to the file's
-    folder. Symbolic links are followed before it is judged whether the path stays inside.
+    "package://name/x" means x or name/x in `mesh_root`; any other path is relative to the file's
+    folder. Symbolic links are resolved before the path is checked to lie in `mesh_root`.
 
     Args:
         owner: Opens the message.
         filename: As written in the file.
         file: URDF file that names it.
-        mesh_root: Folder outside of which no mesh file is read.
+        mesh_root: Folder that mesh files must lie in.
 
     Raises:
         InvalidInput: If there is no such file in `mesh_root`.

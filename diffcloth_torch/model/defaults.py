@@ -1,4 +1,4 @@
-"""Values of the parameters that a scene and its options give."""
+"""Default values of the parameters, from a scene and its options."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.geometry.surfaces import unique_edges
+from diffcloth_torch.geometry.mesh_checks import unique_edges
+from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.materials import Material
-from diffcloth_torch.model.options import ContactOptions
+from diffcloth_torch.model.options import ABILITIES, ContactOptions
 from diffcloth_torch.model.quantities import FACE_QUANTITIES
 from diffcloth_torch.model.rigid_body import RigidBody
-from diffcloth_torch.model.scene import Assembly, Scene
+from diffcloth_torch.model.scene import Scene
 
 __all__ = [
     "check_barrier",
@@ -23,7 +24,7 @@ __all__ = [
     "scene_parameters",
 ]
 
-# The barrier distance, as parts of the median cloth edge and of the smallest distance between
+# The barrier distance, as fractions of the median cloth edge and of the smallest distance between
 # elements of the rest mesh that are not neighbors. Beyond one half of the latter, the surface would
 # repel itself at rest.
 _PART_OF_EDGE = 0.1
@@ -38,7 +39,7 @@ def has_contact(scene: Scene, contact: ContactOptions) -> bool:
 
 def has_barrier(scene: Scene, contact: ContactOptions, scheme: str) -> bool:
     """Whether the barrier keeps any two surfaces of the scene apart."""
-    if scheme == "projective":
+    if not ABILITIES[scheme]["barrier"]:
         return False
     nodal = sum(body.nodal_contact for body in scene.bodies)
     if len(scene.surface_names) - nodal > 1 or (contact.self_contact and len(scene.cloths) > 0):
@@ -47,7 +48,7 @@ def has_barrier(scene: Scene, contact: ContactOptions, scheme: str) -> bool:
 
 
 def scene_parameters(scene: Scene, assembly: Assembly, contact: bool) -> dict[str, Tensor]:
-    """All parameters that the scene has but those of the barrier, as small as they can be written.
+    """All parameters of the scene except those of the barrier, each in its smallest shape.
 
     Args:
         scene: The scene.
@@ -59,13 +60,15 @@ def scene_parameters(scene: Scene, assembly: Assembly, contact: bool) -> dict[st
         values = {field: _material_values(scene, field) for field in FACE_QUANTITIES}
         if all(cloth.bending_model == "hinge" for cloth in scene.cloths):
             del values["poisson"]  # hinges have no Poisson effect
-        values["rest_positions"] = assembly.rest_vertices
+        values["rest_positions"] = assembly.rest_positions
     if contact:
         friction = _surface_values(scene, "friction")
         values["friction"] = np.sqrt(friction[:, None] * friction)
         values["thickness"] = _surface_values(scene, "thickness")
     if len(assembly.soft_pins):
         values["pin_stiffness"] = _shortest([cloth.pin_stiffness for cloth in scene.cloths])
+    if len(assembly.springs):
+        values["attachment_stiffness"] = assembly.springs.stiffness
     values["gravity"] = scene.gravity
     values |= _rigid_values(assembly)
     return {name: torch.from_numpy(np.array(value)) for name, value in values.items()}
@@ -82,7 +85,7 @@ def _surface_values(scene: Scene, field: str) -> FloatArray:
 
 
 def _rigid_values(assembly: Assembly) -> dict[str, FloatArray]:
-    """Masses of bodies and links and properties of joints; rows of what is not dynamic are zero."""
+    """Masses of bodies and links, and properties of joints; zero unless dynamic."""
     bodies = assembly.mechanisms[: assembly.body_count]
     robots = assembly.mechanisms[assembly.body_count :]
     values: dict[str, FloatArray] = {}
@@ -101,7 +104,7 @@ def _rigid_values(assembly: Assembly) -> dict[str, FloatArray]:
 
 
 def _material_values(scene: Scene, field: str) -> FloatArray:
-    """One value where all cloths agree, one per cloth where each has one, else one per face."""
+    """One value if all cloths agree, one per cloth if each is uniform, else one per face."""
     values = [getattr(cloth.material, field) for cloth in scene.cloths]
     if all(isinstance(value, float) for value in values):
         return _shortest(values)
@@ -117,13 +120,13 @@ def _shortest(values: list[float]) -> FloatArray:
 def choose_barrier_distance(
     scene: Scene, nonadjacent_distance: float, contact: ContactOptions
 ) -> float:
-    """Barrier distance from the cloths alone, so that a far body changes nothing [m]."""
+    """Barrier distance [m] from the cloths alone, so that a distant body does not change it."""
     if not scene.cloths:
         raise InvalidInput(
             "Simulator: `contact.barrier_distance` must be given for a scene without cloths"
         )
     edges = [
-        np.linalg.norm(np.diff(cloth.rest_vertices[unique_edges(cloth.faces)[0]], axis=1), axis=-1)
+        np.linalg.norm(np.diff(cloth.rest_positions[unique_edges(cloth.faces)[0]], axis=1), axis=-1)
         for cloth in scene.cloths
     ]
     distance = _PART_OF_EDGE * float(np.median(np.concatenate(edges)))

@@ -19,8 +19,7 @@ __all__ = ["Kinematics", "constant", "joined_frame", "link_frames", "pose_frame"
 class Kinematics:
     """The constants of a mechanism that its links' frames depend on, as tensors.
 
-    A joint turns about an axis of unit length that is a constant: with K the matrix of its cross
-    product,
+    A joint turns about a constant axis of unit length. With K the matrix of its cross product,
 
         R = 1 + sin(a) K + (1 - cos(a)) K^2
 
@@ -29,8 +28,8 @@ class Kinematics:
 
     def __init__(self, mechanism: Mechanism) -> None:
         moving = np.flatnonzero(mechanism.dof >= 0)
-        # A first axis for the environments: a product of all of them at once would round by how
-        # many there are.
+        # A first axis for the environments: rounding in one product of all of them would depend on
+        # their number.
         leaders = np.zeros((1, mechanism.joint_count, mechanism.link_count))
         leaders[0, mechanism.dof[moving], moving] = mechanism.multiplier[moving]
         turns = np.array([kind == "revolute" for kind in mechanism.kind])[:, None]

@@ -1,4 +1,4 @@
-"""What a cloth is made of."""
+"""The material of a cloth."""
 
 from __future__ import annotations
 

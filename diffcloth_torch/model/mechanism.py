@@ -1,4 +1,4 @@
-"""A tree of rigid links: what a robot, or a single rigid body, is to dynamics and to the core."""
+"""A tree of rigid links: how the dynamics and the core see a robot or a single rigid body."""
 
 from __future__ import annotations
 
@@ -27,27 +27,29 @@ class Mechanism:
 
         T_l = T_p offset_l motion(axis_l, multiplier_l q[dof_l] + constant_l),
 
-    where motion turns about, or shifts along, the axis. Links are in the order of the file, parents
-    not necessarily first. Arrays are not marked read-only: torch takes no views of such.
+    where motion turns about the axis or shifts along it. Links are in the order of the file, in
+    which a parent may follow its children. Arrays are not marked read-only, because torch takes no
+    views of read-only arrays.
 
     Attributes:
-        name: Of the robot or body.
+        name: Name of the robot or body.
         base: "fixed", "kinematic" (the root link moves on prescribed poses), or "floating".
         link_names: Names of the L links.
         parent: Index of each link's parent, -1 for the root; shape [L].
-        kind: Joint to the parent: "fixed" (the root's too), "revolute" or "prismatic"; length L.
+        kind: Kind of each link's joint to its parent: "fixed" (also for the root), "revolute" or
+            "prismatic"; length L.
         offset: Frame of that joint in the parent's frame, shape [L, 4, 4].
-        axis: Unit axis in the joint's frame, zero where it is fixed; shape [L, 3].
-        dof: Which of the J joints moves it, -1 where it is fixed; shape [L].
-        multiplier: Of that joint's value, 1 where it does not mimic; shape [L].
-        constant: Added to it [rad or m], shape [L].
+        axis: Unit axis in the joint's frame, zero for a fixed joint; shape [L, 3].
+        dof: Index of the one of the J joints that moves each link, -1 for a fixed joint; shape [L].
+        multiplier: Factor of that joint's value, 1 unless the link's joint mimics; shape [L].
+        constant: Offset added to it [rad or m], shape [L].
         joint_names: Names of the J joints that move and do not mimic, in the order of the file.
-        lower: Lower limits [rad or m], -infinity where there are none; shape [J].
+        lower: Lower limits of the joints [rad or m], -infinity without one; shape [J].
         upper: Upper limits, likewise.
         actuation: "position", "velocity", "torque" or "pd" of each joint; length J.
-        mass: Of each link [kg], shape [L].
+        mass: Mass of each link [kg], shape [L].
         center: Centers of mass in the links' frames [m], shape [L, 3].
-        inertia: About the centers, in the links' axes [kg m^2], shape [L, 3, 3].
+        inertia: Inertia about the centers, in the links' axes [kg m^2], shape [L, 3, 3].
     """
 
     name: str
@@ -80,7 +82,7 @@ class Mechanism:
 
     @property
     def forced(self) -> NDArray[np.bool_]:
-        """Which joints forces move; the motion of the others is prescribed. Shape [J]."""
+        """Which joints are moved by forces, shape [J]; the motion of the others is prescribed."""
         return np.array([mode in FORCED for mode in self.actuation], dtype=bool)
 
     @property
@@ -98,7 +100,7 @@ class Mechanism:
 
     @property
     def rigid_group(self) -> IndexArray:
-        """Of each link, the first link (nearest to the root) that fixed joints join it to; [L]."""
+        """For each link, the link nearest to the root that fixed joints connect it to; [L]."""
         group = np.arange(self.link_count, dtype=np.int32)
         for link in self.order[1:]:
             if self.kind[link] == "fixed":
@@ -107,9 +109,9 @@ class Mechanism:
 
     @property
     def adjacent_links(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of names of links that are rigidly joined, or joined by a single moving joint."""
+        """Pairs of names of links connected by fixed joints and at most one moving joint."""
         group = self.rigid_group
-        # Of each group, that which its first link hangs on.
+        # For each group, the one that carries its first link.
         above = np.where(self.parent[group] >= 0, group[self.parent[group]], -1)
         return tuple(
             (self.link_names[a], self.link_names[b])
@@ -119,5 +121,5 @@ class Mechanism:
 
     @property
     def is_dynamic(self) -> bool:
-        """Whether anything here moves by forces."""
+        """Whether the root or any joint is moved by forces."""
         return self.base == "floating" or bool(self.forced.any())

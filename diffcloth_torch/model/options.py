@@ -1,30 +1,42 @@
-"""How a simulator treats contact and how far it solves."""
+"""Options of contact and of the solver."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from diffcloth_torch import _core
 from diffcloth_torch.checks import POSITIVE, check_bool, check_choice, check_count, check_number
 from diffcloth_torch.model.quantities import check_parameter
 
-__all__ = ["COUPLINGS", "ELASTIC_SOLVERS", "METRICS", "SCHEMES", "ContactOptions", "SolverOptions"]
+__all__ = [
+    "ABILITIES",
+    "COUPLINGS",
+    "ELASTIC_SOLVERS",
+    "METRICS",
+    "SCHEMES",
+    "ContactOptions",
+    "SolverOptions",
+]
 
-SCHEMES = ("coupled", "split", "projective")
-METRICS = ("energy", "elastic", "mass", "identity")
-ELASTIC_SOLVERS = ("newton", "projective")
+ABILITIES = _core.schemes
+"""What each scheme is able to; the default is first."""
+SCHEMES = tuple(ABILITIES)
+METRICS = tuple(_core.metrics)
+ELASTIC_SOLVERS = tuple(_core.elastic_solvers)
 COUPLINGS = ("monolithic", "rigid_to_cloth", "cloth_to_rigid")
+"""How cloths and what forces move act on each other: together, or in turn."""
 
 
 @dataclass(frozen=True, eq=False)
 class ContactOptions:
-    """Contact and friction.
+    """Options of contact and friction.
 
     Attributes:
-        barrier_distance: Gap below which surfaces repel each other [m], > 0; None chooses it from
+        barrier_distance: Gap below which surfaces repel each other [m], > 0; None derives it from
             the cloths when the simulator is made.
-        barrier_stiffness: Stiffness of the barrier of all pairs of surfaces [Pa], > 0; None chooses
-            each pair's from its cloths and from what is heavy of the two.
-        friction_iterations: Solves per step in which the friction force is updated, >= 1.
+        barrier_stiffness: Stiffness of the barrier of all pairs of surfaces [Pa], > 0; None derives
+            a value for each pair from its cloths and from its free bodies.
+        friction_iterations: Solves per step, each with updated friction forces, >= 1.
         slip_velocity: Velocity at which sticking turns into sliding [m/s], > 0.
         self_contact: Whether a cloth collides with itself.
     """
@@ -32,7 +44,7 @@ class ContactOptions:
     barrier_distance: float | None = None
     barrier_stiffness: float | None = None
     friction_iterations: int = 2
-    slip_velocity: float = 1e-3
+    slip_velocity: float = 1e-4
     self_contact: bool = True
 
     def __post_init__(self) -> None:
@@ -51,24 +63,26 @@ class ContactOptions:
 
 @dataclass(frozen=True, eq=False)
 class SolverOptions:
-    """How far a step is solved, and by what.
+    """Tolerance, limits and methods of the solver.
 
     Attributes:
         tolerance: Largest step with the exact Hessian that counts as converged, as a velocity
-            [m/s], > 0. Of Projective Dynamics the largest change of velocity that the residual
-            force gives a vertex in a time step.
-        max_iterations: Newton iterations that a step may take over all its solves, >= 1. Common are
-            5 to 40; single steps of a sheet that whips take some hundreds. Projective Dynamics may
-            take 50 times as many of its own, which cost about as much less.
-        throw: Whether a step that fails in any environment raises `NotConverged` or
-            `InfeasibleMotion`. Otherwise `report.status` says which failed, and their state is the
-            last feasible iterate: bodies, joints and pins are where the motion ended (in staggered
-            couplings, where it began). Backward raises the error where a loss depends on them.
-        metric: What "nearest" means in the contact stage of the scheme "split": "energy" (inertia
-            and elasticity, as they are), or a norm: "elastic" (the masses plus h^2 times the
-            constant matrix of Projective Dynamics), "mass", or "identity" (the paper's Eq. 22).
-            None means "energy" for "split"; the others have no choice.
-        elastic: What solves the elastic stage of the schemes "split" and "projective": "newton", or
+            [m/s], > 0. For Projective Dynamics: largest change of velocity that the residual force
+            gives a vertex in a time step.
+        max_iterations: Largest number of Newton iterations in a step, over all its solves, >= 1.
+            Between 5 and 40 is common; single steps of a sheet that whips take some hundreds.
+            Projective Dynamics may take 50 times as many iterations, which are cheaper by about the
+            same factor.
+        throw: Whether a step that fails in any environment raises `NotConverged`,
+            `InfeasibleMotion` or `TurnedTooFar`. Otherwise `report.status` says which environments
+            failed. Their state is the last feasible iterate: bodies, joints and pins are where the
+            motion ended (in staggered couplings, where it began). Backward raises the error if a
+            loss depends on them.
+        metric: Definition of "nearest" in the contact stage of the scheme "split": "energy" (the
+            energy of inertia and elasticity), or a norm: "elastic" (the mass matrix plus h^2 times
+            the constant matrix of Projective Dynamics), "mass", or "identity" (the paper's Eq. 22).
+            None means "energy" for "split". Other schemes accept only None.
+        elastic: Method for the elastic stage of the schemes "split" and "projective": "newton", or
             "projective", the local/global iterations of Projective Dynamics. Both find the same
             positions.
     """

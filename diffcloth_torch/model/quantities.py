@@ -1,13 +1,14 @@
-"""The quantities that a step takes and returns, each said once: axes, unit, accepted range, source.
+"""The quantities that a step takes and returns, defined once: axes, unit, range and source.
 
-Checks, the shapes of what the core gets, configurations and tests read these tables. Axes are
-numbers, or letters that stand for a size of the scene:
+Checks, shapes of the core's inputs, configurations and tests read these tables. Axes are numbers,
+or letters for the sizes of a scene:
 
     N cloth vertices, F faces, C cloths, K bodies, R robots, L links of all robots, J joints that
     move and do not mimic, V vertices of bodies and links, S surfaces: cloths, bodies, links that
-    have a shape; P pinned vertices, Q softly pinned ones.
+    have a shape; P pinned vertices, Q softly pinned ones; A springs of attachments, U of them to
+    targets.
 
-A leading axis of environments is never written.
+The leading axis of environments is left out.
 """
 
 from __future__ import annotations
@@ -16,7 +17,17 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-from diffcloth_torch.checks import ANY_NUMBER, NON_NEGATIVE, POISSON, POSITIVE, Range, check_number
+from torch import Tensor
+
+from diffcloth_torch.checks import (
+    ANY_NUMBER,
+    NON_NEGATIVE,
+    POISSON,
+    POSITIVE,
+    UNIT_INTERVAL,
+    Range,
+    check_number,
+)
 
 __all__ = [
     "CONTROL",
@@ -25,6 +36,7 @@ __all__ = [
     "PARAMETERS",
     "STATE",
     "Axes",
+    "Fields",
     "Quantity",
     "Shape",
     "check_parameter",
@@ -33,20 +45,23 @@ __all__ = [
 
 Axes = tuple[int | str, ...]
 Shape = tuple[int, ...]
+Fields = dict[str, Tensor]
+"""Values of these by name, with a leading axis of environments."""
 
 
 class Quantity(NamedTuple):
     """A field of `State`, `Control` or `Parameters`.
 
     Attributes:
-        name: Of the field.
+        name: Name of the field.
         unit: Its unit.
         axes: Accepted axes, from the fewest to the most.
         source: What it is where it is not set: that field of a class, "hold" (what the state before
-            the step has), "zero", or the "result" of a step.
+            the step has), "zero", the "result" of a step, or "released" (targets that are not set
+            do not pull).
         accepted: Accepted values.
-        core: Name of the core's input that it becomes; None where it becomes none of its own.
-        ignored: Whether a step does not look at it.
+        core: Name of the core's input that it becomes; None if it has no input of its own.
+        ignored: Whether a step ignores it.
     """
 
     name: str
@@ -59,7 +74,7 @@ class Quantity(NamedTuple):
 
     @property
     def row_shape(self) -> Shape:
-        """Shape of one row of the input that a parameter becomes; what is left are rows."""
+        """Shape of one row of the input that a parameter becomes; its other axes count rows."""
         return tuple(n for n in self.axes[-1][1:] if isinstance(n, int))
 
 
@@ -88,6 +103,8 @@ STATE = _table(
     Quantity("joint_efforts", "N m or N", _JOINTS, "result", ignored=True),
     Quantity("base_poses", _POSES, (("R", 7),), "result"),
     Quantity("base_velocities", _TWIST, (("R", 6),), "result"),
+    Quantity("contact_forces", "N", (("N", 3),), "result", ignored=True),
+    Quantity("pin_forces", "N", (("P", 3),), "result", ignored=True),
 )
 CONTROL = _table(
     Quantity("pins", "m", (("P", 3),), "hold", core="pin_targets"),
@@ -100,6 +117,10 @@ CONTROL = _table(
     Quantity("joint_efforts", "N m or N", _JOINTS, "zero"),
     Quantity("base_poses", _POSES, (("R", 7),), "hold"),
     Quantity("base_wrenches", _WRENCH, (("R", 6),), "zero"),
+    Quantity("attachments", "m", (("U", 3),), "released", core="attachment_targets"),
+    Quantity(
+        "attachment_weights", "-", (("A",),), "released", UNIT_INTERVAL, core="attachment_weights"
+    ),
 )
 _TAKEN_BY_THE_CORE = (
     Quantity("stretch", "N/m", _PER_FACE, "Material.stretch", POSITIVE),
@@ -114,7 +135,8 @@ _TAKEN_BY_THE_CORE = (
     Quantity("slip_velocity", "m/s", _ONE, "ContactOptions.slip_velocity", POSITIVE),
     Quantity("pin_stiffness", "N/m", ((), ("C",)), "Cloth.pin_stiffness", POSITIVE),
     Quantity("gravity", "m/s^2", ((3,),), "Scene.gravity"),
-    Quantity("rest_positions", "m", (("N", 3),), "Cloth.rest_vertices"),
+    Quantity("rest_positions", "m", (("N", 3),), "Cloth.rest_positions"),
+    Quantity("attachment_stiffness", "N/m", (("A",),), "Attachment.stiffness", POSITIVE),
 )
 PARAMETERS = _table(
     *(quantity._replace(core=quantity.name) for quantity in _TAKEN_BY_THE_CORE),
@@ -134,7 +156,7 @@ DERIVED = (
     "coordinate_ends",
     "coordinate_targets",
     "coordinate_metric",
-    "coordinate_origins",
+    "friction_origins",
 )
 """Inputs of the core that follow from several fields: what drives the coordinates of bodies."""
 FACE_QUANTITIES = tuple(name for name, quantity in PARAMETERS.items() if quantity.axes == _PER_FACE)
@@ -142,11 +164,11 @@ FACE_QUANTITIES = tuple(name for name, quantity in PARAMETERS.items() if quantit
 
 
 def shape_of(axes: Axes, sizes: Mapping[str, int]) -> Shape:
-    """Axes with the sizes of a scene in place of letters."""
+    """Replace the letters of axes by the sizes of a scene."""
     return tuple(n if isinstance(n, int) else sizes[n] for n in axes)
 
 
 def check_parameter(owner: str, name: str, value: object) -> float:
-    """Check the number that an owner's field gives to the parameter of the same name."""
+    """Check the number of an owner's field against the parameter of the same name."""
     instead = f"differentiate with respect to Parameters.{name}"
     return check_number(f"{owner}: `{name}`", value, PARAMETERS[name].accepted, instead=instead)

@@ -1,4 +1,4 @@
-"""A rigid body: a triangle mesh that stands still, moves on prescribed poses, or by forces."""
+"""A rigid body: a triangle mesh that is static, follows prescribed poses, or responds to forces."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry import shapes
 from diffcloth_torch.geometry.mass_properties import check_inertia, is_closed, mass_properties
+from diffcloth_torch.geometry.mesh_checks import surface_arrays
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import pose_array
-from diffcloth_torch.geometry.surfaces import surface_arrays
 from diffcloth_torch.model.cloth import plane_size
 from diffcloth_torch.model.quantities import check_parameter
 
@@ -54,8 +54,8 @@ class Primitive(NamedTuple):
 
     Attributes:
         kind: "plane" (z = 0, the solid below), "sphere", "capsule" (along z) or "box".
-        size: Nothing; radius; radius and half length of the cylinder; half lengths [m]. Filled up
-            with zeros.
+        size: In the order of the kinds: nothing; the radius; the radius, and half the length of the
+            cylinder; half the lengths [m]. Padded with zeros.
     """
 
     kind: str
@@ -68,16 +68,16 @@ class RigidBody:
     Attributes:
         vertices: Positions in the body frame [m], shape [v, 3].
         faces: Vertex indices, shape [g, 3].
-        motion: "static", "kinematic" (moves on prescribed poses) or "dynamic" (moves by forces).
+        motion: "static", "kinematic" (follows prescribed poses) or "dynamic" (responds to forces).
         pose: Initial pose [px, py, pz, qw, qx, qy, qz], shape [7].
         friction: Friction coefficient of the surface [-].
         thickness: Full thickness of the surface in contact [m].
-        mass: Mass [kg]; it, center and inertia are zero where the body is not dynamic.
+        mass: Mass [kg]. Mass, center and inertia are zero unless the body is dynamic.
         center: Center of mass in the body frame [m], shape [3].
-        inertia: About the center, in body axes [kg m^2], shape [3, 3].
-        nodal_contact: Whether cloths touch the body at their vertices, by dry friction, instead of
-            through the barrier.
-        primitive: What the mesh stands for; None of one that was given or is a cylinder.
+        inertia: Inertia about the center, in body axes [kg m^2], shape [3, 3].
+        nodal_contact: Whether cloths touch the body at their vertices, with dry friction, instead
+            of through the barrier.
+        primitive: Analytic surface of the body; None for a given mesh and for a cylinder.
         name: Name in the scene; None lets the scene choose one.
     """
 
@@ -113,34 +113,35 @@ class RigidBody:
     ) -> None:
         """Check and copy the arguments.
 
-        A dynamic body has exactly one of `density` and `mass`. Where its mesh is closed, it is
-        filled evenly: that gives `center` and `inertia` unless they are given.
+        A dynamic body needs exactly one of `density` and `mass`. A closed mesh is filled uniformly;
+        this determines `center` and `inertia`, unless they are given.
 
         Args:
             vertices: Positions in the body frame [m], shape [v, 3].
-            faces: Vertex indices of triangles, shape [g, 3]; those of a closed mesh that gives
-                mass properties face outward.
+            faces: Vertex indices of triangles, shape [g, 3]. Faces of a closed mesh must point
+                outward if it determines mass properties.
             motion: "static", "kinematic" or "dynamic".
             pose: Initial pose [px, py, pz, qw, qx, qy, qz]; the identity by default.
             friction: Friction coefficient [-], >= 0.
             thickness: Full thickness [m], >= 0.
-            density: Of a dynamic body with a closed mesh [kg/m^3], > 0.
-            mass: Of a dynamic body [kg], > 0.
+            density: Density of a dynamic body with a closed mesh [kg/m^3], > 0.
+            mass: Mass of a dynamic body [kg], > 0.
             center: Center of mass in the body frame [m], shape [3].
-            inertia: About the center, in body axes [kg m^2], shape [3, 3]; symmetric, positive
-                definite, no principal moment above the sum of the others. It does not follow from
-                a `center` that is given: it is then still that of the evenly filled mesh.
-            nodal_contact: Whether cloths touch the body at their vertices, by dry friction without
-                smoothing, instead of through the barrier: for bodies made by `box`, `sphere`,
-                `capsule` or `plane` that are not dynamic. Cloths may then cut through it between
-                their vertices. Scheme "projective" treats all bodies so.
+            inertia: Inertia about the center, in body axes [kg m^2], shape [3, 3]; symmetric,
+                positive definite, no principal moment above the sum of the others. The default is
+                that of the uniformly filled mesh, even if `center` is given.
+            nodal_contact: Whether cloths touch the body at their vertices, with dry friction
+                without smoothing, instead of through the barrier. Only for bodies made by `box`,
+                `sphere`, `capsule` or `plane` that are not dynamic. Cloths may then cut through
+                the body between their vertices. The scheme "projective" treats all bodies like
+                this.
             name: Name in the scene.
 
         Raises:
-            InvalidInput: If a shape, an index or a value is not accepted, or if a dynamic body
-                lacks what its open mesh cannot give, or if `nodal_contact` is asked of a mesh
-                or of a dynamic body.
-            TypeError: If something has a wrong type.
+            InvalidInput: If a shape, an index or a value is not accepted; if a dynamic body with an
+                open mesh lacks mass properties; or if `nodal_contact` is set for a given mesh
+                or a dynamic body.
+            TypeError: If an argument has a wrong type.
         """
         self.vertices, self.faces = surface_arrays("RigidBody", vertices, faces, instead=_POSES)
         self.motion = check_choice("RigidBody: `motion`", motion, MOTIONS)
@@ -264,7 +265,7 @@ class RigidBody:
 
         Args:
             radius: Radius of the sphere [m], > 0.
-            subdivisions: Times that each triangle is split in four, 0 .. 8; 3 gives 1280 triangles.
+            subdivisions: Times that each triangle is split into four, 0 .. 8; 3 gives 1280 faces.
             **keywords: As for `RigidBody`.
         """
         length = check_number("RigidBody.sphere: `radius`", radius, POSITIVE, instead=_POSES)
@@ -305,7 +306,7 @@ class RigidBody:
     def plane(cls, size: object, **keywords: Any) -> RigidBody:
         """Make a rectangle of two triangles at z = 0 that faces up, centered at the origin.
 
-        In contact at nodes the plane is infinite, and what is below it is inside.
+        In contact at nodes the plane is infinite, and everything below it is inside.
 
         Args:
             size: Lengths along x and y [m], or one length for both.

@@ -1,10 +1,11 @@
-"""A robot: its mechanism, the surfaces of its links, and how its joints are driven."""
+"""A robot: its mechanism, the surfaces of its links, and the drives of its joints."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -28,8 +29,14 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.errors import IgnoredLimitsWarning, InvalidInput
 from diffcloth_torch.files import as_path
+from diffcloth_torch.geometry.mesh_checks import Surface
 from diffcloth_torch.geometry.poses import check_quaternions, pose_array
-from diffcloth_torch.geometry.surfaces import Surface
+from diffcloth_torch.model.chains import (
+    chain_positions,
+    describe_chain,
+    link_surfaces,
+    make_chain,
+)
 from diffcloth_torch.model.collision_shapes import link_surface
 from diffcloth_torch.model.kinematics import link_frames, pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
@@ -52,16 +59,17 @@ _POSE = "differentiate with respect to State.base_poses or Control.base_poses"
 
 
 class Robot:
-    """Links joined by joints; immutable. Made by `Robot.load`.
+    """Links connected by joints; immutable. `Robot.load` or `Robot.from_chain` makes it.
 
     Attributes:
-        mechanism: Its tree of links and joints.
+        mechanism: The tree of links and joints.
         surfaces: Collision surface of each of the L links in the link's frame, or None; length L.
         pose: Initial pose of the root link [px, py, pz, qw, qx, qy, qz], shape [7].
-        joint_positions: Initial [rad or m], shape [J].
-        stiffness: Of the drives of "pd" joints [N m/rad or N/m], zero for others; shape [J].
-        damping: Likewise [N m s/rad or N s/m], shape [J].
-        viscosity: Damping that the joints have of their own, likewise; shape [J].
+        joint_positions: Initial joint positions [rad or m], shape [J].
+        stiffness: Stiffness of the drives of "pd" joints [N m/rad or N/m], zero for other joints;
+            shape [J].
+        damping: Damping of these drives [N m s/rad or N s/m], shape [J].
+        viscosity: Damping of the joints themselves [N m s/rad or N s/m], shape [J].
         friction: Friction coefficient of each link's surface [-], shape [L].
         thickness: Full thickness of each link's surface [m], shape [L].
         ignore_contact: Pairs of names of links that do not collide with each other.
@@ -101,39 +109,40 @@ class Robot:
         """Read a URDF file.
 
         Joints may be fixed, revolute, continuous or prismatic. The J joints are those that move and
-        do not mimic. Links and joints keep the order of the file. What is one value, name -> value
-        or an array may leave names out: they have the default.
+        do not mimic. Links and joints keep the order of the file. A mapping name -> value may omit
+        names; these have the default.
 
         Args:
             path: URDF file.
-            mesh_root: Folder outside of which no mesh file is read; "package://name/x" means x or
-                name/x in it. The folder of `path` by default.
-            base: "fixed", "kinematic" (the root link moves on prescribed poses) or "floating".
+            mesh_root: Folder that must contain all mesh files; "package://name/x" means x or name/x
+                in it. The folder of `path` by default.
+            base: "fixed", "kinematic" (the root link follows prescribed poses) or "floating".
             pose: Initial pose of the root link [px, py, pz, qw, qx, qy, qz]; the identity by
                 default.
-            joint_positions: Initial [rad or m], within the limits; one value, name -> value, or
-                [J]. Zero by default.
-            actuation: "position" and "velocity" prescribe the motion of a joint, "torque" and "pd"
-                leave it to forces; one, name -> mode, or J of them.
-            stiffness: Of the drives of "pd" joints [N m/rad or N/m], >= 0; one value, name ->
-                value, or [J].
-            damping: Likewise [N m s/rad or N s/m].
-            friction: Friction coefficient of the links' surfaces [-], >= 0; one, or link -> number.
-            thickness: Their full thickness [m], >= 0; one, or link -> number.
-            edge_length: Longest edge of the surfaces of boxes, cylinders and spheres [m], > 0; None
-                makes 12 triangles of a box, 1280 of a sphere and some 400 of a cylinder.
-            ignore_contact: Pairs of names of links that do not collide with each other. Links that
-                are rigidly joined, or by a single moving joint, never do.
+            joint_positions: Initial joint positions [rad or m], within the limits; one value,
+                name -> value, or [J]. Zero by default.
+            actuation: "position" and "velocity" prescribe the motion of a joint; with "torque" and
+                "pd" the joint responds to forces. One mode, name -> mode, or J modes.
+            stiffness: Stiffness of the drives of "pd" joints [N m/rad or N/m], >= 0; one value,
+                name -> value, or [J].
+            damping: Damping of these drives [N m s/rad or N s/m], >= 0; as `stiffness`.
+            friction: Friction coefficient of the surfaces of links [-], >= 0; one value, or link ->
+                value.
+            thickness: Full thickness of these surfaces [m], >= 0; one value, or link -> value.
+            edge_length: Longest edge of the surfaces of boxes, cylinders and spheres [m], > 0. With
+                None a box has 12 triangles, a sphere 1280 and a cylinder about 400.
+            ignore_contact: Pairs of names of links that do not collide with each other. Links
+                connected rigidly, or by a single moving joint, never collide.
             name: Name in the scene.
 
         Raises:
             InvalidInput: If the file or an argument is not accepted; see docs/robots.md.
-            TypeError: If something has a wrong type.
+            TypeError: If an argument has a wrong type.
             OSError: If the file cannot be read.
 
         Warns:
-            IgnoredLimitsWarning: If the file limits efforts or velocities or has dry joint
-                friction: none of them is applied.
+            IgnoredLimitsWarning: If the file has effort or velocity limits, or dry joint friction,
+                which are ignored.
         """
         file = as_path("Robot.load: `path`", path)
         check_choice("Robot.load: `base`", base, BASES)
@@ -143,16 +152,11 @@ class Robot:
             )
         description = read_urdf(file)
         moving = [joint for joint in description.joints if joint.moves]
-        modes = _modes(actuation, [joint.name for joint in moving])
+        modes = _modes("Robot.load", actuation, [joint.name for joint in moving])
         mechanism = make_mechanism(file, description, base, modes)
         root = file.parent if mesh_root is None else as_path("Robot.load: `mesh_root`", mesh_root)
         surfaces = [link_surface(link, file, root, edge_length) for link in description.links]
-        if description.unapplied:
-            warnings.warn(
-                f"{file}: {' and '.join(description.unapplied)} are read but not applied",
-                IgnoredLimitsWarning,
-                stacklevel=2,
-            )
+        _warn_of(file, description.unapplied)
         return cls(
             mechanism,
             surfaces,
@@ -166,6 +170,60 @@ class Robot:
             ignore_contact=ignore_contact,
             name=name,
         )
+
+    @classmethod
+    def from_chain(
+        cls,
+        chain: Any,
+        *,
+        surfaces: Mapping[str, Sequence[Any]],
+        inertials: Mapping[str, Sequence[Any]] | None = None,
+        limits: Mapping[str, Sequence[float]] | None = None,
+        base: str = "fixed",
+        actuation: object = "pd",
+        **options: Any,
+    ) -> Robot:
+        """Take a chain of pytorch-kinematics, and what it does not carry.
+
+        A chain has frames, joints and their limits. Of a file it drops masses, collision shapes,
+        the damping of joints and which of them mimic others: where there is a file, `load` keeps
+        them. Frames become links by their names; offsets in single precision are exact to 1e-7.
+
+        >>> chain = pk.build_chain_from_urdf(Path("arm.urdf").read_bytes())
+        >>> hand = dc.RigidBody.box(0.1)
+        >>> arm = dc.Robot.from_chain(
+        ...     chain, surfaces={"hand": (hand.vertices, hand.faces)}, actuation="position"
+        ... )
+
+        Args:
+            chain: `pytorch_kinematics.Chain` or `SerialChain`; not changed.
+            surfaces: Name of a frame -> vertices in it [m], shape [n, 3], and triangles, shape
+                [f, 3]; frames that are left out do not collide.
+            inertials: Name of a frame -> mass [kg], center of mass in it [m], shape [3], and
+                inertia about that center [kg m^2], shape [3, 3]; required for links that are moved
+                by forces.
+            limits: Name of a joint -> lower and upper limit [rad or m], in place of the chain's.
+            base: "fixed", "kinematic" or "floating", as in `load`.
+            actuation: As in `load`.
+            **options: `pose`, `joint_positions`, `stiffness`, `damping`, `friction`, `thickness`,
+                `ignore_contact` and `name`, as in `load`.
+
+        Raises:
+            InvalidInput: If an argument is not accepted, or a link that is moved by forces has no
+                mass.
+            TypeError: If something has a wrong type.
+
+        Warns:
+            IgnoredLimitsWarning: If the chain limits efforts or velocities: they are not applied.
+        """
+        label = "Robot.from_chain"
+        check_choice(f"{label}: `base`", base, BASES)
+        description = describe_chain(chain, inertials or {}, limits or {})
+        moving = [joint.name for joint in description.joints if joint.moves]
+        mechanism = make_mechanism(label, description, base, _modes(label, actuation, moving))
+        links = [link.name for link in description.links]
+        _warn_of(label, description.unapplied)
+        return cls(mechanism, link_surfaces(links, surfaces), np.zeros(len(moving)), **options)
 
     def __init__(
         self,
@@ -207,26 +265,55 @@ class Robot:
         """Names of the L links, in the order of the file."""
         return self.mechanism.link_names
 
-    def forward_kinematics(
-        self, joint_positions: Tensor, base_pose: Tensor | None = None
-    ) -> dict[str, Tensor]:
-        """Frames of all links; differentiable any number of times, limits are not looked at.
+    @property
+    def chain(self) -> Any:
+        """A `pytorch_kinematics.Chain` of the links, to plan with: a new one each time.
+
+        Its frames are in that of the root link, in float64, and agree with `forward_kinematics` to
+        rounding. Make a `SerialChain` in float64 too, and take joints by their names: chains have
+        an order of their own. Joints that mimic others are joints of their own there.
+
+        >>> serial = pk.SerialChain(robot.chain, "hand", dtype=torch.float64)
+        >>> jacobian = serial.jacobian(q)
+        """
+        return make_chain(self.mechanism)
+
+    def chain_positions(self, joint_positions: Tensor) -> dict[str, Tensor]:
+        """Positions of all joints of `chain`, those that mimic included.
 
         Args:
             joint_positions: [rad or m], shape [.., J].
-            base_pose: Pose of the root link, shape [.., 7]; `pose` by default. The leading axes of
-                both are broadcast.
+
+        Returns:
+            Name of a joint of the chain -> its position, shape [..]: what
+            `chain.forward_kinematics` takes.
+        """
+        q = self._checked_positions("chain_positions", joint_positions)
+        return chain_positions(self.mechanism, q)
+
+    def _checked_positions(self, owner: str, joint_positions: Tensor) -> Tensor:
+        q = float_tensor(f"{owner}: `joint_positions`", joint_positions)
+        joints = len(self.joint_names)
+        if q.shape[-1:] != (joints,):
+            raise InvalidInput(
+                f"{owner}: `joint_positions` must have shape [.., {joints}], got {list(q.shape)}"
+            )
+        return q
+
+    def forward_kinematics(
+        self, joint_positions: Tensor, base_pose: Tensor | None = None
+    ) -> dict[str, Tensor]:
+        """Compute the frames of all links, differentiable any number of times; limits are ignored.
+
+        Args:
+            joint_positions: Joint positions [rad or m], shape [.., J].
+            base_pose: Pose of the root link, shape [.., 7]; `pose` by default. Leading axes of both
+                arguments are broadcast.
 
         Returns:
             Name of a link -> its frame in the world, shape [.., 4, 4].
         """
-        q = float_tensor("forward_kinematics: `joint_positions`", joint_positions)
-        joints = len(self.joint_names)
-        if q.shape[-1:] != (joints,):
-            raise InvalidInput(
-                f"forward_kinematics: `joint_positions` must have shape [.., {joints}], "
-                f"got {list(q.shape)}"
-            )
+        q = self._checked_positions("forward_kinematics", joint_positions)
         given = self.pose if base_pose is None else base_pose
         pose = float_tensor("forward_kinematics: `base_pose`", given)
         if pose.shape[-1:] != (7,):
@@ -274,9 +361,9 @@ def _named(
     return frozen(values)
 
 
-def _modes(given: object, names: Sequence[str]) -> list[str]:
+def _modes(owner: str, given: object, names: Sequence[str]) -> list[str]:
     """Actuation of each joint, from one for all, from name -> mode, or from a list of them."""
-    label = "Robot.load: `actuation`"
+    label = f"{owner}: `actuation`"
     if isinstance(given, str):
         modes: list[object] = [given] * len(names)
     elif isinstance(given, Mapping):
@@ -295,6 +382,12 @@ def _modes(given: object, names: Sequence[str]) -> list[str]:
         check_choice(f"{label} of {name!r}", mode, ACTUATIONS)
         for name, mode in zip(names, modes, strict=True)
     ]
+
+
+def _warn_of(source: object, unapplied: Sequence[str]) -> None:
+    if unapplied:
+        text = f"{source}: {' and '.join(unapplied)} are read but not applied"
+        warnings.warn(text, IgnoredLimitsWarning, stacklevel=3)
 
 
 def _check_limits(mechanism: Mechanism, positions: FloatArray) -> None:

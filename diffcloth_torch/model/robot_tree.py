@@ -1,4 +1,4 @@
-"""From what a file says of a robot to its mechanism, checked for the motion that it shall have."""
+"""From the description of a robot in a file to its mechanism, checked for its actuation."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ __all__ = ["make_mechanism"]
 
 
 def make_mechanism(
-    file: Path, description: RobotDescription, base: str, actuation: Sequence[str]
+    file: Path | str, description: RobotDescription, base: str, actuation: Sequence[str]
 ) -> Mechanism:
     """Make the mechanism of a robot.
 
     Args:
-        file: That it stands in; opens messages.
-        description: What the file says.
+        file: File of the robot, or the function that made it; opens messages.
+        description: Contents of the file.
         base: "fixed", "kinematic" or "floating".
-        actuation: Of the joints that move and do not mimic, in their order.
+        actuation: Actuation of the joints that move and do not mimic, in their order.
 
     Raises:
-        InvalidInput: If limits leave a joint nothing, or what moves by forces has no mass or an
-            inertia that no body has.
+        InvalidInput: If limits leave a joint no position, or a part that is moved by forces has no
+            mass or an inertia that no body can have.
     """
     links, joints = description.links, description.joints
     carrier = {joint.child: joint for joint in joints}
@@ -86,7 +86,7 @@ def _indices(values: Sequence[int]) -> IndexArray:
 def _follow(
     joint: Joint, by_name: Mapping[str, Joint], dof: Mapping[str, int]
 ) -> tuple[int, float, float]:
-    """The joint j that a joint follows at last, and m, c such that its value is m q_j + c."""
+    """The joint j at the end of a chain of mimics, and m, c such that the value is m q_j + c."""
     multiplier, constant = 1.0, 0.0
     while joint.mimic is not None:
         name, factor, shift = joint.mimic
@@ -97,7 +97,7 @@ def _follow(
 
 
 def _limits(
-    file: Path,
+    file: Path | str,
     joints: Sequence[Joint],
     by_name: Mapping[str, Joint],
     dof: Mapping[str, int],
@@ -134,10 +134,10 @@ def _limits(
     return lower, upper
 
 
-def _check_masses(file: Path, mechanism: Mechanism) -> None:
-    """Require a mass and an inertia of all that forces move.
+def _check_masses(file: Path | str, mechanism: Mechanism) -> None:
+    """Require a mass and an inertia of all links that are moved by forces.
 
-    Links that fixed joints join are one body, so that one of them may be without a mass.
+    Links connected by fixed joints are one body, so some of them may have no mass.
     """
     group = mechanism.rigid_group
     for link in mechanism.order:
@@ -154,7 +154,7 @@ def _check_masses(file: Path, mechanism: Mechanism) -> None:
 
 
 def _moves_by_forces(mechanism: Mechanism, link: int) -> bool:
-    """Whether a floating base, or a joint under torque or pd, is between the world and a link."""
+    """Whether there is a floating base, or a torque or pd joint, between the world and a link."""
     while mechanism.parent[link] >= 0:
         j = mechanism.dof[link]
         if j >= 0 and mechanism.forced[j]:

@@ -1,9 +1,9 @@
-"""URDF files: read safely, checked entirely, and given to pytorch-kinematics only then.
+"""URDF files: read safely and checked entirely before pytorch-kinematics parses them.
 
-pytorch-kinematics answers bad files with NaN poses, endless recursion or nothing at all, and drops
-inertias and mimicking joints on the way to its chains. So a file is first reduced to the elements
-and attributes below, all checked; its parser reads what is left; and what a tree of links must
-satisfy is checked on what it returns.
+pytorch-kinematics responds to bad files with NaN poses, endless recursion or nothing at all, and
+its chains drop inertias and mimicking joints. So a file is first reduced to the elements and
+attributes below, all checked; its parser then reads only these; and what it returns is checked to
+be a tree of links.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ class Shape:
 
     Attributes:
         kind: "box", "cylinder", "sphere" or "mesh".
-        frame: In the link's frame, shape [4, 4].
+        frame: Its frame in the link's frame, shape [4, 4].
         size: Lengths of a box; radius and length of a cylinder; radius of a sphere [m]; scale of a
             mesh along its axes.
-        filename: Of a mesh, as written in the file; empty for others.
+        filename: File name of a mesh, as written in the file; empty for other shapes.
     """
 
     kind: str
@@ -67,9 +67,9 @@ class Link:
 
     Attributes:
         name: Its name.
-        mass: [kg].
+        mass: Its mass [kg].
         center: Center of mass in the link's frame [m], shape [3].
-        inertia: About the center, in the link's axes [kg m^2], shape [3, 3].
+        inertia: Inertia about the center, in the link's axes [kg m^2], shape [3, 3].
         shapes: Its collision shapes.
     """
 
@@ -87,10 +87,10 @@ class Joint:
     Attributes:
         name: Its name.
         type: "fixed", "revolute", "continuous" or "prismatic".
-        parent: Name of the link that it hangs on.
+        parent: Name of the link that carries it.
         child: Name of the link that it carries.
-        frame: In the parent's frame, shape [4, 4].
-        axis: Of unit length in the joint's frame, shape [3].
+        frame: Its frame in the parent's frame, shape [4, 4].
+        axis: Axis of unit length in the joint's frame, shape [3].
         lower: Lower limit [rad or m], -infinity without one.
         upper: Upper limit [rad or m], infinity without one.
         viscosity: Its damping [N m s/rad or N s/m].
@@ -116,13 +116,13 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class RobotDescription:
-    """What a file says of a robot: a tree of links.
+    """The description of a robot in a file: a tree of links.
 
     Attributes:
-        name: Of the robot.
-        links: In the order of the file.
-        joints: In the order of the file.
-        unapplied: What the file has beyond that and no simulation of ours applies, such as effort
+        name: Name of the robot.
+        links: Its links in the order of the file.
+        joints: Its joints in the order of the file.
+        unapplied: Other contents of the file that no simulation of ours applies, such as effort
             limits; in words.
     """
 
@@ -137,7 +137,7 @@ def read_urdf(path: Path) -> RobotDescription:
 
     Raises:
         InvalidInput: If the file is not safe or well-formed XML, an element or value is not
-            accepted, or its links are no tree. The message names the file and the element.
+            accepted, or its links do not form a tree. The message names the file and the element.
         OSError: If the file cannot be read.
     """
     data = read_regular_file(path, _LARGEST_FILE)
@@ -155,8 +155,8 @@ def read_urdf(path: Path) -> RobotDescription:
     # Imported here: it imports matplotlib.
     from pytorch_kinematics.urdf_parser_py.urdf import URDF
 
-    # Bytes, as its parser refuses text with an XML declaration. Written anew, so that both parsers
-    # see one document whatever the encoding of the file.
+    # Bytes, because its parser refuses text with an XML declaration. Written anew, so that both
+    # parsers see the same document whatever the encoding of the file.
     parse: Callable[[bytes], Any] = URDF.from_xml_string
     return _description(str(path), parse(tostring(reduced)))
 
@@ -165,7 +165,7 @@ def read_urdf(path: Path) -> RobotDescription:
 
 
 class _Attribute(NamedTuple):
-    """Accepted text of an attribute; without a default it is required."""
+    """The accepted text of an attribute, which is required unless it has a default."""
 
     numbers: int = 0  # how many; 0: a word
     default: str | None = None
@@ -261,7 +261,7 @@ _ROBOT = _Element(
 
 
 def _reduced(file: str, node: Element, grammar: _Element, above: Sequence[str]) -> Element:
-    """Copy an element with what the grammar knows of it, checked; the rest is not ours to read."""
+    """Copy and check what the grammar knows of an element; the rest is ignored."""
     name = node.get("name")
     here = (*above, f"<{node.tag}>" if name is None else f"<{node.tag} name={name!r}>")
     where = file + " ".join(here[1:] or here)  # <robot> goes without saying
@@ -317,7 +317,7 @@ def _checked_word(label: str, text: str) -> str:
 
 
 def _description(file: str, robot: Any) -> RobotDescription:
-    """Take a robot from the parser of pytorch-kinematics."""
+    """Describe a robot that the parser of pytorch-kinematics has read."""
     if not robot.links:
         raise InvalidInput(f"{file}: a robot must have a <link>, got none")
     _check_names(file, "link", [link.name for link in robot.links])
@@ -434,7 +434,7 @@ def _joint(file: str, joint: Any) -> Joint:
 
 
 def _check_tree(file: str, links: Sequence[str], joints: Sequence[Joint]) -> None:
-    """Require that the joints make one tree of all links."""
+    """Require that the joints connect all links to one tree."""
     holder: dict[str, str] = {}  # link -> the joint that carries it
     children: dict[str, list[str]] = {link: [] for link in links}
     for joint in joints:
@@ -467,7 +467,7 @@ def _check_tree(file: str, links: Sequence[str], joints: Sequence[Joint]) -> Non
 
 
 def _check_mimics(file: str, joints: Sequence[Joint]) -> None:
-    """Require that mimicking joints follow, at last, one that moves on its own."""
+    """Require that every chain of mimicking joints ends at a joint that moves on its own."""
     by_name = {joint.name: joint for joint in joints}
     for joint in joints:
         where = f"{file}: <joint name={joint.name!r}> <mimic>"

@@ -1,4 +1,4 @@
-"""What a caller sets in a step: where things shall be at its end, and physical parameters."""
+"""What a caller sets in a step: targets for its end, forces, and physical parameters."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from diffcloth_torch._moved import allow_loading
+from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.model.quantities import CONTROL, PARAMETERS
 from diffcloth_torch.reprs import field_text, record_text
 from diffcloth_torch.sim.state import check_field_names
@@ -18,31 +18,37 @@ __all__ = ["Control", "Parameters", "tensors_of"]
 
 @dataclass(frozen=True, eq=False)
 class Control:
-    """Targets for the end of a step, and forces during it. None holds what the state has.
+    """Targets for the end of a step, and forces during it. A target that is None holds.
 
-    Every tensor may have a leading batch axis; without one it holds for all environments.
+    Every tensor may have a leading batch axis; without one it applies to all environments.
 
     Attributes:
-        pins: Positions of the pinned vertices [m], shape [P, 3], or "cloth/pin" (or "pin" where
-            that is unique) -> positions; missing names stay where they are.
+        pins: Positions of the pinned vertices [m], shape [P, 3], or "cloth/pin" (or "pin" if that
+            is unique) -> positions; pins that are not named stay in place.
         soft_pins: Positions to which the soft pins pull [m], shape [Q, 3], or likewise by name.
         body_poses: [px, py, pz, qw, qx, qy, qz] of each body, shape [K, 7], or body -> pose [7];
-            the row of a body that is not kinematic must stay what the state has.
+            the row of a body that is not kinematic must equal that of the state.
         forces: Forces on the cloth vertices [N], shape [N, 3]; none by default.
         body_wrenches: Force at the center of mass of each dynamic body, then torque, in world axes
-            [N, N m], shape [K, 6], or body -> wrench [6]; zero where the body is not dynamic.
+            [N, N m], shape [K, 6], or body -> wrench [6]; must be zero for a body that is not
+            dynamic.
         joint_positions: Targets of position and pd joints [rad or m], shape [J], or "robot/joint"
-            (or "joint" where that is unique) -> number; rows of other joints are ignored, and
-            pd joints that are not named hold their last target.
+            (or "joint" if that is unique) -> number; rows of other joints are ignored, and pd
+            joints that are not named keep their last target.
         joint_velocities: Targets of velocity and pd joints [rad/s or m/s], shape [J], or likewise
             by name; zero by default.
-        joint_efforts: Efforts of torque joints, and those that pd joints add to their drive's
-            [N m or N], shape [J], or likewise by name; zero by default.
+        joint_efforts: Efforts of torque joints, and efforts added to those of pd drives [N m or N],
+            shape [J], or likewise by name; zero by default.
         base_poses: Frames of the robots' root links, shape [R, 7], or robot -> pose [7]; the row of
-            a robot whose base is not kinematic must stay what the state has.
+            a robot whose base is not kinematic must equal that of the state.
         base_wrenches: Force at the center of mass of each floating root link, then torque, in world
-            axes [N, N m], shape [R, 6], or robot -> wrench [6]; zero where the base is not
+            axes [N, N m], shape [R, 6], or robot -> wrench [6]; must be zero for a base that is not
             floating.
+        attachments: Targets of the attachments that have some [m], shape [U, 3], or attachment ->
+            targets [n, 3]. Those that are not set are released.
+        attachment_weights: Share of the stiffness with which the springs of attachments pull [-],
+            between 0 (released) and 1, shape [A], or attachment -> weights [n]; 1 by default, and
+            0 where a target is not set.
     """
 
     pins: Tensor | Mapping[str, Tensor] | None = None
@@ -55,6 +61,8 @@ class Control:
     joint_efforts: Tensor | Mapping[str, Tensor] | None = None
     base_poses: Tensor | Mapping[str, Tensor] | None = None
     base_wrenches: Tensor | Mapping[str, Tensor] | None = None
+    attachments: Tensor | Mapping[str, Tensor] | None = None
+    attachment_weights: Tensor | Mapping[str, Tensor] | None = None
 
     def __repr__(self) -> str:
         return _text(self, CONTROL)
@@ -67,10 +75,16 @@ class Control:
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """Physical parameters, by default those of the scene. None where the scene has no such thing.
+    """Physical parameters. A field that is None takes what the scene has, if anything.
 
-    Each may have a leading batch axis [B]. With the friction and the barrier stiffness of a pair of
-    surfaces (i, j) the mean of its two entries is meant.
+    Each may have a leading batch axis [B]. The friction and the barrier stiffness of a pair of
+    surfaces are the mean of its two entries.
+
+    What has rows may be given by names, as {"shirt": 300.0}: what is per cloth or face by cloths,
+    `thickness` by surfaces, `attachment_stiffness` by attachments, the rest by bodies, by
+    "robot/link" or by "robot/joint" (or the part behind the slash where it is unique, or a robot
+    for all of its rows). What is not named keeps
+    what the scene has.
 
     Attributes:
         stretch: Membrane stiffness [N/m], > 0; shape [], [C] or [F].
@@ -78,28 +92,29 @@ class Parameters:
         poisson: Poisson ratio of bending [-], between -1 and 0.5; shape [], [C] or [F].
         density: Mass per rest area [kg/m^2], > 0; shape [], [C] or [F].
         damping: Time over which strain rates are damped [s], >= 0; shape [], [C] or [F].
-        friction: Friction coefficient [-], >= 0; shape [] or [S, S], or pair of names of surfaces
-            -> number, as {("cloth", "table"): 0.4}, in one order or the other; pairs that are not
-            named keep what the scene has.
+        friction: Friction coefficient [-], >= 0; shape [] or [S, S], or pair of names of surfaces,
+            in either order, -> number, as {("cloth", "table"): 0.4}; pairs that are not named keep
+            the values of the scene.
         thickness: Full thickness of each surface [m], >= 0; shape [S].
-        barrier_stiffness: [Pa], > 0; shape [] or [S, S].
-        barrier_distance: [m], > 0; shape [].
-        slip_velocity: Where sticking turns into sliding [m/s], > 0; shape [].
-        pin_stiffness: Springs of the soft pins [N/m], > 0; shape [] or [C].
-        gravity: Acceleration [m/s^2], shape [3].
+        barrier_stiffness: Stiffness of the barrier [Pa], > 0; shape [] or [S, S].
+        barrier_distance: Distance at which the barrier begins [m], > 0; shape [].
+        slip_velocity: Velocity at which sticking turns into sliding [m/s], > 0; shape [].
+        pin_stiffness: Stiffness of the soft pins [N/m], > 0; shape [] or [C].
+        gravity: Acceleration of gravity [m/s^2], shape [3].
         rest_positions: Stress-free positions of the cloth vertices [m], shape [N, 3].
+        attachment_stiffness: Of the springs of attachments [N/m], > 0, shape [A].
         body_mass: Mass of each body [kg], >= 0, > 0 where it is dynamic; shape [K]. This and the
             next two are ignored where the body is not dynamic.
         body_center: Its center of mass, in its frame [m], shape [K, 3].
         body_inertia: Its inertia about that center, in the axes of its frame [kg m^2]; the
             symmetric part is meant and must be positive definite; shape [K, 3, 3].
         link_mass: Mass of each link [kg], >= 0, shape [L].
-        link_center: Its center of mass, in its frame [m], shape [L, 3].
-        link_inertia: Its inertia about that center, in the axes of its frame [kg m^2]; the
-            symmetric part is meant; shape [L, 3, 3].
-        joint_stiffness: Of pd drives [N m/rad or N/m], >= 0, shape [J].
-        joint_damping: Of pd drives [N m s/rad or N s/m], >= 0, shape [J].
-        joint_viscosity: Of the joints themselves [N m s/rad or N s/m], >= 0, shape [J].
+        link_center: Center of mass of each link, in its frame [m], shape [L, 3].
+        link_inertia: Inertia of each link about that center, in the axes of its frame [kg m^2];
+            only the symmetric part counts; shape [L, 3, 3].
+        joint_stiffness: Stiffness of pd drives [N m/rad or N/m], >= 0, shape [J].
+        joint_damping: Damping of pd drives [N m s/rad or N s/m], >= 0, shape [J].
+        joint_viscosity: Damping of the joints themselves [N m s/rad or N s/m], >= 0, shape [J].
         joint_armature: Inertia of the drives, seen at the joints [kg m^2 or kg], >= 0, shape [J].
     """
 
@@ -116,6 +131,7 @@ class Parameters:
     pin_stiffness: Tensor | None = None
     gravity: Tensor | None = None
     rest_positions: Tensor | None = None
+    attachment_stiffness: Tensor | None = None
     body_mass: Tensor | None = None
     body_center: Tensor | None = None
     body_inertia: Tensor | None = None
@@ -126,7 +142,7 @@ class Parameters:
     joint_damping: Tensor | None = None
     joint_viscosity: Tensor | None = None
     joint_armature: Tensor | None = None
-    # Fields that a simulator made without a batch axis: their [C] or [F] is never taken for [B].
+    # Fields that a simulator made without a batch axis: their [C] or [F] is never read as [B].
     _unbatched: tuple[str, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
@@ -140,14 +156,14 @@ class Parameters:
 
 
 def _text(record: Control | Parameters, names: Iterable[str]) -> str:
-    """What is set in a record."""
+    """Describe the fields that a record sets."""
     values = ((name, getattr(record, name)) for name in names)
     parts = (field_text(name, value) for name, value in values if value is not None)
     return record_text(type(record).__name__, parts)
 
 
 def tensors_of(record: Any) -> Iterator[Tensor]:
-    """Go through the tensors of a State, Control or Parameters; anything else has none."""
+    """Iterate over the tensors of a State, Control or Parameters; anything else has none."""
     if not is_dataclass(record):
         return
     for value in vars(record).values():

@@ -1,4 +1,4 @@
-"""The core in C++ for a scene, and for parts of it."""
+"""The C++ core of a scene, or of a part of it."""
 
 from __future__ import annotations
 
@@ -7,21 +7,43 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from diffcloth_torch import _core
 from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
-from diffcloth_torch.model.scene import Assembly
+from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Fields
+from diffcloth_torch.model.springs import Springs
+from diffcloth_torch.sim.layout import Layout
+from diffcloth_torch.sim.step import Constant, as_array
 from diffcloth_torch.sim.trees import tree_arguments
 
-__all__ = ["CoreOptions", "make_core", "with_all_pinned", "without_cloths"]
+__all__ = [
+    "Core",
+    "CoreOptions",
+    "arrays_of",
+    "constants",
+    "core_inputs",
+    "make_core",
+    "rigid_inputs",
+    "with_all_pinned",
+    "without_cloths",
+]
+
+Core = _core.Simulator
+
+_CORE_NAMES = tuple(
+    tuple((name, quantity.core) for name, quantity in table.items() if quantity.core is not None)
+    for table in (STATE, CONTROL, PARAMETERS)
+)
 
 
 class CoreOptions(NamedTuple):
-    """What a core is told besides the arrays of a scene.
+    """The options of a core, besides the arrays of a scene.
 
     Attributes:
-        bending_models: Of each cloth.
+        bending_models: Bending model of each cloth.
         dt: Time step [s].
         scheme: "coupled", "split" or "projective".
         contact: Contact options.
@@ -46,27 +68,31 @@ def make_core(
 
     Args:
         assembly: Arrays of the scene.
-        options: What else there is to say.
-        limit_stiffness: Of the barriers at the limits of coordinates, shape [n]; None where all
-            bodies move on prescribed poses.
-        all_prescribed: Whether all coordinates move as they are told.
+        options: Options of the core.
+        limit_stiffness: Stiffness of the barriers at the limits of coordinates, shape [n]; None if
+            all bodies move on prescribed poses.
+        all_prescribed: Whether the motion of all coordinates is prescribed.
     """
     trees: dict[str, Any] = {}
     if limit_stiffness is not None:
         trees = tree_arguments(assembly, limit_stiffness, all_prescribed=all_prescribed)
     return _core.Simulator(
         vertices=assembly.vertices,
-        rest_vertices=assembly.rest_vertices,
+        rest_positions=assembly.rest_positions,
         faces=assembly.faces,
         cloth_vertex_start=assembly.cloth_vertex_start,
         cloth_face_start=assembly.cloth_face_start,
         bending_models=list(options.bending_models),
         pins=assembly.pins,
         soft_pins=assembly.soft_pins,
+        attachment_start=assembly.springs.start,
+        attachment_points=assembly.springs.points,
+        attachment_coefficients=assembly.springs.coefficients,
+        attachment_rest_lengths=assembly.springs.rest_lengths,
+        attachment_targets=assembly.springs.targets,
         body_vertices=assembly.body_vertices,
         body_faces=assembly.body_faces,
         body_vertex_start=assembly.body_vertex_start,
-        body_face_start=assembly.body_face_start,
         self_contact=options.contact.self_contact,
         dt=options.dt,
         scheme=options.scheme,
@@ -88,14 +114,55 @@ def make_core(
     )
 
 
+def core_inputs(state: Fields, control: Fields, parameters: Fields) -> Fields:
+    """Fields by the core's names."""
+    return {
+        core: fields[name]
+        for names, fields in zip(_CORE_NAMES, (state, control, parameters), strict=True)
+        for name, core in names
+        if name in fields
+    }
+
+
+def constants(layout: Layout, defaults: Fields) -> dict[str, Constant]:
+    """Values of `core_inputs` for an empty control and default parameters."""
+    fields = core_inputs({}, layout.zeros, defaults)
+    return {name: Constant.of(tensor) for name, tensor in fields.items()}
+
+
+def arrays_of(inputs: Fields) -> dict[str, FloatArray]:
+    """Numbers of inputs, by the core's names."""
+    return {name: as_array(tensor) for name, tensor in inputs.items()}
+
+
+def rigid_inputs(layout: Layout, inputs: Fields) -> Fields:
+    """Select the inputs of bodies and links from those of a scene."""
+    assembly = layout.assembly
+    cloths, surfaces = assembly.cloth_count, assembly.surface_count
+    none = torch.zeros(len(inputs["positions"]), 0, 3, dtype=torch.float64)
+    names = ("positions", "velocities", "pin_targets", "soft_pin_targets", "forces")
+    kept = ("gravity", "barrier_distance", "slip_velocity")
+    rigid = dict.fromkeys(names, none) | {k: inputs[k] for k in kept if k in inputs}
+    if "thickness" in inputs:
+        rigid["thickness"] = inputs["thickness"][:, cloths:]
+    for name in ("friction", "barrier_stiffness"):
+        if name not in inputs:
+            continue
+        rigid[name] = inputs[name]
+        if rigid[name].shape[1] > 1:  # of pairs
+            pairs = rigid[name].reshape(-1, surfaces, surfaces)
+            rigid[name] = pairs[:, cloths:, cloths:].reshape(len(pairs), -1)
+    return rigid
+
+
 def without_cloths(assembly: Assembly) -> Assembly:
-    """The bodies and links of a scene alone."""
+    """The same scene without its cloths."""
     cloths = assembly.cloth_count
     pairs = assembly.ignored_pairs
     return replace(
         assembly,
         vertices=np.empty((0, 3)),
-        rest_vertices=np.empty((0, 3)),
+        rest_positions=np.empty((0, 3)),
         faces=np.empty((0, 3), dtype=np.int32),
         cloth_vertex_start=np.zeros(1, dtype=np.int32),
         cloth_face_start=np.zeros(1, dtype=np.int32),
@@ -103,17 +170,19 @@ def without_cloths(assembly: Assembly) -> Assembly:
         soft_pins=np.empty(0, dtype=np.int32),
         pin_groups={},
         soft_pin_groups={},
+        springs=Springs(),
         surface_names=assembly.surface_names[cloths:],
         ignored_pairs=(pairs[(pairs >= cloths).all(axis=1)] - cloths).astype(np.int32),
     )
 
 
 def with_all_pinned(assembly: Assembly) -> Assembly:
-    """The same scene, of which nothing moves by itself."""
+    """The same scene with all cloth vertices pinned, so that nothing moves by itself."""
     return replace(
         assembly,
         pins=np.arange(len(assembly.vertices), dtype=np.int32),
         soft_pins=np.empty(0, dtype=np.int32),
         pin_groups={},
         soft_pin_groups={},
+        springs=Springs(),
     )

@@ -1,70 +1,84 @@
-"""Environments in which a step failed: their states have no gradient, and say so when asked."""
+"""Environments in which a step failed: their states have no gradient, and backward says so."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from diffcloth_torch.errors import InfeasibleMotion, NotConverged, SimulationError
-from diffcloth_torch.sim.step import INFEASIBLE, UNCONVERGED, vmap_level
+from diffcloth_torch.errors import (
+    InfeasibleMotion,
+    NotConverged,
+    SimulationError,
+    TurnedTooFar,
+)
+from diffcloth_torch.model.quantities import Fields
+from diffcloth_torch.sim.pull_back import vmap_level
+from diffcloth_torch.sim.step import CONVERGED, INFEASIBLE, TURNED, UNCONVERGED
 
-__all__ = ["failures_of", "refuse_gradients"]
+__all__ = ["failures_of", "mark", "refuse_gradients"]
 
 Failures = dict[int, type[SimulationError]]
 """Environments whose step failed -> the error that says so."""
 
-_ERRORS = {UNCONVERGED: NotConverged, INFEASIBLE: InfeasibleMotion}
+_ERRORS = {UNCONVERGED: NotConverged, INFEASIBLE: InfeasibleMotion, TURNED: TurnedTooFar}
 _REMEDIES: dict[type[SimulationError], str] = {
     InfeasibleMotion: "a step that did not complete the prescribed motion has no gradient; move "
     "bodies and pins less far in it",
     NotConverged: "a step that did not converge has no gradient; raise max_iterations",
+    TurnedTooFar: "a step in which a body turns further than contact resolves has no gradient; "
+    "lower dt",
 }
 
 
+def mark(diagnostics: dict[str, Any], messages: Mapping[int, str], status: int) -> None:
+    """Mark environments as failed with a status and its message, unless they failed before."""
+    for environment, message in messages.items():
+        if diagnostics["status"][environment] == CONVERGED:
+            diagnostics["status"][environment] = status
+            diagnostics["message"][environment] = message
+
+
 def failures_of(diagnostics: dict[str, Any]) -> Failures:
-    """Environments that failed, by the diagnostics of the core."""
+    """Environments that failed, according to the diagnostics of the core."""
     return {i: _ERRORS[status] for i, status in enumerate(diagnostics["status"]) if status}
 
 
-def refuse_gradients(
-    fields: dict[str, Tensor], failures: Failures, *, batched: bool
-) -> dict[str, Tensor]:
-    """The same fields of a state; backward raises where a loss depends on a failed environment."""
+def refuse_gradients(fields: Fields, failures: Failures) -> Fields:
+    """The same fields [B, ...]; backward raises if a loss depends on a failed environment."""
     if not failures:
         return fields
     return {
-        name: _Guard.apply(tensor, failures, batched) if tensor.requires_grad else tensor
+        name: _Guard.apply(tensor, failures) if tensor.requires_grad else tensor
         for name, tensor in fields.items()
     }
 
 
 class _Guard(torch.autograd.Function):
-    """The identity, of which backward looks at what comes back."""
+    """The identity; its backward checks the cotangents."""
 
     @staticmethod
-    def forward(ctx, tensor, failures, batched):
-        ctx.failures, ctx.environment_axis = failures, -tensor.ndim if batched else None
+    def forward(ctx, tensor, failures):
+        ctx.failures, ctx.environment_axis = failures, -tensor.ndim
         return tensor.clone()
 
     @staticmethod
     def backward(ctx, cotangent):
         plain = cotangent
         if torch._C._functorch.is_legacy_batchedtensor(cotangent):
-            # As in `step`: the older vmap knows no rule of a Function.
+            # As in `pull_back`: the older vmap knows no rule of a Function.
             plain = torch._remove_batch_dim(cotangent, vmap_level(), 1, 0)
         seen = _Look.apply(plain, ctx.failures, ctx.environment_axis)
-        return seen if plain is cotangent else cotangent, None, None
+        return seen if plain is cotangent else cotangent, None
 
 
 class _Look(torch.autograd.Function):
-    """Raise where cotangents, which may have leading axes, are of a failed environment."""
+    """Raise if cotangents, which may have leading axes, belong to a failed environment."""
 
     @staticmethod
     def forward(cotangent, failures, environment_axis):
-        axis = environment_axis
-        rows = cotangent[None] if axis is None else cotangent.movedim(axis, 0)
+        rows = cotangent.movedim(environment_axis, 0)
         wanted = [i for i in failures if rows[i].count_nonzero()]
         for error, remedy in _REMEDIES.items():
             environments = [i for i in wanted if failures[i] is error]

@@ -1,4 +1,4 @@
-"""Masses of the cloths' vertices, and what follows from them, as ordinary differentiable torch."""
+"""Masses of the cloths' vertices, their momentum and energy, as ordinary differentiable torch."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
-from diffcloth_torch.model.scene import Assembly
-from diffcloth_torch.sim.inputs import Fields
+from diffcloth_torch.model.assembly import Assembly
+from diffcloth_torch.model.quantities import Fields
 
 __all__ = ["cloth_totals", "vertex_masses"]
 
 
 def vertex_masses(assembly: Assembly, parameters: Fields) -> Tensor:
-    """A third of the mass of each face around a vertex, [B or 1, N] kg."""
+    """Mass of each vertex, a third of that of each face around it, [B or 1, N] kg."""
     if not assembly.cloth_count:
         return torch.zeros(1, 0, dtype=torch.float64)
     density, rest = parameters["density"], parameters["rest_positions"]

@@ -1,4 +1,4 @@
-"""What becomes of bodies and robots in a step: the fields of the state behind it."""
+"""Motion of bodies and robots in a step: their fields of the state after it."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.geometry.rotation import row_velocities
-from diffcloth_torch.sim.inputs import Fields
+from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.sim.layout import Layout
 
 __all__ = ["ended_poses", "held_targets", "prescribed_motion", "with_rows"]
 
 
 def ended_poses(targets: Tensor, ended: Mapping[int, FloatArray], environments: int) -> Tensor:
-    """Poses at the end of a step, where the motion of some environments has ended early.
+    """Poses at the end of a step in which the motion of some environments stopped early.
 
     Args:
-        targets: Where it should have led, [B or 1, T, 7].
-        ended: Environment -> poses there, [T, 7].
-        environments: B.
+        targets: Poses at the end of the complete motion, [B or 1, T, 7].
+        ended: Environment that stopped early -> its poses there, [T, 7].
+        environments: Number of environments, B.
     """
     poses = targets.detach().expand(environments, *targets.shape[1:]).clone()
     for i, there in ended.items():
@@ -30,10 +30,10 @@ def ended_poses(targets: Tensor, ended: Mapping[int, FloatArray], environments: 
 
 
 def with_rows(fields: Fields, others: Fields, environments: Iterable[int]) -> Fields:
-    """Fields [B or 1, ...] that have the rows of other ones in some environments.
+    """Fields [B or 1, ...] with the rows of some environments replaced by those of `others`.
 
-    The others are to have no graph: the rest then keeps the gradients, to the bit, that it has
-    where there is nothing to replace.
+    The others must have no graph: all other rows then keep the same gradients, to the bit, as
+    without a replacement.
     """
     mixed = {}
     for name, other in others.items():
@@ -44,9 +44,9 @@ def with_rows(fields: Fields, others: Fields, environments: Iterable[int]) -> Fi
 
 
 def prescribed_motion(layout: Layout, state: Fields, control: Fields, dt: float) -> Fields:
-    """Fields of the next state where bodies only move on prescribed poses.
+    """Fields of the next state if bodies only move on prescribed poses.
 
-    Velocities are left out where nothing moves: a state has zeros then.
+    Velocities are left out if nothing moves: a state then has zeros.
 
     Args:
         layout: What the rows stand for.
@@ -62,5 +62,7 @@ def prescribed_motion(layout: Layout, state: Fields, control: Fields, dt: float)
 
 
 def held_targets(layout: Layout, state: Fields, control: Fields) -> Tensor:
-    """What pd drives pull to from now on, [B, J]."""
-    return torch.where(layout.driven, control["joint_positions"], state["joint_targets"])
+    """Targets of the pd drives from now on, [B, J]."""
+    return torch.where(
+        layout.permissions.driven, control["joint_positions"], state["joint_targets"]
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,31 +13,41 @@ from diffcloth_torch.errors import (
     IntersectingState,
     NotConverged,
     SimulationError,
+    TurnedTooFar,
 )
+from diffcloth_torch.sim.contacts import Contacts
 from diffcloth_torch.sim.report import Report
-from diffcloth_torch.sim.step import CONVERGED, DIAGNOSTICS, INFEASIBLE, INTERSECTING, UNCONVERGED
+from diffcloth_torch.sim.step import (
+    CONVERGED,
+    DIAGNOSTICS,
+    INFEASIBLE,
+    INTERSECTING,
+    TURNED,
+    UNCONVERGED,
+)
 
 __all__ = ["make_report", "raise_on_failure"]
 
 
 def _named(prefix: str) -> dict[str, str]:
-    """What the core's numbers under a prefix are called in a report -> their full names."""
+    """Name in a report -> full name, of the core's numbers with a prefix."""
     return {n.removeprefix(prefix): n for n in DIAGNOSTICS if n.startswith(prefix)}
 
 
-# What a report says of the core's `status`.
+# Texts of a report for the core's `status`.
 _NAMES = {
     CONVERGED: "converged",
     UNCONVERGED: "not_converged",
     INFEASIBLE: "infeasible_motion",
     INTERSECTING: "intersecting_state",
+    TURNED: "turned_too_far",
 }
 _SECONDS = _named("seconds_")
 _COUNTS = _named("count_")
 
 
-def make_report(diagnostics: dict[str, Any], *, batched: bool) -> Report:
-    """Put the core's numbers into a report."""
+def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched: bool) -> Report:
+    """Put the core's numbers into a report, with the names of the surfaces."""
 
     def value(numbers: list[Any]) -> Any:
         return torch.from_numpy(np.array(numbers)) if batched else numbers[0]
@@ -52,13 +63,14 @@ def make_report(diagnostics: dict[str, Any], *, batched: bool) -> Report:
         seconds={phase: value(diagnostics[name]) for phase, name in _SECONDS.items()},
         counts={what: value(diagnostics[name]) for what, name in _COUNTS.items()},
         status=names if batched else names[0],
+        contacts=Contacts.of(diagnostics["pairs"], surfaces, batched=batched),
     )
 
 
 def raise_on_failure(
     diagnostics: dict[str, Any], report: Report, *, throw: bool, batched: bool
 ) -> None:
-    """Raise what is most wrong in any environment; without `throw` only what has no state."""
+    """Raise the worst failure of any environment; without `throw` only one that leaves no state."""
     status = np.array(diagnostics["status"])
     failures: list[tuple[type[SimulationError], np.ndarray[Any, Any], str]] = [
         (
@@ -77,6 +89,11 @@ def raise_on_failure(
             (status == UNCONVERGED) & throw,
             "the solver stopped before its tolerance was reached; raise "
             "SolverOptions.max_iterations or tolerance, or lower dt",
+        ),
+        (
+            TurnedTooFar,
+            (status == TURNED) & throw,
+            "a body turns further than a step resolves",
         ),
     ]
     for error, failed, sentence in failures:

@@ -1,4 +1,4 @@
-"""What a step says about itself."""
+"""The report of a step: convergence, distances, contacts, time and counts."""
 
 from __future__ import annotations
 
@@ -11,40 +11,44 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch._moved import allow_loading
+from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.reprs import record_text, value_text
+from diffcloth_torch.sim.contacts import Contacts
 
 __all__ = ["Report", "outcome_text"]
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """How a step went; Python numbers, or tensors of shape [B] in a batch.
+    """How a step went, in Python numbers, or in tensors of shape [B] in a batch.
 
     Attributes:
         converged: Whether every solve of the step ended in a local minimum: the exact Hessian is
-            positive definite there, and its Newton step is below the tolerance. Of Projective
-            Dynamics, whether its residual is.
-        iterations: Newton iterations of all solves of the step, its prescribed motion included.
-        residual: Largest displacement of the last Newton step, as a velocity [m/s]; of Projective
-            Dynamics the largest change of velocity by the residual force; of several solves the
-            largest.
-        minimum_distance: Smallest distance between mid-surfaces in contact [m], which is above half
-            the sum of their thicknesses; infinite where nothing is within the barrier's reach.
-        contact_count: Contacts within the barrier distance: pairs of primitives of cloths; of a
-            cloth and a body, features that are not hidden behind nearer ones. In "projective"
-            vertices that stick or slip.
-        motion_fraction: Part of the prescribed motion that was reached, 1 for all of it.
+            positive definite there, and the Newton step is below the tolerance. For Projective
+            Dynamics, whether the residual is below the tolerance.
+        iterations: Newton iterations of all solves of the step, including its prescribed motion.
+        residual: Largest displacement of the last Newton step, as a velocity [m/s]; for Projective
+            Dynamics, the largest change of velocity by the residual force. The largest of them if
+            there are several solves.
+        minimum_distance: Smallest distance between mid-surfaces in contact [m], always above half
+            the sum of their thicknesses; infinite if nothing is within the barrier's reach.
+        contact_count: Contacts within the barrier distance: pairs of primitives between cloths;
+            between a cloth and a body, features that are not hidden behind nearer ones; in
+            "projective", vertices that stick or slip.
+        motion_fraction: Fraction of the prescribed motion that was completed, 1 for all of it.
         seconds: Phase of the step -> time [s]; the phases add up to the time in the core.
-        counts: What was done -> how often: steps with the `exact` Hessian, `chord` steps with an
+        counts: Event -> number of times: steps with the `exact` Hessian, `chord` steps with an
             older factor, steps with a `projected` Hessian, Hessians of `negative_curvature`,
-            `local_global` iterations of Projective Dynamics, solves that these have
-            `left_to_newton`, numeric `factorizations`, failed ones included, of these those
-            `in_doubles`, and symbolic `analyses`; vertices in dry frictional contact that are
-            `taking_off`, `sticking` and `slipping`.
-        status: "converged", "not_converged" or "infeasible_motion"; in a batch a tuple of B of
-            them. The report of an `IntersectingState` has "intersecting_state" where that is so.
+            `local_global` iterations of Projective Dynamics, solves that they `left_to_newton`,
+            numeric `factorizations` including failed ones, those of them `in_doubles`, and symbolic
+            `analyses`; vertices in dry frictional contact that are `taking_off`, `sticking` and
+            `slipping`.
+        status: "converged", "not_converged", "infeasible_motion" or "turned_too_far"; in a batch a
+            tuple of B of them. In the report of an `IntersectingState`, environments that intersect
+            have "intersecting_state".
+        contacts: Contacts by pairs of names of surfaces: `contacts["gripper/left", "shirt"]` has
+            `count` and `force`.
     """
 
     converged: bool | Tensor
@@ -55,10 +59,11 @@ class Report:
     motion_fraction: float | Tensor
     seconds: dict[str, float | Tensor]
     counts: dict[str, int | Tensor] = field(default_factory=dict)
-    status: str | tuple[str, ...] = ()  # left out, what `converged` says
+    status: str | tuple[str, ...] = ()  # if left out, derived from `converged`
+    contacts: Contacts = field(default_factory=Contacts)
 
     def __post_init__(self) -> None:
-        # Reports come back from files, too: what is wrong is said here, not where it is used.
+        # Reports may come from files: errors are raised here, not where the report is used.
         for entry in _NUMERIC:
             value = self.__dict__.get(entry)
             table = value if entry in _TABLES else {None: value}
@@ -74,12 +79,17 @@ class Report:
             object.__setattr__(self, "status", _status_by(self.converged))
         status: Any = self.status
         names = (status,) if isinstance(status, str) else status
+        contacts: Any = self.contacts
+        if not isinstance(contacts, Contacts):
+            kind = type(contacts).__name__
+            raise TypeError(f"Report: `contacts` must be Contacts, got {kind}")
         if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
             raise TypeError(f"Report: `status` must be a str or a tuple of them, got {names!r}")
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         # Reports that the first version saved count nothing, and have no status.
-        self.__dict__.update({"counts": {}, "status": ()} | state)
+        defaults = {"counts": {}, "status": (), "contacts": Contacts()}
+        self.__dict__.update(defaults | state)
         self.__post_init__()
 
     def __repr__(self) -> str:
@@ -89,7 +99,7 @@ class Report:
         if self.status != _status_by(self.converged):
             parts.append(f"status={_status_text(self.status)}")
         for table in _TABLES:
-            # What never happened is left out.
+            # Events that never happened are left out.
             texts = {name: _range_text(number) for name, number in getattr(self, table).items()}
             entries = [f"{name}: {text}" for name, text in texts.items() if text != "0"] or [""]
             entries[0] = f"{table}={{{entries[0]}"
@@ -100,7 +110,7 @@ class Report:
     def check_environments(self, owner: str, count: int | None) -> None:
         """Require tensors of shape [count], or numbers where there is no batch axis."""
         shape = [] if count is None else [count]
-        for name in _FIELDS:
+        for name in (*_NUMERIC, "status"):
             value = getattr(self, name)
             for number in value.values() if name in _TABLES else [value]:
                 if list(np.shape(number)) != shape:
@@ -109,31 +119,40 @@ class Report:
                         f"has environments, got {list(np.shape(number))}"
                     )
 
-    def select(self, index: int | slice) -> Report:
-        """Report of one environment, or of some."""
-
-        def pick(values: Any) -> Any:
-            return values[index].item() if isinstance(index, int) else values[index]
-
-        return _combine(pick, [self], self.status[index])
+    def select(self, index: int | slice | Tensor) -> Report:
+        """Report of one environment, or of several."""
+        contacts = self.contacts.select(index)
+        if isinstance(index, int):
+            return _combine(
+                lambda values: values[index].item(), [self], self.status[index], contacts
+            )
+        rows = torch.arange(len(self.status))[index].tolist()
+        status = tuple(self.status[i] for i in rows)
+        return _combine(lambda values: values[index], [self], status, contacts)
 
     @staticmethod
     def stack(reports: Sequence[Report | None]) -> Report | None:
-        """Report of a batch from those of its environments; None if one has none."""
+        """Report of a batch from those of its environments; None if one of them is missing."""
         present = [report for report in reports if report is not None]
         if len(present) < len(reports) or len({_names(r) for r in present}) > 1:
             return None
         status = tuple(str(report.status) for report in present)
-        return _combine(lambda *values: torch.stack([_tensor(v) for v in values]), present, status)
+        contacts = Contacts.stack([report.contacts for report in present])
+        return _combine(
+            lambda *values: torch.stack([_tensor(v) for v in values]), present, status, contacts
+        )
 
     @staticmethod
     def where(mask: Tensor, a: Report | None, b: Report | None) -> Report | None:
-        """Report that takes the environments of `a` where `mask` is true; None if one has none."""
+        """Take environments of `a` where `mask` is true, else of `b`; None if one is missing."""
         if a is None or b is None or _names(a) != _names(b):
             return None
         names = [(r.status,) * len(mask) if isinstance(r.status, str) else r.status for r in (a, b)]
         status = tuple(x if m else y for m, x, y in zip(mask.tolist(), *names, strict=True))
-        return _combine(lambda x, y: torch.where(mask, _tensor(x), _tensor(y)), [a, b], status)
+        contacts = Contacts.where(mask, a.contacts, b.contacts)
+        return _combine(
+            lambda x, y: torch.where(mask, _tensor(x), _tensor(y)), [a, b], status, contacts
+        )
 
 
 def _tensor(value: Any) -> Tensor:
@@ -144,7 +163,7 @@ def _tensor(value: Any) -> Tensor:
 
 
 def outcome_text(report: Report | None) -> str:
-    """A report within another text."""
+    """Short text of a report, for use within another text."""
     if report is None:
         return "None"
     names = ("converged", "iterations")
@@ -152,7 +171,7 @@ def outcome_text(report: Report | None) -> str:
 
 
 def _range_text(values: Any) -> str:
-    """A number, or what the numbers of a batch range over."""
+    """Text of a number, or of the range of the numbers of a batch."""
     if not isinstance(values, Tensor) or values.dim() == 0 or values.numel() == 0:
         return value_text(values)
     if values.dtype == torch.bool and values.any() and not values.all():
@@ -162,14 +181,14 @@ def _range_text(values: Any) -> str:
 
 
 def _status_text(status: str | tuple[str, ...]) -> str:
-    """A status, or how many environments have which."""
+    """Text of a status, or of how many environments have each status."""
     if isinstance(status, str):
         return repr(status)
     return f"{{{', '.join(f'{name}: {n}' for name, n in Counter(status).items())}}}"
 
 
 def _status_by(converged: bool | Tensor) -> str | tuple[str, ...]:
-    """The status of steps of which only that is known."""
+    """Status of steps of which only `converged` is known."""
     names = ("not_converged", "converged")
     if isinstance(converged, Tensor) and converged.dim() > 0:
         return tuple(names[is_true] for is_true in converged.bool().flatten().tolist())
@@ -177,7 +196,7 @@ def _status_by(converged: bool | Tensor) -> str | tuple[str, ...]:
 
 
 _FIELDS = tuple(entry.name for entry in fields(Report))
-_NUMERIC = tuple(name for name in _FIELDS if name != "status")
+_NUMERIC = tuple(name for name in _FIELDS if name not in ("status", "contacts"))
 _NUMBERS = (bool, int, float, Tensor)
 # Fields that hold several numbers by name.
 _TABLES = ("seconds", "counts")
@@ -188,9 +207,12 @@ def _names(report: Report) -> tuple[tuple[str, ...], ...]:
 
 
 def _combine(
-    function: Callable[..., Any], reports: Sequence[Report], status: str | tuple[str, ...]
+    function: Callable[..., Any],
+    reports: Sequence[Report],
+    status: str | tuple[str, ...],
+    contacts: Contacts,
 ) -> Report:
-    """Apply a function to each number of some reports."""
+    """Apply a function to each number of the given reports."""
     plain = {
         name: function(*(getattr(report, name) for report in reports))
         for name in _NUMERIC
@@ -203,7 +225,7 @@ def _combine(
         }
         for table in _TABLES
     }
-    return Report(**plain, **tables, status=status)
+    return Report(**plain, **tables, status=status, contacts=contacts)
 
 
 allow_loading(Report)

@@ -1,4 +1,4 @@
-"""Many steps, with the tapes of all of them or of one segment at a time."""
+"""Many steps, keeping the tapes of all of them or of one segment at a time."""
 
 from __future__ import annotations
 
@@ -14,39 +14,45 @@ from diffcloth_torch.checks import check_count
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.sim.controls import Control, Parameters, tensors_of
 from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.trajectory import Trajectory
 
-__all__ = ["Controls", "roll_out"]
+__all__ = ["Controls", "StepParameters", "roll_out"]
 
 Controls = Sequence[Control | None] | Callable[[int, State], Control | None] | None
+StepParameters = Parameters | Callable[[int, State], Parameters | None] | None
+"""Of all steps, or a function of the index of a step and the state before it."""
+
+Digests = dict[str, bytes]
 
 
 def roll_out(
-    step: Callable[[State, Control | None], State],
+    step: Callable[[State, Control | None, Parameters | None], State],
     state: State,
     controls: Controls,
-    parameters: Parameters | None,
+    parameters: StepParameters,
     steps: int | None,
     checkpoint_every: int | None,
-) -> list[State]:
+) -> Trajectory:
     """Take steps one after the other; see `Simulator.rollout`."""
     count = _step_count(controls, steps)
 
-    asked: dict[int, dict[str, bytes]] = {}  # what a function has returned, by digests
+    asked: dict[int, tuple[Digests, Digests]] = {}  # of what functions have returned
 
     def advance(before: State, first: int, last: int, remember: bool = False) -> list[State]:
         states = []
         for k in range(first, last):
-            control = _control_at(controls, k, before)
+            control, given = _control_at(controls, k, before), _parameters_at(parameters, k, before)
             if k in asked:
-                _require_same(k, _digests(control), asked[k])
-            before = step(before, control)
+                _require_same("controls", k, _digests(control), asked[k][0])
+                _require_same("parameters", k, _digests(given), asked[k][1])
+            before = step(before, control, given)
             if remember:
-                asked[k] = _digests(control)
+                asked[k] = _digests(control), _digests(given)
             states.append(before)
         return states
 
     if checkpoint_every is None:
-        return advance(state, 0, count)
+        return Trajectory(advance(state, 0, count))
     check_count("rollout: `checkpoint_every`", checkpoint_every, 1)
     states: list[State] = []
     for first in range(0, count, checkpoint_every):
@@ -56,11 +62,11 @@ def roll_out(
             watched = [*tensors_of(before), *tensors_of(parameters)]
             if isinstance(controls, Sequence):
                 watched += [t for control in controls[first:last] for t in tensors_of(control)]
-            own = partial(advance, remember=callable(controls))
+            own = partial(advance, remember=callable(controls) or callable(parameters))
             states += _checkpointed(own, before, first, last, watched)
         else:
             states += advance(before, first, last)
-    return states
+    return Trajectory(states)
 
 
 def _step_count(controls: Controls, steps: int | None) -> int:
@@ -86,10 +92,16 @@ def _control_at(controls: Controls, k: int, state: State) -> Control | None:
     return controls(k, state) if callable(controls) else controls[k]
 
 
-def _digests(control: Control | None) -> dict[str, bytes]:
-    """What a control sets, by the names of its fields and entries."""
+def _parameters_at(parameters: StepParameters, k: int, state: State) -> Parameters | None:
+    return parameters(k, state) if callable(parameters) else parameters
+
+
+def _digests(record: Control | Parameters | None) -> Digests:
+    """Digests of what a control or parameters set, by the names of fields and entries."""
     digests = {}
-    for field, value in ({} if control is None else vars(control)).items():
+    for field, value in ({} if record is None else vars(record)).items():
+        if field.startswith("_"):
+            continue
         entries = value if isinstance(value, Mapping) else {None: value}
         for key, entry in entries.items():
             if entry is not None:
@@ -100,15 +112,15 @@ def _digests(control: Control | None) -> dict[str, bytes]:
     return digests
 
 
-def _require_same(k: int, digests: dict[str, bytes], first: dict[str, bytes]) -> None:
-    """Refuse a control that is not the one of the rollout: its gradients would be of another."""
+def _require_same(argument: str, k: int, digests: Digests, first: Digests) -> None:
+    """Refuse a function that returned other values in the rollout: gradients would be wrong."""
     other = [n for n in {**first, **digests} if digests.get(n) != first.get(n)]
     if other:
         raise InvalidInput(
-            "rollout: `controls` must return what it returned before when backward repeats a step "
-            f"from a checkpoint, got another `{other[0]}` for the step [{k}]; what it depends on, "
-            "as the weights of a policy, must not be edited before backward, and nothing in it may "
-            "be random or count its calls"
+            f"rollout: `{argument}` must return what it returned before when backward repeats a "
+            f"step from a checkpoint, got another `{other[0]}` for the step [{k}]; what it depends "
+            "on, as the weights of a policy, must not be edited before backward, and nothing in it "
+            "may be random or count its calls"
         )
 
 
@@ -119,10 +131,10 @@ def _checkpointed(
     last: int,
     watched: Sequence[Tensor],
 ) -> list[State]:
-    """Steps first .. last - 1 whose tapes are dropped now and made again in backward.
+    """Take steps first .. last - 1, drop their tapes, and make them again in backward.
 
-    Checkpointing hides the version counters of saved tensors, so that an edit in place would change
-    what is repeated; the counters are compared here.
+    Checkpointing hides the version counters of saved tensors, so an edit in place would go
+    unnoticed and change the repeated steps; the counters are compared here.
     """
     versions = [tensor._version for tensor in watched]
 

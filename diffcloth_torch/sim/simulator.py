@@ -1,133 +1,68 @@
-"""The simulator: a scene, a time step and a solver, and the step that they define."""
+"""The simulator: a scene, a time step and a solver, which together define a step."""
 
 from __future__ import annotations
 
-import sys
-import warnings
-from collections.abc import Callable, Sequence
-from functools import wraps
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, Literal, ParamSpec, TypeVar, overload
+from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
-from diffcloth_torch.checks import (
-    POSITIVE,
-    check_bool,
-    check_choice,
-    check_count,
-    check_number,
-    check_shape,
+from diffcloth_torch.checks import check_choice, check_count
+from diffcloth_torch.model.assembly import assemble
+from diffcloth_torch.model.defaults import has_barrier, has_contact, scene_parameters
+from diffcloth_torch.model.options import (
+    ABILITIES,
+    COUPLINGS,
+    SCHEMES,
+    ContactOptions,
+    SolverOptions,
 )
-from diffcloth_torch.dynamics.dynamics import Dynamics, Prediction
-from diffcloth_torch.dynamics.limits import limit_stiffness
-from diffcloth_torch.dynamics.totals import Totals
-from diffcloth_torch.errors import IntersectingState, InvalidInput
-from diffcloth_torch.model.defaults import (
-    check_barrier,
-    choose_barrier_distance,
-    has_barrier,
-    has_contact,
-    scene_parameters,
-)
-from diffcloth_torch.model.options import COUPLINGS, SCHEMES, ContactOptions, SolverOptions
-from diffcloth_torch.model.quantities import STATE, shape_of
-from diffcloth_torch.model.scene import Scene, assemble
+from diffcloth_torch.model.quantities import Fields
+from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.axes import without_axes
+from diffcloth_torch.sim.border import Border
+from diffcloth_torch.sim.control_fields import check_control
 from diffcloth_torch.sim.controls import Control, Parameters
-from diffcloth_torch.sim.cores import CoreOptions, make_core
-from diffcloth_torch.sim.coupling import Staggered
-from diffcloth_torch.sim.failures import failures_of, refuse_gradients
-from diffcloth_torch.sim.inputs import (
-    Fields,
-    check_control,
-    check_parameters,
-    constants,
-    control_fields,
-    core_inputs,
-    default_fields,
-    parameter_fields,
-    state_fields,
-)
+from diffcloth_torch.sim.cores import constants
+from diffcloth_torch.sim.engine import Engine
+from diffcloth_torch.sim.equilibrium import Equilibria
+from diffcloth_torch.sim.guards import guarded
 from diffcloth_torch.sim.layout import Layout
-from diffcloth_torch.sim.links import contact_wrenches, link_poses, link_velocities
-from diffcloth_torch.sim.masses import cloth_totals, vertex_masses
-from diffcloth_torch.sim.motion import (
-    ended_poses,
-    held_targets,
-    prescribed_motion,
-    with_rows,
-)
-from diffcloth_torch.sim.outcome import make_report, raise_on_failure
-from diffcloth_torch.sim.rollout import roll_out
+from diffcloth_torch.sim.observables import Observables
+from diffcloth_torch.sim.outcome import make_report
+from diffcloth_torch.sim.parameter_fields import check_parameters, default_fields
+from diffcloth_torch.sim.rollout import Controls, StepParameters, roll_out
 from diffcloth_torch.sim.schemes import check_scheme
-from diffcloth_torch.sim.state import State, Surfaces
-from diffcloth_torch.sim.step import (
-    Outcome,
-    as_array,
-    refuse_transforms,
-    take_step,
+from diffcloth_torch.sim.start import (
+    check_gains,
+    check_start,
+    check_time_step,
+    check_tolerance,
+    choose_barrier,
+    initial_tensors,
 )
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.step import refuse_transforms
+from diffcloth_torch.sim.trajectory import Trajectory
 
 __all__ = ["Simulator"]
-
-# A start is deep inside the barrier below this part of the gap at rest: a sheet is then thrown
-# up by several barrier distances.
-_DEEP = 0.25
-
-# What a step may be off by when its solver stops: in a scene of micrometers the default tolerance
-# would be as long as the barrier.
-_LARGEST_PART_OF_BARRIER = 0.1
 
 _DEFAULT_CONTACT = ContactOptions()
 _DEFAULT_SOLVER = SolverOptions()
 
 
-P = ParamSpec("P")
-T = TypeVar("T")
-
-
-_UNCOMPILED: dict[Callable[..., Any], Callable[..., Any]] = {}
-
-
-def _uncompiled(method: Callable[P, T]) -> Callable[P, T]:
-    """The method as `torch.compile` leaves it alone: there is nothing to fuse in a step."""
-    # Importing the compiler takes longer than all the rest; nobody compiles without it.
-    if not hasattr(sys.modules.get("torch._dynamo"), "disable"):
-        return method
-    if method not in _UNCOMPILED:
-        _UNCOMPILED[method] = torch.compiler.disable(method)  # type: ignore[no-untyped-call]
-    return _UNCOMPILED[method]
-
-
-def _memory_errors(method: Callable[P, T]) -> Callable[P, T]:
-    """Let torch's lack of memory be the error that NumPy and the core raise for theirs."""
-
-    @wraps(method)
-    def guarded(*args: P.args, **keywords: P.kwargs) -> T:
-        try:
-            return _uncompiled(method)(*args, **keywords)
-        except RuntimeError as error:
-            if "can't allocate memory" in str(error):
-                raise MemoryError(f"{method.__name__}: {error}") from error
-            raise
-
-    return guarded
-
-
-class Simulator:
+class Simulator(Observables):
     """Steps a scene through time. Immutable, and safe to use from several threads.
 
     Attributes:
-        scene: What is simulated.
+        scene: The scene.
         dt: Time step [s].
         scheme: "coupled", "split" or "projective".
         coupling: "monolithic", "rigid_to_cloth" or "cloth_to_rigid".
         contact: Contact options, as given.
         solver: Solver options.
-        surfaces: Names of the S surfaces: cloths, bodies, then links that have a shape.
+        surfaces: Names of the S surfaces: cloths, bodies, then links that have collision shapes.
         slices: Name of a surface -> its rows in `positions` for a cloth, in `body_forces` for a
             body or a link.
         joint_slices: Name of a robot -> its rows in `joint_positions` and the like.
@@ -153,23 +88,25 @@ class Simulator:
         contact: ContactOptions = _DEFAULT_CONTACT,
         solver: SolverOptions = _DEFAULT_SOLVER,
     ) -> None:
-        """Prepare the solver and choose the barrier where it is not given.
+        """Prepare the solver, and choose the barrier parameters that are not given.
 
-        A start deep inside the barrier is a warning: it throws surfaces apart.
+        A scene that starts deep inside the barrier causes a warning, because the barrier will throw
+        its surfaces apart.
 
         Args:
-            scene: What is simulated.
-            dt: Time step [s], > 0; a plain number, or one in float64.
+            scene: The scene.
+            dt: Time step [s], > 0; a plain number or a float64 one.
             scheme: "coupled" solves elasticity and contact together; "split" solves elasticity
-                first and then contact, near its result. It takes what forces move only with the
-                staggered couplings. "projective" solves elasticity with dry friction at the
-                cloths' vertices, against bodies that are boxes, spheres, capsules or planes: the
-                baseline, in which surfaces may cross between vertices.
-            coupling: How cloths and what forces move act on each other: "monolithic" solves for
-                both together; "rigid_to_cloth" moves bodies with their velocities, solves the
-                cloths against them, and changes those velocities by the contact impulses;
-                "cloth_to_rigid" solves the cloths against bodies at rest and then moves the bodies.
-            contact: Contact and friction.
+                first and then contact, close to that result; it needs a staggered coupling if a
+                body or a robot is dynamic. "projective" is the baseline: it solves elasticity with
+                dry friction at the cloths' vertices, against bodies that are boxes, spheres,
+                capsules or planes, and surfaces may cross between vertices.
+            coupling: How cloths and dynamic bodies and robots act on each other: "monolithic"
+                solves for both together; "rigid_to_cloth" moves bodies with their velocities,
+                solves the cloths against them, and changes those velocities by the contact
+                impulses; "cloth_to_rigid" solves the cloths against bodies at rest and then moves
+                the bodies.
+            contact: Options of contact and friction.
             solver: Tolerance and limits of the solver.
 
         Raises:
@@ -177,7 +114,7 @@ class Simulator:
                 thickness.
             InvalidInput: If a value is not accepted, the barrier is too wide for the meshes, or a
                 pd joint has no gains.
-            TypeError: If something has a wrong type.
+            TypeError: If an argument has a wrong type.
         """
         for name, value, kind in (
             ("scene", scene, Scene),
@@ -189,46 +126,48 @@ class Simulator:
                     f"Simulator: `{name}` must be a {kind.__name__}, got {type(value).__name__}"
                 )
         self.scene, self.contact, self.solver = scene, contact, solver
-        self.dt = _check_time_step(dt)
+        self.dt = check_time_step(dt)
         self.scheme = check_choice("Simulator: `scheme`", scheme, SCHEMES)
         self.coupling = check_choice("Simulator: `coupling`", coupling, COUPLINGS)
-        self._assembly = assemble(scene, all_nodal=scheme == "projective")
+        abilities = ABILITIES[scheme]
+        self._assembly = assemble(scene, all_nodal=not abilities["barrier"])
         self._layout = Layout(self._assembly)
-        _check_gains(self._layout)
+        check_gains(self._layout)
         check_scheme(self.scheme, self.coupling, scene, self._layout, solver)
-        self._dynamics = Dynamics(self._assembly, self.dt) if self._layout.has_coordinates else None
         self.surfaces = self._assembly.surface_names
         starts = self._assembly.cloth_vertex_start.tolist()
         rows = [slice(a, b) for a, b in pairwise(starts)]
         cloths = zip(scene.cloth_names, rows, strict=True)
         self.slices = {**dict(cloths), **self._layout.rigid_vertices}
         self.joint_slices = dict(self._assembly.joint_slices)
-        self._surfaces = Surfaces.of(scene, self._assembly)
-        # Without cloths there is nothing to split or to couple.
-        options = CoreOptions(
-            bending_models=[cloth.bending_model for cloth in scene.cloths],
+        self._engine = Engine(
+            scene,
+            self._layout,
             dt=self.dt,
-            scheme=scheme if scene.cloths else "coupled",
+            scheme=scheme,
+            coupling=coupling,
             contact=contact,
             solver=solver,
         )
-        stiffness = None
-        if self._dynamics is not None:
-            stiffness = limit_stiffness(self._assembly, self.dt, scene.gravity)
-        self._core = make_core(self._assembly, options, stiffness)
-        self._staggered = None
-        in_turn = coupling != "monolithic" and scene.cloths and self._layout.is_dynamic
-        if in_turn and self._dynamics is not None and stiffness is not None:
-            self._staggered = Staggered(coupling, self._layout, self._dynamics, options, stiffness)
-        self._nonadjacent_distance = self._core.smallest_nonadjacent_distance()
+        self._core = self._engine.core
+        self._equilibria = Equilibria(
+            scene, self._layout, dt=self.dt, scheme=scheme, contact=contact, solver=solver
+        )
+        nonadjacent = self._core.smallest_nonadjacent_distance()
         self._defaults = scene_parameters(scene, self._assembly, has_contact(scene, contact))
-        self._default_fields = default_fields(self._defaults)
+        fields = default_fields(self._defaults)
+        self._border = Border(self._layout, fields, nonadjacent, self_contact=contact.self_contact)
+        start, _ = self._border.enter(self.initial_state(), None, None)
         if has_barrier(scene, contact, scheme):
-            self._choose_barrier()
-        self._constants = constants(self._layout, self._default_fields)
-        self._check_tolerance()
-        if scheme != "projective":
-            self._check_start()
+            self._defaults |= choose_barrier(
+                self._engine, self._border, scene, contact, start, nonadjacent
+            )
+        self._engine.constants = constants(self._layout, self._border.defaults)
+        if "barrier_distance" in self._defaults:
+            distance = float(self._defaults["barrier_distance"])
+            check_tolerance(solver.tolerance, distance, self.dt)
+        if abilities["barrier"]:
+            check_start(self._engine, start._replace(parameters=self._border.defaults))
 
     def __reduce__(self) -> tuple[Any, ...]:
         arguments = (self.scene, self.dt, self.scheme, self.contact, self.solver, self.coupling)
@@ -238,36 +177,24 @@ class Simulator:
         coupling = "" if self.coupling == "monolithic" else f", coupling={self.coupling!r}"
         return f"Simulator({self.scene!r}, dt={self.dt:g}, scheme={self.scheme!r}{coupling})"
 
-    @_memory_errors
+    @guarded
     def initial_state(self, batch_size: int | None = None) -> State:
         """Make the state that the scene describes, at rest.
 
         Args:
-            batch_size: Number of equal environments, >= 1; None makes a state without batch axis.
+            batch_size: Number of identical environments, >= 1; None makes a state without a batch
+                axis.
         """
         if batch_size is not None:
             check_count("initial_state: `batch_size`", batch_size, 1)
-        assembly = self._assembly
-        positions = torch.from_numpy(assembly.vertices)
-        tensors = {
-            "positions": positions,
-            "body_poses": torch.from_numpy(assembly.body_poses),
-            "soft_pin_targets": positions[torch.from_numpy(assembly.soft_pins.astype(np.int64))],
-            "joint_positions": torch.from_numpy(assembly.joint_positions),
-            "joint_targets": torch.from_numpy(assembly.joint_positions),
-            "base_poses": torch.from_numpy(assembly.base_poses),
-        }
-        for name, quantity in STATE.items():  # the rest is at rest
-            shape = shape_of(quantity.axes[0], assembly.sizes)
-            tensors.setdefault(name, torch.zeros(shape, dtype=torch.float64))
         environments = () if batch_size is None else (batch_size,)
         copies = {
             name: tensor.expand((*environments, *tensor.shape)).clone(
                 memory_format=torch.contiguous_format
             )
-            for name, tensor in tensors.items()
+            for name, tensor in initial_tensors(self._assembly).items()
         }
-        return State(**copies, report=None, _surfaces=self._surfaces)
+        return State(**copies, report=None, _surfaces=self._engine.surfaces)
 
     def control(
         self,
@@ -282,14 +209,17 @@ class Simulator:
         joint_efforts: Any = None,
         base_poses: Any = None,
         base_wrenches: Any = None,
+        attachments: Any = None,
+        attachment_weights: Any = None,
     ) -> Control:
-        """Make a control and check it against the scene; what is None holds, or is zero.
+        """Make a control and check it against the scene.
 
-        Everything but `forces` may be given by name too, as in `Control`.
+        A target that is None holds its present value; forces, torques and velocities that are None
+        are zero. All but `forces` may also be given by name, as in `Control`.
 
         Args:
-            pins: Positions at the end of the step [m], shape [P, 3].
-            soft_pins: Likewise, shape [Q, 3].
+            pins: Positions of the pins at the end of the step [m], shape [P, 3].
+            soft_pins: Positions to which the soft pins pull [m], shape [Q, 3].
             body_poses: Poses of kinematic bodies at the end of the step, shape [K, 7].
             forces: Forces on the cloth vertices [N], shape [N, 3].
             body_wrenches: Forces and torques on dynamic bodies [N, N m], shape [K, 6].
@@ -298,10 +228,12 @@ class Simulator:
             joint_efforts: Efforts at torque and pd joints [N m or N], shape [J].
             base_poses: Poses of kinematic bases at the end of the step, shape [R, 7].
             base_wrenches: Forces and torques on floating bases [N, N m], shape [R, 6].
+            attachments: Targets of attachments at the end of the step [m], shape [U, 3].
+            attachment_weights: With which share of their stiffness they pull [-], shape [A].
 
         Raises:
             InvalidInput: If a name, shape or value is not accepted.
-            TypeError: If something is no array of numbers on the CPU.
+            TypeError: If a value is not an array of numbers on the CPU.
         """
         refuse_transforms("control")
         control = Control(
@@ -315,15 +247,17 @@ class Simulator:
             joint_efforts=joint_efforts,
             base_poses=base_poses,
             base_wrenches=base_wrenches,
+            attachments=attachments,
+            attachment_weights=attachment_weights,
         )
         return check_control(self._layout, control)
 
     def parameters(self) -> Parameters:
-        """Make the parameters of the scene, in new tensors; change them with `.replace(...)`."""
+        """Copy the parameters of the scene to new tensors; change them with `.replace(...)`."""
         copies = {name: tensor.clone() for name, tensor in self._defaults.items()}
         return Parameters(**copies, _unbatched=tuple(copies))
 
-    @_memory_errors
+    @guarded
     def step(
         self,
         state: State,
@@ -333,451 +267,115 @@ class Simulator:
         """Advance by one time step. Pure, and differentiable in all three arguments.
 
         Args:
-            state: Where things are.
-            control: Where they shall be; None holds pins and bodies.
+            state: The state at the start of the step.
+            control: Targets for the end of the step, and forces; None holds pins and bodies.
             parameters: Physical parameters; None takes those of the scene.
 
         Returns:
             The state after `dt`. All of its tensors but `time` carry gradients: `positions`,
-            `velocities`, `body_forces`, `soft_pin_targets`, and poses, positions, velocities,
-            targets and efforts of bodies, joints and bases.
+            `velocities`, contact and pin forces, `soft_pin_targets`, and the poses, positions,
+            velocities, targets and efforts of bodies, joints and bases.
 
         Raises:
             IntersectingState: If surfaces intersect in `state`.
             InfeasibleMotion: If bodies, joints or pins cannot reach their targets without an
                 intersection.
-            NotConverged: If the solver stops early. With `SolverOptions(throw=False)` neither
-                of these is raised: see there.
+            NotConverged: If the solver stops before it reaches its tolerance.
+            TurnedTooFar: If a dynamic body in contact turns by more than 1 rad.
+                `SolverOptions(throw=False)` returns these last three as a status instead of raising
+                them.
             InvalidInput: If a shape or value is not accepted.
             TypeError: If a tensor of the state is not float64 on the CPU.
         """
-        (before, wanted, physical), batch = self._fields(state, control, parameters)
-        if self._staggered is None:
-            outcome, after = self._step_together(before, wanted, physical, batch)
-        else:
-            outcome, after = self._step_in_turn(before, wanted, physical, batch)
-        report = make_report(outcome.diagnostics, batched=batch is not None)
-        after["soft_pin_targets"] = wanted["soft_pins"]
-        tensors = {
-            "positions": outcome.positions,
-            "velocities": outcome.velocities,
-            "body_forces": outcome.body_forces,
-            **{name: _own_copy(values, batch) for name, values in after.items()},
-        }
-        failures = failures_of(outcome.diagnostics)
+        given, batch = self._border.enter(state, control, parameters)
+        fields, diagnostics = self._engine.step(given, self._check(batched=batch is not None))
         return State(
-            **refuse_gradients(tensors, failures, batched=batch is not None),
+            **without_axes(fields, batch),
             time=state.time + self.dt,
-            report=report,
-            _surfaces=self._surfaces,
+            report=make_report(diagnostics, self.surfaces, batched=batch is not None),
+            _surfaces=self._engine.surfaces,
         )
 
-    def _step_together(
-        self, state: Fields, control: Fields, parameters: Fields, batch: int | None
-    ) -> tuple[Outcome, Fields]:
-        """One solve for everything; its outcome, and fields of bodies and robots behind it."""
-        prediction = self._predict(state, control, parameters)
-        inputs = self._core_inputs(state, control, parameters, prediction)
-        outcome = take_step(self._core, inputs, self._constants, batched=batch is not None)
-        self._check(outcome.diagnostics, batch)
-        ended = outcome.diagnostics["ended"]
-        if self._dynamics is None or prediction is None:
-            after = prescribed_motion(self._layout, state, control, self.dt)
-            if ended:
-                poses = ended_poses(control["body_poses"], ended, len(state["positions"]))
-                with torch.no_grad():
-                    reached = control | {"body_poses": poses}
-                    there = prescribed_motion(self._layout, state, reached, self.dt)
-                after = with_rows(after, there, ended)
-            return outcome, after
-        forces = outcome.body_forces if batch is not None else outcome.body_forces.unsqueeze(0)
-        coordinates = outcome.coordinates
-        if coordinates is None:  # robots without a joint that moves
-            coordinates = forces.new_zeros(len(forces), 0)
-        elif batch is None:
-            coordinates = coordinates.unsqueeze(0)
-        after = self._dynamics.advance(prediction, coordinates, forces)
-        if ended:
-            poses = ended_poses(prediction.body_targets, ended, len(forces))
-            with torch.no_grad():
-                stopped = self._dynamics.end_at(prediction, poses)
-                there = self._dynamics.advance(stopped, coordinates, forces)
-            after = with_rows(after, there, ended)
-        return outcome, {**after, "joint_targets": held_targets(self._layout, state, control)}
-
-    def _step_in_turn(
-        self, state: Fields, control: Fields, parameters: Fields, batch: int | None
-    ) -> tuple[Outcome, Fields]:
-        """Like `_step_together`, by a staggered coupling."""
-        assert self._staggered is not None
-        inputs = self._core_inputs(state, control, parameters, None)
-        outcome, after = self._staggered.step(
-            state, control, parameters, inputs, lambda found: self._check(found, batch)
-        )
-        if batch is None:
-            outcome = outcome.first()
-        return outcome, {**after, "joint_targets": held_targets(self._layout, state, control)}
-
-    def _check(self, diagnostics: dict[str, Any], batch: int | None) -> None:
-        if not any(diagnostics["status"]):
-            return
-        batched = batch is not None
-        report = make_report(diagnostics, batched=batched)
-        raise_on_failure(diagnostics, report, throw=self.solver.throw, batched=batched)
-
-    def rollout(
-        self,
-        state: State,
-        controls: Sequence[Control | None] | Callable[[int, State], Control | None] | None = None,
-        parameters: Parameters | None = None,
-        *,
-        steps: int | None = None,
-        checkpoint_every: int | None = None,
-    ) -> list[State]:
-        """Take several steps.
-
-        Args:
-            state: Where to start.
-            controls: One control for each step (None holds), or a function of the index of a step
-                and the state before it; None holds throughout.
-            parameters: Physical parameters of all steps.
-            steps: Number of steps; needed unless `controls` is a sequence.
-            checkpoint_every: Keep tapes of this many steps at a time: backward repeats the steps
-                from the state before them. A function `controls` is then called again and must
-                return the same: backward raises `InvalidInput` otherwise.
-
-        Returns:
-            The states after each step.
-        """
-        # Copies of NumPy arrays and lists: edits before backward must not reach what is repeated.
-        if isinstance(controls, Sequence):
-            controls = [c if c is None else check_control(self._layout, c) for c in controls]
-        if parameters is not None:
-            parameters = check_parameters(parameters)
-        return roll_out(
-            lambda before, control: self.step(before, control, parameters),
-            state,
-            controls,
-            parameters,
-            steps,
-            checkpoint_every,
-        )
-
-    def link_poses(self, state: State) -> dict[str, Tensor]:
-        """Frames of the links of all robots, differentiable in the state.
-
-        Args:
-            state: Where things are.
-
-        Returns:
-            "robot/link" -> homogeneous matrix from the link to the world, shape [4, 4], or
-            [B, 4, 4] in a batch.
-        """
-        refuse_transforms("link_poses")
-        fields, batch = state_fields(self._layout, state)
-        return _unbatched(link_poses(self._layout, fields), batch)
-
-    def link_velocities(
-        self, state: State, parameters: Parameters | None = None
-    ) -> dict[str, Tensor]:
-        """Velocities of the links of all robots, differentiable in both arguments.
-
-        Args:
-            state: How things move.
-            parameters: Physical parameters, of which the centers of mass count; None takes those
-                of the scene.
-
-        Returns:
-            "robot/link" -> velocity of the link's center of mass (of the origin of its frame where
-            the robot is not dynamic), then its angular velocity, in world axes [m/s, rad/s], shape
-            [6], or [B, 6] in a batch.
-        """
-        refuse_transforms("link_velocities")
-        fields, batch = state_fields(self._layout, state)
-        centers = self._centers("link", parameters, batch)
-        return _unbatched(link_velocities(self._layout, fields, centers), batch)
-
-    def contact_wrenches(
-        self, state: State, parameters: Parameters | None = None
-    ) -> dict[str, Tensor]:
-        """What the contact forces of a state add up to, differentiable in both arguments.
-
-        Args:
-            state: Its `body_forces` are added up where its bodies and links are.
-            parameters: Physical parameters, of which the centers of mass count; None takes those
-                of the scene.
-
-        Returns:
-            Name of a body, or "robot/link" -> force, then torque about the center of mass (about
-            the origin of its frame where it is not dynamic), in world axes [N, N m], shape [6], or
-            [B, 6] in a batch.
-        """
-        refuse_transforms("contact_wrenches")
-        fields, batch = state_fields(self._layout, state)
-        forces = state.body_forces if batch is not None else state.body_forces.unsqueeze(0)
-        shape = (len(fields["positions"]), *self._assembly.body_vertices.shape)
-        check_shape("contact_wrenches: `state.body_forces`", forces.shape, [shape])
-        centers = [self._centers(owner, parameters, batch) for owner in ("body", "link")]
-        return _unbatched(contact_wrenches(self._layout, fields, forces, *centers), batch)
-
-    def _totals(self, state: Fields, parameters: Fields) -> Totals:
-        """Momentum and energy of all that has mass."""
-        totals = cloth_totals(self._assembly, state, parameters)
-        if self._dynamics is not None:
-            totals = totals.plus(self._dynamics.totals(state, parameters))
-        return totals
-
-    def _centers(self, owner: str, parameters: Parameters | None, batch: int | None) -> Tensor:
-        """Centers of mass of bodies or links, zero where nothing is dynamic; [B or 1, rows, 3]."""
-        fields = self._physical(parameters, batch)
-        rows = self._assembly.sizes["K" if owner == "body" else "L"]
-        return fields.get(f"{owner}_center", torch.zeros(1, rows, 3, dtype=torch.float64))
-
-    def vertex_masses(
-        self, parameters: Parameters | None = None, *, batch_size: int | None = None
-    ) -> Tensor:
-        """Masses of the cloths' vertices, differentiable in density and rest shape.
-
-        Args:
-            parameters: Physical parameters; None takes those of the scene.
-            batch_size: Number of environments, >= 1; needed where parameters have a batch axis.
-
-        Returns:
-            A third of the mass of each face around a vertex [kg], shape [N], or [B, N] in a batch.
-        """
-        refuse_transforms("vertex_masses")
-        if batch_size is not None:
-            check_count("vertex_masses: `batch_size`", batch_size, 1)
-        masses = vertex_masses(self._assembly, self._physical(parameters, batch_size))
-        return _own_copy(masses, batch_size)
-
-    def momentum(self, state: State, parameters: Parameters | None = None) -> Tensor:
-        """Momentum of all that has mass, differentiable in both arguments.
-
-        That is cloths with their pinned vertices, dynamic bodies, and whole robots of which forces
-        move at least a part. Bodies and robots that only follow prescribed motion have no mass.
-
-        Args:
-            state: Where things are, and how they move.
-            parameters: Physical parameters; None takes those of the scene.
-
-        Returns:
-            Linear momentum, then angular momentum about the origin of the world [kg m/s,
-            kg m^2/s], shape [6], or [B, 6] in a batch.
-        """
-        refuse_transforms("momentum")
-        fields, batch = state_fields(self._layout, state)
-        result = self._totals(fields, self._physical(parameters, batch)).momentum
-        return result if batch is not None else result[0]
-
-    def kinetic_energy(self, state: State, parameters: Parameters | None = None) -> Tensor:
-        """Kinetic energy of what `momentum` counts, differentiable in both arguments.
-
-        The inertia of drives, `joint_armature`, adds its part at joints that forces move.
-
-        Args:
-            state: Where things are, and how they move.
-            parameters: Physical parameters; None takes those of the scene.
-
-        Returns:
-            Energy [J], shape [], or [B] in a batch.
-        """
-        refuse_transforms("kinetic_energy")
-        fields, batch = state_fields(self._layout, state)
-        result = self._totals(fields, self._physical(parameters, batch)).kinetic_energy
-        return result if batch is not None else result[0]
-
-    @overload
-    def energy(
-        self, state: State, parameters: Parameters | None = None, *, parts: Literal[False] = False
-    ) -> Tensor: ...
-
-    @overload
-    def energy(
-        self, state: State, parameters: Parameters | None = None, *, parts: Literal[True]
-    ) -> dict[str, Tensor]: ...
-
-    def energy(
-        self, state: State, parameters: Parameters | None = None, *, parts: bool = False
-    ) -> Tensor | dict[str, Tensor]:
-        """Potential energy at the positions of a state: elasticity, soft pins, gravity, contact.
-
-        Gravity is that of cloths, and of the bodies and robots that `momentum` counts; it is zero
-        at the origin of the world. What drives and stops of joints store is left out.
-
-        Args:
-            state: Where things are. It must not require a gradient: there is none.
-            parameters: Physical parameters; None takes those of the scene. They must not require a
-                gradient either.
-            parts: Whether to return what adds up to the energy.
-
-        Returns:
-            Energy [J], shape [], or [B] in a batch; with `parts` a dict of such tensors:
-            "stretch", "bending", "soft_pins", "contact" (the barrier's) and "gravity".
-        """
-        check_bool("energy: `parts`", parts)
-        fields, batch = self._fields(state, None, parameters)
-        before, control, physical = fields
-        # Energy is that of where things are: no speed is too high for it.
-        still = before | {
-            n: torch.zeros_like(t) for n, t in before.items() if n.endswith("velocities")
-        }
-        weightless = physical | {"gravity": torch.zeros_like(physical["gravity"])}
-        inputs = self._core_inputs(
-            before, control, physical, self._predict(still, control, weightless)
-        )
-        if torch.is_grad_enabled():
-            for name, tensor in inputs.items():
-                if tensor.requires_grad:
-                    raise InvalidInput(
-                        f"energy: `{name}` must not require a gradient, energy has none; "
-                        "call it under torch.no_grad() or with a detached state"
-                    )
-        stored = self._core.stored_energy(_arrays(inputs))
-        energies = {name: torch.from_numpy(values) for name, values in stored.items()}
-        with torch.no_grad():
-            energies["gravity"] = self._totals(before, physical).gravity_energy
-        energies = _unbatched(energies, batch)
-        if parts:
-            return energies
-        first, *rest = energies.values()
-        return sum(rest, first)
-
-    def path(
+    @guarded
+    def equilibrium(
         self,
         state: State,
         control: Control | None = None,
         parameters: Parameters | None = None,
-    ) -> Tensor:
-        """Polyline along which the solver takes a step, for an independent judge.
+    ) -> State:
+        """Find a stable static equilibrium near a state. Pure, and differentiable like a step.
 
-        Every straight segment between successive rows is certified free of collisions, while the
-        chord from the first to the last may cross an obstacle. A step that fails gives the path up
-        to its failure.
+        All forces balance there, with pins and prescribed bodies at their targets. Friction resists
+        displacement from the positions in `state`, so the result depends on them, as it does in
+        reality. Damping does not act at rest: its gradient is zero.
 
         Args:
-            state: Where things are, one environment.
-            control: Where they shall be; None holds pins and bodies.
+            state: Where the search begins, and where friction counts displacements from. Its
+                velocities are ignored.
+            control: Targets, and forces that act permanently; None holds pins and bodies.
             parameters: Physical parameters; None takes those of the scene.
 
         Returns:
-            Accepted iterates, shape [M, N + V, 3] [m]: cloth vertices, then body vertices.
+            The state at rest, at the time of `state`. Gradients are those of the equilibrium: one
+            linear solve for each friction iteration of its last step.
+
+        Raises:
+            IntersectingState: If surfaces intersect in `state`.
+            SimulationError: If something is free to move, so that the Hessian is singular; the
+                message names it.
+            NotConverged: If a solve stops before it reaches its tolerance, or friction does not
+                settle.
+            InfeasibleMotion: As for `step`.
+            InvalidInput: As for `step`; also if a robot is dynamic, contact is at vertices, or the
+                control has torques on bodies or velocities of joints.
         """
-        with torch.no_grad():
-            fields, batch = self._fields(state, control, parameters)
-            if batch is not None:
-                raise InvalidInput(
-                    "path: `state` must be one environment, got a batch; use state[i]"
-                )
-            if self._staggered is not None:
-                inputs = self._core_inputs(*fields, None)
-                path = self._staggered.path(*fields, inputs, lambda found: self._check(found, None))
-                return torch.from_numpy(path)
-            inputs = self._core_inputs(*fields, self._predict(*fields))
-            return torch.from_numpy(self._core.path(_arrays(inputs)))
+        given, batch = self._border.enter(state, control, parameters)
+        fields, diagnostics = self._equilibria.find(given, self._check(batched=batch is not None))
+        return State(
+            **without_axes(fields, batch),
+            time=state.time,
+            report=make_report(diagnostics, self.surfaces, batched=batch is not None),
+            _surfaces=self._engine.surfaces,
+        )
+
+    def rollout(
+        self,
+        state: State,
+        controls: Controls = None,
+        parameters: StepParameters = None,
+        *,
+        steps: int | None = None,
+        checkpoint_every: int | None = None,
+    ) -> Trajectory:
+        """Take several steps.
+
+        Args:
+            state: The state before the first step.
+            controls: A sequence with one control, or None to hold, for each step; or a function of
+                the index of a step and the state before it; or None to hold throughout.
+            parameters: Physical parameters of all steps, or a function of the index of a step and
+                the state before it.
+            steps: Number of steps; required unless `controls` is a sequence.
+            checkpoint_every: Keep the tapes of only this many steps at a time; backward repeats
+                these steps from the state before them. Functions are then called again and must
+                return the same values, otherwise backward raises `InvalidInput`.
+
+        Returns:
+            The states after each step, as a list that also has each of their fields over time.
+        """
+        # Copies of NumPy arrays and lists: edits before backward must not change repeated steps.
+        if isinstance(controls, Sequence):
+            controls = [c if c is None else check_control(self._layout, c) for c in controls]
+        if parameters is not None and not callable(parameters):
+            parameters = check_parameters(parameters)
+        return roll_out(self.step, state, controls, parameters, steps, checkpoint_every)
 
     def _inputs(
         self, state: State, control: Control | None, parameters: Parameters | None
     ) -> tuple[Fields, int | None]:
         """Inputs of the core, and the batch size."""
-        fields, batch = self._fields(state, control, parameters)
-        return self._core_inputs(*fields, self._predict(*fields)), batch
-
-    def _fields(
-        self, state: State, control: Control | None, parameters: Parameters | None
-    ) -> tuple[tuple[Fields, Fields, Fields], int | None]:
-        """Check everything and give every tensor its leading axis of environments."""
-        refuse_transforms("step", state, control, parameters)
-        before, batch = state_fields(self._layout, state)
-        wanted = control_fields(self._layout, control, before, batch)
-        physical = self._physical(parameters, batch)
-        return (before, wanted, physical), batch
-
-    def _physical(self, parameters: Parameters | None, batch: int | None) -> Fields:
-        """Check parameters and complete them by those of the scene, which are checked already."""
-        if parameters is None:
-            return self._default_fields
-        physical = parameter_fields(self._layout, parameters, self._default_fields, batch)
-        self._check_barrier("parameters", physical)
-        return physical
-
-    def _predict(self, state: Fields, control: Fields, parameters: Fields) -> Prediction | None:
-        """What bodies and robots do by themselves; None where all are bodies on known poses."""
-        if self._dynamics is None:
-            return None
-        return self._dynamics.predict(state, control, parameters)
-
-    def _core_inputs(
-        self, state: Fields, control: Fields, parameters: Fields, prediction: Prediction | None
-    ) -> Fields:
-        inputs = core_inputs(state, control, parameters)
-        if prediction is not None:
-            inputs |= prediction.core_inputs()
-        rest = inputs.get("rest_positions")
-        if rest is not None and not rest.requires_grad:
-            scene_rest = self._default_fields["rest_positions"]
-            if rest is scene_rest or torch.equal(rest, scene_rest):
-                del inputs["rest_positions"]  # the core has prepared the rest shape of the scene
-        return inputs
-
-    def _choose_barrier(self) -> None:
-        """Complete the defaults by what the contact options give or leave to the scene."""
-        distance = self.contact.barrier_distance
-        if distance is None:
-            distance = choose_barrier_distance(self.scene, self._nonadjacent_distance, self.contact)
-        slip_velocity = self.contact.slip_velocity
-        self._add_defaults(slip_velocity=slip_velocity, barrier_distance=distance)
-        self._check_barrier("Simulator", self._default_fields)
-        stiffness: float | NDArray[np.float64] | None = self.contact.barrier_stiffness
-        if stiffness is None:
-            inputs, _ = self._inputs(self.initial_state(), None, None)
-            pairs = self._core.default_barrier_stiffness(_arrays(inputs), distance)
-            stiffness = pairs if (pairs != pairs[0, 0]).any() else float(pairs[0, 0])
-        self._add_defaults(barrier_stiffness=stiffness)
-
-    def _add_defaults(self, **values: float | NDArray[np.float64]) -> None:
-        tensors = {n: torch.tensor(v, dtype=torch.float64) for n, v in values.items()}
-        self._defaults |= tensors
-        self._default_fields |= default_fields(tensors)
-
-    def _check_barrier(self, owner: str, inputs: Fields) -> None:
-        cloths = len(self.scene.cloths)
-        if cloths and "barrier_distance" in inputs and self.contact.self_contact:
-            thickness = as_array(inputs["thickness"])[:, :cloths]
-            distance = as_array(inputs["barrier_distance"])
-            check_barrier(owner, distance, thickness, self._nonadjacent_distance)
-
-    def _check_tolerance(self) -> None:
-        """Refuse a solver that stops before it sees lengths as small as the scene's."""
-        if "barrier_distance" not in self._defaults:
-            return
-        distance = float(self._defaults["barrier_distance"])
-        largest = _LARGEST_PART_OF_BARRIER * distance / self.dt
-        if self.solver.tolerance > largest:
-            raise InvalidInput(
-                f"Simulator: `solver.tolerance` must be at most {largest:.3g} m/s, with which a "
-                f"step is known to {_LARGEST_PART_OF_BARRIER:g} of the barrier distance "
-                f"{distance:.3g} m, got {self.solver.tolerance:.3g}"
-            )
-
-    def _check_start(self) -> None:
-        """Refuse surfaces that overlap, and warn of those that the barrier would throw apart."""
-        inputs = _arrays(self._inputs(self.initial_state(), None, None)[0])
-        overlap = self._core.find_overlap(inputs)
-        if overlap is not None:
-            raise IntersectingState(
-                f"Simulator: surfaces of the scene overlap: {overlap}; move them apart",
-                environments=(0,),
-            )
-        close = self._core.find_close_start(inputs)
-        if close is not None and close[1] < _DEEP * close[2]:
-            elements, gap, rest_gap = close
-            warnings.warn(
-                f"Simulator: the barrier will throw surfaces apart: {elements} start {gap:.3g} m "
-                f"apart, while at rest their gap would be about {rest_gap:.3g} m; start with more, "
-                "or give a smaller `contact.barrier_distance`",
-                stacklevel=3,
-            )
+        given, batch = self._border.enter(state, control, parameters)
+        return self._engine.core_inputs(given, self._engine.predict(given)), batch
 
 
 def _restore(
@@ -789,40 +387,3 @@ def _restore(
     coupling: str = "monolithic",  # pickles of the first version end before it
 ) -> Simulator:
     return Simulator(scene, dt, scheme=scheme, coupling=coupling, contact=contact, solver=solver)
-
-
-def _check_time_step(dt: object) -> float:
-    instead = "pass a plain number; no gradient with respect to the time step exists: use one"
-    number = check_number("Simulator: `dt`", dt, POSITIVE, instead=instead)
-    # Other numbers are widened as they are. This one is added up, step by step.
-    dtype = str(getattr(dt, "dtype", ""))
-    if dtype.endswith(("float32", "float16")):
-        raise TypeError(
-            f"Simulator: `dt` must be a plain number or one in float64, got {dtype}, "
-            f"which makes it {number!r}"
-        )
-    return number
-
-
-def _check_gains(layout: Layout) -> None:
-    gains = layout.assembly.stiffness + layout.assembly.damping
-    for name, mode, gain in zip(layout.joint_names, layout.actuation, gains, strict=True):
-        if mode == "pd" and gain == 0.0:
-            raise InvalidInput(
-                f"Simulator: the pd joint {name!r} must have gains: give `stiffness` or `damping` "
-                "to its Robot, or another `actuation`"
-            )
-
-
-def _arrays(inputs: Fields) -> dict[str, NDArray[np.float64]]:
-    return {name: as_array(tensor) for name, tensor in inputs.items()}
-
-
-def _unbatched(named: dict[str, Tensor], batch: int | None) -> dict[str, Tensor]:
-    return named if batch is not None else {name: tensor[0] for name, tensor in named.items()}
-
-
-def _own_copy(tensor: Tensor, batch: int | None) -> Tensor:
-    """Copy rows [nb, ...], so that what a caller gets shares no storage with them."""
-    rows = tensor[0] if batch is None else tensor.expand(batch, *tensor.shape[1:])
-    return rows.clone(memory_format=torch.contiguous_format)

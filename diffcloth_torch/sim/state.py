@@ -1,4 +1,4 @@
-"""The state of a simulation: tensors that a step takes and returns, alone or in a batch."""
+"""The state of a simulation: the tensors that a step takes and returns, with or without batch."""
 
 from __future__ import annotations
 
@@ -11,137 +11,59 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch._moved import allow_loading
+from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.checks import is_dense
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.geometry.meshes import MeshPart, write_mesh
-from diffcloth_torch.geometry.poses import transform
-from diffcloth_torch.model.kinematics import link_frames, pose_frame
-from diffcloth_torch.model.mechanism import Mechanism
+from diffcloth_torch.geometry.meshes import write_mesh
 from diffcloth_torch.model.quantities import STATE, shape_of
-from diffcloth_torch.model.robot import Robot
-from diffcloth_torch.model.scene import Assembly, Scene
 from diffcloth_torch.reprs import field_text, record_text
 from diffcloth_torch.sim.report import Report, outcome_text
 
-__all__ = ["State", "Surfaces", "check_field_names", "stack", "where"]
+# Saved states name them here, where they once were.
+from diffcloth_torch.sim.surfaces import LinkSurfaces, Surfaces
+
+__all__ = [
+    "LinkSurfaces",
+    "State",
+    "Surfaces",
+    "check_field_names",
+    "check_state",
+    "stack",
+    "where",
+]
 
 _BATCHED_DIMENSIONS = 3  # positions [B, N, 3]
 
 
 @dataclass(frozen=True, eq=False)
-class LinkSurfaces:
-    """The meshes of a robot's links, and what places them.
-
-    Attributes:
-        mechanism: Fields of the robot's `Mechanism`, arrays as tensors.
-        vertices: Vertices of each link in its frame [m], shape [v, 3]; None without a surface.
-        faces: Vertex indices of each link in its own vertices, shape [g, 3], or None.
-    """
-
-    mechanism: dict[str, Any]
-    vertices: list[Tensor | None]
-    faces: list[Tensor | None]
-
-    @staticmethod
-    def of(name: str, robot: Robot) -> LinkSurfaces:
-        """Take them from a robot with a name in its scene."""
-        plain = {
-            field: torch.from_numpy(np.array(value)) if isinstance(value, np.ndarray) else value
-            for field, value in vars(replace(robot.mechanism, name=name)).items()
-        }
-        meshes = robot.surfaces
-        return LinkSurfaces(
-            mechanism=plain,
-            vertices=[
-                None if m is None else torch.from_numpy(np.array(m.vertices)) for m in meshes
-            ],
-            faces=[None if m is None else torch.from_numpy(np.array(m.faces)) for m in meshes],
-        )
-
-    @property
-    def joint_count(self) -> int:
-        """Number of joints, J."""
-        return len(self.mechanism["joint_names"])
-
-    def parts(self, base_pose: Tensor, joint_positions: Tensor) -> list[MeshPart]:
-        """Place the meshes by a pose [7] of the root link and joint positions [J]."""
-        fields: dict[str, Any] = {
-            field: value.numpy() if isinstance(value, Tensor) else value
-            for field, value in self.mechanism.items()
-        }
-        mechanism = Mechanism(**fields)
-        frames = link_frames(mechanism, pose_frame(base_pose), joint_positions)
-        links = zip(mechanism.link_names, self.vertices, self.faces, frames, strict=True)
-        return [
-            (f"{mechanism.name}/{link}", (v @ frame[:3, :3].mT + frame[:3, 3]).numpy(), f.numpy())
-            for link, v, f, frame in links
-            if v is not None and f is not None
-        ]
-
-
-@dataclass(frozen=True, eq=False)
-class Surfaces:
-    """The meshes that a state moves, as plain tensors, so that a saved state can be exported.
-
-    Attributes:
-        cloth_names: Name of each cloth.
-        cloth_faces: Vertex indices of each cloth in `positions`, shape [f, 3].
-        body_names: Name of each body.
-        body_vertices: Vertices of each body in its frame [m], shape [v, 3].
-        body_faces: Vertex indices of each body in its own vertices, shape [g, 3].
-        robots: The surfaces of each robot.
-    """
-
-    cloth_names: list[str]
-    cloth_faces: list[Tensor]
-    body_names: list[str]
-    body_vertices: list[Tensor]
-    body_faces: list[Tensor]
-    robots: tuple[LinkSurfaces, ...] = ()
-
-    @staticmethod
-    def of(scene: Scene, assembly: Assembly) -> Surfaces:
-        """Take them from a scene."""
-        starts = zip(scene.cloths, assembly.cloth_vertex_start.tolist(), strict=False)
-        return Surfaces(
-            cloth_names=list(scene.cloth_names),
-            cloth_faces=[torch.from_numpy(cloth.faces + start) for cloth, start in starts],
-            body_names=list(scene.body_names),
-            body_vertices=[torch.from_numpy(np.array(body.vertices)) for body in scene.bodies],
-            body_faces=[torch.from_numpy(np.array(body.faces)) for body in scene.bodies],
-            robots=tuple(
-                LinkSurfaces.of(name, robot)
-                for name, robot in zip(scene.robot_names, scene.robots, strict=True)
-            ),
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class State:
-    """Positions and velocities at one time. Every tensor may have a leading batch axis.
+    """Positions, velocities and forces at one time. All tensors may share a leading batch axis.
 
     Attributes:
-        positions: Cloth vertices [m], shape [N, 3].
-        velocities: Cloth vertices [m/s], shape [N, 3].
+        positions: Positions of the cloth vertices [m], shape [N, 3].
+        velocities: Velocities of the cloth vertices [m/s], shape [N, 3].
         body_poses: [px, py, pz, qw, qx, qy, qz] of each body, shape [K, 7].
         soft_pin_targets: Where the soft pins pull [m], shape [Q, 3].
-        body_forces: Contact forces on the body vertices during the step that led here [N],
-            shape [V, 3].
+        body_forces: Forces of contact and attachments on the body vertices during the step that
+            led here [N], shape [V, 3].
         time: Time since the initial state [s], shape [].
-        report: How the step that led here went; None in an initial state.
+        report: Report of the step that led here; None in an initial state.
         body_velocities: Velocity of each body's center of mass, then its angular velocity, in world
-            axes [m/s, rad/s], shape [K, 6]; zero where the body is static, and ignored by a step
-            where it is not dynamic.
-        joint_positions: Values of the joints [rad or m], shape [J].
-        joint_velocities: Their rates [rad/s or m/s], shape [J].
-        joint_targets: What pd drives pull to until a control says otherwise [rad or m], shape [J].
-        joint_efforts: What the drive applied during the step that led here, or where the joint is
-            prescribed what a motor there had to give: for inertia, weights and contact, without
-            the joint's viscosity and the armature of its drive [N m or N], shape [J].
+            axes [m/s, rad/s], shape [K, 6]; zero if the body is static; a step ignores it unless
+            the body is dynamic.
+        joint_positions: Positions of the joints [rad or m], shape [J].
+        joint_velocities: Velocities of the joints [rad/s or m/s], shape [J].
+        joint_targets: Positions to which pd drives pull until a control changes them [rad or m],
+            shape [J].
+        joint_efforts: Efforts of the drives during the step that led here [N m or N], shape [J].
+            For a prescribed joint, the effort that its motion required against inertia, weights and
+            contact, without the joint's viscosity and the armature of its drive.
         base_poses: Frame of each robot's root link, as in `body_poses`, shape [R, 7].
-        base_velocities: Velocity of its center of mass, then its angular velocity, in world axes
-            [m/s, rad/s], shape [R, 6].
+        base_velocities: Velocity of the root link's center of mass, then its angular velocity, in
+            world axes [m/s, rad/s], shape [R, 6].
+        contact_forces: Contact forces on the cloth vertices during the step that led here, barrier
+            and friction [N], shape [N, 3].
+        pin_forces: Forces that held the pinned vertices during that step [N], shape [P, 3].
     """
 
     positions: Tensor
@@ -151,7 +73,7 @@ class State:
     body_forces: Tensor
     time: Tensor
     report: Report | None = None
-    # Never None: what is left out becomes rows of zeros.
+    # Never None: a field that is left out becomes rows of zeros.
     body_velocities: Tensor = None  # type: ignore[assignment]
     joint_positions: Tensor = None  # type: ignore[assignment]
     joint_velocities: Tensor = None  # type: ignore[assignment]
@@ -159,15 +81,18 @@ class State:
     joint_efforts: Tensor = None  # type: ignore[assignment]
     base_poses: Tensor = None  # type: ignore[assignment]
     base_velocities: Tensor = None  # type: ignore[assignment]
+    contact_forces: Tensor = None  # type: ignore[assignment]
+    pin_forces: Tensor = None  # type: ignore[assignment]
     _surfaces: Surfaces | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         missing = [name for name in _ADDED if getattr(self, name) is None]
         if missing:
             shape: tuple[int, ...] = getattr(self.body_poses, "shape", ())
-            environments, bodies = shape[:-2], shape[-2] if len(shape) > 1 else 0
+            environments = shape[:-2]
+            sizes = {"K": _row_count(self.body_poses), "N": _row_count(self.positions)}
             for name in missing:
-                rows = shape_of(STATE[name].axes[0], {"K": bodies, "J": 0, "R": 0})
+                rows = shape_of(STATE[name].axes[0], {"J": 0, "R": 0, "P": 0, **sizes})
                 zeros = torch.zeros(*environments, *rows, dtype=torch.float64)
                 object.__setattr__(self, name, zeros)
 
@@ -177,7 +102,7 @@ class State:
         self.__post_init__()
 
     def __repr__(self) -> str:
-        # What a scene lacks has no rows, and is left out.
+        # Tensors without rows, of things that the scene lacks, are left out.
         tensors = {name: getattr(self, name) for name in ("time", *_TENSORS)}
         there = {n: t for n, t in tensors.items() if not isinstance(t, Tensor) or t.numel()}
         parts = [field_text(name, value) for name, value in there.items()]
@@ -201,70 +126,77 @@ class State:
         """Copy whose tensors carry no graph."""
         return self._map(lambda tensor: tensor.detach(), self.report)
 
-    def __getitem__(self, index: int | slice) -> State:
-        """Take one environment of a batch, without the batch axis, or a slice of the batch."""
-        _check_state("state[i]", self)
-        size = self._require_batch("state[i]")
-        if not isinstance(index, slice):
-            if isinstance(index, bool) or not isinstance(index, int | np.integer):
-                raise TypeError(f"state[i]: `i` must be an integer, got {type(index).__name__}")
-            if not -size <= index < size:
-                raise InvalidInput(f"state[i]: `i` must be in 0 .. {size - 1}, got {index}")
-            index = int(index)
-        report = None if self.report is None else self.report.select(index)
-        return self._map(lambda tensor: tensor[index], report)
+    def clone(self) -> State:
+        """Copy that shares no memory; gradients flow to the original."""
+        return self._map(lambda tensor: tensor.clone(), self.report)
+
+    def meshes(self) -> dict[str, tuple[Tensor, Tensor]]:
+        """Place all surfaces in the world: cloths, bodies, and links that have collision shapes.
+
+        Returns:
+            For each surface, in the order of `Simulator.surfaces`, its name -> its vertices in the
+            world [m], shape [v, 3], or [B, v, 3] in a batch, differentiable in the state, and its
+            faces, shape [f, 3].
+
+        Raises:
+            InvalidInput: If the state was not made by a simulator.
+        """
+        check_state("meshes: the state", self)
+        return self._known_surfaces("meshes").meshes(vars(self))
+
+    def _known_surfaces(self, owner: str) -> Surfaces:
+        if self._surfaces is None:
+            raise InvalidInput(
+                f"{owner}: the state must come from a Simulator, which knows its faces"
+            )
+        return self._surfaces
+
+    def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> State:
+        """Select one environment of a batch, without the batch axis, or several as a batch.
+
+        Args:
+            index: An integer; or, for several, a slice, a list or tensor of integers, or a mask of
+                shape [B].
+
+        Raises:
+            InvalidInput: If the state has no batch axis, an integer is out of range, or a mask has
+                another length.
+            TypeError: If `index` is anything else.
+        """
+        check_state("state[i]", self)
+        chosen = _environments(index, self._require_batch("state[i]"))
+        report = None if self.report is None else self.report.select(chosen)
+        return self._map(lambda tensor: tensor[chosen], report)
 
     def __len__(self) -> int:
         """Number of environments."""
         return self._require_batch("len(state)")
 
     def __iter__(self) -> Iterator[State]:
-        """Go through the environments."""
+        """Iterate over the environments."""
         return (self[i] for i in range(len(self)))
 
     def __bool__(self) -> bool:
-        """Be true: `len` counts environments."""
+        """Return True: `len` counts environments."""
         return True
 
     def export(self, path: str | Path, *, bodies: bool = False) -> None:
         """Write the cloths as a mesh, with the vertices in the order of `positions`.
 
         Args:
-            path: File that ends in .obj (one object per surface) or .ply (all in one).
-            bodies: Whether the bodies and the links of robots, at their poses, follow the cloths.
+            path: File ending in .obj (one object per surface) or .ply (all surfaces in one mesh).
+            bodies: Whether to write the bodies and links, at their poses, after the cloths.
 
         Raises:
-            InvalidInput: If the state is a batch, was not made by a simulator, or the file ending
-                is another.
+            InvalidInput: If the state is a batch, was not made by a simulator, or `path` has
+                another ending.
         """
-        _check_state("export: the state", self)
+        check_state("export: the state", self)
         if self.batch_size is not None:
             raise InvalidInput("export: the state must be a single one; use state[i].export(...)")
-        if self._surfaces is None:
-            raise InvalidInput(
-                "export: the state must come from a Simulator, which knows its faces"
-            )
-        write_mesh(path, self._parts(self._surfaces, bodies))
-
-    def _parts(self, surfaces: Surfaces, bodies: bool) -> list[MeshPart]:
-        positions = self.positions.detach().numpy()
-        parts: list[MeshPart] = []
-        start = 0
-        for name, faces in zip(surfaces.cloth_names, surfaces.cloth_faces, strict=True):
-            end = int(faces.max()) + 1  # every cloth vertex belongs to a face
-            parts.append((name, positions[start:end], faces.numpy() - start))
-            start = end
-        if bodies:
-            poses = self.body_poses.detach().numpy()
-            for k, name in enumerate(surfaces.body_names):
-                vertices = transform(surfaces.body_vertices[k].numpy(), poses[k])
-                parts.append((name, vertices, surfaces.body_faces[k].numpy()))
-            first = 0
-            for r, robot in enumerate(surfaces.robots):
-                rows = slice(first, first := first + robot.joint_count)
-                joints = self.joint_positions.detach()[rows]
-                parts += robot.parts(self.base_poses.detach()[r], joints)
-        return parts
+        plain, surfaces = vars(self.detach()), self._known_surfaces("export")
+        meshes = surfaces.meshes(plain) if bodies else surfaces.cloth_meshes(plain["positions"])
+        write_mesh(path, [(n, v.numpy(), f.numpy()) for n, (v, f) in meshes.items()])
 
     def _require_batch(self, what: str) -> int:
         if self.batch_size is None:
@@ -282,11 +214,11 @@ _ADDED = _TENSORS[_TENSORS.index("body_velocities") :]
 
 
 def stack(states: Sequence[State]) -> State:
-    """Make a batch of states without a batch axis; gradients flow to each of them.
+    """Combine states without a batch axis into a batch; gradients flow to each of them.
 
     Raises:
-        InvalidInput: If there is none, one is a batch already, or their shapes differ.
-        TypeError: If one is no State, or holds what a state does not.
+        InvalidInput: If `states` is empty, one of them is already a batch, or their shapes differ.
+        TypeError: If an item is not a State, or has a field of a wrong type.
     """
     given: Any = states
     if not isinstance(given, Sequence):
@@ -295,7 +227,7 @@ def stack(states: Sequence[State]) -> State:
     if len(states) == 0:
         raise InvalidInput("stack: `states` must hold at least one state")
     for i, state in enumerate(states):
-        _check_state(f"stack: `states[{i}]`", state)
+        check_state(f"stack: `states[{i}]`", state)
         if state.batch_size is not None:
             raise InvalidInput(f"stack: `states` must have no batch axis, got one at [{i}]")
     tensors = {}
@@ -313,7 +245,7 @@ def stack(states: Sequence[State]) -> State:
 
 
 def where(mask: Tensor, a: State, b: State) -> State:
-    """Take environment `i` from `a` where `mask[i]` is true, from `b` elsewhere.
+    """Take environment `i` from `a` if `mask[i]` is true, else from `b`.
 
     Args:
         mask: Booleans, shape [B].
@@ -322,11 +254,11 @@ def where(mask: Tensor, a: State, b: State) -> State:
 
     Raises:
         InvalidInput: If the batch sizes or other shapes differ.
-        TypeError: If `mask` is not a boolean tensor, or `a` or `b` is no State.
+        TypeError: If `mask` is not a boolean tensor, or `a` or `b` is not a State.
     """
     _check_mask(mask)
     for name, state in (("a", a), ("b", b)):
-        _check_state(f"where: `{name}`", state)
+        check_state(f"where: `{name}`", state)
         if state.batch_size not in (None, len(mask)):
             raise InvalidInput(
                 f"where: `{name}` must have {len(mask)} environments, as `mask`, "
@@ -346,8 +278,8 @@ def where(mask: Tensor, a: State, b: State) -> State:
     return State(**tensors, report=report, _surfaces=a._surfaces)
 
 
-def _check_state(name: str, state: Any) -> None:
-    """Require a state whose fields are what they are said to be: it may come from a file."""
+def check_state(name: str, state: Any) -> None:
+    """Require a State whose fields have the right types and batch size: it may come from a file."""
     if not isinstance(state, State):
         raise TypeError(f"{name} must be a State, got {type(state).__name__}")
     for entry in _TENSORS:
@@ -371,6 +303,41 @@ def _check_state(name: str, state: Any) -> None:
         report.check_environments(name, batch)
 
 
+def _environments(index: Any, size: int) -> int | slice | Tensor:
+    """Check an index into a batch of `size` environments; lists and arrays become tensors."""
+    if isinstance(index, slice):
+        return index
+    if isinstance(index, int | np.integer) and not isinstance(index, bool):
+        if not -size <= index < size:
+            raise InvalidInput(f"state[i]: `i` must be in 0 .. {size - 1}, got {index}")
+        return int(index)
+    if not isinstance(index, Sequence | np.ndarray | Tensor) or isinstance(index, str):
+        raise TypeError(f"state[i]: `i` must be an integer, got {type(index).__name__}")
+    rows = torch.as_tensor(index) if len(index) else torch.zeros(0, dtype=torch.int64)
+    if rows.is_floating_point() or rows.is_complex() or rows.ndim != 1:
+        raise TypeError(
+            "state[i]: `i` must be integers or a mask, of one axis, got "
+            f"{rows.dtype} of shape {list(rows.shape)}"
+        )
+    if rows.dtype == torch.bool:
+        if len(rows) != size:
+            raise InvalidInput(f"state[i]: a mask must have shape [{size}], got [{len(rows)}]")
+        return rows.nonzero()[:, 0]
+    wrong = (rows < -size) | (rows >= size)
+    if wrong.any():
+        at = int(wrong.nonzero()[0])
+        raise InvalidInput(
+            f"state[i]: `i` must be in 0 .. {size - 1}, got {int(rows[at])} at [{at}]"
+        )
+    return rows.to(torch.int64)
+
+
+def _row_count(tensor: Any) -> int:
+    """Number of rows of a tensor [.., rows, k]; 0 for anything else."""
+    shape: tuple[int, ...] = getattr(tensor, "shape", ())
+    return shape[-2] if len(shape) > 1 else 0
+
+
 def _check_mask(mask: object) -> None:
     if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
         raise TypeError("where: `mask` must be a boolean tensor")
@@ -386,4 +353,4 @@ def check_field_names(owner: str, instance: Any, changes: dict[str, Any]) -> Non
             raise InvalidInput(f"{owner}: the fields are {', '.join(accepted)}; got {name!r}")
 
 
-allow_loading(State, Surfaces, LinkSurfaces)
+allow_loading(State)

@@ -5,7 +5,7 @@ minimizer the gradient vanishes, and so does its derivative along u:
 
     g(x, u) = dP/dx = 0,    H dx + (dg/du) du = 0,    H = dg/dx.
 
-With the cotangents x_bar of everything that depends on x, the gradient of the loss is
+With the cotangent x_bar of everything that depends on x, the gradient of the loss is
 
     H lambda = x_bar,    u_bar = -(dg/du)^T lambda + (explicit dependence of the outputs on u),
 
@@ -13,15 +13,15 @@ one solve with the Hessian of the same potential, and then products with mixed d
 velocities (x - x_n) / h and the contact forces on the bodies are such outputs; each friction
 iteration adds one solve. The formulas of every term are in the C++ core.
 
-The tape of a step is plain tensors, saved by torch together with the inputs: torch frees them after
-backward, refuses a second backward without `retain_graph`, and notices inputs edited in place. What
-a scene holds constant, and nobody can edit, is not among them.
+The tape of a step consists of plain tensors, which torch saves together with the inputs: torch
+frees them after backward, refuses a second backward without `retain_graph`, and notices inputs
+edited in place. Constants of a scene, which nobody can edit, are not saved.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -33,15 +33,16 @@ from torch.autograd import forward_ad
 
 from diffcloth_torch import _core
 from diffcloth_torch._exit import note_caller
-from diffcloth_torch.checks import is_dense
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.sim.controls import tensors_of
+from diffcloth_torch.sim.pull_back import TRANSFORMS, Differentiated, needed, pull_back
 
 __all__ = [
     "CONVERGED",
     "DIAGNOSTICS",
     "INFEASIBLE",
     "INTERSECTING",
+    "TURNED",
     "UNCONVERGED",
     "Constant",
     "Outcome",
@@ -51,65 +52,60 @@ __all__ = [
     "have_quaternions",
     "refuse_transforms",
     "take_step",
-    "vmap_level",
 ]
 
 # Values of the core's `status`, per environment.
 CONVERGED, UNCONVERGED, INFEASIBLE, INTERSECTING = 0, 1, 2, 3
+TURNED = 4  # not from the core: bodies turn further than a step resolves
 
 DIAGNOSTICS = tuple(_core.number_names)
 """Names of the numbers that the core has for each environment; some open with what they are."""
 
-# The last one only of scenes that have coordinates.
-_OUTPUTS = ("positions", "velocities", "body_forces", "coordinates")
+# The last one exists only in scenes that have coordinates.
+_OUTPUTS = (
+    "positions",
+    "velocities",
+    "body_forces",
+    "contact_forces",
+    "pin_forces",
+    "coordinates",
+)
 _TAPE = "tape_"
 _KEPT = "kept"
 _NO_CONSTANTS: Mapping[str, Constant] = MappingProxyType({})
-_TRANSFORMS = (
-    "torch.func transforms and forward-mode derivatives are not supported; use "
-    "torch.autograd.grad or .backward(), for many losses or a Jacobian with is_grads_batched=True, "
-    "or torch.autograd.functional.jacobian(vectorize=True)"
-)
-_SECOND_DERIVATIVES = (
-    "step: second derivatives are not available; the gradient of a step cannot be differentiated "
-    "again, detach it where it enters another loss"
-)
 
 
 class Outcome(NamedTuple):
-    """What a step returns.
+    """The result of a step, with fields as in `State`.
 
     Attributes:
-        positions: [B, N, 3], or [N, 3] without a batch axis.
-        velocities: Likewise.
-        body_forces: [B, V, 3] or [V, 3].
+        positions: [B, N, 3].
+        velocities: [B, N, 3].
+        body_forces: [B, V, 3].
+        contact_forces: [B, N, 3].
+        pin_forces: [B, P, 3].
         diagnostics: Lists of length B of the core: status, message and the entries of the report;
-            and "ended": environment -> poses of all roots where its motion has ended before its
-            end, [T, 7].
-        coordinates: Of bodies and robots at the end of the step, [B, n] or [n]; None where there
+            "ended": environment whose motion stopped early -> poses of all roots there, [T, 7]; and
+            "pairs": for each environment, (first, second, count, force) of each pair of surfaces in
+            contact.
+        coordinates: Coordinates of bodies and robots at the end of the step, [B, n]; None if there
             are none.
     """
 
     positions: Tensor
     velocities: Tensor
     body_forces: Tensor
+    contact_forces: Tensor
+    pin_forces: Tensor
     diagnostics: dict[str, Any]
     coordinates: Tensor | None = None
-
-    def first(self) -> Outcome:
-        """The first environment, without its axis; the diagnostics stay."""
-        return self._replace(
-            positions=self.positions[0],
-            velocities=self.velocities[0],
-            body_forces=self.body_forces[0],
-        )
 
 
 class Constant(NamedTuple):
     """An input that nobody outside can edit, and that needs no gradient.
 
     Attributes:
-        tensor: By which it is known.
+        tensor: The tensor that identifies it.
         array: Its numbers.
     """
 
@@ -118,7 +114,7 @@ class Constant(NamedTuple):
 
     @staticmethod
     def of(tensor: Tensor) -> Constant:
-        """Take the numbers from the tensor."""
+        """Make the constant of a tensor."""
         return Constant(tensor, as_array(tensor))
 
 
@@ -126,43 +122,41 @@ def take_step(
     core: _core.Simulator,
     inputs: dict[str, Tensor],
     constants: Mapping[str, Constant] = _NO_CONSTANTS,
-    *,
-    batched: bool,
 ) -> Outcome:
-    """Take one step; a tape is kept only if a gradient may be asked for.
+    """Take one step; keep a tape only if a gradient may be asked for.
 
     Args:
         core: The simulator in C++.
         inputs: Float64 tensors, each with a leading axis of environments.
-        constants: Those of the scene: where an input is that very tensor, autograd need not see it.
-        batched: Whether the outputs keep that axis.
+        constants: Constants of the scene: an input that is one of these very tensors bypasses
+            autograd.
     """
     known = {n: c.array for n, c in constants.items() if inputs.get(n) is c.tensor}
     given = {name: tensor for name, tensor in inputs.items() if name not in known}
-    # Inside Function.forward gradients are always off, so this is decided here.
+    # Decided here, because inside Function.forward gradients are always off.
     needs_tape = torch.is_grad_enabled() and any(t.requires_grad for t in given.values())
     if not needs_tape:
         arrays = known | {name: as_array(t) for name, t in given.items()}
         result = _forward(core, arrays, tape=False)
-        return _outcome(_outputs(result, batched), diagnostics_of(result))
+        return _outcome(_outputs(result), diagnostics_of(result))
     diagnostics: dict[str, Any] = {}
-    outputs = _Step.apply(core, known, tuple(given), batched, diagnostics, *given.values())
+    outputs = _Step.apply(core, known, tuple(given), diagnostics, *given.values())
     return _outcome(outputs, diagnostics)
 
 
 def refuse_transforms(owner: str, *records: object) -> None:
-    """Raise where a gradient would be lost or wrong: under torch.func and forward-mode."""
+    """Raise under torch.func and forward-mode, where a gradient would be lost or wrong."""
     if torch._C._are_functorch_transforms_active():
-        raise NotImplementedError(f"{owner}: {_TRANSFORMS}")
+        raise NotImplementedError(f"{owner}: {TRANSFORMS}")
     if forward_ad._current_level < 0:  # no tensor has a tangent
         return
     tensors = (tensor for record in records for tensor in tensors_of(record))
     if any(forward_ad.unpack_dual(t).tangent is not None for t in tensors):
-        raise NotImplementedError(f"{owner}: {_TRANSFORMS}")
+        raise NotImplementedError(f"{owner}: {TRANSFORMS}")
 
 
 def are_within(arrays: list[NDArray[np.float64]], largest: float) -> bool:
-    """Whether all numbers are at most `largest` in size; NaN is not."""
+    """Whether all numbers are at most `largest` in magnitude; false for NaN."""
     return _core.are_within(arrays, largest)
 
 
@@ -172,7 +166,7 @@ def have_quaternions(poses: NDArray[np.float64], shortest: float) -> bool:
 
 
 def as_array(tensor: Tensor) -> NDArray[np.float64]:
-    """Contiguous array of a tensor's numbers; shares its memory where it can."""
+    """Contiguous array of a tensor's numbers; shares its memory if possible."""
     return np.ascontiguousarray((tensor.detach() if tensor.requires_grad else tensor).numpy())
 
 
@@ -184,138 +178,59 @@ def _forward(core: _core.Simulator, arrays: dict[str, Any], *, tape: bool) -> di
         raise SimulationError(f"step: {error}") from error
 
 
-def _outputs(result: dict[str, Any], batched: bool) -> tuple[Tensor, ...]:
-    arrays = (result[name] for name in _OUTPUTS if name in result)
-    return tuple(torch.from_numpy(array if batched else array[0]) for array in arrays)
+def _outputs(result: dict[str, Any]) -> tuple[Tensor, ...]:
+    return tuple(torch.from_numpy(result[name]) for name in _OUTPUTS if name in result)
 
 
 def _outcome(outputs: tuple[Tensor, ...], diagnostics: dict[str, Any]) -> Outcome:
-    positions, velocities, body_forces, *coordinates = outputs
-    return Outcome(positions, velocities, body_forces, diagnostics, *coordinates)
+    x, v, of_bodies, of_contact, of_pins, *coordinates = outputs
+    return Outcome(x, v, of_bodies, of_contact, of_pins, diagnostics, *coordinates)
 
 
 def diagnostics_of(result: dict[str, Any]) -> dict[str, Any]:
-    """What a core says of a step: for each name a list of the environments' numbers or texts."""
+    """Diagnostics of a step: for each name a list with one number or text per environment."""
     numbers = zip(DIAGNOSTICS, result["numbers"], strict=True)
-    return {**dict(numbers), "message": result["message"], "ended": result["ended"]}
+    others = {name: result[name] for name in ("message", "ended", "pairs")}
+    return {**dict(numbers), **others}
 
 
-_PLAIN = 5  # arguments of _Step.forward that are no tensors
+_PLAIN = 4  # arguments of _Step.forward that are not tensors
 
 
 class _Step(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, core, constants, names, batched, diagnostics, *tensors):
+    def forward(ctx, core, constants, names, diagnostics, *tensors):
         arrays = {name: as_array(t) for name, t in zip(names, tensors, strict=True)}
         result = _forward(core, constants | arrays, tape=True)
         tape = {k: torch.from_numpy(v) for k, v in result.items() if k.startswith(_TAPE)}
-        # The inputs themselves, not the arrays: their version counters notice edits in place.
+        # Saves the inputs, not their arrays, because their version counters notice edits in place.
         ctx.save_for_backward(*tensors, *tape.values())
         ctx.shapes = [t.shape for t in (*tensors, *tape.values())]
-        ctx.core, ctx.constants, ctx.batched = core, constants, batched
+        ctx.core, ctx.constants = core, constants
         ctx.names, ctx.tape_names = names, tuple(tape)
-        # Factors and contacts, which the core forgets when the graph goes.
+        # Factors and contacts, which the core frees together with the graph.
         ctx.kept = result[_KEPT]
         diagnostics.update(diagnostics_of(result))
-        return _outputs(result, batched)
+        return _outputs(result)
 
     @staticmethod
     def backward(ctx, *cotangents):
         saved = ctx.saved_tensors  # first: raises torch's own error if the tape was freed
-        gradients = dict(zip(_needs(ctx), _pull_back(ctx, saved, cotangents), strict=True))
-        return *[None] * _PLAIN, *(gradients.get(name) for name in ctx.names)
+        needs = needed(ctx.names, ctx.needs_input_grad[_PLAIN:])
+        function = Differentiated(
+            owner="step",
+            names=(*ctx.names, *ctx.tape_names),
+            shapes=ctx.shapes,
+            axes=3,  # positions: [B, N, 3]
+            gradients=partial(_backward, ctx, needs),
+        )
+        found = dict(zip(needs, pull_back(function, saved, cotangents), strict=True))
+        return *[None] * _PLAIN, *(found.get(name) for name in ctx.names)
 
 
-def _needs(ctx):
-    """Names of the inputs that need a gradient."""
-    needed = zip(ctx.names, ctx.needs_input_grad[_PLAIN:], strict=True)
-    return [name for name, is_needed in needed if is_needed]
-
-
-def _pull_back(ctx, saved, cotangents):
-    if not any(map(torch._C._functorch.is_legacy_batchedtensor, cotangents)):
-        return _PullBack.apply(ctx, *saved, *cotangents)
-    # `is_grads_batched` and vectorized Jacobians still use the older vmap, which knows no rule of
-    # a Function: take its batch axis off and put it on again.
-    level = vmap_level()
-    count = next(
-        torch._remove_batch_dim(c, level, 1, 0).shape[0]
-        for c in cotangents
-        if torch._C._functorch.is_legacy_batchedtensor(c)
-    )
-    losses = [torch._remove_batch_dim(c, level, count, 0) for c in cotangents]
-    gradients = _PullBack.apply(ctx, *saved, *losses)
-    return [torch._add_batch_dim(gradient, 0, level) for gradient in gradients]
-
-
-def vmap_level() -> int:
-    """Level of the older vmap that is active."""
-    level: int = torch._C._vmapmode_increment_nesting() - 1
-    torch._C._vmapmode_decrement_nesting()
-    return level
-
-
-class _PullBack(torch.autograd.Function):
-    """Gradients of a step's inputs from cotangents of its outputs, which may have leading axes.
-
-    A Function of its own, so that all losses of a `vmap` go through one call of the core, and so
-    that torch knows all that a gradient depends on. `once_differentiable` is not enough: where the
-    cotangent has no graph, as for `.sum()`, the gradient would come back as a constant, and a
-    second derivative through it as zero.
-    """
-
-    @staticmethod
-    def forward(step, *tensors):
-        saved, cotangents = tensors[: len(step.shapes)], tensors[len(step.shapes) :]
-        _check_saved(step, saved)
-        axes = cotangents[0].ndim - (3 if step.batched else 2)  # positions: [.., B, N, 3]
-        leading = cotangents[0].shape[:axes]
-        shape = (math.prod(leading), *(() if step.batched else (1,)))
-        losses = [c.reshape(*shape, *c.shape[axes:]) for c in cotangents]
-        gradients = _backward(step, saved, losses)
-        return tuple(g.reshape(*leading, *g.shape[1:]) for g in gradients)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        pass
-
-    @staticmethod
-    def vmap(info, in_dims, step, *tensors):
-        count = len(step.shapes)
-        if any(dim is not None for dim in in_dims[1 : 1 + count]):
-            raise NotImplementedError(f"backward: {_TRANSFORMS}")
-        losses = [
-            c.expand(info.batch_size, *c.shape) if dim is None else c.movedim(dim, 0)
-            for c, dim in zip(tensors[count:], in_dims[1 + count :], strict=True)
-        ]
-        gradients = _PullBack.apply(step, *tensors[:count], *losses)
-        return gradients, (0,) * len(gradients)
-
-    @staticmethod
-    def backward(ctx, *cotangents):
-        raise RuntimeError(_SECOND_DERIVATIVES)
-
-
-def _check_saved(step, saved):
-    """Refuse what hooks on saved tensors return instead of what a step has saved."""
-    for name, shape, tensor in zip(
-        (*step.names, *step.tape_names), step.shapes, saved, strict=True
-    ):
-        if tensor.dtype != torch.float64 or tensor.device.type != "cpu" or not is_dense(tensor):
-            raise TypeError(
-                f"backward: saved `{name}` must come back as a dense float64 tensor on the CPU, "
-                f"got {tensor.dtype} on {tensor.device}"
-            )
-        if tensor.shape != shape:
-            raise InvalidInput(
-                f"backward: saved `{name}` must come back with shape {list(shape)}, "
-                f"got {list(tensor.shape)}"
-            )
-
-
-def _backward(step, saved, losses):
+def _backward(step, needs, saved, losses):
     arrays = [as_array(t) for t in saved]
-    count, needs = len(step.names), _needs(step)
+    count = len(step.names)
     note_caller()
     try:
         gradients = step.core.backward(
@@ -329,6 +244,6 @@ def _backward(step, saved, losses):
         )
     except _core.SimulationError as error:
         raise SimulationError(f"backward: {error}") from error
-    except ValueError as error:  # numbers that hooks on saved tensors have changed
+    except ValueError as error:  # hooks on saved tensors have changed numbers
         raise InvalidInput(f"backward: {error}") from error
     return [torch.from_numpy(gradients[name]) for name in needs]

@@ -1,4 +1,4 @@
-"""The mechanisms of a scene as the core takes them: links one after the other, parents first."""
+"""The mechanisms of a scene in the core's order: all links in one list, parents first."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.limits import ZONE
+from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.mechanism import JOINT_KINDS
-from diffcloth_torch.model.scene import Assembly
 
 __all__ = ["tree_arguments"]
 
@@ -19,11 +19,11 @@ _ROOT = 6  # coordinates of a floating root
 def tree_arguments(
     assembly: Assembly, limit_stiffness: FloatArray, *, all_prescribed: bool = False
 ) -> dict[str, Any]:
-    """Arguments of the core that describe all trees, bodies first.
+    """Make the arguments of the core that describe all trees, bodies first.
 
     Args:
         assembly: Arrays of the scene.
-        limit_stiffness: Of the barriers at the limits of the n coordinates, shape [n].
+        limit_stiffness: Stiffness of the barriers at the limits of the n coordinates, shape [n].
         all_prescribed: Whether the values of all coordinates at the end of a step are given.
     """
     links: dict[str, list[Any]] = {
@@ -42,7 +42,7 @@ def tree_arguments(
     prescribed: list[bool] = []
     lower: list[float] = []
     upper: list[float] = []
-    place: dict[tuple[int, int], int] = {}  # of a mechanism's link in the list of all
+    place: dict[tuple[int, int], int] = {}  # of a mechanism's link in the list of all links
     for t, mechanism in enumerate(assembly.mechanisms):
         if mechanism.base == "floating":
             prescribed += [False] * _ROOT

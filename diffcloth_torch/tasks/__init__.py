@@ -1,1 +1,1 @@
-"""Tasks: a scene, what moves in it, and what is to be achieved; one file per task."""
+"""Tasks: a scene, its control and its objective; one file per task."""

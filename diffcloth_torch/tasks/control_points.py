@@ -1,7 +1,7 @@
 """Control points: springs pull points of cloths along trajectories to targets, through contact.
 
-Nothing is optimized: what counts is whether the cloths get there without intersecting, and how far
-from their targets the points end.
+Nothing is optimized. The result is whether the cloths arrive without intersecting, and how far from
+their targets the points end.
 
 References:
     The experiments "self-intersection" and "cloth and rigid body" of the paper, section V.B.
@@ -58,12 +58,14 @@ class ControlPoints(Drape):
                 self._targets.append((held if moved is None else moved[-1]).mean(dim=0))
 
     def distances(self, state: State) -> Tensor:
-        """Distance of each control point to its last target [m], shape [groups].
+        """Distance of each control point to its last target [m], shape [.., groups].
 
-        A group of soft pins is one control point, held by several vertices: their mean counts.
+        A group of soft pins is one control point, whose position is the mean of its vertices.
         """
-        points = torch.stack([state.positions[rows].mean(dim=0) for rows in self._points])
-        distances: Tensor = (points - torch.stack(self._targets)).norm(dim=1)
+        points = torch.stack(
+            [state.positions[..., rows, :].mean(dim=-2) for rows in self._points], dim=-2
+        )
+        distances: Tensor = (points - torch.stack(self._targets)).norm(dim=-1)
         return distances
 
     def goals(self) -> list[Goal]:

@@ -1,4 +1,4 @@
-"""Drape: simulate any scene that a configuration describes, with the motion that it prescribes."""
+"""Drape: simulate the scene of any configuration, with the motion that it prescribes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from diffcloth_torch.config.scenes import (
     build_scene,
     build_simulator,
     prescribed_motions,
-    step_controls,
+    step_control,
 )
 from diffcloth_torch.config.schema import RunConfig
 from diffcloth_torch.sim.state import State
@@ -33,7 +33,6 @@ class Drape:
         self.simulator = build_simulator(self.scene, config.simulation)
         self.steps = config.simulation.steps
         self._motions = prescribed_motions(config, self.scene, self.steps)
-        self._prescribed = step_controls(self._motions, self.steps)
 
     def initial_state(self) -> State:
         """Make the state that the scene describes."""
@@ -45,7 +44,7 @@ class Drape:
 
     def controller(self, actions: Mapping[str, Tensor]) -> Controller:
         """Follow the keyframes, whatever the state."""
-        return lambda k, _state: self._prescribed[k]
+        return lambda k, _state: step_control(self._motions, k)
 
     def goals(self) -> list[Goal]:
         """Have none."""

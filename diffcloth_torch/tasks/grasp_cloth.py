@@ -1,8 +1,8 @@
 """Grasp cloth: a robot grasps a cloth by friction and brings it into a target shape.
 
-What acts is one robot, in each control interval: its base by velocities if it is kinematic and by a
-force and a torque if it is floating, joints whose motion is prescribed by velocities, joints that
-drives move by efforts. The loss is the L2 distance between the cloth and its target shape.
+For each control interval, the actions are velocities of a kinematic base or a force and a torque on
+a floating one, velocities of velocity joints, and efforts of torque and pd joints. The loss is the
+L2 distance between the cloth and its target shape.
 
 References:
     The task "control a gripper to grasp and lift the cloth" of the paper, section V.D.3.
@@ -42,7 +42,8 @@ JointRows = dict[str, Annotated[list[float], Len(1)]]
 class RobotActionSection(RigidActionSection):
     """The actions of one robot: of its base, and of its joints by their names.
 
-    `velocities` [rad/s or m/s] are of velocity joints, `efforts` [N m or N] of torque and pd ones.
+    `velocities` [rad/s or m/s] apply to velocity joints, `efforts` [N m or N] to torque and pd
+    joints.
     """
 
     robot: str
@@ -94,7 +95,7 @@ class GraspCloth(ReachShape):
                     )
 
     def initial_rows(self) -> dict[str, list[list[float]]]:
-        """What the base does, then velocities and efforts with a column for each joint."""
+        """Actions of the base, then velocities and efforts with a column for each joint."""
         rows = self._actions.rigid_rows()
         for key in _JOINTS:
             columns = getattr(self._actions, key)

@@ -1,8 +1,8 @@
 """Hit cloth: a body strikes a hanging sheet and carries it into a horizontal target shape.
 
-What acts is one body: a kinematic one by a linear and an angular velocity for each control
-interval, from which its poses follow by integration, or a dynamic one by a force and a torque. The
-loss is the L2 distance between the sheet and its target shape.
+For each control interval, the actions are a linear and an angular velocity of a kinematic body,
+which are integrated to poses, or a force and a torque on a dynamic body. The loss is the L2
+distance between the sheet and its target shape.
 
 References:
     The task "control rigid body to hit the cloth" of the paper, section V.D.1.
@@ -59,7 +59,7 @@ class HitCloth(ReachShape):
         self._actions = config.actions
 
     def initial_rows(self) -> dict[str, list[list[float]]]:
-        """Velocities, or a force and a torque."""
+        """Velocities of the body, or a force and a torque on it."""
         return self._actions.rigid_rows()
 
     def motions(self, actions: Mapping[str, Tensor]) -> Motions:

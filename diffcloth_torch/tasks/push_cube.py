@@ -1,8 +1,7 @@
-"""Push cube: points of a cloth are moved so that the cloth pushes a free body to a target position.
+"""Push cube: moving points of a cloth make it push a dynamic body to a target position.
 
-What acts are pins of the cloth, by a velocity for each control interval, from which their
-positions follow by integration. The loss is the distance between the center of the body's frame
-and its target.
+For each control interval, the actions are velocities of pins of the cloth, which are integrated to
+positions. The loss is the distance between the center of the body's frame and its target.
 
 References:
     The task "control cloth to hit the rigid body" of the paper, section V.D.2.
@@ -11,6 +10,7 @@ References:
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -20,7 +20,7 @@ from annotated_types import Len
 from pydantic import model_validator
 from torch import Tensor
 
-from diffcloth_torch.config.scenes import Motions
+from diffcloth_torch.config.scenes import Motions, PerStep
 from diffcloth_torch.config.schema import Section, Vector3
 from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.sim.state import State
@@ -45,14 +45,14 @@ class PinActionSection(ActionSection):
 
 
 class PositionSection(Section):
-    """Where the center of a body's frame shall be [m]."""
+    """Target of the center of a body's frame [m]."""
 
     body: str
     position: Vector3
 
 
 class PushCubeConfig(ReachConfig):
-    """A scene, the pins that act in it, the body that they push, and how to get it there."""
+    """A scene, the pins that act in it, the body that they push, and its target."""
 
     actions: PinActionSection
     target: PositionSection
@@ -71,6 +71,17 @@ class PushCubeConfig(ReachConfig):
         if body.motion != "dynamic":
             raise ValueError(f"must give the body {body.name!r} in `target` `motion: dynamic`")
         return self
+
+
+@dataclass(frozen=True)
+class _Moved:
+    """Displaced positions [p, 3] of pins, made for each step: those of all steps would be many."""
+
+    start: Tensor
+    displacements: Tensor
+
+    def __getitem__(self, k: int, /) -> Tensor:
+        return self.start + self.displacements[k]
 
 
 class PushCube(Reach):
@@ -92,20 +103,20 @@ class PushCube(Reach):
     def motions(self, actions: Mapping[str, Tensor]) -> Motions:
         """Integrate velocities to positions of the pins."""
         cloth = self.scene.cloths[self.scene.cloth_names.index(self._actions.cloth)]
-        targets = {}
+        targets: dict[str, PerStep] = {}
         for name, velocities in actions.items():
             start = torch.from_numpy(cloth.vertices[cloth.pins[name]])
             moved = self.simulator.dt * velocities.cumsum(dim=0)
-            targets[f"{self._actions.cloth}/{name}"] = start + moved[:, None]
+            targets[f"{self._actions.cloth}/{name}"] = _Moved(start, moved)
         return {"pins": targets}
 
     def distance(self, state: State, measure: str) -> Tensor:
         """Distance between the body and its target."""
-        away = state.body_poses[self._body, :3] - self._target
-        return measured(away.square().sum(), measure)
+        away = state.body_poses[..., self._body, :3] - self._target
+        return measured(away.square().sum(dim=-1), measure)
 
     def goals(self) -> list[Goal]:
-        """Show the body where it shall be, turned as it is at the start."""
+        """Show the body at its target, with its initial orientation."""
         body = self.scene.bodies[self._body]
         pose = np.concatenate([self._target.numpy(), body.pose[3:]])
         return [Goal(transform(body.vertices, pose), np.asarray(body.faces))]

@@ -1,4 +1,4 @@
-"""What tasks share that act so that something gets somewhere: rows of actions, and a distance."""
+"""Common parts of tasks that bring something to a target: rows of actions, and a distance."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from diffcloth_torch.config.scenes import (
     build_simulator,
     pose_array,
     prescribed_motions,
-    step_controls,
+    step_control,
 )
 from diffcloth_torch.config.schema import (
     BodySection,
@@ -58,9 +58,9 @@ Rows = Annotated[list[Vector3], Len(1)]
 
 
 class ActionSection(Section):
-    """Actions in rows, each of which holds for `interval` steps.
+    """Actions in rows, each of which applies to `interval` steps.
 
-    A single row holds for all intervals at the start and is optimized for each of them.
+    A single row is the initial value for all intervals; each interval is then optimized on its own.
     """
 
     interval: Annotated[int, Ge(1)] = 1
@@ -69,8 +69,8 @@ class ActionSection(Section):
 class LossSection(Section):
     """The distance to the target, averaged over the last `steps` of the horizon.
 
-    "distance" is in meters, for a shape the root mean square of the distances between vertices;
-    "squared" is its square [m^2].
+    "distance" is in meters; for a shape it is the root mean square of the distances between
+    vertices. "squared" is its square [m^2].
     """
 
     measure: Literal["distance", "squared"] = "distance"
@@ -78,7 +78,7 @@ class LossSection(Section):
 
 
 class ReachConfig(RunConfig):
-    """A scene and how to get there; tasks add what acts and where to."""
+    """A scene, a horizon, a loss and an optimizer; tasks add their actions and target."""
 
     actions: ActionSection
     loss: LossSection = LossSection()
@@ -92,7 +92,7 @@ class ReachConfig(RunConfig):
 
 
 class Reach(ABC):
-    """Something acts, and something shall get to a target.
+    """A task in which actions bring something to a target.
 
     The start must make contact: without contact there is no gradient. Subclasses have a `Config`
     and say what the actions are, what they do, and how far the target is.
@@ -111,15 +111,15 @@ class Reach(ABC):
 
     @abstractmethod
     def initial_rows(self) -> dict[str, list[list[float]]]:
-        """Rows of each tensor of actions, as the configuration has them."""
+        """Rows of each tensor of actions in the configuration."""
 
     @abstractmethod
     def motions(self, actions: Mapping[str, Tensor]) -> Motions:
-        """Make targets and forces of all steps from actions that have a row for each step."""
+        """Make the targets and forces of all steps from actions with a row for each step."""
 
     @abstractmethod
     def distance(self, state: State, measure: str) -> Tensor:
-        """Distance to the target, or its square, shape []."""
+        """Distance to the target, or its square, shape [], or [B] of a batch."""
 
     @abstractmethod
     def goals(self) -> list[Goal]:
@@ -138,14 +138,13 @@ class Reach(ABC):
         }
 
     def controller(self, actions: Mapping[str, Tensor]) -> Controller:
-        """Do what the actions say; the rest of the scene follows keyframes."""
+        """Apply the actions; the rest of the scene follows keyframes."""
         acted = self.motions(self.each_step(actions))
         fields = [*self._prescribed, *(name for name in acted if name not in self._prescribed)]
-        merged = {
+        merged: Motions = {
             field: {**self._prescribed.get(field, {}), **acted.get(field, {})} for field in fields
         }
-        controls = step_controls(merged, self.steps)
-        return lambda k, _state: controls[k]
+        return lambda k, _state: step_control(merged, k)
 
     def each_step(self, actions: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Repeat the row of each control interval for its steps: shape [steps, n]."""
@@ -155,9 +154,9 @@ class Reach(ABC):
         }
 
     def loss(self, states: Sequence[State]) -> Tensor:
-        """Distance to the target, averaged over the last states."""
+        """Distance to the target, averaged over the last states; shape [], or [B] of a batch."""
         last = states[-self._loss.steps :]
-        return torch.stack([self.distance(state, self._loss.measure) for state in last]).mean()
+        return torch.stack([self.distance(state, self._loss.measure) for state in last]).mean(dim=0)
 
 
 def _tensor(name: str, rows: list[list[float]], count: int) -> Tensor:
@@ -175,8 +174,9 @@ def _tensor(name: str, rows: list[list[float]], count: int) -> Tensor:
 class RigidActionSection(ActionSection):
     """Actions on a rigid body, or on the base of a robot.
 
-    Either `linear` [m/s] and `angular` [rad/s] velocities of what is kinematic, or `force` [N] at
-    the center of mass (of the root link) and `torque` [N m] on what is free; all in world axes.
+    Either `linear` [m/s] and `angular` [rad/s] velocities if it is kinematic, or `force` [N] at the
+    center of mass (of the root link) and `torque` [N m] if it is dynamic or floating; all in world
+    axes.
     """
 
     linear: Rows | None = None
@@ -185,7 +185,7 @@ class RigidActionSection(ActionSection):
     torque: Rows | None = None
 
     def rigid_rows(self) -> dict[str, list[list[float]]]:
-        """Those of the four that are given."""
+        """The given ones of the four fields."""
         rows: dict[str, list[list[float]]] = self.model_dump(include=set(_RIGID), exclude_none=True)
         return rows
 
@@ -214,7 +214,7 @@ def rigid_motion(
 
 
 def check_rigid_actions(given: RigidActionSection, actor: BodySection | RobotSection) -> None:
-    """Require velocities for what is kinematic and has no trajectory, forces for what is free."""
+    """Require velocities if kinematic without a trajectory, forces if dynamic or floating."""
     key, free = ("base", "floating") if isinstance(actor, RobotSection) else ("motion", "dynamic")
     names = [name for name in _RIGID if getattr(given, name)]
     if names not in (["linear", "angular"], ["force", "torque"]):
@@ -253,7 +253,7 @@ class ShapeSection(Section):
 
 
 class ShapeConfig(ReachConfig):
-    """A scene, the shape that a cloth shall take, and how to get there."""
+    """A scene, and the target shape of a cloth."""
 
     target: ShapeSection
 
@@ -264,21 +264,21 @@ class ShapeConfig(ReachConfig):
 
 
 class ReachShape(Reach):
-    """Something acts, and a cloth shall take a shape."""
+    """A task in which actions bring a cloth into a target shape."""
 
     def __init__(self, config: ShapeConfig, source: Path) -> None:
         """Build the scene of a configuration that was read from the file `source`."""
         super().__init__(config, source)
         section = config.target
         cloth = self.scene.cloths[self.scene.cloth_names.index(section.cloth)]
-        target = transform(cloth.rest_vertices, pose_array(section.pose))
+        target = transform(cloth.rest_positions, pose_array(section.pose))
         self._rows = self.simulator.slices[section.cloth]
         self._target = torch.from_numpy(target)
         self._goal = Goal(target, cloth.faces)
 
     def distance(self, state: State, measure: str) -> Tensor:
-        """L2 distance between the cloth and its target, as `shape_distance` has it."""
-        return shape_distance(state.positions[self._rows], self._target, measure)
+        """L2 distance between the cloth and its target; see `shape_distance`."""
+        return shape_distance(state.positions[..., self._rows, :], self._target, measure)
 
     def goals(self) -> list[Goal]:
         """Show the target shape."""
@@ -286,16 +286,16 @@ class ReachShape(Reach):
 
 
 def measured(mean_square: Tensor, measure: str) -> Tensor:
-    """Take a square [m^2] as it is, or its root [m]."""
+    """Return a mean square [m^2], or for the measure "distance" its root [m]."""
     return mean_square.sqrt() if measure == "distance" else mean_square
 
 
 def shape_distance(vertices: Tensor, target: Tensor, measure: str = "distance") -> Tensor:
-    """L2 distance between two shapes over the square root of the number of vertices, or its square.
+    """Root mean square of the distances between the vertices of two shapes, or its square.
 
     Args:
-        vertices: Positions [m], shape [n, 3].
+        vertices: Positions [m], shape [.., n, 3].
         target: Positions [m], shape [n, 3].
         measure: "distance" [m] or "squared" [m^2].
     """
-    return measured((vertices - target).square().sum(dim=-1).mean(), measure)
+    return measured((vertices - target).square().sum(dim=-1).mean(dim=-1), measure)

@@ -1,4 +1,4 @@
-"""Tasks by the name that a configuration gives."""
+"""Tasks by their name in a configuration."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TASKS: dict[str, Any] = {
 
 
 def read_config(path: str | Path, assignments: Iterable[str] = ()) -> RunConfig:
-    """Read a configuration, change values and check it against the schema of its task.
+    """Read a configuration, change values, and check it against the schema of its task.
 
     Args:
         path: YAML file.
@@ -45,11 +45,11 @@ def read_config(path: str | Path, assignments: Iterable[str] = ()) -> RunConfig:
 
 
 def check_document(document: Mapping[str, Any], path: str | Path) -> RunConfig:
-    """Check what a configuration file holds against the schema of its task.
+    """Check the contents of a configuration file against the schema of its task.
 
     Args:
         document: Keys and values.
-        path: Where it was read from, for messages.
+        path: File that it was read from, for messages.
 
     Raises:
         InvalidInput: If a key or a value is not accepted.
@@ -64,11 +64,11 @@ def check_document(document: Mapping[str, Any], path: str | Path) -> RunConfig:
 
 
 def make_task(config: RunConfig, path: str | Path) -> Task:
-    """Build what a configuration describes; `path` is where it was read from."""
+    """Build the scene, simulator and task of a configuration that was read from `path`."""
     constructor: Callable[[RunConfig, Path], Task] = TASKS[config.task]
     return constructor(config, Path(path))
 
 
 def load_task(path: str | Path, assignments: Iterable[str] = ()) -> Task:
-    """Read a configuration and build what it describes."""
+    """Read a configuration, and build its scene, simulator and task."""
     return make_task(read_config(path, assignments), path)

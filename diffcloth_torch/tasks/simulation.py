@@ -1,4 +1,4 @@
-"""Simulate a task, one state after the other."""
+"""Simulation of a task, one state after the other."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def simulate(task: Task, actions: Actions | None = None) -> Iterator[State]:
     """Yield the initial state and the state after each step.
 
     Args:
-        task: What to simulate.
-        actions: What is done, as `task.actions()` has it; by default just that.
+        task: The task.
+        actions: Actions with the keys and shapes of `task.actions()`, which is the default.
 
     Raises:
         SimulationError: If a step fails.
@@ -28,7 +28,7 @@ def simulate(task: Task, actions: Actions | None = None) -> Iterator[State]:
         controller = task.controller(task.actions() if actions is None else actions)
         state = task.initial_state()
     yield state
-    # disable=None: quiet where the output is no terminal.
+    # disable=None: quiet if the output is not a terminal.
     for k in tqdm(range(task.steps), desc="simulate", unit="step", disable=None):
         with torch.no_grad():
             state = task.simulator.step(state, controller(k, state))

@@ -1,4 +1,4 @@
-"""What a task is: something that can be simulated, and perhaps optimized."""
+"""The protocol of tasks, which can be simulated, and may be optimized."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ class Task(Protocol):
         ...
 
     def actions(self) -> dict[str, Tensor]:
-        """Make new leaf tensors of the initial actions; none where nothing is optimized."""
+        """Make new leaf tensors of the initial actions; none if nothing is optimized."""
         ...
 
     def controller(self, actions: Mapping[str, Tensor]) -> Controller:
-        """Make what controls each step by some actions.
+        """Make a function that returns the control of a step under the given actions.
 
-        It takes the index of a step and the state before it, and may look at that state. Asked
-        again for the same step, it gives the same: checkpointed rollouts repeat steps.
+        It takes the index of a step and the state before it. For the same arguments it returns the
+        same control, because checkpointed rollouts repeat steps.
         """
         ...
 
     def goals(self) -> Sequence[Goal]:
-        """Shapes that the task aims at; none where it has no aim."""
+        """Shapes to show as targets of the task; may be none."""
         ...
 
 
@@ -56,17 +56,17 @@ class Optimizable(Task, Protocol):
         ...
 
     def loss(self, states: Sequence[State]) -> Tensor:
-        """Loss of the states after each step, shape []."""
+        """Loss of the states after each step, shape [], or [B] of a batch."""
         ...
 
 
 class LoadedConfig(NamedTuple):
-    """What a configuration describes.
+    """The scene, simulator and task of a configuration.
 
     Attributes:
         scene: Cloths, bodies and robots.
         simulator: Steps the scene.
-        task: How the scene is controlled, and what it aims at.
+        task: Control and objective of the scene.
     """
 
     scene: Scene

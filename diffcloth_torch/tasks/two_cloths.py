@@ -1,7 +1,8 @@
-"""Two cloths: hooked into each other, they are pulled apart until one is where it shall be.
+"""Two cloths, hooked into each other, are pulled apart until one reaches its target.
 
-A constant force pulls the one. What acts is the force on the other, for each control interval. The
-loss is the distance between the center of a cloth, the mean of its vertices, and its target.
+A constant force pulls one cloth. The actions are forces on the other, one for each control
+interval. The loss is the distance between the center of a cloth, the mean of its vertices, and its
+target.
 
 References:
     The experiment "checking differentiation calculation" of the paper, section V.C.
@@ -36,7 +37,7 @@ __all__ = ["TwoCloths", "TwoClothsConfig"]
 
 
 class PullSection(Section):
-    """A constant force [N] on vertices of a cloth, which share it evenly."""
+    """A constant force [N], shared evenly by vertices of a cloth."""
 
     cloth: str
     at: Selection
@@ -44,7 +45,7 @@ class PullSection(Section):
 
 
 class ForceActionSection(ActionSection):
-    """Forces [N] on vertices of a cloth, which share them evenly."""
+    """Forces [N], each shared evenly by vertices of a cloth."""
 
     cloth: str
     at: Selection
@@ -52,7 +53,7 @@ class ForceActionSection(ActionSection):
 
 
 class CenterSection(Section):
-    """Where the center of a cloth shall be [m]; it is shown with a radius [m]."""
+    """Target of the center of a cloth [m], and the radius [m] with which it is shown."""
 
     cloth: str
     position: Vector3
@@ -60,7 +61,7 @@ class CenterSection(Section):
 
 
 class TwoClothsConfig(ReachConfig):
-    """A scene, the forces that act in it, the target of a cloth's center, and how to get there."""
+    """A scene, the forces that act in it, and the target of a cloth's center."""
 
     pull: PullSection
     actions: ForceActionSection
@@ -90,7 +91,7 @@ class TwoCloths(Reach):
         self._radius = config.target.marker_radius
 
     def _shares(self, key: str, section: PullSection | ForceActionSection) -> Tensor:
-        """Share of each vertex of the scene in a force, shape [N]."""
+        """Fraction of a force that acts on each vertex of the scene, shape [N]."""
         cloth = self.scene.cloths[self.scene.cloth_names.index(section.cloth)]
         chosen = select_vertices(f"{key}.at", section.at, cloth.vertices)
         if chosen.max() >= len(cloth.vertices):
@@ -104,15 +105,15 @@ class TwoCloths(Reach):
         return shares
 
     def initial_rows(self) -> dict[str, list[list[float]]]:
-        """Forces on the cloth that acts."""
+        """Forces on the actuated cloth."""
         return {"force": self._force}
 
     def motions(self, actions: Mapping[str, Tensor]) -> Motions:
-        """Move nothing but by forces."""
+        """Have no prescribed motion."""
         return {}
 
     def controller(self, actions: Mapping[str, Tensor]) -> Controller:
-        """Pull at both cloths; the rest of the scene follows keyframes."""
+        """Pull both cloths; the rest of the scene follows keyframes."""
         follow = super().controller(actions)
         acting = self.each_step(actions)["force"]
 
@@ -124,9 +125,9 @@ class TwoCloths(Reach):
 
     def distance(self, state: State, measure: str) -> Tensor:
         """Distance between the center of the cloth and its target."""
-        away = state.positions[self._rows].mean(dim=0) - self._target
-        return measured(away.square().sum(), measure)
+        away = state.positions[..., self._rows, :].mean(dim=-2) - self._target
+        return measured(away.square().sum(dim=-1), measure)
 
     def goals(self) -> list[Goal]:
-        """Mark where the center shall be."""
+        """Mark the target of the center."""
         return [marker(self._target.numpy(), self._radius)]

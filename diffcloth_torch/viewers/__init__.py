@@ -1,1 +1,1 @@
-"""Viewers: what becomes of the states of a simulation. Each is shown one state after the other."""
+"""Viewers: each receives the states of a simulation, one after the other."""

@@ -1,8 +1,8 @@
-"""A floor that is only drawn: it fades into the background and takes a soft shadow.
+"""A floor that is only drawn: it fades into the background and receives a soft shadow.
 
 The shadow is a texture. Points on the surfaces are projected to the floor along the light and
-counted on a grid, which is blurred: layers of cloth that lie over each other stay one shadow, as
-they would not with translucent projections, and nothing depends on the shadow maps of a driver.
+counted on a grid, which is blurred. So layers of cloth have one common shadow, unlike translucent
+projections, and the result does not depend on the shadow maps of a driver.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _BLUR = (3, 4, 5)
 
 
 class Floor:
-    """A square at some height whose texture can be shaded."""
+    """A square at a given height whose texture can be shaded."""
 
     def __init__(
         self, pyvista: Any, plotter: Any, bounds: tuple[Points, Points], height: float
@@ -40,7 +40,7 @@ class Floor:
             pyvista: The module.
             plotter: Where it is shown.
             bounds: Lowest and highest coordinates of what stands on it [m].
-            height: Of the floor [m].
+            height: Height of the floor [m].
         """
         low, high = bounds
         self.height = height

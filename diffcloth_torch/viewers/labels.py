@@ -1,4 +1,4 @@
-"""What is written on pictures: the time, and a legend of what is seen."""
+"""Labels of pictures: the time and a legend."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Entry:
     """A line of the legend.
 
     Attributes:
-        text: What is explained.
+        text: What the colors stand for.
         colors: One color "#rrggbb", or those of the front and the back.
     """
 

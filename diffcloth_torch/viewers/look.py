@@ -1,4 +1,4 @@
-"""How what is drawn shall look: options of pictures, colors of surfaces, shapes to reach."""
+"""The look of pictures: options, camera, colors of surfaces, target shapes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,17 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from diffcloth_torch.checks import (
+    ANY_NUMBER,
+    POSITIVE,
+    FloatArray,
+    Range,
+    check_finite,
+    check_number,
+    check_shape,
+    float_array,
+)
+from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry import shapes
 
 __all__ = ["FORCE_COLOR", "GOAL_COLOR", "Camera", "Goal", "Paint", "Pictures", "marker"]
@@ -25,16 +36,30 @@ FORCE_COLOR = "#b3123f"
 _MARKER_SUBDIVISIONS = 2
 
 
+_ACCEPTED = {
+    "azimuth": ANY_NUMBER,
+    "elevation": Range(-90.0, 90.0),
+    "zoom": POSITIVE,
+    "distance": POSITIVE,
+    "field_of_view": Range(0.0, 180.0),
+}
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Where pictures are taken from; None is chosen from the motion.
+    """The camera of pictures; values of None are derived from the motion.
+
+    Give a position, or directions in degrees from which it follows.
 
     Attributes:
         azimuth: Direction of view in degrees: 0 looks along +y, 90 along -x.
         elevation: Height above the horizon in degrees, between -90 and 90.
-        zoom: What the distance is divided by, > 0.
-        target: Point [m] around which lies what is drawn.
-        distance: From the target, before the zoom [m].
+        zoom: Divisor of the distance, > 0.
+        target: Point at the center of the picture [m], shape [3].
+        distance: Distance from the target, before the zoom [m], > 0.
+        position: Position of the camera [m], shape [3]; with it only `target` counts of the above.
+        up: Direction that is up in the picture, shape [3].
+        field_of_view: Vertical angle of the picture in degrees, between 0 and 180.
     """
 
     azimuth: float = 35.0
@@ -42,25 +67,81 @@ class Camera:
     zoom: float = 1.0
     target: Sequence[float] | None = None
     distance: float | None = None
+    position: Sequence[float] | None = None
+    up: Sequence[float] = (0.0, 0.0, 1.0)
+    field_of_view: float = 26.0  # long enough a lens that nothing looks bent
+
+    def __post_init__(self) -> None:
+        for name in ("target", "position", "up"):
+            value = getattr(self, name)
+            if value is not None:
+                point = float_array(f"Camera: `{name}`", value)
+                check_shape(f"Camera: `{name}`", point.shape, [(3,)])
+                check_finite(f"Camera: `{name}`", point)
+        for name, accepted in _ACCEPTED.items():
+            value = getattr(self, name)
+            if value is not None:
+                check_number(f"Camera: `{name}`", value, accepted, instead="pass a plain number")
+        if not np.any(np.asarray(self.up)):
+            raise InvalidInput("Camera: `up` must be a direction, got zeros")
+        if self.position is not None and self.target is not None:
+            view = np.asarray(self.target, float) - np.asarray(self.position, float)
+            self._check_view(view)
+
+    def place(self, center: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
+        """Find the position of the camera and the point that it looks at [m].
+
+        Args:
+            center: Center of the scene [m].
+            radius: Radius of a ball around the scene [m].
+
+        Raises:
+            InvalidInput: If it looks along `up`, or its position is the point that it looks at.
+        """
+        target = center if self.target is None else np.array(self.target, dtype=np.float64)
+        if self.position is not None:
+            position = np.array(self.position, dtype=np.float64)
+            self._check_view(target - position)
+            return position, target
+        fitting = radius / np.sin(np.radians(self.field_of_view / 2))
+        distance = (fitting if self.distance is None else self.distance) / self.zoom
+        azimuth, elevation = np.radians(self.azimuth), np.radians(self.elevation)
+        towards = np.array(
+            [
+                np.sin(azimuth) * np.cos(elevation),
+                -np.cos(azimuth) * np.cos(elevation),
+                np.sin(elevation),
+            ]
+        )
+        return target + distance * towards, target
+
+    def _check_view(self, view: FloatArray) -> None:
+        if not np.linalg.norm(np.cross(view, self.up)) > 1e-9 * np.linalg.norm(view) * (
+            np.linalg.norm(self.up)
+        ):
+            raise InvalidInput(
+                "Camera: `position` must be apart from `target`, and not in the direction of `up` "
+                f"from there, got a view along {view.tolist()}"
+            )
 
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """Pictures and the animation.
+    """Options of pictures and of the animation.
 
     Attributes:
         size: Width and height [pixels], even numbers.
         fps: Pictures per second; None plays in real time.
         video: Kind of the animation.
         frames: Whether every picture of the animation is kept.
-        sheet: Moments in the overview picture, from the first to the last; 0 leaves it out.
-        labels: Whether the time and a legend are written.
+        sheet: Number of moments in the overview, from the first to the last; 0 for no overview.
+        labels: Whether pictures show the time and a legend.
         contact_forces: Whether arrows show the contact forces on the vertices of bodies and links
-            (`State.body_forces`). They end where the forces act; the longest of the motion is a
-            fifth of the size of the scene.
-        ground: Height of a floor that is only drawn [m]: "auto" takes that of a static level plane
-            of the scene, or lies below everything; None leaves it out.
-        camera: Where pictures are taken from.
+            (`State.body_forces`). They end where the forces act; the longest arrow of the motion is
+            a fifth of the size of the scene.
+        ground: Height of a floor that is only drawn [m]: "auto" means the height of a static level
+            plane of the scene, or else below everything; None means no floor.
+        camera: The camera.
     """
 
     size: Sequence[int] = (960, 720)
@@ -76,11 +157,11 @@ class Pictures:
 
 @dataclass(frozen=True, eq=False)
 class Paint:
-    """Colors of a surface as "#rrggbb"; None takes one of the palette.
+    """Colors of a surface as "#rrggbb"; None means a color of the palette.
 
     Attributes:
-        color: Of the front, or of a body.
-        back_color: Of the back of a cloth.
+        color: Color of the front of a cloth, or of a body.
+        back_color: Color of the back of a cloth.
     """
 
     color: str | None = None
@@ -100,7 +181,7 @@ class Paint:
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """A shape to reach.
+    """A target shape.
 
     Attributes:
         vertices: Positions [m], shape [n, 3].
@@ -112,6 +193,6 @@ class Goal:
 
 
 def marker(position: NDArray[np.float64], radius: float) -> Goal:
-    """Mark a point to reach, of shape [3], by a small sphere [m]."""
+    """Mark a target point [m], of shape [3], by a small sphere."""
     vertices, faces = shapes.sphere(radius, _MARKER_SUBDIVISIONS)
     return Goal(vertices + position, faces.astype(np.int32))

@@ -14,7 +14,7 @@ class MeshSequence:
     """Writes `frame_0000.obj`, `frame_0001.obj` .. into a folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Make the folder; files of an earlier sequence in it are removed.
+        """Make the folder, and remove files of an earlier sequence from it.
 
         Args:
             folder: Where the files go.

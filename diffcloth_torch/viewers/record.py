@@ -6,21 +6,25 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 from tqdm import tqdm
 
-from diffcloth_torch.checks import FloatArray, IndexArray
+from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.geometry.poses import transform
-from diffcloth_torch.model.kinematics import pose_frame
+from diffcloth_torch.model.assembly import assemble
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.surfaces import Surfaces, place
 from diffcloth_torch.viewers.labels import Entry, legend_below, overview, write_time
 from diffcloth_torch.viewers.look import FORCE_COLOR, GOAL_COLOR, Goal, Paint, Pictures
 from diffcloth_torch.viewers.stage import Bounds, Skin, Stage, require_pyvista
@@ -31,26 +35,26 @@ Image = NDArray[np.uint8]
 
 _DEFAULT_PICTURES = Pictures()
 
-_GAP_BELOW = 0.04  # of the size of the scene, between the lowest point and a floor of ours
-_LONGEST_ARROW = 0.2  # of the size of the scene, for the largest force
-_GIF_STEP = 2  # every so many pixels of a picture are kept in a GIF
+_GAP_BELOW = 0.04  # fraction of the scene's size, between its lowest point and our floor
+_LONGEST_ARROW = 0.2  # fraction of the scene's size, for the largest force
+_GIF_STEP = 2  # a GIF keeps one of this many pixels along each axis
 
 
 @dataclass(frozen=True, eq=False)
 class _Rigid:
-    """A surface of a body or a link; vertices [v, 3] in its frame, faces [f, 3]."""
+    """A surface of a body or a link: vertices [v, 3] in its frame, faces [f, 3]."""
 
     owner: str
-    vertices: FloatArray
-    faces: IndexArray
+    vertices: Tensor
+    faces: Tensor
     shown: bool
 
 
 class Record:
-    """Keeps the states that it is shown and draws them at the end, when all of the motion is known.
+    """Keeps the states that it is shown and draws them at the end, when the whole motion is known.
 
-    Files: `NAME.mp4` or `NAME.gif`, `NAME.png` (an overview of some moments), and
-    `NAME_frames/0000.png` .. if asked for.
+    The files are `NAME.mp4` or `NAME.gif`, `NAME.png` (an overview of some moments), and if asked
+    for `NAME_frames/0000.png` and so on.
     """
 
     def __init__(
@@ -67,12 +71,12 @@ class Record:
         """Check that pictures can be made, before a long simulation.
 
         Args:
-            folder: Where the files go; it must exist.
-            scene: What is shown.
-            fps: Pictures per second, where `pictures` do not say.
-            pictures: How they are made.
+            folder: Existing folder for the files.
+            scene: The scene to show.
+            fps: Pictures per second, unless `pictures` has them.
+            pictures: Options of the pictures.
             paints: Name of a cloth, a body or a robot -> its colors.
-            goals: Shapes that are shown beside it.
+            goals: Shapes to show beside the scene.
             name: Name of the files.
 
         Raises:
@@ -87,7 +91,8 @@ class Record:
         _require_writer(self._options.video)
         self._folder, self._scene, self._name = folder, scene, name
         self._goals = goals
-        self._rigid = _rigid_surfaces(scene)
+        self._surfaces = Surfaces.of(scene, assemble(scene))
+        self._rigid = _rigid_surfaces(scene, self._surfaces)
         if not scene.cloths and not any(surface.shown for surface in self._rigid):
             raise InvalidInput(
                 "pictures: the scene must have a surface: its robots have no collision shapes, and "
@@ -106,13 +111,13 @@ class Record:
     def show(self, state: State) -> None:
         """Keep one state."""
         self._positions.append(state.positions.detach().numpy().copy())
-        self._frames.append(self._placed_frames(state))
+        self._frames.append(self._shown_frames(state))
         self._times.append(float(state.time))
         if self._options.contact_forces:
             self._forces.append(self._shown_forces(state))
 
     def __enter__(self) -> Record:
-        """Have nothing more to open."""
+        """Return the recorder; nothing is left to open."""
         return self
 
     def __exit__(
@@ -121,7 +126,7 @@ class Record:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Draw what there is; after a failed step too, to see what led to it."""
+        """Draw all states; also after a failed step, to show what led to it."""
         if self._positions and (kind is None or issubclass(kind, SimulationError)):
             self._draw_all()
 
@@ -137,7 +142,7 @@ class Record:
         with self._stage(low, high) as stage, self._writer() as writer:
             drawn = range(count) if all_are_kept else sorted(moments)
             for k in tqdm(drawn, desc="draw", unit="frame", disable=None):
-                image = stage.draw(self._positions[k], self._frames[k], arrows[k])
+                image = stage.draw(self._positions[k], self._placed(self._frames[k]), arrows[k])
                 if labels:
                     image = write_time(image, self._times[k], step)
                 if k in moments:
@@ -152,7 +157,7 @@ class Record:
             _write_image(self._folder / f"{self._name}.png", image)
 
     def _arrows(self, size: float) -> tuple[Sequence[FloatArray | None], list[Entry]]:
-        """Arrows [m] of each state where forces are shown, and all lines of the legend."""
+        """Arrows [m] of each state if forces are shown, and all lines of the legend."""
         entries = []
         for name, paint in self._paints.items():
             colors = [color for color in (paint.color, paint.back_color) if color is not None]
@@ -178,7 +183,7 @@ class Record:
                 )
             ],
             [
-                (surface.vertices, Skin(surface.faces, self._paints[surface.owner]))
+                Skin(surface.faces.numpy(), self._paints[surface.owner])
                 for surface in self._rigid
                 if surface.shown
             ],
@@ -196,40 +201,35 @@ class Record:
         starts: list[int] = np.cumsum([0, *counts])[:-1].tolist()
         return starts
 
-    def _placed_frames(self, state: State) -> FloatArray:
-        """Frames [n, 4, 4] of the surfaces that are shown."""
-        state = state.detach()
-        frames = [*pose_frame(state.body_poses)]
-        first = 0
-        for robot, base in zip(self._scene.robots, state.base_poses, strict=True):
-            joints = state.joint_positions[first : first + len(robot.joint_names)]
-            first += len(joints)
-            placed = robot.forward_kinematics(joints, base)
-            links = zip(robot.link_names, robot.surfaces, strict=True)
-            frames += [placed[link] for link, surface in links if surface is not None]
-        chosen = [
-            frame.numpy()
-            for frame, surface in zip(frames, self._rigid, strict=True)
-            if surface.shown
+    def _shown_frames(self, state: State) -> FloatArray:
+        """Frames [n, 4, 4] of the shown bodies and links."""
+        frames = self._surfaces.surface_frames(vars(state.detach()))
+        shown: FloatArray = frames.numpy()[[surface.shown for surface in self._rigid]]
+        return shown
+
+    def _placed(self, frames: FloatArray) -> list[FloatArray]:
+        """Vertices [v, 3] of the shown bodies and links in the world."""
+        shown = (surface for surface in self._rigid if surface.shown)
+        return [
+            place(surface.vertices, torch.from_numpy(frame)).numpy()
+            for surface, frame in zip(shown, frames, strict=True)
         ]
-        stacked: FloatArray = np.array(chosen).reshape(-1, 4, 4)
-        return stacked
 
     def _shown_forces(self, state: State) -> FloatArray:
-        """Contact forces on the vertices of the surfaces that are shown [N], shape [v, 3]."""
+        """Contact forces on the vertices of the shown surfaces [N], shape [v, 3]."""
         counts = [len(surface.vertices) for surface in self._rigid]
         shown = np.repeat([surface.shown for surface in self._rigid], counts).astype(bool)
         forces: FloatArray = state.body_forces.detach().numpy()[shown]
         return forces
 
     def _bounds(self) -> Bounds:
-        points = [*self._positions, *(goal.vertices for goal in self._goals)]
-        for k, surface in enumerate(surface for surface in self._rigid if surface.shown):
-            frames = np.unique([frames[k] for frames in self._frames], axis=0)
-            points += [surface.vertices @ frame[:3, :3].T + frame[:3, 3] for frame in frames]
-        points = [cloud for cloud in points if len(cloud)]
-        lows = [cloud.min(axis=0) for cloud in points]
-        highs = [cloud.max(axis=0) for cloud in points]
+        lows, highs = [], []
+        placed = (self._placed(frames) for frames in np.unique(self._frames, axis=0))
+        goals = [goal.vertices for goal in self._goals]
+        for points in chain(self._positions, goals, chain.from_iterable(placed)):
+            if len(points):
+                lows.append(points.min(axis=0))
+                highs.append(points.max(axis=0))
         return np.min(lows, axis=0), np.max(highs, axis=0)
 
     def _ground(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> float | None:
@@ -237,12 +237,12 @@ class Record:
             return self._options.ground
         floors = [body for body in self._scene.bodies if _is_floor(body)]
         if floors:
-            return max(float(_placed(body)[0, 2]) for body in floors)
+            return max(float(_placed_body(body)[0, 2]) for body in floors)
         return float(low[2] - _GAP_BELOW * np.linalg.norm(high - low))
 
     @contextmanager
     def _writer(self) -> Iterator[Any]:
-        """Give a function (index, image) that adds a picture to the files."""
+        """Yield a function (index, image) that adds a picture to the files."""
         import imageio.v2 as imageio
 
         frames = self._folder / f"{self._name}_frames"
@@ -289,29 +289,26 @@ def _require_writer(video: str) -> None:
             )
 
 
-def _rigid_surfaces(scene: Scene) -> list[_Rigid]:
-    """Bodies, then links that have a shape, as in `State.body_forces`.
+def _rigid_surfaces(scene: Scene, surfaces: Surfaces) -> list[_Rigid]:
+    """Surfaces of bodies, then of links with a shape, in the order of `State.body_forces`.
 
-    The floor of the stage stands for a level plane, which is not shown.
+    A level plane is not shown: the floor of the stage replaces it.
     """
-    surfaces = [
-        _Rigid(name, body.vertices, body.faces, not _is_floor(body))
-        for name, body in zip(scene.body_names, scene.bodies, strict=True)
+    floors = [n for n, b in zip(scene.body_names, scene.bodies, strict=True) if _is_floor(b)]
+    return [
+        _Rigid(name.partition("/")[0], vertices, faces, name not in floors)
+        for name, (vertices, faces) in surfaces.rigid_meshes().items()
     ]
-    for name, robot in zip(scene.robot_names, scene.robots, strict=True):
-        meshes = [surface for surface in robot.surfaces if surface is not None]
-        surfaces += [_Rigid(name, mesh.vertices, mesh.faces, True) for mesh in meshes]
-    return surfaces
 
 
-def _placed(body: RigidBody) -> NDArray[np.float64]:
+def _placed_body(body: RigidBody) -> NDArray[np.float64]:
     return transform(body.vertices, body.pose)
 
 
 def _is_floor(body: RigidBody) -> bool:
     """Whether a body is a static level plane, as `RigidBody.plane` makes them."""
     is_plane = len(body.vertices) == 4 and len(body.faces) == 2
-    return is_plane and body.motion == "static" and not np.ptp(_placed(body)[:, 2])
+    return is_plane and body.motion == "static" and not np.ptp(_placed_body(body)[:, 2])
 
 
 def _write_image(path: Path, image: Image) -> None:

@@ -1,4 +1,4 @@
-"""Pictures of a scene and its states in one call, without a configuration."""
+"""Pictures of a scene and its states, in one call and without a configuration."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ def render(
     >>> dc.render(scene, states[-1], "end.png", contact_forces=True)
 
     Args:
-        scene: What the states are of.
-        states: In the order of time; none of them a batch.
-        path: File to write, in a folder that exists; a file that is there is replaced.
+        scene: Scene of the states.
+        states: States in the order of time, without a batch axis.
+        path: File to write, in an existing folder; an existing file is replaced.
         size: Width and height of a picture [pixels], even numbers from 64 to 4096.
         fps: Pictures per second of an animation, > 0; None plays in real time.
-        moments: How many pictures an overview has, from the first to the last, >= 1.
-        labels: Whether the time and a legend are written.
+        moments: Number of pictures in an overview, from the first state to the last, >= 1.
+        labels: Whether pictures show the time and a legend.
         contact_forces: Whether arrows show the contact forces on bodies and links
             (`State.body_forces`).
-        camera: Where pictures are taken from; None looks from the front, a little from above.
+        camera: The camera; None looks from the front, slightly from above.
 
     Raises:
-        InvalidInput: If an argument is not accepted, or a package is missing: the message says how
-            to install it.
-        TypeError: If `states` holds something else.
+        InvalidInput: If an argument is not accepted, or if a package is missing; the message says
+            how to install it.
+        TypeError: If `states` contains other objects than states.
     """
     path = Path(path)
     kind = path.suffix.lower().removeprefix(".")

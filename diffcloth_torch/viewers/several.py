@@ -13,7 +13,7 @@ __all__ = ["Viewers"]
 
 
 class Viewers:
-    """Several viewers, of every so many states the first."""
+    """Several viewers, each of which is shown every n-th state."""
 
     def __init__(self, viewers: Iterable[Viewer], every: int = 1) -> None:
         """Remember the viewers.

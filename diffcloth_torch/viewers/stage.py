@@ -1,4 +1,4 @@
-"""The stage that pictures are taken of: light, floor, cloth of two colors, bodies, targets.
+"""The stage for pictures: lights, floor, cloths of two colors, bodies and targets.
 
 Everything is drawn off screen. On a machine without a display VTK draws through EGL.
 """
@@ -25,8 +25,8 @@ Image = NDArray[np.uint8]
 Bounds = tuple[Points, Points]
 """Lowest and highest coordinates [m], each of shape [3]."""
 
-# Directions to the lights, for a camera that looks along +y: they turn with it, so that what is
-# seen is lit. The key light also casts the shadow.
+# Directions to the lights, for a camera that looks along +y. They turn with the camera, so that
+# visible sides are lit. The key light also casts the shadow.
 _SUN = np.array([-0.45, -0.55, 1.0])
 # Direction, intensity and color of the other lights: cool ones across and from behind.
 _FILL = (np.array([1.0, -0.7, 0.3]), 0.45, "#e4eeff")
@@ -35,9 +35,8 @@ _RIM = (np.array([-0.4, 1.0, 0.5]), 0.4, "#fff8f0")
 _CLOTH_SHINE = {"ambient": 0.36, "diffuse": 0.78, "specular": 0.1, "specular_power": 10}
 _BODY_SHINE = {"ambient": 0.4, "diffuse": 0.7, "specular": 0.25, "specular_power": 25}
 
-_VIEW_ANGLE = 26.0  # vertical, in degrees: long enough a lens that nothing looks bent
-_SHORTEST_ARROW = 0.002  # of the size of the scene; shorter ones are left out
-_CREASE_ANGLE = 35.0  # degrees between faces of a body above which an edge is drawn sharp
+_SHORTEST_ARROW = 0.002  # fraction of the scene's size; shorter arrows are left out
+_CREASE_ANGLE = 35.0  # angle [degrees] between faces of a body above which an edge is drawn sharp
 
 _INSTALL = (
     "pictures need pyvista: run  pip install 'diffcloth-torch[viewer]'  or leave them out with  "
@@ -47,7 +46,7 @@ _INSTALL = (
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A surface and how it is painted.
+    """A surface and its colors.
 
     Attributes:
         faces: Vertex indices, shape [f, 3].
@@ -65,7 +64,7 @@ def require_pyvista() -> Any:
         InvalidInput: If it is not installed; the message says how to install it.
     """
     if not os.environ.get("DISPLAY"):
-        # Otherwise VTK tries an X server first, and complains about it.
+        # Otherwise VTK tries an X server first, and prints a warning about it.
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
     try:
         import pyvista
@@ -102,7 +101,7 @@ class Stage:
     def __init__(
         self,
         cloths: Sequence[Skin],
-        bodies: Sequence[tuple[Points, Skin]],
+        bodies: Sequence[Skin],
         *,
         size: Sequence[int],
         bounds: Bounds,
@@ -112,32 +111,33 @@ class Stage:
         """Set the stage.
 
         Args:
-            cloths: Cloths; their faces index the positions that `draw` gets.
-            bodies: Vertices [m], shape [v, 3], and skin of each body or link, in its frame.
+            cloths: Cloths, whose faces are indices into the positions that `draw` gets.
+            bodies: Bodies and links, whose faces are indices into their own vertices.
             size: Width and height [pixels].
-            bounds: Of all that will be drawn.
-            ground: Height of the floor [m]; None leaves it out.
-            camera: Where pictures are taken from.
+            bounds: Bounds of everything that will be drawn.
+            ground: Height of the floor [m]; None draws no floor.
+            camera: View from which pictures are taken.
         """
         self._pv = require_pyvista()
         self._bounds = bounds
         self._plotter = self._pv.Plotter(off_screen=True, window_size=list(size), lighting="none")
         self._plotter.set_background(BACKGROUND)
         self._plotter.enable_anti_aliasing("msaa", multi_samples=8)
-        sun = self._light(camera.azimuth)
+        low, high = bounds
+        radius = float(np.linalg.norm(high - low)) / 2
+        position, target = camera.place((low + high) / 2, radius)
+        sun = self._light(target - position)
         self._cloths = [(skin.faces, self._add_cloth(skin)) for skin in cloths]
-        self._bodies = [
-            (vertices, skin.faces, self._add_body(vertices, skin)) for vertices, skin in bodies
-        ]
-        self._frames: Points | None = None
+        self._bodies = [(skin.faces, self._add_body(skin)) for skin in bodies]
+        self._placed: Sequence[Points] = []
         self._floor = None
         if ground is not None:
             self._floor = Floor(self._pv, self._plotter, bounds, ground)
             self._shadow = Shadow(self._floor, sun)
-        self._aim(camera)
+        self._aim(camera, position, target)
 
     def __enter__(self) -> Stage:
-        """Be open already."""
+        """Return the stage, which is already open."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -145,7 +145,7 @@ class Stage:
         self._plotter.close()
 
     def add_goal(self, goal: Goal) -> None:
-        """Show a shape to reach: translucent, with its border."""
+        """Show a target shape, translucent and with its border."""
         shape = self._pv.PolyData.from_regular_faces(goal.vertices, goal.faces)
         self._plotter.add_mesh(shape, color=GOAL_COLOR, opacity=0.25, lighting=False)
         border = shape.extract_feature_edges(
@@ -156,33 +156,35 @@ class Stage:
             tube = border.strip(join=True).tube(radius=width)
             self._plotter.add_mesh(tube, color=GOAL_COLOR, ambient=0.5)
 
-    def draw(self, positions: Points, frames: Points, arrows: Points | None = None) -> Image:
+    def draw(
+        self, positions: Points, bodies: Sequence[Points], arrows: Points | None = None
+    ) -> Image:
         """Take one picture.
 
         Args:
             positions: Cloth vertices [m], shape [N, 3].
-            frames: Of the bodies and links, shape [n, 4, 4].
-            arrows: Along the vertices of the bodies and links, at which they end [m], one body
-                after the other, shape [V, 3].
+            bodies: Vertices of each body or link [m], shape [v, 3].
+            arrows: Arrows that end at the vertices of the bodies and links [m], one body after the
+                other, shape [V, 3].
 
         Returns:
-            Colors, shape [height, width, 3].
+            Colors of the pixels, shape [height, width, 3].
         """
         casters = []
         for faces, surface in self._cloths:
             surface.move(positions)
             casters.append((positions, faces))
-        for k, (rest, faces, surface) in enumerate(self._bodies):
-            vertices = rest @ frames[k, :3, :3].T + frames[k, :3, 3]
-            if self._frames is None or (frames[k] != self._frames[k]).any():
-                surface.move(vertices)
-            casters.append((vertices, faces))
-        self._frames = frames.copy()
+        for k, (faces, surface) in enumerate(self._bodies):
+            if not self._placed or (bodies[k] != self._placed[k]).any():
+                surface.move(bodies[k])
+            casters.append((bodies[k], faces))
+        self._placed = bodies
         if arrows is not None:
-            self._show_arrows([vertices for vertices, _ in casters[len(self._cloths) :]], arrows)
+            self._show_arrows(bodies, arrows)
         if self._floor is not None:
             self._shadow.cast(casters)
-        self._plotter.render()  # a screenshot alone would show the last picture again
+        self._plotter.reset_camera_clipping_range()
+        self._plotter.render()  # otherwise a screenshot would show the last picture again
         image = self._plotter.screenshot(return_img=True)
         return np.ascontiguousarray(image[..., :3])
 
@@ -197,11 +199,12 @@ class Stage:
         shapes = cloud.glyph(orient="arrows", scale="arrows", geom=self._pv.Arrow())
         self._plotter.add_mesh(shapes, name="arrows", color=FORCE_COLOR, ambient=0.5)
 
-    def _light(self, azimuth: float) -> Points:
-        """Add the lights; returns the direction to the one that casts the shadow."""
+    def _light(self, view: Points) -> Points:
+        """Add the lights for a direction of view; return the direction to the one with shadows."""
         low, high = self._bounds
         center, size = (low + high) / 2, float(np.linalg.norm(high - low))
-        cosine, sine = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
+        azimuth = np.arctan2(-view[0], view[1])
+        cosine, sine = np.cos(azimuth), np.sin(azimuth)
         turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
         for direction, intensity, color in ((_SUN, 0.8, "#fff4e6"), _FILL, _RIM):
             light = self._pv.Light(
@@ -227,7 +230,8 @@ class Stage:
         )
         return surface
 
-    def _add_body(self, vertices: Points, skin: Skin) -> _Surface:
+    def _add_body(self, skin: Skin) -> _Surface:
+        vertices = np.zeros((int(skin.faces.max()) + 1, 3))
         polydata = self._pv.PolyData.from_regular_faces(vertices, skin.faces)
         surface = _Surface(polydata, _CREASE_ANGLE)
         self._plotter.add_mesh(
@@ -235,23 +239,9 @@ class Stage:
         )
         return surface
 
-    def _aim(self, camera: Camera) -> None:
-        low, high = self._bounds
-        target = (low + high) / 2 if camera.target is None else np.array(camera.target)
-        radius = float(np.linalg.norm(high - low)) / 2
-        fitting = radius / np.sin(np.radians(_VIEW_ANGLE / 2))
-        distance = (fitting if camera.distance is None else camera.distance) / camera.zoom
-        azimuth, elevation = np.radians(camera.azimuth), np.radians(camera.elevation)
-        towards = np.array(
-            [
-                np.sin(azimuth) * np.cos(elevation),
-                -np.cos(azimuth) * np.cos(elevation),
-                np.sin(elevation),
-            ]
-        )
+    def _aim(self, camera: Camera, position: Points, target: Points) -> None:
         view = self._plotter.camera
-        view.position = tuple(target + distance * towards)
+        view.position = tuple(position)
         view.focal_point = tuple(target)
-        view.up = (0.0, 0.0, 1.0)
-        view.view_angle = _VIEW_ANGLE
-        self._plotter.reset_camera_clipping_range()
+        view.up = tuple(camera.up)
+        view.view_angle = camera.field_of_view

@@ -1,4 +1,4 @@
-"""What a viewer is, and the one that shows nothing."""
+"""The protocol of viewers, and a viewer that shows nothing."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["NullViewer", "Viewer"]
 
 
 class Viewer(Protocol):
-    """Takes states in the order of time; a context manager that finishes its files at the end."""
+    """Receives states in the order of time; a context manager that finishes its files."""
 
     def show(self, state: State) -> None:
         """Take one state, without a batch axis."""

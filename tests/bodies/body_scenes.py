@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.model.scene import assemble
+from diffcloth_torch.model.assembly import assemble
 from diffcloth_torch.robots import GRIPPER
 from diffcloth_torch.sim.layout import Layout
 

@@ -103,7 +103,7 @@ class CoreScene:
         ]
         self.simulator = dc.Simulator(dc.Scene([cloth], apart), DT)
         assembly = self.simulator._assembly
-        names = ("vertices", "rest_vertices", "faces", "cloth_vertex_start", "cloth_face_start")
+        names = ("vertices", "rest_positions", "faces", "cloth_vertex_start", "cloth_face_start")
         names += ("pins", "soft_pins", "body_vertices", "body_faces", "body_vertex_start")
         self.core = _core.Simulator(
             **{name: getattr(assembly, name) for name in names},

@@ -128,7 +128,7 @@ def cloth_masses(sim):
         return torch.zeros(0, dtype=F64)
     (cloth,) = sim.scene.cloths
     faces = torch.tensor(np.array(cloth.faces, dtype=np.int64))
-    a, b, c = torch.tensor(np.array(cloth.rest_vertices))[faces].unbind(1)
+    a, b, c = torch.tensor(np.array(cloth.rest_positions))[faces].unbind(1)
     share = sim.parameters().density * torch.linalg.cross(b - a, c - a).norm(dim=1) / 6
     masses = torch.zeros(len(cloth.vertices), dtype=F64)
     return masses.index_add(0, faces.flatten(), share.repeat_interleave(3))

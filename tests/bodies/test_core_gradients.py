@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from bodies.core_mechanisms import DT, CoreScene, chain, one_body
 
-OUTPUTS = ("positions", "velocities", "body_forces", "coordinates")
+OUTPUTS = (
+    *("positions", "velocities", "body_forces", "contact_forces", "pin_forces"),
+    "coordinates",
+)
 TURNED = [0.9887, 0.0897, 0.1195, 0.0]  # a quaternion, not quite of unit length
 BOXES = ([0.08, 0.08, 0.05], [0.05, 0.04, 0.12], [0.04, 0.04, 0.1], [0.03, 0.05, 0.06])
 
@@ -102,9 +105,10 @@ CASES = {
 def case(request):
     scene, arrays = CASES[request.param]()
     rng = np.random.default_rng(2)
-    # Friction sees the tree come from elsewhere, as in a staggered coupling.
-    away = 0.3 * DT * rng.standard_normal(arrays["coordinates"].shape)
-    arrays = {**arrays, "coordinate_origins": arrays["coordinates"] - away}
+    # Friction sees everything come from elsewhere, as in a staggered coupling.
+    start = scene.core.path({k: v[:1] for k, v in arrays.items()})[0]
+    away = 0.3 * DT * rng.standard_normal(start.shape)
+    arrays = {**arrays, "friction_origins": (start - away)[None]}
     result = scene.forward(arrays)
     cotangents = {name: rng.standard_normal(result[name].shape) for name in OUTPUTS}
     return scene, arrays, cotangents, scene.gradients(arrays, cotangents)
@@ -127,7 +131,7 @@ STEPS = {
     "rest_positions": 1e-7,
     "coordinates": 1e-7,
     "coordinate_ends": 1e-7,
-    "coordinate_origins": 1e-7,
+    "friction_origins": 1e-7,
     "coordinate_targets": 1e-7,
     "coordinate_metric": 1e-3,
 }

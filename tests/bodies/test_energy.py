@@ -132,7 +132,7 @@ def test_a_light_cube_is_pushed_not_shot():
             assert fastest(coupling) > 4 * speed  # why there is a monolithic one
 
 
-def gripped(coupling, steps, friction=0.4):
+def gripped(coupling, steps):
     """Gaps of two fingers that press 2 N each on a sheet, from 4.5 mm on [m]; and the states."""
     vertices, faces = scenes.grid(7, 7, edge=0.012, seed=3, jitter=0.1)
     vertices = scenes.turned(vertices - vertices.mean(axis=0), (1, 0, 0), np.pi / 2)
@@ -140,7 +140,7 @@ def gripped(coupling, steps, friction=0.4):
     sheet = dc.Cloth(
         vertices + np.array([0, 0, 0.07]),
         faces,
-        material=dc.Material(stretch=300.0, density=0.2, friction=friction),
+        material=dc.Material(stretch=300.0, density=0.2, friction=0.4),
         pins={"rim": rim},
     )
     closed = 0.04  # where a finger would touch the sheet
@@ -168,8 +168,7 @@ def test_a_gripper_settles_at_once():
 @pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
 def test_a_staggered_gripper_is_thrown_open():
     """Why the monolithic coupling is the default."""
-    # With more friction the second step, at kinks of a squeezed sheet, takes 1000s of iterations.
-    gaps, _ = gripped("cloth_to_rigid", 3, friction=0.2)
+    gaps, _ = gripped("cloth_to_rigid", 3)
     assert gaps.max() > 0.01
 
 

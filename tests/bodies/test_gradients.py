@@ -204,7 +204,7 @@ def test_the_stiffness_of_each_pair_has_its_gradient(coupling, base):
 def test_everything_touches_and_rubs_along_the_whole_chain(coupling, base):
     """Otherwise the other tests would prove little."""
     sim, start = coupled_scenes.in_contact(coupling, base)
-    controls = coupled_scenes.controls(sim, coupled_scenes.control(sim), 20, coupled_scenes.WARM_UP)
+    controls = coupled_scenes.controls(sim, coupled_scenes.control(sim), 15, coupled_scenes.WARM_UP)
     for state in sim.rollout(start, controls, coupled_scenes.parameters(sim)):
         wrenches = sim.contact_wrenches(state)
         for name in ("box", "hand/left_finger", "hand/right_finger"):

@@ -6,16 +6,12 @@ import torch
 from body_scenes import F64, make_scene
 
 import diffcloth_torch as dc
+from diffcloth_torch.model.assembly import assemble
 from diffcloth_torch.model.defaults import scene_parameters
-from diffcloth_torch.model.scene import assemble
-from diffcloth_torch.sim.inputs import (
-    check_control,
-    control_fields,
-    default_fields,
-    parameter_fields,
-    state_fields,
-)
+from diffcloth_torch.sim.control_fields import check_control, control_fields
 from diffcloth_torch.sim.layout import Layout
+from diffcloth_torch.sim.parameter_fields import default_fields, parameter_fields
+from diffcloth_torch.sim.state_fields import state_fields
 
 JOINTS = ("arm/slide", "arm/turn", "arm/spin", "hold/left_finger_joint", "hold/right_finger_joint")
 SLIDE, TURN, SPIN, LEFT, RIGHT = range(5)
@@ -65,7 +61,7 @@ def complete(layout, scene, control=None, batch=()):
 
 def test_the_joints_are_in_the_order_of_robots_and_files(layout):
     assert layout.joint_names == JOINTS
-    assert layout.actuation == ("position", "pd", "torque", "velocity", "velocity")
+    assert layout.permissions.actuation == ("position", "pd", "torque", "velocity", "velocity")
     assert layout.is_dynamic
 
 

@@ -8,7 +8,7 @@ import torch
 
 import diffcloth_torch as dc
 from diffcloth_torch.robots import GRIPPER
-from diffcloth_torch.sim import simulator
+from diffcloth_torch.sim import engine
 
 STEPS = 200
 WINDOW = 20
@@ -29,13 +29,13 @@ def rollout(base, steps, **options):
 @pytest.fixture
 def solves(monkeypatch):
     """Times at which the core was called, in order."""
-    times, solve = [], simulator.take_step
+    times, solve = [], engine.take_step
 
     def timed(*args, **keywords):
         times.append(time.perf_counter())
         return solve(*args, **keywords)
 
-    monkeypatch.setattr(simulator, "take_step", timed)
+    monkeypatch.setattr(engine, "take_step", timed)
     return times
 
 

@@ -3,6 +3,7 @@
 import io
 import pickle
 
+import coupled_scenes
 import numpy as np
 import pytest
 import torch
@@ -49,6 +50,15 @@ def acting(sim):
         joint_efforts={"turn": 0.2, "spin": 0.05},
         base_wrenches={"hold": [0.1, 0.2, 5.0, 0.01, 0.0, 0.02]},
     )
+
+
+def test_edges_that_are_nearly_parallel_take_few_iterations():
+    """A box's ridges lie along the edges of a cloth."""
+    sim = coupled_scenes.simulator("monolithic", "fixed")
+    given = coupled_scenes.control(sim), coupled_scenes.parameters(sim)
+    with torch.no_grad():
+        state = sim.step(sim.initial_state(), *given)
+    assert state.report.iterations < 60
 
 
 FIELDS = (

@@ -87,6 +87,16 @@ def test_the_projected_hessian_is_positive(name):
         assert lowest > -1e-12 * highest
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_the_projected_hessian_is_no_smaller_than_the_exact_one(seed):
+    """Between nearly parallel edges, too, where most of the curvature is the mollifier's."""
+    scene = contact_scenes.make("two_cloths", seed)
+    potential = scene.potential()
+    positive = potential.hessian(scene.x, positive=True)
+    lowest = np.linalg.eigvalsh(positive - potential.hessian(scene.x))[0]
+    assert lowest > -1e-12 * np.abs(positive).max()
+
+
 def parameter_of(scene, name):
     count = scene.surface_count
     if name == "kappa":
@@ -186,6 +196,30 @@ def test_mixed_derivatives_of_friction(name, amount):
         )
         expected = found["x_start"] @ d.ravel()
         assert slope == pytest.approx(expected, abs=2e-6 * np.linalg.norm(found["x_start"]))
+
+
+def test_duals_remember_the_other_side_of_a_kink():
+    """A slip that turns round: no curvature along it, but twice the majorant's with duals."""
+    scene = contact_scenes.make("two_cloths")
+    potential = scene.potential(slip=1e-6)
+    slide = np.zeros_like(scene.x)
+    slide[scene.surface == 0] = [2e-3, 1e-3, 0.0]
+    x = scene.x + slide
+    has_duals, h = potential.friction_after(scene.x, scene.x, x, -2 * slide)
+    majorant, exact = (
+        potential.friction(scene.x, scene.x, scene.x - slide, positive=positive)[2]
+        for positive in (True, False)
+    )
+    along = slide.ravel()
+    most = along @ majorant @ along
+    assert has_duals
+    assert abs(along @ exact @ along) < 1e-9 * most
+    assert along @ h @ along == pytest.approx(2 * most, rel=1e-6)
+    # A step that stays on its side has none.
+    has_duals, h = potential.friction_after(scene.x, scene.x, x, -0.5 * slide)
+    assert not has_duals
+    exact = potential.friction(scene.x, scene.x, scene.x + 0.5 * slide)[2]
+    np.testing.assert_allclose(h, exact, rtol=1e-9, atol=1e-9 * np.abs(exact).max())
 
 
 def rotation(angle, seed):

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from diffcloth_torch.dynamics.inertia import Inertia
-from diffcloth_torch.dynamics.kinematics import Tree, root_frame
+from diffcloth_torch.dynamics.jacobians import DifferentialKinematics, root_frame
 from diffcloth_torch.geometry.rotation import quaternion_matrix
 from diffcloth_torch.model.mechanism import Mechanism
 
@@ -146,7 +146,7 @@ class Judge:
 
     def __init__(self, pin, mechanism):
         self.pin, self.mechanism = pin, mechanism
-        self.tree = Tree(mechanism)
+        self.tree = DifferentialKinematics(mechanism)
         self.model = model = pin.Model()
         joint = {}  # link -> its joint in Pinocchio, and its place in that joint's frame
         self.rows = []  # moving links in the order of their joints

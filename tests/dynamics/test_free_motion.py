@@ -10,7 +10,7 @@ from mechanisms import TREES, frame_of, inertia_of, make, random_configuration
 from diffcloth_torch import _core
 from diffcloth_torch.dynamics.free_motion import robot_motion, solve_motion
 from diffcloth_torch.dynamics.inertia import Motion, momentum, slope
-from diffcloth_torch.dynamics.kinematics import Tree, root_frame
+from diffcloth_torch.dynamics.jacobians import DifferentialKinematics, root_frame
 from diffcloth_torch.geometry.rotation import quaternion_matrix, rotation_exp
 
 H = 0.01
@@ -38,7 +38,7 @@ def test_the_velocities_solve_the_equation(name, base, speed):
             strict=True,
         )
     )
-    tree, inertia = Tree(mechanism), inertia_of(mechanism)
+    tree, inertia = DifferentialKinematics(mechanism), inertia_of(mechanism)
     inertia = inertia._replace(armature=inertia.armature + 0.1)
     local = inertia.center[..., tree.root, :]
     rotation = quaternion_matrix(pose[:, 3:])

@@ -21,7 +21,7 @@ from diffcloth_torch.dynamics.inertia import (
     slope,
     wrenches_of_forces,
 )
-from diffcloth_torch.dynamics.kinematics import Tree, root_frame
+from diffcloth_torch.dynamics.jacobians import DifferentialKinematics, root_frame
 from diffcloth_torch.geometry.rotation import quaternion_matrix, rotation_exp
 
 pin = pytest.importorskip("pinocchio", reason="Pinocchio is in the extra `test`")
@@ -166,7 +166,7 @@ def test_acceleration_without_mimic():
 def test_second_derivatives():
     kinds, parents = TREES["branched"]
     mechanism = make(kinds, parents, base="floating", rng=np.random.default_rng(2))
-    tree, inertia = Tree(mechanism), inertia_of(mechanism)
+    tree, inertia = DifferentialKinematics(mechanism), inertia_of(mechanism)
     pose, joints, nu = random_configuration(mechanism, np.random.default_rng(4))
 
     def both(joints, nu, mass, center):

@@ -18,10 +18,10 @@ from mechanisms import (
 )
 
 from diffcloth_torch.dynamics.bodies import BodyInertia, advance_bodies, predict_bodies
-from diffcloth_torch.dynamics.chain import Chain, ChainControl, ChainState
 from diffcloth_torch.dynamics.drives import Gains
 from diffcloth_torch.dynamics.inertia import Motion, momentum
-from diffcloth_torch.dynamics.kinematics import Tree
+from diffcloth_torch.dynamics.jacobians import DifferentialKinematics
+from diffcloth_torch.dynamics.robots import RobotControl, RobotDynamics, RobotState
 from diffcloth_torch.errors import SimulationError
 from diffcloth_torch.geometry.rotation import quaternion_exp, quaternion_log, quaternion_multiply
 
@@ -190,7 +190,7 @@ def controls(chain, **given):
     J = chain.mechanism.joint_count
     rows = {"pose": AT_ORIGIN, "wrench": torch.zeros(1, 6, dtype=F64)}
     rows |= {name: torch.zeros(1, J, dtype=F64) for name in ("joints", "rates", "efforts")}
-    return ChainControl(**(rows | given))
+    return RobotControl(**(rows | given))
 
 
 def gains(chain, **given):
@@ -200,7 +200,7 @@ def gains(chain, **given):
 
 def at_rest(chain, joints=None, pose=AT_ORIGIN, velocity=None, rates=None):
     zeros = torch.zeros(1, chain.mechanism.joint_count, dtype=F64)
-    return ChainState(
+    return RobotState(
         pose=pose,
         velocity=torch.zeros(1, 6, dtype=F64) if velocity is None else velocity,
         joints=zeros if joints is None else joints,
@@ -223,13 +223,15 @@ def step(chain, state, *, control=None, drives=None, gravity=GRAVITY, inertia=No
 
 
 def make_chain(mechanism):
-    return Chain(mechanism, H, NO_LINKS, NO_POINTS)
+    return RobotDynamics(mechanism, H, NO_LINKS, NO_POINTS)
 
 
 def energies(chain, state, gravity):
     """Kinetic energy, potential energy, and the power of gravity."""
     inertia = inertia_of(chain.mechanism)
-    motion = Motion.at(Tree(chain.mechanism), inertia, frame_of(state.pose), state.joints)
+    motion = Motion.at(
+        DifferentialKinematics(chain.mechanism), inertia, frame_of(state.pose), state.joints
+    )
     nu = torch.cat([state.velocity, state.rates], -1)
     speeds = (motion.jacobian[..., :3, :] @ nu[:, None, :, None])[..., 0]
     weights = inertia.mass[..., None] * gravity
@@ -263,12 +265,14 @@ def test_a_double_pendulum_keeps_its_energy(rate, tolerance, gravity):
 def test_a_floating_chain_keeps_its_momentum():
     chain = make_chain(make(*TREES["branched"], base="floating", rng=np.random.default_rng(0)))
     pose, joints, nu = random_configuration(chain.mechanism, np.random.default_rng(1))
-    state = ChainState(pose, nu[:, :6], joints, nu[:, 6:])
+    state = RobotState(pose, nu[:, :6], joints, nu[:, 6:])
     inertia = inertia_of(chain.mechanism)
     total = inertia.mass.sum()
 
     def momenta(state):
-        motion = Motion.at(Tree(chain.mechanism), inertia, frame_of(state.pose), state.joints)
+        motion = Motion.at(
+            DifferentialKinematics(chain.mechanism), inertia, frame_of(state.pose), state.joints
+        )
         p = momentum(motion, inertia, torch.cat([state.velocity, state.rates], -1))[0]
         center = motion.frames.centers[0, chain.mechanism.root]
         return p[:3], p[3:6] + torch.linalg.cross(center, p[:3])
@@ -280,7 +284,7 @@ def test_a_floating_chain_keeps_its_momentum():
         # What eight iterations at 3 rad/s leave.
         expected = linear + n * H * total * GRAVITY[0]
         torch.testing.assert_close(now, expected, rtol=0, atol=1e-10)
-    weightless = ChainState(pose, nu[:, :6], joints, nu[:, 6:])
+    weightless = RobotState(pose, nu[:, :6], joints, nu[:, 6:])
     for _ in range(50):
         _, weightless, _ = step(chain, weightless, gravity=0 * GRAVITY)
     now, turning = momenta(weightless)
@@ -340,7 +344,7 @@ def test_a_position_target_is_reached_to_the_last_bit():
     mechanism = make(*TREES["chain"], rng=rng, actuation=("position", "torque", "position"))
     chain = make_chain(mechanism)
     joints, targets = tensor(rng.uniform(-1.5, 1.5, (2, 40, 3)))
-    state = ChainState(AT_ORIGIN.expand(40, 7), torch.zeros(40, 6, dtype=F64), joints, 0 * joints)
+    state = RobotState(AT_ORIGIN.expand(40, 7), torch.zeros(40, 6, dtype=F64), joints, 0 * joints)
     given = (inertia_of(mechanism), gains(chain), GRAVITY)
     p = chain.predict(state, controls(chain, joints=targets), *given)
     held = [0, 2]
@@ -356,7 +360,7 @@ def test_efforts_of_prescribed_joints_move_a_free_chain_alike():
         mechanism = make(*TREES["chain"], rng=np.random.default_rng(6), actuation="torque")
         h = 0.2 / steps
         led, free = (
-            Chain(replace(mechanism, actuation=modes), h, NO_LINKS, NO_POINTS)
+            RobotDynamics(replace(mechanism, actuation=modes), h, NO_LINKS, NO_POINTS)
             for modes in (("position", "torque", "velocity"), ("torque",) * 3)
         )
         joints, nu = tensor([[0.3, -0.5, 0.8]]), tensor([[0.0, 2.0, 1.7]])
@@ -483,7 +487,7 @@ def test_gradients_of_robots(base, actuation):
     rng = np.random.default_rng(7)
     mechanism = make(*TREES["chain"], base=base, rng=rng, actuation=actuation)
     points, links = tensor(rng.normal(size=(3, 3))), torch.tensor([0, 2, 3])
-    chain = Chain(mechanism, H, links, points)
+    chain = RobotDynamics(mechanism, H, links, points)
     pose, joints, nu = random_configuration(mechanism, rng)
     forces = tensor(rng.normal(size=(1, 3, 3)))
     offset = tensor(rng.normal(size=(1, chain.coordinate_count)) * 1e-3)
@@ -513,10 +517,10 @@ def test_gradients_of_robots(base, actuation):
         own = weights._replace(
             mass=mass, center=center, inertia=(moments + moments.mT) / 2, armature=armature
         )
-        state = ChainState(pose, nu[:, :6], joints, nu[:, 6:])
+        state = RobotState(pose, nu[:, :6], joints, nu[:, 6:])
         for first in (True, False):
             at = end if first else end + 0.02 * wrench.new_tensor([1, 2, 3, 0.1, 0.2, 0.3, 0.4])
-            control = ChainControl(at, wrench, targets[0], targets[1], targets[2])
+            control = RobotControl(at, wrench, targets[0], targets[1], targets[2])
             p = chain.predict(state, control, own, Gains(*drive), gravity, f if first else None)
             q = torch.where(chain.prescribed, p.ends, p.target + o)
             state, efforts = chain.advance(p, q, f, None if first else 0.5 * f)
@@ -536,13 +540,13 @@ def test_the_same_bits_with_and_without_a_graph_alone_and_in_a_batch(tree, base)
     states = []
     for _ in range(5):
         pose, joints, nu = random_configuration(chain.mechanism, rng)
-        states.append(ChainState(pose, nu[:, :6], joints, nu[:, 6:]))
-    batch = ChainState(*(torch.cat(rows) for rows in zip(*states, strict=True)))
+        states.append(RobotState(pose, nu[:, :6], joints, nu[:, 6:]))
+    batch = RobotState(*(torch.cat(rows) for rows in zip(*states, strict=True)))
     with torch.no_grad():
         p, after, _ = step(chain, batch)
     together = (p.target, p.metric, p.coordinates, *after)
     for i, state in enumerate(states):
-        p, after, _ = step(chain, ChainState(*(t.clone().requires_grad_() for t in state)))
+        p, after, _ = step(chain, RobotState(*(t.clone().requires_grad_() for t in state)))
         for a, b in zip((p.target, p.metric, p.coordinates, *after), together, strict=True):
             assert torch.equal(a[0], b[i])
 

@@ -171,10 +171,10 @@ def _step(
         tally.counts[f"NotConverged in: {_kind(scene)}"] += 1
         tally.failed_step(f"NotConverged: {reason}", where, str(error))
         return None
+    except dc.TurnedTooFar as error:
+        tally.failed_step("TooFast", where, str(error))
+        return None
     except Exception as error:
-        if type(error) is dc.SimulationError and "too fast for a time step" in str(error):
-            tally.failed_step("TooFast", where, str(error))
-            return None
         tally.line("error", where, f"{type(error).__name__}: {error}")
         return None
     tally.counts["converged"] += 1

@@ -152,24 +152,20 @@ def draw_cloth_scene(seed: int, index: int) -> RandomScene:
         scheme=d["scheme"],
         contact=dc.ContactOptions(friction_iterations=d["friction_iterations"]),
     )
-    start = simulator.initial_state()
-    start, speed = draw_throw(rng, d, start)
-    pinned = bool(len(simulator._assembly.pins))
-    return RandomScene(
-        description=d,
-        simulator=simulator,
-        start=start,
-        steps=d["steps"],
-        body_velocities=velocities,
-        pin_velocity=speed * rng.normal(size=3) * maybe(rng, 0.5, 0.5) * pinned,
-        masses=sheet_masses(cloths),
-    )
+    return draw_throw(rng, d, simulator, cloths, velocities, pin_speed=0.5)
 
 
 def draw_throw(
-    rng: np.random.Generator, d: dict[str, Any], start: dc.State
-) -> tuple[dc.State, float]:
-    """The start with random velocities of the cloths, and the speed that they are made of."""
+    rng: np.random.Generator,
+    d: dict[str, Any],
+    simulator: dc.Simulator,
+    cloths: list[dc.Cloth],
+    body_velocities: np.ndarray,
+    pin_speed: float,
+    **options: Any,
+) -> RandomScene:
+    """A scene whose cloths start with random velocities, and whose pins move at times."""
+    start = simulator.initial_state()
     speed = float(np.sqrt(G * d["size"]))  # of a fall through the cloth's own size
     d["speed"] = speed * rng.uniform(0, 2)
     d["noise"] = speed * log_uniform(rng, 1e-3, 1.0)
@@ -177,7 +173,17 @@ def draw_throw(
     v = d["speed"] * drift / np.linalg.norm(drift) + d["noise"] * rng.normal(
         size=start.positions.shape
     )
-    return start.replace(velocities=torch.from_numpy(v)), speed
+    pinned = bool(len(simulator._assembly.pins))
+    return RandomScene(
+        description=d,
+        simulator=simulator,
+        start=start.replace(velocities=torch.from_numpy(v)),
+        steps=d["steps"],
+        body_velocities=body_velocities,
+        pin_velocity=speed * rng.normal(size=3) * maybe(rng, 0.5, pin_speed) * pinned,
+        masses=sheet_masses(cloths),
+        **options,
+    )
 
 
 def _material(rng: np.random.Generator, edge: float) -> dc.Material:
@@ -216,13 +222,13 @@ def draw_cloths(
     d["pins"] = _pins(rng, d["layout"], pins, rows, columns)
     if d["pins"]:
         keywords["pins"] = {"held": d["pins"]}
-    cloths = [dc.Cloth(placed, grid.faces, rest_vertices=flat, **keywords)]
+    cloths = [dc.Cloth(placed, grid.faces, rest_positions=flat, **keywords)]
     if d["layout"] == "stack":
         upper = np.array(flat)
         upper[:, :2] += edge * rng.uniform(-0.5, 0.5, 2)
         upper[:, 2] = placed[:, 2].max() + edge * rng.uniform(0.11, 0.3)
         cloths.append(
-            dc.Cloth(upper, grid.faces, rest_vertices=flat, material=_material(rng, edge))
+            dc.Cloth(upper, grid.faces, rest_positions=flat, material=_material(rng, edge))
         )
     return cloths, clearance
 
@@ -299,7 +305,7 @@ def draw_bodies(
 def sheet_masses(cloths: list[dc.Cloth]) -> np.ndarray:
     parts = [np.zeros(0)]
     for cloth in cloths:
-        a, b, c = (cloth.rest_vertices[cloth.faces[:, k]] for k in range(3))
+        a, b, c = (cloth.rest_positions[cloth.faces[:, k]] for k in range(3))
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
         third = np.repeat(cloth.material.density * area / 3, 3)
         parts.append(np.bincount(cloth.faces.ravel(), third, minlength=len(cloth.vertices)))

@@ -6,6 +6,7 @@ start, and what falls, is thrown or is driven meets in a few steps.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -101,22 +102,13 @@ def draw_tower(seed: int, index: int) -> RandomScene:
         ),
         solver=dc.SolverOptions(metric=d["metric"], elastic=d["elastic"]),
     )
-    start = simulator.initial_state()
-    start, speed = draw_throw(rng, d, start)
     dynamic = np.array([body.motion == "dynamic" for body in bodies], dtype=bool)[:, None]
+    moved = velocities * ~dynamic
+    scene = draw_throw(rng, d, simulator, cloths, moved, pin_speed=0.3, drives=drives)
     if dynamic.any():
-        start = start.replace(body_velocities=torch.from_numpy(velocities * dynamic))
-    pinned = bool(len(simulator._assembly.pins))
-    return RandomScene(
-        description=d,
-        simulator=simulator,
-        start=start,
-        steps=d["steps"],
-        body_velocities=velocities * ~dynamic,
-        pin_velocity=speed * rng.normal(size=3) * maybe(rng, 0.5, 0.3) * pinned,
-        masses=sheet_masses(cloths),
-        drives=drives,
-    )
+        start = scene.start.replace(body_velocities=torch.from_numpy(velocities * dynamic))
+        scene = replace(scene, start=start)
+    return scene
 
 
 def _choose_scheme(rng: np.random.Generator, d: dict[str, Any], has_cloths: bool) -> None:

@@ -122,7 +122,7 @@ def test_only_what_is_needed_is_computed(coupled, monkeypatch):
             asked.append(sorted(needs))
             return core.backward(inputs, tape, kept, cotangents, losses, needs, threads)
 
-    monkeypatch.setattr(coupled.sim, "_core", Spy())
+    monkeypatch.setattr(coupled.sim._engine, "core", Spy())
     values = {k: t.clone() for k, t in coupled.inputs().items()}
     values["state.velocities"].requires_grad_()
     total(coupled.step(values)).backward()

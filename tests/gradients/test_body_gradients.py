@@ -73,7 +73,7 @@ def resting(name, *, moving=False, friction_iterations=2, **options):
     while distance(points, vertices[np.asarray(faces)]) < GAP:
         points[:, 2] += 5e-4
     cloth = dc.Cloth(
-        points, cloth_faces, rest_vertices=X, material=scenes.material(cloth_faces, stretch=200.0)
+        points, cloth_faces, rest_positions=X, material=scenes.material(cloth_faces, stretch=200.0)
     )
     solid = dc.RigidBody(
         vertices,
@@ -132,7 +132,7 @@ def test_some_contacts_have_negative_weights():
         [0] * count + [1] * len(body.vertices),
         1,
         True,
-        np.concatenate([cloth.rest_vertices, body.vertices]),
+        np.concatenate([cloth.rest_positions, body.vertices]),
         [False] * count + [True] * len(body.vertices),
         0.01,
         2e-4,

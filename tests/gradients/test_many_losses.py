@@ -194,7 +194,7 @@ def test_all_losses_go_through_one_call_of_the_core(monkeypatch):
             asked.append(losses)
             return core.backward(inputs, tape, kept, cotangents, losses, *rest)
 
-    monkeypatch.setattr(case.sim, "_core", Spy())
+    monkeypatch.setattr(case.sim._engine, "core", Spy())
     outputs, leaves = taken(case)
     at_once(outputs, list(leaves.values()), random_cotangents(outputs))
     assert asked == [LOSSES]

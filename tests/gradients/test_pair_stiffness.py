@@ -32,7 +32,7 @@ def case(scheme, metric, iterations):
         dc.Cloth(
             rest + np.array([0.0, 0.0, height]),
             triangles,
-            rest_vertices=rest,
+            rest_positions=rest,
             material=scenes.material(triangles, friction=0.4),
             bending_model="patch",
         )

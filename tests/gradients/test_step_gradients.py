@@ -48,23 +48,25 @@ CONTACT_PARAMETERS = (
 ZERO = dict.fromkeys(("hanging", "curved", "hinge"), CONTACT_PARAMETERS)
 
 
-def make_loss(case, seed=0, weights=(1.0, scenes.DT, 0.01)):
-    """Random cotangents of all outputs, weighted so that none drowns the others.
+OUTPUTS = ("positions", "velocities", "body_forces")
+
+
+def make_loss(case, seed=0, weights=(1.0, scenes.DT, 0.01), outputs=OUTPUTS):
+    """Random cotangents of outputs, weighted so that none drowns the others.
 
     The loss is that of the change of the outputs, so that differences do not cancel digits.
     """
     with torch.no_grad():
         reference = case.step()
     g = torch.Generator().manual_seed(seed)
-    names = ("positions", "velocities", "body_forces")
-    before = [getattr(reference, name) for name in names]
+    before = [getattr(reference, name) for name in outputs]
     cotangents = [
         w * torch.randn(t.shape, dtype=F64, generator=g)
         for w, t in zip(weights, before, strict=True)
     ]
 
     def loss(state):
-        after = [getattr(state, name) for name in names]
+        after = [getattr(state, name) for name in outputs]
         return sum(((a - b) * c).sum() for a, b, c in zip(after, before, cotangents, strict=True))
 
     return loss
@@ -76,9 +78,9 @@ def gradients(case, loss):
     return dict(zip(leaves, found, strict=True))
 
 
-def check(case, rtol, *, zero=(), weights=(1.0, scenes.DT, 0.01), only=None):
+def check(case, rtol, *, zero=(), weights=(1.0, scenes.DT, 0.01), only=None, outputs=OUTPUTS):
     """Compare the gradient with respect to every input of a case with differences."""
-    loss = make_loss(case, weights=weights)
+    loss = make_loss(case, weights=weights, outputs=outputs)
     found = gradients(case, loss)
     generator = torch.Generator().manual_seed(1)
     problems = []
@@ -91,7 +93,7 @@ def check(case, rtol, *, zero=(), weights=(1.0, scenes.DT, 0.01), only=None):
             assert name == "state.soft_pin_targets"
             assert "soft_pins" in case.control
             continue
-        if (name in zero) != (not gradient.any()):
+        if zero is not None and (name in zero) != (not gradient.any()):
             problems.append(f"{name}: gradient {'not ' if name in zero else ''}zero")
         step = STEPS.get(name, RELATIVE_STEP * tensor.abs().max().item())
         forward = name in NON_NEGATIVE and tensor.min().item() < 10 * step
@@ -211,7 +213,7 @@ def test_some_edges_in_contact_are_nearly_parallel(name):
         for b, pose in zip(case.sim.scene.bodies, after.body_poses.numpy(), strict=True)
     ]
     x = np.concatenate([after.positions.numpy(), *bodies])
-    rest = np.concatenate([assembly.rest_vertices, assembly.body_vertices])
+    rest = np.concatenate([assembly.rest_positions, assembly.body_vertices])
     faces = np.concatenate([assembly.faces, assembly.body_faces + len(assembly.vertices)])
     ends = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     edges = np.unique(ends, axis=0)
@@ -446,6 +448,7 @@ def test_scenes_are_differentiable_in_everything():
         *(f"control.{name}" for name in scenes.CONTROL),
         *(f"parameters.{name}" for name in parameters),
     }
-    # Those of bodies and robots in motion are in tests/bodies/test_gradients.py.
-    of_bodies = {n for n, q in PARAMETERS.items() if {"K", "L", "J"} & set(q.axes[-1])}
-    assert parameters | of_bodies == set(PARAMETERS)
+    # Those of bodies and robots in motion are in tests/bodies/test_gradients.py, those of
+    # attachments in test_attachment_gradients.py.
+    elsewhere = {n for n, q in PARAMETERS.items() if {"K", "L", "J", "A"} & set(q.axes[-1])}
+    assert parameters | elsewhere == set(PARAMETERS)

@@ -25,8 +25,8 @@ from robot_files import (
 
 import diffcloth_torch as dc
 from diffcloth_torch.geometry.poses import rotation_matrix
+from diffcloth_torch.model.assembly import assemble
 from diffcloth_torch.model.defaults import has_contact, scene_parameters
-from diffcloth_torch.model.scene import assemble
 
 ROOT = Path(__file__).resolve().parents[2]
 F64 = torch.float64

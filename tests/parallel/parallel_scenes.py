@@ -23,7 +23,7 @@ def simulator(n, scheme="coupled", folded=True):
     # Deeper in the barrier it is 90 iterations that end this step, in place of 50.
     gap, below = 0.95 * reach, s < (0.0 if folded else 1.0)
     placed = np.stack([flat[:, 0], np.where(below, s, -s), np.where(below, 0, gap)], axis=-1)
-    cloth = dc.Cloth(placed, sheet.faces, rest_vertices=flat, material=dc.Material(friction=0.3))
+    cloth = dc.Cloth(placed, sheet.faces, rest_positions=flat, material=dc.Material(friction=0.3))
     plate = dc.RigidBody.plane(3.0, pose=[0.01, 0.02, -gap, 1, 0, 0, 0])
     contact = dc.ContactOptions(barrier_distance=reach)
     return dc.Simulator(dc.Scene([cloth], [plate]), 0.01, scheme=scheme, contact=contact)

@@ -40,7 +40,8 @@ WITHOUT_THREADS = """
     import threading
     import torch
     import diffcloth_torch as dc
-    from diffcloth_torch import _kernels, step
+    from diffcloth_torch import _kernels
+    from diffcloth_torch.sim import step
 
     try:
         threading.Thread(target=int).start()

@@ -27,13 +27,13 @@ def sheet(cells, size, height, *, seed=0, turn=0.3, center=(0.0, 0.0), **keyword
     vertices = vertices - [size / 2, 0, 0]
     pose = np.array([*center, height, *quaternion([0, 0, 1], turn)])
     posed = vertices @ matrix(pose[3:]).T + pose[:3]
-    return dc.Cloth(posed, faces, rest_vertices=vertices, **keywords)
+    return dc.Cloth(posed, faces, rest_positions=vertices, **keywords)
 
 
 def masses_of(sim):
     parts = []
     for cloth in sim.scene.cloths:
-        parts.append(lumped_masses(cloth.rest_vertices, cloth.faces, cloth.material.density))
+        parts.append(lumped_masses(cloth.rest_positions, cloth.faces, cloth.material.density))
     return tensor(np.concatenate(parts))[:, None]
 
 
@@ -74,7 +74,7 @@ def accordion(cells, folds, size, **keywords):
     layer, along = np.divmod(s * folds * 0.9999, 1)
     flat = np.where(layer % 2 == 0, along, 1 - along) * size / folds
     folded = np.stack([flat, vertices[:, 1], 0.3 * s * size], axis=-1)
-    return dc.Cloth(folded, faces, rest_vertices=vertices, **keywords)
+    return dc.Cloth(folded, faces, rest_positions=vertices, **keywords)
 
 
 def test_a_crumpling_cloth_does_not_intersect_itself():

@@ -106,7 +106,7 @@ def belt(ratio, mu=0.3, tension=1.0):
     position[:, 2] -= np.maximum(s - 0.5 * np.pi * radius, 0)
     position[:, 1] = rest[:, 1] + 0.011
     material = dc.Material(stretch=3e3, bending=1e-6, density=0.2, friction=mu, damping=1e-3)
-    cloth = dc.Cloth(position, faces, rest_vertices=rest, material=material)
+    cloth = dc.Cloth(position, faces, rest_positions=rest, material=material)
     pulley = dc.RigidBody.capsule(
         radius, 0.2, friction=mu, pose=[0, 0, 0, *quaternion([1, 0, 0], np.pi / 2)]
     )

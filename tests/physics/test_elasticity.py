@@ -176,7 +176,7 @@ def test_a_light_strip_hangs_in_a_catenary(length, sag):
     start = np.stack([0.5 - 0.5 * np.cos(t), rest[:, 1], -0.9 * sag * np.sin(t)], axis=-1)
     material = dc.Material(stretch=2e3, bending=1e-9, density=0.1)
     ends = [*range(rows), *range(cells * rows, (cells + 1) * rows)]
-    cloth = dc.Cloth(start, faces, material=material, rest_vertices=rest, pins={"ends": ends})
+    cloth = dc.Cloth(start, faces, material=material, rest_positions=rest, pins={"ends": ends})
     sim = make_sim(cloth, 0.1, gravity=(0, 0, -g), tolerance=1e-6)
     after = settle(sim, sim.initial_state(), steps=200, speed=1e-4)
     assert -after.positions[:, 2].min().item() == pytest.approx(sag, rel=0.01)

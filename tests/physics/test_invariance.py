@@ -48,7 +48,7 @@ class Setting:
         )
         rest = self.vertices / 1.02  # pretension
         cloth = dc.Cloth(
-            self.vertices, self.faces, rest_vertices=rest, material=material, pins={"p": self.pins}
+            self.vertices, self.faces, rest_positions=rest, material=material, pins={"p": self.pins}
         )
         ball = dc.RigidBody.sphere(
             0.1 * m, subdivisions=2, motion="kinematic", pose=self.ball, friction=0.6

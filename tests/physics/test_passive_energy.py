@@ -52,7 +52,7 @@ def passive_scene(seed):
         bodies = [obstacle(kind, (0.02, 0.03, top))]
         if kind != "floor":
             bodies.append(obstacle("floor", (0, 0, low - 0.3)))
-    cloth = dc.Cloth(vertices, flat.faces, rest_vertices=rest, material=material, pins=pins)
+    cloth = dc.Cloth(vertices, flat.faces, rest_positions=rest, material=material, pins=pins)
     return dc.Scene([cloth], bodies), dt, speed
 
 
@@ -61,7 +61,7 @@ def energy_gained(scene, dt, speed=(0.0, 0.0, 0.0), *, metric=None, duration=0.5
     solver = dc.SolverOptions(metric=metric)
     sim = dc.Simulator(scene, dt, scheme="split", solver=solver)
     (cloth,) = scene.cloths
-    masses = tensor(lumped_masses(cloth.rest_vertices, cloth.faces, cloth.material.density))
+    masses = tensor(lumped_masses(cloth.rest_positions, cloth.faces, cloth.material.density))
     state = sim.initial_state()
     state = state.replace(velocities=state.velocities + tensor(np.asarray(speed)))
     energies, touched = [], False
@@ -91,7 +91,7 @@ def swing(stretch):
     noise = 1e-4 * np.random.default_rng(1).standard_normal((len(rest), 1)) * [0, 0, 1]
     edge = np.flatnonzero(np.isclose(rest[:, 0], rest[:, 0].min())).tolist()
     cloth = dc.Cloth(
-        rest + noise, flat.faces, rest_vertices=rest, material=flat.material, pins={"edge": edge}
+        rest + noise, flat.faces, rest_positions=rest, material=flat.material, pins={"edge": edge}
     )
     return dc.Scene([cloth], [obstacle("capsule", (-0.225, 0, -0.22))])
 

@@ -39,7 +39,7 @@ def sheet_on(body, stiffness, *, height=0.0, friction=0.0, stretch=300.0, tolera
     cloth = dc.Cloth(
         posed(vertices, 0.3, [0.003, 0.002, height + 1.5e-3]),
         faces,
-        rest_vertices=vertices,
+        rest_positions=vertices,
         material=dc.Material(stretch=stretch, bending=1e-5, damping=1e-2, friction=friction),
     )
     return dc.Simulator(

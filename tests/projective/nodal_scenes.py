@@ -60,7 +60,7 @@ def on_body(kind, case, *, moving=True, scheme="projective", tolerance=1e-11, **
     cloth = dc.Cloth(
         vertices + np.array([0.0, 0.0, top + 0.0099]),
         faces,
-        rest_vertices=vertices,
+        rest_positions=vertices,
         material=material(faces, friction=friction),
         pins={"corner": [0]},
         soft_pins={"free": [35]},

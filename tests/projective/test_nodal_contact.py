@@ -21,14 +21,17 @@ G = 9.81
 def loss(step, generator):
     """A sum of all outputs with random weights."""
     weights = [torch.randn(36, 3, dtype=F64, generator=generator) for _ in range(2)]
-    forces = torch.randn(step.state.body_forces.shape, dtype=F64, generator=generator)
+    forces = {
+        name: torch.randn(getattr(step.state, name).shape, dtype=F64, generator=generator)
+        for name in ("body_forces", "contact_forces", "pin_forces")
+    }
 
     def value(changes=None):
         after = step(changes)
         return (
             (after.positions * weights[0]).sum()
             + DT * (after.velocities * weights[1]).sum()
-            + 1e-2 * (after.body_forces * forces).sum()
+            + sum(1e-2 * (getattr(after, name) * w).sum() for name, w in forces.items())
         )
 
     return value
@@ -48,6 +51,24 @@ def test_gradients_of_a_step_are_those_of_differences(kind, case):
         largest = float(tensor.abs().max()) if name.startswith("parameters") else 1.0
         sizes[name] = size * max(1.0, largest)
     assert_gradients_are_those_of_differences(loss(step, generator), step.inputs, sizes, generator)
+
+
+@pytest.mark.parametrize("scheme", ["projective", "split"])
+@pytest.mark.parametrize("case", CASES)
+def test_forces_change_the_momentum(case, scheme):
+    step = on_body("plane", case, scheme=scheme)
+    after, sim = step(), step.sim
+    masses = sim.vertex_masses()[:, None]
+    change = (masses * (after.velocities - step.state.velocities)).sum(0) / DT
+    spring = sim.parameters().pin_stiffness * (after.soft_pin_targets[0] - after.positions[35])
+    given = (masses * sim.parameters().gravity + step.inputs["control.forces"]).sum(0) + spring
+    total = given + after.contact_forces.sum(0) + after.pin_forces.sum(0)
+    torch.testing.assert_close(change, total, rtol=1e-7, atol=1e-7)
+    on_all = after.contact_forces.sum(0) + after.body_forces.sum(0)
+    assert on_all.abs().max() < 1e-12
+    pair = after.report.contacts["cloth0", "body0"]
+    assert pair.count == sum(counts(after)[1:])
+    torch.testing.assert_close(pair.force, after.body_forces.sum(0), rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(("kind", "share"), [("plane", 0.3), ("box", 0.1)])
@@ -357,7 +378,10 @@ def test_gradients_of_nodes_and_barrier_in_one_step_are_those_of_differences(met
     generator = torch.Generator().manual_seed(1)
     weights = {
         name: torch.randn(getattr(after, name).shape, dtype=F64, generator=generator) * scale
-        for name, scale in (("positions", 1.0), ("velocities", DT), ("body_forces", 1e-2))
+        for name, scale in (
+            *(("positions", 1.0), ("velocities", DT), ("body_forces", 1e-2)),
+            *(("contact_forces", 1e-2), ("pin_forces", 1e-2)),
+        )
     }
 
     def value(changes):

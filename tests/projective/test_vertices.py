@@ -15,7 +15,7 @@ def stacked(elastic="newton", friction=0.3, tolerance=1e-10):
     lower, faces = grid(5, 5, seed=1, jitter=0.05)
     upper = lower + np.array([0.3 * edge, 0.1 * edge, 0.8 * edge])
     cloths = [
-        dc.Cloth(v, faces, rest_vertices=lower, material=material(faces, k, friction=friction))
+        dc.Cloth(v, faces, rest_positions=lower, material=material(faces, k, friction=friction))
         for k, v in enumerate((lower, upper))
     ]
     sim = dc.Simulator(
@@ -55,6 +55,9 @@ def test_pairs_keep_the_momentum(elastic):
     for _ in range(5):
         state = step.sim.step(state)
         touched += sum(counts(state)[1:])
+        force = state.report.contacts["cloth0", "cloth1"].force
+        on_upper = state.contact_forces[25:].sum(0)
+        torch.testing.assert_close(force, on_upper, rtol=1e-9, atol=1e-12)
     assert touched > 10
     torch.testing.assert_close(momentum(step, state), before, rtol=0, atol=1e-9)
 
@@ -73,11 +76,15 @@ def test_gradients_of_pairs_are_those_of_differences(friction):
     _, sticking, slipping = counts(step())
     assert slipping > 0 if friction < 0.5 else sticking > 0
     generator = torch.Generator().manual_seed(0)
-    weights = [torch.randn(50, 3, dtype=F64, generator=generator) for _ in range(2)]
+    scales = {"positions": 1.0, "velocities": DT, "contact_forces": 1e-2}
+    weights = {
+        name: scale * torch.randn(50, 3, dtype=F64, generator=generator)
+        for name, scale in scales.items()
+    }
 
     def value(changes=None):
         after = step(changes)
-        return (after.positions * weights[0]).sum() + DT * (after.velocities * weights[1]).sum()
+        return sum((getattr(after, name) * w).sum() for name, w in weights.items())
 
     sizes = {
         name: 1e-6 if "positions" in name else 1e-4 * max(1.0, float(tensor.abs().max()))
@@ -95,7 +102,7 @@ def test_self_contact_is_what_the_options_say():
     folded[over, 2] += 0.05
     for self_contact in (True, False):
         sim = dc.Simulator(
-            dc.Scene([dc.Cloth(folded, faces, rest_vertices=lower, material=material(faces))]),
+            dc.Scene([dc.Cloth(folded, faces, rest_positions=lower, material=material(faces))]),
             DT,
             scheme="projective",
             contact=dc.ContactOptions(self_contact=self_contact),

@@ -17,7 +17,7 @@ def pushed(**solver):
     vertices[:, :2] += np.random.default_rng(0).uniform(-0.005, 0.005, (n * n, 2))
     upright = vertices[:, [0, 2, 1]]
     cloth = dc.Cloth(
-        upright, sheet.faces, rest_vertices=vertices, pins={"edge": range(n * n - n, n * n)}
+        upright, sheet.faces, rest_positions=vertices, pins={"edge": range(n * n - n, n * n)}
     )
     box = dc.RigidBody.box(0.15, motion="kinematic", pose=[0.01, -0.085, 0.02, 1, 0, 0, 0])
     sim = dc.Simulator(dc.Scene([cloth], [box]), 0.01, solver=dc.SolverOptions(**solver))

@@ -45,7 +45,7 @@ class Units:
         return dc.Cloth(
             vertices * self.m,
             faces,
-            rest_vertices=(vertices if rest is None else rest) * self.m,
+            rest_positions=(vertices if rest is None else rest) * self.m,
             material=self.material(**(material or {})),
             **keywords,
         )

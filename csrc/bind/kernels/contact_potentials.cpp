@@ -130,20 +130,21 @@ class ContactPotential {
     const contact::FrictionSet set(model_, find(x_lag), x_start.data());
     Values g = Values::Zero(x.size());
     set.add_gradient(x.data(), g.data());
-    Eigen::MatrixXd h = Eigen::MatrixXd::Zero(x.size(), x.size());
-    const Eigen::MatrixXd unit = Eigen::MatrixXd::Identity(x.size(), x.size());
-    for (const contact::FrictionSet::Entry& k : set.entries()) {
-      const auto hessian =
-          set.hessian(k, x.data(), positive ? Curvature::kPositive : Curvature::kExact);
-      const auto all = k.all_points();
-      const std::set<Index> points(all.begin(), all.end());
-      for (const Index v : points) {
-        for (Index a = 3 * v; a < 3 * v + 3; ++a) {
-          hessian.add_product(unit.col(a).data(), h.col(a).data());
-        }
-      }
-    }
+    const Eigen::MatrixXd h = dense(set, x, positive ? Curvature::kPositive : Curvature::kExact);
     return {set.energy_change(x_start.data(), x.data()), g, h};
+  }
+
+  /// After a step along p by alpha from x, friction's primal-dual Hessian; the exact one where it has no duals.
+  std::pair<bool, Eigen::MatrixXd> friction_after(const Positions& x_lag,
+                                                  const Positions& x_start,
+                                                  const Positions& x,
+                                                  const Positions& p,
+                                                  double alpha) {
+    contact::FrictionSet set(model_, find(x_lag), x_start.data());
+    const Positions to = x + alpha * p;
+    set.update_duals(x.data(), p.data(), alpha, to.data());
+    const bool has_duals = set.has_duals(to.data());
+    return {has_duals, dense(set, to, Curvature::kPrimalDual)};
   }
 
   nb::dict friction_mixed(const Positions& x_lag,
@@ -220,6 +221,25 @@ class ContactPotential {
   }
 
  private:
+  static Eigen::MatrixXd dense(const contact::FrictionSet& set,
+                               const Positions& x,
+                               Curvature curvature) {
+    Eigen::MatrixXd h = Eigen::MatrixXd::Zero(x.size(), x.size());
+    const Eigen::MatrixXd unit = Eigen::MatrixXd::Identity(x.size(), x.size());
+    const contact::FrictionSet::Slips& at = set.slips(x.data());
+    for (const contact::FrictionSet::Entry& k : set.entries()) {
+      const auto hessian = set.hessian(k, at, curvature);
+      const auto all = k.all_points();
+      const std::set<Index> points(all.begin(), all.end());
+      for (const Index v : points) {
+        for (Index a = 3 * v; a < 3 * v + 3; ++a) {
+          hessian.add_product(unit.col(a).data(), h.col(a).data());
+        }
+      }
+    }
+    return h;
+  }
+
   std::vector<contact::Candidate> candidates(const Positions& x, const Positions& to) {
     if (x.rows() != mesh_.vertex_count || to.rows() != mesh_.vertex_count) {
       throw nb::value_error("contact potential: positions must have one row a vertex");
@@ -304,6 +324,8 @@ void contact_potentials(nb::module_& m) {
       .def("mixed", &ContactPotential::mixed, "x"_a, "z"_a, "scale"_a = 1.0)
       .def("friction", &ContactPotential::friction, "x_lag"_a, "x_start"_a, "x"_a,
            "positive"_a = false)
+      .def("friction_after", &ContactPotential::friction_after, "x_lag"_a, "x_start"_a, "x"_a,
+           "p"_a, "alpha"_a = 1.0)
       .def("friction_mixed", &ContactPotential::friction_mixed, "x_lag"_a, "x_start"_a, "x"_a,
            "z"_a, "scale"_a = 1.0)
       .def("measure",

@@ -19,7 +19,6 @@
 #include <nanobind/stl/string.h>
 
 #include "bind/kernels/kernels.h"
-#include "elastic/anchors.h"
 #include "elastic/constant_form.h"
 #include "elastic/elastic_potential.h"
 #include "linalg/block_pattern.h"
@@ -52,6 +51,13 @@ nb::ndarray<nb::numpy, Scalar> owned(const Scalar* values,
   });
   buffer.release();  // the capsule owns it now
   return nb::ndarray<nb::numpy, Scalar>(data, shape, owner);
+}
+
+/// 0, 1, 2 ..
+std::vector<Index> counting(std::size_t count) {
+  std::vector<Index> numbers(count);
+  std::iota(numbers.begin(), numbers.end(), 0);
+  return numbers;
 }
 
 Array vector_array(const std::vector<double>& values) {
@@ -254,7 +260,7 @@ class Elastic {
     return result;
   }
 
-  /// L of the constant form with anchors, a product with it, what it costs to go from u by s, and
+  /// L of the constant form with springs to targets, a product with it, what it costs to go from u by s, and
   /// the cotangents of  z . L u.
   nb::dict constant_form(const Indices& vertex,
                          const Values& stiffness,
@@ -262,10 +268,16 @@ class Elastic {
                          const Positions& s,
                          const Positions& z) const {
     check_rows("stiffness", stiffness.shape(0), vertex.shape(0));
-    const elastic::Anchors anchors{.vertex = {vertex.data(), vertex.size()},
-                                   .stiffness = {stiffness.data(), stiffness.size()},
-                                   .target = {}};
-    const elastic::ConstantForm form(model_, slots_, anchors, pattern_);
+    const std::vector<Index> rows = counting(vertex.size() + 1);
+    const std::vector<double> ones(vertex.size(), 1.0);
+    const std::array springs{elastic::Springs{.start = rows,
+                                              .point = {vertex.data(), vertex.size()},
+                                              .coefficient = ones,
+                                              .stiffness = {stiffness.data(), stiffness.size()},
+                                              .rest_length = {},
+                                              .target_row = {rows.data(), vertex.size()},
+                                              .target = nullptr}};
+    const elastic::ConstantForm form(model_, slots_, springs, pattern_);
     std::vector<double> product(u.size(), 0.0);
     form.add_product(positions("u", u).data(), product.data());
     elastic::Bar bar(topology_, stencils_);
@@ -361,43 +373,52 @@ class Elastic {
   std::vector<double> x_n_;
 };
 
-elastic::Anchors anchors_view(const Indices& vertex,
-                              const Values& stiffness,
-                              const Positions& target) {
-  check_rows("stiffness", stiffness.shape(0), vertex.shape(0));
-  check_rows("target", target.shape(0), vertex.shape(0));
-  return {.vertex = {vertex.data(), vertex.size()},
-          .stiffness = {stiffness.data(), stiffness.size()},
-          .target = {target.data(), target.size()}};
-}
-
-/// Value, change, gradient, Hessian product and mixed derivatives of soft pins.
-nb::dict anchors(const Indices& vertex,
+/// Value, change, gradient, Hessian and its product, and mixed derivatives of springs.
+nb::dict springs(const Indices& start,
+                 const Indices& point,
+                 const Values& coefficient,
                  const Values& stiffness,
+                 const Values& rest_length,
+                 const Indices& target_row,
                  const Positions& target,
                  const Positions& x0,
                  const Positions& x1,
-                 const Positions& z) {
-  const elastic::Anchors pins = anchors_view(vertex, stiffness, target);
+                 const Positions& z,
+                 bool positive) {
+  check_rows("stiffness", stiffness.shape(0), start.shape(0) - 1);
+  check_rows("rest_length", rest_length.shape(0), start.shape(0) - 1);
+  check_rows("target_row", target_row.shape(0), start.shape(0) - 1);
+  const elastic::Springs s{.start = {start.data(), start.size()},
+                           .point = {point.data(), point.size()},
+                           .coefficient = {coefficient.data(), coefficient.size()},
+                           .stiffness = {stiffness.data(), stiffness.size()},
+                           .rest_length = {rest_length.data(), rest_length.size()},
+                           .target_row = {target_row.data(), target_row.size()},
+                           .target = target.data()};
+  elastic::SpringPotential potential(s, static_cast<Index>(x1.shape(0)),
+                                     static_cast<Index>(target.shape(0)));
   std::vector<double> gradient(x1.size(), 0.0);
   std::vector<double> product(x1.size(), 0.0);
-  std::vector<double> blocks(3 * x1.size(), 0.0);
-  std::vector<Index> diagonal(x1.shape(0));
-  for (std::size_t i = 0; i < diagonal.size(); ++i) diagonal[i] = static_cast<Index>(i);
-  std::vector<double> stiffness_bar(vertex.size(), 0.0);
-  std::vector<double> target_bar(3 * vertex.size(), 0.0);
-  elastic::add_gradient(pins, x1.data(), gradient.data());
-  elastic::add_hessian_product(pins, z.data(), product.data());
-  elastic::add_hessian(pins, diagonal, blocks.data());
-  elastic::add_mixed(pins, x1.data(), z.data(), stiffness_bar.data(), target_bar.data());
+  std::vector<double> left_out(x1.size(), 0.0);
+  std::vector<double> by_blocks;
+  const Curvature curvature = positive ? Curvature::kPositive : Curvature::kExact;
+  for (Index a = 0; a < s.size(); ++a) {
+    const Mat3 block = elastic::hessian(s, a, x1.data(), positive);
+    by_blocks.insert(by_blocks.end(), block.data(), block.data() + 9);
+  }
+  potential.add_gradient(x1.data(), gradient.data());
+  potential.add_hessian_product(x1.data(), z.data(), product.data());
+  potential.add_left_out_product(x1.data(), curvature, z.data(), left_out.data());
+  potential.accumulate(x1.data(), z.data());
   nb::dict result;
-  result["energy"] = elastic::energy(pins, x1.data());
-  result["energy_change"] = elastic::energy_change(pins, x0.data(), x1.data());
+  result["energy"] = potential.energy(x1.data());
+  result["energy_change"] = potential.energy_change(x0.data(), x1.data());
   result["gradient"] = rows_array(gradient);
   result["hessian_product"] = rows_array(product);
-  result["hessian_blocks"] = owned(blocks.data(), {x1.shape(0), 3, 3});
-  result["stiffness_bar"] = vector_array(stiffness_bar);
-  result["target_bar"] = rows_array(target_bar);
+  result["left_out_product"] = rows_array(left_out);
+  result["hessians"] = owned(by_blocks.data(), {stiffness.shape(0), 3, 3});
+  result["stiffness_bar"] = vector_array(potential.stiffness_bar);
+  result["target_bar"] = rows_array(potential.target_bar);
   return result;
 }
 
@@ -432,8 +453,10 @@ void elastic_kernels(nb::module_& m) {
       .def_prop_ro("edges", &Elastic::edges, nb::rv_policy::automatic)
       .def_prop_ro("edge_faces", &Elastic::edge_faces, nb::rv_policy::automatic)
       .def_prop_ro("face_edges", &Elastic::face_edges, nb::rv_policy::automatic);
-  m.def("anchors", &anchors, "vertex"_a.noconvert(), "stiffness"_a.noconvert(),
-        "target"_a.noconvert(), "x0"_a.noconvert(), "x1"_a.noconvert(), "z"_a.noconvert());
+  m.def("springs", &springs, "start"_a.noconvert(), "point"_a.noconvert(),
+        "coefficient"_a.noconvert(), "stiffness"_a.noconvert(), "rest_length"_a.noconvert(),
+        "target_row"_a.noconvert(), "target"_a.noconvert(), "x0"_a.noconvert(), "x1"_a.noconvert(),
+        "z"_a.noconvert(), "positive"_a);
 }
 
 }  // namespace diffcloth::bind

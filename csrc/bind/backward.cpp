@@ -1,0 +1,165 @@
+// Backward of all environments and losses: which rows there are, and where each writes its gradients.
+
+#include <algorithm>
+#include <cstddef>
+#include <functional>
+#include <span>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include <nanobind/stl/string.h>
+
+#include "bind/environments.h"
+#include "bind/field_arrays.h"
+#include "bind/input_arrays.h"
+#include "bind/simulator.h"
+
+namespace diffcloth::bind {
+namespace {
+
+using step::kInputCount;
+using step::kInputTable;
+
+/// The gradient of an input, [losses, environments or 1, count]. Each environment of a loss writes into its
+/// own copy; those of inputs that environments share are then summed in index order.
+struct Wanted {
+  std::size_t input, count, copies;
+  double* out;
+  std::vector<double> own;  ///< empty where nothing is shared
+
+  double* at(std::size_t row) { return (own.empty() ? out : own.data()) + row * count; }
+
+  void sum(std::size_t environments) const {
+    for (std::size_t row = 0; row < own.size() / std::max<std::size_t>(count, 1); ++row) {
+      double* target = out + row / environments * count;
+      for (std::size_t a = 0; a < count; ++a) target[a] += own[row * count + a];
+    }
+  }
+};
+
+/// Zero gradients of the inputs of these names, put into `out`.
+std::vector<Wanted> make_gradients(const InputArrays& arrays,
+                                   std::size_t losses,
+                                   const std::vector<std::string>& needs,
+                                   nb::dict& out) {
+  std::vector<Wanted> wanted;
+  for (const std::string& name : needs) {
+    std::size_t input = 0;
+    while (input < kInputCount && kInputTable[input].name != name) ++input;
+    if (input == kInputCount || !arrays.present[input]) {
+      throw nb::value_error(("backward: `needs` has an unknown input " + name).c_str());
+    }
+    const Doubles& array = arrays.array[input];
+    std::vector<std::size_t> shape{losses};
+    for (std::size_t d = 0; d < array.ndim(); ++d) shape.push_back(array.shape(d));
+    Owned<double> owned = make_array<double>(shape);
+    out[name.c_str()] = owned.array;
+    const std::size_t copies = array.shape(0);
+    const std::size_t count = array.size() / copies;
+    const std::size_t b = arrays.environments;
+    wanted.push_back({.input = input,
+                      .count = count,
+                      .copies = copies,
+                      .out = owned.data,
+                      .own = std::vector<double>(copies < b ? losses * b * count : 0, 0.0)});
+  }
+  return wanted;
+}
+
+/// Losses of an environment that go back together.
+struct Portion {
+  std::size_t environment;
+  std::vector<std::size_t> rows;  ///< loss * environments + environment
+};
+
+/// A loss that does not depend on an environment has zeros there: that step may even have failed.
+std::vector<Portion> make_portions(const Saved& bars,
+                                   std::size_t environments,
+                                   std::size_t losses) {
+  std::vector<Portion> portions;
+  for (std::size_t e = 0; e < environments; ++e) {
+    std::vector<std::size_t> rows;
+    for (std::size_t row = e; row < losses * environments; row += environments) {
+      if (!bars.is_zero(row)) rows.push_back(row);
+      if (rows.size() < step::kLossesAtOnce) continue;
+      portions.push_back({.environment = e, .rows = std::move(rows)});
+      rows.clear();
+    }
+    if (!rows.empty()) portions.push_back({.environment = e, .rows = std::move(rows)});
+  }
+  return portions;
+}
+
+/// Takes the losses of an environment back, which has so many threads.
+using PullBack = std::function<void(
+    std::size_t environment, std::span<const step::Loss>, int threads, const Checkpoint&)>;
+
+/// Gradients of the inputs that are needed, from cotangents of all losses and environments.
+nb::dict pull_back_all(const InputArrays& arrays,
+                       const Saved& bars,
+                       std::size_t losses,
+                       const std::vector<std::string>& needs,
+                       int threads,
+                       const PullBack& pull_back) {
+  nb::dict out;
+  std::vector<Wanted> wanted = make_gradients(arrays, losses, needs, out);
+  const std::vector<Portion> portions = make_portions(bars, arrays.environments, losses);
+  for_environments(portions.size(), threads, [&](Index i, const Checkpoint& checkpoint) {
+    const auto& [e, rows] = portions[static_cast<std::size_t>(i)];
+    std::vector<step::Loss> of_rows;
+    for (const std::size_t row : rows) {
+      of_rows.push_back({.cotangents = bars.environment(row), .gradients = {}});
+      step::Gradients& gradients = of_rows.back().gradients;
+      for (Wanted& w : wanted) gradients.data[w.input] = w.at(row);
+    }
+    pull_back(e, of_rows, threads_each(portions.size(), threads), checkpoint);
+  });
+  for (const Wanted& w : wanted) w.sum(arrays.environments);
+  return out;
+}
+
+}  // namespace
+
+nb::dict Simulator::backward(const nb::dict& inputs,
+                             const nb::dict& tape,
+                             const KeptSteps& kept,
+                             const nb::dict& cotangents,
+                             std::size_t losses,
+                             const std::vector<std::string>& needs,
+                             int threads) {
+  const InputArrays arrays(scene_, inputs, true);
+  const std::size_t b = arrays.environments;
+  const Saved tapes(tape_, b, "tape_", tape);
+  if (!tapes.is_finite()) throw nb::value_error("core: the tape must be finite");
+  if (kept.tickets.size() != b) {
+    throw nb::value_error("core: `kept` must be of as many environments as the inputs");
+  }
+  const Saved bars(outputs_, losses * b, "", cotangents);
+  return pull_back_all(
+      arrays, bars, losses, needs, threads,
+      [&](std::size_t e, std::span<const step::Loss> of_losses, int each, const Checkpoint& check) {
+        step::backward(scene_, arrays.environment(e), tapes.environment(e),
+                       *kept.tickets[e]->find(), of_losses, each, check);
+      });
+}
+
+nb::dict Simulator::energy_backward(const nb::dict& inputs,
+                                    const nb::dict& cotangents,
+                                    std::size_t losses,
+                                    const std::vector<std::string>& needs,
+                                    int threads) const {
+  const InputArrays arrays(scene_, inputs, true);
+  std::vector<step::Field> parts;
+  for (const nb::handle name : cotangents.keys()) {
+    parts.push_back({.name = nb::cast<std::string>(name), .shape = {}});
+  }
+  const Saved bars(parts, losses * arrays.environments, "", cotangents);
+  return pull_back_all(
+      arrays, bars, losses, needs, threads,
+      [&](std::size_t e, std::span<const step::Loss> of_losses, int, const Checkpoint&) {
+        step::pull_back_energy(scene_, arrays.environment(e), of_losses);
+      });
+}
+
+}  // namespace diffcloth::bind

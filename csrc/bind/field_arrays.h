@@ -1,0 +1,57 @@
+#pragma once
+
+#include <cstddef>
+#include <string>
+#include <vector>
+
+#include "bind/arrays.h"
+#include "step/fields.h"
+
+namespace diffcloth::bind {
+
+/// Arrays of all environments by name, and what one environment sees of them.
+class Outputs {
+ public:
+  /// Zeroed arrays [environments, ...] for these fields, put into `out` under prefix + name.
+  Outputs(const std::vector<step::Field>& fields,
+          std::size_t environments,
+          const std::string& prefix,
+          nb::dict& out);
+
+  step::Arrays<double> environment(std::size_t e) const;
+
+ private:
+  struct Entry {
+    std::string name;
+    double* data;
+    std::size_t size;
+  };
+  std::vector<Entry> entries_;
+};
+
+/// Arrays that came back from Python under prefix + name; their shapes are checked, as hooks on saved
+/// tensors may return anything.
+class Saved {
+ public:
+  Saved(const std::vector<step::Field>& fields,
+        std::size_t environments,
+        const std::string& prefix,
+        const nb::dict& from);
+
+  bool is_finite() const;
+
+  /// Whether an environment's arrays are zero throughout.
+  bool is_zero(std::size_t e) const;
+
+  step::Arrays<const double> environment(std::size_t e) const;
+
+ private:
+  struct Entry {
+    std::string name;
+    Doubles array;
+    std::size_t size;
+  };
+  std::vector<Entry> entries_;
+};
+
+}  // namespace diffcloth::bind

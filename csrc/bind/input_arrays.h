@@ -1,0 +1,26 @@
+#pragma once
+
+#include <array>
+#include <cstddef>
+
+#include "bind/arrays.h"
+#include "step/inputs.h"
+#include "step/scene.h"
+
+namespace diffcloth::bind {
+
+/// The input arrays of a call, and what one environment sees of them.
+struct InputArrays {
+  std::array<Doubles, step::kInputCount> array;
+  std::array<bool, step::kInputCount> present{};
+  std::size_t environments = 1;
+
+  /// @param finite  whether numbers are checked too: what came back from Python may be anything
+  InputArrays(const step::Scene& scene, const nb::dict& inputs, bool finite = false);
+
+  bool has(step::Input input) const { return present[static_cast<std::size_t>(input)]; }
+
+  step::Inputs environment(std::size_t b) const;
+};
+
+}  // namespace diffcloth::bind

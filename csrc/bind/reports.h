@@ -1,0 +1,24 @@
+#pragma once
+
+#include <string>
+#include <vector>
+
+#include "bind/arrays.h"
+#include "step/report.h"
+
+namespace diffcloth::bind {
+
+/// Names of the numbers of a report, seconds of the phases included.
+std::vector<std::string> number_names();
+
+/// The numbers of all environments' reports, a list of each: cheaper than arrays of one number.
+nb::list to_lists(const std::vector<step::Report>& reports);
+
+/// Environments whose prescribed motion has ended before its end -> poses of all roots there [T, 7].
+nb::dict ended_poses(const std::vector<step::Report>& reports);
+
+/// Of each environment the pairs of surfaces in contact: (first, second, count, force of the first on the
+/// second).
+nb::list pair_contacts(const std::vector<step::Report>& reports);
+
+}  // namespace diffcloth::bind

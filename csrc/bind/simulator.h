@@ -1,0 +1,60 @@
+#pragma once
+
+#include <cstddef>
+#include <memory>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "bind/arrays.h"
+#include "step/factor_cache.h"
+#include "step/fields.h"
+#include "step/scene.h"
+#include "step/step.h"
+
+namespace diffcloth::bind {
+
+/// What a step with a tape keeps for its backward, environment by environment: given up with the tape.
+struct KeptSteps {
+  std::vector<std::shared_ptr<step::FactorCache::Ticket>> tickets;
+};
+
+/// A scene as Python holds it: each call takes the arrays of all environments.
+class Simulator {
+ public:
+  explicit Simulator(step::Description description)
+      : scene_(std::move(description)),
+        outputs_(step::output_fields(scene_)),
+        tape_(step::tape_fields(scene_)) {}
+
+  nb::dict forward(const nb::dict& inputs, bool tape, int threads);
+  nb::dict backward(const nb::dict& inputs,
+                    const nb::dict& tape,
+                    const KeptSteps& kept,
+                    const nb::dict& cotangents,
+                    std::size_t losses,
+                    const std::vector<std::string>& needs,
+                    int threads);
+  nb::dict stored_energy(const nb::dict& inputs) const;
+  nb::dict energy_backward(const nb::dict& inputs,
+                           const nb::dict& cotangents,
+                           std::size_t losses,
+                           const std::vector<std::string>& needs,
+                           int threads) const;
+  nb::object path(const nb::dict& inputs);
+  double smallest_nonadjacent_distance() const;
+  nb::object default_barrier_stiffness(const nb::dict& inputs, double barrier_distance) const;
+  nb::object find_overlap(const nb::dict& inputs) const;
+  nb::object find_close_start(const nb::dict& inputs) const;
+  double reference_factorization_seconds(const nb::dict& inputs, int repeats) const;
+  void forget_factors() { factors_.clear(); }
+  std::size_t factor_bytes() const { return factors_.bytes(); }
+
+ private:
+  step::Scene scene_;
+  std::vector<step::Field> outputs_;
+  std::vector<step::Field> tape_;
+  step::FactorCache factors_;
+};
+
+}  // namespace diffcloth::bind

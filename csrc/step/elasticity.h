@@ -1,0 +1,27 @@
+#pragma once
+
+#include "elastic/elastic.h"
+#include "elastic/elastic_potential.h"
+#include "step/step_potential.h"
+
+namespace diffcloth::step {
+
+/// Stretch, bending and damping of the cloths.
+class Elasticity final : public StepPotential {
+ public:
+  /// @param wanted  whose cotangents are wanted; null: nobody's
+  Elasticity(const Problem& problem, const Gradients* wanted);
+
+  elastic::ElasticPotential& potential() override { return potential_; }
+  void pull_back(const Problem& problem, Cotangents& bars, const Gradients& gradients) override;
+  void visit_energy(const double* x, const VisitEnergy& visit) const override;
+  void accumulate_energy(const double* x, const Seed& seed, double* x_bar) override;
+
+  const elastic::Model& model() const { return model_; }
+
+ private:
+  elastic::Model model_;
+  elastic::ElasticPotential potential_;
+};
+
+}  // namespace diffcloth::step

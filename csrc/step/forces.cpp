@@ -1,0 +1,103 @@
+#include "step/forces.h"
+
+#include <algorithm>
+#include <tuple>
+#include <utility>
+
+#include "contact/friction_set.h"
+
+namespace diffcloth::step {
+namespace {
+
+using contact::Contact;
+
+/// Surfaces of a contact, the smaller first.
+std::pair<Index, Index> surfaces(const contact::ContactModel& model, const Contact& contact) {
+  const auto& owner = model.mesh().vertex_surface;
+  return std::minmax(owner[contact.pair.vertices[0]], owner[contact.pair.vertices[3]]);
+}
+
+/// Contacts in an order in which those of one pair follow one another.
+std::vector<Contact> by_pair(const contact::ContactModel& model, std::vector<Contact> contacts) {
+  std::ranges::stable_sort(contacts, {}, [&](const Contact& c) { return surfaces(model, c); });
+  return contacts;
+}
+
+/// Call visit(pair, contacts of it) for every pair.
+template <class Visit>
+void for_each_pair(const contact::ContactModel& model,
+                   const std::vector<Contact>& sorted,
+                   Visit&& visit) {
+  for (auto first = sorted.begin(); first != sorted.end();) {
+    const auto pair = surfaces(model, *first);
+    const auto last = std::find_if(first, sorted.end(),
+                                   [&](const Contact& c) { return surfaces(model, c) != pair; });
+    visit(pair, std::vector<Contact>(first, last));
+    first = last;
+  }
+}
+
+}  // namespace
+
+void add_pin_forces(const Problem& problem,
+                    const solver::Objective& objective,
+                    const std::vector<double>& x,
+                    double* pins) {
+  const std::vector<Index>& pinned = problem.scene.given.pins;
+  if (pinned.empty()) return;
+  std::vector<double> g;
+  objective.gradient(x.data(), g);
+  for (std::size_t p = 0; p < pinned.size(); ++p) {
+    for (std::size_t k = 0; k < 3; ++k) pins[3 * p + k] += g[3 * pinned[p] + k];
+  }
+}
+
+PairContacts& PairTally::of(Index first, Index second) {
+  const auto key = [](const PairContacts& p) { return std::pair(p.first, p.second); };
+  const std::pair pair(first, second);
+  auto place = std::ranges::lower_bound(pairs_, pair, {}, key);
+  if (place == pairs_.end() || key(*place) != pair) {
+    place = pairs_.insert(place, {.first = first, .second = second});
+  }
+  return *place;
+}
+
+void PairTally::add(Index first, Index second, const Vec3& force) {
+  PairContacts& pair = of(std::min(first, second), std::max(first, second));
+  ++pair.count;
+  if (first != second) pair.force += first < second ? force : Vec3(-force);
+}
+
+void PairTally::add(const std::vector<Contact>& contacts,
+                    const std::vector<Contact>& lagged,
+                    const std::vector<double>& x) {
+  if (!problem_.contact) return;
+  const contact::ContactModel& model = *problem_.contact;
+  const std::vector<Index>& owner = model.mesh().vertex_surface;
+  std::vector<double> g(x.size(), 0.0);
+  // The force on the second surface is minus the gradient at its vertices, which are then cleared.
+  const auto take = [&](PairContacts& pair, Index vertex) {
+    Eigen::Map<Vec3> here(g.data() + 3 * vertex);
+    if (owner[vertex] == pair.second && pair.first != pair.second) pair.force -= here;
+    here.setZero();
+  };
+  for_each_pair(model, by_pair(model, contacts), [&](const auto& key, const auto& of_pair) {
+    PairContacts& pair = of(key.first, key.second);
+    pair.count += static_cast<Index>(of_pair.size());
+    model.add_gradient(of_pair, x.data(), g.data());
+    for (const Contact& c : of_pair) {
+      for (const Index vertex : c.pair.vertices) take(pair, vertex);
+    }
+  });
+  for_each_pair(model, by_pair(model, lagged), [&](const auto& key, const auto& of_pair) {
+    const contact::FrictionSet friction(model, of_pair, problem_.moved_from().data());
+    if (friction.empty()) return;
+    PairContacts& pair = of(key.first, key.second);
+    friction.add_gradient(x.data(), g.data());
+    for (const auto& entry : friction.entries()) {
+      for (const Index vertex : entry.all_points()) take(pair, vertex);
+    }
+  });
+}
+
+}  // namespace diffcloth::step

@@ -1,0 +1,19 @@
+#include "step/potentials.h"
+
+#include "step/attachments.h"
+#include "step/elasticity.h"
+#include "step/problem.h"
+#include "step/soft_pins.h"
+
+namespace diffcloth::step {
+
+std::vector<std::unique_ptr<StepPotential>> make_potentials(const Problem& problem,
+                                                            const Gradients* wanted) {
+  std::vector<std::unique_ptr<StepPotential>> list;
+  list.push_back(std::make_unique<Elasticity>(problem, wanted));
+  list.push_back(std::make_unique<Attachments>(problem));
+  list.push_back(std::make_unique<SoftPins>(problem));
+  return list;
+}
+
+}  // namespace diffcloth::step

@@ -1,0 +1,44 @@
+#pragma once
+
+#include <functional>
+#include <stdexcept>
+#include <string>
+
+#include "potential/potential.h"
+#include "step/inputs.h"
+
+namespace diffcloth::step {
+
+class Cotangents;
+class Problem;
+
+/// A potential of the cloths that every step minimizes, and how it hangs together with the step's
+/// inputs. It is made from a Problem; step/potentials.cpp lists all.
+class StepPotential {
+ public:
+  StepPotential() = default;
+  virtual ~StepPotential() = default;
+  StepPotential(const StepPotential&) = delete;
+  StepPotential& operator=(const StepPotential&) = delete;
+
+  virtual Potential& potential() = 0;
+
+  /// Pull what the potential has accumulated back: to the gradients of its own inputs, and to the
+  /// cotangents of what it shares with others, as positions at the start, masses and the rest shape.
+  virtual void pull_back(const Problem& problem, Cotangents& bars, const Gradients& gradients) = 0;
+
+  /// Call visit(name, value) for every part of the energy that it stores at x [J].
+  using VisitEnergy = std::function<void(const char* name, double value)>;
+  virtual void visit_energy(const double* /*x*/, const VisitEnergy& /*visit*/) const {}
+
+  /// Add the derivatives of the sum of seed(name) times each of these parts: by x to x_bar, and by the
+  /// potential's own inputs to the cotangents that pull_back() reads. Whoever visits a part overrides this.
+  using Seed = std::function<double(const char* name)>;
+  virtual void accumulate_energy(const double* x, const Seed& /*seed*/, double* /*x_bar*/) {
+    visit_energy(x, [](const char* name, double /*value*/) {
+      throw std::logic_error(std::string("step: no derivative of the energy ") + name);
+    });
+  }
+};
+
+}  // namespace diffcloth::step

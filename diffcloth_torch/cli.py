@@ -1,0 +1,131 @@
+"""The command line: run, optimize, info.
+
+Commands import what they need when they run: torch takes seconds to import, and `diffcloth --help`
+or a misspelled option need not wait for it.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+__all__ = ["main"]
+
+_SIMULATION_FAILED, _BAD_INPUT, _INTERRUPTED = 1, 2, 130  # exit codes
+
+C = TypeVar("C", bound=Callable[..., Any])
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="diffcloth-torch", prog_name="diffcloth")
+def main() -> None:
+    """Differentiable cloth with intersection-free contact."""
+
+
+def _ending_in_a_sentence(command: C) -> C:
+    """End the errors of a command with one sentence each, and with its exit code."""
+
+    @wraps(command)
+    def guarded(debug: bool, **arguments: Any) -> None:
+        try:
+            from diffcloth_torch.errors import InvalidInput, SimulationError
+
+            try:
+                click.echo(command(**arguments))
+            except (InvalidInput, TypeError, OSError) as error:
+                _end(error, _BAD_INPUT, debug)
+            except SimulationError as error:
+                _end(error, _SIMULATION_FAILED, debug)
+        except KeyboardInterrupt as error:
+            text = str(error) or "before there was anything to keep"
+            click.echo(f"\nInterrupted {text}", err=True)
+            sys.exit(_INTERRUPTED)
+
+    debug = click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+    return debug(guarded)  # type: ignore[return-value]
+
+
+def _end(error: Exception, code: int, debug: bool) -> None:
+    if debug:
+        raise error
+    click.echo(f"Error: {' '.join(str(error).split())}", err=True)
+    sys.exit(code)
+
+
+def _options(command: C) -> C:
+    """Add the options of all commands that simulate."""
+    for option in (
+        click.option(
+            "--overwrite", is_flag=True, help="Replace the results of an earlier run in the folder."
+        ),
+        click.option(
+            "--out",
+            type=click.Path(path_type=Path, file_okay=False),
+            help="Folder for the results; by default results/ and the name of CONFIG.",
+        ),
+        click.option(
+            "--actions",
+            type=click.Path(path_type=Path, dir_okay=False, exists=True),
+            help="Start from the actions that another run found: its actions.npz.",
+        ),
+        click.option(
+            "--set",
+            "assignments",
+            metavar="KEY=VALUE",
+            multiple=True,
+            help="Change a value of the configuration: simulation.steps=50. Repeatable.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+@main.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@_options
+@_ending_in_a_sentence
+def run(**arguments: Any) -> str:
+    """Simulate CONFIG without optimizing."""
+    from diffcloth_torch.commands import run
+
+    return run(**arguments)
+
+
+@main.command()
+@click.argument("config", type=click.Path(path_type=Path), required=False)
+@click.option(
+    "--resume",
+    metavar="DIRECTORY",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Go on with the optimization whose results are there; its CONFIG is there too.",
+)
+@_options
+@_ending_in_a_sentence
+def optimize(**arguments: Any) -> str:
+    """Optimize the actions of CONFIG, and show the best of them."""
+    from diffcloth_torch.commands import optimize, resume
+
+    folder = arguments.pop("resume")
+    if folder is None:
+        if arguments["config"] is None:
+            raise click.UsageError("Missing argument 'CONFIG': a file, or --resume DIRECTORY.")
+        return optimize(**arguments)
+    assignments = arguments.pop("assignments")
+    extra = ["CONFIG" if name == "config" else f"--{name}" for name, a in arguments.items() if a]
+    if extra:
+        raise click.UsageError(f"--resume takes these from its DIRECTORY: {', '.join(extra)}.")
+    return resume(folder, assignments)
+
+
+@main.command()
+@_ending_in_a_sentence
+def info() -> str:
+    """Say what was built in, and which packages are there."""
+    from diffcloth_torch.commands import info
+
+    return info()

@@ -1,0 +1,1 @@
+"""Optimization of inputs of a simulation; depends on the simulator, not on configurations."""

@@ -1,0 +1,181 @@
+"""Which surfaces touch each other in a step, in how many contacts, and with which force."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffcloth_torch._saved import allow_loading
+from diffcloth_torch.checks import texts
+from diffcloth_torch.errors import InvalidInput
+
+__all__ = ["Contacts", "PairContact"]
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class PairContact:
+    """The contact between two surfaces at the end of a step.
+
+    Attributes:
+        count: Number of contacts, as in `Report.contact_count`; in a batch a tensor [B].
+        force: Net contact force of the first surface on the second, barrier and friction [N], shape
+            [3], or [B, 3] in a batch. Zero for a surface and itself.
+    """
+
+    count: int | Tensor
+    force: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Contacts of a step by pairs of names: `contacts["gripper/left", "shirt"]`.
+
+    A pair may be named in either order; swapping the names reverses the force. A pair without
+    contact has zeros. Iteration yields the pairs in contact, in the order of the surfaces.
+
+    Attributes:
+        surfaces: Names of all surfaces.
+        batch_size: Number of environments, None without a batch axis.
+        counts: Pair in contact -> int64 tensor, shape [] or [B].
+        forces: Pair in contact -> force of the first on the second [N], shape [3] or [B, 3].
+    """
+
+    surfaces: tuple[str, ...] = ()
+    batch_size: int | None = None
+    counts: dict[Pair, Tensor] = field(default_factory=dict)
+    forces: dict[Pair, Tensor] = field(default_factory=dict)
+
+    @staticmethod
+    def of(found: Sequence[Sequence[Any]], surfaces: Sequence[str], *, batched: bool) -> Contacts:
+        """Collect the contacts that a core reports for each environment.
+
+        Args:
+            found: For each environment, (first, second, count, force) of each pair of surfaces in
+                contact.
+            surfaces: Names of all surfaces.
+            batched: Whether the result has an axis of environments.
+        """
+        keys = sorted({(pair[0], pair[1]) for pairs in found for pair in pairs})
+        counts = {key: torch.zeros(len(found), dtype=torch.int64) for key in keys}
+        forces = {key: torch.zeros(len(found), 3, dtype=torch.float64) for key in keys}
+        for i, pairs in enumerate(found):
+            for first, second, count, force in pairs:
+                counts[first, second][i] += count
+                forces[first, second][i] += torch.tensor(force, dtype=torch.float64)
+        named = {(i, j): (surfaces[i], surfaces[j]) for i, j in keys}
+        every = Contacts(
+            tuple(surfaces),
+            len(found),
+            {named[key]: count for key, count in counts.items()},
+            {named[key]: force for key, force in forces.items()},
+        )
+        return every if batched else every.select(0)
+
+    def __getitem__(self, pair: Pair) -> PairContact:
+        """Contacts of two surfaces.
+
+        Raises:
+            InvalidInput: If one of them is not a surface of the scene.
+        """
+        given: Any = pair
+        if not isinstance(given, tuple) or len(given) != 2:
+            raise InvalidInput(f"contacts: must be asked for a pair of names, got {pair!r}")
+        for name in pair:
+            if name not in self.surfaces:
+                raise InvalidInput(
+                    f"contacts: the surfaces are {texts(self.surfaces)}; got {name!r}"
+                )
+        turned = (pair[1], pair[0])
+        key = turned if turned in self.counts and pair not in self.counts else pair
+        shape = () if self.batch_size is None else (self.batch_size,)
+        if key not in self.counts:
+            none = torch.zeros(shape, dtype=torch.int64)
+            return PairContact(_plain(none), torch.zeros(*shape, 3, dtype=torch.float64))
+        force = self.forces[key]
+        return PairContact(_plain(self.counts[key]), force.clone() if key == pair else -force)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both have the same surfaces and the same contacts."""
+        if not isinstance(other, Contacts):
+            return NotImplemented
+        same = (self.surfaces, self.batch_size) == (other.surfaces, other.batch_size)
+        return same and all(
+            list(mine) == list(theirs) and all(torch.equal(mine[p], theirs[p]) for p in mine)
+            for mine, theirs in ((self.counts, other.counts), (self.forces, other.forces))
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __iter__(self) -> Iterator[Pair]:
+        """Iterate over the pairs in contact."""
+        return iter(self.counts)
+
+    def __len__(self) -> int:
+        """Number of pairs in contact."""
+        return len(self.counts)
+
+    def __repr__(self) -> str:
+        pairs = (f"{pair}: {_plain(count)}" for pair, count in self.counts.items())
+        return f"Contacts({', '.join(pairs)})"
+
+    def select(self, index: Any) -> Contacts:
+        """Contacts of one environment, or of several."""
+        if self.batch_size is None:  # nothing is known of the environments
+            return self
+        size = None
+        if not isinstance(index, int):
+            size = len(torch.arange(self.batch_size)[index])
+        return self._map(lambda tensor: tensor[index], size)
+
+    @staticmethod
+    def stack(all_contacts: Sequence[Contacts]) -> Contacts:
+        """Contacts of a batch, from those of its environments."""
+        return _combined(lambda *tensors: torch.stack(tensors), all_contacts, len(all_contacts))
+
+    @staticmethod
+    def where(mask: Tensor, a: Contacts, b: Contacts) -> Contacts:
+        """Contacts of `a` where `mask` is true, else of `b`."""
+
+        def mix(x: Tensor, y: Tensor) -> Tensor:
+            rows = max(x.ndim, y.ndim, 1)
+            return torch.where(mask.reshape(-1, *[1] * (rows - 1)), x, y)
+
+        return _combined(mix, [a, b], len(mask))
+
+    def _map(self, function: Callable[[Tensor], Tensor], size: int | None) -> Contacts:
+        counts = {pair: function(count) for pair, count in self.counts.items()}
+        forces = {pair: function(force) for pair, force in self.forces.items()}
+        return Contacts(self.surfaces, size, counts, forces)
+
+
+def _plain(count: Tensor) -> int | Tensor:
+    return int(count) if count.ndim == 0 else count.clone()
+
+
+def _combined(
+    function: Callable[..., Tensor], parts: Sequence[Contacts], size: int | None
+) -> Contacts:
+    """Apply a function to the tensors of each pair in contact in any of the parts."""
+    surfaces = max((part.surfaces for part in parts), key=len)
+    order = {name: i for i, name in enumerate(surfaces)}
+    pairs = sorted({p for part in parts for p in part}, key=lambda p: (order[p[0]], order[p[1]]))
+
+    def all_of(table: str, pair: Pair, row: tuple[int, ...], dtype: torch.dtype) -> list[Tensor]:
+        shapes = ((() if p.batch_size is None else (p.batch_size,)) + row for p in parts)
+        return [
+            getattr(part, table).get(pair, torch.zeros(shape, dtype=dtype))
+            for part, shape in zip(parts, shapes, strict=True)
+        ]
+
+    counts = {p: function(*all_of("counts", p, (), torch.int64)) for p in pairs}
+    forces = {p: function(*all_of("forces", p, (3,), torch.float64)) for p in pairs}
+    return Contacts(surfaces, size, counts, forces)
+
+
+allow_loading(Contacts)

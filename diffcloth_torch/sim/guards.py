@@ -1,0 +1,43 @@
+"""A wrapper of a simulator's larger methods: for lack of memory, and for `torch.compile`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+
+__all__ = ["guarded"]
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+_UNCOMPILED: dict[Callable[..., Any], Callable[..., Any]] = {}
+
+
+def _uncompiled(method: Callable[P, T]) -> Callable[P, T]:
+    """The method, excluded from `torch.compile`: there is nothing to fuse in a step."""
+    # Importing the compiler takes longer than all the rest; who compiles has imported it already.
+    if not hasattr(sys.modules.get("torch._dynamo"), "disable"):
+        return method
+    if method not in _UNCOMPILED:
+        _UNCOMPILED[method] = torch.compiler.disable(method)  # type: ignore[no-untyped-call]
+    return _UNCOMPILED[method]
+
+
+def guarded(method: Callable[P, T]) -> Callable[P, T]:
+    """Raise torch's lack of memory as MemoryError, like NumPy and the core."""
+
+    @wraps(method)
+    def call(*args: P.args, **keywords: P.kwargs) -> T:
+        try:
+            return _uncompiled(method)(*args, **keywords)
+        except RuntimeError as error:
+            if "can't allocate memory" in str(error):
+                raise MemoryError(f"{method.__name__}: {error}") from error
+            raise
+
+    return call

@@ -1,0 +1,254 @@
+"""Quantities of a state: energy, momentum, velocities and poses of links, contact wrenches."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, overload
+
+import torch
+from torch import Tensor
+
+from diffcloth_torch.checks import check_bool, check_count, check_shape
+from diffcloth_torch.dynamics.totals import Totals
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.model.options import SolverOptions
+from diffcloth_torch.model.quantities import Fields
+from diffcloth_torch.sim.axes import with_axis, without_axes, without_axis
+from diffcloth_torch.sim.border import Border, Given
+from diffcloth_torch.sim.controls import Control, Parameters
+from diffcloth_torch.sim.engine import Check, Engine
+from diffcloth_torch.sim.links import contact_wrenches, link_velocities
+from diffcloth_torch.sim.masses import vertex_masses
+from diffcloth_torch.sim.outcome import make_report, raise_on_failure
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.step import refuse_transforms
+from diffcloth_torch.sim.stored_energy import stored_energy
+
+__all__ = ["Observables"]
+
+
+class Observables:
+    """The methods of a simulator that evaluate a state, and return no other state."""
+
+    surfaces: tuple[str, ...]
+    solver: SolverOptions
+    _engine: Engine
+    _border: Border
+
+    def link_poses(self, state: State) -> dict[str, Tensor]:
+        """Return the frames of the links of all robots, differentiable in the state.
+
+        Args:
+            state: The state.
+
+        Returns:
+            "robot/link" -> homogeneous matrix from the link to the world, shape [4, 4], or
+            [B, 4, 4] in a batch.
+        """
+        refuse_transforms("link_poses")
+        fields, batch = self._border.state(state)
+        return without_axes(self._engine.surfaces.link_frames(fields), batch)
+
+    def link_velocities(
+        self, state: State, parameters: Parameters | None = None
+    ) -> dict[str, Tensor]:
+        """Return the velocities of the links of all robots, differentiable in both arguments.
+
+        Args:
+            state: The state.
+            parameters: Physical parameters, of which only the centers of mass are used; None takes
+                those of the scene.
+
+        Returns:
+            "robot/link" -> velocity of the link's center of mass (of the origin of its frame if the
+            robot is not dynamic), then its angular velocity, in world axes [m/s, rad/s], shape [6],
+            or [B, 6] in a batch.
+        """
+        refuse_transforms("link_velocities")
+        fields, batch = self._border.state(state)
+        centers = self._centers("link", parameters, batch)
+        velocities = link_velocities(self._engine.layout, fields, centers)
+        return without_axes(velocities, batch)
+
+    def contact_wrenches(
+        self, state: State, parameters: Parameters | None = None
+    ) -> dict[str, Tensor]:
+        """What forces of contact and attachments add up to, differentiable in both arguments.
+
+        Args:
+            state: The state, whose `body_forces` act on its bodies and links.
+            parameters: Physical parameters, of which only the centers of mass are used; None takes
+                those of the scene.
+
+        Returns:
+            Name of a body, or "robot/link" -> force, then torque about the center of mass (about
+            the origin of its frame if it is not dynamic), in world axes [N, N m], shape [6], or
+            [B, 6] in a batch.
+        """
+        refuse_transforms("contact_wrenches")
+        fields, batch = self._border.state(state)
+        engine = self._engine
+        shape = (*(() if batch is None else (batch,)), *engine.assembly.body_vertices.shape)
+        check_shape("contact_wrenches: `state.body_forces`", state.body_forces.shape, [shape])
+        forces = with_axis("body_forces", state.body_forces, 2, batch)
+        centers = [self._centers(owner, parameters, batch) for owner in ("body", "link")]
+        frames = engine.surfaces.frames(fields)
+        return without_axes(contact_wrenches(engine.layout, frames, forces, *centers), batch)
+
+    def path(
+        self,
+        state: State,
+        control: Control | None = None,
+        parameters: Parameters | None = None,
+    ) -> Tensor:
+        """Return the polyline that the surfaces follow in a step, to check it independently.
+
+        The solver certifies that each straight segment between successive rows is free of
+        collisions; the chord from the first to the last may cross an obstacle. If the step fails,
+        the path ends at the failure.
+
+        Args:
+            state: The state at the start of the step, without a batch axis.
+            control: Targets for the end of the step, and forces; None holds pins and bodies.
+            parameters: Physical parameters; None takes those of the scene.
+
+        Returns:
+            Accepted iterates, shape [M, N + V, 3] [m]: cloth vertices, then body vertices.
+        """
+        with torch.no_grad():
+            given, batch = self._border.enter(state, control, parameters)
+            if batch is not None:
+                raise InvalidInput(
+                    "path: `state` must be one environment, got a batch; use state[i]"
+                )
+            return torch.from_numpy(self._engine.path(given, self._check(batched=False)))
+
+    def vertex_masses(
+        self, parameters: Parameters | None = None, *, batch_size: int | None = None
+    ) -> Tensor:
+        """Return the masses of the cloths' vertices, differentiable in density and rest shape.
+
+        Args:
+            parameters: Physical parameters; None takes those of the scene.
+            batch_size: Number of environments, >= 1; required if the parameters have a batch axis.
+
+        Returns:
+            Mass of each vertex, a third of that of each face around it [kg], shape [N], or [B, N]
+            in a batch.
+        """
+        refuse_transforms("vertex_masses")
+        if batch_size is not None:
+            check_count("vertex_masses: `batch_size`", batch_size, 1)
+        physical = self._border.parameters(parameters, batch_size)
+        return without_axis(vertex_masses(self._engine.assembly, physical), batch_size)
+
+    def momentum(self, state: State, parameters: Parameters | None = None) -> Tensor:
+        """Return the momentum of everything that has mass, differentiable in both arguments.
+
+        Momentum includes cloths with their pinned vertices, dynamic bodies, and all links of
+        dynamic robots. Bodies and robots that only follow prescribed motion have no mass.
+
+        Args:
+            state: The state.
+            parameters: Physical parameters; None takes those of the scene.
+
+        Returns:
+            Linear momentum, then angular momentum about the origin of the world [kg m/s,
+            kg m^2/s], shape [6], or [B, 6] in a batch.
+        """
+        refuse_transforms("momentum")
+        totals, batch = self._totals(state, parameters)
+        return without_axis(totals.momentum, batch)
+
+    def kinetic_energy(self, state: State, parameters: Parameters | None = None) -> Tensor:
+        """Return the kinetic energy of what `momentum` includes, differentiable in both arguments.
+
+        It includes the inertia of the drives, `joint_armature`, at joints under torque or pd.
+
+        Args:
+            state: The state.
+            parameters: Physical parameters; None takes those of the scene.
+
+        Returns:
+            Energy [J], shape [], or [B] in a batch.
+        """
+        refuse_transforms("kinetic_energy")
+        totals, batch = self._totals(state, parameters)
+        return without_axis(totals.kinetic_energy, batch)
+
+    @overload
+    def energy(
+        self, state: State, parameters: Parameters | None = None, *, parts: Literal[False] = False
+    ) -> Tensor: ...
+
+    @overload
+    def energy(
+        self, state: State, parameters: Parameters | None = None, *, parts: Literal[True]
+    ) -> dict[str, Tensor]: ...
+
+    def energy(
+        self, state: State, parameters: Parameters | None = None, *, parts: bool = False
+    ) -> Tensor | dict[str, Tensor]:
+        """Potential energy at the positions of a state: elasticity, springs, gravity, contact.
+
+        Gravity is that of cloths, and of the bodies and robots that `momentum` counts; it is zero
+        at the origin of the world. What drives and stops of joints store is left out.
+
+        All of it is differentiable in positions, poses, joints and targets of the state, and in the
+        parameters that it depends on; velocities, damping and friction are not among them. The
+        gradient by the positions of a cloth is minus the force of these parts on it. All parts, and
+        many losses with `is_grads_batched`, go back in one call; a second derivative is refused.
+
+        Args:
+            state: Where things are.
+            parameters: Physical parameters; None takes those of the scene.
+            parts: Whether to return what adds up to the energy.
+
+        Returns:
+            Energy [J], shape [], or [B] in a batch; with `parts` a dict of such tensors:
+            "stretch", "bending", "attachments" (with weights of one, without those to targets),
+            "soft_pins", "contact" (the barrier's) and "gravity".
+
+        Raises:
+            SimulationError: In backward, if surfaces overlap: the energy is infinite there.
+        """
+        check_bool("energy: `parts`", parts)
+        refuse_transforms("energy", state, parameters)
+        given, batch = self._border.enter(state, None, parameters)
+        energies = stored_energy(self._engine.core, self._at_rest(given))
+        energies["gravity"] = self._engine.totals(given.state, given.parameters).gravity_energy
+        energies = without_axes(energies, batch)
+        if parts:
+            return energies
+        first, *rest = energies.values()
+        return sum(rest, first)
+
+    def _at_rest(self, given: Given) -> Fields:
+        """Inputs of the core where nothing moves: energy is that of where things are."""
+        velocities = [name for name in given.state if name.endswith("velocities")]
+        still = {name: torch.zeros_like(given.state[name]) for name in velocities}
+        weightless = {"gravity": torch.zeros_like(given.parameters["gravity"])}
+        prediction = self._engine.predict(
+            given._replace(state=given.state | still, parameters=given.parameters | weightless)
+        )
+        return self._engine.core_inputs(given, prediction)
+
+    def _check(self, *, batched: bool) -> Check:
+        """Make a function that raises if the diagnostics of a solve show a failure."""
+
+        def check(diagnostics: dict[str, Any]) -> None:
+            if any(diagnostics["status"]):
+                report = make_report(diagnostics, self.surfaces, batched=batched)
+                raise_on_failure(diagnostics, report, throw=self.solver.throw, batched=batched)
+
+        return check
+
+    def _totals(self, state: State, parameters: Parameters | None) -> tuple[Totals, int | None]:
+        """Momentum and energy of everything that has mass, and the batch size."""
+        fields, batch = self._border.state(state)
+        return self._engine.totals(fields, self._border.parameters(parameters, batch)), batch
+
+    def _centers(self, owner: str, parameters: Parameters | None, batch: int | None) -> Tensor:
+        """Centers of mass of bodies or links, zero where nothing is dynamic; [B or 1, rows, 3]."""
+        fields = self._border.parameters(parameters, batch)
+        rows = self._engine.assembly.sizes["K" if owner == "body" else "L"]
+        return fields.get(f"{owner}_center", torch.zeros(1, rows, 3, dtype=torch.float64))

@@ -1,0 +1,92 @@
+"""Which rows of a scene's tensors a control may set, and within which limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.dynamics.limits import ZONE
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.model.assembly import Assembly
+from diffcloth_torch.model.mechanism import Mechanism
+
+__all__ = ["Permissions"]
+
+_MODES: Mapping[str, tuple[str, ...]] = {
+    "joint_positions": ("position", "pd"),
+    "joint_velocities": ("velocity", "pd"),
+    "joint_efforts": ("torque", "pd"),
+}
+"""Field of a control -> actuations of the joints that it sets."""
+
+_MOTIONS = {"fixed": "static", "kinematic": "kinematic", "floating": "dynamic"}
+
+
+class Permissions:
+    """Which rows must keep the state's values and why, and limits of the others. Immutable.
+
+    Attributes:
+        kept: "body_poses" or "base_poses" -> why each row must equal the state's, or "".
+        unforced: "body_wrenches" or "base_wrenches" -> why each row must be zero, or "".
+        actuation: Actuation of each joint, length J.
+        driven: Which joints have a pd drive, shape [J].
+        settable: Field of a control -> which joints it can set, shape [J].
+        massive: "body" or "link" -> which of them are dynamic and have mass, [K] or [L].
+        lower: Lower limits [rad or m], shape [J].
+        upper: Upper limits, likewise.
+        farthest: Ends of the zones beyond the limits of joints under torque or pd, infinite for
+            others; the lower, then the upper ones, shape [2, J].
+    """
+
+    def __init__(self, assembly: Assembly) -> None:
+        bodies, robots = assembly.bodies, assembly.robots
+        body_motions = [f"the body {b.name!r} is {_MOTIONS[b.base]}" for b in bodies]
+        base_motions = [f"the base of the robot {r.name!r} is {r.base}" for r in robots]
+        self.kept = {
+            "body_poses": _unless("kinematic", bodies, body_motions),
+            "base_poses": _unless("kinematic", robots, base_motions),
+        }
+        self.unforced = {
+            "body_wrenches": _unless("floating", bodies, body_motions),
+            "base_wrenches": _unless("floating", robots, base_motions),
+        }
+        self.actuation = tuple(mode for robot in robots for mode in robot.actuation)
+        self.driven = torch.tensor([mode == "pd" for mode in self.actuation], dtype=torch.bool)
+        self.settable = {
+            field: np.array([mode in modes for mode in self.actuation], dtype=bool)
+            for field, modes in _MODES.items()
+        }
+        self.massive = {"body": _massive(bodies), "link": _massive(robots)}
+        self.lower = _joined([robot.lower for robot in robots])
+        self.upper = _joined([robot.upper for robot in robots])
+        reach = np.where(np.isinf(self.upper - self.lower), 0.0, ZONE * (self.upper - self.lower))
+        self.farthest = np.where(
+            assembly.forced, [self.lower - reach, self.upper + reach], [[-np.inf], [np.inf]]
+        )
+
+    def check_settable(self, field: str, joint: int, name: str) -> None:
+        """Refuse a joint that a field of a control cannot set."""
+        if field in _MODES and self.actuation[joint] not in _MODES[field]:
+            raise InvalidInput(
+                f"control: `{field}` sets joints whose actuation is "
+                f"{' or '.join(map(repr, _MODES[field]))}; that of {name!r} is "
+                f"{self.actuation[joint]!r}"
+            )
+
+
+def _joined(arrays: Sequence[FloatArray]) -> FloatArray:
+    joined: FloatArray = np.concatenate([np.empty(0), *arrays])
+    return joined
+
+
+def _massive(mechanisms: Sequence[Mechanism]) -> NDArray[np.bool_]:
+    parts = [(m.mass > 0.0) & m.is_dynamic for m in mechanisms]
+    return np.concatenate([np.empty(0, dtype=bool), *parts])
+
+
+def _unless(base: str, mechanisms: Sequence[Mechanism], why: Sequence[str]) -> list[str]:
+    return ["" if m.base == base else text for m, text in zip(mechanisms, why, strict=True)]

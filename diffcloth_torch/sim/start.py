@@ -1,0 +1,168 @@
+"""Before the first step: the initial state, the choice of the barrier, and checks."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloth_torch.checks import POSITIVE, check_number
+from diffcloth_torch.errors import IntersectingState, InvalidInput
+from diffcloth_torch.model.assembly import Assembly
+from diffcloth_torch.model.defaults import choose_barrier_distance
+from diffcloth_torch.model.options import ContactOptions
+from diffcloth_torch.model.quantities import STATE, Fields, shape_of
+from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.border import Border, Given
+from diffcloth_torch.sim.cores import arrays_of
+from diffcloth_torch.sim.engine import Engine
+from diffcloth_torch.sim.layout import Layout
+from diffcloth_torch.sim.parameter_fields import default_fields
+
+__all__ = [
+    "check_gains",
+    "check_start",
+    "check_time_step",
+    "check_tolerance",
+    "choose_barrier",
+    "initial_tensors",
+]
+
+# A start is deep inside the barrier below this fraction of the gap at rest: the barrier then throws
+# a sheet up by several barrier distances.
+_DEEP = 0.25
+
+# Largest error of a step when its solver stops: in a scene of micrometers the default tolerance
+# would be as long as the barrier.
+_LARGEST_PART_OF_BARRIER = 0.1
+
+
+def initial_tensors(assembly: Assembly) -> Fields:
+    """Tensors of a scene's initial state, at rest; they may share memory with the scene."""
+    positions = torch.from_numpy(assembly.vertices)
+    tensors = {
+        "positions": positions,
+        "body_poses": torch.from_numpy(assembly.body_poses),
+        "soft_pin_targets": positions[torch.from_numpy(assembly.soft_pins.astype(np.int64))],
+        "joint_positions": torch.from_numpy(assembly.joint_positions),
+        "joint_targets": torch.from_numpy(assembly.joint_positions),
+        "base_poses": torch.from_numpy(assembly.base_poses),
+    }
+    for name, quantity in STATE.items():  # everything else is zero
+        shape = shape_of(quantity.axes[0], assembly.sizes)
+        tensors.setdefault(name, torch.zeros(shape, dtype=torch.float64))
+    return tensors
+
+
+def check_time_step(dt: object) -> float:
+    """Return a time step [s] as a float; refuse what is no number in double precision."""
+    instead = "pass a plain number; no gradient with respect to the time step exists: use one"
+    number = check_number("Simulator: `dt`", dt, POSITIVE, instead=instead)
+    # Other numbers are widened as they are. This one is added up, step by step.
+    dtype = str(getattr(dt, "dtype", ""))
+    if dtype.endswith(("float32", "float16")):
+        raise TypeError(
+            f"Simulator: `dt` must be a plain number or one in float64, got {dtype}, "
+            f"which makes it {number!r}"
+        )
+    return number
+
+
+def check_gains(layout: Layout) -> None:
+    """Refuse pd joints without gains."""
+    gains = layout.assembly.stiffness + layout.assembly.damping
+    modes = layout.permissions.actuation
+    for name, mode, gain in zip(layout.joint_names, modes, gains, strict=True):
+        if mode == "pd" and gain == 0.0:
+            raise InvalidInput(
+                f"Simulator: the pd joint {name!r} must have gains: give `stiffness` or `damping` "
+                "to its Robot, or another `actuation`"
+            )
+
+
+def choose_barrier(
+    engine: Engine,
+    border: Border,
+    scene: Scene,
+    contact: ContactOptions,
+    start: Given,
+    nonadjacent_distance: float,
+) -> dict[str, Tensor]:
+    """Take the parameters of the barrier from the contact options, or choose them for the scene.
+
+    Args:
+        engine: Engine of the scene.
+        border: Checks the barrier; the parameters are added to its defaults.
+        scene: The scene.
+        contact: Contact options.
+        start: The initial state, with a control that holds.
+        nonadjacent_distance: Smallest distance between parts of a cloth that share no vertex [m].
+
+    Raises:
+        InvalidInput: If the barrier is too wide for the meshes.
+    """
+    distance = contact.barrier_distance
+    if distance is None:
+        distance = choose_barrier_distance(scene, nonadjacent_distance, contact)
+    chosen = {"slip_velocity": _number(contact.slip_velocity)}
+    chosen["barrier_distance"] = _number(distance)
+    border.defaults |= default_fields(chosen)
+    border.check_barrier("Simulator", border.defaults)
+    stiffness: float | NDArray[np.float64] | None = contact.barrier_stiffness
+    if stiffness is None:
+        given = start._replace(parameters=border.defaults)
+        inputs = engine.core_inputs(given, engine.predict(given))
+        pairs = engine.core.default_barrier_stiffness(arrays_of(inputs), distance)
+        stiffness = pairs if (pairs != pairs[0, 0]).any() else float(pairs[0, 0])
+    chosen["barrier_stiffness"] = _number(stiffness)
+    border.defaults |= default_fields(chosen)
+    return chosen
+
+
+def check_tolerance(tolerance: float, distance: float, dt: float) -> None:
+    """Refuse a solver tolerance that does not resolve the barrier distance.
+
+    Args:
+        tolerance: Tolerance of the solver [m/s].
+        distance: Distance at which the barrier begins [m].
+        dt: Time step [s].
+    """
+    largest = _LARGEST_PART_OF_BARRIER * distance / dt
+    if tolerance > largest:
+        raise InvalidInput(
+            f"Simulator: `solver.tolerance` must be at most {largest:.3g} m/s, with which a "
+            f"step is known to {_LARGEST_PART_OF_BARRIER:g} of the barrier distance "
+            f"{distance:.3g} m, got {tolerance:.3g}"
+        )
+
+
+def check_start(engine: Engine, start: Given) -> None:
+    """Refuse surfaces that overlap, and warn of surfaces that the barrier would throw apart.
+
+    Args:
+        engine: Engine of the scene.
+        start: The initial state, with a control that holds.
+    """
+    inputs = arrays_of(engine.core_inputs(start, engine.predict(start)))
+    overlap = engine.core.find_overlap(inputs)
+    if overlap is not None:
+        raise IntersectingState(
+            f"Simulator: surfaces of the scene overlap: {overlap}; move them apart",
+            environments=(0,),
+        )
+    close = engine.core.find_close_start(inputs)
+    if close is not None and close[1] < _DEEP * close[2]:
+        elements, gap, rest_gap = close
+        warnings.warn(
+            f"Simulator: the barrier will throw surfaces apart: {elements} start {gap:.3g} m "
+            f"apart, while at rest their gap would be about {rest_gap:.3g} m; start with more, "
+            "or give a smaller `contact.barrier_distance`",
+            stacklevel=3,
+        )
+
+
+def _number(value: float | NDArray[np.float64]) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)

@@ -1,0 +1,378 @@
+"""Mesh files, mesh checks and simple shapes: nothing is reordered, dropped or repaired."""
+
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import diffcloth_torch as dc
+from diffcloth_torch.geometry.meshes import read_mesh, write_mesh
+
+DATA = Path(__file__).parents[3] / "shared" / "data"
+
+VERTICES = np.array([[0.1, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 1 / 3], [7, 8, 9]])
+FACES = np.array([[0, 1, 2], [2, 1, 3]])
+
+
+def data(name):
+    if not DATA.is_dir():
+        assert "CI" not in os.environ, f"{DATA} is missing in CI"
+        pytest.skip(f"the public test data are not at {DATA}")
+    return DATA / name
+
+
+def volume(body):
+    """Volume that a closed, outward-facing surface encloses, by the divergence theorem."""
+    a, b, c = (body.vertices[body.faces[:, i]] for i in range(3))
+    return (np.cross(a, b) * c).sum() / 6
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply"])
+def test_a_written_mesh_comes_back_bit_by_bit_with_its_unreferenced_vertex(tmp_path, suffix):
+    path = tmp_path / f"mesh{suffix}"
+    write_mesh(path, [("sheet", VERTICES, FACES)])
+    vertices, faces = read_mesh(path)
+    np.testing.assert_array_equal(vertices, VERTICES)
+    np.testing.assert_array_equal(faces, FACES)
+
+
+def test_obj_corners_are_read_in_every_notation(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text(
+        "# comment\nmtllib x.mtl\no a\nv 0 0 0 1.0\nv 1 0 0 0.5 0.5 0.5\nvt 0 0\nvn 0 0 1\n"
+        "v 0 1 0\nusemtl m\ns off\nf 1/1/1 2//1 3/1\nv 1 1 0\nf -1 \\\n-2 -3\n"
+    )
+    vertices, faces = read_mesh(path)
+    np.testing.assert_array_equal(vertices[:, :2], [[0, 0], [1, 0], [0, 1], [1, 1]])
+    np.testing.assert_array_equal(faces, [[0, 1, 2], [3, 2, 1]])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        pytest.param("", "empty", id="empty"),
+        pytest.param("v 0 0 0\nv 1 0 0\nv 0 1 0\n", "0 triangles", id="no faces"),
+        pytest.param(
+            "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n", r":5: .*triangle, got 4", id="quad"
+        ),
+        pytest.param("v 0 0 0\nf 1 2 3\n", r":2: .*1 \.\. 1 .*got 2", id="index"),
+        pytest.param("v 0 0 0\nf 0 1 1\n", r":2: .*got 0", id="zero index"),
+        pytest.param("v 0 x 0\n", r":1: .*'x'", id="no number"),
+        pytest.param("v 0 0\n", r":1: .*3 coordinates, got 2", id="short vertex"),
+    ],
+)
+def test_a_bad_obj_is_refused_with_its_line(tmp_path, text, message):
+    path = tmp_path / "bad.obj"
+    path.write_text(text)
+    with pytest.raises(dc.InvalidInput, match=message):
+        read_mesh(path)
+
+
+PLY_HEADER = (
+    "ply\nformat {format} 1.0\ncomment by hand\nelement vertex {vertices}\n"
+    "property float x\nproperty double y\nproperty float z\nproperty uchar red\n"
+    "element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
+)
+
+
+def binary_ply(order, faces):
+    header = PLY_HEADER.format(
+        format={"<": "binary_little_endian", ">": "binary_big_endian"}[order],
+        vertices=4,
+        faces=len(faces),
+    )
+    body = b"".join(struct.pack(order + "fdfB", *v, 255) for v in VERTICES[:4])
+    for face in faces:
+        body += struct.pack(f"{order}B{len(face)}i", len(face), *face)
+    return header.encode() + body
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_binary_ply_of_either_byte_order_is_read(tmp_path, order):
+    path = tmp_path / "a.ply"
+    path.write_bytes(binary_ply(order, FACES.tolist()))
+    vertices, faces = read_mesh(path)
+    np.testing.assert_array_equal(vertices[:, 1], VERTICES[:4, 1])
+    np.testing.assert_array_equal(vertices[:, ::2], VERTICES[:4, ::2].astype(np.float32))
+    np.testing.assert_array_equal(faces, FACES)
+
+
+def test_ascii_ply_is_read(tmp_path):
+    path = tmp_path / "a.ply"
+    rows = "".join(f"{x!r} {y!r} {z!r} 255\n" for x, y, z in VERTICES[:4].tolist())
+    header = PLY_HEADER.format(format="ascii", vertices=4, faces=2)
+    path.write_text(header + rows + "3 0 1 2\n3 2 1 3\n")
+    vertices, faces = read_mesh(path)
+    np.testing.assert_array_equal(vertices, VERTICES[:4])
+    np.testing.assert_array_equal(faces, FACES)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        pytest.param(b"", "not a PLY file", id="empty"),
+        pytest.param(binary_ply("<", [[0, 1, 3, 2]]), "face 0 .*got 4", id="quad"),
+        pytest.param(binary_ply("<", [[0, 1, 2], [0, 1, 3, 2]]), "face 1 .*got 4", id="quad later"),
+        pytest.param(binary_ply("<", FACES.tolist())[:-3], "ends within the face", id="cut off"),
+        pytest.param(binary_ply("<", [[0, 1, 9]]), r"face 0 has vertex 9.* 0 \.\. 3", id="index"),
+        pytest.param(
+            PLY_HEADER.format(format="ascii", vertices=10**12, faces=1).encode() + b"0 0 0 0\n",
+            "1000000000000 x 'vertex', but only",
+            id="size checked before allocation",
+        ),
+        pytest.param(b"ply\nformat ascii 1.0\nelement vertex x\nend_header\n", ":3: ", id="header"),
+    ],
+)
+def test_a_bad_ply_is_refused(tmp_path, content, message):
+    path = tmp_path / "bad.ply"
+    path.write_bytes(content)
+    with pytest.raises(dc.InvalidInput, match=message):
+        read_mesh(path)
+
+
+def test_stl_corners_are_merged_in_the_order_of_the_file(tmp_path):
+    path = tmp_path / "a.stl"
+    corners = VERTICES[FACES].astype(np.float32)
+    body = b"".join(struct.pack("<12fH", 0, 0, 0, *c.reshape(-1), 0) for c in corners)
+    path.write_bytes(bytes(80) + struct.pack("<I", len(corners)) + body)
+    vertices, faces = read_mesh(path)
+    np.testing.assert_array_equal(vertices, VERTICES[:4].astype(np.float32))
+    np.testing.assert_array_equal(faces, FACES)
+
+
+@pytest.mark.parametrize("name", ["empty.stl", "mesh.gltf"])
+def test_other_files_are_refused(tmp_path, name):
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(dc.InvalidInput, match=name):
+        read_mesh(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "counts"),
+    [
+        ("cloth/diffcloth_sock482.obj", 482),
+        ("cloth/diffcloth_wind24x24.obj", 576),
+        ("obstacles/spot.ply", 2930),
+    ],
+)
+def test_public_meshes_are_read_as_trimesh_reads_them(name, counts):
+    """Without processing, trimesh keeps these clean meshes in order."""
+    trimesh = pytest.importorskip("trimesh")
+    vertices, faces = read_mesh(data(name))
+    reference = trimesh.load_mesh(data(name), process=False, maintain_order=True)
+    assert len(vertices) == counts
+    np.testing.assert_allclose(vertices, reference.vertices, rtol=1e-7)  # float32 in one of them
+    np.testing.assert_array_equal(faces, reference.faces)
+
+
+def test_the_sock_makes_a_cloth_whose_pins_keep_their_vertices():
+    path = data("cloth/diffcloth_sock482.obj")
+    cloth = dc.Cloth.load(path, scale=0.1, pins={"toe": [3, 17]})
+    lines = [line.split() for line in path.read_text().splitlines() if line.startswith("v ")]
+    expected = 0.1 * np.array([float(word) for word in lines[17][1:4]])
+    np.testing.assert_array_equal(cloth.vertices[cloth.pins["toe"][1]], expected)
+
+
+def square(**changes):
+    arguments = {"vertices": VERTICES[:4], "faces": FACES, **changes}
+    return dc.Cloth(arguments.pop("vertices"), arguments.pop("faces"), **arguments)
+
+
+def changed(array, index, value):
+    copy = np.array(array, dtype=float)
+    copy[index] = value
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"vertices": changed(VERTICES[:4], (2, 1), np.nan)}, dc.InvalidInput, r"nan at \[2, 1\]"),
+        ({"vertices": changed(VERTICES[:4], (2, 1), np.inf)}, dc.InvalidInput, r"inf at \[2, 1\]"),
+        ({"vertices": VERTICES[:4, :2]}, dc.InvalidInput, r"shape \[n, 3\], got \[4, 2\]"),
+        ({"vertices": [[0, 0, 0], [1, 0]]}, dc.InvalidInput, "rectangular"),
+        ({"vertices": VERTICES[:4].astype(complex)}, TypeError, "complex"),
+        ({"vertices": VERTICES}, dc.InvalidInput, "vertex 4 does not"),
+        ({"vertices": torch.zeros(4, 3, requires_grad=True)}, dc.InvalidInput, "State.positions"),
+        ({"vertices": torch.zeros(4, 3, device="meta")}, TypeError, r"\.cpu\(\)"),
+        ({"faces": [[0, 1, 2], [2, 1, 4]]}, dc.InvalidInput, r"between 0 and 3, got 4 at \[1, 2\]"),
+        ({"faces": [[0, 1, 2], [2, 1, -1]]}, dc.InvalidInput, r"got -1 at \[1, 2\]"),
+        ({"faces": [[0, 1, 3, 2]]}, dc.InvalidInput, "only triangles"),
+        ({"faces": np.zeros((0, 3), int)}, dc.InvalidInput, "at least one triangle"),
+        ({"faces": FACES.astype(float)}, TypeError, "integers"),
+        ({"faces": [[0, 1, 2], [2, 1, 3], [3, 3, 0]]}, dc.InvalidInput, r"different .* at \[2\]"),
+        ({"faces": [[0, 1, 2], [2, 1, 3], [1, 0, 2]]}, dc.InvalidInput, "faces 0 and 2"),
+        (
+            {"vertices": changed(VERTICES[:4], 3, (0.55, 0, 0)), "faces": [[0, 1, 2], [0, 1, 3]]},
+            dc.InvalidInput,
+            r"without area at \[1\]",
+        ),
+        (
+            {"vertices": VERTICES, "faces": [[0, 1, 2], [2, 1, 3], [1, 2, 4]]},
+            dc.InvalidInput,
+            r"got 3 on the edge of vertices \[1, 2\]",
+        ),
+        ({"rest_positions": np.zeros((4, 3))}, dc.InvalidInput, "`rest_positions`.* without area"),
+        ({"rest_positions": VERTICES}, dc.InvalidInput, r"\[4, 3\], got \[5, 3\]"),
+        ({"pins": [0, 1]}, dc.InvalidInput, "dict of name"),
+        ({"pins": {"a": [4]}}, dc.InvalidInput, r"`pins\['a'\]` .*0 and 3, got 4 at \[0\]"),
+        ({"pins": {"a": []}}, dc.InvalidInput, "at least one vertex"),
+        ({"pins": {"a/b": [0]}}, dc.InvalidInput, "without '/'"),
+        ({"pins": {"a": [1, 1]}}, dc.InvalidInput, "vertex 1 again"),
+        ({"pins": {"a": [1], "b": [1]}}, dc.InvalidInput, r"vertex 1 again: `pins\['a'\]` does"),
+        ({"pins": {"a": [1]}, "soft_pins": {"b": [1]}}, dc.InvalidInput, "vertex 1 again"),
+        ({"pin_stiffness": 0.0}, dc.InvalidInput, "`pin_stiffness` must be finite and > 0"),
+        ({"bending_model": "plate"}, dc.InvalidInput, "'patch', 'hinge', got 'plate'"),
+        ({"material": 5}, TypeError, "Material"),
+        ({"material": dc.Material(stretch=[1.0, 2.0, 3.0])}, dc.InvalidInput, r"\[2\], got \[3\]"),
+        ({"name": ""}, dc.InvalidInput, "non-empty"),
+        ({"name": "a\nb"}, dc.InvalidInput, "printable"),
+    ],
+)
+def test_a_bad_cloth_is_refused(changes, error, message):
+    with pytest.raises(error, match=message):
+        square(**changes)
+
+
+def test_a_cloth_copies_what_it_is_given():
+    vertices = VERTICES[:4].copy()
+    cloth = square(vertices=vertices)
+    vertices[0] = 99
+    np.testing.assert_array_equal(cloth.vertices, VERTICES[:4])
+    with pytest.raises(ValueError, match="read-only"):
+        cloth.vertices[0] = 0
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("stretch", 0.0, "> 0, got 0"),
+        ("stretch", [1.0, -1.0], r"got -1 at \[1\]"),
+        ("bending", -1.0, ">= 0"),
+        ("poisson", 0.5, "between -1 and 0.5"),
+        ("poisson", -1.0, "between -1 and 0.5"),
+        ("density", 0, "> 0"),
+        ("damping", float("nan"), "nan"),
+        ("friction", -0.1, ">= 0"),
+        ("thickness", float("inf"), "inf"),
+        ("friction", [0.1, 0.2], r"shape \[\], got \[2\]"),
+        ("stretch", [[1.0]], r"\[\] or \[F\]"),
+        ("stretch", torch.tensor(1.0, requires_grad=True), "Parameters.stretch instead"),
+        ("friction", torch.tensor(1.0, requires_grad=True), "Parameters.friction instead"),
+    ],
+)
+def test_a_bad_material_is_refused(field, value, message):
+    with pytest.raises(dc.InvalidInput, match=f"Material: `{field}`.*{message}"):
+        dc.Material(**{field: value})
+
+
+def test_bodies_may_have_unreferenced_vertices_but_no_flat_faces():
+    assert len(dc.RigidBody(VERTICES, FACES).vertices) == len(VERTICES)
+    with pytest.raises(dc.InvalidInput, match="without area"):
+        dc.RigidBody(np.zeros((3, 3)), [[0, 1, 2]])
+
+
+@pytest.mark.parametrize(
+    ("keywords", "message"),
+    [
+        ({"motion": "free"}, "'static', 'kinematic', 'dynamic', got 'free'"),
+        ({"pose": [0, 0, 0, 0, 0, 0, 0]}, "quaternion"),
+        ({"pose": [0, 0, 0]}, r"\[7\], got \[3\]"),
+        ({"friction": -1}, ">= 0"),
+        ({"thickness": -1}, ">= 0"),
+        ({"pose": torch.zeros(7, requires_grad=True)}, "Control.body_poses"),
+    ],
+)
+def test_a_bad_body_is_refused(keywords, message):
+    with pytest.raises(dc.InvalidInput, match=message):
+        dc.RigidBody.box(1.0, **keywords)
+
+
+def test_grid_is_row_major_centered_and_faces_up():
+    cloth = dc.Cloth.grid(3, 4, size=(3.0, 1.0))
+    rows = cloth.vertices.reshape(3, 4, 3)
+    np.testing.assert_allclose(rows[1, :, 0], [-1.5, -0.5, 0.5, 1.5])
+    np.testing.assert_allclose(rows[:, 2, 1], [-0.5, 0, 0.5])
+    a, b, c = (cloth.vertices[cloth.faces[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    assert (normals[:, 2] > 0).all()
+    np.testing.assert_allclose(normals[:, 2].sum() / 2, 3.0)
+
+
+def test_a_pose_moves_the_cloth_and_not_its_rest_shape():
+    half = np.sqrt(0.5)
+    cloth = dc.Cloth.grid(2, 2, size=2.0, pose=[0, 0, 5, half, half, 0, 0])  # 90 degrees about x
+    np.testing.assert_allclose(cloth.vertices[3], [1, 0, 6], atol=1e-15)
+    np.testing.assert_array_equal(cloth.rest_positions, dc.Cloth.grid(2, 2, size=2.0).vertices)
+
+
+def test_shapes_are_closed_and_face_outward():
+    assert volume(dc.RigidBody.box((1, 2, 3))) == pytest.approx(6)
+    # Polyhedra inscribed in round shapes: a little smaller.
+    ball = 4 / 3 * np.pi * 0.5**3
+    assert 0.98 * ball < volume(dc.RigidBody.sphere(0.5)) < ball
+    capsule = ball + np.pi * 0.5**2 * 2
+    assert 0.98 * capsule < volume(dc.RigidBody.capsule(0.5, 2.0)) < capsule
+    for body in (dc.RigidBody.box(1), dc.RigidBody.sphere(1), dc.RigidBody.capsule(1, 1)):
+        directed = body.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        assert sorted(map(tuple, directed)) == sorted(map(tuple, directed[:, ::-1]))
+
+
+def test_round_shapes_lie_on_their_surface():
+    np.testing.assert_allclose(np.linalg.norm(dc.RigidBody.sphere(0.3).vertices, axis=1), 0.3)
+    vertices = dc.RigidBody.capsule(0.2, 1.0).vertices
+    axis = np.clip(vertices[:, 2], -0.5, 0.5)
+    distance = np.hypot(np.hypot(*vertices[:, :2].T), vertices[:, 2] - axis)
+    np.testing.assert_allclose(distance, 0.2)
+
+
+def test_a_plane_faces_up():
+    body = dc.RigidBody.plane((2, 4))
+    a, b, c = body.vertices[body.faces[0]]
+    assert np.cross(b - a, c - a)[2] > 0
+    np.testing.assert_array_equal(np.abs(body.vertices), np.tile([1, 2, 0], (4, 1)))
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e3])
+def test_the_flattest_face_that_is_accepted(scale):
+    # Twice the area over the longest side squared; below 1e-12 rounding decides about its normal.
+    def triangle(height):
+        return [[0, 0, 0], [scale, 0, 0], [0.5 * scale, height * scale, 0]], [[0, 1, 2]]
+
+    for make in (dc.Cloth, dc.RigidBody):
+        assert make(*triangle(1.1e-12)).faces.shape == (1, 3)
+        with pytest.raises(dc.InvalidInput, match=r"without area at \[0\]"):
+            make(*triangle(0.9e-12))
+
+
+REST = 1.5 * VERTICES[:4]
+
+
+def test_the_earlier_name_of_rest_positions_means_the_same():
+    cloth = dc.Cloth(VERTICES[:4], FACES, rest_vertices=REST)
+    assert cloth.rest_vertices is cloth.rest_positions
+    np.testing.assert_array_equal(cloth.rest_positions, REST)
+    np.testing.assert_array_equal(
+        dc.Cloth(VERTICES[:4], FACES, rest_positions=REST).rest_vertices, REST
+    )
+    posed = dc.Cloth.grid(2, 2, pose=[0, 0, 1, 1, 0, 0, 0], rest_vertices=REST)
+    np.testing.assert_array_equal(posed.rest_positions, REST)
+
+
+def test_a_rest_shape_is_given_once_and_named_as_it_was_given():
+    with pytest.raises(dc.InvalidInput, match="`rest_vertices` must be None beside `rest_pos"):
+        dc.Cloth(VERTICES[:4], FACES, rest_positions=REST, rest_vertices=REST)
+    for name in ("rest_positions", "rest_vertices"):
+        with pytest.raises(dc.InvalidInput, match=f"`{name}` must have shape"):
+            dc.Cloth(VERTICES[:4], FACES, **{name: REST[:3]})
+
+
+def test_a_pickle_with_the_earlier_name_loads():
+    state = dc.Cloth(VERTICES[:4], FACES, rest_positions=REST).__getstate__()
+    state["rest_vertices"] = state.pop("rest_positions")
+    cloth = dc.Cloth.__new__(dc.Cloth)
+    cloth.__setstate__(state)
+    np.testing.assert_array_equal(cloth.rest_positions, REST)

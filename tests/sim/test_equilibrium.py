@@ -1,0 +1,338 @@
+"""Equilibria: against closed forms, long rollouts and differences; and what has none."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_bvp
+from scipy.optimize import brentq
+
+import diffcloth_torch as dc
+from diffcloth_torch.sim import equilibrium
+
+F64 = torch.float64
+TIGHT = dc.SolverOptions(tolerance=1e-9)
+
+
+def strip(count, length, width, *, seed=0, **options):
+    """A level strip along x, `count` x 4 vertices, jittered in its plane."""
+    x, y = np.meshgrid(np.linspace(0, length, count), np.linspace(0, width, 4), indexing="ij")
+    vertices = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    jitter = np.random.default_rng(seed).uniform(-0.1, 0.1, vertices.shape) * length / count
+    vertices[2:-2, 1:-1, :2] += jitter[2:-2, 1:-1, :2]
+    i = np.arange(count * 4).reshape(count, 4)
+    a, b, c, d = i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]
+    faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+    return dc.Cloth(vertices.reshape(-1, 3), faces, **options)
+
+
+def cantilever(count=16, bending=2e-4, **options):
+    material = dc.Material(stretch=2000.0, bending=bending, poisson=0.0, density=0.15)
+    cloth = strip(count, 0.2, 0.03, material=material, pins={"clamp": range(8)}, name="strip")
+    return dc.Simulator(dc.Scene([cloth]), 0.01, solver=TIGHT, **options)
+
+
+def drape(scheme="coupled", bending=1e-4, rows=9, **options):
+    """A square sheet over a pedestal with a round rim."""
+    grid = dc.Cloth.grid(rows, rows, (0.24, 0.24))
+    vertices = np.array(grid.vertices)
+    jitter = np.random.default_rng(1).uniform(-0.1, 0.1, (rows * rows, 2)) * 0.24 / (rows - 1)
+    vertices[:, :2] += jitter
+    vertices[:, 2] = 0.003
+    cloth = dc.Cloth(
+        vertices,
+        grid.faces,
+        material=dc.Material(stretch=300.0, bending=bending, friction=0.3, damping=0.01),
+        name="sheet",
+    )
+    ball = dc.RigidBody.sphere(0.07, pose=[0, 0, -0.07, 1, 0, 0, 0], name="pedestal")
+    return dc.Simulator(dc.Scene([cloth], [ball]), 0.01, scheme=scheme, solver=TIGHT, **options)
+
+
+def test_a_hanging_strip_is_a_catenary():
+    length, span = 0.4, 0.3
+    material = dc.Material(stretch=2e4, bending=1e-9, poisson=0.0, density=0.2)
+    cloth = strip(40, length, 0.03, material=material)
+    positions = np.array(cloth.vertices)
+    # A start with the length of the strip: two straight halves.
+    half, drop = span / 2, np.sqrt(length**2 - span**2) / 2
+    s = positions[:, 0] / length
+    positions[:, 0] = span * s
+    positions[:, 2] = -2 * drop * np.minimum(s, 1 - s)
+    ends = {"ends": [*range(4), *range(156, 160)]}
+    held = dc.Cloth(
+        positions, cloth.faces, rest_positions=cloth.vertices, material=material, pins=ends
+    )
+    sim = dc.Simulator(dc.Scene([held]), 0.01, solver=dc.SolverOptions(max_iterations=3000))
+    end = sim.equilibrium(sim.initial_state())
+    a = brentq(lambda a: 2 * a * np.sinh(half / a) - length, 0.01, 10.0)
+    sag = a * (np.cosh(half / a) - 1)
+    # A chain of 39 links is within the square of a link's angle of its curve.
+    assert -float(end.positions[:, 2].min()) == pytest.approx(sag, rel=2e-3)
+    x = end.positions[:, 0].numpy()
+    curve = a * np.cosh((x - half) / a) - a * np.cosh(half / a)
+    np.testing.assert_allclose(end.positions[:, 2].numpy(), curve, atol=0.02 * sag)
+
+
+def test_a_heavy_cantilever_is_an_elastica():
+    sim = cantilever(count=30)
+    end = sim.equilibrium(sim.initial_state()).positions.numpy()
+    clamp = 0.2 / 29  # the second row is held
+    L, D, weight = 0.2 - clamp, 2e-4, 0.15 * 9.81
+
+    def bend(s, y):  # D theta'' = w (L - s) cos(theta), the moment of what hangs beyond s
+        return np.stack([y[1], -weight * (L - s) * np.cos(y[0]) / D])
+
+    s = np.linspace(0, L, 200)
+    found = solve_bvp(bend, lambda a, b: np.array([a[0], b[1]]), s, np.zeros((2, 200)), tol=1e-8)
+    assert found.success
+    drop = np.trapezoid(np.sin(found.sol(s)[0]), s)
+    assert -end[-4:, 2].mean() == pytest.approx(abs(drop), rel=0.02)
+
+
+def test_the_end_of_a_long_rollout_is_one():
+    """What sticks there holds; the rollout still creeps there, by .1 mm/s after 3 s."""
+    contact = dc.ContactOptions(slip_velocity=1e-5)
+    sim = drape(contact=contact)
+    with torch.no_grad():
+        state = sim.initial_state()
+        for _ in range(300):
+            state = sim.step(state)
+    found = sim.equilibrium(state)
+    assert found.time == state.time
+    assert not found.velocities.any()
+    assert state.velocities.norm(dim=-1).max() < 3e-4
+    assert (found.positions - state.positions).norm(dim=-1).max() < 1e-5
+
+
+def test_without_friction_a_rollout_ends_there():
+    cloth = strip(12, 0.2, 0.03, material=dc.Material(bending=1e-4, damping=0.05))
+    pins = {"clamp": range(8)}
+    cloth = dc.Cloth(cloth.vertices, cloth.faces, material=cloth.material, pins=pins)
+    sim = dc.Simulator(dc.Scene([cloth]), 0.02, solver=TIGHT)
+    found = sim.equilibrium(sim.initial_state())
+    with torch.no_grad():
+        state = sim.initial_state()
+        for _ in range(500):
+            state = sim.step(state)
+    assert (state.positions - found.positions).norm(dim=-1).max() < 1e-6
+
+
+def test_a_sheet_sticks_on_an_incline_and_holds_its_weight():
+    angle = 0.3
+    turn = [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]
+    floor = dc.RigidBody.plane(1.0, pose=[0, 0, 0, *turn], friction=0.5)
+    cloth = dc.Cloth.grid(6, 6, (0.2, 0.2), pose=[0.001, 0, 0.004, *turn])
+    sim = dc.Simulator(dc.Scene([cloth], [floor]), 0.01, solver=TIGHT)
+    state = sim.initial_state()
+    found = sim.equilibrium(state)
+    weight = float(sim.vertex_masses().sum()) * 9.81
+    force = found.body_forces.sum(dim=0)
+    torch.testing.assert_close(
+        force, torch.tensor([0, 0, -weight], dtype=F64), rtol=0, atol=1e-6 * weight
+    )
+    # Along the slope it stays within what friction yields by.
+    slope = torch.tensor([np.cos(angle), 0.0, -np.sin(angle)], dtype=F64)
+    assert ((found.positions - state.positions) @ slope).abs().max() < 1e-5
+
+
+def test_a_box_rests_on_a_pinned_sheet():
+    cloth = dc.Cloth.grid(7, 7, (0.3, 0.3), pins={"rim": [0, 6, 42, 48, 3, 21, 27, 45]})
+    box = dc.RigidBody.box(
+        0.08, motion="dynamic", mass=0.02, pose=[0.01, 0.004, 0.045, 1, 0, 0, 0], name="box"
+    )
+    sim = dc.Simulator(dc.Scene([cloth], [box]), 0.01, solver=dc.SolverOptions(tolerance=1e-8))
+    found = sim.equilibrium(sim.initial_state())
+    wrench = sim.contact_wrenches(found)["box"]
+    torch.testing.assert_close(
+        wrench[:3], torch.tensor([0, 0, 0.02 * 9.81], dtype=F64), rtol=0, atol=1e-6
+    )
+    assert wrench[3:].abs().max() < 1e-7
+    assert not found.body_velocities.any()
+
+
+def directions(sim, names):
+    """Parameters, and a random direction of each that keeps its sign."""
+    given = sim.parameters()
+    for k, name in enumerate(names):
+        value = getattr(given, name)
+        generator = torch.Generator().manual_seed(k)
+        factor = torch.rand(value.shape, generator=generator, dtype=F64) + 0.5
+        scale = 0.01 if name == "rest_positions" else 1.0
+        yield name, value, scale * factor * value
+
+
+@pytest.mark.parametrize(
+    ("make", "names"),
+    [
+        (cantilever, ["stretch", "bending", "density", "gravity", "rest_positions"]),
+        (
+            drape,
+            [
+                *("stretch", "bending", "density", "friction"),
+                *("gravity", "thickness", "barrier_stiffness", "barrier_distance"),
+            ],
+        ),
+    ],
+    ids=["cantilever", "drape"],
+)
+def test_gradients_are_those_of_the_equilibrium(make, names):
+    """By differences of equilibria that are searched for from the one found, with its friction."""
+    sim = make()
+    state = sim.initial_state()
+    found = sim.equilibrium(state)
+    weights = torch.randn(
+        found.positions.shape, generator=torch.Generator().manual_seed(9), dtype=F64
+    )
+
+    def loss(start, name, value):
+        end = sim.equilibrium(start, None, sim.parameters().replace(**{name: value}))
+        return (end.positions * weights).sum()
+
+    for name, value, way in directions(sim, names):
+        leaf = value.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(loss(found, name, leaf), leaf)
+        slope = float((gradient * way).sum())
+        with torch.no_grad():
+            ends = [loss(found, name, value + sign * 3e-6 * way) for sign in (1, -1)]
+        assert slope == pytest.approx(float(ends[0] - ends[1]) / 6e-6, rel=1e-4, abs=1e-7), name
+
+
+def test_gradients_by_pins_forces_and_the_state():
+    sim = cantilever()
+    state = sim.initial_state()
+    found = sim.equilibrium(state)
+    weights = torch.randn(found.positions.shape, generator=torch.Generator().manual_seed(9))
+    pins = found.positions[:8].clone()
+    inputs = {
+        "pins": pins,
+        "forces": torch.zeros_like(found.positions),
+        "positions": found.positions.clone(),
+    }
+
+    def loss(values):
+        control = dc.Control(forces=values["forces"])
+        if "pins" in values:
+            control = dc.Control(forces=values["forces"], pins=values["pins"])
+        start = found.replace(positions=values["positions"])
+        return (sim.equilibrium(start, control).positions * weights).sum()
+
+    for name, value in inputs.items():
+        given = {n: v for n, v in inputs.items() if n != "pins" or name == "pins"}
+        leaf = value.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(loss(given | {name: leaf}), leaf)
+        way = torch.randn(value.shape, generator=torch.Generator().manual_seed(3), dtype=F64)
+        if name == "positions":  # pins hold where the state has them, all else is forgotten
+            assert gradient[:8].any()
+            assert gradient[8:].abs().max() < 1e-6 * gradient[:8].abs().max()
+            way[8:] = 0.0
+        step = 1e-7 if name == "forces" else 1e-6
+        with torch.no_grad():
+            ends = [loss(given | {name: value + sign * step * way}) for sign in (1, -1)]
+        slope = float((gradient * way).sum())
+        assert slope == pytest.approx(float(ends[0] - ends[1]) / (2 * step), rel=1e-4), name
+
+
+def test_environments_of_a_batch_are_those_alone():
+    sim = drape(rows=7)
+    state = sim.initial_state(3)
+    parameters = sim.parameters()
+    bending = parameters.bending * torch.tensor([1.0, 3.0, 0.5], dtype=F64)
+    batch = sim.equilibrium(state, None, parameters.replace(bending=bending))
+    for k in range(3):
+        alone = sim.equilibrium(state[k], None, parameters.replace(bending=bending[k]))
+        assert torch.equal(batch.positions[k], alone.positions)
+        assert torch.equal(batch.body_forces[k], alone.body_forces)
+
+
+def test_split_finds_the_same_one():
+    alike = [s.equilibrium(s.initial_state()).positions for s in (drape(), drape("split"))]
+    assert torch.equal(*alike)
+
+
+def test_what_falls_is_named():
+    sheet = dc.Cloth.grid(4, 4, (0.2, 0.2), name="sheet")
+    sim = dc.Simulator(dc.Scene([sheet]), 0.01)
+    with pytest.raises(dc.SimulationError, match="equilibrium: 'sheet' is free to move"):
+        sim.equilibrium(sim.initial_state())
+
+
+def test_what_may_slide_is_named():
+    sheet = dc.Cloth.grid(
+        4, 4, (0.2, 0.2), pose=[0, 0, 0.002, 1, 0, 0, 0], name="sheet",
+        material=dc.Material(friction=0.0),
+    )  # fmt: skip
+    floor = dc.RigidBody.plane(1.0, friction=0.0)
+    sim = dc.Simulator(dc.Scene([sheet], [floor]), 0.01)
+    with pytest.raises(dc.SimulationError, match="'sheet' is free to"):
+        sim.equilibrium(sim.initial_state())
+
+
+def test_a_body_that_floats_is_named():
+    box = dc.RigidBody.box(
+        0.1, motion="dynamic", mass=0.1, pose=[0, 0, 0.3, 1, 0, 0, 0], name="box"
+    )
+    sheet = dc.Cloth.grid(3, 3, (0.2, 0.2), pins={"all": range(9)})
+    sim = dc.Simulator(dc.Scene([sheet], [box], gravity=(0, 0, 0)), 0.01)
+    with pytest.raises(dc.SimulationError, match="'box' is free to"):
+        sim.equilibrium(sim.initial_state())
+
+
+def test_what_has_no_equilibrium_is_refused():
+    sim = cantilever()
+    box = dc.RigidBody.box(0.1, pose=[0, 0, -1, 1, 0, 0, 0], nodal_contact=True, name="box")
+    nodal = dc.Simulator(dc.Scene(sim.scene.cloths, [box]), 0.01, scheme="split")
+    with pytest.raises(dc.InvalidInput, match="make 'box' without nodal_contact"):
+        nodal.equilibrium(nodal.initial_state())
+    hand = dc.Robot.load(
+        dc.robots.GRIPPER, pose=[0, 0, -2, 1, 0, 0, 0], stiffness=10.0, damping=1.0, name="hand"
+    )
+    driven = dc.Simulator(dc.Scene(sim.scene.cloths, [], [hand]), 0.01)
+    with pytest.raises(dc.InvalidInput, match="robot 'hand' must be prescribed"):
+        driven.equilibrium(driven.initial_state())
+    projective = dc.Simulator(sim.scene, 0.01, scheme="projective")
+    with pytest.raises(dc.InvalidInput, match="use another scheme"):
+        projective.equilibrium(projective.initial_state())
+
+
+def test_too_few_iterations_are_a_failure_or_a_value():
+    few = dc.SolverOptions(max_iterations=2)
+    sim = dc.Simulator(cantilever().scene, 0.01, solver=few)
+    with pytest.raises(dc.NotConverged):
+        sim.equilibrium(sim.initial_state())
+    silent = dc.SolverOptions(max_iterations=2, throw=False)
+    sim = dc.Simulator(cantilever().scene, 0.01, solver=silent)
+    assert sim.equilibrium(sim.initial_state()).report.status == "not_converged"
+
+
+def test_what_does_not_settle_has_no_gradient(monkeypatch):
+    """With `throw=False` it is a value, and backward says so."""
+    monkeypatch.setattr(equilibrium, "_SETTLED", 0.0)
+    monkeypatch.setattr(equilibrium, "_REPEATS", 1)
+    silent = dc.SolverOptions(tolerance=1e-12, throw=False)
+    sim = dc.Simulator(drape().scene, 0.01, solver=silent)
+    bending = sim.parameters().bending.clone().requires_grad_()
+    parameters = sim.parameters().replace(bending=bending)
+    found = sim.equilibrium(sim.initial_state(), None, parameters)
+    assert found.report.status == "not_converged"
+    with pytest.raises(dc.NotConverged, match="no gradient"):
+        found.positions.sum().backward()
+
+
+def test_a_scene_of_bodies_has_the_scale_of_its_bodies():
+    """In units a thousand times smaller, what falls is found falling as well."""
+    for unit in (1.0, 1e-3):
+        box = dc.RigidBody.box(
+            0.1 * unit, motion="dynamic", mass=0.1, pose=[0, 0, unit, 1, 0, 0, 0], name="box"
+        )
+        contact = dc.ContactOptions(barrier_distance=1e-3 * unit)
+        solver = dc.SolverOptions(tolerance=1e-6 * unit)
+        gravity = (0, 0, -9.81 * unit)
+        sim = dc.Simulator(
+            dc.Scene([], [box], gravity=gravity), 0.01, contact=contact, solver=solver
+        )
+        moved = 0.5 * 9.81 * unit  # in the first long steps, about
+        with pytest.raises(
+            dc.SimulationError, match=r"'box' is free to move: .* moves by"
+        ) as error:
+            sim.equilibrium(sim.initial_state())
+        assert moved < float(str(error.value).split("moves by ")[1].split(" m")[0]) < 1e3 * moved

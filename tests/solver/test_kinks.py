@@ -1,0 +1,25 @@
+"""Kinks of friction: at a small slip velocity its energy is as good as |w|."""
+
+import importlib
+from pathlib import Path
+
+import pytest
+import torch
+
+import diffcloth_torch as dc
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize(("name", "most"), [("crumple", 30), ("twist", 45)])
+def test_slips_that_turn_round_do_not_zigzag(monkeypatch, name, most):
+    """Newton's method has no curvature along a slip on either side: up to 52 and 66 iterations."""
+    monkeypatch.syspath_prepend(ROOT)
+    scenes = importlib.import_module("benchmarks.scenes")
+    scene = scenes.BUCKLING[name](12)
+    simulator = dc.Simulator(scene.scene, 0.01, contact=dc.ContactOptions(slip_velocity=1e-5))
+    with torch.no_grad():
+        state = scenes.in_regime(simulator, scene, 0)
+        for _ in range(6):
+            state = simulator.step(state, scene.control(state))
+            assert state.report.iterations <= most
