@@ -104,6 +104,19 @@ print(*project["dependencies"], *(name for e in sys.argv[1:] for name in extras[
 PY
 }
 
+# install_requirements EXTRA...: what the package needs, with these extras, but not the package:
+# nothing is compiled.
+install_requirements() {
+  local now required=()
+  now=$(cat pyproject.toml constraints.txt <("$venv/bin/python" -VV) <(echo "$*") | sha256sum)
+  if [[ $(cat "$venv/required" 2>/dev/null) == "$now" ]]; then return 0; fi
+  say "Installing what the package needs, with the extras $*: nothing is compiled"
+  pip_install setuptools
+  mapfile -t required < <(requirements "$@")
+  pip_install "${required[@]}"
+  echo "$now" >"$venv/required"
+}
+
 # install_package EXTRA...: the package, editable, unless it is there and nothing has changed; then
 # the extras that are missing, which builds nothing.
 install_package() {
