@@ -1,6 +1,7 @@
 #pragma once
 
 #include <cstdint>
+#include <stdexcept>
 #include <utility>
 #include <vector>
 
@@ -82,6 +83,13 @@ class Potential {
 
   /// Add -d/d(theta) (z . grad P) to the cotangents that the potential keeps for its inputs theta.
   virtual void accumulate(const double* x, const double* z) = 0;
+
+  /// y += d/d(theta) (grad P) theta_dot over all vertices: how the gradient changes with the inputs theta,
+  /// for the tangents theta_dot that the owner has put into the potential. What accumulate() does,
+  /// transposed.
+  virtual void add_tangent(const double* /*x*/, double* /*y*/) const {
+    throw std::logic_error("potential: it has no tangent");
+  }
 
   /// Call store.exchange() for each of these cotangents: several losses take turns with one potential. A
   /// potential that keeps none, or whose owner swaps them, has none to show.

@@ -11,6 +11,7 @@ namespace diffcloth::step {
 
 class Cotangents;
 class Problem;
+class Tangents;
 
 /// A potential of the cloths that every step minimizes, and how it hangs together with the step's
 /// inputs. It is made from a Problem; step/potentials.cpp lists all.
@@ -26,6 +27,12 @@ class StepPotential {
   /// Pull what the potential has accumulated back: to the gradients of its own inputs, and to the
   /// cotangents of what it shares with others, as positions at the start, masses and the rest shape.
   virtual void pull_back(const Problem& problem, Cotangents& bars, const Gradients& gradients) = 0;
+
+  /// Put the tangents of the potential's inputs into it, for add_tangent(): what pull_back() does,
+  /// transposed.
+  virtual void push_forward(const Problem& /*problem*/, const Tangents& /*tangents*/) {
+    throw std::logic_error("step: a potential has no tangent");
+  }
 
   /// Call visit(name, value) for every part of the energy that it stores at x [J].
   using VisitEnergy = std::function<void(const char* name, double value)>;

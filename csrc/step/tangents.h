@@ -1,0 +1,32 @@
+#pragma once
+
+#include <vector>
+
+#include "mesh/rest_shape.h"
+#include "step/problem.h"
+
+namespace diffcloth::step {
+
+/// Tangents of what the potentials of a step depend on, along one direction of the inputs: Cotangents,
+/// transposed. Fields whose names there are the same mean the tangents of the same quantities.
+class Tangents {
+ public:
+  /// @param directions  a tangent for each input, of the count of that input; zero where null
+  Tangents(const Problem& problem, const Inputs& directions);
+
+  const Inputs& directions;
+
+  std::vector<double> start;       ///< x_n and o_n: all points
+  std::vector<double> origins;     ///< what friction counts motion from, where it is not the start
+  std::vector<double> ends;        ///< what is prescribed, at its end: all points
+  std::vector<double> masses;      ///< [N]
+  std::vector<double> prediction;  ///< y, the target of inertia [3 N]
+  contact::ContactModel::Bar contact;
+
+  mesh::RestShapeBar rest;  ///< empty where the rest shape does not change
+
+  /// Those of an input that is given per face [F].
+  std::vector<double> per_face(const Problem& problem, Input input) const;
+};
+
+}  // namespace diffcloth::step
