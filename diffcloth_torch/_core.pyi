@@ -106,6 +106,9 @@ class Simulator:
     def energy_backward(
         self, inputs: Arrays, cotangents: Arrays, losses: int, needs: list[str], threads: int
     ) -> Arrays: ...
+    def energy_tangent(
+        self, inputs: Arrays, tangents: Arrays, directions: int, threads: int
+    ) -> Arrays: ...
     def path(self, inputs: Arrays) -> NDArray[np.float64]: ...
     def reference_factorization_seconds(self, inputs: Arrays, repeats: int) -> float: ...
     def forget_factors(self) -> None: ...
@@ -116,6 +119,16 @@ class Simulator:
         tape: Arrays,
         kept: Kept,
         cotangents: Arrays,
+        losses: int,
         needs: list[str],
+        threads: int,
+    ) -> Arrays: ...
+    def tangent(
+        self,
+        inputs: Arrays,
+        tape: Arrays,
+        kept: Kept,
+        tangents: Arrays,
+        directions: int,
         threads: int,
     ) -> Arrays: ...

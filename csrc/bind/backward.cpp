@@ -13,6 +13,7 @@
 #include "bind/environments.h"
 #include "bind/field_arrays.h"
 #include "bind/input_arrays.h"
+#include "bind/portions.h"
 #include "bind/simulator.h"
 
 namespace diffcloth::bind {
@@ -67,30 +68,6 @@ std::vector<Wanted> make_gradients(const InputArrays& arrays,
   return wanted;
 }
 
-/// Losses of an environment that go back together.
-struct Portion {
-  std::size_t environment;
-  std::vector<std::size_t> rows;  ///< loss * environments + environment
-};
-
-/// A loss that does not depend on an environment has zeros there: that step may even have failed.
-std::vector<Portion> make_portions(const Saved& bars,
-                                   std::size_t environments,
-                                   std::size_t losses) {
-  std::vector<Portion> portions;
-  for (std::size_t e = 0; e < environments; ++e) {
-    std::vector<std::size_t> rows;
-    for (std::size_t row = e; row < losses * environments; row += environments) {
-      if (!bars.is_zero(row)) rows.push_back(row);
-      if (rows.size() < step::kLossesAtOnce) continue;
-      portions.push_back({.environment = e, .rows = std::move(rows)});
-      rows.clear();
-    }
-    if (!rows.empty()) portions.push_back({.environment = e, .rows = std::move(rows)});
-  }
-  return portions;
-}
-
 /// Takes the losses of an environment back, which has so many threads.
 using PullBack = std::function<void(
     std::size_t environment, std::span<const step::Loss>, int threads, const Checkpoint&)>;
@@ -104,7 +81,9 @@ nb::dict pull_back_all(const InputArrays& arrays,
                        const PullBack& pull_back) {
   nb::dict out;
   std::vector<Wanted> wanted = make_gradients(arrays, losses, needs, out);
-  const std::vector<Portion> portions = make_portions(bars, arrays.environments, losses);
+  // A loss that does not depend on an environment has zeros there: that step may even have failed.
+  const std::vector<Portion> portions = make_portions(
+      arrays.environments, losses, [&](std::size_t row) { return bars.is_zero(row); });
   for_environments(portions.size(), threads, [&](Index i, const Checkpoint& checkpoint) {
     const auto& [e, rows] = portions[static_cast<std::size_t>(i)];
     std::vector<step::Loss> of_rows;
@@ -121,6 +100,17 @@ nb::dict pull_back_all(const InputArrays& arrays,
 
 }  // namespace
 
+Saved Simulator::taken_steps(std::size_t environments,
+                             const nb::dict& tape,
+                             const KeptSteps& kept) const {
+  Saved tapes(tape_, environments, "tape_", tape);
+  if (!tapes.is_finite()) throw nb::value_error("core: the tape must be finite");
+  if (kept.tickets.size() != environments) {
+    throw nb::value_error("core: `kept` must be of as many environments as the inputs");
+  }
+  return tapes;
+}
+
 nb::dict Simulator::backward(const nb::dict& inputs,
                              const nb::dict& tape,
                              const KeptSteps& kept,
@@ -130,11 +120,7 @@ nb::dict Simulator::backward(const nb::dict& inputs,
                              int threads) {
   const InputArrays arrays(scene_, inputs, true);
   const std::size_t b = arrays.environments;
-  const Saved tapes(tape_, b, "tape_", tape);
-  if (!tapes.is_finite()) throw nb::value_error("core: the tape must be finite");
-  if (kept.tickets.size() != b) {
-    throw nb::value_error("core: `kept` must be of as many environments as the inputs");
-  }
+  const Saved tapes = taken_steps(b, tape, kept);
   const Saved bars(outputs_, losses * b, "", cotangents);
   return pull_back_all(
       arrays, bars, losses, needs, threads,

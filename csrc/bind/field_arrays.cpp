@@ -7,11 +7,11 @@
 namespace diffcloth::bind {
 
 Outputs::Outputs(const std::vector<step::Field>& fields,
-                 std::size_t environments,
+                 const std::vector<std::size_t>& rows,
                  const std::string& prefix,
                  nb::dict& out) {
   for (const step::Field& field : fields) {
-    std::vector<std::size_t> shape{environments};
+    std::vector<std::size_t> shape = rows;
     shape.insert(shape.end(), field.shape.begin(), field.shape.end());
     Owned<double> owned = make_array<double>(shape);
     out[(prefix + field.name).c_str()] = owned.array;
@@ -19,9 +19,9 @@ Outputs::Outputs(const std::vector<step::Field>& fields,
   }
 }
 
-step::Arrays<double> Outputs::environment(std::size_t e) const {
+step::Arrays<double> Outputs::environment(std::size_t row) const {
   step::Arrays<double> arrays;
-  for (const Entry& entry : entries_) arrays.set(entry.name, entry.data + e * entry.size);
+  for (const Entry& entry : entries_) arrays.set(entry.name, entry.data + row * entry.size);
   return arrays;
 }
 

@@ -12,13 +12,14 @@ namespace diffcloth::bind {
 /// Arrays of all environments by name, and what one environment sees of them.
 class Outputs {
  public:
-  /// Zeroed arrays [environments, ...] for these fields, put into `out` under prefix + name.
+  /// Zeroed arrays [rows.., ...] for these fields, put into `out` under prefix + name. Rows are
+  /// environments, or directions and environments.
   Outputs(const std::vector<step::Field>& fields,
-          std::size_t environments,
+          const std::vector<std::size_t>& rows,
           const std::string& prefix,
           nb::dict& out);
 
-  step::Arrays<double> environment(std::size_t e) const;
+  step::Arrays<double> environment(std::size_t row) const;
 
  private:
   struct Entry {

@@ -18,8 +18,8 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   const InputArrays arrays(scene_, inputs);
   const std::size_t b = arrays.environments;
   nb::dict out;
-  const Outputs outputs(outputs_, b, "", out);
-  const Outputs tapes(tape ? tape_ : std::vector<step::Field>(), b, "tape_", out);
+  const Outputs outputs(outputs_, {b}, "", out);
+  const Outputs tapes(tape ? tape_ : std::vector<step::Field>(), {b}, "tape_", out);
   std::vector<step::Report> reports(b);
   KeptSteps kept{.tickets = decltype(KeptSteps::tickets)(b)};
   for_environments(b, threads, [&](Index i, const Checkpoint& checkpoint) {
@@ -42,7 +42,7 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
 nb::object Simulator::path(const nb::dict& inputs) {
   const InputArrays arrays(scene_, inputs);
   nb::dict unused;
-  const Outputs outputs(outputs_, 1, "", unused);
+  const Outputs outputs(outputs_, {1}, "", unused);
   std::vector<std::vector<double>> path;
   for_environments(1, 1, [&](Index, const Checkpoint& checkpoint) {
     step::Kept kept;

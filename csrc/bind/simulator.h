@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "bind/arrays.h"
+#include "bind/field_arrays.h"
 #include "step/factor_cache.h"
 #include "step/fields.h"
 #include "step/scene.h"
@@ -35,12 +36,22 @@ class Simulator {
                     std::size_t losses,
                     const std::vector<std::string>& needs,
                     int threads);
+  nb::dict tangent(const nb::dict& inputs,
+                   const nb::dict& tape,
+                   const KeptSteps& kept,
+                   const nb::dict& tangents,
+                   std::size_t directions,
+                   int threads);
   nb::dict stored_energy(const nb::dict& inputs) const;
   nb::dict energy_backward(const nb::dict& inputs,
                            const nb::dict& cotangents,
                            std::size_t losses,
                            const std::vector<std::string>& needs,
                            int threads) const;
+  nb::dict energy_tangent(const nb::dict& inputs,
+                          const nb::dict& tangents,
+                          std::size_t directions,
+                          int threads) const;
   nb::object path(const nb::dict& inputs);
   double smallest_nonadjacent_distance() const;
   nb::object default_barrier_stiffness(const nb::dict& inputs, double barrier_distance) const;
@@ -51,6 +62,9 @@ class Simulator {
   std::size_t factor_bytes() const { return factors_.bytes(); }
 
  private:
+  /// The tapes of steps that forward() took, checked.
+  Saved taken_steps(std::size_t environments, const nb::dict& tape, const KeptSteps& kept) const;
+
   step::Scene scene_;
   std::vector<step::Field> outputs_;
   std::vector<step::Field> tape_;

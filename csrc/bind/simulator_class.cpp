@@ -60,11 +60,20 @@ void simulator(nb::module_& m) {
       .def("backward", &Simulator::backward, "inputs"_a, "tape"_a, "kept"_a, "cotangents"_a,
            "losses"_a, "needs"_a, "threads"_a,
            "Gradients [losses, ...] of the inputs that are needed, from cotangents [losses, ...].")
+      .def("tangent", &Simulator::tangent, "inputs"_a, "tape"_a, "kept"_a, "tangents"_a,
+           "directions"_a, "threads"_a,
+           "Tangents [directions, environments, ...] of all outputs, from those of inputs "
+           "[directions, environments or 1, ...]; what is left out does not change.")
       .def("stored_energy", &Simulator::stored_energy, "inputs"_a)
       .def("energy_backward", &Simulator::energy_backward, "inputs"_a, "cotangents"_a, "losses"_a,
            "needs"_a, "threads"_a,
            "Gradients [losses, ...] of the inputs that are needed, from cotangents [losses, "
            "environments] of the parts of stored_energy().")
+      .def("energy_tangent", &Simulator::energy_tangent, "inputs"_a, "tangents"_a, "directions"_a,
+           "threads"_a,
+           "Tangents [directions, environments] of the parts of stored_energy(), from those of "
+           "inputs "
+           "[directions, environments or 1, ...].")
       .def("path", &Simulator::path, "inputs"_a,
            "Accepted iterates of the first environment's step [M, N + V, 3].")
       .def("smallest_nonadjacent_distance", &Simulator::smallest_nonadjacent_distance)

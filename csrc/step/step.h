@@ -46,8 +46,9 @@ struct Loss {
   Gradients gradients;              ///< the same inputs for all losses
 };
 
-/// How many losses are worth one call of backward(): those that one pass over a factor solves for.
-inline constexpr std::size_t kLossesAtOnce = linalg::kMaxVectors;
+/// How many losses are worth one call of backward(), or directions one of tangent(): those that one pass
+/// over a factor solves for.
+inline constexpr std::size_t kAtOnce = linalg::kMaxVectors;
 
 /// Gradients of a step that forward() took, of several losses, each with the bits that it has alone: see
 /// contact_stage.cpp for the derivation.
@@ -61,6 +62,25 @@ void backward(const Scene& scene,
               std::span<const Loss> losses,
               int threads,
               const Checkpoint& checkpoint);
+
+/// Tangents of the inputs, and where those of the outputs go.
+struct Direction {
+  Inputs tangents;         ///< of the counts of the inputs; zero where null
+  Arrays<double> outputs;  ///< named like output_fields(), zeroed
+};
+
+/// How the outputs of a step that forward() took change along several directions of its inputs, each with
+/// the bits that it has alone.
+///
+/// @param kept  what forward kept, or nothing
+/// @throws std::domain_error when the solution is not a local minimum.
+void tangent(const Scene& scene,
+             const Inputs& inputs,
+             const Arrays<const double>& tape,
+             const Kept& kept,
+             std::span<const Direction> directions,
+             int threads,
+             const Checkpoint& checkpoint);
 
 /// Where surfaces overlap at the start of the step, or are closer than their thickness; else empty.
 std::string find_overlap(const Scene& scene, const Inputs& inputs);
@@ -88,6 +108,14 @@ Energies stored_energy(const Scene& scene, const Inputs& inputs);
 ///
 /// @throws std::domain_error where surfaces overlap, if the barrier's part has a cotangent
 void pull_back_energy(const Scene& scene, const Inputs& inputs, std::span<const Loss> losses);
+
+/// How these parts change along several directions of the inputs; the outputs are numbers by the names of
+/// the parts.
+///
+/// @throws std::domain_error where surfaces overlap
+void push_forward_energy(const Scene& scene,
+                         const Inputs& inputs,
+                         std::span<const Direction> directions);
 
 /// The unit EF that speeds are stated in: seconds of one numeric factorization of the contact-free
 /// Hessian at the inputs' positions by Eigen's SimplicialLDLT, minimum degree order, no BLAS; the

@@ -1,0 +1,26 @@
+#include "bind/portions.h"
+
+#include <utility>
+
+#include "step/step.h"
+
+namespace diffcloth::bind {
+
+std::vector<Portion> make_portions(std::size_t environments,
+                                   std::size_t count,
+                                   const std::function<bool(std::size_t row)>& is_zero) {
+  std::vector<Portion> portions;
+  for (std::size_t e = 0; e < environments; ++e) {
+    std::vector<std::size_t> rows;
+    for (std::size_t row = e; row < count * environments; row += environments) {
+      if (!is_zero(row)) rows.push_back(row);
+      if (rows.size() < step::kAtOnce) continue;
+      portions.push_back({.environment = e, .rows = std::move(rows)});
+      rows.clear();
+    }
+    if (!rows.empty()) portions.push_back({.environment = e, .rows = std::move(rows)});
+  }
+  return portions;
+}
+
+}  // namespace diffcloth::bind

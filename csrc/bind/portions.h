@@ -1,0 +1,20 @@
+#pragma once
+
+#include <cstddef>
+#include <functional>
+#include <vector>
+
+namespace diffcloth::bind {
+
+/// Losses, or directions, of an environment that the core takes together.
+struct Portion {
+  std::size_t environment;
+  std::vector<std::size_t> rows;  ///< loss or direction * environments + environment
+};
+
+/// All rows but those that are zero, environment by environment.
+std::vector<Portion> make_portions(std::size_t environments,
+                                   std::size_t count,
+                                   const std::function<bool(std::size_t row)>& is_zero);
+
+}  // namespace diffcloth::bind
