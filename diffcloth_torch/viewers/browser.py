@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.viewers.drawing import Drawing
@@ -67,6 +68,7 @@ class Browser:
         color: str = "plain",
         arrows: Sequence[str] = (),
         file: Path | None = None,
+        live: bool = False,
     ) -> None:
         """Check that pages can be made; the server starts with the first state.
 
@@ -80,6 +82,8 @@ class Browser:
             color: What colors the cloths at first, one of `LAYERS`.
             arrows: Which of `VECTORS` are shown at first.
             file: A page that is written at the end.
+            live: As a context manager, whether the server runs from the first state on, and at the
+                end until the user presses Enter.
 
         Raises:
             InvalidInput: If a package is missing, or an argument is not accepted.
@@ -93,7 +97,7 @@ class Browser:
         self._host, self._port = host, port
         self._shown = Shown(scene, paints)
         self._goals, self._camera, self._file = tuple(goals), camera, file
-        self._color, self._arrow_names = color, tuple(arrows)
+        self._color, self._arrow_names, self._live = color, tuple(arrows), live
         self.motion = Motion(self._shown)
         self._lock = threading.RLock()  # of what the page shows: a user may move a slider meanwhile
         self._server: Any = None
@@ -154,7 +158,9 @@ class Browser:
         )
 
     def __enter__(self) -> Browser:
-        """Start the server: the page shows states from the first on."""
+        """Start the server where the viewer is live."""
+        if self._live:
+            print(f"The page is at {self.url}", file=sys.stderr)
         return self
 
     def __exit__(
@@ -163,9 +169,13 @@ class Browser:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Write the file; the page stays."""
-        if self._file is not None and self.motion:
-            self.save(self._file)
+        """Write the file, also after a failed step; a live page stays until the user ends it."""
+        if self.motion and (kind is None or issubclass(kind, SimulationError)):
+            if self._file is not None:
+                self.save(self._file)
+            if self._live:
+                input(f"The page at {self.url} stays until you press Enter")
+        self.close()
 
     def _page(self, speed: float) -> str:
         if not self.motion:
@@ -174,7 +184,8 @@ class Browser:
         server = self._start("127.0.0.1")
         try:
             drawing = Drawing(server.scene, self._shown, self.motion, self._goals)
-            drawing.draw(0, self._color, self._arrow_names)
+            drawing.draw(0, "plain", ())
+            drawing.prepare(self._color)
             drawing.aim(server, self._camera)
             recorder = server.get_scene_serializer()
             times = [moment.time for moment in self.motion]

@@ -18,7 +18,7 @@ from diffcloth_torch.viewers.shown import Bounds, Shown
 
 __all__ = ["Drawing"]
 
-_GRADIENT_COLOR = "#3b4cc0"
+_ARROW_COLORS = {"forces": FORCE_COLOR, "gradient": "#3b4cc0"}
 _LONGEST_ARROW = 0.2  # fraction of the scene's size, for the largest vector
 _SHORTEST_ARROW = 0.01  # of the longest; shorter arrows are left out
 _SHAFT = 0.0025  # fraction of the scene's size: radius of an arrow
@@ -52,7 +52,7 @@ class Drawing:
         self._bodies: list[list[Any]] = []
         self._colored: dict[tuple[str, int], list[Any]] = {}
         self._tops: dict[str, float] = {}
-        self._arrows: list[Any] = []
+        self._arrows: dict[tuple[int, str], Any] = {}
         self.bounds: Bounds = (np.zeros(3), np.ones(3))
 
     def aim(self, server: Any, camera: Camera) -> None:
@@ -152,7 +152,7 @@ class Drawing:
 
     def _add_floor(self, count: int) -> None:
         low, high = self.bounds
-        size = float(np.linalg.norm(high - low))
+        size = self._size
         cell = 10.0 ** math.floor(math.log10(size))
         width = 2 * size * (1 + self._columns(count))
         center = (low + high) / 2
@@ -166,62 +166,85 @@ class Drawing:
             position=(center[0], center[1], self._shown.ground(self.bounds)),
         )
 
+    def prepare(self, layer: str) -> None:
+        """Add what colors the cloths in all moments, hidden.
+
+        A page that plays by itself begins again with the nodes as they were at first.
+        """
+        for k in range(len(self._motion) if layer != "plain" else 0):
+            self._add_colored(k, layer, visible=False)
+
     def _show_colored(self, k: int, layer: str) -> None:
-        if layer != "plain" and self._tops.get(layer) != (top := self._motion.top(layer)):
-            self._tops[layer] = top
-            self._forget_colors()
-        for (other, j), handles in self._colored.items():
+        if layer != "plain":
+            top = self._motion.top(layer)
+            if self._tops.setdefault(layer, top) != top:  # later moments have larger numbers
+                self._tops[layer] = top
+                for handle in itertools.chain.from_iterable(self._colored.values()):
+                    handle.remove()
+                self._colored.clear()
+            if (layer, k) not in self._colored:
+                self._add_colored(k, layer, visible=True)
+        for key, handles in self._colored.items():
             for handle in handles:
-                handle.visible = (other, j) == (layer, k)
-        if layer == "plain" or (layer, k) in self._colored:
-            return
+                handle.visible = key == (layer, k)
+
+    def _add_colored(self, k: int, layer: str, *, visible: bool) -> None:
         painted = colors(self._motion.values(layer, k), self._motion.top(layer))
         handles = []
         for e, positions in enumerate(self._rounded(self._motion[k].positions)):
             for c, name in enumerate(self._shown.scene.cloth_names):
                 rows = slice(self._shown.cloth_starts[c], self._shown.cloth_starts[c + 1])
                 mesh = _colored_mesh(positions[rows], self._shown.cloth_faces[c], painted[e, rows])
-                handles.append(self._api.add_glb(f"{self._root(e)}/{name}/{layer}_{k}", mesh))
+                node = f"{self._root(e)}/{name}/{layer}_{k}"
+                handles.append(self._api.add_glb(node, mesh, visible=visible))
         self._colored[layer, k] = handles
 
-    def _forget_colors(self) -> None:
-        """Remove what has been colored before later moments had larger numbers."""
-        for handle in itertools.chain.from_iterable(self._colored.values()):
-            handle.remove()
-        self._colored.clear()
-
     def _show_arrows(self, k: int, vectors: Sequence[str]) -> None:
-        for handle in self._arrows:
-            handle.remove()
-        self._arrows = []
-        moment, low, high = self._motion[k], *self.bounds
-        size = float(np.linalg.norm(high - low))
+        moment = self._motion[k]
         for e in range(len(moment.positions)):
             ends = np.concatenate([moment.positions[e], *self._shown.placed(moment.frames[e])])
-            for what, color in (("forces", FORCE_COLOR), ("gradient", _GRADIENT_COLOR)):
-                if what not in vectors or (arrows := moment.vectors(what)) is None:
-                    continue
-                longest = self._motion.longest(what)
-                far = np.linalg.norm(arrows[e], axis=1) > _SHORTEST_ARROW * longest
-                if not far.any():
-                    continue
-                scaled = arrows[e][far] * (_LONGEST_ARROW * size / longest)
-                points = ends[: len(far)][far]
-                # A force ends where it acts; a gradient begins where it is taken.
-                start = points - scaled if what == "forces" else points
-                arrow = self._api.add_arrows(
-                    f"{self._root(e)}/{what}",
-                    np.stack([start, start + scaled], axis=1),
-                    _rgb(color),
-                    shaft_radius=_SHAFT * size,
-                    head_radius=2.5 * _SHAFT * size,
-                    head_length=5 * _SHAFT * size,
-                )
-                self._arrows.append(arrow)
+            for what in _ARROW_COLORS:
+                found = moment.vectors(what) if what in vectors else None
+                none = np.zeros((0, 2, 3))
+                points = none if found is None else self._arrow_points(what, ends, found[e])
+                if len(points) or (e, what) in self._arrows:
+                    self._set_arrows(e, what, points)
+
+    def _arrow_points(self, what: str, ends: FloatArray, vectors: FloatArray) -> FloatArray:
+        """Start and end of the arrows that are long enough to be seen, [n, 2, 3]."""
+        longest = self._motion.longest(what)
+        seen = np.linalg.norm(vectors, axis=1) > _SHORTEST_ARROW * longest
+        if not seen.any():
+            return np.zeros((0, 2, 3))
+        scaled = vectors[seen] * (_LONGEST_ARROW * self._size / longest)
+        points = ends[: len(seen)][seen]
+        # A force ends where it acts; a gradient begins where it is taken.
+        start = points - scaled if what == "forces" else points
+        return np.stack([start, start + scaled], axis=1)
+
+    def _set_arrows(self, e: int, what: str, points: FloatArray) -> None:
+        known = self._arrows.get((e, what))
+        if known is not None:
+            if len(points):
+                known.points = points.astype(np.float32)
+            known.visible = bool(len(points))
+            return
+        self._arrows[e, what] = self._api.add_arrows(
+            f"{self._root(e)}/{what}",
+            points,
+            _rgb(_ARROW_COLORS[what]),
+            shaft_radius=_SHAFT * self._size,
+            head_radius=2.5 * _SHAFT * self._size,
+            head_length=5 * _SHAFT * self._size,
+        )
+
+    @property
+    def _size(self) -> float:
+        low, high = self.bounds
+        return float(np.linalg.norm(high - low))
 
     def _rounded(self, positions: FloatArray) -> NDArray[np.float32]:
-        low, high = self.bounds
-        step = 2.0 ** math.floor(math.log2(_RESOLUTION * float(np.linalg.norm(high - low))))
+        step = 2.0 ** math.floor(math.log2(_RESOLUTION * self._size))
         return (np.round(positions / step) * step).astype(np.float32)
 
     def _root(self, e: int) -> str:
