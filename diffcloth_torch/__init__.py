@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from diffcloth_torch.tasks.task import LoadedConfig
     from diffcloth_torch.viewers.look import Camera
     from diffcloth_torch.viewers.render import render
+    from diffcloth_torch.viewers.show import show
 
 __all__ = [
     "AddedMassWarning",
@@ -90,6 +91,7 @@ __all__ = [
     "load_config",
     "render",
     "robots",
+    "show",
     "stack",
     "where",
 ]
@@ -123,6 +125,7 @@ _HOMES = {
     "sim.trajectory": ("Trajectory",),
     "viewers.look": ("Camera",),
     "viewers.render": ("render",),
+    "viewers.show": ("show",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

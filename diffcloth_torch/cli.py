@@ -58,7 +58,14 @@ def _end(error: Exception, code: int, debug: bool) -> None:
 
 
 def _options(command: C) -> C:
-    """Add the options of all commands that simulate."""
+    """Add the options of all commands that simulate; what they choose becomes assignments."""
+
+    @wraps(command)
+    def with_viewers(assignments: tuple[str, ...], viewers: tuple[str, ...], **others: Any) -> Any:
+        chosen = (f"output.viewers=[{','.join(viewers)}]",) if viewers else ()
+        return command(assignments=(*assignments, *chosen), **others)
+
+    added: Any = with_viewers
     for option in (
         click.option(
             "--overwrite", is_flag=True, help="Replace the results of an earlier run in the folder."
@@ -80,9 +87,16 @@ def _options(command: C) -> C:
             multiple=True,
             help="Change a value of the configuration: simulation.steps=50. Repeatable.",
         ),
+        click.option(
+            "--viewer",
+            "viewers",
+            type=click.Choice(("record", "meshes", "web")),
+            multiple=True,
+            help="Show the motion in this viewer, in place of those of CONFIG. Repeatable.",
+        ),
     ):
-        command = option(command)
-    return command
+        added = option(added)
+    return added  # type: ignore[no-any-return]
 
 
 @main.command()

@@ -46,7 +46,7 @@ _PACKAGES = ("torch", "numpy", "trimesh", "matplotlib", "pyvista", "imageio", "i
 _METRICS, _RESUME = "metrics.json", "resume.pt"
 _RESULTS = (
     *(_METRICS, _RESUME, "actions.pt", "actions.npz", "loss.png"),
-    *("animation.mp4", "animation.gif", "animation.png"),
+    *("animation.mp4", "animation.gif", "animation.png", "animation.html"),
     *("metrics.part", "resume.part"),
 )
 _FOLDERS = ("meshes", "animation_frames")

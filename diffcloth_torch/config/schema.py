@@ -526,7 +526,7 @@ class PictureSection(Section):
 class OutputSection(Section):
     """Output of a run: a frame for each of the `viewers` after `every` so many steps."""
 
-    viewers: list[Literal["record", "meshes"]] = ["record", "meshes"]
+    viewers: list[Literal["record", "meshes", "web"]] = ["record", "meshes"]
     every: Annotated[int, Ge(1)] = 1
     pictures: PictureSection = PictureSection()
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from diffcloth_torch.config.schema import RunConfig
 from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.viewers.browser import Browser
 from diffcloth_torch.viewers.look import Camera, Goal, Paint, Pictures
 from diffcloth_torch.viewers.meshes import MeshSequence
 from diffcloth_torch.viewers.record import Record
@@ -32,17 +34,20 @@ def open_viewers(
     return Viewers(made, output.every)
 
 
-def _record(config: RunConfig, scene: Scene, folder: Path, goals: Sequence[Goal]) -> Viewer:
+def _paints(config: RunConfig) -> dict[str, Paint]:
     paints = {cloth.name: Paint(cloth.color, cloth.back_color) for cloth in config.scene.cloths}
     paints |= {body.name: Paint(body.color) for body in config.scene.bodies}
-    paints |= {robot.name: Paint(robot.color) for robot in config.scene.robots}
+    return paints | {robot.name: Paint(robot.color) for robot in config.scene.robots}
+
+
+def _record(config: RunConfig, scene: Scene, folder: Path, goals: Sequence[Goal]) -> Viewer:
     options = config.output.pictures.model_dump()
     return Record(
         folder,
         scene,
         fps=1 / (config.simulation.dt * config.output.every),
         pictures=Pictures(**{**options, "camera": Camera(**options["camera"])}),
-        paints=paints,
+        paints=_paints(config),
         goals=goals,
     )
 
@@ -51,8 +56,22 @@ def _meshes(_config: RunConfig, _scene: Scene, folder: Path, _goals: Sequence[Go
     return MeshSequence(folder / "meshes")
 
 
+def _web(config: RunConfig, scene: Scene, folder: Path, goals: Sequence[Goal]) -> Viewer:
+    pictures = config.output.pictures
+    return Browser(
+        scene,
+        paints=_paints(config),
+        goals=goals,
+        camera=Camera(**pictures.model_dump()["camera"]),
+        arrows=["forces"] if pictures.contact_forces else [],
+        file=folder / "animation.html",
+        live=sys.stdin.isatty() and sys.stderr.isatty(),
+    )
+
+
 VIEWERS: tuple[tuple[str, Callable[[RunConfig, Scene, Path, Sequence[Goal]], Viewer]], ...] = (
     ("record", _record),
     ("meshes", _meshes),
+    ("web", _web),
 )
 """Name in a configuration, and what makes the viewer; shown in this order."""

@@ -4,30 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib.util import find_spec
-from itertools import chain
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from tqdm import tqdm
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput, SimulationError
-from diffcloth_torch.geometry.poses import transform
-from diffcloth_torch.model.assembly import assemble
-from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.state import State
-from diffcloth_torch.sim.surfaces import Surfaces, place
 from diffcloth_torch.viewers.labels import Entry, legend_below, overview, write_time
 from diffcloth_torch.viewers.look import FORCE_COLOR, GOAL_COLOR, Goal, Paint, Pictures
-from diffcloth_torch.viewers.stage import Bounds, Skin, Stage, require_pyvista
+from diffcloth_torch.viewers.shown import Bounds, Shown
+from diffcloth_torch.viewers.stage import Skin, Stage, require_pyvista
 
 __all__ = ["Record"]
 
@@ -35,19 +28,8 @@ Image = NDArray[np.uint8]
 
 _DEFAULT_PICTURES = Pictures()
 
-_GAP_BELOW = 0.04  # fraction of the scene's size, between its lowest point and our floor
 _LONGEST_ARROW = 0.2  # fraction of the scene's size, for the largest force
 _GIF_STEP = 2  # a GIF keeps one of this many pixels along each axis
-
-
-@dataclass(frozen=True, eq=False)
-class _Rigid:
-    """A surface of a body or a link: vertices [v, 3] in its frame, faces [f, 3]."""
-
-    owner: str
-    vertices: Tensor
-    faces: Tensor
-    shown: bool
 
 
 class Record:
@@ -91,17 +73,7 @@ class Record:
         _require_writer(self._options.video)
         self._folder, self._scene, self._name = folder, scene, name
         self._goals = goals
-        self._surfaces = Surfaces.of(scene, assemble(scene))
-        self._rigid = _rigid_surfaces(scene, self._surfaces)
-        if not scene.cloths and not any(surface.shown for surface in self._rigid):
-            raise InvalidInput(
-                "pictures: the scene must have a surface: its robots have no collision shapes, and "
-                "a level plane is only the floor of what stands on it"
-            )
-        shown = dict.fromkeys(surface.owner for surface in self._rigid if surface.shown)
-        self._paints = {
-            name: paints.get(name, Paint()).for_cloth(i) for i, name in enumerate(scene.cloth_names)
-        } | {name: paints.get(name, Paint()).for_body(i) for i, name in enumerate(shown)}
+        self._shown = Shown(scene, paints)
         self._fps = fps if self._options.fps is None else self._options.fps
         self._positions: list[NDArray[np.float64]] = []
         self._frames: list[NDArray[np.float64]] = []
@@ -111,10 +83,10 @@ class Record:
     def show(self, state: State) -> None:
         """Keep one state."""
         self._positions.append(state.positions.detach().numpy().copy())
-        self._frames.append(self._shown_frames(state))
+        self._frames.append(self._shown.frames(state))
         self._times.append(float(state.time))
         if self._options.contact_forces:
-            self._forces.append(self._shown_forces(state))
+            self._forces.append(self._shown.forces(state))
 
     def __enter__(self) -> Record:
         """Return the recorder; nothing is left to open."""
@@ -135,14 +107,17 @@ class Record:
         moments = {round(i) for i in np.linspace(0, count - 1, self._options.sheet)}
         all_are_kept = self._options.frames or self._options.video != "none"
         step = float(np.diff(self._times).min(initial=1.0))
-        low, high = self._bounds()
+        bounds = self._shown.bounds(self._positions, self._frames, self._goals)
+        low, high = bounds
         arrows, entries = self._arrows(float(np.linalg.norm(high - low)))
         labels = self._options.labels
         sheet = []
-        with self._stage(low, high) as stage, self._writer() as writer:
+        with self._stage(bounds) as stage, self._writer() as writer:
             drawn = range(count) if all_are_kept else sorted(moments)
             for k in tqdm(drawn, desc="draw", unit="frame", disable=None):
-                image = stage.draw(self._positions[k], self._placed(self._frames[k]), arrows[k])
+                image = stage.draw(
+                    self._positions[k], self._shown.placed(self._frames[k]), arrows[k]
+                )
                 if labels:
                     image = write_time(image, self._times[k], step)
                 if k in moments:
@@ -159,7 +134,7 @@ class Record:
     def _arrows(self, size: float) -> tuple[Sequence[FloatArray | None], list[Entry]]:
         """Arrows [m] of each state if forces are shown, and all lines of the legend."""
         entries = []
-        for name, paint in self._paints.items():
+        for name, paint in self._shown.paints.items():
             colors = [color for color in (paint.color, paint.back_color) if color is not None]
             sides = " (front, back)" if len(colors) > 1 else ""
             entries.append(Entry(name + sides, tuple(colors)))
@@ -173,72 +148,20 @@ class Record:
         scale = _LONGEST_ARROW * size / largest if largest > 0 else 0.0
         return [scale * forces for forces in self._forces], entries
 
-    def _stage(self, low: FloatArray, high: FloatArray) -> Stage:
-        scene = self._scene
+    def _stage(self, bounds: Bounds) -> Stage:
+        shown, ground = self._shown, self._options.ground
+        cloths = zip(shown.cloth_faces, shown.cloth_starts, self._scene.cloth_names, strict=False)
         stage = Stage(
-            [
-                Skin(cloth.faces + start, self._paints[name])
-                for cloth, name, start in zip(
-                    scene.cloths, scene.cloth_names, self._cloth_starts(), strict=True
-                )
-            ],
-            [
-                Skin(surface.faces.numpy(), self._paints[surface.owner])
-                for surface in self._rigid
-                if surface.shown
-            ],
+            [Skin(faces + start, shown.paints[name]) for faces, start, name in cloths],
+            [Skin(r.faces.numpy(), shown.paints[r.owner]) for r in shown.shown_rigid],
             size=self._options.size,
-            bounds=(low, high),
-            ground=self._ground(low, high),
+            bounds=bounds,
+            ground=shown.ground(bounds) if ground == "auto" else ground,
             camera=self._options.camera,
         )
         for goal in self._goals:
             stage.add_goal(goal)
         return stage
-
-    def _cloth_starts(self) -> list[int]:
-        counts = [len(cloth.vertices) for cloth in self._scene.cloths]
-        starts: list[int] = np.cumsum([0, *counts])[:-1].tolist()
-        return starts
-
-    def _shown_frames(self, state: State) -> FloatArray:
-        """Frames [n, 4, 4] of the shown bodies and links."""
-        frames = self._surfaces.surface_frames(vars(state.detach()))
-        shown: FloatArray = frames.numpy()[[surface.shown for surface in self._rigid]]
-        return shown
-
-    def _placed(self, frames: FloatArray) -> list[FloatArray]:
-        """Vertices [v, 3] of the shown bodies and links in the world."""
-        shown = (surface for surface in self._rigid if surface.shown)
-        return [
-            place(surface.vertices, torch.from_numpy(frame)).numpy()
-            for surface, frame in zip(shown, frames, strict=True)
-        ]
-
-    def _shown_forces(self, state: State) -> FloatArray:
-        """Contact forces on the vertices of the shown surfaces [N], shape [v, 3]."""
-        counts = [len(surface.vertices) for surface in self._rigid]
-        shown = np.repeat([surface.shown for surface in self._rigid], counts).astype(bool)
-        forces: FloatArray = state.body_forces.detach().numpy()[shown]
-        return forces
-
-    def _bounds(self) -> Bounds:
-        lows, highs = [], []
-        placed = (self._placed(frames) for frames in np.unique(self._frames, axis=0))
-        goals = [goal.vertices for goal in self._goals]
-        for points in chain(self._positions, goals, chain.from_iterable(placed)):
-            if len(points):
-                lows.append(points.min(axis=0))
-                highs.append(points.max(axis=0))
-        return np.min(lows, axis=0), np.max(highs, axis=0)
-
-    def _ground(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> float | None:
-        if self._options.ground != "auto":
-            return self._options.ground
-        floors = [body for body in self._scene.bodies if _is_floor(body)]
-        if floors:
-            return max(float(_placed_body(body)[0, 2]) for body in floors)
-        return float(low[2] - _GAP_BELOW * np.linalg.norm(high - low))
 
     @contextmanager
     def _writer(self) -> Iterator[Any]:
@@ -287,28 +210,6 @@ def _require_writer(video: str) -> None:
                 "'diffcloth-torch[viewer]'  or change it with  --set output.pictures.video=gif  "
                 "or  --set output.pictures.video=none"
             )
-
-
-def _rigid_surfaces(scene: Scene, surfaces: Surfaces) -> list[_Rigid]:
-    """Surfaces of bodies, then of links with a shape, in the order of `State.body_forces`.
-
-    A level plane is not shown: the floor of the stage replaces it.
-    """
-    floors = [n for n, b in zip(scene.body_names, scene.bodies, strict=True) if _is_floor(b)]
-    return [
-        _Rigid(name.partition("/")[0], vertices, faces, name not in floors)
-        for name, (vertices, faces) in surfaces.rigid_meshes().items()
-    ]
-
-
-def _placed_body(body: RigidBody) -> NDArray[np.float64]:
-    return transform(body.vertices, body.pose)
-
-
-def _is_floor(body: RigidBody) -> bool:
-    """Whether a body is a static level plane, as `RigidBody.plane` makes them."""
-    is_plane = len(body.vertices) == 4 and len(body.faces) == 2
-    return is_plane and body.motion == "static" and not np.ptp(_placed_body(body)[:, 2])
 
 
 def _write_image(path: Path, image: Image) -> None:

@@ -14,7 +14,7 @@ from diffcloth_torch.sim.state import State
 from diffcloth_torch.viewers.look import Camera, Pictures
 from diffcloth_torch.viewers.record import Record
 
-__all__ = ["render"]
+__all__ = ["check_states", "render"]
 
 _ONE_STATE_FPS = 25.0
 
@@ -60,7 +60,7 @@ def render(
     if not path.parent.is_dir():
         raise InvalidInput(f"render: the folder of `path` must exist, got {str(path)!r}")
     shown = [states] if isinstance(states, State) else list(states)
-    _check_states(scene, shown)
+    check_states("render", scene, shown)
     if len(size) != 2 or any(n % 2 or not 64 <= n <= 4096 for n in size):
         raise InvalidInput(f"render: `size` must be two even numbers in 64 .. 4096, got {size}")
     if moments < 1:
@@ -89,21 +89,44 @@ def render(
             record.show(state)
 
 
-def _check_states(scene: Scene, states: Sequence[State]) -> None:
+def check_states(
+    owner: str, scene: Scene, states: Sequence[State], *, batches: bool = False
+) -> None:
+    """Refuse states that are not of a scene.
+
+    Args:
+        owner: What the messages begin with.
+        scene: The scene.
+        states: What was given.
+        batches: Whether states may have a batch axis, all of them the same.
+
+    Raises:
+        InvalidInput: If there is no state, or one is of another shape.
+        TypeError: If something is no state.
+    """
     if not states:
-        raise InvalidInput("render: `states` must hold at least one state")
+        raise InvalidInput(f"{owner}: `states` must hold at least one state")
     vertices = sum(len(cloth.vertices) for cloth in scene.cloths)
     for i, state in enumerate(states):
         if not isinstance(state, State):
-            raise TypeError(f"render: `states` must be states, got {type(state).__name__} at [{i}]")
-        if state.batch_size is not None:
-            raise InvalidInput(f"render: states[{i}] is a batch; take one of it by its index")
-        shapes = {"positions": (vertices, 3), "body_poses": (len(scene.bodies), 7)}
+            raise TypeError(
+                f"{owner}: `states` must be states, got {type(state).__name__} at [{i}]"
+            )
+        size = state.batch_size
+        if size is not None and not batches:
+            raise InvalidInput(f"{owner}: states[{i}] is a batch; take one of it by its index")
+        if size != states[0].batch_size:
+            raise InvalidInput(
+                f"{owner}: states[{i}] must be a batch of {states[0].batch_size} as states[0] is, "
+                f"got {size}"
+            )
+        lead = () if size is None else (size,)
+        shapes = {"positions": (*lead, vertices, 3), "body_poses": (*lead, len(scene.bodies), 7)}
         for name, shape in shapes.items():
             got = tuple(getattr(state, name).shape)
             if got != shape:
                 raise InvalidInput(
-                    f"render: states[{i}] must be of this scene, whose `{name}` have shape "
+                    f"{owner}: states[{i}] must be of this scene, whose `{name}` have shape "
                     f"{list(shape)}, got {list(got)}"
                 )
 

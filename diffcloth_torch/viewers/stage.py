@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.viewers.floor import BACKGROUND, Floor, Shadow
 from diffcloth_torch.viewers.look import FORCE_COLOR, GOAL_COLOR, Camera, Goal, Paint
+from diffcloth_torch.viewers.shown import Bounds
 
-__all__ = ["Bounds", "Skin", "Stage", "require_pyvista"]
+__all__ = ["Skin", "Stage", "require_pyvista"]
 
 Points = NDArray[np.float64]
 Triangles = NDArray[np.integer[Any]]
 Image = NDArray[np.uint8]
-Bounds = tuple[Points, Points]
-"""Lowest and highest coordinates [m], each of shape [3]."""
 
 # Directions to the lights, for a camera that looks along +y. They turn with the camera, so that
 # visible sides are lit. The key light also casts the shadow.

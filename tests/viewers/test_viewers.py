@@ -22,6 +22,7 @@ from diffcloth_torch.viewers.look import FORCE_COLOR, GOAL_COLOR, Camera, Goal, 
 from diffcloth_torch.viewers.meshes import MeshSequence
 from diffcloth_torch.viewers.record import Record
 from diffcloth_torch.viewers.several import Viewers
+from diffcloth_torch.viewers.shown import Shown
 from diffcloth_torch.viewers.viewer import NullViewer
 
 CONFIG = """
@@ -122,10 +123,9 @@ def test_a_scene_is_drawn_without_a_configuration(tmp_path):
         pytest.param(dc.RigidBody.box(2.0, pose=[0, 0, -2, 1, 0, 0, 0]), False, id="box"),
     ],
 )
-def test_the_drawn_floor_stands_for_a_static_level_plane(tmp_path, body, floor):
-    pytest.importorskip("pyvista")
-    record = Record(tmp_path, dc.Scene([dc.Cloth.grid(3, 3)], [body]), fps=10)
-    assert [surface.shown for surface in record._rigid] == [not floor]
+def test_the_drawn_floor_stands_for_a_static_level_plane(body, floor):
+    shown = Shown(dc.Scene([dc.Cloth.grid(3, 3)], [body]), {})
+    assert [surface.shown for surface in shown.rigid] == [not floor]
 
 
 def test_a_mesh_sequence_has_one_file_per_state(make_task, tmp_path):

@@ -1,0 +1,123 @@
+"""The states that a viewer has been shown, as the arrays that it draws."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.viewers.layers import strain
+from diffcloth_torch.viewers.shown import Shown
+
+__all__ = ["LAYERS", "Moment", "Motion"]
+
+LAYERS = ("plain", "strain", "contact")
+"""What colors the cloths: their own colors, their strain, or the contact forces on them [N]."""
+
+_COLORED = 0.99  # of the numbers: a few peaks would leave one color for all else
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """One state of E environments.
+
+    Attributes:
+        time: Time of the first of them [s].
+        positions: Cloth vertices [m], [E, N, 3].
+        frames: Frames of the bodies and links that are shown, [E, n, 4, 4].
+        forces: Contact forces on the cloths' vertices [N], [E, N, 3].
+        body_forces: The same on the vertices of these bodies and links, [E, v, 3].
+        gradient: Gradient of a loss by the cloths' vertices, [E, N, 3]; None if not given.
+    """
+
+    time: float
+    positions: FloatArray
+    frames: FloatArray
+    forces: FloatArray
+    body_forces: FloatArray
+    gradient: FloatArray | None
+
+    def vectors(self, what: str) -> FloatArray | None:
+        """Vectors of "forces" at all vertices, or of "gradient" at those of cloths, [E, v, 3]."""
+        if what == "gradient":
+            return self.gradient
+        return np.concatenate([self.forces, self.body_forces], axis=1)
+
+
+class Motion(list[Moment]):
+    """Moments in the order of time."""
+
+    def __init__(self, shown: Shown) -> None:
+        """Begin without moments.
+
+        Args:
+            shown: What is shown of the scene.
+        """
+        super().__init__()
+        self._shown = shown
+        self._values: defaultdict[str, list[FloatArray]] = defaultdict(list)  # of a layer
+        self._tops: dict[str, tuple[int, float]] = {}  # of a layer: number of moments, and the top
+        self._lengths: defaultdict[str, list[float]] = defaultdict(list)  # of kinds of vectors
+
+    def add(self, state: State, gradient: Tensor | None = None) -> None:
+        """Keep a state, and the gradient of a loss by its positions, of the same shape.
+
+        Raises:
+            InvalidInput: If the gradient has another shape.
+        """
+        if gradient is not None and gradient.shape != state.positions.shape:
+            raise InvalidInput(
+                f"show: `gradients`[{len(self)}] must have shape {list(state.positions.shape)}, "
+                f"like the positions of its state, got {list(gradient.shape)}"
+            )
+        batched = state.batch_size is not None
+        shown = self._shown
+
+        def environments(array: FloatArray) -> FloatArray:
+            # A copy: what a simulation does with its tensors later must not change what was shown.
+            return np.array(array if batched else array[None])
+
+        self.append(
+            Moment(
+                time=float(state.time.reshape(-1)[0]),
+                positions=environments(state.positions.detach().numpy()),
+                frames=environments(shown.frames(state)),
+                forces=environments(state.contact_forces.detach().numpy()),
+                body_forces=environments(shown.forces(state)),
+                gradient=None if gradient is None else environments(gradient.detach().numpy()),
+            )
+        )
+
+    def values(self, layer: str, k: int) -> FloatArray:
+        """Numbers that color the cloths in moment k, [E, N]."""
+        known = self._values[layer]
+        for moment in self[len(known) : k + 1]:
+            if layer == "contact":
+                known.append(np.linalg.norm(moment.forces, axis=-1))
+            else:
+                cloths = self._shown.scene.cloths
+                known.append(np.stack([strain(cloths, x) for x in moment.positions]))
+        return known[k]
+
+    def top(self, layer: str) -> float:
+        """The number at the top of the color map: all but the largest percent that are not zero."""
+        if self._tops.get(layer, (0, 0.0))[0] != len(self):
+            found = np.concatenate([self.values(layer, k).ravel() for k in range(len(self))])
+            found = found[found > 0]
+            top = float(np.quantile(found, _COLORED)) if found.size else 0.0
+            self._tops[layer] = (len(self), top)
+        return self._tops[layer][1]
+
+    def longest(self, what: str) -> float:
+        """The length of the longest of the vectors in the whole motion; 0 if there are none."""
+        lengths = self._lengths[what]
+        for moment in self[len(lengths) :]:
+            vectors = moment.vectors(what)
+            norms = np.zeros(1) if vectors is None else np.linalg.norm(vectors, axis=-1)
+            lengths.append(float(norms.max(initial=0.0)))
+        return max(lengths)

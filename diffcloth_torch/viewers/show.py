@@ -1,0 +1,94 @@
+"""States in the browser, in one call and without a configuration."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from torch import Tensor
+
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.viewers.browser import Browser
+from diffcloth_torch.viewers.look import Camera, Goal
+from diffcloth_torch.viewers.render import check_states
+
+__all__ = ["show"]
+
+
+def show(
+    scene: Scene,
+    states: State | Sequence[State],
+    path: str | Path | None = None,
+    *,
+    color: str = "plain",
+    arrows: Sequence[str] = (),
+    gradients: Sequence[Tensor] | None = None,
+    goals: Sequence[Goal] = (),
+    camera: Camera | None = None,
+    port: int = 8080,
+) -> Browser:
+    """Show states in the browser: play, scrub, and look at them from all sides.
+
+    >>> dc.show(scene, states, "motion.html")          # a page that needs no server
+    >>> dc.show(scene, states, color="strain").wait()  # prints its address, and stays
+
+    In a notebook the page appears below the cell that returns it.
+
+    Args:
+        scene: Scene of the states.
+        states: States in the order of time; of a batch, environments stand side by side.
+        path: File `.html` to write instead of a server; an existing file is replaced.
+        color: What colors the cloths: "plain", their own colors; "strain", the largest |s - 1| of
+            the singular values of dx/dX; or "contact", the contact forces on them [N].
+        arrows: Any of "forces", the contact forces on everything, and "gradient".
+        gradients: For "gradient": of each state the gradient of a loss by its positions.
+        goals: Shapes to show beside the scene.
+        camera: The camera at first; None looks from the front, slightly from above.
+        port: Port of the server on this machine, or the next one that is free.
+
+    Returns:
+        The page: `url`, `wait()`, `save(path)`, `close()`.
+
+    Raises:
+        InvalidInput: If an argument is not accepted, or if a package is missing; the message says
+            how to install it.
+        TypeError: If `states` contains other objects than states.
+    """
+    shown = [states] if isinstance(states, State) else list(states)
+    check_states("show", scene, shown, batches=True)
+    if gradients is not None and len(gradients) != len(shown):
+        raise InvalidInput(
+            f"show: `gradients` must be one for each of {len(shown)} states, got {len(gradients)}"
+        )
+    if "gradient" in arrows and gradients is None:
+        raise InvalidInput("show: `arrows` has 'gradient', which needs `gradients`")
+    file = None if path is None else Path(path)
+    if file is not None and (file.suffix != ".html" or not file.parent.is_dir()):
+        raise InvalidInput(
+            f"show: `path` must end in .html, in an existing folder, got {str(path)!r}"
+        )
+    browser = Browser(
+        scene,
+        port=port,
+        goals=goals,
+        camera=Camera() if camera is None else camera,
+        color=color,
+        arrows=arrows,
+    )
+    for k, state in enumerate(shown):
+        browser.show(state, None if gradients is None else gradients[k])
+    if file is not None:
+        browser.save(file)
+    elif not _is_notebook():
+        print(f"The page is at {browser.url} until this program ends")
+    return browser
+
+
+def _is_notebook() -> bool:
+    """Whether the returned page is shown below a cell."""
+    loaded = sys.modules.get("IPython")  # whoever runs cells has imported it
+    shell = None if loaded is None else loaded.get_ipython()
+    return type(shell).__name__ == "ZMQInteractiveShell"

@@ -1,0 +1,151 @@
+"""What of a scene is shown, and in which colors: cloths, bodies, links with a shape."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry.poses import transform
+from diffcloth_torch.model.assembly import assemble
+from diffcloth_torch.model.rigid_body import RigidBody
+from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.surfaces import Surfaces, place
+from diffcloth_torch.viewers.look import Goal, Paint
+
+__all__ = ["Bounds", "Rigid", "Shown"]
+
+Bounds = tuple[FloatArray, FloatArray]
+"""Lowest and highest coordinates [m], each of shape [3]."""
+
+_GAP_BELOW = 0.04  # fraction of the scene's size, between its lowest point and our floor
+
+
+@dataclass(frozen=True, eq=False)
+class Rigid:
+    """A surface of a body or a link: vertices [v, 3] in its frame, faces [f, 3].
+
+    Attributes:
+        name: Its name: "body" or "robot/link".
+        owner: Name of the body or the robot.
+        vertices: Vertices in its frame [m].
+        faces: Vertex indices.
+        shown: Whether it is drawn; a level plane is not, as the floor replaces it.
+    """
+
+    name: str
+    owner: str
+    vertices: Tensor
+    faces: Tensor
+    shown: bool
+
+
+class Shown:
+    """The surfaces of a scene that are drawn, and where they are in a state.
+
+    Attributes:
+        scene: The scene.
+        rigid: Surfaces of bodies, then of links with a shape, in the order of `State.body_forces`.
+        cloth_faces: Faces of each cloth, as indices into its own vertices, [f, 3].
+        cloth_starts: First row of each cloth among the positions, and the number of all rows.
+        paints: Name of a cloth, of a shown body or robot -> its colors, none of them None.
+    """
+
+    def __init__(self, scene: Scene, paints: Mapping[str, Paint]) -> None:
+        """Find what is shown.
+
+        Args:
+            scene: The scene.
+            paints: Name of a cloth, a body or a robot -> its colors.
+
+        Raises:
+            InvalidInput: If there is nothing to show.
+        """
+        self.scene = scene
+        self._surfaces = Surfaces.of(scene, assemble(scene))
+        floors = [n for n, b in zip(scene.body_names, scene.bodies, strict=True) if _is_floor(b)]
+        self.rigid = [
+            Rigid(name, name.partition("/")[0], vertices, faces, name not in floors)
+            for name, (vertices, faces) in self._surfaces.rigid_meshes().items()
+        ]
+        if not scene.cloths and not any(surface.shown for surface in self.rigid):
+            raise InvalidInput(
+                "pictures: the scene must have a surface: its robots have no collision shapes, and "
+                "a level plane is only the floor of what stands on it"
+            )
+        counts = [len(cloth.vertices) for cloth in scene.cloths]
+        self.cloth_starts: list[int] = np.cumsum([0, *counts]).tolist()
+        self.cloth_faces: list[NDArray[np.integer[Any]]] = [cloth.faces for cloth in scene.cloths]
+        owners = dict.fromkeys(surface.owner for surface in self.rigid if surface.shown)
+        self.paints = {
+            name: paints.get(name, Paint()).for_cloth(i) for i, name in enumerate(scene.cloth_names)
+        } | {name: paints.get(name, Paint()).for_body(i) for i, name in enumerate(owners)}
+
+    @property
+    def shown_rigid(self) -> list[Rigid]:
+        """The surfaces of bodies and links that are drawn."""
+        return [surface for surface in self.rigid if surface.shown]
+
+    def frames(self, state: State) -> FloatArray:
+        """Frames [..., n, 4, 4] of the bodies and links that are drawn."""
+        frames = self._surfaces.surface_frames(vars(state.detach()))
+        shown: FloatArray = frames.numpy()[..., [surface.shown for surface in self.rigid], :, :]
+        return shown
+
+    def placed(self, frames: FloatArray) -> list[FloatArray]:
+        """Vertices [v, 3] in the world of the bodies and links that are drawn."""
+        return [
+            place(surface.vertices, torch.from_numpy(frame)).numpy()
+            for surface, frame in zip(self.shown_rigid, frames, strict=True)
+        ]
+
+    def forces(self, state: State) -> FloatArray:
+        """Contact forces on the vertices of what is drawn of bodies and links [N], [..., v, 3]."""
+        counts = [len(surface.vertices) for surface in self.rigid]
+        shown = np.repeat([surface.shown for surface in self.rigid], counts).astype(bool)
+        forces: FloatArray = state.body_forces.detach().numpy()[..., shown, :]
+        return forces
+
+    def bounds(
+        self, positions: Sequence[FloatArray], frames: Sequence[FloatArray], goals: Sequence[Goal]
+    ) -> Bounds:
+        """Bounds of a whole motion.
+
+        Args:
+            positions: Cloth vertices of each state [m], shape [N, 3].
+            frames: Frames of each state, shape [n, 4, 4].
+            goals: Shapes beside the scene.
+        """
+        placed = (points for f in np.unique(frames, axis=0) for points in self.placed(f))
+        lows, highs = [], []
+        for points in (*positions, *(goal.vertices for goal in goals), *placed):
+            if len(points):
+                lows.append(points.min(axis=0))
+                highs.append(points.max(axis=0))
+        return np.min(lows, axis=0), np.max(highs, axis=0)
+
+    def ground(self, bounds: Bounds) -> float:
+        """Height of the floor [m]: of a static level plane, or else below everything."""
+        floors = [body for body in self.scene.bodies if _is_floor(body)]
+        if floors:
+            return max(float(_placed_body(body)[0, 2]) for body in floors)
+        low, high = bounds
+        return float(low[2] - _GAP_BELOW * np.linalg.norm(high - low))
+
+
+def _placed_body(body: RigidBody) -> NDArray[np.float64]:
+    return transform(body.vertices, body.pose)
+
+
+def _is_floor(body: RigidBody) -> bool:
+    """Whether a body is a static level plane, as `RigidBody.plane` makes them."""
+    is_plane = len(body.vertices) == 4 and len(body.faces) == 2
+    return is_plane and body.motion == "static" and not np.ptp(_placed_body(body)[:, 2])

@@ -1,0 +1,216 @@
+"""Pages of the browser: what they hold, and what a browser shows of them."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import diffcloth_torch as dc
+from diffcloth_torch.commands import run
+from diffcloth_torch.viewers.browser import Browser
+from diffcloth_torch.viewers.layers import colors, strain
+
+pytest.importorskip("viser")
+
+# viser's own, which nobody here can mend.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+
+WIDTH, HEIGHT = 640, 480
+
+
+@pytest.fixture(scope="module")
+def falling():
+    """A sheet that falls past a ball, in two environments of different starts."""
+    scene = dc.Scene(
+        [dc.Cloth.grid(9, 9, size=(0.6, 0.6), pose=[0, 0, 0.35, 1, 0, 0, 0], name="sheet")],
+        [dc.RigidBody.sphere(0.15, name="ball")],
+    )
+    sim = dc.Simulator(scene, 0.02)
+    start = sim.initial_state(batch_size=2)
+    moved = start.positions + torch.tensor([[[0.0, 0, 0]], [[0, 0, 0.1]]])
+    states = sim.rollout(start.replace(positions=moved), steps=12)
+    return scene, [start, *states]
+
+
+def one(states):
+    return [state[0] for state in states]
+
+
+def screenshot(page, file, seconds):
+    """Pixels [height, width, 3] of a page after so many seconds of its own clock."""
+    import imageio.v2 as imageio
+
+    subprocess.run(
+        [
+            CHROMIUM, "--headless=new", "--no-sandbox", "--use-angle=swiftshader",
+            "--enable-unsafe-swiftshader", "--hide-scrollbars",
+            f"--user-data-dir={file.parent}/profile", f"--window-size={WIDTH},{HEIGHT}",
+            f"--virtual-time-budget={1000 * seconds}",
+            f"--screenshot={file}", page,
+        ],
+        check=True, capture_output=True, timeout=120,
+    )  # fmt: skip
+    return np.asarray(imageio.imread(file))[..., :3].astype(int)
+
+
+def is_blue(image):
+    return (image[..., 2] - image[..., 0] > 40) & (image[..., 2] > 120)
+
+
+def test_strain_is_that_of_a_stretched_sheet():
+    cloth = dc.Cloth.grid(5, 7, size=(1.0, 2.0), pose=[0.1, 0.2, 0.3, 0.5, 0.5, 0.5, 0.5])
+    turned = cloth.vertices @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    assert strain([cloth], turned).max() < 1e-12
+    # Stretched by a tenth along one side of the sheet, and squeezed by a fifth along the other.
+    along = cloth.vertices[6] - cloth.vertices[0]
+    along /= np.linalg.norm(along)
+    across = cloth.vertices[-7] - cloth.vertices[0]
+    across /= np.linalg.norm(across)
+    F = np.eye(3) + 0.1 * np.outer(along, along) - 0.2 * np.outer(across, across)
+    np.testing.assert_allclose(strain([cloth, cloth], np.tile(cloth.vertices @ F, (2, 1))), 0.2)
+
+
+def test_colors_go_from_zero_to_the_top():
+    found = colors(np.array([[0.0, 1.0], [2.0, 5.0]]), 2.0)
+    assert found.shape == (2, 2, 4)
+    assert (found[1, 0] == found[1, 1]).all()  # beyond the top it stays
+    assert found[0, 0, :3].sum() < found[0, 1, :3].sum() < found[1, 0, :3].sum()
+    assert (colors(np.zeros(3), 0.0) == found[0, 0]).all()
+
+
+class TestPages:
+    def test_a_page_of_150_frames_of_24_by_24_is_below_3_MB(self, tmp_path):
+        ball = dc.RigidBody.sphere(0.2, pose=[0, 0, -1, 1, 0, 0, 0])
+        scene = dc.Scene([dc.Cloth.grid(24, 24)], [ball])
+        state = dc.Simulator(scene, 0.01).initial_state()
+        generator = torch.Generator().manual_seed(0)
+        moved, states = torch.zeros_like(state.positions), []
+        for k in range(150):  # smooth, but different everywhere
+            moved = moved + 1e-3 * torch.randn(3, generator=generator, dtype=torch.float64)
+            wave = 0.05 * torch.sin(7 * state.positions + 0.1 * k).roll(1, dims=-1)
+            states.append(state.replace(positions=state.positions + moved + wave))
+        for color in ("plain", "strain"):
+            file = tmp_path / f"{color}.html"
+            dc.show(scene, states, file, color=color)
+            assert 0.5e6 < file.stat().st_size < 3e6
+
+    def test_a_notebook_gets_the_page(self, falling):
+        scene, states = falling
+        browser = Browser(scene)
+        browser.show(states[0][0])
+        assert "&lt;!doctype html&gt;" in browser._repr_html_().lower()[:200]
+
+    def test_what_is_shown_later_does_not_change_with_the_tensors(self, falling):
+        scene, states = falling
+        browser = Browser(scene)
+        state = states[0].replace(positions=states[0].positions.clone())
+        browser.show(state)
+        before = browser.motion[0].positions.copy()
+        state.positions.zero_()
+        np.testing.assert_array_equal(browser.motion[0].positions, before)
+
+    @needs_chromium
+    def test_a_page_of_its_own_plays(self, falling, tmp_path):
+        scene, states = falling
+        page = tmp_path / "falling.html"
+        dc.show(scene, one(states), page)
+        early = screenshot(page.as_uri(), tmp_path / "early.png", 3)
+        late = screenshot(page.as_uri(), tmp_path / "late.png", 12)
+        for image in (early, late):
+            assert is_blue(image).sum() > 3000  # the sheet
+        # Without the bar of the page below, which moves in any case.
+        assert (np.abs(early - late)[: HEIGHT // 2] > 60).any(axis=-1).sum() > 1000
+
+    @needs_chromium
+    def test_colors_and_several_environments(self, falling, tmp_path):
+        scene, states = falling
+        page = tmp_path / "strain.html"
+        camera = dc.Camera(azimuth=0, elevation=60)
+        dc.show(scene, states, page, color="strain", arrows=["forces"], camera=camera)
+        image = screenshot(page.as_uri(), tmp_path / "strain.png", 3)
+        purple = (image[..., 0] > image[..., 1] + 20) & (image[..., 2] > image[..., 1] + 40)
+        columns = np.flatnonzero(purple.any(axis=0))
+        assert purple.sum() > 2000
+        assert np.diff(columns).max() > 5  # two sheets, with a gap between them
+
+    @needs_chromium
+    def test_a_server_shows_states_while_they_come(self, falling, tmp_path):
+        scene, states = falling
+        browser = Browser(scene, port=8471)
+        browser.show(states[0][0])
+        try:
+            assert browser.url.startswith("http://127.0.0.1:")
+            for state in one(states[1:]):
+                browser.show(state)
+            image = screenshot(browser.url, tmp_path / "served.png", 5)
+            assert is_blue(image).sum() > 3000
+        finally:
+            browser.close()
+
+
+def test_a_configuration_writes_its_page(tmp_path):
+    config = tmp_path / "sheet.yaml"
+    config.write_text(
+        "task: drape\nsimulation: {dt: 0.01, steps: 3}\n"
+        "scene: {cloths: [{name: sheet, shape: {kind: grid, rows: 4, columns: 4}}]}\n"
+    )
+    run(config, ["output.viewers=[web]"], tmp_path / "out")
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == ["animation.html", "metrics.json"]
+
+
+def test_the_command_line_chooses_viewers(tmp_path):
+    config = tmp_path / "sheet.yaml"
+    config.write_text(
+        "task: drape\nsimulation: {dt: 0.01, steps: 2}\n"
+        "scene: {cloths: [{name: sheet, shape: {kind: grid, rows: 3, columns: 3}}]}\n"
+    )
+    command = [sys.executable, "-m", "diffcloth_torch", "run", config, "--out", tmp_path / "out"]
+    subprocess.run(
+        [*command, "--viewer", "web", "--viewer", "meshes"], check=True, capture_output=True
+    )
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == ["animation.html", "meshes", "metrics.json"]
+
+
+class TestRefused:
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            ({"color": "red"}, "`color` must be one of plain, strain, contact, got 'red'"),
+            ({"arrows": ["wind"]}, "`arrows` must be of forces, gradient, got 'wind'"),
+            ({"arrows": ["gradient"]}, "'gradient', which needs `gradients`"),
+            ({"gradients": []}, "one for each of 13 states, got 0"),
+            ({"path": "page.htm"}, "must end in .html"),
+            ({"path": "nowhere/page.html"}, "in an existing folder"),
+        ],
+    )
+    def test_arguments(self, falling, arguments, message, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        scene, states = falling
+        with pytest.raises(dc.InvalidInput, match=message):
+            dc.show(scene, states, **{"path": "page.html", **arguments})
+        assert not list(tmp_path.iterdir())
+
+    def test_gradients_of_another_shape(self, falling, tmp_path):
+        scene, states = falling
+        with pytest.raises(dc.InvalidInput, match=r"`gradients`\[0\] must have shape \[2, 81, 3\]"):
+            dc.show(scene, states[:1], tmp_path / "p.html", gradients=[torch.zeros(81, 3)])
+
+    def test_states_of_another_scene_or_batch(self, falling, tmp_path):
+        scene, states = falling
+        other = dc.Scene([dc.Cloth.grid(4, 4)])
+        with pytest.raises(dc.InvalidInput, match=r"show: states\[0\] must be of this scene"):
+            dc.show(other, states, tmp_path / "p.html")
+        with pytest.raises(dc.InvalidInput, match=r"states\[1\] must be a batch of 2"):
+            dc.show(scene, [states[0], states[1][0]], tmp_path / "p.html")
