@@ -376,4 +376,78 @@ ScalarBars mixed(const Element& element,
   return result;
 }
 
+namespace {
+
+/// The change of b_n = R(x_n)^T Y(x_n).
+Mat3 start_curvature_change(const Element& element,
+                            const Element& moved,
+                            const double* x_n,
+                            const Tangents& dot) {
+  const Frame frame_n = frame(base_gradient(element, x_n));
+  const Mat3 Rt = frame_n.R.transpose();
+  Mat3 Y_dot = Mat3::Zero();
+  Mat32 F_dot = Mat32::Zero();
+  if (dot.x_n != nullptr) {
+    Y_dot += second_derivatives(element, dot.x_n);
+    F_dot += base_gradient(element, dot.x_n);
+  }
+  if (dot.c != nullptr) {
+    Y_dot += second_derivatives(moved, x_n);
+    F_dot += base_gradient(moved, x_n);
+  }
+  return Rt * Y_dot - cross_columns(rotation(frame_n, Rt * F_dot), *element.b_n);
+}
+
+}  // namespace
+
+// As in body_change(), with the changes of c and g in the place of those of x, and those of b, b_n and
+// Q besides.
+void add_tangent(const Element& element,
+                 const double* x,
+                 const double* x_n,
+                 const Tangents& dot,
+                 double* y) {
+  const bool with_rest = dot.c != nullptr;
+  const Mat3 dQ =
+      dot.weight * form(element.poisson) + element.weight * dot.poisson * form_derivative();
+  if (element.flat && !with_rest && dot.damping == 0.0) {
+    const Mat3 q = second_derivatives(element, x) * dQ;
+    for (Index i = 0; i < element.size(); ++i) {
+      Eigen::Map<Vec3>(y + 3 * element.vertices[i]) += q * element.weights(i);
+    }
+    return;
+  }
+  const BodyState state = body_state(element, x);
+  const Mat3& R = state.frame.R;
+  Element moved = element;  // with the changes of c and g in their places
+  Mat3 RtY = Mat3::Zero();
+  Mat32 K = Mat32::Zero();
+  Mat3 db = Mat3::Zero();
+  if (with_rest) {
+    moved.c = dot.c;
+    moved.g = dot.g;
+    RtY = R.transpose() * second_derivatives(moved, x);
+    K = R.transpose() * base_gradient(moved, x);
+    db = *dot.b;
+  }
+  const Vec3 w = rotation(state.frame, K);
+  const Mat3 ds = RtY - cross_columns(w, *element.b) - db;
+  Mat3 dq = ds * state.Q + (state.curvature - *element.b) * dQ;
+  Vec3 dtau = sum_of_crosses(*element.b, dq) + sum_of_crosses(db, state.q);
+  if (x_n != nullptr && (element.damping != 0.0 || dot.damping != 0.0)) {
+    const Mat3& b_n = *element.b_n;
+    const Mat3 db_n = start_curvature_change(element, moved, x_n, dot);
+    const Mat3 s_n = state.curvature - b_n;
+    const Mat3 ds_n = RtY - cross_columns(w, b_n) - db_n;
+    const Mat3 dq_n =
+        element.damping * (ds_n * state.Q + s_n * dQ) + dot.damping * (s_n * state.Q);
+    dtau += sum_of_crosses(b_n, dq_n) + sum_of_crosses(db_n, state.q_n);
+    dq += dq_n;
+  }
+  const Mat32 V = -rotation_adjoint(state.frame, dtau) +
+                  frame_stress_geometric(state, geometric_torque(element, state), K, w);
+  scatter(element, R * dq, R * V, y);
+  if (with_rest) scatter(moved, R * state.q_total(), R * frame_stress(state), y);
+}
+
 }  // namespace diffcloth::elastic::bending

@@ -93,4 +93,24 @@ ScalarBars mixed(const Element& element,
                  const double* z,
                  const GeometryBars& bars);
 
+/// Tangents of the parameters and the geometry of an element; null pointers are zero.
+struct Tangents {
+  double weight = 0.0;
+  double poisson = 0.0;
+  double damping = 0.0;
+  const double* c = nullptr;               ///< 3 a vertex; with it g and b
+  const mesh::ShapeGradient* g = nullptr;  ///< of the base triangle
+  const Mat3* b = nullptr;
+  const double* x_n = nullptr;  ///< [N, 3]
+};
+
+/// y += the change of grad E with these tangents: mixed(), transposed.
+///
+/// @param x_n  as for mixed()
+void add_tangent(const Element& element,
+                 const double* x,
+                 const double* x_n,
+                 const Tangents& dot,
+                 double* y);
+
 }  // namespace diffcloth::elastic::bending

@@ -40,6 +40,9 @@ std::array<Mat3, 6> hessian(
 /// Change of the stress along a change G of F.
 Mat32 stress_change(double weight, const Mat32& F, const Mat32& F_n, const Mat32& G);
 
+/// Change of the stress along a change G_n of F_n.
+Mat32 start_change(double weight, const Mat32& F, const Mat32& F_n, const Mat32& G_n);
+
 /// Gradient of phi = <stress, G> with respect to F_n, G fixed.
 Mat32 start_bar(double weight, const Mat32& F, const Mat32& F_n, const Mat32& G);
 

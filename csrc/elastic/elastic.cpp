@@ -176,6 +176,80 @@ void add_bending_mixed(
   if (model.x_n != nullptr) add_to_faces(model, e, scalar.damping / model.h, bar.damping);
 }
 
+/// y_p += dP g_p + P g_dot_p, with P = k_s A (F - R) and its change dP.
+void add_face_tangent(const Model& model,
+                      Index f,
+                      const double* x,
+                      const Bar& dot,
+                      const Changing& changing,
+                      double* y) {
+  const double k_s = model.stretch[f];
+  const double area = model.rest->area[f];
+  const double k_dot = changing.materials ? dot.stretch[f] : 0.0;
+  const double area_dot = changing.rest ? dot.rest.area[f] : 0.0;
+  const Mat32 F = face_gradient(model, f, x);
+  const Mat32 unit = stretch::stress(1.0, F);
+  Mat32 change = (k_dot * area + k_s * area_dot) * unit;
+  Mat32 P = k_s * area * unit;
+  Mat32 F_dot = Mat32::Zero();
+  if (changing.rest) {
+    F_dot = face_gradient(model, f, dot.rest.shape_gradient[f], x);
+    change += stretch::stress_change(k_s * area, F, F_dot);
+  }
+  if (model.x_n != nullptr) {
+    const double rate = model.damping[f] / model.h;
+    const double rate_dot = changing.materials ? dot.damping[f] / model.h : 0.0;
+    if (rate != 0.0 || rate_dot != 0.0) {
+      const Mat32 F_n = face_gradient(model, f, model.x_n);
+      const Mat32 unit_n = damping::stress(1.0, F, F_n);
+      const double weight = rate * k_s * area;
+      change += (rate_dot * k_s * area + rate * (k_dot * area + k_s * area_dot)) * unit_n;
+      P += weight * unit_n;
+      Mat32 F_n_dot = Mat32::Zero();
+      if (changing.start) F_n_dot += face_gradient(model, f, dot.x_n.data());
+      if (changing.rest) {
+        F_n_dot += face_gradient(model, f, dot.rest.shape_gradient[f], model.x_n);
+        change += damping::stress_change(weight, F, F_n, F_dot);
+      }
+      change += damping::start_change(weight, F, F_n, F_n_dot);
+    }
+  }
+  scatter(model, f, change, y);
+  if (!changing.rest) return;
+  for (int p = 0; p < 3; ++p) {
+    Eigen::Map<Vec3>(y + 3 * model.topology->faces[f][p]) +=
+        P * dot.rest.shape_gradient[f].row(p).transpose();
+  }
+}
+
+void add_bending_tangent(const Model& model,
+                         Index e,
+                         const double* x,
+                         const Bar& dot,
+                         const Changing& changing,
+                         double* y) {
+  bending::Element element = bending_element(model, e);
+  bending::Tangents tangents;
+  if (changing.materials) {
+    tangents.weight = element_mean(model, e, dot.bending) * model.rest->bending_area[e];
+    tangents.poisson = element_mean(model, e, dot.poisson);
+    if (model.x_n != nullptr) tangents.damping = element_mean(model, e, dot.damping) / model.h;
+  }
+  if (changing.rest) {
+    tangents.weight += element_mean(model, e, model.bending) * dot.rest.bending_area[e];
+    tangents.c = dot.rest.curvature_operator.data() + 3 * model.stencils->start[e];
+    tangents.g = &dot.rest.shape_gradient[model.stencils->faces[e][0]];
+    tangents.b = &dot.rest.curvature[e];
+  }
+  if (changing.start) tangents.x_n = dot.x_n.data();
+  Mat3 curvature_n;
+  if (model.x_n != nullptr) {
+    curvature_n = bending::body_curvature(element, model.x_n);
+    element.b_n = &curvature_n;
+  }
+  bending::add_tangent(element, x, model.x_n, tangents, y);
+}
+
 // E = k_s A W(F), with dW/dF the stress of unit weight.
 void add_face_energy_bars(const Model& model,
                           Index f,
@@ -446,6 +520,19 @@ void add_mixed(const Model& model, const double* x, const double* z, bool with_r
   }
   for (Index e = 0; e < model.stencils->size(); ++e) {
     add_bending_mixed(model, e, x, z, with_rest, bar);
+  }
+}
+
+void add_tangent(const Model& model,
+                 const double* x,
+                 const Bar& dot,
+                 const Changing& changing,
+                 double* y) {
+  const bool damped = model.prepared.damped && changing.start;
+  if (!changing.materials && !changing.rest && !damped) return;
+  for (Index f = 0; f < face_count(model); ++f) add_face_tangent(model, f, x, dot, changing, y);
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    add_bending_tangent(model, e, x, dot, changing, y);
   }
 }
 

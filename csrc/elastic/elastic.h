@@ -146,6 +146,23 @@ struct Bar {
 /// @param with_rest  whether the cotangents of the rest shape are wanted
 void add_mixed(const Model& model, const double* x, const double* z, bool with_rest, Bar& bar);
 
+/// What of a model has tangents that are not zero.
+struct Changing {
+  bool materials = false;
+  bool rest = false;
+  bool start = false;  ///< x_n
+};
+
+/// y += d/d theta (grad_x E(x; theta)) theta_dot over all vertices, damping included: add_mixed(),
+/// transposed.
+///
+/// @param dot  tangents of what a Bar has cotangents of; where `changing` says so
+void add_tangent(const Model& model,
+                 const double* x,
+                 const Bar& dot,
+                 const Changing& changing,
+                 double* y);
+
 /// A number for each of the energies.
 struct Energies {
   double stretch;

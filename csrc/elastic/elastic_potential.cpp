@@ -52,6 +52,10 @@ void ElasticPotential::accumulate(const double* x, const double* z) {
             wanted_ == Wanted::kMaterialsAndRest, bar());
 }
 
+void ElasticPotential::add_tangent(const double* x, double* y) const {
+  elastic::add_tangent(model_, x, dot_, changing_, y);
+}
+
 Bar& ElasticPotential::bar() {
   if (bar_.stretch.empty()) bar_ = Bar(*model_.topology, *model_.stencils);
   return bar_;

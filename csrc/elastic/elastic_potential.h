@@ -44,6 +44,7 @@ class ElasticPotential final : public Potential {
   }
 
   void accumulate(const double* x, const double* z) override;
+  void add_tangent(const double* x, double* y) const override;
   void swap_cotangents(CotangentStore& store) override { store.exchange(bar_); }
 
   const Model& model() const { return model_; }
@@ -53,6 +54,12 @@ class ElasticPotential final : public Potential {
   /// Zero until something is accumulated.
   Bar& bar();
 
+  /// Tangents of the model, for add_tangent().
+  void set_tangent(Bar dot, Changing changing) {
+    dot_ = std::move(dot);
+    changing_ = changing;
+  }
+
  private:
   const Model& model_;
   const Slots& slots_;
@@ -61,6 +68,8 @@ class ElasticPotential final : public Potential {
   mutable std::vector<double> change_;  ///< scratch
   Bar bar_;                             ///< empty where it is zero
   std::vector<Mat2> extrapolated_;      ///< [F] second stresses
+  Bar dot_;
+  Changing changing_;
 };
 
 /// Springs between points as a potential. See springs.h.
@@ -88,6 +97,9 @@ class SpringPotential final : public Potential {
                             const double* d,
                             double* y) const override;
   void accumulate(const double* x, const double* z) override;
+  void add_tangent(const double* x, double* y) const override {
+    elastic::add_tangent(springs_, x, stiffness_dot.data(), target_dot.data(), y);
+  }
   void swap_cotangents(CotangentStore& store) override {
     store.exchange(stiffness_bar);
     store.exchange(target_bar);
@@ -97,6 +109,8 @@ class SpringPotential final : public Potential {
 
   std::vector<double> stiffness_bar;  ///< [A], of what the weight is in
   std::vector<double> target_bar;     ///< [rows of targets, 3]
+  std::vector<double> stiffness_dot;  ///< tangents, for add_tangent()
+  std::vector<double> target_dot;
 
  private:
   Springs springs_;

@@ -22,6 +22,15 @@ inline Mat32 face_gradient(const Model& model, Index f, const double* x) {
                               row(x, face[2]));
 }
 
+/// The same with other shape gradients.
+inline Mat32 face_gradient(const Model& model,
+                           Index f,
+                           const mesh::ShapeGradient& g,
+                           const double* x) {
+  const std::array<Index, 3>& face = model.topology->faces[f];
+  return deformation_gradient(g, row(x, face[0]), row(x, face[1]), row(x, face[2]));
+}
+
 inline double stretch_weight(const Model& model, Index f) {
   return model.stretch[f] * model.rest->area[f];
 }

@@ -147,4 +147,21 @@ void add_mixed(const Springs& springs,
   }
 }
 
+void add_tangent(const Springs& springs,
+                 const double* x,
+                 const double* stiffness_dot,
+                 const double* target_dot,
+                 double* y) {
+  for (Index a = 0; a < springs.size(); ++a) {
+    const Vec3 d = extension(springs, a, x);
+    const double rest = rest_length(springs, a);
+    Vec3 force = stiffness_dot[a] * unit_force(d, rest);
+    const Index target = springs.target_row[a];
+    if (target >= 0) {
+      force -= times_hessian(d, springs.stiffness[a], rest, row(target_dot, target));
+    }
+    add_to_points(springs, a, force, y);
+  }
+}
+
 }  // namespace diffcloth::elastic

@@ -75,4 +75,11 @@ void add_mixed(const Springs& springs,
                double* stiffness_bar,
                double* target_bar);
 
+/// y += d/dk_a (grad E) k_dot_a + d/dc (grad E) c_dot.
+void add_tangent(const Springs& springs,
+                 const double* x,
+                 const double* stiffness_dot,
+                 const double* target_dot,
+                 double* y);
+
 }  // namespace diffcloth::elastic

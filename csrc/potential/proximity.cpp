@@ -52,4 +52,12 @@ void Proximity::accumulate(const double* x, const double* z) {
   }
 }
 
+void Proximity::add_tangent(const double* x, double* y) const {
+  for (Index i = 0; i < size(); ++i) {
+    const Vec3 offset = row(x, i) - row(target_.data(), i);
+    Eigen::Map<Vec3>(y + 3 * i) +=
+        inv_h_sq_ * (metric_dot[i] * offset - metric_[i] * row(target_dot.data(), i));
+  }
+}
+
 }  // namespace diffcloth

@@ -24,6 +24,7 @@ class Proximity final : public Potential {
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
   void add_hessian_product(const double* x, const double* z, double* y) const override;
   void accumulate(const double* x, const double* z) override;
+  void add_tangent(const double* x, double* y) const override;
   void swap_cotangents(CotangentStore& store) override {
     store.exchange(metric_bar);
     store.exchange(target_bar);
@@ -31,6 +32,9 @@ class Proximity final : public Potential {
 
   std::vector<double> metric_bar;  ///< [N], zero until accumulate()
   std::vector<double> target_bar;  ///< [3 N]
+
+  std::vector<double> metric_dot;  ///< [N] tangent, for add_tangent()
+  std::vector<double> target_dot;  ///< [3 N]
 
  private:
   Index size() const { return static_cast<Index>(metric_.size()); }

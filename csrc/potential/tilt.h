@@ -40,9 +40,14 @@ class Tilt final : public Potential {
     for (std::size_t a = 0; a < force_.size(); ++a) force_bar[a] += z[a];
   }
 
+  void add_tangent(const double* /*x*/, double* y) const override {
+    for (std::size_t a = 0; a < force_dot.size(); ++a) y[a] -= force_dot[a];
+  }
+
   void swap_cotangents(CotangentStore& store) override { store.exchange(force_bar); }
 
   std::vector<double> force_bar;  ///< [3 N], zero until accumulate()
+  std::vector<double> force_dot;  ///< [3 N] tangent, for add_tangent()
 
  private:
   std::vector<double> force_;
