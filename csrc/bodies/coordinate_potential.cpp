@@ -196,6 +196,25 @@ void CoordinatePotential::accumulate(const double* x, const double* z) {
   }
 }
 
+void CoordinatePotential::add_tangent(const double* x, double* y) const {
+  const std::ptrdiff_t offset = 3 * static_cast<std::ptrdiff_t>(first_point_);
+  const double* nodes = x + offset;
+  double* out = y + offset;
+  for (const Tree& tree : trees_) {
+    const auto n = static_cast<Index>(tree.slot.size());
+    const double* const change = metric_dot.data() + tree.metric;
+    for (Index i = 0; i < n; ++i) {
+      for (Index j = 0; j < n; ++j) {
+        const std::ptrdiff_t row = static_cast<std::ptrdiff_t>(n) * i + j;
+        const std::ptrdiff_t column = static_cast<std::ptrdiff_t>(n) * j + i;
+        const double step = nodes[tree.slot[j]] - targets_[tree.first_coordinate + j];
+        out[tree.slot[i]] += 0.5 * (change[row] + change[column]) * step -
+                             at(tree, i, j) * target_dot[tree.first_coordinate + j];
+      }
+    }
+  }
+}
+
 void CoordinatePotential::append_diagonal(std::vector<double>& out) const {
   const std::size_t first = out.size();
   out.resize(first + 3 * static_cast<std::size_t>(mechanisms_.node_count()), 0.0);

@@ -33,6 +33,7 @@ class CoordinatePotential final : public Potential {
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
   void add_hessian_product(const double* x, const double* z, double* y) const override;
   void accumulate(const double* x, const double* z) override;
+  void add_tangent(const double* x, double* y) const override;
   void swap_cotangents(CotangentStore& store) override {
     store.exchange(target_bar);
     store.exchange(metric_bar);
@@ -41,6 +42,8 @@ class CoordinatePotential final : public Potential {
   /// Append the diagonal of A for each number of the nodes.
   void append_diagonal(std::vector<double>& out) const;
 
+  std::vector<double> target_dot;  ///< [n] tangents, for add_tangent()
+  std::vector<double> metric_dot;  ///< [sum n_t^2]
   std::vector<double> target_bar;  ///< [n], zero until accumulate()
   std::vector<double> metric_bar;  ///< [sum n_t^2]
 

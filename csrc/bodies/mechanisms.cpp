@@ -196,6 +196,18 @@ void Mechanisms::set_frames(const double* poses, double* points) const {
   }
 }
 
+void Mechanisms::set_frames_jvp(const double* poses, const double* change, double* points) const {
+  const Mat3 basis = Mat3::Identity();
+  for (const Tree& tree : trees_) {
+    const Pose of_tree = Eigen::Map<const Pose>(change + 7 * tree.given);
+    Pose turn = of_tree;
+    turn.head<3>().setZero();  // columns of R do not move with the position
+    transform_jvp(Eigen::Map<const Pose>(poses + 7 * tree.given), turn, basis.data(), 3,
+                  points + 3 * tree.frame);
+    Eigen::Map<Vec3>(points + 3 * (tree.frame + 3)) = of_tree.head<3>();
+  }
+}
+
 void Mechanisms::set_frames_vjp(const double* poses,
                                 const double* points_bar,
                                 double* poses_bar) const {
@@ -397,6 +409,31 @@ void Mechanisms::pull_back_change(const double* points,
           e.turn.value.transpose() * m * link_rate(tree, e, l, change).transpose();
       frame_bar.col(3) = turned.col(3);
       add_to_frame(tree, frame_bar, points_bar);
+    }
+  }
+}
+
+// One coordinate after the other: only frames that move take the second part.
+void Mechanisms::push_forward_change(const double* points,
+                                     const double* change,
+                                     const double* g,
+                                     double* points_dot) const {
+  std::vector<double> unit(3 * static_cast<std::size_t>(point_count()), 0.0);
+  std::vector<double> bar(unit.size());
+  for (const Tree& tree : trees_) {
+    const Eval e = evaluate(tree, points);
+    const Eigen::MatrixXd k = curvature(tree, e, moments(tree, g));
+    Eigen::Map<Eigen::VectorXd>(points_dot + 3 * tree.first_node, k.rows()) +=
+        k.lazyProduct(Eigen::Map<const Eigen::VectorXd>(change + 3 * tree.first_node, k.cols()));
+    const Eigen::Map<const Eigen::Matrix<double, 12, 1>> frame_dot(change + 3 * tree.frame);
+    if (frame_dot.isZero(0.0)) continue;
+    for (Index c = tree.first_coordinate; c < tree.last_coordinate; ++c) {
+      std::ranges::fill(bar, 0.0);
+      unit[slot_[c]] = 1.0;
+      pull_back_change(points, unit.data(), g, bar.data());
+      unit[slot_[c]] = 0.0;
+      points_dot[slot_[c]] += frame_dot.dot(
+          Eigen::Map<const Eigen::Matrix<double, 12, 1>>(bar.data() + 3 * tree.frame));
     }
   }
 }

@@ -89,6 +89,9 @@ class Mechanisms {
   /// poses_bar += pulled back cotangents of the frames' nodes.
   void set_frames_vjp(const double* poses, const double* points_bar, double* poses_bar) const;
 
+  /// Change of the frames' nodes with a change of the poses.
+  void set_frames_jvp(const double* poses, const double* change, double* points) const;
+
   /// World positions of the vertices of these trees' surfaces, at a configuration.
   void place(const double* points, double* vertices) const;
 
@@ -107,6 +110,13 @@ class Mechanisms {
                         const double* change,
                         const double* g,
                         double* points_bar) const;
+
+  /// points_dot += at the nodes of coordinates, the derivative by them of  (push_forward of change) . g,
+  /// for a change of coordinates and frames: pull_back_change(), transposed.
+  void push_forward_change(const double* points,
+                           const double* change,
+                           const double* g,
+                           double* points_dot) const;
 
   /// visit(node_i, node_j, block) for all pairs node_i >= node_j of free nodes of a tree: the second
   /// derivative of  vertices . g.

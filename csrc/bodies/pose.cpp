@@ -45,6 +45,23 @@ Pose transform_vjp(const Pose& pose, const double* points, Index count, const do
   return result;
 }
 
+void transform_jvp(
+    const Pose& pose, const Pose& change, const double* points, Index count, double* out) {
+  const Vec4 q = unit_quaternion(pose);
+  const Vec4 r_dot = change.tail<4>();
+  const Vec4 q_dot = (r_dot - q * q.dot(r_dot)) / pose.tail<4>().norm();
+  const Vec3 u = q.tail<3>();
+  const Vec3 u_dot = q_dot.tail<3>();
+  for (Index i = 0; i < count; ++i) {
+    const Vec3 y = row(points, i);
+    const Vec3 side = u.cross(y);
+    const Vec3 side_dot = u_dot.cross(y);
+    Eigen::Map<Vec3>(out + 3 * i) =
+        change.head<3>() +
+        2.0 * (q_dot[0] * side + q[0] * side_dot + u_dot.cross(side) + u.cross(side_dot));
+  }
+}
+
 Pose interpolate(const Pose& from, const Pose& to, double s) {
   const Vec4 a = unit_quaternion(from);
   const Vec4 b = unit_quaternion(to);
@@ -79,6 +96,16 @@ void BodySet::place_vjp(const double* poses, const double* out_bar, double* pose
     Eigen::Map<Pose>(poses_bar + 7 * pose[k]) +=
         transform_vjp(Eigen::Map<const Pose>(poses + 7 * pose[k]), vertices.data() + 3 * first,
                       vertex_start[k + 1] - first, out_bar + 3 * first);
+  }
+}
+
+void BodySet::place_jvp(const double* poses, const double* change, double* out) const {
+  for (Index k = 0; k < count(); ++k) {
+    if (pose[k] < 0) continue;
+    const Index first = vertex_start[k];
+    transform_jvp(Eigen::Map<const Pose>(poses + 7 * pose[k]),
+                  Eigen::Map<const Pose>(change + 7 * pose[k]), vertices.data() + 3 * first,
+                  vertex_start[k + 1] - first, out + 3 * first);
   }
 }
 

@@ -18,6 +18,10 @@ void transform(const Pose& pose, const double* points, Index count, double* out)
 /// Pull cotangents of the world positions back to the pose's seven numbers, normalization included.
 Pose transform_vjp(const Pose& pose, const double* points, Index count, const double* out_bar);
 
+/// Change of the world positions with a change of the pose's seven numbers.
+void transform_jvp(
+    const Pose& pose, const Pose& change, const double* points, Index count, double* out);
+
 /// Point at fraction s of the way between two poses: straight line and great arc (slerp).
 Pose interpolate(const Pose& from, const Pose& to, double s);
 
@@ -38,6 +42,9 @@ struct BodySet {
 
   /// poses_bar += pulled back out_bar [3 V].
   void place_vjp(const double* poses, const double* out_bar, double* poses_bar) const;
+
+  /// Change of these positions with a change of the poses.
+  void place_jvp(const double* poses, const double* change, double* out) const;
 };
 
 }  // namespace diffcloth::bodies

@@ -135,6 +135,10 @@ void ContactPotential::accumulate(const double* x, const double* z) {
   if (bar_ != nullptr) model_.add_mixed(contacts_, x, z, -1.0, *bar_);
 }
 
+void ContactPotential::add_tangent(const double* x, double* y) const {
+  model_.add_tangent(contacts_, x, *dot_, y);
+}
+
 void FrictionPotential::add_couplings(linalg::Couplings& pairs) const {
   for (const FrictionSet::Entry& k : set_.entries()) add_stencil_couplings(k.all_points(), pairs);
 }
@@ -169,6 +173,10 @@ void FrictionPotential::accumulate(const double* x, const double* z) {
   start_bar.resize(size, 0.0);
   lag_bar.resize(size, 0.0);
   set_.add_mixed(x, z, x_lag_, -1.0, *bar_, start_bar.data(), lag_bar.data());
+}
+
+void FrictionPotential::add_tangent(const double* x, double* y) const {
+  set_.add_tangent(x, x_lag_, *dot_, y);
 }
 
 }  // namespace diffcloth::contact

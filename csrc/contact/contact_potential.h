@@ -1,5 +1,6 @@
 #pragma once
 
+#include <optional>
 #include <utility>
 #include <vector>
 
@@ -78,7 +79,11 @@ class ContactPotential final : public Potential {
                             const double* d,
                             double* y) const override;
   void accumulate(const double* x, const double* z) override;
+  void add_tangent(const double* x, double* y) const override;
   void swap_cotangents(CotangentStore& /*store*/) override {}  // they are the caller's
+
+  /// Tangents of the parameters and the rest shape, for add_tangent(); they outlive its calls.
+  void set_tangent(const ContactModel::Bar& dot) { dot_ = &dot; }
 
  private:
   /// What is near at a point.
@@ -93,6 +98,7 @@ class ContactPotential final : public Potential {
   const ContactModel& model_;
   Detection& detection_;
   ContactModel::Bar* bar_;
+  const ContactModel::Bar* dot_ = nullptr;
   std::vector<Candidate> candidates_;
   std::vector<Contact> contacts_;
   Measured here_;           ///< where the potential stands
@@ -131,9 +137,16 @@ class FrictionPotential final : public Potential {
   }
   bool has_duals(const double* x) const override { return set_.has_duals(x); }
   void accumulate(const double* x, const double* z) override;
+  void add_tangent(const double* x, double* y) const override;
   void swap_cotangents(CotangentStore& /*store*/) override {}  // the caller takes and swaps them
 
-  /// Where the lag configuration lies: accumulate() needs it.
+  /// Tangents, for add_tangent(): of the parameters and the rest shape, of x_start and of the lag
+  /// configuration, both of all vertices. They outlive its calls.
+  void set_tangent(const ContactModel::Bar& dot, const double* start, const double* lag) {
+    dot_.emplace(FrictionSet::Tangents{.parameters = dot, .start = start, .lag = lag});
+  }
+
+  /// Where the lag configuration lies: accumulate() and add_tangent() need it.
   void set_lag(const double* x_lag) { x_lag_ = x_lag; }
 
   std::vector<double> start_bar;  ///< of x_start, all vertices; empty until accumulate()
@@ -143,6 +156,7 @@ class FrictionPotential final : public Potential {
   FrictionSet set_;
   const double* x_lag_ = nullptr;
   ContactModel::Bar* bar_;
+  std::optional<FrictionSet::Tangents> dot_;
 };
 
 }  // namespace diffcloth::contact

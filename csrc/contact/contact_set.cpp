@@ -74,14 +74,17 @@ bool ContactModel::between_bodies(const Candidate& pair) const {
 
 // What multiplies a contact's coefficient to make its weight.
 double ContactModel::area(const Candidate& pair) const {
-  if (between_bodies(pair)) return 1.0;  // its coefficient is the weight
+  return between_bodies(pair) ? 1.0 : area(pair, rest_);  // there its coefficient is the weight
+}
+
+double ContactModel::area(const Candidate& pair, const RestMeasures& rest) const {
   if (pair.kind == PairKind::kPointTriangle) {
     const Index p = pair.vertices[0];
-    return p < mesh_.cloth_vertex_count ? rest_.vertex_area[p]
-                                        : rest_.mean_face_area[surface_b(pair)];
+    return p < mesh_.cloth_vertex_count ? rest.vertex_area[p]
+                                        : rest.mean_face_area[surface_b(pair)];
   }
-  if (!between_cloths(pair)) return rest_.edge_area[pair.a];
-  return rest_.edge_area[pair.a] + rest_.edge_area[pair.b];
+  if (!between_cloths(pair)) return rest.edge_area[pair.a];
+  return rest.edge_area[pair.a] + rest.edge_area[pair.b];
 }
 
 double ContactModel::threshold(const Candidate& pair) const {
@@ -116,6 +119,21 @@ void ContactModel::pull_back(
   RestMeasures& rest = bar.rest;
   rest.edge_length_sq[pair.a] += threshold_bar * k.threshold / rest_.edge_length_sq[pair.a];
   rest.edge_length_sq[pair.b] += threshold_bar * k.threshold / rest_.edge_length_sq[pair.b];
+}
+
+ContactModel::ContactTangent ContactModel::push_forward(const Contact& k, const Bar& dot) const {
+  const Candidate& pair = k.pair;
+  ContactTangent tangent{
+      .kappa = mean_entry(dot.kappa, pair),
+      .weight = k.coefficient * (between_bodies(pair) ? 0.0 : area(pair, dot.rest)),
+      .threshold = 0.0,
+      .xi = 0.5 * (dot.thickness[surface_a(pair)] + dot.thickness[surface_b(pair)])};
+  if (k.mollified) {
+    for (const Index e : {pair.a, pair.b}) {
+      tangent.threshold += k.threshold * dot.rest.edge_length_sq[e] / rest_.edge_length_sq[e];
+    }
+  }
+  return tangent;
 }
 
 ContactModel::Bar::Bar(const CollisionMesh& mesh) : rest(RestMeasures::zero(mesh)) {
@@ -503,6 +521,31 @@ void ContactModel::add_mixed(const std::vector<Contact>& contacts,
         scale * kappa * k.weight * (k.barrier.b_d_hat * m_z + m * k.barrier.b1_d_hat * d_z);
     const double xi_bar = kappa * k.weight * (k.barrier.b_xi * m_z + m * k.barrier.b1_xi * d_z);
     pull_back(k, scale * kappa * per_weight, scale * threshold_bar, scale * xi_bar, bar);
+  }
+}
+
+// grad B = kappa w (b grad m + m b' grad D).
+void ContactModel::add_tangent(const std::vector<Contact>& contacts,
+                               const double* x,
+                               const Bar& dot,
+                               double* y) const {
+  for (const Contact& k : contacts) {
+    const ContactTangent tangent = push_forward(k, dot);
+    const Barrier& b = k.barrier;
+    const double scale = k.kappa * k.weight;
+    const double scale_dot = tangent.kappa * k.weight + k.kappa * tangent.weight;
+    const double b_dot = b.b_d_hat * dot.d_hat + b.b_xi * tangent.xi;
+    const double b1_dot = b.b1_d_hat * dot.d_hat + b.b1_xi * tangent.xi;
+    double along_d = k.mollifier * (scale_dot * b.b1 + scale * b1_dot);
+    Vec12 change = Vec12::Zero();
+    if (k.mollified) {
+      const Mollifier m = mollifier_derivatives(corners(k.pair.vertices, x), k.threshold);
+      along_d += scale * m.m_eps * tangent.threshold * b.b1;
+      change = (scale_dot * b.b + scale * b_dot) * m.gradient +
+               (scale * b.b * tangent.threshold) * m.gradient_eps;
+    }
+    change += along_d * distance_sq_gradient(k.closest);
+    scatter(k.pair.vertices, change, y);
   }
 }
 

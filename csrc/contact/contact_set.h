@@ -200,6 +200,24 @@ class ContactModel {
                  double scale,
                  Bar& bar) const;
 
+  /// y += d/d(theta) (grad B) theta_dot, for tangents of every theta of Bar: add_mixed(), transposed.
+  void add_tangent(const std::vector<Contact>& contacts,
+                   const double* x,
+                   const Bar& dot,
+                   double* y) const;
+
+  /// Tangents of a contact's kappa, weight, mollifier threshold and xi.
+  struct ContactTangent {
+    double kappa;
+    double weight;
+    double threshold;
+    double xi;
+  };
+  ContactTangent push_forward(const Contact& contact, const Bar& dot) const;
+  double push_forward_mu(const Candidate& pair, const Bar& dot) const {
+    return mean_entry(dot.friction, pair);
+  }
+
   /// Pull cotangents of a contact's weight, mollifier threshold and xi back to rest and thickness.
   void pull_back(const Contact& contact,
                  double weight_bar,
@@ -226,6 +244,8 @@ class ContactModel {
   double mean_entry(const std::vector<double>& values, const Candidate& pair) const;
   void pull_back_mean_entry(const Candidate& pair, double mean_bar, std::vector<double>& bar) const;
   double area(const Candidate& pair) const;
+  /// What rest measures, or their tangents, make of it; not between bodies.
+  double area(const Candidate& pair, const RestMeasures& rest) const;
   void pull_back_area(const Contact& contact, double area_bar, RestMeasures& rest) const;
   double threshold(const Candidate& pair) const;
   Contact contact(const Term& term, const double* x) const;

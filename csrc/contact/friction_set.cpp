@@ -401,4 +401,92 @@ void FrictionSet::add_mixed(const double* x,
   }
 }
 
+FrictionSet::LagTangent FrictionSet::push_forward_lag(const Entry& k,
+                                                      const double* x_lag,
+                                                      const Tangents& dot) const {
+  const Contact& lag = k.lag;
+  const Closest& geometry = lag.closest;
+  const double d = std::sqrt(geometry.d_sq);
+  const Vec12 x_dot = stacked(lag.pair.vertices, dot.lag);
+  const double d_sq_dot = distance_sq_gradient(geometry).dot(x_dot);
+
+  // c(beta), and n = t / d with t = sum_i c_i x_i.
+  LagTangent result{.c = Vec4::Zero(), .n = Vec3::Zero(), .lambda = 0.0};
+  Vec3 t_dot = Vec3::Zero();
+  for (int i = 0; i < 4; ++i) t_dot += geometry.c[i] * x_dot.segment<3>(3 * i);
+  if (geometry.parameter_count > 0) {
+    Vec2 beta_dot = beta_jacobian(geometry) * x_dot;
+    if (geometry.parameter_count == 1) beta_dot[1] = 0.0;
+    result.c = geometry.c_beta * beta_dot;
+    t_dot += geometry.s * beta_dot;
+  }
+  result.n = tangential(t_dot, k.n) / d;
+
+  // lambda = -2 d kappa w m b'.
+  const ContactModel::ContactTangent tangent = model_->push_forward(lag, dot.parameters);
+  const double b1 = lag.barrier.b1;
+  double m_dot = 0.0;
+  if (lag.mollified) {
+    const Mollifier m = mollifier_derivatives(corners(lag.pair.vertices, x_lag), lag.threshold);
+    m_dot = m.gradient.dot(x_dot) + m.m_eps * tangent.threshold;
+  }
+  const double scale = lag.kappa * lag.weight;
+  const double scale_dot = tangent.kappa * lag.weight + lag.kappa * tangent.weight;
+  const double b1_dot = lag.barrier.b2 * d_sq_dot + lag.barrier.b1_d_hat * dot.parameters.d_hat +
+                        lag.barrier.b1_xi * tangent.xi;
+  const double m = lag.mollifier;
+  result.lambda = -2.0 * d * (scale_dot * m * b1 + scale * (m_dot * b1 + m * b1_dot)) -
+                  scale * m * b1 * d_sq_dot / d;
+  return result;
+}
+
+// grad D = mu lambda (f1/|w|) B^T w at fixed frames: see add_gradient().
+void FrictionSet::add_tangent(const double* x,
+                              const double* x_lag,
+                              const Tangents& dot,
+                              double* y) const {
+  const Slips& here = slips(x);
+  for (std::size_t e = 0; e < entries_.size(); ++e) {
+    const Entry& k = entries_[e];
+    const auto& v = k.lag.pair.vertices;
+    const Slip& at = here[e];
+    const LagTangent lag = push_forward_lag(k, x_lag, dot);
+
+    // s = r(x) - Q r(x_start), and r(x_start) in its frame.
+    Vec3 s_dot = Vec3::Zero();
+    Vec3 r_dot = gap(k, dot.start);
+    for (int i = 1; i < 4; ++i) {
+      s_dot += lag.c[i] * (row(x, v[i]) - row(x, v[0]));
+      r_dot += lag.c[i] * (row(x_start_, v[i]) - row(x_start_, v[0]));
+    }
+    Vec3 a_dot = Vec3::Zero();
+    if (k.turns) {
+      const Frame frame(k, x_start_);
+      const Vec3 e1_dot = k.edge(0, dot.start);
+      const Vec3 e2_dot = k.edge(1, dot.start);
+      const Vec3 frame_dot = k.a[0] * e1_dot + k.a[1] * e2_dot +
+                             k.a[2] * (e1_dot.cross(frame.e2) + frame.e1.cross(e2_dot));
+      a_dot = frame.coordinates(r_dot - frame_dot);
+      s_dot -= at.frame * a_dot;
+    } else {
+      s_dot -= r_dot;
+    }
+    const Vec3 w_dot = tangential(s_dot, k.n) - lag.n.dot(at.s) * k.n - k.n.dot(at.s) * lag.n;
+
+    const FrictionLaw& law = at.law;
+    const double strength = k.mu * k.lambda;
+    const double mu_dot = model_->push_forward_mu(k.lag.pair, dot.parameters);
+    const Vec3 force = (strength * law.f1_over_y) * at.w;
+    const Vec3 change =
+        ((mu_dot * k.lambda + k.mu * lag.lambda) * law.f1_over_y +
+         strength * law.f1_over_y_e * dot.parameters.slip + strength * law.f2 * at.w.dot(w_dot)) *
+            at.w +
+        (strength * law.f1_over_y) * w_dot;
+    for (int i = 0; i < k.count; ++i) Eigen::Map<Vec3>(y + 3 * k.points[i]) += k.c[i] * change;
+    for (int i = 0; i < 4; ++i) Eigen::Map<Vec3>(y + 3 * v[i]) += lag.c[i] * force;
+    add_edges(k, at.frame.pull_back(-k.a, change), y);
+    add_edges(k, at.frame.pull_back(-a_dot, force), y);
+  }
+}
+
 }  // namespace diffcloth::contact

@@ -159,12 +159,29 @@ class FrictionSet {
                  double* start_bar,
                  double* lag_bar) const;
 
+  /// Tangents of what friction depends on besides x.
+  struct Tangents {
+    const ContactModel::Bar& parameters;
+    const double* start;  ///< of x_start, all vertices
+    const double* lag;    ///< of the lag configuration
+  };
+
+  /// y += d/d(theta) (grad D) theta_dot: add_mixed(), transposed.
+  void add_tangent(const double* x, const double* x_lag, const Tangents& dot, double* y) const;
+
  private:
   /// What is kept of a point.
   struct Kept {
     std::vector<double> x;  ///< all vertices; empty where nothing is known
     Slips slips;
   };
+  /// Changes of what the lag configuration gives to an entry.
+  struct LagTangent {
+    Vec4 c;
+    Vec3 n;
+    double lambda;
+  };
+  LagTangent push_forward_lag(const Entry& entry, const double* x_lag, const Tangents& dot) const;
   bool is_at(const std::vector<double>& point, const double* x) const;
   Slip slip(const Entry& entry, const double* x) const;
 
