@@ -121,6 +121,19 @@ void Coordinates::gather(const std::vector<double>& x, std::vector<double>& bar)
   mechanisms_->clear(bar.data() + body_offset());
 }
 
+void Coordinates::carry(const std::vector<double>& x, std::vector<double>& dx) const {
+  if (!mechanisms_->empty()) {
+    mechanisms_->push_forward(nodes(x), nodes(dx), dx.data() + body_offset());
+  }
+}
+
+void Coordinates::add_change(const std::vector<double>& x,
+                             const std::vector<double>& dx,
+                             const std::vector<double>& g,
+                             std::vector<double>& g_dot) const {
+  mechanisms_->push_forward_change(nodes(x), nodes(dx), g.data() + body_offset(), nodes(g_dot));
+}
+
 void Coordinates::subtract_change(const std::vector<double>& x,
                                   const std::vector<double>& dx,
                                   const std::vector<double>& g,

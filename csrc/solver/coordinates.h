@@ -77,12 +77,22 @@ class Coordinates {
   /// Move the cotangents of the vertices of links to all nodes that they depend on.
   void gather(const std::vector<double>& x, std::vector<double>& bar) const;
 
+  /// Let the vertices of links follow a change of all nodes: gather() transposed.
+  void carry(const std::vector<double>& x, std::vector<double>& dx) const;
+
   /// bar -= the derivative of  g . (change of the vertices of links with the coordinates in dx)  by all
   /// nodes.
   void subtract_change(const std::vector<double>& x,
                        const std::vector<double>& dx,
                        const std::vector<double>& g,
                        std::vector<double>& bar) const;
+
+  /// g_dot += the change of  (dx/dz)^T g  with dx, a change of prescribed nodes: subtract_change()
+  /// transposed, with the other sign.
+  void add_change(const std::vector<double>& x,
+                  const std::vector<double>& dx,
+                  const std::vector<double>& g,
+                  std::vector<double>& g_dot) const;
 
   /// A += the second derivative of  g . x(z)  at x.
   void add_curvature(const double* x, const std::vector<double>& g, linalg::BlockMatrix& A) const;

@@ -1,7 +1,10 @@
 #include "step/attachments.h"
 
+#include <algorithm>
+
 #include "step/cotangents.h"
 #include "step/problem.h"
+#include "step/tangents.h"
 
 namespace diffcloth::step {
 namespace {
@@ -40,6 +43,21 @@ void Attachments::pull_back(const Problem& problem,
     if (k_bar != nullptr) k_bar[a] += w[a] * potential_.stiffness_bar[a];
     if (w_bar != nullptr) w_bar[a] += k[a] * potential_.stiffness_bar[a];
   }
+}
+
+void Attachments::push_forward(const Problem& problem, const Tangents& tangents) {
+  const double* const k = problem.inputs.data(Input::kSpringStiffness);
+  const double* const w = problem.inputs.data(Input::kSpringWeights);
+  const double* const k_dot = tangents.directions.data(Input::kSpringStiffness);
+  const double* const w_dot = tangents.directions.data(Input::kSpringWeights);
+  potential_.stiffness_dot.assign(stiffness_.size(), 0.0);
+  const std::size_t targets = 3 * problem.scene.given.attachments.target_count;
+  potential_.target_dot.assign(targets, 0.0);
+  for (std::size_t a = 0; a < stiffness_.size(); ++a) {
+    potential_.stiffness_dot[a] = (w_dot ? w_dot[a] * k[a] : 0.0) + (k_dot ? w[a] * k_dot[a] : 0.0);
+  }
+  if (const double* t = tangents.directions.data(Input::kSpringTargets))
+    std::copy_n(t, targets, potential_.target_dot.begin());
 }
 
 void Attachments::visit_energy(const double* x, const VisitEnergy& visit) const {

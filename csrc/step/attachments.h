@@ -18,6 +18,7 @@ class Attachments final : public StepPotential {
 
   elastic::SpringPotential& potential() override { return potential_; }
   void pull_back(const Problem& problem, Cotangents& bars, const Gradients& gradients) override;
+  void push_forward(const Problem& problem, const Tangents& tangents) override;
   void visit_energy(const double* x, const VisitEnergy& visit) const override;
   void accumulate_energy(const double* x, const Seed& seed, double* x_bar) override;
 

@@ -1,13 +1,16 @@
 #pragma once
 
 #include <cstddef>
-#include <string_view>
+#include <functional>
 #include <vector>
 
 #include "solver/newton.h"
 #include "step/scheme.h"
 
 namespace diffcloth::step {
+
+/// Puts the tangents along a direction into the potentials of an objective, for Potential::add_tangent().
+using SetTangents = std::function<void(std::size_t direction)>;
 
 /// The stage of a scheme that contact is part of: inertia (or nearness), whatever else, barrier and
 /// friction, minimized once for each friction iteration, with friction lagged at the solution before.
@@ -18,6 +21,7 @@ struct ContactStage {
   solver::PatternCache& patterns;
   std::size_t first_factor;  ///< place of its factors among the scheme's
   Turn::Exchange exchange;   ///< of what its potentials accumulate; only backward needs it
+  SetTangents set_tangents;  ///< of its potentials; only tangent needs it
 
   /// What it keeps on the tape.
   static std::vector<Field> tape(const Scene& scene);
@@ -27,6 +31,9 @@ struct ContactStage {
 
   /// @param g  of each loss, cotangent of the rows (cloth positions, coordinates) at the end
   void backward(const Backward& step, std::vector<std::vector<double>> g);
+
+  /// Change of all points at the end, along each direction.
+  std::vector<std::vector<double>> tangent(const Pushforward& step);
 };
 
 /// zhat of one solve, and everything it pulls back but the lag: see contact_stage.cpp. All losses are
@@ -46,6 +53,21 @@ void pull_back_solve(const Backward& step,
                      bool with_forces,
                      const std::vector<Potential*>& touching,
                      const Turn::Exchange& exchange);
+
+/// How the solution of one solve changes along each direction: all points. See contact_tangent.cpp.
+///
+/// @param x             all points where the objective has been minimized; its potentials stand there
+/// @param certificate   of the exact Hessian there, or none to make it
+/// @param with_forces   whether the forces that the step gives back are those of this solve
+/// @param touching      the potentials of the objective that contact forces are of
+/// @param set_tangents  of the potentials of the objective
+std::vector<std::vector<double>> push_forward_solve(const Pushforward& step,
+                                                    const solver::Objective& objective,
+                                                    const std::vector<double>& x,
+                                                    solver::Certificate certificate,
+                                                    bool with_forces,
+                                                    const std::vector<Potential*>& touching,
+                                                    const SetTangents& set_tangents);
 
 /// Fold the outcome of one minimization into the report.
 void merge(const solver::Outcome& outcome, Report& report);

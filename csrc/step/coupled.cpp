@@ -14,7 +14,8 @@ ContactStage stage(Problem& problem) {
           .others = problem.cloth_potentials(),
           .patterns = problem.scene.elastic_patterns,
           .first_factor = 0,
-          .exchange = {}};
+          .exchange = {},
+          .set_tangents = {}};
 }
 
 }  // namespace
@@ -31,6 +32,12 @@ void Coupled::backward(const Backward& step) const {
   std::vector<std::vector<double>> g;
   for (const Cotangents& bars : step.losses) g.push_back(bars.rows);
   contact.backward(step, std::move(g));
+}
+
+std::vector<std::vector<double>> Coupled::tangent(const Pushforward& step) const {
+  ContactStage contact = stage(step.problem);
+  contact.set_tangents = [&](std::size_t l) { step.directions[l].push_forward(step.problem); };
+  return contact.tangent(step);
 }
 
 }  // namespace diffcloth::step

@@ -13,6 +13,7 @@ class Coupled final : public Scheme {
   std::vector<Field> tape(const Scene& scene) const override;
   void forward(const Forward& step, std::vector<double>& x, const Forces& forces) const override;
   void backward(const Backward& step) const override;
+  std::vector<std::vector<double>> tangent(const Pushforward& step) const override;
 };
 
 }  // namespace diffcloth::step

@@ -28,6 +28,11 @@ std::string_view words(projective::LocalGlobalStatus status) {
   __builtin_unreachable();
 }
 
+/// Of a step that has been taken; none where it is gone.
+solver::Certificate certificate_of(const Taken& step) {
+  return step.kept.certificates.empty() ? solver::Certificate{} : step.kept.certificates.front();
+}
+
 solver::Objective objective(Problem& problem) {
   return problem.objective(problem.inertia, problem.cloth_potentials(),
                            problem.scene.elastic_patterns);
@@ -111,8 +116,7 @@ std::vector<double> ElasticStage::forward(const Forward& step, const Forces& for
 
 void ElasticStage::backward(const Backward& step, const std::vector<std::vector<double>>& g) const {
   const std::vector<double> x = problem_.predicted(step.tape["elastic"]);
-  const solver::Certificate certificate =
-      step.kept.certificates.empty() ? solver::Certificate{} : step.kept.certificates.front();
+  const solver::Certificate certificate = certificate_of(step);
   const Turn::Exchange exchange = [&](std::size_t l) { step.losses[l].exchange(problem_); };
   if (nodes_.has_contacts()) {
     for (std::size_t l = 0; l < g.size(); ++l) {
@@ -124,6 +128,25 @@ void ElasticStage::backward(const Backward& step, const std::vector<std::vector<
   const solver::Objective f = objective(problem_);
   f.stand_at(x.data());
   pull_back_solve(step, f, x, certificate, g, true, {}, exchange);
+}
+
+std::vector<std::vector<double>> ElasticStage::tangent(const Pushforward& step) const {
+  const std::vector<double> x = problem_.predicted(step.tape["elastic"]);
+  const solver::Certificate certificate = certificate_of(step);
+  const SetTangents set_tangents = [&](std::size_t l) {
+    step.directions[l].push_forward(problem_);
+  };
+  if (nodes_.has_contacts()) {
+    std::vector<std::vector<double>> dx;
+    for (std::size_t l = 0; l < step.directions.size(); ++l) {
+      set_tangents(l);
+      dx.push_back(nodes_.tangent(step, x, certificate.factor, l));
+    }
+    return dx;
+  }
+  const solver::Objective f = objective(problem_);
+  f.stand_at(x.data());
+  return push_forward_solve(step, f, x, certificate, true, {}, set_tangents);
 }
 
 }  // namespace diffcloth::step

@@ -21,6 +21,9 @@ class ElasticStage {
   /// @param g  of each loss, cotangent of the rows at its end
   void backward(const Backward& step, const std::vector<std::vector<double>>& g) const;
 
+  /// Change of all points at its end, along each direction.
+  std::vector<std::vector<double>> tangent(const Pushforward& step) const;
+
  private:
   Problem& problem_;
   NodalStage nodes_;

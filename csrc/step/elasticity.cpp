@@ -5,6 +5,7 @@
 
 #include "step/cotangents.h"
 #include "step/problem.h"
+#include "step/tangents.h"
 
 namespace diffcloth::step {
 namespace {
@@ -53,6 +54,24 @@ void Elasticity::pull_back(const Problem& problem, Cotangents& bars, const Gradi
   add_per_face(problem, Input::kDamping, bar.damping, gradients);
   for (std::size_t a = 0; a < bar.x_n.size(); ++a) bars.start[a] += bar.x_n[a];
   if (gradients[Input::kRestPositions] != nullptr) bars.rest += bar.rest;
+}
+
+void Elasticity::push_forward(const Problem& problem, const Tangents& tangents) {
+  const auto changes = [&](Input input) { return tangents.directions.data(input) != nullptr; };
+  elastic::Changing changing;
+  changing.materials = changes(Input::kStretch) || changes(Input::kBending) ||
+                       changes(Input::kPoisson) || changes(Input::kDamping);
+  changing.rest = !tangents.rest.area.empty();
+  changing.start = changes(Input::kPositions);
+  elastic::Bar dot;
+  dot.stretch = tangents.per_face(problem, Input::kStretch);
+  dot.bending = tangents.per_face(problem, Input::kBending);
+  dot.poisson = tangents.per_face(problem, Input::kPoisson);
+  dot.damping = tangents.per_face(problem, Input::kDamping);
+  dot.x_n.assign(tangents.start.begin(),
+                 tangents.start.begin() + static_cast<std::ptrdiff_t>(problem.cloth_size));
+  dot.rest = tangents.rest;
+  potential_.set_tangent(std::move(dot), changing);
 }
 
 void Elasticity::visit_energy(const double* x, const VisitEnergy& visit) const {

@@ -14,6 +14,7 @@ class Elasticity final : public StepPotential {
 
   elastic::ElasticPotential& potential() override { return potential_; }
   void pull_back(const Problem& problem, Cotangents& bars, const Gradients& gradients) override;
+  void push_forward(const Problem& problem, const Tangents& tangents) override;
   void visit_energy(const double* x, const VisitEnergy& visit) const override;
   void accumulate_energy(const double* x, const Seed& seed, double* x_bar) override;
 

@@ -1,4 +1,5 @@
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <stdexcept>
 
@@ -82,6 +83,59 @@ void pull_back_energy(const Scene& scene, const Inputs& inputs, std::span<const 
       accumulate_contact(p, *p.contact, contacts, of_contact(loss), bars);
     }
     bars.write(p, loss.gradients);
+  }
+}
+
+namespace {
+
+/// Gradients that have their numbers.
+struct OwnGradients {
+  std::array<std::vector<double>, kInputCount> numbers;
+
+  /// Of the inputs that change along one of some directions.
+  OwnGradients(const Inputs& inputs, std::span<const Direction> directions) {
+    for (std::size_t k = 0; k < kInputCount; ++k) {
+      const auto changes = [&](const Direction& d) { return d.tangents.views[k].data != nullptr; };
+      if (std::ranges::any_of(directions, changes)) numbers[k].assign(inputs.views[k].count, 0.0);
+    }
+  }
+
+  Gradients views() {
+    Gradients result;
+    for (std::size_t k = 0; k < kInputCount; ++k) {
+      if (!numbers[k].empty()) result.data[k] = numbers[k].data();
+    }
+    return result;
+  }
+
+  double along(const Inputs& tangents) const {
+    double sum = 0.0;
+    for (std::size_t k = 0; k < kInputCount; ++k) {
+      const double* const change = tangents.views[k].data;
+      if (change == nullptr) continue;
+      for (std::size_t a = 0; a < numbers[k].size(); ++a) sum += numbers[k][a] * change[a];
+    }
+    return sum;
+  }
+};
+
+}  // namespace
+
+// Few numbers that depend on many: their gradients, each along all directions.
+void push_forward_energy(const Scene& scene,
+                         const Inputs& inputs,
+                         std::span<const Direction> directions) {
+  const Energies parts = stored_energy(scene, inputs);
+  const double one = 1.0;
+  const double zero = 0.0;
+  for (const auto& [part, value] : parts) {
+    OwnGradients own(inputs, directions);
+    Loss loss{.cotangents = {}, .gradients = own.views()};
+    for (const auto& [name, unused] : parts) loss.cotangents.set(name, name == part ? &one : &zero);
+    pull_back_energy(scene, inputs, {&loss, 1});
+    for (const Direction& direction : directions) {
+      *direction.outputs[part] = own.along(direction.tangents);
+    }
   }
 }
 

@@ -57,6 +57,15 @@ class NodalStage {
                 const std::vector<double>& g,
                 Cotangents& bars) const;
 
+  /// Change of all points along a direction, for a solution x, and of the forces there, which is added. The
+  /// potentials have the tangents of the direction.
+  ///
+  /// @param factor  as solve() gave it, or null to make it again
+  std::vector<double> tangent(const Pushforward& step,
+                              const std::vector<double>& x,
+                              solver::Factor factor,
+                              std::size_t direction) const;
+
  private:
   /// Inertia, elasticity and anchors.
   solver::Objective objective() const;

@@ -25,4 +25,8 @@ void Projective::backward(const Backward& step) const {
   ElasticStage(step.problem).backward(step, g);
 }
 
+std::vector<std::vector<double>> Projective::tangent(const Pushforward& step) const {
+  return ElasticStage(step.problem).tangent(step);
+}
+
 }  // namespace diffcloth::step

@@ -10,6 +10,7 @@
 #include "step/forces.h"
 #include "step/problem.h"
 #include "step/report.h"
+#include "step/tangents.h"
 
 namespace diffcloth::step {
 
@@ -25,18 +26,28 @@ struct Forward {
   Report& report;
 };
 
-/// What it works with going back, for several losses side by side.
-struct Backward {
+/// A step that has been taken, to be differentiated.
+struct Taken {
   Problem& problem;
   contact::Detection& detection;
   solver::Context& context;
   const Arrays<const double>& tape;
   const Kept& kept;  ///< empty where it is gone
+};
+
+/// What a scheme works with going back, for several losses side by side.
+struct Backward : Taken {
   std::span<Cotangents> losses;
   bool barrier;  ///< whether someone asks for the cotangents of what the barrier is made of
 };
 
-/// A way to take a step: what is minimized, in which order, and the adjoint of that.
+/// What it works with for tangents, along several directions of the inputs side by side.
+struct Pushforward : Taken {
+  std::span<const Tangents> directions;
+  std::span<const Forces> forces;  ///< of each direction, where the changes of the forces are added
+};
+
+/// A way to take a step: what is minimized, in which order, and the derivatives of that.
 class Scheme {
  public:
   Scheme() = default;
@@ -69,6 +80,9 @@ class Scheme {
   /// From the cotangents of the end to those of all that the potentials depend on, for each loss as if
   /// it were alone.
   virtual void backward(const Backward& step) const = 0;
+
+  /// How all points at the end change along each direction, as if it were alone.
+  virtual std::vector<std::vector<double>> tangent(const Pushforward& step) const = 0;
 };
 
 /// The scheme of a name.

@@ -1,9 +1,11 @@
 #include "step/soft_pins.h"
 
+#include <algorithm>
 #include <numeric>
 
 #include "step/cotangents.h"
 #include "step/problem.h"
+#include "step/tangents.h"
 
 namespace diffcloth::step {
 namespace {
@@ -48,6 +50,19 @@ void SoftPins::pull_back(const Problem& problem, Cotangents& /*bars*/, const Gra
   const std::vector<Index>& soft = problem.scene.given.soft_pins;
   for (std::size_t k = 0; k < soft.size(); ++k) {
     out[one ? 0 : problem.scene.vertex_cloth[soft[k]]] += potential_.stiffness_bar[k];
+  }
+}
+
+void SoftPins::push_forward(const Problem& problem, const Tangents& tangents) {
+  const std::vector<Index>& soft = problem.scene.given.soft_pins;
+  potential_.stiffness_dot.assign(soft.size(), 0.0);
+  potential_.target_dot.assign(3 * soft.size(), 0.0);
+  if (const double* t = tangents.directions.data(Input::kSoftPinTargets))
+    std::copy_n(t, 3 * soft.size(), potential_.target_dot.begin());
+  if (const double* t = tangents.directions.data(Input::kPinStiffness)) {
+    const bool one = problem.inputs[Input::kPinStiffness].count == 1;
+    for (std::size_t k = 0; k < soft.size(); ++k)
+      potential_.stiffness_dot[k] = t[one ? 0 : problem.scene.vertex_cloth[soft[k]]];
   }
 }
 

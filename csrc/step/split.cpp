@@ -1,6 +1,7 @@
 // The adjoint of `split` is that of its contact stage (contact_stage.cpp), whose target is x^D; the
 // cotangent of x^D is the g of one more adjoint of the same form, that of the elastic stage: the
-// paper's Eqs. 8 and 29 with all explicit terms. In the metric `energy` it is zero, unless nodes touch.
+// paper's Eqs. 8 and 29 with all explicit terms. In the metric `energy` it is zero, unless nodes touch. Tangents
+// go the other way: that of x^D is one of the contact stage's inputs.
 
 #include "step/split.h"
 
@@ -70,7 +71,8 @@ class Nearness {
             .others = std::move(others),
             .patterns = is_diagonal ? scene.diagonal_patterns : scene.elastic_patterns,
             .first_factor = 1,
-            .exchange = {}};
+            .exchange = {},
+            .set_tangents = {}};
   }
 
   /// Swap what its own potentials have accumulated.
@@ -79,6 +81,21 @@ class Nearness {
     if (inertial_) inertial_->swap_cotangents(store);
     if (elastic_) elastic_->swap_cotangents(store);
     if (tilt_) tilt_->swap_cotangents(store);
+  }
+
+  /// Put the tangents of its own potentials into them; those of P are there.
+  ///
+  /// @param x_d_dot  of x^D, of all points
+  void set_tangents(const Tangents& tangents, const Array& x_d_dot) {
+    const Array target(x_d_dot.begin(), x_d_dot.begin() + static_cast<std::ptrdiff_t>(x_d_.size()));
+    if (inertial_) {
+      const bool is_uniform = problem_.scene.given.metric == Metric::kIdentity;
+      inertial_->metric_dot =
+          is_uniform ? Array(tangents.masses.size(), mean(tangents.masses)) : tangents.masses;
+      inertial_->target_dot = target;
+    }
+    if (elastic_) throw std::logic_error("step: the metric elastic has no tangent");
+    if (tilt_) tilt_->force_dot = gradient_tangent(target);
   }
 
   /// Cotangent of x^D; those of what else the nearness is made of go where they belong.
@@ -112,6 +129,15 @@ class Nearness {
     Array g(x_d_.size(), 0.0);
     for_each_of_energy([&](const Potential& p) { p.add_gradient(x_d_.data(), g.data()); });
     return g;
+  }
+
+  Array gradient_tangent(const Array& x_d_dot) const {
+    Array change(x_d_.size(), 0.0);
+    for_each_of_energy([&](const Potential& p) {
+      p.add_hessian_product(x_d_.data(), x_d_dot.data(), change.data());
+      p.add_tangent(x_d_.data(), change.data());
+    });
+    return change;
   }
 
   // f = grad P(x^D):  x^D gets H f_bar, and what P is made of  d/d theta (f_bar . grad P).
@@ -183,6 +209,21 @@ void Split::backward(const Backward& step) const {
     g[l].resize(problem.coordinates.size(), 0.0);
   }
   elastic.backward(step, g);
+}
+
+std::vector<Array> Split::tangent(const Pushforward& step) const {
+  Problem& problem = step.problem;
+  const double* x_d = step.tape["elastic"];
+  const ElasticStage elastic(problem);
+  Nearness nearness(problem, Array(x_d, x_d + problem.cloth_size), elastic.has_contacts());
+  ContactStage contact = nearness.stage();
+  std::vector<Array> x_d_dot;
+  if (Nearness::follows_target(problem, elastic.has_contacts())) x_d_dot = elastic.tangent(step);
+  contact.set_tangents = [&](std::size_t l) {
+    step.directions[l].push_forward(problem);
+    if (!x_d_dot.empty()) nearness.set_tangents(step.directions[l], x_d_dot[l]);
+  };
+  return contact.tangent(step);
 }
 
 }  // namespace diffcloth::step

@@ -40,6 +40,29 @@ void read_outputs(const Problem& problem,
   bars.pin_forces.assign(pin_bar, pin_bar + 3 * scene.given.pins.size());
 }
 
+/// From the change of all points at the end to that of the outputs but the forces.
+void write_outputs(const Problem& problem,
+                   const Tangents& tangents,
+                   std::vector<double> x,
+                   const Arrays<double>& outputs) {
+  double* const positions = outputs["positions"];
+  double* const velocities = outputs["velocities"];
+  for (std::size_t a = 0; a < problem.cloth_size; ++a) {
+    positions[a] = x[a];
+    velocities[a] = (x[a] - tangents.start[a]) / problem.h;
+  }
+  const bodies::Mechanisms& mechanisms = problem.scene.mechanisms;
+  for (Index c = 0; c < mechanisms.coordinate_count(); ++c) {
+    outputs["coordinates"][c] = problem.coordinates.nodes(x)[mechanisms.slot(c)];
+  }
+}
+
+Forces forces_of(const Arrays<double>& outputs) {
+  return {.bodies = outputs["body_forces"],
+          .contact = outputs["contact_forces"],
+          .pins = outputs["pin_forces"]};
+}
+
 }  // namespace
 
 std::vector<Field> output_fields(const Scene& scene) {
@@ -115,10 +138,7 @@ Report forward(const Scene& scene,
                          .tape = tape,
                          .kept = kept,
                          .report = report},
-                        x,
-                        {.bodies = outputs["body_forces"],
-                         .contact = outputs["contact_forces"],
-                         .pins = outputs["pin_forces"]});
+                        x, forces_of(outputs));
   std::copy_n(x.begin(), problem.cloth_size, positions);
   for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
     outputs["coordinates"][c] = problem.coordinates.nodes(x)[scene.mechanisms.slot(c)];
@@ -156,18 +176,48 @@ void backward(const Scene& scene,
                           .workspace = &workspace,
                           .watch = &watch,
                           .counts = &counts};
-  scene.scheme->backward({.problem = problem,
-                          .detection = detection,
-                          .context = context,
-                          .tape = tape,
-                          .kept = kept,
-                          .losses = bars,
-                          .barrier = wants_barrier(wanted)});
+  scene.scheme->backward(
+      {{.problem = problem, .detection = detection, .context = context, .tape = tape, .kept = kept},
+       bars,
+       wants_barrier(wanted)});
   const Turn::Exchange exchange = [&](std::size_t l) { bars[l].exchange(problem); };
   for (std::size_t l = 0; l < losses.size(); ++l) {
     const Turn turn(exchange, l);
     bars[l].add_predicted(problem, losses[l].gradients);
     bars[l].write(problem, losses[l].gradients);
+  }
+}
+
+void tangent(const Scene& scene,
+             const Inputs& inputs,
+             const Arrays<const double>& tape,
+             const Kept& kept,
+             std::span<const Direction> directions,
+             int threads,
+             const Checkpoint& checkpoint) {
+  Stopwatch watch;
+  solver::Counts counts;
+  contact::Detection detection(scene.broad_phase);
+  Problem problem(scene, inputs);
+  std::vector<Tangents> tangents;
+  std::vector<Forces> forces;
+  for (const Direction& direction : directions) {
+    tangents.emplace_back(problem, direction.tangents);
+    forces.push_back(forces_of(direction.outputs));
+  }
+
+  linalg::CholeskyWorkspace workspace(threads);
+  solver::Context context{.checkpoint = &checkpoint,
+                          .options = scene.given.options,
+                          .workspace = &workspace,
+                          .watch = &watch,
+                          .counts = &counts};
+  const auto dx = scene.scheme->tangent(
+      {{.problem = problem, .detection = detection, .context = context, .tape = tape, .kept = kept},
+       tangents,
+       forces});
+  for (std::size_t l = 0; l < directions.size(); ++l) {
+    write_outputs(problem, tangents[l], dx[l], directions[l].outputs);
   }
 }
 

@@ -1,0 +1,104 @@
+#pragma once
+
+#include <optional>
+#include <utility>
+#include <vector>
+
+#include "contact/contact_potential.h"
+#include "step/contact_stage.h"
+
+namespace diffcloth::step {
+
+/// The potentials of one friction iteration of a stage.
+class ContactSum {
+ public:
+  /// @param bar          where friction accumulates; null where it never does
+  /// @param barrier_bar  likewise, the barrier
+  ContactSum(ContactStage& stage,
+             Problem& problem,
+             contact::Detection& detection,
+             contact::ContactModel::Bar* bar,
+             contact::ContactModel::Bar* barrier_bar)
+      : stage_(stage), problem_(problem), bar_(bar) {
+    if (problem.contact) contact_.emplace(*problem.contact, detection, barrier_bar);
+    objective = problem.objective(stage.inertia, stage.others, stage.patterns);
+    objective.contact = contact_ ? &*contact_ : nullptr;
+  }
+
+  /// Contacts at the start of a motion; the contact potential stands there.
+  const std::vector<contact::Contact>& contacts_at_start(const std::vector<double>& x) {
+    if (contact_) contact_->stand_at_start(x.data());
+    return contacts();
+  }
+
+  /// Contacts at a point, found from scratch; the contact potential stands there.
+  const std::vector<contact::Contact>& contacts_at(const std::vector<double>& x) {
+    if (contact_) contact_->look_at(x.data());
+    return contacts();
+  }
+
+  /// Stand where these are the contacts.
+  void adopt(std::vector<contact::Contact> contacts) {
+    if (contact_) contact_->adopt(std::move(contacts));
+  }
+
+  /// Contacts where the contact potential stands.
+  const std::vector<contact::Contact>& contacts() const {
+    static const std::vector<contact::Contact> none;
+    return contact_ ? contact_->contacts() : none;
+  }
+
+  /// The potentials that contact forces are of.
+  std::vector<Potential*> touching() {
+    std::vector<Potential*> potentials;
+    if (objective.contact != nullptr) potentials.push_back(objective.contact);
+    if (friction) potentials.push_back(&*friction);
+    return potentials;
+  }
+
+  /// Contacts that friction is taken from.
+  const std::vector<contact::Contact>& lagged() const { return lagged_; }
+
+  /// Let factors have the couplings of all contacts that there may be on the way from a point: patterns
+  /// seldom change then, and remain functions of the point and this one.
+  void expect_contacts_near(const std::vector<double>& x) {
+    if (!contact_) return;
+    linalg::Couplings points;
+    contact_->add_couplings_near(x.data(), points);
+    objective.expect(std::move(points));
+  }
+
+  /// Take friction from the contacts of a configuration.
+  void lag(const std::vector<contact::Contact>& contacts) {
+    objective.others = stage_.others;
+    friction.reset();
+    lagged_.clear();
+    // Where nothing can touch there are no contacts either.
+    if (!problem_.contact || contacts.empty()) return;
+    friction.emplace(*problem_.contact, contacts, problem_.moved_from().data(), bar_);
+    objective.others.push_back(&*friction);
+    lagged_ = contacts;
+  }
+
+  /// Put the tangents of what barrier and friction depend on into them.
+  ///
+  /// @param lag  that of the lag configuration: all points; outlives the next add_tangent()
+  void set_tangents(const Tangents& tangents, const std::vector<double>& lag) {
+    if (contact_) contact_->set_tangent(tangents.contact);
+    if (friction) {
+      friction->set_tangent(tangents.contact, tangents.moved_from().data(), lag.data());
+    }
+  }
+
+  solver::Objective objective;
+  std::optional<contact::FrictionPotential> friction;
+
+ private:
+  ContactStage& stage_;
+  Problem& problem_;
+  contact::ContactModel::Bar* bar_;
+  std::optional<contact::ContactPotential> contact_;
+  std::vector<contact::Contact> lagged_;
+};
+
+}  // namespace diffcloth::step

@@ -1,0 +1,144 @@
+// The tangent of a step, in the terms of contact_adjoint.cpp.
+//
+// At the minimizer x_k the gradient vanishes at the rows, J^T grad E_k = 0, and stays zero along a direction of
+// the inputs. Let d be the change of all points with what is prescribed alone: pins, bodies, and vertices
+// of links with prescribed joints and frames, at fixed free coordinates. Then
+//
+//   dx_k = d - J H_k^-1 (J^T b + C d),   b = H d + d/d(theta) (grad E_k) theta_dot,
+//
+// with H over all points, H_k that of the rows, and C d the change of J^T grad E_k with J along d. Every potential
+// adds what its own inputs do to b; friction of k = 1..K also what the lag configuration does, whose change
+// is dx_{k-1} (that of the start for k = 1). The outputs change by
+//
+//   dx = dx_K,   dv = (dx - dx_n) / h,   dg = H dx_K + d/d(theta) (grad E_K) theta_dot   at pins,
+//
+// and forces of contact, on cloths and bodies, by minus the same of barrier and friction alone; bodies feel
+// attachments too.
+
+#include <algorithm>
+#include <utility>
+
+#include "step/contact_stage.h"
+#include "step/contact_sum.h"
+#include "step/taken_solves.h"
+
+namespace diffcloth::step {
+namespace {
+
+using Array = std::vector<double>;
+
+/// How grad E changes at all points with the inputs that potentials have, at fixed points.
+struct GradientTangent {
+  Array touching;  ///< of barrier and friction
+  Array others;    ///< of the others
+};
+
+GradientTangent gradient_tangent(const solver::Objective& f,
+                                 const Array& x,
+                                 const std::vector<Potential*>& touching) {
+  GradientTangent result{.touching = Array(x.size(), 0.0), .others = Array(x.size(), 0.0)};
+  f.for_each([&](const Potential& p) {
+    const bool touches = std::ranges::find(touching, &p) != touching.end();
+    p.add_tangent(x.data(), (touches ? result.touching : result.others).data());
+  });
+  return result;
+}
+
+/// d: of all points with what is prescribed, at fixed rows.
+Array prescribed_tangent(const Pushforward& step, std::size_t l, const Array& x) {
+  Array d = step.directions[l].ends;
+  step.problem.coordinates.carry(x, d);
+  return d;
+}
+
+/// The change of the forces with that of all points; `change` becomes that of the gradient.
+void add_force_tangents(const Pushforward& step,
+                        const solver::Objective& f,
+                        const Array& x,
+                        const Array& dx,
+                        const std::vector<Potential*>& touching,
+                        GradientTangent& change,
+                        const Forces& forces) {
+  for (const Potential* p : touching) {
+    p->add_hessian_product(x.data(), dx.data(), change.touching.data());
+  }
+  f.for_each([&](const Potential& p) {
+    if (std::ranges::find(touching, &p) != touching.end()) return;
+    p.add_held_product(x.data(), dx.data(), change.others.data());
+  });
+  const std::size_t cloth = step.problem.cloth_size;
+  const std::size_t end = 3 * static_cast<std::size_t>(step.problem.scene.vertex_count());
+  for (std::size_t a = 0; a < cloth; ++a) forces.contact[a] -= change.touching[a];
+  for (std::size_t a = cloth; a < end; ++a) {
+    // Of the others, attachments alone act on bodies.
+    forces.bodies[a - cloth] -= change.touching[a] + change.others[a];
+  }
+  double* out = forces.pins;
+  for (const Index i : step.problem.scene.given.pins) {
+    for (Index a = 3 * i; a < 3 * i + 3; ++a) *out++ += change.touching[a] + change.others[a];
+  }
+}
+
+}  // namespace
+
+std::vector<Array> push_forward_solve(const Pushforward& step,
+                                      const solver::Objective& f,
+                                      const Array& x,
+                                      solver::Certificate certificate,
+                                      bool with_forces,
+                                      const std::vector<Potential*>& touching,
+                                      const SetTangents& set_tangents) {
+  const solver::Coordinates& coordinates = *f.coordinates;
+  solver::LinearSystem system(f, *step.context.workspace, *step.context.watch,
+                              *step.context.counts);
+  Array gradient;
+  certificate = certified(system, f, x, std::move(certificate), gradient);
+
+  const std::size_t count = step.directions.size();
+  std::vector<GradientTangent> changes;
+  std::vector<Array> d;
+  std::vector<Array> b(count);
+  for (std::size_t l = 0; l < count; ++l) {
+    step.context.checkpoint->check();
+    set_tangents(l);
+    changes.push_back(gradient_tangent(f, x, touching));
+    d.push_back(prescribed_tangent(step, l, x));
+    if (is_zero(d[l])) {
+      b[l].assign(x.size(), 0.0);
+    } else {
+      f.hessian_product(x.data(), d[l].data(), b[l]);
+      if (coordinates.is_curved()) coordinates.add_change(x, d[l], gradient, b[l]);
+    }
+    for (std::size_t a = 0; a < x.size(); ++a) {
+      b[l][a] += changes[l].others[a] + changes[l].touching[a];
+    }
+  }
+  std::vector<Array> dx;
+  system.solve(certificate, b, dx);
+  for (std::size_t l = 0; l < count; ++l) {
+    for (std::size_t a = 0; a < x.size(); ++a) dx[l][a] += d[l][a];
+    if (with_forces) {
+      add_force_tangents(step, f, x, dx[l], touching, changes[l], step.forces[l]);
+    }
+  }
+  return dx;
+}
+
+std::vector<Array> ContactStage::tangent(const Pushforward& step) {
+  ContactSum sum(*this, step.problem, step.detection, nullptr, nullptr);
+  std::vector<Array> dx;  // of the lag configuration
+  for (const Tangents& tangents : step.directions) dx.push_back(tangents.start);
+  const SetTangents set_all = [&](std::size_t l) {
+    set_tangents(l);
+    sum.set_tangents(step.directions[l], dx[l]);
+  };
+  TakenSolves solves(step, sum, first_factor);
+  for (std::size_t k = 0; k < solves.count(); ++k) {
+    solves.stand(k);
+    dx = push_forward_solve(step, sum.objective, solves.x(), solves.certificate(),
+                            k + 1 == solves.count(), sum.touching(), set_all);
+  }
+  return dx;
+}
+
+}  // namespace diffcloth::step
