@@ -400,13 +400,28 @@ Mat3 start_curvature_change(const Element& element,
 
 }  // namespace
 
+void add_constant_tangent(const Element& element, const double* u, const Tangents& dot, double* y) {
+  const Mat3 Q = element.weight * form(element.poisson);
+  const Mat3 dQ =
+      dot.weight * form(element.poisson) + element.weight * dot.poisson * form_derivative();
+  const Mat3 Y = second_derivatives(element, u);
+  Mat3 dq = Y * dQ;
+  Element moved = element;
+  if (dot.c != nullptr) {
+    moved.c = dot.c;
+    dq += second_derivatives(moved, u) * Q;
+  }
+  for (Index i = 0; i < element.size(); ++i) {
+    Eigen::Map<Vec3> y_i(y + 3 * element.vertices[i]);
+    y_i += dq * element.weights(i);
+    if (dot.c != nullptr) y_i += Y * (Q * moved.weights(i));
+  }
+}
+
 // As in body_change(), with the changes of c and g in the place of those of x, and those of b, b_n and
 // Q besides.
-void add_tangent(const Element& element,
-                 const double* x,
-                 const double* x_n,
-                 const Tangents& dot,
-                 double* y) {
+void add_tangent(
+    const Element& element, const double* x, const double* x_n, const Tangents& dot, double* y) {
   const bool with_rest = dot.c != nullptr;
   const Mat3 dQ =
       dot.weight * form(element.poisson) + element.weight * dot.poisson * form_derivative();
@@ -439,8 +454,7 @@ void add_tangent(const Element& element,
     const Mat3 db_n = start_curvature_change(element, moved, x_n, dot);
     const Mat3 s_n = state.curvature - b_n;
     const Mat3 ds_n = RtY - cross_columns(w, b_n) - db_n;
-    const Mat3 dq_n =
-        element.damping * (ds_n * state.Q + s_n * dQ) + dot.damping * (s_n * state.Q);
+    const Mat3 dq_n = element.damping * (ds_n * state.Q + s_n * dQ) + dot.damping * (s_n * state.Q);
     dtau += sum_of_crosses(b_n, dq_n) + sum_of_crosses(db_n, state.q_n);
     dq += dq_n;
   }

@@ -104,13 +104,14 @@ struct Tangents {
   const double* x_n = nullptr;  ///< [N, 3]
 };
 
+/// y += the change of weight Y(u) Q with these tangents, over the element: constant_mixed(), transposed;
+/// of the geometry c alone.
+void add_constant_tangent(const Element& element, const double* u, const Tangents& dot, double* y);
+
 /// y += the change of grad E with these tangents: mixed(), transposed.
 ///
 /// @param x_n  as for mixed()
-void add_tangent(const Element& element,
-                 const double* x,
-                 const double* x_n,
-                 const Tangents& dot,
-                 double* y);
+void add_tangent(
+    const Element& element, const double* x, const double* x_n, const Tangents& dot, double* y);
 
 }  // namespace diffcloth::elastic::bending

@@ -48,6 +48,63 @@ void add_element_mixed(
   }
 }
 
+/// y_p += P g_p over the corners of a face.
+void scatter(const Model& model, Index f, const Mat32& P, const mesh::ShapeGradient& g, double* y) {
+  for (int p = 0; p < 3; ++p) {
+    Eigen::Map<Vec3>(y + 3 * model.topology->faces[f][p]) += P * g.row(p).transpose();
+  }
+}
+
+void add_constant_tangent(const Model& model,
+                          Index f,
+                          const double* u,
+                          const Bar& dot,
+                          const Changing& changing,
+                          double* y) {
+  const double k_s = model.stretch[f];
+  const double area = model.rest->area[f];
+  const double factor = face_factor(model, f);
+  const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
+  const Mat32 F_u = face_gradient(model, f, u);
+  double weight_dot = 0.0;
+  if (changing.materials) {
+    weight_dot += dot.stretch[f] * area * factor;
+    if (model.h > 0.0) weight_dot += k_s * area * dot.damping[f] / model.h;
+  }
+  Mat32 change = weight_dot * F_u;
+  if (changing.rest) {
+    const mesh::ShapeGradient& g_dot = dot.rest.shape_gradient[f];
+    const double weight = k_s * area * factor;
+    change += k_s * factor * dot.rest.area[f] * F_u + weight * face_gradient(model, f, g_dot, u);
+    scatter(model, f, weight * F_u, g_dot, y);
+  }
+  scatter(model, f, change, g, y);
+}
+
+void add_element_tangent(const Model& model,
+                         Index e,
+                         const double* u,
+                         const Bar& dot,
+                         const Changing& changing,
+                         double* y) {
+  const double factor = element_factor(model, e);
+  bending::Element element = bending_element(model, e);
+  element.weight *= factor;
+  bending::Tangents tangents;
+  if (changing.materials) {
+    tangents.weight = element_mean(model, e, dot.bending) * factor * model.rest->bending_area[e];
+    tangents.poisson = element_mean(model, e, dot.poisson);
+    if (model.h > 0.0) {
+      tangents.weight += element_mean(model, e, dot.damping) * model.prepared.bending[e] / model.h;
+    }
+  }
+  if (changing.rest) {
+    tangents.weight += element_mean(model, e, model.bending) * factor * dot.rest.bending_area[e];
+    tangents.c = dot.rest.curvature_operator.data() + 3 * model.stencils->start[e];
+  }
+  bending::add_constant_tangent(element, u, tangents, y);
+}
+
 }  // namespace
 
 ConstantForm ConstantForm::of_flat_bending(const Model& model,
@@ -141,6 +198,17 @@ void ConstantForm::add_product(const double* u, double* y) const {
   for (std::size_t a = 0; a < anchor_vertex_.size(); ++a) {
     const Index i = anchor_vertex_[a];
     Eigen::Map<Vec3>(y + 3 * i) += anchor_stiffness_[a] * row(u, i);
+  }
+}
+
+void add_constant_form_tangent(
+    const Model& model, const double* u, const Bar& dot, const Changing& changing, double* y) {
+  if (!changing.materials && !changing.rest) return;
+  for (Index f = 0; f < face_count(model); ++f) {
+    add_constant_tangent(model, f, u, dot, changing, y);
+  }
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    add_element_tangent(model, e, u, dot, changing, y);
   }
 }
 

@@ -72,4 +72,8 @@ class ConstantForm {
 void add_constant_form_mixed(
     const Model& model, const double* u, const double* z, bool with_rest, Bar& bar);
 
+/// y += d/d theta (L u) theta_dot, springs not included: add_constant_form_mixed(), transposed.
+void add_constant_form_tangent(
+    const Model& model, const double* u, const Bar& dot, const Changing& changing, double* y);
+
 }  // namespace diffcloth::elastic

@@ -523,11 +523,8 @@ void add_mixed(const Model& model, const double* x, const double* z, bool with_r
   }
 }
 
-void add_tangent(const Model& model,
-                 const double* x,
-                 const Bar& dot,
-                 const Changing& changing,
-                 double* y) {
+void add_tangent(
+    const Model& model, const double* x, const Bar& dot, const Changing& changing, double* y) {
   const bool damped = model.prepared.damped && changing.start;
   if (!changing.materials && !changing.rest && !damped) return;
   for (Index f = 0; f < face_count(model); ++f) add_face_tangent(model, f, x, dot, changing, y);

@@ -157,11 +157,8 @@ struct Changing {
 /// transposed.
 ///
 /// @param dot  tangents of what a Bar has cotangents of; where `changing` says so
-void add_tangent(const Model& model,
-                 const double* x,
-                 const Bar& dot,
-                 const Changing& changing,
-                 double* y);
+void add_tangent(
+    const Model& model, const double* x, const Bar& dot, const Changing& changing, double* y);
 
 /// A number for each of the energies.
 struct Energies {

@@ -68,4 +68,22 @@ void ElasticNearness::accumulate(const double* x, const double* z) {
   }
 }
 
+void ElasticNearness::add_tangent(const double* x, double* y) const {
+  std::vector<double> minus(target_dot.size());
+  for (std::size_t a = 0; a < minus.size(); ++a) minus[a] = -target_dot[a];
+  form_.add_product(minus.data(), y);
+  const std::vector<double> u = offset(x);
+  elasticity_.add_constant_form_tangent(u.data(), y);
+  for (const SpringPotential* const kind : springs_) {
+    const Springs& springs = kind->springs();
+    for (Index a = 0; a < springs.size(); ++a) {
+      const Vec3 force = kind->stiffness_dot[a] * difference(springs, a, u.data());
+      const auto points = springs.points(a);
+      for (std::size_t p = 0; p < points.size(); ++p) {
+        Eigen::Map<Vec3>(y + 3 * points[p]) += springs.coefficients(a)[p] * force;
+      }
+    }
+  }
+}
+
 }  // namespace diffcloth::elastic

@@ -26,9 +26,11 @@ class ElasticNearness final : public Potential {
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
   void add_hessian_product(const double* x, const double* z, double* y) const override;
   void accumulate(const double* x, const double* z) override;
+  void add_tangent(const double* x, double* y) const override;
   void swap_cotangents(CotangentStore& store) override { store.exchange(target_bar); }
 
   std::vector<double> target_bar;  ///< [3 N], zero until accumulate()
+  std::vector<double> target_dot;  ///< [3 N] tangent, for add_tangent(); others are the potentials'
 
  private:
   /// u = x - y [3 N].

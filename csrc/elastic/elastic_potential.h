@@ -54,6 +54,11 @@ class ElasticPotential final : public Potential {
   /// Zero until something is accumulated.
   Bar& bar();
 
+  /// The same for the model's ConstantForm.
+  void add_constant_form_tangent(const double* u, double* y) const {
+    elastic::add_constant_form_tangent(model_, u, dot_, changing_, y);
+  }
+
   /// Tangents of the model, for add_tangent().
   void set_tangent(Bar dot, Changing changing) {
     dot_ = std::move(dot);

@@ -57,6 +57,40 @@ void patch_operator_vjp(const Chart& chart, const Operator& c_bar, ChartBar& bar
   }
 }
 
+Operator patch_operator_jvp(const Chart& chart, const ChartBar& dot) {
+  const FitMatrix M = fit_matrix(chart);
+  const double area = chart.area();
+  const double area_dot = 0.5 * (dot.length * chart.base.b + chart.base.length * dot.b);
+  std::array<FitRow<Dual<1>>, kMaxPatch> rows;
+  FitMatrix M_dot = FitMatrix::Zero(M.rows(), 3);
+  for (int j = 3; j < chart.size; ++j) {
+    const std::array<double, 5> values = fit_parameters(chart, j);
+    const std::array<double, 5> changes{dot.length, dot.a, dot.b, dot.u[j].x(), dot.u[j].y()};
+    std::array<Dual<1>, 5> p;
+    for (int k = 0; k < 5; ++k) {
+      p[k] = {values[k], Eigen::Matrix<double, 1, 1>::Constant(changes[k])};
+    }
+    rows[j] = fit_row(p);
+    for (int k = 0; k < 3; ++k) M_dot(j - 3, k) = rows[j].m[k].derivative(0);
+  }
+  const FitInverse inverse = fit_inverse(M) / area;
+  // The derivative of fit_inverse() is its own adjoint.
+  FitInverse inverse_dot = fit_inverse_vjp(M, M_dot.transpose()).transpose() / area;
+  inverse_dot -= (area_dot / area) * inverse;
+
+  Operator c_dot = Operator::Zero(3, chart.size);
+  for (int j = 3; j < chart.size; ++j) {
+    const Vec3 weight = kUnknownScale.cwiseProduct(inverse.col(j - 3));
+    const Vec3 weight_dot = kUnknownScale.cwiseProduct(inverse_dot.col(j - 3));
+    c_dot.col(j) = weight_dot;
+    for (int i = 0; i < 3; ++i) {
+      const Dual<1>& lambda = rows[j].lambda[i];
+      c_dot.col(i) -= lambda.value * weight_dot + lambda.derivative(0) * weight;
+    }
+  }
+  return c_dot;
+}
+
 // ---- the operator of a hinge ----
 
 /// Weights of Bergou's hinge, sqrt(3 / (A0 + A1)) sum_i w_i x_i with cotangent weights w, about the
@@ -119,6 +153,19 @@ void hinge_operator_vjp(const Chart& chart,
   }
 }
 
+Operator hinge_operator_jvp(const Chart& chart,
+                            const std::array<int, 4>& corner,
+                            const ChartBar& dot) {
+  const std::array<Dual8, 4> w = hinge_weights(variables<8>(hinge_coordinates(chart, corner)));
+  Operator c_dot = Operator::Zero(3, 4);
+  for (int i = 0; i < 4; ++i) {
+    for (int k = 0; k < 4; ++k) {
+      c_dot(0, corner[i]) += w[i].derivative.segment<2>(2 * k).dot(dot.u[corner[k]]);
+    }
+  }
+  return c_dot;
+}
+
 }  // namespace
 
 Chart element_chart(const BendingStencils& stencils, Index e, const double* X) {
@@ -147,6 +194,19 @@ void fit_operator_vjp(const BendingStencils& stencils,
     case BendingModel::kHinge:
       return hinge_operator_vjp(chart, hinge_corners(stencils, e), c_bar, bar);
   }
+}
+
+Operator fit_operator_jvp(const BendingStencils& stencils,
+                          Index e,
+                          const Chart& chart,
+                          const ChartBar& dot) {
+  switch (stencils.model[e]) {
+    case BendingModel::kPatch:
+      return patch_operator_jvp(chart, dot);
+    case BendingModel::kHinge:
+      return hinge_operator_jvp(chart, hinge_corners(stencils, e), dot);
+  }
+  return {};
 }
 
 SideWeights side_weights(const Side<double>& side, const Operator& c) {

@@ -13,7 +13,7 @@ namespace diffcloth::mesh {
 /// Weights (c_uu, c_uv, c_vv) of each vertex of the quadratic of an element, one vertex a column.
 using Operator = Eigen::Matrix<double, 3, Eigen::Dynamic, 0, 3, kMaxPatch>;
 
-/// Cotangents of the chart: base triangle and local coordinates.
+/// Cotangents of the chart, or tangents: base triangle and local coordinates.
 struct ChartBar {
   double length = 0.0, a = 0.0, b = 0.0;
   std::array<double, 9> frame{};
@@ -56,6 +56,12 @@ void fit_operator_vjp(const BendingStencils& stencils,
                       const Chart& chart,
                       const Operator& c_bar,
                       ChartBar& bar);
+
+/// (d fit_operator / d chart) dot.
+Operator fit_operator_jvp(const BendingStencils& stencils,
+                          Index e,
+                          const Chart& chart,
+                          const ChartBar& dot);
 
 /// How the quadratic of a base triangle leaves through the side opposite a corner: its outward
 /// derivative at the middle of the side is sum_i (k . c_i + [i < 3] g_i) x_i, and N is the side's

@@ -119,4 +119,10 @@ void rest_shape_vjp(const Topology& topology,
                     const RestShapeBar& bar,
                     double* X_bar);
 
+/// (d rest_shape / dX) X_dot, as in rest_shape_vjp(); cotangents and tangents have the same layout.
+RestShapeBar rest_shape_jvp(const Topology& topology,
+                            const BendingStencils& stencils,
+                            const double* X,
+                            const double* X_dot);
+
 }  // namespace diffcloth::mesh
