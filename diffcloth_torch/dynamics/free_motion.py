@@ -14,6 +14,7 @@ from diffcloth_torch import _core
 from diffcloth_torch.dynamics.inertia import Inertia
 from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.model.mechanism import JOINT_KINDS, Mechanism
+from diffcloth_torch.transforms import is_differentiated, numbers_of
 
 __all__ = ["free_turns", "robot_motion", "solve_motion"]
 
@@ -58,14 +59,14 @@ def free_turns(inertia: Tensor, momentum: Tensor, dt: float) -> tuple[Tensor, Te
     """
     shape = momentum.shape[:-1]
     given = torch.cat([inertia.expand(*shape, 3, 3).flatten(-2), momentum], dim=-1)
-    numbers = given.detach()
-    with_rates = torch.is_grad_enabled() and given.requires_grad
-    J, l = (np.ascontiguousarray(t.numpy()) for t in (numbers[..., :9], numbers[..., 9:]))
+    with_rates = is_differentiated((given,))
+    numbers = numbers_of(given)
+    J, l = (np.ascontiguousarray(part) for part in (numbers[..., :9], numbers[..., 9:]))
     turns, rates, found = _core.free_turns(J, l, dt, with_rates)
     turn = torch.from_numpy(turns).reshape(*shape, 4)
     if with_rates:
         # Adds zero, with the derivative from the core.
-        turn = turn + times(torch.from_numpy(rates).reshape(*shape, 4, 12), given - numbers)
+        turn = turn + times(torch.from_numpy(rates).reshape(*shape, 4, 12), given - given.detach())
     return turn, torch.from_numpy(found).reshape(shape)
 
 
@@ -88,6 +89,6 @@ def solve_motion(
     Returns:
         The unknown velocities [B, n], and which environments have converged [B].
     """
-    values = (np.ascontiguousarray(t.detach().numpy()) for t in (*inertia, *start, known, given))
+    values = (np.ascontiguousarray(numbers_of(t)) for t in (*inertia, *start, known, given))
     velocities, found = motion.solve(*values)
     return torch.from_numpy(velocities), torch.from_numpy(found)

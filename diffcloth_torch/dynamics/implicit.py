@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 
 from diffcloth_torch.dynamics.linear import inverse, times
+from diffcloth_torch.transforms import is_differentiated, outside_transforms, plain
 
 __all__ = ["attach_root", "jacobian_of"]
 
@@ -30,13 +31,13 @@ def attach_root(residual: Residual, root: Tensor, inputs: Sequence[Tensor]) -> T
     Returns:
         The root, to the same bits, with a graph if r has one.
     """
-    if not (torch.is_grad_enabled() and any(u.requires_grad for u in inputs)):
+    if not is_differentiated(inputs):
         return root
     value = residual(root, *inputs)
     # Detached: searching the whole graph of a rollout in each of its steps would make its cost
     # quadratic.
-    numbers = [u.detach() for u in inputs]
-    with torch.no_grad():
+    numbers = [plain(u) for u in inputs]
+    with torch.no_grad(), outside_transforms():
         K = jacobian_of(residual)(root, *numbers)
     step = times(inverse(K), value)
     return root - (step - step.detach())

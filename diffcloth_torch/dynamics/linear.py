@@ -6,6 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch.transforms import is_differentiated, numbers_of
+
 __all__ = ["inverse", "solve", "times"]
 
 
@@ -15,7 +17,7 @@ def inverse(matrices: Tensor) -> Tensor:
     NumPy inverts one matrix after the other; torch distributes a few among threads, which do not
     survive a fork.
     """
-    inverses: Tensor = torch.from_numpy(np.linalg.inv(matrices.detach().numpy()))
+    inverses: Tensor = torch.from_numpy(np.linalg.inv(numbers_of(matrices)))
     return inverses
 
 
@@ -24,9 +26,9 @@ def solve(matrices: Tensor, vectors: Tensor) -> Tensor:
 
     The derivative is dx = M^-1 (dv - dM x), which -M^-1 (M x - v) with a constant M^-1 also has.
     """
-    numbers = matrices.detach().numpy(), vectors.detach().numpy()[..., None]
+    numbers = numbers_of(matrices), numbers_of(vectors)[..., None]
     x: Tensor = torch.from_numpy(np.linalg.solve(*numbers)[..., 0])
-    if not (torch.is_grad_enabled() and (matrices.requires_grad or vectors.requires_grad)):
+    if not is_differentiated((matrices, vectors)):
         return x
     step = times(inverse(matrices), times(matrices, x) - vectors)
     return x - (step - step.detach())

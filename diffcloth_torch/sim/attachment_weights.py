@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.sim.axes import numbers_of
 from diffcloth_torch.sim.layout import Layout
+from diffcloth_torch.transforms import numbers_of
 
 __all__ = ["Targets", "default_weights", "refuse_untargeted"]
 

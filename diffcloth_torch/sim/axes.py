@@ -15,7 +15,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.poses import SHORTEST_QUATERNION, check_quaternions
 from diffcloth_torch.sim.step import have_quaternions
 
-__all__ = ["numbers_of", "refuse_short_quaternions", "with_axis", "without_axes", "without_axis"]
+__all__ = ["refuse_short_quaternions", "with_axis", "without_axes", "without_axis"]
 
 
 def with_axis(name: str, tensor: Tensor, dimensions: int, batch: int | None) -> Tensor:
@@ -60,9 +60,3 @@ def refuse_short_quaternions(name: str, poses: FloatArray) -> None:
     # For lengths near the shortest one, the result of that function decides.
     if not have_quaternions(poses, 2 * SHORTEST_QUATERNION):
         check_quaternions(name, poses)
-
-
-def numbers_of(tensor: Tensor) -> FloatArray:
-    """Array of a tensor's numbers; shares its memory, without its graph."""
-    array: FloatArray = tensor.detach().numpy()
-    return array

@@ -16,7 +16,7 @@ from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.parameter_fields import parameter_fields
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.sim.state_fields import state_fields
-from diffcloth_torch.sim.step import as_array, refuse_transforms
+from diffcloth_torch.sim.step import as_array
 
 __all__ = ["Border", "Given"]
 
@@ -62,7 +62,6 @@ class Border:
         self, state: State, control: Control | None, parameters: Parameters | None
     ) -> tuple[Given, int | None]:
         """Check all inputs; return them with the batch size, None without a batch axis."""
-        refuse_transforms("step", state, control, parameters)
         before, batch = self.state(state)
         wanted = control_fields(self._layout, control, before, batch)
         return Given(before, wanted, self.parameters(parameters, batch)), batch

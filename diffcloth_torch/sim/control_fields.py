@@ -24,10 +24,11 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.quantities import CONTROL, Fields, Shape
 from diffcloth_torch.sim.attachment_weights import Targets, default_weights, refuse_untargeted
-from diffcloth_torch.sim.axes import numbers_of, refuse_short_quaternions, with_axis
+from diffcloth_torch.sim.axes import refuse_short_quaternions, with_axis
 from diffcloth_torch.sim.controls import Control
 from diffcloth_torch.sim.layout import SEVERAL, Layout
-from diffcloth_torch.sim.step import are_within, refuse_transforms
+from diffcloth_torch.sim.step import are_within
+from diffcloth_torch.transforms import numbers_of
 
 __all__ = ["check_control", "control_fields"]
 
@@ -45,7 +46,6 @@ def _targets(layout: Layout, control: Control) -> dict[str, Tensor | dict[str, T
     """The fields that a control sets, checked."""
     if not isinstance(control, Control):
         raise TypeError(f"step: `control` must be a Control, got {type(control).__name__}")
-    refuse_transforms("control")
     checked: dict[str, Tensor | dict[str, Tensor]] = {}
     for field, shape in layout.control_shapes.items():
         given = getattr(control, field)
@@ -197,7 +197,7 @@ def _keep(layout: Layout, field: str, targets: Tensor, poses: Tensor) -> Tensor:
     """Refuse to move what is not kinematic; a row rounded to float32 stands for the state's."""
     reasons = layout.permissions.kept[field]
     still = [k for k, why in enumerate(reasons) if why]
-    if not still or torch.equal(targets, poses):
+    if not still:
         return targets
     given, kept = numbers_of(targets)[:, still], numbers_of(poses)[:, still]
     rounded = kept.astype(np.float32).astype(np.float64)

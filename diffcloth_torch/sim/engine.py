@@ -26,6 +26,7 @@ from diffcloth_torch.sim.motion import ended_poses, held_targets, prescribed_mot
 from diffcloth_torch.sim.staggered import Staggered
 from diffcloth_torch.sim.step import TURNED, Constant, Outcome, take_step
 from diffcloth_torch.sim.surfaces import Surfaces
+from diffcloth_torch.transforms import is_differentiated
 
 __all__ = ["Engine"]
 
@@ -191,7 +192,7 @@ class Engine:
         if prediction is not None:
             inputs |= prediction.core_inputs()
         rest = inputs.get("rest_positions")
-        if rest is not None and not rest.requires_grad and self._is_of_scene(rest):
+        if rest is not None and not is_differentiated((rest,)) and self._is_of_scene(rest):
             del inputs["rest_positions"]  # the core has prepared the rest shape of the scene
         return inputs
 

@@ -16,6 +16,7 @@ from diffcloth_torch.errors import (
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.sim.pull_back import vmap_level
 from diffcloth_torch.sim.step import CONVERGED, INFEASIBLE, TURNED, UNCONVERGED
+from diffcloth_torch.transforms import is_differentiated, same_row
 
 __all__ = ["failures_of", "mark", "refuse_gradients"]
 
@@ -46,22 +47,34 @@ def failures_of(diagnostics: dict[str, Any]) -> Failures:
 
 
 def refuse_gradients(fields: Fields, failures: Failures) -> Fields:
-    """The same fields [B, ...]; backward raises if a loss depends on a failed environment."""
+    """The same fields [B, ...]; a derivative that depends on a failed environment raises."""
     if not failures:
         return fields
     return {
-        name: _Guard.apply(tensor, failures) if tensor.requires_grad else tensor
+        name: _Guard.apply(tensor, failures) if is_differentiated((tensor,)) else tensor
         for name, tensor in fields.items()
     }
 
 
 class _Guard(torch.autograd.Function):
-    """The identity; its backward checks the cotangents."""
+    """The identity; it checks the cotangents of backward, and tangents."""
 
     @staticmethod
-    def forward(ctx, tensor, failures):
-        ctx.failures, ctx.environment_axis = failures, -tensor.ndim
+    def forward(tensor, failures):
         return tensor.clone()
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        tensor, ctx.failures = inputs
+        ctx.environment_axis = -tensor.ndim
+
+    @staticmethod
+    def vmap(info, in_dims, tensor, failures):
+        return _Guard.apply(same_row(tensor.movedim(in_dims[0], 0)), failures), None
+
+    @staticmethod
+    def jvp(ctx, tangent, _):
+        return _Look.apply(tangent, ctx.failures, ctx.environment_axis)
 
     @staticmethod
     def backward(ctx, cotangent):
@@ -97,6 +110,10 @@ class _Look(torch.autograd.Function):
     @staticmethod
     def vmap(info, in_dims, cotangent, *rest):
         return _Look.apply(cotangent.movedim(in_dims[0], 0), *rest), 0
+
+    @staticmethod
+    def jvp(ctx, tangent, *_):
+        return tangent.clone()
 
     @staticmethod
     def backward(ctx, cotangent):

@@ -13,8 +13,9 @@ from torch import Tensor
 from diffcloth_torch.checks import check_range, check_shape, texts
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.quantities import PARAMETERS, Axes, Shape
-from diffcloth_torch.sim.axes import numbers_of, with_axis
+from diffcloth_torch.sim.axes import with_axis
 from diffcloth_torch.sim.layout import Layout
+from diffcloth_torch.transforms import numbers_of
 
 __all__ = ["has_names", "named_rows"]
 

@@ -20,7 +20,6 @@ from diffcloth_torch.sim.links import contact_wrenches, link_velocities
 from diffcloth_torch.sim.masses import vertex_masses
 from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.state import State
-from diffcloth_torch.sim.step import refuse_transforms
 from diffcloth_torch.sim.stored_energy import stored_energy
 
 __all__ = ["Observables"]
@@ -44,7 +43,6 @@ class Observables:
             "robot/link" -> homogeneous matrix from the link to the world, shape [4, 4], or
             [B, 4, 4] in a batch.
         """
-        refuse_transforms("link_poses")
         fields, batch = self._border.state(state)
         return without_axes(self._engine.surfaces.link_frames(fields), batch)
 
@@ -63,7 +61,6 @@ class Observables:
             robot is not dynamic), then its angular velocity, in world axes [m/s, rad/s], shape [6],
             or [B, 6] in a batch.
         """
-        refuse_transforms("link_velocities")
         fields, batch = self._border.state(state)
         centers = self._centers("link", parameters, batch)
         velocities = link_velocities(self._engine.layout, fields, centers)
@@ -84,7 +81,6 @@ class Observables:
             the origin of its frame if it is not dynamic), in world axes [N, N m], shape [6], or
             [B, 6] in a batch.
         """
-        refuse_transforms("contact_wrenches")
         fields, batch = self._border.state(state)
         engine = self._engine
         shape = (*(() if batch is None else (batch,)), *engine.assembly.body_vertices.shape)
@@ -135,7 +131,6 @@ class Observables:
             Mass of each vertex, a third of that of each face around it [kg], shape [N], or [B, N]
             in a batch.
         """
-        refuse_transforms("vertex_masses")
         if batch_size is not None:
             check_count("vertex_masses: `batch_size`", batch_size, 1)
         physical = self._border.parameters(parameters, batch_size)
@@ -155,7 +150,6 @@ class Observables:
             Linear momentum, then angular momentum about the origin of the world [kg m/s,
             kg m^2/s], shape [6], or [B, 6] in a batch.
         """
-        refuse_transforms("momentum")
         totals, batch = self._totals(state, parameters)
         return without_axis(totals.momentum, batch)
 
@@ -171,7 +165,6 @@ class Observables:
         Returns:
             Energy [J], shape [], or [B] in a batch.
         """
-        refuse_transforms("kinetic_energy")
         totals, batch = self._totals(state, parameters)
         return without_axis(totals.kinetic_energy, batch)
 
@@ -212,7 +205,6 @@ class Observables:
             SimulationError: In backward, if surfaces overlap: the energy is infinite there.
         """
         check_bool("energy: `parts`", parts)
-        refuse_transforms("energy", state, parameters)
         given, batch = self._border.enter(state, None, parameters)
         energies = stored_energy(self._engine.core, self._at_rest(given))
         energies["gravity"] = self._engine.totals(given.state, given.parameters).gravity_energy

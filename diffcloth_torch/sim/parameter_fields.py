@@ -18,11 +18,10 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.mesh_checks import check_areas
 from diffcloth_torch.model.quantities import PARAMETERS, Fields, Shape
-from diffcloth_torch.sim.axes import numbers_of
 from diffcloth_torch.sim.controls import Parameters
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.named_parameters import has_names, named_rows
-from diffcloth_torch.sim.step import refuse_transforms
+from diffcloth_torch.transforms import numbers_of
 
 __all__ = ["check_parameters", "default_fields", "parameter_fields"]
 
@@ -31,7 +30,6 @@ def check_parameters(parameters: Parameters) -> Parameters:
     """Promote parameters to tensors; their values are checked in each step."""
     if not isinstance(parameters, Parameters):
         raise TypeError(f"step: `parameters` must be Parameters, got {type(parameters).__name__}")
-    refuse_transforms("parameters")
     given = {name: getattr(parameters, name) for name in PARAMETERS}
     checked = {name: _promoted(name, value) for name, value in given.items() if value is not None}
     return Parameters(**checked, _unbatched=parameters._unbatched)  # type: ignore[arg-type]

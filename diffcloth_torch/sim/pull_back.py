@@ -17,15 +17,9 @@ from torch import Tensor
 
 from diffcloth_torch.checks import is_dense
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.transforms import same_row
 
-__all__ = ["TRANSFORMS", "Differentiated", "needed", "pull_back", "vmap_level"]
-
-TRANSFORMS = (
-    "torch.func transforms and forward-mode derivatives are not supported; use "
-    "torch.autograd.grad or .backward(), for many losses or a Jacobian with is_grads_batched=True, "
-    "or torch.autograd.functional.jacobian(vectorize=True)"
-)
-"""What a message says after its owner."""
+__all__ = ["Differentiated", "needed", "pull_back", "vmap_level"]
 
 
 class Differentiated(NamedTuple):
@@ -99,21 +93,31 @@ class _PullBack(torch.autograd.Function):
     @staticmethod
     def vmap(info, in_dims, function, *tensors):
         count = len(function.shapes)
-        if any(dim is not None for dim in in_dims[1 : 1 + count]):
-            raise NotImplementedError(f"backward: {TRANSFORMS}")
+        saved = [
+            t if dim is None else same_row(t.movedim(dim, 0))
+            for t, dim in zip(tensors[:count], in_dims[1 : 1 + count], strict=True)
+        ]
         losses = [
             c.expand(info.batch_size, *c.shape) if dim is None else c.movedim(dim, 0)
             for c, dim in zip(tensors[count:], in_dims[1 + count :], strict=True)
         ]
-        gradients = _PullBack.apply(function, *tensors[:count], *losses)
+        gradients = _PullBack.apply(function, *saved, *losses)
         return gradients, (0,) * len(gradients)
 
     @staticmethod
+    def jvp(ctx, *tangents):
+        raise RuntimeError(_no_second(ctx.owner))
+
+    @staticmethod
     def backward(ctx, *cotangents):
-        raise RuntimeError(
-            f"{ctx.owner}: second derivatives are not available; its gradient cannot be "
-            "differentiated again, detach it where it enters another loss"
-        )
+        raise RuntimeError(_no_second(ctx.owner))
+
+
+def _no_second(owner):
+    return (
+        f"{owner}: second derivatives are not available; its gradient cannot be differentiated "
+        "again, detach it where it enters another loss"
+    )
 
 
 def _check_saved(function, saved):

@@ -43,7 +43,6 @@ from diffcloth_torch.sim.start import (
     initial_tensors,
 )
 from diffcloth_torch.sim.state import State
-from diffcloth_torch.sim.step import refuse_transforms
 from diffcloth_torch.sim.trajectory import Trajectory
 
 __all__ = ["Simulator"]
@@ -235,7 +234,6 @@ class Simulator(Observables):
             InvalidInput: If a name, shape or value is not accepted.
             TypeError: If a value is not an array of numbers on the CPU.
         """
-        refuse_transforms("control")
         control = Control(
             pins=pins,
             soft_pins=soft_pins,

@@ -9,10 +9,11 @@ from torch import Tensor
 from diffcloth_torch.checks import LARGEST, FloatArray, check_finite, check_shape, is_dense
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.quantities import Fields, Shape
-from diffcloth_torch.sim.axes import numbers_of, refuse_short_quaternions
+from diffcloth_torch.sim.axes import refuse_short_quaternions
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.state import State
-from diffcloth_torch.sim.step import are_within, refuse_transforms
+from diffcloth_torch.sim.step import are_within
+from diffcloth_torch.transforms import numbers_of
 
 __all__ = ["state_fields"]
 
@@ -23,7 +24,6 @@ def state_fields(layout: Layout, state: State) -> tuple[Fields, int | None]:
     """Check a state; returns its tensors and its batch size, None without a batch axis."""
     if not isinstance(state, State):
         raise TypeError(f"step: `state` must be a State, got {type(state).__name__}")
-    refuse_transforms("step")
     tensors = {name: getattr(state, name) for name in layout.state_shapes}
     for name, tensor in tensors.items():
         _check_state_tensor(name, tensor)

@@ -29,13 +29,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from diffcloth_torch import _core
 from diffcloth_torch._exit import note_caller
 from diffcloth_torch.errors import InvalidInput, SimulationError
-from diffcloth_torch.sim.controls import tensors_of
-from diffcloth_torch.sim.pull_back import TRANSFORMS, Differentiated, needed, pull_back
+from diffcloth_torch.sim.pull_back import Differentiated, needed, pull_back
+from diffcloth_torch.sim.push_forward import Directed, push_forward
+from diffcloth_torch.transforms import is_differentiated, numbers_of, same_row
 
 __all__ = [
     "CONVERGED",
@@ -50,7 +50,6 @@ __all__ = [
     "as_array",
     "diagnostics_of",
     "have_quaternions",
-    "refuse_transforms",
     "take_step",
 ]
 
@@ -134,25 +133,13 @@ def take_step(
     known = {n: c.array for n, c in constants.items() if inputs.get(n) is c.tensor}
     given = {name: tensor for name, tensor in inputs.items() if name not in known}
     # Decided here, because inside Function.forward gradients are always off.
-    needs_tape = torch.is_grad_enabled() and any(t.requires_grad for t in given.values())
-    if not needs_tape:
+    if not is_differentiated(given.values()):
         arrays = known | {name: as_array(t) for name, t in given.items()}
         result = _forward(core, arrays, tape=False)
         return _outcome(_outputs(result), diagnostics_of(result))
-    diagnostics: dict[str, Any] = {}
-    outputs = _Step.apply(core, known, tuple(given), diagnostics, *given.values())
-    return _outcome(outputs, diagnostics)
-
-
-def refuse_transforms(owner: str, *records: object) -> None:
-    """Raise under torch.func and forward-mode, where a gradient would be lost or wrong."""
-    if torch._C._are_functorch_transforms_active():
-        raise NotImplementedError(f"{owner}: {TRANSFORMS}")
-    if forward_ad._current_level < 0:  # no tensor has a tangent
-        return
-    tensors = (tensor for record in records for tensor in tensors_of(record))
-    if any(forward_ad.unpack_dual(t).tangent is not None for t in tensors):
-        raise NotImplementedError(f"{owner}: {TRANSFORMS}")
+    taken = _Taken(core, known, tuple(given))
+    outputs = _Step.apply(taken, *given.values())
+    return _outcome(outputs, taken.diagnostics)
 
 
 def are_within(arrays: list[NDArray[np.float64]], largest: float) -> bool:
@@ -167,7 +154,7 @@ def have_quaternions(poses: NDArray[np.float64], shortest: float) -> bool:
 
 def as_array(tensor: Tensor) -> NDArray[np.float64]:
     """Contiguous array of a tensor's numbers; shares its memory if possible."""
-    return np.ascontiguousarray((tensor.detach() if tensor.requires_grad else tensor).numpy())
+    return np.ascontiguousarray(numbers_of(tensor))
 
 
 def _forward(core: _core.Simulator, arrays: dict[str, Any], *, tape: bool) -> dict[str, Any]:
@@ -194,29 +181,70 @@ def diagnostics_of(result: dict[str, Any]) -> dict[str, Any]:
     return {**dict(numbers), **others}
 
 
-_PLAIN = 4  # arguments of _Step.forward that are not tensors
+class _Taken:
+    """A step that has been taken, for its derivatives: what is no input and no output of it."""
+
+    def __init__(
+        self, core: _core.Simulator, constants: dict[str, Any], names: tuple[str, ...]
+    ) -> None:
+        self.core, self.constants, self.names = core, constants, names
+        self.diagnostics: dict[str, Any] = {}
+        self.tape: dict[str, Tensor] = {}
+        # Factors and contacts, which the core frees together with the graph.
+        self.kept: Any = None
+
+    @property
+    def tape_names(self) -> tuple[str, ...]:
+        return tuple(self.tape)
 
 
 class _Step(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, core, constants, names, diagnostics, *tensors):
-        arrays = {name: as_array(t) for name, t in zip(names, tensors, strict=True)}
-        result = _forward(core, constants | arrays, tape=True)
-        tape = {k: torch.from_numpy(v) for k, v in result.items() if k.startswith(_TAPE)}
-        # Saves the inputs, not their arrays, because their version counters notice edits in place.
-        ctx.save_for_backward(*tensors, *tape.values())
-        ctx.shapes = [t.shape for t in (*tensors, *tape.values())]
-        ctx.core, ctx.constants = core, constants
-        ctx.names, ctx.tape_names = names, tuple(tape)
-        # Factors and contacts, which the core frees together with the graph.
-        ctx.kept = result[_KEPT]
-        diagnostics.update(diagnostics_of(result))
+    def forward(taken, *tensors):
+        arrays = {name: as_array(t) for name, t in zip(taken.names, tensors, strict=True)}
+        result = _forward(taken.core, taken.constants | arrays, tape=True)
+        taken.tape = {k: torch.from_numpy(v) for k, v in result.items() if k.startswith(_TAPE)}
+        taken.kept = result[_KEPT]
+        taken.diagnostics = diagnostics_of(result)
         return _outputs(result)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        taken, *tensors = inputs
+        # Saves the inputs, not their arrays, because their version counters notice edits in place.
+        ctx.save_for_backward(*tensors, *taken.tape.values())
+        ctx.save_for_forward(*tensors, *taken.tape.values())
+        ctx.shapes = [t.shape for t in (*tensors, *taken.tape.values())]
+        ctx.core, ctx.constants, ctx.kept = taken.core, taken.constants, taken.kept
+        ctx.names, ctx.tape_names = taken.names, taken.tape_names
+        ctx.status = taken.diagnostics["status"]
+
+    @staticmethod
+    def vmap(info, in_dims, taken, *tensors):
+        """All directions of `jacfwd` have copies of the same inputs: one step serves them."""
+        rows = [
+            t if axis is None else same_row(t.movedim(axis, 0))
+            for t, axis in zip(tensors, in_dims[1:], strict=True)
+        ]
+        outputs = _Step.apply(taken, *rows)
+        return outputs, (None,) * len(outputs)
+
+    @staticmethod
+    def jvp(ctx, _, *tangents):
+        saved = ctx.saved_tensors
+        given = {n: t for n, t in zip(ctx.names, tangents, strict=True) if t is not None}
+        function = Directed(
+            owner="step",
+            saved=len(saved),
+            axes=[saved[ctx.names.index(name)].ndim for name in given],
+            tangents=partial(_tangents, ctx, tuple(given)),
+        )
+        return push_forward(function, saved, tuple(given.values()))
 
     @staticmethod
     def backward(ctx, *cotangents):
         saved = ctx.saved_tensors  # first: raises torch's own error if the tape was freed
-        needs = needed(ctx.names, ctx.needs_input_grad[_PLAIN:])
+        needs = needed(ctx.names, ctx.needs_input_grad[1:])
         function = Differentiated(
             owner="step",
             names=(*ctx.names, *ctx.tape_names),
@@ -225,7 +253,38 @@ class _Step(torch.autograd.Function):
             gradients=partial(_backward, ctx, needs),
         )
         found = dict(zip(needs, pull_back(function, saved, cotangents), strict=True))
-        return *[None] * _PLAIN, *(found.get(name) for name in ctx.names)
+        return None, *(found.get(name) for name in ctx.names)
+
+
+def _tangents(step, given, saved, directions):
+    arrays = [as_array(t) for t in saved]
+    count = len(step.names)
+    failed = [i for i, status in enumerate(step.status) if status]
+    changed = [i for i in failed if any(_depends(d, i) for d in directions)]
+    if changed:
+        raise SimulationError(
+            f"tangent: the step of environments {changed} failed and has no tangent; give their "
+            "inputs none",
+            environments=changed,
+        )
+    note_caller()
+    try:
+        tangents = step.core.tangent(
+            step.constants | dict(zip(step.names, arrays[:count], strict=True)),
+            dict(zip(step.tape_names, arrays[count:], strict=True)),
+            step.kept,
+            {name: as_array(d) for name, d in zip(given, directions, strict=True)},
+            len(directions[0]),
+            torch.get_num_threads(),
+        )
+    except _core.SimulationError as error:
+        raise SimulationError(f"tangent: {error}") from error
+    return [torch.from_numpy(tangents[name]) for name in _OUTPUTS if name in tangents]
+
+
+def _depends(direction, environment):
+    """Whether directions [K, B or 1, ...] change an input of an environment."""
+    return bool(direction[:, min(environment, direction.shape[1] - 1)].count_nonzero())
 
 
 def _backward(step, needs, saved, losses):

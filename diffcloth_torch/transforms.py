@@ -1,0 +1,80 @@
+"""The numbers of tensors that are being differentiated, also inside transforms of `torch.func`.
+
+What is computed outside torch reads numbers, and gives them their derivative again by a function of
+its own. Inside `torch.func.jvp` and the like a tensor is a wrapper without memory, and in
+`torch.func.jacfwd` it has one equal copy for each direction besides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack as outside_transforms
+from torch.autograd import forward_ad
+
+__all__ = ["is_differentiated", "is_plain", "numbers_of", "outside_transforms", "plain", "same_row"]
+
+_CLOSE = 1e-9  # relative; batched products round by their batch
+
+
+def is_plain(tensor: Tensor) -> bool:
+    """Whether a tensor has memory of its own: no transform is at work."""
+    return not torch._C._functorch.is_functorch_wrapped_tensor(tensor)
+
+
+def plain(tensor: Tensor) -> Tensor:
+    """The numbers of a tensor as a tensor outside of all transforms, without graph or tangent.
+
+    Raises:
+        NotImplementedError: If `torch.vmap` gives it different numbers in one call.
+    """
+    value = tensor
+    with outside_transforms():
+        while torch._C._functorch.is_functorch_wrapped_tensor(value):
+            axis = torch._C._functorch.maybe_get_bdim(value)
+            inner = torch._C._functorch.get_unwrapped(value)
+            value = inner if axis < 0 else same_row(inner.movedim(axis, 0))
+        return value.detach()
+
+
+def same_row(rows: Tensor) -> Tensor:
+    """The first of rows that are all equal but for rounding.
+
+    Raises:
+        NotImplementedError: If they are not.
+    """
+    first = rows[0]
+    if is_plain(rows) and rows.stride(0):
+        values = rows.detach()
+        largest = values.abs().max() if values.numel() else 0.0
+        if not bool(((values - values[0]).abs() <= _CLOSE * largest).all()):
+            raise NotImplementedError(
+                "torch.vmap over states, controls or parameters is not supported: give them a "
+                "batch axis, initial_state(batch_size=...), as one call then has all environments"
+            )
+    return first
+
+
+def numbers_of(tensor: Tensor) -> NDArray[np.float64]:
+    """Array of a tensor's numbers; shares its memory, without its graph."""
+    if is_plain(tensor) and not torch._C._are_functorch_transforms_active():
+        return tensor.detach().numpy()
+    value = plain(tensor)
+    with outside_transforms():
+        return value.numpy()
+
+
+def is_differentiated(tensors: Iterable[Tensor]) -> bool:
+    """Whether a derivative of one of these is wanted: backward, or forward."""
+    tensors = list(tensors)
+    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
+        return True
+    if not all(map(is_plain, tensors)):
+        return True
+    if forward_ad._current_level < 0:  # no tensor has a tangent
+        return False
+    return any(forward_ad.unpack_dual(t).tangent is not None for t in tensors)
