@@ -94,7 +94,7 @@ class Nearness {
           is_uniform ? Array(tangents.masses.size(), mean(tangents.masses)) : tangents.masses;
       inertial_->target_dot = target;
     }
-    if (elastic_) throw std::logic_error("step: the metric elastic has no tangent");
+    if (elastic_) elastic_->target_dot = target;
     if (tilt_) tilt_->force_dot = gradient_tangent(target);
   }
 

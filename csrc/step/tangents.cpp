@@ -1,7 +1,6 @@
 #include "step/tangents.h"
 
 #include <algorithm>
-#include <stdexcept>
 
 namespace diffcloth::step {
 namespace {
@@ -63,7 +62,9 @@ Array ends_tangent(const Problem& p, const Inputs& directions) {
 mesh::RestShapeBar rest_tangent(const Problem& p, const Inputs& directions) {
   const double* const change = directions.data(Input::kRestPositions);
   if (change == nullptr) return {};
-  throw std::logic_error("step: the rest shape has no tangent");
+  const double* const X = p.inputs.data(Input::kRestPositions);
+  return mesh::rest_shape_jvp(p.scene.topology, p.scene.stencils,
+                              X != nullptr ? X : p.scene.given.rest_positions.data(), change);
 }
 
 /// y = xhat = x_n + h v_n + h^2 (gravity + f / m).

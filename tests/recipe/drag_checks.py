@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 import torch
+from core_steps import check_pairs, inputs_of
 
 import diffcloth_torch as dc
 
@@ -103,6 +104,17 @@ def test_the_gradients_are_exact_in_every_scheme(solver):
     sim, state = sheet(*solver)
     gradients_of(sim, state, per_face(len(sim.scene.cloths[0].faces)))
     gradients_of(sim, state, torch.tensor(DRAG, dtype=F64))
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=lambda s: "-".join(filter(None, s)))
+def test_the_tangents_are_the_transpose_of_the_gradients(solver):
+    sim, state = sheet(*solver)
+    drag = per_face(len(sim.scene.cloths[0].faces))
+    core, inputs = inputs_of(
+        sim, lambda: sim.step(state, None, sim.parameters().replace(drag=drag))
+    )
+    assert {"drag", "rest_positions"} <= set(inputs)
+    assert {"positions", "velocities"} <= check_pairs(core, inputs, core.forward(inputs, True, 1))
 
 
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
