@@ -8,6 +8,7 @@ its own. Inside `torch.func.jvp` and the like a tensor is a wrapper without memo
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import torch
@@ -77,4 +78,5 @@ def is_differentiated(tensors: Iterable[Tensor]) -> bool:
         return True
     if forward_ad._current_level < 0:  # no tensor has a tangent
         return False
-    return any(forward_ad.unpack_dual(t).tangent is not None for t in tensors)
+    unpack: Any = forward_ad.unpack_dual
+    return any(unpack(t).tangent is not None for t in tensors)
