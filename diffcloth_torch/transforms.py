@@ -19,7 +19,7 @@ from torch.autograd import forward_ad
 
 __all__ = ["is_differentiated", "is_plain", "numbers_of", "outside_transforms", "plain", "same_row"]
 
-_CLOSE = 1e-9  # relative; batched products round by their batch
+_CLOSE = 1e-13  # relative; batched products round by their batch
 
 
 def is_plain(tensor: Tensor) -> bool:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffcloth_torch.sim.pull_back import vmap_level
 from diffcloth_torch.transforms import same_row
 
 __all__ = ["Directed", "push_forward"]
@@ -39,8 +40,19 @@ def push_forward(
     function: Directed, saved: Sequence[Tensor], directions: Sequence[Tensor]
 ) -> tuple[Tensor, ...]:
     """Tangents of all outputs, from those of the inputs that have one."""
-    tangents: tuple[Tensor, ...] = _PushForward.apply(function, *saved, *directions)
-    return tangents
+    if not any(map(torch._C._functorch.is_legacy_batchedtensor, directions)):
+        tangents: tuple[Tensor, ...] = _PushForward.apply(function, *saved, *directions)
+        return tangents
+    # As in `pull_back`: the older vmap knows no rule of a Function.
+    level = vmap_level()
+    count = next(
+        torch._remove_batch_dim(d, level, 1, 0).shape[0]
+        for d in directions
+        if torch._C._functorch.is_legacy_batchedtensor(d)
+    )
+    rows = [torch._remove_batch_dim(d, level, count, 0) for d in directions]
+    tangents = _PushForward.apply(function, *saved, *rows)
+    return tuple(torch._add_batch_dim(tangent, 0, level) for tangent in tangents)
 
 
 class _PushForward(torch.autograd.Function):

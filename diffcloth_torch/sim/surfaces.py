@@ -22,6 +22,7 @@ from diffcloth_torch.model.kinematics import link_frames, pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.robot import Robot
 from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.transforms import numbers_of
 
 __all__ = ["LinkSurfaces", "Surfaces", "place"]
 
@@ -78,7 +79,7 @@ class LinkSurfaces:
     def frames(self, base: Tensor, joint_positions: Tensor) -> ByName:
         """Frames of all links [..., 4, 4], from the root's [..., 4, 4] and joints [..., J]."""
         fields: dict[str, Any] = {
-            field: value.numpy() if isinstance(value, Tensor) else value
+            field: numbers_of(value) if isinstance(value, Tensor) else value
             for field, value in self.mechanism.items()
         }
         frames = link_frames(Mechanism(**fields), base, joint_positions)

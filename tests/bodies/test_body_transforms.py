@@ -1,4 +1,4 @@
-"""What only looks at a state says in a sentence that it does not go with `torch.func`."""
+"""What only looks at a state has the same derivatives under `torch.func`."""
 
 import pytest
 import torch
@@ -16,30 +16,34 @@ def sim():
     return dc.Simulator(dc.Scene([], robots=[hand]), 0.01, contact=contact)
 
 
+@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("transform", [torch.func.grad, torch.func.jacrev, torch.func.vmap])
-def test_functions_of_states_refuse_transforms(sim, name, transform):
+@pytest.mark.parametrize("transform", [torch.func.grad, torch.func.jacrev, torch.func.jacfwd])
+def test_functions_of_states(sim, name, transform):
     state = sim.initial_state()
+    spinning = torch.full_like(state.base_velocities, 0.3)
 
     def value(joints):
-        found = getattr(sim, name)(state.replace(joint_positions=joints))
-        return sum(t.sum() for t in (found.values() if isinstance(found, dict) else [found]))
+        moved = state.replace(joint_positions=joints, base_velocities=spinning)
+        found = getattr(sim, name)(moved)
+        weights = torch.arange(1.0, 17.0, dtype=torch.float64)
+        parts = found.values() if isinstance(found, dict) else [found]
+        return sum((weights[: t.numel()] * t.flatten()).sum() for t in parts)
 
-    given = state.joint_positions
-    given = given.expand(2, -1) if transform is torch.func.vmap else given
-    with pytest.raises(NotImplementedError, match=rf"^{name}: torch.func transforms .* not supp"):
-        transform(value)(given)
-    leaf = state.joint_positions.clone().requires_grad_()
-    value(leaf)  # as ever without
+    given = torch.full_like(state.joint_positions, 0.01)
+    leaf = given.clone().requires_grad_()
+    total = value(leaf)
+    expected = torch.zeros_like(given)
+    if total.requires_grad:
+        (expected,) = torch.autograd.grad(total, leaf)
+    torch.testing.assert_close(transform(value)(given), expected, rtol=1e-11, atol=1e-12)
 
 
-def test_controls_and_masses_refuse_transforms(sim):
-    with pytest.raises(NotImplementedError, match=r"^control: torch.func"):
-        torch.func.grad(lambda x: sim.control(joint_efforts=x).joint_efforts.sum())(
-            torch.zeros(2, dtype=torch.float64)
-        )
-    with pytest.raises(NotImplementedError, match=r"^vertex_masses: torch.func"):
-        torch.func.grad(lambda x: sim.vertex_masses().sum() + x)(torch.zeros(()))
+def test_different_numbers_in_one_call_are_refused(sim):
+    state = sim.initial_state()
+    given = torch.stack([state.joint_positions, state.joint_positions + 0.01])
+    with pytest.raises(NotImplementedError, match=r"torch.vmap over states, .* not supported"):
+        torch.vmap(lambda x: sim.momentum(state.replace(joint_positions=x)))(given)
 
 
 def test_the_compiler_leaves_a_step_alone(sim):

@@ -92,21 +92,6 @@ def test_second_derivatives_are_refused(coupled, loss):
             gradient.sum().backward(retain_graph=True)
 
 
-# The first forward-mode derivative of a process makes torch compile its decompositions.
-@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
-def test_transforms_are_refused(coupled):
-    def f(friction):
-        return coupled.step({"parameters.friction": friction}).positions
-
-    x = coupled.inputs()["parameters.friction"]
-    message = "torch.func transforms and forward-mode derivatives"
-    for transform in (torch.func.jacrev(f), torch.func.grad(lambda x: f(x).sum()), torch.vmap(f)):
-        with pytest.raises(NotImplementedError, match=message):
-            transform(x)
-    with pytest.raises(NotImplementedError, match=message):
-        torch.autograd.functional.jacobian(f, x, vectorize=True, strategy="forward-mode")
-
-
 # --- Which gradients -----------------------------------------------------------------------------
 
 

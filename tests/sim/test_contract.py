@@ -60,6 +60,7 @@ PUBLIC = {
     "descend": "",
     "load_config": "",
     "render": "",
+    "show": "",
     "robots": "GRIPPER panda",
     "stack": "",
     "where": "",
@@ -710,27 +711,6 @@ def test_second_derivatives_are_refused(sim, function):
     assert gradient.requires_grad
     with pytest.raises(RuntimeError, match="second derivatives are not available"):
         torch.autograd.grad((gradient**2).sum(), x)
-
-
-# The first forward-mode derivative of a process makes torch compile its decompositions.
-@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
-def test_transforms_are_refused_in_one_sentence(sim):
-    state = moved(sim)
-
-    def positions(x):
-        return sim.step(state.replace(positions=x)).positions
-
-    message = "torch.func transforms and forward-mode derivatives"
-    with pytest.raises(NotImplementedError, match=message):
-        torch.func.grad(lambda x: positions(x).sum())(state.positions)
-    with pytest.raises(NotImplementedError, match=message):
-        torch.func.vmap(positions)(state.positions.expand(2, -1, -1))
-    with pytest.raises(NotImplementedError, match=message):
-        torch.func.jvp(positions, (state.positions,), (state.positions,))
-    with torch.autograd.forward_ad.dual_level():
-        dual = torch.autograd.forward_ad.make_dual(state.positions, state.positions)
-        with pytest.raises(NotImplementedError, match=message):
-            positions(dual)
 
 
 def test_energy_has_a_value_and_a_gradient_per_environment(sim):
