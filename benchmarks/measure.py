@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
@@ -24,6 +25,8 @@ except ModuleNotFoundError:  # in the first version, which we compare with
 
 ipctk = require("ipctk")
 
+REPEATS = 5  # of the derivatives of one step, after one whose times are dropped
+MANY = 8  # directions
 BLOCK = 5  # steps between two reference factorizations
 WARM_UP = 2  # steps with backward whose times are dropped: caches fill
 
@@ -55,6 +58,8 @@ class Timing:
         forward: Of one step [ms].
         backward: Of one step [ms].
         reference: One Eigen LDL^T factorization of the contact-free Hessian, EF [ms].
+        tangent: Seconds of one tangent of the core, per second of one backward, of the last step [-].
+        many_tangents: The same of `MANY` tangents at once.
         phases: Medians of the phases that the report of a step gives [ms].
         iterations: Median Newton iterations of a step.
         residual: Largest of all steps [m/s].
@@ -70,6 +75,8 @@ class Timing:
     forward: Spread
     backward: Spread
     reference: Spread
+    tangent: float
+    many_tangents: float
     phases: dict[str, float]
     iterations: float
     residual: float
@@ -113,10 +120,12 @@ def time_steps(
     for k in range(WARM_UP + steps):
         if (k - WARM_UP) % BLOCK == 0 and k >= WARM_UP:
             references.append(reference_seconds(simulator, state, repeats))
-        state, sample = _timed_step(simulator, state, scene.control(state))
+        before, control = state, scene.control(state)
+        state, sample = _timed_step(simulator, state, control)
         if k >= WARM_UP:
             samples.append(sample)
     references.append(reference_seconds(simulator, state, repeats))
+    tangent, many = tangent_ratios(simulator, before, control)
 
     def all_of(key: str, factor: float = 1.0) -> list[float]:
         return [factor * sample[key] for sample in samples]
@@ -130,6 +139,8 @@ def time_steps(
         forward=Spread.of(all_of("forward", 1e3)),
         backward=Spread.of(all_of("backward", 1e3)),
         reference=Spread.of([1e3 * seconds for seconds in references]),
+        tangent=tangent,
+        many_tangents=many,
         phases={
             phase: 1e3 * median(sample["phases"][phase] for sample in samples)
             for phase in samples[0]["phases"]
@@ -146,6 +157,44 @@ def reference_seconds(simulator: dc.Simulator, state: dc.State, repeats: int) ->
     inputs, _ = simulator._inputs(state, None, None)
     arrays = {name: as_array(tensor) for name, tensor in inputs.items()}
     return simulator._core.reference_factorization_seconds(arrays, repeats)
+
+
+def tangent_ratios(
+    simulator: dc.Simulator, state: dc.State, control: dc.Control
+) -> tuple[float, float]:
+    """Time of one tangent and of `MANY` at once, relative to a backward, all asked of the core.
+
+    Of positions and velocities, with respect to those before the step and the targets of the bodies.
+    """
+    with torch.no_grad():
+        given, _ = simulator._inputs(state.detach(), control, None)
+    inputs = {name: as_array(tensor) for name, tensor in given.items()}
+    core, threads = simulator._core, torch.get_num_threads()
+    result = core.forward(inputs, True, threads)
+    taken = inputs, {k: v for k, v in result.items() if k.startswith("tape_")}, result["kept"]
+    names = [n for n in ("positions", "velocities", "body_targets") if inputs[n].size]
+    noise = np.random.default_rng(1)
+    cotangents = {
+        name: np.zeros((1, *result[name].shape))
+        for name in ("body_forces", "contact_forces", "pin_forces")
+    }
+    for name in ("positions", "velocities"):
+        cotangents[name] = noise.standard_normal((1, *result[name].shape))
+    tangents = {n: noise.standard_normal((MANY, *inputs[n].shape)) for n in names}
+    one = {n: values[:1] for n, values in tangents.items()}
+    backward = _median_seconds(lambda: core.backward(*taken, cotangents, 1, names, threads))
+    tangent = _median_seconds(lambda: core.tangent(*taken, one, 1, threads))
+    many = _median_seconds(lambda: core.tangent(*taken, tangents, MANY, threads))
+    return tangent / backward, many / backward
+
+
+def _median_seconds(call: Callable[[], object]) -> float:
+    seconds = []
+    for _ in range(1 + REPEATS):
+        start = time.perf_counter()
+        call()
+        seconds.append(time.perf_counter() - start)
+    return median(seconds[1:])
 
 
 def _timed_step(

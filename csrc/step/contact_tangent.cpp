@@ -51,6 +51,21 @@ Array prescribed_tangent(const Pushforward& step, std::size_t l, const Array& x)
   return d;
 }
 
+/// y = H d at the free rows; what others get means nothing.
+void product_with_prescribed(const solver::Objective& f, const Array& x, const Array& d, Array& y) {
+  Array rows;
+  f.coordinates->take_rows(d, rows);
+  if (!is_zero(rows)) {
+    f.hessian_product(x.data(), d.data(), y);
+    return;
+  }
+  y.assign(x.size(), 0.0);
+  if (is_zero(d)) return;
+  f.for_each([&](const Potential& p) {
+    p.add_left_out_product(x.data(), Curvature::kExact, d.data(), y.data());
+  });
+}
+
 /// The change of the forces with that of all points; `change` becomes that of the gradient.
 void add_force_tangents(const Pushforward& step,
                         const solver::Objective& f,
@@ -103,12 +118,8 @@ std::vector<Array> push_forward_solve(const Pushforward& step,
     set_tangents(l);
     changes.push_back(gradient_tangent(f, x, touching));
     d.push_back(prescribed_tangent(step, l, x));
-    if (is_zero(d[l])) {
-      b[l].assign(x.size(), 0.0);
-    } else {
-      f.hessian_product(x.data(), d[l].data(), b[l]);
-      if (coordinates.is_curved()) coordinates.add_change(x, d[l], gradient, b[l]);
-    }
+    product_with_prescribed(f, x, d[l], b[l]);
+    if (coordinates.is_curved()) coordinates.add_change(x, d[l], gradient, b[l]);
     for (std::size_t a = 0; a < x.size(); ++a) {
       b[l][a] += changes[l].others[a] + changes[l].touching[a];
     }
