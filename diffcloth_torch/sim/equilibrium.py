@@ -35,6 +35,7 @@ from diffcloth_torch.sim.engine import Check, Engine
 from diffcloth_torch.sim.failures import failures_of, mark, refuse_gradients
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.step import UNCONVERGED
+from diffcloth_torch.transforms import numbers_of, outside_transforms, plain
 
 __all__ = ["Equilibria"]
 
@@ -118,9 +119,9 @@ class Equilibria:
             iterations.add_(torch.tensor(found.diagnostics["iterations"]))
             return found
 
-        with torch.no_grad():
-            here = Given(*({n: t.detach() for n, t in part.items()} for part in given))
-            anchor = origins.detach()
+        with torch.no_grad(), outside_transforms():
+            here = Given(*({n: plain(t) for n, t in part.items()} for part in given))
+            anchor = plain(origins)
             for length in _GROWTH:
                 here = self._from(here, step(length, here, anchor))
             here = self._probe(here, lambda at: step(_PROBED, at, anchor))
@@ -175,7 +176,7 @@ class Equilibria:
             )
         for field, part in (("body_wrenches", slice(3, 6)), ("joint_velocities", slice(None))):
             values = given.control.get(field)
-            if values is not None and values[..., part].any():
+            if values is not None and numbers_of(values)[..., part].any():
                 what = "torques" if field == "body_wrenches" else "velocities"
                 raise InvalidInput(f"equilibrium: `control.{field}` must have no {what}")
 
