@@ -13,6 +13,7 @@ import test_attachment_gradients as attachments
 import torch
 from bodies import coupled_scenes
 from core_steps import check_pairs, directions, inputs_of, outputs_of, tape_of
+from projective import nodal_scenes
 
 import diffcloth_torch as dc
 from diffcloth_torch.geometry.poses import transform
@@ -55,6 +56,11 @@ def hanging_at_a_box():
     return inputs_of(sim, lambda: sim.step(state, control))
 
 
+def at_nodes(kind, case, scheme="projective", **options):
+    step = nodal_scenes.on_body(kind, case, scheme=scheme, **options)
+    return inputs_of(step.sim, step)
+
+
 def with_a_robot(base):
     sim, state = coupled_scenes.in_contact("monolithic", base)
     parameters = coupled_scenes.parameters(sim)
@@ -88,6 +94,11 @@ STEPS = {
         f"origins-{scheme}-{name}": (with_origins, name, scheme)
         for scheme in ("coupled", "split")
         for name in ("pushing", "stacked")
+    },
+    **{
+        f"nodes-{kind}-{case}": (at_nodes, kind, case)
+        for kind in nodal_scenes.BODIES
+        for case in nodal_scenes.CASES
     },
     "hanging_at_a_box": (hanging_at_a_box,),
     **{f"robot-{base}": (with_a_robot, base) for base in ("fixed", "floating", "kinematic")},
