@@ -103,6 +103,28 @@ void pull_back_pose(const Obstacle& o, double fraction, const Pose& bar, FrameBa
   }
 }
 
+/// Change of the pose at a fraction with those at both ends.
+Pose push_forward_pose(const Obstacle& o, double fraction, const FrameBar& dot) {
+  if (fraction == 0.0) return dot.start;
+  if (fraction == 1.0) return dot.end;
+  const Halfway half(o.start, o.end);
+  const Vec4 a = dot.start.tail<4>() / o.start.tail<4>().norm();
+  const Vec4 b = dot.end.tail<4>() / o.end.tail<4>().norm();
+  Pose result;
+  result << 0.5 * (dot.start.head<3>() + dot.end.head<3>()),
+      a - half.a * half.a.dot(a) + half.side * (b - half.b * half.b.dot(b));
+  return result;
+}
+
+/// Change of the rotation of a pose.
+Mat3 turn_jvp(const Pose& pose, Pose change) {
+  change.head<3>().setZero();
+  const Mat3 axes = Mat3::Identity();
+  Mat3 columns;
+  bodies::transform_jvp(pose, change, axes.data(), 3, columns.data());
+  return columns;
+}
+
 /// Place of a point of a body's frame.
 Vec3 placed(const Pose& pose, const Vec3& y) { return pose.head<3>() + bodies::rotation(pose) * y; }
 
@@ -258,6 +280,41 @@ FrameBar pull_back(const NodalContact& contact,
   Pose pose_bar = turn_vjp(pose, near.normal, normal_bar) + turn_vjp(pose, y_bar, from_origin);
   pose_bar.head<3>() -= out.vertex;
   pull_back_pose(o, contact.fraction, pose_bar, out);
+  return out;
+}
+
+FrameTangent push_forward(const NodalContact& contact,
+                          const Swept& cloths,
+                          std::span<const Obstacle> obstacles,
+                          const FrameBar& dot) {
+  FrameTangent out;
+  const Vec3 x = cloths.at(contact.vertex, contact.fraction);
+  if (contact.partner >= 0) {
+    const Vec3 d = x - cloths.at(contact.partner, contact.fraction);
+    const Vec3 d_dot = dot.vertex - dot.partner;
+    out.normal = (d_dot - contact.normal * contact.normal.dot(d_dot)) / d.norm();
+    return out;
+  }
+  const Obstacle& o = obstacles[contact.obstacle];
+  const Pose pose = pose_at(o, contact.fraction);
+  const Pose pose_dot = push_forward_pose(o, contact.fraction, dot);
+  const Mat3 R = bodies::rotation(pose);
+  const Mat3 R_dot = turn_jvp(pose, pose_dot);
+  const Vec3 from_origin = x - pose.head<3>();
+  const Vec3 y = R.transpose() * from_origin;
+  const Vec3 y_dot =
+      R.transpose() * (dot.vertex - pose_dot.head<3>()) + R_dot.transpose() * from_origin;
+  const Nearest near = nearest(o.shape, y);
+  out.normal = R * (near.normal_derivative * y_dot) + R_dot * near.normal;
+
+  const Vec3& b = contact.surface_point;
+  out.surface_point = near.surface_point_derivative() * y_dot;
+  Vec3 start_dot;
+  Vec3 end_dot;
+  bodies::transform_jvp(o.start, dot.start, b.data(), 1, start_dot.data());
+  bodies::transform_jvp(o.end, dot.end, b.data(), 1, end_dot.data());
+  const Mat3 turn = bodies::rotation(o.end) - bodies::rotation(o.start);
+  out.velocity = (end_dot - start_dot + turn * out.surface_point) / cloths.h;
   return out;
 }
 

@@ -74,7 +74,7 @@ std::vector<NodalContact> find_contacts(const Swept& cloths,
                                         std::span<const Obstacle> obstacles,
                                         const Touching* touching);
 
-/// Cotangents of what the frame of a contact depends on.
+/// Cotangents, or tangents, of what the frame of a contact depends on.
 struct FrameBar {
   Vec3 vertex = Vec3::Zero();   ///< of its place at the fraction
   Vec3 partner = Vec3::Zero();  ///< likewise
@@ -89,6 +89,19 @@ FrameBar pull_back(const NodalContact& contact,
                    const Vec3& normal_bar,
                    const Vec3& velocity_bar,
                    const Vec3& surface_point_bar);
+
+/// Tangents of the frame of a contact.
+struct FrameTangent {
+  Vec3 normal = Vec3::Zero();
+  Vec3 velocity = Vec3::Zero();
+  Vec3 surface_point = Vec3::Zero();
+};
+
+/// Push tangents of what it depends on forward: pull_back() transposed.
+FrameTangent push_forward(const NodalContact& contact,
+                          const Swept& cloths,
+                          std::span<const Obstacle> obstacles,
+                          const FrameBar& dot);
 
 class Cells;
 

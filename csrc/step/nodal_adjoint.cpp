@@ -28,11 +28,6 @@ using projective::NodalContact;
 
 namespace {
 
-/// Of the adjoint, relative.
-constexpr double kAdjointTolerance = 1e-12;
-/// What rounding may leave of it on a badly conditioned mesh.
-constexpr double kLargestAdjointError = 1e-8;
-
 /// What the forces pull back to: on nodes E^T E g, on the bodies minus E g, shared by the corners of the
 /// nearest faces, on pins g.
 struct ForcesBar {
@@ -77,24 +72,6 @@ ForcesBar pull_back_forces(const Problem& problem,
   return result;
 }
 
-/// lambda.
-Array solve_adjoint(const NodalSystem& system,
-                    const NodalSystem::Point& at,
-                    const linalg::BlockMatrix& H,
-                    const linalg::CholeskyFactor& factor,
-                    const Array& b) {
-  Array lambda;
-  const auto solved = system.solve(at, H, factor, true, b, kAdjointTolerance, lambda);
-  if (!solved.converged) {
-    // The floor of rounding may lie above the tolerance: then what has been found must do.
-    Array again;
-    if (!system.solve(at, H, factor, true, b, kLargestAdjointError, again).converged) {
-      throw std::domain_error("the adjoint of nodal friction did not converge");
-    }
-  }
-  return lambda;
-}
-
 /// The cotangent of the normal of a slipping contact; that of its friction goes into `bars`.
 Vec3 pull_back_slipping(const Problem& problem,
                         const NodalContacts& contacts,
@@ -104,17 +81,13 @@ Vec3 pull_back_slipping(const Problem& problem,
                         const Vec3& q_held,
                         Cotangents& bars) {
   const NodalContact& c = contacts.list[k];
-  const Index surfaces = problem.scene.surface_count();
   const Vec3 force = relative(c, at.g.data());
   const double normal_force = c.normal.dot(force);
   const double along = at.laws[k].direction.dot(lambda_e);
-  const Index a = problem.scene.vertex_cloth[c.vertex];
-  const Index other = c.partner >= 0
-                          ? problem.scene.vertex_cloth[c.partner]
-                          : problem.scene.cloth_count() + contacts.obstacles[c.obstacle].body;
   const double friction_bar = normal_force * along;
-  bars.contact.friction[a * surfaces + other] += 0.5 * friction_bar;
-  bars.contact.friction[other * surfaces + a] += 0.5 * friction_bar;
+  for (const std::size_t entry : friction_entries(problem, contacts, c)) {
+    bars.contact.friction[entry] += 0.5 * friction_bar;
+  }
   return normal_force * lambda_e + c.friction * along * force -
          c.normal.dot(q_held) * (problem.h * scale(c)) * at.u[k];
 }
@@ -174,15 +147,14 @@ void NodalStage::backward(const Backward& step,
   at.x = x;
   system.look(at);
   const linalg::BlockMatrix H = linear.assemble(x.data(), Curvature::kExact, at.g);
-  if (!factor) factor = linear.factor_in_doubles(system.without_coupling(at, H));
-  if (!factor) throw std::domain_error("the Hessian is not positive definite at the solution");
+  factor = certified(system, linear, at, H, std::move(factor));
 
   const ForcesBar forces = pull_back_forces(problem_, contacts_, at, f.coordinates->size(), bars);
   Array b = g;
   system.clear_fixed(b);
   if (forces.any) H.add_product(forces.eta.data(), b.data());
   system.project(at, b);
-  const Array lambda = solve_adjoint(system, at, H, *factor, b);
+  const Array lambda = solve_derivative(system, at, H, *factor, true, b);
 
   Array z = lambda;
   system.couple_transposed(at, z);

@@ -50,6 +50,7 @@ class PairPattern final : public Potential {
   void add_hessian_product(const double* /*x*/, const double* /*z*/, double* /*y*/) const override {
   }
   void accumulate(const double* /*x*/, const double* /*z*/) override {}
+  void add_tangent(const double* /*x*/, double* /*y*/) const override {}
   void swap_cotangents(CotangentStore& /*store*/) override {}
 
  private:

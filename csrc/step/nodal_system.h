@@ -1,5 +1,6 @@
 #pragma once
 
+#include <array>
 #include <vector>
 
 #include "linalg/block_matrix.h"
@@ -7,6 +8,7 @@
 #include "linalg/gmres.h"
 #include "projective/coulomb.h"
 #include "projective/nodal_contact.h"
+#include "solver/linear_system.h"
 #include "solver/objective.h"
 #include "step/nodal_contacts.h"
 #include "step/problem.h"
@@ -125,5 +127,29 @@ class NodalSystem {
   const std::vector<double>& inertia_;
   double inv_h_sq_;
 };
+
+/// K^-1 b, or K^-T b, to rounding.
+///
+/// @throws std::domain_error where rounding leaves too much of it
+std::vector<double> solve_derivative(const NodalSystem& system,
+                                     const NodalSystem::Point& at,
+                                     const linalg::BlockMatrix& H,
+                                     const linalg::CholeskyFactor& S,
+                                     bool transposed,
+                                     const std::vector<double>& b);
+
+/// The factor of S at a solution, made again where it is gone.
+///
+/// @throws std::domain_error where the solution is no minimum
+solver::Factor certified(const NodalSystem& system,
+                         solver::LinearSystem& linear,
+                         const NodalSystem::Point& at,
+                         const linalg::BlockMatrix& H,
+                         solver::Factor factor);
+
+/// Places of a contact's two surfaces among the coefficients of friction of all pairs, in both orders.
+std::array<std::size_t, 2> friction_entries(const Problem& problem,
+                                            const NodalContacts& contacts,
+                                            const projective::NodalContact& contact);
 
 }  // namespace diffcloth::step

@@ -12,7 +12,9 @@ import scenes
 import test_attachment_gradients as attachments
 import torch
 from bodies import coupled_scenes
+from bodies import test_core_gradients as mechanisms
 from core_steps import check_pairs, directions, inputs_of, outputs_of, tape_of
+from projective import nodal_scenes
 
 import diffcloth_torch as dc
 from diffcloth_torch.geometry.poses import transform
@@ -55,6 +57,21 @@ def hanging_at_a_box():
     return inputs_of(sim, lambda: sim.step(state, control))
 
 
+def at_nodes(kind, case, scheme="projective", solver=None):
+    step = nodal_scenes.on_body(kind, case, scheme=scheme, **(solver or {}))
+    return inputs_of(step.sim, step)
+
+
+def at_pairs(friction):
+    step = nodal_scenes.stacked(friction=friction)
+    return inputs_of(step.sim, step)
+
+
+def with_joints(name):
+    scene, arrays = mechanisms.CASES[name]()
+    return scene.core, arrays
+
+
 def with_a_robot(base):
     sim, state = coupled_scenes.in_contact("monolithic", base)
     parameters = coupled_scenes.parameters(sim)
@@ -89,6 +106,21 @@ STEPS = {
         for scheme in ("coupled", "split")
         for name in ("pushing", "stacked")
     },
+    **{
+        f"nodes-{kind}-{case}": (at_nodes, kind, case)
+        for kind in nodal_scenes.BODIES
+        for case in nodal_scenes.CASES
+    },
+    **{
+        f"nodes-split-{metric}-{elastic}": (
+            *(at_nodes, "box", "slipping", "split"),
+            {"metric": metric, "elastic": elastic},
+        )
+        for metric in METRICS
+        for elastic in ("newton", "projective")
+    },
+    **{f"pairs-{friction}": (at_pairs, friction) for friction in (0.05, 2.0)},
+    **{f"joints-{name}": (with_joints, name) for name in mechanisms.CASES},
     "hanging_at_a_box": (hanging_at_a_box,),
     **{f"robot-{base}": (with_a_robot, base) for base in ("fixed", "floating", "kinematic")},
 }

@@ -98,6 +98,31 @@ def on_body(kind, case, *, moving=True, scheme="projective", tolerance=1e-11, **
     return Step(sim, state, inputs)
 
 
+def stacked(elastic="newton", friction=0.3, tolerance=1e-10):
+    """A sheet that falls on another one and slides over it; nothing else holds them."""
+    edge = 0.1
+    lower, faces = grid(5, 5, seed=1, jitter=0.05)
+    upper = lower + np.array([0.3 * edge, 0.1 * edge, 0.8 * edge])
+    cloths = [
+        dc.Cloth(v, faces, rest_positions=lower, material=material(faces, k, friction=friction))
+        for k, v in enumerate((lower, upper))
+    ]
+    sim = dc.Simulator(
+        dc.Scene(cloths, gravity=(0.0, 0.0, 0.0)),
+        DT,
+        scheme="projective",
+        solver=dc.SolverOptions(tolerance=tolerance, elastic=elastic),
+    )
+    state = sim.initial_state()
+    velocities = 0.1 * tensor_noise((50, 3), 1.0, 4)
+    velocities[25:] += torch.tensor([1.0, 0.3, -2.0], dtype=F64)
+    state = state.replace(velocities=velocities)
+    inputs = {"state.positions": state.positions, "state.velocities": state.velocities}
+    for name in ("friction", "stretch", "density", "damping", "rest_positions"):
+        inputs[f"parameters.{name}"] = getattr(sim.parameters(), name)
+    return Step(sim, state, inputs)
+
+
 def assert_gradients_are_those_of_differences(value, inputs, sizes, generator):
     """Compare the gradient of a function of named inputs with central differences.
 

@@ -3,35 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from nodal_scenes import DT, Step, assert_gradients_are_those_of_differences, counts
-from scenes import F64, grid, material, tensor_noise
+from nodal_scenes import DT, assert_gradients_are_those_of_differences, counts, stacked
+from scenes import F64, grid, material
 
 import diffcloth_torch as dc
-
-
-def stacked(elastic="newton", friction=0.3, tolerance=1e-10):
-    """A sheet that falls on another one and slides over it; nothing else holds them."""
-    edge = 0.1
-    lower, faces = grid(5, 5, seed=1, jitter=0.05)
-    upper = lower + np.array([0.3 * edge, 0.1 * edge, 0.8 * edge])
-    cloths = [
-        dc.Cloth(v, faces, rest_positions=lower, material=material(faces, k, friction=friction))
-        for k, v in enumerate((lower, upper))
-    ]
-    sim = dc.Simulator(
-        dc.Scene(cloths, gravity=(0.0, 0.0, 0.0)),
-        DT,
-        scheme="projective",
-        solver=dc.SolverOptions(tolerance=tolerance, elastic=elastic),
-    )
-    state = sim.initial_state()
-    velocities = 0.1 * tensor_noise((50, 3), 1.0, 4)
-    velocities[25:] += torch.tensor([1.0, 0.3, -2.0], dtype=F64)
-    state = state.replace(velocities=velocities)
-    inputs = {"state.positions": state.positions, "state.velocities": state.velocities}
-    for name in ("friction", "stretch", "density", "damping", "rest_positions"):
-        inputs[f"parameters.{name}"] = getattr(sim.parameters(), name)
-    return Step(sim, state, inputs)
 
 
 def momentum(step, state):

@@ -1,0 +1,58 @@
+// What the adjoint and the tangent of nodal contact share.
+
+#include <stdexcept>
+
+#include "step/nodal_system.h"
+
+namespace diffcloth::step {
+
+using Array = std::vector<double>;
+
+namespace {
+
+/// Of a derivative, relative.
+constexpr double kTolerance = 1e-12;
+/// What rounding may leave of it on a badly conditioned mesh.
+constexpr double kLargestError = 1e-8;
+
+}  // namespace
+
+Array solve_derivative(const NodalSystem& system,
+                       const NodalSystem::Point& at,
+                       const linalg::BlockMatrix& H,
+                       const linalg::CholeskyFactor& S,
+                       bool transposed,
+                       const Array& b) {
+  Array w;
+  if (!system.solve(at, H, S, transposed, b, kTolerance, w).converged) {
+    // The floor of rounding may lie above the tolerance: then what has been found must do.
+    Array again;
+    if (!system.solve(at, H, S, transposed, b, kLargestError, again).converged) {
+      throw std::domain_error("a derivative of nodal friction did not converge");
+    }
+  }
+  return w;
+}
+
+solver::Factor certified(const NodalSystem& system,
+                         solver::LinearSystem& linear,
+                         const NodalSystem::Point& at,
+                         const linalg::BlockMatrix& H,
+                         solver::Factor factor) {
+  if (!factor) factor = linear.factor_in_doubles(system.without_coupling(at, H));
+  if (!factor) throw std::domain_error("the Hessian is not positive definite at the solution");
+  return factor;
+}
+
+std::array<std::size_t, 2> friction_entries(const Problem& problem,
+                                            const NodalContacts& contacts,
+                                            const projective::NodalContact& c) {
+  const auto surfaces = static_cast<std::size_t>(problem.scene.surface_count());
+  const auto a = static_cast<std::size_t>(problem.scene.vertex_cloth[c.vertex]);
+  const auto b = static_cast<std::size_t>(c.partner >= 0 ? problem.scene.vertex_cloth[c.partner]
+                                                         : problem.scene.cloth_count() +
+                                                               contacts.obstacles[c.obstacle].body);
+  return {a * surfaces + b, b * surfaces + a};
+}
+
+}  // namespace diffcloth::step
