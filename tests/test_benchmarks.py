@@ -125,6 +125,16 @@ def test_what_moves_by_forces_is_timed_beside_what_is_given():
     assert all(float(row[-1]) >= 1 for row in rows[1:])  # steps in contact
 
 
+def test_a_jacobian_is_timed_beside_its_rollout():
+    command = [sys.executable, "-m", "benchmarks.tangents", "--size", "6", "--steps", "4"]
+    command += ["--repeats", "1"]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    rows = {line.split()[0]: line.split()[1] for line in result.stdout.splitlines()[1:]}
+    assert list(rows) == ["rollout", "jacfwd", "differences", "stretch", "friction", "bending"]
+    assert float(rows["stretch"]) < 1e-3
+
+
 @pytest.fixture(scope="module")
 def figures(tmp_path_factory):
     """A folder with the page of a quick run against this very checkout."""

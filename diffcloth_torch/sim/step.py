@@ -1,4 +1,4 @@
-"""One step as one differentiable operation: a call into the core forward, and one backward.
+"""One step as one differentiable operation: a call into the core, and one for its derivatives.
 
 A step finds the minimizer x(u) of a potential P(x, u), where u stands for all inputs. At the
 minimizer the gradient vanishes, and so does its derivative along u:
@@ -12,6 +12,9 @@ With the cotangent x_bar of everything that depends on x, the gradient of the lo
 one solve with the Hessian of the same potential, and then products with mixed derivatives. The
 velocities (x - x_n) / h and the contact forces on the bodies are such outputs; each friction
 iteration adds one solve. The formulas of every term are in the C++ core.
+
+Forward, a direction du of the inputs gives H dx = -(dg/du) du: one solve for each direction, with
+the same Hessian, and one call of the core for all directions of a `vmap`.
 
 The tape of a step consists of plain tensors, which torch saves together with the inputs: torch
 frees them after backward, refuses a second backward without `retain_graph`, and notices inputs
