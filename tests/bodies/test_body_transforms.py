@@ -16,7 +16,6 @@ def sim():
     return dc.Simulator(dc.Scene([], robots=[hand]), 0.01, contact=contact)
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("transform", [torch.func.grad, torch.func.jacrev, torch.func.jacfwd])
 def test_functions_of_states(sim, name, transform):

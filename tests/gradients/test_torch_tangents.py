@@ -15,11 +15,6 @@ import diffcloth_torch as dc
 F64 = torch.float64
 TOLERANCE = 1e-11
 
-# The first forward-mode derivative of a process makes torch compile its decompositions.
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:`torch.jit.script` is deprecated:DeprecationWarning"
-)
-
 FIELDS = (
     *("positions", "velocities", "body_poses", "body_velocities", "soft_pin_targets"),
     *("body_forces", "contact_forces", "pin_forces", "joint_positions", "joint_velocities"),

@@ -57,12 +57,6 @@ def moving(sim, x):
     )
 
 
-# The first forward-mode derivative of a process makes torch compile its decompositions.
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:`torch.jit.script` is deprecated:DeprecationWarning"
-)
-
-
 def start(sim, name):
     """Where the call is differentiated: pins at their places, everything else at rest."""
     places = sim.initial_state().positions[[0, 3]] if "pins" in name or name == "rollout" else 0.0

@@ -357,7 +357,6 @@ def test_second_derivatives_are_refused(part):
         gradient.sum().backward()
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
 @pytest.mark.parametrize("transform", [torch.func.grad, torch.func.jacrev, torch.func.jacfwd])
 def test_transforms_find_the_gradient(transform):
     sim, state = case("folded")
