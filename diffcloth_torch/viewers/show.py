@@ -41,8 +41,8 @@ def show(
         scene: Scene of the states.
         states: States in the order of time; of a batch, environments stand side by side.
         path: File `.html` to write instead of a server; an existing file is replaced.
-        color: What colors the cloths: "plain", their own colors; "strain", the largest |s - 1| of
-            the singular values of dx/dX; or "contact", the contact forces on them [N].
+        color: What colors the cloths: "plain", their own colors; "strain", by how much the singular
+            values of dx/dX differ from one; or "contact", the contact forces on them [N].
         arrows: Any of "forces", the contact forces on everything, and "gradient".
         gradients: For "gradient": of each state the gradient of a loss by its positions.
         goals: Shapes to show beside the scene.
