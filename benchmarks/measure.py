@@ -58,7 +58,7 @@ class Timing:
         forward: Of one step [ms].
         backward: Of one step [ms].
         reference: One Eigen LDL^T factorization of the contact-free Hessian, EF [ms].
-        tangent: Seconds of one tangent of the core, per second of one backward, of the last step [-].
+        tangent: Time of one tangent over that of one backward, both of the core, of the last step.
         many_tangents: The same of `MANY` tangents at once.
         phases: Medians of the phases that the report of a step gives [ms].
         iterations: Median Newton iterations of a step.
@@ -164,7 +164,7 @@ def tangent_ratios(
 ) -> tuple[float, float]:
     """Time of one tangent and of `MANY` at once, relative to a backward, all asked of the core.
 
-    Of positions and velocities, with respect to those before the step and the targets of the bodies.
+    Of positions and velocities, by those before the step and the targets of the bodies.
     """
     with torch.no_grad():
         given, _ = simulator._inputs(state.detach(), control, None)

@@ -12,9 +12,9 @@ is used but where `threads` says otherwise: `torch.set_num_threads(1)`, as `--th
 Each step is differentiated: its backward takes cotangents of positions and velocities to those
 before the step and to the targets of the bodies. Solves are at the default tolerance. `touching`
 is the share of the cloth's vertices in a pair within the barrier distance, found by ipctk (of the
-extra `test`). The core tells phases for forward only; backward is one number. `tangent` and `x 8` are
-the time of one tangent and of eight at once, of the same inputs and outputs, over that of a
-backward, all asked of the core for the last step.
+extra `test`). The core tells phases for forward only; backward is one number. `tangent` and `x 8`
+are the times of one tangent and of eight at once over that of a backward, of the same inputs and
+outputs, all asked of the core for the last step.
 """
 
 from __future__ import annotations
@@ -131,8 +131,8 @@ def batch_scaling(timings: list[Timing]) -> dict[str, dict[str, float]]:
 
 _HEAD = (
     f"{'scene':<13}{'size':>6}{'batch':>6}{'threads':>8}  {'forward [ms]':>22}{'[EF]':>7}"
-    f"  {'backward [ms]':>20}{'[EF]':>7}{'tangent':>9}{'x 8':>6}  {'EF [ms]':>8}{'Newton':>8}{'residual':>10}"
-    f"{'contacts':>9}{'touching':>9}"
+    f"  {'backward [ms]':>20}{'[EF]':>7}{'tangent':>9}{'x 8':>6}"
+    f"  {'EF [ms]':>8}{'Newton':>8}{'residual':>10}{'contacts':>9}{'touching':>9}"
 )
 
 
@@ -140,7 +140,8 @@ def _line(t: Timing) -> str:
     return (
         f"{t.scene:<13}{t.size:>4}^2{t.batch or 1:>6}{t.threads:>8}  {_spread(t.forward):>22}"
         f"{t.forward_in_ef:>7.2f}  {_spread(t.backward):>20}{t.backward_in_ef:>7.2f}"
-        f"{t.tangent:>9.2f}{t.many_tangents:>6.2f}  {_number(t.reference.median):>8}{t.iterations:>8.1f}{t.residual:>10.1e}"
+        f"{t.tangent:>9.2f}{t.many_tangents:>6.2f}"
+        f"  {_number(t.reference.median):>8}{t.iterations:>8.1f}{t.residual:>10.1e}"
         f"{t.contacts:>9.0f}{t.contact_share:>9.1%}"
     )
 
