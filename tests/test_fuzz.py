@@ -4,6 +4,7 @@ import importlib.util
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -83,6 +84,36 @@ def test_the_fuzz_sees_what_is_wrong():
     assert tally.counts["report"] == 2
     assert judge.is_free_path(path)
     assert not judge.is_free_path(np.stack([path[0], -path[0]]))  # all through one point
+
+
+def test_attachments_are_of_every_kind():
+    draws = [fuzz_main.DRAWINGS["all"](1, index) for index in range(60)]
+    kinds = [kind for scene in draws for kind in scene.description.get("attachments", ())]
+    assert set(kinds) == {"target", "cloth", "body"}
+    schemes = {scene.simulator.scheme for scene in draws if scene.pulls}
+    assert schemes >= {"coupled", "split"}  # one in sixty is projective
+    releases = [p.release < scene.steps for scene in draws for p in scene.pulls]
+    assert any(releases)
+    assert not all(releases)
+
+
+def test_the_fuzz_sees_a_target_that_pulls_wrongly():
+    """The momentum of cloths counts what targets pull, computed by hand."""
+    draws = (fuzz_main.DRAWINGS["cloths"](1, index) for index in range(60))
+    scene = next(
+        s
+        for s in draws
+        if any(p.target is not None for p in s.pulls)
+        and not len(s.simulator._assembly.pins)
+        and s.masses.sum() > 0
+    )
+    before, where = scene.start, {"step": 0}
+    after = scene.simulator.step(before, scene.control(before, 0))
+    for factor, wrong in ((1.0, 0), (1.05, 1)):
+        pulls = tuple(replace(p, stiffness=factor * p.stiffness) for p in scene.pulls)
+        tally = fuzz_main.Tally(show_failures=False)
+        fuzz_main._check_momentum(replace(scene, pulls=pulls), before, after, tally, where)
+        assert tally.counts["momentum"] == wrong
 
 
 def test_a_scene_is_a_function_of_its_seed_and_index():

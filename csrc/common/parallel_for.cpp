@@ -26,6 +26,21 @@ bool take_memory() {
   return std::uncaught_exceptions() == 0;
 }
 
+/// Waits until no thread beside the caller is running. The caller alone can see an interrupt, so it
+/// keeps looking while others work.
+void wait_for_others(const int& running,  // guarded by the mutex
+                     std::mutex& mutex,
+                     std::condition_variable& finished,
+                     Interrupt& interrupt) {
+  std::unique_lock lock(mutex);
+  while (running > 0) {
+    finished.wait_for(lock, std::chrono::milliseconds(50));
+    lock.unlock();
+    interrupt.poll();
+    lock.lock();
+  }
+}
+
 }  // namespace
 
 void parallel_for(Index count,
@@ -74,16 +89,7 @@ void parallel_for(Index count,
     }
   }
   work(true);
-  {
-    // The caller alone can see an interrupt, so it keeps looking while others work.
-    std::unique_lock lock(mutex);
-    while (running > 0) {
-      finished.wait_for(lock, std::chrono::milliseconds(50));
-      lock.unlock();
-      interrupt.poll();
-      lock.lock();
-    }
-  }
+  wait_for_others(running, mutex, finished, interrupt);
   pool.clear();
 
   if (interrupt.stopped()) throw Interrupted{};

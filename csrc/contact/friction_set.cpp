@@ -301,6 +301,41 @@ void FrictionSet::add_hessian_product(const double* x, const double* z, double* 
   for (const Entry& k : entries_) hessian(k, at, Curvature::kExact).add_product(z, y);
 }
 
+namespace {
+
+/// Pull the cotangent of a normal force back, times scale into `bar`; returns those of the corners.
+///
+///   d(lambda) = -kappa w (2 d b' dm + m (2 d b'' + b'/d) dD)
+Vec12 pull_back_lambda(const ContactModel& model,
+                       const Contact& lag,
+                       const double* x_lag,
+                       double lambda_bar,
+                       double scale,
+                       ContactModel::Bar& bar) {
+  const double kappa = lag.kappa;
+  const double d = std::sqrt(lag.closest.d_sq);
+  const double area = lag.weight;
+  const double m = lag.mollifier;
+  const double b1 = lag.barrier.b1;
+  const double per_lambda = -2.0 * d * lambda_bar;
+  model.pull_back_kappa(lag.pair, scale * per_lambda * area * m * b1, bar);
+  bar.d_hat += scale * per_lambda * kappa * area * m * lag.barrier.b1_d_hat;
+  const double xi_bar = per_lambda * kappa * area * m * lag.barrier.b1_xi;
+  Vec12 x_bar = (lambda_bar * -kappa * area * m * (2.0 * d * lag.barrier.b2 + b1 / d)) *
+                distance_sq_gradient(lag.closest);
+  double threshold_bar = 0.0;
+  if (lag.mollified) {
+    const Mollifier mol = mollifier_derivatives(corners(lag.pair.vertices, x_lag), lag.threshold);
+    threshold_bar = per_lambda * kappa * area * mol.m_eps * b1;
+    x_bar += (per_lambda * kappa * area * b1) * mol.gradient;
+  }
+  model.pull_back(lag, scale * per_lambda * kappa * m * b1, scale * threshold_bar, scale * xi_bar,
+                  bar);
+  return x_bar;
+}
+
+}  // namespace
+
 // phi = mu lambda q(|w|) w . zeta,  q = f1/y,  w = P s,  s = r(x) - E(x) a,  zeta = r(z) - E'(z) a,
 // with E = (e1, e2, m), its change E' with z, and a = E(x_start)^-1 r(x_start).
 //
@@ -311,8 +346,7 @@ void FrictionSet::add_hessian_product(const double* x, const double* z, double* 
 //   dphi/dx_start = c_i g, less what the frame's edges have in E(x_start) a
 //
 // and the lag configuration moves c through d(beta) = J dx, n through dn = P dt / d with
-// dt = sum c_i dx_i + s d(beta), and lambda through
-//   d(lambda) = -kappa w (2 d b' dm + m (2 d b'' + b'/d) dD).
+// dt = sum c_i dx_i + s d(beta), and lambda as pull_back_lambda() says.
 // Where the frame was a line, Q is the identity.
 void FrictionSet::add_mixed(const double* x,
                             const double* z,
@@ -327,7 +361,6 @@ void FrictionSet::add_mixed(const double* x,
     const Contact& lag = k.lag;
     const Closest& geometry = lag.closest;
     const auto& v = lag.pair.vertices;
-    const double kappa = lag.kappa;
     const double d = std::sqrt(geometry.d_sq);
 
     const Slip& at = here[e];
@@ -345,24 +378,7 @@ void FrictionSet::add_mixed(const double* x,
     bar.slip += scale * k.mu * k.lambda * law.f1_over_y_e * w_zeta;
     model_->pull_back_mu(lag.pair, scale * mu_bar, bar);
 
-    // lambda's parameters.
-    const double area = lag.weight;
-    const double m = lag.mollifier;
-    const double b1 = lag.barrier.b1;
-    const double per_lambda = -2.0 * d * lambda_bar;
-    model_->pull_back_kappa(lag.pair, scale * per_lambda * area * m * b1, bar);
-    bar.d_hat += scale * per_lambda * kappa * area * m * lag.barrier.b1_d_hat;
-    const double xi_bar = per_lambda * kappa * area * m * lag.barrier.b1_xi;
-    Vec12 x_bar = (lambda_bar * -kappa * area * m * (2.0 * d * lag.barrier.b2 + b1 / d)) *
-                  distance_sq_gradient(geometry);
-    double threshold_bar = 0.0;
-    if (lag.mollified) {
-      const Mollifier mol = mollifier_derivatives(corners(v, x_lag), lag.threshold);
-      threshold_bar = per_lambda * kappa * area * mol.m_eps * b1;
-      x_bar += (per_lambda * kappa * area * b1) * mol.gradient;
-    }
-    model_->pull_back(lag, scale * per_lambda * kappa * m * b1, scale * threshold_bar,
-                      scale * xi_bar, bar);
+    Vec12 x_bar = pull_back_lambda(*model_, lag, x_lag, lambda_bar, scale, bar);
 
     // The frame at the start, c and n.
     const double strength = k.mu * k.lambda;

@@ -1,7 +1,6 @@
 #pragma once
 
 #include <cstdint>
-#include <stdexcept>
 #include <utility>
 #include <vector>
 
@@ -87,9 +86,7 @@ class Potential {
   /// y += d/d(theta) (grad P) theta_dot over all vertices: how the gradient changes with the inputs theta,
   /// for the tangents theta_dot that the owner has put into the potential. What accumulate() does,
   /// transposed.
-  virtual void add_tangent(const double* /*x*/, double* /*y*/) const {
-    throw std::logic_error("potential: it has no tangent");
-  }
+  virtual void add_tangent(const double* x, double* y) const = 0;
 
   /// Call store.exchange() for each of these cotangents: several losses take turns with one potential. A
   /// potential that keeps none, or whose owner swaps them, has none to show.

@@ -197,7 +197,7 @@ std::size_t tree_of(const Scene& scene, Index surface) {
 }
 
 /// Mass that a contact with a tree feels [kg]: all of a free root's; of joints the most that one of
-/// them, with its drive, has at the farthest point that it moves. Zero where forces move nothing.
+/// them, with its drive, has at the farthest point that it moves. Zero where nothing is dynamic.
 ///
 /// @param metric  the tree's block of A, [n_t^2]
 /// @param first   the tree's first coordinate; it has `count` of them
@@ -312,9 +312,10 @@ std::vector<double> default_barrier_stiffness(const Scene& scene,
       result.push_back(kappa);
     }
   }
-  // What never touches has no number of its own, and any that is positive will do.
+  // What never touches has no number of its own, and any that is positive will do: also where nothing
+  // touches at all.
   const auto first = std::ranges::find_if(result, [](double kappa) { return kappa > 0.0; });
-  if (first != result.end()) std::ranges::replace(result, 0.0, double{*first});
+  std::ranges::replace(result, 0.0, first != result.end() ? double{*first} : 1.0);
   return result;
 }
 

@@ -60,7 +60,7 @@ class Scheme {
   /// Whether a barrier keeps surfaces apart; else cloths touch all bodies and each other at their nodes.
   virtual bool has_barrier() const { return true; }
 
-  /// Whether cloths and what forces move are solved for together.
+  /// Whether cloths and dynamic bodies are solved for together.
   virtual bool moves_bodies() const { return false; }
 
   /// Whether elasticity is solved for on its own first, by one of kElasticSolvers.

@@ -30,9 +30,7 @@ class StepPotential {
 
   /// Put the tangents of the potential's inputs into it, for add_tangent(): what pull_back() does,
   /// transposed.
-  virtual void push_forward(const Problem& /*problem*/, const Tangents& /*tangents*/) {
-    throw std::logic_error("step: a potential has no tangent");
-  }
+  virtual void push_forward(const Problem& problem, const Tangents& tangents) = 0;
 
   /// Call visit(name, value) for every part of the energy that it stores at x [J].
   using VisitEnergy = std::function<void(const char* name, double value)>;

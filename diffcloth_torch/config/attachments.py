@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.config.keyframes import moved, select_vertices, values_at
-from diffcloth_torch.config.schema import AttachmentSection, EndSection
+from diffcloth_torch.config.scene_schema import AttachmentSection, EndSection
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.model.attachment import Attachment

@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloth_torch.config.schema import JointKeyframe, PinKeyframe, RotationSection, Selection
+from diffcloth_torch.config.scene_schema import JointKeyframe, Selection
+from diffcloth_torch.config.shape_schema import PinKeyframe, RotationSection
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.rotation import interpolate_poses, rotate
 

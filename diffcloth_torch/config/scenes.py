@@ -16,15 +16,10 @@ from diffcloth_torch.config import shapes
 from diffcloth_torch.config.attachments import attachment, attachment_motions
 from diffcloth_torch.config.documents import resolve_path
 from diffcloth_torch.config.keyframes import moved, quaternion, select_vertices, values_at
-from diffcloth_torch.config.schema import (
-    BodySection,
-    ClothSection,
-    PoseSection,
-    RobotSection,
-    RunConfig,
-    Section,
-    SimulationSection,
-)
+from diffcloth_torch.config.scene_schema import BodySection, ClothSection, RobotSection
+from diffcloth_torch.config.schema import RunConfig, SimulationSection
+from diffcloth_torch.config.section import Section
+from diffcloth_torch.config.shape_schema import PoseSection
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import transform

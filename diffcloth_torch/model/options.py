@@ -24,7 +24,7 @@ SCHEMES = tuple(ABILITIES)
 METRICS = tuple(_core.metrics)
 ELASTIC_SOLVERS = tuple(_core.elastic_solvers)
 COUPLINGS = ("monolithic", "rigid_to_cloth", "cloth_to_rigid")
-"""How cloths and what forces move act on each other: together, or in turn."""
+"""How cloths and dynamic bodies act on each other: together, or in turn."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,6 +24,9 @@ from diffcloth_torch.sim.stored_energy import stored_energy
 
 __all__ = ["Observables"]
 
+# Fields of a control that store energy: where springs pull to, and how much.
+_STORING = ("attachments", "attachment_weights", "soft_pins")
+
 
 class Observables:
     """The methods of a simulator that evaluate a state, and return no other state."""
@@ -170,42 +173,69 @@ class Observables:
 
     @overload
     def energy(
-        self, state: State, parameters: Parameters | None = None, *, parts: Literal[False] = False
+        self,
+        state: State,
+        parameters: Parameters | None = None,
+        *,
+        control: Control | None = None,
+        parts: Literal[False] = False,
     ) -> Tensor: ...
 
     @overload
     def energy(
-        self, state: State, parameters: Parameters | None = None, *, parts: Literal[True]
+        self,
+        state: State,
+        parameters: Parameters | None = None,
+        *,
+        control: Control | None = None,
+        parts: Literal[True],
     ) -> dict[str, Tensor]: ...
 
     def energy(
-        self, state: State, parameters: Parameters | None = None, *, parts: bool = False
+        self,
+        state: State,
+        parameters: Parameters | None = None,
+        *,
+        control: Control | None = None,
+        parts: bool = False,
     ) -> Tensor | dict[str, Tensor]:
         """Potential energy at the positions of a state: elasticity, springs, gravity, contact.
 
         Gravity is that of cloths, and of the bodies and robots that `momentum` counts; it is zero
         at the origin of the world. What drives and stops of joints store is left out.
 
-        All of it is differentiable in positions, poses, joints and targets of the state, and in the
-        parameters that it depends on; velocities, damping and friction are not among them. The
-        gradient by the positions of a cloth is minus the force of these parts on it. All parts, and
-        many losses with `is_grads_batched`, go back in one call; a second derivative is refused.
+        A state does not hold where attachments pull to, nor their weights: a control does. Without
+        one, attachments between points pull with a weight of one, and those to targets not at all.
+
+        All of it is differentiable in positions, poses, joints and targets of the state, in targets
+        and weights of the control, and in the parameters that it depends on; velocities, damping
+        and friction are not among them. The gradient by the positions of a cloth is minus the force
+        of these parts on it. All parts, and many losses with `is_grads_batched`, go back in one
+        call; a second derivative is refused.
 
         Args:
             state: Where things are.
             parameters: Physical parameters; None takes those of the scene.
+            control: What acts there, as in a step. Of it `attachments`, `attachment_weights` and
+                `soft_pins` store energy; the rest, as forces and the motion of pins and bodies,
+                counts for nothing.
             parts: Whether to return what adds up to the energy.
 
         Returns:
             Energy [J], shape [], or [B] in a batch; with `parts` a dict of such tensors:
-            "stretch", "bending", "attachments" (with weights of one, without those to targets),
-            "soft_pins", "contact" (the barrier's) and "gravity".
+            "stretch", "bending", "attachments", "soft_pins", "contact" (the barrier's) and
+            "gravity".
 
         Raises:
+            InvalidInput: If an input has a wrong shape, device or value.
             SimulationError: In backward, if surfaces overlap: the energy is infinite there.
         """
         check_bool("energy: `parts`", parts)
-        given, batch = self._border.enter(state, None, parameters)
+        given, batch = self._border.enter(state, control, parameters)
+        if control is not None:
+            unset = self._border.enter(state, None, None)[0].control
+            kept = {name: given.control[name] for name in _STORING if name in given.control}
+            given = given._replace(control=unset | kept)
         energies = stored_energy(self._engine.core, self._at_rest(given))
         energies["gravity"] = self._engine.totals(given.state, given.parameters).gravity_energy
         energies = without_axes(energies, batch)

@@ -106,7 +106,7 @@ def _refuse_row(layout: Layout, name: str, wrong: NDArray[np.bool_], accepted: s
     moved = layout.link_names[row] if owner == "link" else layout.assembly.bodies[row].name
     raise InvalidInput(
         f"parameters: `{name}` must be {accepted} in the row [{row}], that of {moved!r}, which "
-        "forces move"
+        "is dynamic"
     )
 
 

@@ -40,7 +40,7 @@ def check_scheme(
     elif not abilities["moves_bodies"] and coupling == COUPLINGS[0] and layout.is_dynamic:
         raise InvalidInput(
             f"Simulator: scheme {scheme!r} takes prescribed bodies and the staggered couplings "
-            f"{' and '.join(map(repr, COUPLINGS[1:]))}; the scene has something that forces move "
+            f"{' and '.join(map(repr, COUPLINGS[1:]))}; the scene has a dynamic body or robot "
             f"and `coupling` is {coupling!r}"
         )
 
@@ -60,7 +60,7 @@ def _check_attachments(scheme: str, coupling: str, layout: Layout) -> None:
             )
         if is_moved and coupling != COUPLINGS[0]:
             raise InvalidInput(
-                f"Simulator: an attachment to {name!r}, which forces move, needs coupling "
+                f"Simulator: an attachment to {name!r}, which is dynamic, needs coupling "
                 f"{COUPLINGS[0]!r}, got {coupling!r}"
             )
 

@@ -194,11 +194,10 @@ class Staggered:
         remedy = 'passing through a cloth; lower dt, or use coupling="monolithic"'
         if blocked and self._throw:
             raise InfeasibleMotion(
-                f"step: what forces move in the environments {blocked} cannot go on without "
-                f"{remedy}",
+                f"step: dynamic bodies in the environments {blocked} cannot go on without {remedy}",
                 environments=blocked,
             )
-        return dict.fromkeys(blocked, f"what forces move cannot go on without {remedy}")
+        return dict.fromkeys(blocked, f"dynamic bodies cannot go on without {remedy}")
 
 
 class _Solves:

@@ -62,8 +62,8 @@ def _check_zones(layout: Layout, positions: FloatArray) -> None:
         at = tuple(int(i) for i in np.argwhere(beyond)[0])
         joint = at[-1]
         raise InvalidInput(
-            "step: `state.joint_positions` must be at most 1 % of the range beyond a limit where "
-            f"forces move a joint: between {lower[joint]:g} and {upper[joint]:g} (exclusive) for "
+            "step: `state.joint_positions` of a dynamic joint must be at most 1 % of its range "
+            f"beyond a limit: between {lower[joint]:g} and {upper[joint]:g} (exclusive) for "
             f"{layout.joint_names[joint]!r}, got {positions[at]:g} at [{joint}]"
         )
 

@@ -15,7 +15,8 @@ import torch
 from pydantic import model_validator
 from torch import Tensor
 
-from diffcloth_torch.config.schema import Positive, RunConfig
+from diffcloth_torch.config.schema import RunConfig
+from diffcloth_torch.config.section import Positive
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.drape import Drape
 from diffcloth_torch.viewers.look import Goal, marker

@@ -10,7 +10,7 @@ import torch
 from annotated_types import Ge, Gt, Lt
 from torch import Tensor
 
-from diffcloth_torch.config.schema import Positive, Section
+from diffcloth_torch.config.section import Positive, Section
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.optimize.descent import Descent, descend
 from diffcloth_torch.optimize.evaluation import Evaluation, Simulate, Variables

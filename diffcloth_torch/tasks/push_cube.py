@@ -21,7 +21,7 @@ from pydantic import model_validator
 from torch import Tensor
 
 from diffcloth_torch.config.scenes import Motions, PerStep
-from diffcloth_torch.config.schema import Section, Vector3
+from diffcloth_torch.config.section import Section, Vector3
 from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.reach import (

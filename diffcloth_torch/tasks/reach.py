@@ -12,6 +12,7 @@ from annotated_types import Ge, Len
 from pydantic import model_validator
 from torch import Tensor
 
+from diffcloth_torch.config.scene_schema import BodySection, ClothSection, RobotSection
 from diffcloth_torch.config.scenes import (
     Motions,
     build_scene,
@@ -20,15 +21,9 @@ from diffcloth_torch.config.scenes import (
     prescribed_motions,
     step_control,
 )
-from diffcloth_torch.config.schema import (
-    BodySection,
-    ClothSection,
-    PoseSection,
-    RobotSection,
-    RunConfig,
-    Section,
-    Vector3,
-)
+from diffcloth_torch.config.schema import RunConfig
+from diffcloth_torch.config.section import Section, Vector3
+from diffcloth_torch.config.shape_schema import PoseSection
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.geometry.rotation import integrate_poses

@@ -17,8 +17,9 @@ import torch
 from pydantic import model_validator
 from torch import Tensor
 
+from diffcloth_torch.config.scene_schema import Selection
 from diffcloth_torch.config.scenes import Motions, select_vertices
-from diffcloth_torch.config.schema import Positive, Section, Selection, Vector3
+from diffcloth_torch.config.section import Positive, Section, Vector3
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.sim.controls import Control
 from diffcloth_torch.sim.state import State

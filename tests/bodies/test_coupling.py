@@ -231,7 +231,7 @@ def test_cloth_to_rigid_refuses_a_motion_through_a_sheet():
     with pytest.raises(dc.InfeasibleMotion, match="cannot go on without passing through a cloth"):
         sim.step(state)
     both = dc.stack([sim.initial_state(), state])
-    with pytest.raises(dc.InfeasibleMotion, match="what forces move in the environments") as caught:
+    with pytest.raises(dc.InfeasibleMotion, match="dynamic bodies in the environments") as caught:
         sim.step(both)
     assert caught.value.environments == (1,)
 

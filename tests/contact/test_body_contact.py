@@ -41,7 +41,7 @@ def pair(above, under, **values):
 def wrench(scene):
     """Force on the first body, torque about the origin, and the number of contacts."""
     potential = scene.potential()
-    force = -potential.gradient(scene.x).reshape(-1, 3)[scene.surface == 0]
+    force = -potential.gradient(scene.x)[scene.surface == 0]
     torque = np.cross(scene.x[scene.surface == 0], force).sum(axis=0)
     return np.array([*force.sum(axis=0), *torque]), len(potential.contacts(scene.x)[0])
 
@@ -271,10 +271,10 @@ def test_a_sliding_box_is_held_back_by_mu_times_its_normal_force(name, cuts):
     above = placed(box((0.5, 0.4, 0.3), cuts), turn(0, 0, 0.4), (0.013, 0.007, 0.4 * D_HAT))
     scene = pair(above, FLOORS[name])
     potential = scene.potential(friction=[0.0, 0.2, 0.4, 0.0])
-    normal = -potential.gradient(scene.x).reshape(-1, 3)[scene.surface == 0].sum(axis=0)
+    normal = -potential.gradient(scene.x)[scene.surface == 0].sum(axis=0)
     slide = 3 * scene.slip * np.array([0.6, 0.8, 0.0])
     x = scene.x + slide * (scene.surface == 0)[:, None]
-    force = -potential.friction(scene.x, scene.x, x)[1].reshape(-1, 3)
+    force = -potential.friction(scene.x, scene.x).gradient(x)
     on_box = force[scene.surface == 0].sum(axis=0)
     np.testing.assert_allclose(on_box, -0.3 * normal[2] * np.array([0.6, 0.8, 0.0]), atol=1e-12)
     np.testing.assert_allclose(force.sum(axis=0), 0, atol=1e-13)

@@ -137,7 +137,7 @@ def along_a_path(body, x, direction, length, steps, up=(0.0, 0.0, 1.0)):
         at = scene.x.copy()
         at[0] = x + s * direction
         at[1:3] = at[0] + 100 * np.array(up) + [[0, 1e-3, 0], [1e-3, 0, 0]]
-        found.append(potential.gradient(at).reshape(-1, 3)[0])
+        found.append(potential.gradient(at)[0])
     return np.array(found)
 
 

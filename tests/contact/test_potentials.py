@@ -54,7 +54,7 @@ def test_contacts_are_where_they_say(name):
 def test_the_gradient_is_that_of_the_energy(name):
     scene = contact_scenes.make(name)
     potential = scene.potential()
-    g = potential.gradient(scene.x)
+    g = potential.gradient(scene.x).ravel()
     assert np.abs(g).max() > 1e-4
     for d in directions(scene.x.shape):
         # Far below the width of the slivers, 1.5e-5.
@@ -71,8 +71,9 @@ def test_the_hessian_is_that_of_the_gradient(name):
     for d in directions(scene.x.shape):
         found = difference(potential.gradient, scene.x, d, 1e-7)
         product = potential.hessian_product(scene.x, d)
-        np.testing.assert_allclose(found, product, atol=2e-6 * np.abs(product).max())
-        np.testing.assert_allclose(h @ d.ravel(), product, atol=1e-11 * np.abs(product).max())
+        scale = np.abs(product).max()
+        np.testing.assert_allclose(found, product, atol=2e-6 * scale)
+        np.testing.assert_allclose(h @ d.ravel(), product.ravel(), atol=1e-11 * scale)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -80,7 +81,7 @@ def test_the_projected_hessian_is_positive(name):
     scene = contact_scenes.make(name)
     for h in (
         scene.potential().hessian(scene.x, positive=True),
-        scene.potential().friction(scene.x, scene.x, scene.x + 0.01, positive=True)[2],
+        scene.potential().friction(scene.x, scene.x).hessian(scene.x + 0.01, positive=True),
     ):
         lowest, highest = np.linalg.eigvalsh(h)[[0, -1]]
         assert highest > 0
@@ -149,7 +150,7 @@ def test_mixed_derivatives_are_those_of_the_gradient(name):
         scene.thickness = parameter_of(scene, "thickness").tolist()
     for z in directions(scene.x.shape, 1, seed=8):
         found = scene.potential().mixed(scene.x, z)
-        check_parameters(scene, found, lambda p, z=z: p.gradient(scene.x) @ z.ravel())
+        check_parameters(scene, found, lambda p, z=z: (p.gradient(scene.x) * z).sum())
 
 
 def moved(scene, amount, seed=5):
@@ -163,14 +164,16 @@ def test_friction_has_the_derivatives_of_its_energy(name, amount):
     scene = contact_scenes.make(name)
     potential = scene.potential()
     start, x = moved(scene, amount), moved(scene, amount, 6)
-    _, g, h = potential.friction(scene.x, start, x)
+    friction = potential.friction(scene.x, start)
+    g, h = friction.gradient(x), friction.hessian(x)
     for d in directions(x.shape, 2):
-        slope = difference(lambda at: potential.friction(scene.x, start, at)[0], x, d, 1e-7)
-        assert slope == pytest.approx(g @ d.ravel(), abs=1e-7 * np.linalg.norm(g))
-        curvature = difference(lambda at: potential.friction(scene.x, start, at)[1], x, d, 1e-7)
-        np.testing.assert_allclose(
-            curvature, h @ d.ravel(), atol=1e-5 * np.abs(h @ d.ravel()).max()
-        )
+        slope = difference(lambda at: friction.energy_change(start, at), x, d, 1e-7)
+        assert slope == pytest.approx((g * d).sum(), abs=1e-7 * np.linalg.norm(g))
+        curvature = difference(friction.gradient, x, d, 1e-7)
+        product = friction.hessian_product(x, d)
+        scale = np.abs(product).max()
+        np.testing.assert_allclose(curvature, product, atol=1e-5 * scale)
+        np.testing.assert_allclose(h @ d.ravel(), product.ravel(), atol=1e-11 * scale)
 
 
 @pytest.mark.parametrize("amount", [0.003, 0.05])
@@ -183,7 +186,7 @@ def test_mixed_derivatives_of_friction(name, amount):
     z = directions(x.shape, 1, seed=8)[0]
 
     def value(potential, lag=scene.x):
-        return potential.friction(lag, start, x)[1] @ z.ravel()
+        return (potential.friction(lag, start).gradient(x) * z).sum()
 
     found = scene.potential().friction_mixed(scene.x, start, x, z)
     check_parameters(scene, found, value)
@@ -192,7 +195,10 @@ def test_mixed_derivatives_of_friction(name, amount):
         expected = found["x_lag"] @ d.ravel()
         assert slope == pytest.approx(expected, abs=2e-6 * np.linalg.norm(found["x_lag"]))
         slope = difference(
-            lambda at: scene.potential().friction(scene.x, at, x)[1] @ z.ravel(), start, d, 1e-7
+            lambda at: (scene.potential().friction(scene.x, at).gradient(x) * z).sum(),
+            start,
+            d,
+            1e-7,
         )
         expected = found["x_start"] @ d.ravel()
         assert slope == pytest.approx(expected, abs=2e-6 * np.linalg.norm(found["x_start"]))
@@ -205,9 +211,9 @@ def test_duals_remember_the_other_side_of_a_kink():
     slide = np.zeros_like(scene.x)
     slide[scene.surface == 0] = [2e-3, 1e-3, 0.0]
     x = scene.x + slide
-    has_duals, h = potential.friction_after(scene.x, scene.x, x, -2 * slide)
+    has_duals, h = potential.friction(scene.x, scene.x).after(x, -2 * slide)
     majorant, exact = (
-        potential.friction(scene.x, scene.x, scene.x - slide, positive=positive)[2]
+        potential.friction(scene.x, scene.x).hessian(scene.x - slide, positive)
         for positive in (True, False)
     )
     along = slide.ravel()
@@ -216,9 +222,9 @@ def test_duals_remember_the_other_side_of_a_kink():
     assert abs(along @ exact @ along) < 1e-9 * most
     assert along @ h @ along == pytest.approx(2 * most, rel=1e-6)
     # A step that stays on its side has none.
-    has_duals, h = potential.friction_after(scene.x, scene.x, x, -0.5 * slide)
+    has_duals, h = potential.friction(scene.x, scene.x).after(x, -0.5 * slide)
     assert not has_duals
-    exact = potential.friction(scene.x, scene.x, scene.x + 0.5 * slide)[2]
+    exact = potential.friction(scene.x, scene.x).hessian(scene.x + 0.5 * slide)
     np.testing.assert_allclose(h, exact, rtol=1e-9, atol=1e-9 * np.abs(exact).max())
 
 
@@ -235,11 +241,11 @@ def test_what_moves_as_one_has_no_friction(name, angle):
     potential = scene.potential(slip=1e-9)
     start = moved(scene, 0.003)
     end = start @ rotation(angle, 1).T + [0.3, -0.2, 0.5]
-    energy, g, _ = potential.friction(scene.x, start, end)
-    _, sliding, _ = potential.friction(scene.x, start, moved(scene, 0.003, 6))
+    friction = potential.friction(scene.x, start)
+    g, sliding = friction.gradient(end), friction.gradient(moved(scene, 0.003, 6))
     # Rounding of positions over the slip, as a part of full friction.
     assert np.abs(g).max() < 1e-5 * np.abs(sliding).max()
-    assert abs(energy) < 1e-13
+    assert abs(friction.energy_change(start, end)) < 1e-13
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -248,7 +254,7 @@ def test_friction_has_no_couple(name):
     scene = contact_scenes.make(name)
     potential = scene.potential()
     x = moved(scene, 0.003)
-    g = potential.friction(scene.x, scene.x, x)[1].reshape(-1, 3)
+    g = potential.friction(scene.x, scene.x).gradient(x)
     assert np.abs(g).max() > 1e-6
     np.testing.assert_allclose(g.sum(axis=0), 0, atol=1e-13)
     couple = np.linalg.norm(np.cross(x, g).sum(axis=0))

@@ -268,7 +268,10 @@ def _check_momentum(
     m = scene.masses[:, None]
     had, has = (m * state.velocities.numpy() / scene.simulator.dt for state in (before, after))
     weight = m * np.array([0.0, 0.0, -scene.description["gravity"]])
-    _compare(had, has, [weight, -after.body_forces.numpy()], "cloths", tally, where)
+    forces = [weight, -after.body_forces.numpy()]
+    x, dt = after.positions.numpy(), scene.simulator.dt
+    forces += [pull.force(x, where["step"], dt)[None] for pull in scene.pulls]
+    _compare(had, has, forces, "cloths", tally, where)
 
 
 def _check_bodies(

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from random_attachments import Pull, controlled, draw_attachments
+from random_draws import log_uniform, maybe
 
 import diffcloth_torch as dc
 
@@ -62,6 +64,7 @@ class RandomScene:
         pin_velocity: Of the pins [m/s], shape [3].
         masses: Of the cloth vertices [kg].
         drives: Of the robot, if there is one.
+        pulls: What controls do with attachments.
     """
 
     description: dict[str, Any]
@@ -72,6 +75,7 @@ class RandomScene:
     pin_velocity: np.ndarray
     masses: np.ndarray
     drives: Drives | None = None
+    pulls: tuple[Pull, ...] = ()
 
     def control(self, state: dc.State, k: int) -> dc.Control:
         """Of step k."""
@@ -82,6 +86,7 @@ class RandomScene:
         pins = self.simulator._assembly.pins
         held = state.positions.detach()[torch.from_numpy(pins.astype(np.int64))]
         control = dc.Control(body_poses=poses, pins=held + dt * torch.from_numpy(self.pin_velocity))
+        control = controlled(control, self.pulls, k, dt)
         return control if self.drives is None else self._driven(control, self.drives, state, k)
 
     def _driven(self, control: dc.Control, drives: Drives, state: dc.State, k: int) -> dc.Control:
@@ -121,15 +126,6 @@ def turned(q: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     ) / np.linalg.norm(q)
 
 
-def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-
-def maybe(rng: np.random.Generator, probability: float, value: float) -> float:
-    """The value with some probability, else zero."""
-    return value if rng.random() < probability else 0.0
-
-
 def draw_cloth_scene(seed: int, index: int) -> RandomScene:
     rng = np.random.default_rng([seed, index])
     d: dict[str, Any] = {
@@ -146,13 +142,16 @@ def draw_cloth_scene(seed: int, index: int) -> RandomScene:
     }
     cloths, clearance = draw_cloths(rng, d)
     bodies, velocities = draw_bodies(rng, d, clearance)
+    scene = dc.Scene(cloths, bodies, gravity=(0.0, 0.0, -d["gravity"]))
+    # Numbers of their own: scenes are otherwise what they were before there were attachments.
+    scene, pulls = draw_attachments(np.random.default_rng([seed, index, 2]), d, scene)
     simulator = dc.Simulator(
-        dc.Scene(cloths, bodies, gravity=(0.0, 0.0, -d["gravity"])),
+        scene,
         d["dt"],
         scheme=d["scheme"],
         contact=dc.ContactOptions(friction_iterations=d["friction_iterations"]),
     )
-    return draw_throw(rng, d, simulator, cloths, velocities, pin_speed=0.5)
+    return draw_throw(rng, d, simulator, cloths, velocities, pin_speed=0.5, pulls=pulls)
 
 
 def draw_throw(

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from random_attachments import draw_attachments
+from random_draws import log_uniform, maybe
 from random_scenes import (
     BODIES,
     PINS,
@@ -21,8 +23,6 @@ from random_scenes import (
     draw_bodies,
     draw_cloths,
     draw_throw,
-    log_uniform,
-    maybe,
     sheet_masses,
 )
 
@@ -91,8 +91,11 @@ def draw_tower(seed: int, index: int) -> RandomScene:
             bodies.append(_prescribed(rng, d, tower, kinds))
         velocities = np.array([_velocity(rng, d, body) for body in bodies])
         d["bodies"] = kinds
+    drawn = dc.Scene(cloths, bodies, robots, gravity=(0.0, 0.0, -d["gravity"]))
+    # Numbers of their own: scenes are otherwise what they were before there were attachments.
+    drawn, pulls = draw_attachments(np.random.default_rng([seed, index, 2]), d, drawn)
     simulator = dc.Simulator(
-        dc.Scene(cloths, bodies, robots, gravity=(0.0, 0.0, -d["gravity"])),
+        drawn,
         d["dt"],
         scheme=d["scheme"],
         coupling=d["coupling"],
@@ -104,7 +107,7 @@ def draw_tower(seed: int, index: int) -> RandomScene:
     )
     dynamic = np.array([body.motion == "dynamic" for body in bodies], dtype=bool)[:, None]
     moved = velocities * ~dynamic
-    scene = draw_throw(rng, d, simulator, cloths, moved, pin_speed=0.3, drives=drives)
+    scene = draw_throw(rng, d, simulator, cloths, moved, pin_speed=0.3, drives=drives, pulls=pulls)
     if dynamic.any():
         start = scene.start.replace(body_velocities=torch.from_numpy(velocities * dynamic))
         scene = replace(scene, start=start)

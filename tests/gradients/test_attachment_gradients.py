@@ -364,3 +364,26 @@ def test_the_energy_has_the_gradients_of_springs(make):
 
         for d in directions(tensor, generator):
             assert mismatch(f, tensor, gradient, d, 1e-4, FREE) <= FREE, name
+
+
+def test_the_energy_has_the_gradients_of_targets_and_weights():
+    case = picked()
+    inputs = {"positions": case.state.positions} | case.control
+
+    def energy(values):
+        control = dc.Control(**{n: t for n, t in values.items() if n != "positions"})
+        state = case.state.replace(positions=values["positions"])
+        return case.sim.energy(state, control=control, parts=True)["attachments"]
+
+    leaves = {n: t.clone().requires_grad_() for n, t in inputs.items()}
+    found = torch.autograd.grad(energy(leaves), list(leaves.values()))
+    generator = torch.Generator().manual_seed(2)
+    for (name, tensor), gradient in zip(inputs.items(), found, strict=True):
+        assert gradient.any(), name
+
+        def f(changed, name=name):
+            with torch.no_grad():
+                return energy({**inputs, name: changed}).item()
+
+        for d in directions(tensor, generator):
+            assert mismatch(f, tensor, gradient, d, 1e-4, FREE) <= FREE, name

@@ -15,7 +15,7 @@ import torch
 import diffcloth_torch as dc
 from diffcloth_torch import _core
 from diffcloth_torch.checks import POSITIVE
-from diffcloth_torch.config import schema
+from diffcloth_torch.config import scene_schema, schema
 from diffcloth_torch.config.validation import validate
 from diffcloth_torch.model import options
 from diffcloth_torch.model.assembly import assemble
@@ -176,7 +176,7 @@ def test_a_value_beyond_the_range_is_refused_wherever_it_enters(sim, name, value
         range_there = re.escape(str(POSITIVE)) if field == "mass" else accepted
         with pytest.raises(dc.InvalidInput, match=rf"`{field}` must be {range_there}"):
             given_to(owner, field, value)
-    for section in (schema.MaterialSection, schema.ContactSection):
+    for section in (scene_schema.MaterialSection, schema.ContactSection):
         if name in section.model_fields:
             with pytest.raises(dc.InvalidInput, match=rf"`{name}` must be "):
                 validate(section, {name: value}, "here")
@@ -203,9 +203,9 @@ def given_to(owner, field, value):
 
 def test_the_schema_of_a_material_has_the_fields_of_a_material():
     fields = [f.name for f in dataclasses.fields(dc.Material)]
-    assert list(schema.MaterialSection.model_fields) == fields
+    assert list(scene_schema.MaterialSection.model_fields) == fields
     assert list(FACE_QUANTITIES) == fields[: len(FACE_QUANTITIES)]
     given = dict.fromkeys(fields, 0.25)
-    section = validate(schema.MaterialSection, given, "here")
+    section = validate(scene_schema.MaterialSection, given, "here")
     assert section.model_dump() == given
-    assert schema.MaterialSection().model_dump() == dict.fromkeys(fields)
+    assert scene_schema.MaterialSection().model_dump() == dict.fromkeys(fields)

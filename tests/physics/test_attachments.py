@@ -222,3 +222,60 @@ def test_a_kinematic_hand_carries_what_it_holds_and_lets_go():
     fallen = sim.step(state, let_go)
     assert float(fallen.body_forces.abs().max()) == 0.0
     assert fallen.positions[0, 2] < state.positions[0, 2]
+
+
+def test_the_parameters_of_a_scene_without_contact_can_be_given_back():
+    """No pair touches: the stiffness of the barrier has no meaning, but is one that is accepted."""
+    sim = sewn_to_box()
+    state, parameters = sim.initial_state(), sim.parameters()
+    assert parameters.barrier_stiffness > 0.0
+    after = sim.step(state, None, parameters)
+    assert torch.equal(after.positions, sim.step(state).positions)
+
+
+def test_the_energy_counts_targets_and_weights_of_a_control():
+    """w k / 2 (|p - c| - L)^2 by hand; pins that move and forces count for nothing."""
+    weights = torch.tensor([0.25, 0.0, 1.0], dtype=F64)
+    point = dc.Attachment(
+        ("sheet", [5, 6, 9], [0.2, 0.3, 0.5]), stiffness=40.0, rest_length=0.01, name="point"
+    )
+    seam = dc.Attachment(("sheet", 0), ("sheet", 15), stiffness=20.0, rest_length=0.5, name="seam")
+    cloth = sheet(soft_pins={"soft": [3]}, pin_stiffness=60.0, pins={"hard": [12]})
+    sim = dc.Simulator(dc.Scene([cloth], attachments=[point, seam]), DT)
+    state = sim.initial_state(3)
+    x = state.positions
+    target, soft = x[:, [9]] + 0.03, x[:, [3]] + torch.tensor([0.0, 0.0, 0.02], dtype=F64)
+    control = dc.Control(
+        pins={"hard": x[:, [12]] + 0.5},
+        soft_pins=soft,
+        forces=torch.full_like(x, 0.3),
+        attachments=target,
+        attachment_weights={"point": weights[:, None], "seam": weights[:, None]},
+    )
+    parts = sim.energy(state, control=control, parts=True)
+    at = 0.2 * x[:, 5] + 0.3 * x[:, 6] + 0.5 * x[:, 9]
+    of_point = 20.0 * ((at - target[:, 0]).norm(dim=-1) - 0.01) ** 2
+    of_seam = 10.0 * ((x[:, 0] - x[:, 15]).norm(dim=-1) - 0.5) ** 2
+    expected = {
+        "attachments": weights * (of_point + of_seam),
+        "soft_pins": 30.0 * ((x[:, 3] - soft[:, 0]) ** 2).sum(dim=-1),
+    }
+    for name, energy in expected.items():
+        torch.testing.assert_close(parts[name], energy, rtol=1e-13, atol=1e-16)
+    plain = sim.energy(state, parts=True)
+    torch.testing.assert_close(plain["attachments"], of_seam, rtol=1e-13, atol=0.0)
+    assert not plain["soft_pins"].any()
+    for name in ("stretch", "bending", "contact", "gravity"):
+        assert torch.equal(parts[name], plain[name]), name
+    assert torch.equal(sim.energy(state, control=control), sum(parts.values()))
+
+
+def test_the_energy_refuses_a_bad_control():
+    sim = dc.Simulator(
+        dc.Scene([sheet()], attachments=[dc.Attachment(("sheet", 5), stiffness=40.0)]), DT
+    )
+    state = sim.initial_state()
+    with pytest.raises(dc.InvalidInput, match="`attachments` must have"):
+        sim.energy(state, control=dc.Control(attachments=torch.zeros(2, 3, dtype=F64)))
+    with pytest.raises(dc.InvalidInput, match="must set the target"):
+        sim.energy(state, control=dc.Control(attachment_weights=torch.ones(1, dtype=F64)))

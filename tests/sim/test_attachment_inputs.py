@@ -179,5 +179,5 @@ def test_schemes_in_stages_refuse_attached_bodies(scheme):
 def test_staggered_couplings_refuse_what_forces_move(coupling):
     free = box("dynamic", mass=1.0)
     grasp = dc.Attachment(("sheet", 4), ("box", [0, 0, 0]), stiffness=3.0)
-    with pytest.raises(dc.InvalidInput, match="'box', which forces move, needs coupling"):
+    with pytest.raises(dc.InvalidInput, match="'box', which is dynamic, needs coupling"):
         dc.Simulator(scene(grasp, bodies=[free]), 0.01, coupling=coupling)

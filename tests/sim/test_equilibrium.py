@@ -1,5 +1,8 @@
 """Equilibria: against closed forms, long rollouts and differences; and what has none."""
 
+import importlib
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +14,14 @@ from diffcloth_torch.sim import equilibrium
 
 F64 = torch.float64
 TIGHT = dc.SolverOptions(tolerance=1e-9)
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def cusick(monkeypatch):
+    """A disk over a pedestal, and rollouts of it."""
+    monkeypatch.syspath_prepend(ROOT)
+    return importlib.import_module("benchmarks.drape_coefficient")
 
 
 def strip(count, length, width, *, seed=0, **options):
@@ -102,6 +113,33 @@ def test_the_end_of_a_long_rollout_is_one():
     assert not found.velocities.any()
     assert state.velocities.norm(dim=-1).max() < 3e-4
     assert (found.positions - state.positions).norm(dim=-1).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("friction", "seconds"),
+    [(0.0, 4.0), pytest.param(0.3, 12.0, marks=pytest.mark.slow)],
+    ids=["smooth", "rough"],
+)
+def test_a_disk_on_a_pedestal_drapes_as_a_long_rollout_does(cusick, friction, seconds):
+    """Cusick's test, once the folds have formed; friction is anchored where the rollout ends."""
+    drape = cusick.make(5e-5, friction, 0.02)
+    folded, end = cusick.fall(drape, seconds, 0.5)
+    start = end if friction else folded
+    found = drape.simulator.equilibrium(start)
+    assert cusick.distance(found, end) < 1e-6
+    assert cusick.distance(folded, end) > 1e-4
+    coefficient = drape.coefficient(found)
+    assert coefficient == pytest.approx(drape.coefficient(end), abs=1e-6)
+    assert 0.80 < coefficient < 0.90  # far from a plate's, 1, and from a hanging cloth's
+
+
+def test_a_stiffer_disk_drapes_less(cusick):
+    coefficients = []
+    for bending in (2e-4, 1e-3):
+        drape = cusick.make(bending, 0.0, 0.02)
+        found = drape.simulator.equilibrium(drape.simulator.initial_state())
+        coefficients.append(drape.coefficient(found))
+    assert coefficients[0] < coefficients[1] < 1.0
 
 
 def test_without_friction_a_rollout_ends_there():

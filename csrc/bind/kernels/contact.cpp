@@ -243,6 +243,19 @@ void law_kernels(nb::module_& m) {
       "y"_a, "e"_a);
 }
 
+/// Which of the first four boxes are near which of the other four: bits.
+auto near_boxes(const std::string& level, const Boxes& boxes, double range) {
+  std::array<contact::BoxGroup, 2> groups;
+  for (int k = 0; k < 2 * contact::kBoxGroup; ++k) {
+    contact::BoxGroup& group = groups[k / contact::kBoxGroup];
+    for (int axis = 0; axis < 3; ++axis) {
+      group.lo[axis][k % contact::kBoxGroup] = boxes(k, 0, axis);
+      group.hi[axis][k % contact::kBoxGroup] = boxes(k, 1, axis);
+    }
+  }
+  return contact::near_boxes(level_named(level))(groups[0], groups[1], range);
+}
+
 void collision_kernels(nb::module_& m) {
   m.def(
       "safe_step",
@@ -260,21 +273,8 @@ void collision_kernels(nb::module_& m) {
       "edge_edge"_a, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "xi"_a,
       "d_hat"_a = std::numeric_limits<double>::infinity());
 
-  m.def(
-      "near_boxes",
-      [](const std::string& level, const Boxes& boxes, double range) {
-        std::array<contact::BoxGroup, 2> groups;
-        for (int k = 0; k < 2 * contact::kBoxGroup; ++k) {
-          contact::BoxGroup& group = groups[k / contact::kBoxGroup];
-          for (int axis = 0; axis < 3; ++axis) {
-            group.lo[axis][k % contact::kBoxGroup] = boxes(k, 0, axis);
-            group.hi[axis][k % contact::kBoxGroup] = boxes(k, 1, axis);
-          }
-        }
-        return contact::near_boxes(level_named(level))(groups[0], groups[1], range);
-      },
-      "level"_a, "boxes"_a.noconvert(), "range"_a,
-      "Which of the first four boxes, [8, 2, 3], are near which of the other four: bits.");
+  m.def("near_boxes", &near_boxes, "level"_a, "boxes"_a.noconvert(), "range"_a,
+        "Which of the first four boxes, [8, 2, 3], are near which of the other four: bits.");
 
   nb::class_<Search>(m, "BroadPhase")
       .def(nb::init<const Faces&, const Surfaces&, Index, bool, const Positions&,

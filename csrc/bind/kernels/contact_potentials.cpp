@@ -1,5 +1,6 @@
 #include <array>
-#include <set>
+#include <memory>
+#include <optional>
 #include <string>
 #include <tuple>
 #include <utility>
@@ -12,9 +13,12 @@
 #include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
+#include <nanobind/stl/unique_ptr.h>
 #include <nanobind/stl/vector.h>
 
 #include "bind/kernels/kernels.h"
+#include "bind/kernels/potential.h"
+#include "contact/contact_potential.h"
 #include "contact/contact_set.h"
 #include "contact/feature_areas.h"
 #include "contact/friction_set.h"
@@ -24,7 +28,7 @@ namespace diffcloth::bind {
 namespace {
 
 using namespace nb::literals;
-using Positions = Eigen::Ref<const Rows3>;
+using Positions = PointRows;
 using FaceRows = Eigen::Ref<const Eigen::Matrix<Index, Eigen::Dynamic, 3, Eigen::RowMajor>>;
 using Values = Eigen::VectorXd;
 
@@ -37,6 +41,34 @@ std::vector<contact::CollisionMesh::Face> face_list(const FaceRows& faces) {
 Values to_values(const std::vector<double>& v) {
   return Eigen::Map<const Values>(v.data(), static_cast<Eigen::Index>(v.size()));
 }
+
+/// Lagged friction of a mesh, alone: for tests.
+class Friction {
+ public:
+  Friction(const contact::ContactModel& model,
+           const linalg::BlockPattern& pattern,
+           const std::vector<contact::Contact>& lag,
+           const Positions& x_start)
+      : pattern_(pattern), x_start_(x_start), potential_(model, lag, x_start_.data(), nullptr) {}
+  Friction(const Friction&) = delete;
+  Friction& operator=(const Friction&) = delete;
+
+  const linalg::BlockPattern& pattern() const { return pattern_; }
+  Potential& between(const double* /*x*/, const double* /*to*/) { return potential_; }
+
+  /// After a step along p by alpha from x: whether there are duals, and the primal-dual Hessian.
+  std::pair<bool, Eigen::MatrixXd> after(const Positions& x, const Positions& p, double alpha) {
+    const Rows3 to = x + alpha * p;
+    potential_.update_duals(x.data(), p.data(), alpha, to.data());
+    return {potential_.has_duals(to.data()),
+            dense_hessian(potential_, pattern_, to.data(), Curvature::kPrimalDual)};
+  }
+
+ private:
+  const linalg::BlockPattern& pattern_;
+  Rows3 x_start_;
+  contact::FrictionPotential potential_;
+};
 
 /// Barrier and lagged friction of a mesh, alone: for tests.
 class ContactPotential {
@@ -54,6 +86,8 @@ class ContactPotential {
         rest_(contact::measure(mesh_, X.data())),
         model_(mesh_, weights_, rest_, std::move(parameters), prescribed_),
         broad_phase_(mesh_, X.data()),
+        detection_(broad_phase_),
+        pattern_(mesh_.vertex_count, {}),
         X_(X) {}
   ContactPotential(const ContactPotential&) = delete;
   ContactPotential& operator=(const ContactPotential&) = delete;
@@ -93,58 +127,10 @@ class ContactPotential {
     return nb::make_tuple(corners, c, weight, distance);
   }
 
-  Values gradient(const Positions& x) {
-    Values g = Values::Zero(x.size());
-    model_.add_gradient(find(x), x.data(), g.data());
-    return g;
-  }
-
-  Eigen::MatrixXd hessian(const Positions& x, bool positive) {
-    Eigen::MatrixXd h = Eigen::MatrixXd::Zero(x.size(), x.size());
-    for (const contact::Contact& k : find(x)) {
-      add_block(k.pair.vertices,
-                all_blocks(model_.hessian(k, x.data(),
-                                          positive ? Curvature::kPositive : Curvature::kExact)),
-                h);
-    }
-    return h;
-  }
-
-  Values hessian_product(const Positions& x, const Positions& z) {
-    Values y = Values::Zero(x.size());
-    model_.add_hessian_product(find(x), x.data(), z.data(), y.data());
-    return y;
-  }
-
   nb::dict mixed(const Positions& x, const Positions& z, double scale) {
     contact::ContactModel::Bar bar(mesh_);
     model_.add_mixed(find(x), x.data(), z.data(), scale, bar);
     return to_dict(bar);
-  }
-
-  /// Change of friction's energy from x_start to x, its gradient and its Hessian.
-  std::tuple<double, Values, Eigen::MatrixXd> friction(const Positions& x_lag,
-                                                       const Positions& x_start,
-                                                       const Positions& x,
-                                                       bool positive) {
-    const contact::FrictionSet set(model_, find(x_lag), x_start.data());
-    Values g = Values::Zero(x.size());
-    set.add_gradient(x.data(), g.data());
-    const Eigen::MatrixXd h = dense(set, x, positive ? Curvature::kPositive : Curvature::kExact);
-    return {set.energy_change(x_start.data(), x.data()), g, h};
-  }
-
-  /// After a step along p by alpha from x, friction's primal-dual Hessian; the exact one where it has no duals.
-  std::pair<bool, Eigen::MatrixXd> friction_after(const Positions& x_lag,
-                                                  const Positions& x_start,
-                                                  const Positions& x,
-                                                  const Positions& p,
-                                                  double alpha) {
-    contact::FrictionSet set(model_, find(x_lag), x_start.data());
-    const Positions to = x + alpha * p;
-    set.update_duals(x.data(), p.data(), alpha, to.data());
-    const bool has_duals = set.has_duals(to.data());
-    return {has_duals, dense(set, to, Curvature::kPrimalDual)};
   }
 
   nb::dict friction_mixed(const Positions& x_lag,
@@ -161,6 +147,20 @@ class ContactPotential {
     result["x_start"] = start_bar;
     result["x_lag"] = lag_bar;
     return result;
+  }
+
+  const linalg::BlockPattern& pattern() const { return pattern_; }
+
+  Potential& between(const double* x, const double* to) {
+    contact::ContactPotential& barrier = barrier_.emplace(model_, detection_, nullptr);
+    barrier.watch(x, to);
+    barrier.stand_at(x);
+    return barrier;
+  }
+
+  /// Friction with the contacts of x_lag, of what has moved since x_start.
+  std::unique_ptr<Friction> friction(const Positions& x_lag, const Positions& x_start) {
+    return std::make_unique<Friction>(model_, pattern_, find(x_lag), x_start);
   }
 
   /// A rest measure by its name, to be changed by differences.
@@ -221,25 +221,6 @@ class ContactPotential {
   }
 
  private:
-  static Eigen::MatrixXd dense(const contact::FrictionSet& set,
-                               const Positions& x,
-                               Curvature curvature) {
-    Eigen::MatrixXd h = Eigen::MatrixXd::Zero(x.size(), x.size());
-    const Eigen::MatrixXd unit = Eigen::MatrixXd::Identity(x.size(), x.size());
-    const contact::FrictionSet::Slips& at = set.slips(x.data());
-    for (const contact::FrictionSet::Entry& k : set.entries()) {
-      const auto hessian = set.hessian(k, at, curvature);
-      const auto all = k.all_points();
-      const std::set<Index> points(all.begin(), all.end());
-      for (const Index v : points) {
-        for (Index a = 3 * v; a < 3 * v + 3; ++a) {
-          hessian.add_product(unit.col(a).data(), h.col(a).data());
-        }
-      }
-    }
-    return h;
-  }
-
   std::vector<contact::Candidate> candidates(const Positions& x, const Positions& to) {
     if (x.rows() != mesh_.vertex_count || to.rows() != mesh_.vertex_count) {
       throw nb::value_error("contact potential: positions must have one row a vertex");
@@ -255,14 +236,6 @@ class ContactPotential {
     model_.measure(candidates(x, x), x.data(), near);
     model_.find(near, x.data(), found);
     return found;
-  }
-
-  static void add_block(const std::array<Index, 4>& v, const Mat12& h, Eigen::MatrixXd& out) {
-    for (int i = 0; i < 4; ++i) {
-      for (int j = 0; j < 4; ++j) {
-        out.block<3, 3>(3 * v[i], 3 * v[j]) += h.block<3, 3>(3 * i, 3 * j);
-      }
-    }
   }
 
   static nb::dict to_dict(const contact::ContactModel::Bar& bar) {
@@ -286,13 +259,22 @@ class ContactPotential {
   contact::ContactModel model_;
   contact::BroadPhase broad_phase_;
   contact::BroadPhase::Scratch scratch_;
+  contact::Detection detection_;
+  std::optional<contact::ContactPotential> barrier_;  // of the last call
+  linalg::BlockPattern pattern_;                      // of diagonal blocks
   Rows3 X_;
 };
 
 }  // namespace
 
 void contact_potentials(nb::module_& m) {
-  nb::class_<ContactPotential>(m, "ContactPotential")
+  nb::class_<Friction> friction(m, "Friction");
+  bind_potential(friction);
+  friction.def("after", &Friction::after, "x"_a, "p"_a, "alpha"_a = 1.0);
+
+  nb::class_<ContactPotential> barrier(m, "ContactPotential");
+  bind_potential(barrier);
+  barrier
       .def(
           "__init__",
           [](ContactPotential* self, const FaceRows& faces, std::vector<Index> vertex_surface,
@@ -318,14 +300,8 @@ void contact_potentials(nb::module_& m) {
       .def("candidate_count", &ContactPotential::candidate_count, "x"_a)
       .def("energies", &ContactPotential::energies, "x"_a, "other"_a)
       .def("contacts", &ContactPotential::contacts, "x"_a)
-      .def("gradient", &ContactPotential::gradient, "x"_a)
-      .def("hessian", &ContactPotential::hessian, "x"_a, "positive"_a = false)
-      .def("hessian_product", &ContactPotential::hessian_product, "x"_a, "z"_a)
       .def("mixed", &ContactPotential::mixed, "x"_a, "z"_a, "scale"_a = 1.0)
-      .def("friction", &ContactPotential::friction, "x_lag"_a, "x_start"_a, "x"_a,
-           "positive"_a = false)
-      .def("friction_after", &ContactPotential::friction_after, "x_lag"_a, "x_start"_a, "x"_a,
-           "p"_a, "alpha"_a = 1.0)
+      .def("friction", &ContactPotential::friction, "x_lag"_a, "x_start"_a, nb::keep_alive<0, 1>())
       .def("friction_mixed", &ContactPotential::friction_mixed, "x_lag"_a, "x_start"_a, "x"_a,
            "z"_a, "scale"_a = 1.0)
       .def("measure",

@@ -19,6 +19,7 @@
 #include <nanobind/stl/string.h>
 
 #include "bind/kernels/kernels.h"
+#include "bind/kernels/potential.h"
 #include "elastic/constant_form.h"
 #include "elastic/elastic_potential.h"
 #include "linalg/block_pattern.h"
@@ -140,20 +141,6 @@ class Elastic {
     elastic::prepare(model_, slots_);
   }
 
-  double energy(const Positions& x) const {
-    return elastic::energy(model_, positions("x", x).data());
-  }
-
-  double energy_change(const Positions& x0, const Positions& x1) const {
-    return potential().energy_change(positions("x0", x0).data(), positions("x1", x1).data());
-  }
-
-  Array gradient(const Positions& x) const {
-    std::vector<double> g(x.size(), 0.0);
-    potential().add_gradient(positions("x", x).data(), g.data());
-    return rows_array(g);
-  }
-
   Array hessian_blocks(const Positions& x, bool positive) const {
     std::vector<double> blocks(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
     const auto curvature = positive ? Curvature::kPositive : Curvature::kExact;
@@ -193,10 +180,6 @@ class Elastic {
     return owned(pairs.data(), {pairs.size() / 2, 2});
   }
 
-  Array hessian(const Positions& x, bool positive) const {
-    return dense(hessian_blocks(x, positive).data());
-  }
-
   /// The Hessian at x with stresses extrapolated on the straight way from x0.
   Array extrapolated_hessian(const Positions& x0, const Positions& x, bool positive) const {
     const Curvature curvature = positive ? Curvature::kPositive : Curvature::kExact;
@@ -230,13 +213,6 @@ class Elastic {
     }
     const std::size_t size = 3 * static_cast<std::size_t>(n);
     return owned(matrix.data(), {size, size});
-  }
-
-  Array hessian_product(const Positions& x, const Positions& z) const {
-    std::vector<double> y(x.size(), 0.0);
-    elastic::add_hessian_product(model_, positions("x", x).data(), positions("z", z).data(),
-                                 y.data());
-    return rows_array(y);
   }
 
   static void add_materials(const elastic::Bar& bar, nb::dict& result) {
@@ -353,11 +329,13 @@ class Elastic {
     return owned(topology_.face_edges.data()->data(), {topology_.faces.size(), 3});
   }
 
- private:
-  elastic::ElasticPotential potential() const {
-    return {model_, slots_, pattern_, elastic::Wanted::kNone};
+  const linalg::BlockPattern& pattern() const { return pattern_; }
+
+  Potential& between(const double* /*x*/, const double* /*to*/) {
+    return potential_.emplace(model_, slots_, pattern_, elastic::Wanted::kNone);
   }
 
+ private:
   std::vector<double> positions(const char* name, const Positions& x) const {
     check_rows(name, x.shape(0), topology_.vertex_count);
     return {x.data(), x.data() + x.size()};
@@ -371,78 +349,110 @@ class Elastic {
   elastic::Slots slots_;
   elastic::Model model_;
   std::vector<double> x_n_;
+  std::optional<elastic::ElasticPotential> potential_;  // of the model at the last call
 };
 
-/// Value, change, gradient, Hessian and its product, and mixed derivatives of springs.
-nb::dict springs(const Indices& start,
-                 const Indices& point,
-                 const Values& coefficient,
-                 const Values& stiffness,
-                 const Values& rest_length,
-                 const Indices& target_row,
-                 const Positions& target,
-                 const Positions& x0,
-                 const Positions& x1,
-                 const Positions& z,
-                 bool positive) {
-  check_rows("stiffness", stiffness.shape(0), start.shape(0) - 1);
-  check_rows("rest_length", rest_length.shape(0), start.shape(0) - 1);
-  check_rows("target_row", target_row.shape(0), start.shape(0) - 1);
-  const elastic::Springs s{.start = {start.data(), start.size()},
-                           .point = {point.data(), point.size()},
-                           .coefficient = {coefficient.data(), coefficient.size()},
-                           .stiffness = {stiffness.data(), stiffness.size()},
-                           .rest_length = {rest_length.data(), rest_length.size()},
-                           .target_row = {target_row.data(), target_row.size()},
-                           .target = target.data()};
-  elastic::SpringPotential potential(s, static_cast<Index>(x1.shape(0)),
-                                     static_cast<Index>(target.shape(0)));
-  std::vector<double> gradient(x1.size(), 0.0);
-  std::vector<double> product(x1.size(), 0.0);
-  std::vector<double> left_out(x1.size(), 0.0);
-  std::vector<double> by_blocks;
-  const Curvature curvature = positive ? Curvature::kPositive : Curvature::kExact;
-  for (Index a = 0; a < s.size(); ++a) {
-    const Mat3 block = elastic::hessian(s, a, x1.data(), positive);
-    by_blocks.insert(by_blocks.end(), block.data(), block.data() + 9);
-  }
-  potential.add_gradient(x1.data(), gradient.data());
-  potential.add_hessian_product(x1.data(), z.data(), product.data());
-  potential.add_left_out_product(x1.data(), curvature, z.data(), left_out.data());
-  potential.accumulate(x1.data(), z.data());
-  nb::dict result;
-  result["energy"] = potential.energy(x1.data());
-  result["energy_change"] = potential.energy_change(x0.data(), x1.data());
-  result["gradient"] = rows_array(gradient);
-  result["hessian_product"] = rows_array(product);
-  result["left_out_product"] = rows_array(left_out);
-  result["hessians"] = owned(by_blocks.data(), {stiffness.shape(0), 3, 3});
-  result["stiffness_bar"] = vector_array(potential.stiffness_bar);
-  result["target_bar"] = rows_array(potential.target_bar);
-  return result;
+template <class Given>
+auto copied(const Given& values) {
+  return std::vector(values.data(), values.data() + values.size());
 }
+
+/// Springs and their targets, which a test varies by making others.
+class Springs {
+ public:
+  Springs(const Indices& start,
+          const Indices& point,
+          const Values& coefficient,
+          const Values& stiffness,
+          const Values& rest_length,
+          const Indices& target_row,
+          const Positions& target,
+          Index point_count)
+      : start_(copied(start)),
+        point_(copied(point)),
+        coefficient_(copied(coefficient)),
+        stiffness_(copied(stiffness)),
+        rest_length_(copied(rest_length)),
+        target_row_(copied(target_row)),
+        target_(copied(target)),
+        pattern_(point_count, {}),
+        potential_({.start = start_,
+                    .point = point_,
+                    .coefficient = coefficient_,
+                    .stiffness = stiffness_,
+                    .rest_length = rest_length_,
+                    .target_row = target_row_,
+                    .target = target_.data()},
+                   0,
+                   static_cast<Index>(target.shape(0))) {
+    check_rows("stiffness", stiffness_.size(), start_.size() - 1);
+    check_rows("rest_length", rest_length_.size(), start_.size() - 1);
+    check_rows("target_row", target_row_.size(), start_.size() - 1);
+  }
+  Springs(const Springs&) = delete;
+  Springs& operator=(const Springs&) = delete;
+
+  const linalg::BlockPattern& pattern() const { return pattern_; }
+  Potential& between(const double* /*x*/, const double* /*to*/) { return potential_; }
+
+  /// The second derivative of each spring along its vector.
+  Array hessians(const PointRows& x, bool positive) const {
+    std::vector<double> blocks;
+    for (Index a = 0; a < potential_.springs().size(); ++a) {
+      const Mat3 block = elastic::hessian(potential_.springs(), a, x.data(), positive);
+      blocks.insert(blocks.end(), block.data(), block.data() + 9);
+    }
+    return owned(blocks.data(), {stiffness_.size(), 3, 3});
+  }
+
+  Rows3 left_out_product(const PointRows& x, const PointRows& d, bool positive) const {
+    Rows3 y = Rows3::Zero(x.rows(), 3);
+    potential_.add_left_out_product(x.data(), positive ? Curvature::kPositive : Curvature::kExact,
+                                    d.data(), y.data());
+    return y;
+  }
+
+  /// Cotangents of stiffness and targets after one accumulate().
+  nb::dict mixed(const PointRows& x, const PointRows& z) {
+    std::ranges::fill(potential_.stiffness_bar, 0.0);
+    std::ranges::fill(potential_.target_bar, 0.0);
+    potential_.accumulate(x.data(), z.data());
+    nb::dict result;
+    result["stiffness"] = vector_array(potential_.stiffness_bar);
+    result["target"] = rows_array(potential_.target_bar);
+    return result;
+  }
+
+ private:
+  std::vector<Index> start_;
+  std::vector<Index> point_;
+  std::vector<double> coefficient_;
+  std::vector<double> stiffness_;
+  std::vector<double> rest_length_;
+  std::vector<Index> target_row_;
+  std::vector<double> target_;
+  linalg::BlockPattern pattern_;
+  elastic::SpringPotential potential_;
+};
 
 }  // namespace
 
 void elastic_kernels(nb::module_& m) {
-  nb::class_<Elastic>(m, "Elastic", "An elastic model on one rest mesh.")
+  nb::class_<Elastic> model(m, "Elastic", "An elastic model on one rest mesh.");
+  bind_potential(model);
+  model
       .def(nb::init<const Positions&, const Faces&, const std::string&>(), "X"_a.noconvert(),
            "faces"_a.noconvert(), "bending_model"_a)
       .def("set_rest", &Elastic::set_rest, "X"_a.noconvert())
       .def("set_parameters", &Elastic::set_parameters, "stretch"_a.noconvert(),
            "bending"_a.noconvert(), "poisson"_a.noconvert(), "damping"_a.noconvert(), "h"_a,
            "x_n"_a.noconvert().none())
-      .def("energy", &Elastic::energy, "x"_a.noconvert())
-      .def("energy_change", &Elastic::energy_change, "x0"_a.noconvert(), "x1"_a.noconvert())
       .def("stretch", &Elastic::stretch, "level"_a, "x0"_a.noconvert(), "x1"_a.noconvert(),
            "positive"_a = false)
-      .def("gradient", &Elastic::gradient, "x"_a.noconvert())
-      .def("hessian", &Elastic::hessian, "x"_a.noconvert(), "positive"_a)
       .def("extrapolated_hessian", &Elastic::extrapolated_hessian, "x0"_a.noconvert(),
            "x"_a.noconvert(), "positive"_a)
       .def("hessian_blocks", &Elastic::hessian_blocks, "x"_a.noconvert(), "positive"_a)
       .def("block_pairs", &Elastic::block_pairs)
-      .def("hessian_product", &Elastic::hessian_product, "x"_a.noconvert(), "z"_a.noconvert())
       .def("mixed", &Elastic::mixed, "x"_a.noconvert(), "z"_a.noconvert(), "with_rest"_a)
       .def("constant_form", &Elastic::constant_form, "vertex"_a.noconvert(),
            "stiffness"_a.noconvert(), "u"_a.noconvert(), "s"_a.noconvert(), "z"_a.noconvert())
@@ -453,10 +463,18 @@ void elastic_kernels(nb::module_& m) {
       .def_prop_ro("edges", &Elastic::edges, nb::rv_policy::automatic)
       .def_prop_ro("edge_faces", &Elastic::edge_faces, nb::rv_policy::automatic)
       .def_prop_ro("face_edges", &Elastic::face_edges, nb::rv_policy::automatic);
-  m.def("springs", &springs, "start"_a.noconvert(), "point"_a.noconvert(),
-        "coefficient"_a.noconvert(), "stiffness"_a.noconvert(), "rest_length"_a.noconvert(),
-        "target_row"_a.noconvert(), "target"_a.noconvert(), "x0"_a.noconvert(), "x1"_a.noconvert(),
-        "z"_a.noconvert(), "positive"_a);
+  nb::class_<Springs> springs(m, "Springs", "Springs between points and to targets.");
+  bind_potential(springs);
+  springs
+      .def(nb::init<const Indices&, const Indices&, const Values&, const Values&, const Values&,
+                    const Indices&, const Positions&, Index>(),
+           "start"_a.noconvert(), "point"_a.noconvert(), "coefficient"_a.noconvert(),
+           "stiffness"_a.noconvert(), "rest_length"_a.noconvert(), "target_row"_a.noconvert(),
+           "target"_a.noconvert(), "point_count"_a)
+      .def("hessians", &Springs::hessians, "x"_a.noconvert(), "positive"_a)
+      .def("left_out_product", &Springs::left_out_product, "x"_a.noconvert(), "d"_a.noconvert(),
+           "positive"_a)
+      .def("mixed", &Springs::mixed, "x"_a.noconvert(), "z"_a.noconvert());
 }
 
 }  // namespace diffcloth::bind
