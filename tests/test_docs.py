@@ -163,6 +163,8 @@ def test_every_block_of_python_runs_alone(page, line, code):
     if "dc.render" in code:
         pytest.importorskip("pyvista")
         pytest.importorskip("imageio_ffmpeg")
+    if "dc.show" in code:
+        pytest.importorskip("viser")
     if "robots.panda()" in code:
         try:
             dc.robots.panda()

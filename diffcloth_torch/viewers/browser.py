@@ -248,8 +248,10 @@ class Browser:
 
     def _play(self) -> None:
         """Move from moment to moment while the page plays."""
-        while not self._closed.is_set():
+        while True:
             with self._lock:
+                if self._closed.is_set():  # nobody stops the server while this holds the lock
+                    return
                 k, count = int(self._moment.value), len(self.motion)
                 wait = _SHORTEST_WAIT
                 if self._playing.value and count > 1:
