@@ -334,6 +334,15 @@ Vec12 pull_back_lambda(const ContactModel& model,
   return x_bar;
 }
 
+/// Pull cotangents of the gap t and the coefficients c of a contact back to its corners.
+void pull_back_gap(const Closest& geometry, const Vec3& t_bar, const Vec4& c_bar, Vec12& x_bar) {
+  for (int i = 0; i < 4; ++i) x_bar.segment<3>(3 * i) += geometry.c[i] * t_bar;
+  if (geometry.parameter_count == 0) return;
+  Vec2 beta_bar = geometry.s.transpose() * t_bar + geometry.c_beta.transpose() * c_bar;
+  if (geometry.parameter_count == 1) beta_bar[1] = 0.0;
+  x_bar += beta_jacobian(geometry).transpose() * beta_bar;
+}
+
 }  // namespace
 
 // phi = mu lambda q(|w|) w . zeta,  q = f1/y,  w = P s,  s = r(x) - E(x) a,  zeta = r(z) - E'(z) a,
@@ -403,14 +412,9 @@ void FrictionSet::add_mixed(const double* x,
         return row(rows, v[i]) - row(rows, v[0]);
       };
       c_bar[i] = s_bar.dot(from_first(x)) + eta.dot(from_first(z)) + g.dot(from_first(x_start_));
-      x_bar.segment<3>(3 * i) += geometry.c[i] * t_bar;
       Eigen::Map<Vec3>(start_bar + 3 * v[i]) += scale * geometry.c[i] * g;
     }
-    if (geometry.parameter_count > 0) {
-      Vec2 beta_bar = geometry.s.transpose() * t_bar + geometry.c_beta.transpose() * c_bar;
-      if (geometry.parameter_count == 1) beta_bar[1] = 0.0;
-      x_bar += beta_jacobian(geometry).transpose() * beta_bar;
-    }
+    pull_back_gap(geometry, t_bar, c_bar, x_bar);
     for (int i = 0; i < 4; ++i) {
       Eigen::Map<Vec3>(lag_bar + 3 * v[i]) += scale * x_bar.segment<3>(3 * i);
     }
