@@ -48,8 +48,11 @@ if TYPE_CHECKING:
     from diffcloth_torch.model.rigid_body import RigidBody
     from diffcloth_torch.model.robot import Robot
     from diffcloth_torch.model.scene import Scene
+    from diffcloth_torch.optimize import residuals
     from diffcloth_torch.optimize.descent import Descent, descend
     from diffcloth_torch.optimize.evaluation import Evaluation
+    from diffcloth_torch.optimize.fit import Fit, fit
+    from diffcloth_torch.optimize.variables import Variable
     from diffcloth_torch.sim.controls import Control, Parameters
     from diffcloth_torch.sim.report import Report
     from diffcloth_torch.sim.simulator import Simulator
@@ -69,6 +72,7 @@ __all__ = [
     "Control",
     "Descent",
     "Evaluation",
+    "Fit",
     "IgnoredLimitsWarning",
     "InfeasibleMotion",
     "IntersectingState",
@@ -86,10 +90,13 @@ __all__ = [
     "State",
     "Trajectory",
     "TurnedTooFar",
+    "Variable",
     "build_info",
     "descend",
+    "fit",
     "load_config",
     "render",
+    "residuals",
     "robots",
     "show",
     "stack",
@@ -118,6 +125,8 @@ _HOMES = {
     "model.scene": ("Scene",),
     "optimize.descent": ("Descent", "descend"),
     "optimize.evaluation": ("Evaluation",),
+    "optimize.fit": ("Fit", "fit"),
+    "optimize.variables": ("Variable",),
     "sim.controls": ("Control", "Parameters"),
     "sim.report": ("Report",),
     "sim.simulator": ("Simulator",),
@@ -180,6 +189,8 @@ def __getattr__(name: str) -> Any:
         return version("diffcloth-torch")
     if name == "robots":
         return import_module("diffcloth_torch.robots")
+    if name == "residuals":
+        return import_module("diffcloth_torch.optimize.residuals")
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     register_classes()

@@ -70,7 +70,14 @@ CONTENTS = {
     ),
     "How-to": (
         "Choose values, load robots, describe tasks, contribute.",
-        ["docs/guide", "docs/robots", "docs/tasks", "docs/extending", "CONTRIBUTING"],
+        [
+            "docs/guide",
+            "docs/robots",
+            "docs/identification",
+            "docs/tasks",
+            "docs/extending",
+            "CONTRIBUTING",
+        ],
     ),
     "Reference": (
         "Classes and functions, letters and units.",

@@ -1,0 +1,230 @@
+"""Variables of a fit, and the space of numbers that a solver searches."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffcloth_torch.checks import FloatArray, check_choice, check_finite, float_array
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.model.quantities import PARAMETERS
+
+__all__ = ["Space", "Variable"]
+
+_SCALES = ("log", "linear")
+_REACH = 1e3  # factor of what is positive, to both sides of its first value, without bounds
+_SPREAD = 3.0  # factor from the first value within which starts are drawn
+
+
+@dataclass(frozen=True, eq=False)
+class Variable:
+    """What a fit may change: its first value, and where it may go.
+
+    Attributes:
+        value: First value, a number or an array in the unit of what it stands for.
+        bounds: Lowest and highest value of each number. By default what is positive may change by a
+            factor of 1000, and all else has the accepted range of the parameter of its name.
+        scale: "log" searches the logarithm, so that steps are relative; "linear" the value itself.
+            By default "log" for parameters that cannot be negative, where all values are positive.
+        free: False keeps the value.
+    """
+
+    value: object
+    bounds: tuple[float, float] | None = None
+    scale: Literal["log", "linear"] | None = None
+    free: bool = True
+
+    def __post_init__(self) -> None:
+        numbers = float_array("Variable: `value`", self.value)
+        check_finite("Variable: `value`", numbers)
+        object.__setattr__(self, "value", numbers)
+        if self.scale is not None:
+            check_choice("Variable: `scale`", self.scale, _SCALES)
+        if self.bounds is not None:
+            low, high = _ends(self.bounds)
+            wrong = (numbers < low) | (numbers > high)
+            if wrong.any():
+                at = [int(i) for i in np.argwhere(wrong)[0]]
+                raise InvalidInput(
+                    f"Variable: `value` must be between its bounds {low:g} and {high:g}, "
+                    f"got {numbers[tuple(at)]:g}" + (f" at {at}" if at else "")
+                )
+        if self.scale == "log" and not (numbers > 0).all():
+            raise InvalidInput(
+                'Variable: `value` must be positive on the scale "log", got '
+                f"{float(numbers.min()):g}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class _Axis:
+    """A variable that is searched, and its rows in the vector of all numbers."""
+
+    name: str
+    shape: tuple[int, ...]
+    rows: slice
+    log: bool
+    low: float
+    high: float
+
+
+class Space:
+    """Vectors of numbers theta, one for each number of the free variables.
+
+    Attributes:
+        names: Name of each number, as "stretch" or "velocity[0]".
+        first: The first values, as theta.
+        low: Lowest values of theta.
+        high: Highest values of theta.
+    """
+
+    def __init__(self, variables: Mapping[str, Variable]) -> None:
+        """Lay out the free variables.
+
+        Args:
+            variables: Name -> variable.
+
+        Raises:
+            InvalidInput: If none is free.
+            TypeError: If something else than a variable is given.
+        """
+        for name, variable in variables.items():
+            if not isinstance(variable, Variable):
+                raise TypeError(
+                    f"fit: variables[{name!r}] must be a Variable, got {type(variable).__name__}"
+                )
+        self._kept = {
+            name: torch.from_numpy(_numbers(variable))
+            for name, variable in variables.items()
+            if not variable.free
+        }
+        self._order = tuple(variables)
+        self._axes, self.names, first = [], [], 0
+        for name, variable in variables.items():
+            if variable.free:
+                axis = _axis(name, variable, first)
+                first = axis.rows.stop
+                self._axes.append(axis)
+                self.names += _entries(name, axis.shape)
+        if not self._axes:
+            raise InvalidInput("fit: `variables` must have at least one that is free")
+        self.first = np.concatenate(
+            [_to(axis, _numbers(variables[axis.name])) for axis in self._axes]
+        )
+        counts = [axis.rows.stop - axis.rows.start for axis in self._axes]
+        self.low = np.repeat([_bound(axis, axis.low) for axis in self._axes], counts)
+        self.high = np.repeat([_bound(axis, axis.high) for axis in self._axes], counts)
+
+    def __len__(self) -> int:
+        """Count the numbers."""
+        return len(self.names)
+
+    def values(self, theta: Tensor) -> dict[str, Tensor]:
+        """Values of all variables by name, differentiable in theta."""
+        free = {}
+        for axis in self._axes:
+            numbers = theta[axis.rows].reshape(axis.shape)
+            free[axis.name] = numbers.exp() if axis.log else numbers
+        return {name: free.get(name, self._kept.get(name)) for name in self._order}  # type: ignore[misc]
+
+    def rates(self, theta: FloatArray) -> FloatArray:
+        """Derivative of each number by its theta."""
+        rates = np.ones(len(self))
+        for axis in self._axes:
+            if axis.log:
+                rates[axis.rows] = np.exp(theta[axis.rows])
+        return rates
+
+    def from_theta(self, theta: FloatArray) -> FloatArray:
+        """The numbers that theta stands for."""
+        numbers = np.array(theta)
+        for axis in self._axes:
+            if axis.log:
+                numbers[axis.rows] = np.exp(theta[axis.rows])
+        return numbers
+
+    def units(self, theta: FloatArray) -> FloatArray:
+        """What counts as a change of each theta by its own size."""
+        units = np.ones(len(self))
+        for axis in self._axes:
+            if not axis.log:
+                size = max(float(np.abs(theta[axis.rows]).max()), 1e-300)
+                span = axis.high - axis.low
+                units[axis.rows] = span / 2 if math.isfinite(span) else size
+        return units
+
+    def draw(self, generator: np.random.Generator) -> FloatArray:
+        """Draw a start: positive numbers around the first, others between their bounds."""
+        theta = np.array(self.first)
+        for axis in self._axes:
+            first, rows = self.first[axis.rows], axis.rows
+            if axis.log:
+                reach = math.log(_SPREAD)
+                low, high = first - reach, first + reach
+            elif math.isfinite(axis.high - axis.low):
+                low, high = np.full_like(first, axis.low), np.full_like(first, axis.high)
+            else:
+                low, high = first - np.abs(first), first + np.abs(first)
+            low, high = np.maximum(low, self.low[rows]), np.minimum(high, self.high[rows])
+            theta[rows] = generator.uniform(low, high)
+        return theta
+
+
+def _ends(bounds: object) -> tuple[float, float]:
+    ends = float_array("Variable: `bounds`", bounds)
+    if ends.shape != (2,) or not ends[0] < ends[1]:
+        raise InvalidInput(f"Variable: `bounds` must be (low, high) with low < high, got {bounds}")
+    return float(ends[0]), float(ends[1])
+
+
+def _numbers(variable: Variable) -> FloatArray:
+    assert isinstance(variable.value, np.ndarray)
+    return variable.value
+
+
+def _axis(name: str, variable: Variable, first: int) -> _Axis:
+    numbers = _numbers(variable)
+    known = PARAMETERS.get(name)
+    never_negative = known is not None and known.accepted.low == 0.0
+    log = variable.scale == "log"
+    if variable.scale is None:
+        log = never_negative and bool((numbers > 0).all())
+    if variable.bounds is not None:
+        low, high = variable.bounds
+    elif log:
+        low, high = float(numbers.min()) / _REACH, float(numbers.max()) * _REACH
+    elif known is not None:
+        low, high = known.accepted.low, known.accepted.high
+    else:
+        low, high = -math.inf, math.inf
+    return _Axis(
+        name=name,
+        shape=numbers.shape,
+        rows=slice(first, first + numbers.size),
+        log=log,
+        low=max(low, 0.0) if log else low,
+        high=high,
+    )
+
+
+def _to(axis: _Axis, numbers: FloatArray) -> FloatArray:
+    flat = numbers.reshape(-1)
+    return np.log(flat) if axis.log else flat.copy()
+
+
+def _bound(axis: _Axis, value: float) -> float:
+    if not axis.log:
+        return value
+    return math.log(value) if value > 0 else -math.inf
+
+
+def _entries(name: str, shape: tuple[int, ...]) -> list[str]:
+    if not shape:
+        return [name]
+    return [name + "".join(f"[{i}]" for i in index) for index in np.ndindex(*shape)]
