@@ -176,7 +176,7 @@ void FrictionPotential::accumulate(const double* x, const double* z) {
 }
 
 void FrictionPotential::add_tangent(const double* x, double* y) const {
-  set_.add_tangent(x, x_lag_, *dot_, y);
+  set_.add_tangent(x, x_lag_, {.parameters = *dot_, .start = start_dot_, .lag = lag_dot_}, y);
 }
 
 }  // namespace diffcloth::contact

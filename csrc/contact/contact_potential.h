@@ -1,6 +1,5 @@
 #pragma once
 
-#include <optional>
 #include <utility>
 #include <vector>
 
@@ -143,7 +142,9 @@ class FrictionPotential final : public Potential {
   /// Tangents, for add_tangent(): of the parameters and the rest shape, of x_start and of the lag
   /// configuration, both of all vertices. They outlive its calls.
   void set_tangent(const ContactModel::Bar& dot, const double* start, const double* lag) {
-    dot_.emplace(FrictionSet::Tangents{.parameters = dot, .start = start, .lag = lag});
+    dot_ = &dot;
+    start_dot_ = start;
+    lag_dot_ = lag;
   }
 
   /// Where the lag configuration lies: accumulate() and add_tangent() need it.
@@ -156,7 +157,9 @@ class FrictionPotential final : public Potential {
   FrictionSet set_;
   const double* x_lag_ = nullptr;
   ContactModel::Bar* bar_;
-  std::optional<FrictionSet::Tangents> dot_;
+  const ContactModel::Bar* dot_ = nullptr;
+  const double* start_dot_ = nullptr;
+  const double* lag_dot_ = nullptr;
 };
 
 }  // namespace diffcloth::contact

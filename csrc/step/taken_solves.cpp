@@ -30,7 +30,9 @@ const std::vector<Contact>& TakenSolves::contacts_at(std::size_t k, const Array&
   static const std::vector<Contact> none;
   if (step_.tape["contacts"][k] == 0.0) return none;
   if (k < step_.kept.contacts.size()) return step_.kept.contacts[k];
-  if (!found_[k]) found_[k] = sum_.contacts_at(x);
+  if (!found_[k]) {
+    found_[k] = std::make_unique<const std::vector<Contact>>(sum_.contacts_at(x));
+  }
   return *found_[k];
 }
 

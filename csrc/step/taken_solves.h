@@ -1,7 +1,7 @@
 #pragma once
 
 #include <cstddef>
-#include <optional>
+#include <memory>
 #include <vector>
 
 #include "solver/linear_system.h"
@@ -38,7 +38,7 @@ class TakenSolves {
   ContactSum& sum_;
   std::size_t first_factor_;
   std::size_t count_;
-  std::vector<std::optional<std::vector<contact::Contact>>> found_;
+  std::vector<std::unique_ptr<const std::vector<contact::Contact>>> found_;
   std::vector<double> x_, x_lag_;
   solver::Certificate certificate_;
 };
