@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from torch import Tensor
@@ -52,15 +53,24 @@ def jacobian_of(residual: Residual) -> Residual:
 
     def jacobian(x: Tensor, *inputs: Tensor) -> Tensor:
         n = x.shape[-1]
-        # Tensors saved here are used at once; hooks of a checkpoint would repeat its steps for
-        # them.
-        with torch.enable_grad(), saved_tensors_hooks(_same, _same):
+        with torch.enable_grad(), _without_hooks():
             copies = x.detach().expand(n, *x.shape).clone().requires_grad_()
             rows = residual(copies, *inputs).diagonal(dim1=0, dim2=-1).sum()
             (gradient,) = torch.autograd.grad(rows, copies)
         return gradient.movedim(0, -2)
 
     return jacobian
+
+
+def _without_hooks() -> AbstractContextManager[None]:
+    """Save tensors as they are: they are used at once, and a checkpoint's hooks repeat its steps.
+
+    Reverse-mode transforms of `torch.func` forbid hooks, and so there are none inside them.
+    """
+    # Not among the stubs of torch.
+    if torch._C._autograd._saved_tensors_hooks_is_enabled():  # type: ignore[attr-defined]
+        return saved_tensors_hooks(_same, _same)
+    return nullcontext()
 
 
 def _same(tensor: Tensor) -> Tensor:
