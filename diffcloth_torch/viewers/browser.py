@@ -122,10 +122,6 @@ class Browser:
             if self._server is not None:
                 self._extend()
 
-    def serve(self) -> None:
-        """Start the server of the page."""
-        self._serving()
-
     def wait(self) -> None:
         """Keep the page until `close`, or until the user interrupts the program."""
         self._serving()
@@ -140,7 +136,7 @@ class Browser:
         with self._lock:
             if self._server is not None:
                 _stop(self._server)
-                self._server = None
+                self._server, self._drawing = None, None
 
     def save(self, path: str | Path, *, speed: float = 1.0) -> None:
         """Write a page that plays the motion by itself, without a server or a connection.
@@ -209,7 +205,7 @@ class Browser:
                 self._add_controls(self._server.gui)
                 if self.motion:
                     self._extend()
-                threading.Thread(target=self._play, daemon=True).start()
+                threading.Thread(target=self._play, args=(self._server,), daemon=True).start()
             return self._server
 
     def _add_controls(self, gui: Any) -> None:
@@ -246,11 +242,11 @@ class Browser:
             with self._server.atomic():
                 self._drawing.draw(k, self._layer.value, vectors)
 
-    def _play(self) -> None:
-        """Move from moment to moment while the page plays."""
+    def _play(self, server: Any) -> None:
+        """Move from moment to moment while the page of a server plays."""
         while True:
             with self._lock:
-                if self._closed.is_set():  # nobody stops the server while this holds the lock
+                if self._server is not server:  # nobody stops it while this holds the lock
                     return
                 k, count = int(self._moment.value), len(self.motion)
                 wait = _SHORTEST_WAIT

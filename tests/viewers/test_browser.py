@@ -161,6 +161,9 @@ class TestPages:
                 browser.show(state)
             image = screenshot(browser.url, tmp_path / "served.png", 5)
             assert is_blue(image).sum() > 3000
+            browser.close()
+            image = screenshot(browser.url, tmp_path / "again.png", 5)  # opens another page
+            assert is_blue(image).sum() > 3000
         finally:
             browser.close()
 
