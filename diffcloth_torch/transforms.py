@@ -7,7 +7,7 @@ its own. Inside `torch.func.jvp` and the like a tensor is a wrapper without memo
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,14 @@ from torch import Tensor
 from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack as outside_transforms
 from torch.autograd import forward_ad
 
-__all__ = ["is_differentiated", "is_plain", "numbers_of", "outside_transforms", "plain", "same_row"]
+__all__ = [
+    "is_differentiated",
+    "is_plain",
+    "numbers_of",
+    "outside_transforms",
+    "plain",
+    "same_rows",
+]
 
 _CLOSE = 1e-13  # relative; batched products round by their batch
 
@@ -38,16 +45,22 @@ def plain(tensor: Tensor) -> Tensor:
         while torch._C._functorch.is_functorch_wrapped_tensor(value):
             axis = torch._C._functorch.maybe_get_bdim(value)
             inner = torch._C._functorch.get_unwrapped(value)
-            value = inner if axis < 0 else same_row(inner.movedim(axis, 0))
+            value = inner if axis < 0 else _same_row(inner, axis)
         return value.detach()
 
 
-def same_row(rows: Tensor) -> Tensor:
-    """The first of rows that are all equal but for rounding.
+def same_rows(tensors: Sequence[Tensor], axes: Sequence[int | None]) -> list[Tensor]:
+    """Tensors without the axes of a vmap, along which all are equal but for rounding.
 
     Raises:
         NotImplementedError: If they are not.
     """
+    pairs = zip(tensors, axes, strict=True)
+    return [t if axis is None else _same_row(t, axis) for t, axis in pairs]
+
+
+def _same_row(tensor: Tensor, axis: int) -> Tensor:
+    rows = tensor.movedim(axis, 0)
     first = rows[0]
     if is_plain(rows) and rows.stride(0):
         values = rows.detach()

@@ -12,11 +12,11 @@ from diffcloth_torch.model.defaults import check_barrier
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.sim.control_fields import control_fields
 from diffcloth_torch.sim.controls import Control, Parameters
+from diffcloth_torch.sim.core_functions import as_array
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.parameter_fields import parameter_fields
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.sim.state_fields import state_fields
-from diffcloth_torch.sim.step import as_array
 
 __all__ = ["Border", "Given"]
 

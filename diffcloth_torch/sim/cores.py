@@ -15,8 +15,9 @@ from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Fields
 from diffcloth_torch.model.springs import Springs
+from diffcloth_torch.sim.core_functions import as_array
 from diffcloth_torch.sim.layout import Layout
-from diffcloth_torch.sim.step import Constant, as_array
+from diffcloth_torch.sim.step import Constant
 from diffcloth_torch.sim.trees import tree_arguments
 
 __all__ = [

@@ -14,9 +14,9 @@ from diffcloth_torch.errors import (
     TurnedTooFar,
 )
 from diffcloth_torch.model.quantities import Fields
-from diffcloth_torch.sim.pull_back import vmap_level
+from diffcloth_torch.sim.linear_maps import vmap_level
 from diffcloth_torch.sim.step import CONVERGED, INFEASIBLE, TURNED, UNCONVERGED
-from diffcloth_torch.transforms import is_differentiated, same_row
+from diffcloth_torch.transforms import is_differentiated, same_rows
 
 __all__ = ["failures_of", "mark", "refuse_gradients"]
 
@@ -70,7 +70,7 @@ class _Guard(torch.autograd.Function):
 
     @staticmethod
     def vmap(info, in_dims, tensor, failures):
-        return _Guard.apply(same_row(tensor.movedim(in_dims[0], 0)), failures), None
+        return _Guard.apply(*same_rows([tensor], in_dims[:1]), failures), None
 
     @staticmethod
     def jvp(ctx, tangent, _):
@@ -80,7 +80,7 @@ class _Guard(torch.autograd.Function):
     def backward(ctx, cotangent):
         plain = cotangent
         if torch._C._functorch.is_legacy_batchedtensor(cotangent):
-            # As in `pull_back`: the older vmap knows no rule of a Function.
+            # As in `apply_map`: the older vmap knows no rule of a Function.
             plain = torch._remove_batch_dim(cotangent, vmap_level(), 1, 0)
         seen = _Look.apply(plain, ctx.failures, ctx.environment_axis)
         return seen if plain is cotangent else cotangent, None

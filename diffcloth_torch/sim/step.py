@@ -24,7 +24,6 @@ edited in place. Constants of a scene, which nobody can edit, are not saved.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -35,10 +34,9 @@ from torch import Tensor
 
 from diffcloth_torch import _core
 from diffcloth_torch._exit import note_caller
-from diffcloth_torch.errors import InvalidInput, SimulationError
-from diffcloth_torch.sim.pull_back import Differentiated, needed, pull_back
-from diffcloth_torch.sim.push_forward import Directed, push_forward
-from diffcloth_torch.transforms import is_differentiated, numbers_of, same_row
+from diffcloth_torch.errors import SimulationError
+from diffcloth_torch.sim.core_functions import Arrays, CoreFunction, as_array, evaluate
+from diffcloth_torch.transforms import is_differentiated
 
 __all__ = [
     "CONVERGED",
@@ -50,7 +48,6 @@ __all__ = [
     "Constant",
     "Outcome",
     "are_within",
-    "as_array",
     "diagnostics_of",
     "have_quaternions",
     "take_step",
@@ -140,9 +137,9 @@ def take_step(
         arrays = known | {name: as_array(t) for name, t in given.items()}
         result = _forward(core, arrays, tape=False)
         return _outcome(_outputs(result), diagnostics_of(result))
-    taken = _Taken(core, known, tuple(given))
-    outputs = _Step.apply(taken, *given.values())
-    return _outcome(outputs, taken.diagnostics)
+    step = _Step(core, known, tuple(given))
+    outputs = evaluate(step, tuple(given.values()))
+    return _outcome(outputs, step.diagnostics)
 
 
 def are_within(arrays: list[NDArray[np.float64]], largest: float) -> bool:
@@ -153,11 +150,6 @@ def are_within(arrays: list[NDArray[np.float64]], largest: float) -> bool:
 def have_quaternions(poses: NDArray[np.float64], shortest: float) -> bool:
     """Whether all poses [..., 7] have quaternions longer than `shortest`."""
     return _core.have_quaternions(poses, shortest)
-
-
-def as_array(tensor: Tensor) -> NDArray[np.float64]:
-    """Contiguous array of a tensor's numbers; shares its memory if possible."""
-    return np.ascontiguousarray(numbers_of(tensor))
 
 
 def _forward(core: _core.Simulator, arrays: dict[str, Any], *, tape: bool) -> dict[str, Any]:
@@ -184,128 +176,54 @@ def diagnostics_of(result: dict[str, Any]) -> dict[str, Any]:
     return {**dict(numbers), **others}
 
 
-class _Taken:
-    """A step that has been taken, for its derivatives: what is no input and no output of it."""
+class _Step(CoreFunction):
+    """A step; the core frees the factors and contacts that it keeps together with the graph."""
 
-    def __init__(
-        self, core: _core.Simulator, constants: dict[str, Any], names: tuple[str, ...]
-    ) -> None:
-        self.core, self.constants, self.names = core, constants, names
+    owner = "step"
+
+    def __init__(self, core: _core.Simulator, constants: Arrays, names: tuple[str, ...]) -> None:
+        super().__init__(names)
+        self.core, self.constants = core, constants
         self.diagnostics: dict[str, Any] = {}
-        self.tape: dict[str, Tensor] = {}
-        # Factors and contacts, which the core frees together with the graph.
         self.kept: Any = None
 
-    @property
-    def tape_names(self) -> tuple[str, ...]:
-        return tuple(self.tape)
-
-
-class _Step(torch.autograd.Function):
-    @staticmethod
-    def forward(taken, *tensors):
-        arrays = {name: as_array(t) for name, t in zip(taken.names, tensors, strict=True)}
-        result = _forward(taken.core, taken.constants | arrays, tape=True)
-        taken.tape = {k: torch.from_numpy(v) for k, v in result.items() if k.startswith(_TAPE)}
-        taken.kept = result[_KEPT]
-        taken.diagnostics = diagnostics_of(result)
+    def values(self, inputs: Arrays) -> tuple[Tensor, ...]:
+        result = _forward(self.core, self.constants | inputs, tape=True)
+        self.tape = {k: torch.from_numpy(v) for k, v in result.items() if k.startswith(_TAPE)}
+        self.kept = result[_KEPT]
+        self.diagnostics = diagnostics_of(result)
         return _outputs(result)
 
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        taken, *tensors = inputs
-        # Saves the inputs, not their arrays, because their version counters notice edits in place.
-        ctx.save_for_backward(*tensors, *taken.tape.values())
-        ctx.save_for_forward(*tensors, *taken.tape.values())
-        ctx.shapes = [t.shape for t in (*tensors, *taken.tape.values())]
-        ctx.core, ctx.constants, ctx.kept = taken.core, taken.constants, taken.kept
-        ctx.names, ctx.tape_names = taken.names, taken.tape_names
-        ctx.status = taken.diagnostics["status"]
-
-    @staticmethod
-    def vmap(info, in_dims, taken, *tensors):
-        """All directions of `jacfwd` have copies of the same inputs: one step serves them."""
-        rows = [
-            t if axis is None else same_row(t.movedim(axis, 0))
-            for t, axis in zip(tensors, in_dims[1:], strict=True)
-        ]
-        outputs = _Step.apply(taken, *rows)
-        return outputs, (None,) * len(outputs)
-
-    @staticmethod
-    def jvp(ctx, _, *tangents):
-        saved = ctx.saved_tensors
-        given = {n: t for n, t in zip(ctx.names, tangents, strict=True) if t is not None}
-        function = Directed(
-            owner="step",
-            saved=len(saved),
-            axes=[saved[ctx.names.index(name)].ndim for name in given],
-            tangents=partial(_tangents, ctx, tuple(given)),
+    def tangents(self, inputs: Arrays, tape: Arrays, given: Arrays, count: int) -> list[Tensor]:
+        failed = [i for i, status in enumerate(self.diagnostics["status"]) if status]
+        changed = [i for i in failed if any(_depends(d, i) for d in given.values())]
+        if changed:
+            raise SimulationError(
+                f"tangent: the step of environments {changed} failed and has no tangent; give "
+                "their inputs none",
+                environments=changed,
+            )
+        threads = torch.get_num_threads()
+        tangents = self.core.tangent(
+            self.constants | inputs, tape, self.kept, given, count, threads
         )
-        return push_forward(function, saved, tuple(given.values()))
+        return [torch.from_numpy(tangents[name]) for name in _OUTPUTS if name in tangents]
 
-    @staticmethod
-    def backward(ctx, *cotangents):
-        saved = ctx.saved_tensors  # first: raises torch's own error if the tape was freed
-        needs = needed(ctx.names, ctx.needs_input_grad[1:])
-        function = Differentiated(
-            owner="step",
-            names=(*ctx.names, *ctx.tape_names),
-            shapes=ctx.shapes,
-            axes=3,  # positions: [B, N, 3]
-            gradients=partial(_backward, ctx, needs),
-        )
-        found = dict(zip(needs, pull_back(function, saved, cotangents), strict=True))
-        return None, *(found.get(name) for name in ctx.names)
-
-
-def _tangents(step, given, saved, directions):
-    arrays = [as_array(t) for t in saved]
-    count = len(step.names)
-    failed = [i for i, status in enumerate(step.status) if status]
-    changed = [i for i in failed if any(_depends(d, i) for d in directions)]
-    if changed:
-        raise SimulationError(
-            f"tangent: the step of environments {changed} failed and has no tangent; give their "
-            "inputs none",
-            environments=changed,
-        )
-    note_caller()
-    try:
-        tangents = step.core.tangent(
-            step.constants | dict(zip(step.names, arrays[:count], strict=True)),
-            dict(zip(step.tape_names, arrays[count:], strict=True)),
-            step.kept,
-            {name: as_array(d) for name, d in zip(given, directions, strict=True)},
-            len(directions[0]),
-            torch.get_num_threads(),
-        )
-    except _core.SimulationError as error:
-        raise SimulationError(f"tangent: {error}") from error
-    return [torch.from_numpy(tangents[name]) for name in _OUTPUTS if name in tangents]
-
-
-def _depends(direction, environment):
-    """Whether directions [K, B or 1, ...] change an input of an environment."""
-    return bool(direction[:, min(environment, direction.shape[1] - 1)].count_nonzero())
-
-
-def _backward(step, needs, saved, losses):
-    arrays = [as_array(t) for t in saved]
-    count = len(step.names)
-    note_caller()
-    try:
-        gradients = step.core.backward(
-            step.constants | dict(zip(step.names, arrays[:count], strict=True)),
-            dict(zip(step.tape_names, arrays[count:], strict=True)),
-            step.kept,
-            {name: as_array(c) for name, c in zip(_OUTPUTS, losses, strict=False)},
-            len(losses[0]),
+    def gradients(
+        self, inputs: Arrays, tape: Arrays, cotangents: list[Tensor], needs: list[str]
+    ) -> list[Tensor]:
+        gradients = self.core.backward(
+            self.constants | inputs,
+            tape,
+            self.kept,
+            dict(zip(_OUTPUTS, map(as_array, cotangents), strict=False)),
+            len(cotangents[0]),
             needs,
             torch.get_num_threads(),
         )
-    except _core.SimulationError as error:
-        raise SimulationError(f"backward: {error}") from error
-    except ValueError as error:  # hooks on saved tensors have changed numbers
-        raise InvalidInput(f"backward: {error}") from error
-    return [torch.from_numpy(gradients[name]) for name in needs]
+        return [torch.from_numpy(gradients[name]) for name in needs]
+
+
+def _depends(direction: NDArray[np.float64], environment: int) -> bool:
+    """Whether directions [K, B or 1, ...] change an input of an environment."""
+    return bool(direction[:, min(environment, direction.shape[1] - 1)].any())

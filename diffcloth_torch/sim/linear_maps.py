@@ -1,0 +1,129 @@
+"""Tangents and gradients of a function of the core as linear functions, of one vector or of many.
+
+A function of torch of its own, so that all directions or losses of a `vmap` go through one call of
+the core, and so that torch knows all that a derivative depends on. `once_differentiable` is not
+enough: where the cotangent has no graph, as for `.sum()`, the gradient would come back as a
+constant, and a second derivative through it as zero.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from diffcloth_torch.checks import is_dense
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.transforms import same_rows
+
+__all__ = ["LinearMap", "apply_map", "vmap_level"]
+
+
+class LinearMap(NamedTuple):
+    """The derivative of a function of the core where it has been evaluated.
+
+    Attributes:
+        owner: What messages say that the function is.
+        kind: "tangent" or "gradient".
+        saved_names: Of the tensors that the function has saved.
+        saved_shapes: Of these.
+        axes: Of the first vector, without those of directions or losses.
+        rows: From what is saved and vectors with one leading axis, the results with that axis.
+    """
+
+    owner: str
+    kind: str
+    saved_names: Sequence[str]
+    saved_shapes: Sequence[torch.Size]
+    axes: int
+    rows: Callable[[Sequence[Tensor], list[Tensor]], list[Tensor]]
+
+
+def apply_map(
+    linear: LinearMap, saved: Sequence[Tensor], vectors: Sequence[Tensor]
+) -> tuple[Tensor, ...]:
+    """Results for vectors, which a `vmap` may give an axis more."""
+    if not any(map(torch._C._functorch.is_legacy_batchedtensor, vectors)):
+        results: tuple[Tensor, ...] = _Apply.apply(linear, *saved, *vectors)
+        return results
+    # `is_grads_batched` and vectorized Jacobians still use the older vmap, which knows no rule of
+    # a Function: take its batch axis off and put it on again.
+    level = vmap_level()
+    count = next(
+        torch._remove_batch_dim(v, level, 1, 0).shape[0]
+        for v in vectors
+        if torch._C._functorch.is_legacy_batchedtensor(v)
+    )
+    results = _Apply.apply(
+        linear, *saved, *(torch._remove_batch_dim(v, level, count, 0) for v in vectors)
+    )
+    return tuple(torch._add_batch_dim(result, 0, level) for result in results)
+
+
+def vmap_level() -> int:
+    """Level of the older vmap that is active."""
+    level: int = torch._C._vmapmode_increment_nesting() - 1
+    torch._C._vmapmode_decrement_nesting()
+    return level
+
+
+class _Apply(torch.autograd.Function):
+    """Results from vectors, which may have leading axes."""
+
+    @staticmethod
+    def forward(linear, *tensors):
+        count = len(linear.saved_names)
+        saved, vectors = tensors[:count], tensors[count:]
+        _check_saved(linear, saved)
+        leading = vectors[0].shape[: vectors[0].ndim - linear.axes]
+        rows = [v.reshape(math.prod(leading), *v.shape[len(leading) :]) for v in vectors]
+        results = linear.rows(saved, rows)
+        return tuple(r.reshape(*leading, *r.shape[1:]) for r in results)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.map = inputs[0]
+
+    @staticmethod
+    def vmap(info, in_dims, linear, *tensors):
+        count = len(linear.saved_names)
+        saved = same_rows(tensors[:count], in_dims[1 : 1 + count])
+        vectors = [
+            v.expand(info.batch_size, *v.shape) if axis is None else v.movedim(axis, 0)
+            for v, axis in zip(tensors[count:], in_dims[1 + count :], strict=True)
+        ]
+        results = _Apply.apply(linear, *saved, *vectors)
+        return results, (0,) * len(results)
+
+    @staticmethod
+    def jvp(ctx, *tangents):
+        raise RuntimeError(_no_second(ctx.map))
+
+    @staticmethod
+    def backward(ctx, *cotangents):
+        raise RuntimeError(_no_second(ctx.map))
+
+
+def _no_second(linear):
+    return (
+        f"{linear.owner}: second derivatives are not available; its {linear.kind} cannot be "
+        "differentiated again, detach it where it enters another loss"
+    )
+
+
+def _check_saved(linear, saved):
+    """Refuse what hooks on saved tensors return instead of what was saved."""
+    for name, shape, tensor in zip(linear.saved_names, linear.saved_shapes, saved, strict=True):
+        if tensor.dtype != torch.float64 or tensor.device.type != "cpu" or not is_dense(tensor):
+            raise TypeError(
+                f"backward: saved `{name}` must come back as a dense float64 tensor on the CPU, "
+                f"got {tensor.dtype} on {tensor.device}"
+            )
+        if tensor.shape != shape:
+            raise InvalidInput(
+                f"backward: saved `{name}` must come back with shape {list(shape)}, "
+                f"got {list(tensor.shape)}"
+            )
