@@ -26,6 +26,10 @@ bool moves(std::span<const Index> v, const double* d) {
   return std::ranges::any_of(v, [&](Index i) { return !row(d, i).isZero(0.0); });
 }
 
+bool moves(std::span<const Index> v, const Products& products) {
+  return std::ranges::any_of(products.z, [&](const double* d) { return moves(v, d); });
+}
+
 template <class Hessian>
 void add_stencil_product(const Stencil& v, const Hessian& h, const double* d, double* y) {
   const Vec12 product = h * stacked(v, d);
@@ -110,8 +114,13 @@ void ContactPotential::add_hessian(const double* x,
   }
 }
 
-void ContactPotential::add_hessian_product(const double* x, const double* z, double* y) const {
-  model_.add_hessian_product(contacts_, x, z, y);
+void ContactPotential::add_hessian_products(const double* x, const Products& products) const {
+  for (const Contact& k : contacts_) {
+    const ContactHessian h = model_.hessian(k, x, Curvature::kExact);
+    for (std::size_t l = 0; l < products.size(); ++l) {
+      add_stencil_product(k.pair.vertices, h, products.z[l], products.y[l]);
+    }
+  }
 }
 
 void ContactPotential::add_held_product(const double* x, const double* z, double* y) const {
@@ -121,13 +130,16 @@ void ContactPotential::add_held_product(const double* x, const double* z, double
   }
 }
 
-void ContactPotential::add_left_out_product(const double* x,
-                                            Curvature curvature,
-                                            const double* d,
-                                            double* y) const {
+void ContactPotential::add_left_out_products(const double* x,
+                                             Curvature curvature,
+                                             const Products& products) const {
   for (const Contact& k : contacts_) {
-    if (!moves(k.pair.vertices, d)) continue;
-    add_stencil_product(k.pair.vertices, model_.hessian(k, x, curvature), d, y);
+    if (!moves(k.pair.vertices, products)) continue;
+    const ContactHessian h = model_.hessian(k, x, curvature);
+    for (std::size_t l = 0; l < products.size(); ++l) {
+      if (!moves(k.pair.vertices, products.z[l])) continue;
+      add_stencil_product(k.pair.vertices, h, products.z[l], products.y[l]);
+    }
   }
 }
 
@@ -150,6 +162,14 @@ void FrictionPotential::add_hessian(const double* x,
   for (const FrictionSet::Entry& k : set_.entries()) set_.hessian(k, at, curvature).add_to(A);
 }
 
+void FrictionPotential::add_hessian_products(const double* x, const Products& products) const {
+  const FrictionSet::Slips& at = set_.slips(x);
+  for (const FrictionSet::Entry& k : set_.entries()) {
+    const FrictionSet::Hessian h = set_.hessian(k, at, Curvature::kExact);
+    for (std::size_t l = 0; l < products.size(); ++l) h.add_product(products.z[l], products.y[l]);
+  }
+}
+
 void FrictionPotential::add_held_product(const double* x, const double* z, double* y) const {
   const FrictionSet::Slips& at = set_.slips(x);
   for (const FrictionSet::Entry& k : set_.entries()) {
@@ -158,13 +178,16 @@ void FrictionPotential::add_held_product(const double* x, const double* z, doubl
   }
 }
 
-void FrictionPotential::add_left_out_product(const double* x,
-                                             Curvature curvature,
-                                             const double* d,
-                                             double* y) const {
+void FrictionPotential::add_left_out_products(const double* x,
+                                              Curvature curvature,
+                                              const Products& products) const {
   const FrictionSet::Slips& at = set_.slips(x);
   for (const FrictionSet::Entry& k : set_.entries()) {
-    if (moves(k.all_points(), d)) set_.hessian(k, at, curvature).add_product(d, y);
+    if (!moves(k.all_points(), products)) continue;
+    const FrictionSet::Hessian h = set_.hessian(k, at, curvature);
+    for (std::size_t l = 0; l < products.size(); ++l) {
+      if (moves(k.all_points(), products.z[l])) h.add_product(products.z[l], products.y[l]);
+    }
   }
 }
 

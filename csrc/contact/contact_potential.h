@@ -71,12 +71,14 @@ class ContactPotential final : public Potential {
   void add_gradient(const double* x, double* g) const override;
   void add_couplings(linalg::Couplings& pairs) const override;
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
-  void add_hessian_product(const double* x, const double* z, double* y) const override;
+  void add_hessian_product(const double* x, const double* z, double* y) const override {
+    add_hessian_products(x, {.z = {&z, 1}, .y = {&y, 1}});
+  }
+  void add_hessian_products(const double* x, const Products& products) const override;
   void add_held_product(const double* x, const double* z, double* y) const override;
-  void add_left_out_product(const double* x,
-                            Curvature curvature,
-                            const double* d,
-                            double* y) const override;
+  void add_left_out_products(const double* x,
+                             Curvature curvature,
+                             const Products& products) const override;
   void accumulate(const double* x, const double* z) override;
   void add_tangent(const double* x, double* y) const override;
   void swap_cotangents(CotangentStore& /*store*/) override {}  // they are the caller's
@@ -124,13 +126,13 @@ class FrictionPotential final : public Potential {
   void add_couplings(linalg::Couplings& pairs) const override;
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
   void add_hessian_product(const double* x, const double* z, double* y) const override {
-    set_.add_hessian_product(x, z, y);
+    add_hessian_products(x, {.z = {&z, 1}, .y = {&y, 1}});
   }
+  void add_hessian_products(const double* x, const Products& products) const override;
   void add_held_product(const double* x, const double* z, double* y) const override;
-  void add_left_out_product(const double* x,
-                            Curvature curvature,
-                            const double* d,
-                            double* y) const override;
+  void add_left_out_products(const double* x,
+                             Curvature curvature,
+                             const Products& products) const override;
   void update_duals(const double* x, const double* p, double alpha, const double* to) override {
     set_.update_duals(x, p, alpha, to);
   }

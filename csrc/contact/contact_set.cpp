@@ -468,15 +468,6 @@ std::array<Index, 3> ContactModel::frame(const Candidate& pair) const {
   return weights_.carriers(takes_a ? a : b);
 }
 
-void ContactModel::add_hessian_product(const std::vector<Contact>& contacts,
-                                       const double* x,
-                                       const double* z,
-                                       double* y) const {
-  for (const Contact& k : contacts) {
-    scatter(k.pair.vertices, hessian(k, x, Curvature::kExact) * stacked(k.pair.vertices, z), y);
-  }
-}
-
 // B = kappa w m b, contact by contact. Bodies' shares of areas are constant where features do not change.
 void ContactModel::add_energy_bars(const std::vector<Contact>& contacts,
                                    const double* x,

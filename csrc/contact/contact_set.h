@@ -169,12 +169,6 @@ class ContactModel {
   /// Hessian of one contact; kPositive is its positive part, and zero if its weight is negative.
   ContactHessian hessian(const Contact& contact, const double* x, Curvature curvature) const;
 
-  /// y += H z over all vertices, exact.
-  void add_hessian_product(const std::vector<Contact>& contacts,
-                           const double* x,
-                           const double* z,
-                           double* y) const;
-
   /// Cotangents of what the energy depends on.
   struct Bar {
     double d_hat = 0.0;

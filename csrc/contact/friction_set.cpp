@@ -296,11 +296,6 @@ void FrictionSet::Hessian::add_product(const double* z, double* y) const {
   add_edges(k, {turn_.cross(turned.e2), turned.e1.cross(turn_)}, y);
 }
 
-void FrictionSet::add_hessian_product(const double* x, const double* z, double* y) const {
-  const Slips& at = slips(x);
-  for (const Entry& k : entries_) hessian(k, at, Curvature::kExact).add_product(z, y);
-}
-
 namespace {
 
 /// Pull the cotangent of a normal force back, times scale into `bar`; returns those of the corners.

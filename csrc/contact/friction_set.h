@@ -145,9 +145,6 @@ class FrictionSet {
 
   bool has_duals(const double* x) const;
 
-  /// y += H z over all vertices.
-  void add_hessian_product(const double* x, const double* z, double* y) const;
-
   /// d/d(theta) of phi = z . grad D, times scale: into `bar` for the parameters (friction, slip,
   /// and, through lambda, kappa, d_hat, thickness, rest shape), into `start_bar` for x_start, and into
   /// `lag_bar` for the lag configuration's positions `x_lag`.

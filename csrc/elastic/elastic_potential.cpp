@@ -91,17 +91,19 @@ void SpringPotential::add_hessian(const double* x,
   }
 }
 
-void SpringPotential::add_left_out_product(const double* x,
-                                           Curvature curvature,
-                                           const double* d,
-                                           double* y) const {
+void SpringPotential::add_left_out_products(const double* x,
+                                            Curvature curvature,
+                                            const Products& products) const {
   for (Index a = 0; a < springs_.size(); ++a) {
-    const Vec3 change = difference(springs_, a, d);
-    if (change.isZero(0.0)) continue;
-    const Vec3 force = hessian(springs_, a, x, curvature == Curvature::kPositive) * change;
+    const Mat3 core = hessian(springs_, a, x, curvature == Curvature::kPositive);
     const auto points = springs_.points(a);
-    for (std::size_t p = 0; p < points.size(); ++p) {
-      Eigen::Map<Vec3>(y + 3 * points[p]) += springs_.coefficients(a)[p] * force;
+    for (std::size_t l = 0; l < products.size(); ++l) {
+      const Vec3 change = difference(springs_, a, products.z[l]);
+      if (change.isZero(0.0)) continue;
+      const Vec3 force = core * change;
+      for (std::size_t p = 0; p < points.size(); ++p) {
+        Eigen::Map<Vec3>(products.y[l] + 3 * points[p]) += springs_.coefficients(a)[p] * force;
+      }
     }
   }
 }

@@ -97,10 +97,9 @@ class SpringPotential final : public Potential {
   void add_hessian_product(const double* x, const double* z, double* y) const override {
     elastic::add_hessian_product(springs_, x, z, y);
   }
-  void add_left_out_product(const double* x,
-                            Curvature curvature,
-                            const double* d,
-                            double* y) const override;
+  void add_left_out_products(const double* x,
+                             Curvature curvature,
+                             const Products& products) const override;
   void accumulate(const double* x, const double* z) override;
   void add_tangent(const double* x, double* y) const override {
     elastic::add_tangent(springs_, x, stiffness_dot.data(), target_dot.data(), y);

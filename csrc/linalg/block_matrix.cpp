@@ -144,20 +144,36 @@ void BlockMatrix::blend(const BlockMatrix& other, double s) {
   }
 }
 
-void BlockValues::add_product(const double* x, double* y) const {
-  linalg::add_product(merged_->pattern, blocks_.data(), x, y);
+void BlockValues::add_product(const double* x, double* y) const { add_products({&x, 1}, {&y, 1}); }
+
+void BlockValues::add_products(std::span<const double* const> x, std::span<double* const> y) const {
+  linalg::add_products(merged_->pattern, blocks_.data(), x, y);
 }
 
-void add_product(const BlockPattern& pattern, const double* blocks, const double* x, double* y) {
+void add_products(const BlockPattern& pattern,
+                  const double* blocks,
+                  std::span<const double* const> x,
+                  std::span<double* const> y) {
   static const DenseKernels& kernels = dense_kernels(best_level());
-  const auto n = static_cast<std::ptrdiff_t>(pattern.size());
-  std::vector<double> wide(8 * static_cast<std::size_t>(n), 0.0);
-  double* const wide_y = wide.data() + 4 * n;
-  for (std::ptrdiff_t i = 0; i < n; ++i) std::copy_n(x + 3 * i, 3, wide.data() + 4 * i);
-  kernels.multiply_blocks(pattern.column_start().data(), pattern.row().data(), pattern.size(),
-                          blocks, wide.data(), wide_y);
-  for (std::ptrdiff_t i = 0; i < n; ++i) {
-    for (int a = 0; a < 3; ++a) y[3 * i + a] += wide_y[4 * i + a];
+  const auto n = static_cast<std::size_t>(pattern.size());
+  const std::size_t most = std::min<std::size_t>(x.size(), kMaxVectors);
+  std::vector<double> wide(8 * n * most);
+  double* const wide_y = wide.data() + 4 * n * most;
+  for (std::size_t begin = 0; begin < x.size(); begin += most) {
+    const std::size_t count = std::min(most, x.size() - begin);
+    for (std::size_t r = 0; r < count; ++r) {
+      for (std::size_t i = 0; i < n; ++i) {
+        std::copy_n(x[begin + r] + 3 * i, 3, wide.data() + 4 * (r * n + i));
+      }
+    }
+    std::fill_n(wide_y, 4 * n * count, 0.0);
+    kernels.multiply_blocks(pattern.column_start().data(), pattern.row().data(), pattern.size(),
+                            blocks, wide.data(), wide_y, static_cast<int>(count));
+    for (std::size_t r = 0; r < count; ++r) {
+      for (std::size_t i = 0; i < n; ++i) {
+        for (std::size_t a = 0; a < 3; ++a) y[begin + r][3 * i + a] += wide_y[4 * (r * n + i) + a];
+      }
+    }
   }
 }
 

@@ -38,6 +38,9 @@ class BlockValues {
   /// y += A x.
   void add_product(const double* x, double* y) const;
 
+  /// The same for several vectors, each with the bits that it has alone.
+  void add_products(std::span<const double* const> x, std::span<double* const> y) const;
+
   /// Memory of the values, without that of the pattern.
   std::size_t bytes() const { return blocks_.capacity() * sizeof(double); }
 
@@ -155,7 +158,10 @@ class BlockMatrix : public BlockValues {
   std::vector<std::pair<Index, Mat3>> changes_;  // scratch of add_congruence: B, row by row
 };
 
-/// y += A x for a symmetric matrix given by its lower blocks on the pattern.
-void add_product(const BlockPattern& pattern, const double* blocks, const double* x, double* y);
+/// y += A x for a symmetric matrix given by its lower blocks on the pattern, and several vectors.
+void add_products(const BlockPattern& pattern,
+                  const double* blocks,
+                  std::span<const double* const> x,
+                  std::span<double* const> y);
 
 }  // namespace diffcloth::linalg

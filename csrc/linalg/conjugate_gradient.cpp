@@ -33,6 +33,11 @@ struct Descent {
   bool advance(const BlockValues& A) {
     std::ranges::fill(q, 0.0);
     A.add_product(p.data(), q.data());
+    return go();
+  }
+
+  /// The same, when q is what the matrix makes of p.
+  bool go() {
     const double curvature = dot(p, q);
     if (!(curvature > 0.0)) return false;
     const double alpha = rz / curvature;
@@ -150,15 +155,23 @@ std::vector<char> conjugate_gradients(const BlockValues& A,
     }
   }
   for (int iteration = 0; iteration < max_iterations && !left.empty(); ++iteration) {
+    std::vector<const double*> from;
+    std::vector<double*> to;
+    for (const std::size_t k : left) {
+      std::ranges::fill(descents[k].q, 0.0);
+      from.push_back(descents[k].p.data());
+      to.push_back(descents[k].q.data());
+    }
+    A.add_products(from, to);
     std::erase_if(left, [&](std::size_t k) {
-      if (descents[k].advance(A)) return false;
+      if (descents[k].go()) return false;
       converged[k] = 0;
       return true;
     });
     // The last residual is not looked at: that would take another solve.
     std::erase_if(left, [&](std::size_t k) { return descents[k].expected() <= goals[k]; });
-    std::vector<const double*> from;
-    std::vector<double*> to;
+    from.clear();
+    to.clear();
     for (const std::size_t k : left) {
       from.push_back(descents[k].r.data());
       to.push_back(descents[k].z.data());

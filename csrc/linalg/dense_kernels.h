@@ -10,6 +10,9 @@ namespace diffcloth::linalg {
 /// Columns that are factored before later ones see them: what they need at a time stays in the cache.
 constexpr int kColumnBlock = 96;
 
+/// Most vectors that one call of a kernel takes.
+constexpr int kMaxVectors = 8;
+
 /// How the columns of a lower triangle, and of rows below it, are stored: column-major in blocks of
 /// kColumnBlock columns, each without the rows above its part of the triangle. Always inlined, as
 /// files that are compiled for different instructions share it.
@@ -105,7 +108,7 @@ struct FrontKernels {
   void (*add_to_update)(
       const Front& child, const Real* u, const ChildMap& map, const Front& front, Real* parent_u);
 
-  /// c_1 := L_1^-1 c_1, c_2 := c_2 - L_2 c_1 for up to four vectors c, `stride` apart; c_2 begins at
+  /// c_1 := L_1^-1 c_1, c_2 := c_2 - L_2 c_1 for up to kMaxVectors vectors c, `stride` apart; c_2 begins at
   /// `top`, entries of padding are zero.
   void (*forward)(const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride, int count);
 
@@ -116,20 +119,19 @@ struct FrontKernels {
 
 /// All dense kernels of a level.
 struct DenseKernels {
-  /// y += A x for a symmetric matrix given by its lower 3x3 blocks on a BlockPattern. Vectors have four
-  /// numbers a row, the last of which means nothing. The same bits on every level.
+  /// y += A x for a symmetric matrix given by its lower 3x3 blocks on a BlockPattern, and for up to
+  /// kMaxVectors vectors, one behind the other. These have four numbers a row, the last of which means
+  /// nothing. The same bits on every level, and for a vector alone.
   void (*multiply_blocks)(const std::int32_t* column_start,
                           const std::int32_t* row,
                           std::int32_t size,
                           const double* blocks,
                           const double* x,
-                          double* y);
+                          double* y,
+                          int count);
   FrontKernels<double> doubles;
   FrontKernels<float> floats;
 };
-
-/// Most vectors that one call of forward() or backward() takes.
-constexpr int kMaxVectors = 4;
 
 /// The kernels of a supported level.
 const DenseKernels& dense_kernels(KernelLevel level);

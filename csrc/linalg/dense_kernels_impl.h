@@ -432,10 +432,11 @@ struct Fronts {
       const int below = column + kLanes;
       const Real* const l = panel + front.panel().place(0, column);
       const std::ptrdiff_t ld = front.panel().stride(column);
+      constexpr int kAtOnce = R > 4 ? 2 : 4;  // sums stay in registers
       int j = 0;
-      for (; j + 4 <= width; j += 4) {
-        subtract_dots<R, 4>(l + j * ld + below, ld, front.ld - below, c + below, c + column + j,
-                            stride);
+      for (; j + kAtOnce <= width; j += kAtOnce) {
+        subtract_dots<R, kAtOnce>(l + j * ld + below, ld, front.ld - below, c + below,
+                                  c + column + j, stride);
       }
       for (; j < width; ++j) {
         subtract_dots<R, 1>(l + j * ld + below, ld, front.ld - below, c + below, c + column + j,
@@ -449,32 +450,26 @@ struct Fronts {
     }
   }
 
+  /// Call f<R>() for the number of vectors.
+  template <int R = 1, class Call>
+  static DIFFCLOTH_INLINE void with_count(int count, Call call) {
+    if constexpr (R < kMaxVectors) {
+      if (count > R) {
+        with_count<R + 1>(count, call);
+        return;
+      }
+    }
+    call.template operator()<R>();
+  }
+
   static void forward(
       const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride, int count) {
-    switch (count) {
-      case 1:
-        return forward<1>(front, panel, c, stride);
-      case 2:
-        return forward<2>(front, panel, c, stride);
-      case 3:
-        return forward<3>(front, panel, c, stride);
-      default:
-        return forward<4>(front, panel, c, stride);
-    }
+    with_count(count, [&]<int R> { forward<R>(front, panel, c, stride); });
   }
 
   static void backward(
       const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride, int count) {
-    switch (count) {
-      case 1:
-        return backward<1>(front, panel, c, stride);
-      case 2:
-        return backward<2>(front, panel, c, stride);
-      case 3:
-        return backward<3>(front, panel, c, stride);
-      default:
-        return backward<4>(front, panel, c, stride);
-    }
+    with_count(count, [&]<int R> { backward<R>(front, panel, c, stride); });
   }
 
   static constexpr FrontKernels<Real> kKernels{.factor = factor,
@@ -506,31 +501,58 @@ struct Columns {
   }
 };
 
+template <int R>
+void multiply_some(const std::int32_t* column_start,
+                   const std::int32_t* row,
+                   std::int32_t size,
+                   const double* blocks,
+                   const double* x,
+                   double* y) {
+  const std::ptrdiff_t stride = 4 * static_cast<std::ptrdiff_t>(size);
+  for (std::int32_t j = 0; j < size; ++j) {
+    const std::ptrdiff_t place = 4 * static_cast<std::ptrdiff_t>(j);
+    Four dots[R][3] = {};
+    Four x_j[R];
+    Four y_j[R] = {};
+    std::int32_t k = column_start[j];
+    Columns block;
+    block.read(blocks + 9 * static_cast<std::ptrdiff_t>(k));
+    for (int r = 0; r < R; ++r) {
+      x_j[r] = four(x + r * stride + place);
+      block.add_product(x_j[r], y_j[r]);
+    }
+    for (++k; k < column_start[j + 1]; ++k) {
+      block.read(blocks + 9 * static_cast<std::ptrdiff_t>(k));
+      const std::ptrdiff_t i = 4 * static_cast<std::ptrdiff_t>(row[k]);
+      for (int r = 0; r < R; ++r) {
+        const Four x_i = four(x + r * stride + i);
+        Four y_i = four(y + r * stride + i);
+        block.add_product(x_j[r], y_i);
+        *reinterpret_cast<UnalignedFour*>(y + r * stride + i) = y_i;
+        for (int a = 0; a < 3; ++a) dots[r][a] += block.c[a] * x_i;
+      }
+    }
+    for (int r = 0; r < R; ++r) {
+      for (int a = 0; a < 3; ++a) y_j[r][a] += dots[r][a][0] + dots[r][a][1] + dots[r][a][2];
+      *reinterpret_cast<UnalignedFour*>(y + r * stride + place) += y_j[r];
+    }
+  }
+}
+
 void multiply_blocks(const std::int32_t* column_start,
                      const std::int32_t* row,
                      std::int32_t size,
                      const double* blocks,
                      const double* x,
-                     double* y) {
-  for (std::int32_t j = 0; j < size; ++j) {
-    const Four x_j = four(x + 4 * static_cast<std::ptrdiff_t>(j));
-    Four dots[3] = {};
-    std::int32_t k = column_start[j];
-    Four y_j = {};
-    Columns block;
-    block.read(blocks + 9 * static_cast<std::ptrdiff_t>(k));
-    block.add_product(x_j, y_j);
-    for (++k; k < column_start[j + 1]; ++k) {
-      block.read(blocks + 9 * static_cast<std::ptrdiff_t>(k));
-      const std::ptrdiff_t i = 4 * static_cast<std::ptrdiff_t>(row[k]);
-      const Four x_i = four(x + i);
-      Four y_i = four(y + i);
-      block.add_product(x_j, y_i);
-      *reinterpret_cast<UnalignedFour*>(y + i) = y_i;
-      for (int a = 0; a < 3; ++a) dots[a] += block.c[a] * x_i;
-    }
-    for (int a = 0; a < 3; ++a) y_j[a] += dots[a][0] + dots[a][1] + dots[a][2];
-    *reinterpret_cast<UnalignedFour*>(y + 4 * static_cast<std::ptrdiff_t>(j)) += y_j;
+                     double* y,
+                     int count) {
+  constexpr int kAtOnce = 4;  // sums stay in registers
+  const std::ptrdiff_t stride = 4 * static_cast<std::ptrdiff_t>(size);
+  for (; count >= kAtOnce; count -= kAtOnce, x += kAtOnce * stride, y += kAtOnce * stride) {
+    multiply_some<kAtOnce>(column_start, row, size, blocks, x, y);
+  }
+  for (; count > 0; --count, x += stride, y += stride) {
+    multiply_some<1>(column_start, row, size, blocks, x, y);
   }
 }
 

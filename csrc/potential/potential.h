@@ -1,6 +1,8 @@
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
+#include <span>
 #include <utility>
 #include <vector>
 
@@ -13,6 +15,14 @@ namespace diffcloth {
 /// The exact Hessian; a positive semi-definite stand-in for it far from the minimum; or the exact one with
 /// duals in the place of forces, where a potential keeps some.
 enum class Curvature : std::uint8_t { kExact, kPositive, kPrimalDual };
+
+/// Vectors z over all points, and what H z is added to for each of them.
+struct Products {
+  std::span<const double* const> z;
+  std::span<double* const> y;
+
+  std::size_t size() const { return z.size(); }
+};
 
 /// One term of what a step minimizes: an energy of all points, 3 doubles each: vertices, cloth first,
 /// then bodies, and behind them the nodes of coordinates.
@@ -67,18 +77,24 @@ class Potential {
   /// y += H z over all vertices, exact.
   virtual void add_hessian_product(const double* x, const double* z, double* y) const = 0;
 
+  /// The same for several vectors, each with the bits that it has alone.
+  virtual void add_hessian_products(const double* x, const Products& products) const {
+    for (std::size_t l = 0; l < products.size(); ++l) {
+      add_hessian_product(x, products.z[l], products.y[l]);
+    }
+  }
+
   /// y += the rows of H z at all points but the cloths' free vertices, exact; what those get means
   /// nothing.
   virtual void add_held_product(const double* x, const double* z, double* y) const {
     add_hessian_product(x, z, y);
   }
 
-  /// y += H d, of the pairs with points that move in d, for a motion d of points whose rows
-  /// add_hessian() leaves out.
-  virtual void add_left_out_product(const double* /*x*/,
-                                    Curvature /*curvature*/,
-                                    const double* /*d*/,
-                                    double* /*y*/) const {}
+  /// y += H z, of the pairs with points that move in z, for motions z of points whose rows
+  /// add_hessian() leaves out; each with the bits that it has alone.
+  virtual void add_left_out_products(const double* /*x*/,
+                                     Curvature /*curvature*/,
+                                     const Products& /*products*/) const {}
 
   /// Add -d/d(theta) (z . grad P) to the cotangents that the potential keeps for its inputs theta.
   virtual void accumulate(const double* x, const double* z) = 0;

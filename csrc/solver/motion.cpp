@@ -38,8 +38,10 @@ void add_coupling(const Objective& f,
   std::vector<double> product(d_z.size(), 0.0);
   matrix.add_product(d_z.data(), product.data());
   f.coordinates->add_rows(product, g);
+  const double* const motion = d.data();
+  double* const sum = g.data();
   f.for_each([&](const Potential& p) {
-    p.add_left_out_product(x.data(), Curvature::kPositive, d.data(), g.data());
+    p.add_left_out_products(x.data(), Curvature::kPositive, {.z = {&motion, 1}, .y = {&sum, 1}});
   });
 }
 

@@ -51,36 +51,59 @@ Array prescribed_tangent(const Pushforward& step, std::size_t l, const Array& x)
   return d;
 }
 
-/// y = H d at the free rows; what others get means nothing.
-void product_with_prescribed(const solver::Objective& f, const Array& x, const Array& d, Array& y) {
-  Array rows;
-  f.coordinates->take_rows(d, rows);
-  if (!is_zero(rows)) {
-    f.hessian_product(x.data(), d.data(), y);
-    return;
+/// Several vectors, and where their products go.
+struct ProductList {
+  std::vector<const double*> z;
+  std::vector<double*> y;
+
+  void add(const Array& from, Array& to) {
+    z.push_back(from.data());
+    y.push_back(to.data());
   }
-  y.assign(x.size(), 0.0);
-  if (is_zero(d)) return;
+  Products products() const { return {.z = z, .y = y}; }
+};
+
+/// y = H d at the free rows, direction by direction; what others get means nothing.
+void products_with_prescribed(const solver::Objective& f,
+                              const Array& x,
+                              const std::vector<Array>& d,
+                              std::vector<Array>& y) {
+  ProductList whole;
+  ProductList left_out;
+  for (std::size_t l = 0; l < d.size(); ++l) {
+    y[l].assign(x.size(), 0.0);
+    if (is_zero(d[l])) continue;
+    Array rows;
+    f.coordinates->take_rows(d[l], rows);
+    (is_zero(rows) ? left_out : whole).add(d[l], y[l]);
+  }
   f.for_each([&](const Potential& p) {
-    p.add_left_out_product(x.data(), Curvature::kExact, d.data(), y.data());
+    p.add_hessian_products(x.data(), whole.products());
+    p.add_left_out_products(x.data(), Curvature::kExact, left_out.products());
   });
 }
 
-/// The change of the forces with that of all points; `change` becomes that of the gradient.
-void add_force_tangents(const Pushforward& step,
-                        const solver::Objective& f,
-                        const Array& x,
-                        const Array& dx,
-                        const std::vector<Potential*>& touching,
-                        GradientTangent& change,
-                        const Forces& forces) {
-  for (const Potential* p : touching) {
-    p->add_hessian_product(x.data(), dx.data(), change.touching.data());
-  }
+/// Add H dx to the changes of the gradient: at all points for what touches, else at those that are held.
+void add_products_with_motion(const solver::Objective& f,
+                              const Array& x,
+                              const std::vector<Array>& dx,
+                              const std::vector<Potential*>& touching,
+                              std::vector<GradientTangent>& changes) {
+  ProductList list;
+  for (std::size_t l = 0; l < dx.size(); ++l) list.add(dx[l], changes[l].touching);
+  for (const Potential* p : touching) p->add_hessian_products(x.data(), list.products());
   f.for_each([&](const Potential& p) {
     if (std::ranges::find(touching, &p) != touching.end()) return;
-    p.add_held_product(x.data(), dx.data(), change.others.data());
+    for (std::size_t l = 0; l < dx.size(); ++l) {
+      p.add_held_product(x.data(), dx[l].data(), changes[l].others.data());
+    }
   });
+}
+
+/// The change of the forces with that of the gradient.
+void add_force_tangents(const Pushforward& step,
+                        const GradientTangent& change,
+                        const Forces& forces) {
   const std::size_t cloth = step.problem.cloth_size;
   const std::size_t end = 3 * static_cast<std::size_t>(step.problem.scene.vertex_count());
   for (std::size_t a = 0; a < cloth; ++a) forces.contact[a] -= change.touching[a];
@@ -112,13 +135,15 @@ std::vector<Array> push_forward_solve(const Pushforward& step,
   const std::size_t count = step.directions.size();
   std::vector<GradientTangent> changes;
   std::vector<Array> d;
-  std::vector<Array> b(count);
   for (std::size_t l = 0; l < count; ++l) {
     step.context.checkpoint->check();
     set_tangents(l);
     changes.push_back(gradient_tangent(f, x, touching));
     d.push_back(prescribed_tangent(step, l, x));
-    product_with_prescribed(f, x, d[l], b[l]);
+  }
+  std::vector<Array> b(count);
+  products_with_prescribed(f, x, d, b);
+  for (std::size_t l = 0; l < count; ++l) {
     if (coordinates.is_curved()) coordinates.add_change(x, d[l], gradient, b[l]);
     for (std::size_t a = 0; a < x.size(); ++a) {
       b[l][a] += changes[l].others[a] + changes[l].touching[a];
@@ -128,9 +153,10 @@ std::vector<Array> push_forward_solve(const Pushforward& step,
   system.solve(certificate, b, dx);
   for (std::size_t l = 0; l < count; ++l) {
     for (std::size_t a = 0; a < x.size(); ++a) dx[l][a] += d[l][a];
-    if (with_forces) {
-      add_force_tangents(step, f, x, dx[l], touching, changes[l], step.forces[l]);
-    }
+  }
+  if (with_forces) {
+    add_products_with_motion(f, x, dx, touching, changes);
+    for (std::size_t l = 0; l < count; ++l) add_force_tangents(step, changes[l], step.forces[l]);
   }
   return dx;
 }

@@ -407,8 +407,10 @@ class Springs {
 
   Rows3 left_out_product(const PointRows& x, const PointRows& d, bool positive) const {
     Rows3 y = Rows3::Zero(x.rows(), 3);
-    potential_.add_left_out_product(x.data(), positive ? Curvature::kPositive : Curvature::kExact,
-                                    d.data(), y.data());
+    const double* const motion = d.data();
+    double* const sum = y.data();
+    potential_.add_left_out_products(x.data(), positive ? Curvature::kPositive : Curvature::kExact,
+                                     {.z = {&motion, 1}, .y = {&sum, 1}});
     return y;
   }
 
