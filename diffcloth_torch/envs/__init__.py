@@ -1,0 +1,71 @@
+"""Environments for learning: tasks with cloth, in batches, with gradients.
+
+>>> import diffcloth_torch as dc
+>>> env = dc.envs.make("FoldCloth", num_envs=8, size=12)
+>>> observation, info = env.reset(seed=0)
+>>> observation, reward, terminated, truncated, info = env.step(actions)
+
+Importing this module also lets `gymnasium.make_vec("diffcloth/FoldCloth-v0", num_envs=8)` find them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from diffcloth_torch.checks import check_choice
+from diffcloth_torch.envs.actuators import Actuator, Pickers, Velocities
+from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.envs.fold_cloth import FoldCloth, FoldClothDiagonal
+from diffcloth_torch.errors import InvalidInput
+
+try:
+    from diffcloth_torch.envs.gym import ClothVectorEnv, register
+except ModuleNotFoundError as error:
+    if error.name != "gymnasium":
+        raise
+    raise ImportError(
+        "environments need gymnasium: run  pip install 'diffcloth-torch[envs]'"
+    ) from error
+
+__all__ = [
+    "TASKS",
+    "Actuator",
+    "ClothVectorEnv",
+    "EnvState",
+    "Pickers",
+    "Task",
+    "Velocities",
+    "make",
+]
+
+TASKS: dict[str, type[Task]] = {
+    task.name: task for task in (FoldCloth, FoldClothDiagonal)
+}
+"""Name -> task."""
+
+_OF_BATCH = ("seed", "autoreset_mode")
+
+
+def make(task: str | Task, num_envs: int = 1, **options: Any) -> ClothVectorEnv:
+    """Make environments of a task.
+
+    Args:
+        task: One of `TASKS` by name, or a task of your own.
+        num_envs: How many environments step together.
+        **options: `seed` and `autoreset_mode` as for `ClothVectorEnv`; the others go to the task,
+            where it is given by name.
+
+    Raises:
+        InvalidInput: If a name or value is not accepted.
+    """
+    batch = {name: options.pop(name) for name in _OF_BATCH if name in options}
+    if isinstance(task, str):
+        check_choice("make: `task`", task, tuple(TASKS))
+        task = TASKS[task](**options)
+    elif options:
+        raise InvalidInput(f"make: {', '.join(options)} cannot be given with a task of your own")
+    return ClothVectorEnv(task, num_envs, **batch)
+
+
+for _name in TASKS:
+    register(_name)

@@ -1,0 +1,181 @@
+"""What actions move: pickers, which hold vertices of a cloth, and pins of cloths."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import one_hot
+
+from diffcloth_torch.checks import check_count
+from diffcloth_torch.model.attachment import Attachment
+from diffcloth_torch.model.cloth import Cloth
+from diffcloth_torch.sim.controls import Control
+from diffcloth_torch.sim.state import State
+
+__all__ = ["Actuator", "Pickers", "Tools", "Velocities"]
+
+Tools = dict[str, Tensor]
+"""What an actuator keeps from one transition to the next, [B, ...] each."""
+
+_NOTHING = -1  # what an open picker holds
+
+
+class Actuator(ABC):
+    """Makes controls from actions between -1 and 1.
+
+    Attributes:
+        size: A, the length of an action.
+    """
+
+    size: int
+
+    @abstractmethod
+    def act(
+        self, tools: Tools, state: State, actions: Tensor, substeps: int
+    ) -> tuple[list[Control], Tools]:
+        """Controls of the time steps of a transition, and the tools after it.
+
+        Args:
+            tools: Before it.
+            state: Before it.
+            actions: [B, A].
+            substeps: How many time steps it has.
+        """
+
+
+class Pickers(Actuator):
+    """Grippers without a body, as in SoftGym: points that move and hold a vertex.
+
+    An action has four numbers for each picker: its displacement, in shares of `stride` along each
+    axis, and its grasp. A picker whose grasp is positive closes on the nearest vertex within
+    `reach`, and holds it until its grasp is zero or negative. A spring pulls the vertex, with that
+    share of its stiffness: actions have a gradient in the grasp, too.
+
+    Attributes:
+        count: P, the number of pickers.
+        attachments: Springs between each vertex and each picker, for the scene.
+        stride: Longest displacement along an axis in a transition [m].
+        reach: Within which a picker closes on a vertex [m].
+        floor: Lowest height of a picker [m].
+    """
+
+    def __init__(
+        self,
+        cloth: Cloth,
+        count: int = 2,
+        *,
+        stiffness: float = 50.0,
+        stride: float = 0.025,
+        reach: float = 0.03,
+        floor: float = 0.004,
+    ) -> None:
+        """Make pickers for a cloth that has a name.
+
+        Args:
+            cloth: What they hold.
+            count: How many there are.
+            stiffness: Of the spring of a closed picker [N/m].
+            stride: Longest displacement along an axis in a transition [m].
+            reach: Within which a picker closes on a vertex [m].
+            floor: Lowest height of a picker [m].
+        """
+        self.count = check_count("Pickers: `count`", count, 1)
+        self.size = 4 * count
+        self.stride, self.reach, self.floor = stride, reach, floor
+        self._vertices = len(cloth.vertices)
+        self.attachments = tuple(
+            Attachment((str(cloth.name), range(self._vertices)), stiffness=stiffness, name=name)
+            for name in self._names
+        )
+
+    @property
+    def _names(self) -> list[str]:
+        return [f"picker_{p}" for p in range(self.count)]
+
+    def start(self, points: Tensor, held: Tensor | None = None) -> Tools:
+        """Pickers at points [B, P, 3], open, or closed on vertices [B, P] that are there."""
+        if held is None:
+            held = torch.full(points.shape[:2], _NOTHING)
+        return {
+            "points": points,
+            "held": held,
+            "offsets": torch.zeros_like(points),
+            "grasp": (held != _NOTHING).to(points.dtype),
+        }
+
+    def act(
+        self, tools: Tools, state: State, actions: Tensor, substeps: int
+    ) -> tuple[list[Control], Tools]:
+        """Close or open, then move in equal parts; see `Actuator`."""
+        moves, grasp = actions.unflatten(-1, (self.count, 4)).split([3, 1], dim=-1)
+        grasp = grasp[..., 0].clamp(min=0)
+        before = tools["points"]
+        held, offsets = self._close(tools, state.positions, grasp)
+        after = before + self.stride * moves
+        after = torch.cat([after[..., :2], after[..., 2:].clamp(min=self.floor)], dim=-1)
+        chosen = one_hot(held.clamp(min=0), self._vertices) * (held != _NOTHING)[..., None]
+        weights = grasp[..., None] * chosen
+        controls = []
+        for k in range(1, substeps + 1):
+            points = before + (k / substeps) * (after - before) + offsets
+            targets = points[..., None, :].expand(-1, -1, self._vertices, -1)
+            controls.append(
+                Control(
+                    attachments={n: targets[:, p] for p, n in enumerate(self._names)},
+                    attachment_weights={n: weights[:, p] for p, n in enumerate(self._names)},
+                )
+            )
+        return controls, {"points": after, "held": held, "offsets": offsets, "grasp": grasp}
+
+    def _close(self, tools: Tools, positions: Tensor, grasp: Tensor) -> tuple[Tensor, Tensor]:
+        """What each picker holds, and where that is from it."""
+        closed = grasp > 0
+        goes_on = closed & (tools["held"] != _NOTHING)
+        away = positions[:, None] - tools["points"][:, :, None]  # [B, P, N, 3]
+        distances = away.detach().square().sum(dim=-1)
+        nearest = distances.argmin(dim=-1)
+        is_near = distances.gather(-1, nearest[..., None])[..., 0] <= self.reach**2
+        found = torch.where(closed & is_near, nearest, _NOTHING)
+        held = torch.where(goes_on, tools["held"], found)
+        here = away.gather(2, nearest[..., None, None].expand(-1, -1, 1, 3))[:, :, 0]
+        starts = (~goes_on & (held != _NOTHING))[..., None]
+        offsets = torch.where(starts, here, tools["offsets"] * goes_on[..., None])
+        return held, offsets
+
+
+class Velocities(Actuator):
+    """Groups of pins, each of which moves as one with a velocity that the action sets.
+
+    Attributes:
+        speed: Largest velocity along an axis [m/s].
+    """
+
+    def __init__(self, pins: Mapping[str, Sequence[int]], *, dt: float, speed: float) -> None:
+        """Choose the pins.
+
+        Args:
+            pins: "cloth/pin" -> indices of the vertices in `State.positions`.
+            dt: Time step [s].
+            speed: Largest velocity along an axis [m/s].
+        """
+        self._pins = {name: list(indices) for name, indices in pins.items()}
+        self._dt, self.speed = dt, speed
+        self.size = 3 * len(self._pins)
+
+    def act(
+        self, tools: Tools, state: State, actions: Tensor, substeps: int
+    ) -> tuple[list[Control], Tools]:
+        """Move the pins; see `Actuator`."""
+        velocities = self.speed * actions.unflatten(-1, (len(self._pins), 3))
+        starts = {name: state.positions[:, indices] for name, indices in self._pins.items()}
+        controls = []
+        for k in range(1, substeps + 1):
+            moved = {
+                name: start + (k * self._dt) * velocities[:, None, g]
+                for g, (name, start) in enumerate(starts.items())
+            }
+            controls.append(Control(pins=moved))
+        return controls, tools

@@ -1,0 +1,251 @@
+"""Batches of environments for gymnasium, in torch tensors that keep their graph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from torch import Tensor
+
+from diffcloth_torch.checks import check_count
+from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.sim.controls import Parameters
+
+__all__ = ["ClothVectorEnv"]
+
+_FLOAT = torch.float32  # at the border; float64 inside
+
+
+class ClothVectorEnv(VectorEnv[Any, Any, Any]):
+    """A task in several environments that step together; observations and rewards have gradients.
+
+    Observations and rewards are float32 tensors [B, O] and [B]. They keep the graph of actions that
+    need a gradient, through as many steps as have been taken since `clear_grad`; where nothing
+    needs one there is no graph. `info` has "success", "failed" and "elapsed", [B] each, and
+    "obs_before_reset", the observation at the end of the step.
+
+    An episode ends at the horizon of the task (`truncated`), or where a step fails (`terminated`,
+    with `info["failed"]`; its reward is that of the last state that was reached, without a
+    gradient). With `AutoresetMode.SAME_STEP` a new episode then begins in the same step: the
+    observation is that of the new start, and `info["final_obs"]` that of the end, with its graph,
+    where `info["_final_obs"]` is true. With `AutoresetMode.DISABLED` it is begun by
+    `reset(options={"reset_mask": ended})`.
+
+    Environment i starts from numbers of its own, which depend on the seed and on i alone.
+
+    Attributes:
+        task: What is to be done.
+        parameters: Of the simulation, for gradients and for variation; None for those of the scene.
+        env_state: The present state, with its graph.
+    """
+
+    metadata: dict[str, Any]
+    env_state: EnvState
+
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int = 1,
+        *,
+        seed: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+    ) -> None:
+        """Prepare the environments; `reset` starts them.
+
+        Args:
+            task: What is to be done.
+            num_envs: B, the number of environments.
+            seed: Of the first `reset` that gives none.
+            autoreset_mode: SAME_STEP or DISABLED.
+
+        Raises:
+            InvalidInput: If an argument is not accepted.
+        """
+        self.num_envs = check_count("make: `num_envs`", num_envs, 1)
+        mode = AutoresetMode(autoreset_mode)
+        if mode is AutoresetMode.NEXT_STEP:
+            raise InvalidInput("make: `autoreset_mode` must be SAME_STEP or DISABLED, got NextStep")
+        self.metadata = {"autoreset_mode": mode, "render_modes": []}
+        self.task, self.parameters = task, None
+        self.parameters: Parameters | None = None
+        size = task.observation(task._example()).shape[-1]
+        self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
+        self.single_action_space = Box(-1.0, 1.0, (task.action_size,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._first_seed = seed
+        self._generators: list[torch.Generator] | None = None
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """Begin episodes.
+
+        Args:
+            seed: Of all environments, or one for each; None goes on with the numbers drawn so far.
+            options: "reset_mask": booleans [B], of the environments that begin anew; the others go
+                on.
+
+        Returns:
+            Observations [B, O] and information.
+        """
+        mask = self._reset_mask(options)
+        if seed is not None or self._generators is None:
+            self._generators = self._seeded(self._first_seed if seed is None else seed)
+        if mask is None:
+            self.env_state = self._started(range(self.num_envs))
+        else:
+            self.env_state = self._with_starts(self.env_state, mask)
+        return self._observe(self.env_state), self._info(self.env_state)
+
+    def step(
+        self, actions: Any
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Take a transition in all environments.
+
+        Args:
+            actions: [B, A], between -1 and 1; others are clipped.
+
+        Returns:
+            Observations [B, O], rewards [B], terminated [B], truncated [B] and information.
+
+        Raises:
+            InvalidInput: If the actions have another shape or are not finite, or nothing was reset.
+        """
+        if self._generators is None:
+            raise InvalidInput("step: call reset() first")
+        after = self.task.transition(self.env_state, self._actions(actions), self.parameters)
+        reward = self.task.reward(after)
+        observation = self._observe(after)
+        if bool(after.failed.any()):
+            reward = torch.where(after.failed, reward.detach(), reward)
+        terminated = self.task.terminal(after)
+        truncated = (after.elapsed >= self.task.horizon) & ~terminated
+        info = self._info(after)
+        info["obs_before_reset"] = observation
+        ended = terminated | truncated
+        same_step = self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+        if same_step and bool(ended.any()):
+            final = {name: info[name] for name in ("success", "failed", "elapsed")}
+            info |= {"final_obs": observation, "_final_obs": ended}
+            info |= {"final_info": final, "_final_info": ended}
+            after = self._with_starts(after, ended)
+            observation = self._observe(after)
+        self.env_state = after
+        return observation, reward.to(_FLOAT), terminated, truncated, info
+
+    def scripted_actions(self) -> Tensor:
+        """Actions of the policy made by hand, for the present state, [B, A]."""
+        with torch.no_grad():
+            return self.task.scripted(self.env_state).to(_FLOAT)
+
+    def clear_grad(self) -> None:
+        """Cut the graph of the present state: gradients of later rewards end here."""
+        self.env_state = self.env_state.detach()
+
+    def initialize_trajectory(self) -> Tensor:
+        """Cut the graph, and give the observation [B, O] to go on from."""
+        self.clear_grad()
+        return self._observe(self.env_state)
+
+    def generator_states(self) -> list[Tensor]:
+        """States of the generators of starts, to go on with later: see `resume`."""
+        return [generator.get_state() for generator in self._generators or []]
+
+    def resume(self, env_state: EnvState, generator_states: Sequence[Tensor]) -> Tensor:
+        """Go on from a state and generators that were kept; gives the observation [B, O]."""
+        self._generators = [torch.Generator() for _ in generator_states]
+        for generator, state in zip(self._generators, generator_states, strict=True):
+            generator.set_state(state)
+        self.env_state = env_state
+        return self._observe(env_state)
+
+    def _seeded(self, seed: int | Sequence[int] | None) -> list[torch.Generator]:
+        if seed is None:
+            seed = int(np.random.SeedSequence().generate_state(1)[0])
+        count = self.num_envs
+        if isinstance(seed, Sequence):
+            if len(seed) != count:
+                raise InvalidInput(f"reset: `seed` must have {count} numbers, got {len(seed)}")
+            keys = [[int(s)] for s in seed]
+        else:
+            keys = [[int(seed), i] for i in range(count)]
+        words = [np.random.SeedSequence(key).generate_state(1, np.uint64)[0] for key in keys]
+        return [torch.Generator().manual_seed(int(word >> np.uint64(1))) for word in words]
+
+    def _started(self, environments: Sequence[int]) -> EnvState:
+        generators = self._generators or []
+        return self.task.start([self.task.draw(generators[i]) for i in environments])
+
+    def _with_starts(self, env: EnvState, mask: Tensor) -> EnvState:
+        """New starts where the mask is true."""
+        chosen = mask.nonzero()[:, 0].tolist()
+        if not chosen:
+            return env
+        # Only these draw, so that others do not depend on when these end.
+        fresh = self._started(chosen)
+        rows = torch.zeros(self.num_envs, dtype=torch.int64)
+        rows[chosen] = torch.arange(len(chosen))
+        spread = EnvState(
+            fresh.state[rows],
+            {name: t[rows] for name, t in fresh.tools.items()},
+            {name: t[rows] for name, t in fresh.drawn.items()},
+            fresh.elapsed[rows],
+            fresh.failed[rows],
+        )
+        return EnvState.where(mask, spread, env)
+
+    def _observe(self, env: EnvState) -> Tensor:
+        observation = self.task.observation(env)
+        if bool(env.failed.any()):
+            observation = torch.where(env.failed[:, None], observation.detach(), observation)
+        return observation.to(_FLOAT)
+
+    def _info(self, env: EnvState) -> dict[str, Any]:
+        with torch.no_grad():
+            success = self.task.success(env)
+        return {"success": success, "failed": env.failed, "elapsed": env.elapsed}
+
+    def _actions(self, given: Any) -> Tensor:
+        actions = torch.as_tensor(given)
+        expected = (self.num_envs, self.task.action_size)
+        if actions.shape != expected:
+            raise InvalidInput(
+                f"step: `actions` must have shape {list(expected)}, got {list(actions.shape)}"
+            )
+        if not bool(torch.isfinite(actions).all()):
+            row = int((~torch.isfinite(actions)).any(dim=-1).nonzero()[0])
+            raise InvalidInput(f"step: `actions` must be finite, those of environment {row} are not")
+        return actions.to(torch.float64)
+
+    def _reset_mask(self, options: dict[str, Any] | None) -> Tensor | None:
+        unknown = set(options or {}) - {"reset_mask"}
+        if unknown:
+            raise InvalidInput(f"reset: `options` must have only reset_mask, got {sorted(unknown)}")
+        if not options or options["reset_mask"] is None:
+            return None
+        mask = torch.as_tensor(options["reset_mask"])
+        if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
+            raise InvalidInput(
+                f"reset: `reset_mask` must be booleans [{self.num_envs}], "
+                f"got {mask.dtype} {list(mask.shape)}"
+            )
+        if self._generators is None:
+            raise InvalidInput("reset: `reset_mask` needs environments that have begun")
+        return mask
+
+
+def register(name: str) -> None:
+    """Let `gymnasium.make_vec("diffcloth/NAME-v0", num_envs=8)` find a task."""
+    gymnasium.register(
+        f"diffcloth/{name}-v0",
+        vector_entry_point="diffcloth_torch.envs:make",
+        kwargs={"task": name},
+    )
