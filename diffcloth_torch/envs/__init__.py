@@ -14,8 +14,10 @@ from typing import Any
 
 from diffcloth_torch.checks import check_choice
 from diffcloth_torch.envs.actuators import Actuator, Pickers, Velocities
+from diffcloth_torch.envs.drop_cloth import DropCloth
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.envs.fold_cloth import FoldCloth, FoldClothDiagonal
+from diffcloth_torch.envs.spread_cloth import FlingCloth, SpreadCloth
 from diffcloth_torch.errors import InvalidInput
 
 try:
@@ -39,7 +41,8 @@ __all__ = [
 ]
 
 TASKS: dict[str, type[Task]] = {
-    task.name: task for task in (FoldCloth, FoldClothDiagonal)
+    task.name: task
+    for task in (FoldCloth, FoldClothDiagonal, SpreadCloth, DropCloth, FlingCloth)
 }
 """Name -> task."""
 

@@ -11,7 +11,6 @@ from diffcloth_torch.envs.sheets import SIDE, SheetTask, arc, follow
 __all__ = ["FoldCloth", "FoldClothDiagonal"]
 
 _DRIFT = 1.2  # weight of how far the kept half moves, as in SoftGym
-_CLOSE = 0.1  # of the side: mean distance of the halves of a fold that succeeds
 
 
 class FoldCloth(SheetTask):
@@ -22,6 +21,10 @@ class FoldCloth(SheetTask):
     """
 
     name = "FoldCloth"
+    closes = (True, True)  # pickers that a fold needs
+    lift = 0.45  # how high they carry it, in sides
+    pace = 3  # transitions for an eighth of the way
+    close = 0.1  # in sides: see success()
 
     def pairs(self) -> tuple[Tensor, Tensor]:
         """Vertices that move, and the ones on which they are to lie."""
@@ -44,8 +47,8 @@ class FoldCloth(SheetTask):
         return -(apart + _DRIFT * drift)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether reward is above -.1 of the side."""
-        return self.reward(env) > -_CLOSE * SIDE
+        """Whether the reward is above -`close` sides."""
+        return self.reward(env) > -self.close * SIDE
 
     def ends(self) -> list[int]:
         """Vertices onto which the pickers carry those that they begin at."""
@@ -54,13 +57,19 @@ class FoldCloth(SheetTask):
     def scripted(self, env: EnvState) -> Tensor:
         """Close on the corners, carry them over in an arc, put them down, let go."""
         start = env.drawn["start"]
-        low = torch.tensor([0.0, 0.0, 0.008], dtype=torch.float64)
+        low = torch.tensor([0.0, 0.0, 0.016], dtype=torch.float64)
         here, there = start[:, self.beginnings()], start[:, self.ends()] + low
-        carried = arc(here, there, 0.4 * SIDE, 8)
-        times = [4, *(8 + 3 * k for k in range(8)), 32, 36]
+        carried = arc(here, there, self.lift * SIDE, 8)
+        end = 5 + 8 * self.pace
+        times = [4, *(5 + self.pace * k for k in range(1, 9)), end + 2, end + 6]
         points = [here, *carried, there, there + 4 * low]
-        grasps = [-1.0, *[1.0] * 9, -1.0]
-        return self.moves_to(env, *follow(env, times, points, grasps))
+        points, grasp = follow(env, times, points, [-1.0, *[1.0] * 9, -1.0])
+        closes = torch.tensor(self.closes)
+        return self.moves_to(
+            env,
+            torch.where(closes[:, None], points, env.tools["points"]),
+            torch.where(closes, grasp, -1.0),
+        )
 
 
 class FoldClothDiagonal(FoldCloth):
@@ -71,6 +80,10 @@ class FoldClothDiagonal(FoldCloth):
     """
 
     name = "FoldClothDiagonal"
+    closes = (True, False)
+    lift = 0.7
+    pace = 4
+    close = 0.25  # corners beside the fold hang
 
     def pairs(self) -> tuple[Tensor, Tensor]:
         """Vertices that move, and the ones on which they are to lie."""
