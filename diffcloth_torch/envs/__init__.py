@@ -17,6 +17,8 @@ from diffcloth_torch.envs.actuators import Actuator, Pickers, Velocities
 from diffcloth_torch.envs.drop_cloth import DropCloth
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.envs.fold_cloth import FoldCloth, FoldClothDiagonal
+from diffcloth_torch.envs.hands import GraspCloth, LiftCloth
+from diffcloth_torch.envs.push_cube import PushCube
 from diffcloth_torch.envs.spread_cloth import FlingCloth, SpreadCloth
 from diffcloth_torch.errors import InvalidInput
 
@@ -42,7 +44,16 @@ __all__ = [
 
 TASKS: dict[str, type[Task]] = {
     task.name: task
-    for task in (FoldCloth, FoldClothDiagonal, SpreadCloth, DropCloth, FlingCloth)
+    for task in (
+        FoldCloth,
+        FoldClothDiagonal,
+        SpreadCloth,
+        DropCloth,
+        FlingCloth,
+        LiftCloth,
+        PushCube,
+        GraspCloth,
+    )
 }
 """Name -> task."""
 

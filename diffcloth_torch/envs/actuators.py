@@ -1,4 +1,4 @@
-"""What actions move: pickers, which hold vertices of a cloth, and pins of cloths."""
+"""What actions move: pickers, pins, rigid bodies and hands, or with what forces they pull."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from diffcloth_torch.checks import check_count
+from diffcloth_torch.geometry.rotation import quaternion_exp, quaternion_multiply
 from diffcloth_torch.model.attachment import Attachment
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.sim.controls import Control
 from diffcloth_torch.sim.state import State
 
-__all__ = ["Actuator", "Pickers", "Tools", "Velocities"]
+__all__ = ["Actuator", "Forces", "Hand", "Pickers", "Tools", "Twist", "Velocities", "moved"]
 
 Tools = dict[str, Tensor]
 """What an actuator keeps from one transition to the next, [B, ...] each."""
@@ -179,3 +180,96 @@ class Velocities(Actuator):
             }
             controls.append(Control(pins=moved))
         return controls, tools
+
+
+class Forces(Actuator):
+    """Forces on groups of vertices, each shared evenly by the vertices of a group.
+
+    Attributes:
+        largest: Force along an axis at an action of 1 [N].
+        steady: Forces [N, 3] that act besides.
+    """
+
+    def __init__(self, groups: Sequence[Sequence[int]], steady: Tensor, *, largest: float) -> None:
+        """Choose the vertices, by their indices in `State.positions`."""
+        self._groups = [list(group) for group in groups]
+        self.steady, self.largest = steady, largest
+        self.size = 3 * len(self._groups)
+
+    def act(
+        self, tools: Tools, state: State, actions: Tensor, substeps: int
+    ) -> tuple[list[Control], Tools]:
+        """Pull with the same force throughout; see `Actuator`."""
+        forces = self.steady.expand_as(state.positions).clone()
+        for g, group in enumerate(self._groups):
+            share = self.largest / len(group) * actions[:, None, 3 * g : 3 * g + 3]
+            forces[:, group] = forces[:, group] + share
+        return [Control(forces=forces)] * substeps, tools
+
+
+class Twist(Actuator):
+    """The velocity of a kinematic body: linear, then angular, in world axes.
+
+    Attributes:
+        speeds: Velocities at actions of 1 [m/s, rad/s], [6].
+    """
+
+    size = 6
+
+    def __init__(self, body: str, row: int, *, dt: float, speed: float, spin: float) -> None:
+        """Choose the body, by its name and its row in `State.body_poses`."""
+        self._body, self._row, self._dt = body, row, dt
+        self.speeds = torch.tensor([speed] * 3 + [spin] * 3, dtype=torch.float64)
+
+    def act(
+        self, tools: Tools, state: State, actions: Tensor, substeps: int
+    ) -> tuple[list[Control], Tools]:
+        """Move the body; see `Actuator`."""
+        pose, controls = state.body_poses[:, self._row], []
+        for _ in range(substeps):
+            pose = moved(pose, self._dt * self.speeds * actions)
+            controls.append(Control(body_poses={self._body: pose}))
+        return controls, tools
+
+
+class Hand(Actuator):
+    """A gripper on a kinematic base: its velocity as in `Twist`, then the effort of its joints.
+
+    Attributes:
+        speeds: Velocities of the base at actions of 1 [m/s, rad/s], [6].
+        effort: Of each joint at an action of 1 [N or N m]; actions below zero open.
+    """
+
+    size = 7
+
+    def __init__(
+        self,
+        robot: str,
+        joints: Sequence[str],
+        *,
+        dt: float,
+        speed: float = 0.3,
+        spin: float = 4.0,
+        effort: float = 18.0,
+    ) -> None:
+        """Choose the only robot of a scene, and the joints of its fingers, by "robot/joint"."""
+        self._robot, self._joints, self._dt = robot, list(joints), dt
+        self.speeds = torch.tensor([speed] * 3 + [spin] * 3, dtype=torch.float64)
+        self.effort = effort
+
+    def act(
+        self, tools: Tools, state: State, actions: Tensor, substeps: int
+    ) -> tuple[list[Control], Tools]:
+        """Move the base and pull at the joints; see `Actuator`."""
+        pose, controls = state.base_poses[:, 0], []
+        efforts = dict.fromkeys(self._joints, self.effort * actions[:, 6])
+        for _ in range(substeps):
+            pose = moved(pose, self._dt * self.speeds * actions[:, :6])
+            controls.append(Control(base_poses={self._robot: pose}, joint_efforts=efforts))
+        return controls, tools
+
+
+def moved(pose: Tensor, twist: Tensor) -> Tensor:
+    """Poses [B, 7] displaced by twists [B, 6]: translations [m] and rotation vectors [rad]."""
+    turned = quaternion_multiply(quaternion_exp(twist[:, 3:]), pose[:, 3:])
+    return torch.cat([pose[:, :3] + twist[:, :3], turned], dim=-1)

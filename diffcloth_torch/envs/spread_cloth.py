@@ -22,6 +22,7 @@ _CELL = 0.02  # of the grid on which areas are counted [m]
 _EXTENT = 0.6  # of the grid: it reaches so far from the origin, along both axes [m]
 _WIDTH = 0.6  # of the kernel around a vertex, in distances of vertices
 _FILL = 1.5  # so that cells within a flat sheet count .97
+_JUDGED = 10  # transitions at the end of a fling
 _SPREAD = 0.9  # share of the area of a flat sheet that succeeds
 
 
@@ -141,7 +142,8 @@ class SpreadCloth(SheetTask):
 class FlingCloth(SpreadCloth):
     """Two pickers lift a pleated sheet by one edge, and spread it: by a fling, or by laying it down.
 
-    Reward as in `SpreadCloth`; after the fling of RGBench.
+    The reward is that of `SpreadCloth` in the last ten transitions, and zero before: what counts is
+    the covered area after the fling, as in RGBench.
     """
 
     name = "FlingCloth"
@@ -149,6 +151,10 @@ class FlingCloth(SpreadCloth):
     def __init__(self, *, horizon: int = 70, **options: object) -> None:
         """Build the scene: see `SheetTask`."""
         super().__init__(horizon=horizon, **options)  # type: ignore[arg-type]
+
+    def reward(self, env: EnvState) -> Tensor:
+        """See the class."""
+        return super().reward(env) * (env.elapsed > self.horizon - _JUDGED)
 
     def beginnings(self) -> list[int]:
         """Two corners of an edge along the pleats."""

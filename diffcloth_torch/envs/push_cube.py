@@ -1,0 +1,115 @@
+"""A hanging sheet pushes a cube to a target."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from diffcloth_torch.envs.actuators import Tools, Velocities
+from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.envs.sheets import uniform
+from diffcloth_torch.model.cloth import Cloth
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.options import SolverOptions
+from diffcloth_torch.model.rigid_body import RigidBody
+from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.simulator import Simulator
+from diffcloth_torch.sim.state import State
+
+__all__ = ["PushCube"]
+
+_SIDE, _CUBE = 0.3, 0.1  # [m]
+_HEIGHT = 0.5 * _CUBE + 0.004  # of the center of the cube [m]
+_DT, _SPEED = 0.02, 0.4  # [s], [m/s] of the pins
+_CLOSE = 0.03  # distance to the target that succeeds [m]
+
+
+class PushCube(Task):
+    """The two upper corners of a hanging sheet move, so that it pushes a cube to a target.
+
+    The reward of each transition is -(distance of the cube's center from the target) [m]; the task
+    of the paper, section V.D.2.
+    """
+
+    name = "PushCube"
+
+    def __init__(self, *, size: int = 12, horizon: int = 40, substeps: int = 2) -> None:
+        """Build the scene.
+
+        Args:
+            size: Vertices along a side of the sheet.
+            horizon: Transitions of an episode.
+            substeps: Time steps of a transition, of .02 s each.
+        """
+        sheet = Cloth.grid(
+            size,
+            size,
+            _SIDE,
+            name="sheet",
+            pose=[0, -0.1, 0.17, 0.5**0.5, 0.5**0.5, 0, 0],
+            material=Material(stretch=200, bending=1e-4, density=0.5, damping=5e-3, friction=0.3),
+            pins={"left": [size * (size - 1)], "right": [size * size - 1]},
+        )
+        cube = RigidBody.box(
+            _CUBE, motion="dynamic", mass=0.03, friction=0.15, name="cube",
+            pose=[0, 0, _HEIGHT, 1, 0, 0, 0],
+        )
+        floor = RigidBody.plane(4.0, friction=0.15, name="floor")
+        simulator = Simulator(Scene([sheet], [cube, floor]), _DT, solver=SolverOptions(throw=False))
+        pins = {f"sheet/{name}": list(rows) for name, rows in sheet.pins.items()}
+        actuator = Velocities(pins, dt=_DT, speed=_SPEED)
+        super().__init__(simulator, actuator, horizon=horizon, substeps=substeps)
+        self._pins = [row for rows in pins.values() for row in rows]
+        self._rows = torch.linspace(0, size * size - 1, 16).round().long()
+
+    def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """Where the cube stands, within 2 cm, and its target, within 5 cm."""
+        return {
+            "cube": uniform(generator, 2, -0.02, 0.02),
+            "target": torch.tensor([0.0, 0.22]) + uniform(generator, 2, -0.05, 0.05),
+        }
+
+    def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
+        """See `Task`."""
+        state = self.simulator.initial_state(len(drawn["cube"]))
+        poses = state.body_poses.clone()
+        poses[:, 0, :2] += drawn["cube"]
+        return state.replace(body_poses=poses), {}
+
+    def features(self, env: EnvState) -> dict[str, Tensor]:
+        """Pins, some vertices of the sheet, the cube and what it still has to go."""
+        state = env.state
+        return {
+            "pins": state.positions[:, self._pins].flatten(1),
+            "positions": state.positions[:, self._rows].flatten(1),
+            "velocities": state.velocities[:, self._rows].flatten(1),
+            "cube": state.body_poses[:, 0],
+            "cube_velocities": state.body_velocities[:, 0],
+            "to_target": self._away(env),
+            "time": (env.elapsed / self.horizon).to(torch.float64)[:, None],
+        }
+
+    def reward(self, env: EnvState) -> Tensor:
+        """See the class."""
+        return -(self._away(env).square().sum(dim=-1) + 1e-12).sqrt()
+
+    def success(self, env: EnvState) -> Tensor:
+        """Whether the cube is within 3 cm of the target."""
+        return self.reward(env) > -_CLOSE
+
+    def scripted(self, env: EnvState) -> Tensor:
+        """Follow the cube in the direction of the target, and step back when it is there."""
+        away = self._away(env)
+        cube, velocity = env.state.body_poses[:, 0, :2], env.state.body_velocities[:, 0, :2]
+        distance = away.square().sum(dim=-1, keepdim=True).sqrt()
+        ahead = away - 0.25 * velocity
+        pushes = ((ahead * away).sum(dim=-1, keepdim=True) > 0) & (distance > 0.5 * _CLOSE)
+        middle = env.state.positions[:, self._pins].mean(dim=1)[:, :2]
+        behind = cube + away / distance.clamp(min=1e-3) * (-0.5 * _CUBE + 0.03)
+        goal = torch.where(pushes, behind, cube - torch.tensor([0.0, 0.5 * _CUBE + 0.03]))
+        move = ((goal - middle) / (0.1 * _SPEED)).clamp(-0.6, 0.6)
+        move = torch.cat([move, torch.zeros_like(move[:, :1])], dim=-1)
+        return move.repeat(1, 2)
+
+    def _away(self, env: EnvState) -> Tensor:
+        return env.drawn["target"] - env.state.body_poses[:, 0, :2]
