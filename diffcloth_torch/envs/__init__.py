@@ -18,6 +18,7 @@ from diffcloth_torch.envs.drop_cloth import DropCloth
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.envs.fold_cloth import FoldCloth, FoldClothDiagonal
 from diffcloth_torch.envs.hands import GraspCloth, LiftCloth
+from diffcloth_torch.envs.hit_cloth import HitCloth
 from diffcloth_torch.envs.push_cube import PushCube
 from diffcloth_torch.envs.spread_cloth import FlingCloth, SpreadCloth
 from diffcloth_torch.errors import InvalidInput
@@ -53,6 +54,7 @@ TASKS: dict[str, type[Task]] = {
         LiftCloth,
         PushCube,
         GraspCloth,
+        HitCloth,
     )
 }
 """Name -> task."""

@@ -21,6 +21,7 @@ __all__ = ["PushCube"]
 _SIDE, _CUBE = 0.3, 0.1  # [m]
 _HEIGHT = 0.5 * _CUBE + 0.004  # of the center of the cube [m]
 _DT, _SPEED = 0.02, 0.4  # [s], [m/s] of the pins
+_BRAKING = 0.1  # time in which a scripted cube comes to rest [s]
 _CLOSE = 0.03  # distance to the target that succeeds [m]
 
 
@@ -33,7 +34,7 @@ class PushCube(Task):
 
     name = "PushCube"
 
-    def __init__(self, *, size: int = 12, horizon: int = 40, substeps: int = 2) -> None:
+    def __init__(self, *, size: int = 12, horizon: int = 50, substeps: int = 2) -> None:
         """Build the scene.
 
         Args:
@@ -98,18 +99,19 @@ class PushCube(Task):
         return self.reward(env) > -_CLOSE
 
     def scripted(self, env: EnvState) -> Tensor:
-        """Follow the cube in the direction of the target, and step back when it is there."""
+        """Push the cube with the sheet across the way to the target, and step back in time."""
         away = self._away(env)
         cube, velocity = env.state.body_poses[:, 0, :2], env.state.body_velocities[:, 0, :2]
         distance = away.square().sum(dim=-1, keepdim=True).sqrt()
-        ahead = away - 0.25 * velocity
-        pushes = ((ahead * away).sum(dim=-1, keepdim=True) > 0) & (distance > 0.5 * _CLOSE)
-        middle = env.state.positions[:, self._pins].mean(dim=1)[:, :2]
-        behind = cube + away / distance.clamp(min=1e-3) * (-0.5 * _CUBE + 0.03)
-        goal = torch.where(pushes, behind, cube - torch.tensor([0.0, 0.5 * _CUBE + 0.03]))
-        move = ((goal - middle) / (0.1 * _SPEED)).clamp(-0.6, 0.6)
-        move = torch.cat([move, torch.zeros_like(move[:, :1])], dim=-1)
-        return move.repeat(1, 2)
+        to_target = away / distance.clamp(min=1e-3)
+        ahead = away - _BRAKING * velocity
+        pushes = ((ahead * away).sum(dim=-1, keepdim=True) > 0) & (distance > 0.3 * _CLOSE)
+        middle = cube + torch.where(pushes, 0.04, -_CUBE) * to_target
+        across = 0.5 * _SIDE * torch.stack([to_target[:, 1], -to_target[:, 0]], dim=-1)
+        goals = torch.stack([middle - across, middle + across], dim=1)
+        pins = env.state.positions[:, self._pins, :2]
+        moves = ((goals - pins) / (self.substeps * _DT * _SPEED)).clamp(-0.5, 0.5)
+        return torch.cat([moves, torch.zeros_like(moves[..., :1])], dim=-1).flatten(1)
 
     def _away(self, env: EnvState) -> Tensor:
         return env.drawn["target"] - env.state.body_poses[:, 0, :2]
