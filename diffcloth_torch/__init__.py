@@ -30,7 +30,7 @@ from diffcloth_torch._saved import let_saved_states_load, register_classes
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from diffcloth_torch import robots
+    from diffcloth_torch import envs, robots
     from diffcloth_torch.errors import (
         AddedMassWarning,
         IgnoredLimitsWarning,
@@ -93,6 +93,7 @@ __all__ = [
     "Variable",
     "build_info",
     "descend",
+    "envs",
     "fit",
     "load_config",
     "render",
@@ -187,8 +188,8 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("diffcloth-torch")
-    if name == "robots":
-        return import_module("diffcloth_torch.robots")
+    if name in ("envs", "robots"):
+        return import_module(f"diffcloth_torch.{name}")
     if name == "residuals":
         return import_module("diffcloth_torch.optimize.residuals")
     if name not in _HOME_OF:

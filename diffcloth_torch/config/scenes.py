@@ -24,6 +24,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.geometry.rotation import interpolate_poses
+from diffcloth_torch.geometry.shapes import strip
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
@@ -101,7 +102,7 @@ def _cloth(section: ClothSection, root: str, source: Path) -> Cloth:
         rest, faces = _generated(section.name, shapes.disk, _given(shape))
         start = rest
     elif shape.kind == "strip":
-        rest, start, faces = _generated(section.name, shapes.strip, _given(shape))
+        rest, start, faces = _generated(section.name, strip, _given(shape))
     else:
         start, faces = read_mesh(resolve_path(source, root, shape.path))
         start = rest = shape.scale * start

@@ -1,16 +1,13 @@
-"""Meshes that the tasks generate: a round sheet, a strip that may be bent, and a chair."""
+"""Meshes that the tasks generate: a round sheet and a chair."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diffcloth_torch.geometry.shapes import grid
-
-__all__ = ["chair", "disk", "strip"]
+__all__ = ["chair", "disk"]
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 
@@ -91,53 +88,6 @@ def _neighbor_means(points: NDArray[np.float64], faces: NDArray[np.int64]) -> ND
         np.add.at(counts, edges[:, a], 1)
     means: NDArray[np.float64] = sums / counts
     return means
-
-
-def strip(
-    length: float,
-    width: float | Sequence[float],
-    rows: int,
-    columns: int,
-    bend: float,
-    radius: float,
-    middle: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Strip along x, bent downwards about an axis along y: up to a U that opens downwards.
-
-    The bend preserves all lengths along and across the strip.
-
-    Args:
-        length: Length of the strip [m].
-        width: Width of the strip [m]; one number, or one for each end, with straight sides between
-            them.
-        rows: Number of vertices across.
-        columns: Number of vertices along.
-        bend: Angle between the directions of its two ends [degrees], 0 to 180.
-        radius: Radius of the bend, whose axis passes through the origin [m].
-        middle: Position of the middle of the bend, as a fraction of the length.
-
-    Returns:
-        Flat vertices [n, 3], bent vertices [n, 3], and faces [f, 3].
-    """
-    arc = np.radians(bend) * radius
-    if not arc / 2 <= min(middle, 1 - middle) * length:
-        raise ValueError(
-            f"strip: `bend` and `radius` must fit on both sides of `middle`: half of the arc is "
-            f"{arc / 2:g} m, the shorter side {min(middle, 1 - middle) * length:g} m"
-        )
-    flat, faces = grid(rows, columns, np.array([length, 1.0]))
-    along = np.linspace(0, length, columns)
-    ends = np.broadcast_to(width, 2)
-    flat[:, 1] *= np.tile(np.interp(along, [0, length], ends), rows)
-    # Each cell is turned like the middle of its arc, so that it keeps its length.
-    cells = (along[1:] + along[:-1]) / 2 - middle * length
-    turned = np.clip(cells / radius, -np.radians(bend) / 2, np.radians(bend) / 2)
-    steps = np.diff(along) * np.stack([np.cos(turned), -np.sin(turned)])
-    curve = np.concatenate([np.zeros((2, 1)), steps.cumsum(axis=1)], axis=1)
-    top = [np.interp(middle * length, along, coordinate) for coordinate in curve]
-    x, z = curve - np.array([[top[0]], [top[1] - radius]])
-    bent = np.stack([np.tile(x, rows), flat[:, 1], np.tile(z, rows)], axis=-1)
-    return flat, bent, faces
 
 
 def chair(

@@ -5,7 +5,8 @@
 >>> observation, info = env.reset(seed=0)
 >>> observation, reward, terminated, truncated, info = env.step(actions)
 
-Importing this module also lets `gymnasium.make_vec("diffcloth/FoldCloth-v0", num_envs=8)` find them.
+Importing this module also lets gymnasium find them:
+`gymnasium.make_vec("diffcloth/FoldCloth-v0", num_envs=8)`.
 """
 
 from __future__ import annotations
@@ -18,9 +19,11 @@ from diffcloth_torch.envs.drop_cloth import DropCloth
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.envs.fold_cloth import FoldCloth, FoldClothDiagonal
 from diffcloth_torch.envs.hands import GraspCloth, LiftCloth
+from diffcloth_torch.envs.hang_cloth import HangCloth
 from diffcloth_torch.envs.hit_cloth import HitCloth
 from diffcloth_torch.envs.push_cube import PushCube
 from diffcloth_torch.envs.spread_cloth import FlingCloth, SpreadCloth
+from diffcloth_torch.envs.two_cloths import TwoCloths
 from diffcloth_torch.errors import InvalidInput
 
 try:
@@ -52,8 +55,10 @@ TASKS: dict[str, type[Task]] = {
         DropCloth,
         FlingCloth,
         LiftCloth,
+        HangCloth,
         PushCube,
         GraspCloth,
+        TwoCloths,
         HitCloth,
     )
 }

@@ -111,8 +111,8 @@ class Pickers(Actuator):
         self, tools: Tools, state: State, actions: Tensor, substeps: int
     ) -> tuple[list[Control], Tools]:
         """Close or open, then move in equal parts; see `Actuator`."""
-        moves, grasp = actions.unflatten(-1, (self.count, 4)).split([3, 1], dim=-1)
-        grasp = grasp[..., 0].clamp(min=0)
+        actions = actions.reshape(-1, self.count, 4)
+        moves, grasp = actions[..., :3], actions[..., 3].clamp(min=0)
         before = tools["points"]
         held, offsets = self._close(tools, state.positions, grasp)
         after = before + self.stride * moves
@@ -170,7 +170,7 @@ class Velocities(Actuator):
         self, tools: Tools, state: State, actions: Tensor, substeps: int
     ) -> tuple[list[Control], Tools]:
         """Move the pins; see `Actuator`."""
-        velocities = self.speed * actions.unflatten(-1, (len(self._pins), 3))
+        velocities = self.speed * actions.reshape(-1, len(self._pins), 3)
         starts = {name: state.positions[:, indices] for name, indices in self._pins.items()}
         controls = []
         for k in range(1, substeps + 1):

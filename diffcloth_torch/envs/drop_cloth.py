@@ -29,14 +29,13 @@ class DropCloth(SheetTask):
         """Also how high the lower edge is, 1 to 6 cm."""
         return super().draw(generator) | {"height": uniform(generator, 1, 0.01, 0.06)[0]}
 
-    def shape(self, drawn: Mapping[str, Tensor]) -> Tensor:
+    def shape(self, drawn: dict[str, Tensor]) -> Tensor:
         """Upright, with the rest shape's x as height; adds the flat sheet to what was drawn."""
         flat = super().shape(drawn)
         x, y, z = flat.unbind(dim=-1)
         upright = torch.stack(
             [torch.zeros_like(x), y, x + SIDE / 2 + drawn["height"][:, None] + HEIGHT], dim=-1
         )
-        assert isinstance(drawn, dict)
         drawn["goal"] = self.posed(torch.stack([x + SIDE / 2, y, z], dim=-1), drawn)
         return upright
 

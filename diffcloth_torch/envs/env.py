@@ -184,13 +184,14 @@ class Task(ABC):
     @property
     def observation_slices(self) -> dict[str, slice]:
         """Name of a feature -> its place in an observation."""
-        sizes = {n: f.shape[-1] for n, f in self.features(self._example()).items()}
+        sizes = {n: f.shape[-1] for n, f in self.features(self.example()).items()}
         ends = torch.tensor(list(sizes.values())).cumsum(0).tolist()
         return {
             n: slice(end - size, end) for (n, size), end in zip(sizes.items(), ends, strict=True)
         }
 
-    def _example(self) -> EnvState:
+    def example(self) -> EnvState:
+        """A start of one environment, which shows the shapes of everything."""
         return self.initial(torch.Generator().manual_seed(0), 1)
 
 

@@ -16,8 +16,8 @@ _DRIFT = 1.2  # weight of how far the kept half moves, as in SoftGym
 class FoldCloth(SheetTask):
     """One half of a sheet is to lie on the other, which is to stay where it is.
 
-    The reward of each transition is -(mean distance of paired vertices + 1.2 times the mean drift of
-    the kept half) [m], after ClothFold of SoftGym and fold_cloth of DaXBench.
+    The reward of each transition is -(mean distance of paired vertices + 1.2 times the mean drift
+    of the kept half) [m], after ClothFold of SoftGym and fold_cloth of DaXBench.
     """
 
     name = "FoldCloth"
@@ -63,11 +63,11 @@ class FoldCloth(SheetTask):
         end = 5 + 8 * self.pace
         times = [4, *(5 + self.pace * k for k in range(1, 9)), end + 2, end + 6]
         points = [here, *carried, there, there + 4 * low]
-        points, grasp = follow(env, times, points, [-1.0, *[1.0] * 9, -1.0])
+        wanted, grasp = follow(env, times, points, [-1.0, *[1.0] * 9, -1.0])
         closes = torch.tensor(self.closes)
         return self.moves_to(
             env,
-            torch.where(closes[:, None], points, env.tools["points"]),
+            torch.where(closes[:, None], wanted, env.tools["points"]),
             torch.where(closes, grasp, -1.0),
         )
 

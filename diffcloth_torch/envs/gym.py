@@ -73,9 +73,9 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         if mode is AutoresetMode.NEXT_STEP:
             raise InvalidInput("make: `autoreset_mode` must be SAME_STEP or DISABLED, got NextStep")
         self.metadata = {"autoreset_mode": mode, "render_modes": []}
-        self.task, self.parameters = task, None
+        self.task = task
         self.parameters: Parameters | None = None
-        size = task.observation(task._example()).shape[-1]
+        size = task.observation(task.example()).shape[-1]
         self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (task.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -105,9 +105,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
             self.env_state = self._with_starts(self.env_state, mask)
         return self._observe(self.env_state), self._info(self.env_state)
 
-    def step(
-        self, actions: Any
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Take a transition in all environments.
 
         Args:
@@ -222,7 +220,9 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
             )
         if not bool(torch.isfinite(actions).all()):
             row = int((~torch.isfinite(actions)).any(dim=-1).nonzero()[0])
-            raise InvalidInput(f"step: `actions` must be finite, those of environment {row} are not")
+            raise InvalidInput(
+                f"step: `actions` must be finite, those of environment {row} are not"
+            )
         return actions.to(torch.float64)
 
     def _reset_mask(self, options: dict[str, Any] | None) -> Tensor | None:

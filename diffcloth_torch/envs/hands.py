@@ -23,7 +23,7 @@ from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State
 
-__all__ = ["GraspCloth", "LiftCloth"]
+__all__ = ["GraspCloth", "HandTask", "LiftCloth", "twist_to"]
 
 _DT = 0.02  # [s]
 _SIDE, _TOP = 0.12, 0.105  # of the cloth, and at which it lies [m]
@@ -37,6 +37,8 @@ class HandTask(Task):
     Actions are the linear and angular velocity of the gripper's base and the effort of its fingers.
     The start is drawn: where the gripper is, within 4 mm.
     """
+
+    obstacles: tuple[RigidBody, ...] = ()
 
     def __init__(self, *, size: int = 12, horizon: int = 40, substeps: int = 2) -> None:
         """Build the scene.
@@ -67,7 +69,9 @@ class HandTask(Task):
             name="gripper",
         )
         simulator = Simulator(
-            Scene([cloth], [table, ground], [gripper]), _DT, solver=SolverOptions(throw=False)
+            Scene([cloth], [table, ground, *self.obstacles], [gripper]),
+            _DT,
+            solver=SolverOptions(throw=False),
         )
         hand = Hand("gripper", _JOINTS, dt=_DT)
         super().__init__(simulator, hand, horizon=horizon, substeps=substeps)
@@ -103,7 +107,8 @@ class HandTask(Task):
     def towards(self, env: EnvState, twist: Tensor) -> Tensor:
         """Actions that close the fingers, and then move by a twist [B, 6] as far as they go."""
         duration = self.substeps * _DT
-        moves = (twist / (duration * self.hand.speeds)).clamp(-1, 1)
+        moves = twist / (duration * self.hand.speeds)
+        moves = moves / moves.abs().amax(dim=-1, keepdim=True).clamp(min=1)
         moves = moves * (env.elapsed >= _CLOSING)[:, None]
         return torch.cat([moves, torch.ones_like(moves[:, :1])], dim=-1)
 
@@ -190,6 +195,11 @@ class GraspCloth(HandTask):
     def scripted(self, env: EnvState) -> Tensor:
         """Close, then move the hand as the cloth has to move."""
         base, target = env.state.base_poses[:, 0], env.drawn["target_base"]
-        inverse = base[:, 3:] * torch.tensor([1.0, -1.0, -1.0, -1.0])
-        turn = quaternion_log(quaternion_multiply(target[:, 3:], inverse))
-        return self.towards(env, 0.15 * torch.cat([target[:, :3] - base[:, :3], turn], dim=-1))
+        return self.towards(env, 0.15 * twist_to(base, target))
+
+
+def twist_to(base: Tensor, target: Tensor) -> Tensor:
+    """Translation and rotation vector [B, 6] from poses [B, 7] to others."""
+    inverse = base[:, 3:] * torch.tensor([1.0, -1.0, -1.0, -1.0])
+    turn = quaternion_log(quaternion_multiply(target[:, 3:], inverse))
+    return torch.cat([target[:, :3] - base[:, :3], turn], dim=-1)

@@ -52,7 +52,11 @@ class PushCube(Task):
             pins={"left": [size * (size - 1)], "right": [size * size - 1]},
         )
         cube = RigidBody.box(
-            _CUBE, motion="dynamic", mass=0.03, friction=0.15, name="cube",
+            _CUBE,
+            motion="dynamic",
+            mass=0.03,
+            friction=0.15,
+            name="cube",
             pose=[0, 0, _HEIGHT, 1, 0, 0, 0],
         )
         floor = RigidBody.plane(4.0, friction=0.15, name="floor")

@@ -83,7 +83,7 @@ class SheetTask(Task):
         some = torch.linspace(0, size - 1, _KEY_POINTS).round().long()
         rows = some if observation == "keypoints" else torch.arange(size)
         self.key_points = (rows[:, None] * size + rows).flatten()
-        self._share = float(self.simulator.parameters().density.mean()) * SIDE**2 * 9.81 / size**2
+        self._share = float(np.mean(material.density)) * SIDE**2 * 9.81 / size**2
 
     def vertex(self, row: int, column: int) -> int:
         """Index of a vertex; negative rows and columns count from the end."""
@@ -97,7 +97,7 @@ class SheetTask(Task):
             "pickers": uniform(generator, 6, -1.0, 1.0).reshape(2, 3),
         }
 
-    def shape(self, drawn: Mapping[str, Tensor]) -> Tensor:
+    def shape(self, drawn: dict[str, Tensor]) -> Tensor:
         """Positions [B, N, 3] of the sheet before it is turned and moved: flat on the table."""
         flat = self.rest + torch.tensor([0.0, 0.0, HEIGHT], dtype=torch.float64)
         return flat.expand(len(drawn["turn"]), -1, -1)
@@ -107,7 +107,9 @@ class SheetTask(Task):
         x, y, z = points.unbind(dim=-1)
         c, s = drawn["turn"].cos()[:, None], drawn["turn"].sin()[:, None]
         shift = drawn["shift"][:, None]
-        return torch.stack([c * x - s * y + shift[..., 0], s * x + c * y + shift[..., 1], z], dim=-1)
+        return torch.stack(
+            [c * x - s * y + shift[..., 0], s * x + c * y + shift[..., 1], z], dim=-1
+        )
 
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
         """The sheet as drawn, and pickers near the vertices that they begin at; see `Task`."""
@@ -175,6 +177,4 @@ def arc(a: Tensor, b: Tensor, height: float, count: int) -> list[Tensor]:
     """Points on half an ellipse from a to b above the line between them, without a itself."""
     up = torch.tensor([0.0, 0.0, height], dtype=torch.float64)
     turns = [math.pi * k / count for k in range(1, count + 1)]
-    return [
-        a + 0.5 * (1 - math.cos(turn)) * (b - a) + math.sin(turn) * up for turn in turns
-    ]
+    return [a + 0.5 * (1 - math.cos(turn)) * (b - a) + math.sin(turn) * up for turn in turns]

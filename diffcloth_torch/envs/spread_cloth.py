@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -68,7 +67,7 @@ class SpreadCloth(SheetTask):
         }
         return super().draw(generator) | pleats
 
-    def shape(self, drawn: Mapping[str, Tensor]) -> Tensor:
+    def shape(self, drawn: dict[str, Tensor]) -> Tensor:
         """Pleats across x that keep all lengths: the slope is a sine of the arc length."""
         n = self.side
         s = torch.linspace(0.0, 1.0, 16 * (n - 1) + 1, dtype=torch.float64)
@@ -134,13 +133,17 @@ class SpreadCloth(SheetTask):
         up = torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64)
         return self.moves_to(
             env,
-            *follow(env, [4, 6, 26, 30, 34], [here, here, apart, apart, apart + up],
-                    [-1.0, 1.0, 1.0, 1.0, -1.0]),
+            *follow(
+                env,
+                [4, 6, 26, 30, 34],
+                [here, here, apart, apart, apart + up],
+                [-1.0, 1.0, 1.0, 1.0, -1.0],
+            ),
         )
 
 
 class FlingCloth(SpreadCloth):
-    """Two pickers lift a pleated sheet by one edge, and spread it: by a fling, or by laying it down.
+    """Two pickers lift a pleated sheet by one edge and spread it, by a fling or by laying it down.
 
     The reward is that of `SpreadCloth` in the last ten transitions, and zero before: what counts is
     the covered area after the fling, as in RGBench.

@@ -1,4 +1,4 @@
-"""Vertices and outward-facing triangles of simple shapes, centered at the origin."""
+"""Vertices and outward-facing triangles of simple shapes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray
 
-__all__ = ["MOST_FACES", "Mesh", "box", "capsule", "cylinder", "grid", "plane", "sphere"]
+__all__ = ["MOST_FACES", "Mesh", "box", "capsule", "cylinder", "grid", "plane", "sphere", "strip"]
 
 Mesh = tuple[FloatArray, NDArray[np.int64]]
 
@@ -36,6 +36,53 @@ def grid(rows: int, columns: int, size: FloatArray) -> Mesh:
     lower = np.stack([corner, corner + 1, corner + columns + 1], axis=-1)
     upper = np.stack([corner, corner + columns + 1, corner + columns], axis=-1)
     return vertices, np.stack([lower, upper], axis=1).reshape(-1, 3)
+
+
+def strip(
+    length: float,
+    width: float | Sequence[float],
+    rows: int,
+    columns: int,
+    bend: float,
+    radius: float,
+    middle: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Strip along x, bent downwards about an axis along y: up to a U that opens downwards.
+
+    The bend preserves all lengths along and across the strip.
+
+    Args:
+        length: Length of the strip [m].
+        width: Width of the strip [m]; one number, or one for each end, with straight sides between
+            them.
+        rows: Number of vertices across.
+        columns: Number of vertices along.
+        bend: Angle between the directions of its two ends [degrees], 0 to 180.
+        radius: Radius of the bend, whose axis passes through the origin [m].
+        middle: Position of the middle of the bend, as a fraction of the length.
+
+    Returns:
+        Flat vertices [n, 3], bent vertices [n, 3], and faces [f, 3].
+    """
+    arc = np.radians(bend) * radius
+    if not arc / 2 <= min(middle, 1 - middle) * length:
+        raise ValueError(
+            f"strip: `bend` and `radius` must fit on both sides of `middle`: half of the arc is "
+            f"{arc / 2:g} m, the shorter side {min(middle, 1 - middle) * length:g} m"
+        )
+    flat, faces = grid(rows, columns, np.array([length, 1.0]))
+    along = np.linspace(0, length, columns)
+    ends = np.broadcast_to(width, 2)
+    flat[:, 1] *= np.tile(np.interp(along, [0, length], ends), rows)
+    # Each cell is turned like the middle of its arc, so that it keeps its length.
+    cells = (along[1:] + along[:-1]) / 2 - middle * length
+    turned = np.clip(cells / radius, -np.radians(bend) / 2, np.radians(bend) / 2)
+    steps = np.diff(along) * np.stack([np.cos(turned), -np.sin(turned)])
+    curve = np.concatenate([np.zeros((2, 1)), steps.cumsum(axis=1)], axis=1)
+    top = [np.interp(middle * length, along, coordinate) for coordinate in curve]
+    x, z = curve - np.array([[top[0]], [top[1] - radius]])
+    bent = np.stack([np.tile(x, rows), flat[:, 1], np.tile(z, rows)], axis=-1)
+    return flat, bent, faces
 
 
 def plane(size: FloatArray) -> Mesh:

@@ -10,6 +10,7 @@ from short_tasks import SHEET, write_config
 
 import diffcloth_torch as dc
 from diffcloth_torch.config import shapes
+from diffcloth_torch.geometry.shapes import strip
 from diffcloth_torch.tasks.registry import load_task
 
 
@@ -42,7 +43,7 @@ def test_a_disk_is_the_same_every_time():
 
 
 def test_a_bent_strip_keeps_its_lengths_and_opens_downwards():
-    flat, bent, faces = shapes.strip(1.4, [0.04, 0.09], 4, 60, 180, 0.07, 0.4)
+    flat, bent, faces = strip(1.4, [0.04, 0.09], 4, 60, 180, 0.07, 0.4)
     edges, _ = edges_of(faces)
     assert len(flat) - len(edges) + len(faces) == 1  # Euler: a disk
     along = np.abs(np.diff(edges)[:, 0]) == 1
@@ -61,7 +62,7 @@ def test_a_bent_strip_keeps_its_lengths_and_opens_downwards():
 
 
 def test_a_strip_that_is_not_bent_is_flat():
-    flat, bent, _ = shapes.strip(1.0, 0.1, 3, 11, 0, 0.1, 0.5)
+    flat, bent, _ = strip(1.0, 0.1, 3, 11, 0, 0.1, 0.5)
     np.testing.assert_allclose(bent[:, :2], flat[:, :2], atol=1e-15)
     np.testing.assert_allclose(bent[:, 2], 0.1, atol=1e-15)  # at the top of the bend
 

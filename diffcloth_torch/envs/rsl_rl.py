@@ -1,0 +1,54 @@
+"""The same environments with the interface that rsl_rl expects, without gradients."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from diffcloth_torch.envs.gym import ClothVectorEnv
+
+__all__ = ["RslRlEnv"]
+
+
+class RslRlEnv:
+    """What `rsl_rl.env.VecEnv` (3.0 and later) asks for; observations are in the group "policy".
+
+    Attributes:
+        num_envs: B.
+        num_actions: A.
+        max_episode_length: Steps of an episode.
+        episode_length_buf: Steps since each environment began [B].
+        device: The CPU.
+        cfg: Nothing.
+    """
+
+    def __init__(self, env: ClothVectorEnv, *, seed: int | None = None) -> None:
+        """Take environments that begin anew by themselves, and begin."""
+        self.env = env
+        self.num_envs, self.num_actions = env.num_envs, env.task.action_size
+        self.max_episode_length = env.task.horizon
+        self.device = torch.device("cpu")
+        self.cfg: dict[str, Any] = {}
+        self._observation, _ = env.reset(seed=seed)
+
+    @property
+    def episode_length_buf(self) -> Tensor:
+        """Steps since each environment began [B]."""
+        return self.env.env_state.elapsed
+
+    def get_observations(self) -> TensorDict:
+        """The present observations."""
+        return TensorDict({"policy": self._observation}, [self.num_envs])
+
+    def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
+        """Observations, rewards [B], whether episodes have ended [B], and more."""
+        with torch.no_grad():
+            self._observation, reward, terminated, truncated, info = self.env.step(actions)
+        extras = {
+            "time_outs": truncated,
+            "log": {name: info[name].float().mean() for name in ("success", "failed")},
+        }
+        return self.get_observations(), reward, (terminated | truncated).long(), extras

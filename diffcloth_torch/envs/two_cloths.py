@@ -1,0 +1,114 @@
+"""One strip of cloth pulls another, into which it is hooked, to a target."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from diffcloth_torch.envs.actuators import Forces, Tools
+from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.envs.sheets import uniform
+from diffcloth_torch.geometry.poses import transform
+from diffcloth_torch.geometry.shapes import strip
+from diffcloth_torch.model.cloth import Cloth
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.options import SolverOptions
+from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.simulator import Simulator
+from diffcloth_torch.sim.state import State
+
+__all__ = ["TwoCloths"]
+
+_DT = 0.02  # [s]
+_LENGTH, _WIDTH, _ROWS = 0.4, 0.06, 5  # of a strip [m]
+_PULL, _LARGEST = 0.3, 0.8  # on the ends of the other strip, and at an action of 1 [N]
+_POSES = {"blue": [0, 0, 0, 0.5**0.5, 0, 0.5**0.5, 0], "red": [0.07, 0, 0, 0.5, 0.5, -0.5, -0.5]}
+_FAR = 1.0  # distance at which an episode ends [m]
+_CLOSE = 0.02  # distance to the target that succeeds [m]
+
+
+class TwoCloths(Task):
+    """Forces on the ends of a bent strip of cloth bring its center to a target.
+
+    Another strip, which is pulled the other way with a constant force, is hooked into it. The
+    reward of each transition is -(distance of the center from the target) [m]; the task of the
+    paper, section V.D.4.
+    """
+
+    name = "TwoCloths"
+
+    def __init__(self, *, size: int = 12, horizon: int = 60, substeps: int = 2) -> None:
+        """Build the scene.
+
+        Args:
+            size: Each strip has 5 vertices across and 2 size + 7 along: 31 by default.
+            horizon: Transitions of an episode.
+            substeps: Time steps of a transition, of .02 s each.
+        """
+        columns = 2 * size + 7
+        flat, bent, faces = strip(_LENGTH, _WIDTH, _ROWS, columns, 180.0, 0.05, 0.5)
+        material = Material(stretch=300, bending=1e-5, density=0.2, damping=0.01, friction=0.3)
+        cloths = [
+            Cloth(
+                transform(bent, torch.tensor(pose, dtype=torch.float64).numpy()),
+                faces,
+                rest_positions=flat,
+                material=material,
+                name=name,
+            )
+            for name, pose in _POSES.items()
+        ]
+        count = len(flat)
+        ends = [row * columns + end for row in range(_ROWS) for end in (0, columns - 1)]
+        weight = 0.2 * _LENGTH * _WIDTH * 9.81
+        steady = torch.zeros(2 * count, 3, dtype=torch.float64)
+        steady[ends, 2] = weight / len(ends)
+        pulled = [count + i for i in ends]
+        steady[pulled] = torch.tensor([_PULL, 0.0, weight], dtype=torch.float64) / len(ends)
+        simulator = Simulator(Scene(cloths), _DT, solver=SolverOptions(throw=False))
+        actuator = Forces([ends], steady, largest=_LARGEST)
+        super().__init__(simulator, actuator, horizon=horizon, substeps=substeps)
+        self._count, self._weight = count, weight
+        self._rows = torch.linspace(0, 2 * count - 1, 20).round().long()
+
+    def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """The target, within 3 cm."""
+        target = torch.tensor([-0.2, 0.05, 0.05], dtype=torch.float64)
+        return {"target": target + uniform(generator, 3, -0.03, 0.03)}
+
+    def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
+        """See `Task`."""
+        return self.simulator.initial_state(len(drawn["target"])), {}
+
+    def features(self, env: EnvState) -> dict[str, Tensor]:
+        """Some vertices of both strips, and what the center still has to go."""
+        state = env.state
+        return {
+            "positions": state.positions[:, self._rows].flatten(1),
+            "velocities": state.velocities[:, self._rows].flatten(1),
+            "to_target": self._away(env),
+            "center_velocity": state.velocities[:, : self._count].mean(dim=1),
+            "time": (env.elapsed / self.horizon).to(torch.float64)[:, None],
+        }
+
+    def reward(self, env: EnvState) -> Tensor:
+        """See the class."""
+        return -(self._away(env).square().sum(dim=-1) + 1e-12).sqrt()
+
+    def success(self, env: EnvState) -> Tensor:
+        """Whether the center is within 2 cm of the target."""
+        return self.reward(env) > -_CLOSE
+
+    def terminal(self, env: EnvState) -> Tensor:
+        """Also where the center is more than 1 m from the target."""
+        return super().terminal(env) | (self.reward(env) < -_FAR)
+
+    def scripted(self, env: EnvState) -> Tensor:
+        """Bear the pull, and be a damped spring to the target."""
+        velocity = env.state.velocities[:, : self._count].mean(dim=1)
+        bear = torch.tensor([-_PULL, 0.0, 0.0], dtype=torch.float64)
+        force = bear + 0.7 * self._away(env) - 0.12 * velocity
+        return (force / _LARGEST).clamp(-1, 1)
+
+    def _away(self, env: EnvState) -> Tensor:
+        return env.drawn["target"] - env.state.positions[:, : self._count].mean(dim=1)

@@ -1,0 +1,83 @@
+"""The same environments for libraries of reinforcement learning."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+import diffcloth_torch.envs as envs
+from diffcloth_torch.errors import InvalidInput
+
+SMALL = 6
+
+
+@pytest.mark.filterwarnings("ignore")
+class TestTorchRL:
+    @pytest.fixture(scope="class")
+    def adapter(self):
+        pytest.importorskip("torchrl")
+        from diffcloth_torch.envs.torchrl import TorchRLEnv
+
+        env = envs.make("FoldCloth", 2, size=SMALL, horizon=5, autoreset_mode="Disabled")
+        return TorchRLEnv(env)
+
+    def test_specs(self, adapter):
+        from torchrl.envs.utils import check_env_specs
+
+        check_env_specs(adapter)
+
+    def test_gradients_are_those_of_the_environment(self, adapter):
+        weights = torch.linspace(-0.3, 0.3, 8).requires_grad_()
+
+        def policy(tensordict):
+            return tensordict.set("action", weights.tanh().expand(2, -1))
+
+        adapter.set_seed(4)
+        rollout = adapter.rollout(3, policy, auto_reset=True)
+        (found,) = torch.autograd.grad(rollout["next", "reward"].sum(), weights)
+        raw = envs.make("FoldCloth", 2, size=SMALL, horizon=5)
+        raw.reset(seed=4)
+        total = sum(raw.step(weights.tanh().expand(2, -1))[1].sum() for _ in range(3))
+        (expected,) = torch.autograd.grad(total, weights)
+        torch.testing.assert_close(found, expected, rtol=1e-6, atol=0)
+        assert bool((expected != 0).any())
+
+    def test_environments_that_begin_anew_are_refused(self):
+        pytest.importorskip("torchrl")
+        from diffcloth_torch.envs.torchrl import TorchRLEnv
+
+        with pytest.raises(InvalidInput, match="autoreset_mode='Disabled'"):
+            TorchRLEnv(envs.make("FoldCloth", 1, size=SMALL))
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_stable_baselines_learns():
+    sb3 = pytest.importorskip("stable_baselines3")
+    from diffcloth_torch.envs.stable_baselines import StableBaselinesEnv
+
+    env = StableBaselinesEnv(envs.make("FoldCloth", 2, size=SMALL, horizon=4))
+    env.seed(3)
+    first = env.reset()
+    assert first.shape == (2, env.observation_space.shape[0])
+    for _ in range(4):
+        _, reward, ended, infos = env.step(env.action_space.sample()[None].repeat(2, 0))
+    assert ended.tolist() == [True, True]
+    assert infos[0]["TimeLimit.truncated"]
+    assert infos[0]["terminal_observation"].shape == env.observation_space.shape
+    model = sb3.PPO("MlpPolicy", env, n_steps=4, batch_size=8, n_epochs=1, device="cpu")
+    model.learn(8)
+    assert reward.shape == (2,)
+
+
+def test_what_rsl_rl_asks_for():
+    pytest.importorskip("tensordict")
+    from diffcloth_torch.envs.rsl_rl import RslRlEnv
+
+    env = RslRlEnv(envs.make("FoldCloth", 2, size=SMALL, horizon=2), seed=0)
+    assert env.get_observations()["policy"].shape[0] == env.num_envs == 2
+    for _ in range(2):
+        observations, reward, ended, extras = env.step(torch.zeros(2, env.num_actions))
+    assert ended.tolist() == [1, 1]
+    assert extras["time_outs"].tolist() == [True, True]
+    assert env.episode_length_buf.tolist() == [0, 0]
+    assert observations["policy"].shape[0] == reward.shape[0] == 2

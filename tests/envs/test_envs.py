@@ -1,0 +1,291 @@
+"""Environments for learning: interfaces, gradients, failures, seeds, and what policies get."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+import diffcloth_torch as dc
+import diffcloth_torch.envs as envs
+from diffcloth_torch.envs.env import Task
+
+NAMES = tuple(envs.TASKS)
+SMALL = 6  # vertices along a side
+
+
+def make(name, num_envs=2, **options):
+    return envs.make(name, num_envs, size=SMALL, **options)
+
+
+def actions_of(env, seed, scale=1.0):
+    noise = torch.Generator().manual_seed(seed)
+    shape = (env.num_envs, env.task.action_size)
+    return scale * (2 * torch.rand(shape, generator=noise) - 1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shapes_and_spaces(name):
+    env = make(name)
+    observation, info = env.reset(seed=3)
+    assert env.observation_space.contains(observation.numpy())
+    assert env.action_space.contains(env.action_space.sample())
+    assert (
+        sum(s.stop - s.start for s in env.task.observation_slices.values())
+        == (observation.shape[1])
+    )
+    observation, reward, terminated, truncated, info = env.step(actions_of(env, 0, 0.2))
+    assert env.observation_space.contains(observation.numpy())
+    assert reward.dtype == torch.float32
+    assert bool(torch.isfinite(reward).all())
+    assert terminated.dtype == truncated.dtype == torch.bool
+    for value in (reward, terminated, truncated, *(info[k] for k in ("success", "failed"))):
+        assert value.shape == (2,)
+    assert not observation.requires_grad
+    assert not reward.requires_grad
+    assert env.scripted_actions().shape == env.action_space.shape
+
+
+def test_gymnasium_finds_tasks():
+    env = gymnasium.make_vec("diffcloth/FoldCloth-v0", num_envs=3, size=SMALL)
+    assert env.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.SAME_STEP
+    assert env.reset(seed=0)[0].shape == (3, env.single_observation_space.shape[0])
+    assert env.spec.id == "diffcloth/FoldCloth-v0"
+    assert {f"diffcloth/{name}-v0" for name in NAMES} <= set(gymnasium.registry)
+
+
+@pytest.mark.parametrize("name", ["FoldCloth", "SpreadCloth", "PushCube", "LiftCloth", "HitCloth"])
+def test_gradients_of_a_return_are_those_of_differences(name):
+    env = make(name, 1)
+    sim = env.task.simulator
+    exact = dc.SolverOptions(throw=False, tolerance=1e-10)
+    env.task.simulator = dc.Simulator(sim.scene, sim.dt, contact=sim.contact, solver=exact)
+    env.reset(seed=1)
+    start = env.env_state
+    script = []
+    with torch.no_grad():
+        for _ in range(7):  # past the moment in which pickers and hands close
+            script.append(0.9 * env.scripted_actions().double())
+            env.step(script[-1])
+
+    def total(actions):
+        state, value = start, torch.zeros(())
+        for action in actions:
+            state = env.task.transition(state, action)
+            # Weights, as returns of some tasks are flat at first.
+            value = value + env.task.reward(state).sum() + 0.1 * env.task.observation(state).mean()
+        return value
+
+    leaf = torch.stack(script).requires_grad_()
+    (gradient,) = torch.autograd.grad(total(leaf), leaf)
+    noise = torch.Generator().manual_seed(0)
+    direction = torch.randn(leaf.shape, generator=noise, dtype=torch.float64)
+    # Not beyond the limits of actions, where they are cut.
+    direction = direction * (leaf.detach().abs() < 0.95)
+    eps = 1e-6
+    with torch.no_grad():
+        ahead, behind = (total(leaf + sign * eps * direction) for sign in (1, -1))
+    slope = float(ahead - behind) / (2 * eps)
+    assert float((gradient * direction).sum()) == pytest.approx(slope, rel=2e-4, abs=1e-7)
+    assert float(gradient.norm()) > 0
+
+
+def test_steps_keep_the_graph_until_it_is_cleared():
+    env = make("FoldCloth", 2)
+    env.reset(seed=0)
+    first, second = (actions_of(env, k, 0.3).requires_grad_() for k in (1, 2))
+    env.step(first)
+    reward = env.step(second)[1]
+    gradients = torch.autograd.grad(reward.sum(), [first, second], retain_graph=True)
+    assert all(bool((g != 0).any()) for g in gradients)
+    observation = env.initialize_trajectory()
+    assert not observation.requires_grad
+    third = actions_of(env, 3, 0.3).requires_grad_()
+    reward = env.step(third)[1]
+    (only,) = torch.autograd.grad(reward.sum(), [third])
+    assert bool((only != 0).any())
+
+
+def test_a_parameter_has_a_gradient():
+    env = make("DropCloth", 2)
+    env.reset(seed=0)
+    density = env.task.simulator.parameters().density.requires_grad_()
+    env.parameters = env.task.simulator.parameters().replace(density=density)
+    for _ in range(3):
+        reward = env.step(env.scripted_actions())[1]
+    (gradient,) = torch.autograd.grad(reward.sum(), density)
+    assert bool((gradient != 0).all())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_starts_depend_on_the_seed_and_the_environment_alone(name):
+    few, many = make(name, 1), make(name, 3)
+    one, _ = few.reset(seed=7)
+    three, _ = many.reset(seed=7)
+    assert torch.equal(one[0], three[0])
+    assert not torch.equal(three[0], three[1])
+    again, _ = many.reset(seed=7)
+    assert torch.equal(three, again)
+    other, _ = many.reset(seed=8)
+    assert not torch.equal(three, other)
+
+
+@pytest.mark.parametrize("name", ["FoldCloth", "SpreadCloth", "LiftCloth"])
+def test_threads_and_batches_change_no_bit(name):
+    results = []
+    threads = torch.get_num_threads()
+    try:
+        for count, num_envs in ((1, 2), (2, 2), (1, 3)):
+            torch.set_num_threads(count)
+            env = make(name, num_envs)
+            env.reset(seed=5)
+            for k in range(6):
+                observation, reward, *_ = env.step(actions_of(make_like(num_envs, env), k))
+            results.append((observation[:2], reward[:2]))
+    finally:
+        torch.set_num_threads(threads)
+    for observation, reward in results[1:]:
+        assert torch.equal(observation, results[0][0])
+        assert torch.equal(reward, results[0][1])
+
+
+def make_like(num_envs, env):
+    """The first rows of the same actions for any number of environments."""
+
+    class Rows:
+        task = env.task
+
+    Rows.num_envs = num_envs
+    return Rows
+
+
+def test_an_episode_ends_at_its_horizon_and_begins_again_in_the_same_step():
+    env = make("FoldCloth", 2, horizon=3)
+    env.reset(seed=0)
+    for k in range(3):
+        actions = actions_of(env, k, 0.3).requires_grad_()
+        observation, _, terminated, truncated, info = env.step(actions)
+        assert truncated.tolist() == [k == 2] * 2
+        assert not bool(terminated.any())
+    assert info["_final_obs"].tolist() == [True, True]
+    assert not torch.equal(info["final_obs"], observation)
+    assert info["final_obs"].requires_grad
+    (gradient,) = torch.autograd.grad(observation.sum(), actions)
+    assert bool((gradient == 0).all())  # the new start depends on nothing
+    assert torch.equal(info["final_obs"], info["obs_before_reset"])
+    assert env.env_state.elapsed.tolist() == [0, 0]
+    assert info["final_info"]["elapsed"].tolist() == [3, 3]
+
+
+def test_resets_by_mask_leave_the_others_alone():
+    env = make("FoldCloth", 3, horizon=2, autoreset_mode="Disabled")
+    env.reset(seed=0)
+    for k in range(2):
+        observation, _, _, truncated, _ = env.step(actions_of(env, k))
+    assert bool(truncated.all())
+    mask = torch.tensor([True, False, True])
+    after, info = env.reset(options={"reset_mask": mask})
+    assert torch.equal(after[1], observation[1])
+    assert not torch.equal(after[0], observation[0])
+    assert info["elapsed"].tolist() == [0, 2, 0]
+
+
+def test_failure_changes_no_bit_of_the_others():
+    """Hand 1 is driven into the table; it begins anew."""
+    results = []
+    for push in (0.0, 1.0):
+        env = make("LiftCloth", 3)
+        env.reset(seed=0)
+        actions = actions_of(env, 0, 0.1)
+        actions[1, 0] = push
+        actions.requires_grad_()
+        total, failed = 0.0, False
+        for _ in range(6):
+            observation, reward, _, _, info = env.step(actions)
+            total = total + reward + observation.sum(-1)
+            if bool(info["failed"][1]):
+                failed = True
+                assert info["_final_obs"].tolist() == [False, True, False]
+                assert env.env_state.elapsed[1] == 0
+        (gradient,) = torch.autograd.grad(total.sum(), actions)
+        results.append((total, gradient, failed))
+    assert [failed for *_, failed in results] == [False, True]
+    for whole, part in zip(results[0][:2], results[1][:2], strict=True):
+        assert torch.equal(whole[[0, 2]], part[[0, 2]])
+        assert bool(torch.isfinite(part).all())
+
+
+def test_a_kept_state_goes_on_with_the_same_bits():
+    env = make("FoldCloth", 2, horizon=4)
+    env.reset(seed=0)
+    for k in range(3):
+        env.step(actions_of(env, k))
+    kept = env.env_state, env.generator_states()
+    other = make("FoldCloth", 2, horizon=4)
+    other.resume(*kept)
+    for k in range(3, 6):  # past a new start
+        expected = env.step(actions_of(env, k))
+        found = other.step(actions_of(other, k))
+        assert all(torch.equal(a, b) for a, b in zip(expected[:4], found[:4], strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_scripts_succeed(name):
+    env = envs.make(name, 4, autoreset_mode="Disabled")
+    totals = {}
+    for policy in ("zero", "random", "scripted"):
+        env.reset(seed=11)
+        totals[policy] = torch.zeros(4)
+        for k in range(env.task.horizon):
+            actions = {
+                "zero": lambda: torch.zeros(4, env.task.action_size),
+                "random": lambda k=k: actions_of(env, k),
+                "scripted": env.scripted_actions,
+            }[policy]()
+            _, reward, _, _, info = env.step(actions)
+        totals[policy] = reward
+    assert int(info["success"].sum()) >= 3
+    assert float(totals["scripted"].mean()) > float(totals["zero"].mean())
+    assert float(totals["scripted"].mean()) > float(totals["random"].mean())
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: envs.make("Fold"), "`task` must be"),
+        (lambda: envs.make("FoldCloth", 0), "`num_envs` must be"),
+        (lambda: make("FoldCloth", observation="images"), "`observation` must be"),
+        (lambda: envs.make("FoldCloth", size=2), "`size` must be"),
+        (lambda: make("FoldCloth", autoreset_mode="NextStep"), "SAME_STEP or DISABLED"),
+        (lambda: make("FoldCloth").step(torch.zeros(2, 8)), r"call reset\(\) first"),
+        (lambda: begun().step(torch.zeros(2, 7)), r"must have shape \[2, 8\], got \[2, 7\]"),
+        (lambda: begun().step(torch.full((2, 8), torch.nan)), "environment 0 are not"),
+        (lambda: begun().reset(options={"mask": 1}), "only reset_mask"),
+        (lambda: begun().reset(options={"reset_mask": [True]}), r"booleans \[2\]"),
+        (lambda: begun().reset(seed=[1]), "must have 2 numbers"),
+    ],
+)
+def test_bad_input(call, message):
+    with pytest.raises(dc.InvalidInput, match=message):
+        call()
+
+
+def begun():
+    env = make("FoldCloth")
+    env.reset(seed=0)
+    return env
+
+
+def test_a_task_of_ones_own():
+    class Lift(envs.TASKS["FoldCloth"]):
+        name = "Lift"
+
+        def reward(self, env):
+            return env.state.positions[..., 2].mean(dim=-1)
+
+    assert issubclass(Lift, Task)
+    env = envs.make(Lift(size=SMALL), 2)
+    env.reset(seed=0)
+    assert env.step(np.zeros((2, 8)))[1].tolist() == pytest.approx([4e-3] * 2, rel=0.1)
