@@ -140,10 +140,16 @@ def _episode(env: envs.ClothVectorEnv, policy: str) -> tuple[float, int]:
         "scripted": env.scripted_actions,
     }
     total = torch.zeros(env.num_envs)
+    success = torch.zeros(env.num_envs, dtype=torch.bool)
+    running = ~success
     for _ in range(env.task.horizon):
-        _, reward, _, _, info = env.step(act[policy]())
-        total += reward
-    return float(total.mean()), int(info["success"].sum())
+        _, reward, terminated, truncated, info = env.step(act[policy]())
+        total += torch.where(running, reward, 0.0)
+        success = torch.where(running, info["success"], success)
+        running = running & ~(terminated | truncated)
+        if not bool(running.any()):
+            break
+    return float(total.mean()), int(success.sum())
 
 
 if __name__ == "__main__":

@@ -74,6 +74,7 @@ CONTENTS = {
             "docs/guide",
             "docs/robots",
             "docs/identification",
+            "docs/environments",
             "docs/tasks",
             "docs/extending",
             "CONTRIBUTING",

@@ -38,7 +38,7 @@ class HangCloth(HandTask):
     name = "HangCloth"
     obstacles = (_peg(0.045), _peg(-0.045))
 
-    def __init__(self, *, size: int = 12, horizon: int = 110, substeps: int = 2) -> None:
+    def __init__(self, *, size: int = 12, horizon: int = 115, substeps: int = 2) -> None:
         """Build the scene: see `HandTask`."""
         super().__init__(size=size, horizon=horizon, substeps=substeps)
 
@@ -71,10 +71,14 @@ class HangCloth(HandTask):
         pegs = _PEG + torch.tensor([0.0, 0.0, _TIP], dtype=torch.float64)
         points = [(pegs + torch.tensor(tip, dtype=torch.float64)) for tip in tips]
         path = [p.expand(len(env), 1, 3) for p in points]
-        grasps = [1.0 if step <= _RELEASE else -1.0 for step in steps]
+        grasps = [1.0 if step <= _RELEASE else _AJAR for step in steps]
         wanted, grasp = follow(env, steps, path, grasps)
         target = torch.cat([wanted[:, 0], env.drawn["down"]], dim=-1)
-        moves = self.towards(env, 0.5 * twist_to(env.state.base_poses[:, 0], target))
+        base = env.state.base_poses[:, 0]
+        rise = torch.zeros(len(env), 6, dtype=torch.float64)
+        rise[:, 2] = 0.02
+        risen = (env.elapsed >= _RISEN)[:, None]
+        moves = self.towards(env, torch.where(risen, 0.5 * twist_to(base, target), rise))
         return torch.cat([moves[:, :6], grasp], dim=-1)
 
     def _away(self, env: EnvState) -> Tensor:
@@ -86,9 +90,11 @@ _PATH = (
     (30, (-0.15, 0.0, 0.1)),
     (44, (-0.05, 0.0, 0.06)),
     (66, (0.03, 0.0, 0.04)),
-    (74, (0.04, 0.0, 0.0)),
-    (80, (0.04, 0.0, 0.0)),
-    (86, (0.04, 0.0, 0.0)),
-    (106, (0.04, 0.0, 0.15)),
+    (74, (0.04, 0.0, 0.005)),
+    (80, (0.04, 0.0, 0.005)),
+    (86, (0.04, 0.0, 0.005)),
+    (108, (0.04, 0.0, 0.15)),
 )
 _RELEASE = 80
+_AJAR = 0.5  # effort with which fingers open by 1.7 cm each: further ones would push the cloth
+_RISEN = 12  # transitions after which the hand may turn: it has left the table

@@ -65,6 +65,7 @@ PUBLIC = {
     "fit": "",
     "Variable": "",
     "residuals": "markers point_cloud",
+    "envs": "make TASKS ClothVectorEnv Task",
     "robots": "GRIPPER panda",
     "stack": "",
     "where": "",
