@@ -162,7 +162,6 @@ def outline(
         InvalidInput: If a shape or value is not accepted, or a silhouette leaves a direction empty.
     """
     owner = "residuals.outline"
-    positions = _positions(owner, states)
     check_count(f"{owner}: `directions`", directions, 3)
     origin = float_array(f"{owner}: `center`", center)
     if origin.shape != (2,):
@@ -171,10 +170,8 @@ def outline(
         raise InvalidInput(
             f"{owner}: `outlines` must be one for each of {len(states)} states, got {len(outlines)}"
         )
-    edges = _edges(index_array(f"{owner}: `faces`", faces, positions.shape[1]))
-    angles = 2 * np.pi / directions * np.arange(directions)
-    rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    radii, seen = [], []
+    silhouette, rays = silhouettes(owner, states, faces, origin, directions)
+    seen = []
     for k, given in enumerate(outlines):
         corners = float_array(f"{owner}: `outlines`[{k}]", given)
         check_finite(f"{owner}: `outlines`[{k}]", corners)
@@ -186,19 +183,34 @@ def outline(
         ring = np.stack([np.arange(len(corners)), np.roll(np.arange(len(corners)), -1)], axis=1)
         polygon = torch.from_numpy(corners - origin)
         seen.append(_radii(f"{owner}: `outlines`[{k}]", polygon, ring, rays))
-        flat = positions[k][:, :2] - torch.from_numpy(origin)
-        radii.append(_radii(f"{owner}: the silhouette of `states`[{k}]", flat, edges, rays))
+    observed = torch.stack(seen)
     note(
         Comparison(
             kind="outline",
             times=_times(states),
-            simulated=[origin + numbers_of(r)[:, None] * rays for r in radii],
-            observed=[origin + numbers_of(r)[:, None] * rays for r in seen],
-            labels=[f"{np.degrees(angle):.0f} degrees" for angle in angles],
+            simulated=list(origin + numbers_of(silhouette)[..., None] * rays),
+            observed=list(origin + numbers_of(observed)[..., None] * rays),
+            labels=[f"{360 * i / directions:.0f} degrees" for i in range(directions)],
             noise=noise,
         )
     )
-    return (torch.cat(radii) - torch.cat(seen)) / _noise(noise)
+    return (silhouette - observed).flatten() / _noise(noise)
+
+
+def silhouettes(
+    owner: str, states: Sequence[State], faces: object, center: FloatArray, directions: int
+) -> tuple[Tensor, FloatArray]:
+    """Radii of the silhouettes seen from above, [T, D], and the directions [D, 2]."""
+    positions = _positions(owner, states)
+    edges = _edges(index_array(f"{owner}: `faces`", faces, positions.shape[1]))
+    angles = 2 * np.pi / directions * np.arange(directions)
+    rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    flat = positions[..., :2] - torch.from_numpy(center)
+    radii = [
+        _radii(f"{owner}: the silhouette of `states`[{k}]", points, edges, rays)
+        for k, points in enumerate(flat)
+    ]
+    return torch.stack(radii), rays
 
 
 def _radii(owner: str, points: Tensor, edges: Any, rays: FloatArray) -> Tensor:
