@@ -1,9 +1,12 @@
-"""Fits of configurations: the four that are shipped find what is known, and bad ones are refused."""
+"""Fits of configurations: those that are shipped find what is known, and bad ones are refused."""
 
 from __future__ import annotations
 
 import json
 import pickle
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -218,3 +221,23 @@ def test_the_command_refuses_what_is_no_fit(config, tmp_path):
     assert "must hold what `diffcloth fit` wrote" in result.output
     result = CliRunner().invoke(main, ["fit"])
     assert "Missing argument 'CONFIG'" in result.output
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [
+        ([], r"stretch +30 .* [01] of 1\n"),
+        (["--places"], r"1 numbers, 1 trajectories\n1 of 1 starts end at the same place"),
+        (["--compare"], r"tangents +\d+(.*\n)differences +\d+(.*\n)Adam +100(.*\n)CMA-ES +\d+"),
+    ],
+)
+def test_the_benchmark_runs(option, expected):
+    if "--compare" in option:
+        pytest.importorskip("cma")
+    config = CONFIGS / "fit_hang.yaml"
+    command = [sys.executable, "-m", "benchmarks.identification", *option, "--seeds", "1", config]
+    result = subprocess.run(
+        command, cwd=CONFIGS.parent, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    assert re.search(expected, result.stdout), result.stdout
