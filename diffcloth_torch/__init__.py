@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from diffcloth_torch.optimize import residuals
     from diffcloth_torch.optimize.descent import Descent, descend
     from diffcloth_torch.optimize.evaluation import Evaluation
-    from diffcloth_torch.optimize.fit import Fit, fit
+    from diffcloth_torch.optimize.fit import Fit, Stage, fit
     from diffcloth_torch.optimize.variables import Variable
     from diffcloth_torch.sim.controls import Control, Parameters
     from diffcloth_torch.sim.report import Report
@@ -87,6 +87,7 @@ __all__ = [
     "SimulationError",
     "Simulator",
     "SolverOptions",
+    "Stage",
     "State",
     "Trajectory",
     "TurnedTooFar",
@@ -126,7 +127,7 @@ _HOMES = {
     "model.scene": ("Scene",),
     "optimize.descent": ("Descent", "descend"),
     "optimize.evaluation": ("Evaluation",),
-    "optimize.fit": ("Fit", "fit"),
+    "optimize.fit": ("Fit", "Stage", "fit"),
     "optimize.variables": ("Variable",),
     "sim.controls": ("Control", "Parameters"),
     "sim.report": ("Report",),

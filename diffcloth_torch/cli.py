@@ -1,4 +1,4 @@
-"""The command line: run, optimize, info.
+"""The command line: run, optimize, fit, info.
 
 Commands import what they need when they run: torch takes seconds to import, and `diffcloth --help`
 or a misspelled option need not wait for it.
@@ -57,6 +57,23 @@ def _end(error: Exception, code: int, debug: bool) -> None:
     sys.exit(code)
 
 
+_OVERWRITE = click.option(
+    "--overwrite", is_flag=True, help="Replace the results of an earlier run in the folder."
+)
+_OUT = click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder for the results; by default results/ and the name of CONFIG.",
+)
+_SET = click.option(
+    "--set",
+    "assignments",
+    metavar="KEY=VALUE",
+    multiple=True,
+    help="Change a value of the configuration: simulation.steps=50. Repeatable.",
+)
+
+
 def _options(command: C) -> C:
     """Add the options of all commands that simulate; what they choose becomes assignments."""
 
@@ -67,26 +84,14 @@ def _options(command: C) -> C:
 
     added: Any = with_viewers
     for option in (
-        click.option(
-            "--overwrite", is_flag=True, help="Replace the results of an earlier run in the folder."
-        ),
-        click.option(
-            "--out",
-            type=click.Path(path_type=Path, file_okay=False),
-            help="Folder for the results; by default results/ and the name of CONFIG.",
-        ),
+        _OVERWRITE,
+        _OUT,
         click.option(
             "--actions",
             type=click.Path(path_type=Path, dir_okay=False, exists=True),
             help="Start from the actions that another run found: its actions.npz.",
         ),
-        click.option(
-            "--set",
-            "assignments",
-            metavar="KEY=VALUE",
-            multiple=True,
-            help="Change a value of the configuration: simulation.steps=50. Repeatable.",
-        ),
+        _SET,
         click.option(
             "--viewer",
             "viewers",
@@ -134,6 +139,33 @@ def optimize(**arguments: Any) -> str:
     if extra:
         raise click.UsageError(f"--resume takes these from its DIRECTORY: {', '.join(extra)}.")
     return resume(folder, assignments)
+
+
+@main.command()
+@click.argument("config", type=click.Path(path_type=Path), required=False)
+@click.option(
+    "--resume",
+    metavar="DIRECTORY",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Go on with the fit whose results are there; its CONFIG is there too.",
+)
+@_SET
+@_OUT
+@_OVERWRITE
+@_ending_in_a_sentence
+def fit(**arguments: Any) -> str:
+    """Fit the variables of CONFIG to what was observed."""
+    from diffcloth_torch.fit_command import fit_configuration, resume_fit
+
+    folder = arguments.pop("resume")
+    if folder is None:
+        if arguments["config"] is None:
+            raise click.UsageError("Missing argument 'CONFIG': a file, or --resume DIRECTORY.")
+        return fit_configuration(**arguments)
+    extra = ["CONFIG" if name == "config" else f"--{name}" for name, a in arguments.items() if a]
+    if extra:
+        raise click.UsageError(f"--resume takes these from its DIRECTORY: {', '.join(extra)}.")
+    return resume_fit(folder)
 
 
 @main.command()

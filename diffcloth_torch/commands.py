@@ -37,7 +37,7 @@ from diffcloth_torch.tasks.statistics import (
 from diffcloth_torch.tasks.task import Optimizable, Task
 from diffcloth_torch.viewers.curves import draw_loss_curve
 
-__all__ = ["info", "optimize", "resume", "run"]
+__all__ = ["check_folder", "info", "optimize", "resume", "run"]
 
 # Packages that a run or its pictures need; `info` lists which of them are installed.
 _PACKAGES = ("torch", "numpy", "trimesh", "matplotlib", "pyvista", "imageio", "imageio-ffmpeg")
@@ -79,7 +79,7 @@ def run(
         SimulationError: If a step fails; earlier results are kept.
         KeyboardInterrupt: If the user ends the run; the message says what is kept.
     """
-    out = _check_folder(config, out, overwrite)
+    out = check_folder(config, out, overwrite)
     task = load_task(config, assignments)
     start_actions = _read_actions(task, actions)
     states: list[State] = []
@@ -136,7 +136,7 @@ def optimize(
 
     Arguments and errors are those of `run`.
     """
-    out = _check_folder(config, out, overwrite)
+    out = check_folder(config, out, overwrite)
     task = load_task(config, assignments)
     if not isinstance(task, Optimizable):
         able = ", ".join(name for name, kind in TASKS.items() if hasattr(kind, "loss"))
@@ -273,7 +273,8 @@ def _values_used(task: Task) -> dict[str, Any]:
     }
 
 
-def _check_folder(config: Path, out: Path | None, overwrite: bool) -> Path:
+def check_folder(config: Path, out: Path | None, overwrite: bool) -> Path:
+    """Name the folder for results, and refuse one that holds others unless `overwrite`."""
     folder = Path("results") / config.stem if out is None else out
     if folder.is_dir() and any(folder.iterdir()) and not overwrite:
         going_on = f", `optimize --resume {folder}` goes on" if (folder / _RESUME).exists() else ""

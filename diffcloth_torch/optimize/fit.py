@@ -6,69 +6,29 @@ the residuals comes from tangents of the simulation, one for each number that is
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray, check_choice, check_count
-from diffcloth_torch.errors import InvalidInput, SimulationError
-from diffcloth_torch.model.quantities import PARAMETERS
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.files import as_path
+from diffcloth_torch.optimize.fit_page import Page, write_page
+from diffcloth_torch.optimize.problem import Residuals, Trial, parameters_of, trajectories
+from diffcloth_torch.optimize.starts import Job, Stage, Start, judge, run_all
+from diffcloth_torch.optimize.uncertainty import Direction, uncertainty_of
 from diffcloth_torch.optimize.variables import Space, Variable
 from diffcloth_torch.sim.controls import Parameters
 
-__all__ = ["Direction", "Fit", "Trial", "fit"]
-
-Residuals = Callable[..., Tensor | Sequence[Tensor]]
+__all__ = ["Direction", "Fit", "Stage", "Start", "Trial", "fit"]
 
 _METHODS = ("least_squares",)
 _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
-# Standard error of a direction, in sizes of its variables, from which on it is not known at all.
-_UNSURE = 1.0
-_SHOWN = 0.1  # share of a direction below which a variable is not named
-_CONFIDENCE = 0.95
-_TINY = 1e-300
-
-
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """One evaluation of the residuals.
-
-    Attributes:
-        start: Index of the start that it belongs to.
-        cost: Half the sum of squares; infinite if the simulation failed.
-        values: Values of all variables.
-        seconds: Time that it took [s].
-        failure: What the simulation raised, empty if nothing.
-    """
-
-    start: int
-    cost: float
-    values: dict[str, Tensor]
-    seconds: float
-    failure: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class Direction:
-    """A combination of variables that the observations do not tell.
-
-    Attributes:
-        standard_error: Of the combination, in sizes of its variables: relative on the scale "log".
-        shares: Name of a number -> its share in the combination, which has length one.
-    """
-
-    standard_error: float
-    shares: dict[str, float]
-
-    def __str__(self) -> str:
-        """Name the variables and their signs."""
-        parts = [f"{share:+.2f} {name}" for name, share in self.shares.items()]
-        return f"{' '.join(parts)} (standard error {self.standard_error:.2g})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,12 +45,15 @@ class Fit:
         correlation: Likewise.
         intervals: Name of each number -> its interval of 95 %.
         unidentifiable: Directions that the observations do not tell, the worst first.
-        residuals: At the solution [M].
+        residuals: At the solution [M], of the last stage.
         cost: Half the sum of their squares.
         success: Whether the solver converged.
         message: How it ended.
-        starts: Cost at which each start ended; infinite where the simulation failed at the start.
-        history: All evaluations, in their order.
+        starts: Where each start ended, and why not at the best place.
+        held_out: Root mean square of the residuals of each trajectory that was kept out of the fit:
+            about one if the model is right and the noise is known.
+        history: All evaluations, start after start.
+        compared: The residuals of the last stage, and those kept out, for the report.
     """
 
     parameters: Parameters
@@ -104,18 +67,56 @@ class Fit:
     cost: float
     success: bool
     message: str
-    starts: list[float]
+    starts: list[Start]
+    held_out: list[float]
     history: list[Trial] = field(repr=False)
+    compared: list[Residuals] = field(repr=False)
 
     @property
     def failures(self) -> int:
         """Number of trial steps in which the simulation failed."""
         return sum(bool(trial.failure) for trial in self.history)
 
+    def report(self, path: str | Path) -> None:
+        """Write a page that shows the fit: one file, which loads nothing.
+
+        It has the values with their intervals, the correlation, the residuals over time, the worst
+        marker, the first and the last values beside what was observed, and the starts. For this,
+        the residuals are evaluated at the first and at the last values.
+
+        Args:
+            path: File that ends in ".html".
+
+        Raises:
+            InvalidInput: If it ends otherwise.
+            SimulationError: If the simulation fails.
+        """
+        file = as_path("Fit.report: `path`", path)
+        if file.suffix != ".html":
+            raise InvalidInput(f'Fit.report: `path` must end in ".html", got {str(path)!r}')
+        write_page(
+            file,
+            Page(
+                names=self.names,
+                values=self.values,
+                first=self.starts[0].first,
+                intervals=self.intervals,
+                correlation=self.correlation,
+                unidentifiable=[str(direction) for direction in self.unidentifiable],
+                cost=self.cost,
+                residual_count=len(self.residuals),
+                message=self.message,
+                starts=self.starts,
+                history=self.history,
+                held_out=self.held_out,
+                residuals=self.compared,
+            ),
+        )
+
 
 def fit(
     variables: Mapping[str, Variable],
-    residuals: Residuals,
+    residuals: Residuals | Sequence[Stage],
     *,
     method: str = "least_squares",
     starts: int = 1,
@@ -124,6 +125,10 @@ def fit(
     loss_scale: float = 1.0,
     max_evaluations: int = 100,
     tolerance: float = 1e-8,
+    hold_out: Residuals | None = None,
+    workers: int | Executor = 0,
+    resume: str | Path | None = None,
+    progress: Callable[[Trial], None] = lambda _: None,
 ) -> Fit:
     """Fit variables to observations.
 
@@ -136,14 +141,22 @@ def fit(
         residuals: Function of a `Parameters` that holds the variables, and of name -> value of the
             other variables if there are some; returns a tensor [M], or a list of tensors, one for
             each trajectory: see `dc.residuals`. It is called with tensors that are being
-            differentiated, and must return the same values for the same input.
+            differentiated, and must return the same values for the same input. Or a list of
+            `Stage`, run one after the other; the last one must free all variables.
         method: The solver; "least_squares".
-        starts: Number of starts: the first values, then random ones between the bounds.
+        starts: Number of starts: the first values, then random ones, see `Variable`.
         seed: Of the random starts.
         loss: Of the squares: "linear", "soft_l1", "huber", "cauchy" or "arctan", as SciPy has them.
         loss_scale: Residual from which on the others count less, > 0.
-        max_evaluations: Of the residuals, for each start.
-        tolerance: Relative change of the cost or the variables at which a start ends.
+        max_evaluations: Of the residuals, for each stage of each start.
+        tolerance: Relative change of the cost or the variables at which a stage ends.
+        hold_out: Residuals of trajectories that are kept out of the fit, as `residuals`.
+        workers: Number of processes for the starts, 0 for none, or an executor. The result has the
+            same bits for any number. `residuals` must then be a function of a module or another
+            object that can be pickled, and a script needs `if __name__ == "__main__":`.
+        resume: Folder that keeps all evaluations. A fit that was interrupted takes them from there,
+            and ends with the same bits; delete it if `residuals` change.
+        progress: Called after each evaluation; of starts in processes, when they have ended.
 
     Returns:
         The best fit, with its uncertainty. A trial step in which the simulation fails is rejected,
@@ -154,179 +167,98 @@ def fit(
         SimulationError: If the simulation fails at the first values of every start.
         TypeError: If `residuals` returns something else than tensors.
     """
-    optimize = _require_scipy()
+    _require_scipy()
     check_choice("fit: `method`", method, _METHODS)
     check_choice("fit: `loss`", loss, _LOSSES)
     check_count("fit: `starts`", starts, 1)
     check_count("fit: `max_evaluations`", max_evaluations, 1)
-    problem = _Problem(Space(variables), residuals)
+    if not isinstance(workers, Executor):
+        check_count("fit: `workers`", workers, 0)
+    space = Space(variables)
+    job = Job(
+        space=space,
+        stages=_stages(residuals, space),
+        options={
+            "loss": loss,
+            "f_scale": loss_scale,
+            "max_nfev": max_evaluations,
+            "ftol": tolerance,
+            "xtol": tolerance,
+            "gtol": tolerance,
+        },
+        folder=_folder(resume),
+        threads=torch.get_num_threads(),
+    )
     generator = np.random.default_rng(seed)
-    space, ends, failure = problem.space, [], None
-    costs = []
-    for k in range(starts):
-        problem.start = k
-        first = space.first if k == 0 else space.draw(generator)
-        try:
-            problem.require(first)
-        except SimulationError as error:
-            failure = error
-            costs.append(np.inf)
-            continue
-        end = optimize.least_squares(
-            problem.residuals,
-            first,
-            jac=problem.jacobian,
-            bounds=(space.low, space.high),
-            method="trf",
-            x_scale="jac",
-            loss=loss,
-            f_scale=loss_scale,
-            max_nfev=max_evaluations,
-            ftol=tolerance,
-            xtol=tolerance,
-            gtol=tolerance,
-        )
-        costs.append(float(end.cost))
-        ends.append(end)
-    if not ends:
-        assert failure is not None
-        raise failure
-    return _summary(problem, min(ends, key=lambda end: end.cost), costs)
-
-
-class _Problem:
-    """The residuals as functions of theta, and what was asked of them."""
-
-    def __init__(self, space: Space, residuals: Residuals) -> None:
-        self.space, self._residuals = space, residuals
-        self.history: list[Trial] = []
-        self.start = 0
-        self._count = 0
-
-    def require(self, theta: FloatArray) -> None:
-        """Evaluate at a start, where a failure ends it."""
-        found = self._trial(theta)
-        if isinstance(found, SimulationError):
-            raise found
-        self._count = len(found)
-        if self._count == 0:
-            raise InvalidInput("fit: `residuals` must return at least one number")
-
-    def residuals(self, theta: FloatArray) -> FloatArray:
-        """Residuals [M]; infinite where the simulation fails: the solver rejects that step."""
-        found = self._trial(theta)
-        return np.full(self._count, np.inf) if isinstance(found, SimulationError) else found
-
-    def jacobian(self, theta: FloatArray) -> FloatArray:
-        """Jacobian [M, p]: forward where numbers are fewer than residuals, else backward."""
-        few = len(self.space) <= self._count
-        transform = torch.func.jacfwd if few else torch.func.jacrev
-        found: FloatArray = transform(self._call)(torch.from_numpy(np.array(theta))).numpy()
-        return found
-
-    def parameters(self, values: dict[str, Tensor]) -> Parameters:
-        """Parameters that hold the variables of their names."""
-        return Parameters(**{n: v for n, v in values.items() if n in PARAMETERS})  # type: ignore[arg-type]
-
-    def _trial(self, theta: FloatArray) -> FloatArray | SimulationError:
-        begin = time.perf_counter()
-        numbers = torch.from_numpy(np.array(theta))
-        failure: SimulationError | None = None
-        found = np.zeros(0)
-        try:
-            with torch.no_grad():
-                found = self._call(numbers).numpy()
-        except SimulationError as error:
-            failure = error
-        if failure is None and not np.isfinite(found).all():
-            raise InvalidInput("fit: `residuals` must return finite numbers")
-        self.history.append(
-            Trial(
-                start=self.start,
-                cost=float(np.inf) if failure else 0.5 * float(found @ found),
-                values=self.space.values(numbers),
-                seconds=time.perf_counter() - begin,
-                failure="" if failure is None else str(failure),
-            )
-        )
-        return found if failure is None else failure
-
-    def _call(self, theta: Tensor) -> Tensor:
-        values = self.space.values(theta)
-        others = {n: v for n, v in values.items() if n not in PARAMETERS}
-        parameters = self.parameters(values)
-        found = self._residuals(parameters, others) if others else self._residuals(parameters)
-        parts = [found] if isinstance(found, Tensor) else found
-        if not isinstance(parts, list | tuple) or not all(isinstance(p, Tensor) for p in parts):
-            raise TypeError("fit: `residuals` must return a tensor or a list of tensors")
-        return torch.cat([part.reshape(-1).to(torch.float64) for part in parts])
-
-
-def _summary(problem: _Problem, end: Any, costs: list[float]) -> Fit:
-    space = problem.space
-    theta, J, found = end.x, end.jac, end.fun
-    count, p = J.shape
-    noise = 2 * float(end.cost) / max(count - p, 1)
-    # In sizes of the variables, so that directions compare.
-    units = space.units(theta)
-    U_s, singular, V = np.linalg.svd(J * units, full_matrices=False)
-    del U_s
-    errors = np.sqrt(noise) / np.maximum(singular, _TINY)
-    spread = V.T * errors  # columns: directions times their standard error
-    of_theta = units[:, None] * (spread @ spread.T) * units
-    rates = space.rates(theta)
-    covariance = rates[:, None] * of_theta * rates
-    deviations = np.sqrt(np.diag(covariance))
-    correlation = covariance / np.maximum(np.outer(deviations, deviations), _TINY)
-    values = space.values(torch.from_numpy(np.array(theta)))
+    firsts = [space.first] + [space.draw(generator) for _ in range(starts - 1)]
+    ends = run_all(job, firsts, workers, progress)
+    best = min(ends, key=lambda end: end.cost)
+    if best.failure is not None:
+        raise next(end.failure for end in reversed(ends) if end.failure is not None)
+    found = uncertainty_of(space, best.theta, best.jacobian, best.cost)
+    values = space.values(torch.from_numpy(np.array(best.theta)))
     return Fit(
-        parameters=problem.parameters(values),
+        parameters=parameters_of(values),
         values=values,
         names=list(space.names),
-        covariance=covariance,
-        correlation=correlation,
-        intervals=_intervals(space, theta, np.sqrt(np.diag(of_theta)), count - p),
-        unidentifiable=_directions(space.names, V, errors),
-        residuals=found,
-        cost=float(end.cost),
-        success=bool(end.success),
-        message=str(end.message),
-        starts=costs,
-        history=problem.history,
+        covariance=found.covariance,
+        correlation=found.correlation,
+        intervals=found.intervals,
+        unidentifiable=found.unidentifiable,
+        residuals=best.residuals,
+        cost=best.cost,
+        success=best.success,
+        message=best.message,
+        starts=judge(job, ends, best, found.deviations),
+        held_out=[] if hold_out is None else _errors(hold_out, values),
+        history=[trial for end in ends for trial in end.history],
+        compared=[r for r in (job.stages[-1].residuals, hold_out) if r is not None],
     )
 
 
-def _intervals(
-    space: Space, theta: FloatArray, deviations: FloatArray, freedom: int
-) -> dict[str, tuple[float, float]]:
-    from scipy.stats import t
+def _stages(residuals: Residuals | Sequence[Stage], space: Space) -> list[Stage]:
+    if callable(residuals):
+        return [Stage(residuals)]
+    stages = list(residuals)
+    if not stages or not all(isinstance(stage, Stage) for stage in stages):
+        raise TypeError("fit: `residuals` must be a function, or a list of one or more Stage")
+    for k, stage in enumerate(stages):
+        if stage.free is None:
+            continue
+        if isinstance(stage.free, str) or not stage.free:
+            raise TypeError(f"fit: `residuals[{k}].free` must be a list of names, got {stage.free}")
+        for name in stage.free:
+            if name not in space.variables:
+                raise InvalidInput(
+                    f"fit: `residuals[{k}].free` may name {', '.join(space.variables)}; "
+                    f"got {name!r}"
+                )
+    left = set(space.variables) - set(stages[-1].free or space.variables)
+    if left:
+        raise InvalidInput(
+            "fit: the last stage must free all variables, as standard errors come from it; "
+            f"it leaves out {', '.join(sorted(left))}"
+        )
+    return stages
 
-    reach = float(t.ppf(0.5 + _CONFIDENCE / 2, max(freedom, 1))) * deviations
-    with np.errstate(over="ignore"):
-        low, high = space.from_theta(theta - reach), space.from_theta(theta + reach)
-    return {name: (float(low[i]), float(high[i])) for i, name in enumerate(space.names)}
+
+def _folder(resume: str | Path | None) -> Path | None:
+    if resume is None:
+        return None
+    folder = as_path("fit: `resume`", resume)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
-def _directions(names: list[str], V: FloatArray, errors: FloatArray) -> list[Direction]:
-    """The directions whose standard error is as large as the variables themselves."""
-    found = []
-    for direction, error in zip(V, errors, strict=True):
-        if not error < _UNSURE:
-            signed = direction * np.sign(direction[np.abs(direction).argmax()])
-            shares = {
-                name: float(share)
-                for name, share in zip(names, signed, strict=True)
-                if abs(share) > _SHOWN
-            }
-            found.append(Direction(float(error), shares))
-    return sorted(found, key=lambda direction: -direction.standard_error)
+def _errors(residuals: Residuals, values: Mapping[str, Tensor]) -> list[float]:
+    with torch.no_grad():
+        return [float(part.square().mean().sqrt()) for part in trajectories(residuals, values)]
 
 
-def _require_scipy() -> Any:
+def _require_scipy() -> None:
     try:
-        from scipy import optimize
+        import scipy  # noqa: F401
     except ImportError as error:
         raise InvalidInput(
             f"fit: it needs SciPy: run  pip install 'diffcloth-torch[fit]'  ({error})"
         ) from error
-    return optimize

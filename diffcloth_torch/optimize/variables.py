@@ -19,7 +19,6 @@ __all__ = ["Space", "Variable"]
 
 _SCALES = ("log", "linear")
 _REACH = 1e3  # factor of what is positive, to both sides of its first value, without bounds
-_SPREAD = 3.0  # factor from the first value within which starts are drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,15 +32,21 @@ class Variable:
         scale: "log" searches the logarithm, so that steps are relative; "linear" the value itself.
             By default "log" for parameters that cannot be negative, where all values are positive.
         free: False keeps the value.
+        spread: Factor, > 1, by which the random starts of what is searched on the scale "log" may
+            differ from the first value; their logarithms are uniform. On the scale "linear" they
+            are uniform between the bounds, or up to twice the first value where these are infinite.
     """
 
     value: object
     bounds: tuple[float, float] | None = None
     scale: Literal["log", "linear"] | None = None
     free: bool = True
+    spread: float = 3.0
 
     def __post_init__(self) -> None:
         numbers = float_array("Variable: `value`", self.value)
+        if not 1 < self.spread < math.inf:
+            raise InvalidInput(f"Variable: `spread` must be greater than 1, got {self.spread}")
         check_finite("Variable: `value`", numbers)
         object.__setattr__(self, "value", numbers)
         if self.scale is not None:
@@ -72,12 +77,14 @@ class _Axis:
     log: bool
     low: float
     high: float
+    spread: float
 
 
 class Space:
     """Vectors of numbers theta, one for each number of the free variables.
 
     Attributes:
+        variables: Names of the free variables.
         names: Name of each number, as "stretch" or "velocity[0]".
         first: The first values, as theta.
         low: Lowest values of theta.
@@ -114,6 +121,7 @@ class Space:
                 self.names += _entries(name, axis.shape)
         if not self._axes:
             raise InvalidInput("fit: `variables` must have at least one that is free")
+        self.variables = [axis.name for axis in self._axes]
         self.first = np.concatenate(
             [_to(axis, _numbers(variables[axis.name])) for axis in self._axes]
         )
@@ -124,6 +132,11 @@ class Space:
     def __len__(self) -> int:
         """Count the numbers."""
         return len(self.names)
+
+    def rows(self, name: str) -> range:
+        """Rows of theta that belong to a variable."""
+        rows = next(axis.rows for axis in self._axes if axis.name == name)
+        return range(rows.start, rows.stop)
 
     def values(self, theta: Tensor) -> dict[str, Tensor]:
         """Values of all variables by name, differentiable in theta."""
@@ -165,7 +178,7 @@ class Space:
         for axis in self._axes:
             first, rows = self.first[axis.rows], axis.rows
             if axis.log:
-                reach = math.log(_SPREAD)
+                reach = math.log(axis.spread)
                 low, high = first - reach, first + reach
             elif math.isfinite(axis.high - axis.low):
                 low, high = np.full_like(first, axis.low), np.full_like(first, axis.high)
@@ -210,6 +223,7 @@ def _axis(name: str, variable: Variable, first: int) -> _Axis:
         log=log,
         low=max(low, 0.0) if log else low,
         high=high,
+        spread=variable.spread,
     )
 
 

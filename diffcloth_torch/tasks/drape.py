@@ -24,7 +24,7 @@ __all__ = ["Drape"]
 class Drape:
     """A scene, and bodies and pins that follow keyframes. Nothing is optimized."""
 
-    Config = RunConfig
+    Config: type[RunConfig] = RunConfig
 
     def __init__(self, config: RunConfig, source: Path) -> None:
         """Build the scene of a configuration that was read from the file `source`."""

@@ -14,6 +14,7 @@ from diffcloth_torch.tasks.control_points import ControlPoints
 from diffcloth_torch.tasks.drape import Drape
 from diffcloth_torch.tasks.grasp_cloth import GraspCloth
 from diffcloth_torch.tasks.hit_cloth import HitCloth
+from diffcloth_torch.tasks.identify import Identify
 from diffcloth_torch.tasks.push_cube import PushCube
 from diffcloth_torch.tasks.task import Task
 from diffcloth_torch.tasks.two_cloths import TwoCloths
@@ -27,6 +28,7 @@ TASKS: dict[str, Any] = {
     "grasp_cloth": GraspCloth,
     "two_cloths": TwoCloths,
     "control_points": ControlPoints,
+    "identify": Identify,
 }
 """Name -> class with a `Config` and a constructor that takes one and the path it was read from."""
 

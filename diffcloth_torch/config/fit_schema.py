@@ -1,0 +1,100 @@
+"""The schema of fits in configurations: what is searched, and what was observed."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Gt, Len
+from pydantic import model_validator
+
+from diffcloth_torch.config.scene_schema import Selection
+from diffcloth_torch.config.schema import RunConfig
+from diffcloth_torch.config.section import Positive, Section, Vector3, require_one
+
+__all__ = ["FitConfig", "FitSection", "SyntheticSection", "TrajectorySection", "VariableSection"]
+
+Numbers = float | list[float]
+
+
+class VariableSection(Section):
+    """What a fit may change, as in `Variable`."""
+
+    value: Numbers
+    bounds: Annotated[list[float], Len(2, 2)] | None = None
+    scale: Literal["log", "linear"] | None = None
+    free: bool = True
+    spread: Annotated[float, Gt(1)] = 3.0
+
+
+class SyntheticSection(Section):
+    """Observations that another simulation makes, to try a fit where the truth is known.
+
+    `changes` are assignments to the configuration, as after `--set`: a finer mesh, a smaller time
+    step. `values` are those of the variables; the standard deviation of the noise is that of the
+    trajectory.
+    """
+
+    values: dict[str, Numbers]
+    changes: list[str] = []
+    seed: Annotated[int, Ge(0)] = 0
+
+
+class TrajectorySection(Section):
+    """What was observed of one motion, or of one equilibrium.
+
+    `changes` are assignments to the configuration that make this motion, as after `--set`. The
+    cloth is observed after each of `steps`, or once at `equilibrium`. `file` is an .npz with the
+    `positions` [T, m, 3] of the `markers` (NaN where one was not seen), or with the `outlines`
+    [T, n, 2] of silhouettes seen from above, around `center`.
+    """
+
+    name: str
+    changes: list[str] = []
+    kind: Literal["markers", "outline"] = "markers"
+    steps: Annotated[list[Annotated[int, Ge(1)]], Len(1)] | None = None
+    equilibrium: bool = False
+    velocity: Vector3 | None = None
+    markers: Selection | None = None
+    center: Annotated[list[float], Len(2, 2)] = [0.0, 0.0]
+    directions: Annotated[int, Ge(3)] = 72
+    noise: Positive
+    file: str | None = None
+    synthetic: SyntheticSection | None = None
+    hold_out: bool = False
+
+    @model_validator(mode="after")
+    def _check_trajectory(self) -> TrajectorySection:
+        require_one(self, ("file", "synthetic"))
+        if self.equilibrium == (self.steps is not None):
+            raise ValueError("must have `steps`, or `equilibrium: true`, not both")
+        if self.steps is not None and sorted(set(self.steps)) != self.steps:
+            raise ValueError(f"must have increasing `steps`, got {self.steps}")
+        if self.kind == "outline" and self.markers is not None:
+            raise ValueError("has the kind `outline` and must have no `markers`")
+        return self
+
+
+class FitSection(Section):
+    """Variables by name, trajectories, and the options of `fit`."""
+
+    variables: Annotated[dict[str, VariableSection], Len(1)]
+    trajectories: Annotated[list[TrajectorySection], Len(1)]
+    starts: Annotated[int, Ge(1)] = 1
+    seed: Annotated[int, Ge(0)] = 0
+    workers: Annotated[int, Ge(0)] = 0
+    loss: Literal["linear", "soft_l1", "huber", "cauchy", "arctan"] = "linear"
+    loss_scale: Positive = 1.0
+    max_evaluations: Annotated[int, Ge(1)] = 100
+    tolerance: Positive = 1e-8
+
+    @model_validator(mode="after")
+    def _check_trajectories(self) -> FitSection:
+        if all(trajectory.hold_out for trajectory in self.trajectories):
+            raise ValueError("must have a trajectory without `hold_out` in `trajectories`")
+        return self
+
+
+class FitConfig(RunConfig):
+    """A scene, and what a fit is to find in it."""
+
+    fit: FitSection

@@ -1,0 +1,165 @@
+"""The command `diffcloth fit`: fit a configuration to observations, and go on with a fit."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from diffcloth_torch.commands import check_folder
+from diffcloth_torch.config.documents import Document, set_values
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.files import read_regular_file
+from diffcloth_torch.optimize.fit import Fit, Trial, fit
+from diffcloth_torch.optimize.statistics import finite_or_none
+from diffcloth_torch.tasks.identify import Identify
+from diffcloth_torch.tasks.registry import check_document, load_task, make_task
+from diffcloth_torch.tasks.statistics import write_metrics
+
+__all__ = ["fit_configuration", "resume_fit"]
+
+# Files in a folder of results. Evaluations lie in a folder, one file for each start.
+_RESULT, _PAGE, _RESUME, _EVALUATIONS = "fit.json", "fit.html", "resume.json", "evaluations"
+_LARGEST = 1 << 20  # bytes of a configuration
+
+
+def fit_configuration(
+    config: Path,
+    assignments: Iterable[str] = (),
+    out: Path | None = None,
+    *,
+    overwrite: bool = False,
+) -> str:
+    """Fit the variables of a configuration to its observations.
+
+    Args:
+        config: YAML file.
+        assignments: "key=value" each, see `set_values`.
+        out: Folder for the results; by default results/ and the name of `config`.
+        overwrite: Whether to replace existing results.
+
+    Raises:
+        InvalidInput: If an argument or the configuration is not accepted.
+        SimulationError: If the simulation fails at the first values of every start.
+        KeyboardInterrupt: If the user ends the fit; the message says how to go on.
+    """
+    task = load_task(config, assignments)
+    if not isinstance(task, Identify):
+        raise InvalidInput(
+            f"{config}: `task` must be identify to fit something, got {task.config.task!r}"
+        )
+    out = check_folder(config, out, overwrite)
+    out.mkdir(parents=True, exist_ok=True)
+    for name in (_RESULT, _PAGE, _RESUME):
+        (out / name).unlink(missing_ok=True)
+    for file in (out / _EVALUATIONS).glob("start_*.pt"):
+        file.unlink()
+    document = task.config.model_dump(mode="json", exclude_unset=True)
+    write_metrics(out / _RESUME, {"config": document, "source": str(config.resolve())})
+    return _run(task, out)
+
+
+def resume_fit(folder: Path) -> str:
+    """Go on with a fit that was interrupted; it ends with the same bits.
+
+    Args:
+        folder: Folder of its results.
+
+    Raises:
+        InvalidInput: If the folder has no such results.
+    """
+    file = folder / _RESUME
+    if not file.is_file():
+        raise InvalidInput(f"--resume: {folder} must hold what `diffcloth fit` wrote: no {file}")
+    try:
+        saved = json.loads(read_regular_file(file, _LARGEST))
+        document: Document = saved["config"]
+        source = Path(saved["source"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InvalidInput(f"--resume: {file} is not what `diffcloth fit` wrote") from error
+    task = make_task(check_document(set_values(document, ()), source), source)
+    assert isinstance(task, Identify)
+    return _run(task, folder)
+
+
+def _run(task: Identify, out: Path) -> str:
+    with _Progress() as bar:
+        try:
+            found = fit(
+                task.variables(),
+                task.observed,
+                hold_out=task.held_out if len(task.held_out) else None,
+                resume=out / _EVALUATIONS,
+                progress=bar.show,
+                **task.options(),
+            )
+        except KeyboardInterrupt as error:
+            raise KeyboardInterrupt(
+                f"after {bar.count} evaluations, which are kept: go on with  "
+                f"diffcloth fit --resume {out}"
+            ) from error
+    write_metrics(out / _RESULT, _record(task, found))
+    found.report(out / _PAGE)
+    lines = [
+        f"{name} {_number(found, k):.5g}, between {low:.5g} and {high:.5g}"
+        for k, (name, (low, high)) in enumerate(found.intervals.items())
+    ]
+    lines += [f"cannot be told apart: {direction}" for direction in found.unidentifiable]
+    lines += [f"start {k}: {start.apart}" for k, start in enumerate(found.starts) if start.apart]
+    return "\n".join([*lines, f"{len(found.history)} evaluations; results are in {out}"])
+
+
+def _record(task: Identify, found: Fit) -> dict[str, Any]:
+    return {
+        "config": task.config.model_dump(mode="json"),
+        "success": found.success,
+        "message": found.message,
+        "cost": found.cost,
+        "values": {name: value.tolist() for name, value in found.values.items()},
+        "names": found.names,
+        "intervals": {n: [*map(finite_or_none, ends)] for n, ends in found.intervals.items()},
+        "covariance": [[*map(finite_or_none, row)] for row in found.covariance.tolist()],
+        "unidentifiable": [str(direction) for direction in found.unidentifiable],
+        "held_out": found.held_out,
+        "starts": [
+            {
+                "values": {name: value.tolist() for name, value in start.values.items()},
+                "cost": finite_or_none(start.cost),
+                "evaluations": start.evaluations,
+                "apart": start.apart,
+            }
+            for start in found.starts
+        ],
+        "history": [
+            {"start": t.start, "cost": finite_or_none(t.cost), "failure": t.failure}
+            for t in found.history
+        ],
+    }
+
+
+def _number(found: Fit, k: int) -> float:
+    free = dict.fromkeys(name.partition("[")[0] for name in found.names)
+    return [float(x) for name in free for x in found.values[name].flatten()][k]
+
+
+class _Progress:
+    """A progress bar over evaluations, whose number is not known; quiet without a terminal."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._bar: tqdm[Any] = tqdm(desc="fit", unit="evaluation", disable=None)
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def show(self, trial: Trial) -> None:
+        """Show an evaluation."""
+        self.count += 1
+        self._bar.set_postfix({"start": trial.start, "cost": f"{trial.cost:.5g}"}, refresh=False)
+        self._bar.update()

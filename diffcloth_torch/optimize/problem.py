@@ -1,0 +1,223 @@
+"""Residuals as functions of the numbers that a solver searches, and what was asked of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.model.quantities import PARAMETERS
+from diffcloth_torch.optimize.variables import Space
+from diffcloth_torch.sim.controls import Parameters
+
+__all__ = ["Memory", "Problem", "Residuals", "Trial", "parameters_of", "trajectories"]
+
+Residuals = Callable[..., Tensor | Sequence[Tensor]]
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One evaluation of the residuals.
+
+    Attributes:
+        start: Index of the start that it belongs to.
+        stage: Index of the stage.
+        cost: Half the sum of squares; infinite if the simulation failed.
+        values: Values of all variables.
+        seconds: Time that it took [s].
+        failure: What the simulation raised, empty if nothing.
+    """
+
+    start: int
+    stage: int
+    cost: float
+    values: dict[str, Tensor]
+    seconds: float
+    failure: str = ""
+
+
+class Memory:
+    """Evaluations of one start, in a file: a fit that goes on takes them from there."""
+
+    def __init__(self, file: Path | None, problem: Sequence[Any]) -> None:
+        """Read what an earlier run left.
+
+        Args:
+            file: Where it is kept; None keeps nothing.
+            problem: What the evaluations belong to, in types that `torch.load` reads.
+
+        Raises:
+            InvalidInput: If the file belongs to another problem, or is none.
+        """
+        self._file, self._problem = file, list(problem)
+        self._records: dict[tuple[str, int, bytes], dict[str, Any]] = {}
+        if file is None or not file.exists():
+            return
+        try:
+            saved = torch.load(file, weights_only=True)
+            problem, records = saved["problem"], saved["records"]
+            keys = [(r["kind"], r["stage"], _key(r["theta"])) for r in records]
+        except (OSError, MemoryError):
+            raise
+        except Exception as error:  # whatever unpickling makes of bytes that are not its own
+            raise InvalidInput(f"fit: `resume`: {file} is not what a fit wrote") from error
+        if problem != self._problem:
+            raise InvalidInput(
+                f"fit: `resume`: {file} belongs to other variables or options: {problem}; "
+                f"these are {self._problem}"
+            )
+        self._records = dict(zip(keys, records, strict=True))
+
+    def recall(self, kind: str, stage: int, theta: FloatArray) -> dict[str, Any] | None:
+        """Look up an evaluation of residuals or of their Jacobian."""
+        return self._records.get((kind, stage, theta.tobytes()))
+
+    def keep(self, kind: str, stage: int, theta: FloatArray, **found: Any) -> dict[str, Any]:
+        """Add an evaluation, and write the file."""
+        numbers = torch.from_numpy(np.array(theta))
+        record = {"kind": kind, "stage": stage, "theta": numbers, **found}
+        self._records[kind, stage, theta.tobytes()] = record
+        if self._file is not None:
+            part = self._file.with_suffix(".part")
+            torch.save({"problem": self._problem, "records": list(self._records.values())}, part)
+            part.replace(self._file)
+        return record
+
+
+class Problem:
+    """The residuals of one stage of one start, as functions of the part of theta that is free."""
+
+    def __init__(
+        self,
+        space: Space,
+        residuals: Residuals,
+        *,
+        at: FloatArray,
+        rows: NDArray[np.int64],
+        start: int,
+        stage: int,
+        memory: Memory,
+        report: Callable[[Trial], None],
+    ) -> None:
+        """Fix all but some rows of theta.
+
+        Args:
+            space: What theta stands for.
+            residuals: The residuals of the stage.
+            at: The whole theta where the stage begins.
+            rows: Its rows that are free.
+            start: Index of the start.
+            stage: Index of the stage.
+            memory: Evaluations of the start.
+            report: Called after each evaluation.
+        """
+        self.history: list[Trial] = []
+        self._space, self._at, self._rows = space, torch.from_numpy(at.copy()), rows
+        self._residuals, self._memory, self._report = residuals, memory, report
+        self._start, self._stage, self._count = start, stage, 0
+        self._last: tuple[bytes, FloatArray | SimulationError] | None = None
+
+    def require(self, theta: FloatArray) -> None:
+        """Evaluate at a start, where a failure ends it."""
+        found = self._trial(theta)
+        if isinstance(found, SimulationError):
+            raise found
+        self._count = len(found)
+        if self._count == 0:
+            raise InvalidInput("fit: `residuals` must return at least one number")
+
+    def residuals(self, theta: FloatArray) -> FloatArray:
+        """Residuals [M]; infinite where the simulation fails: the solver rejects that step."""
+        found = self._trial(theta)
+        return np.full(self._count, np.inf) if isinstance(found, SimulationError) else found
+
+    def jacobian(self, theta: FloatArray) -> FloatArray:
+        """Jacobian [M, p]: forward where numbers are fewer than residuals, else backward."""
+        record = self._memory.recall("jacobian", self._stage, theta)
+        if record is None:
+            few = len(self._rows) <= self._count
+            transform = torch.func.jacfwd if few else torch.func.jacrev
+            found = transform(self._call)(torch.from_numpy(np.array(theta)))
+            record = self._memory.keep("jacobian", self._stage, theta, found=found)
+        jacobian: FloatArray = record["found"].numpy()
+        return jacobian
+
+    def _trial(self, theta: FloatArray) -> FloatArray | SimulationError:
+        # The solver asks first for what the start has just been tried with.
+        key = theta.tobytes()
+        if self._last is None or self._last[0] != key:
+            self._last = key, self._evaluate(theta)
+        return self._last[1]
+
+    def _evaluate(self, theta: FloatArray) -> FloatArray | SimulationError:
+        record = self._memory.recall("residuals", self._stage, theta)
+        numbers = torch.from_numpy(np.array(theta))
+        failure: SimulationError | None = None
+        if record is None:
+            begin = time.perf_counter()
+            found = torch.zeros(0, dtype=torch.float64)
+            try:
+                with torch.no_grad():
+                    found = self._call(numbers)
+            except SimulationError as error:
+                failure = error
+            if not torch.isfinite(found).all():
+                raise InvalidInput("fit: `residuals` must return finite numbers")
+            record = self._memory.keep(
+                "residuals",
+                self._stage,
+                theta,
+                found=found,
+                seconds=time.perf_counter() - begin,
+                failure="" if failure is None else f"{type(failure).__name__}: {failure}",
+            )
+        elif record["failure"]:
+            failure = SimulationError(record["failure"])
+        values: FloatArray = record["found"].numpy()
+        trial = Trial(
+            start=self._start,
+            stage=self._stage,
+            cost=float("inf") if failure else 0.5 * float(values @ values),
+            values=self._space.values(self._whole(numbers)),
+            seconds=record["seconds"],
+            failure=record["failure"],
+        )
+        self.history.append(trial)
+        self._report(trial)
+        return values if failure is None else failure
+
+    def _call(self, theta: Tensor) -> Tensor:
+        parts = trajectories(self._residuals, self._space.values(self._whole(theta)))
+        return torch.cat([part.reshape(-1).to(torch.float64) for part in parts])
+
+    def _whole(self, theta: Tensor) -> Tensor:
+        return self._at.index_copy(0, torch.from_numpy(self._rows), theta)
+
+
+def parameters_of(values: Mapping[str, Tensor]) -> Parameters:
+    """Parameters that hold the variables of their names."""
+    return Parameters(**{n: v for n, v in values.items() if n in PARAMETERS})  # type: ignore[arg-type]
+
+
+def trajectories(residuals: Residuals, values: Mapping[str, Tensor]) -> list[Tensor]:
+    """The residuals of each trajectory, at values of all variables."""
+    others = {n: v for n, v in values.items() if n not in PARAMETERS}
+    parameters = parameters_of(values)
+    found = residuals(parameters, others) if others else residuals(parameters)
+    parts = [found] if isinstance(found, Tensor) else found
+    if not isinstance(parts, list | tuple) or not all(isinstance(p, Tensor) for p in parts):
+        raise TypeError("fit: `residuals` must return a tensor or a list of tensors")
+    return list(parts)
+
+
+def _key(theta: Tensor) -> bytes:
+    return bytes(theta.numpy().tobytes())

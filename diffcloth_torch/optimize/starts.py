@@ -1,0 +1,260 @@
+"""One start of a fit: its stages, one after the other, and how it ended; several in processes."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.optimize.problem import Memory, Problem, Residuals, Trial
+from diffcloth_torch.optimize.variables import Space
+
+__all__ = ["End", "Job", "Stage", "Start", "judge", "run", "run_all"]
+
+# Ends closer than this share of a standard error, or of their own size, are one place.
+_SAME_ERROR, _SAME_SIZE = 0.1, 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A part of a fit, with residuals of its own; the next stage begins where it ends.
+
+    Attributes:
+        residuals: As those of `fit`.
+        free: Names of the variables that it changes; None means all that are free.
+    """
+
+    residuals: Residuals
+    free: Sequence[str] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where a start of a fit began and ended.
+
+    Attributes:
+        first: Values of all variables where it began.
+        values: Where it ended; those of `first` if the simulation failed there.
+        cost: Half the sum of squares there; infinite if the simulation failed.
+        evaluations: Number of evaluations of the residuals.
+        success: Whether the solver converged in every stage.
+        message: How it ended.
+        apart: Why it did not end at the best place; empty if it did.
+    """
+
+    first: dict[str, Tensor]
+    values: dict[str, Tensor]
+    cost: float
+    evaluations: int
+    success: bool
+    message: str
+    apart: str
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What the starts of a fit have in common; may be sent to another process.
+
+    Attributes:
+        space: What is searched.
+        stages: One or more; the last one frees everything.
+        options: Of SciPy's `least_squares`.
+        folder: Where evaluations are kept, or None.
+        threads: Of torch: sums of its larger operations depend on it.
+    """
+
+    space: Space
+    stages: list[Stage]
+    options: dict[str, Any]
+    folder: Path | None
+    threads: int
+
+
+@dataclass(frozen=True, eq=False)
+class End:
+    """The end of a start.
+
+    Attributes:
+        start: Its index.
+        first: Theta where it began.
+        theta: Where it ended.
+        cost: Infinite if the simulation failed at the first values of a stage.
+        residuals: There.
+        jacobian: There.
+        success: Whether the solver converged in every stage.
+        message: How it ended.
+        history: Its evaluations.
+        failure: The error of a failure.
+    """
+
+    start: int
+    first: FloatArray
+    theta: FloatArray
+    cost: float
+    residuals: FloatArray
+    jacobian: FloatArray
+    success: bool
+    message: str
+    history: list[Trial]
+    failure: SimulationError | None
+
+
+def run(job: Job, start: int, first: FloatArray, report: Callable[[Trial], None]) -> End:
+    """Run all stages of a start."""
+    from scipy.optimize import least_squares
+
+    space, at, history, success = job.space, first, list[Trial](), True
+    described = [space.names, [float(x) for x in first], repr(sorted(job.options.items()))]
+    file = None if job.folder is None else job.folder / f"start_{start}.pt"
+    memory = Memory(file, described)
+    for k, stage in enumerate(job.stages):
+        rows = _rows(space, stage)
+        problem = Problem(
+            space,
+            stage.residuals,
+            at=at,
+            rows=rows,
+            start=start,
+            stage=k,
+            memory=memory,
+            report=report,
+        )
+        problem.history = history
+        try:
+            problem.require(at[rows])
+        except SimulationError as error:
+            nothing = np.zeros(0)
+            return End(
+                start, first, at, np.inf, nothing, nothing, False, str(error), history, error
+            )
+        end = least_squares(
+            problem.residuals,
+            at[rows],
+            jac=problem.jacobian,
+            bounds=(space.low[rows], space.high[rows]),
+            method="trf",
+            x_scale="jac",
+            **job.options,
+        )
+        at = at.copy()
+        at[rows] = end.x
+        success = success and bool(end.success)
+    return End(
+        start=start,
+        first=first,
+        theta=at,
+        cost=float(end.cost),
+        residuals=end.fun,
+        jacobian=end.jac,
+        success=success,
+        message=str(end.message),
+        history=history,
+        failure=None,
+    )
+
+
+def run_all(
+    job: Job,
+    firsts: Sequence[FloatArray],
+    workers: int | Executor,
+    report: Callable[[Trial], None],
+) -> list[End]:
+    """Run all starts, here or in processes: each is the same computation wherever it runs."""
+    if workers == 0:
+        return [run(job, k, first, report) for k, first in enumerate(firsts)]
+    try:
+        pickle.dumps(job)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise InvalidInput(
+            "fit: with `workers`, `residuals` must be a function of a module, or an object that "
+            f"can be pickled: {error}"
+        ) from error
+    return [*_remote(job, firsts, workers, report)]
+
+
+def _remote(
+    job: Job,
+    firsts: Sequence[FloatArray],
+    workers: int | Executor,
+    report: Callable[[Trial], None],
+) -> Iterator[End]:
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    # Processes that are spawned inherit no thread or lock.
+    pool = (
+        ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+        if isinstance(workers, int)
+        else workers
+    )
+    try:
+        for future in [pool.submit(_work, job, k, first) for k, first in enumerate(firsts)]:
+            end = future.result()
+            for trial in end.history:
+                report(trial)
+            yield end
+    finally:
+        if isinstance(workers, int):
+            pool.shutdown(cancel_futures=True)
+
+
+def _work(job: Job, start: int, first: FloatArray) -> End:
+    before = torch.get_num_threads()
+    torch.set_num_threads(job.threads)
+    try:
+        return run(job, start, first, _silent)
+    finally:
+        torch.set_num_threads(before)
+
+
+def _silent(trial: Trial) -> None:
+    """Report nothing: the caller reports when the start has ended."""
+
+
+def judge(job: Job, ends: Sequence[End], best: End, deviations: FloatArray) -> list[Start]:
+    """Say of each end whether it is at the best place, and if not, why."""
+    space = job.space
+    return [
+        Start(
+            first=space.values(torch.from_numpy(end.first.copy())),
+            values=space.values(torch.from_numpy(end.theta.copy())),
+            cost=end.cost,
+            evaluations=len(end.history),
+            success=end.success,
+            message=end.message,
+            apart=_apart(space, end, best, deviations),
+        )
+        for end in ends
+    ]
+
+
+def _apart(space: Space, end: End, best: End, deviations: FloatArray) -> str:
+    if end.failure is not None:
+        where = "its first values" if len(end.history) == 1 else "the first values of a stage"
+        return f"the simulation failed at {where}: {end.failure}"
+    near = _SAME_ERROR * deviations + _SAME_SIZE * space.units(best.theta)
+    far = np.abs(end.theta - best.theta) / near
+    if (far <= 1.0).all():
+        return ""
+    name = space.names[int(far.argmax())]
+    if not end.success:
+        return f"it had not converged after {len(end.history)} evaluations, {name} most of all"
+    bound = ((end.theta <= space.low + 1e-6) | (end.theta >= space.high - 1e-6)).nonzero()[0]
+    at = f", with {space.names[bound[0]]} at its bound" if len(bound) else ""
+    return f"another minimum: cost {end.cost:.6g} instead of {best.cost:.6g}, {name} differs{at}"
+
+
+def _rows(space: Space, stage: Stage) -> NDArray[np.int64]:
+    if stage.free is None:
+        return np.arange(len(space))
+    return np.array([i for name in stage.free for i in space.rows(name)], dtype=np.int64)

@@ -1,0 +1,243 @@
+"""Fits of configurations: those that are shipped find what is known, and bad ones are refused."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from click.testing import CliRunner
+
+import diffcloth_torch as dc
+from diffcloth_torch.cli import main
+from diffcloth_torch.tasks.registry import load_task, read_config
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+
+# Short forms: fewer vertices and larger steps. Without noise, what is left is what mesh and time
+# step do; that is at most this share of the true value.
+SHORT = {
+    "fit_cantilever": (
+        [
+            "simulation={dt: 0.01, steps: 20, contact: {self_contact: false}}",
+            "scene.cloths.strip.shape.rows=11",
+            "fit.trajectories.fall.steps=[5, 10, 15, 20]",
+            "fit.trajectories.fall.synthetic.changes=[simulation.dt=0.005, simulation.steps=40, "
+            "scene.cloths.strip.shape.rows=21, scene.cloths.strip.shape.columns=5]",
+        ],
+        {"bending": 0.05, "damping": 0.15},
+    ),
+    "fit_throw": (
+        [
+            "simulation={dt: 0.005, steps: 32, contact: {self_contact: false}}",
+            "fit.trajectories.throw.steps=[8, 16, 24, 32]",
+            "fit.trajectories.throw.synthetic.changes=[simulation.dt=0.0025, simulation.steps=64, "
+            "scene.cloths.sheet.shape.rows=9, scene.cloths.sheet.shape.columns=33]",
+        ],
+        {"velocity": 0.01, "bending": 0.05, "damping": 0.1},
+    ),
+    "fit_hang": ([], {"stretch": 0.01}),
+    "fit_slope": (
+        [
+            "simulation.dt=0.006",
+            "simulation.steps=50",
+            "fit.trajectories.slide.steps=[17, 33, 50]",
+            "fit.trajectories.slide.synthetic.changes=[simulation.dt=0.003, simulation.steps=100, "
+            "scene.cloths.sheet.shape.rows=9, scene.cloths.sheet.shape.columns=9]",
+        ],
+        {"friction": 0.02},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_what_is_known_is_found_on_a_coarser_mesh(name):
+    changes, shares = SHORT[name]
+    first = read_config(CONFIGS / f"{name}.yaml").fit.trajectories
+    quiet = [f"fit.trajectories.{k}.noise=1e-6" for k in range(len(first))]
+    task = load_task(CONFIGS / f"{name}.yaml", [*changes, *quiet, "fit.starts=1"])
+    found = dc.fit(task.variables(), task.observed, **task.options())
+    assert found.success
+    for variable, true in first[0].synthetic.values.items():
+        value = found.values[variable].numpy()
+        assert np.linalg.norm(value - true) < shares[variable] * np.linalg.norm(true), variable
+
+
+HANG = """
+task: identify
+simulation: {dt: 0.02, steps: 4}
+scene:
+  cloths:
+    - name: sheet
+      shape: {kind: grid, rows: 3, columns: 3, size: 0.2}
+      pose: {axis: [1, 0, 0], degrees: 90}
+      material: {stretch: 40, density: 0.3}
+      pins: {top: {box: {lower: [-1, -1, 0.09], upper: [1, 1, 0.11]}}}
+fit:
+  variables: {stretch: {value: 20}}
+  trajectories:
+    - {name: rest, equilibrium: true, noise: 1e-3, synthetic: {values: {stretch: 40}}}
+"""
+
+
+@pytest.fixture
+def config(tmp_path):
+    path = tmp_path / "hang.yaml"
+    path.write_text(HANG)
+    return path
+
+
+def test_observations_can_be_sent_to_a_process(config):
+    task = load_task(config)
+    copy = pickle.loads(pickle.dumps(task.observed))
+    given = dc.Parameters(stretch=torch.tensor(30.0, dtype=torch.float64))
+    assert torch.equal(copy(given)[0], task.observed(given)[0])
+
+
+def test_observations_of_a_file_are_those_of_the_file(config):
+    seen = load_task(config).observed._trajectories[0].seen
+    np.savez(config.with_name("seen.npz"), positions=seen)
+    change = "fit.trajectories=[{name: rest, equilibrium: true, noise: 1e-3, file: seen.npz}]"
+    task = load_task(config, [change])
+    np.testing.assert_array_equal(task.observed._trajectories[0].seen, seen)
+    found = dc.fit(task.variables(), task.observed)
+    low, high = found.intervals["stretch"]
+    assert low < 40 < high
+
+
+def test_an_outline_is_fitted(config):
+    """The shadow of a sheet that sags between two held edges narrows by nothing but its stretch."""
+    changes = [
+        "scene.cloths.sheet.pose={}",
+        "scene.cloths.sheet.pins.top={vertices: [1, 4, 7]}",
+        "scene.cloths.sheet.material.bending=1e-3",
+        "fit.variables={bending: {value: 5e-4}}",
+        "fit.trajectories.rest.kind=outline",
+        "fit.trajectories.rest.noise=1e-6",
+        "fit.trajectories.rest.synthetic.values={bending: 1e-3}",
+    ]
+    task = load_task(config, changes)
+    found = dc.fit(task.variables(), task.observed)
+    assert float(found.values["bending"]) == pytest.approx(1e-3, rel=1e-3)
+
+
+def test_a_velocity_is_that_of_free_fall(config):
+    """With the start of a real throw, positions are v t + g t^2 / 2 at every step."""
+    changes = [
+        "scene.cloths.sheet.pins={}",
+        "fit.variables={velocity: {value: [1.0, 0.0, 2.0]}}",
+        "fit.trajectories=[{name: a, steps: [1, 4], noise: 1.0, "
+        "synthetic: {values: {velocity: [1.0, 0.0, 2.0]}}}]",
+    ]
+    task = load_task(config, changes)
+    motion = task.observed._trajectories[0].motion
+    states = motion.simulate({"velocity": torch.tensor([1.0, 0.0, 2.0], dtype=torch.float64)})
+    for state in states:
+        t = float(state.time)
+        moved = (state.positions - task.initial_state().positions).numpy()
+        np.testing.assert_allclose(moved[:, 0], t, atol=1e-9)
+        np.testing.assert_allclose(moved[:, 2], 2 * t - 0.5 * 9.81 * t * t, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("fit.variables={drag: {value: 1}}", "may name velocity, stretch"),
+        ("fit.trajectories.rest.equilibrium=false", "must have `steps`, or `equilibrium: true`"),
+        ("fit.trajectories.rest.hold_out=true", "a trajectory without `hold_out`"),
+        ("fit.trajectories.rest.file=seen.npz", "exactly one of file, synthetic"),
+        ("fit.trajectories.rest.synthetic.values={drag: 1}", "may name velocity"),
+        (
+            "fit.trajectories.rest.synthetic.changes=[scene.cloths.sheet.shape.rows=4]",
+            "a vertex at each marker",
+        ),
+        (
+            "fit.trajectories=[{name: a, steps: [5], noise: 1, synthetic: {values: {stretch: 1}}}]",
+            "at most `simulation.steps`, 4, got 5",
+        ),
+        (
+            "fit.trajectories=[{name: a, steps: [2, 1], noise: 1, synthetic: {values: {}}}]",
+            "increasing `steps`",
+        ),
+        (
+            "fit.trajectories=[{name: a, steps: [2], noise: 1, "
+            "synthetic: {values: {stretch: 1}, changes: [simulation.dt=0.015]}}]",
+            "must divide the time step",
+        ),
+    ],
+)
+def test_bad_configurations_are_refused(config, change, message):
+    with pytest.raises(dc.InvalidInput, match=message):
+        load_task(config, [change])
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"places": np.zeros((1, 9, 3))}, "the array `positions`"),
+        ({"positions": np.zeros((2, 9, 3))}, r"must have shape \[1, 9, 3\], got \[2, 9, 3\]"),
+    ],
+)
+def test_bad_observations_are_refused(config, arrays, message):
+    np.savez(config.with_name("seen.npz"), **arrays)
+    change = "fit.trajectories=[{name: rest, equilibrium: true, noise: 1e-3, file: seen.npz}]"
+    with pytest.raises(dc.InvalidInput, match=message):
+        load_task(config, [change])
+
+
+def test_the_command_writes_its_results_and_goes_on_with_the_same_bits(config, tmp_path):
+    out = tmp_path / "out"
+    result = CliRunner().invoke(main, ["fit", str(config), "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    assert "stretch" in result.output
+    assert (out / "fit.html").read_text().startswith("<!doctype html>")
+    record = (out / "fit.json").read_text()
+    low, high = json.loads(record)["intervals"]["stretch"]
+    assert low < 40 < high
+    evaluations = out / "evaluations/start_0.pt"
+    saved = torch.load(evaluations, weights_only=True)
+    assert len(saved["records"]) > 3
+    torch.save(saved | {"records": saved["records"][:3]}, evaluations)  # as if interrupted
+    result = CliRunner().invoke(main, ["fit", "--resume", str(out)])
+    assert result.exit_code == 0, result.output
+    assert (out / "fit.json").read_text() == record
+    again = CliRunner().invoke(main, ["fit", str(config), "--out", str(out)])
+    assert again.exit_code == 2
+    assert "holds results already" in again.output
+
+
+def test_the_command_refuses_what_is_no_fit(config, tmp_path):
+    result = CliRunner().invoke(main, ["fit", str(CONFIGS / "drape.yaml")])
+    assert result.exit_code == 2
+    assert "`task` must be identify" in result.output
+    result = CliRunner().invoke(main, ["fit", "--resume", str(tmp_path / "nothing")])
+    assert result.exit_code == 2
+    assert "must hold what `diffcloth fit` wrote" in result.output
+    result = CliRunner().invoke(main, ["fit"])
+    assert "Missing argument 'CONFIG'" in result.output
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [
+        ([], r"stretch +30 .* [01] of 1\n"),
+        (["--places"], r"1 numbers, 1 trajectories\n1 of 1 starts end at the same place"),
+        (["--compare"], r"tangents +\d+(.*\n)differences +\d+(.*\n)Adam +100(.*\n)CMA-ES +\d+"),
+    ],
+)
+def test_the_benchmark_runs(option, expected):
+    if "--compare" in option:
+        pytest.importorskip("cma")
+    config = CONFIGS / "fit_hang.yaml"
+    command = [sys.executable, "-m", "benchmarks.identification", *option, "--seeds", "1", config]
+    result = subprocess.run(
+        command, cwd=CONFIGS.parent, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    assert re.search(expected, result.stdout), result.stdout
