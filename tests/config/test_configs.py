@@ -153,7 +153,7 @@ REFUSED = [
     pytest.param(
         "task=dance",
         r"`task` must be one of drape, hit_cloth, push_cube, grasp_cloth, two_cloths, "
-        r"control_points; got 'dance'",
+        r"control_points, identify; got 'dance'",
         id="task",
     ),
 ]
