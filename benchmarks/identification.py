@@ -78,12 +78,12 @@ def fit(task: Any, **options: Any) -> Found:
     return Found(found, task, time.process_time() - start)
 
 
-def coverage(config: Path, seeds: int) -> Iterator[str]:
+def coverage(config: Path, first: int, seeds: int) -> Iterator[str]:
     """Rows of what was found with each seed of the noise."""
     quiet = fit(load(config, 0, QUIET)).numbers()
     runs = [
         fit(load(config, seed))
-        for seed in tqdm(range(seeds), config.stem, leave=False, disable=None)
+        for seed in tqdm(range(first, first + seeds), config.stem, leave=False, disable=None)
     ]
     rms = statistics.median((2 * r.fit.cost / len(r.fit.residuals)) ** 0.5 for r in runs)
     seconds = statistics.median(r.seconds for r in runs)
@@ -213,14 +213,15 @@ def _with(found: dc.Fit, values: dict[str, torch.Tensor]) -> dc.Fit:
 
 @click.command(help=__doc__.replace("\n\n    ", "\n\n\b\n    "))
 @click.argument("configs", nargs=-1, type=click.Path(path_type=Path, exists=True))
-@click.option("--seeds", default=10, type=click.IntRange(min=1))
+@click.option("--seeds", default=10, type=click.IntRange(min=1), help="How many, of the noise.")
+@click.option("--first", default=0, type=click.IntRange(min=0), help="The first of them.")
 @click.option("--compare", "comparing", is_flag=True, help="Differences, Adam and CMA-ES.")
 @click.option("--places", "placing", is_flag=True, help="Do random starts end at one place?")
-def main(configs: tuple[Path, ...], seeds: int, comparing: bool, placing: bool) -> None:
+def main(configs: tuple[Path, ...], seeds: int, first: int, comparing: bool, placing: bool) -> None:
     torch.set_num_threads(1)
     for config in configs or sorted(CONFIGS.glob("fit_*.yaml")):
         rows = compare(config) if comparing else None
-        for row in rows or (places(config, seeds) if placing else coverage(config, seeds)):
+        for row in rows or (places(config, seeds) if placing else coverage(config, first, seeds)):
             click.echo(row)
 
 

@@ -32,7 +32,8 @@ class TwoCloths(Task):
 
     Another strip, which is pulled the other way with a constant force, is hooked into it. The
     reward of each transition is -(distance of the center from the target) [m]; the task of the
-    paper, section V.D.4.
+    paper, section V.D.4. An episode ends where that is more than 1 m; the transitions that are left
+    then count as the last one.
     """
 
     name = "TwoCloths"
@@ -91,17 +92,24 @@ class TwoCloths(Task):
             "time": (env.elapsed / self.horizon).to(torch.float64)[:, None],
         }
 
+    def distance(self, env: EnvState) -> Tensor:
+        """Distance of the center from the target [m], [B]."""
+        return (self._away(env).square().sum(dim=-1) + 1e-12).sqrt()
+
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return -(self._away(env).square().sum(dim=-1) + 1e-12).sqrt()
+        distance = self.distance(env)
+        # Where an episode ends early, what is left of it counts as its last step.
+        left = (self.horizon - env.elapsed).clamp(min=0)
+        return -distance * torch.where(distance > _FAR, 1 + left, 1)
 
     def success(self, env: EnvState) -> Tensor:
         """Whether the center is within 2 cm of the target."""
-        return self.reward(env) > -_CLOSE
+        return self.distance(env) < _CLOSE
 
     def terminal(self, env: EnvState) -> Tensor:
         """Also where the center is more than 1 m from the target."""
-        return super().terminal(env) | (self.reward(env) < -_FAR)
+        return super().terminal(env) | (self.distance(env) > _FAR)
 
     def scripted(self, env: EnvState) -> Tensor:
         """Bear the pull, and be a damped spring to the target."""
