@@ -17,6 +17,7 @@ from diffcloth_torch.transforms import numbers_of
 
 __all__ = ["markers", "outline", "point_cloud"]
 
+_ROUNDING = 1e-9  # of shares of an edge
 _NOT_CROSSED = 1e-300  # cross product below which an edge lies along a ray
 
 
@@ -222,7 +223,9 @@ def _radii(owner: str, points: Tensor, edges: Any, rays: FloatArray) -> Tensor:
     """
     flat = numbers_of(points)
     found, share = _crossings(flat[edges[:, 0]], flat[edges[:, 1]], rays)
-    found = np.where((share >= 0) & (share <= 1) & (found > 0), found, -np.inf)
+    # A ray through a corner must not pass between the two edges that meet there.
+    crosses = (share >= -_ROUNDING) & (share <= 1 + _ROUNDING) & (found > 0)
+    found = np.where(crosses, found, -np.inf)
     last = found.argmax(axis=1)
     empty = np.isneginf(found.max(axis=1)).nonzero()[0]
     if len(empty):

@@ -231,6 +231,15 @@ class TestOutline:
         expected = -0.1 * 0.1 / np.abs(self.RAYS).max(axis=1) / 0.01
         np.testing.assert_allclose(larger.numpy(), expected, atol=1e-12)
 
+    @pytest.mark.parametrize("seed", range(10))
+    def test_rays_through_corners_meet_the_outline(self, seed):
+        turns = 2 * np.pi / 97 * np.arange(97)
+        rays = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+        radii = 0.1 + 0.01 * np.random.default_rng(seed).standard_normal(97)
+        ring = np.stack([np.arange(97), np.roll(np.arange(97), -1)], axis=1)
+        found = _radii("", torch.from_numpy(radii[:, None] * rays), ring, rays)
+        np.testing.assert_allclose(found.numpy(), radii, atol=1e-9)
+
     def test_it_is_the_last_crossing_and_its_derivative_is_that_of_differences(self):
         points = torch.from_numpy(np.random.default_rng(2).normal(size=(30, 2)))
         pairs = np.array([(i, j) for i in range(30) for j in range(i)])
