@@ -30,7 +30,7 @@ from diffcloth_torch._saved import let_saved_states_load, register_classes
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from diffcloth_torch import envs, robots
+    from diffcloth_torch import envs, learn, robots
     from diffcloth_torch.errors import (
         AddedMassWarning,
         IgnoredLimitsWarning,
@@ -96,6 +96,7 @@ __all__ = [
     "descend",
     "envs",
     "fit",
+    "learn",
     "load_config",
     "render",
     "residuals",
@@ -189,7 +190,7 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("diffcloth-torch")
-    if name in ("envs", "robots"):
+    if name in ("envs", "learn", "robots"):
         return import_module(f"diffcloth_torch.{name}")
     if name == "residuals":
         return import_module("diffcloth_torch.optimize.residuals")

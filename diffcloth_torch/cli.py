@@ -1,4 +1,4 @@
-"""The command line: run, optimize, fit, info.
+"""The command line: run, optimize, fit, train, info.
 
 Commands import what they need when they run: torch takes seconds to import, and `diffcloth --help`
 or a misspelled option need not wait for it.
@@ -157,15 +157,44 @@ def fit(**arguments: Any) -> str:
     """Fit the variables of CONFIG to what was observed."""
     from diffcloth_torch.fit_command import fit_configuration, resume_fit
 
+    return _begin_or_resume(arguments, fit_configuration, resume_fit)
+
+
+@main.command()
+@click.argument("config", type=click.Path(path_type=Path), required=False)
+@click.option(
+    "--resume",
+    metavar="DIRECTORY",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Go on with the training whose results are there; its CONFIG is there too.",
+)
+@_SET
+@_OUT
+@_OVERWRITE
+@_ending_in_a_sentence
+def train(**arguments: Any) -> str:
+    """Train the policy of CONFIG, and show what it does."""
+    try:
+        from diffcloth_torch.train_command import resume_training, train
+    except ImportError as error:  # its message says what to install
+        from diffcloth_torch.errors import InvalidInput
+
+        raise InvalidInput(str(error)) from error
+    return _begin_or_resume(arguments, train, resume_training)
+
+
+def _begin_or_resume(
+    arguments: dict[str, Any], begin: Callable[..., str], go_on: Callable[[Path], str]
+) -> str:
     folder = arguments.pop("resume")
     if folder is None:
         if arguments["config"] is None:
             raise click.UsageError("Missing argument 'CONFIG': a file, or --resume DIRECTORY.")
-        return fit_configuration(**arguments)
+        return begin(**arguments)
     extra = ["CONFIG" if name == "config" else f"--{name}" for name, a in arguments.items() if a]
     if extra:
         raise click.UsageError(f"--resume takes these from its DIRECTORY: {', '.join(extra)}.")
-    return resume_fit(folder)
+    return go_on(folder)
 
 
 @main.command()

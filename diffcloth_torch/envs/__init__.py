@@ -11,6 +11,7 @@ Importing this module also lets gymnasium find them:
 
 from __future__ import annotations
 
+from inspect import signature
 from typing import Any
 
 from diffcloth_torch.checks import check_choice
@@ -82,10 +83,24 @@ def make(task: str | Task, num_envs: int = 1, **options: Any) -> ClothVectorEnv:
     batch = {name: options.pop(name) for name in _OF_BATCH if name in options}
     if isinstance(task, str):
         check_choice("make: `task`", task, tuple(TASKS))
+        accepted = _options(TASKS[task])
+        for name in options:
+            check_choice(f"make: an option of {task}", name, (*accepted, *_OF_BATCH))
         task = TASKS[task](**options)
     elif options:
         raise InvalidInput(f"make: {', '.join(options)} cannot be given with a task of your own")
     return ClothVectorEnv(task, num_envs, **batch)
+
+
+def _options(task: type[Task]) -> list[str]:
+    """Names that a task takes, or that it passes on to the class before it."""
+    names: list[str] = []
+    for kind in task.__mro__:
+        parameters = signature(kind).parameters.values()
+        names += [p.name for p in parameters if p.kind is p.KEYWORD_ONLY and p.name not in names]
+        if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+            break
+    return names
 
 
 for _name in TASKS:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 
 from diffcloth_torch.checks import check_count
+from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.rotation import quaternion_exp, quaternion_multiply
 from diffcloth_torch.model.attachment import Attachment
 from diffcloth_torch.model.cloth import Cloth
@@ -51,9 +52,11 @@ class Pickers(Actuator):
     """Grippers without a body, as in SoftGym: points that move and hold a vertex.
 
     An action has four numbers for each picker: its displacement, in shares of `stride` along each
-    axis, and its grasp. A picker whose grasp is positive closes on the nearest vertex within
-    `reach`, and holds it until its grasp is zero or negative. A spring pulls the vertex, with that
-    share of its stiffness: actions have a gradient in the grasp, too.
+    axis, and its grasp. A picker whose grasp is above `opens_at` closes on the nearest vertex
+    within `reach`, and holds it until its grasp is not above it any more. A spring pulls the
+    vertex, with the share of its stiffness that the grasp is on the way from `opens_at` to 1:
+    actions have a gradient in the grasp of a closed picker. With `opens_at=-1` a picker that does
+    nothing is half closed, and gradients say to a policy whether to hold on or to let go.
 
     Attributes:
         count: P, the number of pickers.
@@ -61,6 +64,7 @@ class Pickers(Actuator):
         stride: Longest displacement along an axis in a transition [m].
         reach: Within which a picker closes on a vertex [m].
         floor: Lowest height of a picker [m].
+        opens_at: The largest grasp of an open picker.
     """
 
     def __init__(
@@ -72,6 +76,7 @@ class Pickers(Actuator):
         stride: float = 0.025,
         reach: float = 0.03,
         floor: float = 0.004,
+        opens_at: float = 0.0,
     ) -> None:
         """Make pickers for a cloth that has a name.
 
@@ -82,7 +87,14 @@ class Pickers(Actuator):
             stride: Longest displacement along an axis in a transition [m].
             reach: Within which a picker closes on a vertex [m].
             floor: Lowest height of a picker [m].
+            opens_at: The largest grasp of an open picker, at least -1 and below 1.
+
+        Raises:
+            InvalidInput: If a value is not accepted.
         """
+        if not -1.0 <= opens_at < 1.0:
+            raise InvalidInput(f"Pickers: `opens_at` must be in [-1, 1), got {opens_at}")
+        self.opens_at = float(opens_at)
         self.count = check_count("Pickers: `count`", count, 1)
         self.size = 4 * count
         self.stride, self.reach, self.floor = stride, reach, floor
@@ -112,7 +124,8 @@ class Pickers(Actuator):
     ) -> tuple[list[Control], Tools]:
         """Close or open, then move in equal parts; see `Actuator`."""
         actions = actions.reshape(-1, self.count, 4)
-        moves, grasp = actions[..., :3], actions[..., 3].clamp(min=0)
+        moves = actions[..., :3]
+        grasp = ((actions[..., 3] - self.opens_at) / (1 - self.opens_at)).clamp(min=0)
         before = tools["points"]
         held, offsets = self._close(tools, state.positions, grasp)
         after = before + self.stride * moves

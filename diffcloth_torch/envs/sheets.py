@@ -54,6 +54,8 @@ class SheetTask(Task):
         substeps: int = 2,
         observation: str = "keypoints",
         material: Material = _MATERIAL,
+        opens_at: float = 0.0,
+        reach: float = 0.03,
     ) -> None:
         """Build the scene.
 
@@ -63,13 +65,16 @@ class SheetTask(Task):
             substeps: Time steps of a transition, of .02 s each.
             observation: "keypoints" for 4 x 4 vertices, or "particles" for all.
             material: Of the sheet.
+            opens_at: The largest grasp of an open picker: 0, or -1 for a soft grasp, whose gradient
+                is nowhere zero; see `Pickers`.
+            reach: Within which a picker closes on a vertex [m]; at .06 all begin within reach.
         """
         self.side = check_count(f"{self.name}: `size`", size, 4)
         check_choice(f"{self.name}: `observation`", observation, OBSERVATIONS)
         sheet = Cloth.grid(
             size, size, SIDE, name="sheet", pose=[0, 0, HEIGHT, 1, 0, 0, 0], material=material
         )
-        pickers = Pickers(sheet)
+        pickers = Pickers(sheet, opens_at=opens_at, reach=reach)
         table = RigidBody.plane(4.0, friction=0.5, name="table")
         simulator = Simulator(
             Scene([sheet], [table], attachments=pickers.attachments),

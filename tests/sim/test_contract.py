@@ -67,6 +67,7 @@ PUBLIC = {
     "Variable": "",
     "residuals": "markers outline point_cloud",
     "envs": "make TASKS ClothVectorEnv Task",
+    "learn": "Policy Processes Ranks RayActors Trainer TrainerOptions",
     "robots": "GRIPPER panda",
     "stack": "",
     "where": "",

@@ -1,0 +1,50 @@
+"""The schema of configurations that train a policy."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from annotated_types import Ge
+
+from diffcloth_torch.config.schema import PictureSection
+from diffcloth_torch.config.section import Section
+
+__all__ = ["EnvironmentSection", "TrainConfig", "WorkersSection"]
+
+Count = Annotated[int, Ge(1)]
+
+
+class EnvironmentSection(Section):
+    """Name and options of a task, as in `dc.envs.make`."""
+
+    name: str
+    options: dict[str, Any] = {}
+
+
+class WorkersSection(Section):
+    """Who makes the rollouts: this process, others, actors of Ray, or the ranks of torchrun."""
+
+    kind: Literal["none", "processes", "ray", "ranks"] = "none"
+    count: Count = 1
+    threads: Count = 1
+
+
+class TrainConfig(Section):
+    """Environments, the options of `TrainerOptions`, and how long to learn.
+
+    The policy is evaluated, and kept, after each `evaluate_every` updates and at the end, in
+    `episodes` episodes of their own. With `until_success` training ends before its last update, as
+    soon as that share of them succeeds.
+    """
+
+    task: Literal["train"]
+    environment: EnvironmentSection
+    trainer: dict[str, Any] = {}
+    num_envs: Count = 4
+    chunk: Count | None = None
+    updates: Count = 100
+    evaluate_every: Count = 10
+    episodes: Count = 8
+    until_success: Annotated[float, Ge(0)] | None = None
+    workers: WorkersSection = WorkersSection()
+    pictures: PictureSection = PictureSection()

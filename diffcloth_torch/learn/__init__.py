@@ -1,0 +1,15 @@
+"""Policies by gradients through the simulation, on one machine or on many.
+
+>>> from functools import partial
+>>> make = partial(dc.envs.make, "FoldCloth", size=12, opens_at=-1, reach=0.06)
+>>> trainer = dc.learn.Trainer(make, dc.learn.TrainerOptions(), num_envs=8)
+>>> for _ in range(100):
+...     log = trainer.update()
+"""
+
+from diffcloth_torch.learn.options import TrainerOptions
+from diffcloth_torch.learn.rollouts import Policy
+from diffcloth_torch.learn.trainer import Trainer
+from diffcloth_torch.learn.workers import Processes, Ranks, RayActors, Workers
+
+__all__ = ["Policy", "Processes", "Ranks", "RayActors", "Trainer", "TrainerOptions", "Workers"]

@@ -1,0 +1,92 @@
+"""How a policy is learned."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from diffcloth_torch.checks import check_choice, check_count
+from diffcloth_torch.errors import InvalidInput
+
+__all__ = ["ALGORITHMS", "TrainerOptions"]
+
+ALGORITHMS = ("apg", "shac")
+_LEAST_SHARE = 0.1
+
+
+@dataclass(frozen=True)
+class TrainerOptions:
+    """How a policy is learned.
+
+    Attributes:
+        algorithm: "apg": the rewards of a rollout alone. "shac": also the value of its end, by a
+            critic that learns beside the policy.
+        horizon: Steps of a rollout that is differentiated at once.
+        feedback: Whether gradients flow through what the policy sees, too. Without, each action is
+            differentiated as that of a plan: where a plan cannot be improved the policy cannot
+            either, and what a policy sees does not multiply gradients step by step.
+        discount: Of rewards from step to step, gamma.
+        trace: Of lambda returns, lambda.
+        actor_rate: Learning rate of Adam for the policy.
+        critic_rate: The same for the critic.
+        decay_updates: Number of updates over which both fall, linearly, to a tenth; 0 for never.
+        betas: Of both.
+        critic_epochs: How often the critic sees each rollout.
+        critic_batches: Parts of a rollout between two steps of the critic.
+        critic_only: Updates at first that improve the critic alone.
+        target_rate: Share by which the target critic moves after each rollout.
+        gradient_norm: Largest norm of a gradient of the policy; longer ones are shortened.
+        deviation: Of the noise of actions at first.
+        first_action: Action of the policy at first, between -1 and 1; None for zeros.
+        hidden: Sizes of hidden layers.
+        seed: Of networks, noise and starts.
+
+    Raises:
+        InvalidInput: If a value is not accepted.
+    """
+
+    algorithm: str = "shac"
+    horizon: int = 16
+    feedback: bool = False
+    discount: float = 0.99
+    trace: float = 0.95
+    actor_rate: float = 2e-3
+    critic_rate: float = 2e-3
+    decay_updates: int = 0
+    betas: tuple[float, float] = (0.7, 0.95)
+    critic_epochs: int = 16
+    critic_batches: int = 4
+    critic_only: int = 0
+    target_rate: float = 0.2
+    gradient_norm: float = 1.0
+    deviation: float = 0.1
+    first_action: tuple[float, ...] | None = None
+    hidden: tuple[int, ...] = (128, 64, 32)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_choice("TrainerOptions: `algorithm`", self.algorithm, ALGORITHMS)
+        for name in ("horizon", "critic_epochs", "critic_batches"):
+            check_count(f"TrainerOptions: `{name}`", getattr(self, name), 1)
+        for name in ("critic_only", "decay_updates", "seed"):
+            check_count(f"TrainerOptions: `{name}`", getattr(self, name), 0)
+        for name in ("discount", "trace", "target_rate"):
+            self._check(name, getattr(self, name), 0.0 <= getattr(self, name) <= 1.0, "in [0, 1]")
+        for name in ("actor_rate", "critic_rate", "gradient_norm", "deviation"):
+            self._check(name, getattr(self, name), 0.0 < getattr(self, name) < 1e6, "positive")
+        for beta in self.betas:
+            self._check("betas", beta, 0.0 <= beta < 1.0, "in [0, 1)")
+        for size in self.hidden:
+            check_count("TrainerOptions: `hidden`", size, 1)
+        for k, value in enumerate(self.first_action or ()):
+            self._check(f"first_action[{k}]", value, abs(value) < 1.0, "between -1 and 1")
+
+    def rate_share(self, updates: int) -> float:
+        """Share of the learning rates that is left after some updates."""
+        if self.decay_updates == 0:
+            return 1.0
+        return 1.0 - (1.0 - _LEAST_SHARE) * min(updates / self.decay_updates, 1.0)
+
+    @staticmethod
+    def _check(name: str, value: float, is_accepted: bool, accepted: str) -> None:
+        if not is_accepted:
+            raise InvalidInput(f"TrainerOptions: `{name}` must be {accepted}, got {value}")

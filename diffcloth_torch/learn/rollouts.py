@@ -1,0 +1,173 @@
+"""Rollouts of a policy: where they start, what they saw, and their gradient.
+
+A piece of work is all that a rollout needs, and its result all that it found: both can be sent to
+another process. No graph leaves the process that made it.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from diffcloth_torch.envs.env import EnvState
+from diffcloth_torch.envs.gym import ClothVectorEnv
+from diffcloth_torch.learn.networks import Actor, Critic, Scale
+from diffcloth_torch.learn.options import TrainerOptions
+
+__all__ = [
+    "MakeEnv",
+    "Piece",
+    "Policy",
+    "Rollout",
+    "roll_out",
+    "roll_out_remotely",
+    "threads_of_torch",
+]
+
+MakeEnv = Callable[..., ClothVectorEnv]
+"""A function that makes environments, as `dc.envs.make` does; called with `num_envs` by name."""
+
+
+class Policy(torch.nn.Module):
+    """A policy, its critic, the critic that it aims at, and the scale of what they see."""
+
+    def __init__(self, env: ClothVectorEnv, options: TrainerOptions) -> None:
+        """Make networks for the observations and actions of environments."""
+        super().__init__()
+        observations = env.task.observation(env.task.example()).shape[-1]
+        first = options.first_action or [0.0] * env.task.action_size
+        self.actor = Actor(observations, torch.tensor(first), options.hidden, options.deviation)
+        self.critic = Critic(observations, options.hidden)
+        self.target = Critic(observations, options.hidden)
+        self.target.load_state_dict(self.critic.state_dict())
+        self.scale = Scale(observations)
+
+    def forward(self, observation: Tensor, noise: Tensor | None = None) -> Tensor:
+        """Actions [B, A] for observations [B, O], with standard normal noise [B, A] or without."""
+        actions: Tensor = self.actor(self.scale(observation), noise)
+        return actions
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A rollout that is to be made, of some of the environments.
+
+    Attributes:
+        options: Of the trainer.
+        weights: State of the `Policy`.
+        start: Where the environments are, without a graph.
+        generators: Of their next starts.
+        noise: Standard normal, [h, n, A].
+        share: What each environment counts in the loss: one over their number in all pieces.
+        threads: Of torch.
+    """
+
+    options: TrainerOptions
+    weights: dict[str, Tensor]
+    start: EnvState
+    generators: list[Tensor]
+    noise: Tensor
+    share: float
+    threads: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """What came of a piece: h steps of n environments.
+
+    Attributes:
+        gradients: Of the loss, in the order of `Policy.actor.parameters()`.
+        loss: Minus what the rollout is worth.
+        seen: Observations before each step [h, n, O].
+        after: Observations after it, before a new start [h, n, O].
+        rewards: [h, n].
+        terminated: Whether it failed [h, n].
+        ended: Whether an episode ended with it [h, n].
+        success: Whether the task was done after it [h, n].
+        end: Where the environments are.
+        generators: Of their next starts.
+    """
+
+    gradients: list[Tensor]
+    loss: float
+    seen: Tensor
+    after: Tensor
+    rewards: Tensor
+    terminated: Tensor
+    ended: Tensor
+    success: Tensor
+    end: EnvState
+    generators: list[Tensor]
+
+
+def roll_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
+    """Make a rollout, and the gradient of its loss."""
+    o = piece.options
+    policy = Policy(env, o)
+    policy.load_state_dict(piece.weights)
+    observation = env.resume(piece.start, piece.generators)
+    count, horizon = env.num_envs, len(piece.noise)
+    rows: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]] = []
+    discount, total = torch.ones(count), torch.zeros(count)
+    for t, noise in enumerate(piece.noise):
+        seen = observation.detach()
+        actions = policy(observation if o.feedback else seen, noise)
+        observation, reward, terminated, truncated, info = env.step(actions)
+        ended = terminated | truncated
+        after = info["obs_before_reset"]
+        total = total + discount * reward
+        discount = discount * o.discount
+        if o.algorithm == "shac":
+            # What follows the end of an episode or of the rollout; nothing follows a failure.
+            closes = truncated if t < horizon - 1 else ~terminated
+            value = policy.target(policy.scale(after))
+            total = total + torch.where(closes, discount * value, 0.0)
+        discount = torch.where(ended, 1.0, discount)
+        success = info.get("final_info", info)["success"]
+        rows.append((seen, after.detach(), reward.detach(), terminated, ended, success))
+    loss = -piece.share / horizon * total.sum()
+    gradients = torch.autograd.grad(loss, list(policy.actor.parameters()))
+    env.clear_grad()
+    columns = [torch.stack(column) for column in zip(*rows, strict=True)]
+    return Rollout(
+        list(gradients),
+        float(loss.detach()),
+        *(columns[0], columns[1], columns[2], columns[3], columns[4], columns[5]),
+        end=env.env_state,
+        generators=env.generator_states(),
+    )
+
+
+_made: dict[tuple[bytes, int], ClothVectorEnv] = {}  # in a worker's process
+
+
+def roll_out_remotely(work: tuple[bytes, Piece]) -> Rollout:
+    """Make a rollout in this process, whose environments last for later ones.
+
+    Args:
+        work: A pickled `MakeEnv`, and the piece.
+    """
+    make_env, piece = work
+    key = make_env, len(piece.start)
+    with threads_of_torch(piece.threads):
+        if key not in _made:
+            make: Any = pickle.loads(make_env)
+            _made[key] = make(num_envs=len(piece.start))
+        return roll_out(_made[key], piece)
+
+
+@contextmanager
+def threads_of_torch(count: int) -> Iterator[None]:
+    """Let torch have some threads; products of its matrices round by their number."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

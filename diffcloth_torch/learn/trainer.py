@@ -1,0 +1,336 @@
+"""Policies by gradients through the simulation: APG and SHAC.
+
+References:
+    SHAC: Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin, "Accelerated Policy Learning with
+    Parallel Differentiable Simulation", ICLR 2022. APG is the same without its critic.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffcloth_torch.checks import check_count
+from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.learn.options import TrainerOptions
+from diffcloth_torch.learn.rollouts import (
+    MakeEnv,
+    Piece,
+    Policy,
+    Rollout,
+    roll_out,
+    roll_out_remotely,
+    threads_of_torch,
+)
+from diffcloth_torch.learn.workers import Workers
+from diffcloth_torch.sim.state import State
+
+__all__ = ["Trainer"]
+
+
+class Trainer:
+    """Learns a policy for environments whose rewards have gradients.
+
+    The environments are in chunks of a fixed size, and results are summed in their order: any
+    number of workers gives the same bits.
+
+    Attributes:
+        policy: The policy and its critic.
+        options: As given.
+        steps: Environment steps so far.
+        updates: Of the policy so far.
+    """
+
+    def __init__(
+        self,
+        make_env: MakeEnv,
+        options: TrainerOptions | None = None,
+        *,
+        num_envs: int = 4,
+        chunk: int | None = None,
+        workers: Workers | None = None,
+        threads: int = 1,
+    ) -> None:
+        """Make the networks, and begin episodes.
+
+        Args:
+            make_env: Makes environments that begin anew in the step in which they end:
+                `functools.partial(dc.envs.make, "FoldCloth", size=12)`.
+            options: How to learn.
+            num_envs: Number of environments in a rollout.
+            chunk: Number of them that step together; all by default. It must divide `num_envs`.
+            workers: What makes the rollouts of chunks; None makes them here.
+            threads: Of torch in an update, here and in each worker. Results depend on it in the
+                last bits.
+
+        Raises:
+            InvalidInput: If an argument is not accepted.
+        """
+        self.options = options or TrainerOptions()
+        self._chunk = num_envs if chunk is None else check_count("Trainer: `chunk`", chunk, 1)
+        check_count("Trainer: `num_envs`", num_envs, 1)
+        if num_envs % self._chunk:
+            raise InvalidInput(f"Trainer: `chunk` must divide {num_envs}, got {chunk}")
+        self._make_env, self._workers, self._threads = make_env, workers, threads
+        self._pickled = b"" if workers is None else _pickled(make_env)
+        self._env = make_env(num_envs=self._chunk)
+        self._count = num_envs
+        actions, first = self.task.action_size, self.options.first_action
+        if first is not None and len(first) != actions:
+            raise InvalidInput(
+                f"TrainerOptions: `first_action` must have {actions} numbers, got {len(first)}"
+            )
+        o = self.options
+        self._noise = torch.Generator().manual_seed(o.seed)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(o.seed)
+            self.policy = Policy(self._env, o)
+        self._places = [self._begin(range(k, k + self._chunk)) for k in self._chunks]
+        self._actor_steps = torch.optim.Adam(
+            self.policy.actor.parameters(), lr=o.actor_rate, betas=o.betas
+        )
+        self._critic_steps = torch.optim.Adam(
+            self.policy.critic.parameters(), lr=o.critic_rate, betas=o.betas
+        )
+        self.steps = self.updates = 0
+        self._return = torch.zeros(num_envs)
+
+    @property
+    def task(self) -> Task:
+        """What is to be done."""
+        return self._env.task
+
+    def act(self, observation: Tensor) -> Tensor:
+        """Actions [B, A] without noise."""
+        with torch.no_grad():
+            actions: Tensor = self.policy(observation)
+        return actions
+
+    def update(self) -> dict[str, float]:
+        """Take one rollout of all environments, and improve the policy and the critic by it.
+
+        Returns:
+            What to log: "loss", "gradient_norm" before it is limited, "reward" (the mean of the
+            rollout), "failed" (share of steps), "critic_loss" and, where episodes ended, their mean
+            "return" and share of "success".
+
+        Raises:
+            SimulationError: If a gradient is not finite.
+        """
+        with threads_of_torch(self._threads):
+            return self._update()
+
+    def _update(self) -> dict[str, float]:
+        share = self.options.rate_share(self.updates)
+        self._actor_steps.param_groups[0]["lr"] = share * self.options.actor_rate
+        self._critic_steps.param_groups[0]["lr"] = share * self.options.critic_rate
+        rollouts = self._rollouts()
+        log = {"loss": sum(r.loss for r in rollouts)}
+        learns = self.options.algorithm == "apg" or self.updates >= self.options.critic_only
+        log["gradient_norm"] = self._step_actor(rollouts, learns)
+        rows = _Rows(rollouts)
+        log["reward"] = float(rows.rewards.mean())
+        log["failed"] = float(rows.terminated.float().mean())
+        if self.options.algorithm == "shac":
+            log["critic_loss"] = self._fit_critic(rows)
+        self.policy.scale.see(rows.seen.flatten(0, 1))
+        self._places = [(r.end, r.generators) for r in rollouts]
+        self.steps += rows.rewards.numel()
+        self.updates += 1
+        return log | self._ended(rows)
+
+    def evaluate(self, episodes: int = 8, seed: int = 0) -> tuple[float, float, list[State]]:
+        """Follow the policy without noise.
+
+        Args:
+            episodes: How many.
+            seed: Of their starts.
+
+        Returns:
+            Mean return, share of successes at the end, and the states of the first episode.
+        """
+        env = self._make_env(num_envs=episodes)
+        observation, _ = env.reset(seed=seed)
+        total, running = torch.zeros(episodes), torch.ones(episodes, dtype=torch.bool)
+        success = torch.zeros(episodes, dtype=torch.bool)
+        states = [env.env_state.state[0]]
+        while bool(running.any()):
+            observation, reward, terminated, truncated, info = env.step(self.act(observation))
+            total += torch.where(running, reward, 0.0)
+            success = torch.where(running, info.get("final_info", info)["success"], success)
+            running = running & ~(terminated | truncated)
+            if running[0]:
+                states.append(env.env_state.state[0])
+        return float(total.mean()), float(success.float().mean()), states
+
+    def save(self, path: str | Path) -> None:
+        """Write all that goes on to a file; it loads with `weights_only`."""
+        torch.save(
+            {
+                "options": asdict(self.options),
+                "counts": [self.steps, self.updates],
+                "return": self._return,
+                "noise": self._noise.get_state(),
+                "policy": self.policy.state_dict(),
+                "optimizers": [o.state_dict() for o in (self._actor_steps, self._critic_steps)],
+                "places": [
+                    ([e.state, e.tools, e.drawn, e.elapsed, e.failed], generators)
+                    for e, generators in self._places
+                ],
+            },
+            path,
+        )
+
+    def load(self, path: str | Path) -> None:
+        """Go on with what a file has, to the same bits.
+
+        Raises:
+            InvalidInput: If it is of other options, or of environments in other chunks.
+        """
+        kept: dict[str, Any] = torch.load(path, weights_only=True)
+        if kept["options"] != asdict(self.options):
+            raise InvalidInput(f"Trainer.load: {path} was written with other options")
+        sizes = [len(generators) for _, generators in kept["places"]]
+        if sizes != [self._chunk] * len(self._places):
+            raise InvalidInput(
+                f"Trainer.load: {path} has chunks of {sizes} environments, "
+                f"not {len(self._places)} of {self._chunk}"
+            )
+        self.policy.load_state_dict(kept["policy"])
+        self._actor_steps.load_state_dict(kept["optimizers"][0])
+        self._critic_steps.load_state_dict(kept["optimizers"][1])
+        self.steps, self.updates = kept["counts"]
+        self._return = kept["return"]
+        self._noise.set_state(kept["noise"])
+        self._places = [(EnvState(*parts), generators) for parts, generators in kept["places"]]
+
+    @property
+    def _chunks(self) -> range:
+        return range(0, self._count, self._chunk)
+
+    def _begin(self, numbers: Sequence[int]) -> tuple[EnvState, list[Tensor]]:
+        """Environments by their numbers, each of which has a seed of its own."""
+        words = [np.random.SeedSequence([self.options.seed, i]).generate_state(1) for i in numbers]
+        self._env.reset(seed=[int(word[0]) for word in words])
+        return self._env.env_state, self._env.generator_states()
+
+    def _rollouts(self) -> list[Rollout]:
+        o = self.options
+        sizes = (o.horizon, self._count, self.task.action_size)
+        noise = torch.randn(sizes, generator=self._noise)
+        # The workers' copies must not change with ours.
+        weights = {name: t.clone() for name, t in self.policy.state_dict().items()}
+        pieces = [
+            Piece(
+                o,
+                weights,
+                start,
+                generators,
+                noise[:, k : k + self._chunk],
+                1.0 / self._count,
+                self._threads,
+            )
+            for k, (start, generators) in zip(self._chunks, self._places, strict=True)
+        ]
+        if self._workers is None:
+            return [roll_out(self._env, piece) for piece in pieces]
+        return list(self._workers.map(roll_out_remotely, [(self._pickled, p) for p in pieces]))
+
+    def _step_actor(self, rollouts: Sequence[Rollout], learns: bool) -> float:
+        for k, parameter in enumerate(self.policy.actor.parameters()):
+            # One after the other, in the order of the chunks.
+            gradient = torch.zeros_like(parameter)
+            for rollout in rollouts:
+                gradient += rollout.gradients[k]
+            parameter.grad = gradient
+        norm = torch.nn.utils.clip_grad_norm_(
+            self.policy.actor.parameters(), self.options.gradient_norm, error_if_nonfinite=True
+        )
+        if learns:
+            self._actor_steps.step()
+        return float(norm)
+
+    def _fit_critic(self, rows: _Rows) -> float:
+        o, policy = self.options, self.policy
+        with torch.no_grad():
+            values = policy.target(policy.scale(rows.after))
+            goals = _lambda_returns(rows, values, o.discount, o.trace).flatten()
+            seen = policy.scale(rows.seen).flatten(0, 1)
+        losses = []
+        for _ in range(o.critic_epochs):
+            order = torch.randperm(len(goals), generator=self._noise)
+            for chosen in order.chunk(o.critic_batches):
+                self._critic_steps.zero_grad()
+                loss = (policy.critic(seen[chosen]) - goals[chosen]).square().mean()
+                loss.backward()
+                self._critic_steps.step()
+                losses.append(float(loss.detach()))
+        with torch.no_grad():
+            pairs = zip(policy.target.parameters(), policy.critic.parameters(), strict=True)
+            for slow, fast in pairs:
+                slow.lerp_(fast, o.target_rate)
+        return sum(losses) / len(losses)
+
+    def _ended(self, rows: _Rows) -> dict[str, float]:
+        """Mean return and share of success of the episodes that have ended, if any has."""
+        returns, successes = [], []
+        for rewards, ended, success in zip(rows.rewards, rows.ended, rows.success, strict=True):
+            self._return += rewards
+            returns += self._return[ended].tolist()
+            successes += success[ended].tolist()
+            self._return[ended] = 0.0
+        if not returns:
+            return {}
+        return {
+            "return": sum(returns) / len(returns),
+            "success": sum(successes) / len(successes),
+        }
+
+
+class _Rows:
+    """The rollouts of all chunks, side by side: [h, B, ...]."""
+
+    def __init__(self, rollouts: Sequence[Rollout]) -> None:
+        def all_of(name: str) -> Tensor:
+            return torch.cat([getattr(r, name) for r in rollouts], dim=1)
+
+        self.seen, self.after = all_of("seen"), all_of("after")
+        self.rewards, self.terminated = all_of("rewards"), all_of("terminated")
+        self.ended, self.success = all_of("ended"), all_of("success")
+
+
+def _lambda_returns(rows: _Rows, values: Tensor, discount: float, trace: float) -> Tensor:
+    """Returns [h, B] that mix all lengths of look-ahead, from values after each step [h, B]."""
+    from torchrl.objectives.value.functional import td_lambda_return_estimate
+
+    # The last step ends what is known.
+    ended = rows.ended.clone()
+    ended[-1] = True
+    result: Tensor = td_lambda_return_estimate(
+        discount,
+        trace,
+        values[..., None],
+        rows.rewards[..., None],
+        ended[..., None],
+        rows.terminated[..., None],
+        time_dim=0,
+    )
+    return result[..., 0]
+
+
+def _pickled(make_env: MakeEnv) -> bytes:
+    try:
+        return pickle.dumps(make_env)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise InvalidInput(
+            "Trainer: with `workers`, `make_env` must be a function of a module, or such as "
+            f"functools.partial(dc.envs.make, 'FoldCloth'), that can be pickled: {error}"
+        ) from error

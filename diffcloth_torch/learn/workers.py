@@ -1,0 +1,164 @@
+"""Workers that make pieces of work: processes, actors of Ray, ranks of a torchrun job.
+
+Each has `map(function, items)`, which gives the results in the order of the items, as executors of
+`concurrent.futures` do. A piece does not depend on who makes it: all give the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from typing import Any, Protocol, TypeVar
+
+from diffcloth_torch.checks import check_count
+from diffcloth_torch.errors import InvalidInput
+
+__all__ = ["Processes", "Ranks", "RayActors", "Workers"]
+
+A = TypeVar("A")
+B = TypeVar("B")
+
+_REPEATS = 3  # of pieces whose process died, before the error is passed on
+
+
+class Workers(Protocol):
+    """What makes pieces of work; every `concurrent.futures.Executor` is one."""
+
+    def map(self, function: Callable[[Any], Any], items: Any, /) -> Iterable[Any]:
+        """Results of a function for items, in their order."""
+        ...
+
+
+class Processes:
+    """Processes on this machine; what a process that dies did not finish is made again."""
+
+    def __init__(self, count: int) -> None:
+        """Prepare to start `count` processes."""
+        self._count = check_count("Processes: `count`", count, 1)
+        self._pool: ProcessPoolExecutor | None = None
+
+    def map(self, function: Callable[[A], B], items: Sequence[A], /) -> list[B]:
+        """Results in the order of the items.
+
+        Raises:
+            BrokenProcessPool: If processes die again and again.
+        """
+        for repeat in range(_REPEATS + 1):
+            if self._pool is None:
+                # Processes that are spawned inherit no thread or lock.
+                self._pool = ProcessPoolExecutor(self._count, mp_context=get_context("spawn"))
+            try:
+                return list(self._pool.map(function, items))
+            except BrokenProcessPool:
+                self.close()
+                if repeat == _REPEATS:
+                    raise
+        raise AssertionError("unreachable")
+
+    def close(self) -> None:
+        """End the processes."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
+
+
+class RayActors:
+    """Actors of Ray, on this machine or on a cluster: `ray.init` says which.
+
+    An actor that dies is started again, and what it did not finish is made again.
+    """
+
+    def __init__(self, count: int, *, cores: float = 1.0) -> None:
+        """Start the actors, and Ray on this machine where it has not been started.
+
+        Args:
+            count: Number of actors.
+            cores: That each occupies.
+
+        Raises:
+            InvalidInput: If Ray is not there.
+        """
+        check_count("RayActors: `count`", count, 1)
+        try:
+            import ray
+        except ModuleNotFoundError as error:
+            raise InvalidInput(
+                "RayActors needs ray: run  pip install 'diffcloth-torch[ray]'"
+            ) from error
+        if not ray.is_initialized():
+            ray.init(num_cpus=max(count, 1), include_dashboard=False, log_to_driver=False)
+        remote: Any = ray.remote(num_cpus=cores, max_restarts=-1, max_task_retries=-1)(_Caller)
+        self.actors: list[Any] = [remote.remote() for _ in range(count)]
+
+    def map(self, function: Callable[[A], B], items: Sequence[A], /) -> list[B]:
+        """Results in the order of the items."""
+        from ray.util import ActorPool
+
+        pool: Any = ActorPool(self.actors)
+        return list(pool.map(lambda actor, item: actor.call.remote(function, item), items))
+
+    def close(self) -> None:
+        """End the actors."""
+        import ray
+
+        for actor in self.actors:
+            ray.kill(actor)
+        self.actors = []
+
+
+class _Caller:
+    def call(self, function: Callable[[A], B], item: A) -> B:
+        return function(item)
+
+
+class Ranks:
+    """The processes of a `torchrun` job, each of which runs the same program.
+
+    Each makes the pieces that fall to it and sends the results to all, so that all go on alike.
+    """
+
+    def __init__(self) -> None:
+        """Join the job by gloo, where `torch.distributed` has not been initialized.
+
+        Raises:
+            InvalidInput: If this is no process of a job.
+        """
+        import torch.distributed as dist
+
+        if not dist.is_initialized():
+            if not dist.is_torchelastic_launched():
+                raise InvalidInput("Ranks must run under torchrun")
+            dist.init_process_group("gloo")
+        self.rank, self.size = dist.get_rank(), dist.get_world_size()
+
+    def map(self, function: Callable[[A], B], items: Sequence[A], /) -> list[B]:
+        """Results in the order of the items, in every process.
+
+        Raises:
+            Exception: What a piece raised in any of the processes.
+        """
+        import torch.distributed as dist
+
+        made: list[tuple[B | None, Exception | None]] = []
+        for item in items[self.rank :: self.size]:
+            try:
+                made.append((function(item), None))
+            except Exception as error:  # all processes must learn of it, or they would wait
+                made.append((None, error))
+        gathered: list[Any] = [None] * self.size
+        dist.all_gather_object(gathered, made)
+        results = []
+        for k in range(len(items)):
+            result, failure = gathered[k % self.size][k // self.size]
+            if failure is not None:
+                raise failure
+            results.append(result)
+        return results
+
+    def close(self) -> None:
+        """Leave the job."""
+        import torch.distributed as dist
+
+        dist.destroy_process_group()

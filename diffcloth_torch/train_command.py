@@ -1,0 +1,224 @@
+"""The command `diffcloth train`: train a policy, and go on with a training."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from diffcloth_torch import envs
+from diffcloth_torch.commands import check_folder
+from diffcloth_torch.config.documents import read_document, set_values
+from diffcloth_torch.config.train_schema import TrainConfig, WorkersSection
+from diffcloth_torch.config.validation import validate
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.files import read_regular_file
+from diffcloth_torch.learn.options import TrainerOptions
+from diffcloth_torch.learn.trainer import Trainer
+from diffcloth_torch.learn.workers import Processes, Ranks, RayActors
+from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.tasks.statistics import replace_file, write_metrics
+from diffcloth_torch.viewers.look import Camera, Pictures
+from diffcloth_torch.viewers.record import Record
+
+__all__ = ["resume_training", "train"]
+
+# Files in a folder of results; TensorBoard reads those of a folder.
+_RESULT, _RESUME, _POLICY, _EVENTS = "train.json", "resume.json", "policy.pt", "events"
+_VIDEO = "evaluation"
+_LARGEST = 1 << 20  # bytes of a configuration
+
+
+def train(
+    config: Path,
+    assignments: Iterable[str] = (),
+    out: Path | None = None,
+    *,
+    overwrite: bool = False,
+) -> str:
+    """Train the policy of a configuration.
+
+    Args:
+        config: YAML file.
+        assignments: "key=value" each, see `set_values`.
+        out: Folder for the results; by default results/ and the name of `config`.
+        overwrite: Whether to replace existing results.
+
+    Raises:
+        InvalidInput: If an argument or the configuration is not accepted.
+        SimulationError: If a gradient is not finite.
+        KeyboardInterrupt: If the user ends the training; the message says how to go on.
+    """
+    section = _check(set_values(read_document(config), assignments), config)
+    job = _Job(section, config)
+    out = Path("results") / config.stem if out is None else out
+    if job.writes:
+        check_folder(config, out, overwrite)
+        out.mkdir(parents=True, exist_ok=True)
+        for file in [out / _RESULT, out / _RESUME, out / _POLICY, *(out / _EVENTS).glob("*")]:
+            file.unlink(missing_ok=True)
+        document = section.model_dump(mode="json", exclude_unset=True)
+        write_metrics(out / _RESUME, {"config": document, "source": str(config.resolve())})
+    return job.run(out, [])
+
+
+def resume_training(folder: Path) -> str:
+    """Go on with a training that was interrupted; it goes on with the same bits.
+
+    Args:
+        folder: Folder of its results.
+
+    Raises:
+        InvalidInput: If the folder has no such results.
+    """
+    file = folder / _RESUME
+    if not file.is_file():
+        raise InvalidInput(f"--resume: {folder} must hold what `diffcloth train` wrote: no {file}")
+    try:
+        saved = json.loads(read_regular_file(file, _LARGEST))
+        document, source = saved["config"], Path(saved["source"])
+        history: list[dict[str, Any]] = []
+        if (folder / _RESULT).is_file():
+            history = json.loads((folder / _RESULT).read_text())["evaluations"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise InvalidInput(f"--resume: {file} is not what `diffcloth train` wrote") from error
+    job = _Job(_check(document, source), source)
+    if (folder / _POLICY).is_file():
+        job.trainer.load(folder / _POLICY)
+    return job.run(folder, [e for e in history if e["updates"] <= job.trainer.updates])
+
+
+def _check(document: dict[str, Any], source: Path) -> TrainConfig:
+    if document.get("task") != "train":
+        raise InvalidInput(
+            f"{source}: `task` must be train to train something, got {document.get('task')!r}"
+        )
+    return validate(TrainConfig, document, source)
+
+
+class _Job:
+    """A training: its trainer, its workers, and what it has found so far."""
+
+    def __init__(self, section: TrainConfig, source: Path) -> None:
+        self.section = section
+        where = f"{source}: `trainer`"
+        options = _named(where, TrainerOptions, section.trainer)
+        self._workers = _workers(section.workers)
+        self.writes = not isinstance(self._workers, Ranks) or self._workers.rank == 0
+        env = section.environment
+        self.trainer = Trainer(
+            partial(envs.make, env.name, **env.options),
+            options,
+            num_envs=section.num_envs,
+            chunk=section.chunk,
+            workers=self._workers,
+            threads=section.workers.threads,
+        )
+
+    def run(self, out: Path, evaluations: list[dict[str, Any]]) -> str:
+        """Learn until the end, and write what was found."""
+        from torch.utils.tensorboard import SummaryWriter
+
+        trainer, section = self.trainer, self.section
+        begin = time.perf_counter()
+        events: Any = None
+        if self.writes:
+            events = SummaryWriter(out / _EVENTS, purge_step=trainer.steps)
+        bar = tqdm(
+            total=section.updates, initial=trainer.updates, desc="train", disable=_quiet(self)
+        )
+        before = evaluations[-1]["seconds"] if evaluations else 0.0
+        states: list[State] = []
+        try:
+            while trainer.updates < section.updates:
+                log = trainer.update()
+                bar.update()
+                for name, value in log.items() if events else ():
+                    events.add_scalar(name, value, trainer.steps)
+                last = trainer.updates == section.updates
+                if trainer.updates % section.evaluate_every and not last:
+                    continue
+                value, success, states = trainer.evaluate(section.episodes)
+                evaluations.append(
+                    {
+                        "updates": trainer.updates,
+                        "steps": trainer.steps,
+                        "seconds": before + time.perf_counter() - begin,
+                        "return": value,
+                        "success": success,
+                    }
+                )
+                bar.set_postfix({"return": f"{value:.4g}", "success": f"{success:.0%}"})
+                if events:
+                    events.add_scalar("evaluation/return", value, trainer.steps)
+                    events.add_scalar("evaluation/success", success, trainer.steps)
+                    self._write(out, evaluations)
+                if section.until_success is not None and success >= section.until_success:
+                    break
+        except KeyboardInterrupt as error:
+            kept = evaluations[-1]["updates"] if evaluations else 0
+            raise KeyboardInterrupt(
+                f"after {trainer.updates} updates, of which {kept} are kept: go on with  "
+                f"diffcloth train --resume {out}"
+            ) from error
+        finally:
+            bar.close()
+            if events:
+                events.close()
+            if self._workers is not None:
+                self._workers.close()
+        if not states:
+            return f"nothing is left to do: {trainer.updates} updates are done"
+        if self.writes:
+            self._film(out, states)
+        end = evaluations[-1]
+        return (
+            f"{end['steps']} environment steps in {end['seconds']:.0f} s: return "
+            f"{end['return']:.4g}, success {end['success']:.0%}; results are in {out}"
+        )
+
+    def _write(self, out: Path, evaluations: list[dict[str, Any]]) -> None:
+        # The policy last: `--resume` goes on from it, and what was found until then must be there.
+        config = self.section.model_dump(mode="json")
+        write_metrics(out / _RESULT, {"config": config, "evaluations": evaluations})
+        with replace_file(out / _POLICY) as file:
+            self.trainer.save(file)
+
+    def _film(self, out: Path, states: list[State]) -> None:
+        task, options = self.trainer.task, self.section.pictures.model_dump()
+        scene: Scene = task.simulator.scene
+        pictures = Pictures(**{**options, "camera": Camera(**options["camera"])})
+        fps = 1 / (task.simulator.dt * task.substeps)
+        with Record(out, scene, fps=fps, pictures=pictures, name=_VIDEO) as record:
+            for state in states:
+                record.show(state)
+
+
+def _quiet(job: _Job) -> bool | None:
+    """Whether to show no progress; None where that depends on the terminal."""
+    return None if job.writes else True
+
+
+def _workers(section: WorkersSection) -> Processes | RayActors | Ranks | None:
+    if section.kind == "processes":
+        return Processes(section.count)
+    if section.kind == "ray":
+        return RayActors(section.count, cores=section.threads)
+    return Ranks() if section.kind == "ranks" else None
+
+
+def _named(where: str, options: type[TrainerOptions], given: dict[str, Any]) -> TrainerOptions:
+    """Options by their names, with lists as tuples."""
+    accepted = [field.name for field in fields(options)]
+    for name in given:
+        if name not in accepted:
+            raise InvalidInput(f"{where} may have {', '.join(accepted)}; got {name!r}")
+    values: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in given.items()}
+    return options(**values)

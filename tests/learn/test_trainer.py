@@ -1,0 +1,280 @@
+"""Policies by gradients: the gradient, the critic's aims, checkpoints, and that they improve."""
+
+from __future__ import annotations
+
+import functools
+
+import pytest
+import torch
+from processes import threads
+
+import diffcloth_torch as dc
+from diffcloth_torch import envs
+from diffcloth_torch.envs.fold_cloth import FoldCloth
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.learn import Trainer, TrainerOptions
+from diffcloth_torch.learn import rollouts as rollouts_module
+from diffcloth_torch.learn.rollouts import Policy
+from diffcloth_torch.learn.trainer import _lambda_returns
+
+HOLD = (0.0, 0.0, 0.1, 0.9, 0.0, 0.0, 0.1, 0.9)
+SOFT = {"opens_at": -1.0, "reach": 0.06}
+
+
+def fold(size=6, horizon=8):
+    return functools.partial(envs.make, "FoldCloth", size=size, horizon=horizon, **SOFT)
+
+
+def exact(num_envs):
+    """Environments whose steps are solved to 1e-10, to compare with differences."""
+    env = fold()(num_envs=num_envs)
+    sim = env.task.simulator
+    solver = dc.SolverOptions(throw=False, tolerance=1e-10)
+    env.task.simulator = dc.Simulator(sim.scene, sim.dt, contact=sim.contact, solver=solver)
+    return env
+
+
+def parameters(trainer):
+    return list(trainer.policy.actor.parameters())
+
+
+def state_of(trainer):
+    return {name: t.clone() for name, t in trainer.policy.state_dict().items()}
+
+
+def assert_same_bits(a, b):
+    for name, tensor in a.items():
+        assert torch.equal(tensor, b[name]), name
+
+
+class TestGradient:
+    """Of the loss of one rollout, with a critic that is far from constant."""
+
+    OPTIONS = TrainerOptions(
+        algorithm="shac", horizon=5, first_action=HOLD, feedback=True, deviation=0.02
+    )
+
+    @staticmethod
+    def trainer(options):
+        trainer = Trainer(exact, options, num_envs=2)
+        with torch.no_grad():
+            # The last layers are nearly zero at first.
+            trainer.policy.target.value[-1].weight.mul_(100.0)
+            trainer.policy.actor.mean[-1].weight.mul_(5.0)
+        return trainer
+
+    def rollout(self, trainer):
+        noise = trainer._noise.get_state()
+        (found,) = trainer._rollouts()
+        trainer._noise.set_state(noise)
+        return found
+
+    def test_is_that_of_differences(self):
+        trainer = self.trainer(self.OPTIONS)
+        found = self.rollout(trainer)
+        scale = torch.stack([g.norm() for g in found.gradients]).norm()
+        assert scale > 1
+        step = 1e-4 / scale
+        losses = []
+        for side in (1, -1):
+            with torch.no_grad():
+                for p, g in zip(parameters(trainer), found.gradients, strict=True):
+                    p += side * step * g
+            losses.append(self.rollout(trainer).loss)
+            with torch.no_grad():
+                for p, g in zip(parameters(trainer), found.gradients, strict=True):
+                    p -= side * step * g
+        slope = (losses[0] - losses[1]) / (2 * float(step))
+        assert slope == pytest.approx(float(scale) ** 2, rel=0.02)
+
+    def test_without_feedback_is_that_of_a_plan(self):
+        options = TrainerOptions(algorithm="shac", horizon=5, first_action=HOLD)
+        trainer = self.trainer(options)
+        found = self.rollout(trainer)
+        piece = trainer._places[0]
+        env = exact(2)
+        observation = env.resume(*piece)
+        noise = torch.Generator()
+        noise.set_state(trainer._noise.get_state())
+        noise = torch.randn((5, 2, 8), generator=noise)
+        policy, plan, total, discount = trainer.policy, [], 0.0, 1.0
+        for t in range(5):
+            action = policy(observation.detach(), noise[t])
+            plan.append((action, action.detach().requires_grad_()))
+            observation, reward, *_ = env.step(plan[-1][1])
+            total, discount = total + discount * reward, discount * options.discount
+        total = total + discount * policy.target(policy.scale(observation))
+        of_plan = torch.autograd.grad(-total.sum() / 10, [leaf for _, leaf in plan])
+        expected = torch.autograd.grad([a for a, _ in plan], parameters(trainer), of_plan)
+        for e, g in zip(expected, found.gradients, strict=True):
+            torch.testing.assert_close(g, e, rtol=1e-4, atol=1e-6)
+
+    def test_feedback_counts(self):
+        with_it, without = (
+            self.rollout(self.trainer(TrainerOptions(horizon=5, first_action=HOLD, feedback=f)))
+            for f in (True, False)
+        )
+        assert with_it.loss == without.loss
+        assert not torch.allclose(with_it.gradients[0], without.gradients[0], rtol=1e-2)
+
+
+def test_lambda_returns_are_those_of_the_recursion():
+    generator = torch.Generator().manual_seed(0)
+    h, count, gamma, trace = 7, 3, 0.9, 0.8
+    rows = rollouts_rows(h, count, generator)
+    values = torch.randn(h, count, generator=generator)
+    found = _lambda_returns(rows, values, gamma, trace)
+    for b in range(count):
+        ahead = 0.0
+        for t in reversed(range(h)):
+            last = t == h - 1 or bool(rows.ended[t, b])
+            next_value = 0.0 if rows.terminated[t, b] else float(values[t, b])
+            follows = next_value if last else (1 - trace) * next_value + trace * ahead
+            ahead = float(rows.rewards[t, b]) + gamma * follows
+            assert float(found[t, b]) == pytest.approx(ahead, rel=1e-5)
+
+
+def rollouts_rows(h, count, generator):
+    class Rows:
+        rewards = torch.randn(h, count, generator=generator)
+        terminated = torch.zeros(h, count, dtype=torch.bool)
+        ended = torch.zeros(h, count, dtype=torch.bool)
+
+    Rows.ended[2, 0] = Rows.ended[4, 1] = Rows.terminated[4, 1] = True
+    return Rows
+
+
+@pytest.mark.parametrize("algorithm", ["apg", "shac"])
+def test_a_training_that_is_loaded_goes_on_with_the_same_bits(tmp_path, algorithm):
+    options = TrainerOptions(algorithm=algorithm, horizon=3, first_action=HOLD, decay_updates=4)
+    one = Trainer(fold(), options, num_envs=4, chunk=2)
+    one.update()
+    one.update()
+    one.save(tmp_path / "policy.pt")
+    other = Trainer(fold(), options, num_envs=4, chunk=2)
+    other.load(tmp_path / "policy.pt")
+    logs = [[t.update() for _ in range(2)] for t in (one, other)]
+    assert logs[0] == logs[1]
+    assert one.steps == other.steps == 4 * 3 * 4
+    assert_same_bits(state_of(one), state_of(other))
+
+
+def test_other_options_and_chunks_do_not_load(tmp_path):
+    Trainer(fold(), TrainerOptions(horizon=3), num_envs=2).save(tmp_path / "policy.pt")
+    with pytest.raises(InvalidInput, match="other options"):
+        Trainer(fold(), TrainerOptions(horizon=4), num_envs=2).load(tmp_path / "policy.pt")
+    with pytest.raises(InvalidInput, match=r"chunks of \[2\] environments, not 2 of 1"):
+        Trainer(fold(), TrainerOptions(horizon=3), num_envs=2, chunk=1).load(tmp_path / "policy.pt")
+
+
+def test_threads_outside_do_not_matter():
+    found = []
+    for count in (1, 2):
+        with threads(count):
+            trainer = Trainer(fold(), TrainerOptions(horizon=3, first_action=HOLD), num_envs=2)
+            trainer.update()
+            assert torch.get_num_threads() == count
+        found.append(state_of(trainer))
+    assert_same_bits(*found)
+
+
+def test_only_the_critic_learns_at_first():
+    options = TrainerOptions(horizon=3, first_action=HOLD, critic_only=1)
+    trainer = Trainer(fold(), options, num_envs=2)
+    before = state_of(trainer)
+    log = trainer.update()
+    assert log["critic_loss"] > 0
+    changed = {name for name, t in state_of(trainer).items() if not torch.equal(t, before[name])}
+    assert {name.partition(".")[0] for name in changed} == {"critic", "target", "scale"}
+    trainer.update()
+    assert any(
+        not torch.equal(t, before[name])
+        for name, t in state_of(trainer).items()
+        if name.startswith("actor")
+    )
+
+
+def test_a_failed_environment_ends_its_episode_and_has_no_gradient(monkeypatch):
+    trainer = Trainer(fold(), TrainerOptions(algorithm="apg", horizon=3), num_envs=2)
+    real = rollouts_module.ClothVectorEnv.step
+
+    def step(env, actions):
+        observation, reward, terminated, truncated, info = real(env, actions)
+        terminated = torch.tensor([True, False])
+        info["final_info"] = {"success": info["success"]}
+        return observation, reward, terminated, truncated, info
+
+    monkeypatch.setattr(rollouts_module.ClothVectorEnv, "step", step)
+    log = trainer.update()
+    assert log["failed"] == 0.5
+    assert log["success"] == 0.0
+
+
+class LiftCorner(FoldCloth):
+    """One corner is to be 10 cm above the table."""
+
+    name = "LiftCorner"
+
+    def height(self, env):
+        return env.state.positions[:, self.vertex(0, -1), 2]
+
+    def reward(self, env):
+        return -(self.height(env) - 0.1).abs()
+
+    def success(self, env):
+        return (self.height(env) - 0.1).abs() < 0.01
+
+
+def lift_corner(num_envs):
+    return envs.make(LiftCorner(size=6, horizon=10, **SOFT), num_envs)
+
+
+@pytest.mark.parametrize("algorithm", ["apg", "shac"])
+def test_it_improves(algorithm):
+    options = TrainerOptions(algorithm=algorithm, horizon=10, actor_rate=4e-3, deviation=0.05)
+    trainer = Trainer(lift_corner, options, num_envs=4)
+    before, _, states = trainer.evaluate(4)
+    assert len(states) == 10
+    for _ in range(15):
+        trainer.update()
+    after, _, _ = trainer.evaluate(4)
+    assert after > 0.8 * before
+
+
+def test_noise_and_scale_of_a_policy():
+    env = fold()(num_envs=3)
+    policy = Policy(env, TrainerOptions(first_action=HOLD, deviation=0.2))
+    observation, _ = env.reset(seed=0)
+    quiet = policy(observation)
+    torch.testing.assert_close(quiet, torch.tensor(HOLD).expand(3, -1), atol=0.03, rtol=0)
+    noise = torch.ones(3, 8)
+    torch.testing.assert_close(policy(observation, noise).atanh(), quiet.atanh() + 0.2)
+    rows = torch.randn(500, 5) * 3 + 2
+    scale = rollouts_module.Scale(5)
+    scale.see(rows[:200])
+    scale.see(rows[200:])
+    torch.testing.assert_close(scale.mean, rows.mean(dim=0))
+    torch.testing.assert_close(
+        scale(rows[:4]),
+        ((rows[:4] - rows.mean(dim=0)) / rows.std(dim=0, correction=0)).clamp(-5, 5),
+        rtol=1e-4, atol=1e-4,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: TrainerOptions(algorithm="ppo"), "`algorithm` must be one of 'apg', 'shac'"),
+        (lambda: TrainerOptions(horizon=0), "`horizon` must be"),
+        (lambda: TrainerOptions(discount=1.5), r"`discount` must be in \[0, 1\], got 1.5"),
+        (lambda: TrainerOptions(actor_rate=float("nan")), "`actor_rate` must be positive"),
+        (lambda: TrainerOptions(first_action=(1.0,)), r"`first_action\[0\]` must be between"),
+        (lambda: Trainer(fold(), TrainerOptions(first_action=(0.0,))), "must have 8 numbers"),
+        (lambda: Trainer(fold(), num_envs=4, chunk=3), "`chunk` must divide 4, got 3"),
+        (lambda: envs.make("FoldCloth", bend=1), "an option of FoldCloth must be one of"),
+        (lambda: envs.make("FoldCloth", opens_at=1.0), r"`opens_at` must be in \[-1, 1\)"),
+    ],
+)
+def test_bad_input(make, message):
+    with pytest.raises(InvalidInput, match=message):
+        make()
