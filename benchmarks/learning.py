@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 import torch
 
 from diffcloth_torch import envs
@@ -30,7 +31,6 @@ APG = {"algorithm": "apg", "discount": 1.0}
 SHAC = {"algorithm": "shac", "horizon": 16, "discount": 0.99, "actor_rate": 1e-3}
 ALGORITHMS = ("apg", "shac", "ppo", "sac")
 _EPISODES = 8  # of an evaluation
-_CORES_EACH = 1
 
 
 @click.command()
@@ -119,7 +119,8 @@ def _run(work: tuple[str, str, int, int, int]) -> list[dict[str, float]]:
     make = partial(envs.make, task, **document["environment"].get("options", {}))
     every = steps / (evaluations - 1)
     if algorithm in ("ppo", "sac"):
-        return _free(make, algorithm, seed, steps, every)
+        first = document["trainer"].get("first_action")
+        return _free(make, algorithm, seed, steps, every, first)
     given = dict(document["trainer"])
     if given["algorithm"] != algorithm:
         given |= APG if algorithm == "apg" else SHAC
@@ -169,22 +170,34 @@ class _Curve:
 
 
 def _free(
-    make: Callable[..., Any], algorithm: str, seed: int, steps: int, every: float
+    make: Callable[..., Any],
+    algorithm: str,
+    seed: int,
+    steps: int,
+    every: float,
+    first: Sequence[float] | None,
 ) -> list[dict[str, float]]:
-    """PPO or SAC with their usual options, on as many environments."""
+    """PPO or SAC with their usual options, on as many environments, from the same first action."""
     from stable_baselines3 import PPO, SAC
     from stable_baselines3.common.callbacks import BaseCallback
 
     from diffcloth_torch.envs.stable_baselines import StableBaselinesEnv
 
-    env = StableBaselinesEnv(make(num_envs=4, seed=seed))
+    class Begun(StableBaselinesEnv):
+        def step_async(self, actions: Any) -> None:
+            super().step_async(begun(actions))
+
+    def begun(actions: Any) -> Any:
+        return actions if first is None else np.clip(actions + np.float32(first), -1, 1)
+
+    env = Begun(make(num_envs=4, seed=seed))
     if algorithm == "ppo":
         model: Any = PPO("MlpPolicy", env, n_steps=128, batch_size=64, seed=seed, device="cpu")
     else:
         model = SAC(
             "MlpPolicy", env, learning_starts=400, gradient_steps=-1, seed=seed, device="cpu"
         )
-    curve = _Curve(make, lambda seen: model.predict(seen.numpy(), deterministic=True)[0])
+    curve = _Curve(make, lambda seen: begun(model.predict(seen.numpy(), deterministic=True)[0]))
     curve.add(0)
 
     class Evaluate(BaseCallback):  # type: ignore[misc]
@@ -203,8 +216,6 @@ def draw(runs: Sequence[dict[str, Any]], path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
-    import numpy as np
-
     tasks = list(dict.fromkeys(run["task"] for run in runs))
     figure, axes = plt.subplots(len(tasks), 2, figsize=(9, 3.2 * len(tasks)), squeeze=False)
     for row, task in zip(axes, tasks, strict=True):

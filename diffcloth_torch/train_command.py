@@ -127,40 +127,33 @@ class _Job:
         from torch.utils.tensorboard import SummaryWriter
 
         trainer, section = self.trainer, self.section
-        begin = time.perf_counter()
         events: Any = None
         if self.writes:
             events = SummaryWriter(out / _EVENTS, purge_step=trainer.steps)
         bar = tqdm(
-            total=section.updates, initial=trainer.updates, desc="train", disable=_quiet(self)
+            total=section.updates,
+            initial=trainer.updates,
+            desc="train",
+            disable=None if self.writes else True,
         )
-        before = evaluations[-1]["seconds"] if evaluations else 0.0
         states: list[State] = []
+        before = time.perf_counter() - (evaluations[-1]["seconds"] if evaluations else 0.0)
         try:
-            while trainer.updates < section.updates:
-                log = trainer.update()
-                bar.update()
-                for name, value in log.items() if events else ():
-                    events.add_scalar(name, value, trainer.steps)
-                last = trainer.updates == section.updates
-                if trainer.updates % section.evaluate_every and not last:
-                    continue
-                value, success, states = trainer.evaluate(section.episodes)
-                evaluations.append(
-                    {
-                        "updates": trainer.updates,
-                        "steps": trainer.steps,
-                        "seconds": before + time.perf_counter() - begin,
-                        "return": value,
-                        "success": success,
-                    }
-                )
-                bar.set_postfix({"return": f"{value:.4g}", "success": f"{success:.0%}"})
+            while not evaluations or trainer.updates < section.updates:
+                if evaluations:
+                    log = trainer.update()
+                    bar.update()
+                    for name, value in log.items() if events else ():
+                        events.add_scalar(name, value, trainer.steps)
+                    is_last = trainer.updates == section.updates
+                    if trainer.updates % section.evaluate_every and not is_last:
+                        continue
+                states, found = self._evaluate()
+                evaluations.append(found | {"seconds": time.perf_counter() - before})
+                bar.set_postfix({"return": f"{found['return']:.4g}"})
                 if events:
-                    events.add_scalar("evaluation/return", value, trainer.steps)
-                    events.add_scalar("evaluation/success", success, trainer.steps)
-                    self._write(out, evaluations)
-                if section.until_success is not None and success >= section.until_success:
+                    self._write(out, evaluations, events)
+                if section.until_success is not None and found["success"] >= section.until_success:
                     break
         except KeyboardInterrupt as error:
             kept = evaluations[-1]["updates"] if evaluations else 0
@@ -181,10 +174,18 @@ class _Job:
         end = evaluations[-1]
         return (
             f"{end['steps']} environment steps in {end['seconds']:.0f} s: return "
-            f"{end['return']:.4g}, success {end['success']:.0%}; results are in {out}"
+            f"{evaluations[0]['return']:.4g} -> {end['return']:.4g}, "
+            f"success {end['success']:.0%}; results are in {out}"
         )
 
-    def _write(self, out: Path, evaluations: list[dict[str, Any]]) -> None:
+    def _evaluate(self) -> tuple[list[State], dict[str, Any]]:
+        value, success, states = self.trainer.evaluate(self.section.episodes)
+        counts = {"updates": self.trainer.updates, "steps": self.trainer.steps}
+        return states, counts | {"return": value, "success": success}
+
+    def _write(self, out: Path, evaluations: list[dict[str, Any]], events: Any) -> None:
+        for name in ("return", "success"):
+            events.add_scalar(f"evaluation/{name}", evaluations[-1][name], self.trainer.steps)
         # The policy last: `--resume` goes on from it, and what was found until then must be there.
         config = self.section.model_dump(mode="json")
         write_metrics(out / _RESULT, {"config": config, "evaluations": evaluations})
@@ -199,11 +200,6 @@ class _Job:
         with Record(out, scene, fps=fps, pictures=pictures, name=_VIDEO) as record:
             for state in states:
                 record.show(state)
-
-
-def _quiet(job: _Job) -> bool | None:
-    """Whether to show no progress; None where that depends on the terminal."""
-    return None if job.writes else True
 
 
 def _workers(section: WorkersSection) -> Processes | RayActors | Ranks | None:

@@ -75,6 +75,8 @@ CONTENTS = {
             "docs/robots",
             "docs/identification",
             "docs/environments",
+            "docs/learning",
+            "docs/scaling",
             "docs/tasks",
             "docs/extending",
             "CONTRIBUTING",

@@ -32,9 +32,9 @@ class WorkersSection(Section):
 class TrainConfig(Section):
     """Environments, the options of `TrainerOptions`, and how long to learn.
 
-    The policy is evaluated, and kept, after each `evaluate_every` updates and at the end, in
-    `episodes` episodes of their own. With `until_success` training ends before its last update, as
-    soon as that share of them succeeds.
+    The policy is evaluated, and kept, at first, after each `evaluate_every` updates and at the end,
+    in `episodes` episodes of their own. With `until_success` training ends before its last update,
+    as soon as that share of them succeeds.
     """
 
     task: Literal["train"]

@@ -223,12 +223,18 @@ class Trainer:
         return self._env.env_state, self._env.generator_states()
 
     def _rollouts(self) -> list[Rollout]:
+        pieces = self._pieces()
+        if self._workers is None:
+            return [roll_out(self._env, piece) for piece in pieces]
+        return list(self._workers.map(roll_out_remotely, [(self._pickled, p) for p in pieces]))
+
+    def _pieces(self) -> list[Piece]:
         o = self.options
         sizes = (o.horizon, self._count, self.task.action_size)
         noise = torch.randn(sizes, generator=self._noise)
         # The workers' copies must not change with ours.
         weights = {name: t.clone() for name, t in self.policy.state_dict().items()}
-        pieces = [
+        return [
             Piece(
                 o,
                 weights,
@@ -240,9 +246,6 @@ class Trainer:
             )
             for k, (start, generators) in zip(self._chunks, self._places, strict=True)
         ]
-        if self._workers is None:
-            return [roll_out(self._env, piece) for piece in pieces]
-        return list(self._workers.map(roll_out_remotely, [(self._pickled, p) for p in pieces]))
 
     def _step_actor(self, rollouts: Sequence[Rollout], learns: bool) -> float:
         for k, parameter in enumerate(self.policy.actor.parameters()):

@@ -45,14 +45,14 @@ def test_results(config, tmp_path):
     assert result.exit_code == 0, result.output
     assert "32 environment steps" in result.output
     record = json.loads((tmp_path / "out" / "train.json").read_text())
-    assert [e["steps"] for e in record["evaluations"]] == [16, 32]
+    assert [e["steps"] for e in record["evaluations"]] == [0, 16, 32]
     assert record["config"]["environment"]["name"] == "FoldCloth"
     assert (tmp_path / "out" / "evaluation.png").stat().st_size > 100
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(tmp_path / "out" / "events")).Reload()
     assert [e.step for e in events.Scalars("gradient_norm")] == [8, 16, 24, 32]
-    assert len(events.Scalars("evaluation/return")) == 2
+    assert len(events.Scalars("evaluation/return")) == 3
 
 
 def test_an_interrupted_training_goes_on_with_the_same_bits(config, tmp_path, monkeypatch):
@@ -86,7 +86,7 @@ def test_success_ends_it(config, tmp_path):
     result = call(config, "--out", tmp_path / "out", "--set", "until_success=0.0")
     assert result.exit_code == 0, result.output
     record = json.loads((tmp_path / "out" / "train.json").read_text())
-    assert [e["updates"] for e in record["evaluations"]] == [2]
+    assert [e["updates"] for e in record["evaluations"]] == [0]
 
 
 @pytest.mark.parametrize(

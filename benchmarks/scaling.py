@@ -1,0 +1,100 @@
+"""What workers cost, and what they bring: updates of a policy here, in processes and on Ray."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import statistics
+import time
+from functools import partial
+from typing import Any
+
+import click
+import torch
+
+from diffcloth_torch import envs
+from diffcloth_torch.learn import Processes, RayActors, Trainer, TrainerOptions
+from diffcloth_torch.learn.rollouts import Piece, roll_out
+
+HOLD = (0.0, 0.0, 0.2, 0.95, 0.0, 0.0, 0.2, 0.95)
+
+
+@click.command()
+@click.option("--size", default=12, show_default=True, help="Vertices along a side.")
+@click.option("--chunks", default=4, show_default=True, type=click.IntRange(2))
+@click.option("--chunk", default=2, show_default=True, type=click.IntRange(1))
+@click.option("--updates", default=5, show_default=True, type=click.IntRange(1))
+@click.option("--workers", default=2, show_default=True, type=click.IntRange(1))
+@click.option("--ray/--no-ray", default=True, help="Whether to start Ray.")
+def main(size: int, chunks: int, chunk: int, updates: int, workers: int, ray: bool) -> None:
+    """Time updates of APG on FoldCloth, 16 steps a rollout, and what is sent for one.
+
+    The same updates everywhere; the first is left out, in which workers start. `of n` is how many
+    times as fast they are as here, one core each. At the end: how long an update would take with
+    more workers of one chunk each, if the messages of all pass through the trainer one by one.
+    """
+    torch.set_num_threads(1)
+    make = partial(envs.make, "FoldCloth", size=size, opens_at=-1.0, reach=0.06)
+    options = TrainerOptions(algorithm="apg", horizon=16, first_action=HOLD)
+
+    def trainer(kind: Any) -> Trainer:
+        return Trainer(make, options, num_envs=chunks * chunk, chunk=chunk, workers=kind)
+
+    kinds: list[tuple[str, Any]] = [("here", None), (f"{workers} processes", Processes(workers))]
+    if ray:
+        start = time.perf_counter()
+        kinds.append((f"{workers} actors of Ray", RayActors(workers)))
+        print(f"Ray started in {time.perf_counter() - start:.1f} s")
+    made = [(name, kind, trainer(kind)) for name, kind in kinds]
+    times: dict[str, list[float]] = {name: [] for name, _ in kinds}
+    # Side by side: what else runs on the machine slows all of them.
+    for k in range(updates + 1):
+        for name, _, one in made:
+            start = time.perf_counter()
+            one.update()
+            if k:
+                times[name].append(time.perf_counter() - start)
+            else:
+                print(f"{name}: first update {time.perf_counter() - start:.2f} s")
+    bits = {_bits(one) for _, _, one in made}
+    print(f"{chunks} chunks of {chunk} environments, {size} x {size}; "
+          f"{'the same bits' if len(bits) == 1 else 'BITS DIFFER'}")  # fmt: skip
+    print("                      s an update      of n   environment steps a second")
+    here = statistics.median(times["here"])
+    for name, seconds in times.items():
+        middle = statistics.median(seconds)
+        rate = 16 * chunks * chunk / middle
+        print(f"{name:20} {middle:12.3f} {here / middle:9.2f} {rate:20.1f}")
+    _messages(made[0][2], here / chunks)
+    for _, kind, _ in made:
+        if kind is not None:
+            kind.close()
+
+
+def _bits(trainer: Trainer) -> str:
+    tensors = trainer.policy.state_dict().values()
+    return hashlib.sha256(b"".join(t.numpy().tobytes() for t in tensors)).hexdigest()
+
+
+def _messages(trainer: Trainer, chunk_seconds: float) -> None:
+    """Sizes and times of what is sent, and what follows for more workers."""
+    pieces: list[Piece] = trainer._pieces()
+    piece, result = pieces[0], roll_out(trainer._env, pieces[0])
+    seconds = 0.0
+    for name, thing in (("piece", piece), ("result", result)):
+        spent = []
+        for _ in range(20):
+            start = time.perf_counter()
+            data = pickle.dumps(thing)
+            pickle.loads(data)
+            spent.append(time.perf_counter() - start)
+        seconds += statistics.median(spent)
+        print(f"{name}: {len(data) / 1024:.0f} KiB, {1e3 * statistics.median(spent):.2f} ms")
+    print("workers   s an update   efficiency, if messages pass one by one")
+    for count in (2, 4, 8, 16, 32, 64, 128):
+        update = chunk_seconds + count * seconds
+        print(f"{count:7d} {update:13.3f} {chunk_seconds / update:12.0%}")
+
+
+if __name__ == "__main__":
+    main()
