@@ -29,7 +29,8 @@ CONFIGS = {
 # What the other algorithm has in place of the configuration's.
 APG = {"algorithm": "apg", "discount": 1.0}
 SHAC = {"algorithm": "shac", "horizon": 16, "discount": 0.99, "actor_rate": 1e-3}
-ALGORITHMS = ("apg", "shac", "ppo", "sac")
+ALGORITHMS = ("plan", "apg", "shac", "ppo", "sac")
+KNOTS, PLAN_RATE = 10, 0.02  # of a plan: actions that last a tenth of an episode
 _EPISODES = 8  # of an evaluation
 
 
@@ -55,6 +56,8 @@ def main(
     plot: Path | None,
 ) -> None:
     """Train with each algorithm and seed, and evaluate without noise on the way.
+
+    `plan` is no policy: it optimizes the actions of one episode, whose return it is.
 
     Prints the median over seeds of the best mean return, how many environment steps and seconds
     each needed to reach the best that PPO reached, and the share of successes at the end. The time
@@ -118,8 +121,10 @@ def _run(work: tuple[str, str, int, int, int]) -> list[dict[str, float]]:
     document = read_document(Path(CONFIGS[task]))
     make = partial(envs.make, task, **document["environment"].get("options", {}))
     every = steps / (evaluations - 1)
+    first = document["trainer"].get("first_action")
+    if algorithm == "plan":
+        return _plan(make, first, seed, steps)
     if algorithm in ("ppo", "sac"):
-        first = document["trainer"].get("first_action")
         return _free(make, algorithm, seed, steps, every, first)
     given = dict(document["trainer"])
     if given["algorithm"] != algorithm:
@@ -135,6 +140,39 @@ def _run(work: tuple[str, str, int, int, int]) -> list[dict[str, float]]:
         if trainer.steps >= every * len(curve.points):
             curve.add(trainer.steps)
     return curve.points
+
+
+def _plan(
+    make: Callable[..., Any], first: Sequence[float] | None, seed: int, steps: int
+) -> list[dict[str, float]]:
+    """The actions of one episode, by Adam."""
+    env = make(num_envs=1)
+    horizon = env.task.horizon
+    start = torch.zeros(env.task.action_size) if first is None else torch.tensor(first)
+    plan = start.repeat(KNOTS, 1).requires_grad_()
+    adam = torch.optim.Adam([plan], lr=PLAN_RATE)
+    points: list[dict[str, float]] = []
+    begin = time.perf_counter()
+    while not points or points[-1]["steps"] < steps:
+        env.reset(seed=1000 + seed)
+        total = torch.zeros(())
+        for k in range(horizon):
+            _, reward, _, _, info = env.step(plan[None, k * KNOTS // horizon])
+            total = total + reward.sum()
+        points.append(
+            {
+                "steps": float(horizon * (len(points) + 1)),
+                "seconds": time.perf_counter() - begin,
+                "return": float(total.detach()),
+                "success": float(info["final_info"]["success"]),
+            }
+        )
+        adam.zero_grad()
+        (-total).backward()
+        adam.step()
+        with torch.no_grad():
+            plan.clamp_(-1, 1)
+    return points
 
 
 class _Curve:
@@ -216,6 +254,7 @@ def draw(runs: Sequence[dict[str, Any]], path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+
     tasks = list(dict.fromkeys(run["task"] for run in runs))
     figure, axes = plt.subplots(len(tasks), 2, figsize=(9, 3.2 * len(tasks)), squeeze=False)
     for row, task in zip(axes, tasks, strict=True):

@@ -168,12 +168,22 @@ def fit(**arguments: Any) -> str:
     type=click.Path(path_type=Path, file_okay=False),
     help="Go on with the training whose results are there; its CONFIG is there too.",
 )
+@click.option(
+    "--viewer",
+    "viewers",
+    type=click.Choice(("record", "web")),
+    multiple=True,
+    help="Show the last evaluation so, in place of the viewers of CONFIG. Repeatable.",
+)
 @_SET
 @_OUT
 @_OVERWRITE
 @_ending_in_a_sentence
-def train(**arguments: Any) -> str:
+def train(viewers: tuple[str, ...], assignments: tuple[str, ...], **arguments: Any) -> str:
     """Train the policy of CONFIG, and show what it does."""
+    if viewers:
+        assignments = (*assignments, f"viewers=[{','.join(viewers)}]")
+    arguments["assignments"] = assignments
     try:
         from diffcloth_torch.train_command import resume_training, train
     except ImportError as error:  # its message says what to install

@@ -27,6 +27,7 @@ from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.statistics import replace_file, write_metrics
 from diffcloth_torch.viewers.look import Camera, Pictures
 from diffcloth_torch.viewers.record import Record
+from diffcloth_torch.viewers.show import show
 
 __all__ = ["resume_training", "train"]
 
@@ -193,13 +194,18 @@ class _Job:
             self.trainer.save(file)
 
     def _film(self, out: Path, states: list[State]) -> None:
+        """Show the first episode of the last evaluation, or in the browser all of them."""
         task, options = self.trainer.task, self.section.pictures.model_dump()
         scene: Scene = task.simulator.scene
-        pictures = Pictures(**{**options, "camera": Camera(**options["camera"])})
-        fps = 1 / (task.simulator.dt * task.substeps)
-        with Record(out, scene, fps=fps, pictures=pictures, name=_VIDEO) as record:
-            for state in states:
-                record.show(state)
+        camera = Camera(**options["camera"])
+        if "record" in self.section.viewers:
+            pictures = Pictures(**{**options, "camera": camera})
+            fps = 1 / (task.simulator.dt * task.substeps)
+            with Record(out, scene, fps=fps, pictures=pictures, name=_VIDEO) as record:
+                for state in states:
+                    record.show(state[0])
+        if "web" in self.section.viewers:
+            show(scene, states, out / f"{_VIDEO}.html", camera=camera)
 
 
 def _workers(section: WorkersSection) -> Processes | RayActors | Ranks | None:

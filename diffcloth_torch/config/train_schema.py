@@ -47,4 +47,5 @@ class TrainConfig(Section):
     episodes: Count = 8
     until_success: Annotated[float, Ge(0)] | None = None
     workers: WorkersSection = WorkersSection()
+    viewers: list[Literal["record", "web"]] = ["record"]
     pictures: PictureSection = PictureSection()

@@ -155,20 +155,21 @@ class Trainer:
             seed: Of their starts.
 
         Returns:
-            Mean return, share of successes at the end, and the states of the first episode.
+            Mean return, share of successes at the end, and the states of all episodes until the
+            first of them ends.
         """
         env = self._make_env(num_envs=episodes)
         observation, _ = env.reset(seed=seed)
         total, running = torch.zeros(episodes), torch.ones(episodes, dtype=torch.bool)
         success = torch.zeros(episodes, dtype=torch.bool)
-        states = [env.env_state.state[0]]
+        states = [env.env_state.state]
         while bool(running.any()):
             observation, reward, terminated, truncated, info = env.step(self.act(observation))
             total += torch.where(running, reward, 0.0)
             success = torch.where(running, info.get("final_info", info)["success"], success)
             running = running & ~(terminated | truncated)
-            if running[0]:
-                states.append(env.env_state.state[0])
+            if bool(running.all()):
+                states.append(env.env_state.state)
         return float(total.mean()), float(success.float().mean()), states
 
     def save(self, path: str | Path) -> None:

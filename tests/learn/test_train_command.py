@@ -48,6 +48,7 @@ def test_results(config, tmp_path):
     assert [e["steps"] for e in record["evaluations"]] == [0, 16, 32]
     assert record["config"]["environment"]["name"] == "FoldCloth"
     assert (tmp_path / "out" / "evaluation.png").stat().st_size > 100
+    assert not (tmp_path / "out" / "evaluation.html").exists()
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     events = EventAccumulator(str(tmp_path / "out" / "events")).Reload()
@@ -80,6 +81,14 @@ def test_an_interrupted_training_goes_on_with_the_same_bits(config, tmp_path, mo
     records = [json.loads((f / "train.json").read_text())["evaluations"] for f in (whole, cut)]
     assert [e["return"] for e in records[0]] == [e["return"] for e in records[1]]
     assert "nothing is left" in call("--resume", cut).output
+
+
+def test_a_page_shows_all_episodes_of_the_evaluation(config, tmp_path):
+    out = tmp_path / "out"
+    result = call(config, "--out", out, "--viewer", "web", "--set", "updates=1")
+    assert result.exit_code == 0, result.output
+    assert (out / "evaluation.html").stat().st_size > 10_000
+    assert not (out / "evaluation.png").exists()
 
 
 def test_success_ends_it(config, tmp_path):
