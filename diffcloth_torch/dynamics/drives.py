@@ -60,7 +60,13 @@ class Drives(NamedTuple):
 
 
 def fold(
-    drives: Drives, inertial: Tensor, predicted: Tensor, start: Tensor, dt: float, unknown: Tensor
+    drives: Drives,
+    inertial: Tensor,
+    predicted: Tensor,
+    start: Tensor,
+    dt: float,
+    unknown: Tensor,
+    force: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Add drives and viscosity to 1/2 (q - q^)^T M/h^2 (q - q^), giving 1/2 (q - t)^T A (q - t).
 
@@ -71,12 +77,13 @@ def fold(
         start: q_n of the joints, shape [B, J].
         dt: h [s].
         unknown: Indices of the coordinates that are not prescribed; t equals q^ for the others.
+        force: Another constant force, shape [B, n].
 
     Returns:
         A [B, n, n] and t [B, n].
     """
     n, joints = predicted.shape[-1], start.shape[-1]
-    if not (joints and len(unknown)):
+    if not (len(unknown) and (joints or force is not None)):
         return inertial, predicted
     moved = predicted[..., n - joints :] - start
     pull = (
@@ -86,6 +93,8 @@ def fold(
     )
     gains = drives.stiffness + (drives.damping + drives.viscosity) / dt
     metric = inertial + torch.diag_embed(torch.nn.functional.pad(gains, (n - joints, 0)))
-    force = torch.nn.functional.pad(pull, (n - joints, 0))[..., unknown]
+    pull = torch.nn.functional.pad(pull, (n - joints, 0))
+    if force is not None:
+        pull = pull - force
     solved = metric[..., unknown[:, None], unknown]
-    return metric, predicted.index_add(-1, unknown, -solve(solved, force))
+    return metric, predicted.index_add(-1, unknown, -solve(solved, pull[..., unknown]))

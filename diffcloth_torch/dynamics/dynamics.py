@@ -99,12 +99,15 @@ class Dynamics:
         prescribed: Which coordinates are prescribed, [n].
     """
 
-    def __init__(self, assembly: Assembly, dt: float) -> None:
+    def __init__(self, assembly: Assembly, dt: float, weight: str | None = None) -> None:
         """Prepare the constants.
 
         Args:
             assembly: Arrays of the scene.
             dt: Time step [s].
+            weight: None for steps in time. In steps that lead to an equilibrium, how the weight of
+                robots changes with their configuration: "bounded" (an upper bound, for steps from
+                afar) or "exact" (the derivative).
         """
         self.dt = dt
         K = assembly.body_count
@@ -134,7 +137,7 @@ class Dynamics:
         for t in range(K, len(mechanisms)):
             mechanism = mechanisms[t]
             rows = torch.nonzero(owner == t)[:, 0]
-            robot = RobotDynamics(mechanism, dt, link[rows], vertices[rows])
+            robot = RobotDynamics(mechanism, dt, link[rows], vertices[rows], weight)
             joint_rows = slice(joints, joints := joints + mechanism.joint_count)
             link_rows = slice(links, links := links + mechanism.link_count)
             self._robots.append(robot)

@@ -18,6 +18,10 @@ is prescribed, nu_n+1 is nu, and tau lacks an effort tau_c. Both lines together,
 of contact, give this effort from the change of momentum:
 
     M(q_n+1) nu_n+1 - M(q_n) nu_n = h (s(q_mid, nu) + tau(q_n) + f(q_n+1) + tau_c).
+
+**At rest.** A step that looks for an equilibrium is long, and tau(q_n) would lead far away in it.
+Such a step predicts no motion; it counts tau(q_n) as a force and adds a stiffness of the weight to
+M/h^2: see `weights.py`.
 """
 
 from __future__ import annotations
@@ -30,7 +34,7 @@ from torch import Tensor
 
 from diffcloth_torch.dynamics.drives import Drives, Gains, fold
 from diffcloth_torch.dynamics.free_motion import robot_motion, solve_motion
-from diffcloth_torch.dynamics.implicit import attach_root
+from diffcloth_torch.dynamics.implicit import attach_root, jacobian_of
 from diffcloth_torch.dynamics.inertia import (
     Inertia,
     Motion,
@@ -44,6 +48,7 @@ from diffcloth_torch.dynamics.inertia import (
 from diffcloth_torch.dynamics.jacobians import ROOT, DifferentialKinematics, root_frame
 from diffcloth_torch.dynamics.linear import solve, times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
+from diffcloth_torch.dynamics.weights import WeightBound
 from diffcloth_torch.errors import SimulationError
 from diffcloth_torch.geometry.products import product
 from diffcloth_torch.geometry.rotation import (
@@ -57,6 +62,7 @@ from diffcloth_torch.geometry.rotation import (
 )
 from diffcloth_torch.model.kinematics import constant, pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
+from diffcloth_torch.transforms import outside_transforms, plain
 
 __all__ = ["RobotControl", "RobotDynamics", "RobotPrediction", "RobotState"]
 
@@ -146,7 +152,14 @@ class RobotDynamics:
         root: The root link.
     """
 
-    def __init__(self, mechanism: Mechanism, dt: float, links: Tensor, points: Tensor) -> None:
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        dt: float,
+        links: Tensor,
+        points: Tensor,
+        weight: str | None = None,
+    ) -> None:
         """Prepare the constants.
 
         Args:
@@ -154,6 +167,7 @@ class RobotDynamics:
             dt: Time step [s].
             links: Index of the link of each vertex that may be in contact, shape [V].
             points: These vertices, in the frames of their links [m], shape [V, 3].
+            weight: As for `Dynamics`.
         """
         self.mechanism, self._kinematics, self._dt = (
             mechanism,
@@ -180,6 +194,8 @@ class RobotDynamics:
         self._solved = torch.tensor([i for i in solved if i >= first], dtype=torch.long)
         self._unknown = self._solved - first
         self._free_motion = robot_motion(mechanism, self._solved, dt)
+        self._weight = weight
+        self._weight_bound = WeightBound(self._kinematics)
         # Without joints, nobody needs the efforts that hold a prescribed base.
         self._has_dynamics = mechanism.is_dynamic or joints > 0
         self._own_inertia = None if mechanism.is_dynamic else _inertia_of_prescribed(mechanism)
@@ -214,7 +230,7 @@ class RobotDynamics:
         if self._has_dynamics:
             here = self._motion(inertia, start)
             given = self._given(inertia, here, state, control, drives, gravity, contact)
-        if len(self._solved):
+        if len(self._solved) and self._weight is None:
             velocity = self._solve(inertia, start, known, given)
         end = self._moved(start, velocity, self._dt)
         joints = torch.where(self._prescribed, ends, end.joints)
@@ -230,8 +246,12 @@ class RobotDynamics:
             predicted = quaternion_multiply(quaternion_exp(turn), quaternion)
             offset = -times(end.rotation, local)
             root_start = root_end = torch.cat([offset, predicted], dim=-1)
-        inertial = self._inertial(inertia, end)
-        metric, target = fold(drives, inertial, free, state.joints, self._dt, self._unknown)
+        inertial, force = self._inertial(inertia, end), None
+        if len(self._solved) and self._weight is not None:
+            rows = slice(given.shape[-1] - self.coordinate_count, None)
+            inertial = inertial + self._weight_stiffness(inertia, start, gravity)[..., rows, rows]
+            force = (given / self._dt)[..., rows]
+        metric, target = fold(drives, inertial, free, state.joints, self._dt, self._unknown, force)
         return RobotPrediction(
             root_start=root_start,
             root_end=root_end,
@@ -382,9 +402,8 @@ class RobotDynamics:
         contact: Tensor | None,
     ) -> Tensor:
         """M(q_n) nu_n + h tau(q_n), [B, 6 + J]."""
-        weights = inertia.mass[..., None] * torch.nn.functional.pad(gravity, (0, 3))[..., None, :]
         acting = torch.cat([control.wrench, drives.efforts], dim=-1)
-        acting = acting + generalized_force(here, weights)
+        acting = acting + generalized_force(here, _weights(inertia, gravity))
         if contact is not None:
             acting = acting + self._generalized(here, contact)
         return momentum(here, inertia, self._velocity(state)) + self._dt * acting
@@ -397,6 +416,25 @@ class RobotDynamics:
         mass = mass_matrix(self._motion(inertia, at), inertia)
         rows = slice(mass.shape[-1] - n, None)
         return mass[..., rows, rows] / self._dt**2
+
+    def _weight_stiffness(self, inertia: Inertia, start: _Configuration, gravity: Tensor) -> Tensor:
+        """K of the weight at the start, without a graph, [B, 6 + J, 6 + J]."""
+        inputs = [plain(t) for t in (*inertia, *start, gravity)]
+
+        def pull(x: Tensor, *inputs: Tensor) -> Tensor:
+            weights, begin = Inertia(*inputs[:4]), _Configuration(*inputs[4:7])
+            motion = self._motion(weights, self._moved(begin, x, 1.0))
+            return generalized_force(motion, _weights(weights, inputs[7]))
+
+        with torch.no_grad(), outside_transforms():
+            if self._weight == "bounded":
+                frames = self._motion(Inertia(*inputs[:4]), _Configuration(*inputs[4:7])).frames
+                bound = self._weight_bound.stiffness(frames, Inertia(*inputs[:4]), inputs[7])
+                return torch.diag_embed(bound)
+            still = inputs[6].new_zeros(len(inputs[6]), ROOT + self.mechanism.joint_count)
+            slopes = jacobian_of(pull)(still, *inputs)
+            # The moments of a turn are those of its rotation vector but for a skew part.
+            return -(slopes + slopes.transpose(-1, -2)) / 2
 
     def _solve(
         self,
@@ -486,6 +524,11 @@ class RobotDynamics:
 
     def _at_joints(self, values: Tensor) -> Tensor:
         return values[..., values.shape[-1] - self.mechanism.joint_count :]
+
+
+def _weights(inertia: Inertia, gravity: Tensor) -> Tensor:
+    """The weight of each link as a wrench about its center, [B, L, 6]."""
+    return inertia.mass[..., None] * torch.nn.functional.pad(gravity, (0, 3))[..., None, :]
 
 
 def _inertia_of_prescribed(mechanism: Mechanism) -> Inertia:

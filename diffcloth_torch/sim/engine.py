@@ -56,11 +56,25 @@ class Engine:
         coupling: str,
         contact: ContactOptions,
         solver: SolverOptions,
+        weight: str | None = None,
+        limits_dt: float | None = None,
     ) -> None:
-        """Make the cores; the arguments are those of `Simulator`, checked."""
+        """Make the cores; the arguments are those of `Simulator`, checked.
+
+        Args:
+            scene: The scene.
+            layout: Its sizes and permissions.
+            dt: Time step [s].
+            scheme: Name of the scheme.
+            coupling: Name of the coupling.
+            contact: Options of contact.
+            solver: Options of the solver.
+            weight: As for `Dynamics`.
+            limits_dt: Time step that sets the stiffness of joint limits; None takes `dt`.
+        """
         assembly = layout.assembly
         self.layout, self._dt = layout, dt
-        self.dynamics = Dynamics(assembly, dt) if layout.has_coordinates else None
+        self.dynamics = Dynamics(assembly, dt, weight) if layout.has_coordinates else None
         self.surfaces = Surfaces.of(scene, assembly)
         self.constants: Mapping[str, Constant] = {}
         # Without cloths there is nothing to split or to couple.
@@ -73,7 +87,7 @@ class Engine:
         )
         stiffness = None
         if self.dynamics is not None:
-            stiffness = limit_stiffness(assembly, dt, scene.gravity)
+            stiffness = limit_stiffness(assembly, limits_dt or dt, scene.gravity)
         self.core = make_core(assembly, options, stiffness)
         self._staggered = None
         in_turn = coupling != "monolithic" and scene.cloths and layout.is_dynamic

@@ -8,8 +8,9 @@ with the weight and all other forces f, elasticity W, the barrier B and friction
 first term vanishes: the steps descend to a stable minimum of the other terms (pseudo-transient
 continuation), and the last one is Newton's method without inertia, certified like every step. In
 all steps friction counts motion from the state x_0 where the search begins, so that contacts that
-stick there keep sticking. Friction uses the normal forces of the previous solution: the last step
-is repeated until these no longer change. Its adjoint is that of the equilibrium.
+stick there keep sticking. Friction uses the normal forces of the previous solution, and the weight
+of robots their configuration there: the last step is repeated until these no longer change. Its
+adjoint is that of the equilibrium.
 
 References:
     Kelley and Keyes, "Convergence analysis of pseudo-transient continuation", SIAM Journal on
@@ -27,12 +28,14 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.border import Given
 from diffcloth_torch.sim.engine import Check, Engine
 from diffcloth_torch.sim.failures import failures_of, mark, refuse_gradients
+from diffcloth_torch.sim.free_modes import refuse_free_modes, surface_of_vertex
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.step import UNCONVERGED
 from diffcloth_torch.transforms import numbers_of, outside_transforms, plain
@@ -48,6 +51,11 @@ _GROWTH = (1e1, 1e2, 1e3)
 _PROBED = 1e5
 _LAST = 1e8
 
+# Robots settle in steps that count their weight with an upper bound of its stiffness, until nothing
+# moves by more than this share of the scene; then in those with the stiffness itself.
+_NEAR = 1e-3
+_DESCENTS = 300
+
 # Friction iterations of the last step, so that normal forces settle within it, and how often that
 # step is repeated at most.
 _FRICTION_ITERATIONS = 8
@@ -59,10 +67,6 @@ _SETTLED = 0.1
 
 # Anything that has moved by this many sizes of the scene is falling.
 _FALLEN = 30.0
-
-# A mode is free if a velocity moves it by this fraction of its way without forces.
-_FREE = 0.5
-_AXES = "xyz"
 
 
 class _Found(NamedTuple):
@@ -90,8 +94,13 @@ class Equilibria:
         self._contact, self._solver = contact, solver
         self._engines: dict[float, Engine] = {}
         assembly = layout.assembly
+        self._settles = any(robot.is_dynamic for robot in assembly.robots)
         points = assembly.vertices if len(assembly.vertices) else assembly.body_vertices
-        self._size = float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
+        size = float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
+        self._size = max([size, *(_reach(robot) for robot in assembly.robots)])
+        turns = [kind == "revolute" for robot in assembly.robots for kind in _kinds(robot)]
+        # A radian counts like the size of the scene.
+        self._lever = torch.where(torch.tensor(turns, dtype=torch.bool), self._size, 1.0).double()
 
     def find(self, given: Given, check: Check) -> tuple[Fields, Diagnostics]:
         """Find an equilibrium in each environment.
@@ -124,9 +133,11 @@ class Equilibria:
             anchor = plain(origins)
             for length in _GROWTH:
                 here = self._from(here, step(length, here, anchor))
+            if self._settles:
+                here = self._descend(here, lambda at: step(_GROWTH[-1], at, anchor))
             here = self._probe(here, lambda at: step(_PROBED, at, anchor))
             here, unsettled = self._settle(here, lambda at: step(_LAST, at, anchor))
-        fields, diagnostics = step(_LAST, given._replace(state=here.state), origins)
+        fields, diagnostics = step(_LAST, self._begun(given, here.state), origins)
         if unsettled:
             alternate = dict.fromkeys(unsettled, "friction and normal forces alternate")
             mark(diagnostics, alternate, UNCONVERGED)
@@ -154,6 +165,8 @@ class Equilibria:
                 contact=contact,
                 # Steps of all lengths must be solved to the same length, not to the same velocity.
                 solver=replace(solver, tolerance=solver.tolerance / length, metric=None),
+                weight="bounded" if length in _GROWTH else "exact",
+                limits_dt=self._dt,
             )
         return self._engines[length]
 
@@ -168,17 +181,46 @@ class Equilibria:
                 + ("use another scheme" if self._scheme == "projective" else "")
                 + (f"make {nodal[0]!r} without nodal_contact" if nodal else "")
             )
-        moved = [r.name for r in assembly.robots if r.is_dynamic]
-        if moved:
-            raise InvalidInput(
-                f"equilibrium: the robot {moved[0]!r} must be prescribed, its joints of position "
-                "or velocity actuation and its base fixed or kinematic; roll out until it rests"
-            )
-        for field, part in (("body_wrenches", slice(3, 6)), ("joint_velocities", slice(None))):
+        for field, part in (
+            ("body_wrenches", slice(3, 6)),
+            ("base_wrenches", slice(3, 6)),
+            ("joint_velocities", slice(None)),
+        ):
             values = given.control.get(field)
             if values is not None and numbers_of(values)[..., part].any():
-                what = "torques" if field == "body_wrenches" else "velocities"
+                what = "velocities" if field == "joint_velocities" else "torques"
                 raise InvalidInput(f"equilibrium: `control.{field}` must have no {what}")
+
+    def _begun(self, given: Given, state: Fields) -> Given:
+        """The given inputs, at a state that was found; what its robots hold keeps its graph."""
+        names, layout = ("joint_positions", "base_poses"), self._layout
+        held = (layout.permissions.at_rates, ~layout.permissions.floating)
+        kept = {
+            n: torch.where(mask.reshape(-1, *[1] * (t.dim() - 2)), given.state[n], t)
+            for n, mask in zip(names, held, strict=True)
+            if (t := state.get(n)) is not None
+        }
+        return given._replace(state=state | kept)
+
+    def _descend(self, here: Given, step: Callable[[Given], _Found]) -> Given:
+        """Repeat a step until robots are near an equilibrium."""
+        far = torch.ones(len(here.state["positions"]), dtype=torch.bool)
+        for _ in range(_DESCENTS):
+            after = _only(far, self._from(here, step(here)), here)
+            moved = self._moved(here.state, after.state)
+            here, far = after, (moved > _NEAR * self._size).any(dim=-1)
+            if not far.any():
+                break
+        return here
+
+    def _moved(self, before: Fields, after: Fields) -> Tensor:
+        """How far vertices and joints have moved [m], [B, N + V + J]."""
+        surfaces = self._engine(_LAST).surfaces
+        moved: Tensor = (surfaces.vertices(after) - surfaces.vertices(before)).norm(dim=-1)
+        if "joint_positions" not in after:
+            return moved
+        turned = (after["joint_positions"] - before["joint_positions"]).abs() * self._lever
+        return torch.cat([moved, turned], dim=-1)
 
     def _from(self, here: Given, found: _Found) -> Given:
         """Make the start of the next step, unless something is falling."""
@@ -189,7 +231,7 @@ class Equilibria:
         fallen = ~(moved < _FALLEN * self._size)
         if fallen.any():
             environment, vertex = (int(i) for i in fallen.nonzero()[0])
-            name = self._surface_of(vertex)
+            name = surface_of_vertex(self._layout, vertex)
             raise SimulationError(
                 f"equilibrium: {name!r} is free to move: in a long step from rest it moves by "
                 f"{float(moved[environment, vertex]):.3g} m; hold it, or put something under it",
@@ -199,89 +241,63 @@ class Equilibria:
 
     def _settle(self, here: Given, step: Callable[[Given], _Found]) -> tuple[Given, list[int]]:
         """Repeat the last step until friction has settled, a limited number of times."""
-        surfaces = self._engine(_LAST).surfaces
         slip = here.parameters.get("slip_velocity")
         enough = self._dt * self._solver.tolerance
         if slip is not None:
             enough = max(enough, _SETTLED * self._dt * float(slip.min()))
+        moves = torch.ones(len(here.state["positions"]), dtype=torch.bool)
         for _ in range(_REPEATS):
             found = step(here)
-            after = self._from(here, found)
-            moved = surfaces.vertices(after.state) - surfaces.vertices(here.state)
-            here, far = after, moved.norm(dim=-1) > enough
-            unsettled: list[int] = far.any(dim=-1).nonzero()[:, 0].tolist()
-            if not unsettled or any(found.diagnostics["status"]):
+            after = _only(moves, self._from(here, found), here)
+            moves = (self._moved(here.state, after.state) > enough).any(dim=-1)
+            here = after
+            if not moves.any() or any(found.diagnostics["status"]):
                 break
+        unsettled: list[int] = moves.nonzero()[:, 0].tolist()
         return here, unsettled
 
     def _probe(self, here: Given, step: Callable[[Given], _Found]) -> Given:
         """Take a step, and refuse things that a push moves without end: the Hessian is singular."""
-        names: list[str] = [n for n in ("velocities", "body_velocities") if n in here.state]
+        names = ["velocities", "body_velocities"]
+        if self._settles:
+            names += ["joint_velocities", "base_velocities"]
+        pushes = {n: _leaf(here.state[n]) for n in names if n in here.state}
+        forces = {}
+        if self._settles:
+            forces = {
+                "joint_efforts": _leaf(here.state["joint_velocities"]),
+                "base_wrenches": _leaf(here.state["base_velocities"]),
+            }
         with torch.enable_grad():
-            probes = {n: torch.zeros_like(here.state[n]).requires_grad_() for n in names}
-            found = step(here._replace(state=here.state | probes))
+            control = here.control | {n: here.control[n] + push for n, push in forces.items()}
+            found = step(Given(here.state | pushes, control, here.parameters))
         if not any(found.diagnostics["status"]):
-            self._refuse_free_modes(found.fields, probes)
+            refuse_free_modes(self._layout, found.fields, pushes, forces, _PROBED * self._dt)
         return self._from(here, found)
 
-    def _refuse_free_modes(self, fields: Fields, probes: Fields) -> None:
-        """Raise if the end of the step, weighted by noise, responds too much to initial pushes."""
-        outputs = [fields[n] for n in ("positions", "body_poses")]
-        outputs = [t for t in outputs if t.requires_grad]
-        if not outputs:
-            return
-        generator = torch.Generator().manual_seed(0)
-        noise = [torch.randn(t.shape, generator=generator, dtype=t.dtype) for t in outputs]
-        modes = torch.autograd.grad(
-            outputs,
-            list(probes.values()),
-            noise,
-            allow_unused=True,
-            materialize_grads=True,
-        )
-        for name, mode in zip(probes, modes, strict=True):
-            count = mode[0].numel() ** 0.5  # a rigid mode spreads its push
-            free = mode.flatten(1).norm(dim=1) * count > _FREE * _PROBED * self._dt
-            if free.any():
-                environments = free.nonzero()[:, 0].tolist()
-                raise SimulationError(
-                    f"equilibrium: {self._describe(name, mode[environments[0]])}; nothing holds "
-                    "it, so that there is no single equilibrium; pin it, or give it friction",
-                    environments=environments,
-                )
 
-    def _describe(self, field: str, mode: Tensor) -> str:
-        """Say what is free, and to do what."""
-        assembly = self._layout.assembly
-        if field == "body_velocities":
-            row = int(mode.abs().amax(dim=1).argmax())
-            linear, angular = torch.split(mode[row], 3)
-            name = assembly.bodies[row].name
-            way, vector = ("slide along", linear)
-            if angular.norm() > linear.norm():
-                way, vector = ("turn about", angular)
-        else:
-            vertex = int(mode.norm(dim=1).argmax())
-            name = self._surface_of(vertex)
-            start = assembly.cloth_vertex_start
-            k = assembly.surface_names.index(name)
-            vector = mode[start[k] : start[k + 1]].mean(dim=0)
-            way = "slide along"
-            if vector.norm() < 0.5 * mode[vertex].norm():
-                return f"{name!r} is free to turn or to change its shape"
-        axis = int(vector.abs().argmax())
-        if vector[axis].abs() > 0.95 * vector.norm():
-            return f"{name!r} is free to {way} {_AXES[axis]}"
-        direction = ", ".join(f"{v:.2f}" for v in (vector / vector.norm()).tolist())
-        return f"{name!r} is free to {way} ({direction})"
+def _only(mask: Tensor, after: Given, before: Given) -> Given:
+    """The state after, in the environments of a mask; the bits of the others stay as they were."""
+    state = {
+        name: torch.where(mask.reshape(-1, *[1] * (t.dim() - 1)), t, before.state[name])
+        for name, t in after.state.items()
+    }
+    return after._replace(state=state)
 
-    def _surface_of(self, vertex: int) -> str:
-        """Name of the surface to which a row of all vertices belongs."""
-        assembly = self._layout.assembly
-        ends = [*assembly.cloth_vertex_start[1:]]
-        ends += [len(assembly.vertices) + end for end in assembly.body_vertex_start[1:]]
-        surface = next(s for s, end in enumerate(ends) if vertex < end)
-        return assembly.surface_names[surface]
+
+def _leaf(values: Tensor) -> Tensor:
+    return torch.zeros_like(values).requires_grad_()
+
+
+def _reach(robot: Mechanism) -> float:
+    """How far the links of a robot reach at most, without shifts of joints [m]."""
+    return float(np.linalg.norm(robot.offset[:, :3, 3], axis=-1).sum())
+
+
+def _kinds(robot: Mechanism) -> list[str]:
+    """Kind of each of the J joints."""
+    leads = [int(np.flatnonzero(robot.dof == j)[0]) for j in range(robot.joint_count)]
+    return [robot.kind[link] for link in leads]
 
 
 def _resting(given: Given) -> Given:

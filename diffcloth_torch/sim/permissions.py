@@ -34,6 +34,8 @@ class Permissions:
         unforced: "body_wrenches" or "base_wrenches" -> why each row must be zero, or "".
         actuation: Actuation of each joint, length J.
         driven: Which joints have a pd drive, shape [J].
+        at_rates: Which joints have prescribed velocities, shape [J].
+        floating: Which robots have a floating base, shape [R].
         settable: Field of a control -> which joints it can set, shape [J].
         massive: "body" or "link" -> which of them are dynamic and have mass, [K] or [L].
         lower: Lower limits [rad or m], shape [J].
@@ -56,6 +58,8 @@ class Permissions:
         }
         self.actuation = tuple(mode for robot in robots for mode in robot.actuation)
         self.driven = torch.tensor([mode == "pd" for mode in self.actuation], dtype=torch.bool)
+        self.at_rates = torch.tensor([m == "velocity" for m in self.actuation], dtype=torch.bool)
+        self.floating = torch.tensor([r.base == "floating" for r in robots], dtype=torch.bool)
         self.settable = {
             field: np.array([mode in modes for mode in self.actuation], dtype=bool)
             for field, modes in _MODES.items()

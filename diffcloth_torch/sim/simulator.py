@@ -324,8 +324,8 @@ class Simulator(Observables):
             NotConverged: If a solve stops before it reaches its tolerance, or friction does not
                 settle.
             InfeasibleMotion: As for `step`.
-            InvalidInput: As for `step`; also if a robot is dynamic, contact is at vertices, or the
-                control has torques on bodies or velocities of joints.
+            InvalidInput: As for `step`; also if contact is at vertices, or the control has torques
+                on bodies or bases, or velocities of joints.
         """
         given, batch = self._border.enter(state, control, parameters)
         fields, diagnostics = self._equilibria.find(given, self._check(batched=batch is not None))

@@ -321,12 +321,6 @@ def test_what_has_no_equilibrium_is_refused():
     nodal = dc.Simulator(dc.Scene(sim.scene.cloths, [box]), 0.01, scheme="split")
     with pytest.raises(dc.InvalidInput, match="make 'box' without nodal_contact"):
         nodal.equilibrium(nodal.initial_state())
-    hand = dc.Robot.load(
-        dc.robots.GRIPPER, pose=[0, 0, -2, 1, 0, 0, 0], stiffness=10.0, damping=1.0, name="hand"
-    )
-    driven = dc.Simulator(dc.Scene(sim.scene.cloths, [], [hand]), 0.01)
-    with pytest.raises(dc.InvalidInput, match="robot 'hand' must be prescribed"):
-        driven.equilibrium(driven.initial_state())
     projective = dc.Simulator(sim.scene, 0.01, scheme="projective")
     with pytest.raises(dc.InvalidInput, match="use another scheme"):
         projective.equilibrium(projective.initial_state())

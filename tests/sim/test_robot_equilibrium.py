@@ -1,0 +1,229 @@
+"""Equilibria of robots, against statics by hand, long rollouts and differences."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import fsolve
+
+import diffcloth_torch as dc
+
+F64 = torch.float64
+TIGHT = dc.SolverOptions(tolerance=1e-9)
+MASSES, CENTERS, LENGTH = (0.4, 0.3), (0.15, 0.1), 0.3
+
+LINK = """
+<link name="{name}">
+  <inertial><origin xyz="{center} 0 0"/><mass value="{mass}"/>
+    <inertia ixx="1e-3" iyy="3e-3" izz="3e-3" ixy="0" ixz="0" iyz="0"/></inertial>
+  <collision><origin xyz="{center} 0 0"/><geometry><box size="{length} .03 .03"/></geometry>
+  </collision>
+</link>"""
+BASE = """
+<link name="base"><inertial><mass value="1"/>
+  <inertia ixx="1e-2" iyy="1e-2" izz="1e-2" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+JOINT = """
+<joint name="{name}" type="revolute"><parent link="{parent}"/><child link="{child}"/>
+  <origin xyz="{at} 0 0"/><axis xyz="0 1 0"/>
+  <limit lower="-6" upper="6" effort="9" velocity="9"/></joint>"""
+
+
+@pytest.fixture
+def arm(tmp_path):
+    """Load an arm of two links that turn about y, in the direction of x at first."""
+    links = zip(("upper", "lower"), MASSES, CENTERS, (0.26, 0.16), strict=True)
+    parts = [LINK.format(name=n, mass=m, center=c, length=size) for n, m, c, size in links]
+    parts += [
+        JOINT.format(name="shoulder", parent="base", child="upper", at=0),
+        JOINT.format(name="elbow", parent="upper", child="lower", at=LENGTH),
+    ]
+    path = tmp_path / "arm.urdf"
+    path.write_text(f'<robot name="arm">{BASE}{"".join(parts)}</robot>')
+
+    def load(**options):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", dc.IgnoredLimitsWarning)
+            return dc.Robot.load(path, name="arm", **options)
+
+    return load
+
+
+def alone(robot, **options):
+    contact = dc.ContactOptions(barrier_distance=2e-3)
+    floor = dc.RigidBody.plane(3.0, pose=[0, 0, -3, 1, 0, 0, 0], name="floor")
+    scene = dc.Scene([], [floor], [robot], **options)
+    return dc.Simulator(scene, 0.01, contact=contact, solver=TIGHT)
+
+
+def moments(joints, gravity=9.81):
+    """Moments of the weight about both axes, which point along y."""
+    first, second = joints[0], joints[0] + joints[1]
+    lower = MASSES[1] * gravity * CENTERS[1] * np.cos(second)
+    upper = (MASSES[0] * CENTERS[0] + MASSES[1] * LENGTH) * gravity * np.cos(first)
+    return np.array([upper + lower, lower])
+
+
+@pytest.mark.parametrize("stiffness", [8.0, 2.0])
+def test_an_arm_sags_on_its_drives(arm, stiffness):
+    sim = alone(arm(stiffness=stiffness, damping=1.0))
+    found = sim.equilibrium(sim.initial_state())
+    expected = fsolve(lambda q: moments(q) - stiffness * q, [0.3, 0.0], xtol=1e-13)
+    np.testing.assert_allclose(found.joint_positions.numpy(), expected, atol=1e-9)
+    np.testing.assert_allclose(found.joint_efforts.numpy(), -moments(expected), atol=1e-8)
+    assert not found.joint_velocities.any()
+
+
+def test_an_arm_without_drives_hangs(arm):
+    """Also from a start at which the weight has nearly no moment, above the axis."""
+    start = {"shoulder": -1.5, "elbow": 0.3}
+    sim = alone(arm(actuation="torque", joint_positions=start))
+    found = sim.equilibrium(sim.initial_state())
+    np.testing.assert_allclose(found.joint_positions.numpy(), [np.pi / 2, 0.0], atol=1e-9)
+
+
+def test_efforts_of_prescribed_joints_hold_the_weight(arm):
+    actuation = {"shoulder": "position", "elbow": "pd"}
+    drives = {"elbow": 5.0}
+    sim = alone(arm(actuation=actuation, stiffness=drives, damping={"elbow": 1.0}))
+    target = torch.tensor([0.4, 0.0], dtype=F64)
+    found = sim.equilibrium(sim.initial_state(), sim.control(joint_positions=target))
+    joints = found.joint_positions.numpy()
+    assert joints[0] == pytest.approx(0.4, abs=1e-12)
+    np.testing.assert_allclose(found.joint_efforts.numpy(), -moments(joints), atol=1e-8)
+
+
+def slopes(loss, value, way, step):
+    leaf = value.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss(leaf), leaf)
+    with torch.no_grad():
+        ends = [float(loss(value + sign * step * way)) for sign in (1, -1)]
+    return float((gradient * way).sum()), (ends[0] - ends[1]) / (2 * step)
+
+
+def random_way(value, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    return (torch.rand(value.shape, generator=generator, dtype=F64) + 0.5) * value
+
+
+def onto_a_sheet(arm, **options):
+    """An arm that presses on a sheet, which is pinned at its corners."""
+    robot = arm(stiffness=3.0, damping=1.0, pose=[0, 0, 0.3, 1, 0, 0, 0], **options)
+    corners = {"corners": [0, 9, 90, 99]}
+    sheet = dc.Cloth.grid(10, 10, (0.5, 0.5), pose=[0.35, 0, 0.15, 1, 0, 0, 0], pins=corners)
+    return dc.Simulator(dc.Scene([sheet], [], [robot]), 0.01, solver=TIGHT)
+
+
+def test_gradients_of_an_arm_that_presses_on_a_sheet(arm):
+    sim = onto_a_sheet(arm)
+    found = sim.equilibrium(sim.initial_state())
+    assert found.report.contacts["cloth0", "arm/lower"].count > 0
+    weights = torch.randn(100, 3, generator=torch.Generator().manual_seed(9), dtype=F64)
+
+    def value_of(end):
+        return (end.positions * weights).sum() + 3.0 * end.joint_positions[0]
+
+    def by_parameter(name):
+        return lambda value: value_of(
+            sim.equilibrium(found, None, sim.parameters().replace(**{name: value}))
+        )
+
+    for name in ("link_mass", "link_center", "joint_stiffness", "stretch", "friction", "gravity"):
+        value = getattr(sim.parameters(), name)
+        exact, differences = slopes(by_parameter(name), value, random_way(value), 1e-5)
+        assert exact == pytest.approx(differences, rel=1e-4), name
+
+    def by_control(name):
+        return lambda value: value_of(sim.equilibrium(found, sim.control(**{name: value})))
+
+    for name in ("joint_efforts", "joint_positions"):
+        value = torch.zeros(2, dtype=F64)
+        way = torch.tensor([1.0, 0.6], dtype=F64)
+        exact, differences = slopes(by_control(name), value, way, 1e-5)
+        assert exact == pytest.approx(differences, rel=1e-4), name
+
+    def by_base(value):
+        return value_of(sim.equilibrium(found.replace(base_poses=value)))
+
+    way = torch.tensor([[0.3, 0.2, 1.0, 0, 0.1, 0.2, 0.1]], dtype=F64)
+    exact, differences = slopes(by_base, found.base_poses, way, 1e-6)
+    assert exact == pytest.approx(differences, rel=1e-4)
+
+
+def test_a_batch_of_arms_has_the_bits_of_each(arm):
+    sim = onto_a_sheet(arm)
+    stiffness = torch.tensor([[3.0, 3.0], [5.0, 1.0]], dtype=F64)
+    parameters = sim.parameters()
+    batch = sim.equilibrium(
+        sim.initial_state(2), None, parameters.replace(joint_stiffness=stiffness)
+    )
+    for k in range(2):
+        given = parameters.replace(joint_stiffness=stiffness[k])
+        single = sim.equilibrium(sim.initial_state(), None, given)
+        assert torch.equal(batch.positions[k], single.positions)
+        assert torch.equal(batch.joint_positions[k], single.joint_positions)
+
+
+def test_a_rollout_ends_there(arm):
+    """But for what a step adds to the weight, which is of the order of its length squared."""
+    errors = []
+    for dt in (0.02, 0.01):
+        robot = arm(stiffness=4.0, damping=0.5)
+        contact = dc.ContactOptions(barrier_distance=2e-3)
+        floor = dc.RigidBody.plane(3.0, pose=[0, 0, -3, 1, 0, 0, 0])
+        sim = dc.Simulator(dc.Scene([], [floor], [robot]), dt, contact=contact, solver=TIGHT)
+        found = sim.equilibrium(sim.initial_state())
+        given = sim.parameters().replace(joint_viscosity=torch.tensor([0.5, 0.5], dtype=F64))
+        with torch.no_grad():
+            end = sim.rollout(sim.initial_state(), parameters=given, steps=int(4 / dt))[-1]
+        errors.append(float((end.joint_positions - found.joint_positions).abs().max()))
+    assert errors[1] < 1e-4
+    assert errors[0] / errors[1] > 2.5
+
+
+def test_a_hand_rests_on_a_floor():
+    hand = dc.Robot.load(
+        dc.robots.GRIPPER, base="floating", pose=[0, 0, 0.2, 1, 0, 0, 0], stiffness=50.0,
+        damping=1.0, name="hand",
+    )  # fmt: skip
+    contact = dc.ContactOptions(barrier_distance=2e-3)
+    floor = dc.RigidBody.plane(3.0, name="floor")
+    sim = dc.Simulator(dc.Scene([], [floor], [hand]), 0.005, contact=contact, solver=TIGHT)
+    found = sim.equilibrium(sim.initial_state())
+    weight = float(sim.parameters().link_mass.sum()) * 9.81
+    force = found.body_forces[sim.slices["floor"]].sum(0)
+    torch.testing.assert_close(force, torch.tensor([0, 0, -weight], dtype=F64), rtol=0, atol=1e-6)
+    with torch.no_grad():
+        end = sim.rollout(sim.initial_state(), steps=600)[-1]
+    torch.testing.assert_close(found.base_poses, end.base_poses, rtol=0, atol=1e-6)
+
+
+def test_a_joint_that_nothing_holds_is_named(arm):
+    robot = arm(actuation={"shoulder": "pd", "elbow": "torque"},
+                stiffness={"shoulder": 5.0}, damping={"shoulder": 1.0})  # fmt: skip
+    sim = alone(robot, gravity=(0, 9.81, 0))  # along the axes
+    with pytest.raises(dc.SimulationError, match="joint 'arm/elbow' is free to move"):
+        sim.equilibrium(sim.initial_state())
+
+
+def test_a_hand_that_floats_is_named():
+    hand = dc.Robot.load(
+        dc.robots.GRIPPER, base="floating", stiffness=50.0, damping=1.0, name="hand"
+    )
+    contact = dc.ContactOptions(barrier_distance=2e-3)
+    floor = dc.RigidBody.plane(3.0, pose=[0, 0, -1, 1, 0, 0, 0])
+    scene = dc.Scene([], [floor], [hand], gravity=(0, 0, 0))
+    sim = dc.Simulator(scene, 0.005, contact=contact)
+    with pytest.raises(dc.SimulationError, match="'hand' is free to"):
+        sim.equilibrium(sim.initial_state())
+
+
+def test_torques_on_bases_and_velocities_of_joints_are_refused(arm):
+    sim = alone(arm(stiffness=8.0, damping=1.0))
+    rates = sim.control(joint_velocities=torch.tensor([0.1, 0.0], dtype=F64))
+    with pytest.raises(dc.InvalidInput, match="joint_velocities` must have no velocities"):
+        sim.equilibrium(sim.initial_state(), rates)
+    floating = alone(arm(stiffness=8.0, damping=1.0, base="floating"))
+    wrench = torch.tensor([[0, 0, 1.0, 0.1, 0, 0]], dtype=F64)
+    with pytest.raises(dc.InvalidInput, match="base_wrenches` must have no torques"):
+        floating.equilibrium(floating.initial_state(), floating.control(base_wrenches=wrench))
