@@ -149,6 +149,28 @@ class ContactPotential {
     return result;
   }
 
+  /// How the gradients of barrier and friction change with tangents of what they depend on: transposes of
+  /// the two above.
+  Rows3 tangent(const Positions& x, const nb::dict& dot) {
+    Rows3 y = Rows3::Zero(x.rows(), 3);
+    model_.add_tangent(find(x), x.data(), from_dict(dot), y.data());
+    return y;
+  }
+
+  Rows3 friction_tangent(const Positions& x_lag,
+                         const Positions& x_start,
+                         const Positions& x,
+                         const nb::dict& dot) {
+    const contact::FrictionSet set(model_, find(x_lag), x_start.data());
+    const contact::ContactModel::Bar parameters = from_dict(dot);
+    const auto start = nb::cast<Values>(dot["x_start"]);
+    const auto lag = nb::cast<Values>(dot["x_lag"]);
+    Rows3 y = Rows3::Zero(x.rows(), 3);
+    set.add_tangent(x.data(), x_lag.data(),
+                    {.parameters = parameters, .start = start.data(), .lag = lag.data()}, y.data());
+    return y;
+  }
+
   const linalg::BlockPattern& pattern() const { return pattern_; }
 
   Potential& between(const double* x, const double* to) {
@@ -252,6 +274,21 @@ class ContactPotential {
     return result;
   }
 
+  contact::ContactModel::Bar from_dict(const nb::dict& dot) const {
+    const auto list = [&](const char* name) { return nb::cast<std::vector<double>>(dot[name]); };
+    contact::ContactModel::Bar result(mesh_);
+    result.d_hat = nb::cast<double>(dot["d_hat"]);
+    result.slip = nb::cast<double>(dot["slip"]);
+    result.thickness = list("thickness");
+    result.kappa = list("kappa");
+    result.friction = list("friction");
+    result.rest.vertex_area = list("vertex_area");
+    result.rest.edge_area = list("edge_area");
+    result.rest.edge_length_sq = list("edge_length_sq");
+    result.rest.mean_face_area = list("mean_face_area");
+    return result;
+  }
+
   contact::CollisionMesh mesh_;
   std::vector<char> prescribed_;
   contact::FeatureWeights weights_;
@@ -304,6 +341,9 @@ void contact_potentials(nb::module_& m) {
       .def("friction", &ContactPotential::friction, "x_lag"_a, "x_start"_a, nb::keep_alive<0, 1>())
       .def("friction_mixed", &ContactPotential::friction_mixed, "x_lag"_a, "x_start"_a, "x"_a,
            "z"_a, "scale"_a = 1.0)
+      .def("tangent", &ContactPotential::tangent, "x"_a, "dot"_a)
+      .def("friction_tangent", &ContactPotential::friction_tangent, "x_lag"_a, "x_start"_a, "x"_a,
+           "dot"_a)
       .def("measure",
            [](ContactPotential& self, const std::string& name) { return self.measure(name); })
       .def("set_measure",
