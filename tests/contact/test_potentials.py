@@ -204,6 +204,80 @@ def test_mixed_derivatives_of_friction(name, amount):
         assert slope == pytest.approx(expected, abs=2e-6 * np.linalg.norm(found["x_start"]))
 
 
+def random_tangents(found, seed=9):
+    """A direction of everything that a dictionary of cotangents has."""
+    rng = np.random.default_rng(seed)
+    return {name: rng.normal(size=np.shape(bar)).tolist() for name, bar in found.items()}
+
+
+def pairing(found, dot):
+    """Of cotangents and tangents: the sum, and that of its sizes."""
+    terms = [np.dot(np.ravel(bar), np.ravel(dot[name])) for name, bar in found.items()]
+    return sum(terms), sum(abs(term) for term in terms)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_tangents_are_mixed_derivatives_transposed(name):
+    scene = contact_scenes.make(name)
+    for z in directions(scene.x.shape, 2, seed=8):
+        found = scene.potential().mixed(scene.x, z)
+        dot = random_tangents(found)
+        expected, size = pairing(found, dot)
+        y = scene.potential().tangent(scene.x, dot)
+        # Both are sums of the same products.
+        assert (y * z).sum() == pytest.approx(expected, abs=1e-12 * size)
+        assert size > 0
+
+
+@pytest.mark.parametrize("amount", [0.003, 0.05])
+@pytest.mark.parametrize("name", NAMES)
+def test_tangents_of_friction_are_mixed_derivatives_transposed(name, amount):
+    scene = contact_scenes.make(name)
+    start, x = moved(scene, amount), moved(scene, amount, 6)
+    for z in directions(scene.x.shape, 2, seed=8):
+        found = scene.potential().friction_mixed(scene.x, start, x, z)
+        dot = random_tangents(found)
+        dot["x_start"], dot["x_lag"] = np.array(dot["x_start"]), np.array(dot["x_lag"])
+        expected, size = pairing(found, dot)
+        y = scene.potential().friction_tangent(scene.x, start, x, dot)
+        # Both are sums of the same products.
+        assert (y * z).sum() == pytest.approx(expected, abs=1e-11 * size)
+        assert size > 0
+
+
+def test_contacts_that_are_expected_to_slide_are_as_soft_as_there():
+    """At rest the curvature is that of sticking, thousands of times as much."""
+    scene = contact_scenes.make("two_cloths")
+    potential = scene.potential(slip=1e-6)
+    slide = np.zeros_like(scene.x)
+    slide[scene.surface == 0] = [2e-3, 1e-3, 0.0]
+    friction = potential.friction(scene.x, scene.x)
+    at_rest = friction.hessian(scene.x)
+    sliding = friction.hessian(scene.x + slide, True)
+    expects, h, positive = friction.expecting(scene.x, scene.x + slide)
+    along = slide.ravel()
+    assert expects
+    assert along @ h @ along == pytest.approx(along @ sliding @ along, rel=1e-6)
+    np.testing.assert_array_equal(h, positive)
+    assert along @ at_rest @ along > 1e3 * (along @ h @ along)
+    np.testing.assert_array_equal(friction.hessian(scene.x), at_rest)  # the exact one stays
+    # A step ends it.
+    friction.after(scene.x, slide)
+    np.testing.assert_array_equal(friction.hessian(scene.x, True), at_rest)
+
+
+def test_nothing_is_expected_where_all_sticks():
+    scene = contact_scenes.make("two_cloths")
+    friction = scene.potential(slip=1e-6).friction(scene.x, scene.x)
+    shift = np.zeros_like(scene.x)
+    shift[scene.surface == 0] = [3e-8, 0.0, 0.0]
+    expects, h, positive = friction.expecting(scene.x, scene.x + shift)
+    assert not expects
+    exact = friction.hessian(scene.x)
+    np.testing.assert_array_equal(h, exact)
+    np.testing.assert_array_equal(positive, exact)
+
+
 def test_duals_remember_the_other_side_of_a_kink():
     """A slip that turns round: no curvature along it, but twice the majorant's with duals."""
     scene = contact_scenes.make("two_cloths")

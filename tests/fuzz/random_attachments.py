@@ -71,13 +71,15 @@ def controlled(control: dc.Control, pulls: tuple[Pull, ...], k: int, dt: float) 
 
 
 def draw_attachments(
-    rng: np.random.Generator, d: dict[str, Any], scene: dc.Scene
+    seed: int, index: int, d: dict[str, Any], scene: dc.Scene
 ) -> tuple[dc.Scene, tuple[Pull, ...]]:
     """The scene with up to three attachments of its cloths, and what controls do with them.
 
     Ends are a vertex of a cloth, or a point of one of its faces, and a target, another vertex or,
     where one solve moves cloths and bodies, a point of a body.
     """
+    # Numbers of their own: scenes are otherwise what they were before there were attachments.
+    rng = np.random.default_rng([seed, index, 2])
     if not scene.cloths or rng.random() >= SHARE:
         return scene, ()
     attachments, pulls = [], []

@@ -143,8 +143,7 @@ def draw_cloth_scene(seed: int, index: int) -> RandomScene:
     cloths, clearance = draw_cloths(rng, d)
     bodies, velocities = draw_bodies(rng, d, clearance)
     scene = dc.Scene(cloths, bodies, gravity=(0.0, 0.0, -d["gravity"]))
-    # Numbers of their own: scenes are otherwise what they were before there were attachments.
-    scene, pulls = draw_attachments(np.random.default_rng([seed, index, 2]), d, scene)
+    scene, pulls = draw_attachments(seed, index, d, scene)
     simulator = dc.Simulator(
         scene,
         d["dt"],

@@ -92,8 +92,7 @@ def draw_tower(seed: int, index: int) -> RandomScene:
         velocities = np.array([_velocity(rng, d, body) for body in bodies])
         d["bodies"] = kinds
     drawn = dc.Scene(cloths, bodies, robots, gravity=(0.0, 0.0, -d["gravity"]))
-    # Numbers of their own: scenes are otherwise what they were before there were attachments.
-    drawn, pulls = draw_attachments(np.random.default_rng([seed, index, 2]), d, drawn)
+    drawn, pulls = draw_attachments(seed, index, d, drawn)
     simulator = dc.Simulator(
         drawn,
         d["dt"],

@@ -64,6 +64,16 @@ class Friction {
             dense_hessian(potential_, pattern_, to.data(), Curvature::kPrimalDual)};
   }
 
+  /// At x, where a motion to another point is expected: whether there are duals, and the primal-dual and
+  /// the positive Hessian.
+  std::tuple<bool, Eigen::MatrixXd, Eigen::MatrixXd> expecting(const Positions& x,
+                                                               const Positions& to) {
+    potential_.expect(x.data(), to.data());
+    return {potential_.has_duals(x.data()),
+            dense_hessian(potential_, pattern_, x.data(), Curvature::kPrimalDual),
+            dense_hessian(potential_, pattern_, x.data(), Curvature::kPositive)};
+  }
+
  private:
   const linalg::BlockPattern& pattern_;
   Rows3 x_start_;
@@ -147,6 +157,28 @@ class ContactPotential {
     result["x_start"] = start_bar;
     result["x_lag"] = lag_bar;
     return result;
+  }
+
+  /// How the gradients of barrier and friction change with tangents of what they depend on: transposes of
+  /// the two above.
+  Rows3 tangent(const Positions& x, const nb::dict& dot) {
+    Rows3 y = Rows3::Zero(x.rows(), 3);
+    model_.add_tangent(find(x), x.data(), from_dict(dot), y.data());
+    return y;
+  }
+
+  Rows3 friction_tangent(const Positions& x_lag,
+                         const Positions& x_start,
+                         const Positions& x,
+                         const nb::dict& dot) {
+    const contact::FrictionSet set(model_, find(x_lag), x_start.data());
+    const contact::ContactModel::Bar parameters = from_dict(dot);
+    const auto start = nb::cast<Values>(dot["x_start"]);
+    const auto lag = nb::cast<Values>(dot["x_lag"]);
+    Rows3 y = Rows3::Zero(x.rows(), 3);
+    set.add_tangent(x.data(), x_lag.data(),
+                    {.parameters = parameters, .start = start.data(), .lag = lag.data()}, y.data());
+    return y;
   }
 
   const linalg::BlockPattern& pattern() const { return pattern_; }
@@ -252,6 +284,21 @@ class ContactPotential {
     return result;
   }
 
+  contact::ContactModel::Bar from_dict(const nb::dict& dot) const {
+    const auto list = [&](const char* name) { return nb::cast<std::vector<double>>(dot[name]); };
+    contact::ContactModel::Bar result(mesh_);
+    result.d_hat = nb::cast<double>(dot["d_hat"]);
+    result.slip = nb::cast<double>(dot["slip"]);
+    result.thickness = list("thickness");
+    result.kappa = list("kappa");
+    result.friction = list("friction");
+    result.rest.vertex_area = list("vertex_area");
+    result.rest.edge_area = list("edge_area");
+    result.rest.edge_length_sq = list("edge_length_sq");
+    result.rest.mean_face_area = list("mean_face_area");
+    return result;
+  }
+
   contact::CollisionMesh mesh_;
   std::vector<char> prescribed_;
   contact::FeatureWeights weights_;
@@ -270,7 +317,8 @@ class ContactPotential {
 void contact_potentials(nb::module_& m) {
   nb::class_<Friction> friction(m, "Friction");
   bind_potential(friction);
-  friction.def("after", &Friction::after, "x"_a, "p"_a, "alpha"_a = 1.0);
+  friction.def("after", &Friction::after, "x"_a, "p"_a, "alpha"_a = 1.0)
+      .def("expecting", &Friction::expecting, "x"_a, "to"_a);
 
   nb::class_<ContactPotential> barrier(m, "ContactPotential");
   bind_potential(barrier);
@@ -304,6 +352,9 @@ void contact_potentials(nb::module_& m) {
       .def("friction", &ContactPotential::friction, "x_lag"_a, "x_start"_a, nb::keep_alive<0, 1>())
       .def("friction_mixed", &ContactPotential::friction_mixed, "x_lag"_a, "x_start"_a, "x"_a,
            "z"_a, "scale"_a = 1.0)
+      .def("tangent", &ContactPotential::tangent, "x"_a, "dot"_a)
+      .def("friction_tangent", &ContactPotential::friction_tangent, "x_lag"_a, "x_start"_a, "x"_a,
+           "dot"_a)
       .def("measure",
            [](ContactPotential& self, const std::string& name) { return self.measure(name); })
       .def("set_measure",
