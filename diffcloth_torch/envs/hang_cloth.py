@@ -25,7 +25,7 @@ def _peg(y: float) -> RigidBody:
     x, _, z = _PEG.tolist()
     across = [0.5**0.5, 0.5**0.5, 0, 0]
     side = "left" if y > 0 else "right"
-    return RigidBody.capsule(0.01, 0.02, pose=[x, y, z, *across], friction=0.8, name=f"{side}_peg")
+    return RigidBody.capsule(0.01, 0.02, pose=[x, y, z, *across], friction=2.0, name=f"{side}_peg")
 
 
 class HangCloth(HandTask):
@@ -85,15 +85,17 @@ class HangCloth(HandTask):
         return _PEG - env.state.positions.mean(dim=1)
 
 
-# Transitions, and where the tip of the hand should then be from between the pegs [m].
+# Transitions, and where the tip of the hand should then be from between the pegs [m]. With the tip
+# 2.8 cm beyond the pegs the middle of the cloth lies over them: 4 cm beyond, what hangs on the side of
+# the hand pulls the rest after it when the open fingers rise.
 _PATH = (
     (30, (-0.15, 0.0, 0.1)),
     (44, (-0.05, 0.0, 0.06)),
-    (66, (0.03, 0.0, 0.04)),
-    (74, (0.04, 0.0, 0.005)),
-    (80, (0.04, 0.0, 0.005)),
-    (86, (0.04, 0.0, 0.005)),
-    (108, (0.04, 0.0, 0.15)),
+    (64, (0.018, 0.0, 0.04)),
+    (72, (0.028, 0.0, 0.005)),
+    (80, (0.028, 0.0, 0.005)),
+    (86, (0.028, 0.0, 0.005)),
+    (112, (0.028, 0.0, 0.12)),
 )
 _RELEASE = 80
 _AJAR = 0.5  # effort with which fingers open by 1.7 cm each: further ones would push the cloth
