@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from diffcloth_torch.envs.actuators import Tools
 from diffcloth_torch.envs.env import EnvState
@@ -48,7 +49,7 @@ class DropCloth(SheetTask):
     def distance(self, env: EnvState) -> Tensor:
         """Mean distance from the flat sheet [m], [B]."""
         away = env.state.positions - env.drawn["goal"]
-        return (away.square().sum(dim=-1) + 1e-12).sqrt().mean(dim=-1)
+        return vector_norm(away, dim=-1).mean(dim=-1)
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""

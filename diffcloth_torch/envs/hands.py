@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from diffcloth_torch import robots
 from diffcloth_torch.envs.actuators import Hand, Tools
@@ -150,7 +151,7 @@ class LiftCloth(HandTask):
         return env.drawn["goal"] - env.state.positions.mean(dim=1)
 
     def _distance(self, env: EnvState) -> Tensor:
-        return (self._away(env).square().sum(dim=-1) + 1e-12).sqrt()
+        return vector_norm(self._away(env), dim=-1)
 
 
 class GraspCloth(HandTask):
@@ -182,7 +183,7 @@ class GraspCloth(HandTask):
     def distance(self, env: EnvState) -> Tensor:
         """Mean distance from the target shape [m], [B]."""
         away = env.state.positions - env.drawn["target"]
-        return (away.square().sum(dim=-1) + 1e-12).sqrt().mean(dim=-1)
+        return vector_norm(away, dim=-1).mean(dim=-1)
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from diffcloth_torch.envs.actuators import Tools
 from diffcloth_torch.envs.env import EnvState
@@ -56,7 +57,7 @@ class HangCloth(HandTask):
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return -(self._away(env).square().sum(dim=-1) + 1e-12).sqrt()
+        return -vector_norm(self._away(env), dim=-1)
 
     def success(self, env: EnvState) -> Tensor:
         """Whether the cloth hangs near the pegs, at rest, and nothing else holds it."""
@@ -86,8 +87,7 @@ class HangCloth(HandTask):
 
 
 # Transitions, and where the tip of the hand should then be from between the pegs [m]. With the tip
-# 2.8 cm beyond the pegs the middle of the cloth lies over them: 4 cm beyond, what hangs on the side of
-# the hand pulls the rest after it when the open fingers rise.
+# 2.8 cm beyond them the middle of the cloth lies on the pegs.
 _PATH = (
     (30, (-0.15, 0.0, 0.1)),
     (44, (-0.05, 0.0, 0.06)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from diffcloth_torch.envs.actuators import Tools, Twist
 from diffcloth_torch.envs.env import EnvState, Task
@@ -96,7 +97,7 @@ class HitCloth(Task):
     def distance(self, env: EnvState) -> Tensor:
         """Mean distance from the target [m], [B]."""
         away = env.state.positions - self.target
-        return (away.square().sum(dim=-1) + 1e-12).sqrt().mean(dim=-1)
+        return vector_norm(away, dim=-1).mean(dim=-1)
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""

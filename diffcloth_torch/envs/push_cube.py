@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from diffcloth_torch.envs.actuators import Tools, Velocities
 from diffcloth_torch.envs.env import EnvState, Task
@@ -96,7 +97,7 @@ class PushCube(Task):
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return -(self._away(env).square().sum(dim=-1) + 1e-12).sqrt()
+        return -vector_norm(self._away(env), dim=-1)
 
     def success(self, env: EnvState) -> Tensor:
         """Whether the cube is within 3 cm of the target."""
@@ -106,7 +107,7 @@ class PushCube(Task):
         """Push the cube with the sheet across the way to the target, and step back in time."""
         away = self._away(env)
         cube, velocity = env.state.body_poses[:, 0, :2], env.state.body_velocities[:, 0, :2]
-        distance = away.square().sum(dim=-1, keepdim=True).sqrt()
+        distance = vector_norm(away, dim=-1, keepdim=True)
         to_target = away / distance.clamp(min=1e-3)
         ahead = away - _BRAKING * velocity
         pushes = ((ahead * away).sum(dim=-1, keepdim=True) > 0) & (distance > 0.3 * _CLOSE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.linalg import vector_norm
 
 from diffcloth_torch.envs.actuators import Forces, Tools
 from diffcloth_torch.envs.env import EnvState, Task
@@ -94,7 +95,7 @@ class TwoCloths(Task):
 
     def distance(self, env: EnvState) -> Tensor:
         """Distance of the center from the target [m], [B]."""
-        return (self._away(env).square().sum(dim=-1) + 1e-12).sqrt()
+        return vector_norm(self._away(env), dim=-1)
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
