@@ -109,9 +109,9 @@ class RayActors:
             # As many as they occupy, or they would wait for cores for ever.
             cpus = max(math.ceil(count * cores), 1)
             ray.init(num_cpus=cpus, include_dashboard=False, log_to_driver=False)
-        remote: Any = ray.remote(
-            num_cpus=cores, max_restarts=-1, max_task_retries=_REPEATS
-        )(_Caller)
+        remote: Any = ray.remote(num_cpus=cores, max_restarts=-1, max_task_retries=_REPEATS)(
+            _Caller
+        )
         self.actors: list[Any] = [remote.remote() for _ in range(count)]
 
     def map(self, function: Callable[[A], B], items: Sequence[A], /) -> list[B]:

@@ -340,7 +340,10 @@ def test_noise_and_scale_of_a_policy():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: TrainerOptions(algorithm="ppo"), "`algorithm` must be one of 'apg', 'shac', 'sapo'"),
+        (
+            lambda: TrainerOptions(algorithm="ppo"),
+            "`algorithm` must be one of 'apg', 'shac', 'sapo'",
+        ),
         (lambda: TrainerOptions(critics=0), "`critics` must be"),
         (lambda: TrainerOptions(temperature=0.0), "`temperature` must be positive, got 0.0"),
         (lambda: TrainerOptions(target_entropy=float("inf")), "`target_entropy` must be finite"),
