@@ -6,10 +6,9 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor
-from torch.linalg import vector_norm
 
 from diffcloth_torch.envs.actuators import Tools
-from diffcloth_torch.envs.env import EnvState
+from diffcloth_torch.envs.env import EnvState, lengths
 from diffcloth_torch.envs.sheets import HEIGHT, SIDE, SheetTask, follow, uniform
 
 __all__ = ["DropCloth"]
@@ -49,7 +48,7 @@ class DropCloth(SheetTask):
     def distance(self, env: EnvState) -> Tensor:
         """Mean distance from the flat sheet [m], [B]."""
         away = env.state.positions - env.drawn["goal"]
-        return vector_norm(away, dim=-1).mean(dim=-1)
+        return lengths(away).mean(dim=-1)
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""

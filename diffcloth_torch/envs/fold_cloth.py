@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.linalg import vector_norm
 
-from diffcloth_torch.envs.env import EnvState
+from diffcloth_torch.envs.env import EnvState, lengths
 from diffcloth_torch.envs.sheets import SIDE, SheetTask, arc, follow
 
 __all__ = ["FoldCloth", "FoldClothDiagonal"]
@@ -108,4 +107,4 @@ class FoldClothDiagonal(FoldCloth):
 
 def _mean_length(vectors: Tensor) -> Tensor:
     """Mean length [B] of vectors [B, n, 3]; those that are zero have no gradient."""
-    return vector_norm(vectors, dim=-1).mean(dim=-1)
+    return lengths(vectors).mean(dim=-1)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.linalg import vector_norm
 
 from diffcloth_torch import robots
 from diffcloth_torch.envs.actuators import Hand, Tools
-from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import uniform
 from diffcloth_torch.geometry.rotation import (
     quaternion_log,
@@ -151,7 +150,7 @@ class LiftCloth(HandTask):
         return env.drawn["goal"] - env.state.positions.mean(dim=1)
 
     def _distance(self, env: EnvState) -> Tensor:
-        return vector_norm(self._away(env), dim=-1)
+        return lengths(self._away(env))
 
 
 class GraspCloth(HandTask):
@@ -183,7 +182,7 @@ class GraspCloth(HandTask):
     def distance(self, env: EnvState) -> Tensor:
         """Mean distance from the target shape [m], [B]."""
         away = env.state.positions - env.drawn["target"]
-        return vector_norm(away, dim=-1).mean(dim=-1)
+        return lengths(away).mean(dim=-1)
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""

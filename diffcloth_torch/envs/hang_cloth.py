@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.linalg import vector_norm
 
 from diffcloth_torch.envs.actuators import Tools
-from diffcloth_torch.envs.env import EnvState
+from diffcloth_torch.envs.env import EnvState, lengths
 from diffcloth_torch.envs.hands import HandTask, twist_to
 from diffcloth_torch.envs.sheets import follow
 from diffcloth_torch.geometry.rotation import quaternion_multiply
@@ -57,7 +56,7 @@ class HangCloth(HandTask):
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return -vector_norm(self._away(env), dim=-1)
+        return -lengths(self._away(env))
 
     def success(self, env: EnvState) -> Tensor:
         """Whether the cloth hangs near the pegs, at rest, and nothing else holds it."""

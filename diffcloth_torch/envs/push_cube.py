@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.linalg import vector_norm
 
 from diffcloth_torch.envs.actuators import Tools, Velocities
-from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import uniform
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
@@ -97,7 +96,7 @@ class PushCube(Task):
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return -vector_norm(self._away(env), dim=-1)
+        return -lengths(self._away(env))
 
     def success(self, env: EnvState) -> Tensor:
         """Whether the cube is within 3 cm of the target."""
@@ -107,7 +106,7 @@ class PushCube(Task):
         """Push the cube with the sheet across the way to the target, and step back in time."""
         away = self._away(env)
         cube, velocity = env.state.body_poses[:, 0, :2], env.state.body_velocities[:, 0, :2]
-        distance = vector_norm(away, dim=-1, keepdim=True)
+        distance = lengths(away)[:, None]
         to_target = away / distance.clamp(min=1e-3)
         ahead = away - _BRAKING * velocity
         pushes = ((ahead * away).sum(dim=-1, keepdim=True) > 0) & (distance > 0.3 * _CLOSE)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.linalg import vector_norm
 
 from diffcloth_torch.envs.actuators import Forces, Tools
-from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import uniform
 from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.geometry.shapes import strip
@@ -95,7 +94,7 @@ class TwoCloths(Task):
 
     def distance(self, env: EnvState) -> Tensor:
         """Distance of the center from the target [m], [B]."""
-        return vector_norm(self._away(env), dim=-1)
+        return lengths(self._away(env))
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from diffcloth_torch.checks import check_choice, check_count
@@ -11,6 +13,7 @@ __all__ = ["ALGORITHMS", "TrainerOptions"]
 
 ALGORITHMS = ("apg", "shac", "sapo")
 _LEAST_SHARE = 0.1
+_INFINITE = 1e6  # above every sensible rate
 _POSITIVE = (
     "actor_rate", "critic_rate", "gradient_norm", "deviation", "temperature", "temperature_rate",
 )  # fmt: skip
@@ -78,21 +81,29 @@ class TrainerOptions:
 
     def __post_init__(self) -> None:
         check_choice("TrainerOptions: `algorithm`", self.algorithm, ALGORITHMS)
+        if not isinstance(self.feedback, bool):
+            raise InvalidInput(f"TrainerOptions: `feedback` must be a bool, got {self.feedback!r}")
         for name in ("horizon", "critic_epochs", "critic_batches", "critics"):
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 1)
         for name in ("critic_only", "decay_updates", "seed"):
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 0)
         for name in ("discount", "trace", "target_rate"):
-            self._check(name, getattr(self, name), 0.0 <= getattr(self, name) <= 1.0, "in [0, 1]")
+            _check_number(name, getattr(self, name), lambda v: 0 <= v <= 1, "in [0, 1]")
         for name in _POSITIVE:
-            self._check(name, getattr(self, name), 0.0 < getattr(self, name) < 1e6, "positive")
-        self._check("target_entropy", self.target_entropy, abs(self.target_entropy) < 1e6, "finite")
-        for beta in self.betas:
-            self._check("betas", beta, 0.0 <= beta < 1.0, "in [0, 1)")
-        for size in self.hidden:
-            check_count("TrainerOptions: `hidden`", size, 1)
+            _check_number(name, getattr(self, name), lambda v: 0 < v < _INFINITE, "positive")
+        _check_number("target_entropy", self.target_entropy, math.isfinite, "finite")
+        for name in ("betas", "hidden", "first_action"):
+            value = getattr(self, name)
+            if not isinstance(value, tuple) and (name, value) != ("first_action", None):
+                raise InvalidInput(f"TrainerOptions: `{name}` must be a tuple, got {value!r}")
+        if len(self.betas) != 2:
+            raise InvalidInput(f"TrainerOptions: `betas` must be two numbers, got {self.betas}")
+        for k, beta in enumerate(self.betas):
+            _check_number(f"betas[{k}]", beta, lambda v: 0 <= v < 1, "in [0, 1)")
+        for k, size in enumerate(self.hidden):
+            check_count(f"TrainerOptions: `hidden[{k}]`", size, 1)
         for k, value in enumerate(self.first_action or ()):
-            self._check(f"first_action[{k}]", value, abs(value) < 1.0, "between -1 and 1")
+            _check_number(f"first_action[{k}]", value, lambda v: -1 < v < 1, "between -1 and 1")
 
     @property
     def has_critic(self) -> bool:
@@ -110,7 +121,10 @@ class TrainerOptions:
             return 1.0
         return 1.0 - (1.0 - _LEAST_SHARE) * min(updates / self.decay_updates, 1.0)
 
-    @staticmethod
-    def _check(name: str, value: float, is_accepted: bool, accepted: str) -> None:
-        if not is_accepted:
-            raise InvalidInput(f"TrainerOptions: `{name}` must be {accepted}, got {value}")
+
+def _check_number(
+    name: str, value: object, is_accepted: Callable[[float], bool], accepted: str
+) -> None:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not is_number or not is_accepted(value):  # type: ignore[arg-type]
+        raise InvalidInput(f"TrainerOptions: `{name}` must be {accepted}, got {value!r}")

@@ -136,7 +136,7 @@ def roll_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
     observation = env.resume(piece.start, piece.generators)
     count, horizon = env.num_envs, len(piece.noise)
     temperature = policy.temperature
-    rows: list[tuple[Tensor, ...]] = []
+    rows: list[dict[str, Tensor]] = []
     discount, total = torch.ones(count), torch.zeros(count)
     for t, noise in enumerate(piece.noise):
         seen = observation.detach()
@@ -153,18 +153,26 @@ def roll_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
             total = total + torch.where(closes, discount * value, 0.0)
         discount = torch.where(ended, 1.0, discount)
         success = info.get("final_info", info)["success"]
-        whole = reward.detach(), entropy.detach()
-        rows.append((seen, after.detach(), *whole, terminated, ended, success))
+        rows.append(
+            {
+                "seen": seen,
+                "after": after.detach(),
+                "rewards": reward.detach(),
+                "entropies": entropy.detach(),
+                "terminated": terminated,
+                "ended": ended,
+                "success": success,
+            }
+        )
     loss = -piece.share / horizon * total.sum()
     gradients = torch.autograd.grad(loss, list(policy.actor.parameters()))
     env.clear_grad()
-    columns = (torch.stack(column) for column in zip(*rows, strict=True))
     return Rollout(
-        list(gradients),
-        float(loss.detach()),
-        *columns,
+        gradients=list(gradients),
+        loss=float(loss.detach()),
         end=env.env_state,
         generators=env.generator_states(),
+        **{name: torch.stack([row[name] for row in rows]) for name in rows[0]},
     )
 
 

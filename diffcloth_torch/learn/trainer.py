@@ -115,7 +115,7 @@ class Trainer:
 
     def act(self, observation: Tensor) -> Tensor:
         """Actions [B, A] without noise."""
-        with torch.no_grad():
+        with torch.no_grad(), threads_of_torch(self._threads):
             actions: Tensor = self.policy(observation)
         return actions
 
