@@ -45,10 +45,10 @@ def main(
     FoldCloth by default, and for --returns all tasks. With gradients, the sum of the rewards of ten
     steps at a time is differentiated by the actions. Memory is the largest of the process so far.
 
-    `python` is what the processor spends outside of the core, as a share of the time that is needed
-    without gradients: that time and, of what it spends in the core, the part of one thread.
-    `waiting` is how much of the time that passes is not needed: threads that wait for the last of
-    them, and for other programs on the machine.
+    Rates are by what processors do, so that other programs do not count: seconds outside of the
+    core, and of those in the core the part of one thread. `python` is the share of the former, and
+    `waiting` how much longer it took than that, in shares of the time that passed: threads that
+    wait for the last of them, and for other programs.
     """
     if returns:
         print_returns(tasks or tuple(envs.TASKS), episodes)
@@ -62,7 +62,7 @@ def main(
         script, start = _script(env, steps)
         forward, python, waiting = _forward(env, script)
         env.env_state = start
-        backward = _backward(env, script)
+        backward = _backward(env, script, python)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(
             f"{task:12} {size:4d} {batch:6d} {count:8d} {batch * forward:9.1f} "
@@ -96,19 +96,25 @@ def _forward(
     seconds, all_threads, this_thread = (b - a for a, b in zip(before, after, strict=True))
     python = this_thread - in_core
     needed = python + (all_threads - python) / min(torch.get_num_threads(), env.num_envs)
-    return len(script) / seconds, python / needed, max(1 - needed / seconds, 0.0)
+    return len(script) / needed, python / needed, max(1 - needed / seconds, 0.0)
 
 
-def _backward(env: envs.ClothVectorEnv, script: Sequence[torch.Tensor]) -> float:
-    """Steps a second with the gradient of the rewards of ten at a time."""
-    start = time.perf_counter()
+def _backward(env: envs.ClothVectorEnv, script: Sequence[torch.Tensor], python: float) -> float:
+    """Steps a second with the gradient of the rewards of ten at a time.
+
+    The share of Python is taken to be that of steps without gradients.
+    """
+    start = time.process_time()
     for first in range(0, len(script), 10):
         leaves = [actions.clone().requires_grad_() for actions in script[first : first + 10]]
         env.clear_grad()
         total = sum(env.step(leaf)[1].sum() for leaf in leaves)
         torch.autograd.grad(total, leaves)
     env.clear_grad()
-    return len(script) / (time.perf_counter() - start)
+    spent = time.process_time() - start
+    # Of a second that is needed, all threads spend this: what is in the core counts for each.
+    threads = min(torch.get_num_threads(), env.num_envs)
+    return len(script) * (python + (1 - python) * threads) / spent
 
 
 def _script(env: envs.ClothVectorEnv, steps: int) -> tuple[list[torch.Tensor], envs.EnvState]:
