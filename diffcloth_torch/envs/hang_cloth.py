@@ -29,7 +29,7 @@ def _peg(y: float) -> RigidBody:
 
 
 class HangCloth(HandTask):
-    """A gripper hangs a cloth over two pegs, and lets it go.
+    """A gripper hangs a cloth over two pegs of rubber, and lets it go.
 
     The reward of each transition is -(distance of the cloth's center from between the pegs) [m];
     after the hanging tasks of GarmentLab. A cloth that is let go and stays there succeeds.
