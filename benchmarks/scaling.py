@@ -17,6 +17,7 @@ from diffcloth_torch import envs
 from diffcloth_torch.learn import Processes, RayActors, Trainer, TrainerOptions
 from diffcloth_torch.learn.rollouts import Piece, roll_out
 
+_REPEATS = 50
 HOLD = (0.0, 0.0, 0.2, 0.95, 0.0, 0.0, 0.2, 0.95)
 
 
@@ -88,14 +89,13 @@ def _messages(trainer: Trainer, chunk_seconds: float) -> None:
     piece, result = pieces[0], roll_out(trainer._env, pieces[0])
     seconds = 0.0
     for name, thing in (("piece", piece), ("result", result)):
-        spent = []
-        for _ in range(20):
-            start = time.perf_counter()
+        start = time.process_time()
+        for _ in range(_REPEATS):
             data = pickle.dumps(thing)
             pickle.loads(data)
-            spent.append(time.perf_counter() - start)
-        seconds += statistics.median(spent)
-        print(f"{name}: {len(data) / 1024:.0f} KiB, {1e3 * statistics.median(spent):.2f} ms")
+        spent = (time.process_time() - start) / _REPEATS
+        seconds += spent
+        print(f"{name}: {len(data) / 1024:.0f} KiB, {1e3 * spent:.2f} ms")
     print("workers   s an update   efficiency, if messages pass one by one")
     for count in (2, 4, 8, 16, 32, 64, 128):
         update = chunk_seconds + count * seconds
