@@ -126,7 +126,9 @@ def _print(task: str, runs: Sequence[dict[str, Any]]) -> None:
     goals = [max(p["return"] for p in run["curve"]) for run in runs if run["algorithm"] == "ppo"]
     goal = statistics.median(goals) if goals else math.nan
     print(f"{task}: goal {goal:.2f}, the median of PPO's best")
-    print("algorithm   first     best      last  success  steps to goal  seconds to goal  steps")
+    print(
+        "algorithm  seeds   first     best      last  success  steps to goal  seconds to it  steps"
+    )
     for algorithm in (*ALGORITHMS, *VARIANTS):
         mine = [run for run in runs if run["algorithm"] == algorithm]
         if not mine:
@@ -137,8 +139,8 @@ def _print(task: str, runs: Sequence[dict[str, Any]]) -> None:
         ]
         first, best, last, success, at, after, steps = columns
         print(
-            f"{algorithm:9}{first:8.2f} {best:8.2f} {last:9.2f} {success:8.0%} {at:14.0f} "
-            f"{after:16.1f} {steps:6.0f}"
+            f"{algorithm:9}{len(mine):6d}{first:8.2f}{best:8.2f}{last:8.2f} {success:7.0%} "
+            f"{at:14.0f} {after:14.1f} {steps:6.0f}"
         )
 
 
