@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import sys
 import time
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import Any
 
 import click
 import torch
 
 from diffcloth_torch import envs
+from diffcloth_torch.sim import step as core_step
 
 SIZES, BATCHES = (8, 12, 24), (1, 4, 8, 32)
 POLICIES = ("zero", "random", "scripted")
@@ -19,17 +22,17 @@ _WARM_UP = 4  # transitions: pickers close
 
 
 @click.command()
-@click.option("--task", default="FoldCloth", show_default=True, type=click.Choice(list(envs.TASKS)))
+@click.option("--task", "tasks", multiple=True, type=click.Choice(list(envs.TASKS)))
 @click.option(
     "--sizes", default=SIZES, multiple=True, type=click.IntRange(4), help="Vertices a side."
 )
 @click.option("--batches", default=BATCHES, multiple=True, type=click.IntRange(1))
 @click.option("--threads", default=(1, 2), multiple=True, type=click.IntRange(1))
 @click.option("--steps", default=20, show_default=True, type=click.IntRange(1))
-@click.option("--returns", is_flag=True, help="What policies get instead, in all tasks.")
+@click.option("--returns", is_flag=True, help="What policies get instead.")
 @click.option("--episodes", default=8, show_default=True, help="Of each policy, for --returns.")
 def main(
-    task: str,
+    tasks: Sequence[str],
     sizes: Sequence[int],
     batches: Sequence[int],
     threads: Sequence[int],
@@ -39,70 +42,83 @@ def main(
 ) -> None:
     """Environment steps a second, without and with gradients, under the scripted policy.
 
-    With gradients, the sum of the rewards of ten steps at a time is differentiated by the actions.
-    `python` is the share of the time without gradients that is not spent in the core. Memory is
-    the largest of the process so far.
+    FoldCloth by default, and for --returns all tasks. With gradients, the sum of the rewards of ten
+    steps at a time is differentiated by the actions. Memory is the largest of the process so far.
+
+    Rates are by what processors do, so that other programs do not count: seconds outside of the
+    core, and of those in the core the part of one thread. `python` is the share of the former, and
+    `waiting` how much longer it took than that, in shares of the time that passed: threads that
+    wait for the last of them, and for other programs.
     """
     if returns:
-        print_returns(episodes)
+        print_returns(tasks or tuple(envs.TASKS), episodes)
         return
-    print(f"{task}, environment steps a second")
-    print("size  batch  threads   forward  with gradients   python   memory [MiB]")
-    for size in sizes:
-        for batch in batches:
-            for count in threads:
-                torch.set_num_threads(count)
-                env = envs.make(task, batch, size=size, horizon=10**6)
-                forward, python = _forward(env, steps)
-                backward = _backward(env, steps)
-                peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-                print(
-                    f"{size:4d} {batch:6d} {count:8d} {batch * forward:9.1f} "
-                    f"{batch * backward:15.1f} {python:8.1%} {peak:14.0f}"
-                )
-                sys.stdout.flush()
+    print("environment steps a second; load of the machine", end=" ")
+    print(f"{os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    print("task         size  batch  threads   forward  with gradients  python  waiting   MiB")
+    for task, size, batch, count in product(tasks or ("FoldCloth",), sizes, batches, threads):
+        torch.set_num_threads(count)
+        env = envs.make(task, batch, size=size, horizon=10**6)
+        script, start = _script(env, steps)
+        forward, python, waiting = _forward(env, script)
+        env.env_state = start
+        backward = _backward(env, script, python)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(
+            f"{task:12} {size:4d} {batch:6d} {count:8d} {batch * forward:9.1f} "
+            f"{batch * backward:15.1f} {python:7.1%} {waiting:8.1%} {peak:5.0f}"
+        )
+        sys.stdout.flush()
 
 
-def _forward(env: envs.ClothVectorEnv, steps: int) -> tuple[float, float]:
-    """Steps a second, and the share of the time that the core does not need."""
-    script = _script(env, steps)
-    core = 0.0
-    step = env.task.simulator.step
+def _forward(
+    env: envs.ClothVectorEnv, script: Sequence[torch.Tensor]
+) -> tuple[float, float, float]:
+    """Steps a second, the share of Python in the time that is needed, and that of waiting."""
+    in_core = 0.0  # of this thread, in calls of the core
+    call = core_step._forward
 
-    def timed(*given: Any) -> Any:
-        nonlocal core
-        state = step(*given)
-        # The phases of all environments add up to the time of all threads.
-        seconds = sum(float(t.sum()) for t in state.report.seconds.values())
-        core += seconds / min(torch.get_num_threads(), env.num_envs)
-        return state
+    def timed(*given: Any, **named: Any) -> Any:
+        nonlocal in_core
+        start = time.thread_time()
+        result = call(*given, **named)
+        in_core += time.thread_time() - start
+        return result
 
-    env.task.simulator.step = timed
+    core_step._forward = timed
     try:
-        start = time.perf_counter()
+        before = time.perf_counter(), time.process_time(), time.thread_time()
         for actions in script:
             env.step(actions)
-        seconds = time.perf_counter() - start
+        after = time.perf_counter(), time.process_time(), time.thread_time()
     finally:
-        env.task.simulator.step = step
-    return steps / seconds, max(1 - core / seconds, 0.0)
+        core_step._forward = call
+    seconds, all_threads, this_thread = (b - a for a, b in zip(before, after, strict=True))
+    python = this_thread - in_core
+    needed = python + (all_threads - python) / min(torch.get_num_threads(), env.num_envs)
+    return len(script) / needed, python / needed, max(1 - needed / seconds, 0.0)
 
 
-def _backward(env: envs.ClothVectorEnv, steps: int) -> float:
-    """Steps a second with the gradient of the rewards of ten at a time."""
-    script = _script(env, steps)
-    start = time.perf_counter()
-    for first in range(0, steps, 10):
+def _backward(env: envs.ClothVectorEnv, script: Sequence[torch.Tensor], python: float) -> float:
+    """Steps a second with the gradient of the rewards of ten at a time.
+
+    The share of Python is taken to be that of steps without gradients.
+    """
+    start = time.process_time()
+    for first in range(0, len(script), 10):
         leaves = [actions.clone().requires_grad_() for actions in script[first : first + 10]]
         env.clear_grad()
         total = sum(env.step(leaf)[1].sum() for leaf in leaves)
         torch.autograd.grad(total, leaves)
     env.clear_grad()
-    return steps / (time.perf_counter() - start)
+    spent = time.process_time() - start
+    # Of a second that is needed, all threads spend this: what is in the core counts for each.
+    threads = min(torch.get_num_threads(), env.num_envs)
+    return len(script) * (python + (1 - python) * threads) / spent
 
 
-def _script(env: envs.ClothVectorEnv, steps: int) -> list[torch.Tensor]:
-    """Scripted actions from a start, to which the environments are then brought back."""
+def _script(env: envs.ClothVectorEnv, steps: int) -> tuple[list[torch.Tensor], envs.EnvState]:
+    """Scripted actions, and where they begin; the environments are there again."""
     env.reset(seed=0)
     with torch.no_grad():
         for _ in range(_WARM_UP):
@@ -113,14 +129,14 @@ def _script(env: envs.ClothVectorEnv, steps: int) -> list[torch.Tensor]:
             script.append(env.scripted_actions())
             env.step(script[-1])
     env.env_state = start
-    return script
+    return script, start
 
 
-def print_returns(episodes: int) -> None:
-    """What zero, random and scripted policies get in each task."""
+def print_returns(tasks: Sequence[str], episodes: int) -> None:
+    """What zero, random and scripted policies get in some tasks."""
     print(f"Mean return of {episodes} episodes, and how many end in success, at size 12")
     print(f"{'task':18}" + "".join(f"{policy:>18}" for policy in POLICIES))
-    for name in envs.TASKS:
+    for name in tasks:
         env = envs.make(name, episodes, autoreset_mode="Disabled")
         line = f"{name:18}"
         for policy in POLICIES:

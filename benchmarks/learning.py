@@ -7,7 +7,8 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -21,74 +22,114 @@ from diffcloth_torch import envs
 from diffcloth_torch.config.documents import read_document
 from diffcloth_torch.learn import Trainer, TrainerOptions
 
-CONFIGS = {
-    "FoldCloth": "configs/train_fold.yaml",
-    "PushCube": "configs/train_push.yaml",
-    "LiftCloth": "configs/train_lift.yaml",
+
+@dataclass(frozen=True)
+class Job:
+    """A task: its configuration, vertices a side, and environment steps of a run.
+
+    Attributes:
+        free_steps: Of PPO and SAC, which need more.
+    """
+
+    config: str
+    size: int
+    steps: int
+    free_steps: int
+
+
+JOBS = {
+    "FoldCloth": Job("configs/train_fold.yaml", 8, 1400, 2500),
+    "PushCube": Job("configs/train_push.yaml", 8, 640, 1600),
+    "LiftCloth": Job("configs/train_lift.yaml", 6, 600, 1500),
 }
-# What the other algorithm has in place of the configuration's.
-APG = {"algorithm": "apg", "discount": 1.0}
-SHAC = {"algorithm": "shac", "horizon": 16, "discount": 0.99, "actor_rate": 1e-3}
-ALGORITHMS = ("plan", "apg", "shac", "ppo", "sac")
+FIRST_ORDER, FREE = ("apg", "shac", "sapo"), ("ppo", "sac")
+ALGORITHMS = ("scripted", "plan", *FIRST_ORDER, *FREE)
+# Of FoldCloth alone: a plan with hard grasps, and APG with gradients through what it sees.
+VARIANTS = ("hard", "feedback")
+# Of all tasks: APG takes whole episodes, the others halves, whose ends critics value.
+COMMON: dict[str, Any] = {"betas": (0.9, 0.99), "deviation": 0.05, "target_entropy": -2.0}
+APG = {"discount": 1.0, "actor_rate": 4e-3}
+WITH_CRITIC = {"discount": 0.99, "actor_rate": 2e-3}
+NUM_ENVS, FREE_ENVS = 2, 4
 KNOTS, PLAN_RATE = 10, 0.02  # of a plan: actions that last a tenth of an episode
-_EPISODES = 8  # of an evaluation
+EPISODES = 4  # of an evaluation
 
 
 @click.command()
-@click.option("--tasks", multiple=True, default=("FoldCloth",), type=click.Choice(list(CONFIGS)))
-@click.option("--algorithms", multiple=True, default=ALGORITHMS, type=click.Choice(ALGORITHMS))
+@click.option("--tasks", multiple=True, default=tuple(JOBS), type=click.Choice(list(JOBS)))
+@click.option(
+    "--algorithms",
+    multiple=True,
+    default=(*ALGORITHMS, *VARIANTS),
+    type=click.Choice((*ALGORITHMS, *VARIANTS)),
+)
 @click.option("--seeds", default=3, show_default=True, type=click.IntRange(1))
-@click.option("--steps", default=7000, show_default=True, help="Environment steps of a run.")
-@click.option("--free-steps", default=7000, show_default=True, help="The same of PPO and SAC.")
-@click.option("--evaluations", default=12, show_default=True, type=click.IntRange(2))
+@click.option("--share", default=1.0, show_default=True, help="Of the steps of all runs.")
+@click.option("--evaluations", default=6, show_default=True, type=click.IntRange(2))
 @click.option("--jobs", default=2, show_default=True, help="Runs at once, one core each.")
-@click.option("--json", "file", type=click.Path(path_type=Path), help="Also write the curves.")
+@click.option("--json", "file", type=click.Path(path_type=Path), help="File that keeps the runs.")
 @click.option("--plot", type=click.Path(path_type=Path), help="Also draw them.")
+@click.option("--only-show", is_flag=True, help="Run nothing: show what the file has.")
 def main(
     tasks: Sequence[str],
     algorithms: Sequence[str],
     seeds: int,
-    steps: int,
-    free_steps: int,
+    share: float,
     evaluations: int,
     jobs: int,
     file: Path | None,
     plot: Path | None,
+    only_show: bool,
 ) -> None:
     """Train with each algorithm and seed, and evaluate without noise on the way.
 
-    `plan` is no policy: it optimizes the actions of one episode, whose return it is.
+    `plan` is no policy: it optimizes the actions of one episode, whose return it is. `scripted` is
+    the policy made by hand. FoldCloth has two more: `hard`, a plan with hard grasps, and
+    `feedback`, APG with gradients through what it sees. A file keeps what was run, and a run that
+    it has is not made again.
 
     Prints the median over seeds of the best mean return, how many environment steps and seconds
-    each needed to reach the best that PPO reached, and the share of successes at the end. The time
-    of evaluations does not count.
+    of one core each needed to reach the best that PPO reached, and the share of successes at the
+    end. The time of evaluations does not count.
     """
+    runs: list[dict[str, Any]] = []
+    if file is not None and file.exists():
+        runs = json.loads(file.read_text())
+    have = {(r["task"], r["algorithm"], r["seed"]) for r in runs}
     work = [
-        (task, algorithm, seed, free_steps if algorithm in ("ppo", "sac") else steps, evaluations)
+        (task, algorithm, seed, share, evaluations)
+        for seed in range(seeds)
         for task in tasks
         for algorithm in algorithms
-        for seed in range(seeds)
+        if (task, algorithm, seed) not in have and not only_show
+        if task == "FoldCloth" or algorithm not in VARIANTS
     ]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        curves = list(pool.map(_run, work))
-    runs = [
-        {"task": t, "algorithm": a, "seed": s, "curve": curve}
-        for (t, a, s, *_), curve in zip(work, curves, strict=True)
-    ]
+        for work_of_one in as_completed([pool.submit(_run, one) for one in work]):
+            runs.append(work_of_one.result())
+            if file is not None:
+                file.write_text(_document(runs))
     for task in tasks:
         _print(task, [run for run in runs if run["task"] == task])
-    if file is not None:
-        file.write_text(json.dumps(runs, indent=1))
     if plot is not None:
         draw(runs, plot)
 
 
+def _document(runs: Sequence[dict[str, Any]]) -> str:
+    """One run a line, in a fixed order."""
+    order = (*ALGORITHMS, *VARIANTS)
+    rows = sorted(runs, key=lambda r: (r["task"], order.index(r["algorithm"]), r["seed"]))
+    return "[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n"
+
+
 def _print(task: str, runs: Sequence[dict[str, Any]]) -> None:
-    goals = [_best(run) for run in runs if run["algorithm"] == "ppo"]
+    goals = [max(p["return"] for p in run["curve"]) for run in runs if run["algorithm"] == "ppo"]
     goal = statistics.median(goals) if goals else math.nan
     print(f"{task}: goal {goal:.2f}, the median of PPO's best")
-    print("algorithm   first     best      last  success   steps to goal  seconds to goal  seconds")
-    for algorithm in ALGORITHMS:
+    print(
+        "algorithm  seeds   first     best      last  success  steps to goal  seconds to it  steps"
+    )
+    for algorithm in (*ALGORITHMS, *VARIANTS):
         mine = [run for run in runs if run["algorithm"] == algorithm]
         if not mine:
             continue
@@ -96,15 +137,11 @@ def _print(task: str, runs: Sequence[dict[str, Any]]) -> None:
             statistics.median(values)
             for values in zip(*[_summary(run["curve"], goal) for run in mine], strict=True)
         ]
-        first, best, last, success, at, after, seconds = columns
+        first, best, last, success, at, after, steps = columns
         print(
-            f"{algorithm:9}{first:8.2f} {best:8.2f} {last:9.2f} {success:8.0%} {at:15.0f} "
-            f"{after:16.0f} {seconds:8.0f}"
+            f"{algorithm:9}{len(mine):6d}{first:8.2f}{best:8.2f}{last:8.2f} {success:7.0%} "
+            f"{at:14.0f} {after:14.1f} {steps:6.0f}"
         )
-
-
-def _best(run: dict[str, Any]) -> float:
-    return max(point["return"] for point in run["curve"])
 
 
 def _summary(curve: Sequence[dict[str, float]], goal: float) -> list[float]:
@@ -112,27 +149,71 @@ def _summary(curve: Sequence[dict[str, float]], goal: float) -> list[float]:
     at, after = (reached[0]["steps"], reached[0]["seconds"]) if reached else (math.inf, math.inf)
     best = max(point["return"] for point in curve)
     end = curve[-1]
-    return [curve[0]["return"], best, end["return"], end["success"], at, after, end["seconds"]]
+    return [curve[0]["return"], best, end["return"], end["success"], at, after, end["steps"]]
 
 
-def _run(work: tuple[str, str, int, int, int]) -> list[dict[str, float]]:
+def _run(work: tuple[str, str, int, float, int]) -> dict[str, Any]:
     torch.set_num_threads(1)
-    task, algorithm, seed, steps, evaluations = work
-    document = read_document(Path(CONFIGS[task]))
-    make = partial(envs.make, task, **document["environment"].get("options", {}))
-    every = steps / (evaluations - 1)
+    task, algorithm, seed, share, evaluations = work
+    job = JOBS[task]
+    document = read_document(Path(job.config))
+    given = document["environment"].get("options", {}) | {"size": job.size}
+    make = partial(envs.make, task, **given)
     first = document["trainer"].get("first_action")
-    if algorithm == "plan":
-        return _plan(make, first, seed, steps)
-    if algorithm in ("ppo", "sac"):
-        return _free(make, algorithm, seed, steps, every, first)
-    given = dict(document["trainer"])
-    if given["algorithm"] != algorithm:
-        given |= APG if algorithm == "apg" else SHAC
-    options = {n: tuple(v) if isinstance(v, list) else v for n, v in given.items()}
-    trainer = Trainer(
-        make, TrainerOptions(**{**options, "seed": seed}), num_envs=document["num_envs"]
+    steps = round(share * (job.free_steps if algorithm in FREE else job.steps))
+    every = steps / (evaluations - 1)
+    if algorithm == "scripted":
+        curve = _scripted(make)
+    elif algorithm == "plan":
+        curve = _plan(make, first, seed, steps)
+    elif algorithm == "hard":
+        hard = {n: v for n, v in given.items() if n not in ("opens_at", "reach")}
+        curve = _plan(partial(envs.make, task, **hard), first, seed, steps)
+    elif algorithm in FREE:
+        curve = _free(make, algorithm, seed, steps, every, first)
+    else:
+        curve = _first_order(make, algorithm, seed, steps, every, first)
+    return {"task": task, "algorithm": algorithm, "seed": seed, "curve": curve}
+
+
+def _point(steps: int, seconds: float, value: float, success: float) -> dict[str, float]:
+    return {
+        "steps": steps,
+        "seconds": round(seconds, 2),
+        "return": round(value, 4),
+        "success": success,
+    }
+
+
+def _scripted(make: Callable[..., Any]) -> list[dict[str, float]]:
+    curve = _Curve(make, None)
+    curve.add(0)
+    return curve.points
+
+
+def _first_order(
+    make: Callable[..., Any],
+    algorithm: str,
+    seed: int,
+    steps: int,
+    every: float,
+    first: Sequence[float] | None,
+) -> list[dict[str, float]]:
+    """A policy by gradients, of which the learning rate falls to half."""
+    episode = make(num_envs=1).task.horizon
+    has_critic = algorithm in ("shac", "sapo")
+    horizon = episode // 2 if has_critic else episode
+    options = TrainerOptions(
+        algorithm=algorithm if has_critic else "apg",
+        feedback=algorithm == "feedback",
+        horizon=horizon,
+        decay_updates=2 * steps // (NUM_ENVS * horizon),
+        first_action=None if first is None else tuple(first),
+        seed=seed,
+        **COMMON,
+        **(WITH_CRITIC if has_critic else APG),
     )
+    trainer = Trainer(make, options, num_envs=NUM_ENVS)
     curve = _Curve(make, trainer.act)
     curve.add(0)
     while trainer.steps < steps:
@@ -152,21 +233,16 @@ def _plan(
     plan = start.repeat(KNOTS, 1).requires_grad_()
     adam = torch.optim.Adam([plan], lr=PLAN_RATE)
     points: list[dict[str, float]] = []
-    begin = time.perf_counter()
+    begin = time.process_time()
     while not points or points[-1]["steps"] < steps:
         env.reset(seed=1000 + seed)
         total = torch.zeros(())
         for k in range(horizon):
             _, reward, _, _, info = env.step(plan[None, k * KNOTS // horizon])
             total = total + reward.sum()
-        points.append(
-            {
-                "steps": float(horizon * (len(points) + 1)),
-                "seconds": time.perf_counter() - begin,
-                "return": float(total.detach()),
-                "success": float(info["final_info"]["success"]),
-            }
-        )
+        success = float(info["final_info"]["success"])
+        at = horizon * (len(points) + 1)
+        points.append(_point(at, time.process_time() - begin, float(total.detach()), success))
         adam.zero_grad()
         (-total).backward()
         adam.step()
@@ -178,33 +254,32 @@ def _plan(
 class _Curve:
     """Returns of evaluations; their own time does not count."""
 
-    def __init__(self, make: Callable[..., Any], act: Callable[[torch.Tensor], Any]) -> None:
+    def __init__(self, make: Callable[..., Any], act: Callable[[torch.Tensor], Any] | None) -> None:
+        """Evaluate a policy, or the one that was made by hand."""
         self.points: list[dict[str, float]] = []
-        self._env, self._act = make(num_envs=_EPISODES), act
-        self._start = time.perf_counter()
+        self._env, self._act = make(num_envs=EPISODES), act
+        self._start = time.process_time()
 
     def add(self, steps: int) -> None:
-        begin = time.perf_counter()
+        begin = time.process_time()
         env = self._env
         observation, _ = env.reset(seed=1000)
-        total = torch.zeros(_EPISODES)
-        running = torch.ones(_EPISODES, dtype=torch.bool)
-        success = torch.zeros(_EPISODES, dtype=torch.bool)
+        total = torch.zeros(EPISODES)
+        running = torch.ones(EPISODES, dtype=torch.bool)
+        success = torch.zeros(EPISODES, dtype=torch.bool)
         with torch.no_grad():
             while bool(running.any()):
-                actions = torch.as_tensor(self._act(observation))
+                scripted = env.scripted_actions() if self._act is None else None
+                actions = scripted if self._act is None else self._act(observation)
                 observation, reward, terminated, truncated, info = env.step(actions)
                 total += torch.where(running, reward, 0.0)
                 success = torch.where(running, info.get("final_info", info)["success"], success)
                 running = running & ~(terminated | truncated)
-        point = {
-            "steps": float(steps),
-            "seconds": begin - self._start,
-            "return": float(total.mean()),
-            "success": float(success.float().mean()),
-        }
-        self.points.append(point)
-        self._start += time.perf_counter() - begin
+        seconds = begin - self._start
+        self.points.append(
+            _point(steps, seconds, float(total.mean()), float(success.float().mean()))
+        )
+        self._start += time.process_time() - begin
 
 
 def _free(
@@ -215,7 +290,11 @@ def _free(
     every: float,
     first: Sequence[float] | None,
 ) -> list[dict[str, float]]:
-    """PPO or SAC with their usual options, on as many environments, from the same first action."""
+    """PPO or SAC from the same first action.
+
+    Their options are the usual ones, but that PPO learns every 256 steps, with less noise at first:
+    with 2048 and a deviation of 1 it learns nothing in so few steps.
+    """
     from stable_baselines3 import PPO, SAC
     from stable_baselines3.common.callbacks import BaseCallback
 
@@ -228,9 +307,16 @@ def _free(
     def begun(actions: Any) -> Any:
         return actions if first is None else np.clip(actions + np.float32(first), -1, 1)
 
-    env = Begun(make(num_envs=4, seed=seed))
+    env = Begun(make(num_envs=FREE_ENVS, seed=seed))
     if algorithm == "ppo":
-        model: Any = PPO("MlpPolicy", env, n_steps=128, batch_size=64, seed=seed, device="cpu")
+        model: Any = PPO(
+            "MlpPolicy",
+            env,
+            n_steps=64,
+            policy_kwargs={"log_std_init": -1.0},
+            seed=seed,
+            device="cpu",
+        )
     else:
         model = SAC(
             "MlpPolicy", env, learning_starts=400, gradient_steps=-1, seed=seed, device="cpu"
@@ -255,31 +341,36 @@ def draw(runs: Sequence[dict[str, Any]], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    tasks = list(dict.fromkeys(run["task"] for run in runs))
-    figure, axes = plt.subplots(len(tasks), 2, figsize=(9, 3.2 * len(tasks)), squeeze=False)
+    tasks = [task for task in JOBS if any(run["task"] == task for run in runs)]
+    figure, axes = plt.subplots(len(tasks), 2, figsize=(9, 3.0 * len(tasks)), squeeze=False)
     for row, task in zip(axes, tasks, strict=True):
-        for axis, (key, label) in zip(
-            row, (("steps", "environment steps"), ("seconds", "seconds on one core")), strict=True
-        ):
-            for k, algorithm in enumerate(ALGORITHMS):
-                curves = [
-                    r["curve"] for r in runs if r["task"] == task and r["algorithm"] == algorithm
-                ]
-                if not curves:
-                    continue
-                end = min(curve[-1][key] for curve in curves)
-                at = np.linspace(0, end, 60)
-                returns = np.array(
-                    [np.interp(at, [p[key] for p in c], [p["return"] for p in c]) for c in curves]
-                )
-                axis.plot(at, np.median(returns, axis=0), color=f"C{k}", label=algorithm.upper())
-                axis.fill_between(at, returns.min(0), returns.max(0), color=f"C{k}", alpha=0.15)
-            axis.set(xlabel=label, ylabel="return", title=task)
+        for axis, key in zip(row, ("steps", "seconds"), strict=True):
+            _draw_task(axis, key, [run for run in runs if run["task"] == task])
+            label = "environment steps" if key == "steps" else "seconds of one core"
+            axis.set(xlabel=label, ylabel="return", title=task, xscale="symlog")
             axis.spines[["top", "right"]].set_visible(False)
-    axes[0, 0].legend(frameon=False)
+    axes[0, 0].legend(frameon=False, fontsize=7)
     figure.tight_layout()
-    figure.savefig(path)
+    figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def _draw_task(axis: Any, key: str, runs: Sequence[dict[str, Any]]) -> None:
+    for k, algorithm in enumerate(ALGORITHMS):
+        curves = [r["curve"] for r in runs if r["algorithm"] == algorithm]
+        if not curves:
+            continue
+        if algorithm == "scripted":
+            axis.axhline(curves[0][0]["return"], color="0.5", ls=":", label="scripted")
+            continue
+        end = min(curve[-1][key] for curve in curves)
+        at = np.linspace(0, end, 200)
+        returns = np.array(
+            [np.interp(at, [p[key] for p in c], [p["return"] for p in c]) for c in curves]
+        )
+        label = "plan" if algorithm == "plan" else algorithm.upper()
+        axis.plot(at, np.median(returns, axis=0), color=f"C{k}", label=label)
+        axis.fill_between(at, returns.min(0), returns.max(0), color=f"C{k}", alpha=0.15)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import pickle
 import statistics
 import time
@@ -16,6 +17,7 @@ from diffcloth_torch import envs
 from diffcloth_torch.learn import Processes, RayActors, Trainer, TrainerOptions
 from diffcloth_torch.learn.rollouts import Piece, roll_out
 
+_REPEATS = 50
 HOLD = (0.0, 0.0, 0.2, 0.95, 0.0, 0.0, 0.2, 0.95)
 
 
@@ -30,8 +32,10 @@ def main(size: int, chunks: int, chunk: int, updates: int, workers: int, ray: bo
     """Time updates of APG on FoldCloth, 16 steps a rollout, and what is sent for one.
 
     The same updates everywhere; the first is left out, in which workers start. `of n` is how many
-    times as fast they are as here, one core each. At the end: how long an update would take with
-    more workers of one chunk each, if the messages of all pass through the trainer one by one.
+    times as fast they are as here, one core each, by the time that passes. `on idle cores` is the
+    same by what processors do: C / (S + C / n), where C is what an update takes here and S what the
+    trainer itself does while workers make it. At the end: how long an update would take with more
+    workers of one chunk each, if the messages of all pass through the trainer one by one.
     """
     torch.set_num_threads(1)
     make = partial(envs.make, "FoldCloth", size=size, opens_at=-1.0, reach=0.06)
@@ -46,26 +50,29 @@ def main(size: int, chunks: int, chunk: int, updates: int, workers: int, ray: bo
         kinds.append((f"{workers} actors of Ray", RayActors(workers)))
         print(f"Ray started in {time.perf_counter() - start:.1f} s")
     made = [(name, kind, trainer(kind)) for name, kind in kinds]
-    times: dict[str, list[float]] = {name: [] for name, _ in kinds}
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name, _ in kinds}
     # Side by side: what else runs on the machine slows all of them.
     for k in range(updates + 1):
         for name, _, one in made:
-            start = time.perf_counter()
+            start, start_of_core = time.perf_counter(), time.process_time()
             one.update()
+            spent = time.perf_counter() - start, time.process_time() - start_of_core
             if k:
-                times[name].append(time.perf_counter() - start)
+                times[name].append(spent)
             else:
-                print(f"{name}: first update {time.perf_counter() - start:.2f} s")
+                print(f"{name}: first update {spent[0]:.2f} s")
     bits = {_bits(one) for _, _, one in made}
     print(f"{chunks} chunks of {chunk} environments, {size} x {size}; "
           f"{'the same bits' if len(bits) == 1 else 'BITS DIFFER'}")  # fmt: skip
-    print("                      s an update      of n   environment steps a second")
-    here = statistics.median(times["here"])
-    for name, seconds in times.items():
-        middle = statistics.median(seconds)
+    print(f"load of the machine {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    print("                      s an update      of n  on idle cores   environment steps a second")
+    here, core = (statistics.median(part) for part in zip(*times["here"], strict=True))
+    for name, spent in times.items():
+        middle, mine = (statistics.median(part) for part in zip(*spent, strict=True))
+        idle = 1.0 if name == "here" else core / (mine + core / workers)
         rate = 16 * chunks * chunk / middle
-        print(f"{name:20} {middle:12.3f} {here / middle:9.2f} {rate:20.1f}")
-    _messages(made[0][2], here / chunks)
+        print(f"{name:20} {middle:12.3f} {here / middle:9.2f} {idle:14.2f} {rate:20.1f}")
+    _messages(made[0][2], core / chunks)
     for _, kind, _ in made:
         if kind is not None:
             kind.close()
@@ -82,14 +89,13 @@ def _messages(trainer: Trainer, chunk_seconds: float) -> None:
     piece, result = pieces[0], roll_out(trainer._env, pieces[0])
     seconds = 0.0
     for name, thing in (("piece", piece), ("result", result)):
-        spent = []
-        for _ in range(20):
-            start = time.perf_counter()
+        start = time.process_time()
+        for _ in range(_REPEATS):
             data = pickle.dumps(thing)
             pickle.loads(data)
-            spent.append(time.perf_counter() - start)
-        seconds += statistics.median(spent)
-        print(f"{name}: {len(data) / 1024:.0f} KiB, {1e3 * statistics.median(spent):.2f} ms")
+        spent = (time.process_time() - start) / _REPEATS
+        seconds += spent
+        print(f"{name}: {len(data) / 1024:.0f} KiB, {1e3 * spent:.2f} ms")
     print("workers   s an update   efficiency, if messages pass one by one")
     for count in (2, 4, 8, 16, 32, 64, 128):
         update = chunk_seconds + count * seconds

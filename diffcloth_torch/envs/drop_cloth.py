@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.envs.actuators import Tools
-from diffcloth_torch.envs.env import EnvState
+from diffcloth_torch.envs.env import EnvState, lengths
 from diffcloth_torch.envs.sheets import HEIGHT, SIDE, SheetTask, follow, uniform
 
 __all__ = ["DropCloth"]
@@ -48,7 +48,7 @@ class DropCloth(SheetTask):
     def distance(self, env: EnvState) -> Tensor:
         """Mean distance from the flat sheet [m], [B]."""
         away = env.state.positions - env.drawn["goal"]
-        return (away.square().sum(dim=-1) + 1e-12).sqrt().mean(dim=-1)
+        return lengths(away).mean(dim=-1)
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""

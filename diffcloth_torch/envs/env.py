@@ -21,7 +21,7 @@ from diffcloth_torch.sim.controls import Parameters
 from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State, where
 
-__all__ = ["EnvState", "Task"]
+__all__ = ["EnvState", "Task", "lengths"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +199,13 @@ def failures(state: State) -> Tensor:
     """Environments whose last step failed [B]."""
     report: Any = state.report
     return torch.tensor([status != "converged" for status in report.status])
+
+
+def lengths(vectors: Tensor) -> Tensor:
+    """Lengths [...] of vectors [..., n]; those that are zero have no gradient."""
+    # No square root of torch: for a few numbers of float64 it wakes all threads.
+    norms: Tensor = torch.linalg.vector_norm(vectors, dim=-1)
+    return norms
 
 
 def _cut(tensor: Tensor, mask: Tensor) -> Tensor:

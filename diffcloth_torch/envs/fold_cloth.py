@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from diffcloth_torch.envs.env import EnvState
+from diffcloth_torch.envs.env import EnvState, lengths
 from diffcloth_torch.envs.sheets import SIDE, SheetTask, arc, follow
 
 __all__ = ["FoldCloth", "FoldClothDiagonal"]
@@ -106,5 +106,5 @@ class FoldClothDiagonal(FoldCloth):
 
 
 def _mean_length(vectors: Tensor) -> Tensor:
-    """Mean length [B] of vectors [B, n, 3], with a gradient where some are zero."""
-    return (vectors.square().sum(dim=-1) + 1e-12).sqrt().mean(dim=-1)
+    """Mean length [B] of vectors [B, n, 3]; those that are zero have no gradient."""
+    return lengths(vectors).mean(dim=-1)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from diffcloth_torch import robots
 from diffcloth_torch.envs.actuators import Hand, Tools
-from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import uniform
 from diffcloth_torch.geometry.rotation import (
     quaternion_log,
@@ -150,7 +150,7 @@ class LiftCloth(HandTask):
         return env.drawn["goal"] - env.state.positions.mean(dim=1)
 
     def _distance(self, env: EnvState) -> Tensor:
-        return (self._away(env).square().sum(dim=-1) + 1e-12).sqrt()
+        return lengths(self._away(env))
 
 
 class GraspCloth(HandTask):
@@ -182,7 +182,7 @@ class GraspCloth(HandTask):
     def distance(self, env: EnvState) -> Tensor:
         """Mean distance from the target shape [m], [B]."""
         away = env.state.positions - env.drawn["target"]
-        return (away.square().sum(dim=-1) + 1e-12).sqrt().mean(dim=-1)
+        return lengths(away).mean(dim=-1)
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""

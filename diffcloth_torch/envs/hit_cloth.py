@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.envs.actuators import Tools, Twist
-from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import follow, uniform
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
@@ -96,7 +96,7 @@ class HitCloth(Task):
     def distance(self, env: EnvState) -> Tensor:
         """Mean distance from the target [m], [B]."""
         away = env.state.positions - self.target
-        return (away.square().sum(dim=-1) + 1e-12).sqrt().mean(dim=-1)
+        return lengths(away).mean(dim=-1)
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.envs.actuators import Tools, Velocities
-from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import uniform
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
@@ -96,7 +96,7 @@ class PushCube(Task):
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return -(self._away(env).square().sum(dim=-1) + 1e-12).sqrt()
+        return -lengths(self._away(env))
 
     def success(self, env: EnvState) -> Tensor:
         """Whether the cube is within 3 cm of the target."""
@@ -106,7 +106,7 @@ class PushCube(Task):
         """Push the cube with the sheet across the way to the target, and step back in time."""
         away = self._away(env)
         cube, velocity = env.state.body_poses[:, 0, :2], env.state.body_velocities[:, 0, :2]
-        distance = away.square().sum(dim=-1, keepdim=True).sqrt()
+        distance = lengths(away)[:, None]
         to_target = away / distance.clamp(min=1e-3)
         ahead = away - _BRAKING * velocity
         pushes = ((ahead * away).sum(dim=-1, keepdim=True) > 0) & (distance > 0.3 * _CLOSE)

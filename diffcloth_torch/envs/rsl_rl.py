@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -20,7 +21,6 @@ class RslRlEnv:
         num_envs: B.
         num_actions: A.
         max_episode_length: Steps of an episode.
-        episode_length_buf: Steps since each environment began [B].
         device: The CPU.
         cfg: Nothing.
     """
@@ -36,8 +36,12 @@ class RslRlEnv:
 
     @property
     def episode_length_buf(self) -> Tensor:
-        """Steps since each environment began [B]."""
+        """Steps since each environment began [B]; a runner may begin with random ones."""
         return self.env.env_state.elapsed
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, steps: Tensor) -> None:
+        self.env.env_state = replace(self.env.env_state, elapsed=steps)
 
     def get_observations(self) -> TensorDict:
         """The present observations."""

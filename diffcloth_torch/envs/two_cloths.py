@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.envs.actuators import Forces, Tools
-from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import uniform
 from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.geometry.shapes import strip
@@ -94,7 +94,7 @@ class TwoCloths(Task):
 
     def distance(self, env: EnvState) -> Tensor:
         """Distance of the center from the target [m], [B]."""
-        return (self._away(env).square().sum(dim=-1) + 1e-12).sqrt()
+        return lengths(self._away(env))
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""

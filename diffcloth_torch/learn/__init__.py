@@ -10,6 +10,15 @@
 from diffcloth_torch.learn.options import TrainerOptions
 from diffcloth_torch.learn.rollouts import Policy
 from diffcloth_torch.learn.trainer import Trainer
-from diffcloth_torch.learn.workers import Processes, Ranks, RayActors, Workers
+from diffcloth_torch.learn.workers import Jobs, Processes, Ranks, RayActors, Workers
 
-__all__ = ["Policy", "Processes", "Ranks", "RayActors", "Trainer", "TrainerOptions", "Workers"]
+__all__ = [
+    "Jobs",
+    "Policy",
+    "Processes",
+    "Ranks",
+    "RayActors",
+    "Trainer",
+    "TrainerOptions",
+    "Workers",
+]

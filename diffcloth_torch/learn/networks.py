@@ -8,11 +8,13 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import softplus
 
-__all__ = ["Actor", "Critic", "Scale"]
+__all__ = ["Actor", "Critics", "Scale"]
 
 _LIMIT = 5.0  # of a scaled observation
 _QUIET = 0.01  # share of the weights of a last layer that is left at first
+_WIDEST = 2.0  # of the logarithm of a width: how far what is seen changes it
 _LEAST = 1e-2  # standard deviation that observations are divided by
 
 
@@ -24,8 +26,9 @@ def _layers(sizes: Sequence[int], outputs: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
 
 
-def _quieten(layers: nn.Sequential) -> Tensor:
+def _quieten(layers: nn.Module) -> Tensor:
     """Make the last layer nearly constant; gives its bias."""
+    assert isinstance(layers, nn.Sequential)
     last = layers[-1]
     assert isinstance(last, nn.Linear)
     with torch.no_grad():
@@ -34,38 +37,61 @@ def _quieten(layers: nn.Sequential) -> Tensor:
 
 
 class Actor(nn.Module):
-    """A policy: the tanh of a normal distribution, whose width does not depend on what is seen."""
+    """A policy: the tanh of a normal distribution.
+
+    The width of the distribution is the same everywhere, or else also depends on what is seen.
+    """
 
     def __init__(
-        self, observations: int, first_action: Tensor, hidden: Sequence[int], deviation: float
+        self,
+        observations: int,
+        first_action: Tensor,
+        hidden: Sequence[int],
+        deviation: float,
+        *,
+        sees_width: bool,
     ) -> None:
         """Make a policy whose actions are nearly the first one [A], but for noise."""
         super().__init__()
-        self.mean = _layers([observations, *hidden], len(first_action))
-        _quieten(self.mean).copy_(first_action.atanh())
+        self._size = len(first_action)
+        self.layers = _layers([observations, *hidden], (2 if sees_width else 1) * self._size)
+        _quieten(self.layers)[: self._size] = first_action.atanh()
         self.log_deviation = nn.Parameter(torch.full_like(first_action, math.log(deviation)))
 
-    def forward(self, scaled: Tensor, noise: Tensor | None = None) -> Tensor:
-        """Actions [B, A] for observations [B, O] and standard normal noise [B, A], or without."""
-        mean: Tensor = self.mean(scaled)
-        if noise is not None:
-            mean = mean + self.log_deviation.exp() * noise
-        return mean.tanh()
+    def forward(self, scaled: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions and their entropy.
+
+        Args:
+            scaled: Observations [B, O].
+            noise: Standard normal [B, A]; zeros give the actions of a policy without noise.
+
+        Returns:
+            Actions [B, A], and minus the logarithm of their density [B], whose mean is the entropy.
+        """
+        mean, *widths = self.layers(scaled).split(self._size, dim=-1)
+        log_deviation = self.log_deviation.expand_as(mean)
+        for width in widths:
+            log_deviation = log_deviation + _WIDEST * width.tanh()
+        before = mean + log_deviation.exp() * noise
+        # The slope of tanh, 1 - tanh^2 = 4 / (e^x + e^-x)^2, also where it is nearly 0.
+        log_slope = 2 * (math.log(2.0) - before - softplus(-2 * before))
+        entropy = 0.5 * noise.square() + 0.5 * math.log(2 * math.pi) + log_deviation + log_slope
+        return before.tanh(), entropy.sum(dim=-1)
 
 
-class Critic(nn.Module):
-    """The value of a state."""
+class Critics(nn.Module):
+    """Several opinions on the value of a state."""
 
-    def __init__(self, observations: int, hidden: Sequence[int]) -> None:
-        """Make a critic that knows of no difference between states, so that it has no gradient."""
+    def __init__(self, observations: int, hidden: Sequence[int], count: int) -> None:
+        """Make critics that know of no difference between states, so that they have no gradient."""
         super().__init__()
-        self.value = _layers([observations, *hidden], 1)
-        _quieten(self.value)
+        self.values = nn.ModuleList(_layers([observations, *hidden], 1) for _ in range(count))
+        for value in self.values:
+            _quieten(value)
 
     def forward(self, scaled: Tensor) -> Tensor:
-        """Values [...] of observations [..., O]."""
-        values: Tensor = self.value(scaled)
-        return values[..., 0]
+        """Values [critics, ...] of observations [..., O]."""
+        return torch.stack([value(scaled)[..., 0] for value in self.values])
 
 
 class Scale(nn.Module):

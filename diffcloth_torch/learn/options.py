@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from diffcloth_torch.checks import check_choice, check_count
@@ -9,8 +11,12 @@ from diffcloth_torch.errors import InvalidInput
 
 __all__ = ["ALGORITHMS", "TrainerOptions"]
 
-ALGORITHMS = ("apg", "shac")
+ALGORITHMS = ("apg", "shac", "sapo")
 _LEAST_SHARE = 0.1
+_INFINITE = 1e6  # above every sensible rate
+_POSITIVE = (
+    "actor_rate", "critic_rate", "gradient_norm", "deviation", "temperature", "temperature_rate",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -19,7 +25,8 @@ class TrainerOptions:
 
     Attributes:
         algorithm: "apg": the rewards of a rollout alone. "shac": also the value of its end, by a
-            critic that learns beside the policy.
+            critic that learns beside the policy. "sapo": also the entropy of the policy, whose
+            noise depends on what it sees, and several critics.
         horizon: Steps of a rollout that is differentiated at once.
         feedback: Whether gradients flow through what the policy sees, too. Without, each action is
             differentiated as that of a plan: where a plan cannot be improved the policy cannot
@@ -36,6 +43,11 @@ class TrainerOptions:
         target_rate: Share by which the target critic moves after each rollout.
         gradient_norm: Largest norm of a gradient of the policy; longer ones are shortened.
         deviation: Of the noise of actions at first.
+        critics: Number of critics of "sapo": their mean is the value that a policy climbs, their
+            least one the value that they learn.
+        temperature: Of "sapo" at first: what a unit of entropy is worth, in units of reward.
+        temperature_rate: Learning rate of Adam for its logarithm.
+        target_entropy: Mean entropy, per number of an action, that the temperature aims at.
         first_action: Action of the policy at first, between -1 and 1; None for zeros.
         hidden: Sizes of hidden layers.
         seed: Of networks, noise and starts.
@@ -59,26 +71,49 @@ class TrainerOptions:
     target_rate: float = 0.2
     gradient_norm: float = 1.0
     deviation: float = 0.1
+    critics: int = 2
+    temperature: float = 1e-3
+    temperature_rate: float = 2e-2
+    target_entropy: float = -1.0
     first_action: tuple[float, ...] | None = None
     hidden: tuple[int, ...] = (128, 64, 32)
     seed: int = 0
 
     def __post_init__(self) -> None:
         check_choice("TrainerOptions: `algorithm`", self.algorithm, ALGORITHMS)
-        for name in ("horizon", "critic_epochs", "critic_batches"):
+        if not isinstance(self.feedback, bool):
+            raise InvalidInput(f"TrainerOptions: `feedback` must be a bool, got {self.feedback!r}")
+        for name in ("horizon", "critic_epochs", "critic_batches", "critics"):
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 1)
         for name in ("critic_only", "decay_updates", "seed"):
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 0)
         for name in ("discount", "trace", "target_rate"):
-            self._check(name, getattr(self, name), 0.0 <= getattr(self, name) <= 1.0, "in [0, 1]")
-        for name in ("actor_rate", "critic_rate", "gradient_norm", "deviation"):
-            self._check(name, getattr(self, name), 0.0 < getattr(self, name) < 1e6, "positive")
-        for beta in self.betas:
-            self._check("betas", beta, 0.0 <= beta < 1.0, "in [0, 1)")
-        for size in self.hidden:
-            check_count("TrainerOptions: `hidden`", size, 1)
+            _check_number(name, getattr(self, name), lambda v: 0 <= v <= 1, "in [0, 1]")
+        for name in _POSITIVE:
+            _check_number(name, getattr(self, name), lambda v: 0 < v < _INFINITE, "positive")
+        _check_number("target_entropy", self.target_entropy, math.isfinite, "finite")
+        for name in ("betas", "hidden", "first_action"):
+            value = getattr(self, name)
+            if not isinstance(value, tuple) and (name, value) != ("first_action", None):
+                raise InvalidInput(f"TrainerOptions: `{name}` must be a tuple, got {value!r}")
+        if len(self.betas) != 2:
+            raise InvalidInput(f"TrainerOptions: `betas` must be two numbers, got {self.betas}")
+        for k, beta in enumerate(self.betas):
+            _check_number(f"betas[{k}]", beta, lambda v: 0 <= v < 1, "in [0, 1)")
+        for k, size in enumerate(self.hidden):
+            check_count(f"TrainerOptions: `hidden[{k}]`", size, 1)
         for k, value in enumerate(self.first_action or ()):
-            self._check(f"first_action[{k}]", value, abs(value) < 1.0, "between -1 and 1")
+            _check_number(f"first_action[{k}]", value, lambda v: -1 < v < 1, "between -1 and 1")
+
+    @property
+    def has_critic(self) -> bool:
+        """Whether a critic says what the end of a rollout is worth."""
+        return self.algorithm != "apg"
+
+    @property
+    def has_entropy(self) -> bool:
+        """Whether the entropy of the policy counts, too."""
+        return self.algorithm == "sapo"
 
     def rate_share(self, updates: int) -> float:
         """Share of the learning rates that is left after some updates."""
@@ -86,7 +121,10 @@ class TrainerOptions:
             return 1.0
         return 1.0 - (1.0 - _LEAST_SHARE) * min(updates / self.decay_updates, 1.0)
 
-    @staticmethod
-    def _check(name: str, value: float, is_accepted: bool, accepted: str) -> None:
-        if not is_accepted:
-            raise InvalidInput(f"TrainerOptions: `{name}` must be {accepted}, got {value}")
+
+def _check_number(
+    name: str, value: object, is_accepted: Callable[[float], bool], accepted: str
+) -> None:
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not is_number or not is_accepted(value):  # type: ignore[arg-type]
+        raise InvalidInput(f"TrainerOptions: `{name}` must be {accepted}, got {value!r}")

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from diffcloth_torch.envs.env import EnvState
 from diffcloth_torch.envs.gym import ClothVectorEnv
-from diffcloth_torch.learn.networks import Actor, Critic, Scale
+from diffcloth_torch.learn.networks import Actor, Critics, Scale
 from diffcloth_torch.learn.options import TrainerOptions
 
 __all__ = [
@@ -35,22 +35,42 @@ MakeEnv = Callable[..., ClothVectorEnv]
 
 
 class Policy(torch.nn.Module):
-    """A policy, its critic, the critic that it aims at, and the scale of what they see."""
+    """A policy, its critics, slower copies that they aim at, and the scale of what they see.
+
+    Attributes:
+        log_temperature: Logarithm of what a unit of entropy is worth; of "sapo" alone.
+    """
 
     def __init__(self, env: ClothVectorEnv, options: TrainerOptions) -> None:
         """Make networks for the observations and actions of environments."""
         super().__init__()
         observations = env.task.observation(env.task.example()).shape[-1]
         first = options.first_action or [0.0] * env.task.action_size
-        self.actor = Actor(observations, torch.tensor(first), options.hidden, options.deviation)
-        self.critic = Critic(observations, options.hidden)
-        self.target = Critic(observations, options.hidden)
-        self.target.load_state_dict(self.critic.state_dict())
+        self.actor = Actor(
+            observations,
+            torch.tensor(first),
+            options.hidden,
+            options.deviation,
+            sees_width=options.has_entropy,
+        )
+        critics = options.critics if options.has_entropy else 1
+        self.critics = Critics(observations, options.hidden, critics)
+        self.targets = Critics(observations, options.hidden, critics)
+        self.targets.load_state_dict(self.critics.state_dict())
         self.scale = Scale(observations)
+        self.log_temperature = torch.nn.Parameter(torch.tensor(options.temperature).log())
+        self._has_entropy = options.has_entropy
+
+    @property
+    def temperature(self) -> float:
+        """What a unit of entropy is worth, in units of reward."""
+        return float(self.log_temperature.detach().exp()) if self._has_entropy else 0.0
 
     def forward(self, observation: Tensor, noise: Tensor | None = None) -> Tensor:
         """Actions [B, A] for observations [B, O], with standard normal noise [B, A] or without."""
-        actions: Tensor = self.actor(self.scale(observation), noise)
+        if noise is None:
+            noise = torch.zeros(1)
+        actions: Tensor = self.actor(self.scale(observation), noise)[0]
         return actions
 
 
@@ -87,6 +107,7 @@ class Rollout:
         seen: Observations before each step [h, n, O].
         after: Observations after it, before a new start [h, n, O].
         rewards: [h, n].
+        entropies: Of the actions: minus the logarithm of their density [h, n].
         terminated: Whether it failed [h, n].
         ended: Whether an episode ended with it [h, n].
         success: Whether the task was done after it [h, n].
@@ -99,6 +120,7 @@ class Rollout:
     seen: Tensor
     after: Tensor
     rewards: Tensor
+    entropies: Tensor
     terminated: Tensor
     ended: Tensor
     success: Tensor
@@ -113,34 +135,44 @@ def roll_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
     policy.load_state_dict(piece.weights)
     observation = env.resume(piece.start, piece.generators)
     count, horizon = env.num_envs, len(piece.noise)
-    rows: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]] = []
+    temperature = policy.temperature
+    rows: list[dict[str, Tensor]] = []
     discount, total = torch.ones(count), torch.zeros(count)
     for t, noise in enumerate(piece.noise):
         seen = observation.detach()
-        actions = policy(observation if o.feedback else seen, noise)
+        actions, entropy = policy.actor(policy.scale(observation if o.feedback else seen), noise)
         observation, reward, terminated, truncated, info = env.step(actions)
         ended = terminated | truncated
         after = info["obs_before_reset"]
-        total = total + discount * reward
+        total = total + discount * (reward + temperature * entropy)
         discount = discount * o.discount
-        if o.algorithm == "shac":
+        if o.has_critic:
             # What follows the end of an episode or of the rollout; nothing follows a failure.
             closes = truncated if t < horizon - 1 else ~terminated
-            value = policy.target(policy.scale(after))
+            value = policy.targets(policy.scale(after)).mean(dim=0)
             total = total + torch.where(closes, discount * value, 0.0)
         discount = torch.where(ended, 1.0, discount)
         success = info.get("final_info", info)["success"]
-        rows.append((seen, after.detach(), reward.detach(), terminated, ended, success))
+        rows.append(
+            {
+                "seen": seen,
+                "after": after.detach(),
+                "rewards": reward.detach(),
+                "entropies": entropy.detach(),
+                "terminated": terminated,
+                "ended": ended,
+                "success": success,
+            }
+        )
     loss = -piece.share / horizon * total.sum()
     gradients = torch.autograd.grad(loss, list(policy.actor.parameters()))
     env.clear_grad()
-    columns = [torch.stack(column) for column in zip(*rows, strict=True)]
     return Rollout(
-        list(gradients),
-        float(loss.detach()),
-        *(columns[0], columns[1], columns[2], columns[3], columns[4], columns[5]),
+        gradients=list(gradients),
+        loss=float(loss.detach()),
         end=env.env_state,
         generators=env.generator_states(),
+        **{name: torch.stack([row[name] for row in rows]) for name in rows[0]},
     )
 
 

@@ -1,8 +1,10 @@
-"""Policies by gradients through the simulation: APG and SHAC.
+"""Policies by gradients through the simulation: APG, SHAC and SAPO.
 
 References:
     SHAC: Xu, Makoviychuk, Narang, Ramos, Matusik, Garg, Macklin, "Accelerated Policy Learning with
     Parallel Differentiable Simulation", ICLR 2022. APG is the same without its critic.
+    SAPO: Xing, Luk, Oh, "Stabilizing Reinforcement Learning in Differentiable Multiphysics
+    Simulation", ICLR 2025: the same with entropy and several critics.
 """
 
 from __future__ import annotations
@@ -98,7 +100,10 @@ class Trainer:
             self.policy.actor.parameters(), lr=o.actor_rate, betas=o.betas
         )
         self._critic_steps = torch.optim.Adam(
-            self.policy.critic.parameters(), lr=o.critic_rate, betas=o.betas
+            self.policy.critics.parameters(), lr=o.critic_rate, betas=o.betas
+        )
+        self._temperature_steps = torch.optim.Adam(
+            [self.policy.log_temperature], lr=o.temperature_rate, betas=o.betas
         )
         self.steps = self.updates = 0
         self._return = torch.zeros(num_envs)
@@ -110,7 +115,7 @@ class Trainer:
 
     def act(self, observation: Tensor) -> Tensor:
         """Actions [B, A] without noise."""
-        with torch.no_grad():
+        with torch.no_grad(), threads_of_torch(self._threads):
             actions: Tensor = self.policy(observation)
         return actions
 
@@ -119,8 +124,9 @@ class Trainer:
 
         Returns:
             What to log: "loss", "gradient_norm" before it is limited, "reward" (the mean of the
-            rollout), "failed" (share of steps), "critic_loss" and, where episodes ended, their mean
-            "return" and share of "success".
+            rollout), "failed" (share of steps), "entropy" (of the policy, per number of an action),
+            "critic_loss", "temperature" and, where episodes ended, their mean "return" and share of
+            "success".
 
         Raises:
             SimulationError: If a gradient is not finite.
@@ -134,13 +140,17 @@ class Trainer:
         self._critic_steps.param_groups[0]["lr"] = share * self.options.critic_rate
         rollouts = self._rollouts()
         log = {"loss": sum(r.loss for r in rollouts)}
-        learns = self.options.algorithm == "apg" or self.updates >= self.options.critic_only
+        learns = not self.options.has_critic or self.updates >= self.options.critic_only
         log["gradient_norm"] = self._step_actor(rollouts, learns)
         rows = _Rows(rollouts)
         log["reward"] = float(rows.rewards.mean())
         log["failed"] = float(rows.terminated.float().mean())
-        if self.options.algorithm == "shac":
-            log["critic_loss"] = self._fit_critic(rows)
+        log["entropy"] = float(rows.entropies.mean()) / self.task.action_size
+        if self.options.has_critic:
+            log["critic_loss"] = self._fit_critics(rows)
+        if self.options.has_entropy:
+            log["temperature"] = self.policy.temperature
+            self._step_temperature(log["entropy"])
         self.policy.scale.see(rows.seen.flatten(0, 1))
         self._places = [(r.end, r.generators) for r in rollouts]
         self.steps += rows.rewards.numel()
@@ -181,7 +191,7 @@ class Trainer:
                 "return": self._return,
                 "noise": self._noise.get_state(),
                 "policy": self.policy.state_dict(),
-                "optimizers": [o.state_dict() for o in (self._actor_steps, self._critic_steps)],
+                "optimizers": [o.state_dict() for o in self._optimizers],
                 "places": [
                     ([e.state, e.tools, e.drawn, e.elapsed, e.failed], generators)
                     for e, generators in self._places
@@ -206,12 +216,16 @@ class Trainer:
                 f"not {len(self._places)} of {self._chunk}"
             )
         self.policy.load_state_dict(kept["policy"])
-        self._actor_steps.load_state_dict(kept["optimizers"][0])
-        self._critic_steps.load_state_dict(kept["optimizers"][1])
+        for optimizer, state in zip(self._optimizers, kept["optimizers"], strict=True):
+            optimizer.load_state_dict(state)
         self.steps, self.updates = kept["counts"]
         self._return = kept["return"]
         self._noise.set_state(kept["noise"])
         self._places = [(EnvState(*parts), generators) for parts, generators in kept["places"]]
+
+    @property
+    def _optimizers(self) -> tuple[torch.optim.Optimizer, ...]:
+        return self._actor_steps, self._critic_steps, self._temperature_steps
 
     @property
     def _chunks(self) -> range:
@@ -262,26 +276,34 @@ class Trainer:
             self._actor_steps.step()
         return float(norm)
 
-    def _fit_critic(self, rows: _Rows) -> float:
+    def _fit_critics(self, rows: _Rows) -> float:
         o, policy = self.options, self.policy
         with torch.no_grad():
-            values = policy.target(policy.scale(rows.after))
-            goals = _lambda_returns(rows, values, o.discount, o.trace).flatten()
+            # The least opinion: what one critic alone overestimates a policy would climb.
+            values = policy.targets(policy.scale(rows.after)).amin(dim=0)
+            rewards = rows.rewards + policy.temperature * rows.entropies
+            goals = _lambda_returns(rows, rewards, values, o.discount, o.trace).flatten()
             seen = policy.scale(rows.seen).flatten(0, 1)
         losses = []
         for _ in range(o.critic_epochs):
             order = torch.randperm(len(goals), generator=self._noise)
             for chosen in order.chunk(o.critic_batches):
                 self._critic_steps.zero_grad()
-                loss = (policy.critic(seen[chosen]) - goals[chosen]).square().mean()
-                loss.backward()
+                errors = (policy.critics(seen[chosen]) - goals[chosen]).square().mean(dim=-1)
+                errors.sum().backward()
                 self._critic_steps.step()
-                losses.append(float(loss.detach()))
+                losses.append(float(errors.detach().mean()))
         with torch.no_grad():
-            pairs = zip(policy.target.parameters(), policy.critic.parameters(), strict=True)
+            pairs = zip(policy.targets.parameters(), policy.critics.parameters(), strict=True)
             for slow, fast in pairs:
                 slow.lerp_(fast, o.target_rate)
         return sum(losses) / len(losses)
+
+    def _step_temperature(self, entropy: float) -> None:
+        """Make entropy worth more where there is too little of it, and less where too much."""
+        too_much = entropy - self.options.target_entropy
+        self.policy.log_temperature.grad = torch.tensor(too_much * self.policy.temperature)
+        self._temperature_steps.step()
 
     def _ended(self, rows: _Rows) -> dict[str, float]:
         """Mean return and share of success of the episodes that have ended, if any has."""
@@ -307,12 +329,23 @@ class _Rows:
             return torch.cat([getattr(r, name) for r in rollouts], dim=1)
 
         self.seen, self.after = all_of("seen"), all_of("after")
-        self.rewards, self.terminated = all_of("rewards"), all_of("terminated")
-        self.ended, self.success = all_of("ended"), all_of("success")
+        self.rewards, self.entropies = all_of("rewards"), all_of("entropies")
+        self.terminated, self.ended = all_of("terminated"), all_of("ended")
+        self.success = all_of("success")
 
 
-def _lambda_returns(rows: _Rows, values: Tensor, discount: float, trace: float) -> Tensor:
-    """Returns [h, B] that mix all lengths of look-ahead, from values after each step [h, B]."""
+def _lambda_returns(
+    rows: _Rows, rewards: Tensor, values: Tensor, discount: float, trace: float
+) -> Tensor:
+    """Returns [h, B] that mix all lengths of look-ahead.
+
+    Args:
+        rows: When episodes ended or failed.
+        rewards: Of each step [h, B].
+        values: Of what follows each step [h, B].
+        discount: Gamma.
+        trace: Lambda.
+    """
     from torchrl.objectives.value.functional import td_lambda_return_estimate
 
     # The last step ends what is known.
@@ -322,7 +355,7 @@ def _lambda_returns(rows: _Rows, values: Tensor, discount: float, trace: float) 
         discount,
         trace,
         values[..., None],
-        rows.rewards[..., None],
+        rewards[..., None],
         ended[..., None],
         rows.terminated[..., None],
         time_dim=0,

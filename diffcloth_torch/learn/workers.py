@@ -1,4 +1,4 @@
-"""Workers that make pieces of work: processes, actors of Ray, ranks of a torchrun job.
+"""Workers that make pieces of work: processes, jobs, actors of Ray, ranks of a torchrun job.
 
 Each has `map(function, items)`, which gives the results in the order of the items, as executors of
 `concurrent.futures` do. A piece does not depend on who makes it: all give the same bits.
@@ -6,6 +6,7 @@ Each has `map(function, items)`, which gives the results in the order of the ite
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -15,12 +16,12 @@ from typing import Any, Protocol, TypeVar
 from diffcloth_torch.checks import check_count
 from diffcloth_torch.errors import InvalidInput
 
-__all__ = ["Processes", "Ranks", "RayActors", "Workers"]
+__all__ = ["Jobs", "Processes", "Ranks", "RayActors", "Workers"]
 
 A = TypeVar("A")
 B = TypeVar("B")
 
-_REPEATS = 3  # of pieces whose process died, before the error is passed on
+_REPEATS = 3  # of pieces whose process or actor died, before the error is passed on
 
 
 class Workers(Protocol):
@@ -64,10 +65,27 @@ class Processes:
             self._pool = None
 
 
+class Jobs:
+    """Whatever has `submit(function, item)`, whose result has `result()`.
+
+    So do executors of submitit (Slurm) and clients of dask, whose `map` is another one.
+    """
+
+    def __init__(self, executor: Any) -> None:
+        """Take an executor that has been set up; it is closed by who made it."""
+        self.executor = executor
+
+    def map(self, function: Callable[[A], B], items: Sequence[A], /) -> list[B]:
+        """Results in the order of the items."""
+        jobs = [self.executor.submit(function, item) for item in items]
+        return [job.result() for job in jobs]
+
+
 class RayActors:
     """Actors of Ray, on this machine or on a cluster: `ray.init` says which.
 
-    An actor that dies is started again, and what it did not finish is made again.
+    An actor that dies is started again, and what it did not finish is made again, up to three
+    times.
     """
 
     def __init__(self, count: int, *, cores: float = 1.0) -> None:
@@ -88,12 +106,20 @@ class RayActors:
                 "RayActors needs ray: run  pip install 'diffcloth-torch[ray]'"
             ) from error
         if not ray.is_initialized():
-            ray.init(num_cpus=max(count, 1), include_dashboard=False, log_to_driver=False)
-        remote: Any = ray.remote(num_cpus=cores, max_restarts=-1, max_task_retries=-1)(_Caller)
+            # As many as they occupy, or they would wait for cores for ever.
+            cpus = max(math.ceil(count * cores), 1)
+            ray.init(num_cpus=cpus, include_dashboard=False, log_to_driver=False)
+        remote: Any = ray.remote(num_cpus=cores, max_restarts=-1, max_task_retries=_REPEATS)(
+            _Caller
+        )
         self.actors: list[Any] = [remote.remote() for _ in range(count)]
 
     def map(self, function: Callable[[A], B], items: Sequence[A], /) -> list[B]:
-        """Results in the order of the items."""
+        """Results in the order of the items.
+
+        Raises:
+            RayActorError: If actors die again and again.
+        """
         from ray.util import ActorPool
 
         pool: Any = ActorPool(self.actors)

@@ -81,3 +81,6 @@ def test_what_rsl_rl_asks_for():
     assert extras["time_outs"].tolist() == [True, True]
     assert env.episode_length_buf.tolist() == [0, 0]
     assert observations["policy"].shape[0] == reward.shape[0] == 2
+    # Runners may begin with episodes of random lengths.
+    env.episode_length_buf = torch.tensor([1, 0])
+    assert env.step(torch.zeros(2, env.num_actions))[2].tolist() == [1, 0]

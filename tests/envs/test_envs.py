@@ -246,8 +246,7 @@ def test_scripts_succeed(name):
             }[policy]()
             _, reward, _, _, info = env.step(actions)
         totals[policy] = reward
-    # What hangs over pegs may slide off when the hand rises.
-    assert int(info["success"].sum()) >= (1 if name == "HangCloth" else 3)
+    assert int(info["success"].sum()) >= 3
     assert float(totals["scripted"].mean()) > float(totals["zero"].mean())
     assert float(totals["scripted"].mean()) > float(totals["random"].mean())
 

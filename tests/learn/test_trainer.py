@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,8 +15,10 @@ from diffcloth_torch.envs.fold_cloth import FoldCloth
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.learn import Trainer, TrainerOptions
 from diffcloth_torch.learn import rollouts as rollouts_module
+from diffcloth_torch.learn import trainer as trainer_module
+from diffcloth_torch.learn.networks import Actor
 from diffcloth_torch.learn.rollouts import Policy
-from diffcloth_torch.learn.trainer import _lambda_returns
+from diffcloth_torch.learn.trainer import _lambda_returns, _Rows
 
 HOLD = (0.0, 0.0, 0.1, 0.9, 0.0, 0.0, 0.1, 0.9)
 SOFT = {"opens_at": -1.0, "reach": 0.06}
@@ -59,8 +62,9 @@ class TestGradient:
         trainer = Trainer(exact, options, num_envs=2)
         with torch.no_grad():
             # The last layers are nearly zero at first.
-            trainer.policy.target.value[-1].weight.mul_(100.0)
-            trainer.policy.actor.mean[-1].weight.mul_(5.0)
+            for value in trainer.policy.targets.values:
+                value[-1].weight.mul_(100.0)
+            trainer.policy.actor.layers[-1].weight.mul_(5.0)
         return trainer
 
     def rollout(self, trainer):
@@ -69,11 +73,13 @@ class TestGradient:
         trainer._noise.set_state(noise)
         return found
 
-    def test_is_that_of_differences(self):
-        trainer = self.trainer(self.OPTIONS)
+    @pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
+    def test_is_that_of_differences(self, algorithm):
+        options = replace(self.OPTIONS, algorithm=algorithm, temperature=0.02)
+        trainer = self.trainer(options)
         found = self.rollout(trainer)
         scale = torch.stack([g.norm() for g in found.gradients]).norm()
-        assert scale > 1
+        assert scale > 0.1
         step = 1e-4 / scale
         losses = []
         for side in (1, -1):
@@ -103,7 +109,7 @@ class TestGradient:
             plan.append((action, action.detach().requires_grad_()))
             observation, reward, *_ = env.step(plan[-1][1])
             total, discount = total + discount * reward, discount * options.discount
-        total = total + discount * policy.target(policy.scale(observation))
+        total = total + discount * policy.targets(policy.scale(observation))[0]
         of_plan = torch.autograd.grad(-total.sum() / 10, [leaf for _, leaf in plan])
         expected = torch.autograd.grad([a for a, _ in plan], parameters(trainer), of_plan)
         for e, g in zip(expected, found.gradients, strict=True):
@@ -123,7 +129,7 @@ def test_lambda_returns_are_those_of_the_recursion():
     h, count, gamma, trace = 7, 3, 0.9, 0.8
     rows = rollouts_rows(h, count, generator)
     values = torch.randn(h, count, generator=generator)
-    found = _lambda_returns(rows, values, gamma, trace)
+    found = _lambda_returns(rows, rows.rewards, values, gamma, trace)
     for b in range(count):
         ahead = 0.0
         for t in reversed(range(h)):
@@ -132,6 +138,76 @@ def test_lambda_returns_are_those_of_the_recursion():
             follows = next_value if last else (1 - trace) * next_value + trace * ahead
             ahead = float(rows.rewards[t, b]) + gamma * follows
             assert float(found[t, b]) == pytest.approx(ahead, rel=1e-5)
+
+
+class TestEntropy:
+    """Of SAPO: its value, what it is worth, and who learns from it."""
+
+    def test_is_that_of_the_density(self):
+        """Minus the logarithm of the density, beside torch.distributions, also at its edges."""
+        first = torch.tensor([0.0, 0.95, -0.3])
+        torch.manual_seed(0)
+        actor = Actor(4, first, [8], 0.3, sees_width=True)
+        with torch.no_grad():
+            actor.layers[-1].weight.mul_(100.0)
+        scaled, noise = torch.randn(50, 4), 3 * torch.randn(50, 3)
+        actions, entropy = (t.detach() for t in actor(scaled, noise))
+        with torch.no_grad():
+            mean, width = actor.layers(scaled).split(3, dim=-1)
+            deviation = (actor.log_deviation + 2 * width.tanh()).exp()
+        assert float(deviation.max() / deviation.min()) > 3  # depends on what is seen
+        normal = torch.distributions.Normal(mean.double(), deviation.double())
+        squash = torch.distributions.TanhTransform()
+        before = (mean + deviation * noise).double()
+        expected = squash.log_abs_det_jacobian(before, before.tanh()) - normal.log_prob(before)
+        torch.testing.assert_close(entropy, expected.sum(-1).float(), rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(actions, before.tanh().float())
+        assert float(actions.abs().max()) > 0.999
+
+    def test_its_worth_grows_where_there_is_too_little(self):
+        for target, sign in ((5.0, 1), (-5.0, -1)):
+            options = TrainerOptions("sapo", horizon=2, first_action=HOLD, target_entropy=target)
+            trainer = Trainer(fold(), options, num_envs=2)
+            before = trainer.policy.temperature
+            log = trainer.update()
+            assert log["temperature"] == before == pytest.approx(1e-3)
+            assert sign * (trainer.policy.temperature - before) > 0
+
+    def test_is_part_of_the_loss_and_of_what_critics_learn(self):
+        """With rewards far below what entropy is worth, both are those of the entropy alone."""
+        options = TrainerOptions("sapo", horizon=3, discount=0.5, temperature=1e4, trace=1.0)
+        trainer = Trainer(fold(), options, num_envs=2)
+        (rollout,) = trainer._rollouts()
+        worth = sum(0.5**t * rollout.entropies[t] for t in range(3)).mean()
+        assert rollout.loss == pytest.approx(-1e4 * float(worth) / 3, rel=1e-3)
+        # Values are near zero at first, so that their errors are what entropy is worth.
+        assert trainer._fit_critics(_Rows([rollout])) > 1e6
+
+    def test_critics_differ_and_their_least_is_learned(self, monkeypatch):
+        options = TrainerOptions("sapo", horizon=3, critics=3)
+        trainer = Trainer(fold(), options, num_envs=2)
+        kept = []
+
+        def returns(rows, rewards, values, *others):
+            kept.append(values)
+            return torch.zeros_like(rewards)
+
+        monkeypatch.setattr(trainer_module, "_lambda_returns", returns)
+        with torch.no_grad():
+            for k, value in enumerate(trainer.policy.targets.values):
+                value[-1].bias.fill_([3.0, -2.0, 1.0][k])
+        trainer.update()
+        assert kept[0].shape == (3, 2)
+        torch.testing.assert_close(kept[0], torch.full((3, 2), -2.0), atol=0.5, rtol=0)
+
+    def test_only_sapo_has_it(self):
+        for algorithm in ("apg", "shac"):
+            trainer = Trainer(fold(), TrainerOptions(algorithm, horizon=2), num_envs=2)
+            assert trainer.policy.temperature == 0.0
+            assert len(trainer.policy.critics.values) == 1
+            before = trainer.policy.log_temperature.clone()
+            assert "temperature" not in trainer.update()
+            assert torch.equal(before, trainer.policy.log_temperature)
 
 
 def rollouts_rows(h, count, generator):
@@ -144,7 +220,7 @@ def rollouts_rows(h, count, generator):
     return Rows
 
 
-@pytest.mark.parametrize("algorithm", ["apg", "shac"])
+@pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
 def test_a_training_that_is_loaded_goes_on_with_the_same_bits(tmp_path, algorithm):
     options = TrainerOptions(algorithm=algorithm, horizon=3, first_action=HOLD, decay_updates=4)
     one = Trainer(fold(), options, num_envs=4, chunk=2)
@@ -185,7 +261,7 @@ def test_only_the_critic_learns_at_first():
     log = trainer.update()
     assert log["critic_loss"] > 0
     changed = {name for name, t in state_of(trainer).items() if not torch.equal(t, before[name])}
-    assert {name.partition(".")[0] for name in changed} == {"critic", "target", "scale"}
+    assert {name.partition(".")[0] for name in changed} == {"critics", "targets", "scale"}
     trainer.update()
     assert any(
         not torch.equal(t, before[name])
@@ -229,7 +305,7 @@ def lift_corner(num_envs):
     return envs.make(LiftCorner(size=6, horizon=10, **SOFT), num_envs)
 
 
-@pytest.mark.parametrize("algorithm", ["apg", "shac"])
+@pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
 def test_it_improves(algorithm):
     options = TrainerOptions(algorithm=algorithm, horizon=10, actor_rate=4e-3, deviation=0.05)
     trainer = Trainer(lift_corner, options, num_envs=4)
@@ -264,7 +340,18 @@ def test_noise_and_scale_of_a_policy():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: TrainerOptions(algorithm="ppo"), "`algorithm` must be one of 'apg', 'shac'"),
+        (
+            lambda: TrainerOptions(algorithm="ppo"),
+            "`algorithm` must be one of 'apg', 'shac', 'sapo'",
+        ),
+        (lambda: TrainerOptions(critics=0), "`critics` must be"),
+        (lambda: TrainerOptions(temperature=0.0), "`temperature` must be positive, got 0.0"),
+        (lambda: TrainerOptions(target_entropy=float("inf")), "`target_entropy` must be finite"),
+        (lambda: TrainerOptions(deviation="wide"), "`deviation` must be positive, got 'wide'"),
+        (lambda: TrainerOptions(feedback="no"), "`feedback` must be a bool, got 'no'"),
+        (lambda: TrainerOptions(betas=(0.9,)), "`betas` must be two numbers"),
+        (lambda: TrainerOptions(hidden=64), "`hidden` must be a tuple, got 64"),
+        (lambda: TrainerOptions(hidden=(64, 0)), r"`hidden\[1\]` must be"),
         (lambda: TrainerOptions(horizon=0), "`horizon` must be"),
         (lambda: TrainerOptions(discount=1.5), r"`discount` must be in \[0, 1\], got 1.5"),
         (lambda: TrainerOptions(actor_rate=float("nan")), "`actor_rate` must be positive"),

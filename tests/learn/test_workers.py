@@ -8,6 +8,8 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -15,14 +17,14 @@ import torch
 
 from diffcloth_torch import envs
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.learn import Processes, Ranks, RayActors, Trainer, TrainerOptions
+from diffcloth_torch.learn import Jobs, Processes, Ranks, RayActors, Trainer, TrainerOptions
 
 MAKE = functools.partial(envs.make, "FoldCloth", size=6, horizon=5, opens_at=-1.0, reach=0.06)
 OPTIONS = TrainerOptions(horizon=4, first_action=(0.0, 0.0, 0.1, 0.9) * 2)
 
 
-def train(workers, updates=2):
-    trainer = Trainer(MAKE, OPTIONS, num_envs=4, chunk=2, workers=workers)
+def train(workers, updates=2, make=MAKE):
+    trainer = Trainer(make, OPTIONS, num_envs=4, chunk=2, workers=workers)
     logs = [trainer.update() for _ in range(updates)]
     return trainer.policy.state_dict(), logs
 
@@ -42,6 +44,39 @@ def test_processes(here):
     workers = Processes(2)
     try:
         assert_same(train(workers), here)
+    finally:
+        workers.close()
+
+
+def test_jobs_of_whatever_submits(here):
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        assert_same(train(Jobs(pool)), here)
+        assert_same(train(pool), here)
+        with pytest.raises(ZeroDivisionError):
+            Jobs(pool).map(divide, [1, 0])
+
+
+def divide(number):
+    return 1 / number
+
+
+def dies_in_its_first_worker(path, main, num_envs):
+    """Make environments, but kill the first process that is to make them for the trainer."""
+    if os.getpid() != main and not path.exists():
+        path.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return MAKE(num_envs=num_envs)
+
+
+def dying(folder):
+    return functools.partial(dies_in_its_first_worker, folder / "died", os.getpid())
+
+
+def test_a_process_that_dies_in_an_update_changes_no_bit(here, tmp_path):
+    workers = Processes(2)
+    try:
+        assert_same(train(workers, make=dying(tmp_path)), here)
+        assert (tmp_path / "died").exists()
     finally:
         workers.close()
 
@@ -75,21 +110,48 @@ def test_what_a_process_that_dies_did_not_finish_is_made_again(tmp_path):
 class TestRay:
     @pytest.fixture(scope="class")
     def ray(self):
-        # Before the import, or Ray's processes disagree about it: a cluster of this test alone.
-        os.environ.setdefault("RAY_AUTH_MODE", "disabled")
-        ray = pytest.importorskip("ray")
-        yield ray
-        ray.shutdown()
+        with pytest.MonkeyPatch.context() as patch:
+            # Before the import, or Ray's processes disagree about it: a cluster of this test alone.
+            patch.setenv("RAY_AUTH_MODE", os.environ.get("RAY_AUTH_MODE", "disabled"))
+            # Its processes import this file.
+            patch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+            ray = pytest.importorskip("ray")
+            yield ray
+            ray.shutdown()
 
-    def test_same_bits_also_where_an_actor_is_killed(self, ray, here):
+    def test_same_bits_also_where_an_actor_dies_in_an_update(self, ray, here, tmp_path):
         workers = RayActors(2)
         try:
-            assert_same(train(workers), here)
+            assert_same(train(workers, make=dying(tmp_path)), here)
+            assert (tmp_path / "died").exists()
+        finally:
+            workers.close()
+
+    def test_same_bits_also_where_an_actor_is_killed_between_updates(self, ray, here):
+        workers = RayActors(2)
+        try:
             trainer = Trainer(MAKE, OPTIONS, num_envs=4, chunk=2, workers=workers)
             logs = [trainer.update()]
             ray.kill(workers.actors[0], no_restart=False)
             logs.append(trainer.update())
             assert_same((trainer.policy.state_dict(), logs), here)
+        finally:
+            workers.close()
+
+    def test_who_dies_again_and_again_ends_it(self, ray):
+        workers = RayActors(1)
+        try:
+            with pytest.raises(ray.exceptions.RayActorError):
+                workers.map(die, [0])
+        finally:
+            workers.close()
+
+    def test_ray_has_the_cores_that_actors_occupy(self, ray):
+        ray.shutdown()
+        workers = RayActors(2, cores=1.5)
+        try:
+            assert workers.map(str, [1, 2, 3]) == ["1", "2", "3"]
+            assert ray.cluster_resources()["CPU"] == 3
         finally:
             workers.close()
 
