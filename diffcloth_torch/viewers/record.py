@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 from tqdm import tqdm
 
 from diffcloth_torch.checks import FloatArray
@@ -80,8 +81,8 @@ class Record:
         self._times: list[float] = []
         self._forces: list[NDArray[np.float64]] = []
 
-    def show(self, state: State) -> None:
-        """Keep one state."""
+    def show(self, state: State, gradient: Tensor | None = None) -> None:
+        """Keep one state; pictures have no gradients."""
         self._positions.append(state.positions.detach().numpy().copy())
         self._frames.append(self._shown.frames(state))
         self._times.append(float(state.time))

@@ -63,7 +63,7 @@ class Counter(NullViewer):
     def __init__(self):
         self.times = []
 
-    def show(self, state):
+    def show(self, state, gradient=None):
         self.times.append(round(float(state.time), 6))
 
 
