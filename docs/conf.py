@@ -153,7 +153,7 @@ def add_contents(app, name, source):
             cards += CARD.format(caption=caption, page=pages[0], text=text)
             contents += TOCTREE.format(caption=caption, pages="\n".join(pages))
         head, heading, body = source[0].partition("\n## ")
-        source[0] = f"{head}\n::::{{grid}} 2 2 3 4\n{cards}::::\n{heading}{body}{contents}"
+        source[0] = f"{head}\n::::{{grid}} 1 2 3 4\n{cards}::::\n{heading}{body}{contents}"
     elif source[0].startswith("---\nfile_format: mystnb"):
         head, title, text = re.split(r"^(# .+\n)", source[0], maxsplit=1, flags=re.MULTILINE)
         page = name.rpartition("/")[2]

@@ -121,6 +121,21 @@ class TestPages:
         browser.show(states[0][0])
         assert "&lt;!doctype html&gt;" in browser._repr_html_().lower()[:200]
 
+    def test_a_page_in_a_notebook_comes_without_announcements(self, falling, capsys, monkeypatch):
+        import rich
+
+        scene, states = falling
+        # As in a notebook, where what is printed is no standard output.
+        printed = []
+        monkeypatch.setattr(rich.get_console(), "is_jupyter", True, raising=False)
+        monkeypatch.setattr("rich.jupyter.display", lambda *a: printed.append(a))
+        browser = Browser(scene)
+        browser.show(states[0][0])
+        browser._repr_html_()
+        assert printed == []
+        assert capsys.readouterr().out == ""
+        assert not rich.get_console().quiet
+
     def test_what_is_shown_later_does_not_change_with_the_tensors(self, falling):
         scene, states = falling
         browser = Browser(scene)
