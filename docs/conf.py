@@ -131,7 +131,8 @@ CARD = """\
 DOWNLOAD = "{{nb-download}}`This page as a notebook <{page}.ipynb>`\n\n"
 NOT_EXECUTED = """\
 :::{note}
-This build of the site did not execute the cells: nothing is shown below them. `scripts/docs --execute` does.
+The cells were not executed for this build of the site, and nothing is shown below them:
+`scripts/docs --execute` does that.
 :::
 
 """
