@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from numpy.lib import format as npy
 from numpy.typing import NDArray
+from torch import Tensor
 
 from diffcloth_torch import build_info
 from diffcloth_torch.config.documents import set_values
@@ -25,7 +26,7 @@ from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.descent import Descent
 from diffcloth_torch.optimize.statistics import rollout_statistics
 from diffcloth_torch.sim.state import State
-from diffcloth_torch.tasks.optimization import Actions
+from diffcloth_torch.tasks.optimization import Actions, position_gradients
 from diffcloth_torch.tasks.optimization import optimize as run_optimization
 from diffcloth_torch.tasks.registry import TASKS, check_document, load_task, make_task
 from diffcloth_torch.tasks.simulation import simulate
@@ -213,9 +214,14 @@ def _optimize(
             f"diffcloth optimize --resume {out}"
         ) from error
     draw_loss_curve(out / "loss.png", found.metrics()["losses"])
+    # Only pages show them, and they cost another rollout.
+    gradients: list[Tensor | None] = [None] * len(found.best.states)
+    if "web" in task.config.output.viewers:
+        gradients = [*position_gradients(task, found.best.variables)]
     with viewers:
-        for state in [task.initial_state(), *found.best.states]:
-            viewers.show(state)
+        viewers.show(task.initial_state())
+        for state, gradient in zip(found.best.states, gradients, strict=True):
+            viewers.show(state, gradient)
     return (
         f"loss {found.first.loss:.5f} -> {found.best.loss:.5f} in {len(found.history)} iterations, "
         f"{found.seconds:.1f} s; results are in {out}"

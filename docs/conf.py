@@ -3,9 +3,11 @@
 The root of the repository is the source folder, so that links between pages are the same as on
 GitHub. The front page is the README; the reference comes from the docstrings. The package is
 imported from its sources with a stand-in for the compiled core: nothing is built or installed.
+Only the cells of tutorials and examples, if they are executed, run the package that is built.
 """
 
 import inspect
+import os
 import re
 import shutil
 import sys
@@ -25,7 +27,7 @@ release = version = re.search(
 )[1]
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
@@ -44,6 +46,20 @@ html_copy_source = False
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 
+# `scripts/docs --execute` turns this to "force".
+nb_execution_mode = "off"
+nb_execution_in_temp = True
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
+nb_merge_streams = True
+# Pages of examples run them by their names.
+os.environ["PYTHONPATH"] = str(ROOT / "examples")
+os.environ["TQDM_DISABLE"] = "1"
+# What `scripts/replays` makes for the gallery is served as it is.
+EXTRA = ROOT / "build" / "extra"
+EXTRA.mkdir(parents=True, exist_ok=True)
+html_extra_path = [str(EXTRA)]
+
 # `Name` in a docstring is a link where it is the name of something documented, else plain code.
 default_role = "py:obj"
 autodoc_member_order = "bysource"
@@ -61,48 +77,64 @@ napoleon_attr_annotations = False
 copybutton_prompt_text = r">>> |\.\.\. "
 copybutton_prompt_is_regexp = True
 
-# On GitHub the README needs no table of contents: it is the site's. The front page shows the four
-# parts as cards, each with its first page.
+# On GitHub the README needs no table of contents: it is the site's. The front page shows the parts
+# as cards, each with its first page.
 CONTENTS = {
     "Start": (
-        "Install, and take a first gradient.",
-        ["docs/getting-started", "docs/examples", "docs/gallery"],
+        "Install, take a first gradient, work through tutorials.",
+        ["docs/getting-started", "docs/tutorials/index", "docs/gallery"],
     ),
     "How-to": (
-        "Choose values, load robots, describe tasks, contribute.",
+        "Your mesh, your robot, batches, failures, identification, learning, many machines.",
         [
-            "docs/guide",
+            "docs/meshes",
             "docs/robots",
+            "docs/batches",
+            "docs/failures",
             "docs/identification",
             "docs/environments",
             "docs/learning",
             "docs/scaling",
-            "docs/tasks",
-            "docs/extending",
-            "CONTRIBUTING",
         ],
+    ),
+    "Concepts": (
+        "What is guaranteed, how to choose values, how it works.",
+        ["docs/guide", "docs/bodies", "docs/design", "docs/gpu"],
     ),
     "Reference": (
-        "Classes and functions, letters and units.",
-        ["docs/reference/index", "docs/notation", "CHANGELOG"],
+        "Classes and functions, configurations, letters and units.",
+        ["docs/reference/index", "docs/tasks", "docs/notation", "CHANGELOG"],
     ),
-    "Background": (
-        "How it works, and what was measured.",
-        [
-            "docs/design",
-            "docs/bodies",
-            "docs/experiments",
-            "docs/performance",
-            "docs/notes/index",
-        ],
+    "Examples": (
+        "Programs and configurations, one page each, with their output.",
+        ["docs/examples"],
+    ),
+    "Performance": (
+        "What was measured, and how others compare.",
+        ["docs/performance", "docs/experiments", "docs/comparison"],
+    ),
+    "Development": (
+        "Extend the package, contribute, read what was tried.",
+        ["docs/extending", "CONTRIBUTING", "docs/notes/index"],
     ),
 }
+PICTURE_OF_A_COMMAND = re.compile(
+    r"^    diffcloth \w+ configs/(\w+)\.yaml\n\n!\[.*\]\(.*\)$", re.MULTILINE
+)
 CARD = """\
 :::{{grid-item-card}} {caption}
 :link: {page}
 :link-type: doc
 {text}
 :::
+"""
+DOWNLOAD = "{{nb-download}}`This page as a notebook <{page}.ipynb>`\n\n"
+NOT_EXECUTED = """\
+:::{note}
+The cells were not executed for this build of the site, and nothing is shown below them:
+`scripts/docs --execute` does that.
+:::
+
 """
 TOCTREE = """
 ```{{toctree}}
@@ -116,14 +148,28 @@ TOCTREE = """
 
 def add_contents(app, name, source):
     """Add what GitHub has no use for: cards above the first section, and tables of contents."""
-    if name != root_doc:
-        return
-    cards, contents = "", ""
-    for caption, (text, pages) in CONTENTS.items():
-        cards += CARD.format(caption=caption, page=pages[0], text=text)
-        contents += TOCTREE.format(caption=caption, pages="\n".join(pages))
-    head, heading, body = source[0].partition("\n## ")
-    source[0] = f"{head}\n::::{{grid}} 2 2 4 4\n{cards}::::\n{heading}{body}{contents}"
+    if name == root_doc:
+        cards, contents = "", ""
+        for caption, (text, pages) in CONTENTS.items():
+            cards += CARD.format(caption=caption, page=pages[0], text=text)
+            contents += TOCTREE.format(caption=caption, pages="\n".join(pages))
+        head, heading, body = source[0].partition("\n## ")
+        source[0] = f"{head}\n::::{{grid}} 1 2 3 4\n{cards}::::\n{heading}{body}{contents}"
+    elif source[0].startswith("---\nfile_format: mystnb"):
+        head, title, text = re.split(r"^(# .+\n)", source[0], maxsplit=1, flags=re.MULTILINE)
+        page = name.rpartition("/")[2]
+        note = "" if app.config.nb_execution_mode == "force" else NOT_EXECUTED
+        source[0] = f"{head}{title}\n{DOWNLOAD.format(page=page)}{note}{text}"
+    elif name == "docs/gallery":
+        source[0] = PICTURE_OF_A_COMMAND.sub(with_replay, source[0])
+
+
+def with_replay(found):
+    """What was found, and under it a link to the replay of its configuration, if there is one."""
+    page = Path("replays", f"{found[1]}.html")
+    if not (EXTRA / page).exists():
+        return found[0]
+    return f'{found[0]}\n\n<a href="../{page}">Play this motion, and look from all sides</a>\n'
 
 
 def copy_front_page(app, exception):

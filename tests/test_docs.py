@@ -66,6 +66,35 @@ def test_the_gallery_shows_every_picture_that_a_configuration_makes():
     assert shown == {path.name for path in ROOT.glob("docs/images/*.png")}
 
 
+@pytest.mark.parametrize(
+    ("word", "page"),
+    [
+        ("tutorial", "tutorials/index.md"),
+        ("notebook", "tutorials/index.md"),
+        ("gymnasium", "environments.md"),
+        ("system identification", "identification.md"),
+        ("equilibrium", "guide.md"),
+        ("GPU", "gpu.md"),
+        ("batch", "guide.md"),
+        ("robot", "robots.md"),
+        ("own mesh", "meshes.md"),
+        ("go wrong", "failures.md"),
+    ],
+)
+def test_a_newcomers_word_stands_in_a_heading(word, page):
+    """The search of the site lists pages first whose headings have what is asked for."""
+    headings = re.findall(r"^#+ (.+)$", (ROOT / "docs" / page).read_text(), re.MULTILINE)
+    assert any(word.lower() in heading.lower() for heading in headings)
+
+
+def test_the_front_page_has_three_moving_pictures():
+    readme = (ROOT / "README.md").read_text()
+    shown = re.findall(r"\]\((docs/images/\w+\.webp)\)", readme)
+    assert len(shown) == 3
+    assert {ROOT / path for path in shown} == set(ROOT.glob("docs/images/*.webp"))
+    assert sum((ROOT / path).stat().st_size for path in shown) < 500e3
+
+
 @pytest.mark.parametrize("record", [dc.Parameters, dc.Control, dc.ContactOptions])
 def test_notation_has_every_name(record):
     rows = "\n".join(

@@ -29,6 +29,14 @@ def test_the_version_stands_in_one_place():
     assert diffcloth_torch.__version__ == version
 
 
+def test_the_classifiers_name_the_wheels_that_a_release_builds():
+    named = re.findall(r'"Programming Language :: Python :: 3\.(\d+)"', PYPROJECT)
+    built = re.findall(r"cp3(\d+)-\*", re.search(r'^build = "(.+)"$', PYPROJECT, re.MULTILINE)[1])
+    assert named == built
+    (oldest,) = re.findall(r'^requires-python = ">=3\.(\d+)"$', PYPROJECT, re.MULTILINE)
+    assert oldest == named[0]
+
+
 def test_the_build_needs_no_torch():
     (requires,) = re.findall(r"^requires = (\[.*\])$", PYPROJECT, re.MULTILINE)
     assert "nanobind" in requires

@@ -63,7 +63,8 @@ def _web(config: RunConfig, scene: Scene, folder: Path, goals: Sequence[Goal]) -
         paints=_paints(config),
         goals=goals,
         camera=Camera(**pictures.model_dump()["camera"]),
-        arrows=["forces"] if pictures.contact_forces else [],
+        # Gradients are given by an optimization alone; without them there are no such arrows.
+        arrows=["forces", "gradient"] if pictures.contact_forces else ["gradient"],
         file=folder / "animation.html",
         live=sys.stdin.isatty() and sys.stderr.isatty(),
     )

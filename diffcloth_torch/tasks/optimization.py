@@ -26,6 +26,7 @@ __all__ = [
     "OptimizerSection",
     "evaluate",
     "optimize",
+    "position_gradients",
 ]
 
 Actions = dict[str, Tensor]
@@ -114,6 +115,17 @@ def optimize(
 def evaluate(task: _Optimizable, actions: Actions) -> Evaluation:
     """Roll a task out and store the gradient of its loss in the `.grad` of the actions."""
     return evaluate_variables(_simulation(task, lambda _: None), task.loss, actions)
+
+
+def position_gradients(task: _Optimizable, actions: Mapping[str, Tensor]) -> list[Tensor]:
+    """Gradients of the loss of a task by the positions after each step, [N, 3] each.
+
+    Each is the whole derivative: what moves at a step also moves all that follows.
+    """
+    leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in actions.items()}
+    states = _simulation(task, lambda _: None)(leaves)
+    positions = [state.positions for state in states]
+    return list(torch.autograd.grad(task.loss(states), positions, materialize_grads=True))
 
 
 def _simulation(task: _Optimizable, on_step: Callable[[int], None]) -> Simulate:

@@ -6,9 +6,8 @@ import html
 import sys
 import threading
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import redirect_stdout
-from io import StringIO
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any
@@ -194,7 +193,7 @@ class Browser:
         return page
 
     def _start(self, host: str) -> Any:
-        with redirect_stdout(StringIO()):  # it announces itself there
+        with _silently():
             return self._viser.ViserServer(host, self._port, verbose=False)
 
     def _serving(self) -> Any:
@@ -259,5 +258,18 @@ class Browser:
 
 
 def _stop(server: Any) -> None:
-    with redirect_stdout(StringIO()):
+    with _silently():
         server.stop()
+
+
+@contextmanager
+def _silently() -> Iterator[None]:
+    """Without the announcements of servers, which in a notebook are no standard output."""
+    from rich import get_console
+
+    console = get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before

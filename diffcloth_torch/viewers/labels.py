@@ -17,7 +17,7 @@ from diffcloth_torch.viewers.floor import BACKGROUND
 if TYPE_CHECKING:
     from PIL import ImageDraw
 
-__all__ = ["Entry", "legend_below", "overview", "write_time"]
+__all__ = ["Entry", "legend_strip", "overview", "write_time"]
 
 Image = NDArray[np.uint8]
 
@@ -26,6 +26,8 @@ _MARGIN = 8  # pixels between the pictures of an overview
 # Parts of the height of a picture.
 _TIME_SIZE = 1 / 18
 _LEGEND_SIZE = 1 / 22
+_LARGEST_LEGEND = 0.25
+_SMALLEST_LETTERS = 7  # pixels
 _LINE = 1.6  # from one line of a legend to the next, in sizes of its letters
 
 
@@ -58,42 +60,84 @@ def write_time(image: Image, time: float, step: float) -> Image:
     return np.asarray(canvas)
 
 
-def legend_below(image: Image, entries: Sequence[Entry]) -> Image:
-    """Put the legend below a picture, in as many lines as it needs; the height stays even."""
-    height, width = image.shape[:2]
-    size = height * _LEGEND_SIZE
+def legend_strip(size: Sequence[int], entries: Sequence[Entry]) -> Image:
+    """Draw the legend for the lower end of a picture, in as many lines as it needs.
+
+    Args:
+        size: Width and height of the picture with its legend [pixels].
+        entries: Its lines; they may share one.
+
+    Returns:
+        Colors, shape [height, width, 3], with an even height.
+    """
+    width, letters = size[0], size[1] * _LEGEND_SIZE
+    # Many or long entries: smaller letters rather than a picture without a place for the scene.
+    while True:
+        lines = _break(entries, width, letters)
+        height = 2 * math.ceil((len(lines) + 0.4) * _LINE * letters / 2)
+        if height <= _LARGEST_LEGEND * size[1] or letters < _SMALLEST_LETTERS:
+            break
+        letters *= 0.9
+    strip, drawing = _canvas(_blank(height, width))
+    for i, line in enumerate(lines):
+        for x, entry in line:
+            _draw_entry(drawing, entry, x, (i + 0.4) * _LINE * letters, letters)
+    return np.asarray(strip)
+
+
+def _break(
+    entries: Sequence[Entry], width: float, letters: float
+) -> list[list[tuple[float, Entry]]]:
+    """Entries of each line, and where they begin."""
     lines: list[list[tuple[float, Entry]]] = [[]]
-    x = start = 0.6 * size
+    x = start = 0.6 * letters
     for entry in entries:
-        length = _entry_width(entry, size)
+        length = _entry_width(entry, letters)
         if lines[-1] and x + length > width:
             lines.append([])
             x = start
         lines[-1].append((x, entry))
-        x += length + size
-    strip_height = 2 * math.ceil((len(lines) + 0.4) * _LINE * size / 2)
-    strip, drawing = _canvas(_blank(strip_height, width))
-    for i, line in enumerate(lines):
-        for x, entry in line:
-            _draw_entry(drawing, entry, x, (i + 0.4) * _LINE * size, size)
-    return np.concatenate([image, np.asarray(strip)])
+        x += length + letters
+    return lines
 
 
 def overview(images: Sequence[Image], entries: Sequence[Entry]) -> Image:
-    """Arrange pictures of one size in rows, and the legend in the cell after the last."""
+    """Arrange pictures of one size in rows, and the legend in all cells that are left.
+
+    No cell is blank: without a legend, a last row that is not full is in the middle.
+    """
     height, width = images[0].shape[:2]
-    columns = math.ceil(math.sqrt(len(images) + 1))
-    rows = math.ceil((len(images) + 1) / columns)
-    whole = np.full(
-        (rows * (height + _MARGIN) - _MARGIN, columns * (width + _MARGIN) - _MARGIN, 3),
-        255,
-        dtype=np.uint8,
-    )
-    for k, image in enumerate([*images, _legend_cell(height, width, entries)]):
+    columns, rows = _grid(len(images), bool(entries))
+    whole = np.full((_length(rows, height), _length(columns, width), 3), 255, dtype=np.uint8)
+    left = columns * rows - len(images)
+    cells: list[Image] = list(images)
+    if entries:
+        cells.append(_legend_cell(height, _length(left, width), entries))
+    last = (rows - 1) * columns
+    indent = 0 if entries else left * (width + _MARGIN) // 2
+    for k, image in enumerate(cells):
         row, column = divmod(k, columns)
-        top, left = row * (height + _MARGIN), column * (width + _MARGIN)
-        whole[top : top + height, left : left + width] = image
+        y = row * (height + _MARGIN)
+        x = column * (width + _MARGIN) + (indent if k >= last else 0)
+        whole[y : y + height, x : x + image.shape[1]] = image
     return whole
+
+
+def _length(count: int, size: int) -> int:
+    """Pixels of so many cells beside each other."""
+    return count * (size + _MARGIN) - _MARGIN
+
+
+def _grid(count: int, legend: bool) -> tuple[int, int]:
+    """Columns and rows for so many pictures: nearly square, with few cells left for the legend."""
+    cells = count + legend
+    square = math.ceil(math.sqrt(cells))
+
+    def cost(columns: int) -> tuple[int, int]:
+        return -(-cells // columns) * columns - cells, columns
+
+    columns = min(range(square, min(square + 1, cells) + 1), key=cost)
+    return columns, -(-cells // columns)
 
 
 def _legend_cell(height: int, width: int, entries: Sequence[Entry]) -> Image:
@@ -102,9 +146,10 @@ def _legend_cell(height: int, width: int, entries: Sequence[Entry]) -> Image:
     size = min(size, 0.9 * height / (_LINE * max(1, len(entries))))
     widest = max((_entry_width(entry, size) for entry in entries), default=0.0)
     size *= min(1.0, 0.9 * width / max(widest, 1.0))
+    left = (width - max((_entry_width(entry, size) for entry in entries), default=0.0)) / 2
     top = (height - _LINE * size * len(entries)) / 2
     for i, entry in enumerate(entries):
-        _draw_entry(drawing, entry, 0.05 * width, top + i * _LINE * size, size)
+        _draw_entry(drawing, entry, left, top + i * _LINE * size, size)
     return np.asarray(canvas)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from types import TracebackType
 
+from torch import Tensor
+
 from diffcloth_torch.sim.state import State
 
 __all__ = ["MeshSequence"]
@@ -25,8 +27,8 @@ class MeshSequence:
         self._folder = folder
         self._count = 0
 
-    def show(self, state: State) -> None:
-        """Write one file."""
+    def show(self, state: State, gradient: Tensor | None = None) -> None:
+        """Write one file of a state."""
         state.export(self._folder / f"frame_{self._count:04d}.obj", bodies=True)
         self._count += 1
 

@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 from tqdm import tqdm
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.state import State
-from diffcloth_torch.viewers.labels import Entry, legend_below, overview, write_time
+from diffcloth_torch.viewers.labels import Entry, legend_strip, overview, write_time
 from diffcloth_torch.viewers.look import FORCE_COLOR, GOAL_COLOR, Goal, Paint, Pictures
 from diffcloth_torch.viewers.shown import Bounds, Shown
 from diffcloth_torch.viewers.stage import Skin, Stage, require_pyvista
@@ -80,8 +81,8 @@ class Record:
         self._times: list[float] = []
         self._forces: list[NDArray[np.float64]] = []
 
-    def show(self, state: State) -> None:
-        """Keep one state."""
+    def show(self, state: State, gradient: Tensor | None = None) -> None:
+        """Keep one state; pictures have no gradients."""
         self._positions.append(state.positions.detach().numpy().copy())
         self._frames.append(self._shown.frames(state))
         self._times.append(float(state.time))
@@ -111,8 +112,12 @@ class Record:
         low, high = bounds
         arrows, entries = self._arrows(float(np.linalg.norm(high - low)))
         labels = self._options.labels
+        # The legend is a part of each picture, except in an overview, where it has a place.
+        legend = None
+        if labels and (all_are_kept or len(moments) == 1):
+            legend = legend_strip(self._options.size, entries)
         sheet = []
-        with self._stage(bounds) as stage, self._writer() as writer:
+        with self._stage(bounds, legend) as stage, self._writer() as writer:
             drawn = range(count) if all_are_kept else sorted(moments)
             for k in tqdm(drawn, desc="draw", unit="frame", disable=None):
                 image = stage.draw(
@@ -123,12 +128,11 @@ class Record:
                 if k in moments:
                     sheet.append(image)
                 if all_are_kept:
-                    writer(k, legend_below(image, entries) if labels else image)
-        if sheet:
-            if len(sheet) == 1:
-                image = legend_below(sheet[0], entries) if labels else sheet[0]
-            else:
-                image = overview(sheet, entries if labels else [])
+                    writer(k, _with(legend, image))
+        if len(sheet) == 1:
+            _write_image(self._folder / f"{self._name}.png", _with(legend, sheet[0]))
+        elif sheet:
+            image = overview(sheet, entries if labels else [])
             _write_image(self._folder / f"{self._name}.png", image)
 
     def _arrows(self, size: float) -> tuple[Sequence[FloatArray | None], list[Entry]]:
@@ -148,13 +152,14 @@ class Record:
         scale = _LONGEST_ARROW * size / largest if largest > 0 else 0.0
         return [scale * forces for forces in self._forces], entries
 
-    def _stage(self, bounds: Bounds) -> Stage:
+    def _stage(self, bounds: Bounds, legend: Image | None) -> Stage:
         shown, ground = self._shown, self._options.ground
+        width, height = self._options.size
         cloths = zip(shown.cloth_faces, shown.cloth_starts, self._scene.cloth_names, strict=False)
         stage = Stage(
             [Skin(faces + start, shown.paints[name]) for faces, start, name in cloths],
             [Skin(r.faces.numpy(), shown.paints[r.owner]) for r in shown.shown_rigid],
-            size=self._options.size,
+            size=(width, height if legend is None else height - len(legend)),
             bounds=bounds,
             ground=shown.ground(bounds) if ground == "auto" else ground,
             camera=self._options.camera,
@@ -199,6 +204,10 @@ class Record:
         finally:
             if video is not None:
                 video.close()
+
+
+def _with(legend: Image | None, image: Image) -> Image:
+    return image if legend is None else np.concatenate([image, legend])
 
 
 def _require_writer(video: str) -> None:

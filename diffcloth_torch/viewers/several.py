@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from contextlib import ExitStack
 from types import TracebackType
 
+from torch import Tensor
+
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.viewers.viewer import Viewer
 
@@ -27,11 +29,11 @@ class Viewers:
         self._count = 0
         self._stack = ExitStack()
 
-    def show(self, state: State) -> None:
-        """Take the next state."""
+    def show(self, state: State, gradient: Tensor | None = None) -> None:
+        """Take the next state, and the gradient of a loss by its positions."""
         if self._count % self._every == 0:
             for viewer in self._viewers:
-                viewer.show(state)
+                viewer.show(state, gradient)
         self._count += 1
 
     def __enter__(self) -> Viewers:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from types import TracebackType
 from typing import Protocol
 
+from torch import Tensor
+
 from diffcloth_torch.sim.state import State
 
 __all__ = ["NullViewer", "Viewer"]
@@ -13,8 +15,8 @@ __all__ = ["NullViewer", "Viewer"]
 class Viewer(Protocol):
     """Receives states in the order of time; a context manager that finishes its files."""
 
-    def show(self, state: State) -> None:
-        """Take one state, without a batch axis."""
+    def show(self, state: State, gradient: Tensor | None = None) -> None:
+        """Take one state, without a batch axis, and the gradient of a loss by its positions."""
         ...
 
     def __enter__(self) -> Viewer: ...
@@ -30,7 +32,7 @@ class Viewer(Protocol):
 class NullViewer:
     """Shows nothing: for measurements."""
 
-    def show(self, state: State) -> None:
+    def show(self, state: State, gradient: Tensor | None = None) -> None:
         """Do nothing."""
 
     def __enter__(self) -> NullViewer:

@@ -9,9 +9,10 @@ import sys
 import numpy as np
 import pytest
 import torch
+from short_tasks import CONFIGS, DYNAMIC, controls_of
 
 import diffcloth_torch as dc
-from diffcloth_torch.commands import run
+from diffcloth_torch.commands import optimize, run
 from diffcloth_torch.viewers.browser import Browser
 from diffcloth_torch.viewers.layers import colors, strain
 
@@ -120,6 +121,21 @@ class TestPages:
         browser.show(states[0][0])
         assert "&lt;!doctype html&gt;" in browser._repr_html_().lower()[:200]
 
+    def test_a_page_in_a_notebook_comes_without_announcements(self, falling, capsys, monkeypatch):
+        import rich
+
+        scene, states = falling
+        # As in a notebook, where what is printed is no standard output.
+        printed = []
+        monkeypatch.setattr(rich.get_console(), "is_jupyter", True, raising=False)
+        monkeypatch.setattr("rich.jupyter.display", lambda *a: printed.append(a))
+        browser = Browser(scene)
+        browser.show(states[0][0])
+        browser._repr_html_()
+        assert printed == []
+        assert capsys.readouterr().out == ""
+        assert not rich.get_console().quiet
+
     def test_what_is_shown_later_does_not_change_with_the_tensors(self, falling):
         scene, states = falling
         browser = Browser(scene)
@@ -177,6 +193,40 @@ def test_a_configuration_writes_its_page(tmp_path):
     run(config, ["output.viewers=[web]"], tmp_path / "out")
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == ["animation.html", "metrics.json"]
+
+
+def test_an_optimization_shows_the_gradient_of_its_loss(tmp_path, monkeypatch):
+    """By differences: move a vertex after a step, go on, and look at the loss."""
+    task = DYNAMIC.load("simulation.solver.tolerance=1e-9")
+    shown = []
+    monkeypatch.setattr(Browser, "show", lambda _, *given: shown.append(given))
+    monkeypatch.setattr(Browser, "__exit__", lambda *_: None)
+    changes = [
+        *DYNAMIC.assignments,
+        "simulation.solver.tolerance=1e-9",
+        "optimizer.iterations=1",
+        "output={viewers: [web], every: 1}",
+    ]
+    optimize(CONFIGS / DYNAMIC.config, changes, tmp_path / "out")
+    (_, none), *rest = shown
+    assert none is None
+    assert len(rest) == task.steps
+    k, vertex = 2, 12
+    state, gradient = rest[k]
+    controls = controls_of(task, {n: a.detach() for n, a in task.actions().items()})[k + 1 :]
+    moved = torch.zeros_like(state.positions)
+    moved[vertex, 1] = 1e-5
+    losses = []
+    for sign in (1, -1):
+        begin = state.replace(positions=state.positions + sign * moved)
+        states = [s for s, _ in rest[: k + 1]]
+        with torch.no_grad():
+            states += task.simulator.rollout(begin, controls)
+            losses.append(task.loss(states).item())
+    difference = (losses[0] - losses[1]) / 2e-5
+    assert abs(difference) > 1e-5
+    # The solver's tolerance, over the step of the difference.
+    assert gradient[vertex, 1].item() == pytest.approx(difference, rel=1e-3)
 
 
 def test_the_command_line_chooses_viewers(tmp_path):

@@ -63,7 +63,7 @@ class Counter(NullViewer):
     def __init__(self):
         self.times = []
 
-    def show(self, state):
+    def show(self, state, gradient=None):
         self.times.append(round(float(state.time), 6))
 
 
@@ -178,8 +178,14 @@ class TestRecord:
         assert (tmp_path / "animation.mp4").stat().st_size > 500
         frames = sorted(path.name for path in (tmp_path / "animation_frames").iterdir())
         assert frames == [f"{k:04d}.png" for k in range(5)]
-        # Two moments and the legend, in two rows of two.
-        assert read_image(tmp_path / "animation.png").shape == (2 * 120 + 8, 2 * 160 + 8, 3)
+        # Frames have the legend inside; the overview has it beside two moments.
+        frame = read_image(tmp_path / "animation_frames" / "0004.png")
+        assert frame.shape == (120, 160, 3)
+        overview = read_image(tmp_path / "animation.png")
+        assert overview.shape[1] == 3 * 160 + 2 * 8
+        legend = frame[overview.shape[0] :]
+        assert 0 < len(legend) <= 120 // 4
+        assert has_hue(legend, 0)  # the sheet's front
 
     def test_the_overview_has_five_moments_and_a_legend(self, make_task, tmp_path):
         task = make_task("output.pictures.video=none")
@@ -209,9 +215,9 @@ class TestRecord:
             images.append(read_image(tmp_path / "animation.png"))
         with_labels, without = images
         assert without.shape == (120, 160, 3)
-        below = with_labels[120:]
-        assert len(below) % 2 == 0
-        assert has_hue(below, 0)  # the sheet's front
+        assert with_labels.shape == (120, 160, 3)
+        assert has_hue(with_labels[-12:], 0)  # the sheet's front, in the legend
+        assert not has_hue(without[-12:], 0)
         assert (with_labels[:14, :80] < 100).any()
         assert not (without[:14, :80] < 100).any()
 

@@ -1,0 +1,66 @@
+"""Tutorials are notebooks: each runs from its first cell to its last in an empty folder."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+jupytext = pytest.importorskip("jupytext")
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+TUTORIALS = sorted(set(DOCS.glob("tutorials/*.md")) - {DOCS / "tutorials" / "index.md"})
+EXAMPLES = sorted(DOCS.glob("examples/*.md"))
+
+each_tutorial = pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+
+
+def names(text):
+    """Pages in tables of contents."""
+    (toctree,) = re.findall(r"```\{toctree\}\n:hidden:\n(.*?)```", text, re.DOTALL)
+    return toctree.split()
+
+
+def test_all_of_them_are_listed():
+    assert len(TUTORIALS) == 7
+    index = (DOCS / "tutorials/index.md").read_text()
+    assert sorted(names(index)) == [page.stem for page in TUTORIALS]
+    for page in TUTORIALS:
+        assert f"({page.name})" in index
+
+
+def test_every_program_has_a_page():
+    programs = sorted(path.stem for path in (DOCS.parent / "examples").glob("*.py"))
+    assert [page.stem for page in EXAMPLES] == programs
+    listed = names((DOCS / "examples.md").read_text())
+    assert sorted(listed) == [f"examples/{name}" for name in programs]
+
+
+@pytest.mark.parametrize("page", [*TUTORIALS, *EXAMPLES], ids=lambda page: page.stem)
+def test_a_page_is_a_notebook(page):
+    """Of Python 3, with cells that compile, and text around them."""
+    notebook = jupytext.read(page)
+    assert notebook.metadata.kernelspec.name == "python3"
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert cells
+    assert notebook.cells[0].cell_type == "markdown"
+    for cell in cells:
+        ast.parse(re.sub(r"^%.*$", "", cell.source, flags=re.MULTILINE))
+
+
+@pytest.mark.slow
+@each_tutorial
+def test_a_tutorial_runs_in_an_empty_folder(page, tmp_path):
+    nbclient = pytest.importorskip("nbclient")
+    nbformat = pytest.importorskip("nbformat")
+    for module in ("ipykernel", "viser", "scipy", "gymnasium"):
+        pytest.importorskip(module)
+    file = tmp_path / f"{page.stem}.ipynb"
+    jupytext.write(jupytext.read(page), file)
+    notebook = nbformat.read(file, as_version=4)
+    # A cell that fails raises.
+    resources = {"metadata": {"path": str(tmp_path)}}
+    nbclient.NotebookClient(notebook, timeout=600, resources=resources).execute()
+    assert any(cell.get("outputs") for cell in notebook.cells)
