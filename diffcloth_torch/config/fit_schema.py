@@ -45,7 +45,7 @@ class TrajectorySection(Section):
     `changes` are assignments to the configuration that make this motion, as after `--set`. The
     cloth is observed after each of `steps`, or once at `equilibrium`. `file` is an .npz with the
     `positions` [T, m, 3] of the `markers` (NaN where one was not seen), or with the `outlines`
-    [T, n, 2] of silhouettes seen from above, around `center`.
+    [T, n, 2] of silhouettes seen from above, around `center`, about which they may be `turned`.
     """
 
     name: str
@@ -57,6 +57,7 @@ class TrajectorySection(Section):
     markers: Selection | None = None
     center: Annotated[list[float], Len(2, 2)] = [0.0, 0.0]
     directions: Annotated[int, Ge(3)] = 72
+    turned: bool = False
     noise: Positive
     file: str | None = None
     synthetic: SyntheticSection | None = None

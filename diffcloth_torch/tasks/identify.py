@@ -23,6 +23,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize import residuals
+from diffcloth_torch.optimize.outlines import silhouettes
 from diffcloth_torch.optimize.variables import Variable
 from diffcloth_torch.sim.controls import Parameters
 from diffcloth_torch.sim.state import State
@@ -126,6 +127,7 @@ class _Observed:
             center=section.center,
             directions=section.directions,
             noise=section.noise,
+            turned=section.turned,
         )
 
 
@@ -219,7 +221,7 @@ def _synthesize(
         seen: FloatArray = torch.stack([state.positions for state in states]).numpy()[:, rows]
         return seen + section.noise * generator.standard_normal(seen.shape)
     center = np.array(section.center)
-    radii, rays = residuals.silhouettes(
+    radii, rays = silhouettes(
         "fit", states, other.task.scene.cloths[0].faces, center, section.directions
     )
     numbers = radii.numpy() + section.noise * generator.standard_normal(radii.shape)

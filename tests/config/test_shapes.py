@@ -20,7 +20,7 @@ def edges_of(faces):
 
 
 def test_a_disk_is_one_sheet_of_good_triangles():
-    vertices, faces = shapes.disk(0.6, 0.06)
+    vertices, _, faces = shapes.disk(0.6, 0.06)
     edges, counts = edges_of(faces)
     border = edges[counts == 1]
     np.testing.assert_allclose(np.linalg.norm(vertices[border].reshape(-1, 3), axis=1), 0.6)

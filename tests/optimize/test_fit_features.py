@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.optimize.residuals import _radii
+from diffcloth_torch.optimize.outlines import _radii
 
 F64 = torch.float64
 TRUTH = torch.tensor([2.0, 0.5, -0.3], dtype=F64)
