@@ -15,10 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.checks import FloatArray, check_choice, check_count
+from diffcloth_torch.checks import POSITIVE, FloatArray, check_choice, check_count, check_number
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path
 from diffcloth_torch.optimize.fit_page import Page, write_page
+from diffcloth_torch.optimize.methods import METHODS, Method, Options
 from diffcloth_torch.optimize.problem import Residuals, Trial, parameters_of, trajectories
 from diffcloth_torch.optimize.starts import Job, Stage, Start, judge, run_all
 from diffcloth_torch.optimize.uncertainty import Direction, uncertainty_of
@@ -27,7 +28,6 @@ from diffcloth_torch.sim.controls import Parameters
 
 __all__ = ["Direction", "Fit", "Stage", "Start", "Trial", "fit"]
 
-_METHODS = ("least_squares",)
 _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
 
 
@@ -35,7 +35,8 @@ _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
 class Fit:
     """The best of all starts.
 
-    Standard errors follow from J^T J at the solution, with the noise that the residuals show.
+    Standard errors follow from J^T J at the solution, with the noise that the residuals show, and
+    from the priors.
 
     Attributes:
         parameters: Parameters that hold the variables, None elsewhere.
@@ -45,8 +46,8 @@ class Fit:
         correlation: Likewise.
         intervals: Name of each number -> its interval of 95 %.
         unidentifiable: Directions that the observations do not tell, the worst first.
-        residuals: At the solution [M], of the last stage.
-        cost: Half the sum of their squares.
+        residuals: At the solution [M], of the last stage, without priors.
+        cost: Half the sum of their squares and of those of the priors.
         success: Whether the solver converged.
         message: How it ended.
         starts: Where each start ended, and why not at the best place.
@@ -118,7 +119,7 @@ def fit(
     variables: Mapping[str, Variable],
     residuals: Residuals | Sequence[Stage],
     *,
-    method: str = "least_squares",
+    method: Method = "least_squares",
     starts: int = 1,
     seed: int = 0,
     loss: str = "linear",
@@ -143,10 +144,14 @@ def fit(
             each trajectory: see `dc.residuals`. It is called with tensors that are being
             differentiated, and must return the same values for the same input. Or a list of
             `Stage`, run one after the other; the last one must free all variables.
-        method: The solver; "least_squares".
+        method: The solver. "least_squares" is SciPy's trust region, with Jacobians. "L-BFGS-B" is
+            SciPy's, with gradients, for many variables. A function that makes an optimizer of
+            torch, as `partial(torch.optim.Adam, lr=0.05)`, takes `max_evaluations` steps of
+            `dc.descend`.
         starts: Number of starts: the first values, then random ones, see `Variable`.
         seed: Of the random starts.
-        loss: Of the squares: "linear", "soft_l1", "huber", "cauchy" or "arctan", as SciPy has them.
+        loss: Of the squares: "linear", "soft_l1", "huber", "cauchy" or "arctan", as SciPy has them;
+            "linear" for other methods than "least_squares".
         loss_scale: Residual from which on the others count less, > 0.
         max_evaluations: Of the residuals, for each stage of each start.
         tolerance: Relative change of the cost or the variables at which a stage ends.
@@ -168,24 +173,15 @@ def fit(
         TypeError: If `residuals` returns something else than tensors.
     """
     _require_scipy()
-    check_choice("fit: `method`", method, _METHODS)
-    check_choice("fit: `loss`", loss, _LOSSES)
     check_count("fit: `starts`", starts, 1)
-    check_count("fit: `max_evaluations`", max_evaluations, 1)
+    check_count("fit: `seed`", seed, 0)
     if not isinstance(workers, Executor):
         check_count("fit: `workers`", workers, 0)
     space = Space(variables)
     job = Job(
         space=space,
         stages=_stages(residuals, space),
-        options={
-            "loss": loss,
-            "f_scale": loss_scale,
-            "max_nfev": max_evaluations,
-            "ftol": tolerance,
-            "xtol": tolerance,
-            "gtol": tolerance,
-        },
+        options=_options(method, loss, loss_scale, max_evaluations, tolerance),
         folder=_folder(resume),
         threads=torch.get_num_threads(),
     )
@@ -195,7 +191,7 @@ def fit(
     best = min(ends, key=lambda end: end.cost)
     if best.failure is not None:
         raise next(end.failure for end in reversed(ends) if end.failure is not None)
-    found = uncertainty_of(space, best.theta, best.jacobian, best.cost)
+    found = uncertainty_of(space, best.theta, best.jacobian, best.residuals)
     values = space.values(torch.from_numpy(np.array(best.theta)))
     return Fit(
         parameters=parameters_of(values),
@@ -213,6 +209,33 @@ def fit(
         held_out=[] if hold_out is None else _errors(hold_out, values),
         history=[trial for end in ends for trial in end.history],
         compared=[r for r in (job.stages[-1].residuals, hold_out) if r is not None],
+    )
+
+
+def _options(
+    method: Method, loss: str, loss_scale: float, max_evaluations: int, tolerance: float
+) -> Options:
+    if isinstance(method, torch.optim.Optimizer) or not (
+        isinstance(method, str) or callable(method)
+    ):
+        raise TypeError(
+            "fit: `method` must be a name or make an optimizer of torch from a list of tensors, "
+            f"got {type(method).__name__}"
+        )
+    if isinstance(method, str):
+        check_choice("fit: `method`", method, METHODS)
+    check_choice("fit: `loss`", loss, _LOSSES)
+    if loss != "linear" and method != "least_squares":
+        raise InvalidInput(
+            f'fit: `loss` must be "linear" unless `method` is "least_squares", got {loss!r}'
+        )
+    instead = "pass a plain number"
+    return Options(
+        method=method,
+        loss=loss,
+        loss_scale=check_number("fit: `loss_scale`", loss_scale, POSITIVE, instead=instead),
+        max_evaluations=check_count("fit: `max_evaluations`", max_evaluations, 1),
+        tolerance=check_number("fit: `tolerance`", tolerance, POSITIVE, instead=instead),
     )
 
 

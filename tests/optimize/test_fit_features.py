@@ -201,7 +201,7 @@ def test_a_late_and_biased_sensor_is_found():
             "it leaves out decay, offset",
         ),
         (lambda: dc.fit(VARIABLES, residuals, workers=-1), dc.InvalidInput, "`workers`"),
-        (lambda: dc.Variable(1.0, spread=1.0), dc.InvalidInput, "`spread` must be greater than 1"),
+        (lambda: dc.Variable(1.0, spread=1.0), dc.InvalidInput, "`spread` must be finite and > 1"),
     ],
 )
 def test_bad_input(call, error, message):
@@ -237,19 +237,20 @@ class TestOutline:
         rays = np.stack([np.cos(turns), np.sin(turns)], axis=1)
         radii = 0.1 + 0.01 * np.random.default_rng(seed).standard_normal(97)
         ring = np.stack([np.arange(97), np.roll(np.arange(97), -1)], axis=1)
-        found = _radii("", torch.from_numpy(radii[:, None] * rays), ring, rays)
+        found = _radii("", torch.from_numpy(radii[:, None] * rays), ring, torch.from_numpy(rays))
         np.testing.assert_allclose(found.numpy(), radii, atol=1e-9)
 
     def test_it_is_the_last_crossing_and_its_derivative_is_that_of_differences(self):
         points = torch.from_numpy(np.random.default_rng(2).normal(size=(30, 2)))
         pairs = np.array([(i, j) for i in range(30) for j in range(i)])
-        found = _radii("", points, pairs, self.RAYS)
+        found = _radii("", points, pairs, torch.from_numpy(self.RAYS))
         along = points @ torch.from_numpy(self.RAYS).T
         assert (found <= along.max(dim=0).values + 1e-12).all()
         tangent = torch.from_numpy(np.random.default_rng(3).normal(size=(30, 2)))
         h = 1e-6
-        ends = [_radii("", points + s * h * tangent, pairs, self.RAYS) for s in (1, -1)]
-        _, exact = torch.func.jvp(lambda p: _radii("", p, pairs, self.RAYS), (points,), (tangent,))
+        rays = torch.from_numpy(self.RAYS)
+        ends = [_radii("", points + s * h * tangent, pairs, rays) for s in (1, -1)]
+        _, exact = torch.func.jvp(lambda p: _radii("", p, pairs, rays), (points,), (tangent,))
         torch.testing.assert_close(exact, (ends[0] - ends[1]) / (2 * h), rtol=1e-5, atol=1e-7)
 
     @pytest.mark.parametrize(
@@ -261,7 +262,7 @@ class TestOutline:
             ({"center": (1.0, 0.0, 0.0)}, r"`center` must have shape \[2\]"),
             ({"faces": [[0, 1, 25]]}, "indices between 0 and 24"),
             ({"directions": 2}, "`directions` must be at least 3"),
-            ({"noise": 0.0}, "`noise` must be greater than 0"),
+            ({"noise": 0.0}, "`noise` must be finite and > 0"),
         ],
     )
     def test_bad_input(self, change, message):
