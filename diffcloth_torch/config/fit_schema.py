@@ -24,6 +24,7 @@ class VariableSection(Section):
     scale: Literal["log", "linear"] | None = None
     free: bool = True
     spread: Annotated[float, Gt(1)] = 3.0
+    prior: Annotated[list[Numbers], Len(2, 2)] | None = None
 
 
 class SyntheticSection(Section):
@@ -83,6 +84,7 @@ class FitSection(Section):
     starts: Annotated[int, Ge(1)] = 1
     seed: Annotated[int, Ge(0)] = 0
     workers: Annotated[int, Ge(0)] = 0
+    method: Literal["least_squares", "L-BFGS-B"] = "least_squares"
     loss: Literal["linear", "soft_l1", "huber", "cauchy", "arctan"] = "linear"
     loss_scale: Positive = 1.0
     max_evaluations: Annotated[int, Ge(1)] = 100

@@ -6,10 +6,13 @@ the residuals comes from tangents of the simulation, one for each number that is
 
 from __future__ import annotations
 
+import difflib
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +21,7 @@ from torch import Tensor
 from diffcloth_torch.checks import POSITIVE, FloatArray, check_choice, check_count, check_number
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path
+from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.fit_page import Page, write_page
 from diffcloth_torch.optimize.methods import METHODS, Method, Options
 from diffcloth_torch.optimize.problem import Residuals, Trial, parameters_of, trajectories
@@ -215,8 +219,9 @@ def fit(
 def _options(
     method: Method, loss: str, loss_scale: float, max_evaluations: int, tolerance: float
 ) -> Options:
-    if isinstance(method, torch.optim.Optimizer) or not (
-        isinstance(method, str) or callable(method)
+    given: Any = method
+    if not isinstance(given, str) and (
+        isinstance(given, torch.optim.Optimizer) or not callable(given)
     ):
         raise TypeError(
             "fit: `method` must be a name or make an optimizer of torch from a list of tensors, "
@@ -240,12 +245,17 @@ def _options(
 
 
 def _stages(residuals: Residuals | Sequence[Stage], space: Space) -> list[Stage]:
-    if callable(residuals):
-        return [Stage(residuals)]
-    stages = list(residuals)
-    if not stages or not all(isinstance(stage, Stage) for stage in stages):
+    given: Any = residuals
+    stages = [Stage(residuals)] if callable(residuals) else given
+    if (
+        not isinstance(stages, list | tuple)
+        or not stages
+        or not all(isinstance(stage, Stage) and callable(stage.residuals) for stage in stages)
+    ):
         raise TypeError("fit: `residuals` must be a function, or a list of one or more Stage")
+    stages = list(stages)
     for k, stage in enumerate(stages):
+        _check_signature(stage.residuals, space)
         if stage.free is None:
             continue
         if isinstance(stage.free, str) or not stage.free:
@@ -263,6 +273,30 @@ def _stages(residuals: Residuals | Sequence[Stage], space: Space) -> list[Stage]
             f"it leaves out {', '.join(sorted(left))}"
         )
     return stages
+
+
+def _check_signature(residuals: Residuals, space: Space) -> None:
+    """Refuse a misspelled parameter, which would reach a function that does not take it."""
+    others = [name for name in space.all_variables if name not in PARAMETERS]
+    try:
+        signature = inspect.signature(residuals)
+    except (TypeError, ValueError):  # of some built-in functions nobody knows it
+        return
+    arguments = ["parameters", "values"] if others else ["parameters"]
+    try:
+        signature.bind(*arguments)
+    except TypeError as error:
+        if others:
+            close = difflib.get_close_matches(others[0], PARAMETERS, n=1)
+            hint = f"; is {close[0]!r} meant?" if close else ""
+            raise InvalidInput(
+                f"fit: `variables` has {others[0]!r}, which is no field of Parameters, so that "
+                f"`residuals` must take (parameters, values), got {signature}{hint}"
+            ) from error
+        raise InvalidInput(
+            f"fit: `residuals` must take (parameters), as all variables are fields of Parameters, "
+            f"got {signature}"
+        ) from error
 
 
 def _folder(resume: str | Path | None) -> Path | None:

@@ -11,12 +11,14 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.errors import SimulationError
 from diffcloth_torch.optimize.descent import descend
 from diffcloth_torch.optimize.problem import Problem
 
 __all__ = ["METHODS", "Method", "Options", "Solution", "solve"]
 
 METHODS = ("least_squares", "L-BFGS-B")
+_TINY = 1e-300
 
 Method = str | Callable[[list[Tensor]], torch.optim.Optimizer]
 """A solver of SciPy by its name, or what makes an optimizer of torch."""
@@ -122,8 +124,25 @@ def _l_bfgs_b(
 ) -> tuple[FloatArray, bool, str]:
     from scipy.optimize import minimize
 
+    best, theta = np.inf, first
+    highest = 0.0
+
+    def cost(at: FloatArray) -> tuple[float, FloatArray]:
+        nonlocal best, theta, highest
+        found = problem.cost_and_gradient(at)
+        if found is None:
+            # Its line search interpolates costs, and takes none that is infinite: a slope that
+            # rises from the best point, above all costs so far, sends it back.
+            away = at - theta
+            wall = 2 * highest + 1.0
+            return wall, wall * away / max(float(away @ away), _TINY)
+        highest = max(highest, found[0])
+        if found[0] < best:
+            best, theta = found[0], at.copy()
+        return found
+
     end = minimize(
-        problem.cost_and_gradient,
+        cost,
         first,
         jac=True,
         method="L-BFGS-B",
@@ -134,7 +153,7 @@ def _l_bfgs_b(
             "gtol": options.tolerance,
         },
     )
-    return end.x, bool(end.success), str(end.message)
+    return theta, bool(end.success), str(end.message)
 
 
 def _by_torch(
@@ -150,17 +169,24 @@ def _by_torch(
         nonlocal best
         inside = theta.clamp(lowest, highest)
         at = inside.detach().numpy().copy()
-        cost, gradient = problem.cost_and_gradient(at, fails=True)
+        found = problem.cost_and_gradient(at)
+        if found is None:
+            raise problem.failure(at)
+        cost, gradient = found
         costs.append(cost)
         if cost < best[0]:
             best = cost, at
         # A function with this value and gradient: both may come from an earlier run.
         return cost + (torch.from_numpy(gradient) * (inside - inside.detach())).sum()
 
-    descend(lambda _: [], loss, {"theta": theta}, method, iterations=options.max_evaluations)
+    end = ""
+    try:
+        descend(lambda _: [], loss, {"theta": theta}, method, iterations=options.max_evaluations)
+    except SimulationError as error:
+        if not costs:
+            raise
+        end = f"; then {error}"
     change = abs(costs[-1] - costs[-2]) if len(costs) > 1 else np.inf
     name = getattr(getattr(method, "func", method), "__name__", type(method).__name__)
-    message = (
-        f"{options.max_evaluations} steps of {name}; the last changed the cost by {change:.3g}"
-    )
-    return best[1], bool(change <= options.tolerance * best[0]), message
+    message = f"{len(costs)} steps of {name}; the last one changed the cost by {change:.3g}{end}"
+    return best[1], not end and bool(change <= options.tolerance * best[0]), message

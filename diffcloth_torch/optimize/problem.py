@@ -160,20 +160,17 @@ class Problem:
         jacobian: FloatArray = record["found"].numpy()
         return jacobian
 
-    def cost_and_gradient(
-        self, theta: FloatArray, *, fails: bool = False
-    ) -> tuple[float, FloatArray]:
-        """Half the sum of squares, and its gradient by backward [p].
+    def failure(self, theta: FloatArray) -> SimulationError:
+        """What the simulation raised at a point where it fails."""
+        found = self._trial(theta)
+        assert isinstance(found, SimulationError)
+        return found
 
-        Args:
-            theta: Where.
-            fails: Whether to raise if the simulation fails; else the cost is infinite.
-        """
+    def cost_and_gradient(self, theta: FloatArray) -> tuple[float, FloatArray] | None:
+        """Half the sum of squares, and its gradient by backward [p]; None if it fails."""
         found = self._trial(theta)
         if isinstance(found, SimulationError):
-            if fails:
-                raise found
-            return np.inf, np.zeros_like(theta)
+            return None
         record = self._memory.recall("gradient", self._stage, theta)
         if record is None:
             at = torch.from_numpy(np.array(theta)).requires_grad_()

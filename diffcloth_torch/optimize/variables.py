@@ -99,6 +99,7 @@ class Space:
     """Vectors of numbers theta, one for each number of the free variables.
 
     Attributes:
+        all_variables: Names of all variables, in their order.
         variables: Names of the free variables.
         names: Name of each number, as "stretch" or "velocity[0]".
         first: The first values, as theta.
@@ -118,7 +119,14 @@ class Space:
             InvalidInput: If none is free.
             TypeError: If something else than a variable is given.
         """
+        if not isinstance(variables, Mapping):
+            raise TypeError(
+                "fit: `variables` must be a dict of name -> Variable, got "
+                f"{type(variables).__name__}"
+            )
         for name, variable in variables.items():
+            if not isinstance(name, str):
+                raise TypeError(f"fit: `variables` must have names as keys, got {name!r}")
             if not isinstance(variable, Variable):
                 raise TypeError(
                     f"fit: variables[{name!r}] must be a Variable, got {type(variable).__name__}"
@@ -128,7 +136,7 @@ class Space:
             for name, variable in variables.items()
             if not variable.free
         }
-        self._order = tuple(variables)
+        self.all_variables = tuple(variables)
         self._axes, self.names, first = [], [], 0
         for name, variable in variables.items():
             if variable.free:
@@ -173,7 +181,7 @@ class Space:
         for axis in self._axes:
             numbers = theta[axis.rows].reshape(axis.shape)
             free[axis.name] = numbers.exp() if axis.log else numbers
-        return {name: free.get(name, self._kept.get(name)) for name in self._order}  # type: ignore[misc]
+        return {name: free.get(name, self._kept.get(name)) for name in self.all_variables}  # type: ignore[misc]
 
     def rates(self, theta: FloatArray) -> FloatArray:
         """Derivative of each number by its theta."""
@@ -282,8 +290,15 @@ def _axis(name: str, variable: Variable, first: int) -> _Axis:
         _check_positive(f"fit: variables[{name!r}], `value`", numbers)
         if prior is not None:
             _check_positive(f"fit: variables[{name!r}], the mean of `prior`,", prior[0])
+    if known is not None:
+        check_range(f"fit: variables[{name!r}], `value`", numbers, known.accepted)
     if variable.bounds is not None:
         low, high = variable.bounds
+        if known is not None and not known.accepted.low <= low < high <= known.accepted.high:
+            raise InvalidInput(
+                f"fit: variables[{name!r}], `bounds` must be between {known.accepted.low:g} and "
+                f"{known.accepted.high:g}, got {low:g} and {high:g}"
+            )
     elif log:
         low, high = float(numbers.min()) / _REACH, float(numbers.max()) * _REACH
     elif known is not None:

@@ -63,6 +63,7 @@ class Identify(Drape):
                 scale=section.scale,
                 free=section.free,
                 spread=section.spread,
+                prior=None if section.prior is None else (section.prior[0], section.prior[1]),
             )
             for name, section in self._fit.variables.items()
         }
