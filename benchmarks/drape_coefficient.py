@@ -53,7 +53,7 @@ class Drape(NamedTuple):
 
 def make(bending: float, friction: float, edge_length: float) -> Drape:
     """A disk just above a pedestal, flat."""
-    vertices, faces = disk(RADIUS, edge_length)
+    vertices, _, faces = disk(RADIUS, edge_length)
     vertices[:, 2] = 0.0015
     cloth = dc.Cloth(
         vertices,

@@ -4,13 +4,14 @@
     python -m benchmarks.identification --seeds 2 configs/fit_cantilever.yaml
     python -m benchmarks.identification --compare         # other ways to the same numbers
     python -m benchmarks.identification --places          # ten starts: do they end at one place?
+    python -m benchmarks.identification --set scene.cloths.disk.shape.edge_length=0.014 ...
 
 Each configuration makes observations of its own on a finer mesh, with half the time step and noise
-of 1 mm, and is fitted with ten seeds of this noise. Printed for each number that is fitted: the
-true value, the median of what is found, the median half width of the intervals of 95 %, the bias
-without noise, which is what mesh and time step do, and in how many seeds the interval holds the
-true value; and the median root mean square of the residuals, in units of the noise, and of the
-processor time.
+of 1 mm, and is fitted with ten seeds of this noise, from its first values. Printed for each number
+that is fitted: the true value, the median of what is found, the median half width of the intervals
+of 95 %, the bias without noise, which is what mesh and time step do, and in how many seeds the
+interval holds the true value; and the median root mean square of the residuals, in units of the
+noise, and of the processor time.
 
 With `--compare`, columns are evaluations of the residuals (an evaluation of a Jacobian by tangents
 counts as one, its processor time is in the seconds), processor time [s], final cost over the lowest
@@ -78,11 +79,11 @@ def fit(task: Any, **options: Any) -> Found:
     return Found(found, task, time.process_time() - start)
 
 
-def coverage(config: Path, first: int, seeds: int) -> Iterator[str]:
+def coverage(config: Path, first: int, seeds: int, changes: tuple[str, ...]) -> Iterator[str]:
     """Rows of what was found with each seed of the noise."""
-    quiet = fit(load(config, 0, QUIET)).numbers()
+    quiet = fit(load(config, 0, QUIET, *changes), starts=1).numbers()
     runs = [
-        fit(load(config, seed))
+        fit(load(config, seed, None, *changes), starts=1)
         for seed in tqdm(range(first, first + seeds), config.stem, leave=False, disable=None)
     ]
     rms = statistics.median((2 * r.fit.cost / len(r.fit.residuals)) ** 0.5 for r in runs)
@@ -99,9 +100,9 @@ def coverage(config: Path, first: int, seeds: int) -> Iterator[str]:
         )
 
 
-def places(config: Path, seeds: int) -> Iterator[str]:
+def places(config: Path, seeds: int, changes: tuple[str, ...]) -> Iterator[str]:
     """How many starts end at the best place: the first values, and random ones."""
-    task = load(config, 0)
+    task = load(config, 0, None, *changes)
     numbers = len(Space(task.variables()))
     yield f"\n{config.stem}: {numbers} numbers, {len(task.observed)} trajectories"
     found = fit(task, starts=seeds, seed=1).fit
@@ -173,9 +174,9 @@ def by_cma(problem: _Counted) -> Any:
     return cma.fmin2(problem.cost, space.first, CMA_SPREAD, options)[0]
 
 
-def compare(config: Path) -> Iterator[str]:
+def compare(config: Path, changes: tuple[str, ...]) -> Iterator[str]:
     """Rows of the ways to the same numbers."""
-    task = load(config, 0)
+    task = load(config, 0, None, *changes)
     ways: dict[str, Callable[[_Counted], Any]] = {
         "differences": by_differences,
         "Adam": by_adam,
@@ -217,11 +218,24 @@ def _with(found: dc.Fit, values: dict[str, torch.Tensor]) -> dc.Fit:
 @click.option("--first", default=0, type=click.IntRange(min=0), help="The first of them.")
 @click.option("--compare", "comparing", is_flag=True, help="Differences, Adam and CMA-ES.")
 @click.option("--places", "placing", is_flag=True, help="Do random starts end at one place?")
-def main(configs: tuple[Path, ...], seeds: int, first: int, comparing: bool, placing: bool) -> None:
+@click.option("--set", "changes", multiple=True, help="An assignment, as of `diffcloth fit`.")
+def main(
+    configs: tuple[Path, ...],
+    seeds: int,
+    first: int,
+    comparing: bool,
+    placing: bool,
+    changes: tuple[str, ...],
+) -> None:
     torch.set_num_threads(1)
     for config in configs or sorted(CONFIGS.glob("fit_*.yaml")):
-        rows = compare(config) if comparing else None
-        for row in rows or (places(config, seeds) if placing else coverage(config, first, seeds)):
+        if comparing:
+            rows = compare(config, changes)
+        elif placing:
+            rows = places(config, seeds, changes)
+        else:
+            rows = coverage(config, first, seeds, changes)
+        for row in rows:
             click.echo(row)
 
 

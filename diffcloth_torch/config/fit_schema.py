@@ -24,6 +24,7 @@ class VariableSection(Section):
     scale: Literal["log", "linear"] | None = None
     free: bool = True
     spread: Annotated[float, Gt(1)] = 3.0
+    prior: Annotated[list[Numbers], Len(2, 2)] | None = None
 
 
 class SyntheticSection(Section):
@@ -45,7 +46,7 @@ class TrajectorySection(Section):
     `changes` are assignments to the configuration that make this motion, as after `--set`. The
     cloth is observed after each of `steps`, or once at `equilibrium`. `file` is an .npz with the
     `positions` [T, m, 3] of the `markers` (NaN where one was not seen), or with the `outlines`
-    [T, n, 2] of silhouettes seen from above, around `center`.
+    [T, n, 2] of silhouettes seen from above, around `center`, about which they may be `turned`.
     """
 
     name: str
@@ -57,6 +58,7 @@ class TrajectorySection(Section):
     markers: Selection | None = None
     center: Annotated[list[float], Len(2, 2)] = [0.0, 0.0]
     directions: Annotated[int, Ge(3)] = 72
+    turned: bool = False
     noise: Positive
     file: str | None = None
     synthetic: SyntheticSection | None = None
@@ -82,6 +84,7 @@ class FitSection(Section):
     starts: Annotated[int, Ge(1)] = 1
     seed: Annotated[int, Ge(0)] = 0
     workers: Annotated[int, Ge(0)] = 0
+    method: Literal["least_squares", "L-BFGS-B"] = "least_squares"
     loss: Literal["linear", "soft_l1", "huber", "cauchy", "arctan"] = "linear"
     loss_scale: Positive = 1.0
     max_evaluations: Annotated[int, Ge(1)] = 100

@@ -99,8 +99,7 @@ def _cloth(section: ClothSection, root: str, source: Path) -> Cloth:
         rest, faces = sheet.vertices, sheet.faces
         start = rest
     elif shape.kind == "disk":
-        rest, faces = _generated(section.name, shapes.disk, _given(shape))
-        start = rest
+        rest, start, faces = _generated(section.name, shapes.disk, _given(shape))
     elif shape.kind == "strip":
         rest, start, faces = _generated(section.name, strip, _given(shape))
     else:

@@ -101,11 +101,16 @@ class Grid(Section):
 
 
 class Disk(Section):
-    """Round sheet in the xy-plane on an unstructured mesh with edges of about `edge_length` [m]."""
+    """Round sheet in the xy-plane on an unstructured mesh with edges of about `edge_length` [m].
+
+    It may start with `folds`, waves along the rim of a height of `fold_height` [m].
+    """
 
     kind: Literal["disk"]
     radius: Positive
     edge_length: Positive
+    folds: Annotated[int, Ge(0)] = 0
+    fold_height: NonNegative = 0.01
 
 
 class Strip(Section):

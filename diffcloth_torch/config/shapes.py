@@ -27,18 +27,25 @@ _JITTER = 0.25
 _SEED = 0
 
 
-def disk(radius: float, edge_length: float) -> Mesh:
+def disk(
+    radius: float, edge_length: float, folds: int = 0, fold_height: float = 0.01
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Round sheet in the xy-plane that faces up, on an unstructured mesh.
 
     A Delaunay triangulation joins the points of a disturbed lattice inside a ring of evenly spaced
     points, and is smoothed. The same arguments give the same mesh.
 
+    Folds are waves along the rim, upwards from the plane. They grow with the fourth power of the
+    distance from the middle, which stays flat.
+
     Args:
         radius: Radius of the ring [m].
         edge_length: Approximate length of the edges [m].
+        folds: Number of folds.
+        fold_height: Height of their crests on the ring [m].
 
     Returns:
-        Vertices [n, 3], the ring first, and faces [f, 3].
+        Flat vertices [n, 3], the ring first, folded vertices [n, 3], and faces [f, 3].
     """
     if not _FEWEST_EDGES <= radius / edge_length <= _MOST_EDGES:
         raise ValueError(
@@ -51,8 +58,12 @@ def disk(radius: float, edge_length: float) -> Mesh:
     points = np.concatenate([ring, _disturbed_lattice(radius - 0.7 * edge_length, edge_length)])
     for _ in range(_SMOOTHING_ROUNDS):
         points[count:] = _neighbor_means(points, _triangulate(points))[count:]
-    faces = _triangulate(points)
-    return np.concatenate([points, np.zeros((len(points), 1))], axis=1), faces
+    flat = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
+    folded = flat.copy()
+    if folds:
+        waves = 1 + np.cos(folds * np.arctan2(points[:, 1], points[:, 0]))
+        folded[:, 2] = fold_height / 2 * (np.hypot(*points.T) / radius) ** 4 * waves
+    return flat, folded, _triangulate(points)
 
 
 def _disturbed_lattice(radius: float, edge_length: float) -> NDArray[np.float64]:

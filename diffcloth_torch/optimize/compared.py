@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from typing import Any
 
-from diffcloth_torch.checks import FloatArray
+import numpy as np
+import torch
+from torch import Tensor
 
-__all__ = ["Comparison", "note", "noting"]
+from diffcloth_torch.checks import POSITIVE, FloatArray, check_number
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.transforms import numbers_of
+
+__all__ = ["Comparison", "checked_noise", "note", "noting", "positions_of", "times_of"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,3 +60,31 @@ def note(comparison: Comparison) -> None:
     notes = _NOTES.get()
     if notes is not None:
         notes.append(comparison)
+
+
+def positions_of(owner: str, states: Sequence[State]) -> Tensor:
+    """Positions of states without a batch axis [T, N, 3]; refuses anything else."""
+    given: Any = states
+    if isinstance(given, State):
+        raise TypeError(f"{owner}: `states` must be a list of State, got one State")
+    if not len(given):
+        raise InvalidInput(f"{owner}: `states` must be one or more, got none")
+    for k, state in enumerate(given):
+        if not isinstance(state, State):
+            raise TypeError(f"{owner}: `states`[{k}] must be a State, got {type(state).__name__}")
+        if state.batch_size is not None:
+            raise InvalidInput(
+                f"{owner}: `states`[{k}] must have no batch axis, got {state.batch_size} "
+                "environments; state[i] is one of them"
+            )
+    return torch.stack([state.positions for state in states])
+
+
+def times_of(states: Sequence[State]) -> FloatArray:
+    """Times of states [s], shape [T]."""
+    return np.array([float(numbers_of(state.time)) for state in states])
+
+
+def checked_noise(owner: str, noise: float) -> float:
+    """A standard deviation; refuses what is not a positive number."""
+    return check_number(f"{owner}: `noise`", noise, POSITIVE, instead="pass a plain number")

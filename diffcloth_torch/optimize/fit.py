@@ -6,19 +6,24 @@ the residuals comes from tangents of the simulation, one for each number that is
 
 from __future__ import annotations
 
+import difflib
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.checks import FloatArray, check_choice, check_count
+from diffcloth_torch.checks import POSITIVE, FloatArray, check_choice, check_count, check_number
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path
+from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.fit_page import Page, write_page
+from diffcloth_torch.optimize.methods import METHODS, Method, Options
 from diffcloth_torch.optimize.problem import Residuals, Trial, parameters_of, trajectories
 from diffcloth_torch.optimize.starts import Job, Stage, Start, judge, run_all
 from diffcloth_torch.optimize.uncertainty import Direction, uncertainty_of
@@ -27,7 +32,6 @@ from diffcloth_torch.sim.controls import Parameters
 
 __all__ = ["Direction", "Fit", "Stage", "Start", "Trial", "fit"]
 
-_METHODS = ("least_squares",)
 _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
 
 
@@ -35,7 +39,8 @@ _LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
 class Fit:
     """The best of all starts.
 
-    Standard errors follow from J^T J at the solution, with the noise that the residuals show.
+    Standard errors follow from J^T J at the solution, with the noise that the residuals show, and
+    from the priors.
 
     Attributes:
         parameters: Parameters that hold the variables, None elsewhere.
@@ -45,8 +50,8 @@ class Fit:
         correlation: Likewise.
         intervals: Name of each number -> its interval of 95 %.
         unidentifiable: Directions that the observations do not tell, the worst first.
-        residuals: At the solution [M], of the last stage.
-        cost: Half the sum of their squares.
+        residuals: At the solution [M], of the last stage, without priors.
+        cost: Half the sum of their squares and of those of the priors.
         success: Whether the solver converged.
         message: How it ended.
         starts: Where each start ended, and why not at the best place.
@@ -118,7 +123,7 @@ def fit(
     variables: Mapping[str, Variable],
     residuals: Residuals | Sequence[Stage],
     *,
-    method: str = "least_squares",
+    method: Method = "least_squares",
     starts: int = 1,
     seed: int = 0,
     loss: str = "linear",
@@ -143,10 +148,14 @@ def fit(
             each trajectory: see `dc.residuals`. It is called with tensors that are being
             differentiated, and must return the same values for the same input. Or a list of
             `Stage`, run one after the other; the last one must free all variables.
-        method: The solver; "least_squares".
+        method: The solver. "least_squares" is SciPy's trust region, with Jacobians. "L-BFGS-B" is
+            SciPy's, with gradients, for many variables. A function that makes an optimizer of
+            torch, as `partial(torch.optim.Adam, lr=0.05)`, takes `max_evaluations` steps of
+            `dc.descend`.
         starts: Number of starts: the first values, then random ones, see `Variable`.
         seed: Of the random starts.
-        loss: Of the squares: "linear", "soft_l1", "huber", "cauchy" or "arctan", as SciPy has them.
+        loss: Of the squares: "linear", "soft_l1", "huber", "cauchy" or "arctan", as SciPy has them;
+            "linear" for other methods than "least_squares".
         loss_scale: Residual from which on the others count less, > 0.
         max_evaluations: Of the residuals, for each stage of each start.
         tolerance: Relative change of the cost or the variables at which a stage ends.
@@ -168,24 +177,15 @@ def fit(
         TypeError: If `residuals` returns something else than tensors.
     """
     _require_scipy()
-    check_choice("fit: `method`", method, _METHODS)
-    check_choice("fit: `loss`", loss, _LOSSES)
     check_count("fit: `starts`", starts, 1)
-    check_count("fit: `max_evaluations`", max_evaluations, 1)
+    check_count("fit: `seed`", seed, 0)
     if not isinstance(workers, Executor):
         check_count("fit: `workers`", workers, 0)
     space = Space(variables)
     job = Job(
         space=space,
         stages=_stages(residuals, space),
-        options={
-            "loss": loss,
-            "f_scale": loss_scale,
-            "max_nfev": max_evaluations,
-            "ftol": tolerance,
-            "xtol": tolerance,
-            "gtol": tolerance,
-        },
+        options=_options(method, loss, loss_scale, max_evaluations, tolerance),
         folder=_folder(resume),
         threads=torch.get_num_threads(),
     )
@@ -195,7 +195,7 @@ def fit(
     best = min(ends, key=lambda end: end.cost)
     if best.failure is not None:
         raise next(end.failure for end in reversed(ends) if end.failure is not None)
-    found = uncertainty_of(space, best.theta, best.jacobian, best.cost)
+    found = uncertainty_of(space, best.theta, best.jacobian, best.residuals)
     values = space.values(torch.from_numpy(np.array(best.theta)))
     return Fit(
         parameters=parameters_of(values),
@@ -216,13 +216,46 @@ def fit(
     )
 
 
+def _options(
+    method: Method, loss: str, loss_scale: float, max_evaluations: int, tolerance: float
+) -> Options:
+    given: Any = method
+    if not isinstance(given, str) and (
+        isinstance(given, torch.optim.Optimizer) or not callable(given)
+    ):
+        raise TypeError(
+            "fit: `method` must be a name or make an optimizer of torch from a list of tensors, "
+            f"got {type(method).__name__}"
+        )
+    if isinstance(method, str):
+        check_choice("fit: `method`", method, METHODS)
+    check_choice("fit: `loss`", loss, _LOSSES)
+    if loss != "linear" and method != "least_squares":
+        raise InvalidInput(
+            f'fit: `loss` must be "linear" unless `method` is "least_squares", got {loss!r}'
+        )
+    instead = "pass a plain number"
+    return Options(
+        method=method,
+        loss=loss,
+        loss_scale=check_number("fit: `loss_scale`", loss_scale, POSITIVE, instead=instead),
+        max_evaluations=check_count("fit: `max_evaluations`", max_evaluations, 1),
+        tolerance=check_number("fit: `tolerance`", tolerance, POSITIVE, instead=instead),
+    )
+
+
 def _stages(residuals: Residuals | Sequence[Stage], space: Space) -> list[Stage]:
-    if callable(residuals):
-        return [Stage(residuals)]
-    stages = list(residuals)
-    if not stages or not all(isinstance(stage, Stage) for stage in stages):
+    given: Any = residuals
+    stages = [Stage(residuals)] if callable(residuals) else given
+    if (
+        not isinstance(stages, list | tuple)
+        or not stages
+        or not all(isinstance(stage, Stage) and callable(stage.residuals) for stage in stages)
+    ):
         raise TypeError("fit: `residuals` must be a function, or a list of one or more Stage")
+    stages = list(stages)
     for k, stage in enumerate(stages):
+        _check_signature(stage.residuals, space)
         if stage.free is None:
             continue
         if isinstance(stage.free, str) or not stage.free:
@@ -240,6 +273,30 @@ def _stages(residuals: Residuals | Sequence[Stage], space: Space) -> list[Stage]
             f"it leaves out {', '.join(sorted(left))}"
         )
     return stages
+
+
+def _check_signature(residuals: Residuals, space: Space) -> None:
+    """Refuse a misspelled parameter, which would reach a function that does not take it."""
+    others = [name for name in space.all_variables if name not in PARAMETERS]
+    try:
+        signature = inspect.signature(residuals)
+    except (TypeError, ValueError):  # of some built-in functions nobody knows it
+        return
+    arguments = ["parameters", "values"] if others else ["parameters"]
+    try:
+        signature.bind(*arguments)
+    except TypeError as error:
+        if others:
+            close = difflib.get_close_matches(others[0], PARAMETERS, n=1)
+            hint = f"; is {close[0]!r} meant?" if close else ""
+            raise InvalidInput(
+                f"fit: `variables` has {others[0]!r}, which is no field of Parameters, so that "
+                f"`residuals` must take (parameters, values), got {signature}{hint}"
+            ) from error
+        raise InvalidInput(
+            f"fit: `residuals` must take (parameters), as all variables are fields of Parameters, "
+            f"got {signature}"
+        ) from error
 
 
 def _folder(resume: str | Path | None) -> Path | None:

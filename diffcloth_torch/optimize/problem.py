@@ -124,7 +124,15 @@ class Problem:
         self._space, self._at, self._rows = space, torch.from_numpy(at.copy()), rows
         self._residuals, self._memory, self._report = residuals, memory, report
         self._start, self._stage, self._count = start, stage, 0
+        self._known = torch.from_numpy(np.flatnonzero(space.precisions[rows]))
+        self._means = torch.from_numpy(space.means[rows])[self._known]
+        self._precisions = torch.from_numpy(space.precisions[rows])[self._known]
         self._last: tuple[bytes, FloatArray | SimulationError] | None = None
+
+    @property
+    def prior_count(self) -> int:
+        """Number of the residuals, the last ones, that are those of priors."""
+        return len(self._known)
 
     def require(self, theta: FloatArray) -> None:
         """Evaluate at a start, where a failure ends it."""
@@ -132,8 +140,8 @@ class Problem:
         if isinstance(found, SimulationError):
             raise found
         self._count = len(found)
-        if self._count == 0:
-            raise InvalidInput("fit: `residuals` must return at least one number")
+        if self._count == self.prior_count:
+            raise InvalidInput("fit: `residuals` must return at least one number, got none")
 
     def residuals(self, theta: FloatArray) -> FloatArray:
         """Residuals [M]; infinite where the simulation fails: the solver rejects that step."""
@@ -147,9 +155,31 @@ class Problem:
             few = len(self._rows) <= self._count
             transform = torch.func.jacfwd if few else torch.func.jacrev
             found = transform(self._call)(torch.from_numpy(np.array(theta)))
+            _check_derivative(found)
             record = self._memory.keep("jacobian", self._stage, theta, found=found)
         jacobian: FloatArray = record["found"].numpy()
         return jacobian
+
+    def failure(self, theta: FloatArray) -> SimulationError:
+        """What the simulation raised at a point where it fails."""
+        found = self._trial(theta)
+        assert isinstance(found, SimulationError)
+        return found
+
+    def cost_and_gradient(self, theta: FloatArray) -> tuple[float, FloatArray] | None:
+        """Half the sum of squares, and its gradient by backward [p]; None if it fails."""
+        found = self._trial(theta)
+        if isinstance(found, SimulationError):
+            return None
+        record = self._memory.recall("gradient", self._stage, theta)
+        if record is None:
+            at = torch.from_numpy(np.array(theta)).requires_grad_()
+            with torch.enable_grad():
+                cost = 0.5 * self._call(at).square().sum()
+                (gradient,) = torch.autograd.grad(cost, at)
+            _check_derivative(gradient)
+            record = self._memory.keep("gradient", self._stage, theta, found=gradient)
+        return 0.5 * float(found @ found), record["found"].numpy()
 
     def _trial(self, theta: FloatArray) -> FloatArray | SimulationError:
         # The solver asks first for what the start has just been tried with.
@@ -170,8 +200,8 @@ class Problem:
                     found = self._call(numbers)
             except SimulationError as error:
                 failure = error
-            if not torch.isfinite(found).all():
-                raise InvalidInput("fit: `residuals` must return finite numbers")
+            if failure is None:
+                self._check(found)
             record = self._memory.keep(
                 "residuals",
                 self._stage,
@@ -195,9 +225,23 @@ class Problem:
         self._report(trial)
         return values if failure is None else failure
 
+    def _check(self, found: Tensor) -> None:
+        wrong = (~torch.isfinite(found)).nonzero()
+        if len(wrong):
+            at = int(wrong[0])
+            raise InvalidInput(
+                f"fit: `residuals` must return finite numbers, got {float(found[at]):g} at [{at}]"
+            )
+        if self._count not in (0, len(found)):
+            raise InvalidInput(
+                "fit: `residuals` must return as many numbers in every call, got "
+                f"{len(found) - self.prior_count} after {self._count - self.prior_count}"
+            )
+
     def _call(self, theta: Tensor) -> Tensor:
         parts = trajectories(self._residuals, self._space.values(self._whole(theta)))
-        return torch.cat([part.reshape(-1).to(torch.float64) for part in parts])
+        found = [part.reshape(-1).to(torch.float64) for part in parts]
+        return torch.cat([*found, (theta[self._known] - self._means) * self._precisions])
 
     def _whole(self, theta: Tensor) -> Tensor:
         return self._at.index_copy(0, torch.from_numpy(self._rows), theta)
@@ -217,6 +261,14 @@ def trajectories(residuals: Residuals, values: Mapping[str, Tensor]) -> list[Ten
     if not isinstance(parts, list | tuple) or not all(isinstance(p, Tensor) for p in parts):
         raise TypeError("fit: `residuals` must return a tensor or a list of tensors")
     return list(parts)
+
+
+def _check_derivative(found: Tensor) -> None:
+    if not torch.isfinite(found).all():
+        raise InvalidInput(
+            "fit: `residuals` must have finite derivatives, got infinite ones or NaN; a square "
+            "root or a norm has none at 0"
+        )
 
 
 def _key(theta: Tensor) -> bytes:

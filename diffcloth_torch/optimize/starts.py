@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.optimize.methods import Options, solve
 from diffcloth_torch.optimize.problem import Memory, Problem, Residuals, Trial
 from diffcloth_torch.optimize.variables import Space
 
@@ -45,7 +45,7 @@ class Start:
     Attributes:
         first: Values of all variables where it began.
         values: Where it ended; those of `first` if the simulation failed there.
-        cost: Half the sum of squares there; infinite if the simulation failed.
+        cost: Half the sum of squares there, priors included; infinite if the simulation failed.
         evaluations: Number of evaluations of the residuals.
         success: Whether the solver converged in every stage.
         message: How it ended.
@@ -68,14 +68,14 @@ class Job:
     Attributes:
         space: What is searched.
         stages: One or more; the last one frees everything.
-        options: Of SciPy's `least_squares`.
+        options: How each stage is solved.
         folder: Where evaluations are kept, or None.
         threads: Of torch: sums of its larger operations depend on it.
     """
 
     space: Space
     stages: list[Stage]
-    options: dict[str, Any]
+    options: Options
     folder: Path | None
     threads: int
 
@@ -89,8 +89,8 @@ class End:
         first: Theta where it began.
         theta: Where it ended.
         cost: Infinite if the simulation failed at the first values of a stage.
-        residuals: There.
-        jacobian: There.
+        residuals: There, without those of priors.
+        jacobian: Theirs.
         success: Whether the solver converged in every stage.
         message: How it ended.
         history: Its evaluations.
@@ -111,10 +111,8 @@ class End:
 
 def run(job: Job, start: int, first: FloatArray, report: Callable[[Trial], None]) -> End:
     """Run all stages of a start."""
-    from scipy.optimize import least_squares
-
     space, at, history, success = job.space, first, list[Trial](), True
-    described = [space.names, [float(x) for x in first], repr(sorted(job.options.items()))]
+    described = [space.described(), [float(x) for x in first], job.options.described()]
     file = None if job.folder is None else job.folder / f"start_{start}.pt"
     memory = Memory(file, described)
     for k, stage in enumerate(job.stages):
@@ -132,32 +130,25 @@ def run(job: Job, start: int, first: FloatArray, report: Callable[[Trial], None]
         problem.history = history
         try:
             problem.require(at[rows])
+            end = solve(problem, at[rows], space.low[rows], space.high[rows], job.options)
         except SimulationError as error:
             nothing = np.zeros(0)
             return End(
                 start, first, at, np.inf, nothing, nothing, False, str(error), history, error
             )
-        end = least_squares(
-            problem.residuals,
-            at[rows],
-            jac=problem.jacobian,
-            bounds=(space.low[rows], space.high[rows]),
-            method="trf",
-            x_scale="jac",
-            **job.options,
-        )
         at = at.copy()
-        at[rows] = end.x
-        success = success and bool(end.success)
+        at[rows] = end.theta
+        success = success and end.success
+    data = len(end.residuals) - problem.prior_count
     return End(
         start=start,
         first=first,
         theta=at,
-        cost=float(end.cost),
-        residuals=end.fun,
-        jacobian=end.jac,
+        cost=end.cost,
+        residuals=end.residuals[:data],
+        jacobian=end.jacobian[:data],
         success=success,
-        message=str(end.message),
+        message=end.message,
         history=history,
         failure=None,
     )

@@ -56,45 +56,61 @@ class Uncertainty(NamedTuple):
 
 
 def uncertainty_of(
-    space: Space, theta: FloatArray, jacobian: FloatArray, cost: float
+    space: Space, theta: FloatArray, jacobian: FloatArray, residuals: FloatArray
 ) -> Uncertainty:
-    """Standard errors from J^T J at the solution, with the noise that the residuals show."""
+    """Standard errors at the solution, from the noise that the residuals show and from the priors.
+
+    With the variance s^2 of the residuals and the precisions P of the priors, the covariance is
+    (J^T J / s^2 + P^2)^-1. Where residuals are too few to show the noise, and priors make up for
+    them, s is one: the noise that was given.
+    """
     count, p = jacobian.shape
-    noise = 2 * cost / max(count - p, 1)
+    freedom = count - p
+    given = freedom < 1 and bool(space.precisions.any())
+    noise = 1.0 if given else np.sqrt(float(residuals @ residuals) / max(freedom, 1))
     # In sizes of the variables, so that directions compare.
     units = space.units(theta)
-    # With zero rows, where residuals are fewer than numbers, no direction is left out.
-    rows = np.vstack([jacobian * units, np.zeros((max(p - count, 0), p))])
-    _, singular, directions = np.linalg.svd(rows, full_matrices=False)
-    errors = np.sqrt(noise) / np.maximum(singular, _TINY)
-    spread = directions.T * errors  # columns: directions times their standard error
+    priors = np.diag(space.precisions * units)
+    _, singular, directions = np.linalg.svd(np.vstack([jacobian * units, priors * noise]))
+    spread = directions.T * (noise / np.maximum(singular, _TINY))
     with np.errstate(over="ignore", invalid="ignore"):
         of_theta = units[:, None] * (spread @ spread.T) * units
     rates = space.rates(theta)
     covariance = rates[:, None] * of_theta * rates
     deviations = np.sqrt(np.diag(covariance))
+    reach = _reach(np.inf if given else max(freedom, 1))
     return Uncertainty(
         covariance=covariance,
         correlation=covariance / np.maximum(np.outer(deviations, deviations), _TINY),
-        intervals=_intervals(space, theta, np.sqrt(np.diag(of_theta)), count - p),
-        unidentifiable=_directions(space.names, directions, errors),
+        intervals=_intervals(space, theta, reach * np.sqrt(np.diag(of_theta))),
+        unidentifiable=_directions(space.names, jacobian * units, noise),
         deviations=np.sqrt(np.diag(of_theta)),
     )
 
 
-def _intervals(
-    space: Space, theta: FloatArray, deviations: FloatArray, freedom: int
-) -> dict[str, tuple[float, float]]:
-    from scipy.stats import t
+def _reach(freedom: float) -> float:
+    """Half of an interval of 95 %, in standard errors, of Student's t or of the normal law."""
+    from scipy.stats import norm, t
 
-    reach = float(t.ppf(0.5 + _CONFIDENCE / 2, max(freedom, 1))) * deviations
+    share = 0.5 + _CONFIDENCE / 2
+    return float(norm.ppf(share) if np.isinf(freedom) else t.ppf(share, freedom))
+
+
+def _intervals(
+    space: Space, theta: FloatArray, reach: FloatArray
+) -> dict[str, tuple[float, float]]:
     with np.errstate(over="ignore"):
         low, high = space.from_theta(theta - reach), space.from_theta(theta + reach)
     return {name: (float(low[i]), float(high[i])) for i, name in enumerate(space.names)}
 
 
-def _directions(names: list[str], directions: FloatArray, errors: FloatArray) -> list[Direction]:
-    """The directions whose standard error is as large as the variables themselves."""
+def _directions(names: list[str], jacobian: FloatArray, noise: float) -> list[Direction]:
+    """The directions whose standard error, without priors, is as large as the variables."""
+    count, p = jacobian.shape
+    # With zero rows, where residuals are fewer than numbers, no direction is left out.
+    rows = np.vstack([jacobian, np.zeros((max(p - count, 0), p))])
+    _, singular, directions = np.linalg.svd(rows, full_matrices=False)
+    errors = noise / np.maximum(singular, _TINY)
     found = []
     for direction, error in zip(directions, errors, strict=True):
         if not error < _UNSURE:

@@ -5,19 +5,31 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.checks import FloatArray, check_choice, check_finite, float_array
+from diffcloth_torch.checks import (
+    POSITIVE,
+    FloatArray,
+    Range,
+    check_bool,
+    check_choice,
+    check_finite,
+    check_number,
+    check_range,
+    check_shape,
+    float_array,
+)
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.quantities import PARAMETERS
 
 __all__ = ["Space", "Variable"]
 
 _SCALES = ("log", "linear")
+_SPREADS = Range(1.0)
 _REACH = 1e3  # factor of what is positive, to both sides of its first value, without bounds
 
 
@@ -35,6 +47,11 @@ class Variable:
         spread: Factor, > 1, by which the random starts of what is searched on the scale "log" may
             differ from the first value; their logarithms are uniform. On the scale "linear" they
             are uniform between the bounds, or up to twice the first value where these are infinite.
+        prior: What is known before anything is observed: (mean, deviation), numbers or arrays of
+            the shape of the value. On the scale "log" the deviation is that of the natural
+            logarithm: 0.1 is about 10 %. The fit weighs it against the residuals, as one more
+            observation of that standard deviation, and draws the random starts from it. None knows
+            nothing but the bounds.
     """
 
     value: object
@@ -42,29 +59,26 @@ class Variable:
     scale: Literal["log", "linear"] | None = None
     free: bool = True
     spread: float = 3.0
+    prior: tuple[object, object] | None = None
 
     def __post_init__(self) -> None:
-        numbers = float_array("Variable: `value`", self.value)
-        if not 1 < self.spread < math.inf:
-            raise InvalidInput(f"Variable: `spread` must be greater than 1, got {self.spread}")
+        numbers = float_array("Variable: `value`", self.value).copy()
+        check_number("Variable: `spread`", self.spread, _SPREADS, instead="pass a plain number")
         check_finite("Variable: `value`", numbers)
+        if not numbers.size:
+            raise InvalidInput("Variable: `value` must be one or more numbers, got none")
+        check_bool("Variable: `free`", self.free)
         object.__setattr__(self, "value", numbers)
         if self.scale is not None:
             check_choice("Variable: `scale`", self.scale, _SCALES)
         if self.bounds is not None:
-            low, high = _ends(self.bounds)
-            wrong = (numbers < low) | (numbers > high)
-            if wrong.any():
-                at = [int(i) for i in np.argwhere(wrong)[0]]
-                raise InvalidInput(
-                    f"Variable: `value` must be between its bounds {low:g} and {high:g}, "
-                    f"got {numbers[tuple(at)]:g}" + (f" at {at}" if at else "")
-                )
-        if self.scale == "log" and not (numbers > 0).all():
-            raise InvalidInput(
-                'Variable: `value` must be positive on the scale "log", got '
-                f"{float(numbers.min()):g}"
-            )
+            ends = _ends(self.bounds)
+            object.__setattr__(self, "bounds", ends)
+            _check_between("Variable: `value`", numbers, ends)
+        if self.scale == "log":
+            _check_positive("Variable: `value`", numbers)
+        if self.prior is not None:
+            object.__setattr__(self, "prior", _prior(self.prior, numbers.shape, self.bounds))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,17 +92,21 @@ class _Axis:
     low: float
     high: float
     spread: float
+    prior: tuple[FloatArray, FloatArray] | None
 
 
 class Space:
     """Vectors of numbers theta, one for each number of the free variables.
 
     Attributes:
+        all_variables: Names of all variables, in their order.
         variables: Names of the free variables.
         names: Name of each number, as "stretch" or "velocity[0]".
         first: The first values, as theta.
         low: Lowest values of theta.
         high: Highest values of theta.
+        means: Means of the priors, as theta; zero where there is none.
+        precisions: One over the standard deviations of the priors; zero where there is none.
     """
 
     def __init__(self, variables: Mapping[str, Variable]) -> None:
@@ -101,7 +119,14 @@ class Space:
             InvalidInput: If none is free.
             TypeError: If something else than a variable is given.
         """
+        if not isinstance(variables, Mapping):
+            raise TypeError(
+                "fit: `variables` must be a dict of name -> Variable, got "
+                f"{type(variables).__name__}"
+            )
         for name, variable in variables.items():
+            if not isinstance(name, str):
+                raise TypeError(f"fit: `variables` must have names as keys, got {name!r}")
             if not isinstance(variable, Variable):
                 raise TypeError(
                     f"fit: variables[{name!r}] must be a Variable, got {type(variable).__name__}"
@@ -111,7 +136,7 @@ class Space:
             for name, variable in variables.items()
             if not variable.free
         }
-        self._order = tuple(variables)
+        self.all_variables = tuple(variables)
         self._axes, self.names, first = [], [], 0
         for name, variable in variables.items():
             if variable.free:
@@ -128,6 +153,18 @@ class Space:
         counts = [axis.rows.stop - axis.rows.start for axis in self._axes]
         self.low = np.repeat([_bound(axis, axis.low) for axis in self._axes], counts)
         self.high = np.repeat([_bound(axis, axis.high) for axis in self._axes], counts)
+        self.means, self.precisions = np.zeros(len(self)), np.zeros(len(self))
+        for axis in self._axes:
+            if axis.prior is not None:
+                mean, deviation = axis.prior
+                self.means[axis.rows] = _to(axis, mean)
+                self.precisions[axis.rows] = 1 / deviation.reshape(-1)
+
+    def described(self) -> list[Any]:
+        """What evaluations belong to, in types that `torch.load` reads."""
+        numbers = (self.low, self.high, self.means, self.precisions)
+        kept = [[name, value.tolist()] for name, value in self._kept.items()]
+        return [list(self.names), kept, *(found.tolist() for found in numbers)]
 
     def __len__(self) -> int:
         """Count the numbers."""
@@ -144,7 +181,7 @@ class Space:
         for axis in self._axes:
             numbers = theta[axis.rows].reshape(axis.shape)
             free[axis.name] = numbers.exp() if axis.log else numbers
-        return {name: free.get(name, self._kept.get(name)) for name in self._order}  # type: ignore[misc]
+        return {name: free.get(name, self._kept.get(name)) for name in self.all_variables}  # type: ignore[misc]
 
     def rates(self, theta: FloatArray) -> FloatArray:
         """Derivative of each number by its theta."""
@@ -173,10 +210,14 @@ class Space:
         return units
 
     def draw(self, generator: np.random.Generator) -> FloatArray:
-        """Draw a start: positive numbers around the first, others between their bounds."""
+        """Draw a start: from priors, positive numbers around the first, others between bounds."""
         theta = np.array(self.first)
         for axis in self._axes:
             first, rows = self.first[axis.rows], axis.rows
+            if axis.prior is not None:
+                drawn = generator.normal(self.means[rows], 1 / self.precisions[rows])
+                theta[rows] = np.clip(drawn, self.low[rows], self.high[rows])
+                continue
             if axis.log:
                 reach = math.log(axis.spread)
                 low, high = first - reach, first + reach
@@ -196,6 +237,42 @@ def _ends(bounds: object) -> tuple[float, float]:
     return float(ends[0]), float(ends[1])
 
 
+def _check_between(name: str, numbers: FloatArray, ends: tuple[float, float]) -> None:
+    wrong = (numbers < ends[0]) | (numbers > ends[1])
+    if wrong.any():
+        at = [int(i) for i in np.argwhere(wrong)[0]]
+        raise InvalidInput(
+            f"{name} must be between its bounds {ends[0]:g} and {ends[1]:g}, "
+            f"got {numbers[tuple(at)]:g}" + (f" at {at}" if at else "")
+        )
+
+
+def _check_positive(name: str, numbers: FloatArray) -> None:
+    if not (numbers > 0).all():
+        raise InvalidInput(
+            f'{name} must be positive on the scale "log", got {float(numbers.min()):g}'
+        )
+
+
+def _prior(
+    prior: object, shape: tuple[int, ...], bounds: tuple[float, float] | None
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and deviation of each number."""
+    if not isinstance(prior, tuple | list) or len(prior) != 2:
+        raise InvalidInput(f"Variable: `prior` must be (mean, deviation), got {prior!r}")
+    found = []
+    for name, part in zip(("mean", "deviation"), prior, strict=True):
+        numbers = float_array(f"Variable: the {name} of `prior`", part)
+        check_shape(f"Variable: the {name} of `prior`", numbers.shape, [(), shape])
+        found.append(np.broadcast_to(numbers, shape).copy())
+    mean, deviation = found
+    check_finite("Variable: the mean of `prior`", mean)
+    check_range("Variable: the deviation of `prior`", deviation, POSITIVE)
+    if bounds is not None:
+        _check_between("Variable: the mean of `prior`", mean, bounds)
+    return mean, deviation
+
+
 def _numbers(variable: Variable) -> FloatArray:
     assert isinstance(variable.value, np.ndarray)
     return variable.value
@@ -208,8 +285,20 @@ def _axis(name: str, variable: Variable, first: int) -> _Axis:
     log = variable.scale == "log"
     if variable.scale is None:
         log = never_negative and bool((numbers > 0).all())
+    prior: Any = variable.prior
+    if log:
+        _check_positive(f"fit: variables[{name!r}], `value`", numbers)
+        if prior is not None:
+            _check_positive(f"fit: variables[{name!r}], the mean of `prior`,", prior[0])
+    if known is not None:
+        check_range(f"fit: variables[{name!r}], `value`", numbers, known.accepted)
     if variable.bounds is not None:
         low, high = variable.bounds
+        if known is not None and not known.accepted.low <= low < high <= known.accepted.high:
+            raise InvalidInput(
+                f"fit: variables[{name!r}], `bounds` must be between {known.accepted.low:g} and "
+                f"{known.accepted.high:g}, got {low:g} and {high:g}"
+            )
     elif log:
         low, high = float(numbers.min()) / _REACH, float(numbers.max()) * _REACH
     elif known is not None:
@@ -224,6 +313,7 @@ def _axis(name: str, variable: Variable, first: int) -> _Axis:
         low=max(low, 0.0) if log else low,
         high=high,
         spread=variable.spread,
+        prior=prior,
     )
 
 

@@ -23,6 +23,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize import residuals
+from diffcloth_torch.optimize.outlines import silhouettes
 from diffcloth_torch.optimize.variables import Variable
 from diffcloth_torch.sim.controls import Parameters
 from diffcloth_torch.sim.state import State
@@ -62,6 +63,7 @@ class Identify(Drape):
                 scale=section.scale,
                 free=section.free,
                 spread=section.spread,
+                prior=None if section.prior is None else (section.prior[0], section.prior[1]),
             )
             for name, section in self._fit.variables.items()
         }
@@ -126,6 +128,7 @@ class _Observed:
             center=section.center,
             directions=section.directions,
             noise=section.noise,
+            turned=section.turned,
         )
 
 
@@ -219,7 +222,7 @@ def _synthesize(
         seen: FloatArray = torch.stack([state.positions for state in states]).numpy()[:, rows]
         return seen + section.noise * generator.standard_normal(seen.shape)
     center = np.array(section.center)
-    radii, rays = residuals.silhouettes(
+    radii, rays = silhouettes(
         "fit", states, other.task.scene.cloths[0].faces, center, section.directions
     )
     numbers = radii.numpy() + section.noise * generator.standard_normal(radii.shape)

@@ -20,7 +20,7 @@ def edges_of(faces):
 
 
 def test_a_disk_is_one_sheet_of_good_triangles():
-    vertices, faces = shapes.disk(0.6, 0.06)
+    vertices, _, faces = shapes.disk(0.6, 0.06)
     edges, counts = edges_of(faces)
     border = edges[counts == 1]
     np.testing.assert_allclose(np.linalg.norm(vertices[border].reshape(-1, 3), axis=1), 0.6)
@@ -97,3 +97,13 @@ def test_a_shape_that_cannot_be_made_is_refused(tmp_path, shape, message):
     config = write_config(tmp_path, SHEET)
     with pytest.raises(dc.InvalidInput, match=message):
         load_task(config, [f"scene.cloths.sheet.shape={shape}"])
+
+
+def test_a_disk_starts_with_folds_and_is_flat_at_rest():
+    flat, folded, _ = shapes.disk(0.15, 0.01, 3, 0.02)
+    assert not flat[:, 2].any()
+    np.testing.assert_array_equal(folded[:, :2], flat[:, :2])
+    angles, radii = np.arctan2(flat[:, 1], flat[:, 0]), np.hypot(*flat[:, :2].T)
+    expected = 0.01 * (1 + np.cos(3 * angles)) * (radii / 0.15) ** 4
+    np.testing.assert_allclose(folded[:, 2], expected, atol=1e-15)
+    assert folded[:, 2].max() == pytest.approx(0.02)

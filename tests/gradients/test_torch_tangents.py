@@ -103,6 +103,29 @@ def test_attachments(make):
     check_case(make(**attachments.SCHEMES["coupled"]))
 
 
+@pytest.mark.parametrize("make", [attachments.picked, attachments.sewn, attachments.held])
+def test_attachments_by_many_tangents_at_once(make):
+    """A control that is the same in all directions, as in a fit, and one that is not."""
+    case = make(**attachments.SCHEMES["coupled"])
+    wanted = ("state.positions", "control.attachment_weights", "control.attachments")
+    names = [name for name in wanted if name in case.inputs()]
+    inputs = [case.inputs()[name] for name in names]
+
+    def step(positions, scale):
+        given = dict(zip(names, [positions, *inputs[1:]], strict=True))
+        if wanted[1] in given:
+            given[wanted[1]] = given[wanted[1]] * scale
+        return case.step(given).positions
+
+    one = torch.ones((), dtype=F64)
+    by_position, by_scale = torch.func.jacfwd(step, argnums=(0, 1))(inputs[0], one)
+    for seed in range(2):
+        v = random([inputs[0], one], seed)
+        _, expected = torch.func.jvp(step, (inputs[0], one), tuple(v))
+        found = torch.tensordot(by_position, v[0], dims=2) + by_scale * v[1]
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-12)
+
+
 def moving_fields(state):
     names = ("positions", "velocities", "body_poses", "body_velocities", "joint_positions")
     names += ("joint_velocities", "joint_targets", "base_poses", "base_velocities")

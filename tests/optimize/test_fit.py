@@ -242,11 +242,11 @@ class TestResiduals:
             (lambda s: dc.residuals.markers([], np.zeros((0, 4, 3))), "must be one or more"),
             (
                 lambda s: dc.residuals.markers(s, np.zeros((6, 24, 3)), noise=0.0),
-                "`noise` must be greater than 0, got 0",
+                "`noise` must be finite and > 0, got 0",
             ),
             (
                 lambda s: dc.residuals.markers(s, np.zeros((6, 24, 3)), weights=[-1.0] * 24),
-                "`weights` must be at least 0",
+                "`weights` must be finite and >= 0, got -1 at",
             ),
             (lambda s: dc.residuals.point_cloud(s, [np.zeros((3, 3))]), "one for each of 6 states"),
             (

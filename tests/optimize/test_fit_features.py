@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.optimize.residuals import _radii
+from diffcloth_torch.optimize.outlines import _radii
 
 F64 = torch.float64
 TRUTH = torch.tensor([2.0, 0.5, -0.3], dtype=F64)
@@ -201,7 +201,7 @@ def test_a_late_and_biased_sensor_is_found():
             "it leaves out decay, offset",
         ),
         (lambda: dc.fit(VARIABLES, residuals, workers=-1), dc.InvalidInput, "`workers`"),
-        (lambda: dc.Variable(1.0, spread=1.0), dc.InvalidInput, "`spread` must be greater than 1"),
+        (lambda: dc.Variable(1.0, spread=1.0), dc.InvalidInput, "`spread` must be finite and > 1"),
     ],
 )
 def test_bad_input(call, error, message):
@@ -237,20 +237,77 @@ class TestOutline:
         rays = np.stack([np.cos(turns), np.sin(turns)], axis=1)
         radii = 0.1 + 0.01 * np.random.default_rng(seed).standard_normal(97)
         ring = np.stack([np.arange(97), np.roll(np.arange(97), -1)], axis=1)
-        found = _radii("", torch.from_numpy(radii[:, None] * rays), ring, rays)
+        found = _radii("", torch.from_numpy(radii[:, None] * rays), ring, torch.from_numpy(rays))
         np.testing.assert_allclose(found.numpy(), radii, atol=1e-9)
 
     def test_it_is_the_last_crossing_and_its_derivative_is_that_of_differences(self):
         points = torch.from_numpy(np.random.default_rng(2).normal(size=(30, 2)))
         pairs = np.array([(i, j) for i in range(30) for j in range(i)])
-        found = _radii("", points, pairs, self.RAYS)
+        found = _radii("", points, pairs, torch.from_numpy(self.RAYS))
         along = points @ torch.from_numpy(self.RAYS).T
         assert (found <= along.max(dim=0).values + 1e-12).all()
         tangent = torch.from_numpy(np.random.default_rng(3).normal(size=(30, 2)))
         h = 1e-6
-        ends = [_radii("", points + s * h * tangent, pairs, self.RAYS) for s in (1, -1)]
-        _, exact = torch.func.jvp(lambda p: _radii("", p, pairs, self.RAYS), (points,), (tangent,))
+        rays = torch.from_numpy(self.RAYS)
+        ends = [_radii("", points + s * h * tangent, pairs, rays) for s in (1, -1)]
+        _, exact = torch.func.jvp(lambda p: _radii("", p, pairs, rays), (points,), (tangent,))
         torch.testing.assert_close(exact, (ends[0] - ends[1]) / (2 * h), rtol=1e-5, atol=1e-7)
+
+    @staticmethod
+    def wavy(phase, sizes, count=180):
+        """A wheel whose radius has waves, as a cloth with edges from its hub to its rim."""
+        angles = 2 * np.pi / count * (np.arange(count) + 0.3)  # no ray meets a corner
+        radii = np.full(count, 0.1)
+        for k, size in sizes.items():
+            radii += size * np.cos(k * (angles - phase) + 0.3 * k)
+        rim = radii[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        vertices = np.concatenate([rim, np.zeros((1, 2))])
+        k = np.arange(count)
+        faces = np.stack([k, np.roll(k, -1), np.full(count, count)], axis=1)
+        cloth = dc.Cloth(np.pad(vertices, ((0, 0), (0, 1))), faces)
+        contact = dc.ContactOptions(self_contact=False)
+        return cloth, dc.Simulator(dc.Scene([cloth]), 0.01, contact=contact).initial_state(), rim
+
+    @pytest.mark.parametrize("phase", [0.0, 0.4, 1.7, 3.0, 5.0])
+    def test_a_turned_outline_is_turned_back(self, phase):
+        """Among the three turns that agree with the largest wave, the others tell the right one."""
+        sizes = {1: 0.002, 3: 0.01, 4: 0.004}
+        cloth, state, _ = self.wavy(0.0, sizes)
+        *_, seen = self.wavy(phase, sizes)
+        call = {"faces": cloth.faces, "directions": 48}
+        found = dc.residuals.outline([state], [seen], turned=True, **call)
+        assert float(found.abs().max()) < 5e-5
+        larger = dc.residuals.outline([state], [1.02 * seen], turned=True, **call)
+        assert float(larger.mean()) == pytest.approx(-0.02 * 0.1, rel=1e-2)
+
+    def test_derivatives_know_of_the_turn(self):
+        cloth, state, _ = self.wavy(0.0, {1: 0.002, 3: 0.01, 4: 0.004})
+        *_, seen = self.wavy(1.7, {1: 0.001, 3: 0.012, 4: 0.006})
+
+        def call(positions):
+            moved = state.replace(positions=positions)
+            return dc.residuals.outline(
+                [moved], [seen], cloth.faces, directions=25, turned=True, noise=0.01
+            )
+
+        tangent = torch.from_numpy(np.random.default_rng(3).normal(size=state.positions.shape))
+        h = 1e-8
+        ends = [call(state.positions + s * h * tangent) for s in (1, -1)]
+        _, exact = torch.func.jvp(call, (state.positions,), (tangent,))
+        torch.testing.assert_close(exact, (ends[0] - ends[1]) / (2 * h), rtol=1e-4, atol=1e-4)
+        positions = state.positions.clone().requires_grad_()
+        weights = torch.from_numpy(np.random.default_rng(4).normal(size=25))
+        (gradient,) = torch.autograd.grad(call(positions) @ weights, positions)
+        assert float((gradient * tangent).sum()) == pytest.approx(float(exact @ weights), rel=1e-9)
+
+    def test_a_circle_has_no_direction(self):
+        cloth, state, _ = self.wavy(0.0, {})
+        *_, seen = self.wavy(0.0, {3: 0.01})
+        call = {"faces": cloth.faces, "directions": 30}
+        found = dc.residuals.outline([state], [seen], turned=True, **call)
+        torch.testing.assert_close(found, dc.residuals.outline([state], [seen], **call))
+        with pytest.raises(dc.InvalidInput, match="at least 12 for an outline with 3 folds, got 8"):
+            dc.residuals.outline([state], [seen], cloth.faces, directions=8, turned=True)
 
     @pytest.mark.parametrize(
         ("change", "message"),
@@ -261,7 +318,9 @@ class TestOutline:
             ({"center": (1.0, 0.0, 0.0)}, r"`center` must have shape \[2\]"),
             ({"faces": [[0, 1, 25]]}, "indices between 0 and 24"),
             ({"directions": 2}, "`directions` must be at least 3"),
-            ({"noise": 0.0}, "`noise` must be greater than 0"),
+            ({"noise": 0.0}, "`noise` must be finite and > 0"),
+            ({"outlines": [np.full((3, 2), np.nan)]}, r"`outlines`\[0\] must be finite"),
+            ({"faces": np.zeros((0, 3), int)}, r"`faces` must have shape \[F, 3\] with F >= 1"),
         ],
     )
     def test_bad_input(self, change, message):
