@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch.errors import InvalidInput
@@ -20,7 +22,7 @@ Targets = Tensor | Mapping[str, Tensor]
 def default_weights(layout: Layout, targets: Targets | None) -> Tensor:
     """One of every spring that has both ends, zero of those whose target is not set; [1, A]."""
     unset = layout.zeros["attachment_weights"]
-    return unset if targets is None else _are_whole(layout, targets).to(unset)[None]
+    return unset if targets is None else torch.from_numpy(_are_whole(layout, targets)).to(unset)[None]
 
 
 def refuse_untargeted(layout: Layout, weights: Tensor, targets: Targets | None) -> None:
@@ -29,7 +31,7 @@ def refuse_untargeted(layout: Layout, weights: Tensor, targets: Targets | None) 
     Raises:
         InvalidInput: If one is not zero.
     """
-    whole = _are_whole(layout, targets).numpy()
+    whole = _are_whole(layout, targets)
     for name in layout.assembly.springs.target_groups:
         springs = layout.assembly.springs.groups[name]
         if not whole[springs].all() and numbers_of(weights)[:, springs].any():
@@ -38,10 +40,10 @@ def refuse_untargeted(layout: Layout, weights: Tensor, targets: Targets | None) 
             )
 
 
-def _are_whole(layout: Layout, targets: Targets | None) -> Tensor:
-    """Which springs have both ends."""
+def _are_whole(layout: Layout, targets: Targets | None) -> NDArray[np.bool_]:
+    """Which springs have both ends; numbers, which no transform of torch wraps."""
     springs = layout.assembly.springs
-    whole = torch.from_numpy(springs.targets < 0)
+    whole = np.asarray(springs.targets < 0)
     names = springs.target_groups if isinstance(targets, Tensor) else targets or ()
     for name in names:
         whole[springs.groups[name]] = True
