@@ -147,8 +147,15 @@ void ContactPotential::accumulate(const double* x, const double* z) {
   if (bar_ != nullptr) model_.add_mixed(contacts_, x, z, -1.0, *bar_);
 }
 
-void ContactPotential::add_tangent(const double* x, double* y) const {
-  model_.add_tangent(contacts_, x, *dot_, y);
+void ContactPotential::add_tangents(const double* x, std::span<double* const> y) const {
+  std::vector<const ContactModel::Bar*> dots;
+  std::vector<double*> out;
+  for (std::size_t l = 0; l < directions_.size(); ++l) {
+    if (directions_[l] == nullptr) continue;
+    dots.push_back(directions_[l]);
+    out.push_back(y[l]);
+  }
+  if (!dots.empty()) model_.add_tangents(contacts_, x, dots, out);
 }
 
 void FrictionPotential::add_couplings(linalg::Couplings& pairs) const {
@@ -198,8 +205,8 @@ void FrictionPotential::accumulate(const double* x, const double* z) {
   set_.add_mixed(x, z, x_lag_, -1.0, *bar_, start_bar.data(), lag_bar.data());
 }
 
-void FrictionPotential::add_tangent(const double* x, double* y) const {
-  set_.add_tangent(x, x_lag_, {.parameters = *dot_, .start = start_dot_, .lag = lag_dot_}, y);
+void FrictionPotential::add_tangents(const double* x, std::span<double* const> y) const {
+  set_.add_tangents(x, x_lag_, directions_, y);
 }
 
 }  // namespace diffcloth::contact

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <span>
 #include <utility>
 #include <vector>
 
@@ -21,11 +22,21 @@ struct Detection {
   BroadPhase::Scratch scratch;
 };
 
+/// A potential that contact forces are of. The directions of a tangent share what they have in common.
+class TouchingPotential : public Potential {
+ public:
+  /// add_tangent() along several directions, whose tangents are in the potential, each with the bits that it
+  /// has alone.
+  virtual void add_tangents(const double* x, std::span<double* const> y) const = 0;
+
+  void add_tangent(const double* x, double* y) const final { add_tangents(x, {&y, 1}); }
+};
+
 /// The barrier of all contacts as a potential, and the detection of what may come into contact.
 ///
 /// It acts on the pairs that the last watch() has found: a motion must be watched before the
 /// potential is asked about any point of it.
-class ContactPotential final : public Potential {
+class ContactPotential final : public TouchingPotential {
  public:
   /// @param bar  where accumulate() adds; null where nobody asks for it
   ContactPotential(const ContactModel& model, Detection& detection, ContactModel::Bar* bar)
@@ -80,11 +91,14 @@ class ContactPotential final : public Potential {
                              Curvature curvature,
                              const Products& products) const override;
   void accumulate(const double* x, const double* z) override;
-  void add_tangent(const double* x, double* y) const override;
+  void add_tangents(const double* x, std::span<double* const> y) const override;
   void swap_cotangents(CotangentStore& /*store*/) override {}  // they are the caller's
 
-  /// Tangents of the parameters and the rest shape, for add_tangent(); they outlive its calls.
-  void set_tangent(const ContactModel::Bar& dot) { dot_ = &dot; }
+  /// Tangents of the parameters and the rest shape along each direction, null where none changes; they
+  /// outlive the calls of add_tangents().
+  void set_tangents(std::vector<const ContactModel::Bar*> directions) {
+    directions_ = std::move(directions);
+  }
 
  private:
   /// What is near at a point.
@@ -99,7 +113,7 @@ class ContactPotential final : public Potential {
   const ContactModel& model_;
   Detection& detection_;
   ContactModel::Bar* bar_;
-  const ContactModel::Bar* dot_ = nullptr;
+  std::vector<const ContactModel::Bar*> directions_;
   std::vector<Candidate> candidates_;
   std::vector<Contact> contacts_;
   Measured here_;           ///< where the potential stands
@@ -107,7 +121,7 @@ class ContactPotential final : public Potential {
 };
 
 /// Lagged friction as a potential of the displacement over the step. See friction_set.h.
-class FrictionPotential final : public Potential {
+class FrictionPotential final : public TouchingPotential {
  public:
   /// @param contacts  of the lag configuration
   /// @param x_start   positions at the start of the step
@@ -141,18 +155,15 @@ class FrictionPotential final : public Potential {
   /// Expect the motion from the start of the step to another point: see FrictionSet::expect().
   void expect(const double* x, const double* to) { set_.expect(x, to); }
   void accumulate(const double* x, const double* z) override;
-  void add_tangent(const double* x, double* y) const override;
+  void add_tangents(const double* x, std::span<double* const> y) const override;
   void swap_cotangents(CotangentStore& /*store*/) override {}  // the caller takes and swaps them
 
-  /// Tangents, for add_tangent(): of the parameters and the rest shape, of x_start and of the lag
-  /// configuration, both of all vertices. They outlive its calls.
-  void set_tangent(const ContactModel::Bar& dot, const double* start, const double* lag) {
-    dot_ = &dot;
-    start_dot_ = start;
-    lag_dot_ = lag;
+  /// Tangents along each direction; they outlive the calls of add_tangents().
+  void set_tangents(std::vector<FrictionSet::Tangents> directions) {
+    directions_ = std::move(directions);
   }
 
-  /// Where the lag configuration lies: accumulate() and add_tangent() need it.
+  /// Where the lag configuration lies: accumulate() and add_tangents() need it.
   void set_lag(const double* x_lag) { x_lag_ = x_lag; }
 
   std::vector<double> start_bar;  ///< of x_start, all vertices; empty until accumulate()
@@ -162,9 +173,7 @@ class FrictionPotential final : public Potential {
   FrictionSet set_;
   const double* x_lag_ = nullptr;
   ContactModel::Bar* bar_;
-  const ContactModel::Bar* dot_ = nullptr;
-  const double* start_dot_ = nullptr;
-  const double* lag_dot_ = nullptr;
+  std::vector<FrictionSet::Tangents> directions_;
 };
 
 }  // namespace diffcloth::contact

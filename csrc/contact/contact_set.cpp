@@ -521,27 +521,32 @@ void ContactModel::add_mixed(const std::vector<Contact>& contacts,
 }
 
 // grad B = kappa w (b grad m + m b' grad D).
-void ContactModel::add_tangent(const std::vector<Contact>& contacts,
-                               const double* x,
-                               const Bar& dot,
-                               double* y) const {
+void ContactModel::add_tangents(const std::vector<Contact>& contacts,
+                                const double* x,
+                                std::span<const Bar* const> directions,
+                                std::span<double* const> y) const {
   for (const Contact& k : contacts) {
-    const ContactTangent tangent = push_forward(k, dot);
-    const Barrier& b = k.barrier;
-    const double scale = k.kappa * k.weight;
-    const double scale_dot = tangent.kappa * k.weight + k.kappa * tangent.weight;
-    const double b_dot = b.b_d_hat * dot.d_hat + b.b_xi * tangent.xi;
-    const double b1_dot = b.b1_d_hat * dot.d_hat + b.b1_xi * tangent.xi;
-    double along_d = k.mollifier * (scale_dot * b.b1 + scale * b1_dot);
-    Vec12 change = Vec12::Zero();
-    if (k.mollified) {
-      const Mollifier m = mollifier_derivatives(corners(k.pair.vertices, x), k.threshold);
-      along_d += scale * m.m_eps * tangent.threshold * b.b1;
-      change = (scale_dot * b.b + scale * b_dot) * m.gradient +
-               (scale * b.b * tangent.threshold) * m.gradient_eps;
+    const Vec12 d_gradient = distance_sq_gradient(k.closest);
+    std::optional<Mollifier> m;
+    if (k.mollified) m = mollifier_derivatives(corners(k.pair.vertices, x), k.threshold);
+    for (std::size_t l = 0; l < directions.size(); ++l) {
+      const Bar& dot = *directions[l];
+      const ContactTangent tangent = push_forward(k, dot);
+      const Barrier& b = k.barrier;
+      const double scale = k.kappa * k.weight;
+      const double scale_dot = tangent.kappa * k.weight + k.kappa * tangent.weight;
+      const double b_dot = b.b_d_hat * dot.d_hat + b.b_xi * tangent.xi;
+      const double b1_dot = b.b1_d_hat * dot.d_hat + b.b1_xi * tangent.xi;
+      double along_d = k.mollifier * (scale_dot * b.b1 + scale * b1_dot);
+      Vec12 change = Vec12::Zero();
+      if (m) {
+        along_d += scale * m->m_eps * tangent.threshold * b.b1;
+        change = (scale_dot * b.b + scale * b_dot) * m->gradient +
+                 (scale * b.b * tangent.threshold) * m->gradient_eps;
+      }
+      change += along_d * d_gradient;
+      scatter(k.pair.vertices, change, y[l]);
     }
-    change += along_d * distance_sq_gradient(k.closest);
-    scatter(k.pair.vertices, change, y);
   }
 }
 

@@ -197,11 +197,12 @@ class ContactModel {
                  double scale,
                  Bar& bar) const;
 
-  /// y += d/d(theta) (grad B) theta_dot, for tangents of every theta of Bar: add_mixed(), transposed.
-  void add_tangent(const std::vector<Contact>& contacts,
-                   const double* x,
-                   const Bar& dot,
-                   double* y) const;
+  /// y += d/d(theta) (grad B) theta_dot along each direction, for tangents of every theta of Bar: add_mixed(),
+  /// transposed.
+  void add_tangents(const std::vector<Contact>& contacts,
+                    const double* x,
+                    std::span<const Bar* const> directions,
+                    std::span<double* const> y) const;
 
   /// Tangents of a contact's kappa, weight, mollifier threshold and xi.
   struct ContactTangent {

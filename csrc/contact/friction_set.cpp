@@ -18,26 +18,6 @@ constexpr double kClose = 0.1;
 /// Squared sine of the angle from which on two edges cross.
 constexpr double kCrossing = 0.2;
 
-Vec3 tangential(const Vec3& u, const Vec3& n) { return u - n.dot(u) * n; }
-
-/// sum_i c_i x_i, which no translation changes: from the first point, as that cancels less.
-Vec3 gap(const Entry& k, const double* x) {
-  const Vec3 origin = row(x, k.points[0]);
-  Vec3 r = Vec3::Zero();
-  for (int i = 1; i < k.count; ++i) {
-    if (k.c[i] != 0.0) r += k.c[i] * (row(x, k.points[i]) - origin);
-  }
-  return r;
-}
-
-/// Add cotangents of e1 and e2 to those of the frame's vertices.
-void add_edges(const Entry& k, const std::array<Vec3, 2>& bar, double* x_bar) {
-  for (int e = 0; e < 2; ++e) {
-    Eigen::Map<Vec3>(x_bar + 3 * k.points[k.edges[2 * e + 1]]) += bar[e];
-    Eigen::Map<Vec3>(x_bar + 3 * k.points[k.edges[2 * e]]) -= bar[e];
-  }
-}
-
 /// Let the edges of a pair be the frame.
 void turn_with_edges(Entry& entry) {
   const auto& v = entry.lag.pair.vertices;
@@ -82,6 +62,22 @@ Mat3 cross_matrix(const Vec3& u) {
 }
 
 }  // namespace
+
+Vec3 FrictionSet::Entry::gap(const double* rows) const {
+  const Vec3 origin = row(rows, points[0]);
+  Vec3 r = Vec3::Zero();
+  for (int i = 1; i < count; ++i) {
+    if (c[i] != 0.0) r += c[i] * (row(rows, points[i]) - origin);
+  }
+  return r;
+}
+
+void FrictionSet::Entry::add_edges(const std::array<Vec3, 2>& bar, double* x_bar) const {
+  for (int e = 0; e < 2; ++e) {
+    Eigen::Map<Vec3>(x_bar + 3 * points[edges[2 * e + 1]]) += bar[e];
+    Eigen::Map<Vec3>(x_bar + 3 * points[edges[2 * e]]) -= bar[e];
+  }
+}
 
 bool crosses(const Candidate& pair, const double* x) {
   if (pair.kind != PairKind::kEdgeEdge) return false;
@@ -135,7 +131,7 @@ FrictionSet::FrictionSet(const ContactModel& model,
     }
     const Frame at_start(entry, x_start);
     entry.turns = !at_start.is_line();
-    if (entry.turns) entry.a = at_start.coordinates(gap(entry, x_start));
+    if (entry.turns) entry.a = at_start.coordinates(entry.gap(x_start));
     entries_.push_back(entry);
   }
 }
@@ -195,7 +191,7 @@ void FrictionSet::add_gradient(const double* x, double* g) const {
     for (int i = 0; i < k.count; ++i) {
       Eigen::Map<Vec3>(g + 3 * k.points[i]) += k.c[i] * force;
     }
-    add_edges(k, at.frame.pull_back(-k.a, force), g);
+    k.add_edges(at.frame.pull_back(-k.a, force), g);
   }
 }
 
@@ -319,7 +315,7 @@ void FrictionSet::Hessian::add_product(const double* z, double* y) const {
     Eigen::Map<Vec3>(y + 3 * k.points[p]) += B_[p - k.frame].transpose() * force;
   }
   const Frame turned(k, z);
-  add_edges(k, {turn_.cross(turned.e2), turned.e1.cross(turn_)}, y);
+  k.add_edges({turn_.cross(turned.e2), turned.e1.cross(turn_)}, y);
 }
 
 namespace {
@@ -397,7 +393,7 @@ void FrictionSet::add_mixed(const double* x,
     const FrictionLaw& law = at.law;
     const Frame change(k, z);
     const Vec3 m_change = change.e1.cross(at.frame.e2) + at.frame.e1.cross(change.e2);
-    const Vec3 zeta = gap(k, z) - k.a[0] * change.e1 - k.a[1] * change.e2 - k.a[2] * m_change;
+    const Vec3 zeta = k.gap(z) - k.a[0] * change.e1 - k.a[1] * change.e2 - k.a[2] * m_change;
     const double w_zeta = at.w.dot(zeta);
 
     const double mu_bar = k.lambda * law.f1_over_y * w_zeta;
@@ -419,7 +415,7 @@ void FrictionSet::add_mixed(const double* x,
                        -at.frame.m.dot(s_bar) - m_change.dot(eta));
       const Frame frame(k, x_start_);
       g = frame.dual(a_bar);
-      add_edges(k, frame.pull_back(-scale * k.a, g), start_bar);
+      k.add_edges(frame.pull_back(-scale * k.a, g), start_bar);
     }
     const Vec3 n_bar = -k.n.dot(at.s) * omega - k.n.dot(omega) * at.s;
     const Vec3 t_bar = tangential(n_bar, k.n) / d;
@@ -435,94 +431,6 @@ void FrictionSet::add_mixed(const double* x,
     for (int i = 0; i < 4; ++i) {
       Eigen::Map<Vec3>(lag_bar + 3 * v[i]) += scale * x_bar.segment<3>(3 * i);
     }
-  }
-}
-
-FrictionSet::LagTangent FrictionSet::push_forward_lag(const Entry& k,
-                                                      const double* x_lag,
-                                                      const Tangents& dot) const {
-  const Contact& lag = k.lag;
-  const Closest& geometry = lag.closest;
-  const double d = std::sqrt(geometry.d_sq);
-  const Vec12 x_dot = stacked(lag.pair.vertices, dot.lag);
-  const double d_sq_dot = distance_sq_gradient(geometry).dot(x_dot);
-
-  // c(beta), and n = t / d with t = sum_i c_i x_i.
-  LagTangent result{.c = Vec4::Zero(), .n = Vec3::Zero(), .lambda = 0.0};
-  Vec3 t_dot = Vec3::Zero();
-  for (int i = 0; i < 4; ++i) t_dot += geometry.c[i] * x_dot.segment<3>(3 * i);
-  if (geometry.parameter_count > 0) {
-    Vec2 beta_dot = beta_jacobian(geometry) * x_dot;
-    if (geometry.parameter_count == 1) beta_dot[1] = 0.0;
-    result.c = geometry.c_beta * beta_dot;
-    t_dot += geometry.s * beta_dot;
-  }
-  result.n = tangential(t_dot, k.n) / d;
-
-  // lambda = -2 d kappa w m b'.
-  const ContactModel::ContactTangent tangent = model_->push_forward(lag, dot.parameters);
-  const double b1 = lag.barrier.b1;
-  double m_dot = 0.0;
-  if (lag.mollified) {
-    const Mollifier m = mollifier_derivatives(corners(lag.pair.vertices, x_lag), lag.threshold);
-    m_dot = m.gradient.dot(x_dot) + m.m_eps * tangent.threshold;
-  }
-  const double scale = lag.kappa * lag.weight;
-  const double scale_dot = tangent.kappa * lag.weight + lag.kappa * tangent.weight;
-  const double b1_dot = lag.barrier.b2 * d_sq_dot + lag.barrier.b1_d_hat * dot.parameters.d_hat +
-                        lag.barrier.b1_xi * tangent.xi;
-  const double m = lag.mollifier;
-  result.lambda = -2.0 * d * (scale_dot * m * b1 + scale * (m_dot * b1 + m * b1_dot)) -
-                  scale * m * b1 * d_sq_dot / d;
-  return result;
-}
-
-// grad D = mu lambda (f1/|w|) B^T w at fixed frames: see add_gradient().
-void FrictionSet::add_tangent(const double* x,
-                              const double* x_lag,
-                              const Tangents& dot,
-                              double* y) const {
-  const Slips& here = slips(x);
-  for (std::size_t e = 0; e < entries_.size(); ++e) {
-    const Entry& k = entries_[e];
-    const auto& v = k.lag.pair.vertices;
-    const Slip& at = here[e];
-    const LagTangent lag = push_forward_lag(k, x_lag, dot);
-
-    // s = r(x) - Q r(x_start), and r(x_start) in its frame.
-    Vec3 s_dot = Vec3::Zero();
-    Vec3 r_dot = gap(k, dot.start);
-    for (int i = 1; i < 4; ++i) {
-      s_dot += lag.c[i] * (row(x, v[i]) - row(x, v[0]));
-      r_dot += lag.c[i] * (row(x_start_, v[i]) - row(x_start_, v[0]));
-    }
-    Vec3 a_dot = Vec3::Zero();
-    if (k.turns) {
-      const Frame frame(k, x_start_);
-      const Vec3 e1_dot = k.edge(0, dot.start);
-      const Vec3 e2_dot = k.edge(1, dot.start);
-      const Vec3 frame_dot = k.a[0] * e1_dot + k.a[1] * e2_dot +
-                             k.a[2] * (e1_dot.cross(frame.e2) + frame.e1.cross(e2_dot));
-      a_dot = frame.coordinates(r_dot - frame_dot);
-      s_dot -= at.frame * a_dot;
-    } else {
-      s_dot -= r_dot;
-    }
-    const Vec3 w_dot = tangential(s_dot, k.n) - lag.n.dot(at.s) * k.n - k.n.dot(at.s) * lag.n;
-
-    const FrictionLaw& law = at.law;
-    const double strength = k.mu * k.lambda;
-    const double mu_dot = model_->push_forward_mu(k.lag.pair, dot.parameters);
-    const Vec3 force = (strength * law.f1_over_y) * at.w;
-    const Vec3 change =
-        ((mu_dot * k.lambda + k.mu * lag.lambda) * law.f1_over_y +
-         strength * law.f1_over_y_e * dot.parameters.slip + strength * law.f2 * at.w.dot(w_dot)) *
-            at.w +
-        (strength * law.f1_over_y) * w_dot;
-    for (int i = 0; i < k.count; ++i) Eigen::Map<Vec3>(y + 3 * k.points[i]) += k.c[i] * change;
-    for (int i = 0; i < 4; ++i) Eigen::Map<Vec3>(y + 3 * v[i]) += lag.c[i] * force;
-    add_edges(k, at.frame.pull_back(-k.a, change), y);
-    add_edges(k, at.frame.pull_back(-a_dot, force), y);
   }
 }
 

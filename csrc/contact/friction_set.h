@@ -12,6 +12,9 @@ namespace diffcloth::contact {
 /// Whether the edges of a pair between cloths cross at an angle at x, so that they say how it turns.
 bool crosses(const Candidate& pair, const double* x);
 
+/// What a vector has across a unit normal.
+inline Vec3 tangential(const Vec3& u, const Vec3& n) { return u - n.dot(u) * n; }
+
 /// Lagged friction: sum over contacts of mu lambda f0(|w|; e)  [J],
 ///
 ///   w = (I - n n^T) s,   s = r(x) - Q r(x_start),   r(x) = sum_i c_i x_i,   e = eps_v h,
@@ -60,6 +63,12 @@ class FrictionSet {
     Vec3 edge(int e, const double* rows) const {
       return row(rows, points[edges[2 * e + 1]]) - row(rows, points[edges[2 * e]]);
     }
+
+    /// sum_i c_i of some rows, which no translation changes: from the first point, as that cancels less.
+    Vec3 gap(const double* rows) const;
+
+    /// Add cotangents of e1 and e2 to those of the frame's vertices.
+    void add_edges(const std::array<Vec3, 2>& bar, double* x_bar) const;
 
     /// How often a point counts in e1 or e2: 1 at the end, -1 at the start.
     int sign(int e, int point) const {
@@ -158,15 +167,18 @@ class FrictionSet {
                  double* start_bar,
                  double* lag_bar) const;
 
-  /// Tangents of what friction depends on besides x.
+  /// Tangents of what friction depends on besides x, along a direction.
   struct Tangents {
-    const ContactModel::Bar& parameters;
-    const double* start;  ///< of x_start, all vertices
-    const double* lag;    ///< of the lag configuration
+    const ContactModel::Bar* parameters;  ///< null where none changes
+    const double* start;                  ///< of x_start, all vertices
+    const double* lag;                    ///< of the lag configuration
   };
 
-  /// y += d/d(theta) (grad D) theta_dot: add_mixed(), transposed.
-  void add_tangent(const double* x, const double* x_lag, const Tangents& dot, double* y) const;
+  /// y += d/d(theta) (grad D) theta_dot along each direction: add_mixed(), transposed.
+  void add_tangents(const double* x,
+                    const double* x_lag,
+                    std::span<const Tangents> directions,
+                    std::span<double* const> y) const;
 
  private:
   /// What is kept of a point.
@@ -174,13 +186,6 @@ class FrictionSet {
     std::vector<double> x;  ///< all vertices; empty where nothing is known
     Slips slips;
   };
-  /// Changes of what the lag configuration gives to an entry.
-  struct LagTangent {
-    Vec4 c;
-    Vec3 n;
-    double lambda;
-  };
-  LagTangent push_forward_lag(const Entry& entry, const double* x_lag, const Tangents& dot) const;
   bool is_at(const std::vector<double>& point, const double* x) const;
   Slip slip(const Entry& entry, const double* x) const;
   void keep_duals_at(const double* x);

@@ -67,7 +67,7 @@ void pull_back_solve(const Backward& step,
                      solver::Certificate certificate,
                      const std::vector<Array>& g,
                      bool with_forces,
-                     const std::vector<Potential*>& touching,
+                     const std::vector<contact::TouchingPotential*>& touching,
                      const Turn::Exchange& exchange) {
   const solver::Coordinates& coordinates = *f.coordinates;
   const bool with_bodies = !touching.empty() || step.problem.scene.has_attached_bodies();

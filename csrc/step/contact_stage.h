@@ -9,7 +9,8 @@
 
 namespace diffcloth::step {
 
-/// Puts the tangents along a direction into the potentials of an objective, for Potential::add_tangent().
+/// Puts the tangents along a direction into the potentials of an objective but those that touch, for
+/// Potential::add_tangent().
 using SetTangents = std::function<void(std::size_t direction)>;
 
 /// The stage of a scheme that contact is part of: inertia (or nearness), whatever else, barrier and
@@ -51,7 +52,7 @@ void pull_back_solve(const Backward& step,
                      solver::Certificate certificate,
                      const std::vector<std::vector<double>>& g,
                      bool with_forces,
-                     const std::vector<Potential*>& touching,
+                     const std::vector<contact::TouchingPotential*>& touching,
                      const Turn::Exchange& exchange);
 
 /// How the solution of one solve changes along each direction: all points. See contact_tangent.cpp.
@@ -59,15 +60,17 @@ void pull_back_solve(const Backward& step,
 /// @param x             all points where the objective has been minimized; its potentials stand there
 /// @param certificate   of the exact Hessian there, or none to make it
 /// @param with_forces   whether the forces that the step gives back are those of this solve
-/// @param touching      the potentials of the objective that contact forces are of
-/// @param set_tangents  of the potentials of the objective
-std::vector<std::vector<double>> push_forward_solve(const Pushforward& step,
-                                                    const solver::Objective& objective,
-                                                    const std::vector<double>& x,
-                                                    solver::Certificate certificate,
-                                                    bool with_forces,
-                                                    const std::vector<Potential*>& touching,
-                                                    const SetTangents& set_tangents);
+/// @param touching      the potentials of the objective that contact forces are of; the tangents along all
+///                      directions are in them
+/// @param set_tangents  of the other potentials
+std::vector<std::vector<double>> push_forward_solve(
+    const Pushforward& step,
+    const solver::Objective& objective,
+    const std::vector<double>& x,
+    solver::Certificate certificate,
+    bool with_forces,
+    const std::vector<contact::TouchingPotential*>& touching,
+    const SetTangents& set_tangents);
 
 /// Fold the outcome of one minimization into the report.
 void merge(const solver::Outcome& outcome, Report& report);

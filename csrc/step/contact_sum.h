@@ -1,6 +1,7 @@
 #pragma once
 
 #include <optional>
+#include <span>
 #include <utility>
 #include <vector>
 
@@ -49,8 +50,8 @@ class ContactSum {
   }
 
   /// The potentials that contact forces are of.
-  std::vector<Potential*> touching() {
-    std::vector<Potential*> potentials;
+  std::vector<contact::TouchingPotential*> touching() {
+    std::vector<contact::TouchingPotential*> potentials;
     if (objective.contact != nullptr) potentials.push_back(objective.contact);
     if (friction) potentials.push_back(&*friction);
     return potentials;
@@ -80,14 +81,22 @@ class ContactSum {
     lagged_ = contacts;
   }
 
-  /// Put the tangents of what barrier and friction depend on into them.
+  /// Put the tangents of what barrier and friction depend on into them, along each direction.
   ///
-  /// @param lag  that of the lag configuration: all points; outlives the next add_tangent()
-  void set_tangents(const Tangents& tangents, const std::vector<double>& lag) {
-    if (contact_) contact_->set_tangent(tangents.contact);
-    if (friction) {
-      friction->set_tangent(tangents.contact, tangents.moved_from().data(), lag.data());
+  /// @param lag  those of the lag configuration: all points; they outlive the next add_tangents()
+  void set_tangents(std::span<const Tangents> directions,
+                    const std::vector<std::vector<double>>& lag) {
+    if (!contact_) return;
+    std::vector<const contact::ContactModel::Bar*> of_barrier;
+    std::vector<contact::FrictionSet::Tangents> of_friction;
+    for (std::size_t l = 0; l < directions.size(); ++l) {
+      of_barrier.push_back(directions[l].changes_contact ? &directions[l].contact : nullptr);
+      of_friction.push_back({.parameters = of_barrier.back(),
+                             .start = directions[l].moved_from().data(),
+                             .lag = lag[l].data()});
     }
+    contact_->set_tangents(std::move(of_barrier));
+    if (friction) friction->set_tangents(std::move(of_friction));
   }
 
   solver::Objective objective;

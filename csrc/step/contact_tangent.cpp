@@ -33,14 +33,27 @@ struct GradientTangent {
   Array others;    ///< of the others
 };
 
-GradientTangent gradient_tangent(const solver::Objective& f,
-                                 const Array& x,
-                                 const std::vector<Potential*>& touching) {
-  GradientTangent result{.touching = Array(x.size(), 0.0), .others = Array(x.size(), 0.0)};
-  f.for_each([&](const Potential& p) {
-    const bool touches = std::ranges::find(touching, &p) != touching.end();
-    p.add_tangent(x.data(), (touches ? result.touching : result.others).data());
-  });
+std::vector<GradientTangent> gradient_tangents(
+    const Pushforward& step,
+    const solver::Objective& f,
+    const Array& x,
+    const std::vector<contact::TouchingPotential*>& touching,
+    const SetTangents& set_tangents) {
+  std::vector<GradientTangent> result;
+  std::vector<double*> of_touching;
+  for (std::size_t l = 0; l < step.directions.size(); ++l) {
+    result.push_back({.touching = Array(x.size(), 0.0), .others = Array(x.size(), 0.0)});
+    of_touching.push_back(result.back().touching.data());
+  }
+  for (const contact::TouchingPotential* p : touching) p->add_tangents(x.data(), of_touching);
+  for (std::size_t l = 0; l < step.directions.size(); ++l) {
+    step.context.checkpoint->check();
+    set_tangents(l);
+    f.for_each([&](const Potential& p) {
+      if (std::ranges::find(touching, &p) != touching.end()) return;
+      p.add_tangent(x.data(), result[l].others.data());
+    });
+  }
   return result;
 }
 
@@ -87,7 +100,7 @@ void products_with_prescribed(const solver::Objective& f,
 void add_products_with_motion(const solver::Objective& f,
                               const Array& x,
                               const std::vector<Array>& dx,
-                              const std::vector<Potential*>& touching,
+                              const std::vector<contact::TouchingPotential*>& touching,
                               std::vector<GradientTangent>& changes) {
   ProductList list;
   for (std::size_t l = 0; l < dx.size(); ++l) list.add(dx[l], changes[l].touching);
@@ -124,7 +137,7 @@ std::vector<Array> push_forward_solve(const Pushforward& step,
                                       const Array& x,
                                       solver::Certificate certificate,
                                       bool with_forces,
-                                      const std::vector<Potential*>& touching,
+                                      const std::vector<contact::TouchingPotential*>& touching,
                                       const SetTangents& set_tangents) {
   const solver::Coordinates& coordinates = *f.coordinates;
   solver::LinearSystem system(f, *step.context.workspace, *step.context.watch,
@@ -133,14 +146,9 @@ std::vector<Array> push_forward_solve(const Pushforward& step,
   certificate = certified(system, f, x, std::move(certificate), gradient);
 
   const std::size_t count = step.directions.size();
-  std::vector<GradientTangent> changes;
+  std::vector<GradientTangent> changes = gradient_tangents(step, f, x, touching, set_tangents);
   std::vector<Array> d;
-  for (std::size_t l = 0; l < count; ++l) {
-    step.context.checkpoint->check();
-    set_tangents(l);
-    changes.push_back(gradient_tangent(f, x, touching));
-    d.push_back(prescribed_tangent(step, l, x));
-  }
+  for (std::size_t l = 0; l < count; ++l) d.push_back(prescribed_tangent(step, l, x));
   std::vector<Array> b(count);
   products_with_prescribed(f, x, d, b);
   for (std::size_t l = 0; l < count; ++l) {
@@ -165,15 +173,12 @@ std::vector<Array> ContactStage::tangent(const Pushforward& step) {
   ContactSum sum(*this, step.problem, step.detection, nullptr, nullptr);
   std::vector<Array> dx;  // of the lag configuration
   for (const Tangents& tangents : step.directions) dx.push_back(tangents.start);
-  const SetTangents set_all = [&](std::size_t l) {
-    set_tangents(l);
-    sum.set_tangents(step.directions[l], dx[l]);
-  };
   TakenSolves solves(step, sum, first_factor);
   for (std::size_t k = 0; k < solves.count(); ++k) {
     solves.stand(k);
+    sum.set_tangents(step.directions, dx);
     dx = push_forward_solve(step, sum.objective, solves.x(), solves.certificate(),
-                            k + 1 == solves.count(), sum.touching(), set_all);
+                            k + 1 == solves.count(), sum.touching(), set_tangents);
   }
   return dx;
 }

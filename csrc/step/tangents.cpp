@@ -1,6 +1,7 @@
 #include "step/tangents.h"
 
 #include <algorithm>
+#include <array>
 
 namespace diffcloth::step {
 namespace {
@@ -88,6 +89,10 @@ Array predicted(const Problem& p, const Tangents& tangents) {
   return result;
 }
 
+/// What barrier and friction depend on besides points and the rest shape.
+constexpr std::array kOfContact = {Input::kBarrierDistance, Input::kSlipVelocity, Input::kThickness,
+                                   Input::kBarrierStiffness, Input::kFriction};
+
 /// Of an input that has one value for all pairs of surfaces, or one for each.
 void copy_pairs(const Problem& p, const Inputs& directions, Input input, Array& out) {
   const double* const change = directions.data(input);
@@ -131,6 +136,9 @@ Tangents::Tangents(const Problem& p, const Inputs& directions_in)
   masses = lumped(p, Input::kDensity, p.density);
   prediction = predicted(p, *this);
   fill_contact(p, *this, contact);
+  changes_contact = !rest.area.empty() || std::ranges::any_of(kOfContact, [&](Input input) {
+    return directions.data(input) != nullptr;
+  });
 }
 
 void Tangents::push_forward(Problem& p) const {

@@ -28,6 +28,7 @@ class Tangents {
   std::vector<double> masses;   ///< [N]
   std::vector<double> prediction;  ///< y, the target of inertia [3 N]
   contact::ContactModel::Bar contact;
+  bool changes_contact = false;  ///< whether that is not zero
 
   mesh::RestShapeBar rest;  ///< empty where the rest shape does not change
 

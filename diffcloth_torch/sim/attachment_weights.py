@@ -43,9 +43,9 @@ def refuse_untargeted(layout: Layout, weights: Tensor, targets: Targets | None) 
 
 
 def _are_whole(layout: Layout, targets: Targets | None) -> NDArray[np.bool_]:
-    """Which springs have both ends."""
+    """Which springs have both ends; numbers, which no transform of torch wraps."""
     springs = layout.assembly.springs
-    whole: NDArray[np.bool_] = springs.targets < 0
+    whole = np.asarray(springs.targets < 0)
     names = springs.target_groups if isinstance(targets, Tensor) else targets or ()
     for name in names:
         whole[springs.groups[name]] = True

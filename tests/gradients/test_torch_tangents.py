@@ -271,6 +271,29 @@ def test_a_jacobian_of_a_rollout_against_differences():
         assert error < 1e-4, (k, error)
 
 
+def test_jacobians_of_pickers_in_a_batch():
+    """Targets and weights of each environment, inside transforms."""
+    cloth = dc.Cloth.grid(6, 6, (0.3, 0.3), name="sheet", pins={"edge": range(6)})
+    picker = dc.Attachment(("sheet", [30, 35]), stiffness=50.0, name="picker")
+    sim = dc.Simulator(dc.Scene([cloth], attachments=[picker]), 0.01)
+    start = sim.initial_state(2)
+    targets = torch.tensor(cloth.vertices[[30, 35]]) + 0.05
+
+    def end(values):
+        weights, shift = values[:4].reshape(2, 2), values[4:].reshape(2, 1, 3)
+        control = dc.Control(
+            attachments={"picker": targets + shift}, attachment_weights={"picker": weights}
+        )
+        return sim.rollout(start, [control] * 2)[-1].positions
+
+    values = torch.cat([torch.full((4,), 0.5, dtype=F64), torch.zeros(6, dtype=F64)])
+    found, expected = torch.func.jacfwd(end)(values), torch.func.jacrev(end)(values)
+    # Both are exact: they differ by the rounding of two solves.
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-11 * float(expected.abs().max()))
+    assert found[0, ..., :2].any()
+    assert not found[0, ..., 2:4].any()
+
+
 class TestFailures:
     """With throw=False a failed environment has no tangent, and the others have theirs."""
 
