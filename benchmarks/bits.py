@@ -21,7 +21,7 @@ from torch import Tensor
 
 import diffcloth_torch as dc
 from benchmarks import coupling
-from benchmarks.scenes import BUCKLING, DT, SCENES, in_regime
+from benchmarks.scenes import BUCKLING, DT, SCENES, WOVEN, in_regime
 
 START = ("positions", "velocities", "body_poses", "body_velocities", "joint_positions")
 END = (*START, "body_forces", "joint_velocities", "joint_efforts", "base_poses", "base_velocities")
@@ -38,7 +38,7 @@ class Case:
 
 def cases(size: int) -> Iterator[Case]:
     """All regimes."""
-    for name, make in {**SCENES, **BUCKLING}.items():
+    for name, make in {**SCENES, **BUCKLING, **WOVEN}.items():
         for scheme in ("coupled", "split", "projective"):
             if scheme == "projective" and name not in ("hanging", "stiff", "plane", "sphere"):
                 continue

@@ -66,15 +66,14 @@ struct Model {
   std::vector<double> poisson;  ///< [F] nu [-]
   std::vector<double> damping;  ///< [F] k_d [s]
   // [F] each, or all of one kind empty: every face is isotropic.
-  std::vector<double> stretch_weft;   ///< k_f [N/m]
-  std::vector<double> stretch_shear;  ///< k_s of a woven face [N/m]
-  std::vector<double> bending_weft;   ///< D_f [N m]
-  std::vector<double> bending_twill;  ///< D_t [N m]
-  const std::vector<Vec2>* axes =
-      nullptr;                     ///< [F] the warp in the rest frames; where there is a weft
-  double h = 0.0;                  ///< time step [s]; only damping needs it
-  const double* x_n = nullptr;     ///< [N, 3] start of the step [m]; only damping needs it
-  double least_inertia = 0.0;      ///< smallest M / h^2 of a vertex [N/m]
+  std::vector<double> stretch_weft;         ///< k_f [N/m]
+  std::vector<double> stretch_shear;        ///< k_wf [N/m]
+  std::vector<double> bending_weft;         ///< D_f [N m]
+  std::vector<double> bending_twill;        ///< D_t [N m]
+  const std::vector<Vec2>* axes = nullptr;  ///< [F] the warp in the rest frames
+  double h = 0.0;                           ///< time step [s]; only damping needs it
+  const double* x_n = nullptr;              ///< [N, 3] start of the step [m]; only damping needs it
+  double least_inertia = 0.0;               ///< smallest M / h^2 of a vertex [N/m]
   const Elements* held = nullptr;  ///< those with a prescribed corner; only backward needs them
   Prepared prepared;               ///< filled by prepare()
 };

@@ -11,7 +11,7 @@ namespace diffcloth::elastic::orthotropic {
 
 /// Stretch energy of one woven triangle. With S = sqrt(F^T F) in material axes and e = S - I,
 ///
-///   E = A / 2 (k_w e_ww^2 + k_f e_ff^2 + 2 k_s e_wf^2),
+///   E = A / 2 (k_w e_ww^2 + k_f e_ff^2 + 2 k_wf e_wf^2),
 ///
 /// which is that of stretch.h where the three are equal. With T = A K o e, t = tr S, R the polar
 /// factor of F and J the rotation by 90 degrees,

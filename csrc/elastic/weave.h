@@ -8,9 +8,8 @@ namespace diffcloth::elastic {
 struct Weave {
   double warp;   ///< k_w [N/m]; times the area where an energy is meant
   double weft;   ///< k_f likewise
-  double shear;  ///< k_s likewise
-  Vec2
-      axis;  ///< unit vector along the warp in the rest frame; the weft lies 90 degrees to its left
+  double shear;  ///< k_wf likewise
+  Vec2 axis;     ///< unit vector along the warp in the rest frame; the weft is to its left
 
   /// Q = [warp, weft], the material axes as columns: F Q has the columns of F along them.
   Mat2 axes() const {
@@ -19,7 +18,7 @@ struct Weave {
     return Q;
   }
 
-  /// K o A, entry by entry, of a symmetric matrix in material axes: K = [[k_w, k_s], [k_s, k_f]].
+  /// K o A, entry by entry, of a symmetric matrix in material axes: K = [[k_w, k_wf], [k_wf, k_f]].
   Mat2 times(const Mat2& A) const {
     Mat2 result;
     result << warp * A(0, 0), shear * A(0, 1), shear * A(1, 0), weft * A(1, 1);

@@ -108,9 +108,8 @@ struct Scene {
   Description given;
   const Scheme* scheme;
   mesh::Topology topology;
-  std::vector<Index> face_cloth;  ///< [F]
-  std::vector<Vec2>
-      material_axes;  ///< [F] unit vector of the warp in the rest frame; empty: no weft
+  std::vector<Index> face_cloth;    ///< [F]
+  std::vector<Vec2> material_axes;  ///< [F] the warp in the rest frames; empty: no weft
   std::vector<Index> vertex_cloth;  ///< [N]
   mesh::BendingStencils stencils;
   mesh::RestShape rest;  ///< of given.rest_positions

@@ -138,6 +138,12 @@ _TAKEN_BY_THE_CORE = (
     Quantity("rest_positions", "m", (("N", 3),), "Cloth.rest_positions"),
     Quantity("attachment_stiffness", "N/m", (("A",),), "Attachment.stiffness", POSITIVE),
 )
+_OF_WOVEN_CLOTH = (
+    Quantity("stretch_weft", "N/m", _PER_FACE, "Material.stretch_weft", POSITIVE),
+    Quantity("stretch_shear", "N/m", _PER_FACE, "Material.stretch_shear", POSITIVE),
+    Quantity("bending_weft", "N m", _PER_FACE, "Material.bending_weft", NON_NEGATIVE),
+    Quantity("bending_twill", "N m", _PER_FACE, "Material.bending_twill", NON_NEGATIVE),
+)
 PARAMETERS = _table(
     *(quantity._replace(core=quantity.name) for quantity in _TAKEN_BY_THE_CORE),
     Quantity("body_mass", "kg", (("K",),), "RigidBody.mass", NON_NEGATIVE),
@@ -150,6 +156,7 @@ PARAMETERS = _table(
     Quantity("joint_damping", "N m s/rad or N s/m", _JOINTS, "Robot.damping", NON_NEGATIVE),
     Quantity("joint_viscosity", "N m s/rad or N s/m", _JOINTS, "Robot.viscosity", NON_NEGATIVE),
     Quantity("joint_armature", "kg m^2 or kg", _JOINTS, "zero", NON_NEGATIVE),
+    *(quantity._replace(core=quantity.name) for quantity in _OF_WOVEN_CLOTH),
 )
 DERIVED = (
     "coordinates",

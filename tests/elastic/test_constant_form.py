@@ -108,7 +108,7 @@ def test_the_form_is_the_sum_of_its_elements(rest, bending_model, damped, woven)
 def test_it_is_the_hessian_at_rest_out_of_plane_and_bounds_it_elsewhere(bending_model, woven):
     """Flat and undamped: no step of local/global iterations raises the energy.
 
-    Woven cloth, whose shear is softer than its yarns, exceeds the form by strains times a part of it.
+    Woven cloth whose shear is softer than its yarns exceeds the form by strains times a part.
     """
     elastic, X, _, _ = problem(False, bending_model, 0.0, woven)
     L = dense(elastic, elastic.constant_form(*NO_ANCHORS, X, X, X)["values"])

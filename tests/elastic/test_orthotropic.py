@@ -15,8 +15,8 @@ from elastic_meshes import (
     rigid,
 )
 
-K_W, K_F, K_S = 100.0, 40.0, 7.0  # [N/m]
-STRETCH = {"stretch": K_W, "stretch_weft": K_F, "stretch_shear": K_S}
+K_W, K_F, K_WF = 100.0, 40.0, 7.0  # [N/m]
+STRETCH = {"stretch": K_W, "stretch_weft": K_F, "stretch_shear": K_WF}
 ANGLE = 0.6  # of the warp to the first side
 RNG = np.random.default_rng(11)
 
@@ -39,8 +39,8 @@ def turned(angle, like):
     return torch.as_tensor(np.array([[c, -s], [s, c]]), dtype=like.dtype)
 
 
-def stretch_energy(x, X, k_w, k_f, k_s, angle):
-    """E = A / 2 (k_w e_ww^2 + k_f e_ff^2 + 2 k_s e_wf^2), e = sqrt(F^T F) - I in material axes."""
+def stretch_energy(x, X, k_w, k_f, k_wf, angle):
+    """E = A / 2 (k_w e_ww^2 + k_f e_ff^2 + 2 k_wf e_wf^2), e = sqrt(F^T F) - I in material axes."""
     first = X[1] - X[0]
     r1 = first / first.norm()
     normal = torch.linalg.cross(first, X[2] - X[0])
@@ -50,7 +50,7 @@ def stretch_energy(x, X, k_w, k_f, k_s, angle):
     F = torch.stack([x[1] - x[0], x[2] - x[0]], 1) @ torch.linalg.inv(D) @ turned(angle, x)
     values, V = torch.linalg.eigh(F.T @ F)
     e = V @ torch.diag(values.sqrt()) @ V.T - torch.eye(2, dtype=x.dtype)
-    squares = k_w * e[0, 0] ** 2 + k_f * e[1, 1] ** 2 + 2 * k_s * e[0, 1] ** 2
+    squares = k_w * e[0, 0] ** 2 + k_f * e[1, 1] ** 2 + 2 * k_wf * e[0, 1] ** 2
     return 0.25 * normal.norm() * squares
 
 
@@ -65,7 +65,7 @@ def test_energy_gradient_and_hessian_are_those_of_the_formula(state):
     x = deformed(state)
 
     def energy(x):
-        return stretch_energy(x.reshape(3, 3), X, K_W, K_F, K_S, ANGLE)
+        return stretch_energy(x.reshape(3, 3), X, K_W, K_F, K_WF, ANGLE)
 
     flat = torch.from_numpy(x).ravel()
     elastic = woven_triangle()
@@ -81,7 +81,7 @@ def test_energy_gradient_and_hessian_are_those_of_the_formula(state):
 def test_mixed_derivatives_are_those_of_the_formula(state):
     X = torch.from_numpy(TRIANGLE[0]).requires_grad_()
     x = torch.from_numpy(deformed(state)).requires_grad_()
-    k = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (K_W, K_F, K_S)]
+    k = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (K_W, K_F, K_WF)]
     z = RNG.normal(size=(3, 3))
     energy = stretch_energy(x, X, *k, ANGLE)
     (g,) = torch.autograd.grad(energy, x, create_graph=True)
@@ -186,7 +186,7 @@ def extended_energy(X, faces, x, angles):
         d = np.sqrt(ww * ff - wf * wf)
         t = np.sqrt(ww + ff + 2 * d)
         e_ww, e_ff, e_wf = (ww + d) / t - 1, (ff + d) / t - 1, wf / t
-        total += u * b2 / 4 * (K_W * e_ww**2 + K_F * e_ff**2 + 2 * K_S * e_wf**2)
+        total += u * b2 / 4 * (K_W * e_ww**2 + K_F * e_ff**2 + 2 * K_WF * e_wf**2)
     return total
 
 
@@ -215,17 +215,18 @@ def test_rigid_motion_costs_nothing(name):
 @pytest.mark.parametrize("name", MESHES)
 @pytest.mark.parametrize("direction", [0.0, 30.0, 45.0, 90.0])
 def test_uniaxial_stretch_has_the_traction_of_the_law(name, direction):
-    """A stretch s along x, the warp at an angle to x, has in its own axes the strain s n n^T.
+    """A strain e along x, with the warp at an angle phi to it, has a traction along x of
 
-    Its traction along x is  s (k_w c^4 + k_f s^4 + 2 k_s c^2 s^2): k_w along the warp, k_f along the
-    weft, (k_w + k_f + 2 k_s) / 4 along the bias.
+    e (k_w c^4 + k_f s^4 + 2 k_wf c^2 s^2),  c = cos phi,  s = sin phi:
+
+    k_w along the warp, k_f along the weft, (k_w + k_f + 2 k_wf) / 4 along the bias.
     """
     X, faces = MESHES[name](5, 4)
     phi, s = np.radians(direction), 0.2
     elastic = model(X, faces, angles=angles_along(X, faces, phi), **STRETCH)
     g = elastic.gradient(np.ascontiguousarray(X * [1 + s, 1.0, 1.0]))
     c2, s2 = np.cos(phi) ** 2, np.sin(phi) ** 2
-    traction = s * (K_W * c2**2 + K_F * s2**2 + 2 * K_S * c2 * s2)
+    traction = s * (K_W * c2**2 + K_F * s2**2 + 2 * K_WF * c2 * s2)
     area = elastic.rest()["area"].sum()
     # Virtual work of the displacement x, which has strain one: area times traction.
     assert (g[:, 0] * X[:, 0]).sum() == pytest.approx(area * traction, rel=1e-10)
@@ -233,13 +234,41 @@ def test_uniaxial_stretch_has_the_traction_of_the_law(name, direction):
 
 @pytest.mark.parametrize("name", MESHES)
 def test_shear_between_warp_and_weft_has_its_own_stiffness(name):
-    """S = I + gamma (w f^T + f w^T) costs k_s gamma^2 an area, whatever the other two are."""
+    """S = I + gamma (w f^T + f w^T) costs k_wf gamma^2 an area, whatever the other two are."""
     X, faces = MESHES[name](5, 4)
     gamma = 0.1
     elastic = model(X, faces, angles=angles_along(X, faces, 0.0), **STRETCH)
     S = np.array([[1.0, gamma, 0], [gamma, 1, 0], [0, 0, 1]])
     area = elastic.rest()["area"].sum()
-    assert elastic.energy(X @ S) == pytest.approx(area * K_S * gamma**2, rel=1e-10)
+    assert elastic.energy(X @ S) == pytest.approx(area * K_WF * gamma**2, rel=1e-10)
+
+
+@pytest.mark.parametrize("name", MESHES)
+@pytest.mark.parametrize("direction", [0.0, 30.0, 45.0, 90.0])
+def test_a_strip_that_may_contract_has_the_compliance_of_the_law(name, direction):
+    """A tension T along x alone strains along x by T (c^4 / k_w + s^4 / k_f + 2 c^2 s^2 / k_wf).
+
+    In material axes e_ww = T c^2 / k_w, e_ff = T s^2 / k_f, e_wf = -T c s / k_wf: on the bias it is
+    shear that gives way. No vertex but those at the ends has a force on it.
+    """
+    X, faces = MESHES[name](6, 5)
+    phi, tension = np.radians(direction), 1e-5 * K_F
+    c, s = np.cos(phi), np.sin(phi)
+    Q = np.array([[c, -s], [s, c]])
+    e = np.array([[c * c / K_W, -c * s / K_WF], [-c * s / K_WF, s * s / K_F]])
+    e = tension * Q @ e @ Q.T
+    law = c**4 / K_W + s**4 / K_F + 2 * (c * s) ** 2 / K_WF
+    assert e[0, 0] == pytest.approx(tension * law)
+    elastic = model(X, faces, angles=angles_along(X, faces, phi), **STRETCH)
+    x = X.copy()
+    x[:, :2] += X[:, :2] @ e
+    # The weak form of the stress T along x.
+    expected = np.zeros_like(X)
+    for face in faces:
+        for k in range(3):
+            edge = X[face[(k + 2) % 3]] - X[face[(k + 1) % 3]]
+            expected[face[k], 0] -= 0.5 * tension * edge[1]
+    np.testing.assert_allclose(elastic.gradient(x), expected, atol=1e-3 * tension)
 
 
 D_W, D_F, D_T, NU = 1.0, 0.4, 0.6, 0.3  # [N m], [-]

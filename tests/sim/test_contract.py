@@ -35,14 +35,18 @@ PUBLIC = {
     "InfeasibleMotion": "",
     "IntersectingState": "",
     "InvalidInput": "",
-    "Material": "stretch bending poisson density damping friction thickness",
+    "Material": (
+        "stretch bending poisson density damping friction thickness stretch_weft stretch_shear "
+        "bending_weft bending_twill is_orthotropic per_face"
+    ),
     "NotConverged": "",
     "TurnedTooFar": "",
     "Parameters": (
         "stretch bending poisson density damping friction thickness barrier_stiffness "
         "barrier_distance slip_velocity pin_stiffness gravity rest_positions attachment_stiffness "
         "body_mass body_center body_inertia link_mass link_center link_inertia joint_stiffness "
-        "joint_damping joint_viscosity joint_armature replace"
+        "joint_damping joint_viscosity joint_armature stretch_weft stretch_shear "
+        "bending_weft bending_twill replace"
     ),
     "Report": "select stack where",
     "RigidBody": "load box sphere capsule cylinder plane",
@@ -67,6 +71,7 @@ PUBLIC = {
     "Variable": "",
     "residuals": "markers outline point_cloud",
     "envs": "make TASKS ClothVectorEnv Task",
+    "fabrics": "MEASUREMENTS Measurement material",
     "learn": "Policy Processes Ranks RayActors Trainer TrainerOptions",
     "robots": "GRIPPER panda",
     "stack": "",
@@ -216,6 +221,10 @@ def test_parameters_that_the_scene_lacks_are_none_and_refused():
         assert getattr(parameters, name) is None
     assert parameters.pin_stiffness is None
     assert parameters.poisson is None
+    for name in ("stretch_weft", "stretch_shear", "bending_weft", "bending_twill"):
+        assert getattr(parameters, name) is None
+        with pytest.raises(dc.InvalidInput, match=f"`{name}` must be None"):
+            sim.step(sim.initial_state(), None, parameters.replace(**{name: 0.1}))
     with pytest.raises(dc.InvalidInput, match="`friction` must be None"):
         sim.step(sim.initial_state(), None, parameters.replace(friction=0.1))
 
