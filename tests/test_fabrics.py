@@ -70,5 +70,5 @@ def test_an_unknown_one_is_refused():
         dc.fabrics.material("tweed")
     with pytest.raises(dc.InvalidInput, match="`fabric` must be "):
         validate(MaterialSection, {"fabric": "tweed"}, "here")
-    with pytest.raises(dc.InvalidInput, match="Material: `density` must be > 0"):
+    with pytest.raises(dc.InvalidInput, match="Material: `density` must be finite and > 0"):
         dc.fabrics.material("denim", density=-1.0)

@@ -112,8 +112,9 @@ def _rigid_values(assembly: Assembly) -> dict[str, FloatArray]:
 def _material_values(scene: Scene, field: str) -> FloatArray:
     """One value if all cloths agree, one per cloth if each is uniform, else one per face."""
     values = [cloth.material.per_face(field) for cloth in scene.cloths]
-    if all(isinstance(value, float) for value in values):
-        return _shortest(values)
+    numbers = [value for value in values if isinstance(value, float)]
+    if len(numbers) == len(values):
+        return _shortest(numbers)
     counts = [len(cloth.faces) for cloth in scene.cloths]
     parts = [np.broadcast_to(v, n) for v, n in zip(values, counts, strict=True)]
     return np.concatenate(parts)
