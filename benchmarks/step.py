@@ -2,6 +2,7 @@
 
     python -m benchmarks.step                                    # all of it: long
     python -m benchmarks.step --scene sphere --size 24 --size 48
+    python -m benchmarks.step --scene sphere --scene woven-sphere --size 24
     python -m benchmarks.step --quick                            # seconds
     python -m benchmarks.step --scene hanging --scene air        # what a potential costs
 
@@ -58,7 +59,7 @@ def main(
     quick: bool,
     out: Path | None,
 ) -> None:
-    names = scenes or tuple(SCENES)
+    names = scenes or tuple(TIMED)
     given = tuple(sorted(sizes)) or ((6, 8) if quick else SIZES)
     batch_size = max(given) if quick else BATCH_SIZE
     rows: list[Row] = [(name, size, 0, threads) for name in names for size in given]

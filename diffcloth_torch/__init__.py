@@ -30,7 +30,7 @@ from diffcloth_torch._saved import let_saved_states_load, register_classes
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from diffcloth_torch import envs, learn, robots
+    from diffcloth_torch import envs, fabrics, learn, robots
     from diffcloth_torch.errors import (
         AddedMassWarning,
         IgnoredLimitsWarning,
@@ -95,6 +95,7 @@ __all__ = [
     "build_info",
     "descend",
     "envs",
+    "fabrics",
     "fit",
     "learn",
     "load_config",
@@ -190,7 +191,7 @@ def __getattr__(name: str) -> Any:
         from importlib.metadata import version
 
         return version("diffcloth-torch")
-    if name in ("envs", "learn", "robots"):
+    if name in ("envs", "fabrics", "learn", "robots"):
         return import_module(f"diffcloth_torch.{name}")
     if name == "residuals":
         return import_module("diffcloth_torch.optimize.residuals")

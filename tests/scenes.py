@@ -87,14 +87,16 @@ def turned(vertices, axis, angle):
     return vertices @ (np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K).T
 
 
-def material(faces, seed=0, *, friction=0.5, thickness=0.0, damping=0.002, stretch=300.0):
+def material(
+    faces, seed=0, *, friction=0.5, thickness=0.0, damping=0.002, stretch=300.0, woven=False
+):
     """Values that differ from face to face, so that no gradient is spread by accident."""
     rng = np.random.default_rng(seed)
 
     def spread(value):
         return value * rng.uniform(0.8, 1.2, len(faces))
 
-    return dc.Material(
+    plain = dc.Material(
         stretch=spread(stretch),
         bending=spread(1e-3),
         poisson=spread(0.25),
@@ -105,6 +107,20 @@ def material(faces, seed=0, *, friction=0.5, thickness=0.0, damping=0.002, stret
         normal_drag=spread(1.5),
         tangential_drag=spread(0.3),
     )
+    if not woven:
+        return plain
+    return replace(
+        plain,
+        stretch_weft=spread(0.6 * stretch),
+        stretch_shear=spread(0.15 * stretch),
+        bending_weft=spread(6e-4),
+        bending_twill=spread(9e-4),
+    )
+
+
+def warp(faces, woven, seed=21):
+    """Directions that differ from face to face; None where the cloth is not woven."""
+    return noise((len(faces), 3), 1.0, seed) * [1.0, 1.0, 0.1] if woven else None
 
 
 def simulator(
@@ -146,7 +162,7 @@ def settled(sim, state, steps, control=None, *, velocity=None, hold=None):
 # --- Free flight ---------------------------------------------------------------------------------
 
 
-def hanging(curved=False, model="patch", **options):
+def hanging(curved=False, model="patch", woven=False, **options):
     """A sheet in the air with hard and soft pins; its rest shape is flat, or a shallow bowl."""
     vertices, faces = grid(6, 6)
     placed = turned(vertices, (1, 0.3, 0.2), 1.1)
@@ -158,11 +174,12 @@ def hanging(curved=False, model="patch", **options):
         placed,
         faces,
         rest_positions=rest,
-        material=material(faces),
+        material=material(faces, woven=woven),
         pins={"corner": [0, 5]},
         soft_pins={"row": [30, 32, 35]},
         pin_stiffness=200.0,
         bending_model=model,
+        directions=warp(faces, woven),
     )
     sim = simulator([cloth], **options)
     state = sim.initial_state()
@@ -180,7 +197,16 @@ def hanging(curved=False, model="patch", **options):
 
 
 def on_box(
-    friction, velocity, *, thickness=0.0, pins=None, steps=6, above=0.008, moving=False, **options
+    friction,
+    velocity,
+    *,
+    thickness=0.0,
+    pins=None,
+    steps=6,
+    above=0.008,
+    moving=False,
+    woven=False,
+    **options,
 ):
     """A sheet that lies on a box, slightly tilted, with its rim in the air."""
     vertices, faces = grid(6, 6, seed=3)
@@ -197,7 +223,8 @@ def on_box(
     cloth = dc.Cloth(
         placed,
         faces,
-        material=material(faces, friction=friction, thickness=1.4 * thickness),
+        material=material(faces, friction=friction, thickness=1.4 * thickness, woven=woven),
+        directions=warp(faces, woven),
         pins=pins,
         soft_pins={"free": [35]},
         pin_stiffness=2.0,
@@ -320,10 +347,10 @@ def folded(thickness=0.0, **options):
     return Case(sim, state.replace(velocities=v), {"forces": tensor_noise(v.shape, 0.001, 5)})
 
 
-def stacked(dragged=False, **options):
+def stacked(dragged=False, woven=False, **options):
     """One cloth slides on another, softly pinned one; densities and thicknesses differ.
 
-    Where it is dragged, pins over the lower one move it.
+    Where it is dragged, pins over the lower one move it. The lower one may be woven.
     """
     lower, faces = grid(6, 6, seed=11)
     upper, upper_faces = grid(5, 5, edge=0.09, seed=12)
@@ -332,7 +359,8 @@ def stacked(dragged=False, **options):
         dc.Cloth(
             lower,
             faces,
-            material=material(faces, friction=0.4, thickness=0.004),
+            material=material(faces, friction=0.4, thickness=0.004, woven=woven),
+            directions=warp(faces, woven),
             soft_pins={"all": range(36)},
             pin_stiffness=100.0,
         ),
@@ -401,6 +429,10 @@ REGIMES = {
     "dragged": lambda **o: stacked(dragged=True, **o),
     "sphere": on_sphere,
     "poking": poking,
+    "woven": lambda **o: hanging(curved=True, woven=True, **o),
+    "woven_flat": lambda **o: hanging(woven=True, **o),
+    "woven_pinned": lambda **o: pinned(woven=True, **o),
+    "woven_stacked": lambda **o: stacked(woven=True, **o),
 }
 
 

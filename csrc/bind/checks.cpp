@@ -67,6 +67,18 @@ std::size_t squares_of_coordinates(const step::Scene& scene) {
   return result;
 }
 
+/// Inputs of woven cloth go in pairs, and only where the scene knows its axes.
+void check_woven(const step::Scene& scene, const step::Inputs& inputs) {
+  using step::Input;
+  const auto has = [&](Input input) { return inputs.data(input) != nullptr; };
+  require(has(Input::kStretchWeft) == has(Input::kStretchShear),
+          "`stretch_weft` and `stretch_shear` must be given together");
+  require(has(Input::kBendingWeft) == has(Input::kBendingTwill),
+          "`bending_weft` and `bending_twill` must be given together");
+  require(!(has(Input::kStretchWeft) || has(Input::kBendingWeft)) || !scene.material_axes.empty(),
+          "`stretch_weft` and `bending_weft` need a scene with `material_axes`");
+}
+
 /// Whether a step of the scene needs an input, given which others there are.
 bool is_needed(const step::Scene& scene, const step::Inputs& inputs, const step::InputRow& row) {
   switch (row.need) {
@@ -99,6 +111,8 @@ void check_description(const step::Description& d) {
   check_faces("faces", d.faces, vertices);
   check_starts("cloth_vertex_start", d.cloth_vertex_start, cloths, vertices);
   check_starts("cloth_face_start", d.cloth_face_start, cloths, d.faces.size());
+  require(d.material_axes.empty() || d.material_axes.size() == 2 * d.faces.size(),
+          "`material_axes` must have the shape [F, 2]");
   check_indices("pins", d.pins, static_cast<Index>(vertices));
   check_indices("soft_pins", d.soft_pins, static_cast<Index>(vertices));
   require(d.bodies.vertices.size() % 3 == 0 && !d.bodies.vertex_start.empty(),
@@ -176,6 +190,7 @@ std::vector<std::size_t> accepted_counts(const step::Scene& scene, Extent extent
 }
 
 void check_inputs(const step::Scene& scene, const step::Inputs& inputs) {
+  check_woven(scene, inputs);
   for (const step::InputRow& row : step::kInputTable) {
     const step::View& view = inputs[row.input];
     const bool absent = view.data == nullptr && view.count == 0;

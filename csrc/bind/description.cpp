@@ -147,6 +147,7 @@ void take_surfaces(NamedFields& fields, step::Description& d) {
   for (const std::string& model : fields.take<Names>("bending_models")) {
     d.bending_models.push_back(choose<mesh::BendingModel>("bending_models", kBendingModels, model));
   }
+  if (fields.has("material_axes")) d.material_axes = fields.doubles("material_axes");
   d.pins = fields.indices("pins");
   d.soft_pins = fields.indices("soft_pins");
   d.bodies = {.vertices = fields.doubles("body_vertices"),

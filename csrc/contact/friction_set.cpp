@@ -52,7 +52,7 @@ void turn_with(const std::array<Index, 3>& frame, Entry& entry) {
 /// The change of s with z, at a frame.
 Vec3 change_of_slip(const Entry& k, const Frame& frame, const double* z) {
   const Frame edges(k, z);
-  return gap(k, z) - k.a[0] * edges.e1 - k.a[1] * edges.e2 -
+  return k.gap(z) - k.a[0] * edges.e1 - k.a[1] * edges.e2 -
          k.a[2] * (edges.e1.cross(frame.e2) + frame.e1.cross(edges.e2));
 }
 

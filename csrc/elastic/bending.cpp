@@ -52,7 +52,7 @@ struct BodyState {
 BodyState body_state(const Element& element, const double* x) {
   BodyState state;
   state.frame = frame(base_gradient(element, x));
-  state.Q = element.weight * form(element.poisson);
+  state.Q = element.weight * element.form;
   state.curvature = state.frame.R.transpose() * second_derivatives(element, x);
   state.q = (state.curvature - *element.b) * state.Q;
   state.tau = sum_of_crosses(*element.b, state.q);
@@ -169,18 +169,6 @@ BaseBlocks geometric_blocks(const Element& element, const BodyState& state) {
 
 }  // namespace
 
-Mat3 form(double poisson) {
-  Mat3 Q;
-  Q << 1.0, 0.0, poisson, 0.0, 2.0 * (1.0 - poisson), 0.0, poisson, 0.0, 1.0;
-  return Q;
-}
-
-Mat3 form_derivative() {
-  Mat3 Q;
-  Q << 0.0, 0.0, 1.0, 0.0, -2.0, 0.0, 1.0, 0.0, 0.0;
-  return Q;
-}
-
 Mat3 body_curvature(const Element& element, const double* x) {
   return frame(base_gradient(element, x)).R.transpose() * second_derivatives(element, x);
 }
@@ -188,13 +176,13 @@ Mat3 body_curvature(const Element& element, const double* x) {
 double energy(const Element& element, const double* x) {
   const Mat3 s =
       element.flat ? second_derivatives(element, x) : Mat3(body_curvature(element, x) - *element.b);
-  return 0.5 * element.weight * (s * form(element.poisson)).cwiseProduct(s).sum();
+  return 0.5 * element.weight * (s * element.form).cwiseProduct(s).sum();
 }
 
 double energy_change(const Element& element, const double* x0, const double* x1) {
   const Mat3 Y0 = second_derivatives(element, x0);
   const Mat3 dY = second_derivatives_change(element, x0, x1);
-  const Mat3 Q = element.weight * form(element.poisson);
+  const Mat3 Q = element.weight * element.form;
   if (element.flat) return 0.5 * ((2.0 * Y0 + dY) * Q).cwiseProduct(dY).sum();
 
   const Mat3 R0 = frame(base_gradient(element, x0)).R;
@@ -211,7 +199,7 @@ double energy_change(const Element& element, const double* x0, const double* x1)
 
 void add_gradient(const Element& element, const double* x, double* g) {
   if (element.flat) {
-    const Mat3 q = second_derivatives(element, x) * (element.weight * form(element.poisson));
+    const Mat3 q = second_derivatives(element, x) * (element.weight * element.form);
     for (Index i = 0; i < element.size(); ++i) {
       Eigen::Map<Vec3>(g + 3 * element.vertices[i]) += q * element.weights(i);
     }
@@ -270,7 +258,7 @@ void add_hessian(const Element& element,
 }
 
 void add_constant(const Element& element, std::span<const Index> slots, double* constant) {
-  const Mat3 Q = element.weight * form(element.poisson);
+  const Mat3 Q = element.weight * element.form;
   for (Index i = 0; i < element.size(); ++i) {
     const Vec3 Qc = Q * element.weights(i);
     for (Index j = 0; j <= i; ++j) {
@@ -290,10 +278,14 @@ void add_hessian_product(const Element& element, const double* x, const double* 
   scatter(element, R * change.dq_total(), R * change.V, y);
 }
 
-ScalarBars constant_mixed(const Element& element, const double* u, const double* z, double* c_bar) {
+ScalarBars constant_mixed(const Element& element,
+                          FormDerivatives derivatives,
+                          const double* u,
+                          const double* z,
+                          double* c_bar) {
   const Mat3 Y_u = second_derivatives(element, u);
   const Mat3 Y_z = second_derivatives(element, z);
-  const Mat3 Q = form(element.poisson);
+  const Mat3& Q = element.form;
   if (c_bar != nullptr) {
     const Index v0 = element.vertices[0];
     const Mat3 q_u = element.weight * Q * Y_u.transpose();
@@ -304,14 +296,22 @@ ScalarBars constant_mixed(const Element& element, const double* u, const double*
           q_u * (row(z, v) - row(z, v0)) + q_z * (row(u, v) - row(u, v0));
     }
   }
-  return {.weight = (Y_u * Q).cwiseProduct(Y_z).sum(),
-          .poisson = element.weight * (Y_u * form_derivative()).cwiseProduct(Y_z).sum()};
+  ScalarBars result;
+  result.weight = (Y_u * Q).cwiseProduct(Y_z).sum();
+  for (std::size_t k = 0; k < derivatives.size(); ++k) {
+    result.form[k] = element.weight * (Y_u * derivatives[k]).cwiseProduct(Y_z).sum();
+  }
+  return result;
 }
 
 // By body_state(), d phi = <q, R^T dY - db> - tau . w. Where b = 0 the frame drops out, as it does in
 // energy(), but not of the derivative by b.
-ScalarBars energy_bars(
-    Element element, const double* x, double seed, const GeometryBars& bars, double* x_bar) {
+ScalarBars energy_bars(Element element,
+                       FormDerivatives derivatives,
+                       const double* x,
+                       double seed,
+                       const GeometryBars& bars,
+                       double* x_bar) {
   element.weight *= seed;
   element.damping = 0.0;
   const BodyState state = body_state(element, x);
@@ -324,8 +324,12 @@ ScalarBars energy_bars(
     *bars.b -= state.q;
     scatter_geometry(element, Y_bar, F_bar, x, bars);
   }
-  return {.weight = 0.5 * seed * (s * form(element.poisson)).cwiseProduct(s).sum(),
-          .poisson = 0.5 * element.weight * (s * form_derivative()).cwiseProduct(s).sum()};
+  ScalarBars result;
+  result.weight = 0.5 * seed * (s * element.form).cwiseProduct(s).sum();
+  for (std::size_t k = 0; k < derivatives.size(); ++k) {
+    result.form[k] = 0.5 * element.weight * (s * derivatives[k]).cwiseProduct(s).sum();
+  }
+  return result;
 }
 
 // phi = z . grad E = weight [ <s Q, ds> + damping <s_n Q, ds_n> ] with ds the change of s along z:
@@ -333,29 +337,36 @@ ScalarBars energy_bars(
 // (Y, F) is the change of (dE/dY, dE/dF) along z, and that with respect to (Y(z), F(z)) is
 // (dE/dY, dE/dF). What depends on b: db -> -dq . db + (w x q) . db.
 ScalarBars mixed(const Element& element,
+                 FormDerivatives derivatives,
                  const double* x,
                  const double* x_n,
                  const double* z,
                  const GeometryBars& bars) {
   const bool with_rest = bars.c != nullptr;
-  if (element.flat && x_n == nullptr && !with_rest) return constant_mixed(element, x, z, nullptr);
+  if (element.flat && x_n == nullptr && !with_rest) {
+    return constant_mixed(element, derivatives, x, z, nullptr);
+  }
   const BodyState state = body_state(element, x);
   const BodyChange change = body_change(element, state, z);
   const Mat3& R = state.frame.R;
 
-  const Mat3 Q = form(element.poisson);
-  const Mat3 dQ = form_derivative();
+  const Mat3& Q = element.form;
   const Mat3 s = state.curvature - *element.b;
   ScalarBars result;
   result.weight = (s * Q).cwiseProduct(change.ds).sum();
-  result.poisson = element.weight * (s * dQ).cwiseProduct(change.ds).sum();
+  for (std::size_t k = 0; k < derivatives.size(); ++k) {
+    result.form[k] = element.weight * (s * derivatives[k]).cwiseProduct(change.ds).sum();
+  }
   if (x_n != nullptr) {
     // Also where the damping is zero, whose derivative is not.
     const Mat3 s_n = state.curvature - *element.b_n;
     const Mat3 ds_n = change.ds + cross_columns(change.w, *element.b - *element.b_n);
     const double work_n = (s_n * Q).cwiseProduct(ds_n).sum();
     result.weight += element.damping * work_n;
-    result.poisson += element.weight * element.damping * (s_n * dQ).cwiseProduct(ds_n).sum();
+    for (std::size_t k = 0; k < derivatives.size(); ++k) {
+      const double work = (s_n * derivatives[k]).cwiseProduct(ds_n).sum();
+      result.form[k] += element.weight * element.damping * work;
+    }
     result.damping = element.weight * work_n;
   }
 
@@ -401,9 +412,8 @@ Mat3 start_curvature_change(const Element& element,
 }  // namespace
 
 void add_constant_tangent(const Element& element, const double* u, const Tangents& dot, double* y) {
-  const Mat3 Q = element.weight * form(element.poisson);
-  const Mat3 dQ =
-      dot.weight * form(element.poisson) + element.weight * dot.poisson * form_derivative();
+  const Mat3 Q = element.weight * element.form;
+  const Mat3 dQ = dot.weight * element.form + element.weight * dot.form;
   const Mat3 Y = second_derivatives(element, u);
   Mat3 dq = Y * dQ;
   Element moved = element;
@@ -423,8 +433,7 @@ void add_constant_tangent(const Element& element, const double* u, const Tangent
 void add_tangent(
     const Element& element, const double* x, const double* x_n, const Tangents& dot, double* y) {
   const bool with_rest = dot.c != nullptr;
-  const Mat3 dQ =
-      dot.weight * form(element.poisson) + element.weight * dot.poisson * form_derivative();
+  const Mat3 dQ = dot.weight * element.form + element.weight * dot.form;
   if (element.flat && !with_rest && dot.damping == 0.0) {
     const Mat3 q = second_derivatives(element, x) * dQ;
     for (Index i = 0; i < element.size(); ++i) {

@@ -1,8 +1,10 @@
 #pragma once
 
+#include <array>
 #include <span>
 
 #include "common/types.h"
+#include "elastic/bending_form.h"
 #include "elastic/frame.h"
 
 namespace diffcloth::elastic::bending {
@@ -11,17 +13,15 @@ namespace diffcloth::elastic::bending {
 /// the base triangle, its curvature in the frame it carries along is R^T Y, and
 ///
 ///   E = weight / 2 [ <s Q, s> + damping <s_n Q, s_n> ],   s = R^T Y - b,  s_n = R^T Y - b_n,
-///   <s Q, s> = |s_uu + s_vv|^2 - 2 (1 - nu) (s_uu . s_vv - |s_uv|^2),
-///
-/// b the rest curvature and b_n the curvature at the start of the step: both terms are exactly
+/// Q a form of bending_form.h, b the rest curvature and b_n the curvature at the start of the step: both terms are exactly
 /// invariant under rigid motion. Where b = 0 and damping = 0 the energy is quadratic in x. In a
 /// hinge only the row uu is not zero, and nu has no effect.
 struct Element {
   std::span<const Index> vertices;  ///< the base triangle first
   const double* c;                  ///< 3 a vertex: c_uu, c_uv, c_vv [1/m^2]
   const mesh::ShapeGradient* g;     ///< of the base triangle
-  double weight;                    ///< D A [N m^3]
-  double poisson;                   ///< nu [-]
+  double weight;                    ///< D A [N m^3], or A [m^2] where D is in the form
+  Mat3 form;                        ///< Q
   double damping;                   ///< k_d / h [-]
   const Mat3* b;                    ///< rest curvature [1/m]
   const Mat3* b_n;                  ///< curvature at the start of the step [1/m]
@@ -30,10 +30,6 @@ struct Element {
   Eigen::Map<const Vec3> weights(Index i) const { return Eigen::Map<const Vec3>(c + 3 * i); }
   Index size() const { return static_cast<Index>(vertices.size()); }
 };
-
-/// The quadratic form Q on (uu, uv, vv), and its derivative with respect to nu.
-Mat3 form(double poisson);
-Mat3 form_derivative();
 
 /// Curvature R^T Y in the frame that the base triangle carries along.
 Mat3 body_curvature(const Element& element, const double* x);
@@ -62,15 +58,22 @@ void add_constant(const Element& element, std::span<const Index> slots, double* 
 /// y += H z.
 void add_hessian_product(const Element& element, const double* x, const double* z, double* y);
 
+/// Derivatives of the form of an element by the numbers that it is made of, at most four.
+using FormDerivatives = std::span<const Mat3>;
+
 /// Cotangents of the parameters of an element for phi = z . grad E.
 struct ScalarBars {
   double weight = 0.0;
-  double poisson = 0.0;
   double damping = 0.0;
+  std::array<double, 4> form{};  ///< of the numbers of the form
 };
 
 /// Cotangents for phi = weight <Y(u) Q, Y(z)>, the form of add_constant(); c_bar may be null.
-ScalarBars constant_mixed(const Element& element, const double* u, const double* z, double* c_bar);
+ScalarBars constant_mixed(const Element& element,
+                          FormDerivatives derivatives,
+                          const double* u,
+                          const double* z,
+                          double* c_bar);
 
 /// Where the cotangents of the geometry of an element are added. Null pointers are skipped.
 struct GeometryBars {
@@ -83,11 +86,16 @@ struct GeometryBars {
 /// Cotangents for phi = seed E, without damping; bars.x_n stays as it is.
 ///
 /// @param x_bar  += d phi / dx, [N, 3]
-ScalarBars energy_bars(
-    Element element, const double* x, double seed, const GeometryBars& bars, double* x_bar);
+ScalarBars energy_bars(Element element,
+                       FormDerivatives derivatives,
+                       const double* x,
+                       double seed,
+                       const GeometryBars& bars,
+                       double* x_bar);
 
 /// @param x_n  start of the step, or null where there is none (then element.b_n is not read)
 ScalarBars mixed(const Element& element,
+                 FormDerivatives derivatives,
                  const double* x,
                  const double* x_n,
                  const double* z,
@@ -96,8 +104,8 @@ ScalarBars mixed(const Element& element,
 /// Tangents of the parameters and the geometry of an element; null pointers are zero.
 struct Tangents {
   double weight = 0.0;
-  double poisson = 0.0;
   double damping = 0.0;
+  Mat3 form = Mat3::Zero();
   const double* c = nullptr;               ///< 3 a vertex; with it g and b
   const mesh::ShapeGradient* g = nullptr;  ///< of the base triangle
   const Mat3* b = nullptr;

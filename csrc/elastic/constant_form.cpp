@@ -2,6 +2,7 @@
 
 #include "elastic/bending.h"
 #include "elastic/elements.h"
+#include "elastic/form_numbers.h"
 
 namespace diffcloth::elastic {
 namespace {
@@ -12,6 +13,34 @@ double face_factor(const Model& model, Index f) {
 }
 
 double element_factor(const Model& model, Index e) { return 1.0 + model.prepared.damping[e]; }
+
+/// F diag(k_w, k_f) in material axes: the warp resists what its own yarns do, the weft likewise. Shear
+/// adds nothing, which leaves L linear in the stiffnesses; where it is no stiffer than the yarns, the
+/// Hessian stays below L.
+Mat32 constant_stress(const Weave& k, const Mat32& F) {
+  const Mat2 Q = k.axes();
+  return F * Q * Vec2(k.warp, k.weft).asDiagonal() * Q.transpose();
+}
+
+void add_woven_constant_mixed(
+    const Model& model, Index f, const double* u, const double* z, bool with_rest, Bar& bar) {
+  const Weave k = weave(model, f);
+  const double area = model.rest->area[f];
+  const double factor = face_factor(model, f);
+  const Mat32 F_u = face_gradient(model, f, u);
+  const Mat32 F_z = face_gradient(model, f, z);
+  const Mat2 work = k.axes().transpose() * F_u.transpose() * F_z * k.axes();
+  const double total = k.warp * work(0, 0) + k.weft * work(1, 1);
+  bar.stretch[f] += area * factor * work(0, 0);
+  bar.stretch_weft[f] += area * factor * work(1, 1);
+  if (model.h > 0.0) bar.damping[f] += area / model.h * total;
+  if (!with_rest) return;
+  bar.rest.area[f] += factor * total;
+  mesh::ShapeGradient& g_bar = bar.rest.shape_gradient[f];
+  const Weave weight = k.scaled(area * factor);
+  scatter_gradient_bar(model, f, constant_stress(weight, F_z), u, g_bar);
+  scatter_gradient_bar(model, f, constant_stress(weight, F_u), z, g_bar);
+}
 
 void add_constant_mixed(
     const Model& model, Index f, const double* u, const double* z, bool with_rest, Bar& bar) {
@@ -33,25 +62,46 @@ void add_constant_mixed(
 void add_element_mixed(
     const Model& model, Index e, const double* u, const double* z, bool with_rest, Bar& bar) {
   const double factor = element_factor(model, e);
-  bending::Element element = bending_element(model, e);
+  bending::Element element = differentiable_element(model, e);
   element.weight *= factor;
   double* const c_bar =
       with_rest ? bar.rest.curvature_operator.data() + 3 * model.stencils->start[e] : nullptr;
-  const bending::ScalarBars scalar = bending::constant_mixed(element, u, z, c_bar);
-  add_to_faces(model, e, scalar.weight * factor * model.rest->bending_area[e], bar.bending);
-  add_to_faces(model, e, scalar.poisson, bar.poisson);
+  const FormNumbers numbers(model, e);
+  bending::ScalarBars scalar = bending::constant_mixed(element, numbers.derivatives(), u, z, c_bar);
   if (model.h > 0.0) {
-    add_to_faces(model, e, scalar.weight * model.prepared.bending[e] / model.h, bar.damping);
+    const double stiffness = element_stiffness(model, e) * model.rest->bending_area[e];
+    add_to_faces(model, e, scalar.weight * stiffness / model.h, bar.damping);
   }
-  if (with_rest) {
-    bar.rest.bending_area[e] += scalar.weight * factor * element_mean(model, e, model.bending);
-  }
+  scalar.weight *= factor;
+  add_weight_bars(model, e, scalar, with_rest, bar);
 }
 
-/// y_p += P g_p over the corners of a face.
-void scatter(const Model& model, Index f, const Mat32& P, const mesh::ShapeGradient& g, double* y) {
-  for (int p = 0; p < 3; ++p) {
-    Eigen::Map<Vec3>(y + 3 * model.topology->faces[f][p]) += P * g.row(p).transpose();
+void add_woven_constant_tangent(const Model& model,
+                                Index f,
+                                const double* u,
+                                const Bar& dot,
+                                const Changing& changing,
+                                double* y) {
+  const Weave k = weave(model, f);
+  const double area = model.rest->area[f];
+  const double factor = face_factor(model, f);
+  const Mat32 F_u = face_gradient(model, f, u);
+  Weave change = k.scaled(0.0);
+  if (changing.materials) {
+    const double factor_dot = model.h > 0.0 ? dot.damping[f] / model.h : 0.0;
+    change.warp += area * (factor * dot.stretch[f] + factor_dot * k.warp);
+    change.weft += area * (factor * dot.stretch_weft[f] + factor_dot * k.weft);
+  }
+  Mat32 F_dot = Mat32::Zero();
+  if (changing.rest) {
+    change.warp += factor * dot.rest.area[f] * k.warp;
+    change.weft += factor * dot.rest.area[f] * k.weft;
+    F_dot = face_gradient(model, f, dot.rest.shape_gradient[f], u);
+  }
+  const Weave weight = k.scaled(area * factor);
+  scatter(model, f, constant_stress(change, F_u) + constant_stress(weight, F_dot), y);
+  if (changing.rest) {
+    scatter(model, f, constant_stress(weight, F_u), dot.rest.shape_gradient[f], y);
   }
 }
 
@@ -88,18 +138,21 @@ void add_element_tangent(const Model& model,
                          const Changing& changing,
                          double* y) {
   const double factor = element_factor(model, e);
-  bending::Element element = bending_element(model, e);
+  bending::Element element = differentiable_element(model, e);
+  const double stiffness = element.weight;
   element.weight *= factor;
   bending::Tangents tangents;
   if (changing.materials) {
-    tangents.weight = element_mean(model, e, dot.bending) * factor * model.rest->bending_area[e];
-    tangents.poisson = element_mean(model, e, dot.poisson);
+    if (!is_plate(model, e)) {
+      tangents.weight = element_mean(model, e, dot.bending) * factor * model.rest->bending_area[e];
+    }
+    tangents.form = FormNumbers(model, e).change(dot);
     if (model.h > 0.0) {
-      tangents.weight += element_mean(model, e, dot.damping) * model.prepared.bending[e] / model.h;
+      tangents.weight += element_mean(model, e, dot.damping) * stiffness / model.h;
     }
   }
   if (changing.rest) {
-    tangents.weight += element_mean(model, e, model.bending) * factor * dot.rest.bending_area[e];
+    tangents.weight += element_stiffness(model, e) * factor * dot.rest.bending_area[e];
     tangents.c = dot.rest.curvature_operator.data() + 3 * model.stencils->start[e];
   }
   bending::add_constant_tangent(element, u, tangents, y);
@@ -122,8 +175,19 @@ ConstantForm::ConstantForm(const Model& model,
       values_(own_values_) {
   for (Index f = 0; f < face_count(model); ++f) {
     const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
-    const double weight = face_factor(model, f) * stretch_weight(model, f);
     const Index* slot = slots.stretch.data() + 6 * static_cast<std::ptrdiff_t>(f);
+    if (is_orthotropic(model, f)) {
+      const Weave k = weave(model, f).scaled(face_factor(model, f) * model.rest->area[f]);
+      const mesh::ShapeGradient woven = g * k.axes();
+      for (int p = 0; p < 3; ++p) {
+        for (int q = 0; q <= p; ++q) {
+          own_values_[*slot++] +=
+              k.warp * woven(p, 0) * woven(q, 0) + k.weft * woven(p, 1) * woven(q, 1);
+        }
+      }
+      continue;
+    }
+    const double weight = face_factor(model, f) * stretch_weight(model, f);
     for (int p = 0; p < 3; ++p) {
       for (int q = 0; q <= p; ++q) own_values_[*slot++] += weight * g.row(p).dot(g.row(q));
     }
@@ -204,9 +268,8 @@ void ConstantForm::add_product(const double* u, double* y) const {
 void add_constant_form_tangent(
     const Model& model, const double* u, const Bar& dot, const Changing& changing, double* y) {
   if (!changing.materials && !changing.rest) return;
-  for (Index f = 0; f < face_count(model); ++f) {
-    add_constant_tangent(model, f, u, dot, changing, y);
-  }
+  const auto add = is_woven(model) ? add_woven_constant_tangent : add_constant_tangent;
+  for (Index f = 0; f < face_count(model); ++f) add(model, f, u, dot, changing, y);
   for (Index e = 0; e < model.stencils->size(); ++e) {
     add_element_tangent(model, e, u, dot, changing, y);
   }
@@ -214,7 +277,8 @@ void add_constant_form_tangent(
 
 void add_constant_form_mixed(
     const Model& model, const double* u, const double* z, bool with_rest, Bar& bar) {
-  for (Index f = 0; f < face_count(model); ++f) add_constant_mixed(model, f, u, z, with_rest, bar);
+  const auto add = is_woven(model) ? add_woven_constant_mixed : add_constant_mixed;
+  for (Index f = 0; f < face_count(model); ++f) add(model, f, u, z, with_rest, bar);
   for (Index e = 0; e < model.stencils->size(); ++e) {
     add_element_mixed(model, e, u, z, with_rest, bar);
   }

@@ -2,6 +2,8 @@
 
 #include <cmath>
 
+#include "elastic/symmetric2.h"
+
 namespace diffcloth::elastic::damping {
 namespace {
 
@@ -15,8 +17,6 @@ Mat2 positive_part(const Mat2& A) {
   const Mat2 projector = 0.5 * (Mat2::Identity() + (A - mean * Mat2::Identity()) / radius);
   return (mean + radius) * projector;
 }
-
-Mat2 symmetric_part(const Mat2& A) { return 0.5 * (A + A.transpose()); }
 
 }  // namespace
 

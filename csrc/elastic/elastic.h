@@ -43,14 +43,15 @@ Elements elements_at(const mesh::Topology& topology,
 
 /// What prepare() derives from a Model: constant during one step.
 struct Prepared {
-  std::vector<double> bending;     ///< [B] D of an element times its area
-  std::vector<double> poisson;     ///< [B]
-  std::vector<double> damping;     ///< [B] k_d / h [-]
-  std::vector<std::uint8_t> flat;  ///< [B] no rest curvature and no damping: a constant Hessian
-  std::vector<Mat3> curvature_n;   ///< [B] body-frame curvature at x_n, where damped
-  std::vector<double> constant;    ///< [slots] sum of the flat elements' Hessians, times I
-  std::vector<StretchBatch> stretch;
-  bool damped = false;    ///< some face has damping
+  std::vector<double> bending;        ///< [B] weight of an element, see bending.h
+  std::vector<Mat3> form;             ///< [B]
+  std::vector<double> damping;        ///< [B] k_d / h [-]
+  std::vector<std::uint8_t> flat;     ///< [B] no rest curvature and no damping: a constant Hessian
+  std::vector<Mat3> curvature_n;      ///< [B] body-frame curvature at x_n, where damped
+  std::vector<double> constant;       ///< [slots] sum of the flat elements' Hessians, times I
+  std::vector<StretchBatch> stretch;  ///< of isotropic faces
+  std::vector<Index> orthotropic;     ///< all others, ascending
+  bool damped = false;                ///< some face has damping
   bool by_matrix = true;  ///< energy and gradient of flat elements are those of their matrix
   bool bends = false;     ///< some element is evaluated by itself
 };
@@ -60,13 +61,19 @@ struct Model {
   const mesh::Topology* topology = nullptr;
   const mesh::BendingStencils* stencils = nullptr;
   const mesh::RestShape* rest = nullptr;
-  std::vector<double> stretch;     ///< [F] k_s [N/m]
-  std::vector<double> bending;     ///< [F] D [N m]
-  std::vector<double> poisson;     ///< [F] nu [-]
-  std::vector<double> damping;     ///< [F] k_d [s]
-  double h = 0.0;                  ///< time step [s]; only damping needs it
-  const double* x_n = nullptr;     ///< [N, 3] start of the step [m]; only damping needs it
-  double least_inertia = 0.0;      ///< smallest M / h^2 of a vertex [N/m]
+  std::vector<double> stretch;  ///< [F] k_s [N/m]; of the warp where there is a weft
+  std::vector<double> bending;  ///< [F] D [N m]; likewise
+  std::vector<double> poisson;  ///< [F] nu [-]
+  std::vector<double> damping;  ///< [F] k_d [s]
+  // [F] each, or all of one kind empty: every face is isotropic.
+  std::vector<double> stretch_weft;         ///< k_f [N/m]
+  std::vector<double> stretch_shear;        ///< k_wf [N/m]
+  std::vector<double> bending_weft;         ///< D_f [N m]
+  std::vector<double> bending_twill;        ///< D_t [N m]
+  const std::vector<Vec2>* axes = nullptr;  ///< [F] the warp in the rest frames
+  double h = 0.0;                           ///< time step [s]; only damping needs it
+  const double* x_n = nullptr;              ///< [N, 3] start of the step [m]; only damping needs it
+  double least_inertia = 0.0;               ///< smallest M / h^2 of a vertex [N/m]
   const Elements* held = nullptr;  ///< those with a prescribed corner; only backward needs them
   Prepared prepared;               ///< filled by prepare()
 };
@@ -129,7 +136,8 @@ void add_hessian_product(
 
 /// Cotangents of what a Model depends on.
 struct Bar {
-  std::vector<double> stretch, bending, poisson, damping;  ///< [F]
+  std::vector<double> stretch, bending, poisson, damping;                        ///< [F]
+  std::vector<double> stretch_weft, stretch_shear, bending_weft, bending_twill;  ///< [F]
   mesh::RestShapeBar rest;
   std::vector<double> x_n;  ///< [3 N] through damping
 

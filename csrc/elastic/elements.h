@@ -7,6 +7,7 @@
 #include "elastic/bending.h"
 #include "elastic/elastic.h"
 #include "elastic/frame.h"
+#include "elastic/weave.h"
 
 namespace diffcloth::elastic {
 
@@ -31,8 +32,44 @@ inline Mat32 face_gradient(const Model& model,
   return deformation_gradient(g, row(x, face[0]), row(x, face[1]), row(x, face[2]));
 }
 
+/// That of x1 - x0, whose differences are taken first.
+inline Mat32 face_gradient_change(const Model& model, Index f, const double* x0, const double* x1) {
+  const std::array<Index, 3>& face = model.topology->faces[f];
+  return deformation_gradient(model.rest->shape_gradient[f], row(x1, face[0]) - row(x0, face[0]),
+                              row(x1, face[1]) - row(x0, face[1]),
+                              row(x1, face[2]) - row(x0, face[2]));
+}
+
+/// y_p += P g_p over the corners of a face.
+inline void scatter(
+    const Model& model, Index f, const Mat32& P, const mesh::ShapeGradient& g, double* y) {
+  for (int p = 0; p < 3; ++p) {
+    Eigen::Map<Vec3>(y + 3 * model.topology->faces[f][p]) += P * g.row(p).transpose();
+  }
+}
+inline void scatter(const Model& model, Index f, const Mat32& P, double* y) {
+  scatter(model, f, P, model.rest->shape_gradient[f], y);
+}
+
 inline double stretch_weight(const Model& model, Index f) {
   return model.stretch[f] * model.rest->area[f];
+}
+
+/// Whether stretch has derivatives by three stiffnesses. Their values may be equal: see
+/// is_orthotropic().
+inline bool is_woven(const Model& model) { return !model.stretch_weft.empty(); }
+
+inline Weave weave(const Model& model, Index f) {
+  return {.warp = model.stretch[f],
+          .weft = model.stretch_weft[f],
+          .shear = model.stretch_shear[f],
+          .axis = (*model.axes)[f]};
+}
+
+/// Whether a face stretches differently in some directions. Others go by one number, k_s.
+inline bool is_orthotropic(const Model& model, Index f) {
+  return is_woven(model) &&
+         (model.stretch_weft[f] != model.stretch[f] || model.stretch_shear[f] != model.stretch[f]);
 }
 
 /// The mean over the faces of a bending element.
@@ -52,6 +89,21 @@ inline void add_to_faces(const Model& model, Index e, double bar, std::vector<do
   }
 }
 
+/// Whether bending has derivatives by three stiffnesses: patches alone, as a hinge bends one way.
+inline bool is_plate(const Model& model, Index e) {
+  return !model.bending_weft.empty() && model.stencils->model[e] == mesh::BendingModel::kPatch;
+}
+
+/// Of a patch, whose numbers are those of its base face.
+inline Plate plate(const Model& model, Index e) {
+  const Index f = model.stencils->faces[e][0];
+  return {.warp = model.bending[f],
+          .weft = model.bending_weft[f],
+          .twill = model.bending_twill[f],
+          .poisson = model.poisson[f],
+          .axis = (*model.axes)[f]};
+}
+
 inline bending::Element bending_element(const Model& model, Index e) {
   const mesh::BendingStencils& stencils = *model.stencils;
   const Prepared& prepared = model.prepared;
@@ -59,7 +111,7 @@ inline bending::Element bending_element(const Model& model, Index e) {
           .c = model.rest->curvature_operator.data() + 3 * stencils.start[e],
           .g = &model.rest->shape_gradient[stencils.faces[e][0]],
           .weight = prepared.bending[e],
-          .poisson = prepared.poisson[e],
+          .form = prepared.form[e],
           .damping = prepared.damping[e],
           .b = &model.rest->curvature[e],
           .b_n = &prepared.curvature_n[e],

@@ -1,6 +1,7 @@
 #include "step/elasticity.h"
 
 #include <algorithm>
+#include <array>
 #include <vector>
 
 #include "step/cotangents.h"
@@ -10,14 +11,32 @@
 namespace diffcloth::step {
 namespace {
 
+/// An input with one value a face, and where models and their cotangents have it.
+struct FaceValue {
+  Input input;
+  std::vector<double> elastic::Model::* value;
+  std::vector<double> elastic::Bar::* bar;
+};
+
+using elastic::Bar;
+using elastic::Model;
+constexpr std::array kFaceValues{
+    FaceValue{Input::kStretch, &Model::stretch, &Bar::stretch},
+    FaceValue{Input::kBending, &Model::bending, &Bar::bending},
+    FaceValue{Input::kPoisson, &Model::poisson, &Bar::poisson},
+    FaceValue{Input::kDamping, &Model::damping, &Bar::damping},
+    FaceValue{Input::kStretchWeft, &Model::stretch_weft, &Bar::stretch_weft},
+    FaceValue{Input::kStretchShear, &Model::stretch_shear, &Bar::stretch_shear},
+    FaceValue{Input::kBendingWeft, &Model::bending_weft, &Bar::bending_weft},
+    FaceValue{Input::kBendingTwill, &Model::bending_twill, &Bar::bending_twill},
+};
+
 elastic::Wanted of_model(const Gradients* wanted) {
   using enum elastic::Wanted;
   if (wanted == nullptr) return kNone;
   if ((*wanted)[Input::kRestPositions] != nullptr) return kMaterialsAndRest;
-  for (const Input input : {Input::kStretch, Input::kBending, Input::kPoisson, Input::kDamping}) {
-    if ((*wanted)[input] != nullptr) return kMaterials;
-  }
-  return kNone;
+  const auto is_wanted = [&](const FaceValue& m) { return (*wanted)[m.input] != nullptr; };
+  return std::ranges::any_of(kFaceValues, is_wanted) ? kMaterials : kNone;
 }
 
 elastic::Model make_model(const Problem& p) {
@@ -25,12 +44,11 @@ elastic::Model make_model(const Problem& p) {
   model.topology = &p.scene.topology;
   model.stencils = &p.scene.stencils;
   model.rest = p.rest;
-  model.stretch = values_per_face(p, Input::kStretch);
-  model.bending = values_per_face(p, Input::kBending);
-  model.poisson = p.inputs.data(Input::kPoisson) != nullptr
-                      ? values_per_face(p, Input::kPoisson)
-                      : std::vector<double>(p.scene.face_cloth.size(), 0.0);
-  model.damping = values_per_face(p, Input::kDamping);
+  for (const FaceValue& m : kFaceValues) {
+    if (p.inputs.data(m.input) != nullptr) model.*m.value = values_per_face(p, m.input);
+  }
+  model.poisson.resize(p.scene.face_cloth.size(), 0.0);
+  model.axes = &p.scene.material_axes;
   model.h = p.h;
   model.x_n = p.inputs.data(Input::kPositions);
   model.held = &p.scene.held_elements;
@@ -48,10 +66,7 @@ Elasticity::Elasticity(const Problem& problem, const Gradients* wanted)
 
 void Elasticity::pull_back(const Problem& problem, Cotangents& bars, const Gradients& gradients) {
   const elastic::Bar& bar = potential_.bar();
-  add_per_face(problem, Input::kStretch, bar.stretch, gradients);
-  add_per_face(problem, Input::kBending, bar.bending, gradients);
-  add_per_face(problem, Input::kPoisson, bar.poisson, gradients);
-  add_per_face(problem, Input::kDamping, bar.damping, gradients);
+  for (const FaceValue& m : kFaceValues) add_per_face(problem, m.input, bar.*m.bar, gradients);
   for (std::size_t a = 0; a < bar.x_n.size(); ++a) bars.start[a] += bar.x_n[a];
   if (gradients[Input::kRestPositions] != nullptr) bars.rest += bar.rest;
 }
@@ -59,15 +74,12 @@ void Elasticity::pull_back(const Problem& problem, Cotangents& bars, const Gradi
 void Elasticity::push_forward(const Problem& problem, const Tangents& tangents) {
   const auto changes = [&](Input input) { return tangents.directions.data(input) != nullptr; };
   elastic::Changing changing;
-  changing.materials = changes(Input::kStretch) || changes(Input::kBending) ||
-                       changes(Input::kPoisson) || changes(Input::kDamping);
+  changing.materials =
+      std::ranges::any_of(kFaceValues, [&](const FaceValue& m) { return changes(m.input); });
   changing.rest = !tangents.rest.area.empty();
   changing.start = changes(Input::kPositions);
   elastic::Bar dot;
-  dot.stretch = tangents.per_face(problem, Input::kStretch);
-  dot.bending = tangents.per_face(problem, Input::kBending);
-  dot.poisson = tangents.per_face(problem, Input::kPoisson);
-  dot.damping = tangents.per_face(problem, Input::kDamping);
+  for (const FaceValue& m : kFaceValues) dot.*m.bar = tangents.per_face(problem, m.input);
   dot.x_n.assign(tangents.start.begin(),
                  tangents.start.begin() + static_cast<std::ptrdiff_t>(problem.cloth_size));
   dot.rest = tangents.rest;

@@ -23,6 +23,10 @@ enum class Input : std::uint8_t {
   kPoisson,            ///< nu [-]
   kDensity,            ///< rho [kg/m^2]
   kDamping,            ///< k_d [s]
+  kStretchWeft,        ///< k_f [N/m]; with it k_wf, and k_s is k_w
+  kStretchShear,       ///< k_wf [N/m]
+  kBendingWeft,        ///< D_f [N m]; with it D_t, and D is D_w
+  kBendingTwill,       ///< D_t [N m]
   kFriction,           ///< mu [-]
   kThickness,          ///< [m]
   kBarrierStiffness,   ///< kappa [Pa]
@@ -102,6 +106,10 @@ inline constexpr std::array kInputTable{
     InputRow{Input::kPoisson, "poisson", Extent::kPerFace, Need::kNowhere},
     InputRow{Input::kDensity, "density", Extent::kPerFace},
     InputRow{Input::kDamping, "damping", Extent::kPerFace},
+    InputRow{Input::kStretchWeft, "stretch_weft", Extent::kPerFace, Need::kNowhere},
+    InputRow{Input::kStretchShear, "stretch_shear", Extent::kPerFace, Need::kNowhere},
+    InputRow{Input::kBendingWeft, "bending_weft", Extent::kPerFace, Need::kNowhere},
+    InputRow{Input::kBendingTwill, "bending_twill", Extent::kPerFace, Need::kNowhere},
     InputRow{Input::kFriction, "friction", Extent::kPairs, Need::kBarrier},
     InputRow{Input::kThickness, "thickness", Extent::kSurfaces, Need::kBarrier},
     InputRow{Input::kBarrierStiffness, "barrier_stiffness", Extent::kPairs, Need::kNowhere},

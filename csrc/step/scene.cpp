@@ -58,6 +58,12 @@ std::vector<double> all_rest_positions(const Description& d) {
   return x;
 }
 
+std::vector<Vec2> vectors(const std::vector<double>& rows) {
+  std::vector<Vec2> result;
+  for (std::size_t k = 0; k + 1 < rows.size(); k += 2) result.emplace_back(rows[k], rows[k + 1]);
+  return result;
+}
+
 std::vector<Index> owners(const std::vector<Index>& start) {
   std::vector<Index> owner(static_cast<std::size_t>(start.back()));
   for (std::size_t c = 0; c + 1 < start.size(); ++c) {
@@ -216,6 +222,7 @@ Scene::Scene(Description description)
       scheme(&find_scheme(given.scheme)),
       topology(static_cast<Index>(given.vertices.size() / 3), given.faces),
       face_cloth(owners(given.cloth_face_start)),
+      material_axes(vectors(given.material_axes)),
       vertex_cloth(owners(given.cloth_vertex_start)),
       stencils(mesh::choose_stencils(topology, given.rest_positions.data(), face_models(given))),
       rest(mesh::rest_shape(topology, stencils, given.rest_positions.data())),

@@ -70,6 +70,7 @@ struct Description {
   std::vector<Index> cloth_vertex_start;           ///< [C + 1]
   std::vector<Index> cloth_face_start;             ///< [C + 1]
   std::vector<mesh::BendingModel> bending_models;  ///< [C]
+  std::vector<double> material_axes;               ///< [2 F] see Scene; empty: no cloth is woven
   std::vector<Index> pins;                         ///< [P]
   std::vector<Index> soft_pins;                    ///< [Q]
   AttachmentDescription attachments;
@@ -108,6 +109,7 @@ struct Scene {
   const Scheme* scheme;
   mesh::Topology topology;
   std::vector<Index> face_cloth;    ///< [F]
+  std::vector<Vec2> material_axes;  ///< [F] the warp in the rest frames; empty: no weft
   std::vector<Index> vertex_cloth;  ///< [N]
   mesh::BendingStencils stencils;
   mesh::RestShape rest;  ///< of given.rest_positions

@@ -81,8 +81,25 @@ _LIMITED: dict[str, Any] = {
 _MaterialFields: Any = create_model("_MaterialFields", __base__=Section, **_LIMITED)
 
 
+Fabric = Literal[
+    "denim",
+    "trouser_cloth",
+    "tablecloth",
+    "windbreaker",
+    "blanket",
+    "ponte",
+    "interlock",
+    "rib_knit",
+]
+
+
 class MaterialSection(_MaterialFields):  # type: ignore[misc]  # its fields are those of Material
-    """Properties of a cloth, in the units of `Material`, with its defaults."""
+    """Properties of a cloth, in the units of `Material`, with its defaults.
+
+    Of a `fabric`, whose numbers are those of `dc.fabrics`, only what is to be another is given.
+    """
+
+    fabric: Fabric | None = None
 
 
 class ClothSection(Section):
@@ -97,6 +114,7 @@ class ClothSection(Section):
     pin_stiffness: Annotated[float, limits("pin_stiffness")] | None = None
     pin_trajectories: dict[str, Annotated[list[PinKeyframe], Len(1)]] = {}
     bending_model: Literal["patch", "hinge"] | None = None
+    directions: Vector3 | None = None
     color: Color | None = None
     back_color: Color | None = None
 

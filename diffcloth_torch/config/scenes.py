@@ -11,12 +11,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloth_torch import robots
+from diffcloth_torch import fabrics, robots
 from diffcloth_torch.config import shapes
 from diffcloth_torch.config.attachments import attachment, attachment_motions
 from diffcloth_torch.config.documents import resolve_path
 from diffcloth_torch.config.keyframes import moved, quaternion, select_vertices, values_at
-from diffcloth_torch.config.scene_schema import BodySection, ClothSection, RobotSection
+from diffcloth_torch.config.scene_schema import (
+    BodySection,
+    ClothSection,
+    MaterialSection,
+    RobotSection,
+)
 from diffcloth_torch.config.schema import RunConfig, SimulationSection
 from diffcloth_torch.config.section import Section
 from diffcloth_torch.config.shape_schema import PoseSection
@@ -112,7 +117,7 @@ def _cloth(section: ClothSection, root: str, source: Path) -> Cloth:
             rest = shape.scale * read_mesh(resolve_path(source, root, shape.rest))[0]
     vertices = transform(start, pose_array(section.pose))
     options: dict[str, Any] = section.model_dump(
-        include={"pin_stiffness", "bending_model"}, exclude_none=True
+        include={"pin_stiffness", "bending_model", "directions"}, exclude_none=True
     )
     for kind in ("pins", "soft_pins"):
         options[kind] = {
@@ -122,11 +127,17 @@ def _cloth(section: ClothSection, root: str, source: Path) -> Cloth:
     return Cloth(
         vertices,
         faces,
-        material=Material(**_given(section.material)),
+        material=_material(section.material),
         rest_positions=rest,
         name=section.name,
         **options,
     )
+
+
+def _material(section: MaterialSection) -> Material:
+    values = _given(section)
+    fabric = values.pop("fabric", None)
+    return Material(**values) if fabric is None else fabrics.material(fabric, **values)
 
 
 def _generated(name: str, generate: Any, arguments: dict[str, Any]) -> Any:

@@ -36,6 +36,8 @@ class Assembly:
         vertices: Initial cloth positions [m], shape [N, 3].
         rest_positions: Stress-free cloth positions [m], shape [N, 3].
         faces: Cloth faces, indices into `vertices`, shape [F, 3].
+        material_axes: Unit vector of the warp in the rest frame of each face, shape [F, 2]; empty
+            if no cloth is woven.
         cloth_vertex_start: First vertex of each cloth, then N; shape [C + 1].
         cloth_face_start: First face of each cloth, then F; shape [C + 1].
         pins: Pinned vertices, shape [P].
@@ -70,6 +72,7 @@ class Assembly:
     vertices: FloatArray
     rest_positions: FloatArray
     faces: IndexArray
+    material_axes: FloatArray
     cloth_vertex_start: IndexArray
     cloth_face_start: IndexArray
     pins: IndexArray
@@ -177,6 +180,7 @@ def assemble(scene: Scene, *, all_nodal: bool = False) -> Assembly:
             [np.empty((0, 3)), *(cloth.rest_positions for cloth in scene.cloths)]
         ),
         faces=faces,
+        material_axes=_material_axes(scene),
         cloth_vertex_start=vertex_start,
         cloth_face_start=face_start,
         pins=pins,
@@ -211,6 +215,14 @@ def assemble(scene: Scene, *, all_nodal: bool = False) -> Assembly:
         joint_viscosity=_joined(robot.viscosity for robot in scene.robots),
         joint_armature=np.zeros_like(joint_positions),
     )
+
+
+def _material_axes(scene: Scene) -> FloatArray:
+    """Axes of all cloths where one is woven: parameters may make others differ by direction."""
+    if not any(cloth.material.is_orthotropic for cloth in scene.cloths):
+        return np.empty((0, 2))
+    cloths = zip(scene.cloth_names, scene.cloths, strict=True)
+    return np.concatenate([cloth.material_axes(f"Scene: {name!r}") for name, cloth in cloths])
 
 
 _BASES = {"static": "fixed", "kinematic": "kinematic", "dynamic": "floating"}

@@ -30,6 +30,7 @@ from diffcloth_torch.geometry.mesh_checks import check_areas, check_manifold, su
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import pose_array, transform
 from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.orthotropy import material_axes
 from diffcloth_torch.model.quantities import FACE_QUANTITIES, check_parameter
 
 __all__ = ["BENDING_MODELS", "Cloth", "plane_size"]
@@ -37,6 +38,7 @@ __all__ = ["BENDING_MODELS", "Cloth", "plane_size"]
 BENDING_MODELS = ("patch", "hinge")
 
 _DEFAULT_MATERIAL = Material()
+_ALONG_X = frozen(np.array([1.0, 0.0, 0.0]))
 _POSITIONS = "differentiate with respect to State.positions"
 _REST = "differentiate with respect to Parameters.rest_positions"
 
@@ -54,6 +56,7 @@ class Cloth:
         rest_positions: Where the cloth is free of stress [m], shape [n, 3].
         bending_model: "patch" (six-point patches, isotropic on any mesh) or "hinge".
         name: Name in the scene; None lets the scene choose one.
+        directions: Direction of the warp at rest, shape [3], or one per face, shape [f, 3].
     """
 
     vertices: FloatArray
@@ -65,6 +68,7 @@ class Cloth:
     rest_positions: FloatArray
     bending_model: str
     name: str | None
+    directions: FloatArray
 
     def __init__(
         self,
@@ -79,6 +83,7 @@ class Cloth:
         bending_model: str = "patch",
         name: str | None = None,
         rest_vertices: object = None,
+        directions: object = None,
     ) -> None:
         """Check and copy the arguments.
 
@@ -93,6 +98,9 @@ class Cloth:
             bending_model: "patch" or "hinge".
             name: Name in the scene.
             rest_vertices: Earlier name of `rest_positions`; give one of them.
+            directions: Direction of the warp in the rest shape, shape [3] or [f, 3]; along x by
+                default. It is projected onto each face and fixed to the material, also where
+                `Parameters.rest_positions` are others. Isotropic cloth has no use for it.
 
         Raises:
             InvalidInput: If a shape, an index or a value is not accepted.
@@ -107,6 +115,19 @@ class Cloth:
         self.pin_stiffness = check_parameter("Cloth", "pin_stiffness", pin_stiffness)
         self.bending_model = check_choice("Cloth: `bending_model`", bending_model, BENDING_MODELS)
         self.name = check_name("Cloth: `name`", name)
+        self.directions = _directions(directions, len(triangles))
+        if self.material.is_orthotropic or directions is not None:
+            self.material_axes("Cloth")
+        if self.bending_model == "hinge":
+            _refuse_woven_hinges(self.material)
+
+    def material_axes(self, owner: str) -> FloatArray:
+        """Unit vectors of the warp in the rest frames of the faces, shape [f, 2].
+
+        Args:
+            owner: Opens the message of the error where a direction is normal to a face.
+        """
+        return material_axes(owner, self.directions, self.rest_positions, self.faces)
 
     @classmethod
     def load(
@@ -188,6 +209,7 @@ class Cloth:
         return {**vars(self), **plain}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        self.directions = _ALONG_X  # pickles of earlier versions have none
         for name, value in state.items():
             # Pickles of earlier versions have that name.
             setattr(self, "rest_positions" if name == "rest_vertices" else name, value)
@@ -225,9 +247,33 @@ def _material(material: object, face_count: int) -> Material:
     if not isinstance(material, Material):
         raise TypeError(f"Cloth: `material` must be a Material, got {type(material).__name__}")
     for field in FACE_QUANTITIES:
-        value = np.asarray(getattr(material, field))
+        value = np.asarray(material.per_face(field))
         check_shape(f"Cloth: `material.{field}`", value.shape, [(), (face_count,)])
     return material
+
+
+def _directions(given: object, face_count: int) -> FloatArray:
+    if given is None:
+        return _ALONG_X
+    name = "Cloth: `directions`"
+    directions = float_array(name, given, instead="directions have no gradient: detach them")
+    check_shape(name, directions.shape, [(3,), (face_count, 3)])
+    check_finite(name, directions)
+    zero = ~directions.any(axis=-1)
+    if zero.any():
+        where = f" at [{int(np.argmax(zero))}]" if directions.ndim == 2 else ""
+        raise InvalidInput(f"{name} must not be zero, got [0.0, 0.0, 0.0]{where}")
+    frozen(directions)
+    return directions
+
+
+def _refuse_woven_hinges(material: Material) -> None:
+    for field in ("bending_weft", "bending_twill"):
+        if getattr(material, field) is not None:
+            raise InvalidInput(
+                f"Cloth: `material.{field}` must be None where `bending_model` is 'hinge', which "
+                "has one bending stiffness; 'patch' has three"
+            )
 
 
 def _pin_groups(

@@ -12,6 +12,7 @@ from diffcloth_torch.geometry.mesh_checks import unique_edges
 from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ABILITIES, ContactOptions
+from diffcloth_torch.model.orthotropy import WOVEN_GROUPS
 from diffcloth_torch.model.quantities import FACE_QUANTITIES
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
@@ -60,6 +61,11 @@ def scene_parameters(scene: Scene, assembly: Assembly, contact: bool) -> dict[st
         values = {field: _material_values(scene, field) for field in FACE_QUANTITIES}
         if all(cloth.bending_model == "hinge" for cloth in scene.cloths):
             del values["poisson"]  # hinges have no Poisson effect
+        materials = [cloth.material for cloth in scene.cloths]
+        for group in WOVEN_GROUPS:
+            if all(getattr(m, field) is None for m in materials for field in group):
+                for field in group:
+                    del values[field]
         values["rest_positions"] = assembly.rest_positions
         values["air_density"] = np.array(scene.air_density)
     if contact:
@@ -106,9 +112,10 @@ def _rigid_values(assembly: Assembly) -> dict[str, FloatArray]:
 
 def _material_values(scene: Scene, field: str) -> FloatArray:
     """One value if all cloths agree, one per cloth if each is uniform, else one per face."""
-    values = [getattr(cloth.material, field) for cloth in scene.cloths]
-    if all(isinstance(value, float) for value in values):
-        return _shortest(values)
+    values = [cloth.material.per_face(field) for cloth in scene.cloths]
+    numbers = [value for value in values if isinstance(value, float)]
+    if len(numbers) == len(values):
+        return _shortest(numbers)
     counts = [len(cloth.faces) for cloth in scene.cloths]
     parts = [np.broadcast_to(v, n) for v, n in zip(values, counts, strict=True)]
     return np.concatenate(parts)

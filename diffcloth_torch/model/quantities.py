@@ -142,6 +142,12 @@ _TAKEN_BY_THE_CORE = (
     Quantity("tangential_drag", "-", _PER_FACE, "Material.tangential_drag", NON_NEGATIVE),
     Quantity("air_density", "kg/m^3", _ONE, "Scene.air_density", NON_NEGATIVE),
 )
+_OF_WOVEN_CLOTH = (
+    Quantity("stretch_weft", "N/m", _PER_FACE, "Material.stretch_weft", POSITIVE),
+    Quantity("stretch_shear", "N/m", _PER_FACE, "Material.stretch_shear", POSITIVE),
+    Quantity("bending_weft", "N m", _PER_FACE, "Material.bending_weft", NON_NEGATIVE),
+    Quantity("bending_twill", "N m", _PER_FACE, "Material.bending_twill", NON_NEGATIVE),
+)
 PARAMETERS = _table(
     *(quantity._replace(core=quantity.name) for quantity in _TAKEN_BY_THE_CORE),
     Quantity("body_mass", "kg", (("K",),), "RigidBody.mass", NON_NEGATIVE),
@@ -154,6 +160,7 @@ PARAMETERS = _table(
     Quantity("joint_damping", "N m s/rad or N s/m", _JOINTS, "Robot.damping", NON_NEGATIVE),
     Quantity("joint_viscosity", "N m s/rad or N s/m", _JOINTS, "Robot.viscosity", NON_NEGATIVE),
     Quantity("joint_armature", "kg m^2 or kg", _JOINTS, "zero", NON_NEGATIVE),
+    *(quantity._replace(core=quantity.name) for quantity in _OF_WOVEN_CLOTH),
 )
 DERIVED = (
     "coordinates",

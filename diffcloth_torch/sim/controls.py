@@ -124,6 +124,15 @@ class Parameters:
         joint_damping: Damping of pd drives [N m s/rad or N s/m], >= 0, shape [J].
         joint_viscosity: Damping of the joints themselves [N m s/rad or N s/m], >= 0, shape [J].
         joint_armature: Inertia of the drives, seen at the joints [kg m^2 or kg], >= 0, shape [J].
+        stretch_weft: Membrane stiffness of woven cloth along its weft [N/m], > 0; shape [], [C] or
+            [F]. This and the next three exist where a material sets one of the kind; then
+            `stretch` and `bending` are those along the warp, also of cloths that are isotropic,
+            which keep their own numbers here.
+        stretch_shear: Membrane stiffness of woven cloth in shear [N/m], > 0; shape [], [C] or [F].
+        bending_weft: Bending stiffness of woven cloth along its weft [N m], >= 0; shape [], [C] or
+            [F]; > 0 where `bending` is.
+        bending_twill: Bending stiffness of woven cloth at 45 degrees [N m], >= 0; shape [], [C] or
+            [F]; at least (bending + bending_weft + 2 poisson sqrt(bending bending_weft)) / 4.
     """
 
     stretch: Tensor | None = None
@@ -153,6 +162,10 @@ class Parameters:
     joint_damping: Tensor | None = None
     joint_viscosity: Tensor | None = None
     joint_armature: Tensor | None = None
+    stretch_weft: Tensor | None = None
+    stretch_shear: Tensor | None = None
+    bending_weft: Tensor | None = None
+    bending_twill: Tensor | None = None
     # Fields that a simulator made without a batch axis: their [C] or [F] is never read as [B].
     _unbatched: tuple[str, ...] = field(default=(), repr=False)
 

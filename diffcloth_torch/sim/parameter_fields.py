@@ -17,6 +17,7 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.mesh_checks import check_areas
+from diffcloth_torch.model.orthotropy import check_bending
 from diffcloth_torch.model.quantities import PARAMETERS, Fields, Shape
 from diffcloth_torch.sim.controls import Parameters
 from diffcloth_torch.sim.layout import Layout
@@ -24,6 +25,8 @@ from diffcloth_torch.sim.named_parameters import has_names, named_rows
 from diffcloth_torch.transforms import numbers_of
 
 __all__ = ["check_parameters", "default_fields", "parameter_fields"]
+
+_BENDING = ("bending", "bending_weft", "bending_twill", "poisson")
 
 
 def check_parameters(parameters: Parameters) -> Parameters:
@@ -68,7 +71,18 @@ def parameter_fields(
         environments = _environments(label, tuple(given.shape), shared, batch, unbatched)
         fields[name] = _rows(given, environments, quantity.row_shape)
         _check_values(layout, name, numbers_of(fields[name]), numbers_of(defaults[name]))
+    if "bending_weft" in fields and any(getattr(checked, name) is not None for name in _BENDING):
+        values = (_per_face(layout, numbers_of(fields[name])) for name in _BENDING)
+        check_bending("parameters", *values)
     return fields
+
+
+def _per_face(layout: Layout, values: FloatArray) -> FloatArray:
+    """Values [nb, 1 or C or F] as values [nb, 1 or F]."""
+    assembly = layout.assembly
+    if values.shape[1] != assembly.cloth_count:
+        return values
+    return np.repeat(values, np.diff(assembly.cloth_face_start), axis=1)
 
 
 def default_fields(defaults: Mapping[str, Tensor]) -> Fields:

@@ -10,6 +10,7 @@ from diffcloth_torch import _kernels
 Elastic = _kernels.Elastic
 
 STEP = 0.01  # time step [s]
+WOVEN = ("stretch_weft", "stretch_shear", "bending_weft", "bending_twill")
 
 
 def grid(nu: int, nv: int, diagonal: str = "right") -> tuple[np.ndarray, np.ndarray]:
@@ -99,15 +100,23 @@ def rest_mesh(rest: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def random_materials(
-    rng: np.random.Generator, face_count: int, damped: float
+    rng: np.random.Generator, face_count: int, damped: float, woven: bool = False
 ) -> dict[str, np.ndarray]:
     """Materials that differ from face to face; `damped` scales the damping."""
-    return {
+    of_weave = {
+        "angles": rng.uniform(-np.pi, np.pi, face_count),
+        "stretch_weft": 1.2 * rng.uniform(1, 2, face_count),
+        "stretch_shear": 0.3 * rng.uniform(1, 2, face_count),
+        "bending_weft": 0.2 * rng.uniform(1, 2, face_count),
+        "bending_twill": 0.5 * rng.uniform(1, 2, face_count),
+    }
+    isotropic = {
         "stretch": 2.0 * rng.uniform(1, 2, face_count),
         "bending": 0.5 * rng.uniform(1, 2, face_count),
         "poisson": 0.3 * rng.uniform(0.5, 1, face_count),
         "damping": 0.02 * rng.uniform(0.5, 1, face_count) * damped,
     }
+    return isotropic | of_weave if woven else isotropic
 
 
 def model(
@@ -120,7 +129,9 @@ def model(
     poisson: float | np.ndarray = 0.0,
     damping: float | np.ndarray = 0.0,
     x_n: np.ndarray | None = None,
+    **woven: float | np.ndarray,
 ) -> Elastic:
+    """A model; of woven cloth where `angles` of the warp to the first sides of faces are given."""
     elastic = Elastic(X, faces, bending_model)
     set_parameters(
         elastic,
@@ -130,14 +141,26 @@ def model(
         poisson=poisson,
         damping=damping,
         x_n=X if x_n is None else x_n,
+        **woven,
     )
     return elastic
 
 
 def set_parameters(
-    elastic: Elastic, face_count: int, *, x_n: np.ndarray | None, **parameters: float | np.ndarray
+    elastic: Elastic,
+    face_count: int,
+    *,
+    x_n: np.ndarray | None,
+    angles: np.ndarray | None = None,
+    **parameters: float | np.ndarray,
 ) -> None:
     one = np.ones(face_count)
+    if angles is None:
+        elastic.set_weave(np.empty(0), np.empty(0))
+    else:
+        axes = np.stack([np.cos(angles), np.sin(angles)], 1).ravel()
+        values = [parameters.get(name, parameters[name.split("_")[0]]) for name in WOVEN]
+        elastic.set_weave(axes, np.concatenate([value * one for value in values]))
     elastic.set_parameters(
         parameters["stretch"] * one,
         parameters["bending"] * one,
@@ -146,6 +169,12 @@ def set_parameters(
         STEP,
         None if x_n is None else np.ascontiguousarray(x_n),
     )
+
+
+def angles_along(X: np.ndarray, faces: np.ndarray, direction: float) -> np.ndarray:
+    """Angles to the first sides of the faces of a flat mesh of what lies at an angle to x."""
+    side = X[faces[:, 1]] - X[faces[:, 0]]
+    return direction - np.arctan2(side[:, 1], side[:, 0])
 
 
 def differences(f: Callable[[np.ndarray], float | np.ndarray], x: np.ndarray, eps: float):

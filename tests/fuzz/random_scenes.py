@@ -9,7 +9,7 @@ the simulator, the start and the controls are made.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -205,6 +205,21 @@ def _material(rng: np.random.Generator, edge: float, air: Air) -> dc.Material:
     )
 
 
+def _woven(rng: np.random.Generator, material: dc.Material) -> dc.Material:
+    """Half of the time with stiffnesses of the weft, shear and bias that differ from the warp's."""
+    if rng.random() < 0.5:
+        return material
+    D, weft = material.bending, material.bending * log_uniform(rng, 0.1, 10.0)
+    least = (D + weft + 2 * material.poisson * np.sqrt(D * weft)) / 4
+    return replace(
+        material,
+        stretch_weft=material.stretch * log_uniform(rng, 0.05, 20.0),
+        stretch_shear=material.stretch * log_uniform(rng, 0.01, 2.0),
+        bending_weft=weft,
+        bending_twill=least * log_uniform(rng, 1.0001, 4.0),
+    )
+
+
 def draw_cloths(
     rng: np.random.Generator, d: dict[str, Any], air: Air, pins: tuple[str, ...] = PINS
 ) -> tuple[list[dc.Cloth], float]:
@@ -215,9 +230,12 @@ def draw_cloths(
     flat = np.array(grid.vertices)
     flat[:, :2] += d["jitter"] * edge * rng.uniform(-1, 1, (len(flat), 2))
     clearance = edge * rng.uniform(0.11, 0.5)
-    material = _material(rng, edge, air)
+    # Numbers of their own: scenes are otherwise what they were before there was woven cloth.
+    of_weave = np.random.default_rng(rng.bit_generator.seed_seq.spawn(1)[0])
+    material = _woven(of_weave, _material(rng, edge, air))
     d["material"] = {k: getattr(material, k) for k in material.__dataclass_fields__}
-    keywords: dict[str, Any] = {"material": material}
+    warp = {"directions": [*of_weave.normal(size=2), 0.0]}
+    keywords: dict[str, Any] = {"material": material, **warp}
     if d["layout"] == "fold":
         placed = _folded(flat, 0.15 * edge)
     else:
@@ -235,7 +253,13 @@ def draw_cloths(
         upper[:, :2] += edge * rng.uniform(-0.5, 0.5, 2)
         upper[:, 2] = placed[:, 2].max() + edge * rng.uniform(0.11, 0.3)
         cloths.append(
-            dc.Cloth(upper, grid.faces, rest_positions=flat, material=_material(rng, edge, air))
+            dc.Cloth(
+                upper,
+                grid.faces,
+                rest_positions=flat,
+                material=_woven(of_weave, _material(rng, edge, air)),
+                **warp,
+            )
         )
     return cloths, clearance
 

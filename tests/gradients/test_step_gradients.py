@@ -54,7 +54,7 @@ CONTACT_PARAMETERS = (
     "parameters.slip_velocity",
 )
 # Where a gradient vanishes; everywhere else it must not.
-ZERO = dict.fromkeys(("hanging", "curved", "hinge"), CONTACT_PARAMETERS)
+ZERO = dict.fromkeys(("hanging", "curved", "hinge", "woven", "woven_flat"), CONTACT_PARAMETERS)
 
 
 OUTPUTS = ("positions", "velocities", "body_forces")
@@ -207,7 +207,7 @@ def test_a_pinned_vertex_is_in_contact():
 
 
 def test_free_flight_is_free():
-    for name in ("hanging", "curved", "hinge"):
+    for name in ZERO:
         assert scenes.regime(name).step().report.contact_count == 0
 
 
@@ -271,6 +271,13 @@ QUICK = [
     ("stacked", COUPLED, 2),
     ("dragged", COUPLED, 2),
     ("poking", COUPLED, 2),
+    ("woven", COUPLED, 2),
+    ("woven_flat", ELASTIC, 2),
+    ("woven_pinned", COUPLED, 2),
+    ("woven_pinned", ENERGY, 2),
+    ("woven_pinned", MASS, 1),
+    ("woven_stacked", COUPLED, 2),
+    ("woven_stacked", ELASTIC, 2),
 ]
 ALL = [
     (name, scheme, iterations)
@@ -450,7 +457,7 @@ def test_friction_iterations_change_the_step():
 
 def test_scenes_are_differentiable_in_everything():
     """No input is forgotten by these tests."""
-    sim = scenes.regime("pushing").sim
+    sim = scenes.regime("woven_pinned").sim
     parameters = {k for k, v in vars(sim.parameters()).items() if isinstance(v, torch.Tensor)}
     seen = {name for regime in scenes.REGIMES for name in scenes.regime(regime).inputs()}
     assert seen == {

@@ -88,17 +88,17 @@ STEPS = {
     },
     **{
         f"split-{metric}-{name}": (regime, name, "split", metric)
-        for name in ("curved", "pinned", "folded_thick", "pushing")
+        for name in ("curved", "pinned", "folded_thick", "pushing", "woven_pinned")
         for metric in METRICS
     },
     **{
         f"split-{metric}-{name}-projective": (regime, name, "split", metric, 3, "projective")
-        for name in ("hanging", "pinned")
+        for name in ("hanging", "pinned", "woven_pinned")
         for metric in ("energy", "elastic")
     },
     **{
         f"projective-{name}": (regime, name, "projective")
-        for name in ("hanging", "curved", "hinge")
+        for name in ("hanging", "curved", "hinge", "woven")
     },
     **{f"{make.__name__}-{scheme}": (attached, make, scheme) for make, scheme in attachments.CASES},
     **{

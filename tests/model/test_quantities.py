@@ -42,7 +42,11 @@ def sim():
     """A scene that has every quantity."""
     cloths = [
         dc.Cloth.grid(3, 4, pins={"a": [0]}, soft_pins={"b": [8]}),
-        dc.Cloth.grid(2, 2, pose=[0, 0, 1, 1, 0, 0, 0], material=dc.Material(stretch=100.0)),
+        dc.Cloth.grid(
+            *(2, 2),
+            pose=[0, 0, 1, 1, 0, 0, 0],
+            material=dc.Material(stretch=100.0, stretch_weft=50.0, bending_weft=5e-6),
+        ),
     ]
     bodies = [
         dc.RigidBody.box(0.2, motion="kinematic", pose=[0, 0, -0.2, 1, 0, 0, 0]),
@@ -205,9 +209,9 @@ def given_to(owner, field, value):
 
 def test_the_schema_of_a_material_has_the_fields_of_a_material():
     fields = [f.name for f in dataclasses.fields(dc.Material)]
-    assert list(scene_schema.MaterialSection.model_fields) == fields
-    assert list(FACE_QUANTITIES) == [field for field in fields if field in FACE_QUANTITIES]
-    given = dict.fromkeys(fields, 0.25)
+    assert list(scene_schema.MaterialSection.model_fields) == [*fields, "fabric"]
+    assert set(FACE_QUANTITIES) == set(fields) - {"friction", "thickness"}
+    given = dict.fromkeys(fields, 0.25) | {"fabric": "denim"}
     section = validate(scene_schema.MaterialSection, given, "here")
     assert section.model_dump() == given
-    assert scene_schema.MaterialSection().model_dump() == dict.fromkeys(fields)
+    assert scene_schema.MaterialSection().model_dump() == dict.fromkeys(given)

@@ -11,7 +11,7 @@ F64 = torch.float64
 
 
 @cache
-def simulator(n, scheme="coupled", folded=True):
+def simulator(n, scheme="coupled", folded=True, woven=False):
     """n x n vertices; the lower half rests on a plate, the upper half on the lower one, or on
     the plate too."""
     sheet = dc.Cloth.grid(n, n)
@@ -23,15 +23,18 @@ def simulator(n, scheme="coupled", folded=True):
     # Deeper in the barrier it is 90 iterations that end this step, in place of 50.
     gap, below = 0.95 * reach, s < (0.0 if folded else 1.0)
     placed = np.stack([flat[:, 0], np.where(below, s, -s), np.where(below, 0, gap)], axis=-1)
-    cloth = dc.Cloth(placed, sheet.faces, rest_positions=flat, material=dc.Material(friction=0.3))
+    material = dc.fabrics.material("blanket") if woven else dc.Material(friction=0.3)
+    cloth = dc.Cloth(
+        placed, sheet.faces, rest_positions=flat, material=material, directions=[1.0, 0.5, 0.0]
+    )
     plate = dc.RigidBody.plane(3.0, pose=[0.01, 0.02, -gap, 1, 0, 0, 0])
     contact = dc.ContactOptions(barrier_distance=reach)
     return dc.Simulator(dc.Scene([cloth], [plate]), 0.01, scheme=scheme, contact=contact)
 
 
-def batch(n, environments, seed=0, scheme="coupled", folded=True):
+def batch(n, environments, seed=0, scheme="coupled", folded=True, woven=False):
     """A state whose environments differ in their velocities."""
-    state = simulator(n, scheme, folded).initial_state(environments)
+    state = simulator(n, scheme, folded, woven).initial_state(environments)
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(state.velocities.shape, generator=generator, dtype=F64)
     speed = torch.tensor([0.3, 0.1, -0.05], dtype=F64)

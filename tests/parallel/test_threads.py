@@ -71,6 +71,21 @@ def test_split_has_the_same_bits_on_any_number_of_threads(serial, count):
 
 
 @pytest.mark.parametrize("n", SIZES[:2])
+def test_woven_cloth_has_the_same_bits_alone_and_on_any_number_of_threads(n):
+    sim, state = simulator(n, woven=True), batch(n, ENVIRONMENTS, woven=True)
+    with threads(1):
+        after, expected = step(sim, state)
+        alone = [step(sim, environment)[0] for environment in state]
+    assert (after.report.contact_count > n * n // 2).all()
+    for i, one in enumerate(alone):
+        assert torch.equal(one.positions, expected[0][i])
+    for count in (2, 4):
+        with threads(count):
+            _, values = step(sim, state)
+        assert differing(values, expected) == []
+
+
+@pytest.mark.parametrize("n", SIZES[:2])
 def test_an_environment_has_the_same_bits_alone_and_in_a_batch(serial, n):
     state, expected = serial(n)
     with threads(1):

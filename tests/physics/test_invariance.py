@@ -13,7 +13,11 @@ import diffcloth_torch as dc
 G = 9.81
 DT = 0.01
 STEPS = 4
-SCHEMES = ["coupled", "split"]
+SETTINGS = {
+    "coupled": {"scheme": "coupled"},
+    "split": {"scheme": "split"},
+    "woven": {"scheme": "coupled", "warp": np.array([0.8, 0.6, 0.0])},
+}
 CONTACT = {"barrier_distance": 4e-3, "slip_velocity": 1e-2}
 SAME = 1e-9
 
@@ -35,6 +39,7 @@ class Setting:
     s: float = 1.0
     far_body: bool = False
     scheme: str = "coupled"
+    warp: np.ndarray | None = None  # direction; None: the cloth is isotropic
 
     def simulator(self):
         m, kg, s = self.m, self.kg, self.s
@@ -46,9 +51,22 @@ class Setting:
             friction=0.3,
             thickness=1e-3 * m,
         )
+        if self.warp is not None:
+            material = dataclasses.replace(
+                material,
+                stretch_weft=80.0 * kg / s**2,
+                stretch_shear=20.0 * kg / s**2,
+                bending_weft=4e-4 * kg * m**2 / s**2,
+                bending_twill=7e-4 * kg * m**2 / s**2,
+            )
         rest = self.vertices / 1.02  # pretension
         cloth = dc.Cloth(
-            self.vertices, self.faces, rest_positions=rest, material=material, pins={"p": self.pins}
+            self.vertices,
+            self.faces,
+            rest_positions=rest,
+            material=material,
+            pins={"p": self.pins},
+            directions=self.warp,
         )
         ball = dc.RigidBody.sphere(
             0.1 * m, subdivisions=2, motion="kinematic", pose=self.ball, friction=0.6
@@ -107,9 +125,9 @@ def setting(**changes):
     return dataclasses.replace(base, **changes)
 
 
-@pytest.fixture(scope="module", params=SCHEMES)
+@pytest.fixture(scope="module", params=SETTINGS)
 def reference(request):
-    base = setting(scheme=request.param)
+    base = setting(**SETTINGS[request.param])
     return base, base.run()
 
 
@@ -134,6 +152,7 @@ def test_turning_moving_and_relabeling_the_scene_changes_nothing(reference):
         lift=R @ base.lift,
         spin=multiply(multiply(q, base.spin), q * [1, -1, -1, -1]),
         gravity=R @ base.gravity,
+        warp=None if base.warp is None else R @ base.warp,
     )
     after = moved.run()
     back = (after.positions[place] - tensor(shift)) @ tensor(R)

@@ -17,7 +17,11 @@ REFUSED = (ValueError, TypeError, RuntimeError, KeyError)
 def make():
     """A scene that has every input and a tape with contacts."""
     cloth = dc.Cloth.grid(
-        4, 4, pins={"a": [0]}, soft_pins={"b": [15]}, pose=[0, 0, 0.04, 1, 0, 0, 0]
+        *(4, 4),
+        pins={"a": [0]},
+        soft_pins={"b": [15]},
+        pose=[0, 0, 0.04, 1, 0, 0, 0],
+        material=dc.fabrics.material("denim"),
     )
     box = dc.RigidBody.box(0.2, motion="dynamic", mass=1.0, pose=[0, 0, -0.2, 1, 0, 0, 0])
     hand = dc.Robot.load(dc.robots.GRIPPER, pose=[0, 0, 3, 1, 0, 0, 0], stiffness=1.0, damping=1.0)
@@ -92,6 +96,12 @@ def wrong(array):
 
 KINDS = list(wrong(np.zeros((1, 2))))
 OPTIONAL = {"poisson", "rest_positions", "barrier_stiffness", "friction_origins"}
+WOVEN = {
+    "stretch_weft": "stretch_shear",
+    "stretch_shear": "stretch_weft",
+    "bending_weft": "bending_twill",
+    "bending_twill": "bending_weft",
+}
 
 
 @pytest.mark.boundary
@@ -119,7 +129,23 @@ def test_an_input_of_another_size_is_refused(sim, inputs, forward, name, kind):
 
 
 @pytest.mark.boundary
-@pytest.mark.parametrize("name", [n for n in _core.input_names if n not in OPTIONAL])
+@pytest.mark.parametrize("name", WOVEN)
+def test_inputs_of_woven_cloth_go_in_pairs_where_there_are_axes(sim, inputs, name):
+    pair = {name, WOVEN[name]}
+    both = {key: array for key, array in inputs.items() if key not in pair}
+    sim._core.forward(both, False, 1)
+    alone = both | {name: inputs[name]}
+    with pytest.raises(ValueError, match=rf"core: `{name}`|core: .*`{name}` must be given togeth"):
+        sim._core.forward(alone, False, 1)
+    plain = dc.Simulator(dc.Scene([dc.Cloth.grid(4, 4)]), 0.01)
+    tensors, _ = plain._inputs(plain.initial_state(), None, None)
+    given = {k: as_array(t) for k, t in tensors.items()} | {k: np.ones((1, 1)) for k in pair}
+    with pytest.raises(ValueError, match=r"core: .* need a scene with `material_axes`"):
+        plain._core.forward(given, False, 1)
+
+
+@pytest.mark.boundary
+@pytest.mark.parametrize("name", [n for n in _core.input_names if n not in OPTIONAL | set(WOVEN)])
 def test_an_input_that_is_not_there_is_refused(sim, inputs, name):
     without = {key: array for key, array in inputs.items() if key != name}
     with pytest.raises(ValueError, match=f"core: `{name}`"):

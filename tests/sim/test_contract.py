@@ -36,7 +36,8 @@ PUBLIC = {
     "IntersectingState": "",
     "InvalidInput": "",
     "Material": (
-        "stretch bending poisson density damping friction thickness normal_drag tangential_drag"
+        "stretch bending poisson density damping friction thickness normal_drag tangential_drag "
+        "stretch_weft stretch_shear bending_weft bending_twill is_orthotropic per_face"
     ),
     "NotConverged": "",
     "TurnedTooFar": "",
@@ -45,7 +46,8 @@ PUBLIC = {
         "barrier_distance slip_velocity pin_stiffness gravity rest_positions attachment_stiffness "
         "normal_drag tangential_drag air_density body_mass body_center body_inertia link_mass "
         "link_center link_inertia joint_stiffness "
-        "joint_damping joint_viscosity joint_armature replace"
+        "joint_damping joint_viscosity joint_armature stretch_weft stretch_shear "
+        "bending_weft bending_twill replace"
     ),
     "Report": "select stack where",
     "RigidBody": "load box sphere capsule cylinder plane",
@@ -70,6 +72,7 @@ PUBLIC = {
     "Variable": "",
     "residuals": "markers outline point_cloud",
     "envs": "make TASKS ClothVectorEnv Task",
+    "fabrics": "MEASUREMENTS Measurement material",
     "learn": "Policy Processes Ranks RayActors Trainer TrainerOptions",
     "robots": "GRIPPER panda",
     "stack": "",
@@ -219,6 +222,10 @@ def test_parameters_that_the_scene_lacks_are_none_and_refused():
         assert getattr(parameters, name) is None
     assert parameters.pin_stiffness is None
     assert parameters.poisson is None
+    for name in ("stretch_weft", "stretch_shear", "bending_weft", "bending_twill"):
+        assert getattr(parameters, name) is None
+        with pytest.raises(dc.InvalidInput, match=f"`{name}` must be None"):
+            sim.step(sim.initial_state(), None, parameters.replace(**{name: 0.1}))
     with pytest.raises(dc.InvalidInput, match="`friction` must be None"):
         sim.step(sim.initial_state(), None, parameters.replace(friction=0.1))
 

@@ -26,6 +26,10 @@ DEPENDS = {
     | {"parameters.thickness", "parameters.barrier_stiffness", "parameters.barrier_distance"},
     "gravity": SHAPE | {"parameters.density", "parameters.gravity"},
 }
+OF_WOVEN_CLOTH = {
+    "stretch": {"parameters.stretch_weft", "parameters.stretch_shear"},
+    "bending": {"parameters.bending_weft", "parameters.bending_twill"},
+}
 OF_BODIES = {
     "contact": {"state.body_poses", "state.base_poses", "state.joint_positions"},
     "gravity": {
@@ -158,6 +162,8 @@ REGIMES = {
     "folded": (),
     "folded_thick": (),
     "stacked": (),
+    "woven": {"contact"},
+    "woven_stacked": (),
     **dict.fromkeys(HANDLED, ()),
 }
 
@@ -171,6 +177,8 @@ def dependencies(name, part):
         found = found | {"state.body_poses"}
     if name == "hinge":
         found = found - {"parameters.poisson"}
+    if name.startswith("woven"):
+        found = found | OF_WOVEN_CLOTH.get(part, set())
     return found
 
 

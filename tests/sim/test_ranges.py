@@ -23,7 +23,8 @@ def sim():
 @pytest.fixture(scope="module")
 def moved_sim():
     """With a body and a robot that forces move: a scene that has every parameter."""
-    cloth = dc.Cloth.grid(3, 3, pins={"a": [0]}, soft_pins={"b": [8]})
+    material = dc.fabrics.material("denim")
+    cloth = dc.Cloth.grid(3, 3, pins={"a": [0]}, soft_pins={"b": [8]}, material=material)
     box = dc.RigidBody.box(0.2, motion="dynamic", mass=1.0, pose=[0, 0, -0.2, 1, 0, 0, 0])
     hand = dc.Robot.load(dc.robots.GRIPPER, pose=[0, 0, 3, 1, 0, 0, 0], stiffness=1.0, damping=1.0)
     picker = dc.Attachment(("cloth0", 4), stiffness=1.0)

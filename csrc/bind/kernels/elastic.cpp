@@ -141,6 +141,32 @@ class Elastic {
     elastic::prepare(model_, slots_);
   }
 
+  /// Make the faces woven, or isotropic again where `axes` is empty. To be called before
+  /// set_parameters(), which takes the warp's stiffnesses.
+  ///
+  /// @param axes     [2 F] unit vectors of the warp in the rest frames
+  /// @param woven    [4 F] k_f, k_s, D_f and D_t, one after the other
+  void set_weave(const Values& axes, const Values& woven) {
+    const std::size_t faces = topology_.faces.size();
+    const bool is_woven = axes.shape(0) > 0;
+    check_rows("axes", axes.shape(0), is_woven ? 2 * faces : 0);
+    check_rows("woven", woven.shape(0), is_woven ? 4 * faces : 0);
+    axes_.clear();
+    for (std::size_t f = 0; 2 * f < axes.shape(0); ++f)
+      axes_.emplace_back(axes(2 * f), axes(2 * f + 1));
+    const std::array fields{&model_.stretch_weft, &model_.stretch_shear, &model_.bending_weft,
+                            &model_.bending_twill};
+    for (std::size_t k = 0; k < fields.size(); ++k) {
+      const double* const first = woven.data() + k * faces;
+      if (is_woven) {
+        fields[k]->assign(first, first + faces);
+      } else {
+        fields[k]->clear();
+      }
+    }
+    model_.axes = &axes_;
+  }
+
   Array hessian_blocks(const Positions& x, bool positive) const {
     std::vector<double> blocks(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
     const auto curvature = positive ? Curvature::kPositive : Curvature::kExact;
@@ -220,6 +246,10 @@ class Elastic {
     result["bending"] = vector_array(bar.bending);
     result["poisson"] = vector_array(bar.poisson);
     result["damping"] = vector_array(bar.damping);
+    result["stretch_weft"] = vector_array(bar.stretch_weft);
+    result["stretch_shear"] = vector_array(bar.stretch_shear);
+    result["bending_weft"] = vector_array(bar.bending_weft);
+    result["bending_twill"] = vector_array(bar.bending_twill);
   }
 
   nb::dict mixed(const Positions& x, const Positions& z, bool with_rest) const {
@@ -349,6 +379,7 @@ class Elastic {
   elastic::Slots slots_;
   elastic::Model model_;
   std::vector<double> x_n_;
+  std::vector<Vec2> axes_;
   std::optional<elastic::ElasticPotential> potential_;  // of the model at the last call
 };
 
@@ -446,6 +477,7 @@ void elastic_kernels(nb::module_& m) {
       .def(nb::init<const Positions&, const Faces&, const std::string&>(), "X"_a.noconvert(),
            "faces"_a.noconvert(), "bending_model"_a)
       .def("set_rest", &Elastic::set_rest, "X"_a.noconvert())
+      .def("set_weave", &Elastic::set_weave, "axes"_a.noconvert(), "woven"_a.noconvert())
       .def("set_parameters", &Elastic::set_parameters, "stretch"_a.noconvert(),
            "bending"_a.noconvert(), "poisson"_a.noconvert(), "damping"_a.noconvert(), "h"_a,
            "x_n"_a.noconvert().none())

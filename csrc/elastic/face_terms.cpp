@@ -1,0 +1,82 @@
+#include "elastic/face_terms.h"
+
+#include "elastic/damping.h"
+#include "elastic/elements.h"
+#include "elastic/orthotropic_damping.h"
+#include "elastic/orthotropic_stretch.h"
+#include "elastic/stretch.h"
+
+namespace diffcloth::elastic {
+namespace {
+
+Weave stretch_weave(const Model& model, Index f) {
+  return weave(model, f).scaled(model.rest->area[f]);
+}
+
+double damping_weight(const Model& model, Index f) {
+  return model.damping[f] / model.h * stretch_weight(model, f);
+}
+
+Weave damping_weave(const Model& model, Index f) {
+  return stretch_weave(model, f).scaled(model.damping[f] / model.h);
+}
+
+}  // namespace
+
+double stretch_energy(const Model& model, Index f, const Mat32& F) {
+  if (is_orthotropic(model, f)) return orthotropic::energy(stretch_weave(model, f), F);
+  return stretch::energy(stretch_weight(model, f), F);
+}
+
+Mat32 stretch_stress(const Model& model, Index f, const Mat32& F) {
+  if (is_orthotropic(model, f)) return orthotropic::stress(stretch_weave(model, f), F);
+  return stretch::stress(stretch_weight(model, f), F);
+}
+
+Mat2 second_stress(const Model& model, Index f, const Mat32& F) {
+  if (is_orthotropic(model, f)) return orthotropic::second_stress(stretch_weave(model, f), F);
+  return stretch::second_stress(stretch_weight(model, f), F);
+}
+
+Mat32 stretch_stress_change(const Model& model, Index f, const Mat32& F, const Mat32& G) {
+  if (is_orthotropic(model, f)) return orthotropic::stress_change(stretch_weave(model, f), F, G);
+  return stretch::stress_change(stretch_weight(model, f), F, G);
+}
+
+double damping_energy_change(const Model& model,
+                             Index f,
+                             const Mat32& F0,
+                             const Mat32& F1,
+                             const Mat32& dF,
+                             const Mat32& F_n) {
+  if (is_orthotropic(model, f)) {
+    return orthotropic_damping::energy_change(damping_weave(model, f), F0, F1, dF, F_n);
+  }
+  return damping::energy_change(damping_weight(model, f), F0, F1, dF, F_n);
+}
+
+Mat32 damping_stress(const Model& model, Index f, const Mat32& F, const Mat32& F_n) {
+  if (is_orthotropic(model, f)) {
+    return orthotropic_damping::stress(damping_weave(model, f), F, F_n);
+  }
+  return damping::stress(damping_weight(model, f), F, F_n);
+}
+
+Mat32 damping_stress_change(
+    const Model& model, Index f, const Mat32& F, const Mat32& F_n, const Mat32& G) {
+  if (is_orthotropic(model, f)) {
+    return orthotropic_damping::stress_change(damping_weave(model, f), F, F_n, G);
+  }
+  return damping::stress_change(damping_weight(model, f), F, F_n, G);
+}
+
+std::array<Mat3, 6> damping_hessian(
+    const Model& model, Index f, const Mat32& F, const Mat32& F_n, bool positive) {
+  const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
+  if (is_orthotropic(model, f)) {
+    return orthotropic_damping::hessian(damping_weave(model, f), g, F, F_n, positive);
+  }
+  return damping::hessian(damping_weight(model, f), g, F, F_n, positive);
+}
+
+}  // namespace diffcloth::elastic

@@ -1,0 +1,32 @@
+#pragma once
+
+#include "elastic/elastic.h"
+
+namespace diffcloth::elastic {
+
+// The parts of add_mixed(), add_tangent() and add_energy_bars() of one face whose stretch has three
+// stiffnesses, also where their values are equal.
+
+void add_woven_mixed(
+    const Model& model, Index f, const double* x, const double* z, bool with_rest, Bar& bar);
+
+/// Of damping; the model has a start of the step.
+void add_woven_damping_mixed(
+    const Model& model, Index f, const double* x, const double* z, bool with_rest, Bar& bar);
+
+void add_woven_tangent(const Model& model,
+                       Index f,
+                       const double* x,
+                       const Bar& dot,
+                       const Changing& changing,
+                       double* y);
+
+void add_woven_energy_bars(const Model& model,
+                           Index f,
+                           const double* x,
+                           double seed,
+                           bool with_rest,
+                           Bar& bar,
+                           double* x_bar);
+
+}  // namespace diffcloth::elastic
