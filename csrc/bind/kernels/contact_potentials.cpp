@@ -163,7 +163,10 @@ class ContactPotential {
   /// the two above.
   Rows3 tangent(const Positions& x, const nb::dict& dot) {
     Rows3 y = Rows3::Zero(x.rows(), 3);
-    model_.add_tangent(find(x), x.data(), from_dict(dot), y.data());
+    const contact::ContactModel::Bar parameters = from_dict(dot);
+    const std::array directions{&parameters};
+    const std::array out{y.data()};
+    model_.add_tangents(find(x), x.data(), directions, out);
     return y;
   }
 
@@ -176,8 +179,10 @@ class ContactPotential {
     const auto start = nb::cast<Values>(dot["x_start"]);
     const auto lag = nb::cast<Values>(dot["x_lag"]);
     Rows3 y = Rows3::Zero(x.rows(), 3);
-    set.add_tangent(x.data(), x_lag.data(),
-                    {.parameters = parameters, .start = start.data(), .lag = lag.data()}, y.data());
+    const std::array<contact::FrictionSet::Tangents, 1> directions{
+        {{.parameters = &parameters, .start = start.data(), .lag = lag.data()}}};
+    const std::array out{y.data()};
+    set.add_tangents(x.data(), x_lag.data(), directions, out);
     return y;
   }
 
