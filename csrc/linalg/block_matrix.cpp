@@ -150,30 +150,62 @@ void BlockValues::add_products(std::span<const double* const> x, std::span<doubl
   linalg::add_products(merged_->pattern, blocks_.data(), x, y);
 }
 
+namespace {
+
+const DenseKernels& kernels() {
+  static const DenseKernels& best = dense_kernels(best_level());
+  return best;
+}
+
+using Numbers = std::vector<double, RecyclingAllocator<double>>;
+
+void add_one_product(const BlockPattern& pattern,
+                     const double* blocks,
+                     const double* x,
+                     double* y) {
+  const auto n = static_cast<std::size_t>(pattern.size());
+  Numbers wide(8 * n);
+  double* const wide_y = wide.data() + 4 * n;
+  for (std::size_t i = 0; i < n; ++i) std::copy_n(x + 3 * i, 3, wide.data() + 4 * i);
+  kernels().multiply_blocks(pattern.column_start().data(), pattern.row().data(), pattern.size(),
+                            blocks, wide.data(), wide_y);
+  for (std::size_t i = 0; i < n; ++i) {
+    for (std::size_t a = 0; a < 3; ++a) y[3 * i + a] += wide_y[4 * i + a];
+  }
+}
+
+/// For at most kMaxVectors.
+void add_many_products(const BlockPattern& pattern,
+                       const double* blocks,
+                       std::span<const double* const> x,
+                       std::span<double* const> y) {
+  const std::size_t n = 3 * static_cast<std::size_t>(pattern.size());
+  Numbers wide(2 * n * kMaxVectors);
+  double* const wide_y = wide.data() + n * kMaxVectors;
+  for (std::size_t i = 0; i < n; ++i) {
+    for (std::size_t r = 0; r < x.size(); ++r) wide[i * kMaxVectors + r] = x[r][i];
+  }
+  kernels().multiply_blocks_many(pattern.column_start().data(), pattern.row().data(),
+                                 pattern.size(), blocks, wide.data(), wide_y);
+  for (std::size_t i = 0; i < n; ++i) {
+    for (std::size_t r = 0; r < y.size(); ++r) y[r][i] += wide_y[i * kMaxVectors + r];
+  }
+}
+
+}  // namespace
+
 void add_products(const BlockPattern& pattern,
                   const double* blocks,
                   std::span<const double* const> x,
                   std::span<double* const> y) {
-  static const DenseKernels& kernels = dense_kernels(best_level());
-  const auto n = static_cast<std::size_t>(pattern.size());
-  const std::size_t most = std::min<std::size_t>(x.size(), kMaxVectors);
-  std::vector<double> wide(8 * n * most);
-  double* const wide_y = wide.data() + 4 * n * most;
-  for (std::size_t begin = 0; begin < x.size(); begin += most) {
-    const std::size_t count = std::min(most, x.size() - begin);
-    for (std::size_t r = 0; r < count; ++r) {
-      for (std::size_t i = 0; i < n; ++i) {
-        std::copy_n(x[begin + r] + 3 * i, 3, wide.data() + 4 * (r * n + i));
-      }
+  for (std::size_t begin = 0; begin < x.size();) {
+    const std::size_t count = at_once(x.size() - begin);
+    if (count == 1) {
+      add_one_product(pattern, blocks, x[begin], y[begin]);
+    } else {
+      add_many_products(pattern, blocks, x.subspan(begin, count), y.subspan(begin, count));
     }
-    std::fill_n(wide_y, 4 * n * count, 0.0);
-    kernels.multiply_blocks(pattern.column_start().data(), pattern.row().data(), pattern.size(),
-                            blocks, wide.data(), wide_y, static_cast<int>(count));
-    for (std::size_t r = 0; r < count; ++r) {
-      for (std::size_t i = 0; i < n; ++i) {
-        for (std::size_t a = 0; a < 3; ++a) y[begin + r][3 * i + a] += wide_y[4 * (r * n + i) + a];
-      }
-    }
+    begin += count;
   }
 }
 

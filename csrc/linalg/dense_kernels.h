@@ -10,8 +10,14 @@ namespace diffcloth::linalg {
 /// Columns that are factored before later ones see them: what they need at a time stays in the cache.
 constexpr int kColumnBlock = 96;
 
-/// Most vectors that one call of a kernel takes.
+/// Vectors that kernels for many take at once.
 constexpr int kMaxVectors = 8;
+
+/// How many of some vectors that are left take one call: where they are few, one at a time is as fast.
+constexpr std::size_t at_once(std::size_t left) {
+  constexpr std::size_t kFew = 4;
+  return left <= kFew ? 1 : left < kMaxVectors ? left : kMaxVectors;
+}
 
 /// How the columns of a lower triangle, and of rows below it, are stored: column-major in blocks of
 /// kColumnBlock columns, each without the rows above its part of the triangle. Always inlined, as
@@ -108,27 +114,31 @@ struct FrontKernels {
   void (*add_to_update)(
       const Front& child, const Real* u, const ChildMap& map, const Front& front, Real* parent_u);
 
-  /// c_1 := L_1^-1 c_1, c_2 := c_2 - L_2 c_1 for up to kMaxVectors vectors c, `stride` apart; c_2 begins at
-  /// `top`, entries of padding are zero.
-  void (*forward)(const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride, int count);
+  /// c_1 := L_1^-1 c_1, c_2 := c_2 - L_2 c_1; c_2 begins at `top`, entries of padding are zero.
+  void (*forward)(const Front& front, const Real* panel, Real* c);
 
   /// c_1 := L_1^-T (c_1 - L_2^T c_2), in the same layout.
-  void (*backward)(
-      const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride, int count);
+  void (*backward)(const Front& front, const Real* panel, Real* c);
+
+  /// The same for kMaxVectors vectors, entry by entry, each with the bits that it has alone.
+  void (*forward_many)(const Front& front, const Real* panel, Real* c);
+  void (*backward_many)(const Front& front, const Real* panel, Real* c);
 };
+
+/// y += A x for a symmetric matrix given by its lower 3x3 blocks on a BlockPattern. The same bits on every
+/// level.
+using MultiplyBlocks = void (*)(const std::int32_t* column_start,
+                                const std::int32_t* row,
+                                std::int32_t size,
+                                const double* blocks,
+                                const double* x,
+                                double* y);
 
 /// All dense kernels of a level.
 struct DenseKernels {
-  /// y += A x for a symmetric matrix given by its lower 3x3 blocks on a BlockPattern, and for up to
-  /// kMaxVectors vectors, one behind the other. These have four numbers a row, the last of which means
-  /// nothing. The same bits on every level, and for a vector alone.
-  void (*multiply_blocks)(const std::int32_t* column_start,
-                          const std::int32_t* row,
-                          std::int32_t size,
-                          const double* blocks,
-                          const double* x,
-                          double* y,
-                          int count);
+  MultiplyBlocks multiply_blocks;  ///< x and y have four numbers a row, the last means nothing
+  MultiplyBlocks
+      multiply_blocks_many;  ///< three, and each kMaxVectors times, with the bits of one alone
   FrontKernels<double> doubles;
   FrontKernels<float> floats;
 };

@@ -1,9 +1,10 @@
 // The dense kernels, written once over packs of numbers that fill a cache line: eight doubles or sixteen
 // floats. A file that compiles them for some instructions defines, in its anonymous namespace and
-// before it includes this one, the types Doubles and Floats of such packs, with the operations on them,
-// and
+// before it includes this one, the types Doubles and Floats of such packs, ManyFloats of kMaxVectors floats,
+// with the operations on them, and
 //
-//   kPacks  packs of rows in a block of registers,   kWidth  columns of it, a divisor of eight
+//   kPacks   packs of rows in a block of registers,   kWidth  columns of it, a divisor of eight
+//   kAcross  vectors that a product with a block takes in registers, a divisor of kMaxVectors
 //
 // Such a file must hold nothing that another file could define, too: the linker would keep one copy,
 // perhaps of instructions that the machine lacks. So this one includes no Eigen and no standard
@@ -26,8 +27,8 @@ namespace {
 inline double square_root(double a) { return __builtin_sqrt(a); }
 inline float square_root(float a) { return __builtin_sqrtf(a); }
 
-/// The factorization of fronts, over packs of either precision.
-template <class Pack>
+/// The factorization of fronts, over packs of either precision, and of numbers of kMaxVectors vectors.
+template <class Pack, class Many>
 struct Fronts {
   using Real = typename Pack::Real;  // NOLINT(readability-redundant-typename): for older compilers
   static constexpr int kLanes = 64 / sizeof(Real);
@@ -332,38 +333,53 @@ struct Fronts {
     }
   }
 
-  /// y := L^-1 y for `width` columns l of a panel from their diagonal on, in registers.
-  template <int Width>
-  static DIFFCLOTH_INLINE void solve_triangle(const Real* l, std::ptrdiff_t ld, Real* y) {
-    Real t[Width];
+  /// y := L^-1 y for `Width` columns l of a panel from their diagonal on, in registers; of one vector where
+  /// Number is Real, of many where it is Many.
+  template <int Width, class Number>
+  static DIFFCLOTH_INLINE void solve_triangle(const Real* l, std::ptrdiff_t ld, Number* y) {
+    Number t[Width];
 #pragma GCC unroll 16
     for (int i = 0; i < Width; ++i) t[i] = y[i];
 #pragma GCC unroll 16
     for (int j = 0; j < Width; ++j) {
-      t[j] *= l[j * ld + j];
+      t[j] = t[j] * same<Number>(l[j * ld + j]);
 #pragma GCC unroll 16
-      for (int i = j + 1; i < Width; ++i) t[i] = subtract_product_of(t[i], l[j * ld + i], t[j]);
+      for (int i = j + 1; i < Width; ++i) {
+        t[i] = subtract_product_of(t[i], same<Number>(l[j * ld + i]), t[j]);
+      }
     }
 #pragma GCC unroll 16
     for (int i = 0; i < Width; ++i) y[i] = t[i];
   }
 
   /// y := L^-T y, likewise.
-  template <int Width>
+  template <int Width, class Number>
   static DIFFCLOTH_INLINE void solve_transposed_triangle(const Real* l,
                                                          std::ptrdiff_t ld,
-                                                         Real* y) {
-    Real t[Width];
+                                                         Number* y) {
+    Number t[Width];
 #pragma GCC unroll 16
     for (int i = 0; i < Width; ++i) t[i] = y[i];
 #pragma GCC unroll 16
     for (int j = Width - 1; j >= 0; --j) {
-      t[j] *= l[j * ld + j];
+      t[j] = t[j] * same<Number>(l[j * ld + j]);
 #pragma GCC unroll 16
-      for (int i = 0; i < j; ++i) t[i] = subtract_product_of(t[i], l[i * ld + j], t[j]);
+      for (int i = 0; i < j; ++i) {
+        t[i] = subtract_product_of(t[i], same<Number>(l[i * ld + j]), t[j]);
+      }
     }
 #pragma GCC unroll 16
     for (int i = 0; i < Width; ++i) y[i] = t[i];
+  }
+
+  /// A number, for each of the vectors.
+  template <class Number>
+  static DIFFCLOTH_INLINE Number same(Real a) {
+    if constexpr (sizeof(Number) == sizeof(Real)) {
+      return a;
+    } else {
+      return to_many(a);
+    }
   }
 
   /// Call f<Width>() for the width of a triangle; supernodes are made of vertices of three columns each,
@@ -379,104 +395,156 @@ struct Fronts {
     call.template operator()<Width>();
   }
 
-  template <int R>
-  static void forward(const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride) {
+  static void forward(const Front& front, const Real* panel, Real* c) {
     for (int column = 0; column < front.columns; column += kLanes) {
       const int width = front.columns - column < kLanes ? front.columns - column : kLanes;
       const Real* const l = panel + front.panel().place(0, column);
       const std::ptrdiff_t ld = front.panel().stride(column);
-      for (int r = 0; r < R; ++r) {
-        with_triangle(width, [&]<int Width> {
-          solve_triangle<Width>(l + column, ld, c + r * stride + column);
-        });
-      }
+      with_triangle(width, [&]<int Width> { solve_triangle<Width>(l + column, ld, c + column); });
       for (int row = column + kLanes; row < front.ld; row += kLanes) {
-        Pack sum[R];
-        for (int r = 0; r < R; ++r) sum[r] = load(c + r * stride + row);
+        Pack sum = load(c + row);
         for (int j = 0; j < width; ++j) {
-          const Pack l_j = load(l + j * ld + row);
-          for (int r = 0; r < R; ++r) {
-            sum[r] = subtract_product_of(sum[r], l_j, broadcast(c[r * stride + column + j]));
-          }
+          sum = subtract_product_of(sum, load(l + j * ld + row), broadcast(c[column + j]));
         }
-        for (int r = 0; r < R; ++r) store(c + r * stride + row, sum[r]);
+        store(c + row, sum);
       }
     }
   }
 
-  /// Subtract from y[0 .. W - 1] the products of W columns, `ld` apart, with the vectors c.
-  template <int R, int W>
-  static void subtract_dots(
-      const Real* l, std::ptrdiff_t ld, int length, const Real* c, Real* y, std::ptrdiff_t stride) {
-    Pack sum[R][W];
-    for (int r = 0; r < R; ++r) {
-      for (int j = 0; j < W; ++j) sum[r][j] = Pack{};
-    }
+  /// Subtract from y[0 .. W - 1] the products of W columns, `ld` apart, with the vector c.
+  template <int W>
+  static void subtract_dots(const Real* l, std::ptrdiff_t ld, int length, const Real* c, Real* y) {
+    Pack sum[W];
+    for (int j = 0; j < W; ++j) sum[j] = Pack{};
     for (int row = 0; row < length; row += kLanes) {
-      Pack l_j[W];
-      for (int j = 0; j < W; ++j) l_j[j] = load(l + j * ld + row);
-      for (int r = 0; r < R; ++r) {
-        const Pack c_r = load(c + r * stride + row);
-        for (int j = 0; j < W; ++j) sum[r][j] = subtract_product_of(sum[r][j], l_j[j], c_r);
+      const Pack c_row = load(c + row);
+      for (int j = 0; j < W; ++j) {
+        sum[j] = subtract_product_of(sum[j], load(l + j * ld + row), c_row);
       }
     }
-    for (int r = 0; r < R; ++r) {
-      for (int j = 0; j < W; ++j) y[r * stride + j] += total(sum[r][j]);
-    }
+    for (int j = 0; j < W; ++j) y[j] += total(sum[j]);
   }
 
-  template <int R>
-  static void backward(const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride) {
+  static void backward(const Front& front, const Real* panel, Real* c) {
     for (int column = down_to_pack(front.columns - 1); column >= 0; column -= kLanes) {
       const int width = front.columns - column < kLanes ? front.columns - column : kLanes;
       const int below = column + kLanes;
       const Real* const l = panel + front.panel().place(0, column);
       const std::ptrdiff_t ld = front.panel().stride(column);
-      constexpr int kAtOnce = R > 4 ? 2 : 4;  // sums stay in registers
       int j = 0;
-      for (; j + kAtOnce <= width; j += kAtOnce) {
-        subtract_dots<R, kAtOnce>(l + j * ld + below, ld, front.ld - below, c + below,
-                                  c + column + j, stride);
+      for (; j + 4 <= width; j += 4) {
+        subtract_dots<4>(l + j * ld + below, ld, front.ld - below, c + below, c + column + j);
       }
       for (; j < width; ++j) {
-        subtract_dots<R, 1>(l + j * ld + below, ld, front.ld - below, c + below, c + column + j,
-                            stride);
+        subtract_dots<1>(l + j * ld + below, ld, front.ld - below, c + below, c + column + j);
       }
-      for (int r = 0; r < R; ++r) {
-        with_triangle(width, [&]<int Width> {
-          solve_transposed_triangle<Width>(l + column, ld, c + r * stride + column);
-        });
+      with_triangle(
+          width, [&]<int Width> { solve_transposed_triangle<Width>(l + column, ld, c + column); });
+    }
+  }
+
+  /// The triangle of a block of columns, of many vectors.
+  template <bool kTransposed>
+  static DIFFCLOTH_INLINE void solve_triangle_of_many(const Real* l,
+                                                      std::ptrdiff_t ld,
+                                                      int width,
+                                                      Real* c) {
+    with_triangle(width, [&]<int Width> {
+      Many y[Width];
+      for (int i = 0; i < Width; ++i) y[i] = load_many(c + kMaxVectors * i);
+      if constexpr (kTransposed) {
+        solve_transposed_triangle<Width>(l, ld, y);
+      } else {
+        solve_triangle<Width>(l, ld, y);
+      }
+      for (int i = 0; i < Width; ++i) store(c + kMaxVectors * i, y[i]);
+    });
+  }
+
+  static void forward_many(const Front& front, const Real* panel, Real* c) {
+    constexpr int kRows = 8;  // sums stay in registers
+    for (int column = 0; column < front.columns; column += kLanes) {
+      const int width = front.columns - column < kLanes ? front.columns - column : kLanes;
+      const Real* const l = panel + front.panel().place(0, column);
+      const std::ptrdiff_t ld = front.panel().stride(column);
+      Real* const c_column = c + kMaxVectors * column;
+      solve_triangle_of_many<false>(l + column, ld, width, c_column);
+      for (int row = column + kLanes; row < front.ld; row += kRows) {
+        Many sum[kRows];
+        for (int i = 0; i < kRows; ++i) sum[i] = load_many(c + kMaxVectors * (row + i));
+        for (int j = 0; j < width; ++j) {
+          const Many c_j = load_many(c_column + kMaxVectors * j);
+          const Real* const l_j = l + j * ld + row;
+#pragma GCC unroll 8
+          for (int i = 0; i < kRows; ++i) {
+            sum[i] = subtract_product_of(sum[i], to_many(l_j[i]), c_j);
+          }
+        }
+        for (int i = 0; i < kRows; ++i) store(c + kMaxVectors * (row + i), sum[i]);
       }
     }
   }
 
-  /// Call f<R>() for the number of vectors.
-  template <int R = 1, class Call>
-  static DIFFCLOTH_INLINE void with_count(int count, Call call) {
-    if constexpr (R < kMaxVectors) {
-      if (count > R) {
-        with_count<R + 1>(count, call);
-        return;
+  /// Subtract from y[0 .. W - 1] the products of W columns, `ld` apart, with many vectors. Sums have the order
+  /// of subtract_dots(): in lanes, here L of them at a time, which are added up in the order of total().
+  template <int L, int W>
+  static void subtract_dots_of_many(
+      const Real* l, std::ptrdiff_t ld, int length, const Real* c, Real* y) {
+    Many sum[W][kLanes];
+    for (int lane = 0; lane < kLanes; lane += L) {
+      Many s[W][L];
+#pragma GCC unroll 8
+      for (int k = 0; k < W * L; ++k) s[k / L][k % L] = Many{};
+      for (int row = lane; row < length; row += kLanes) {
+#pragma GCC unroll 8
+        for (int i = 0; i < L; ++i) {
+          const Many c_i = load_many(c + kMaxVectors * (row + i));
+#pragma GCC unroll 8
+          for (int j = 0; j < W; ++j) {
+            s[j][i] = subtract_product_of(s[j][i], to_many(l[j * ld + row + i]), c_i);
+          }
+        }
       }
+#pragma GCC unroll 8
+      for (int k = 0; k < W * L; ++k) sum[k / L][lane + k % L] = s[k / L][k % L];
     }
-    call.template operator()<R>();
+    for (int j = 0; j < W; ++j) {
+      for (int half = kLanes / 2; half > 0; half /= 2) {
+        for (int i = 0; i < half; ++i) sum[j][i] = sum[j][i] + sum[j][i + half];
+      }
+      Real* const y_j = y + kMaxVectors * j;
+      store(y_j, load_many(y_j) + sum[j][0]);
+    }
   }
 
-  static void forward(
-      const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride, int count) {
-    with_count(count, [&]<int R> { forward<R>(front, panel, c, stride); });
-  }
-
-  static void backward(
-      const Front& front, const Real* panel, Real* c, std::ptrdiff_t stride, int count) {
-    with_count(count, [&]<int R> { backward<R>(front, panel, c, stride); });
+  static void backward_many(const Front& front, const Real* panel, Real* c) {
+    for (int column = down_to_pack(front.columns - 1); column >= 0; column -= kLanes) {
+      const int width = front.columns - column < kLanes ? front.columns - column : kLanes;
+      const int below = column + kLanes;
+      const Real* const l = panel + front.panel().place(0, column);
+      const std::ptrdiff_t ld = front.panel().stride(column);
+      Real* const c_column = c + kMaxVectors * column;
+      const Real* const c_below = c + kMaxVectors * below;
+      int j = 0;
+      for (; j + 4 <= width; j += 4) {
+        subtract_dots_of_many<2, 4>(l + j * ld + below, ld, front.ld - below, c_below,
+                                    c_column + kMaxVectors * j);
+      }
+      for (; j < width; ++j) {
+        subtract_dots_of_many<8, 1>(l + j * ld + below, ld, front.ld - below, c_below,
+                                    c_column + kMaxVectors * j);
+      }
+      solve_triangle_of_many<true>(l + column, ld, width, c_column);
+    }
   }
 
   static constexpr FrontKernels<Real> kKernels{.factor = factor,
                                                .add_to_panel = add_to_panel,
                                                .add_to_update = add_to_update,
                                                .forward = forward,
-                                               .backward = backward};
+                                               .backward = backward,
+                                               .forward_many = forward_many,
+                                               .backward_many = backward_many};
 };
 
 using Four = double __attribute__((vector_size(32)));
@@ -501,64 +569,94 @@ struct Columns {
   }
 };
 
-template <int R>
-void multiply_some(const std::int32_t* column_start,
-                   const std::int32_t* row,
-                   std::int32_t size,
-                   const double* blocks,
-                   const double* x,
-                   double* y) {
-  const std::ptrdiff_t stride = 4 * static_cast<std::ptrdiff_t>(size);
-  for (std::int32_t j = 0; j < size; ++j) {
-    const std::ptrdiff_t place = 4 * static_cast<std::ptrdiff_t>(j);
-    Four dots[R][3] = {};
-    Four x_j[R];
-    Four y_j[R] = {};
-    std::int32_t k = column_start[j];
-    Columns block;
-    block.read(blocks + 9 * static_cast<std::ptrdiff_t>(k));
-    for (int r = 0; r < R; ++r) {
-      x_j[r] = four(x + r * stride + place);
-      block.add_product(x_j[r], y_j[r]);
-    }
-    for (++k; k < column_start[j + 1]; ++k) {
-      block.read(blocks + 9 * static_cast<std::ptrdiff_t>(k));
-      const std::ptrdiff_t i = 4 * static_cast<std::ptrdiff_t>(row[k]);
-      for (int r = 0; r < R; ++r) {
-        const Four x_i = four(x + r * stride + i);
-        Four y_i = four(y + r * stride + i);
-        block.add_product(x_j[r], y_i);
-        *reinterpret_cast<UnalignedFour*>(y + r * stride + i) = y_i;
-        for (int a = 0; a < 3; ++a) dots[r][a] += block.c[a] * x_i;
-      }
-    }
-    for (int r = 0; r < R; ++r) {
-      for (int a = 0; a < 3; ++a) y_j[r][a] += dots[r][a][0] + dots[r][a][1] + dots[r][a][2];
-      *reinterpret_cast<UnalignedFour*>(y + r * stride + place) += y_j[r];
-    }
-  }
-}
-
 void multiply_blocks(const std::int32_t* column_start,
                      const std::int32_t* row,
                      std::int32_t size,
                      const double* blocks,
                      const double* x,
-                     double* y,
-                     int count) {
-  constexpr int kAtOnce = 4;  // sums stay in registers
-  const std::ptrdiff_t stride = 4 * static_cast<std::ptrdiff_t>(size);
-  for (; count >= kAtOnce; count -= kAtOnce, x += kAtOnce * stride, y += kAtOnce * stride) {
-    multiply_some<kAtOnce>(column_start, row, size, blocks, x, y);
+                     double* y) {
+  for (std::int32_t j = 0; j < size; ++j) {
+    const std::ptrdiff_t place = 4 * static_cast<std::ptrdiff_t>(j);
+    Four dots[3] = {};
+    const Four x_j = four(x + place);
+    Four y_j = {};
+    std::int32_t k = column_start[j];
+    Columns block;
+    block.read(blocks + 9 * static_cast<std::ptrdiff_t>(k));
+    block.add_product(x_j, y_j);
+    for (++k; k < column_start[j + 1]; ++k) {
+      block.read(blocks + 9 * static_cast<std::ptrdiff_t>(k));
+      const std::ptrdiff_t i = 4 * static_cast<std::ptrdiff_t>(row[k]);
+      const Four x_i = four(x + i);
+      Four y_i = four(y + i);
+      block.add_product(x_j, y_i);
+      *reinterpret_cast<UnalignedFour*>(y + i) = y_i;
+      for (int a = 0; a < 3; ++a) dots[a] += block.c[a] * x_i;
+    }
+    for (int a = 0; a < 3; ++a) y_j[a] += dots[a][0] + dots[a][1] + dots[a][2];
+    *reinterpret_cast<UnalignedFour*>(y + place) += y_j;
   }
-  for (; count > 0; --count, x += stride, y += stride) {
-    multiply_some<1>(column_start, row, size, blocks, x, y);
+}
+
+/// Numbers of kAcross of kMaxVectors vectors.
+using Across = double __attribute__((vector_size(8 * kAcross)));
+using UnalignedAcross = double __attribute__((vector_size(8 * kAcross), aligned(8), may_alias));
+
+DIFFCLOTH_INLINE const UnalignedAcross& across(const double* from) {
+  return *reinterpret_cast<const UnalignedAcross*>(from);
+}
+
+/// The same for kAcross of kMaxVectors vectors, whose numbers lie side by side.
+void multiply_some(const std::int32_t* __restrict column_start,
+                   const std::int32_t* __restrict row,
+                   std::int32_t size,
+                   const double* __restrict blocks,
+                   const double* __restrict x,
+                   double* __restrict y) {
+  constexpr std::ptrdiff_t kRow = 3 * kMaxVectors;
+  for (std::int32_t j = 0; j < size; ++j) {
+    Across x_j[3];
+    Across y_j[3];
+    Across dots[3][3] = {};
+    for (int b = 0; b < 3; ++b) x_j[b] = across(x + j * kRow + b * kMaxVectors);
+    std::int32_t k = column_start[j];
+    const double* A = blocks + 9 * static_cast<std::ptrdiff_t>(k);
+    for (int b = 0; b < 3; ++b) y_j[b] = A[b] * x_j[0] + A[3 + b] * x_j[1] + A[6 + b] * x_j[2];
+    for (++k; k < column_start[j + 1]; ++k) {
+      A += 9;
+      const double* const x_i = x + row[k] * kRow;
+      double* const y_i = y + row[k] * kRow;
+#pragma GCC unroll 3
+      for (int b = 0; b < 3; ++b) {
+        const Across x_ib = across(x_i + b * kMaxVectors);
+#pragma GCC unroll 3
+        for (int a = 0; a < 3; ++a) dots[a][b] += A[3 * a + b] * x_ib;
+        const Across sum = A[b] * x_j[0] + A[3 + b] * x_j[1] + A[6 + b] * x_j[2];
+        *reinterpret_cast<UnalignedAcross*>(y_i + b * kMaxVectors) += sum;
+      }
+    }
+    for (int a = 0; a < 3; ++a) {
+      y_j[a] += dots[a][0] + dots[a][1] + dots[a][2];
+      *reinterpret_cast<UnalignedAcross*>(y + j * kRow + a * kMaxVectors) += y_j[a];
+    }
+  }
+}
+
+void multiply_blocks_many(const std::int32_t* column_start,
+                          const std::int32_t* row,
+                          std::int32_t size,
+                          const double* blocks,
+                          const double* x,
+                          double* y) {
+  for (int first = 0; first < kMaxVectors; first += kAcross) {
+    multiply_some(column_start, row, size, blocks, x + first, y + first);
   }
 }
 
 constexpr DenseKernels kKernels{.multiply_blocks = multiply_blocks,
-                                .doubles = Fronts<Doubles>::kKernels,
-                                .floats = Fronts<Floats>::kKernels};
+                                .multiply_blocks_many = multiply_blocks_many,
+                                .doubles = Fronts<Doubles, Doubles>::kKernels,
+                                .floats = Fronts<Floats, ManyFloats>::kKernels};
 
 }  // namespace
 }  // namespace diffcloth::linalg

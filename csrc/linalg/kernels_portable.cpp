@@ -23,6 +23,12 @@ struct Floats {
   FourFloats v[4];  // NOLINT(modernize-avoid-c-arrays): see dense_kernels_impl.h
 };
 
+/// Of kMaxVectors vectors.
+struct ManyFloats {
+  using Real = float;
+  FourFloats v[2];  // NOLINT(modernize-avoid-c-arrays): see dense_kernels_impl.h
+};
+
 inline Doubles load(const double* from) {
   const auto* const lanes = reinterpret_cast<const UnalignedTwo*>(from);
   return {{lanes[0], lanes[1], lanes[2], lanes[3]}};
@@ -47,14 +53,32 @@ inline Floats broadcast(float a) {
   const FourFloats lanes = {a, a, a, a};
   return {{lanes, lanes, lanes, lanes}};
 }
+inline ManyFloats load_many(const float* from) {
+  const auto* const lanes = reinterpret_cast<const UnalignedFourFloats*>(from);
+  return {{lanes[0], lanes[1]}};
+}
+inline void store(float* to, ManyFloats a) {
+  auto* const lanes = reinterpret_cast<UnalignedFourFloats*>(to);
+  for (int i = 0; i < 2; ++i) lanes[i] = a.v[i];
+}
+inline ManyFloats to_many(float a) {
+  const FourFloats lanes = {a, a, a, a};
+  return {{lanes, lanes}};
+}
+inline Doubles load_many(const double* from) { return load(from); }
+inline Doubles to_many(double a) { return broadcast(a); }
+
+template <class Pack>
+constexpr int kParts = sizeof(Pack) / 16;
+
 template <class Pack>
 inline Pack operator+(Pack a, Pack b) {
-  for (int i = 0; i < 4; ++i) a.v[i] += b.v[i];
+  for (int i = 0; i < kParts<Pack>; ++i) a.v[i] += b.v[i];
   return a;
 }
 template <class Pack>
 inline Pack operator*(Pack a, Pack b) {
-  for (int i = 0; i < 4; ++i) a.v[i] *= b.v[i];
+  for (int i = 0; i < kParts<Pack>; ++i) a.v[i] *= b.v[i];
   return a;
 }
 
@@ -76,13 +100,13 @@ inline float subtract_product_of(float c, float a, float b) {
 template <class Pack>
 inline Pack subtract_product_of(Pack c, Pack a, Pack b) {
 #ifdef __FP_FAST_FMA
-  for (int i = 0; i < 4; ++i) {
+  for (int i = 0; i < kParts<Pack>; ++i) {
     for (unsigned lane = 0; lane < 16 / sizeof(typename Pack::Real); ++lane) {
       c.v[i][lane] = subtract_product_of(c.v[i][lane], a.v[i][lane], b.v[i][lane]);
     }
   }
 #else
-  for (int i = 0; i < 4; ++i) c.v[i] -= a.v[i] * b.v[i];
+  for (int i = 0; i < kParts<Pack>; ++i) c.v[i] -= a.v[i] * b.v[i];
 #endif
   return c;
 }
@@ -105,6 +129,7 @@ inline void add_some(const Real* from, int count, Real* to) {
 
 constexpr int kPacks = 1;  // 8 of 16 registers
 constexpr int kWidth = 2;
+constexpr int kAcross = 4;
 
 }  // namespace
 }  // namespace diffcloth::linalg

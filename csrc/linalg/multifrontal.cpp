@@ -161,9 +161,14 @@ class MultifrontalFactor final : public FactorBackend {
   void solve(std::span<const double* const> b,
              std::span<double* const> x,
              CholeskyWorkspace& workspace) const override {
-    for (std::size_t begin = 0; begin < b.size(); begin += kMaxVectors) {
-      const std::size_t count = std::min<std::size_t>(kMaxVectors, b.size() - begin);
-      solve_some(b.subspan(begin, count), x.subspan(begin, count), workspace);
+    for (std::size_t begin = 0; begin < b.size();) {
+      const std::size_t count = at_once(b.size() - begin);
+      if (count == 1) {
+        solve_some<1>(b.subspan(begin, count), x.subspan(begin, count), workspace);
+      } else {
+        solve_some<kMaxVectors>(b.subspan(begin, count), x.subspan(begin, count), workspace);
+      }
+      begin += count;
     }
   }
 
@@ -346,21 +351,21 @@ class MultifrontalFactor final : public FactorBackend {
             .run_count = child.run_count};
   }
 
-  /// Right-hand sides on their way through the factor, one vector after another.
+  /// Right-hand sides on their way through the factor, R to an entry; those beyond the given ones are zero.
+  template <int R>
   struct Vectors {
     std::span<const double* const> b;
     std::span<double* const> x;
-    std::size_t n;          ///< length of y, in the order of elimination
-    std::ptrdiff_t stride;  ///< length of a front
-    Real* y;
+    Real* y;       ///< in the order of elimination
     Real* passed;  ///< what tasks have to subtract from rows of others
 
     /// Powers of two that the scaled right sides are divided by, so that they have the range of a Real.
-    std::array<double, kMaxVectors> unit;
+    std::array<double, R> unit;
 
-    int count() const { return static_cast<int>(b.size()); }
+    std::size_t count() const { return R == 1 ? 1 : b.size(); }
   };
 
+  template <int R>
   void solve_some(std::span<const double* const> b,
                   std::span<double* const> x,
                   CholeskyWorkspace& workspace) const {
@@ -370,15 +375,9 @@ class MultifrontalFactor final : public FactorBackend {
     constexpr std::size_t kPadding = kLine<Real>;
     const std::size_t own = (n + longest + kPadding) / kPadding * kPadding;
     const std::size_t all = own * members(workspace);
-    Real* const memory = workspace.reserve<Real>(b.size() * (all + n + s_.passed_size));
-    Real* const y = memory + b.size() * all;
-    const Vectors v{.b = b,
-                    .x = x,
-                    .n = n,
-                    .stride = s_.longest,
-                    .y = y,
-                    .passed = y + b.size() * n,
-                    .unit = units(b)};
+    Real* const memory = workspace.reserve<Real>(R * (all + n + s_.passed_size));
+    Real* const y = memory + R * all;
+    const Vectors<R> v{.b = b, .x = x, .y = y, .passed = y + R * n, .unit = units<R>(b)};
     const auto tasks = static_cast<Index>(s_.tasks.size());
     const auto ready = [&](Index k, const Team::Done& done) {
       if (k < tasks) return has_all(k, [&](Index child) { return done[child] != 0; });
@@ -388,9 +387,9 @@ class MultifrontalFactor final : public FactorBackend {
     };
     const auto go = [&](Index k, int member) {
       const Mode mode;
-      Real* const front = memory + b.size() * own * static_cast<std::size_t>(member);
+      Real* const front = memory + R * own * static_cast<std::size_t>(member);
       if (k < tasks) {
-        forward(k, v, front + b.size() * longest, front);
+        forward(k, v, front + R * longest, front);
       } else {
         backward(2 * tasks - 1 - k, v, front);
       }
@@ -398,8 +397,9 @@ class MultifrontalFactor final : public FactorBackend {
     run(workspace, 2 * tasks, ready, go);
   }
 
-  std::array<double, kMaxVectors> units(std::span<const double* const> b) const {
-    std::array<double, kMaxVectors> result;
+  template <int R>
+  std::array<double, R> units(std::span<const double* const> b) const {
+    std::array<double, R> result;
     result.fill(1.0);
     if (!kIsScaled) return result;
     for (std::size_t r = 0; r < b.size(); ++r) {
@@ -416,99 +416,113 @@ class MultifrontalFactor final : public FactorBackend {
   }
 
   /// Rows of a vertex on their way in.
-  void take(const double* b, Index k, double unit, Real* to) const {
-    const double* const from = b + 3 * static_cast<std::ptrdiff_t>(s_.vertex[k]);
-    if constexpr (kIsScaled) {
-      const double* const scale = scale_.data() + 3 * static_cast<std::ptrdiff_t>(k);
-      for (int i = 0; i < 3; ++i) to[i] = static_cast<Real>(from[i] * scale[i] / unit);
-    } else {
-      std::copy_n(from, 3, to);
+  template <int R>
+  void take(const Vectors<R>& v, Index k, Real* to) const {
+    const std::ptrdiff_t place = 3 * static_cast<std::ptrdiff_t>(s_.vertex[k]);
+    for (std::size_t r = 0; r < v.count(); ++r) {
+      const double* const from = v.b[r] + place;
+      if constexpr (kIsScaled) {
+        const double* const scale = scale_.data() + 3 * static_cast<std::ptrdiff_t>(k);
+        for (std::size_t i = 0; i < 3; ++i) {
+          to[R * i + r] = static_cast<Real>(from[i] * scale[i] / v.unit[r]);
+        }
+      } else {
+        for (std::size_t i = 0; i < 3; ++i) to[R * i + r] = from[i];
+      }
+    }
+    for (std::size_t r = v.count(); r < R; ++r) {
+      for (std::size_t i = 0; i < 3; ++i) to[R * i + r] = Real{};
     }
   }
 
   /// The same on their way out.
-  void give(const Real* from, Index k, double unit, double* x) const {
-    double* const to = x + 3 * static_cast<std::ptrdiff_t>(s_.vertex[k]);
-    if constexpr (kIsScaled) {
-      const double* const scale = scale_.data() + 3 * static_cast<std::ptrdiff_t>(k);
-      for (int i = 0; i < 3; ++i) to[i] = static_cast<double>(from[i]) * scale[i] * unit;
-    } else {
-      std::copy_n(from, 3, to);
+  template <int R>
+  void give(const Vectors<R>& v, const Real* from, Index k) const {
+    const std::ptrdiff_t place = 3 * static_cast<std::ptrdiff_t>(s_.vertex[k]);
+    for (std::size_t r = 0; r < v.count(); ++r) {
+      double* const to = v.x[r] + place;
+      if constexpr (kIsScaled) {
+        const double* const scale = scale_.data() + 3 * static_cast<std::ptrdiff_t>(k);
+        for (std::size_t i = 0; i < 3; ++i) {
+          to[i] = static_cast<double>(from[R * i + r]) * scale[i] * v.unit[r];
+        }
+      } else {
+        for (std::size_t i = 0; i < 3; ++i) to[i] = from[R * i + r];
+      }
     }
+  }
+
+  /// Where the rows of a vertex begin.
+  template <int R>
+  static std::ptrdiff_t entry(Index vertex) {
+    return std::ptrdiff_t{3 * R} * vertex;
   }
 
   /// y := L^-1 y in the columns of a task.
   ///
   /// @param z  [n] vectors of the thread: the right side less what has been subtracted from it
-  void forward(Index k, const Vectors& v, Real* z, Real* c) const {
+  template <int R>
+  void forward(Index k, const Vectors<R>& v, Real* z, Real* c) const {
     const Task& task = s_.tasks[k];
     const Supernode& root = root_of(k);
-    for (int r = 0; r < v.count(); ++r) {
-      Real* const z_r = z + r * v.n;
-      for (Index i = s_.supernodes[task.begin].first; i < root.first + root.columns; ++i) {
-        take(v.b[r], i, v.unit[r], z_r + 3 * static_cast<std::ptrdiff_t>(i));
-      }
-      for (std::size_t i = root.rows_begin; i < root.rows_end; ++i) {
-        std::fill_n(z_r + 3 * s_.rows[i], 3, Real{});
-      }
-      for_children(k, [&](Index child) {
-        add_rows(root_of(child), v.passed + r * s_.passed_size + s_.tasks[child].passed, z_r);
-      });
+    for (Index i = s_.supernodes[task.begin].first; i < root.first + root.columns; ++i) {
+      take(v, i, z + entry<R>(i));
     }
+    for (std::size_t i = root.rows_begin; i < root.rows_end; ++i) {
+      std::fill_n(z + entry<R>(s_.rows[i]), 3 * R, Real{});
+    }
+    for_children(k, [&](Index child) {
+      add_rows<R>(root_of(child), v.passed + R * s_.tasks[child].passed, z);
+    });
     for (Index s = task.begin; s < task.end; ++s) {
       const Supernode& node = s_.supernodes[s];
       const Front& f = node.front;
-      for (int r = 0; r < v.count(); ++r) {
-        Real* const c_r = c + r * v.stride;
-        std::fill_n(c_r, f.ld, Real{});
-        std::copy_n(z + r * v.n + 3 * node.first, f.columns, c_r);
+      std::copy_n(z + entry<R>(node.first), R * f.columns, c);
+      std::fill(c + R * f.columns, c + R * f.ld, Real{});
+      if constexpr (R == 1) {
+        kernels_.forward(f, factor_.data() + node.panel, c);
+      } else {
+        kernels_.forward_many(f, factor_.data() + node.panel, c);
       }
-      kernels_.forward(f, factor_.data() + node.panel, c, v.stride, v.count());
-      for (int r = 0; r < v.count(); ++r) {
-        const Real* const c_r = c + r * v.stride;
-        std::copy_n(c_r, f.columns, v.y + r * v.n + 3 * node.first);
-        add_rows(node, c_r + f.top, z + r * v.n);
-      }
+      std::copy_n(c, R * f.columns, v.y + entry<R>(node.first));
+      add_rows<R>(node, c + R * f.top, z);
     }
-    for (int r = 0; r < v.count(); ++r) {
-      Real* to = v.passed + r * s_.passed_size + task.passed;
-      for (std::size_t i = root.rows_begin; i < root.rows_end; ++i, to += 3) {
-        std::copy_n(z + r * v.n + 3 * s_.rows[i], 3, to);
-      }
+    Real* to = v.passed + R * task.passed;
+    for (std::size_t i = root.rows_begin; i < root.rows_end; ++i, to += 3 * R) {
+      std::copy_n(z + entry<R>(s_.rows[i]), 3 * R, to);
     }
   }
 
   /// to += values at the rows below a supernode.
+  template <int R>
   void add_rows(const Supernode& node, const Real* values, Real* to) const {
-    for (std::size_t k = node.rows_begin; k < node.rows_end; ++k, values += 3) {
-      for (int i = 0; i < 3; ++i) to[3 * s_.rows[k] + i] += values[i];
+    for (std::size_t k = node.rows_begin; k < node.rows_end; ++k, values += 3 * R) {
+      Real* const sum = to + entry<R>(s_.rows[k]);
+      for (int i = 0; i < 3 * R; ++i) sum[i] += values[i];
     }
   }
 
   /// x := L^-T y in the columns of a task.
-  void backward(Index k, const Vectors& v, Real* c) const {
+  template <int R>
+  void backward(Index k, const Vectors<R>& v, Real* c) const {
     const Task& task = s_.tasks[k];
     for (Index s = task.end; s-- > task.begin;) {
       const Supernode& node = s_.supernodes[s];
       const Front& f = node.front;
-      for (int r = 0; r < v.count(); ++r) {
-        Real* const c_r = c + r * v.stride;
-        const Real* const y_r = v.y + r * v.n;
-        std::fill_n(c_r, f.ld, Real{});
-        std::copy_n(y_r + 3 * node.first, f.columns, c_r);
-        Real* below = c_r + f.top;
-        for (std::size_t i = node.rows_begin; i < node.rows_end; ++i, below += 3) {
-          std::copy_n(y_r + 3 * s_.rows[i], 3, below);
-        }
+      std::copy_n(v.y + entry<R>(node.first), R * f.columns, c);
+      std::fill(c + R * f.columns, c + R * f.top, Real{});
+      Real* below = c + R * f.top;
+      for (std::size_t i = node.rows_begin; i < node.rows_end; ++i, below += 3 * R) {
+        std::copy_n(v.y + entry<R>(s_.rows[i]), 3 * R, below);
       }
-      kernels_.backward(f, factor_.data() + node.panel, c, v.stride, v.count());
-      for (int r = 0; r < v.count(); ++r) {
-        Real* const y_r = v.y + r * v.n;
-        std::copy_n(c + r * v.stride, f.columns, y_r + 3 * node.first);
-        for (Index i = node.first; i < node.first + node.columns; ++i) {
-          give(y_r + 3 * static_cast<std::ptrdiff_t>(i), i, v.unit[r], v.x[r]);
-        }
+      std::fill(below, c + R * f.ld, Real{});
+      if constexpr (R == 1) {
+        kernels_.backward(f, factor_.data() + node.panel, c);
+      } else {
+        kernels_.backward_many(f, factor_.data() + node.panel, c);
       }
+      std::copy_n(c, R * f.columns, v.y + entry<R>(node.first));
+      for (Index i = node.first; i < node.first + node.columns; ++i) give(v, v.y + entry<R>(i), i);
     }
   }
 

@@ -22,9 +22,9 @@ Targets = Tensor | Mapping[str, Tensor]
 def default_weights(layout: Layout, targets: Targets | None) -> Tensor:
     """One of every spring that has both ends, zero of those whose target is not set; [1, A]."""
     unset = layout.zeros["attachment_weights"]
-    return (
-        unset if targets is None else torch.from_numpy(_are_whole(layout, targets)).to(unset)[None]
-    )
+    if targets is None:
+        return unset
+    return torch.from_numpy(_are_whole(layout, targets)).to(unset)[None]
 
 
 def refuse_untargeted(layout: Layout, weights: Tensor, targets: Targets | None) -> None:
