@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from diffcloth_torch.optimize.evaluation import Evaluation
     from diffcloth_torch.optimize.fit import Fit, Stage, fit
     from diffcloth_torch.optimize.variables import Variable
+    from diffcloth_torch.sim.contact_points import ContactPoints
     from diffcloth_torch.sim.controls import Control, Parameters
     from diffcloth_torch.sim.report import Report
     from diffcloth_torch.sim.simulator import Simulator
@@ -69,6 +70,7 @@ __all__ = [
     "Camera",
     "Cloth",
     "ContactOptions",
+    "ContactPoints",
     "Control",
     "Descent",
     "Evaluation",
@@ -131,6 +133,7 @@ _HOMES = {
     "optimize.evaluation": ("Evaluation",),
     "optimize.fit": ("Fit", "Stage", "fit"),
     "optimize.variables": ("Variable",),
+    "sim.contact_points": ("ContactPoints",),
     "sim.controls": ("Control", "Parameters"),
     "sim.report": ("Report",),
     "sim.simulator": ("Simulator",),

@@ -58,6 +58,24 @@ def test_a_picker_folds_a_sheet():
     assert distances[-1] < 0.2 * distances[0]
 
 
+def test_a_finger_feels_a_pen_through_a_cloth(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "image.png"
+    monkeypatch.setattr(sys, "argv", ["tactile_image.py", str(path)])
+    names = runpy.run_path(str(ROOT / "examples/tactile_image.py"), run_name="__main__")
+    image, force = names["image"].numpy(), float(names["pressing"].normal_forces.sum())
+    # At rest, the drive's effort is what presses; little of it is spread beyond the pad.
+    assert force == pytest.approx(names["EFFORT"], rel=0.1)
+    assert image.sum() * names["PIXEL"] ** 2 == pytest.approx(force, rel=0.2)
+    # Where it is pressed hardest, row by row, is a line as steep as the pen.
+    rows = image.max(axis=1) > 0.3 * image.max()
+    z, x = np.flatnonzero(rows), image.argmax(axis=1)[rows]
+    assert len(z) > 20
+    degrees = np.degrees(np.arctan(np.polyfit(z, x, 1)[0]))
+    assert abs(degrees) == pytest.approx(25, abs=5)
+    assert path.stat().st_size > 100
+    assert f"press with {force:.2f} N" in capsys.readouterr().out
+
+
 def test_own_mesh(own_mesh, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["own_mesh.py", str(own_mesh)])
     check_throw(runpy.run_path(str(ROOT / "examples/own_mesh.py")))

@@ -64,4 +64,25 @@ nb::list pair_contacts(const std::vector<step::Report>& reports) {
   return environments;
 }
 
+nb::list contact_points(const std::vector<step::Report>& reports) {
+  constexpr std::size_t kColumns = 16;
+  nb::list environments;
+  for (const step::Report& report : reports) {
+    Owned<double> owned = make_array<double>({report.points.size(), kColumns});
+    double* out = owned.data;
+    for (const step::ContactPoint& point : report.points) {
+      *out++ = point.first;
+      *out++ = point.second;
+      for (const Vec3& v : {point.points[0], point.points[1], point.normal}) {
+        out = std::copy_n(v.data(), 3, out);
+      }
+      *out++ = point.gap;
+      *out++ = point.normal_force;
+      out = std::copy_n(point.tangential_force.data(), 3, out);
+    }
+    environments.append(owned.array);
+  }
+  return environments;
+}
+
 }  // namespace diffcloth::bind

@@ -21,4 +21,8 @@ nb::dict ended_poses(const std::vector<step::Report>& reports);
 /// second).
 nb::list pair_contacts(const std::vector<step::Report>& reports);
 
+/// Of each environment the contacts [M, 16]: both surfaces, the points on them, the normal from the first to
+/// the second, the gap, and the normal and the tangential force of the first on the second.
+nb::list contact_points(const std::vector<step::Report>& reports);
+
 }  // namespace diffcloth::bind

@@ -36,6 +36,7 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   out["message"] = messages;
   out["ended"] = ended_poses(reports);
   out["pairs"] = pair_contacts(reports);
+  out["points"] = contact_points(reports);
   return out;
 }
 

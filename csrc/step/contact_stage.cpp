@@ -9,6 +9,7 @@
 
 #include "solver/newton.h"
 #include "step/attachments.h"
+#include "step/contact_points.h"
 #include "step/contact_sum.h"
 #include "step/motion.h"
 
@@ -159,6 +160,7 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
   if (!step.tape.empty()) *step.tape["solves"] = solves;
   add_forces(problem, sum, x, forces);
   PairTally(problem, step.report).add(sum.contacts(), sum.lagged(), x);
+  step.report.points = contact_points(problem, sum.contacts(), sum.lagged(), x);
 }
 
 }  // namespace diffcloth::step

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <array>
 #include <cstdint>
 #include <string>
 #include <vector>
@@ -26,6 +27,17 @@ struct PairContacts {
   Vec3 force = Vec3::Zero();  ///< of the first on the second, barrier and friction [N]
 };
 
+/// A contact between two surfaces, of which the first has the smaller index.
+struct ContactPoint {
+  Index first = 0;
+  Index second = 0;
+  std::array<Vec3, 2> points{Vec3::Zero(), Vec3::Zero()};  ///< nearest, on each of them [m]
+  Vec3 normal = Vec3::Zero();                              ///< from the first to the second
+  double gap = 0.0;                      ///< between the surfaces, their thickness taken off [m]
+  double normal_force = 0.0;             ///< of the first on the second, along the normal [N]
+  Vec3 tangential_force = Vec3::Zero();  ///< likewise, of friction [N]
+};
+
 struct Report {
   Result result = Result::kConverged;
   Index iterations = 0;
@@ -40,7 +52,8 @@ struct Report {
   solver::Counts counts;
   Seconds seconds{};
   std::string message;
-  std::vector<PairContacts> pairs;  ///< in ascending order
+  std::vector<PairContacts> pairs;   ///< in ascending order
+  std::vector<ContactPoint> points;  ///< of barrier and friction, not of nodes
 
   /// Call visit(name, value) for every number but the seconds.
   template <class Visit>

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch._saved import allow_loading
-from diffcloth_torch.checks import texts
+from diffcloth_torch.checks import FloatArray, texts
 from diffcloth_torch.errors import InvalidInput
 
 __all__ = ["Contacts", "PairContact"]
@@ -44,20 +44,29 @@ class Contacts:
         batch_size: Number of environments, None without a batch axis.
         counts: Pair in contact -> int64 tensor, shape [] or [B].
         forces: Pair in contact -> force of the first on the second [N], shape [3] or [B, 3].
+        rows: Single contacts of each environment, for `Simulator.contacts`.
     """
 
     surfaces: tuple[str, ...] = ()
     batch_size: int | None = None
     counts: dict[Pair, Tensor] = field(default_factory=dict)
     forces: dict[Pair, Tensor] = field(default_factory=dict)
+    rows: tuple[Tensor, ...] = ()
 
     @staticmethod
-    def of(found: Sequence[Sequence[Any]], surfaces: Sequence[str], *, batched: bool) -> Contacts:
+    def of(
+        found: Sequence[Sequence[Any]],
+        rows: Sequence[FloatArray],
+        surfaces: Sequence[str],
+        *,
+        batched: bool,
+    ) -> Contacts:
         """Collect the contacts that a core reports for each environment.
 
         Args:
             found: For each environment, (first, second, count, force) of each pair of surfaces in
                 contact.
+            rows: For each environment, its single contacts.
             surfaces: Names of all surfaces.
             batched: Whether the result has an axis of environments.
         """
@@ -74,6 +83,7 @@ class Contacts:
             len(found),
             {named[key]: count for key, count in counts.items()},
             {named[key]: force for key, force in forces.items()},
+            tuple(map(torch.from_numpy, rows)),
         )
         return every if batched else every.select(0)
 
@@ -105,6 +115,8 @@ class Contacts:
         if not isinstance(other, Contacts):
             return NotImplemented
         same = (self.surfaces, self.batch_size) == (other.surfaces, other.batch_size)
+        same = same and len(self.rows) == len(other.rows)
+        same = same and all(map(torch.equal, self.rows, other.rows))
         return same and all(
             list(mine) == list(theirs) and all(torch.equal(mine[p], theirs[p]) for p in mine)
             for mine, theirs in ((self.counts, other.counts), (self.forces, other.forces))
@@ -128,15 +140,19 @@ class Contacts:
         """Contacts of one environment, or of several."""
         if self.batch_size is None:  # nothing is known of the environments
             return self
-        size = None
-        if not isinstance(index, int):
-            size = len(torch.arange(self.batch_size)[index])
-        return self._map(lambda tensor: tensor[index], size)
+        chosen = torch.arange(self.batch_size)[index].reshape(-1).tolist()
+        size = None if isinstance(index, int) else len(chosen)
+        rows = tuple(self.rows[i] for i in chosen) if self.rows else ()
+        return self._map(lambda tensor: tensor[index], size, rows)
 
     @staticmethod
     def stack(all_contacts: Sequence[Contacts]) -> Contacts:
         """Contacts of a batch, from those of its environments."""
-        return _combined(lambda *tensors: torch.stack(tensors), all_contacts, len(all_contacts))
+        known = all(contacts.rows for contacts in all_contacts)
+        rows = tuple(contacts.rows[0] for contacts in all_contacts) if known else ()
+        return _combined(
+            lambda *tensors: torch.stack(tensors), all_contacts, len(all_contacts), rows
+        )
 
     @staticmethod
     def where(mask: Tensor, a: Contacts, b: Contacts) -> Contacts:
@@ -146,12 +162,18 @@ class Contacts:
             rows = max(x.ndim, y.ndim, 1)
             return torch.where(mask.reshape(-1, *[1] * (rows - 1)), x, y)
 
-        return _combined(mix, [a, b], len(mask))
+        rows: tuple[Tensor, ...] = ()
+        if a.rows and b.rows:
+            chosen = [(a if is_a else b).rows for is_a in mask.tolist()]
+            rows = tuple(own[i if len(own) > 1 else 0] for i, own in enumerate(chosen))
+        return _combined(mix, [a, b], len(mask), rows)
 
-    def _map(self, function: Callable[[Tensor], Tensor], size: int | None) -> Contacts:
+    def _map(
+        self, function: Callable[[Tensor], Tensor], size: int | None, rows: tuple[Tensor, ...]
+    ) -> Contacts:
         counts = {pair: function(count) for pair, count in self.counts.items()}
         forces = {pair: function(force) for pair, force in self.forces.items()}
-        return Contacts(self.surfaces, size, counts, forces)
+        return Contacts(self.surfaces, size, counts, forces, rows)
 
 
 def _plain(count: Tensor) -> int | Tensor:
@@ -159,7 +181,10 @@ def _plain(count: Tensor) -> int | Tensor:
 
 
 def _combined(
-    function: Callable[..., Tensor], parts: Sequence[Contacts], size: int | None
+    function: Callable[..., Tensor],
+    parts: Sequence[Contacts],
+    size: int | None,
+    rows: tuple[Tensor, ...],
 ) -> Contacts:
     """Apply a function to the tensors of each pair in contact in any of the parts."""
     surfaces = max((part.surfaces for part in parts), key=len)
@@ -175,7 +200,7 @@ def _combined(
 
     counts = {p: function(*all_of("counts", p, (), torch.int64)) for p in pairs}
     forces = {p: function(*all_of("forces", p, (3,), torch.float64)) for p in pairs}
-    return Contacts(surfaces, size, counts, forces)
+    return Contacts(surfaces, size, counts, forces, rows)
 
 
 allow_loading(Contacts)

@@ -14,6 +14,7 @@ from diffcloth_torch.model.options import SolverOptions
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.sim.axes import with_axis, without_axes, without_axis
 from diffcloth_torch.sim.border import Border, Given
+from diffcloth_torch.sim.contact_points import ContactPoints, refuse_gradient
 from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.engine import Check, Engine
 from diffcloth_torch.sim.links import contact_wrenches, link_velocities
@@ -32,6 +33,7 @@ class Observables:
     """The methods of a simulator that evaluate a state, and return no other state."""
 
     surfaces: tuple[str, ...]
+    scheme: str
     solver: SolverOptions
     _engine: Engine
     _border: Border
@@ -92,6 +94,38 @@ class Observables:
         centers = [self._centers(owner, parameters, batch) for owner in ("body", "link")]
         frames = engine.surfaces.frames(fields)
         return without_axes(contact_wrenches(engine.layout, frames, forces, *centers), batch)
+
+    def contacts(self, state: State) -> ContactPoints:
+        """Return where surfaces touch at the end of the step that led to a state, and how hard.
+
+        What is returned has no gradient: a derivative of it by the state raises InvalidInput.
+        `state.contact_forces`, `state.body_forces` and `contact_wrenches(state)` have one.
+
+        Args:
+            state: The result of a step of this simulator. Fields that have been replaced since do
+                not change its contacts.
+
+        Returns:
+            All contacts, with a leading axis and padded to one number in a batch.
+
+        Raises:
+            InvalidInput: If the state has no contacts of a step, or the scene has contact at
+                vertices (the scheme "projective", and `nodal_contact`).
+        """
+        nodal = any(primitive is not None for primitive in self._engine.assembly.primitives)
+        if nodal or self.scheme == "projective":
+            raise InvalidInput(
+                "contacts: contact at vertices, of the scheme 'projective' and of bodies with "
+                "nodal_contact, has no points; take state.contact_forces and report.contacts"
+            )
+        fields, batch = self._border.state(state)
+        rows = () if state.report is None else state.report.contacts.rows
+        if len(rows) != (1 if batch is None else batch):
+            raise InvalidInput(
+                "contacts: `state` must be the result of a step, whose report has the contacts"
+            )
+        points = ContactPoints.of(rows, self.surfaces, batched=batch is not None)
+        return refuse_gradient(points, list(fields.values()))
 
     def path(
         self,

@@ -63,7 +63,9 @@ def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched
         seconds={phase: value(diagnostics[name]) for phase, name in _SECONDS.items()},
         counts={what: value(diagnostics[name]) for what, name in _COUNTS.items()},
         status=names if batched else names[0],
-        contacts=Contacts.of(diagnostics["pairs"], surfaces, batched=batched),
+        contacts=Contacts.of(
+            diagnostics["pairs"], diagnostics["points"], surfaces, batched=batched
+        ),
     )
 
 

@@ -17,6 +17,7 @@ from diffcloth_torch.errors import InfeasibleMotion
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.sim.added_mass import AddedMassWatch
 from diffcloth_torch.sim.border import Given
+from diffcloth_torch.sim.contact_points import COLUMNS
 from diffcloth_torch.sim.cores import (
     CoreOptions,
     arrays_of,
@@ -290,8 +291,15 @@ def _merged(cloth: dict[str, Any], rigid: dict[str, Any], cloth_count: int) -> d
         [(first + cloth_count, second + cloth_count, *rest) for first, second, *rest in pairs]
         for pairs in rigid["pairs"]
     ]
+    shift = np.zeros(COLUMNS)
+    shift[:2] = cloth_count
+    points = [
+        np.concatenate([own, others + shift])
+        for own, others in zip(cloth["points"], rigid["points"], strict=True)
+    ]
     return {
         **merged,
+        "points": points,
         "message": ["; ".join(filter(None, pair)) for pair in messages],
         "pairs": [[*a, *b] for a, b in zip(cloth["pairs"], shifted, strict=True)],
     }

@@ -84,9 +84,9 @@ class Outcome(NamedTuple):
         contact_forces: [B, N, 3].
         pin_forces: [B, P, 3].
         diagnostics: Lists of length B of the core: status, message and the entries of the report;
-            "ended": environment whose motion stopped early -> poses of all roots there, [T, 7]; and
+            "ended": environment whose motion stopped early -> poses of all roots there, [T, 7];
             "pairs": for each environment, (first, second, count, force) of each pair of surfaces in
-            contact.
+            contact; and "points": for each environment, its contacts, see `contact_points.COLUMNS`.
         coordinates: Coordinates of bodies and robots at the end of the step, [B, n]; None if there
             are none.
     """
@@ -172,7 +172,7 @@ def _outcome(outputs: tuple[Tensor, ...], diagnostics: dict[str, Any]) -> Outcom
 def diagnostics_of(result: dict[str, Any]) -> dict[str, Any]:
     """Diagnostics of a step: for each name a list with one number or text per environment."""
     numbers = zip(DIAGNOSTICS, result["numbers"], strict=True)
-    others = {name: result[name] for name in ("message", "ended", "pairs")}
+    others = {name: result[name] for name in ("message", "ended", "pairs", "points")}
     return {**dict(numbers), **others}
 
 

@@ -25,6 +25,7 @@ PUBLIC = {
     "ContactOptions": (
         "barrier_distance barrier_stiffness friction_iterations slip_velocity self_contact"
     ),
+    "ContactPoints": "on forces",
     "Control": (
         "pins soft_pins body_poses forces body_wrenches joint_positions joint_velocities "
         "joint_efforts base_poses base_wrenches attachments attachment_weights wind replace"
@@ -56,7 +57,7 @@ PUBLIC = {
     "SimulationError": "",
     "Simulator": (
         "initial_state control parameters step rollout equilibrium energy kinetic_energy momentum "
-        "vertex_masses link_poses link_velocities contact_wrenches"
+        "vertex_masses link_poses link_velocities contact_wrenches contacts"
     ),
     "SolverOptions": "tolerance max_iterations throw metric elastic",
     "State": "batch_size replace detach clone export meshes contact_forces pin_forces",
