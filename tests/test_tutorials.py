@@ -62,5 +62,8 @@ def test_a_tutorial_runs_in_an_empty_folder(page, tmp_path):
     notebook = nbformat.read(file, as_version=4)
     # A cell that fails raises.
     resources = {"metadata": {"path": str(tmp_path)}}
-    nbclient.NotebookClient(notebook, timeout=600, resources=resources).execute()
+    client = nbclient.NotebookClient(
+        notebook, timeout=600, startup_timeout=600, resources=resources
+    )
+    client.execute()
     assert any(cell.get("outputs") for cell in notebook.cells)
