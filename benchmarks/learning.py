@@ -339,6 +339,7 @@ def draw(runs: Sequence[dict[str, Any]], path: Path) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
+    matplotlib.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "learning"})
     import matplotlib.pyplot as plt
 
     tasks = [task for task in JOBS if any(run["task"] == task for run in runs)]
@@ -347,7 +348,8 @@ def draw(runs: Sequence[dict[str, Any]], path: Path) -> None:
         for axis, key in zip(row, ("steps", "seconds"), strict=True):
             _draw_task(axis, key, [run for run in runs if run["task"] == task])
             label = "environment steps" if key == "steps" else "seconds of one core"
-            axis.set(xlabel=label, ylabel="return", title=task, xscale="symlog")
+            axis.set(xlabel=label, ylabel="return", title=task)
+            axis.set_xscale("symlog", linthresh=100 if key == "steps" else 1)
             axis.spines[["top", "right"]].set_visible(False)
     axes[0, 0].legend(frameon=False, fontsize=7)
     figure.tight_layout()
@@ -364,7 +366,7 @@ def _draw_task(axis: Any, key: str, runs: Sequence[dict[str, Any]]) -> None:
             axis.axhline(curves[0][0]["return"], color="0.5", ls=":", label="scripted")
             continue
         end = min(curve[-1][key] for curve in curves)
-        at = np.linspace(0, end, 200)
+        at = np.linspace(0, end, 40)
         returns = np.array(
             [np.interp(at, [p[key] for p in c], [p["return"] for p in c]) for c in curves]
         )
