@@ -44,8 +44,8 @@ def cantilever(count=16, bending=2e-4, directions=None, **options):
             material,
             stretch_weft=1000.0,
             stretch_shear=100.0,
-            bending_weft=5e-5,
-            bending_twill=9e-5,
+            bending_weft=4e-4,
+            bending_twill=2e-4,
         )
     cloth = strip(
         *(count, 0.2, 0.03),
@@ -104,7 +104,7 @@ def test_a_hanging_strip_is_a_catenary():
     [
         pytest.param(None, 2e-4, id="isotropic"),
         pytest.param([1, 0, 0], 2e-4, id="by the warp"),
-        pytest.param([0, 1, 0], 5e-5, id="by the weft"),
+        pytest.param([0, 1, 0], 4e-4, id="by the weft"),
     ],
 )
 def test_a_heavy_cantilever_is_an_elastica(directions, D):
