@@ -137,6 +137,9 @@ class FrictionPotential final : public Potential {
     set_.update_duals(x, p, alpha, to);
   }
   bool has_duals(const double* x) const override { return set_.has_duals(x); }
+
+  /// Expect the motion from the start of the step to another point: see FrictionSet::expect().
+  void expect(const double* x, const double* to) { set_.expect(x, to); }
   void accumulate(const double* x, const double* z) override;
   void add_tangent(const double* x, double* y) const override;
   void swap_cotangents(CotangentStore& /*store*/) override {}  // the caller takes and swaps them

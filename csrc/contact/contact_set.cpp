@@ -454,6 +454,11 @@ bool ContactModel::is_held(std::span<const Index> points) const {
       points, [&](Index v) { return v >= mesh_.cloth_vertex_count || prescribed_[v] != 0; });
 }
 
+bool ContactModel::is_of_moving_body(std::span<const Index> points) const {
+  return std::ranges::any_of(
+      points, [&](Index v) { return v >= mesh_.cloth_vertex_count && prescribed_[v] == 0; });
+}
+
 std::array<Index, 3> ContactModel::frame(const Candidate& pair) const {
   const auto& v = pair.vertices;
   if (between_cloths(pair)) {

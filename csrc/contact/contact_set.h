@@ -156,6 +156,9 @@ class ContactModel {
   /// Whether one of some points is no free vertex of a cloth.
   bool is_held(std::span<const Index> points) const;
 
+  /// Whether one of some points belongs to a body or a link whose motion is not given.
+  bool is_of_moving_body(std::span<const Index> points) const;
+
   bool between_cloths(const Candidate& pair) const;
 
   /// Three vertices of one of a pair's surfaces, with which the gap between both turns: of a body, at rest

@@ -69,6 +69,13 @@ void turn_with(const std::array<Index, 3>& frame, Entry& entry) {
   entry.edges = {entry.frame, entry.frame + 1, entry.frame, entry.frame + 2};
 }
 
+/// The change of s with z, at a frame.
+Vec3 change_of_slip(const Entry& k, const Frame& frame, const double* z) {
+  const Frame edges(k, z);
+  return gap(k, z) - k.a[0] * edges.e1 - k.a[1] * edges.e2 -
+         k.a[2] * (edges.e1.cross(frame.e2) + frame.e1.cross(edges.e2));
+}
+
 /// The matrix of v -> u x v.
 Mat3 cross_matrix(const Vec3& u) {
   return Mat3{{0.0, -u[2], u[1]}, {u[2], 0.0, -u[0]}, {-u[1], u[0], 0.0}};
@@ -192,6 +199,28 @@ void FrictionSet::add_gradient(const double* x, double* g) const {
   }
 }
 
+void FrictionSet::expect(const double* x, const double* to) {
+  const FrictionLaw at_rest = friction_law(0.0, model_->parameters().slip);
+  bool any = false;
+  for (const Entry& k : entries_) {
+    const Slip there = slip(k, to);
+    const bool is_known = !model_->is_of_moving_body(k.lag.pair.vertices);
+    expected_.push_back(is_known ? there.law.f1_over_y : at_rest.f1_over_y);
+    any = any || (is_known && there.force().norm() > kClose);
+  }
+  if (!any) return expected_.clear();
+  duals_.assign(entries_.size(), Vec3::Zero());
+  keep_duals_at(x);
+}
+
+void FrictionSet::keep_duals_at(const double* x) {
+  duals_at_.assign(x, x + 3 * static_cast<std::ptrdiff_t>(model_->mesh().vertex_count));
+}
+
+double FrictionSet::stiffness(std::size_t entry, const Slip& at) const {
+  return expected_.empty() || !at.w.isZero(0.0) ? at.law.f1_over_y : expected_[entry];
+}
+
 void FrictionSet::update_duals(const double* x, const double* p, double alpha, const double* to) {
   const Slips& end = slips(to);
   const Slips& start = slips(x);  // both are kept
@@ -202,18 +231,19 @@ void FrictionSet::update_duals(const double* x, const double* p, double alpha, c
     const FrictionLaw& law = start[i].law;
     const Vec3& w = start[i].w;
     const Vec3 v = go_on ? duals_[i] : start[i].force();
-    const Hessian h = hessian(entries_[i], start, Curvature::kExact);
-    const Vec3 dw = tangential(h.change(p), entries_[i].n);
-    const Vec3 linear = law.f1_over_y * (w + dw) + (law.f2 / law.f1_over_y * w.dot(dw)) * v;
+    const Vec3 dw = tangential(change_of_slip(entries_[i], start[i].frame, p), entries_[i].n);
+    const Vec3 linear =
+        stiffness(i, start[i]) * (w + dw) + (law.f2 / law.f1_over_y * w.dot(dw)) * v;
     duals[i] = v + std::min(alpha, 1.0) * (linear - v);
     duals[i] /= std::max(duals[i].norm(), 1.0);
     if (entries_[i].lambda < 0.0) duals[i] = end[i].force();
     any = any || (duals[i] - end[i].force()).norm() > kClose;
   }
+  expected_.clear();
   duals_at_.clear();
   if (!any) return;
   duals_ = std::move(duals);
-  duals_at_.assign(to, to + 3 * static_cast<std::ptrdiff_t>(model_->mesh().vertex_count));
+  keep_duals_at(to);
 }
 
 bool FrictionSet::has_duals(const double* x) const { return is_at(duals_at_, x); }
@@ -232,7 +262,8 @@ FrictionSet::Hessian FrictionSet::hessian(const Entry& k,
   }
   if (curvature == Curvature::kPositive && k.lambda < 0.0) return h;
   const double strength = k.mu * k.lambda;
-  h.core_ = (strength * at.law.f1_over_y) * (identity - k.n * k.n.transpose());
+  const double q = curvature == Curvature::kExact ? at.law.f1_over_y : stiffness(i, at);
+  h.core_ = (strength * q) * (identity - k.n * k.n.transpose());
   if (curvature == Curvature::kPositive) return h;
   if (curvature == Curvature::kPrimalDual && !duals_at_.empty()) {
     const Mat3 outer = duals_[i] * at.w.transpose();
@@ -277,17 +308,12 @@ void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
   });
 }
 
-Vec3 FrictionSet::Hessian::change(const double* z) const {
-  const Entry& k = *entry_;
-  Vec3 result = Vec3::Zero();
-  for (int p = 0; p < k.frame; ++p) result += k.c[p] * row(z, k.points[p]);
-  for (int p = k.frame; p < k.count; ++p) result += B_[p - k.frame] * row(z, k.points[p]);
-  return result;
-}
-
 void FrictionSet::Hessian::add_product(const double* z, double* y) const {
   const Entry& k = *entry_;
-  const Vec3 force = core_ * change(z);
+  Vec3 change = Vec3::Zero();
+  for (int p = 0; p < k.frame; ++p) change += k.c[p] * row(z, k.points[p]);
+  for (int p = k.frame; p < k.count; ++p) change += B_[p - k.frame] * row(z, k.points[p]);
+  const Vec3 force = core_ * change;
   for (int p = 0; p < k.frame; ++p) Eigen::Map<Vec3>(y + 3 * k.points[p]) += k.c[p] * force;
   for (int p = k.frame; p < k.count; ++p) {
     Eigen::Map<Vec3>(y + 3 * k.points[p]) += B_[p - k.frame].transpose() * force;

@@ -112,9 +112,6 @@ class FrictionSet {
     void add_to(linalg::BlockMatrix& A) const;
     void add_product(const double* z, double* y) const;
 
-    /// The change of s with z.
-    Vec3 change(const double* z) const;
-
    private:
     friend class FrictionSet;
     explicit Hessian(const Entry& entry) : entry_(&entry) {}
@@ -136,10 +133,15 @@ class FrictionSet {
   /// @param at  slips(x); duals are those of has_duals(x)
   Hessian hessian(const Entry& entry, const Slips& at, Curvature curvature) const;
 
+  /// Expect the motion from x, where nothing has slipped yet, to another point. The Hessians at x but the
+  /// exact one then have q of the slip there: that of a contact at rest knows nothing of sliding. Nothing
+  /// is expected of bodies and links whose motion is not given.
+  void expect(const double* x, const double* to);
+
   /// Keep the duals of a step: v + min(alpha, 1) (q (w + dw) + f2 / q (w . dw) v - v), no longer than 1. None
   /// where all are close to the forces at its end.
   ///
-  /// @param p   direction of the step, by the fraction alpha of it
+  /// @param p   direction of the step of all points, by the fraction alpha of it
   /// @param to  its end
   void update_duals(const double* x, const double* p, double alpha, const double* to);
 
@@ -181,6 +183,9 @@ class FrictionSet {
   LagTangent push_forward_lag(const Entry& entry, const double* x_lag, const Tangents& dot) const;
   bool is_at(const std::vector<double>& point, const double* x) const;
   Slip slip(const Entry& entry, const double* x) const;
+  void keep_duals_at(const double* x);
+  /// q of the Hessians that are not exact.
+  double stiffness(std::size_t entry, const Slip& at) const;
 
   const ContactModel* model_ = nullptr;
   const double* x_start_ = nullptr;
@@ -189,6 +194,7 @@ class FrictionSet {
   mutable std::size_t last_ = 0;  // of these
   std::vector<double> duals_at_;  // all vertices; empty where there are none
   std::vector<Vec3> duals_;       // of the entries
+  std::vector<double> expected_;  // q of the entries; empty where nothing is expected
 };
 
 }  // namespace diffcloth::contact

@@ -138,8 +138,8 @@ Directions::Direction Directions::next() {
   leave();
   const bool nearby = s_ == 0.0 && last_.factor != nullptr;
   const double* x = walk_.x().data();
+  if (nearby && chord()) return {.kind = Kind::kChord, .first = 1.0};
   const bool has_duals = walk_.f.has_duals(x);
-  if (nearby && !has_duals && chord()) return {.kind = Kind::kChord, .first = 1.0};
   const Curvature curvature = has_duals ? Curvature::kPrimalDual : Curvature::kExact;
   linalg::BlockMatrix H = walk_.system.assemble(x, curvature, walk_.g());
   if (s_ == 0.0) {

@@ -71,6 +71,7 @@ double joint_step(Walk& walk, const std::vector<double>& ends) {
       for (Index a = 3 * i; a < 3 * i + 3; ++a) to[a] = ends[a];
     }
   }
+  walk.f.update_duals(walk.x().data(), p.data(), alpha, to.data());
   walk.go(to);
   walk.refresh();
   return alpha;

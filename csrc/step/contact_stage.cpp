@@ -120,6 +120,8 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
   const std::vector<Contact>& at_start = sum.contacts_at_start(x);
   keep(0, at_start);
   sum.lag(at_start);
+  if (sum.friction && problem.origins.empty())
+    sum.friction->expect(x.data(), problem.coasting().data());
   {
     const Stopwatch::Scope scope(*step.context.watch, Phase::kAnalysis);
     sum.expect_contacts_near(problem.start);

@@ -221,6 +221,15 @@ std::vector<double> Problem::at(const double* rows) const {
   return x;
 }
 
+std::vector<double> Problem::coasting() const {
+  std::vector<double> x = ends;
+  const double* velocities = inputs.data(Input::kVelocities);
+  for (std::size_t a = 0; a < cloth_size; ++a) {
+    if (scene.prescribed[a / 3] == 0) x[a] += h * velocities[a];
+  }
+  return x;
+}
+
 std::vector<double> Problem::predicted(const double* cloth_positions) const {
   std::vector<double> x = ends;
   std::copy_n(cloth_positions, cloth_size, x.begin());

@@ -85,6 +85,9 @@ class Problem {
   /// All points, with these rows and everything prescribed at its targets.
   std::vector<double> at(const double* rows) const;
 
+  /// All points where cloths go on as they move at the start, and everything prescribed is at its target.
+  std::vector<double> coasting() const;
+
   /// All points, with these cloth positions, free coordinates at their targets t, and everything
   /// prescribed at its own.
   std::vector<double> predicted(const double* cloth_positions) const;

@@ -245,6 +245,39 @@ def test_tangents_of_friction_are_mixed_derivatives_transposed(name, amount):
         assert size > 0
 
 
+def test_contacts_that_are_expected_to_slide_are_as_soft_as_there():
+    """At rest the curvature is that of sticking, thousands of times as much."""
+    scene = contact_scenes.make("two_cloths")
+    potential = scene.potential(slip=1e-6)
+    slide = np.zeros_like(scene.x)
+    slide[scene.surface == 0] = [2e-3, 1e-3, 0.0]
+    friction = potential.friction(scene.x, scene.x)
+    at_rest = friction.hessian(scene.x)
+    sliding = friction.hessian(scene.x + slide, True)
+    expects, h, positive = friction.expecting(scene.x, scene.x + slide)
+    along = slide.ravel()
+    assert expects
+    assert along @ h @ along == pytest.approx(along @ sliding @ along, rel=1e-6)
+    np.testing.assert_array_equal(h, positive)
+    assert along @ at_rest @ along > 1e3 * (along @ h @ along)
+    np.testing.assert_array_equal(friction.hessian(scene.x), at_rest)  # the exact one stays
+    # A step ends it.
+    friction.after(scene.x, slide)
+    np.testing.assert_array_equal(friction.hessian(scene.x, True), at_rest)
+
+
+def test_nothing_is_expected_where_all_sticks():
+    scene = contact_scenes.make("two_cloths")
+    friction = scene.potential(slip=1e-6).friction(scene.x, scene.x)
+    shift = np.zeros_like(scene.x)
+    shift[scene.surface == 0] = [3e-8, 0.0, 0.0]
+    expects, h, positive = friction.expecting(scene.x, scene.x + shift)
+    assert not expects
+    exact = friction.hessian(scene.x)
+    np.testing.assert_array_equal(h, exact)
+    np.testing.assert_array_equal(positive, exact)
+
+
 def test_duals_remember_the_other_side_of_a_kink():
     """A slip that turns round: no curvature along it, but twice the majorant's with duals."""
     scene = contact_scenes.make("two_cloths")

@@ -23,3 +23,19 @@ def test_slips_that_turn_round_do_not_zigzag(monkeypatch, name, most):
         for _ in range(6):
             state = simulator.step(state, scene.control(state))
             assert state.report.iterations <= most
+
+
+@pytest.mark.parametrize(("name", "most"), [("two-sheets", 55), ("moving-body", 38)])
+def test_what_slides_is_expected_to_slide_on(monkeypatch, name, most):
+    """Factorizations of eight steps: 76 and 46 where each step begins as if all contacts stuck."""
+    monkeypatch.syspath_prepend(ROOT)
+    scenes = importlib.import_module("benchmarks.scenes")
+    scene = scenes.SCENES[name](12)
+    simulator = dc.Simulator(scene.scene, 0.01)
+    count = 0
+    with torch.no_grad():
+        state = scenes.in_regime(simulator, scene, 0)
+        for _ in range(8):
+            state = simulator.step(state, scene.control(state))
+            count += state.report.counts["factorizations"]
+    assert count <= most

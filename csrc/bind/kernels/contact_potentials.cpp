@@ -64,6 +64,16 @@ class Friction {
             dense_hessian(potential_, pattern_, to.data(), Curvature::kPrimalDual)};
   }
 
+  /// At x, where a motion to another point is expected: whether there are duals, and the primal-dual and
+  /// the positive Hessian.
+  std::tuple<bool, Eigen::MatrixXd, Eigen::MatrixXd> expecting(const Positions& x,
+                                                               const Positions& to) {
+    potential_.expect(x.data(), to.data());
+    return {potential_.has_duals(x.data()),
+            dense_hessian(potential_, pattern_, x.data(), Curvature::kPrimalDual),
+            dense_hessian(potential_, pattern_, x.data(), Curvature::kPositive)};
+  }
+
  private:
   const linalg::BlockPattern& pattern_;
   Rows3 x_start_;
@@ -307,7 +317,8 @@ class ContactPotential {
 void contact_potentials(nb::module_& m) {
   nb::class_<Friction> friction(m, "Friction");
   bind_potential(friction);
-  friction.def("after", &Friction::after, "x"_a, "p"_a, "alpha"_a = 1.0);
+  friction.def("after", &Friction::after, "x"_a, "p"_a, "alpha"_a = 1.0)
+      .def("expecting", &Friction::expecting, "x"_a, "to"_a);
 
   nb::class_<ContactPotential> barrier(m, "ContactPotential");
   bind_potential(barrier);
