@@ -396,11 +396,8 @@ void FrictionSet::add_mixed(const double* x,
     const Slip& at = here[e];
     const FrictionLaw& law = at.law;
     const Frame change(k, z);
-    const auto turned = [&](const Vec3& a) -> Vec3 {
-      return a[0] * change.e1 + a[1] * change.e2 +
-             a[2] * (change.e1.cross(at.frame.e2) + at.frame.e1.cross(change.e2));
-    };
-    const Vec3 zeta = gap(k, z) - turned(k.a);
+    const Vec3 m_change = change.e1.cross(at.frame.e2) + at.frame.e1.cross(change.e2);
+    const Vec3 zeta = gap(k, z) - k.a[0] * change.e1 - k.a[1] * change.e2 - k.a[2] * m_change;
     const double w_zeta = at.w.dot(zeta);
 
     const double mu_bar = k.lambda * law.f1_over_y * w_zeta;
@@ -417,10 +414,9 @@ void FrictionSet::add_mixed(const double* x,
     const Vec3 s_bar = tangential(omega, k.n);
     Vec3 g = -s_bar;
     if (k.turns) {
-      Vec3 a_bar;
-      for (int a = 0; a < 3; ++a) {
-        a_bar[a] = -(at.frame * Vec3::Unit(a)).dot(s_bar) - turned(Vec3::Unit(a)).dot(eta);
-      }
+      const Vec3 a_bar(-at.frame.e1.dot(s_bar) - change.e1.dot(eta),
+                       -at.frame.e2.dot(s_bar) - change.e2.dot(eta),
+                       -at.frame.m.dot(s_bar) - m_change.dot(eta));
       const Frame frame(k, x_start_);
       g = frame.dual(a_bar);
       add_edges(k, frame.pull_back(-scale * k.a, g), start_bar);
