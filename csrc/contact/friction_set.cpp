@@ -200,7 +200,11 @@ void FrictionSet::expect(const double* x, const double* to) {
   bool any = false;
   for (const Entry& k : entries_) {
     const Slip there = slip(k, to);
-    const bool is_known = !model_->is_of_moving_body(k.lag.pair.vertices);
+    const auto is_driven = [&](Index v) {
+      return model_->is_held({&v, 1}) && row(x, v) != row(to, v);
+    };
+    const bool is_known = !model_->is_of_moving_body(k.lag.pair.vertices) &&
+                          std::ranges::none_of(k.lag.pair.vertices, is_driven);
     expected_.push_back(is_known ? there.law.f1_over_y : at_rest.f1_over_y);
     any = any || (is_known && there.force().norm() > kClose);
   }

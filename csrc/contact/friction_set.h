@@ -143,8 +143,9 @@ class FrictionSet {
   Hessian hessian(const Entry& entry, const Slips& at, Curvature curvature) const;
 
   /// Expect the motion from x, where nothing has slipped yet, to another point. The Hessians at x but the
-  /// exact one then have q of the slip there: that of a contact at rest knows nothing of sliding. Nothing
-  /// is expected of bodies and links whose motion is not given.
+  /// exact one then have q of the slip there: that of a contact at rest knows nothing of sliding. Of bodies
+  /// and pins that move, and of bodies and links whose motion is not given, nothing is expected: what they
+  /// hold often sticks, and follows where they speed up.
   void expect(const double* x, const double* to);
 
   /// Keep the duals of a step: v + min(alpha, 1) (q (w + dw) + f2 / q (w . dw) v - v), no longer than 1. None
