@@ -88,9 +88,20 @@ def turned(vertices, axis, angle):
 
 
 def material(
-    faces, seed=0, *, friction=0.5, thickness=0.0, damping=0.002, stretch=300.0, woven=False
+    faces,
+    seed=0,
+    *,
+    friction=0.5,
+    thickness=0.0,
+    damping=0.002,
+    stretch=300.0,
+    drag=0.0,
+    woven=False,
 ):
-    """Values that differ from face to face, so that no gradient is spread by accident."""
+    """Values that differ from face to face, so that no gradient is spread by accident.
+
+    `drag` is the share of that of a sheet in air; none by default, as momentum is then kept.
+    """
     rng = np.random.default_rng(seed)
 
     def spread(value):
@@ -104,8 +115,8 @@ def material(
         damping=spread(damping),
         friction=friction,
         thickness=thickness,
-        normal_drag=spread(1.5),
-        tangential_drag=spread(0.3),
+        normal_drag=spread(1.5 * drag),
+        tangential_drag=spread(0.3 * drag),
     )
     if not woven:
         return plain
@@ -174,7 +185,7 @@ def hanging(curved=False, model="patch", woven=False, **options):
         placed,
         faces,
         rest_positions=rest,
-        material=material(faces, woven=woven),
+        material=material(faces, drag=1.0, woven=woven),
         pins={"corner": [0, 5]},
         soft_pins={"row": [30, 32, 35]},
         pin_stiffness=200.0,
@@ -223,7 +234,9 @@ def on_box(
     cloth = dc.Cloth(
         placed,
         faces,
-        material=material(faces, friction=friction, thickness=1.4 * thickness, woven=woven),
+        material=material(
+            faces, drag=1.0, friction=friction, thickness=1.4 * thickness, woven=woven
+        ),
         directions=warp(faces, woven),
         pins=pins,
         soft_pins={"free": [35]},
@@ -293,7 +306,7 @@ def poking(**options):
         vertices + corner + [0.013, 0.017, 0.007],
         faces,
         rest_positions=vertices,
-        material=material(faces, friction=0.5),
+        material=material(faces, drag=1.0, friction=0.5),
         pins={"rim": [0, 5, 30, 35]},
         soft_pins={"free": [14]},
         pin_stiffness=2.0,
@@ -334,7 +347,7 @@ def folded(thickness=0.0, **options):
         placed,
         faces,
         rest_positions=vertices,
-        material=material(faces, friction=0.5, thickness=thickness),
+        material=material(faces, drag=1.0, friction=0.5, thickness=thickness),
         pins={"end": [0, 11, 22, 33, 44]},
         soft_pins={"middle": [29]},
         pin_stiffness=20.0,
@@ -359,7 +372,7 @@ def stacked(dragged=False, woven=False, **options):
         dc.Cloth(
             lower,
             faces,
-            material=material(faces, friction=0.4, thickness=0.004, woven=woven),
+            material=material(faces, drag=1.0, friction=0.4, thickness=0.004, woven=woven),
             directions=warp(faces, woven),
             soft_pins={"all": range(36)},
             pin_stiffness=100.0,
@@ -403,7 +416,7 @@ def on_sphere(friction=0.4, rows=6, body_friction=None, **options):
         turned(vertices, (0.2, 1, 0), 0.05) + np.array([0.05, 0.02, 0.207]),
         faces,
         rest_positions=vertices,
-        material=material(faces, friction=friction),
+        material=material(faces, drag=1.0, friction=friction),
     )
     sim = simulator([cloth], [ball], **options)
     state = settled(sim, sim.initial_state(), 4, velocity=(0.4, 0.1, 0.0))

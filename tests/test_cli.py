@@ -16,6 +16,9 @@ from click.testing import CliRunner
 
 import diffcloth_torch as dc
 from diffcloth_torch.cli import main
+from diffcloth_torch.config.documents import read_document
+from diffcloth_torch.config.train_schema import TrainConfig
+from diffcloth_torch.config.validation import validate
 from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.tasks.registry import check_document, read_config
 
@@ -334,6 +337,10 @@ def test_resume_takes_the_rest_from_its_folder(call):
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_a_configuration_comes_back_from_its_record(path):
+    if path.stem.startswith("train_"):  # of `diffcloth train`, with a schema of its own
+        config = validate(TrainConfig, read_document(path), path)
+        assert validate(TrainConfig, config.model_dump(mode="json"), path) == config
+        return
     config = read_config(path)
     assert check_document(config.model_dump(mode="json"), path) == config
 

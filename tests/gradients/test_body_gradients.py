@@ -72,9 +72,8 @@ def resting(name, *, moving=False, friction_iterations=2, **options):
     points = X + np.array([0, 0, GAP])
     while distance(points, vertices[np.asarray(faces)]) < GAP:
         points[:, 2] += 5e-4
-    cloth = dc.Cloth(
-        points, cloth_faces, rest_positions=X, material=scenes.material(cloth_faces, stretch=200.0)
-    )
+    material = scenes.material(cloth_faces, stretch=200.0, drag=1.0)
+    cloth = dc.Cloth(points, cloth_faces, rest_positions=X, material=material)
     solid = dc.RigidBody(
         vertices,
         np.array(faces),
@@ -89,12 +88,13 @@ def resting(name, *, moving=False, friction_iterations=2, **options):
     )
     state = state.replace(velocities=velocity)
     state = scenes.settled(sim, state, 2)
-    control = {}
+    # In air at rest, drag is so little that differences would not show it.
+    control = {"wind": scenes.WIND}
     if moving:
         poses = state.body_poses.clone()
         poses[0, :3] += torch.tensor([2e-3, 1e-3, 1e-3], dtype=F64)
         poses[0, 3:] += torch.tensor([0.0, 2e-3, -3e-3, 4e-3], dtype=F64)
-        control = {"body_poses": poses}
+        control["body_poses"] = poses
     return scenes.Case(sim, state, control)
 
 
