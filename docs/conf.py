@@ -159,7 +159,9 @@ def add_contents(app, name, source):
         head, title, text = re.split(r"^(# .+\n)", source[0], maxsplit=1, flags=re.MULTILINE)
         page = name.rpartition("/")[2]
         note = "" if app.config.nb_execution_mode == "force" else NOT_EXECUTED
-        source[0] = f"{head}{title}\n{DOWNLOAD.format(page=page)}{note}{text}"
+        # Examples run a program of the repository, which is not where a notebook goes.
+        link = DOWNLOAD.format(page=page) if name.startswith("docs/tutorials/") else ""
+        source[0] = f"{head}{title}\n{link}{note}{text}"
     elif name == "docs/gallery":
         source[0] = PICTURE_OF_A_COMMAND.sub(with_replay, source[0])
 
