@@ -21,11 +21,12 @@ from torch import Tensor
 
 import diffcloth_torch as dc
 from benchmarks import coupling
-from benchmarks.scenes import BUCKLING, DT, SCENES, in_regime
+from benchmarks.scenes import BUCKLING, DT, FURTHER, SCENES, in_regime
 
 START = ("positions", "velocities", "body_poses", "body_velocities", "joint_positions")
 END = (*START, "body_forces", "joint_velocities", "joint_efforts", "base_poses", "base_velocities")
 STEPS = 2  # with a graph
+PROJECTIVE = ("hanging", "stiff", "plane", "sphere", "air")
 
 
 @dataclass(frozen=True)
@@ -38,9 +39,9 @@ class Case:
 
 def cases(size: int) -> Iterator[Case]:
     """All regimes."""
-    for name, make in {**SCENES, **BUCKLING}.items():
+    for name, make in {**SCENES, **BUCKLING, **FURTHER}.items():
         for scheme in ("coupled", "split", "projective"):
-            if scheme == "projective" and name not in ("hanging", "stiff", "plane", "sphere"):
+            if scheme == "projective" and name not in PROJECTIVE:
                 continue
             for batch in (0, 3) if scheme == "coupled" else (0,):
 

@@ -2,7 +2,8 @@
 
 Sheets are jittered in their plane, as exact grids sit on kinks of the contact energy. Each scene
 takes steps that bring it into its regime before anything is timed. `SCENES` are the ordinary ones;
-in `BUCKLING` cloth buckles in many places at once, which costs many iterations.
+in `BUCKLING` cloth buckles in many places at once, which costs many iterations; those of `FURTHER`
+have a potential that the others lack.
 """
 
 from __future__ import annotations
@@ -73,11 +74,17 @@ def _upright(n: int, **keywords: object) -> dc.Cloth:
     return dc.Cloth(placed, faces, rest_positions=vertices, **keywords)
 
 
-def hanging(n: int) -> Scene:
+def hanging(n: int, **material: float) -> Scene:
     """Swing down from the horizontal, held by two corners: free of contact."""
     vertices, faces = sheet(n)
     pins = {"corners": [n * (n - 1), n * n - 1]}
-    return Scene(dc.Scene([dc.Cloth(vertices, faces, pins=pins)]), approach=10)
+    cloth = dc.Cloth(vertices, faces, pins=pins, material=dc.Material(**material))
+    return Scene(dc.Scene([cloth]), approach=10)
+
+
+def air(n: int) -> Scene:
+    """Swing down like `hanging`, through air."""
+    return hanging(n, normal_drag=1.5, tangential_drag=0.03)
 
 
 def stiff(n: int) -> Scene:
@@ -192,6 +199,8 @@ SCENES: dict[str, Callable[[int], Scene]] = {
     "two-sheets": two_sheets,
     "moving-body": moving_body,
 }
+
+FURTHER: dict[str, Callable[[int], Scene]] = {"air": air}
 
 BUCKLING: dict[str, Callable[[int], Scene]] = {
     "twist": twist,

@@ -3,6 +3,7 @@
     python -m benchmarks.step                                    # all of it: long
     python -m benchmarks.step --scene sphere --size 24 --size 48
     python -m benchmarks.step --quick                            # seconds
+    python -m benchmarks.step --scene hanging --scene air        # what a potential costs
 
 Times are medians with quartiles, in milliseconds per environment, and medians in EF: one numeric
 factorization of the contact-free Hessian of the same state by `Eigen::SimplicialLDLT`, timed in
@@ -30,17 +31,18 @@ from tqdm import tqdm
 
 import diffcloth_torch as dc
 from benchmarks.measure import Spread, Timing, time_steps
-from benchmarks.scenes import DT, SCENES
+from benchmarks.scenes import DT, FURTHER, SCENES
 
 SIZES = (12, 24, 48, 96)
 BATCH, BATCH_SIZE = 8, 24  # environments, and the size at which they are timed
 SCALING_THREADS = 2
 
+TIMED = {**SCENES, **FURTHER}
 Row = tuple[str, int, int, int]  # scene, size, batch, threads
 
 
 @click.command(help=__doc__.replace("\n\n    ", "\n\n\b\n    "))
-@click.option("--scene", "scenes", multiple=True, type=click.Choice(list(SCENES)))
+@click.option("--scene", "scenes", multiple=True, type=click.Choice(list(TIMED)))
 @click.option("--size", "sizes", multiple=True, type=click.IntRange(min=4), help="Vertices a side.")
 @click.option("--steps", type=click.IntRange(min=1), help="Timed steps; by default fewer if large.")
 @click.option("--threads", default=1, type=click.IntRange(min=1), help="Of torch.")
@@ -71,7 +73,7 @@ def main(
     timings = []
     for name, size, environments, count in tqdm(rows, disable=None, leave=False):
         timed = steps or (2 if quick else 20 if size <= 24 else 10 if size <= 48 else 5)
-        timing = time_steps(name, size, environments, count, timed, SCENES[name](size))
+        timing = time_steps(name, size, environments, count, timed, TIMED[name](size))
         timings.append(timing)
         tqdm.write(_line(timing))
     print(f"\n{_phase_table(timings)}")

@@ -21,9 +21,10 @@ F64 = torch.float64
 DT = 0.01
 EDGE = 0.1  # [m], of all cloths but the folded one
 TOLERANCE = 1e-11
+WIND = torch.tensor([1.1, -0.7, 0.4], dtype=F64)  # [m/s]
 
 STATE = ("positions", "velocities", "body_poses", "soft_pin_targets")
-CONTROL = ("pins", "soft_pins", "body_poses", "forces")
+CONTROL = ("pins", "soft_pins", "body_poses", "forces", "wind")
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,8 @@ def material(faces, seed=0, *, friction=0.5, thickness=0.0, damping=0.002, stret
         damping=spread(damping),
         friction=friction,
         thickness=thickness,
+        normal_drag=spread(1.5),
+        tangential_drag=spread(0.3),
     )
 
 
@@ -170,7 +173,7 @@ def hanging(curved=False, model="patch", **options):
     )
     pins = state.positions[[0, 5]] + tensor_noise((2, 3), 0.01, 4)
     control = {"pins": pins, "forces": tensor_noise(state.positions.shape, 0.02, 5)}
-    return Case(sim, state, control)
+    return Case(sim, state, control | {"wind": WIND})
 
 
 # --- A sheet on a box ----------------------------------------------------------------------------
@@ -202,7 +205,7 @@ def on_box(
     sim = simulator([cloth], [box], **options)
     state = settled(sim, sim.initial_state(), steps, velocity=velocity)
     forces = tensor_noise(state.positions.shape, 0.002, 5)
-    control = {"forces": forces, "soft_pins": state.soft_pin_targets + 0.01}
+    control = {"forces": forces, "soft_pins": state.soft_pin_targets + 0.01, "wind": WIND}
     if pins:
         control["pins"] = state.positions[[i for g in pins.values() for i in g]].clone()
         control["pins"] += tensor_noise(control["pins"].shape, 5e-4, 6)
@@ -343,6 +346,8 @@ def stacked(dragged=False, **options):
                 damping=0.001,
                 friction=0.6,
                 thickness=0.006,
+                normal_drag=1.0,
+                tangential_drag=0.2,
             ),
             soft_pins={"one": [12]},
             pin_stiffness=3.0,

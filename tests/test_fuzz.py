@@ -116,6 +116,20 @@ def test_the_fuzz_sees_a_target_that_pulls_wrongly():
         assert tally.counts["momentum"] == wrong
 
 
+def test_the_fuzz_sees_air_that_pushes_wrongly():
+    """The momentum of cloths counts what the air does, computed by hand, in gusts too."""
+    draws = [fuzz_main.DRAWINGS["cloths"](1, index) for index in range(60)]
+    windy = [s for s in draws if s.air.wind is not None and not len(s.simulator._assembly.pins)]
+    scene = next(s for s in windy if s.air.normal_drag > 0.2)
+    before, where = scene.start, {"step": 1}
+    after = scene.simulator.step(before, scene.control(before, 1))
+    for factor, wrong in ((1.0, 0), (1.1, 1)):
+        air = replace(scene.air, density=factor * scene.air.density)
+        tally = fuzz_main.Tally(show_failures=False)
+        fuzz_main._check_momentum(replace(scene, air=air), before, after, tally, where)
+        assert tally.counts["momentum"] == wrong
+
+
 def test_a_scene_is_a_function_of_its_seed_and_index():
     first, again = (fuzz("--only", "2", "--seed", "1") for _ in range(2))
     assert numbers(first.stdout) == numbers(again.stdout)

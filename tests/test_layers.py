@@ -15,7 +15,7 @@ CPP_LAYERS = [
     {"linalg"},
     {"mesh"},
     {"potential"},
-    {"elastic", "contact", "bodies"},
+    {"elastic", "air", "contact", "bodies"},
     {"solver", "projective"},
     {"step"},
     {"bind"},

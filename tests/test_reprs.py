@@ -129,7 +129,7 @@ def test_what_a_scene_is_made_of(simulator):
     with_faces = dc.Material(stretch=np.linspace(1, 2, 1058), friction=0.25)
     assert lines(with_faces) == (
         "Material(stretch=float64[1058], bending=1e-05, poisson=0.3, density=0.124, damping=0, "
-        "friction=0.25, thickness=0)"
+        "friction=0.25, thickness=0, normal_drag=0, tangential_drag=0)"
     )
 
 

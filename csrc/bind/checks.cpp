@@ -77,6 +77,8 @@ bool is_needed(const step::Scene& scene, const step::Inputs& inputs, const step:
       return std::ranges::max(accepted_counts(scene, row.extent)) > 0;
     case step::Need::kNowhere:
       return false;
+    case step::Need::kCloths:
+      return scene.cloth_count() > 0;
     case step::Need::kBarrier:
       return inputs.data(step::Input::kBarrierStiffness) != nullptr;
     case step::Need::kSoftPins:

@@ -33,6 +33,10 @@ enum class Input : std::uint8_t {
   kSpringWeights,      ///< w [-]
   kSpringStiffness,    ///< k [N/m]
   kRestPositions,      ///< X [m]
+  kNormalDrag,         ///< C_n [-]
+  kTangentialDrag,     ///< C_t [-]
+  kAirDensity,         ///< rho [kg/m^3]
+  kWind,               ///< w [m/s]
   kCoordinates,        ///< of mechanisms, at the start of the step
   kCoordinateEnds,     ///< at its end, where prescribed
   kCoordinateTargets,  ///< t, see bodies::CoordinatePotential
@@ -64,6 +68,7 @@ enum class Extent : std::uint8_t {
 enum class Need : std::uint8_t {
   kExtent,           ///< where the scene has anything of its extent
   kNowhere,          ///< what stands in for it is known
+  kCloths,           ///< where there are cloths
   kBarrier,          ///< where there is a barrier
   kSoftPins,         ///< where there are soft pins
   kFreeCoordinates,  ///< where forces move coordinates
@@ -107,6 +112,10 @@ inline constexpr std::array kInputTable{
     InputRow{Input::kSpringWeights, "attachment_weights", Extent::kAttachments},
     InputRow{Input::kSpringStiffness, "attachment_stiffness", Extent::kAttachments},
     InputRow{Input::kRestPositions, "rest_positions", Extent::kVertices, Need::kNowhere},
+    InputRow{Input::kNormalDrag, "normal_drag", Extent::kPerFace},
+    InputRow{Input::kTangentialDrag, "tangential_drag", Extent::kPerFace},
+    InputRow{Input::kAirDensity, "air_density", Extent::kOne, Need::kCloths},
+    InputRow{Input::kWind, "wind", Extent::kVector, Need::kCloths},
     InputRow{Input::kCoordinates, "coordinates", Extent::kCoordinates},
     InputRow{Input::kCoordinateEnds, "coordinate_ends", Extent::kCoordinates},
     InputRow{Input::kCoordinateTargets, "coordinate_targets", Extent::kCoordinates,

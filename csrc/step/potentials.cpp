@@ -1,5 +1,6 @@
 #include "step/potentials.h"
 
+#include "step/air.h"
 #include "step/attachments.h"
 #include "step/elasticity.h"
 #include "step/problem.h"
@@ -11,6 +12,7 @@ std::vector<std::unique_ptr<StepPotential>> make_potentials(const Problem& probl
                                                             const Gradients* wanted) {
   std::vector<std::unique_ptr<StepPotential>> list;
   list.push_back(std::make_unique<Elasticity>(problem, wanted));
+  list.push_back(std::make_unique<Air>(problem, wanted));
   list.push_back(std::make_unique<Attachments>(problem));
   list.push_back(std::make_unique<SoftPins>(problem));
   return list;

@@ -38,6 +38,7 @@ from diffcloth_torch.config.shape_schema import (
 from diffcloth_torch.model.materials import Material
 
 __all__ = [
+    "AirSection",
     "AttachmentSection",
     "BodySection",
     "BoxSelection",
@@ -251,10 +252,18 @@ class AttachmentSection(Section):
         return self
 
 
+class AirSection(Section):
+    """Density of the air [kg/m^3], and its steady velocity [m/s], which cloths with drag feel."""
+
+    density: Annotated[float, limits("air_density")] | None = None
+    wind: Vector3 | None = None
+
+
 class SceneSection(Section):
-    """Cloths, bodies, robots and gravity. Without cloths, a body or a robot must be dynamic."""
+    """Cloths, bodies, robots, gravity, air. Without cloths, a body or a robot must be dynamic."""
 
     gravity: Vector3 | None = None
+    air: AirSection = AirSection()
     cloths: list[ClothSection] = []
     bodies: list[BodySection] = []
     robots: list[RobotSection] = []
@@ -265,4 +274,6 @@ class SceneSection(Section):
     def _check_cloths(self) -> SceneSection:
         if not (self.cloths or self.robots or any(b.motion == "dynamic" for b in self.bodies)):
             raise ValueError("must have a cloth in `cloths` unless a body or a robot is dynamic")
+        if self.air.wind is not None and not self.cloths:
+            raise ValueError("has `air.wind` and must have a cloth in `cloths` that feels it")
         return self

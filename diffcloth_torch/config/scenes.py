@@ -45,6 +45,7 @@ __all__ = [
     "prescribed_poses",
     "quaternion",
     "select_vertices",
+    "steady_wind",
     "step_control",
 ]
 
@@ -56,6 +57,8 @@ def build_scene(config: RunConfig, source: Path) -> Scene:
     bodies = [_body(section, config.root, source) for section in config.scene.bodies]
     robots = [_robot(section, config.root, source) for section in config.scene.robots]
     options = config.scene.model_dump(include={"gravity", "ignore_contact"}, exclude_none=True)
+    if config.scene.air.density is not None:
+        options["air_density"] = config.scene.air.density
     attachments = [attachment(section, cloths) for section in config.scene.attachments]
     return Scene(cloths, bodies, robots, attachments=attachments, **options)
 
@@ -258,14 +261,22 @@ def prescribed_motions(config: RunConfig, scene: Scene, steps: int) -> Trajector
     return motions | attachment_motions(config.scene.attachments, scene, times)
 
 
-def step_control(motions: Mapping[str, Mapping[str, PerStep]], k: int) -> Control:
-    """Control of the step k from motions of all steps."""
+def steady_wind(config: RunConfig) -> Tensor | None:
+    """Velocity of the air in every step, shape [3]."""
+    wind = config.scene.air.wind
+    return None if wind is None else torch.tensor(wind, dtype=torch.float64)
+
+
+def step_control(
+    motions: Mapping[str, Mapping[str, PerStep]], k: int, wind: Tensor | None
+) -> Control:
+    """Control of the step k from motions of all steps, and from the wind."""
     fields: dict[str, Any] = {
         field: {name: values[k] for name, values in named.items()}
         for field, named in motions.items()
         if named
     }
-    return Control(**fields)
+    return Control(**fields, wind=wind)
 
 
 def _pin_motions(config: RunConfig, scene: Scene, times: Tensor) -> Trajectories:

@@ -61,6 +61,7 @@ def scene_parameters(scene: Scene, assembly: Assembly, contact: bool) -> dict[st
         if all(cloth.bending_model == "hinge" for cloth in scene.cloths):
             del values["poisson"]  # hinges have no Poisson effect
         values["rest_positions"] = assembly.rest_positions
+        values["air_density"] = np.array(scene.air_density)
     if contact:
         friction = _surface_values(scene, "friction")
         values["friction"] = np.sqrt(friction[:, None] * friction)

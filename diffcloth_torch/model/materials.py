@@ -20,7 +20,7 @@ __all__ = ["Material"]
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Properties of a cloth; numbers, or one value per face for the first five.
+    """Properties of a cloth; numbers, or one value per face for all but friction and thickness.
 
     Attributes:
         stretch: Membrane stiffness [N/m], > 0.
@@ -30,6 +30,10 @@ class Material:
         damping: Time over which strain rates are damped [s], >= 0.
         friction: Friction coefficient of the surface [-], >= 0.
         thickness: Full thickness of the surface in contact [m], >= 0.
+        normal_drag: Coefficient of the pressure of air that flows across the faces [-], >= 0; about
+            1 to 2 for cloth that no air passes through.
+        tangential_drag: Coefficient of the friction of air that flows along them, of both sides
+            together [-], >= 0; a few hundredths.
     """
 
     stretch: float | FloatArray = 550.0
@@ -39,6 +43,8 @@ class Material:
     damping: float | FloatArray = 0.0
     friction: float = 0.4
     thickness: float = 0.0
+    normal_drag: float | FloatArray = 0.0
+    tangential_drag: float | FloatArray = 0.0
 
     def __post_init__(self) -> None:
         for field in FACE_QUANTITIES:

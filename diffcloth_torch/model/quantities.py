@@ -121,6 +121,7 @@ CONTROL = _table(
     Quantity(
         "attachment_weights", "-", (("A",),), "released", UNIT_INTERVAL, core="attachment_weights"
     ),
+    Quantity("wind", "m/s", ((3,),), "zero", core="wind"),
 )
 _TAKEN_BY_THE_CORE = (
     Quantity("stretch", "N/m", _PER_FACE, "Material.stretch", POSITIVE),
@@ -137,6 +138,9 @@ _TAKEN_BY_THE_CORE = (
     Quantity("gravity", "m/s^2", ((3,),), "Scene.gravity"),
     Quantity("rest_positions", "m", (("N", 3),), "Cloth.rest_positions"),
     Quantity("attachment_stiffness", "N/m", (("A",),), "Attachment.stiffness", POSITIVE),
+    Quantity("normal_drag", "-", _PER_FACE, "Material.normal_drag", NON_NEGATIVE),
+    Quantity("tangential_drag", "-", _PER_FACE, "Material.tangential_drag", NON_NEGATIVE),
+    Quantity("air_density", "kg/m^3", _ONE, "Scene.air_density", NON_NEGATIVE),
 )
 PARAMETERS = _table(
     *(quantity._replace(core=quantity.name) for quantity in _TAKEN_BY_THE_CORE),

@@ -16,12 +16,14 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.attachment import Attachment
 from diffcloth_torch.model.cloth import Cloth
+from diffcloth_torch.model.quantities import check_parameter
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.robot import Robot
 from diffcloth_torch.model.springs import AttachedSurface, Springs, make_springs, surfaces_of
 
 __all__ = ["Scene"]
 
+_AIR_DENSITY = 1.2  # [kg/m^3], dry, at 20 degrees Celsius and sea level
 
 S = TypeVar("S")
 
@@ -34,6 +36,7 @@ class Scene:
         bodies: Rigid bodies.
         robots: Robots.
         gravity: Acceleration [m/s^2], shape [3].
+        air_density: Density of the air [kg/m^3], which cloths with drag feel.
         ignore_contact: Pairs of names of surfaces that do not collide with each other.
         cloth_names: Names of the cloths; "cloth0", "cloth1" .. where none was given.
         body_names: Names of the bodies; "body0", "body1" .. where none was given.
@@ -48,6 +51,7 @@ class Scene:
     # Without robots, for pickles that were made before scenes had them.
     robots: tuple[Robot, ...] = ()
     gravity: FloatArray
+    air_density: float = _AIR_DENSITY
     ignore_contact: tuple[tuple[str, str], ...] = ()
     cloth_names: tuple[str, ...]
     body_names: tuple[str, ...]
@@ -63,6 +67,7 @@ class Scene:
         robots: Iterable[Robot] = (),
         *,
         gravity: object = (0.0, 0.0, -9.81),
+        air_density: float = _AIR_DENSITY,
         ignore_contact: Iterable[Sequence[str]] = (),
         attachments: Iterable[Attachment] = (),
     ) -> None:
@@ -74,6 +79,7 @@ class Scene:
             robots: Robots, in the order of `base_poses`; their joints are numbered in the same
                 order.
             gravity: Acceleration [m/s^2], shape [3].
+            air_density: Density of the air [kg/m^3], >= 0; by default that at 20 degrees Celsius.
             ignore_contact: Pairs of names of surfaces that do not collide with each other.
             attachments: Springs between points of the scene, or to targets.
 
@@ -100,6 +106,7 @@ class Scene:
         check_finite("Scene: `gravity`", acceleration)
         frozen(acceleration)
         self.gravity = acceleration
+        self.air_density = check_parameter("Scene", "air_density", air_density)
         self.ignore_contact = check_pairs(
             "Scene: `ignore_contact`", ignore_contact, self.surface_names
         )

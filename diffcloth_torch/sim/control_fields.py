@@ -96,7 +96,9 @@ def _named_targets(layout: Layout, field: str, given: Mapping[str, object]) -> d
 
 
 def _check_rows(layout: Layout, field: str, values: FloatArray, first: int = 0) -> None:
-    """Refuse wrenches on bodies that are not dynamic, and joint positions beyond a limit."""
+    """Refuse what nothing feels, as wrenches on prescribed bodies; joints beyond a limit."""
+    if field == "wind" and not layout.cloth_names:
+        raise InvalidInput("control: `wind` must be None: the scene has no cloth that feels it")
     if field in layout.permissions.unforced:
         rows = slice(first, first + values.shape[-2])
         for k, why in enumerate(layout.permissions.unforced[field][rows]):

@@ -49,6 +49,8 @@ class Control:
         attachment_weights: Share of the stiffness with which the springs of attachments pull [-],
             between 0 (released) and 1, shape [A], or attachment -> weights [n]; 1 by default, and
             0 where a target is not set.
+        wind: Velocity of the air around the cloths [m/s], shape [3]; none by default. Faces whose
+            material has drag feel it.
     """
 
     pins: Tensor | Mapping[str, Tensor] | None = None
@@ -63,6 +65,7 @@ class Control:
     base_wrenches: Tensor | Mapping[str, Tensor] | None = None
     attachments: Tensor | Mapping[str, Tensor] | None = None
     attachment_weights: Tensor | Mapping[str, Tensor] | None = None
+    wind: Tensor | None = None
 
     def __repr__(self) -> str:
         return _text(self, CONTROL)
@@ -103,6 +106,11 @@ class Parameters:
         gravity: Acceleration of gravity [m/s^2], shape [3].
         rest_positions: Stress-free positions of the cloth vertices [m], shape [N, 3].
         attachment_stiffness: Of the springs of attachments [N/m], > 0, shape [A].
+        normal_drag: Coefficient of the pressure of air across faces [-], >= 0; shape [], [C] or
+            [F].
+        tangential_drag: Coefficient of the friction of air along faces [-], >= 0; shape [], [C] or
+            [F].
+        air_density: Density of the air [kg/m^3], >= 0; shape [].
         body_mass: Mass of each body [kg], >= 0, > 0 where it is dynamic; shape [K]. This and the
             next two are ignored where the body is not dynamic.
         body_center: Its center of mass, in its frame [m], shape [K, 3].
@@ -132,6 +140,9 @@ class Parameters:
     gravity: Tensor | None = None
     rest_positions: Tensor | None = None
     attachment_stiffness: Tensor | None = None
+    normal_drag: Tensor | None = None
+    tangential_drag: Tensor | None = None
+    air_density: Tensor | None = None
     body_mass: Tensor | None = None
     body_center: Tensor | None = None
     body_inertia: Tensor | None = None

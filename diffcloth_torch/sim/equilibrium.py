@@ -179,6 +179,11 @@ class Equilibria:
             if values is not None and numbers_of(values)[..., part].any():
                 what = "torques" if field == "body_wrenches" else "velocities"
                 raise InvalidInput(f"equilibrium: `control.{field}` must have no {what}")
+        if numbers_of(given.control["wind"]).any():
+            raise InvalidInput(
+                "equilibrium: `control.wind` must be zero: what wind does to a sheet follows from "
+                "where the sheet is at the start of a step; roll out with damping until it rests"
+            )
 
     def _from(self, here: Given, found: _Found) -> Given:
         """Make the start of the next step, unless something is falling."""
@@ -285,11 +290,12 @@ class Equilibria:
 
 
 def _resting(given: Given) -> Given:
-    """The same inputs at rest and without damping, which does not act there."""
+    """The same inputs at rest, without damping and drag, which do not act there."""
     state, parameters = given.state, given.parameters
     still = {n: torch.zeros_like(t) for n, t in state.items() if n.endswith("velocities")}
-    damping = {n: 0.0 * t for n, t in parameters.items() if n == "damping"}
-    return given._replace(state=state | still, parameters=parameters | damping)
+    resisting = ("damping", "normal_drag", "tangential_drag")
+    none = {n: 0.0 * t for n, t in parameters.items() if n in resisting}
+    return given._replace(state=state | still, parameters=parameters | none)
 
 
 def _slower(given: Given, length: float) -> Given:

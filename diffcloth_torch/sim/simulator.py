@@ -210,11 +210,12 @@ class Simulator(Observables):
         base_wrenches: Any = None,
         attachments: Any = None,
         attachment_weights: Any = None,
+        wind: Any = None,
     ) -> Control:
         """Make a control and check it against the scene.
 
         A target that is None holds its present value; forces, torques and velocities that are None
-        are zero. All but `forces` may also be given by name, as in `Control`.
+        are zero. All but `forces` and `wind` may also be given by name, as in `Control`.
 
         Args:
             pins: Positions of the pins at the end of the step [m], shape [P, 3].
@@ -229,6 +230,7 @@ class Simulator(Observables):
             base_wrenches: Forces and torques on floating bases [N, N m], shape [R, 6].
             attachments: Targets of attachments at the end of the step [m], shape [U, 3].
             attachment_weights: With which share of their stiffness they pull [-], shape [A].
+            wind: Velocity of the air around the cloths [m/s], shape [3].
 
         Raises:
             InvalidInput: If a name, shape or value is not accepted.
@@ -247,6 +249,7 @@ class Simulator(Observables):
             base_wrenches=base_wrenches,
             attachments=attachments,
             attachment_weights=attachment_weights,
+            wind=wind,
         )
         return check_control(self._layout, control)
 

@@ -28,6 +28,10 @@ _STORES_NOTHING = frozenset(
         "coordinate_targets",
         "coordinate_metric",
         "friction_origins",
+        "normal_drag",
+        "tangential_drag",
+        "air_density",
+        "wind",
     }
 )
 

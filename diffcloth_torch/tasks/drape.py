@@ -11,6 +11,7 @@ from diffcloth_torch.config.scenes import (
     build_scene,
     build_simulator,
     prescribed_motions,
+    steady_wind,
     step_control,
 )
 from diffcloth_torch.config.schema import RunConfig
@@ -33,6 +34,7 @@ class Drape:
         self.simulator = build_simulator(self.scene, config.simulation)
         self.steps = config.simulation.steps
         self._motions = prescribed_motions(config, self.scene, self.steps)
+        self._wind = steady_wind(config)
 
     def initial_state(self) -> State:
         """Make the state that the scene describes."""
@@ -44,7 +46,7 @@ class Drape:
 
     def controller(self, actions: Mapping[str, Tensor]) -> Controller:
         """Follow the keyframes, whatever the state."""
-        return lambda k, _state: step_control(self._motions, k)
+        return lambda k, _state: step_control(self._motions, k, self._wind)
 
     def goals(self) -> list[Goal]:
         """Have none."""

@@ -19,6 +19,7 @@ from diffcloth_torch.config.scenes import (
     build_simulator,
     pose_array,
     prescribed_motions,
+    steady_wind,
     step_control,
 )
 from diffcloth_torch.config.schema import RunConfig
@@ -103,6 +104,7 @@ class Reach(ABC):
         self._loss = config.loss
         self._interval = config.actions.interval
         self._prescribed = prescribed_motions(config, self.scene, self.steps)
+        self._wind = steady_wind(config)
 
     @abstractmethod
     def initial_rows(self) -> dict[str, list[list[float]]]:
@@ -139,7 +141,7 @@ class Reach(ABC):
         merged: Motions = {
             field: {**self._prescribed.get(field, {}), **acted.get(field, {})} for field in fields
         }
-        return lambda k, _state: step_control(merged, k)
+        return lambda k, _state: step_control(merged, k, self._wind)
 
     def each_step(self, actions: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Repeat the row of each control interval for its steps: shape [steps, n]."""

@@ -471,6 +471,28 @@ def test_attachments_are_built_and_follow_their_keyframes(write):
     assert end.positions[8, 0] > 0.15  # grasped
 
 
+def test_air_is_built_and_blows_in_every_step(write):
+    sheet = "scene.cloths.sheet.material="
+    given = ["scene.air={density: 0.9, wind: [0, 3, 0]}", sheet + "{normal_drag: 1.5}"]
+    task = load_task(write(ATTACHED), given)
+    assert task.scene.air_density == 0.9
+    assert task.scene.cloths[0].material.normal_drag == 1.5
+    controller = task.controller({})
+    assert all(controller(k, None).wind.tolist() == [0, 3, 0] for k in range(4))
+    still = load_task(write(ATTACHED), [])
+    assert still.scene.air_density == 1.2
+    assert still.controller({})(0, None).wind is None
+
+
+def test_wind_needs_a_cloth(write):
+    text = ATTACHED.partition("  cloths:")[0] + "  air: {wind: [1, 0, 0]}\n"
+    box = "  bodies:\n    - {name: b, shape: {kind: box, size: 1}, motion: dynamic, mass: 1}\n"
+    with pytest.raises(InvalidInput, match=r"has `air\.wind` and must have a cloth"):
+        load_task(write(text + box), [])
+    with pytest.raises(InvalidInput, match="density` must be"):
+        load_task(write(ATTACHED), ["scene.air.density=-1"])
+
+
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [

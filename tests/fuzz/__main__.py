@@ -262,7 +262,7 @@ def _check_momentum(
     tally: Tally,
     where: dict[str, Any],
 ) -> None:
-    """Internal forces cancel: momentum changes by gravity and what the bodies push back."""
+    """Internal forces cancel: momentum changes by gravity, air and what bodies push back."""
     if not len(scene.masses):
         return
     m = scene.masses[:, None]
@@ -271,6 +271,8 @@ def _check_momentum(
     forces = [weight, -after.body_forces.numpy()]
     x, dt = after.positions.numpy(), scene.simulator.dt
     forces += [pull.force(x, where["step"], dt)[None] for pull in scene.pulls]
+    faces, start = scene.simulator._assembly.faces, before.positions.numpy()
+    forces.append(scene.air.force(faces, start, x, where["step"], dt)[None])
     _compare(had, has, forces, "cloths", tally, where)
 
 

@@ -132,6 +132,7 @@ def draw_attachments(
         scene.bodies,
         scene.robots,
         gravity=scene.gravity,
+        air_density=scene.air_density,
         attachments=attachments,
     )
     return with_attachments, tuple(pulls)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from random_air import NO_AIR, Air, draw_air
 from random_attachments import Pull, controlled, draw_attachments
 from random_draws import log_uniform, maybe
 
@@ -65,6 +66,7 @@ class RandomScene:
         masses: Of the cloth vertices [kg].
         drives: Of the robot, if there is one.
         pulls: What controls do with attachments.
+        air: What is around the cloths.
     """
 
     description: dict[str, Any]
@@ -76,6 +78,7 @@ class RandomScene:
     masses: np.ndarray
     drives: Drives | None = None
     pulls: tuple[Pull, ...] = ()
+    air: Air = NO_AIR
 
     def control(self, state: dc.State, k: int) -> dc.Control:
         """Of step k."""
@@ -87,6 +90,8 @@ class RandomScene:
         held = state.positions.detach()[torch.from_numpy(pins.astype(np.int64))]
         control = dc.Control(body_poses=poses, pins=held + dt * torch.from_numpy(self.pin_velocity))
         control = controlled(control, self.pulls, k, dt)
+        if (wind := self.air.wind_at(k)) is not None:
+            control = control.replace(wind=torch.from_numpy(wind))
         return control if self.drives is None else self._driven(control, self.drives, state, k)
 
     def _driven(self, control: dc.Control, drives: Drives, state: dc.State, k: int) -> dc.Control:
@@ -140,10 +145,11 @@ def draw_cloth_scene(seed: int, index: int) -> RandomScene:
         "gravity": maybe(rng, 0.9, G),
         "steps": int(rng.integers(3, 7)),
     }
-    cloths, clearance = draw_cloths(rng, d)
+    # Numbers of their own, as those of attachments: scenes are otherwise what they were before.
+    air = draw_air(np.random.default_rng([seed, index, 3]), d)
+    cloths, clearance = draw_cloths(rng, d, air)
     bodies, velocities = draw_bodies(rng, d, clearance)
-    scene = dc.Scene(cloths, bodies, gravity=(0.0, 0.0, -d["gravity"]))
-    # Numbers of their own: scenes are otherwise what they were before there were attachments.
+    scene = dc.Scene(cloths, bodies, gravity=(0.0, 0.0, -d["gravity"]), air_density=air.density)
     scene, pulls = draw_attachments(np.random.default_rng([seed, index, 2]), d, scene)
     simulator = dc.Simulator(
         scene,
@@ -151,7 +157,7 @@ def draw_cloth_scene(seed: int, index: int) -> RandomScene:
         scheme=d["scheme"],
         contact=dc.ContactOptions(friction_iterations=d["friction_iterations"]),
     )
-    return draw_throw(rng, d, simulator, cloths, velocities, pin_speed=0.5, pulls=pulls)
+    return draw_throw(rng, d, simulator, cloths, velocities, pin_speed=0.5, pulls=pulls, air=air)
 
 
 def draw_throw(
@@ -185,7 +191,7 @@ def draw_throw(
     )
 
 
-def _material(rng: np.random.Generator, edge: float) -> dc.Material:
+def _material(rng: np.random.Generator, edge: float, air: Air) -> dc.Material:
     return dc.Material(
         stretch=log_uniform(rng, 30.0, 3e4),
         bending=log_uniform(rng, 1e-7, 1e-4),
@@ -194,11 +200,13 @@ def _material(rng: np.random.Generator, edge: float) -> dc.Material:
         damping=maybe(rng, 0.3, log_uniform(rng, 1e-4, 1e-1)),
         friction=maybe(rng, 0.8, rng.uniform(0.05, 1.2)),
         thickness=maybe(rng, 0.4, 0.05 * edge * rng.uniform(0.2, 1.0)),
+        normal_drag=air.normal_drag,
+        tangential_drag=air.tangential_drag,
     )
 
 
 def draw_cloths(
-    rng: np.random.Generator, d: dict[str, Any], pins: tuple[str, ...] = PINS
+    rng: np.random.Generator, d: dict[str, Any], air: Air, pins: tuple[str, ...] = PINS
 ) -> tuple[list[dc.Cloth], float]:
     """The cloths, all above z = 0 by the clearance that is returned."""
     rows, columns, size = d["rows"], d["columns"], d["size"]
@@ -207,7 +215,7 @@ def draw_cloths(
     flat = np.array(grid.vertices)
     flat[:, :2] += d["jitter"] * edge * rng.uniform(-1, 1, (len(flat), 2))
     clearance = edge * rng.uniform(0.11, 0.5)
-    material = _material(rng, edge)
+    material = _material(rng, edge, air)
     d["material"] = {k: getattr(material, k) for k in material.__dataclass_fields__}
     keywords: dict[str, Any] = {"material": material}
     if d["layout"] == "fold":
@@ -227,7 +235,7 @@ def draw_cloths(
         upper[:, :2] += edge * rng.uniform(-0.5, 0.5, 2)
         upper[:, 2] = placed[:, 2].max() + edge * rng.uniform(0.11, 0.3)
         cloths.append(
-            dc.Cloth(upper, grid.faces, rest_positions=flat, material=_material(rng, edge))
+            dc.Cloth(upper, grid.faces, rest_positions=flat, material=_material(rng, edge, air))
         )
     return cloths, clearance
 

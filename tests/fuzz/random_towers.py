@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from random_air import NO_AIR, draw_air
 from random_attachments import draw_attachments
 from random_draws import log_uniform, maybe
 from random_scenes import (
@@ -69,7 +70,11 @@ def draw_tower(seed: int, index: int) -> RandomScene:
         "steps": int(rng.integers(3, 7)),
     }
     _choose_scheme(rng, d, has_cloths)
-    cloths, clearance = draw_cloths(rng, d, (*PINS, "rim")) if has_cloths else ([], 0.03 * size)
+    # Numbers of their own, as those of attachments: scenes are otherwise what they were before.
+    air = draw_air(np.random.default_rng([seed, index, 3]), d) if has_cloths else NO_AIR
+    cloths, clearance = [], 0.03 * size
+    if has_cloths:
+        cloths, clearance = draw_cloths(rng, d, air, (*PINS, "rim"))
     heights = np.concatenate([[0.0] if not cloths else [], *(c.vertices[:, 2] for c in cloths)])
     tower = Tower(heights.min(), heights.max(), clearance)
     mass = float(sheet_masses(cloths).sum())
@@ -91,8 +96,8 @@ def draw_tower(seed: int, index: int) -> RandomScene:
             bodies.append(_prescribed(rng, d, tower, kinds))
         velocities = np.array([_velocity(rng, d, body) for body in bodies])
         d["bodies"] = kinds
-    drawn = dc.Scene(cloths, bodies, robots, gravity=(0.0, 0.0, -d["gravity"]))
-    # Numbers of their own: scenes are otherwise what they were before there were attachments.
+    gravity = (0.0, 0.0, -d["gravity"])
+    drawn = dc.Scene(cloths, bodies, robots, gravity=gravity, air_density=air.density)
     drawn, pulls = draw_attachments(np.random.default_rng([seed, index, 2]), d, drawn)
     simulator = dc.Simulator(
         drawn,
@@ -107,7 +112,8 @@ def draw_tower(seed: int, index: int) -> RandomScene:
     )
     dynamic = np.array([body.motion == "dynamic" for body in bodies], dtype=bool)[:, None]
     moved = velocities * ~dynamic
-    scene = draw_throw(rng, d, simulator, cloths, moved, pin_speed=0.3, drives=drives, pulls=pulls)
+    options = {"drives": drives, "pulls": pulls, "air": air}
+    scene = draw_throw(rng, d, simulator, cloths, moved, pin_speed=0.3, **options)
     if dynamic.any():
         start = scene.start.replace(body_velocities=torch.from_numpy(velocities * dynamic))
         scene = replace(scene, start=start)

@@ -24,6 +24,7 @@ STEPS = {
     "control.soft_pins": 1e-4,
     "control.body_poses": 1e-5,
     "control.forces": 1e-4,
+    "control.wind": 1e-3,
     "parameters.gravity": 1e-1,
     "parameters.rest_positions": 1e-5,
     "parameters.thickness": 1e-5,
@@ -32,10 +33,18 @@ STEPS = {
     "parameters.poisson": 1e-3,
     "parameters.damping": 1e-5,
     "parameters.friction": 1e-3,
+    "parameters.normal_drag": 1e-2,
+    "parameters.tangential_drag": 1e-2,
 }
 RELATIVE_STEP = 2e-3  # of the others
 # Not to be stepped below zero.
-NON_NEGATIVE = ("parameters.thickness", "parameters.damping", "parameters.friction")
+NON_NEGATIVE = (
+    "parameters.thickness",
+    "parameters.damping",
+    "parameters.friction",
+    "parameters.normal_drag",
+    "parameters.tangential_drag",
+)
 
 CONTACT_PARAMETERS = (
     "parameters.friction",
@@ -340,6 +349,7 @@ def test_coarser_parameters_get_the_sums_of_finer_ones():
     faces = [len(cloth.faces) for cloth in sim.scene.cloths]
     uniform = {
         "stretch": 280.0, "bending": 1e-3, "poisson": 0.2, "density": 0.3, "damping": 0.001,
+        "normal_drag": 1.2, "tangential_drag": 0.1,
     }  # fmt: skip
     groups = torch.cat([torch.full((n,), c) for c, n in enumerate(faces)])
 
@@ -371,13 +381,13 @@ def test_coarser_parameters_get_the_sums_of_finer_ones():
 
 
 def test_a_parameter_of_zero_has_its_gradient():
-    """No damping, no bending, no friction: the gradient with respect to them is one-sided."""
+    """No damping, bending, friction, drag: the gradient with respect to them is one-sided."""
     case = scenes.regime("pushing", "coupled", "mass", 2)
-    zero = {name: torch.zeros((), dtype=F64) for name in ("damping", "bending", "friction")}
+    names = ("damping", "bending", "friction", "normal_drag", "tangential_drag")
     check(
-        case.where(parameters=zero),
+        case.where(parameters={name: torch.zeros((), dtype=F64) for name in names}),
         CONTACT,
-        only=("parameters.damping", "parameters.friction"),
+        only=[f"parameters.{name}" for name in names if name != "bending"],
     )
 
 

@@ -27,7 +27,7 @@ PUBLIC = {
     ),
     "Control": (
         "pins soft_pins body_poses forces body_wrenches joint_positions joint_velocities "
-        "joint_efforts base_poses base_wrenches attachments attachment_weights replace"
+        "joint_efforts base_poses base_wrenches attachments attachment_weights wind replace"
     ),
     "Descent": "record restore metrics",
     "Evaluation": "failed_environments is_better_than record",
@@ -35,13 +35,16 @@ PUBLIC = {
     "InfeasibleMotion": "",
     "IntersectingState": "",
     "InvalidInput": "",
-    "Material": "stretch bending poisson density damping friction thickness",
+    "Material": (
+        "stretch bending poisson density damping friction thickness normal_drag tangential_drag"
+    ),
     "NotConverged": "",
     "TurnedTooFar": "",
     "Parameters": (
         "stretch bending poisson density damping friction thickness barrier_stiffness "
         "barrier_distance slip_velocity pin_stiffness gravity rest_positions attachment_stiffness "
-        "body_mass body_center body_inertia link_mass link_center link_inertia joint_stiffness "
+        "normal_drag tangential_drag air_density body_mass body_center body_inertia link_mass "
+        "link_center link_inertia joint_stiffness "
         "joint_damping joint_viscosity joint_armature replace"
     ),
     "Report": "select stack where",

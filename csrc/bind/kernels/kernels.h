@@ -23,6 +23,9 @@ contact::SurfacePairs touching_surfaces(const std::vector<Index>& vertex_surface
 /// The level of that name, among those that this machine has.
 linalg::KernelLevel level_named(const std::string& name);
 
+/// Drag of faces, for tests against its formula and differences.
+void air_kernels(nb::module_& m);
+
 /// Threads, for tests of what happens when they fail or are interrupted.
 void common_kernels(nb::module_& m);
 

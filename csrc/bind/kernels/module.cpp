@@ -5,6 +5,7 @@ NB_MODULE(_kernels, m) {
   diffcloth::bind::nb::set_leak_warnings(false);  // see bind/module.cpp
   m.doc() = "Single kernels of the C++ core, exposed for tests and benchmarks.";
 
+  diffcloth::bind::air_kernels(m);
   diffcloth::bind::common_kernels(m);
   diffcloth::bind::contact_kernels(m);
   diffcloth::bind::contact_potentials(m);

@@ -1,0 +1,152 @@
+#include "air/drag_potential.h"
+
+#include <utility>
+
+namespace diffcloth::air {
+namespace {
+
+using Face = std::array<Index, 3>;
+
+Vec3 sum_of_corners(const Face& face, const double* rows) {
+  return row(rows, face[0]) + row(rows, face[1]) + row(rows, face[2]);
+}
+
+void add_to_corners(const Face& face, const Vec3& value, double* rows) {
+  for (const Index i : face) Eigen::Map<Vec3>(rows + 3 * i) += value;
+}
+
+Vec3 edge(const Face& face, int p, const double* rows) {
+  return row(rows, face[p]) - row(rows, face[0]);
+}
+
+}  // namespace
+
+DragPotential::DragPotential(Flow flow, Index vertex_count, bool of_coefficients)
+    : across_bar(flow.faces.size(), 0.0),
+      along_bar(flow.faces.size(), 0.0),
+      start_bar(3 * static_cast<std::size_t>(vertex_count), 0.0),
+      wind_bar(3, 0.0),
+      flow_(std::move(flow)),
+      of_coefficients_(of_coefficients) {
+  for (std::size_t f = 0; f < flow_.faces.size(); ++f) {
+    if (flow_.across[f] != 0.0 || flow_.along[f] != 0.0)
+      with_drag_.push_back(static_cast<Index>(f));
+  }
+}
+
+FaceDrag DragPotential::drag(Index f) const {
+  const Face& face = flow_.faces[f];
+  const Vec3 N = edge(face, 1, flow_.start).cross(edge(face, 2, flow_.start));
+  return {N, flow_.across[f], flow_.along[f]};
+}
+
+/// u.
+Vec3 DragPotential::velocity(Index f, const double* x) const {
+  Vec3 moved = Vec3::Zero();
+  for (const Index i : flow_.faces[f]) moved += row(x, i) - row(flow_.start, i);
+  return moved / (3.0 * flow_.h) - flow_.wind;
+}
+
+double DragPotential::energy(const double* x) const {
+  double sum = 0.0;
+  for (const Index f : with_drag_) sum += drag(f).power(velocity(f, x));
+  return flow_.h * sum;
+}
+
+double DragPotential::energy_change(const double* x, const double* to) const {
+  double sum = 0.0;
+  for (const Index f : with_drag_) {
+    Vec3 moved = Vec3::Zero();
+    for (const Index i : flow_.faces[f]) moved += row(to, i) - row(x, i);
+    sum += drag(f).power_change(velocity(f, x), velocity(f, to), moved / (3.0 * flow_.h));
+  }
+  return flow_.h * sum;
+}
+
+void DragPotential::add_gradient(const double* x, double* g) const {
+  for (const Index f : with_drag_) {
+    add_to_corners(flow_.faces[f], drag(f).force(velocity(f, x)) / 3.0, g);
+  }
+}
+
+void DragPotential::add_hessian(const double* x,
+                                Curvature /*curvature*/,
+                                linalg::BlockMatrix& A) const {
+  for (const Index f : with_drag_) {
+    const Mat3 block = drag(f).slope(velocity(f, x)) / (9.0 * flow_.h);
+    A.add_rows(flow_.faces[f], [&](int /*p*/, int /*q*/) -> const Mat3& { return block; });
+  }
+}
+
+void DragPotential::add_hessian_product(const double* x, const double* z, double* y) const {
+  for (const Index f : with_drag_) {
+    const Vec3 sum = sum_of_corners(flow_.faces[f], z);
+    if (sum.isZero(0.0)) continue;
+    add_to_corners(flow_.faces[f], drag(f).slope(velocity(f, x)) * sum / (9.0 * flow_.h), y);
+  }
+}
+
+void DragPotential::accumulate(const double* x, const double* z) {
+  // z . grad P = sum_f z_f . grad D_f,  z_f the mean of the corners' z.
+  const auto add = [&](Index f) {
+    const FaceDrag face = drag(f);
+    const Vec3 u = velocity(f, x);
+    const Vec3 z_f = sum_of_corners(flow_.faces[f], z) / 3.0;
+    across_bar[f] -= z_f.dot(face.by_across(u));
+    along_bar[f] -= z_f.dot(face.by_along(u));
+    if (face.across == 0.0 && face.along == 0.0) return;
+    const Vec3 minus_u_bar = face.slope(u) * z_f;
+    Eigen::Map<Vec3>(wind_bar.data()) += minus_u_bar;
+    add_to_corners(flow_.faces[f], minus_u_bar / (3.0 * flow_.h), start_bar.data());
+    add_frame_bar(f, -face.frame_bar(u, z_f));
+  };
+  if (of_coefficients_) {
+    for (std::size_t f = 0; f < flow_.faces.size(); ++f) add(static_cast<Index>(f));
+  } else {
+    for (const Index f : with_drag_) add(f);
+  }
+}
+
+void DragPotential::add_tangent(const double* x, double* y) const {
+  for (std::size_t k = 0; k < flow_.faces.size(); ++k) {
+    const auto f = static_cast<Index>(k);
+    const bool drags = flow_.across[k] != 0.0 || flow_.along[k] != 0.0;
+    if (!drags && across_dot[k] == 0.0 && along_dot[k] == 0.0) continue;
+    const FaceDrag face = drag(f);
+    const Vec3 u = velocity(f, x);
+    Vec3 change = across_dot[k] * face.by_across(u) + along_dot[k] * face.by_along(u);
+    if (drags) {
+      const Vec3 u_dot =
+          -sum_of_corners(flow_.faces[k], start_dot.data()) / (3.0 * flow_.h) - wind_dot;
+      change += face.slope(u) * u_dot + face.frame_change(u, frame_dot(f));
+    }
+    add_to_corners(flow_.faces[k], change / 3.0, y);
+  }
+}
+
+void DragPotential::swap_cotangents(CotangentStore& store) {
+  store.exchange(across_bar);
+  store.exchange(along_bar);
+  store.exchange(start_bar);
+  store.exchange(wind_bar);
+}
+
+/// N = e_1 x e_2: pull its cotangent back to x_n.
+void DragPotential::add_frame_bar(Index f, const Vec3& N_bar) {
+  const Face& face = flow_.faces[f];
+  const Vec3 first = edge(face, 2, flow_.start).cross(N_bar);
+  const Vec3 second = N_bar.cross(edge(face, 1, flow_.start));
+  Eigen::Map<Vec3>(start_bar.data() + 3 * face[0]) -= first + second;
+  Eigen::Map<Vec3>(start_bar.data() + 3 * face[1]) += first;
+  Eigen::Map<Vec3>(start_bar.data() + 3 * face[2]) += second;
+}
+
+/// The tangent of N.
+Vec3 DragPotential::frame_dot(Index f) const {
+  const Face& face = flow_.faces[f];
+  const double* const dot = start_dot.data();
+  return edge(face, 1, dot).cross(edge(face, 2, flow_.start)) +
+         edge(face, 1, flow_.start).cross(edge(face, 2, dot));
+}
+
+}  // namespace diffcloth::air

@@ -1,0 +1,66 @@
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <span>
+#include <vector>
+
+#include "air/face_drag.h"
+#include "common/types.h"
+#include "potential/potential.h"
+
+namespace diffcloth::air {
+
+/// Faces that move through air during a step.
+struct Flow {
+  std::span<const std::array<Index, 3>> faces;
+  std::vector<double> across;     ///< [F] a [kg/m^3]
+  std::vector<double> along;      ///< [F] b [kg/m^3]
+  const double* start = nullptr;  ///< [N, 3] x_n [m]
+  Vec3 wind = Vec3::Zero();       ///< w [m/s]
+  double h = 0.0;                 ///< time step [s]
+};
+
+/// Drag and lift of faces over one step,
+///
+///   P(x) = h sum_f D_f(u_f),    u_f = 1/3 sum_p (x_p - x_n,p) / h - w,
+///
+/// the sum over the corners p of a face. D, see FaceDrag, takes the normal and the area of the face from x_n,
+/// so that P is convex in x. Each corner bears a third of the face's force: together they have the force and
+/// the moment of one at the centroid.
+class DragPotential final : public Potential {
+ public:
+  /// @param flow             the arrays that it views outlive the potential
+  /// @param vertex_count     N
+  /// @param of_coefficients  whether the cotangents of faces without drag are wanted too
+  DragPotential(Flow flow, Index vertex_count, bool of_coefficients);
+
+  double energy(const double* x) const override;
+  double energy_change(const double* x, const double* to) const override;
+  void add_gradient(const double* x, double* g) const override;
+  void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
+  void add_hessian_product(const double* x, const double* z, double* y) const override;
+  void accumulate(const double* x, const double* z) override;
+  void add_tangent(const double* x, double* y) const override;
+  void swap_cotangents(CotangentStore& store) override;
+
+  // Cotangents, zero until accumulate(), and tangents, for add_tangent().
+  std::vector<double> across_bar, along_bar;  ///< [F]
+  std::vector<double> start_bar;              ///< [3 N]
+  std::vector<double> wind_bar;               ///< [3]
+  std::vector<double> across_dot, along_dot;  ///< [F]
+  std::vector<double> start_dot;              ///< [3 N]
+  Vec3 wind_dot = Vec3::Zero();
+
+ private:
+  FaceDrag drag(Index f) const;
+  Vec3 velocity(Index f, const double* x) const;
+  void add_frame_bar(Index f, const Vec3& N_bar);
+  Vec3 frame_dot(Index f) const;
+
+  Flow flow_;
+  std::vector<Index> with_drag_;  ///< faces that have some
+  bool of_coefficients_;
+};
+
+}  // namespace diffcloth::air
