@@ -108,8 +108,7 @@ class Fit:
                 intervals=self.intervals,
                 correlation=self.correlation,
                 unidentifiable=[str(direction) for direction in self.unidentifiable],
-                cost=self.cost,
-                residual_count=len(self.residuals),
+                rms=float(np.sqrt(np.square(self.residuals).mean())),
                 message=self.message,
                 starts=self.starts,
                 history=self.history,
@@ -181,7 +180,12 @@ def fit(
     check_count("fit: `seed`", seed, 0)
     if not isinstance(workers, Executor):
         check_count("fit: `workers`", workers, 0)
+    for name, function in (("hold_out", hold_out), ("progress", progress)):
+        if not callable(function) and not (name == "hold_out" and function is None):
+            raise TypeError(f"fit: `{name}` must be a function, got {type(function).__name__}")
     space = Space(variables)
+    if hold_out is not None:
+        _check_signature(hold_out, space)
     job = Job(
         space=space,
         stages=_stages(residuals, space),
@@ -291,10 +295,10 @@ def _check_signature(residuals: Residuals, space: Space) -> None:
             hint = f"; is {close[0]!r} meant?" if close else ""
             raise InvalidInput(
                 f"fit: `variables` has {others[0]!r}, which is no field of Parameters, so that "
-                f"`residuals` must take (parameters, values), got {signature}{hint}"
+                f"residuals must take (parameters, values), got {signature}{hint}"
             ) from error
         raise InvalidInput(
-            f"fit: `residuals` must take (parameters), as all variables are fields of Parameters, "
+            f"fit: residuals must take (parameters), as all variables are fields of Parameters, "
             f"got {signature}"
         ) from error
 

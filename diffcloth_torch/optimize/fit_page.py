@@ -43,8 +43,7 @@ class Page:
     intervals: Mapping[str, tuple[float, float]]
     correlation: FloatArray
     unidentifiable: list[str]
-    cost: float
-    residual_count: int
+    rms: float
     message: str
     starts: Sequence[Start]
     history: Sequence[Trial]
@@ -57,7 +56,7 @@ def write_page(path: Path, page: Page) -> None:
     first, last = _compare(page, page.first), _compare(page, page.values)
     parts = [
         f"<p>{html.escape(page.message)} The residuals have a root mean square of "
-        f"{np.sqrt(2 * page.cost / page.residual_count):.3g}, in units of the noise that was "
+        f"{page.rms:.3g}, in units of the noise that was "
         f"given; {len(page.history)} evaluations, "
         f"{sum(bool(trial.failure) for trial in page.history)} of which failed.</p>",
         "<h2>Values</h2>",

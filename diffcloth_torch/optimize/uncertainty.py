@@ -81,11 +81,20 @@ def uncertainty_of(
     reach = _reach(np.inf if given else max(freedom, 1))
     return Uncertainty(
         covariance=covariance,
-        correlation=covariance / np.maximum(np.outer(deviations, deviations), _TINY),
+        correlation=_correlation(covariance, deviations),
         intervals=_intervals(space, theta, reach * np.sqrt(np.diag(of_theta))),
         unidentifiable=_directions(space.names, jacobian * units, noise),
         deviations=np.sqrt(np.diag(of_theta)),
     )
+
+
+def _correlation(covariance: FloatArray, deviations: FloatArray) -> FloatArray:
+    """Correlations; zero with a number of which nothing is known, whose variance is infinite."""
+    with np.errstate(invalid="ignore"):
+        found = covariance / np.maximum(np.outer(deviations, deviations), _TINY)
+    found = np.where(np.isfinite(found), found, 0.0)
+    np.fill_diagonal(found, 1.0)
+    return found
 
 
 def _reach(freedom: float) -> float:

@@ -133,6 +133,14 @@ def test_what_acts_as_a_ratio_cannot_be_told_apart(strip):
     assert "stretch" in str(found.unidentifiable[0])
 
 
+def test_nothing_is_known_of_what_residuals_do_not_use():
+    found = dc.fit(START, lambda p: torch.stack([p.stretch / 50 - 1, p.stretch / 52 - 1]))
+    assert 50 < float(found.values["stretch"]) < 52
+    assert found.intervals["bending"] == (0.0, np.inf)
+    np.testing.assert_array_equal(found.correlation, np.eye(2))
+    assert [set(direction.shares) for direction in found.unidentifiable] == [{"bending"}]
+
+
 def test_values_of_starts_and_several_trajectories(strip):
     """A velocity that is no parameter, with a frozen stiffness, in two trajectories."""
     true = np.array([0.3, -0.2, 0.1])
@@ -248,6 +256,14 @@ class TestResiduals:
                 lambda s: dc.residuals.markers(s, np.zeros((6, 24, 3)), weights=[-1.0] * 24),
                 "`weights` must be finite and >= 0, got -1 at",
             ),
+            (
+                lambda s: dc.residuals.markers(s, np.full((6, 24, 3), np.inf)),
+                r"`observed`, where it is not NaN, must be finite, got inf at \[0, 0, 0\]",
+            ),
+            (
+                lambda s: dc.residuals.markers(s, np.zeros((6, 24, 3)), [np.nan] * 24),
+                r"`weights` must be finite and >= 0, got nan at \[0\]",
+            ),
             (lambda s: dc.residuals.point_cloud(s, [np.zeros((3, 3))]), "one for each of 6 states"),
             (
                 lambda s: dc.residuals.point_cloud(s[:1], [np.full((3, 3), np.nan)]),
@@ -281,10 +297,49 @@ class TestResiduals:
         (lambda: dc.fit(START, lambda p: [1.0]), TypeError, "a tensor or a list of tensors"),
         (lambda: dc.fit(START, lambda p: 1.0), TypeError, "a tensor or a list of tensors"),
         (lambda: dc.Variable(1.0, bounds=(0, 1, 2)), dc.InvalidInput, "low < high"),
+        (lambda: dc.Variable([]), dc.InvalidInput, "one or more numbers, got none"),
+        (lambda: dc.Variable("1"), TypeError, "must hold real numbers"),
+        (lambda: dc.fit([dc.Variable(1.0)], len), TypeError, "must be a dict of name -> Variable"),
+        (lambda: dc.fit({3: dc.Variable(1.0)}, len), TypeError, "must have names as keys, got 3"),
+        (
+            lambda: dc.fit({"strech": dc.Variable(1.0)}, lambda p: p.stretch),
+            dc.InvalidInput,
+            r"'strech', which is no field of Parameters.*\(parameters, values\).*'stretch' meant",
+        ),
+        (
+            lambda: dc.fit(START, lambda p, v: p.stretch),
+            dc.InvalidInput,
+            r"must take \(parameters\)",
+        ),
+        (
+            lambda: dc.fit({"friction": dc.Variable(0.3, bounds=(-1, 2))}, len),
+            dc.InvalidInput,
+            r"variables\['friction'\], `bounds` must be between 0 and inf, got -1 and 2",
+        ),
+        (
+            lambda: dc.fit({"poisson": dc.Variable(0.9)}, len),
+            dc.InvalidInput,
+            r"variables\['poisson'\], `value` must be between -1 and 0.5",
+        ),
+        (lambda: dc.fit(START, lambda p: []), dc.InvalidInput, "at least one number, got none"),
+        (
+            lambda: dc.fit(START, lambda p: (p.stretch - p.stretch).abs().sqrt().reshape(1)),
+            dc.InvalidInput,
+            "must have finite derivatives",
+        ),
+        (
+            lambda: dc.fit(
+                START, lambda p: torch.stack([p.stretch] * (1 + (float(p.stretch.detach()) < 29)))
+            ),
+            dc.InvalidInput,
+            "as many numbers in every call, got 2 after 1",
+        ),
+        (lambda: dc.fit(START, len, hold_out="a"), TypeError, "`hold_out` must be a function"),
+        (lambda: dc.fit(START, len, progress=None), TypeError, "`progress` must be a function"),
         (
             lambda: dc.fit(START, lambda p: p.stretch.reshape(1) * np.nan),
             dc.InvalidInput,
-            "finite numbers",
+            r"finite numbers, got nan at \[0\]",
         ),
     ],
 )
