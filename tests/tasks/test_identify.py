@@ -42,6 +42,15 @@ SHORT = {
         ],
         {"velocity": 0.01, "bending": 0.05, "damping": 0.1},
     ),
+    "fit_drag": (
+        [
+            "simulation={dt: 0.004, steps: 40, contact: {self_contact: false}}",
+            "fit.trajectories.throw.steps=[10, 20, 30, 40]",
+            "fit.trajectories.throw.synthetic.changes=[simulation.dt=0.002, simulation.steps=80, "
+            "scene.cloths.sheet.shape.rows=5, scene.cloths.sheet.shape.columns=17]",
+        ],
+        {"velocity": 0.02, "normal_drag": 0.1},
+    ),
     "fit_hang": ([], {"stretch": 0.01}),
     "fit_slope": (
         [
