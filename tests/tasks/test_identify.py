@@ -51,7 +51,7 @@ SHORT = {
         ],
         {"velocity": 0.02, "normal_drag": 0.1},
     ),
-    "fit_hang": ([], {"stretch": 0.01}),
+    "fit_hang": ([], {"stretch": 0.01, "stretch_weft": 0.01}),
     "fit_slope": (
         [
             "simulation.dt=0.005",
@@ -267,7 +267,7 @@ def test_the_command_refuses_what_is_no_fit(config, tmp_path):
     ("option", "expected"),
     [
         ([], r"stretch +30 .* [01] of 1\n"),
-        (["--places"], r"1 numbers, 1 trajectories\n1 of 1 starts end at the same place"),
+        (["--places"], r"2 numbers, 2 trajectories\n1 of 1 starts end at the same place"),
         (["--compare"], r"tangents +\d+(.*\n)differences +\d+(.*\n)Adam +100(.*\n)CMA-ES +\d+"),
     ],
 )
