@@ -16,7 +16,7 @@ _CENTRAL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 _FORWARD = ((0, -25 / 12), (1, 4), (2, -3), (3, 4 / 3), (4, -1 / 4))
 
 # Where a difference misses, other steps are tried: rounding wants larger, kinks want smaller ones.
-_SWEEP = (1.0, 0.25, 4.0, 0.0625, 16.0, 1 / 64, 1 / 256, 1 / 1024)
+_SWEEP = (1.0, 0.25, 4.0, 0.0625, 16.0, 1 / 64, 1 / 256, 1 / 1024, 8.0, 32.0)
 
 
 def directions(tensor: torch.Tensor, generator: torch.Generator) -> Iterator[torch.Tensor]:

@@ -91,7 +91,7 @@ def test_names_are_found_where_they_are_said_to_be():
     homes = {(home, name) for home, names in dc._HOMES.items() for name in names}
     modules = {("optimize", "residuals")}
     assert seen - {("tasks.task", "LoadedConfig")} - modules == homes
-    others = {"build_info", "envs", "learn", "load_config", "residuals", "robots"}
+    others = {"build_info", "envs", "fabrics", "learn", "load_config", "residuals", "robots"}
     assert {name for _, name in homes} | others == set(dc.__all__)
     for name in dc.__all__:
         assert getattr(dc, name) is not None

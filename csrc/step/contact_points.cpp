@@ -19,16 +19,18 @@ using Features = std::pair<contact::Candidate, std::array<Index, 4>>;
 Features features(const Contact& contact) { return {contact.pair, contact.pair.vertices}; }
 
 /// Where a pair is, with the surface of the smaller index first; and whether that is its second one.
-std::pair<ContactPoint, bool> placed(const Problem& problem, const Contact& c, const double* x) {
-  const std::vector<Index>& owner = problem.contact->mesh().vertex_surface;
+std::pair<ContactPoint, bool> placed(const contact::ContactModel& model,
+                                     const Contact& c,
+                                     const double* x) {
+  const std::vector<Index>& owner = model.mesh().vertex_surface;
   const auto& v = c.pair.vertices;
   const int of_a = c.pair.kind == contact::PairKind::kPointTriangle ? 1 : 2;
-  std::array<Vec3, 2> points{Vec3::Zero(), Vec3::Zero()};
+  ContactPoint point{.first = owner[v[0]], .second = owner[v[3]]};
+  std::array<Vec3, 2>& points = point.points;
   for (int i = 0; i < 4; ++i) {
     const double weight = c.closest.c[i];
     points[i < of_a ? 0 : 1] += (i < of_a ? weight : -weight) * row(x, v[i]);
   }
-  ContactPoint point{.first = owner[v[0]], .second = owner[v[3]]};
   const bool is_turned = point.first > point.second;
   if (is_turned) {
     std::swap(point.first, point.second);
@@ -36,7 +38,6 @@ std::pair<ContactPoint, bool> placed(const Problem& problem, const Contact& c, c
   }
   const Vec3 way = points[1] - points[0];
   const double distance = way.norm();
-  point.points = points;
   point.normal = distance > 0.0 ? Vec3(way / distance) : Vec3(Vec3::Zero());
   point.gap = distance - c.xi;
   return {point, is_turned};
@@ -54,17 +55,18 @@ std::vector<ContactPoint> contact_points(const Problem& problem,
                                          const std::vector<double>& x) {
   std::vector<ContactPoint> points;
   if (!problem.contact) return points;
+  const contact::ContactModel& model = *problem.contact;
   points.reserve(contacts.size());
   std::map<Features, std::size_t> places;
   const auto add = [&](const Contact& c) {
-    points.push_back(placed(problem, c, x.data()).first);
+    points.push_back(placed(model, c, x.data()).first);
     places.emplace(features(c), points.size() - 1);
   };
   for (const Contact& c : contacts) {
     add(c);
     points.back().normal_force = normal_force(c);
   }
-  const contact::FrictionSet friction(*problem.contact, lagged, problem.moved_from().data());
+  const contact::FrictionSet friction(model, lagged, problem.moved_from().data());
   if (friction.empty()) return points;
   const contact::FrictionSet::Slips& slips = friction.slips(x.data());
   for (std::size_t k = 0; k < slips.size(); ++k) {
@@ -73,7 +75,7 @@ std::vector<ContactPoint> contact_points(const Problem& problem,
     ContactPoint& point = points[places.at(features(entry.lag))];
     // It acts against the motion of the pair's first feature relative to the second one.
     const Vec3 on_b = (entry.mu * entry.lambda) * slips[k].force();
-    const bool is_turned = placed(problem, entry.lag, x.data()).second;
+    const bool is_turned = placed(model, entry.lag, x.data()).second;
     point.tangential_force += is_turned ? Vec3(-on_b) : on_b;
   }
   return points;

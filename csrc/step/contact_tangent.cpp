@@ -148,6 +148,7 @@ std::vector<Array> push_forward_solve(const Pushforward& step,
   const std::size_t count = step.directions.size();
   std::vector<GradientTangent> changes = gradient_tangents(step, f, x, touching, set_tangents);
   std::vector<Array> d;
+  d.reserve(count);
   for (std::size_t l = 0; l < count; ++l) d.push_back(prescribed_tangent(step, l, x));
   std::vector<Array> b(count);
   products_with_prescribed(f, x, d, b);

@@ -21,14 +21,18 @@ struct FaceValue {
 using elastic::Bar;
 using elastic::Model;
 constexpr std::array kFaceValues{
-    FaceValue{Input::kStretch, &Model::stretch, &Bar::stretch},
-    FaceValue{Input::kBending, &Model::bending, &Bar::bending},
-    FaceValue{Input::kPoisson, &Model::poisson, &Bar::poisson},
-    FaceValue{Input::kDamping, &Model::damping, &Bar::damping},
-    FaceValue{Input::kStretchWeft, &Model::stretch_weft, &Bar::stretch_weft},
-    FaceValue{Input::kStretchShear, &Model::stretch_shear, &Bar::stretch_shear},
-    FaceValue{Input::kBendingWeft, &Model::bending_weft, &Bar::bending_weft},
-    FaceValue{Input::kBendingTwill, &Model::bending_twill, &Bar::bending_twill},
+    FaceValue{.input = Input::kStretch, .value = &Model::stretch, .bar = &Bar::stretch},
+    FaceValue{.input = Input::kBending, .value = &Model::bending, .bar = &Bar::bending},
+    FaceValue{.input = Input::kPoisson, .value = &Model::poisson, .bar = &Bar::poisson},
+    FaceValue{.input = Input::kDamping, .value = &Model::damping, .bar = &Bar::damping},
+    FaceValue{
+        .input = Input::kStretchWeft, .value = &Model::stretch_weft, .bar = &Bar::stretch_weft},
+    FaceValue{
+        .input = Input::kStretchShear, .value = &Model::stretch_shear, .bar = &Bar::stretch_shear},
+    FaceValue{
+        .input = Input::kBendingWeft, .value = &Model::bending_weft, .bar = &Bar::bending_weft},
+    FaceValue{
+        .input = Input::kBendingTwill, .value = &Model::bending_twill, .bar = &Bar::bending_twill},
 };
 
 elastic::Wanted of_model(const Gradients* wanted) {

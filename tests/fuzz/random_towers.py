@@ -96,9 +96,9 @@ def draw_tower(seed: int, index: int) -> RandomScene:
             bodies.append(_prescribed(rng, d, tower, kinds))
         velocities = np.array([_velocity(rng, d, body) for body in bodies])
         d["bodies"] = kinds
-        gravity = (0.0, 0.0, -d["gravity"])
-        drawn = dc.Scene(cloths, bodies, robots, gravity=gravity, air_density=air.density)
-        drawn, pulls = draw_attachments(seed, index, d, drawn)
+    gravity = (0.0, 0.0, -d["gravity"])
+    drawn = dc.Scene(cloths, bodies, robots, gravity=gravity, air_density=air.density)
+    drawn, pulls = draw_attachments(seed, index, d, drawn)
     simulator = dc.Simulator(
         drawn,
         d["dt"],

@@ -138,7 +138,9 @@ def taken(name):
 
 @pytest.mark.parametrize("name", STEPS)
 def test_tangents_are_the_transpose_of_gradients(name):
-    moved = check_pairs(*taken(name))
+    # GMRES ends where its residual is 1e-12 of the right side, solves of the others at rounding.
+    tolerance = 3e-11 if name.startswith("nodes") else 1e-11
+    moved = check_pairs(*taken(name), tolerance)
     assert {"positions", "velocities"} <= moved
 
 
