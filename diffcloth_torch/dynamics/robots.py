@@ -195,7 +195,7 @@ class RobotDynamics:
         self._unknown = self._solved - first
         self._free_motion = robot_motion(mechanism, self._solved, dt)
         self._weight = weight
-        self._weight_bound = WeightBound(self._kinematics)
+        self._weight_bound = WeightBound(self._kinematics) if weight == "bounded" else None
         # Without joints, nobody needs the efforts that hold a prescribed base.
         self._has_dynamics = mechanism.is_dynamic or joints > 0
         self._own_inertia = None if mechanism.is_dynamic else _inertia_of_prescribed(mechanism)
@@ -419,20 +419,22 @@ class RobotDynamics:
 
     def _weight_stiffness(self, inertia: Inertia, start: _Configuration, gravity: Tensor) -> Tensor:
         """K of the weight at the start, without a graph, [B, 6 + J, 6 + J]."""
-        inputs = [plain(t) for t in (*inertia, *start, gravity)]
+        inertia, start, gravity = (
+            Inertia(*map(plain, inertia)),
+            _Configuration(*map(plain, start)),
+            plain(gravity),
+        )
 
-        def pull(x: Tensor, *inputs: Tensor) -> Tensor:
-            weights, begin = Inertia(*inputs[:4]), _Configuration(*inputs[4:7])
-            motion = self._motion(weights, self._moved(begin, x, 1.0))
-            return generalized_force(motion, _weights(weights, inputs[7]))
+        def pull(x: Tensor) -> Tensor:
+            motion = self._motion(inertia, self._moved(start, x, 1.0))
+            return generalized_force(motion, _weights(inertia, gravity))
 
         with torch.no_grad(), outside_transforms():
-            if self._weight == "bounded":
-                frames = self._motion(Inertia(*inputs[:4]), _Configuration(*inputs[4:7])).frames
-                bound = self._weight_bound.stiffness(frames, Inertia(*inputs[:4]), inputs[7])
-                return torch.diag_embed(bound)
-            still = inputs[6].new_zeros(len(inputs[6]), ROOT + self.mechanism.joint_count)
-            slopes = jacobian_of(pull)(still, *inputs)
+            if self._weight_bound is not None:
+                frames = self._motion(inertia, start).frames
+                return torch.diag_embed(self._weight_bound.stiffness(frames, inertia, gravity))
+            still = start.joints.new_zeros(len(start.joints), ROOT + self.mechanism.joint_count)
+            slopes = jacobian_of(pull)(still)
             # The moments of a turn are those of its rotation vector but for a skew part.
             return -(slopes + slopes.transpose(-1, -2)) / 2
 
