@@ -12,12 +12,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.checks import POSITIVE, FloatArray, check_number
+from diffcloth_torch.checks import (
+    POSITIVE,
+    FloatArray,
+    check_finite,
+    check_number,
+    check_shape,
+    float_array,
+)
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.transforms import numbers_of
 
-__all__ = ["Comparison", "checked_noise", "note", "noting", "positions_of", "times_of"]
+__all__ = [
+    "Comparison",
+    "checked_noise",
+    "checked_points",
+    "note",
+    "noting",
+    "positions_of",
+    "times_of",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +98,14 @@ def positions_of(owner: str, states: Sequence[State]) -> Tensor:
 def times_of(states: Sequence[State]) -> FloatArray:
     """Times of states [s], shape [T]."""
     return np.array([float(numbers_of(state.time)) for state in states])
+
+
+def checked_points(name: str, value: object) -> FloatArray:
+    """Finite points [n, 3], copied into float64."""
+    points = float_array(name, value)
+    check_shape(name, points.shape, [("n", 3)])
+    check_finite(name, points)
+    return points
 
 
 def checked_noise(owner: str, noise: float) -> float:

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from diffcloth_torch.checks import (
     NON_NEGATIVE,
-    FloatArray,
     check_finite,
     check_range,
     check_shape,
@@ -22,6 +21,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.optimize.compared import (
     Comparison,
     checked_noise,
+    checked_points,
     note,
     positions_of,
     times_of,
@@ -120,7 +120,7 @@ def point_cloud(states: Sequence[State], clouds: Sequence[object], *, noise: flo
         )
     parts, nearest_points, seen = [], [], []
     for k, cloud in enumerate(clouds):
-        points = _points(f"{owner}: `clouds`[{k}]", cloud)
+        points = checked_points(f"{owner}: `clouds`[{k}]", cloud)
         tree: Any = cKDTree(numbers_of(positions[k]))
         nearest = torch.from_numpy(np.asarray(tree.query(points)[1], dtype=np.int64))
         found = positions[k][nearest]
@@ -139,11 +139,3 @@ def point_cloud(states: Sequence[State], clouds: Sequence[object], *, noise: flo
         )
     )
     return torch.cat(parts) / scale
-
-
-def _points(name: str, cloud: object) -> FloatArray:
-    points = float_array(name, cloud)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InvalidInput(f"{name} must have shape [n, 3], got {list(points.shape)}")
-    check_finite(name, points)
-    return points

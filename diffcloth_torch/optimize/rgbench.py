@@ -41,6 +41,7 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path, read_regular_file
 from diffcloth_torch.geometry.pcd import read_pcd
+from diffcloth_torch.optimize.compared import checked_points
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.transforms import numbers_of
 
@@ -156,7 +157,7 @@ def nearest_vertices(positions: object, grippers: Mapping[str, object]) -> dict[
         InvalidInput: If a shape or value is not accepted.
     """
     owner = "rgbench.nearest_vertices"
-    vertices = _points(f"{owner}: `positions`", positions)
+    vertices = checked_points(f"{owner}: `positions`", positions)
     if not len(vertices):
         raise InvalidInput(f"{owner}: `positions` must have one or more vertices, got none")
     found = {}
@@ -193,20 +194,12 @@ def chamfer(states: Sequence[State], clouds: Sequence[object], *, norm: int = 1)
         )
     found = []
     for k, (state, cloud) in enumerate(zip(states, clouds, strict=True)):
-        points = _points(f"{owner}: `clouds`[{k}]", cloud)
+        points = checked_points(f"{owner}: `clouds`[{k}]", cloud)
         if not len(points):
             raise InvalidInput(f"{owner}: `clouds`[{k}] must have one or more points, got none")
         tree: Any = cKDTree(numbers_of(state.positions))
         found.append(float(np.mean(tree.query(points, p=norm)[0])))
     return found
-
-
-def _points(name: str, value: object) -> FloatArray:
-    points = float_array(name, value)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InvalidInput(f"{name} must have shape [n, 3], got {list(points.shape)}")
-    check_finite(name, points)
-    return points
 
 
 def _read_poses(file: Path) -> tuple[FloatArray, FloatArray]:
