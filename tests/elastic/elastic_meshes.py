@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 import scipy.spatial
 
 from diffcloth_torch import _kernels
@@ -11,6 +12,18 @@ Elastic = _kernels.Elastic
 
 STEP = 0.01  # time step [s]
 WOVEN = ("stretch_weft", "stretch_shear", "bending_weft", "bending_twill")
+
+TRIANGLE = (np.array([[0.0, 0, 0], [1, 0.1, 0], [0.3, 0.8, 0]]), np.array([[0, 1, 2]], np.int32))
+
+# In-plane maps of the triangle, with a bit of noise out of plane: tension, compression in one and
+# in both directions, an inversion.
+STATES = [
+    pytest.param(np.diag([1.3, 1.2, 1.0]), id="tension"),
+    pytest.param(np.diag([1.2, 0.7, 1.0]), id="compressed in one direction"),
+    pytest.param(np.diag([0.6, 0.5, 1.0]), id="compressed"),
+    pytest.param(np.array([[1.0, 0.8, 0], [0, 1, 0], [0.4, 0, 1]]), id="sheared"),
+    pytest.param(np.diag([-1.1, 0.9, 1.0]), id="turned over"),
+]
 
 
 def grid(nu: int, nv: int, diagonal: str = "right") -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,8 @@ import pytest
 import torch
 from elastic_meshes import (
     MESHES,
+    STATES,
+    TRIANGLE,
     WOVEN,
     angles_along,
     differences,
@@ -19,15 +21,6 @@ K_W, K_F, K_WF = 100.0, 40.0, 7.0  # [N/m]
 STRETCH = {"stretch": K_W, "stretch_weft": K_F, "stretch_shear": K_WF}
 ANGLE = 0.6  # of the warp to the first side
 RNG = np.random.default_rng(11)
-
-TRIANGLE = (np.array([[0.0, 0, 0], [1, 0.1, 0], [0.3, 0.8, 0]]), np.array([[0, 1, 2]], np.int32))
-STATES = [
-    pytest.param(np.diag([1.3, 1.2, 1.0]), id="tension"),
-    pytest.param(np.diag([1.2, 0.7, 1.0]), id="compressed in one direction"),
-    pytest.param(np.diag([0.6, 0.5, 1.0]), id="compressed"),
-    pytest.param(np.array([[1.0, 0.8, 0], [0, 1, 0], [0.4, 0, 1]]), id="sheared"),
-    pytest.param(np.diag([-1.1, 0.9, 1.0]), id="turned over"),
-]
 
 
 def woven_triangle(**values):

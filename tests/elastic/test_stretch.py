@@ -2,24 +2,21 @@
 
 import numpy as np
 import pytest
-from elastic_meshes import MESHES, differences, grid, jittered, model, rigid
+from elastic_meshes import (
+    MESHES,
+    STATES,
+    TRIANGLE,
+    differences,
+    grid,
+    jittered,
+    model,
+    rigid,
+)
 
 from diffcloth_torch import _kernels
 
 K_S = 100.0  # [N/m]
 RNG = np.random.default_rng(3)
-
-TRIANGLE = (np.array([[0.0, 0, 0], [1, 0.1, 0], [0.3, 0.8, 0]]), np.array([[0, 1, 2]], np.int32))
-
-# In-plane maps of the triangle, with a bit of noise out of plane: tension, compression in one and
-# in both directions, an inversion.
-STATES = [
-    pytest.param(np.diag([1.3, 1.2, 1.0]), id="tension"),
-    pytest.param(np.diag([1.2, 0.7, 1.0]), id="compressed in one direction"),
-    pytest.param(np.diag([0.6, 0.5, 1.0]), id="compressed"),
-    pytest.param(np.array([[1.0, 0.8, 0], [0, 1, 0], [0.4, 0, 1]]), id="sheared"),
-    pytest.param(np.diag([-1.1, 0.9, 1.0]), id="turned over"),
-]
 
 
 @pytest.mark.parametrize("name", MESHES)
