@@ -3,6 +3,8 @@
 
 #include <immintrin.h>
 
+#include "linalg/many_floats_avx.h"
+
 namespace diffcloth::linalg {
 namespace {
 
@@ -71,25 +73,8 @@ inline void add_some(const float* from, int count, float* to) {
   _mm512_mask_storeu_ps(to, lanes, sum);
 }
 
-/// Of kMaxVectors vectors.
-struct ManyFloats {
-  using Real = float;
-  __m256 v;
-};
-
-inline ManyFloats load_many(const float* from) { return {_mm256_loadu_ps(from)}; }
-inline void store(float* to, ManyFloats a) { _mm256_storeu_ps(to, a.v); }
-inline ManyFloats to_many(float a) { return {_mm256_set1_ps(a)}; }
-inline ManyFloats operator+(ManyFloats a, ManyFloats b) { return {_mm256_add_ps(a.v, b.v)}; }
-inline ManyFloats operator*(ManyFloats a, ManyFloats b) { return {_mm256_mul_ps(a.v, b.v)}; }
-inline ManyFloats subtract_product_of(ManyFloats c, ManyFloats a, ManyFloats b) {
-  return {_mm256_fnmadd_ps(a.v, b.v, c.v)};
-}
 inline Doubles load_many(const double* from) { return load(from); }
 inline Doubles to_many(double a) { return broadcast(a); }
-
-inline double subtract_product_of(double c, double a, double b) { return __builtin_fma(-a, b, c); }
-inline float subtract_product_of(float c, float a, float b) { return __builtin_fmaf(-a, b, c); }
 
 constexpr int kPacks = 3;  // 24 of 32 registers
 constexpr int kWidth = 8;
