@@ -27,7 +27,9 @@ __all__ = ["WeightBound"]
 
 
 class WeightBound:
-    """Bounds the second derivative of the energy of a robot's weight, in any configuration.
+    """Bounds the second derivative of the energy of a robot's weight, however its joints turn.
+
+    Joints that shift count with their present values.
 
     A turn moves the center of a link by at most its way from the axis along the links between, r.
     The second derivative by two turns is at most the smaller r of both; by a turn and a shift it

@@ -1,0 +1,77 @@
+"""The stiffness of weight: a second derivative, and its bound in other configurations."""
+
+import numpy as np
+import pytest
+import torch
+from mechanisms import F64, inertia_of, make, random_configuration
+
+from diffcloth_torch.dynamics.robots import RobotDynamics, _Configuration
+from diffcloth_torch.geometry.rotation import quaternion_matrix
+
+TREES = {
+    "chain": (["fixed", *["revolute"] * 4], [-1, 0, 1, 2, 3], None),
+    "branches": (["fixed", *["revolute"] * 4], [-1, 0, 1, 1, 0], None),
+    "mimic": (["fixed", *["revolute"] * 3], [-1, 0, 1, 2], {3: (1, -1.5, 0.2)}),
+    "slide": (["fixed", "revolute", "prismatic"], [-1, 0, 1], None),
+}
+NO_CONTACT = torch.zeros(0, dtype=torch.long), torch.zeros(0, 3, dtype=F64)
+GRAVITY = torch.tensor([[1.0, -2.0, -9.0]], dtype=F64)
+
+
+def stiffness(mechanism, weight, at):
+    robot = RobotDynamics(mechanism, 1.0, *NO_CONTACT, weight)
+    return robot._weight_stiffness(inertia_of(mechanism), at, GRAVITY)[0].numpy()
+
+
+def energy(mechanism, at, x):
+    """Of the weight, after a motion x of the root and the joints."""
+    robot = RobotDynamics(mechanism, 1.0, *NO_CONTACT)
+    inertia = inertia_of(mechanism)
+    centers = robot._motion(inertia, robot._moved(at, x, 1.0)).frames.centers
+    return -(inertia.mass[..., None] * centers * GRAVITY[:, None]).sum()
+
+
+def configuration(mechanism, rng):
+    pose, joints, _ = random_configuration(mechanism, rng)
+    return _Configuration(pose[:, :3], quaternion_matrix(pose[:, 3:]), joints)
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_it_is_the_second_derivative_of_the_energy(name):
+    kinds, parents, mimic = TREES[name]
+    rng = np.random.default_rng(4)
+    mechanism = make(kinds, parents, base="floating", rng=rng, mimic=mimic)
+    at = configuration(mechanism, rng)
+    found = stiffness(mechanism, "exact", at)
+    n = len(found)
+
+    def value(x):
+        return energy(mechanism, at, torch.as_tensor(x, dtype=F64)[None]).item()
+
+    h = 1e-4
+    unit = h * np.eye(n)
+    expected = [
+        [(value(a + b) - value(a - b) - value(b - a) + value(-a - b)) / (4 * h * h) for b in unit]
+        for a in unit
+    ]
+    np.testing.assert_allclose(found, expected, atol=2e-6 * np.abs(found).max())
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_the_bound_is_above_it_in_all_configurations(name):
+    """Except where joints shift: the bound counts with their present values."""
+    kinds, parents, mimic = TREES[name]
+    rng = np.random.default_rng(5)
+    mechanism = make(kinds, parents, base="floating", rng=rng, mimic=mimic)
+    first = configuration(mechanism, rng)
+    bound = stiffness(mechanism, "bounded", first)
+    slides = torch.tensor([kind == "prismatic" for kind in kinds if kind != "fixed"])
+    largest = 0.0
+    for _ in range(200):
+        other = configuration(mechanism, rng)
+        if name == "slide":
+            other = other._replace(joints=torch.where(slides, first.joints, other.joints))
+        exact = stiffness(mechanism, "exact", other)
+        assert np.linalg.eigvalsh(bound - exact).min() > -1e-9 * bound.max()
+        largest = max(largest, np.linalg.eigvalsh(exact).max())
+    assert largest > 0.05 * bound.max()  # it is not far too large
