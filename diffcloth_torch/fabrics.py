@@ -14,7 +14,8 @@ bending stiffness k of hinges on lines at 0, 45 and 90 degrees to direction 1 at
 
 A line at 0 degrees bends direction 2. The factor is that between a plate and the energy
 k l^2 theta^2 / (8 A) of a hinge of length l and angle theta in two faces of area A, on a mesh of
-equilateral triangles. The database does not name the warp.
+equilateral triangles. The database names neither the warp nor the measure of strain: with another
+one than stretch minus one, the stiffnesses of stretch would be up to twice as large.
 
 These are starting points, not the fabric on your table. Real cloth stiffens as it is stretched,
 contracts sideways (c12, which has no counterpart here) and has hysteresis; samples of one name
