@@ -174,6 +174,22 @@ std::optional<Directions::Direction> Directions::next_extrapolated() {
   return damp(H, walk_.system.assemble_extrapolated(x, Curvature::kPositive, walk_.g()));
 }
 
+bool Directions::descend(const linalg::BlockMatrix& A, bool doubts) {
+  Factor factor = this->factor(A, doubts);
+  if (!factor) return false;
+  solve(*factor, A);
+  slope_ = dot(walk_.g(), p_);
+  if (slope_ < 0.0 || factor->precision() == linalg::Precision::kDouble) return true;
+  // Single precision has turned it: what a positive matrix makes of a gradient descends.
+  walk_.context.single.was_wrong = true;
+  factor = nullptr;  // never two at once
+  factor = walk_.system.factor_in_doubles(A);
+  if (!factor) return false;
+  solve(*factor, A);
+  slope_ = dot(walk_.g(), p_);
+  return true;
+}
+
 std::optional<Directions::Direction> Directions::damp(const linalg::BlockMatrix& H,
                                                       const linalg::BlockMatrix& P) {
   make_room();
@@ -182,10 +198,7 @@ std::optional<Directions::Direction> Directions::damp(const linalg::BlockMatrix&
     walk_.context.checkpoint->check();
     linalg::BlockMatrix A = H;
     A.blend(P, s_);
-    const Factor factor = this->factor(A, s_ > kFirstShare);
-    if (factor) {
-      solve(*factor, A);
-      slope_ = dot(walk_.g(), p_);
+    if (descend(A, s_ > kFirstShare)) {
       curvature = curvature_along(H);
       const double positive = (-(1.0 + s_) * slope_ - curvature) / s_;
       if (-slope_ >= kHeld * positive || !is_far()) break;

@@ -122,6 +122,9 @@ class Directions {
 
   /// Go on from there to that of the exact Hessian H, by conjugate gradients.
   bool iterate(const linalg::BlockMatrix& H, bool& indefinite);
+
+  /// The direction of a matrix and its slope; false where the matrix is not positive definite.
+  bool descend(const linalg::BlockMatrix& A, bool doubts);
   std::optional<Direction> damp(const linalg::BlockMatrix& H, const linalg::BlockMatrix& P);
 
   Walk& walk_;

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
@@ -17,7 +18,7 @@ from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.sim.linear_maps import LinearMap, apply_map
 from diffcloth_torch.transforms import numbers_of, same_rows
 
-__all__ = ["Arrays", "CoreFunction", "as_array", "evaluate"]
+__all__ = ["Arrays", "CoreFunction", "as_array", "evaluate", "failing_as"]
 
 Arrays = dict[str, NDArray[np.float64]]
 
@@ -25,6 +26,15 @@ Arrays = dict[str, NDArray[np.float64]]
 def as_array(tensor: Tensor) -> NDArray[np.float64]:
     """Contiguous array of a tensor's numbers; shares its memory if possible."""
     return np.ascontiguousarray(numbers_of(tensor))
+
+
+@contextmanager
+def failing_as(operation: str) -> Iterator[None]:
+    """Let failures of the core name the operation."""
+    try:
+        yield
+    except _core.SimulationError as error:
+        raise SimulationError(f"{operation}: {error}") from error
 
 
 class CoreFunction(ABC):
@@ -123,19 +133,16 @@ def _tangents(ctx, given, saved, directions):
     inputs, tape = _arrays(ctx, saved)
     rows = dict(zip(given, map(as_array, directions), strict=True))
     note_caller()
-    try:
+    with failing_as("tangent"):
         return ctx.function.tangents(inputs, tape, rows, len(directions[0]))
-    except _core.SimulationError as error:
-        raise SimulationError(f"tangent: {error}") from error
 
 
 def _gradients(ctx, needs, saved, losses):
     inputs, tape = _arrays(ctx, saved)
     note_caller()
     try:
-        return ctx.function.gradients(inputs, tape, losses, needs)
-    except _core.SimulationError as error:
-        raise SimulationError(f"backward: {error}") from error
+        with failing_as("backward"):
+            return ctx.function.gradients(inputs, tape, losses, needs)
     except ValueError as error:  # hooks on saved tensors have changed numbers
         raise InvalidInput(f"backward: {error}") from error
 

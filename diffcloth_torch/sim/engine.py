@@ -18,6 +18,7 @@ from diffcloth_torch.model.options import SCHEMES, ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.border import Given
+from diffcloth_torch.sim.core_functions import failing_as
 from diffcloth_torch.sim.cores import CoreOptions, arrays_of, core_inputs, make_core
 from diffcloth_torch.sim.failures import failures_of, mark, refuse_gradients
 from diffcloth_torch.sim.layout import Layout
@@ -192,9 +193,10 @@ class Engine:
 
     def path(self, given: Given, check: Check) -> FloatArray:
         """Polyline that the surfaces of one environment follow in a step, [M, N + V, 3]."""
-        if self._staggered is not None:
-            return self._staggered.path(given, self.core_inputs(given, None), check)
-        return self.core.path(arrays_of(self.core_inputs(given, self.predict(given))))
+        with failing_as("path"):
+            if self._staggered is not None:
+                return self._staggered.path(given, self.core_inputs(given, None), check)
+            return self.core.path(arrays_of(self.core_inputs(given, self.predict(given))))
 
     def predict(self, given: Given) -> Prediction | None:
         """Predict bodies and robots without contact; None if all are bodies on prescribed poses."""

@@ -35,7 +35,13 @@ from torch import Tensor
 from diffcloth_torch import _core
 from diffcloth_torch._exit import note_caller
 from diffcloth_torch.errors import SimulationError
-from diffcloth_torch.sim.core_functions import Arrays, CoreFunction, as_array, evaluate
+from diffcloth_torch.sim.core_functions import (
+    Arrays,
+    CoreFunction,
+    as_array,
+    evaluate,
+    failing_as,
+)
 from diffcloth_torch.transforms import is_differentiated
 
 __all__ = [
@@ -154,10 +160,8 @@ def have_quaternions(poses: NDArray[np.float64], shortest: float) -> bool:
 
 def _forward(core: _core.Simulator, arrays: dict[str, Any], *, tape: bool) -> dict[str, Any]:
     note_caller()
-    try:
+    with failing_as("step"):
         return core.forward(arrays, tape, torch.get_num_threads())
-    except _core.SimulationError as error:
-        raise SimulationError(f"step: {error}") from error
 
 
 def _outputs(result: dict[str, Any]) -> tuple[Tensor, ...]:
