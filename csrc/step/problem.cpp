@@ -157,7 +157,8 @@ Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, const Gradients
       potentials(make_potentials(*this, wanted)) {
   if (scene.mechanisms.has_free()) {
     chart.emplace(scene.mechanisms, scene.vertex_count(), scene.cloth_vertex_count(),
-                  inputs.data(Input::kCoordinateTargets), inputs.data(Input::kCoordinateMetric));
+                  inputs.data(Input::kCoordinateTargets), inputs.data(Input::kCoordinateMetric),
+                  inputs.data(Input::kJointTerms), h);
   }
   if (inputs.data(Input::kBarrierStiffness) != nullptr) {
     contact.emplace(scene.collision_mesh, scene.feature_weights, measures,
