@@ -196,3 +196,225 @@ def test_a_drive_goes_as_fast_as_it_may(tmp_path):
     assert speeds.max() < 1.5 * 1.01
     assert (speeds > 1.49).sum() == 60
     assert float(states[-1].joint_positions) < 1.2
+
+
+# --- Joints that mimic ----------------------------------------------------------------------------
+
+
+def test_a_joint_that_mimics_acts_on_its_leader_by_virtual_work(tmp_path):
+    """The second joint turns twice as far back: what holds it counts twice, against the sum."""
+    path = arm_file(tmp_path, 2, effort=[1, 2], friction=[0.2, 0.3], mimic={1: -2.0})
+    robot = dc.Robot.load(path, actuation="torque")
+    sim = simulator(robot, gravity=(0, 0, 0))
+    assert robot.effort_limits == 1 + 2 * 2
+    assert robot.joint_friction == 0.2 + 2 * 0.3
+    held = rolled(sim, 10, joint_efforts=tensor(0.75))[-1]
+    assert 0 < float(held.joint_velocities) < float(sim.parameters().joint_slip_rates)
+    free = simulator(
+        dc.Robot.load(path, actuation="torque", joint_friction=False), gravity=(0, 0, 0)
+    )
+    start = sim.initial_state().replace(joint_velocities=tensor(0.4))
+    slips = sim.step(start, sim.control(joint_efforts=tensor(1.3)))
+    moved = free.step(start, free.control(joint_efforts=tensor(1.3 - 0.8)))
+    assert float(moved.joint_velocities) > 0.41
+    assert float(slips.joint_velocities) == pytest.approx(float(moved.joint_velocities), rel=1e-4)
+
+
+# --- Against Pinocchio ----------------------------------------------------------------------------
+
+
+def test_accelerations_are_those_of_pinocchio_with_friction_and_limits(tmp_path):
+    """Three joints that slide, the first one with more effort than it may have."""
+    pin = pytest.importorskip("pinocchio", reason="Pinocchio is in the extra `test`")
+    path = arm_file(tmp_path, 3, effort=[2, 9, 9], friction=[0.3, 0.2, 0.1])
+    robot = dc.Robot.load(path, actuation="torque", joint_positions=[0.3, -0.5, 0.8])
+    dt = 1e-5
+    sim = simulator(robot, dt)
+    rates, efforts = np.array([0.5, -0.4, 0.7]), np.array([5.0, 0.4, -0.3])
+    start = sim.initial_state().replace(joint_velocities=torch.from_numpy(rates))
+    end = sim.step(start, sim.control(joint_efforts=torch.from_numpy(efforts)))
+    acting = efforts - np.sign(rates) * robot.joint_friction
+    acting[0] = limited(5.0, 2.0) - 0.3
+    model = pin.buildModelFromUrdf(str(path))
+    expected = pin.aba(model, model.createData(), robot.joint_positions, rates, acting)
+    found = (end.joint_velocities.numpy() - rates) / dt
+    np.testing.assert_allclose(found, expected, rtol=1e-3)
+
+
+# --- Derivatives ----------------------------------------------------------------------------------
+
+NEW = ("joint_effort_limits", "joint_velocity_limits", "joint_friction", "joint_slip_rates")
+REGIMES = {
+    # Limits of efforts and speeds, friction, slip rate; the effort or target of the joints.
+    "sticking": ([9.0, 9.0], [9.0, 9.0], [3.0, 2.0], [0.1, 0.2], [0.5, -0.3]),
+    "slipping": ([9.0, 9.0], [9.0, 9.0], [0.1, 0.05], [0.01, 0.02], [1.5, -1.0]),
+    "saturated": ([0.5, 0.3], [9.0, 9.0], [0.0, 0.1], [0.01, 0.02], [3.0, -2.5]),
+    "blend": ([1.0, 1.0], [9.0, 9.0], [0.1, 0.0], [0.5, 0.2], [0.95, -1.02]),
+    "fast": ([9.0, 9.0], [0.4, 0.3], [0.1, 0.1], [0.05, 0.05], [2.5, -2.0]),
+}
+
+
+def two_joints(folder, mode):
+    gains = {} if mode == "torque" else {"stiffness": 4.0, "damping": 0.05}
+    return dc.Robot.load(arm_file(folder, 2), actuation=mode, **gains)
+
+
+def regime_of(sim, name):
+    *values, asked = (tensor(*row) for row in REGIMES[name])
+    return dict(zip(NEW, values, strict=True)), asked
+
+
+def loss_of(sim, mode, state, inputs):
+    parameters = sim.parameters().replace(**{n: inputs[n] for n in NEW})
+    names = ("joint_positions", "joint_velocities")
+    state = state.replace(**{n: inputs[f"start.{n}"] for n in names})
+    efforts = inputs["asked"]
+    control = {"joint_efforts": efforts}
+    if mode == "pd":
+        control = {"joint_positions": 0.2 * efforts, "joint_efforts": 0.3 * efforts}
+    for _ in range(3):
+        state = sim.step(state, sim.control(**control), parameters)
+    weights = tensor(1.0, -0.7)
+    return (weights * (state.joint_positions + 0.1 * state.joint_velocities)).sum() + (
+        0.01 * weights * state.joint_efforts
+    ).sum()
+
+
+@pytest.mark.parametrize("mode", ["torque", "pd"])
+@pytest.mark.parametrize("name", REGIMES)
+def test_gradients_in_every_regime_are_central_differences(tmp_path, mode, name):
+    sim = simulator(two_joints(tmp_path, mode))
+    values, asked = regime_of(sim, name)
+    start = sim.initial_state()
+    inputs = values | {
+        "asked": asked,
+        "start.joint_positions": tensor(0.1, 0.05),
+        "start.joint_velocities": tensor(0.0, 0.0) if name == "sticking" else tensor(0.3, -0.2),
+    }
+    leaves = {n: t.clone().requires_grad_() for n, t in inputs.items()}
+    gradients = torch.autograd.grad(loss_of(sim, mode, start, leaves), list(leaves.values()))
+    active = {
+        "sticking": ("joint_friction", "joint_slip_rates"),
+        "slipping": ("joint_friction",),
+        "saturated": ("joint_effort_limits",),
+        "blend": ("joint_effort_limits", "asked"),
+        "fast": ("joint_velocity_limits",),
+    }[name]
+    for gradient, (n, value) in zip(gradients, inputs.items(), strict=True):
+        if n in active:
+            assert gradient.any()
+        for k in range(2):
+            step = 1e-6 * torch.nn.functional.one_hot(torch.tensor(k), 2).to(F64)
+            if float(value[k]) == 0.0 and n == "joint_friction":
+                continue  # at the end of its range
+            with torch.no_grad():
+                ends = [
+                    loss_of(sim, mode, start, inputs | {n: value + s * step}) for s in (1.0, -1.0)
+                ]
+            found = float(ends[0] - ends[1]) / 2e-6
+            assert float(gradient[k]) == pytest.approx(found, rel=1e-5, abs=2e-7), (n, k)
+
+
+@pytest.mark.parametrize("mode", ["torque", "pd"])
+@pytest.mark.parametrize("name", REGIMES)
+def test_tangents_are_the_transpose_of_gradients(tmp_path, mode, name):
+    sim = simulator(two_joints(tmp_path, mode))
+    values, asked = regime_of(sim, name)
+    start = sim.initial_state().replace(joint_velocities=tensor(0.3, -0.2))
+    inputs = values | {"asked": asked}
+    names = ("joint_positions", "joint_velocities")
+    inputs |= {f"start.{n}": getattr(start, n) for n in names}
+
+    def loss(*tensors):
+        return loss_of(sim, mode, start, dict(zip(inputs, tensors, strict=True)))
+
+    generator = torch.Generator().manual_seed(3)
+    ways = [torch.randn(t.shape, generator=generator, dtype=F64) for t in inputs.values()]
+    _, tangent = torch.func.jvp(loss, tuple(inputs.values()), tuple(ways))
+    gradients = torch.func.grad(loss, tuple(range(len(inputs))))(*inputs.values())
+    terms = [(g * w).sum() for g, w in zip(gradients, ways, strict=True)]
+    assert abs(float(tangent - sum(terms))) <= 1e-11 * float(sum(abs(t) for t in terms))
+
+
+def test_environments_have_limits_of_their_own_with_the_bits_that_they_have_alone(tmp_path):
+    sim = simulator(two_joints(tmp_path, "pd"))
+    rows = [regime_of(sim, name) for name in REGIMES]
+    control = {"joint_positions": tensor(0.4, -0.3), "joint_efforts": tensor(0.8, -0.9)}
+    batch, together = sim.initial_state(len(rows)), []
+    given = {n: torch.stack([values[n] for values, _ in rows]) for n in NEW}
+    before = torch.get_num_threads()
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            state = batch
+            for _ in range(4):
+                parameters = sim.parameters().replace(**given)
+                state = sim.step(state, sim.control(**control), parameters)
+            together.append(state)
+    finally:
+        torch.set_num_threads(before)
+    for k, (values, _) in enumerate(rows):
+        alone = sim.initial_state()
+        for _ in range(4):
+            alone = sim.step(alone, sim.control(**control), sim.parameters().replace(**values))
+        for state in together:
+            assert torch.equal(state.joint_positions[k], alone.joint_positions)
+            assert torch.equal(state.joint_efforts[k], alone.joint_efforts)
+    assert len(together[0].joint_positions.unique(dim=0)) == len(rows)
+
+
+# --- Equilibria -----------------------------------------------------------------------------------
+
+
+def test_friction_holds_an_arm_where_the_search_begins(tmp_path):
+    """As far as it goes: a joint yields up to the slip at which it slides, and stays there."""
+    robot = dc.Robot.load(arm_file(tmp_path, friction=1.2 * WEIGHT), actuation="torque")
+    sim = simulator(robot)
+    found = sim.equilibrium(sim.initial_state())
+    slip = float(sim.parameters().joint_slip_rates) * H
+    share = float(found.joint_positions) / slip
+    assert share * (2.0 - share) == pytest.approx(1.0 / 1.2, rel=1e-6)
+    # With less, it falls until friction holds what is left of the weight.
+    robot = dc.Robot.load(arm_file(tmp_path, friction=0.5 * WEIGHT), actuation="torque")
+    found = simulator(robot).equilibrium(sim.initial_state())
+    assert WEIGHT * np.cos(float(found.joint_positions)) == pytest.approx(0.5 * WEIGHT, rel=1e-6)
+
+
+def test_gradients_of_an_equilibrium_by_limits_friction_and_start(tmp_path):
+    robot = dc.Robot.load(arm_file(tmp_path, 2), stiffness=3.0, damping=0.1)
+    sim = simulator(robot)
+    up = sim.control(joint_positions=tensor(-0.5, -0.4))
+    values = {
+        "joint_effort_limits": tensor(1.1, 0.7),
+        "joint_friction": tensor(0.3, 0.9),
+        "joint_slip_rates": tensor(0.3, 0.4),
+        "joint_stiffness": tensor(3.0, 2.0),
+        "start": tensor(0.1, 0.05),
+    }
+    start = sim.initial_state()
+
+    def end(inputs):
+        given = {n: t for n, t in inputs.items() if n != "start"}
+        state = start.replace(joint_positions=inputs["start"])
+        found = sim.equilibrium(state, up, sim.parameters().replace(**given))
+        return (found.joint_positions * tensor(1.0, -0.6)).sum() + 0.1 * found.joint_efforts.sum()
+
+    leaves = {n: t.clone().requires_grad_() for n, t in values.items()}
+    gradients = torch.autograd.grad(end(leaves), list(leaves.values()))
+    for gradient, (n, value) in zip(gradients, values.items(), strict=True):
+        assert gradient.any()
+        for k in range(2):
+            step = 1e-6 * torch.nn.functional.one_hot(torch.tensor(k), 2).to(F64)
+            with torch.no_grad():
+                ends = [end(values | {n: value + s * step}) for s in (1.0, -1.0)]
+            found = float(ends[0] - ends[1]) / 2e-6
+            assert float(gradient[k]) == pytest.approx(found, rel=1e-5, abs=1e-6), (n, k)
+
+
+def test_a_limit_of_the_speed_does_not_slow_the_way_to_an_equilibrium(tmp_path):
+    ends = []
+    for velocity in (0, 0.1):
+        robot = dc.Robot.load(arm_file(tmp_path, velocity=velocity), stiffness=5.0, damping=0.1)
+        sim = simulator(robot)
+        ends.append(sim.equilibrium(sim.initial_state()).joint_positions)
+    assert torch.equal(*ends)
