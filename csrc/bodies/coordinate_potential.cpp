@@ -296,6 +296,15 @@ bool CoordinatePotential::has_duals(const double* x) const {
   return !duals_at_.empty() && std::equal(duals_at_.begin(), duals_at_.end(), nodes(x));
 }
 
+double CoordinatePotential::within_speed(Index coordinate, double q) const {
+  visit_joints([&](Index c, Index, const JointTerm& term, const JointConstants& constants) {
+    if (c != coordinate) return;
+    const double reach = (1.0 + 0.5 * constants.zone) * term.velocity_limit * constants.h;
+    q = std::clamp(q, term.origin - reach, term.origin + reach);
+  });
+  return q;
+}
+
 double CoordinatePotential::largest_fraction(const double* x,
                                              const double* dx,
                                              double share) const {

@@ -50,6 +50,9 @@ class CoordinatePotential final : public Potential {
     store.exchange(joint_bar);
   }
 
+  /// The value q of a coordinate, or where its limit of the speed lets it come instead.
+  double within_speed(Index coordinate, double q) const;
+
   /// Of what is left to the ends of the limits of speeds, the fraction of a change that uses a share.
   double largest_fraction(const double* x, const double* dx, double share) const;
 

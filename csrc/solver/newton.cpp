@@ -291,7 +291,7 @@ bool start_from(Walk& walk, const std::vector<double>& guess) {
   }
   std::vector<double> change(guess.size());
   for (std::size_t a = 0; a < guess.size(); ++a) change[a] = guess[a] - walk.x()[a];
-  if (walk.f.largest_fraction(walk.x(), change) < 1.0 || walk.watch(guess) < 1.0) return false;
+  if (coordinates.largest_fraction(walk.x(), change) < 1.0 || walk.watch(guess) < 1.0) return false;
   if (walk.f.contact != nullptr) {
     walk.f.contact->stand_at(guess.data());
     if (!walk.f.contact->contacts().empty()) return false;

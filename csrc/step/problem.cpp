@@ -236,7 +236,8 @@ std::vector<double> Problem::predicted(const double* cloth_positions) const {
   std::copy_n(cloth_positions, cloth_size, x.begin());
   for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
     if (scene.mechanisms.given().prescribed[c] != 0) continue;
-    coordinates.nodes(x)[scene.mechanisms.slot(c)] = inputs.data(Input::kCoordinateTargets)[c];
+    const double target = inputs.data(Input::kCoordinateTargets)[c];
+    coordinates.nodes(x)[scene.mechanisms.slot(c)] = chart->within_speed(c, target);
   }
   coordinates.place(x);
   for (const Index i : scene.given.pins) {

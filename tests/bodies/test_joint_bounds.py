@@ -418,3 +418,24 @@ def test_a_limit_of_the_speed_does_not_slow_the_way_to_an_equilibrium(tmp_path):
         sim = simulator(robot)
         ends.append(sim.equilibrium(sim.initial_state()).joint_positions)
     assert torch.equal(*ends)
+
+
+# --- Iterations -----------------------------------------------------------------------------------
+
+
+def test_friction_that_turns_round_takes_few_iterations(tmp_path):
+    """Duals remember the other side of its kink; without them, Newton's method crosses it."""
+    path = arm_file(tmp_path, 3, friction=[1.0, 0.7, 0.4])
+    robot = dc.Robot.load(path, stiffness=40.0, damping=2.0)
+    sim = dc.Simulator(
+        dc.Scene([], robots=[robot], gravity=(0, 0, 0)),
+        H,
+        contact=dc.ContactOptions(barrier_distance=1e-3),
+    )
+    state, counts = sim.initial_state(), []
+    for k in range(40):
+        target = 0.02 * np.sin(0.3 * k) * tensor(1.0, -1.0, 1.0)
+        state = sim.step(state, sim.control(joint_positions=target))
+        counts.append(state.report.iterations)
+    assert np.mean(counts) < 10
+    assert max(counts) < 20
