@@ -38,7 +38,8 @@ class Control:
         joint_velocities: Targets of velocity and pd joints [rad/s or m/s], shape [J], or likewise
             by name; zero by default.
         joint_efforts: Efforts of torque joints, and efforts added to those of pd drives [N m or N],
-            shape [J], or likewise by name; zero by default.
+            shape [J], or likewise by name; zero by default. What is beyond the limits of a joint
+            does not act.
         base_poses: Frames of the robots' root links, shape [R, 7], or robot -> pose [7]; the row of
             a robot whose base is not kinematic must equal that of the state.
         base_wrenches: Force at the center of mass of each floating root link, then torque, in world
