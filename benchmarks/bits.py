@@ -52,7 +52,8 @@ def cases(size: int) -> Iterator[Case]:
                     return simulator, in_regime(simulator, scene, batch), scene.control
 
                 yield Case(f"{name} {scheme}" + (f" x{batch}" if batch else ""), start)
-    for name, make_pair in coupling.PAIRS.items():
+    pairs = {**coupling.PAIRS, "limited gripper": coupling.limited_gripper}
+    for name, make_pair in pairs.items():
         for how in ("monolithic", "rigid_to_cloth", "cloth_to_rigid"):
 
             def start_pair(make_pair=make_pair, how=how):  # type: ignore[no-untyped-def]

@@ -53,10 +53,10 @@ def body(size: int) -> Pair:
     )
 
 
-def gripper(size: int) -> Pair:
+def gripper(size: int, **bounds: float) -> Pair:
     """A hand on a floating base whose palm comes down on the sheet while its fingers close."""
     # Turned over: its fingers point down, and end 1 cm above the sheet.
-    options = {"pose": [0.013, 0.007, 0.1, 0, 1, 0, 0], "name": "hand"}
+    options = {"pose": [0.013, 0.007, 0.1, 0, 1, 0, 0], "name": "hand", **bounds}
     robots = [
         dc.Robot.load(dc.robots.GRIPPER, base="floating", stiffness=200.0, damping=5.0, **options),
         dc.Robot.load(dc.robots.GRIPPER, base="kinematic", actuation="position", **options),
@@ -69,6 +69,11 @@ def gripper(size: int) -> Pair:
             base_poses=after.base_poses, joint_positions=after.joint_positions
         ),
     )
+
+
+def limited_gripper(size: int) -> Pair:
+    """The same with friction, and drives at the limits of their efforts and speeds."""
+    return gripper(size, effort_limits=2.0, velocity_limits=0.05, joint_friction=0.2)
 
 
 PAIRS = {"free body": body, "gripper": gripper}

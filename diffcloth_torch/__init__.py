@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from diffcloth_torch import envs, fabrics, learn, robots
     from diffcloth_torch.errors import (
         AddedMassWarning,
-        IgnoredLimitsWarning,
         InfeasibleMotion,
         IntersectingState,
         InvalidInput,
@@ -75,7 +74,6 @@ __all__ = [
     "Descent",
     "Evaluation",
     "Fit",
-    "IgnoredLimitsWarning",
     "InfeasibleMotion",
     "IntersectingState",
     "InvalidInput",
@@ -114,7 +112,6 @@ __all__ = [
 _HOMES = {
     "errors": (
         "AddedMassWarning",
-        "IgnoredLimitsWarning",
         "InfeasibleMotion",
         "IntersectingState",
         "InvalidInput",

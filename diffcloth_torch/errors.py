@@ -7,7 +7,6 @@ from typing import Any
 
 __all__ = [
     "AddedMassWarning",
-    "IgnoredLimitsWarning",
     "InfeasibleMotion",
     "IntersectingState",
     "InvalidInput",
@@ -60,10 +59,6 @@ class TurnedTooFar(SimulationError):  # noqa: N818
 
     Raised by a step, or by backward through a step whose failure was returned as a value.
     """
-
-
-class IgnoredLimitsWarning(UserWarning):
-    """The file of a robot has limits of effort or velocity, or dry friction, which are ignored."""
 
 
 class AddedMassWarning(UserWarning):

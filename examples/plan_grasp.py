@@ -9,8 +9,6 @@ the middle of the cloth gets to a goal. Gradients flow through the simulation an
 
 from __future__ import annotations
 
-import warnings
-
 import pytorch_kinematics as pk
 import torch
 
@@ -29,18 +27,16 @@ def load(arm: list[float]) -> dc.Robot:
     path, root = dc.robots.panda()
     joints = {f"panda_joint{i + 1}": q for i, q in enumerate(arm)}
     modes = dict.fromkeys(joints, "position")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", dc.IgnoredLimitsWarning)
-        return dc.Robot.load(
-            path,
-            mesh_root=root,
-            joint_positions=joints | {"panda_finger_joint1": 0.01},
-            actuation=modes | {"panda_finger_joint1": "pd"},
-            stiffness=400,
-            damping=15,
-            friction=0.8,
-            name="panda",
-        )
+    return dc.Robot.load(
+        path,
+        mesh_root=root,
+        joint_positions=joints | {"panda_finger_joint1": 0.01},
+        actuation=modes | {"panda_finger_joint1": "pd"},
+        stiffness=400,
+        damping=15,
+        friction=0.8,
+        name="panda",
+    )
 
 
 def reach(serial: pk.SerialChain, position: list[float]) -> list[float]:

@@ -129,10 +129,7 @@ TWO = Short(
 )
 
 
-needs_panda = [
-    pytest.mark.skipif(not has_panda(), reason="the Panda is in the extra `robots`"),
-    pytest.mark.filterwarnings("ignore::diffcloth_torch.IgnoredLimitsWarning"),
-]
+needs_panda = pytest.mark.skipif(not has_panda(), reason="the Panda is in the extra `robots`")
 SHORT = [
     pytest.param(PUSH, id="push_cube"),
     pytest.param(DYNAMIC, id="hit_cloth_dynamic"),

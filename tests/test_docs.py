@@ -184,8 +184,6 @@ def as_a_reader(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("page", "line", "code"), list(python_blocks()))
-# The Panda has limits that are not applied, as a warning says.
-@pytest.mark.filterwarnings("ignore::diffcloth_torch.IgnoredLimitsWarning")
 @pytest.mark.usefixtures("as_a_reader")
 def test_every_block_of_python_runs_alone(page, line, code):
     """Pasted into a fresh interpreter: it imports what it uses."""

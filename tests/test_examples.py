@@ -76,6 +76,19 @@ def test_a_finger_feels_a_pen_through_a_cloth(tmp_path, monkeypatch, capsys):
     assert f"press with {force:.2f} N" in capsys.readouterr().out
 
 
+def test_a_motor_lifts_what_its_limits_allow(capsys):
+    names = runpy.run_path(str(ROOT / "examples/joint_limits.py"))
+    angles, state = names["angles"][-1], names["state"].detach()
+    assert (angles[:3] > 0.9).all()
+    assert names["fastest"][1] < 1.01  # of the slow one
+    assert names["fastest"][0] > 3.9
+    # The weak one hangs where the weight, which turns it by W cos q, is at its limit.
+    assert float(state.joint_efforts[3]) == pytest.approx(0.5, abs=2e-3)
+    slope = 1.0 / (0.5 * math.tan(-float(angles[3])))
+    assert float(names["limits"].grad[3]) == pytest.approx(slope, rel=0.1)
+    assert "with friction" in capsys.readouterr().out
+
+
 def test_own_mesh(own_mesh, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["own_mesh.py", str(own_mesh)])
     check_throw(runpy.run_path(str(ROOT / "examples/own_mesh.py")))

@@ -183,6 +183,9 @@ std::vector<std::size_t> accepted_counts(const step::Scene& scene, Extent extent
       return {1, surfaces * surfaces};
     case Extent::kCoordinates:
       return {static_cast<std::size_t>(scene.mechanisms.coordinate_count())};
+    case Extent::kJointTerms:
+      return {bodies::kJointColumns *
+              static_cast<std::size_t>(scene.mechanisms.coordinate_count())};
     case Extent::kBlocks:
       return {squares_of_coordinates(scene)};
   }

@@ -97,6 +97,8 @@ bodies::MechanismsDescription take_mechanisms(NamedFields& fields, Index surface
   m.upper = fields.doubles("coordinate_upper");
   m.limit_stiffness = fields.doubles("limit_stiffness");
   m.limit_zone = fields.take<double>("limit_zone");
+  m.velocity_stiffness = fields.doubles("velocity_stiffness");
+  m.velocity_force = fields.doubles("velocity_force");
   m.surface_link = fields.indices("surface_link");
   m.links = to_links({.tree = fields.indices("link_tree"),
                       .parent = fields.indices("link_parent"),
@@ -108,7 +110,8 @@ bodies::MechanismsDescription take_mechanisms(NamedFields& fields, Index surface
                       .constant = fields.doubles("link_constant")},
                      static_cast<Index>(m.prescribed.size()));
   const std::size_t n = m.prescribed.size();
-  for (const std::size_t size : {m.lower.size(), m.upper.size(), m.limit_stiffness.size()}) {
+  for (const std::size_t size : {m.lower.size(), m.upper.size(), m.limit_stiffness.size(),
+                                 m.velocity_stiffness.size(), m.velocity_force.size()}) {
     if (size != n || m.held.size() != n)
       throw nb::value_error("trees: arrays of coordinates must have equal lengths");
   }

@@ -7,20 +7,8 @@
 namespace diffcloth::bodies {
 namespace {
 
-double limit_barrier(double u, double w) {
-  if (u >= w) return 0.0;
-  if (!(u > 0.0)) return std::numeric_limits<double>::infinity();
-  return -(u - w) * (u - w) * std::log(u / w);
-}
-
-double limit_slope(double u, double w) {
-  return -2.0 * (u - w) * std::log(u / w) - (u - w) * (u - w) / u;
-}
-
-double limit_curvature(double u, double w) {
-  const double r = (u - w) / u;
-  return -2.0 * std::log(u / w) - 4.0 * r + r * r;
-}
+/// Duals this near the direction of friction are dropped.
+constexpr double kClose = 0.1;
 
 }  // namespace
 
@@ -28,13 +16,18 @@ CoordinatePotential::CoordinatePotential(const Mechanisms& mechanisms,
                                          Index first_point,
                                          Index first_row,
                                          const double* targets,
-                                         const double* metric)
+                                         const double* metric,
+                                         const double* joints,
+                                         double h)
     : target_bar(static_cast<std::size_t>(mechanisms.coordinate_count()), 0.0),
+      joint_bar(joints == nullptr ? 0 : kJointColumns * target_bar.size(), 0.0),
       mechanisms_(mechanisms),
       first_point_(first_point),
       first_row_(first_row),
       targets_(targets),
-      metric_(metric) {
+      metric_(metric),
+      joints_(joints),
+      h_(h) {
   const std::vector<Index>& owner = mechanisms.given().coordinate_tree;
   std::size_t offset = 0;
   for (std::size_t first = 0; first < owner.size();) {
@@ -73,6 +66,28 @@ void CoordinatePotential::visit_limits(const double* nodes, Visit&& visit) const
   }
 }
 
+template <class Visit>
+void CoordinatePotential::visit_joints(Visit&& visit) const {
+  if (joints_ == nullptr) return;
+  const MechanismsDescription& given = mechanisms_.given();
+  for (Index c = 0; c < mechanisms_.coordinate_count(); ++c) {
+    if (given.prescribed[c] != 0) continue;
+    const double* const t = joints_ + static_cast<std::ptrdiff_t>(kJointColumns) * c;
+    const JointTerm term{.origin = t[0],
+                         .effort = t[1],
+                         .stiffness = t[2],
+                         .effort_limit = t[3],
+                         .velocity_limit = t[4],
+                         .friction = t[5],
+                         .slip_rate = t[6]};
+    visit(c, mechanisms_.slot(c), term,
+          JointConstants{.h = h_,
+                         .zone = given.limit_zone,
+                         .velocity_stiffness = given.velocity_stiffness[c],
+                         .velocity_force = given.velocity_force[c]});
+  }
+}
+
 double CoordinatePotential::energy(const double* x) const {
   const double* nodes = x + 3 * static_cast<std::ptrdiff_t>(first_point_);
   double e = 0.0;
@@ -87,6 +102,9 @@ double CoordinatePotential::energy(const double* x) const {
   }
   visit_limits(nodes,
                [&](Index, double, double u, double w, double k) { e += k * limit_barrier(u, w); });
+  visit_joints([&](Index, Index slot, const JointTerm& term, const JointConstants& constants) {
+    e += joint_energy_change(term, constants, term.origin, nodes[slot]);
+  });
   return e;
 }
 
@@ -111,6 +129,9 @@ double CoordinatePotential::energy_change(const double* x, const double* to) con
   visit_limits(to_nodes, [&](Index, double, double u, double w, double k) {
     change += k * limit_barrier(u, w);
   });
+  visit_joints([&](Index, Index slot, const JointTerm& term, const JointConstants& constants) {
+    change += joint_energy_change(term, constants, from_nodes[slot], to_nodes[slot]);
+  });
   return change;
 }
 
@@ -129,10 +150,13 @@ void CoordinatePotential::add_gradient(const double* x, double* g) const {
   visit_limits(nodes, [&](Index slot, double sign, double u, double w, double k) {
     if (u < w) out[slot] -= sign * k * limit_slope(u, w);
   });
+  visit_joints([&](Index, Index slot, const JointTerm& term, const JointConstants& constants) {
+    out[slot] += joint_force(term, constants, nodes[slot]).slope;
+  });
 }
 
 void CoordinatePotential::add_hessian(const double* x,
-                                      Curvature /*curvature*/,
+                                      Curvature curvature,
                                       linalg::BlockMatrix& A) const {
   const double* nodes = x + 3 * static_cast<std::ptrdiff_t>(first_point_);
   for (const Tree& tree : trees_) {
@@ -161,6 +185,18 @@ void CoordinatePotential::add_hessian(const double* x,
     diagonal[slot % 3] = k * limit_curvature(u, w);
     A.add_to_diagonal(first_row_ + slot / 3, diagonal);
   });
+  const bool dual = curvature == Curvature::kPrimalDual && has_duals(x);
+  visit_joints([&](Index c, Index slot, const JointTerm& term, const JointConstants& constants) {
+    const JointForce f = joint_force(term, constants, nodes[slot]);
+    double value = f.sticking + std::max(f.curvature, 0.0);
+    if (curvature != Curvature::kPositive) {
+      value = f.sticking + f.turning * (dual ? duals_[c] : f.friction) + f.curvature;
+    }
+    if (value == 0.0) return;
+    Vec3 diagonal = Vec3::Zero();
+    diagonal[slot % 3] = value;
+    A.add_to_diagonal(first_row_ + slot / 3, diagonal);
+  });
 }
 
 void CoordinatePotential::add_hessian_product(const double* x, const double* z, double* y) const {
@@ -175,6 +211,10 @@ void CoordinatePotential::add_hessian_product(const double* x, const double* z, 
   }
   visit_limits(x + offset, [&](Index slot, double, double u, double w, double k) {
     if (u < w) out[slot] += k * limit_curvature(u, w) * in[slot];
+  });
+  visit_joints([&](Index, Index slot, const JointTerm& term, const JointConstants& constants) {
+    const JointForce f = joint_force(term, constants, (x + offset)[slot]);
+    out[slot] += (f.sticking + f.turning * f.friction + f.curvature) * in[slot];
   });
 }
 
@@ -194,6 +234,11 @@ void CoordinatePotential::accumulate(const double* x, const double* z) {
       }
     }
   }
+  visit_joints([&](Index c, Index slot, const JointTerm& term, const JointConstants& constants) {
+    const JointRow by = joint_force(term, constants, nodes[slot]).by;
+    double* const bar = joint_bar.data() + static_cast<std::ptrdiff_t>(kJointColumns) * c;
+    for (int k = 0; k < kJointColumns; ++k) bar[k] -= by[k] * in[slot];
+  });
 }
 
 void CoordinatePotential::add_tangent(const double* x, double* y) const {
@@ -213,6 +258,65 @@ void CoordinatePotential::add_tangent(const double* x, double* y) const {
       }
     }
   }
+  visit_joints([&](Index c, Index slot, const JointTerm& term, const JointConstants& constants) {
+    const JointRow by = joint_force(term, constants, nodes[slot]).by;
+    const double* const dot = joint_dot.data() + static_cast<std::ptrdiff_t>(kJointColumns) * c;
+    for (int k = 0; k < kJointColumns; ++k) out[slot] += by[k] * dot[k];
+  });
+}
+
+void CoordinatePotential::update_duals(const double* x,
+                                       const double* p,
+                                       double alpha,
+                                       const double* to) {
+  if (joints_ == nullptr) return;
+  const bool go_on = has_duals(x);
+  std::vector<double> duals(static_cast<std::size_t>(mechanisms_.coordinate_count()), 0.0);
+  bool any = false;
+  visit_joints([&](Index c, Index slot, const JointTerm& term, const JointConstants& constants) {
+    if (!(term.friction > 0.0)) return;
+    const JointForce start = joint_force(term, constants, nodes(x)[slot]);
+    const double end = joint_force(term, constants, nodes(to)[slot]).friction;
+    const double v = go_on ? duals_[c] : start.friction;
+    const double slip = nodes(x)[slot] - term.origin;
+    const double change = nodes(p)[slot];
+    const double linear =
+        (start.sticking * (slip + change) + start.turning * v * change) / term.friction;
+    duals[c] = std::clamp(v + std::min(alpha, 1.0) * (linear - v), -1.0, 1.0);
+    any = any || std::abs(duals[c] - end) > kClose;
+  });
+  duals_at_.clear();
+  if (!any) return;
+  duals_ = std::move(duals);
+  duals_at_.assign(nodes(to),
+                   nodes(to) + 3 * static_cast<std::ptrdiff_t>(mechanisms_.node_count()));
+}
+
+bool CoordinatePotential::has_duals(const double* x) const {
+  return !duals_at_.empty() && std::equal(duals_at_.begin(), duals_at_.end(), nodes(x));
+}
+
+double CoordinatePotential::within_speed(Index coordinate, double q) const {
+  visit_joints([&](Index c, Index, const JointTerm& term, const JointConstants& constants) {
+    if (c != coordinate) return;
+    const double reach = (1.0 + 0.5 * constants.zone) * term.velocity_limit * constants.h;
+    q = std::clamp(q, term.origin - reach, term.origin + reach);
+  });
+  return q;
+}
+
+double CoordinatePotential::largest_fraction(const double* x,
+                                             const double* dx,
+                                             double share) const {
+  double fraction = std::numeric_limits<double>::infinity();
+  visit_joints([&](Index, Index slot, const JointTerm& term, const JointConstants& constants) {
+    const double end = (1.0 + constants.zone) * term.velocity_limit * constants.h;
+    const double change = nodes(dx)[slot];
+    const double slip = nodes(x)[slot] - term.origin;
+    const double left = change > 0.0 ? end - slip : end + slip;
+    if (std::abs(change) > 0.0) fraction = std::min(fraction, share * left / std::abs(change));
+  });
+  return fraction;
 }
 
 void CoordinatePotential::append_diagonal(std::vector<double>& out) const {

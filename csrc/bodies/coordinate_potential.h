@@ -2,6 +2,7 @@
 
 #include <vector>
 
+#include "bodies/joint_term.h"
 #include "bodies/mechanisms.h"
 #include "potential/potential.h"
 
@@ -9,23 +10,30 @@ namespace diffcloth::bodies {
 
 /// The potential of the mechanisms' coordinates q themselves:
 ///
-///   sum over trees of 1/2 (q - t)^T A (q - t)  +  sum over limits of k b(u),
+///   sum over trees of 1/2 (q - t)^T A (q - t)  +  sum over limits of k b(u)  +  sum of joints' terms,
 ///
 /// with everything quadratic (inertia, drives, damping) in the metric A and the target t. A limit acts
 /// from itself to `limit_zone` of the joint's range beyond it, its end: u is what is left to the end, and
 ///
 ///   b(u) = -(u - w)^2 log(u / w),   w the width of that zone,   0 for u >= w.
+///
+/// For a joint's own term see JointTerm. Its friction has a kink, which Newton's method would cross to
+/// and fro: it has duals, as that of contacts has (contact/friction_set.h).
 class CoordinatePotential final : public Potential {
  public:
   /// @param first_point  of the nodes among all points
   /// @param first_row    of the nodes in the linear system
   /// @param targets      t [n]
   /// @param metric       A, row by row, tree after tree [sum n_t^2]; its symmetric part counts
+  /// @param joints       rows of JointTerm [n]; null where no coordinate has such a term
+  /// @param h            time step [s]
   CoordinatePotential(const Mechanisms& mechanisms,
                       Index first_point,
                       Index first_row,
                       const double* targets,
-                      const double* metric);
+                      const double* metric,
+                      const double* joints,
+                      double h);
 
   double energy(const double* x) const override;
   double energy_change(const double* x, const double* to) const override;
@@ -34,18 +42,29 @@ class CoordinatePotential final : public Potential {
   void add_hessian_product(const double* x, const double* z, double* y) const override;
   void accumulate(const double* x, const double* z) override;
   void add_tangent(const double* x, double* y) const override;
+  void update_duals(const double* x, const double* p, double alpha, const double* to) override;
+  bool has_duals(const double* x) const override;
   void swap_cotangents(CotangentStore& store) override {
     store.exchange(target_bar);
     store.exchange(metric_bar);
+    store.exchange(joint_bar);
   }
+
+  /// The value q of a coordinate, or where its limit of the speed lets it come instead.
+  double within_speed(Index coordinate, double q) const;
+
+  /// Of what is left to the ends of the limits of speeds, the fraction of a change that uses a share.
+  double largest_fraction(const double* x, const double* dx, double share) const;
 
   /// Append the diagonal of A for each number of the nodes.
   void append_diagonal(std::vector<double>& out) const;
 
   std::vector<double> target_dot;  ///< [n] tangents, for add_tangent()
   std::vector<double> metric_dot;  ///< [sum n_t^2]
+  std::vector<double> joint_dot;   ///< [n, columns]
   std::vector<double> target_bar;  ///< [n], zero until accumulate()
   std::vector<double> metric_bar;  ///< [sum n_t^2]
+  std::vector<double> joint_bar;   ///< [n, columns]
 
  private:
   struct Tree {
@@ -65,12 +84,23 @@ class CoordinatePotential final : public Potential {
   template <class Visit>
   void visit_limits(const double* nodes, Visit&& visit) const;
 
+  /// Visit the terms of free joints: visit(c, slot, term, constants).
+  template <class Visit>
+  void visit_joints(Visit&& visit) const;
+  const double* nodes(const double* x) const {
+    return x + 3 * static_cast<std::ptrdiff_t>(first_point_);
+  }
+
   const Mechanisms& mechanisms_;
   Index first_point_;
   Index first_row_;
   const double* targets_;
   const double* metric_;
+  const double* joints_;
+  double h_;
   std::vector<Tree> trees_;
+  std::vector<double> duals_;     // [n] directions of friction
+  std::vector<double> duals_at_;  // numbers of the nodes where they hold; empty: nowhere
 };
 
 }  // namespace diffcloth::bodies

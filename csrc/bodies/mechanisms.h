@@ -38,8 +38,11 @@ struct MechanismsDescription {
   std::vector<double> lower;           ///< [n] limits of free joints; infinite where there are none
   std::vector<double> upper;
   std::vector<double> limit_stiffness;  ///< [n]
-  double limit_zone = 0.0;              ///< share of its range that a joint can go beyond a limit
-  std::vector<Index> surface_link;      ///< [surfaces]
+  double limit_zone =
+      0.0;  ///< share of its range that a joint can go beyond a limit; of a speed likewise
+  std::vector<double> velocity_stiffness;  ///< [n] see JointConstants
+  std::vector<double> velocity_force;      ///< [n]
+  std::vector<Index> surface_link;         ///< [surfaces]
 };
 
 /// Trees of rigid links, and how the vertices of their surfaces follow from coordinates.

@@ -4,8 +4,8 @@
 #include <span>
 #include <vector>
 
+#include "common/friction_law.h"
 #include "contact/contact_set.h"
-#include "contact/friction.h"
 
 namespace diffcloth::contact {
 

@@ -11,9 +11,6 @@ namespace {
 /// No link turns farther in one step: beyond, the quadratic model of where its points go is void.
 constexpr double kLargestTurn = std::numbers::pi / 4.0;
 
-/// Of what is left to the end of a joint's limits, the share that a step may use.
-constexpr double kShareOfLimit = 0.9;
-
 /// Largest size among some numbers; NaN counts as infinite.
 double largest(const double* first, const double* last) {
   double result = 0.0;

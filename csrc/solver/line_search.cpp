@@ -20,8 +20,7 @@ double Trial::enough(double slope) const { return kArmijo * alpha * slope; }
 
 Trial farthest(Walk& walk, const std::vector<double>& p, double first) {
   Trial trial;
-  trial.alpha =
-      walk.watch(p, std::min(first, walk.f.coordinates->largest_fraction(walk.x(), p)), trial.to);
+  trial.alpha = walk.watch(p, std::min(first, walk.f.largest_fraction(walk.x(), p)), trial.to);
   if (trial.alpha > 0.0) trial.gain = walk.change(trial.to);
   return trial;
 }

@@ -61,8 +61,7 @@ double joint_step(Walk& walk, const std::vector<double>& ends) {
   for (std::size_t a = 0; a < p.size(); ++a) p[a] += d[a];
 
   std::vector<double> to;
-  const double alpha =
-      walk.watch(p, std::min(1.0, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
+  const double alpha = walk.watch(p, std::min(1.0, walk.f.largest_fraction(walk.x(), p)), to);
   if (!(alpha > 0.0)) return 0.0;
   if (alpha == 1.0) {
     // To the bit; what follows has been placed by nodes that differ from these by rounding.

@@ -24,6 +24,14 @@ std::vector<double> Objective::metric() const {
   return result;
 }
 
+double Objective::largest_fraction(const std::vector<double>& x,
+                                   const std::vector<double>& dx) const {
+  const double fraction = coordinates->largest_fraction(x, dx);
+  if (chart == nullptr) return fraction;
+  return std::min(fraction,
+                  chart->largest_fraction(x.data(), dx.data(), Coordinates::kShareOfLimit));
+}
+
 linalg::Couplings Objective::couplings() const {
   linalg::Couplings points;
   for_each([&](const Potential& p) { p.add_couplings(points); });

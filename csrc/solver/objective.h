@@ -70,6 +70,9 @@ struct Objective {
     return any;
   }
 
+  /// Largest fraction of a change of all points that keeps links and limits in bounds.
+  double largest_fraction(const std::vector<double>& x, const std::vector<double>& dx) const;
+
   /// grad P at all points, prescribed ones included.
   void gradient(const double* x, std::vector<double>& g) const {
     g.assign(3 * static_cast<std::size_t>(coordinates->point_count()), 0.0);

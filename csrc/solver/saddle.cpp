@@ -51,8 +51,7 @@ Factor shifted_factor(const std::vector<double>& metric,
 bool go_down(Walk& walk, const std::vector<double>& p) {
   const double length = kFirstMove * walk.f.length;
   std::vector<double> to;
-  double alpha =
-      walk.watch(p, std::min(length, walk.f.coordinates->largest_fraction(walk.x(), p)), to);
+  double alpha = walk.watch(p, std::min(length, walk.f.largest_fraction(walk.x(), p)), to);
   double best = 0.0;
   double best_alpha = 0.0;
   for (int k = 0; k < kEscapeBacktracks; ++k, alpha *= 0.5) {

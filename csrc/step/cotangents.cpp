@@ -47,6 +47,7 @@ void write_surfaces(const Problem& p, const Cotangents& bars, const Gradients& g
   if (p.chart) {
     add_to(gradients[Input::kCoordinateTargets], p.chart->target_bar);
     add_to(gradients[Input::kCoordinateMetric], p.chart->metric_bar);
+    add_to(gradients[Input::kJointTerms], p.chart->joint_bar);
   }
   if (double* out = gradients[Input::kBarrierDistance]) *out += bars.contact.d_hat;
   if (double* out = gradients[Input::kSlipVelocity]) *out += p.h * bars.contact.slip;

@@ -45,6 +45,7 @@ enum class Input : std::uint8_t {
   kCoordinateEnds,     ///< at its end, where prescribed
   kCoordinateTargets,  ///< t, see bodies::CoordinatePotential
   kCoordinateMetric,   ///< A
+  kJointTerms,         ///< rows of bodies::JointTerm; absent: no coordinate has one
   kFrictionOrigins,    ///< where friction counts motion from [m]; absent: at the start
 };
 
@@ -65,6 +66,7 @@ enum class Extent : std::uint8_t {
   kSurfaces,     ///< [S]
   kPairs,        ///< one value or [S, S]
   kCoordinates,  ///< [n]
+  kJointTerms,   ///< [n, 7]
   kBlocks,       ///< [sum n_t^2], tree after tree
 };
 
@@ -130,6 +132,7 @@ inline constexpr std::array kInputTable{
              Need::kFreeCoordinates},
     InputRow{Input::kCoordinateMetric, "coordinate_metric", Extent::kBlocks,
              Need::kFreeCoordinates},
+    InputRow{Input::kJointTerms, "joint_terms", Extent::kJointTerms, Need::kNowhere},
     InputRow{Input::kFrictionOrigins, "friction_origins", Extent::kAllVertices, Need::kNowhere},
 };
 inline constexpr std::size_t kInputCount = kInputTable.size();

@@ -157,7 +157,8 @@ Problem::Problem(const Scene& scene_in, const Inputs& inputs_in, const Gradients
       potentials(make_potentials(*this, wanted)) {
   if (scene.mechanisms.has_free()) {
     chart.emplace(scene.mechanisms, scene.vertex_count(), scene.cloth_vertex_count(),
-                  inputs.data(Input::kCoordinateTargets), inputs.data(Input::kCoordinateMetric));
+                  inputs.data(Input::kCoordinateTargets), inputs.data(Input::kCoordinateMetric),
+                  inputs.data(Input::kJointTerms), h);
   }
   if (inputs.data(Input::kBarrierStiffness) != nullptr) {
     contact.emplace(scene.collision_mesh, scene.feature_weights, measures,
@@ -235,7 +236,8 @@ std::vector<double> Problem::predicted(const double* cloth_positions) const {
   std::copy_n(cloth_positions, cloth_size, x.begin());
   for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
     if (scene.mechanisms.given().prescribed[c] != 0) continue;
-    coordinates.nodes(x)[scene.mechanisms.slot(c)] = inputs.data(Input::kCoordinateTargets)[c];
+    const double target = inputs.data(Input::kCoordinateTargets)[c];
+    coordinates.nodes(x)[scene.mechanisms.slot(c)] = chart->within_speed(c, target);
   }
   coordinates.place(x);
   for (const Index i : scene.given.pins) {

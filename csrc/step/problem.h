@@ -88,8 +88,8 @@ class Problem {
   /// All points where cloths go on as they move at the start, and everything prescribed is at its target.
   std::vector<double> coasting() const;
 
-  /// All points, with these cloth positions, free coordinates at their targets t, and everything
-  /// prescribed at its own.
+  /// All points, with these cloth positions, free coordinates at their targets t as far as their speed
+  /// is not limited, and everything prescribed at its own.
   std::vector<double> predicted(const double* cloth_positions) const;
 };
 

@@ -153,6 +153,7 @@ void Tangents::push_forward(Problem& p) const {
   };
   p.chart->target_dot = copy(Input::kCoordinateTargets);
   p.chart->metric_dot = copy(Input::kCoordinateMetric);
+  p.chart->joint_dot = copy(Input::kJointTerms);
 }
 
 Array Tangents::per_face(const Problem& p, Input input) const {

@@ -176,6 +176,8 @@ class JointKeyframe(Section):
 Names = Annotated[list[str], Len(2, 2)]
 ForAll = float | dict[str, float]
 """One value for all, or name -> value."""
+Bounds = Literal[False] | float | dict[str, Literal[False] | float]
+"""Likewise, where false means none."""
 
 
 class RobotSection(Section):
@@ -195,6 +197,9 @@ class RobotSection(Section):
     actuation: Actuation | dict[str, Actuation] | None = None
     stiffness: ForAll | None = None
     damping: ForAll | None = None
+    effort_limits: Bounds | None = None
+    velocity_limits: Bounds | None = None
+    joint_friction: Bounds | None = None
     friction: ForAll | None = None
     thickness: ForAll | None = None
     edge_length: Positive | None = None

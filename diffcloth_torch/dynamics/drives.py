@@ -1,4 +1,4 @@
-"""The drives of the joints, as quadratic terms of the objective that a step minimizes.
+"""The drives of the joints, as terms of the objective that a step minimizes.
 
 A joint under `pd` adds, with q_n its value at the start of the step of length h,
 
@@ -6,6 +6,14 @@ A joint under `pd` adds, with q_n its value at the start of the step of length h
 
 so its drive acts at the end of the step, implicitly and without a bound on the gains. Under
 `torque` there is only the last term, the joint's own viscosity.
+
+That is a drive that has whatever effort it asks for. Under a limit L, of an effort a it has only
+
+    s(a) = a for |a| <= 0.9 L,    sign(a) (0.9 L + 0.1 L r / sqrt(1 + r^2)) beyond,
+
+with the excess r = (|a| - 0.9 L) / (0.1 L). This has two continuous derivatives, and its slope
+never vanishes. What a drive lacks, a - s(a), is part of the term of a joint, which the core
+evaluates (see csrc/bodies/joint_term.h), as are a limit of the speed and Coulomb friction.
 """
 
 from __future__ import annotations
@@ -15,9 +23,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffcloth_torch.checks import LARGEST
 from diffcloth_torch.dynamics.linear import solve
 
-__all__ = ["Drives", "Gains", "fold"]
+__all__ = ["Bounds", "Drives", "Gains", "fold", "joint_terms", "limited_effort"]
+
+# A drive has what it asks for up to this share of its limit; the core has the same number.
+_LINEAR = 0.9
 
 
 class Gains(NamedTuple):
@@ -34,6 +46,22 @@ class Gains(NamedTuple):
     viscosity: Tensor
 
 
+class Bounds(NamedTuple):
+    """What each joint can do and what resists it, [B or 1, J].
+
+    Attributes:
+        efforts: L [N m or N].
+        velocities: Largest speed [rad/s or m/s].
+        friction: Coulomb friction [N m or N].
+        slip_rates: Speed at which sticking turns into sliding [rad/s or m/s].
+    """
+
+    efforts: Tensor
+    velocities: Tensor
+    friction: Tensor
+    slip_rates: Tensor
+
+
 class Drives(NamedTuple):
     """Gains and targets of each joint, zero if its actuation does not use them; [B or 1, J].
 
@@ -43,7 +71,9 @@ class Drives(NamedTuple):
         viscosity: Likewise.
         positions: q_t [rad or m].
         velocities: qd_t [rad/s or m/s].
-        efforts: Constant efforts over the whole step [N m or N].
+        asked: Constant efforts over the whole step that are asked for [N m or N].
+        efforts: Those of them that are within the limit.
+        limits: L of pd drives, where there is one; None for no limits at all.
     """
 
     stiffness: Tensor
@@ -51,12 +81,57 @@ class Drives(NamedTuple):
     viscosity: Tensor
     positions: Tensor
     velocities: Tensor
+    asked: Tensor
     efforts: Tensor
+    limits: Tensor | None
+
+    def asked_efforts(self, start: Tensor, end: Tensor, dt: float) -> Tensor:
+        """Efforts that drives ask for in a step between joint values `start` and `end` [B, J]."""
+        spring = self.stiffness * (self.positions - end)
+        return self.asked + spring + self.damping * (self.velocities - (end - start) / dt)
 
     def applied_efforts(self, start: Tensor, end: Tensor, dt: float) -> Tensor:
-        """Efforts of the drives over a step between joint values `start` and `end` [B, J]."""
-        spring = self.stiffness * (self.positions - end)
-        return self.efforts + spring + self.damping * (self.velocities - (end - start) / dt)
+        """Efforts that they have."""
+        asked = self.asked_efforts(start, end, dt)
+        return asked if self.limits is None else limited_effort(asked, self.limits)
+
+
+def limited_effort(asked: Tensor, limit: Tensor) -> Tensor:
+    """The effort s(a) of a drive that asks for a; see the top of this file."""
+    excess = (asked.abs() - _LINEAR * limit).clamp(min=0.0) / ((1.0 - _LINEAR) * limit)
+    bent = (1.0 - _LINEAR) * limit * excess / torch.sqrt(1.0 + excess * excess)
+    return torch.where(excess > 0.0, torch.sign(asked) * (_LINEAR * limit + bent), asked)
+
+
+def joint_terms(
+    drives: Drives,
+    bounds: Bounds,
+    start: Tensor,
+    origins: Tensor,
+    forced: Tensor,
+    dt: float,
+) -> Tensor:
+    """Rows of the core's joint terms, [B, J, 7]; those of prescribed joints do nothing.
+
+    Args:
+        drives: Drives of the joints.
+        bounds: Their limits and friction.
+        start: q_n, [B, J].
+        origins: Values from which friction counts motion, [B, J].
+        forced: Which joints are moved by forces, [J].
+        dt: h [s].
+    """
+    none = torch.full_like(start, LARGEST)
+    rows = (
+        origins,
+        drives.asked_efforts(start, origins, dt),
+        drives.stiffness + drives.damping / dt,
+        none if drives.limits is None else drives.limits,
+        torch.where(forced, bounds.velocities, none),
+        forced * bounds.friction,
+        bounds.slip_rates,
+    )
+    return torch.stack([row.expand_as(start) for row in rows], dim=-1)
 
 
 def fold(
@@ -93,6 +168,8 @@ def fold(
     )
     gains = drives.stiffness + (drives.damping + drives.viscosity) / dt
     metric = inertial + torch.diag_embed(torch.nn.functional.pad(gains, (n - joints, 0)))
+    if drives.limits is not None:
+        pull = pull - (drives.asked - drives.efforts)
     pull = torch.nn.functional.pad(pull, (n - joints, 0))
     if force is not None:
         pull = pull - force

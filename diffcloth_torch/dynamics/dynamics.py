@@ -18,9 +18,15 @@ from diffcloth_torch.dynamics.bodies import (
     predict_bodies,
     turn_sentence,
 )
-from diffcloth_torch.dynamics.drives import Gains
+from diffcloth_torch.dynamics.drives import Bounds, Gains
 from diffcloth_torch.dynamics.inertia import Inertia
-from diffcloth_torch.dynamics.robots import RobotControl, RobotDynamics, RobotPrediction, RobotState
+from diffcloth_torch.dynamics.robots import (
+    RobotControl,
+    RobotDynamics,
+    RobotPrediction,
+    RobotState,
+    idle_terms,
+)
 from diffcloth_torch.dynamics.totals import Totals
 from diffcloth_torch.geometry.rotation import (
     quaternion_exp,
@@ -61,6 +67,8 @@ class Prediction:
         coordinate_ends: Coordinates at the end if they are prescribed, [B, n].
         coordinate_targets: t of the term (q - t)^T A (q - t) / 2 of the objective, [B, n].
         coordinate_metric: A, row by row, mechanism after mechanism, [B, sum n_t^2].
+        joint_terms: What limits and resists joints: rows of the core, one for each coordinate,
+            [B, n, 7]; None if no joint is moved by forces.
         bodies: Details of the dynamic bodies, None if there are none.
         robots: Details of the robots.
         held_poses: Poses of all bodies, for dynamic ones those at the start, [B, K, 7].
@@ -73,6 +81,7 @@ class Prediction:
     coordinate_ends: Tensor
     coordinate_targets: Tensor
     coordinate_metric: Tensor
+    joint_terms: Tensor | None
     bodies: BodyPrediction | None
     robots: tuple[RobotPrediction, ...]
     held_poses: Tensor
@@ -80,7 +89,8 @@ class Prediction:
 
     def core_inputs(self) -> dict[str, Tensor]:
         """The inputs of the core, by its names."""
-        return {
+        terms = {} if self.joint_terms is None else {"joint_terms": self.joint_terms}
+        return terms | {
             "body_poses": self.body_poses,
             "body_targets": self.body_targets,
             "coordinates": self.coordinates,
@@ -153,6 +163,7 @@ class Dynamics:
         control: Fields,
         parameters: Fields,
         contact: Tensor | None = None,
+        joint_origins: Tensor | None = None,
     ) -> Prediction:
         """Predict the step without contact and limits.
 
@@ -163,6 +174,8 @@ class Dynamics:
                 axes B or 1.
             contact: Forces on the vertices of bodies and links [N] that act over the step like
                 gravity, shape [B, V, 3].
+            joint_origins: Values of all joints from which their friction counts motion, [B, J];
+                those at the start by default.
         """
         if _forked and torch.get_num_threads() > 1:
             # Threads of torch and MKL do not survive a fork: an operation would wait for them
@@ -182,7 +195,7 @@ class Dynamics:
             start = start.index_copy(1, self._free, bodies.frames)
             end = end.index_copy(1, self._free, bodies.frames)
         robots = tuple(
-            self._predict_robot(i, now, acting, parameters, gravity, contact)
+            self._predict_robot(i, now, acting, parameters, gravity, contact, joint_origins)
             for i in range(len(self._robots))
         )
         none = start.new_zeros(batch, 0)
@@ -192,6 +205,9 @@ class Dynamics:
             return torch.cat([first, *(t.flatten(1) for t in of_robots)], dim=1)
 
         b = bodies
+        terms = [c.terms for c in robots if c.terms is not None]
+        if terms:
+            terms.insert(0, idle_terms(terms[0], self._widths[0]))
         return Prediction(
             body_poses=torch.cat([start, *(c.root_start[:, None] for c in robots)], dim=1),
             body_targets=torch.cat([end, *(c.root_end[:, None] for c in robots)], dim=1),
@@ -199,6 +215,7 @@ class Dynamics:
             coordinate_ends=rows(b and b.coordinates, (c.ends for c in robots)),
             coordinate_targets=rows(b and b.target, (c.target for c in robots)),
             coordinate_metric=rows(b and b.metric, (c.metric for c in robots)),
+            joint_terms=torch.cat(terms, dim=1) if terms else None,
             bodies=bodies,
             robots=robots,
             held_poses=held,
@@ -430,8 +447,17 @@ class Dynamics:
         parameters: Fields,
         gravity: Tensor,
         contact: Tensor | None,
+        origins: Tensor | None,
     ) -> RobotPrediction:
         joints, _, vertices = self._robot_rows[i]
+        bounds = None
+        if "joint_effort_limits" in parameters:  # as where any joint is moved by forces
+            bounds = Bounds(
+                efforts=parameters["joint_effort_limits"][:, joints],
+                velocities=parameters["joint_velocity_limits"][:, joints],
+                friction=parameters["joint_friction"][:, joints],
+                slip_rates=parameters["joint_slip_rates"][:, joints],
+            )
         gains = Gains(
             stiffness=_rows(parameters, "joint_stiffness", joints),
             damping=_rows(parameters, "joint_damping", joints),
@@ -450,6 +476,8 @@ class Dynamics:
             gains,
             gravity,
             None if contact is None else contact[:, vertices],
+            bounds,
+            None if origins is None else origins[:, joints],
         )
 
     def _wrenches(self, quaternions: Tensor, centers: Tensor, forces: Tensor) -> Tensor:

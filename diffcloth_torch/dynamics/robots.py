@@ -32,7 +32,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.dynamics.drives import Drives, Gains, fold
+from diffcloth_torch.checks import LARGEST
+from diffcloth_torch.dynamics.drives import (
+    Bounds,
+    Drives,
+    Gains,
+    fold,
+    joint_terms,
+    limited_effort,
+)
 from diffcloth_torch.dynamics.free_motion import robot_motion, solve_motion
 from diffcloth_torch.dynamics.implicit import attach_root, jacobian_of
 from diffcloth_torch.dynamics.inertia import (
@@ -64,7 +72,7 @@ from diffcloth_torch.model.kinematics import constant, pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.transforms import outside_transforms, plain
 
-__all__ = ["RobotControl", "RobotDynamics", "RobotPrediction", "RobotState"]
+__all__ = ["RobotControl", "RobotDynamics", "RobotPrediction", "RobotState", "idle_terms"]
 
 
 class RobotState(NamedTuple):
@@ -112,6 +120,7 @@ class RobotPrediction(NamedTuple):
         ends: Coordinates at the end if they are prescribed, [B, n].
         target: t, [B, n].
         metric: A, [B, n, n].
+        terms: Rows of the core's joint terms, [B, n, 7]; None if the scene has none.
         inertia: Masses and inertias of links and joints.
         drives: Gains and targets of the joints.
         start: Configuration of the robot at the start.
@@ -126,6 +135,7 @@ class RobotPrediction(NamedTuple):
     ends: Tensor
     target: Tensor
     metric: Tensor
+    terms: Tensor | None
     inertia: Inertia
     drives: Drives
     start: _Configuration
@@ -208,6 +218,8 @@ class RobotDynamics:
         gains: Gains,
         gravity: Tensor,
         contact: Tensor | None = None,
+        bounds: Bounds | None = None,
+        origins: Tensor | None = None,
     ) -> RobotPrediction:
         """Predict a step without contact, limits and drives of the joints.
 
@@ -218,8 +230,11 @@ class RobotDynamics:
             gains: Gains of the joints.
             gravity: [B or 1, 3] m/s^2.
             contact: Forces on the vertices that act like the wrenches, [B, V, 3] N.
+            bounds: Limits and friction of the joints; None if no joint of the scene can have any.
+            origins: Values of the joints from which friction counts motion, [B, J]; those at the
+                start by default.
         """
-        drives = self._drives(gains, control)
+        drives = self._drives(gains, control, bounds)
         inertia = self._acting(inertia)
         local = inertia.center[..., self._kinematics.root, :]
         quaternion = torch.nn.functional.normalize(state.pose[..., 3:], dim=-1)
@@ -252,6 +267,14 @@ class RobotDynamics:
             inertial = inertial + self._weight_stiffness(inertia, start, gravity)[..., rows, rows]
             force = (given / self._dt)[..., rows]
         metric, target = fold(drives, inertial, free, state.joints, self._dt, self._unknown, force)
+        terms = None
+        if bounds is not None:
+            slid_from = state.joints if origins is None else origins
+            of_joints = joint_terms(
+                drives, bounds, state.joints, slid_from, ~self._prescribed, self._dt
+            )
+            roots = coordinates.shape[-1] - state.joints.shape[-1]
+            terms = torch.cat([idle_terms(of_joints, roots), of_joints], dim=1)
         return RobotPrediction(
             root_start=root_start,
             root_end=root_end,
@@ -259,6 +282,7 @@ class RobotDynamics:
             ends=ends,
             target=target,
             metric=metric,
+            terms=terms,
             inertia=inertia,
             drives=drives,
             start=start,
@@ -356,16 +380,26 @@ class RobotDynamics:
             root = torch.zeros_like(root)
         return torch.cat([root, state.rates], dim=-1)
 
-    def _drives(self, gains: Gains, control: RobotControl) -> Drives:
+    def _drives(self, gains: Gains, control: RobotControl, bounds: Bounds | None) -> Drives:
         """Set gains and targets to zero that the actuation of a joint does not use."""
         pd, force = self._modes["pd"], ~self._prescribed
+        asked = applied = force * control.efforts
+        limits = None
+        if bounds is not None:
+            # What is applied to a joint without a drive has its limit here. A drive has it for all
+            # that it asks for; the prediction takes what alone would be within.
+            applied = torch.where(force, limited_effort(asked, bounds.efforts), asked)
+            asked = torch.where(pd > 0, asked, applied)
+            limits = torch.where(pd > 0, bounds.efforts, LARGEST)
         return Drives(
             stiffness=pd * gains.stiffness,
             damping=pd * gains.damping,
             viscosity=force * gains.viscosity,
             positions=pd * control.joints,
             velocities=pd * control.rates,
-            efforts=force * control.efforts,
+            asked=asked,
+            efforts=applied,
+            limits=limits,
         )
 
     def _prescribed_motion(
@@ -526,6 +560,12 @@ class RobotDynamics:
 
     def _at_joints(self, values: Tensor) -> Tensor:
         return values[..., values.shape[-1] - self.mechanism.joint_count :]
+
+
+def idle_terms(like: Tensor, count: int) -> Tensor:
+    """Rows of joint terms that do nothing, [B, count, 7], for coordinates that are no joints."""
+    row = like.new_tensor([0.0, 0.0, 0.0, LARGEST, LARGEST, 0.0, 1.0])
+    return row.expand(len(like), count, len(row))
 
 
 def _weights(inertia: Inertia, gravity: Tensor) -> Tensor:

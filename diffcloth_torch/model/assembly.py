@@ -66,6 +66,10 @@ class Assembly:
         stiffness: Stiffness of the joints' drives [N m/rad or N/m], shape [J].
         damping: Damping of the joints' drives [N m s/rad or N s/m], shape [J].
         joint_viscosity: Damping of the joints themselves [N m s/rad or N s/m], shape [J].
+        joint_effort_limits: Largest efforts of the drives [N m or N], infinity without a limit;
+            shape [J].
+        joint_velocity_limits: Largest speeds of the joints [rad/s or m/s], likewise.
+        joint_friction: Coulomb friction of the joints [N m or N], shape [J].
         joint_armature: Inertia of the drives' rotors on the joints [kg m^2 or kg], shape [J].
     """
 
@@ -99,6 +103,9 @@ class Assembly:
     stiffness: FloatArray
     damping: FloatArray
     joint_viscosity: FloatArray
+    joint_effort_limits: FloatArray
+    joint_velocity_limits: FloatArray
+    joint_friction: FloatArray
     joint_armature: FloatArray
 
     @property
@@ -213,6 +220,9 @@ def assemble(scene: Scene, *, all_nodal: bool = False) -> Assembly:
         stiffness=_joined(robot.stiffness for robot in scene.robots),
         damping=_joined(robot.damping for robot in scene.robots),
         joint_viscosity=_joined(robot.viscosity for robot in scene.robots),
+        joint_effort_limits=_joined(robot.effort_limits for robot in scene.robots),
+        joint_velocity_limits=_joined(robot.velocity_limits for robot in scene.robots),
+        joint_friction=_joined(robot.joint_friction for robot in scene.robots),
         joint_armature=np.zeros_like(joint_positions),
     )
 

@@ -126,7 +126,6 @@ def describe_chain(chain: Any, inertials: Inertials, limits: Limits) -> RobotDes
         name="robot",
         links=tuple(_link(name, inertials.get(name)) for name in links),
         joints=tuple(joints),
-        unapplied=tuple(_unapplied(frame for frame, _ in frames)),
     )
 
 
@@ -171,8 +170,26 @@ def _joint(frame: Any, parent: Any, limits: Limits) -> Joint:
         lower=lower,
         upper=upper,
         viscosity=0.0,
+        effort=_largest(label, "effort_limits", joint),
+        velocity=_largest(label, "velocity_limits", joint),
+        friction=0.0,
         mimic=None,
     )
+
+
+def _largest(label: str, field: str, joint: Any) -> float:
+    """The largest effort or speed of a chain's joint; it has -limit and limit, or none."""
+    given = getattr(joint, field)
+    if given is None:
+        return math.inf
+    _check_length(f"{label}: `{field}`", given, "(-limit, limit)", 2)
+    lower, upper = (float(end) for end in given)
+    if not -lower == upper >= 0.0:
+        raise InvalidInput(
+            f"{label}: `{field}` must be (-limit, limit) with a limit >= 0, got ({lower:g}, "
+            f"{upper:g}); change it in the chain"
+        )
+    return upper or math.inf  # as in files
 
 
 def _limits(label: str, joint: Any, limits: Limits) -> tuple[float, float]:
@@ -247,10 +264,3 @@ def _check_root(root: Any) -> None:
         raise InvalidInput(
             f"{_OWNER}: the root {root.name!r} must have no offset: place the robot by `pose`"
         )
-
-
-def _unapplied(frames: Iterator[Any]) -> Iterator[str]:
-    joints = [frame.joint for frame in frames if frame.joint.joint_type != "fixed"]
-    for field in ("effort_limits", "velocity_limits"):
-        if any(getattr(joint, field) and any(getattr(joint, field)) for joint in joints):
-            yield field.replace("_", " ")

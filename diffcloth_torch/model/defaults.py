@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.checks import LARGEST, FloatArray
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.mesh_checks import unique_edges
 from diffcloth_torch.model.assembly import Assembly
@@ -107,6 +107,10 @@ def _rigid_values(assembly: Assembly) -> dict[str, FloatArray]:
         values["joint_damping"] = assembly.damping
         values["joint_viscosity"] = forced * assembly.joint_viscosity
         values["joint_armature"] = forced * assembly.joint_armature
+        for field in ("joint_effort_limits", "joint_velocity_limits"):
+            limits = np.where(forced, getattr(assembly, field), np.inf)
+            values[field] = np.minimum(limits, LARGEST)  # a number, where there is none
+        values["joint_friction"] = forced * assembly.joint_friction
     return values
 
 

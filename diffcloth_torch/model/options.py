@@ -37,7 +37,8 @@ class ContactOptions:
         barrier_stiffness: Stiffness of the barrier of all pairs of surfaces [Pa], > 0; None derives
             a value for each pair from its cloths and from its free bodies.
         friction_iterations: Solves per step, each with updated friction forces, >= 1.
-        slip_velocity: Velocity at which sticking turns into sliding [m/s], > 0.
+        slip_velocity: Velocity at which sticking turns into sliding [m/s], > 0; also where joints
+            with friction move what they carry, in scenes without contact too.
         self_contact: Whether a cloth collides with itself.
     """
 

@@ -161,12 +161,17 @@ PARAMETERS = _table(
     Quantity("joint_viscosity", "N m s/rad or N s/m", _JOINTS, "Robot.viscosity", NON_NEGATIVE),
     Quantity("joint_armature", "kg m^2 or kg", _JOINTS, "zero", NON_NEGATIVE),
     *(quantity._replace(core=quantity.name) for quantity in _OF_WOVEN_CLOTH),
+    Quantity("joint_effort_limits", "N m or N", _JOINTS, "Robot.effort_limits", POSITIVE),
+    Quantity("joint_velocity_limits", "rad/s or m/s", _JOINTS, "Robot.velocity_limits", POSITIVE),
+    Quantity("joint_friction", "N m or N", _JOINTS, "Robot.joint_friction", NON_NEGATIVE),
+    Quantity("joint_slip_rates", "rad/s or m/s", _JOINTS, "ContactOptions.slip_velocity", POSITIVE),
 )
 DERIVED = (
     "coordinates",
     "coordinate_ends",
     "coordinate_targets",
     "coordinate_metric",
+    "joint_terms",
     "friction_origins",
 )
 """Inputs of the core that follow from several fields: what drives the coordinates of bodies."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from diffcloth_torch.checks import (
     frozen,
     texts,
 )
-from diffcloth_torch.errors import IgnoredLimitsWarning, InvalidInput
+from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path
 from diffcloth_torch.geometry.mesh_checks import Surface
 from diffcloth_torch.geometry.poses import check_quaternions, pose_array
@@ -40,7 +39,7 @@ from diffcloth_torch.model.chains import (
 from diffcloth_torch.model.collision_shapes import link_surface
 from diffcloth_torch.model.kinematics import link_frames, pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
-from diffcloth_torch.model.robot_tree import make_mechanism
+from diffcloth_torch.model.robot_tree import JointBounds, joint_bounds, make_mechanism
 from diffcloth_torch.model.urdf import read_urdf
 
 __all__ = ["ACTUATIONS", "BASES", "Robot"]
@@ -52,6 +51,9 @@ _DIFFERENTIABLE = {
     "joint_positions": "State.joint_positions or Control.joint_positions",
     "stiffness": "Parameters.joint_stiffness",
     "damping": "Parameters.joint_damping",
+    "effort_limits": "Parameters.joint_effort_limits",
+    "velocity_limits": "Parameters.joint_velocity_limits",
+    "joint_friction": "Parameters.joint_friction",
     "friction": "Parameters.friction",
     "thickness": "Parameters.thickness",
 }
@@ -70,6 +72,10 @@ class Robot:
             shape [J].
         damping: Damping of these drives [N m s/rad or N s/m], shape [J].
         viscosity: Damping of the joints themselves [N m s/rad or N s/m], shape [J].
+        effort_limits: Largest efforts of the drives of "pd" joints and of what is applied to
+            "torque" joints [N m or N], infinity without a limit; shape [J].
+        velocity_limits: Largest speeds of these joints [rad/s or m/s], likewise.
+        joint_friction: Their Coulomb friction [N m or N], shape [J].
         friction: Friction coefficient of each link's surface [-], shape [L].
         thickness: Full thickness of each link's surface [m], shape [L].
         ignore_contact: Pairs of names of links that do not collide with each other.
@@ -83,6 +89,9 @@ class Robot:
     stiffness: FloatArray
     damping: FloatArray
     viscosity: FloatArray
+    effort_limits: FloatArray
+    velocity_limits: FloatArray
+    joint_friction: FloatArray
     friction: FloatArray
     thickness: FloatArray
     ignore_contact: tuple[tuple[str, str], ...]
@@ -100,6 +109,9 @@ class Robot:
         actuation: object = "pd",
         stiffness: object = None,
         damping: object = None,
+        effort_limits: object = None,
+        velocity_limits: object = None,
+        joint_friction: object = None,
         friction: object = 0.4,
         thickness: object = 0.0,
         edge_length: float | None = None,
@@ -126,6 +138,11 @@ class Robot:
             stiffness: Stiffness of the drives of "pd" joints [N m/rad or N/m], >= 0; one value,
                 name -> value, or [J].
             damping: Damping of these drives [N m s/rad or N s/m], >= 0; as `stiffness`.
+            effort_limits: Largest efforts of "pd" and "torque" joints [N m or N], > 0. None takes
+                those of the file, where 0 means no limit; False applies none. Otherwise one value,
+                name -> value or False (the rest as in the file), or [J].
+            velocity_limits: Largest speeds of these joints [rad/s or m/s], > 0, likewise.
+            joint_friction: Coulomb friction of these joints [N m or N], >= 0, likewise.
             friction: Friction coefficient of the surfaces of links [-], >= 0; one value, or link ->
                 value.
             thickness: Full thickness of these surfaces [m], >= 0; one value, or link -> value.
@@ -139,10 +156,6 @@ class Robot:
             InvalidInput: If the file or an argument is not accepted; see docs/robots.md.
             TypeError: If an argument has a wrong type.
             OSError: If the file cannot be read.
-
-        Warns:
-            IgnoredLimitsWarning: If the file has effort or velocity limits, or dry joint friction,
-                which are ignored.
         """
         file = as_path("Robot.load: `path`", path)
         check_choice("Robot.load: `base`", base, BASES)
@@ -156,15 +169,18 @@ class Robot:
         mechanism = make_mechanism(file, description, base, modes)
         root = file.parent if mesh_root is None else as_path("Robot.load: `mesh_root`", mesh_root)
         surfaces = [link_surface(link, file, root, edge_length) for link in description.links]
-        _warn_of(file, description.unapplied)
         return cls(
             mechanism,
             surfaces,
             np.array([joint.viscosity for joint in moving]),
+            joint_bounds(description.joints),
             pose=pose,
             joint_positions=joint_positions,
             stiffness=stiffness,
             damping=damping,
+            effort_limits=effort_limits,
+            velocity_limits=velocity_limits,
+            joint_friction=joint_friction,
             friction=friction,
             thickness=thickness,
             ignore_contact=ignore_contact,
@@ -186,8 +202,9 @@ class Robot:
         """Take a chain of pytorch-kinematics, and what it does not carry.
 
         A chain has frames, joints and their limits. Of a file it drops masses, collision shapes,
-        the damping of joints and which of them mimic others: where there is a file, `load` keeps
-        them. Frames become links by their names; offsets in single precision are exact to 1e-7.
+        the damping and friction of joints and which of them mimic others: where there is a file,
+        `load` keeps them. Frames become links by their names; offsets in single precision are
+        exact to 1e-7.
 
         >>> chain = pk.build_chain_from_urdf(Path("arm.urdf").read_bytes())
         >>> hand = dc.RigidBody.box(0.1)
@@ -205,16 +222,14 @@ class Robot:
             limits: Name of a joint -> lower and upper limit [rad or m], in place of the chain's.
             base: "fixed", "kinematic" or "floating", as in `load`.
             actuation: As in `load`.
-            **options: `pose`, `joint_positions`, `stiffness`, `damping`, `friction`, `thickness`,
-                `ignore_contact` and `name`, as in `load`.
+            **options: `pose`, `joint_positions`, `stiffness`, `damping`, `effort_limits`,
+                `velocity_limits`, `joint_friction`, `friction`, `thickness`, `ignore_contact` and
+                `name`, as in `load`.
 
         Raises:
             InvalidInput: If an argument is not accepted, or a link that is moved by forces has no
                 mass.
             TypeError: If something has a wrong type.
-
-        Warns:
-            IgnoredLimitsWarning: If the chain limits efforts or velocities: they are not applied.
         """
         label = "Robot.from_chain"
         check_choice(f"{label}: `base`", base, BASES)
@@ -222,19 +237,24 @@ class Robot:
         moving = [joint.name for joint in description.joints if joint.moves]
         mechanism = make_mechanism(label, description, base, _modes(label, actuation, moving))
         links = [link.name for link in description.links]
-        _warn_of(label, description.unapplied)
-        return cls(mechanism, link_surfaces(links, surfaces), np.zeros(len(moving)), **options)
+        bounds = joint_bounds(description.joints)
+        viscosity = np.zeros(len(moving))
+        return cls(mechanism, link_surfaces(links, surfaces), viscosity, bounds, **options)
 
     def __init__(
         self,
         mechanism: Mechanism,
         surfaces: Sequence[Surface | None],
         viscosity: FloatArray,
+        bounds: JointBounds,
         *,
         pose: object = None,
         joint_positions: object = None,
         stiffness: object = None,
         damping: object = None,
+        effort_limits: object = None,
+        velocity_limits: object = None,
+        joint_friction: object = None,
         friction: object = 0.4,
         thickness: object = 0.0,
         ignore_contact: Iterable[Sequence[str]] = (),
@@ -250,6 +270,10 @@ class Robot:
         driven = np.array([mode == "pd" for mode in mechanism.actuation], dtype=bool)
         self.stiffness = frozen(driven * _named("stiffness", stiffness, joints, 0.0, NON_NEGATIVE))
         self.damping = frozen(driven * _named("damping", damping, joints, 0.0, NON_NEGATIVE))
+        efforts, speeds, friction_there = bounds
+        self.effort_limits = _bounds("effort_limits", effort_limits, joints, efforts)
+        self.velocity_limits = _bounds("velocity_limits", velocity_limits, joints, speeds)
+        self.joint_friction = _bounds("joint_friction", joint_friction, joints, friction_there)
         self.friction = _named("friction", friction, links, 0.4, NON_NEGATIVE)
         self.thickness = _named("thickness", thickness, links, 0.0, NON_NEGATIVE)
         self.ignore_contact = check_pairs("Robot: `ignore_contact`", ignore_contact, links)
@@ -347,9 +371,8 @@ def _named(
     instead = f"differentiate with respect to {_DIFFERENTIABLE[field]}"
     if isinstance(given, Mapping):
         values = np.full(len(names), default)
+        _check_known(field, given, names)
         for key, value in given.items():
-            if key not in names:
-                raise InvalidInput(f"{label} has the names {texts(names)}; got {key!r}")
             number = float_array(f"{label}[{key!r}]", value, instead=instead)
             check_shape(f"{label}[{key!r}]", number.shape, [()])
             values[names.index(key)] = number
@@ -359,6 +382,35 @@ def _named(
         values = np.array(np.broadcast_to(values, len(names)))
     check_range(label, values, accepted)
     return frozen(values)
+
+
+def _bounds(field: str, given: object, names: Sequence[str], of_file: FloatArray) -> FloatArray:
+    """One value for each joint, from those of its file unless something else is given."""
+    none, accepted = (0.0, NON_NEGATIVE) if field == "joint_friction" else (np.inf, POSITIVE)
+    if given is None:
+        return frozen(np.array(of_file))
+    if given is False:
+        return frozen(np.full(len(names), none))
+    if given is True:
+        raise InvalidInput(
+            f"Robot: `{field}` must be False (not applied), numbers, or None (as in the file), got "
+            "True"
+        )
+    if not isinstance(given, Mapping):
+        return _named(field, given, names, none, accepted)
+    off = {name: value for name, value in given.items() if value is False}
+    on = {name: value for name, value in given.items() if name not in off}
+    _check_known(field, off, names)
+    values = np.array(_named(field, on, names, 1.0, accepted))
+    listed = np.array([name in on for name in names], dtype=bool)
+    unlisted = np.where([name in off for name in names], none, of_file)
+    return frozen(np.where(listed, values, unlisted))
+
+
+def _check_known(field: str, given: Iterable[object], names: Sequence[str]) -> None:
+    for key in given:
+        if key not in names:
+            raise InvalidInput(f"Robot: `{field}` has the names {texts(names)}; got {key!r}")
 
 
 def _modes(owner: str, given: object, names: Sequence[str]) -> list[str]:
@@ -382,12 +434,6 @@ def _modes(owner: str, given: object, names: Sequence[str]) -> list[str]:
         check_choice(f"{label} of {name!r}", mode, ACTUATIONS)
         for name, mode in zip(names, modes, strict=True)
     ]
-
-
-def _warn_of(source: object, unapplied: Sequence[str]) -> None:
-    if unapplied:
-        text = f"{source}: {' and '.join(unapplied)} are read but not applied"
-        warnings.warn(text, IgnoredLimitsWarning, stacklevel=3)
 
 
 def _check_limits(mechanism: Mechanism, positions: FloatArray) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from diffcloth_torch.geometry.mass_properties import check_inertia
 from diffcloth_torch.model.mechanism import FORCED, Mechanism
 from diffcloth_torch.model.urdf import Joint, RobotDescription
 
-__all__ = ["make_mechanism"]
+__all__ = ["JointBounds", "joint_bounds", "make_mechanism"]
 
 
 def make_mechanism(
@@ -132,6 +133,47 @@ def _limits(
                 f"{lower[j]:g} for both; make its type 'fixed', or prescribe its position"
             )
     return lower, upper
+
+
+class JointBounds(NamedTuple):
+    """What the J joints of a robot can do and what resists them, those that mimic them included.
+
+    Attributes:
+        efforts: Largest efforts of their drives [N m or N], infinity without a limit; shape [J].
+        velocities: Largest speeds [rad/s or m/s], likewise.
+        friction: Coulomb friction [N m or N], shape [J].
+    """
+
+    efforts: FloatArray
+    velocities: FloatArray
+    friction: FloatArray
+
+
+def joint_bounds(joints: Sequence[Joint]) -> JointBounds:
+    """Bounds of the joints that move and do not mimic.
+
+    A joint that mimics moves m times as fast as the one that it follows, so by virtual work its
+    efforts count |m| times there, and its limit of speed is 1/|m| of itself. Its own drive adds to
+    that of a joint with a limit; without a limit it has no drive of its own.
+    """
+    by_name = {joint.name: joint for joint in joints}
+    leaders = [joint for joint in joints if joint.moves]
+    dof = {joint.name: j for j, joint in enumerate(leaders)}
+    efforts = _stack([joint.effort for joint in leaders])
+    velocities = _stack([joint.velocity for joint in leaders])
+    friction = _stack([joint.friction for joint in leaders])
+    for joint in joints:
+        if joint.mimic is None:
+            continue
+        j, multiplier, _ = _follow(joint, by_name, dof)
+        size = abs(multiplier)
+        if size == 0.0:
+            continue
+        if np.isfinite(joint.effort):
+            efforts[j] += size * joint.effort
+        velocities[j] = min(velocities[j], joint.velocity / size)
+        friction[j] += size * joint.friction
+    return JointBounds(efforts, velocities, friction)
 
 
 def _check_masses(file: Path | str, mechanism: Mechanism) -> None:

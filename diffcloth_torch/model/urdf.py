@@ -9,7 +9,7 @@ checked to be a tree of links.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,6 +86,9 @@ class Joint:
         lower: Lower limit [rad or m], -infinity without one.
         upper: Upper limit [rad or m], infinity without one.
         viscosity: Its damping [N m s/rad or N s/m].
+        effort: Largest effort of its drive [N m or N], infinity without a limit.
+        velocity: Largest speed [rad/s or m/s], infinity without a limit.
+        friction: Its Coulomb friction [N m or N].
         mimic: Name of the joint whose value it follows, a multiplier and an offset; or None.
     """
 
@@ -98,6 +101,9 @@ class Joint:
     lower: float
     upper: float
     viscosity: float
+    effort: float
+    velocity: float
+    friction: float
     mimic: tuple[str, float, float] | None
 
     @property
@@ -114,14 +120,11 @@ class RobotDescription:
         name: Name of the robot.
         links: Its links in the order of the file.
         joints: Its joints in the order of the file.
-        unapplied: Other contents of the file that no simulation of ours applies, such as effort
-            limits; in words.
     """
 
     name: str
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
-    unapplied: tuple[str, ...]
 
 
 def read_urdf(path: Path) -> RobotDescription:
@@ -163,7 +166,7 @@ def _description(file: str, robot: Any) -> RobotDescription:
     joints = tuple(_joint(file, joint) for joint in robot.joints)
     _check_tree(file, [link.name for link in links], joints)
     _check_mimics(file, joints)
-    return RobotDescription(robot.name, links, joints, tuple(_unapplied(robot)))
+    return RobotDescription(robot.name, links, joints)
 
 
 def _check_names(file: str, kind: str, names: Sequence[str]) -> None:
@@ -266,6 +269,10 @@ def _joint(file: str, joint: Any) -> Joint:
         lower=lower,
         upper=upper,
         viscosity=joint.dynamics.damping if joint.dynamics else 0.0,
+        # Files write 0 where they have no limit.
+        effort=(joint.limit and joint.limit.effort) or math.inf,
+        velocity=(joint.limit and joint.limit.velocity) or math.inf,
+        friction=joint.dynamics.friction if joint.dynamics else 0.0,
         mimic=mimic and (mimic.joint, mimic.multiplier, mimic.offset),
     )
 
@@ -322,14 +329,3 @@ def _check_mimics(file: str, joints: Sequence[Joint]) -> None:
                 )
             followed.add(name)
             leader = by_name[name]
-
-
-def _unapplied(robot: Any) -> Iterator[str]:
-    moving = [joint for joint in robot.joints if joint.type != "fixed"]
-    limits = [joint.limit for joint in moving if joint.limit]
-    if any(limit.effort for limit in limits):
-        yield "effort limits"
-    if any(limit.velocity for limit in limits):
-        yield "velocity limits"
-    if any(joint.dynamics and joint.dynamics.friction for joint in moving):
-        yield "Coulomb friction of joints"

@@ -85,7 +85,9 @@ _JOINT = _Element(
         "axis": _Child(_Element({"xyz": _Attribute(3, "1 0 0")}, {})),
         "limit": _Child(
             _Element(
-                dict.fromkeys(("lower", "upper", "effort", "velocity"), _Attribute(1, "0")), {}
+                dict.fromkeys(("lower", "upper"), _Attribute(1, "0"))
+                | dict.fromkeys(("effort", "velocity"), _Attribute(1, "0", NON_NEGATIVE)),
+                {},
             )
         ),
         "dynamics": _Child(

@@ -38,7 +38,8 @@ class Control:
         joint_velocities: Targets of velocity and pd joints [rad/s or m/s], shape [J], or likewise
             by name; zero by default.
         joint_efforts: Efforts of torque joints, and efforts added to those of pd drives [N m or N],
-            shape [J], or likewise by name; zero by default.
+            shape [J], or likewise by name; zero by default. What is beyond the limits of a joint
+            does not act.
         base_poses: Frames of the robots' root links, shape [R, 7], or robot -> pose [7]; the row of
             a robot whose base is not kinematic must equal that of the state.
         base_wrenches: Force at the center of mass of each floating root link, then torque, in world
@@ -133,6 +134,14 @@ class Parameters:
             [F]; > 0 where `bending` is.
         bending_twill: Bending stiffness of woven cloth at 45 degrees [N m], >= 0; shape [], [C] or
             [F]; at least (bending + bending_weft + 2 poisson sqrt(bending bending_weft)) / 4.
+        joint_effort_limits: Largest efforts of pd drives, and of what is applied to torque joints
+            [N m or N], > 0, shape [J]; 1e30 where there is no limit.
+        joint_velocity_limits: Largest speeds of pd and torque joints [rad/s or m/s], > 0, shape
+            [J], likewise.
+        joint_friction: Coulomb friction of these joints [N m or N], >= 0, shape [J].
+        joint_slip_rates: Speeds at which sticking joints turn into sliding ones [rad/s or m/s],
+            > 0, shape [J]; by default those at which the joint moves what it carries by
+            `ContactOptions.slip_velocity`, at the radius of gyration about its axis.
     """
 
     stretch: Tensor | None = None
@@ -166,6 +175,10 @@ class Parameters:
     stretch_shear: Tensor | None = None
     bending_weft: Tensor | None = None
     bending_twill: Tensor | None = None
+    joint_effort_limits: Tensor | None = None
+    joint_velocity_limits: Tensor | None = None
+    joint_friction: Tensor | None = None
+    joint_slip_rates: Tensor | None = None
     # Fields that a simulator made without a batch axis: their [C] or [F] is never read as [B].
     _unbatched: tuple[str, ...] = field(default=(), repr=False)
 

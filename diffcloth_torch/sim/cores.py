@@ -11,6 +11,7 @@ import torch
 
 from diffcloth_torch import _core
 from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.dynamics.limits import LimitStiffness
 from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Fields
@@ -61,7 +62,7 @@ class CoreOptions(NamedTuple):
 def make_core(
     assembly: Assembly,
     options: CoreOptions,
-    limit_stiffness: FloatArray | None = None,
+    limit_stiffness: LimitStiffness | None = None,
     *,
     all_prescribed: bool = False,
 ) -> _core.Simulator:
@@ -70,7 +71,7 @@ def make_core(
     Args:
         assembly: Arrays of the scene.
         options: Options of the core.
-        limit_stiffness: Stiffness of the barriers at the limits of coordinates, shape [n]; None if
+        limit_stiffness: Stiffness of the barriers at the limits of coordinates; None if
             all bodies move on prescribed poses.
         all_prescribed: Whether the motion of all coordinates is prescribed.
     """

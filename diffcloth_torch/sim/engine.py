@@ -104,7 +104,11 @@ class Engine:
         return self.layout.assembly
 
     def step(
-        self, given: Given, check: Check, origins: Tensor | None = None
+        self,
+        given: Given,
+        check: Check,
+        origins: Tensor | None = None,
+        joint_origins: Tensor | None = None,
     ) -> tuple[Fields, Diagnostics]:
         """Take a step.
 
@@ -113,13 +117,14 @@ class Engine:
             check: Checks the diagnostics of each solve.
             origins: Positions of all vertices, from which friction counts motion, [B, N + V, 3] m;
                 None takes the start of the step, or what a staggered coupling chooses.
+            joint_origins: The same for the values of joints and their friction, [B, J].
 
         Returns:
             Fields of the next state except the time, [B, ...], and the diagnostics. Backward
             refuses gradients of environments that failed.
         """
         if self._staggered is None:
-            outcome, after = self._step_together(given, check, origins)
+            outcome, after = self._step_together(given, check, origins, joint_origins)
         else:
             outcome, after = self._step_in_turn(given, check)
         fields = {
@@ -136,10 +141,14 @@ class Engine:
         return refuse_gradients(fields, failures_of(outcome.diagnostics)), outcome.diagnostics
 
     def _step_together(
-        self, given: Given, check: Check, origins: Tensor | None
+        self,
+        given: Given,
+        check: Check,
+        origins: Tensor | None,
+        joint_origins: Tensor | None,
     ) -> tuple[Outcome, Fields]:
         """Solve for everything at once; the outcome, and fields of bodies and robots after it."""
-        prediction = self.predict(given)
+        prediction = self.predict(given, joint_origins)
         inputs = self.core_inputs(given, prediction)
         if origins is not None:
             inputs["friction_origins"] = origins
@@ -198,9 +207,11 @@ class Engine:
                 return self._staggered.path(given, self.core_inputs(given, None), check)
             return self.core.path(arrays_of(self.core_inputs(given, self.predict(given))))
 
-    def predict(self, given: Given) -> Prediction | None:
+    def predict(self, given: Given, joint_origins: Tensor | None = None) -> Prediction | None:
         """Predict bodies and robots without contact; None if all are bodies on prescribed poses."""
-        return None if self.dynamics is None else self.dynamics.predict(*given)
+        if self.dynamics is None:
+            return None
+        return self.dynamics.predict(*given, joint_origins=joint_origins)
 
     def core_inputs(self, given: Given, prediction: Prediction | None) -> Fields:
         """Inputs of the core, including the prediction of bodies and robots."""

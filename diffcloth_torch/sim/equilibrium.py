@@ -27,6 +27,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch.checks import LARGEST
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
@@ -121,23 +122,25 @@ class Equilibria:
         self._refuse(given)
         given = _resting(given)
         origins = self._engine(_LAST).surfaces.vertices(given.state)
+        joints = given.state.get("joint_positions")
         iterations = torch.zeros(len(given.state["positions"]), dtype=torch.long)
 
-        def step(length: float, at: Given, anchor: Tensor) -> _Found:
-            found = _Found(*self._engine(length).step(_slower(at, length), check, anchor))
+        def step(length: float, at: Given, anchor: Tensor, turned: Tensor | None) -> _Found:
+            given = _slower(at, length)
+            found = _Found(*self._engine(length).step(given, check, anchor, turned))
             iterations.add_(torch.tensor(found.diagnostics["iterations"]))
             return found
 
         with torch.no_grad(), outside_transforms():
             here = Given(*({n: plain(t) for n, t in part.items()} for part in given))
-            anchor = plain(origins)
+            anchor = plain(origins), None if joints is None else plain(joints)
             for length in _GROWTH:
-                here = self._from(here, step(length, here, anchor))
+                here = self._from(here, step(length, here, *anchor))
             if self._settles:
-                here = self._descend(here, lambda at: step(_GROWTH[-1], at, anchor))
-            here = self._probe(here, lambda at: step(_PROBED, at, anchor))
-            here, unsettled = self._settle(here, lambda at: step(_LAST, at, anchor))
-        fields, diagnostics = step(_LAST, self._begun(given, here.state), origins)
+                here = self._descend(here, lambda at: step(_GROWTH[-1], at, *anchor))
+            here = self._probe(here, lambda at: step(_PROBED, at, *anchor))
+            here, unsettled = self._settle(here, lambda at: step(_LAST, at, *anchor))
+        fields, diagnostics = step(_LAST, self._begun(given, here.state), origins, joints)
         if unsettled:
             alternate = dict.fromkeys(unsettled, "friction and normal forces alternate")
             mark(diagnostics, alternate, UNCONVERGED)
@@ -306,16 +309,20 @@ def _kinds(robot: Mechanism) -> list[str]:
 
 
 def _resting(given: Given) -> Given:
-    """The same inputs at rest, without damping and drag, which do not act there."""
+    """The same inputs at rest, without damping, drag and limits of speeds: none acts there."""
     state, parameters = given.state, given.parameters
     still = {n: torch.zeros_like(t) for n, t in state.items() if n.endswith("velocities")}
     resisting = ("damping", "normal_drag", "tangential_drag")
     none = {n: 0.0 * t for n, t in parameters.items() if n in resisting}
+    if "joint_velocity_limits" in parameters:
+        none["joint_velocity_limits"] = torch.full_like(
+            parameters["joint_velocity_limits"], LARGEST
+        )
     return given._replace(state=state | still, parameters=parameters | none)
 
 
 def _slower(given: Given, length: float) -> Given:
-    """The same inputs with a slip velocity at which a longer step slips equally far."""
-    parameters = given.parameters
-    slip = {n: t / length for n, t in parameters.items() if n == "slip_velocity"}
+    """The same inputs with slip velocities at which a longer step slips equally far."""
+    parameters, slipping = given.parameters, ("slip_velocity", "joint_slip_rates")
+    slip = {n: t / length for n, t in parameters.items() if n in slipping}
     return given._replace(parameters=parameters | slip)

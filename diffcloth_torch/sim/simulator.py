@@ -40,6 +40,7 @@ from diffcloth_torch.sim.start import (
     check_time_step,
     check_tolerance,
     choose_barrier,
+    choose_slip_rates,
     initial_tensors,
 )
 from diffcloth_torch.sim.state import State
@@ -154,6 +155,7 @@ class Simulator(Observables):
         )
         nonadjacent = self._core.smallest_nonadjacent_distance()
         self._defaults = scene_parameters(scene, self._assembly, has_contact(scene, contact))
+        self._defaults |= choose_slip_rates(self._assembly, contact)
         fields = default_fields(self._defaults)
         self._border = Border(self._layout, fields, nonadjacent, self_contact=contact.self_contact)
         start, _ = self._border.enter(self.initial_state(), None, None)

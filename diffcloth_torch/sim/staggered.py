@@ -12,6 +12,7 @@ from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.dynamics import Dynamics, Prediction
+from diffcloth_torch.dynamics.limits import LimitStiffness
 from diffcloth_torch.dynamics.staggering import cloth_to_rigid, rigid_to_cloth
 from diffcloth_torch.errors import InfeasibleMotion
 from diffcloth_torch.model.quantities import Fields
@@ -85,7 +86,7 @@ class Staggered:
         surfaces: Surfaces,
         dynamics: Dynamics,
         options: CoreOptions,
-        limit_stiffness: FloatArray,
+        limit_stiffness: LimitStiffness,
     ) -> None:
         """Make the cores of the solves.
 
@@ -95,7 +96,7 @@ class Staggered:
             surfaces: The surfaces that a state places.
             dynamics: Dynamics of the bodies and robots.
             options: Options of the cores.
-            limit_stiffness: Stiffness of the barriers at the limits of coordinates, shape [n].
+            limit_stiffness: Stiffness of the barriers at the limits of coordinates.
         """
         self._coupling, self.layout, self.dynamics = coupling, layout, dynamics
         self._throw, self._surfaces = options.solver.throw, surfaces

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch.checks import POSITIVE, check_number
+from diffcloth_torch.dynamics.limits import slip_rates
 from diffcloth_torch.errors import IntersectingState, InvalidInput
 from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.defaults import choose_barrier_distance
@@ -28,6 +29,7 @@ __all__ = [
     "check_time_step",
     "check_tolerance",
     "choose_barrier",
+    "choose_slip_rates",
     "initial_tensors",
 ]
 
@@ -120,6 +122,13 @@ def choose_barrier(
     chosen["barrier_stiffness"] = _number(stiffness)
     border.defaults |= default_fields(chosen)
     return chosen
+
+
+def choose_slip_rates(assembly: Assembly, contact: ContactOptions) -> dict[str, Tensor]:
+    """Take the slip rates of joints, where forces move any, from the slip velocity of contacts."""
+    if not assembly.forced.any():
+        return {}
+    return {"joint_slip_rates": _number(slip_rates(assembly, contact.slip_velocity))}
 
 
 def check_tolerance(tolerance: float, distance: float, dt: float) -> None:

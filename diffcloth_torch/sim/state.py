@@ -55,9 +55,10 @@ class State:
         joint_velocities: Velocities of the joints [rad/s or m/s], shape [J].
         joint_targets: Positions to which pd drives pull until a control changes them [rad or m],
             shape [J].
-        joint_efforts: Efforts of the drives during the step that led here [N m or N], shape [J].
-            For a prescribed joint, the effort that its motion required against inertia, weights and
-            contact, without the joint's viscosity and the armature of its drive.
+        joint_efforts: Efforts of the drives during the step that led here [N m or N], within their
+            limits and without the friction of the joints, shape [J]. For a prescribed joint, the
+            effort that its motion required against inertia, weights and contact, without the
+            joint's viscosity and the armature of its drive.
         base_poses: Frame of each robot's root link, as in `body_poses`, shape [R, 7].
         base_velocities: Velocity of the root link's center of mass, then its angular velocity, in
             world axes [m/s, rad/s], shape [R, 6].

@@ -27,6 +27,7 @@ _STORES_NOTHING = frozenset(
         "coordinate_ends",
         "coordinate_targets",
         "coordinate_metric",
+        "joint_terms",
         "friction_origins",
         "normal_drag",
         "tangential_drag",

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from diffcloth_torch.checks import FloatArray
-from diffcloth_torch.dynamics.limits import ZONE
+from diffcloth_torch.dynamics.limits import ZONE, LimitStiffness
 from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.mechanism import JOINT_KINDS
 
@@ -17,13 +16,13 @@ _ROOT = 6  # coordinates of a floating root
 
 
 def tree_arguments(
-    assembly: Assembly, limit_stiffness: FloatArray, *, all_prescribed: bool = False
+    assembly: Assembly, limit_stiffness: LimitStiffness, *, all_prescribed: bool = False
 ) -> dict[str, Any]:
     """Make the arguments of the core that describe all trees, bodies first.
 
     Args:
         assembly: Arrays of the scene.
-        limit_stiffness: Stiffness of the barriers at the limits of the n coordinates, shape [n].
+        limit_stiffness: Stiffness of the barriers at the limits of coordinates.
         all_prescribed: Whether the values of all coordinates at the end of a step are given.
     """
     links: dict[str, list[Any]] = {
@@ -79,8 +78,10 @@ def tree_arguments(
         "coordinate_held": _indices([all_prescribed and not given for given in prescribed]),
         "coordinate_lower": np.array(lower, dtype=np.float64),
         "coordinate_upper": np.array(upper, dtype=np.float64),
-        "limit_stiffness": limit_stiffness,
+        "limit_stiffness": limit_stiffness.positions,
         "limit_zone": ZONE,
+        "velocity_stiffness": limit_stiffness.velocities,
+        "velocity_force": limit_stiffness.forces,
     }
 
 

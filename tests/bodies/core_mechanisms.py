@@ -80,6 +80,8 @@ def trees(
         "coordinate_upper": np.array([np.inf] * root + list(upper)),
         "limit_stiffness": np.array([0.0] * root + list(limit_stiffness)),
         "limit_zone": 0.01,
+        "velocity_stiffness": np.array([0.0] * root + [40.0] * len(prescribed)),
+        "velocity_force": np.array([0.0] * root + [0.2] * len(prescribed)),
         "surface_link": np.arange(links, dtype=np.int32),
         "ignored_pairs": np.array(
             [(1 + a, 1 + b) for b in range(links) for a in range(b)], np.int32

@@ -20,6 +20,13 @@ WEIGHT = 0.46 * 9.81  # of the gripper [N]
 # Of the gripper: its fingers point along -x and close along z.
 _FACING = [0.5, -0.5, -0.5, 0.5]
 
+# What the fingers would exceed in each scene [m/s].
+_FASTEST = {
+    "monolithic": {"fixed": 0.012, "floating": 0.004, "kinematic": 0.01},
+    "rigid_to_cloth": {"fixed": 0.012, "floating": 0.004, "kinematic": 0.02},
+    "cloth_to_rigid": {"fixed": 0.004, "floating": 0.0025, "kinematic": 0.03},
+}
+
 # Staggered couplings need bodies that are heavy against the cloth; less gravity keeps their weight.
 _HEAVIER = {"monolithic": 1.0, "rigid_to_cloth": 10.0, "cloth_to_rigid": 10.0}
 
@@ -65,14 +72,22 @@ def simulator(coupling, base, **options):
 
 
 def parameters(sim):
-    """Those of the scene; fingers are as much heavier as the box is."""
+    """Those of the scene; fingers are as much heavier as the box is.
+
+    They have friction, drives at the edge of their limits, and are as fast as they may be.
+    """
     given = sim.parameters()
     heavier = _HEAVIER[sim.coupling]
+    fastest = _FASTEST[sim.coupling][sim.scene.robots[0].mechanism.base]
     return given.replace(
         link_mass=heavier * given.link_mass,
         link_inertia=heavier * given.link_inertia,
         joint_viscosity=given.joint_viscosity + 1.0,
         joint_armature=given.joint_armature + 0.02,
+        joint_effort_limits=torch.tensor([1.5, 1.05], dtype=F64),
+        joint_velocity_limits=torch.full((2,), fastest, dtype=F64),
+        joint_friction=torch.tensor([0.1, 0.08], dtype=F64),
+        joint_slip_rates=torch.tensor([0.006, 0.02], dtype=F64),
     )
 
 

@@ -42,6 +42,25 @@ def body_in_contact():
         q = result["coordinates"][0]
 
 
+def with_bounds(arrays, scene, name):
+    """The last step again, with a term of the hinge that is active in one of its parts."""
+    n = arrays["coordinates"].shape[1]
+    hinge, stiffness = n - 2, 40.0
+    slip = float(scene.forward(arrays)["coordinates"][0, hinge] - arrays["coordinates"][0, hinge])
+    metric = arrays["coordinate_metric"].reshape(1, n, n).copy()
+    metric[0, hinge, hinge] += stiffness  # the drive's
+    speed = abs(slip) / DT
+    terms = np.tile([0.0, 0.0, 0.0, 1e30, 1e30, 0.0, 1.0], (1, n, 1))
+    terms[0, hinge] = {
+        "limit": [0.0, 1.3, stiffness, 1.0, 1e30, 0.0, 1.0],
+        "slow": [0.0, 0.0, stiffness, 1e30, 0.9 * speed, 0.0, 1.0],
+        "creep": [0.0, 0.0, stiffness, 1e30, 1e30, 2.0, 2.0 * speed],
+        "slide": [0.0, -0.95, stiffness, 1.0, 1e30, 0.2, 0.1 * speed],
+    }[name]
+    terms[0, hinge, 0] = arrays["coordinates"][0, hinge] - 1e-3 * slip
+    return arrays | {"coordinate_metric": metric.reshape(1, -1), "joint_terms": terms}
+
+
 def chain_in_contact(*, free, light=False):
     """A chain that comes down on the cloth, its hinge beyond its limit, its slide prescribed.
 
@@ -101,9 +120,15 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=list(CASES))
+BOUNDS = ["chain-limit", "light-slow", "floating-creep", "chain-slide"]
+
+
+@pytest.fixture(scope="module", params=[*CASES, *BOUNDS])
 def case(request):
-    scene, arrays = CASES[request.param]()
+    name, _, bound = request.param.partition("-")
+    scene, arrays = CASES[name]()
+    if bound:
+        arrays = with_bounds(arrays, scene, bound)
     rng = np.random.default_rng(2)
     # Friction sees everything come from elsewhere, as in a staggered coupling.
     start = scene.core.path({k: v[:1] for k, v in arrays.items()})[0]
@@ -134,6 +159,7 @@ STEPS = {
     "friction_origins": 1e-7,
     "coordinate_targets": 1e-7,
     "coordinate_metric": 1e-3,
+    "joint_terms": 1e-6,
 }
 
 
@@ -142,6 +168,8 @@ def test_gradients_agree_with_differences(case, name):
     scene, arrays, cotangents, gradients = case
     if name == "coordinate_ends" and not gradients[name].any():
         pytest.skip("nothing is prescribed in this tree")
+    if name == "joint_terms" and name not in arrays:
+        pytest.skip("no joint has a term")
     if name not in arrays:
         arrays = {**arrays, name: scene.simulator.parameters().rest_positions.numpy()[None]}
         gradients = scene.gradients(arrays, cotangents)
@@ -149,6 +177,10 @@ def test_gradients_agree_with_differences(case, name):
     direction = rng.standard_normal(arrays[name].shape)
     if name in ("friction", "thickness"):
         direction = abs(direction)
+    if name == "joint_terms":
+        direction *= arrays[name] < 1e20  # not where a limit is none
+        direction[..., [3, 4, 6]] *= 10.0
+        assert ((gradients[name] * direction) != 0.0).sum() >= 2
     if name == "coordinate_metric":
         n = int(direction.size**0.5)
         direction = direction.reshape(n, n)

@@ -12,10 +12,7 @@ from diffcloth_torch.robots import GRIPPER
 F64 = torch.float64
 pin = pytest.importorskip("pinocchio", reason="Pinocchio is in the extra `test`")
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore::diffcloth_torch.IgnoredLimitsWarning"),
-    pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning"),
-]
+pytestmark = pytest.mark.filterwarnings("ignore::diffcloth_torch.AddedMassWarning")
 
 ARM = """<robot name="arm">
 <link name="root"><inertial><origin xyz="0.03 0.05 0"/><mass value="0.9"/>

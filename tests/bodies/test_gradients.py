@@ -42,6 +42,10 @@ SCALES = {
         "joint_damping": 0.1,
         "joint_viscosity": 0.1,
         "joint_armature": 0.1,
+        "joint_effort_limits": 0.1,
+        "joint_velocity_limits": 0.1,
+        "joint_friction": 0.1,
+        "joint_slip_rates": 0.1,
     },
 }
 # What has no effect: the fingers slide, and forces on a base that does not float are refused.

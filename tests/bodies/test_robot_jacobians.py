@@ -4,7 +4,8 @@ import pytest
 import torch
 from bodies.coupled_scenes import COUPLINGS, control, in_contact, parameters
 
-STEP = 1e-5  # of differences
+# Of differences; fingers at the limit of their speed hardly feel their viscosity.
+STEPS = [1e-5] * 4 + [1e-3]
 
 
 @pytest.mark.parametrize("base", ["fixed", "floating"])
@@ -30,8 +31,9 @@ def test_both_modes_find_the_jacobian(coupling, base):
         column = forward[:, k]
         assert (reverse[:, k] - column).norm() <= 1e-9 * column.norm()
         with torch.no_grad():
-            change = end(theta + STEP * direction) - end(theta - STEP * direction)
-        assert (change / (2 * STEP) - column).norm() <= 2e-5 * column.norm()
+            step = STEPS[k] * direction
+            change = end(theta + step) - end(theta - step)
+        assert (change / (2 * STEPS[k]) - column).norm() <= 2e-5 * column.norm()
 
 
 def test_a_gradient_by_torch_func():

@@ -391,6 +391,7 @@ CONTROL_FIELDS = (
 PARAMETER_FIELDS = (
     *("gravity", "body_mass", "body_center", "body_inertia", "link_mass", "link_center"),
     *("link_inertia", "joint_stiffness", "joint_damping", "joint_viscosity", "joint_armature"),
+    *("joint_effort_limits", "joint_velocity_limits", "joint_friction", "joint_slip_rates"),
 )
 EVERY = [
     *(("state", name) for name in STATE_FIELDS),
@@ -425,6 +426,10 @@ def test_gradients_of_two_steps_are_those_of_differences(sim, record, name):
         joint_damping=parameters.joint_damping + 0.05,
         joint_viscosity=parameters.joint_viscosity + 0.02,
         joint_armature=parameters.joint_armature + 0.001,
+        joint_effort_limits=torch.tensor([1.0, 0.3, 0.05, 1.0, 1.0], dtype=F64),
+        joint_velocity_limits=torch.tensor([9.0, 9.0, 0.5, 9.0, 9.0], dtype=F64),
+        joint_friction=torch.tensor([0.0, 0.02, 0.01, 0.0, 0.0], dtype=F64),
+        joint_slip_rates=torch.tensor([0.1, 0.3, 0.4, 0.1, 0.1], dtype=F64),
     )
     records = {"state": start, "control": control, "parameters": parameters}
     weights = weights_of(start)
@@ -474,5 +479,7 @@ def allowed_directions(record, name, x):
         moments = x.diagonal(dim1=-2, dim2=-1)
         return (moments[..., :, None] * moments[..., None, :]).sqrt()
     return (
-        x.abs() if name.endswith(("mass", "stiffness", "damping", "viscosity")) else torch.ones(1)
+        x.abs()
+        if name.endswith(("mass", "stiffness", "damping", "viscosity", "limits", "friction"))
+        else torch.ones(1)
     )

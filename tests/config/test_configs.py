@@ -282,6 +282,8 @@ scene:
   robots:
     - {name: left, model: gripper, base: kinematic, pose: {position: [-1, 0, 0]}, stiffness: 100,
        damping: {left_finger_joint: 2}, joint_positions: 0.01, friction: {palm: 0.9},
+       effort_limits: 30, velocity_limits: {left_finger_joint: 0.5, right_finger_joint: false},
+       joint_friction: false,
        trajectory: [{time: 0.02, position: [-1, 0, 0.01]}],
        joint_trajectories: {left_finger_joint: [{time: 0.02, value: 0.03}]}}
     - {name: right, model: gripper, pose: {position: [2, 0, 0]},
@@ -305,6 +307,9 @@ def test_what_moves_by_forces_is_built(write):
     assert left.damping.tolist() == [2, 0]
     assert left.joint_positions.tolist() == [0.01, 0.01]
     assert left.friction.tolist() == [0.9, 0.4, 0.4]
+    assert left.effort_limits.tolist() == [30, 30]
+    assert left.velocity_limits.tolist() == [0.5, float("inf")]
+    assert left.joint_friction.tolist() == [0, 0]
     assert right.mechanism.actuation == ("velocity", "torque")
     assert scene.ignore_contact == (("ball", "left/palm"), ("sheet", "crate"))
     assert task.simulator.coupling == "rigid_to_cloth"
@@ -344,6 +349,9 @@ def test_bases_and_joints_follow_their_keyframes(write):
         ("scene.robots.left.actuation=servo", "`scene.robots.0..actuation` must be 'position'"),
         ("scene.robots.left.name=ball", "the name 'ball' must be given once"),
         ("scene.robots.left.stiffness={thumb: 1}", "has the names .*'thumb'"),
+        ("scene.robots.left.effort_limits={thumb: false}", "has the names .*'thumb'"),
+        ("scene.robots.left.velocity_limits=-1", "`velocity_limits` must be finite and > 0"),
+        ("scene.robots.left.joint_friction=true", r"joint_friction\S* must be"),
         (
             "scene.robots.left.joint_trajectories={thumb: [{time: 1, value: 1}]}",
             "may name its joints 'left_finger_joint', 'right_finger_joint'; got 'thumb'",

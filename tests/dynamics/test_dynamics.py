@@ -18,6 +18,7 @@ from diffcloth_torch.geometry.rotation import quaternion_exp, rotate
 from diffcloth_torch.model.assembly import assemble
 from diffcloth_torch.model.defaults import scene_parameters
 from diffcloth_torch.robots import GRIPPER
+from diffcloth_torch.sim.start import choose_slip_rates
 
 H = 0.01
 
@@ -80,6 +81,7 @@ def fields(assembly, moved, seed=0, batch=1):
 
 def parameters_of(scene, assembly):
     defaults = scene_parameters(scene, assembly, True)
+    defaults |= choose_slip_rates(assembly, dc.ContactOptions())
     return {name: value[None] for name, value in defaults.items() if value.dim()}
 
 
@@ -297,7 +299,7 @@ def test_a_joint_rests_on_its_limit_near_its_beginning():
     """Weight against the slope of the barrier k b(u), b = -(u - w)^2 log(u / w)."""
     scene = make_scene(actuation="torque", base="fixed")
     assembly = assemble(scene)
-    k = limit_stiffness(assembly, H, scene.gravity)
+    k = limit_stiffness(assembly, H, scene.gravity).positions
     assert k.shape == (14,)
     assert not k[:12].any()
     mechanism = assembly.mechanisms[-1]
@@ -316,14 +318,14 @@ def test_a_limit_without_weight_is_as_stiff_as_its_joint_is_heavy(dt):
     assembly = assemble(make_scene(actuation="torque", base="fixed"))
     (hand,) = assembly.mechanisms[-1:]
     heavy = replace(assembly, joint_armature=np.array([0.02, 0.05]))
-    k = limit_stiffness(heavy, dt, np.zeros(3))
+    k = limit_stiffness(heavy, dt, np.zeros(3)).positions
     fingers = [hand.mass[hand.dof == j].sum() for j in range(2)]  # they slide
     np.testing.assert_allclose(k[12:], (fingers + heavy.joint_armature) / dt**2, rtol=1e-12)
 
 
 def test_joints_without_a_limit_to_keep_have_no_barrier():
     assembly = assemble(make_scene(actuation="position", base="fixed"))
-    assert not limit_stiffness(assembly, H, np.zeros(3)).any()
+    assert not np.concatenate(limit_stiffness(assembly, H, np.zeros(3))).any()
 
 
 # Couplings

@@ -215,6 +215,8 @@ def _gripper(
         "friction": maybe(rng, 0.8, rng.uniform(0.1, 1.2)),
         "name": "hand",
     }
+    bounds = _bounds(*rng.spawn(1))  # other draws stay what they are
+    options |= bounds
     hand = dc.Robot.load(dc.robots.GRIPPER, pose=[0.0, 0.0, 0.0, *q], **options)
     frames = hand.forward_kinematics(torch.from_numpy(start)).values()
     vertices = np.concatenate(
@@ -225,7 +227,7 @@ def _gripper(
     )
     shift = 0.1 * d["size"] * rng.uniform(-1, 1, 2)
     at = np.array([*shift, tower.place(rng, vertices, side)])
-    d["robot"] = {"base": base, "actuation": modes, "holds": hold}
+    d["robot"] = {"base": base, "actuation": modes, "holds": hold, **bounds}
     hand = dc.Robot.load(dc.robots.GRIPPER, pose=[*at, *q], **options)
     held = []
     if hold:
@@ -250,6 +252,17 @@ def _gripper(
         base_wrench=wrench,
     )
     return [hand], drives, held
+
+
+def _bounds(rng: np.random.Generator) -> dict[str, Any]:
+    """What the fingers can do and what resists them, now and then."""
+    ends = {
+        "effort_limits": (0.1, 30.0),
+        "velocity_limits": (0.02, 2.0),
+        "joint_friction": (0.01, 5.0),
+    }
+    drawn = {name: log_uniform(rng, *range_of) for name, range_of in ends.items()}
+    return {name: value if rng.random() < 0.5 else False for name, value in drawn.items()}
 
 
 def _velocity(rng: np.random.Generator, d: dict[str, Any], body: dc.RigidBody) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 import math
 import os
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -56,13 +55,6 @@ def save(folder, text, name="robot.urdf"):
 
 def load(folder, *parts, **keywords):
     return dc.Robot.load(save(folder, robot(*parts)), **keywords)
-
-
-def quietly(path, **keywords):
-    """Load a file of others, which has effort limits."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", dc.IgnoredLimitsWarning)
-        return dc.Robot.load(path, **keywords)
 
 
 def two_links(content="", kind="revolute", **keywords):

@@ -16,7 +16,6 @@ from robot_files import (
     load,
     panda,
     pinocchio_frames,
-    quietly,
     random_robot,
     save,
     two_links,
@@ -95,20 +94,20 @@ def test_the_core_places_the_panda_as_forward_kinematics_does():
     path, root = panda()
     start = {"panda_joint4": -1.0}
     options = {"base": "kinematic", "actuation": "position", "joint_positions": start}
-    compare_with_core(quietly(path, mesh_root=root, name="panda", **options), seed=0)
+    compare_with_core(dc.Robot.load(path, mesh_root=root, name="panda", **options), seed=0)
 
 
 @pytest.mark.parametrize("name", ["joint_limit_robot", "prismatic_robot", "simple_y_arm"])
 def test_frames_of_public_robots_are_those_of_pinocchio(name):
     path = data(f"{name}.urdf")
     start = {"joint1": 9, "joint2": 10, "joint3": 11, "joint4": 12} if "limit" in name else None
-    robot = quietly(path, actuation="position", joint_positions=start)
+    robot = dc.Robot.load(path, actuation="position", joint_positions=start)
     compare_with_pinocchio(path, robot)
 
 
 def test_frames_of_the_panda_are_those_of_pinocchio():
     path, root = panda()
-    robot = quietly(path, mesh_root=root, joint_positions={"panda_joint4": -1.0})
+    robot = dc.Robot.load(path, mesh_root=root, joint_positions={"panda_joint4": -1.0})
     assert len(robot.joint_names) == 8
     compare_with_pinocchio(path, robot)
 
@@ -425,14 +424,80 @@ def test_zero_outside_the_limits_is_no_start(tmp_path):
     load(tmp_path, *two_links(limit='lower="1" upper="2"'), joint_positions={"hinge": 1})
 
 
-def test_what_is_not_applied_is_said_once(tmp_path):
-    limits = '<limit lower="-1" upper="1" effort="10" velocity="1"/><dynamics friction="1"/>'
-    parts = two_links(limits, limit="")
-    with pytest.warns(dc.IgnoredLimitsWarning) as caught:
-        load(tmp_path, *parts)
-    (warning,) = caught
-    assert "effort limits and velocity limits and Coulomb friction" in str(warning.message)
-    assert warning.filename.endswith("robot_files.py")  # where Robot.load is called
+BOUNDS = ("effort_limits", "velocity_limits", "joint_friction")
+BOUNDED = '<limit lower="-1" upper="1" effort="10" velocity="2"/><dynamics friction="0.5"/>'
+
+
+def bounds(robot):
+    return [getattr(robot, field).tolist() for field in BOUNDS]
+
+
+def test_limits_and_friction_are_those_of_the_file_unless_others_are_given(tmp_path):
+    parts = [
+        *(link(name) for name in ("base", "arm", "hand")),
+        joint("hinge", "base", "arm", content=BOUNDED, limit=""),
+        joint("wrist", "arm", "hand", content=BOUNDED, limit=""),
+    ]
+
+    def given(value):
+        return bounds(load(tmp_path, *parts, **dict.fromkeys(BOUNDS, value)))
+
+    assert given(None) == [[10.0, 10.0], [2.0, 2.0], [0.5, 0.5]]
+    assert given(False) == [[np.inf, np.inf], [np.inf, np.inf], [0.0, 0.0]]
+    assert given(3.0) == [[3.0, 3.0]] * 3
+    assert given([3.0, 4.0]) == [[3.0, 4.0]] * 3
+    assert given({"wrist": 3.0}) == [[10.0, 3.0], [2.0, 3.0], [0.5, 3.0]]
+    assert given({"hinge": False}) == [[np.inf, 10.0], [np.inf, 2.0], [0.0, 0.5]]
+    with pytest.raises(dc.InvalidInput, match=r"`effort_limits` must be False .* got True"):
+        given(True)
+    with pytest.raises(dc.InvalidInput, match="`effort_limits` has the names 'hinge', 'wrist'"):
+        given({"elbow": False})
+    with pytest.raises(dc.InvalidInput, match=r"`effort_limits` must be finite and > 0, got 0"):
+        given([1.0, 0.0])
+
+
+def test_zero_in_a_file_is_no_limit(tmp_path):
+    none = '<limit lower="-1" upper="1" effort="0" velocity="0"/>'
+    assert bounds(load(tmp_path, *two_links(none, limit=""))) == [[np.inf], [np.inf], [0.0]]
+    assert bounds(load(tmp_path, *two_links(kind="continuous", limit=""))) == [
+        [np.inf],
+        [np.inf],
+        [0.0],
+    ]
+    with pytest.raises(dc.InvalidInput, match="`effort` must be a number finite and >= 0"):
+        load(tmp_path, *two_links(none.replace('effort="0"', 'effort="-1"'), limit=""))
+
+
+def test_joints_that_mimic_count_by_virtual_work(tmp_path):
+    """They move m times as far, so their efforts count |m| times, and their speed 1/|m|."""
+    parts = [
+        *(link(name) for name in ("base", "arm", "hand", "tip", "nail")),
+        joint("hinge", "base", "arm", content=BOUNDED, limit=""),
+        joint(
+            "wrist",
+            "arm",
+            "hand",
+            content='<mimic joint="hinge" multiplier="-4"/>' + BOUNDED,
+            limit="",
+        ),
+        joint(
+            "knuckle",
+            "hand",
+            "tip",
+            "continuous",
+            '<mimic joint="wrist" multiplier="0.5"/><dynamics friction="3"/>',
+            limit="",
+        ),
+        joint(
+            "none",
+            "hand",
+            "nail",
+            content='<mimic joint="wrist" multiplier="0"/>' + BOUNDED,
+            limit="",
+        ),
+    ]
+    robot = load(tmp_path, *parts)
+    assert bounds(robot) == [[10 + 4 * 10], [2 / 4], [0.5 + 4 * 0.5 + 2 * 3]]
 
 
 def test_the_damping_of_a_joint_is_its_viscosity(tmp_path):
@@ -565,7 +630,7 @@ def test_the_masses_of_the_gripper_are_those_of_its_boxes():
 def test_the_panda_loads_from_its_wheel():
     path, root = panda()
     start = {"panda_joint4": -1.5, "panda_joint6": 1.5, "panda_finger_joint1": 0.02}
-    robot = quietly(path, mesh_root=root, joint_positions=start, base="floating")
+    robot = dc.Robot.load(path, mesh_root=root, joint_positions=start, base="floating")
     assert sum(surface is not None for surface in robot.surfaces) == 11
     assert robot.mechanism.dof.tolist()[-2:] == [7, 7]  # the right finger mimics the left
     assert len(robot.surfaces[0].faces) == 200
@@ -577,7 +642,6 @@ def test_the_extra_is_named_where_the_panda_is_missing(monkeypatch):
         dc.robots.panda()
 
 
-@pytest.mark.filterwarnings("ignore::diffcloth_torch.IgnoredLimitsWarning")
 def test_the_examples_of_the_docs_run():
     panda()
     page = (ROOT / "docs" / "robots.md").read_text()

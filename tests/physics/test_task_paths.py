@@ -88,10 +88,7 @@ CASES = [
             "scene.cloths.cloth.shape={kind: grid, rows: 10, columns: 10, size: 0.12}",
         ],
         id="panda_pick",
-        marks=[
-            pytest.mark.slow,
-            pytest.mark.filterwarnings("ignore::diffcloth_torch.IgnoredLimitsWarning"),
-        ],
+        marks=pytest.mark.slow,
     ),
 ]
 

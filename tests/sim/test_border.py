@@ -95,7 +95,10 @@ def wrong(array):
 
 
 KINDS = list(wrong(np.zeros((1, 2))))
-OPTIONAL = {"poisson", "rest_positions", "barrier_stiffness", "friction_origins"}
+OPTIONAL = {
+    *("poisson", "rest_positions", "barrier_stiffness", "friction_origins"),
+    "joint_terms",
+}
 WOVEN = {
     "stretch_weft": "stretch_shear",
     "stretch_shear": "stretch_weft",
@@ -299,6 +302,8 @@ ARRAYS = [
     "body_vertices",
     "coordinate_lower",
     "limit_stiffness",
+    "velocity_stiffness",
+    "velocity_force",
     "link_offset",
     "link_axis",
     "link_constant",

@@ -32,7 +32,6 @@ PUBLIC = {
     ),
     "Descent": "record restore metrics",
     "Evaluation": "failed_environments is_better_than record",
-    "IgnoredLimitsWarning": "",
     "InfeasibleMotion": "",
     "IntersectingState": "",
     "InvalidInput": "",
@@ -48,7 +47,8 @@ PUBLIC = {
         "normal_drag tangential_drag air_density body_mass body_center body_inertia link_mass "
         "link_center link_inertia joint_stiffness "
         "joint_damping joint_viscosity joint_armature stretch_weft stretch_shear "
-        "bending_weft bending_twill replace"
+        "bending_weft bending_twill joint_effort_limits joint_velocity_limits joint_friction "
+        "joint_slip_rates replace"
     ),
     "Report": "select stack where",
     "RigidBody": "load box sphere capsule cylinder plane",

@@ -28,7 +28,7 @@
 #include "contact/collision_mesh.h"
 #include "contact/distance/closest.h"
 #include "contact/distance/mollifier.h"
-#include "contact/friction.h"
+#include "common/friction_law.h"
 #include "contact/nonadjacent_distance.h"
 
 namespace diffcloth::bind {
@@ -237,7 +237,7 @@ void law_kernels(nb::module_& m) {
   m.def(
       "friction_law",
       [](double y, double e) {
-        const contact::FrictionLaw f = contact::friction_law(y, e);
+        const FrictionLaw f = friction_law(y, e);
         return std::tuple(f.f0, f.f1_over_y, f.f2, f.f1_over_y_e, f.f0_e);
       },
       "y"_a, "e"_a);

@@ -1,8 +1,8 @@
-#include "contact/friction.h"
+#include "common/friction_law.h"
 
 #include <limits>
 
-namespace diffcloth::contact {
+namespace diffcloth {
 
 FrictionLaw friction_law(double y, double e) {
   if (!(y < e)) {
@@ -17,4 +17,4 @@ FrictionLaw friction_law(double y, double e) {
           .f0_e = 1.0 / 3 - r * r * (1 - 2 * r / 3)};
 }
 
-}  // namespace diffcloth::contact
+}  // namespace diffcloth

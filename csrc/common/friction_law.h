@@ -1,6 +1,6 @@
 #pragma once
 
-namespace diffcloth::contact {
+namespace diffcloth {
 
 /// Smoothed Coulomb friction as a function of the tangential slip y >= 0 [m], with e = eps_v h [m]:
 ///
@@ -21,4 +21,4 @@ struct FrictionLaw {
 
 FrictionLaw friction_law(double y, double e);
 
-}  // namespace diffcloth::contact
+}  // namespace diffcloth
