@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput, SimulationError
@@ -22,6 +24,13 @@ from diffcloth_torch.sim.controls import Parameters
 __all__ = ["Memory", "Problem", "Residuals", "Trial", "parameters_of", "trajectories"]
 
 Residuals = Callable[..., Tensor | Sequence[Tensor]]
+
+# Parts of what torch says of `.numpy()` where a tensor is being differentiated.
+_NO_NUMBERS = ("call numpy() on Tensor", "access data pointer of Tensor")
+_NO_DERIVATIVE = (
+    "as it is differentiated: `.numpy()`, `.detach()`, `.item()`, `float()` and `torch.tensor()` "
+    "of a state or a parameter keep no derivative; `dc.residuals` and the functions of torch do"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +163,8 @@ class Problem:
         if record is None:
             few = len(self._rows) <= self._count
             transform = torch.func.jacfwd if few else torch.func.jacrev
-            found = transform(self._call)(torch.from_numpy(np.array(theta)))
+            call = partial(self._differentiated, backward=not few)
+            found = transform(call)(torch.from_numpy(np.array(theta)))
             _check_derivative(found)
             record = self._memory.keep("jacobian", self._stage, theta, found=found)
         jacobian: FloatArray = record["found"].numpy()
@@ -175,7 +185,7 @@ class Problem:
         if record is None:
             at = torch.from_numpy(np.array(theta)).requires_grad_()
             with torch.enable_grad():
-                cost = 0.5 * self._call(at).square().sum()
+                cost = 0.5 * self._differentiated(at, backward=True).square().sum()
                 (gradient,) = torch.autograd.grad(cost, at)
             _check_derivative(gradient)
             record = self._memory.keep("gradient", self._stage, theta, found=gradient)
@@ -240,6 +250,26 @@ class Problem:
 
     def _call(self, theta: Tensor) -> Tensor:
         parts = trajectories(self._residuals, self._space.values(self._whole(theta)))
+        return self._with_priors(parts, theta)
+
+    def _differentiated(self, theta: Tensor, *, backward: bool) -> Tensor:
+        """The same, where a derivative is wanted; refuses residuals that have none."""
+        try:
+            parts = trajectories(self._residuals, self._space.values(self._whole(theta)))
+        except RuntimeError as error:
+            if any(sign in str(error) for sign in _NO_NUMBERS):
+                raise InvalidInput(
+                    f"fit: `residuals` must compute with torch from the parameters to the result, "
+                    f"not with NumPy, {_NO_DERIVATIVE}"
+                ) from error
+            raise
+        if not any(p.requires_grad if backward else _has_tangent(p) for p in parts):
+            raise InvalidInput(
+                f"fit: `residuals` must depend on the variables that are free, {_NO_DERIVATIVE}"
+            )
+        return self._with_priors(parts, theta)
+
+    def _with_priors(self, parts: Sequence[Tensor], theta: Tensor) -> Tensor:
         found = [part.reshape(-1).to(torch.float64) for part in parts]
         return torch.cat([*found, (theta[self._known] - self._means) * self._precisions])
 
@@ -261,6 +291,11 @@ def trajectories(residuals: Residuals, values: Mapping[str, Tensor]) -> list[Ten
     if not isinstance(parts, list | tuple) or not all(isinstance(p, Tensor) for p in parts):
         raise TypeError("fit: `residuals` must return a tensor or a list of tensors")
     return list(parts)
+
+
+def _has_tangent(part: Tensor) -> bool:
+    unpack: Any = forward_ad.unpack_dual
+    return unpack(part).tangent is not None
 
 
 def _check_derivative(found: Tensor) -> None:
