@@ -69,6 +69,13 @@ SHORT = {
         ],
         {"bending": 0.1},
     ),
+    "fit_drape_woven": (
+        [
+            "scene.cloths.disk.shape.edge_length=0.012",
+            "fit.trajectories.shadow.synthetic.changes=[scene.cloths.disk.shape.edge_length=0.006]",
+        ],
+        {"bending": 0.12, "bending_weft": 0.12, "bending_twill": 0.12},
+    ),
 }
 
 
