@@ -23,7 +23,7 @@ from diffcloth_torch.viewers.shown import Shown
 __all__ = ["FittedPage", "Track"]
 
 _COLOR = (230, 85, 13)  # of what was observed
-_POINT = 0.012  # fraction of the scene's size: width of a point
+_POINT, _LINE = 0.012, 0.005  # fractions of the scene's size: widths of a point, and of an outline
 _BETWEEN = 8  # points of an outline from one corner to the next
 
 
@@ -40,11 +40,16 @@ class Track:
     states: Sequence[State]
     observed: Sequence[FloatArray]
 
+    @property
+    def is_outline(self) -> bool:
+        """Whether outlines were observed."""
+        return bool(self.observed[0].shape[1] == 2)
+
     def points(self) -> list[FloatArray]:
         """Points to draw of each state, [n, 3]."""
         return [
             _outline(seen, float(state.positions[:, 2].min()))
-            if seen.shape[1] == 2
+            if self.is_outline
             else seen[~np.isnan(seen).any(axis=1)]
             for seen, state in zip(self.observed, self.states, strict=True)
         ]
@@ -91,6 +96,7 @@ class FittedPage(Page):
         self._shown = [Shown(scene, paints) for scene in scenes]
         self._motions = [Motion(shown) for shown in self._shown]
         self._points: list[list[FloatArray]] = []
+        self._widths: list[float] = []
         self._said = ""
         self._text: Any = None
 
@@ -126,6 +132,7 @@ class FittedPage(Page):
         with self._lock:
             self._motions, self._said = motions, text
             self._points = [track.points() for track in tracks]
+            self._widths = [_LINE if track.is_outline else _POINT for track in tracks]
             if isinstance(self._drawing, _Beside):
                 self._drawing.restart(motions, self._points)
                 self._draw()
@@ -138,7 +145,7 @@ class FittedPage(Page):
         super()._add_controls(gui)
 
     def _draw_on(self, api: Any) -> _Beside:
-        return _Beside(api, self._shown, self._motions, self._points)
+        return _Beside(api, self._shown, self._motions, self._points, self._widths)
 
 
 class _Beside:
@@ -150,13 +157,15 @@ class _Beside:
         shown: Sequence[Shown],
         motions: Sequence[Motion],
         points: Sequence[Sequence[FloatArray]],
+        widths: Sequence[float],
     ) -> None:
         ends = [corner for motion in motions for corner in motion.bounds(())]
         ends += [cloud for clouds in points for cloud in clouds]
         every = np.concatenate([np.atleast_2d(end) for end in ends])
         bounds = (every.min(axis=0), every.max(axis=0))
         self._api, self._points = api, points
-        self._width = _POINT * float(np.linalg.norm(bounds[1] - bounds[0]))
+        size = float(np.linalg.norm(bounds[1] - bounds[0]))
+        self._widths = [size * width for width in widths]
         self._clouds: dict[int, Any] = {}
         self._drawings = [
             Drawing(api, s, m, (), bounds=bounds, first=i, places=len(shown))
@@ -192,7 +201,7 @@ class _Beside:
                 f"{root}/observed",
                 points,
                 _COLOR,
-                point_size=self._width,
+                point_size=self._widths[i],
                 point_shape="circle",
                 precision="float32",
             )
