@@ -2,6 +2,7 @@
 
     python -m benchmarks.identification
     python -m benchmarks.identification --seeds 2 configs/fit_cantilever.yaml
+    python -m benchmarks.identification --seeds 40 configs/fit_throw.yaml      # chance, or a bias?
     python -m benchmarks.identification --compare         # other ways to the same numbers
     python -m benchmarks.identification --places          # ten starts: do they end at one place?
     python -m benchmarks.identification --set scene.cloths.disk.shape.edge_length=0.014 ...
@@ -10,8 +11,9 @@ Each configuration makes observations of its own on a finer mesh, with half the 
 of 1 mm, and is fitted with ten seeds of this noise, from its first values. Printed for each number
 that is fitted: the true value, the median of what is found, the median half width of the intervals
 of 95 %, the bias without noise, which is what mesh and time step do, and in how many seeds the
-interval holds the true value; and the median root mean square of the residuals, in units of the
-noise, and of the processor time.
+interval holds the true value, with the interval of 95 % of this share (Clopper and Pearson), and
+the share that the bias leaves: with noise alone it would be 95 %. Above them stand the median root
+mean square of the residuals, in units of the noise, and of the processor time.
 
 With `--compare`, columns are evaluations of the residuals (an evaluation of a Jacobian by tangents
 counts as one, its processor time is in the seconds), processor time [s], final cost over the lowest
@@ -96,8 +98,28 @@ def coverage(config: Path, first: int, seeds: int, changes: tuple[str, ...]) -> 
         inside = [r.fit.intervals[name][0] <= true <= r.fit.intervals[name][1] for r in runs]
         yield (
             f"{name:14} {true:10.4g} {found:10.4g} {statistics.median(widths):9.2g} "
-            f"{unbiased - true:+9.1g}  {sum(inside)} of {seeds}"
+            f"{unbiased - true:+9.1g}  {shares(sum(inside), seeds)}; by the bias "
+            f"{biased_share(unbiased - true, statistics.median(widths)):.0%}"
         )
+
+
+def shares(inside: int, seeds: int) -> str:
+    """A count, and the interval of 95 % of the probability behind it."""
+    from scipy.stats import binomtest
+
+    low, high = binomtest(inside, seeds).proportion_ci()
+    return f"{inside} of {seeds} ({low:.0%} to {high:.0%})"
+
+
+def biased_share(bias: float, half_width: float) -> float:
+    """Probability that an interval of 95 % holds the truth, from which its middle is `bias` away.
+
+    Of a normal law, whose interval reaches 1.96 standard deviations.
+    """
+    from scipy.stats import norm
+
+    reach, away = norm.ppf(0.975), abs(bias) / half_width * norm.ppf(0.975)
+    return float(norm.cdf(reach - away) - norm.cdf(-reach - away))
 
 
 def places(config: Path, seeds: int, changes: tuple[str, ...]) -> Iterator[str]:

@@ -149,12 +149,22 @@ def optimize(**arguments: Any) -> str:
     type=click.Path(path_type=Path, file_okay=False),
     help="Go on with the fit whose results are there; its CONFIG is there too.",
 )
+@click.option(
+    "--viewer",
+    "viewers",
+    type=click.Choice(("web",)),
+    multiple=True,
+    help="Show the fit on a page while it goes on, beside what was observed.",
+)
 @_SET
 @_OUT
 @_OVERWRITE
 @_ending_in_a_sentence
-def fit(**arguments: Any) -> str:
+def fit(viewers: tuple[str, ...], assignments: tuple[str, ...], **arguments: Any) -> str:
     """Fit the variables of CONFIG to what was observed."""
+    if viewers:
+        assignments = (*assignments, f"output.viewers=[{','.join(viewers)}]")
+    arguments["assignments"] = assignments
     from diffcloth_torch.fit_command import fit_configuration, resume_fit
 
     return _begin_or_resume(arguments, fit_configuration, resume_fit)
@@ -201,7 +211,8 @@ def _begin_or_resume(
         if arguments["config"] is None:
             raise click.UsageError("Missing argument 'CONFIG': a file, or --resume DIRECTORY.")
         return begin(**arguments)
-    extra = ["CONFIG" if name == "config" else f"--{name}" for name, a in arguments.items() if a]
+    named = {"config": "CONFIG", "assignments": "--set or --viewer"}
+    extra = [named.get(name, f"--{name}") for name, a in arguments.items() if a]
     if extra:
         raise click.UsageError(f"--resume takes these from its DIRECTORY: {', '.join(extra)}.")
     return go_on(folder)

@@ -7,6 +7,7 @@ from typing import Any
 
 __all__ = [
     "AddedMassWarning",
+    "InadmissibleMaterial",
     "InfeasibleMotion",
     "IntersectingState",
     "InvalidInput",
@@ -18,6 +19,10 @@ __all__ = [
 
 class InvalidInput(ValueError):  # noqa: N818 - names of the public contract
     """An argument has a wrong shape, value or name; the message names it and what is accepted."""
+
+
+class InadmissibleMaterial(InvalidInput):
+    """Numbers that are each in their range, but together belong to no material."""
 
 
 class SimulationError(RuntimeError):

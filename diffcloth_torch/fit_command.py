@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
 from tqdm import tqdm
 
 from diffcloth_torch.commands import check_folder
 from diffcloth_torch.config.documents import Document, set_values
+from diffcloth_torch.config.viewers import open_fitted
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.optimize.fit import Fit, Trial, fit
@@ -18,11 +21,13 @@ from diffcloth_torch.optimize.statistics import finite_or_none
 from diffcloth_torch.tasks.identify import Identify
 from diffcloth_torch.tasks.registry import check_document, load_task, make_task
 from diffcloth_torch.tasks.statistics import write_metrics
+from diffcloth_torch.viewers.fitted import FittedPage
 
 __all__ = ["fit_configuration", "resume_fit"]
 
 # Files in a folder of results. Evaluations lie in a folder, one file for each start.
 _RESULT, _PAGE, _RESUME, _EVALUATIONS = "fit.json", "fit.html", "resume.json", "evaluations"
+_ANIMATION = "animation.html"
 _LARGEST = 1 << 20  # bytes of a configuration
 
 
@@ -53,7 +58,7 @@ def fit_configuration(
         )
     out = check_folder(config, out, overwrite)
     out.mkdir(parents=True, exist_ok=True)
-    for name in (_RESULT, _PAGE, _RESUME):
+    for name in (_RESULT, _PAGE, _RESUME, _ANIMATION):
         (out / name).unlink(missing_ok=True)
     for file in (out / _EVALUATIONS).glob("start_*.pt"):
         file.unlink()
@@ -86,7 +91,8 @@ def resume_fit(folder: Path) -> str:
 
 
 def _run(task: Identify, out: Path) -> str:
-    with _Progress() as bar:
+    page = open_fitted(task.config, task.observed.scenes(), out)
+    with page or nullcontext(), _Progress(task, page) as bar:
         try:
             found = fit(
                 task.variables(),
@@ -145,11 +151,19 @@ def _number(found: Fit, k: int) -> float:
     return [float(x) for name in free for x in found.values[name].flatten()][k]
 
 
-class _Progress:
-    """A progress bar over evaluations, whose number is not known; quiet without a terminal."""
+def _short(value: Tensor) -> str:
+    return ", ".join(f"{x:.4g}" for x in value.flatten().tolist())
 
-    def __init__(self) -> None:
+
+class _Progress:
+    """A progress bar over evaluations, whose number is not known; quiet without a terminal.
+
+    A page shows the best of them so far.
+    """
+
+    def __init__(self, task: Identify, page: FittedPage | None) -> None:
         self.count = 0
+        self._task, self._page, self._lowest = task, page, float("inf")
         self._bar: tqdm[Any] = tqdm(desc="fit", unit="evaluation", disable=None)
 
     def __enter__(self) -> _Progress:
@@ -163,3 +177,8 @@ class _Progress:
         self.count += 1
         self._bar.set_postfix({"start": trial.start, "cost": f"{trial.cost:.5g}"}, refresh=False)
         self._bar.update()
+        if self._page is not None and trial.cost < self._lowest:
+            self._lowest = trial.cost
+            text = [f"Evaluation {self.count} of the fit: cost {trial.cost:.5g}", ""]
+            text += [f"- {name}: {_short(value)}" for name, value in trial.values.items()]
+            self._page.show(self._task.observed.tracks(trial.values), "\n".join(text))

@@ -9,13 +9,16 @@ from pathlib import Path
 from diffcloth_torch.config.schema import RunConfig
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.viewers.browser import Browser
+from diffcloth_torch.viewers.fitted import FittedPage
 from diffcloth_torch.viewers.look import Camera, Goal, Paint, Pictures
 from diffcloth_torch.viewers.meshes import MeshSequence
 from diffcloth_torch.viewers.record import Record
 from diffcloth_torch.viewers.several import Viewers
 from diffcloth_torch.viewers.viewer import Viewer
 
-__all__ = ["VIEWERS", "open_viewers"]
+__all__ = ["VIEWERS", "open_fitted", "open_viewers"]
+
+_PAGE = "animation.html"
 
 
 def open_viewers(
@@ -32,6 +35,29 @@ def open_viewers(
     output = config.output
     made = [make(config, scene, folder, goals) for name, make in VIEWERS if name in output.viewers]
     return Viewers(made, output.every)
+
+
+def open_fitted(config: RunConfig, scenes: Sequence[Scene], folder: Path) -> FittedPage | None:
+    """Make the page of a fit, if the configuration wants one.
+
+    Args:
+        config: The configuration.
+        scenes: The scene of each of its trajectories.
+        folder: Existing folder for its file.
+    """
+    if "web" not in config.output.viewers:
+        return None
+    return FittedPage(
+        scenes,
+        paints=_paints(config),
+        camera=Camera(**config.output.pictures.model_dump()["camera"]),
+        file=folder / _PAGE,
+        live=_is_watched(),
+    )
+
+
+def _is_watched() -> bool:
+    return sys.stdin.isatty() and sys.stderr.isatty()
 
 
 def _paints(config: RunConfig) -> dict[str, Paint]:
@@ -65,8 +91,8 @@ def _web(config: RunConfig, scene: Scene, folder: Path, goals: Sequence[Goal]) -
         camera=Camera(**pictures.model_dump()["camera"]),
         # Gradients are given by an optimization alone; without them there are no such arrows.
         arrows=["forces", "gradient"] if pictures.contact_forces else ["gradient"],
-        file=folder / "animation.html",
-        live=sys.stdin.isatty() and sys.stderr.isatty(),
+        file=folder / _PAGE,
+        live=_is_watched(),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray, IndexArray
-from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.errors import InadmissibleMaterial, InvalidInput
 
 __all__ = ["STAND_INS", "WOVEN_GROUPS", "check_bending", "material_axes"]
 
@@ -50,14 +50,14 @@ def check_bending(
     if uneven.any():
         at, where = _first(uneven)
         sign = "> 0" if bending[at] > 0.0 else "0"
-        raise InvalidInput(
+        raise InadmissibleMaterial(
             f"{owner}: `bending_weft` must be {sign} like `bending`, got {weft[at]:g}{where}"
         )
     least = (bending + weft + 2.0 * poisson * np.sqrt(bending * weft)) / 4.0
     low = twill < least
     if low.any():
         at, where = _first(low)
-        raise InvalidInput(
+        raise InadmissibleMaterial(
             f"{owner}: `bending_twill` must be at least (bending + bending_weft + 2 poisson "
             f"sqrt(bending bending_weft)) / 4, which is {least[at]:g}, got {twill[at]:g}{where}"
         )

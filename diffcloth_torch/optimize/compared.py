@@ -44,6 +44,7 @@ class Comparison:
         times: Of the frames [s], shape [T].
         simulated: Of each frame the simulated points [m], shape [n, 3] or [n, 2].
         observed: The observed ones, likewise; NaN where one was not seen.
+        placed: The observed ones beside the states: an outline that was turned lies as they do.
         labels: Name of each point of a frame: its vertex, direction or number.
         noise: Standard deviation of an observation [m].
     """
@@ -52,6 +53,7 @@ class Comparison:
     times: FloatArray
     simulated: list[FloatArray]
     observed: list[FloatArray]
+    placed: list[FloatArray]
     labels: list[str]
     noise: float
 

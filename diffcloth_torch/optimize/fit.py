@@ -79,7 +79,7 @@ class Fit:
 
     @property
     def failures(self) -> int:
-        """Number of trial steps in which the simulation failed."""
+        """Number of trial steps that were rejected."""
         return sum(bool(trial.failure) for trial in self.history)
 
     def report(self, path: str | Path) -> None:
@@ -167,8 +167,8 @@ def fit(
         progress: Called after each evaluation; of starts in processes, when they have ended.
 
     Returns:
-        The best fit, with its uncertainty. A trial step in which the simulation fails is rejected,
-        and counted.
+        The best fit, with its uncertainty. A trial step in which the simulation fails, or whose
+        numbers belong to no material together, is rejected, and counted.
 
     Raises:
         InvalidInput: If an argument is not accepted.

@@ -171,7 +171,10 @@ def _by_torch(
         at = inside.detach().numpy().copy()
         found = problem.cost_and_gradient(at)
         if found is None:
-            raise problem.failure(at)
+            failure = problem.failure(at)
+            if not isinstance(failure, SimulationError):
+                raise SimulationError(str(failure)) from failure  # from which `descend` goes back
+            raise failure
         cost, gradient = found
         costs.append(cost)
         if cost < best[0]:

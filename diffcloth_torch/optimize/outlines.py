@@ -89,13 +89,17 @@ def outline(
             f"{owner}: `outlines` must be one for each of {len(states)} states, got {len(outlines)}"
         )
     rays = _rays(directions)
-    radii, seen = [], []
+    radii, seen, turns = [], [], []
     for k, (points, given) in enumerate(zip(flat, outlines, strict=True)):
         observed = _observed(f"{owner}: `outlines`[{k}]", given, origin, rays)
         name = f"{owner}: the silhouette of `states`[{k}]"
         found = _radii(name, points, edges, rays)
-        radii.append(_turned(name, points, edges, found, observed) if turned else found)
+        turn = 0.0
+        if turned:
+            found, turn = _turned(name, points, edges, found, observed)
+        radii.append(found)
         seen.append(observed)
+        turns.append(turn)
     simulated = torch.stack(radii)
     note(
         Comparison(
@@ -103,6 +107,10 @@ def outline(
             times=times_of(states),
             simulated=list(origin + numbers_of(simulated)[..., None] * numbers_of(rays)),
             observed=[origin + numbers_of(radius)[:, None] * numbers_of(rays) for radius in seen],
+            placed=[
+                origin + numbers_of(radius)[:, None] * numbers_of(_rays(directions, turn))
+                for radius, turn in zip(seen, turns, strict=True)
+            ],
             labels=[f"{360 * i / directions:.0f} degrees" for i in range(directions)],
             noise=noise,
         )
@@ -153,8 +161,10 @@ def _observed(name: str, outline: object, center: FloatArray, rays: Tensor) -> T
     return _radii(name, torch.from_numpy(corners - center), ring, rays)
 
 
-def _turned(owner: str, points: Tensor, edges: Any, found: Tensor, observed: Tensor) -> Tensor:
-    """Radii of a silhouette that is turned as the observed one is, shape [D].
+def _turned(
+    owner: str, points: Tensor, edges: Any, found: Tensor, observed: Tensor
+) -> tuple[Tensor, float]:
+    """Radii of a silhouette that is turned as the observed one is, shape [D], and the angle.
 
     The radius r(a) = sum_k c_k exp(i k a) has waves c_k, and so has the observed one, d_k. With
     the angle b = (arg d_m - arg c_m) / m the largest of them, m, agrees: r(a + b) has the phase of
@@ -169,15 +179,15 @@ def _turned(owner: str, points: Tensor, edges: Any, found: Tensor, observed: Ten
             f"{largest} folds, got {count}"
         )
     if np.hypot(*numbers_of(waves)[largest]) < _ROUND * numbers_of(found).sum():
-        return found
+        return found, 0.0
     angle = (_phase(seen[largest]) - _phase(waves[largest])) / largest
-    target, best, smallest = numbers_of(observed), found, np.inf
+    target, best, smallest = numbers_of(observed), (found, 0.0), np.inf
     for fold in range(largest):
         turn = angle + 2 * np.pi * fold / largest
         radii = _radii(owner, points, edges, _rays(count, turn))
         misfit = float(((numbers_of(radii) - target) ** 2).sum())
         if misfit < smallest:
-            best, smallest = radii, misfit
+            best, smallest = (radii, float(numbers_of(turn))), misfit
     return best
 
 

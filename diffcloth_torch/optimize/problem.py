@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +13,38 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from diffcloth_torch.checks import FloatArray
-from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.errors import InadmissibleMaterial, InvalidInput, SimulationError
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.variables import Space
 from diffcloth_torch.sim.controls import Parameters
 
-__all__ = ["Memory", "Problem", "Residuals", "Trial", "parameters_of", "trajectories"]
+__all__ = [
+    "FAILURES",
+    "Failure",
+    "Memory",
+    "Problem",
+    "Residuals",
+    "Trial",
+    "parameters_of",
+    "trajectories",
+]
 
 Residuals = Callable[..., Tensor | Sequence[Tensor]]
+
+Failure = SimulationError | InadmissibleMaterial
+FAILURES = (SimulationError, InadmissibleMaterial)
+"""What ends a trial step and not the fit: bounds do not keep out numbers that belong to no material
+together, though each is in its range."""
+
+# Parts of what torch says of `.numpy()` where a tensor is being differentiated.
+_NO_NUMBERS = ("call numpy() on Tensor", "access data pointer of Tensor")
+_NO_DERIVATIVE = (
+    "as it is differentiated: `.numpy()`, `.detach()`, `.item()`, `float()` and `torch.tensor()` "
+    "of a state or a parameter keep no derivative; `dc.residuals` and the functions of torch do"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +150,7 @@ class Problem:
         self._known = torch.from_numpy(np.flatnonzero(space.precisions[rows]))
         self._means = torch.from_numpy(space.means[rows])[self._known]
         self._precisions = torch.from_numpy(space.precisions[rows])[self._known]
-        self._last: tuple[bytes, FloatArray | SimulationError] | None = None
+        self._last: tuple[bytes, FloatArray | Failure] | None = None
 
     @property
     def prior_count(self) -> int:
@@ -137,7 +160,7 @@ class Problem:
     def require(self, theta: FloatArray) -> None:
         """Evaluate at a start, where a failure ends it."""
         found = self._trial(theta)
-        if isinstance(found, SimulationError):
+        if isinstance(found, FAILURES):
             raise found
         self._count = len(found)
         if self._count == self.prior_count:
@@ -146,7 +169,7 @@ class Problem:
     def residuals(self, theta: FloatArray) -> FloatArray:
         """Residuals [M]; infinite where the simulation fails: the solver rejects that step."""
         found = self._trial(theta)
-        return np.full(self._count, np.inf) if isinstance(found, SimulationError) else found
+        return np.full(self._count, np.inf) if isinstance(found, FAILURES) else found
 
     def jacobian(self, theta: FloatArray) -> FloatArray:
         """Jacobian [M, p]: forward where numbers are fewer than residuals, else backward."""
@@ -154,51 +177,52 @@ class Problem:
         if record is None:
             few = len(self._rows) <= self._count
             transform = torch.func.jacfwd if few else torch.func.jacrev
-            found = transform(self._call)(torch.from_numpy(np.array(theta)))
+            call = partial(self._differentiated, backward=not few)
+            found = transform(call)(torch.from_numpy(np.array(theta)))
             _check_derivative(found)
             record = self._memory.keep("jacobian", self._stage, theta, found=found)
         jacobian: FloatArray = record["found"].numpy()
         return jacobian
 
-    def failure(self, theta: FloatArray) -> SimulationError:
+    def failure(self, theta: FloatArray) -> Failure:
         """What the simulation raised at a point where it fails."""
         found = self._trial(theta)
-        assert isinstance(found, SimulationError)
+        assert isinstance(found, FAILURES)
         return found
 
     def cost_and_gradient(self, theta: FloatArray) -> tuple[float, FloatArray] | None:
         """Half the sum of squares, and its gradient by backward [p]; None if it fails."""
         found = self._trial(theta)
-        if isinstance(found, SimulationError):
+        if isinstance(found, FAILURES):
             return None
         record = self._memory.recall("gradient", self._stage, theta)
         if record is None:
             at = torch.from_numpy(np.array(theta)).requires_grad_()
             with torch.enable_grad():
-                cost = 0.5 * self._call(at).square().sum()
+                cost = 0.5 * self._differentiated(at, backward=True).square().sum()
                 (gradient,) = torch.autograd.grad(cost, at)
             _check_derivative(gradient)
             record = self._memory.keep("gradient", self._stage, theta, found=gradient)
         return 0.5 * float(found @ found), record["found"].numpy()
 
-    def _trial(self, theta: FloatArray) -> FloatArray | SimulationError:
+    def _trial(self, theta: FloatArray) -> FloatArray | Failure:
         # The solver asks first for what the start has just been tried with.
         key = theta.tobytes()
         if self._last is None or self._last[0] != key:
             self._last = key, self._evaluate(theta)
         return self._last[1]
 
-    def _evaluate(self, theta: FloatArray) -> FloatArray | SimulationError:
+    def _evaluate(self, theta: FloatArray) -> FloatArray | Failure:
         record = self._memory.recall("residuals", self._stage, theta)
         numbers = torch.from_numpy(np.array(theta))
-        failure: SimulationError | None = None
+        failure: Failure | None = None
         if record is None:
             begin = time.perf_counter()
             found = torch.zeros(0, dtype=torch.float64)
             try:
                 with torch.no_grad():
                     found = self._call(numbers)
-            except SimulationError as error:
+            except FAILURES as error:
                 failure = error
             if failure is None:
                 self._check(found)
@@ -240,6 +264,26 @@ class Problem:
 
     def _call(self, theta: Tensor) -> Tensor:
         parts = trajectories(self._residuals, self._space.values(self._whole(theta)))
+        return self._with_priors(parts, theta)
+
+    def _differentiated(self, theta: Tensor, *, backward: bool) -> Tensor:
+        """The same, where a derivative is wanted; refuses residuals that have none."""
+        try:
+            parts = trajectories(self._residuals, self._space.values(self._whole(theta)))
+        except RuntimeError as error:
+            if any(sign in str(error) for sign in _NO_NUMBERS):
+                raise InvalidInput(
+                    f"fit: `residuals` must compute with torch from the parameters to the result, "
+                    f"not with NumPy, {_NO_DERIVATIVE}"
+                ) from error
+            raise
+        if not any(p.requires_grad if backward else _has_tangent(p) for p in parts):
+            raise InvalidInput(
+                f"fit: `residuals` must depend on the variables that are free, {_NO_DERIVATIVE}"
+            )
+        return self._with_priors(parts, theta)
+
+    def _with_priors(self, parts: Sequence[Tensor], theta: Tensor) -> Tensor:
         found = [part.reshape(-1).to(torch.float64) for part in parts]
         return torch.cat([*found, (theta[self._known] - self._means) * self._precisions])
 
@@ -261,6 +305,11 @@ def trajectories(residuals: Residuals, values: Mapping[str, Tensor]) -> list[Ten
     if not isinstance(parts, list | tuple) or not all(isinstance(p, Tensor) for p in parts):
         raise TypeError("fit: `residuals` must return a tensor or a list of tensors")
     return list(parts)
+
+
+def _has_tangent(part: Tensor) -> bool:
+    unpack: Any = forward_ad.unpack_dual
+    return unpack(part).tangent is not None
 
 
 def _check_derivative(found: Tensor) -> None:

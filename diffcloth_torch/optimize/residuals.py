@@ -84,6 +84,7 @@ def markers(
             times=times_of(states),
             simulated=list(numbers_of(positions)),
             observed=list(seen),
+            placed=list(seen),
             labels=[f"vertex {i}" for i in marked],
             noise=noise,
         )
@@ -134,6 +135,7 @@ def point_cloud(states: Sequence[State], clouds: Sequence[object], *, noise: flo
             times=times_of(states),
             simulated=nearest_points,
             observed=seen,
+            placed=seen,
             labels=[f"point {i}" for i in range(most)],
             noise=noise,
         )

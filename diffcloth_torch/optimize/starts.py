@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
-from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.optimize.methods import Options, solve
-from diffcloth_torch.optimize.problem import Memory, Problem, Residuals, Trial
+from diffcloth_torch.optimize.problem import FAILURES, Failure, Memory, Problem, Residuals, Trial
 from diffcloth_torch.optimize.variables import Space
 
 __all__ = ["End", "Job", "Stage", "Start", "judge", "run", "run_all"]
@@ -106,7 +106,7 @@ class End:
     success: bool
     message: str
     history: list[Trial]
-    failure: SimulationError | None
+    failure: Failure | None
 
 
 def run(job: Job, start: int, first: FloatArray, report: Callable[[Trial], None]) -> End:
@@ -131,7 +131,7 @@ def run(job: Job, start: int, first: FloatArray, report: Callable[[Trial], None]
         try:
             problem.require(at[rows])
             end = solve(problem, at[rows], space.low[rows], space.high[rows], job.options)
-        except SimulationError as error:
+        except FAILURES as error:
             nothing = np.zeros(0)
             return End(
                 start, first, at, np.inf, nothing, nothing, False, str(error), history, error

@@ -22,12 +22,15 @@ from diffcloth_torch.config.validation import validate
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.model.quantities import PARAMETERS
+from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.optimize import residuals
+from diffcloth_torch.optimize.compared import noting
 from diffcloth_torch.optimize.outlines import silhouettes
 from diffcloth_torch.optimize.variables import Variable
 from diffcloth_torch.sim.controls import Parameters
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.drape import Drape
+from diffcloth_torch.viewers.fitted import Track
 
 __all__ = ["Identify", "Observations"]
 
@@ -118,7 +121,17 @@ class _Observed:
 
     def residuals(self, values: Mapping[str, Tensor]) -> Tensor:
         """What is simulated less what was seen, over the noise."""
-        states, section = self.motion.simulate(values), self.section
+        return self._compare(self.motion.simulate(values))
+
+    def track(self, values: Mapping[str, Tensor]) -> Track:
+        """What is simulated, and beside it what was seen."""
+        with torch.no_grad(), noting() as notes:
+            states = self.motion.simulate(values)
+            self._compare(states)
+        return Track(states, notes[0].placed)
+
+    def _compare(self, states: list[State]) -> Tensor:
+        section = self.section
         if section.kind == "markers":
             return residuals.markers(states, self.seen, vertices=self.vertices, noise=section.noise)
         return residuals.outline(
@@ -148,6 +161,14 @@ class Observations:
         """Give the residuals of each trajectory."""
         given = {n: v for n, v in vars(parameters).items() if isinstance(v, Tensor)}
         return [t.residuals(given | dict(values or {})) for t in self._trajectories]
+
+    def scenes(self) -> list[Scene]:
+        """Give the scene of each trajectory."""
+        return [t.motion.task.scene for t in self._trajectories]
+
+    def tracks(self, values: Mapping[str, Tensor]) -> list[Track]:
+        """Simulate each trajectory at values of all variables, for a viewer."""
+        return [t.track(values) for t in self._trajectories]
 
 
 def _trajectory(

@@ -2,53 +2,25 @@
 
 from __future__ import annotations
 
-import html
-import sys
-import threading
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import Any
 
-import numpy as np
 from torch import Tensor
 
-from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.viewers.drawing import Drawing
 from diffcloth_torch.viewers.look import Camera, Goal, Paint
-from diffcloth_torch.viewers.motion import LAYERS, Motion
+from diffcloth_torch.viewers.motion import Motion
+from diffcloth_torch.viewers.page import DEFAULT_CAMERA, Page
 from diffcloth_torch.viewers.shown import Shown
 
-__all__ = ["VECTORS", "Browser", "require_viser"]
-
-VECTORS = ("forces", "gradient")
-"""Arrows: contact forces on everything, and the gradient of a loss by the cloths' vertices."""
-
-_INSTALL = "pages of the browser need viser: run  pip install 'diffcloth-torch[viewer]'"
-_DEFAULT_CAMERA = Camera()
-_HEIGHT = 480  # pixels of a page inside a notebook
-_SHORTEST_WAIT = 0.01  # seconds between two moments of the page
-_SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
+__all__ = ["Browser"]
 
 
-def require_viser() -> Any:
-    """Import viser.
-
-    Raises:
-        InvalidInput: If it is not installed; the message says how to install it.
-    """
-    try:
-        import viser
-    except ImportError as error:
-        raise InvalidInput(f"{_INSTALL} ({error})") from error
-    return viser
-
-
-class Browser:
+class Browser(Page):
     """Shows the states that it gets on a page of the browser, and writes them to a page of its own.
 
     The page has a slider of the moments, play, speed, what colors the cloths and which arrows are
@@ -63,7 +35,7 @@ class Browser:
         port: int = 8080,
         paints: Mapping[str, Paint] = MappingProxyType({}),
         goals: Sequence[Goal] = (),
-        camera: Camera = _DEFAULT_CAMERA,
+        camera: Camera = DEFAULT_CAMERA,
         color: str = "plain",
         arrows: Sequence[str] = (),
         file: Path | None = None,
@@ -87,27 +59,17 @@ class Browser:
         Raises:
             InvalidInput: If a package is missing, or an argument is not accepted.
         """
-        self._viser = require_viser()
-        if color not in LAYERS:
-            raise InvalidInput(f"show: `color` must be one of {', '.join(LAYERS)}, got {color!r}")
-        for arrow in arrows:
-            if arrow not in VECTORS:
-                raise InvalidInput(f"show: `arrows` must be of {', '.join(VECTORS)}, got {arrow!r}")
-        self._host, self._port = host, port
+        super().__init__(
+            host=host, port=port, camera=camera, color=color, arrows=arrows, file=file, live=live
+        )
         self._shown = Shown(scene, paints)
-        self._goals, self._camera, self._file = tuple(goals), camera, file
-        self._color, self._arrow_names, self._live = color, tuple(arrows), live
+        self._goals = tuple(goals)
         self.motion = Motion(self._shown)
-        self._lock = threading.RLock()  # of what the page shows: a user may move a slider meanwhile
-        self._server: Any = None
-        self._drawing: Drawing | None = None
-        self._closed = threading.Event()
 
     @property
-    def url(self) -> str:
-        """Address of the page; the server starts if it does not run."""
-        server = self._serving()
-        return f"http://{server.get_host()}:{server.get_port()}"
+    def moments(self) -> Motion:
+        """The motion whose moments are on the slider."""
+        return self.motion
 
     def show(self, state: State, gradient: Tensor | None = None) -> None:
         """Keep a state, and show it if the page follows.
@@ -121,155 +83,5 @@ class Browser:
             if self._server is not None:
                 self._extend()
 
-    def wait(self) -> None:
-        """Keep the page until `close`, or until the user interrupts the program."""
-        self._serving()
-        try:
-            self._closed.wait()
-        except KeyboardInterrupt:
-            self.close()
-
-    def close(self) -> None:
-        """Stop the server."""
-        self._closed.set()
-        with self._lock:
-            if self._server is not None:
-                _stop(self._server)
-                self._server, self._drawing = None, None
-
-    def save(self, path: str | Path, *, speed: float = 1.0) -> None:
-        """Write a page that plays the motion by itself, without a server or a connection.
-
-        Args:
-            path: File to write, in an existing folder; an existing file is replaced.
-            speed: Speed of the motion, 1 in real time.
-        """
-        Path(path).write_text(self._page(speed), encoding="utf-8")
-
-    def _repr_html_(self) -> str:
-        page = html.escape(self._page(1.0), quote=True)
-        return (
-            f'<iframe srcdoc="{page}" width="100%" height="{_HEIGHT}" style="border:none"></iframe>'
-        )
-
-    def __enter__(self) -> Browser:
-        """Start the server where the viewer is live."""
-        if self._live:
-            print(f"The page is at {self.url}", file=sys.stderr)
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Write the file, also after a failed step; a live page stays until the user ends it."""
-        if self.motion and (kind is None or issubclass(kind, SimulationError)):
-            if self._file is not None:
-                self.save(self._file)
-            if self._live:
-                input(f"The page at {self.url} stays until you press Enter")
-        self.close()
-
-    def _page(self, speed: float) -> str:
-        if not self.motion:
-            raise InvalidInput("show: there must be at least one state")
-        # A server of its own: the one of the page goes on.
-        server = self._start("127.0.0.1")
-        try:
-            drawing = Drawing(server.scene, self._shown, self.motion, self._goals)
-            drawing.draw(0, "plain", ())
-            drawing.prepare(self._color)
-            drawing.aim(server, self._camera)
-            recorder = server.get_scene_serializer()
-            times = [moment.time for moment in self.motion]
-            for k, wait in enumerate(np.diff([*times, times[-1]])):
-                drawing.draw(k, self._color, self._arrow_names)
-                recorder.insert_sleep(max(float(wait) / speed, 0.0))
-            page: str = recorder.as_html()
-        finally:
-            _stop(server)
-        return page
-
-    def _start(self, host: str) -> Any:
-        with _silently():
-            return self._viser.ViserServer(host, self._port, verbose=False)
-
-    def _serving(self) -> Any:
-        with self._lock:
-            if self._server is None:
-                self._closed.clear()
-                self._server = self._start(self._host)
-                self._add_controls(self._server.gui)
-                if self.motion:
-                    self._extend()
-                threading.Thread(target=self._play, args=(self._server,), daemon=True).start()
-            return self._server
-
-    def _add_controls(self, gui: Any) -> None:
-        self._moment = gui.add_slider("moment", 0, max(len(self.motion) - 1, 1), 1, 0)
-        self._time = gui.add_text("time [s]", "0", disabled=True)
-        self._playing = gui.add_checkbox("play", initial_value=True)
-        self._speed = gui.add_dropdown("speed", [str(s) for s in _SPEEDS], initial_value="1.0")
-        self._layer = gui.add_dropdown("color", LAYERS, initial_value=self._color)
-        self._vectors = {
-            name: gui.add_checkbox(f"arrows: {name}", initial_value=name in self._arrow_names)
-            for name in VECTORS
-        }
-        for control in (self._moment, self._layer, *self._vectors.values()):
-            control.on_update(lambda _: self._draw())
-
-    def _extend(self) -> None:
-        """Take note of a new moment."""
-        if self._drawing is None:
-            self._drawing = Drawing(self._server.scene, self._shown, self.motion, self._goals)
-            self._draw()
-            self._drawing.aim(self._server, self._camera)
-        follows = self._moment.value >= len(self.motion) - 2
-        self._moment.max = max(len(self.motion) - 1, 1)
-        if follows:
-            self._moment.value = len(self.motion) - 1
-
-    def _draw(self) -> None:
-        with self._lock:
-            if self._drawing is None or self._server is None:
-                return
-            k = min(int(self._moment.value), len(self.motion) - 1)
-            self._time.value = f"{self.motion[k].time:.3f}"
-            vectors = [name for name, box in self._vectors.items() if box.value]
-            with self._server.atomic():
-                self._drawing.draw(k, self._layer.value, vectors)
-
-    def _play(self, server: Any) -> None:
-        """Move from moment to moment while the page of a server plays."""
-        while True:
-            with self._lock:
-                if self._server is not server:  # nobody stops it while this holds the lock
-                    return
-                k, count = int(self._moment.value), len(self.motion)
-                wait = _SHORTEST_WAIT
-                if self._playing.value and count > 1:
-                    after = (k + 1) % count
-                    step = self.motion[after].time - self.motion[min(k, count - 1)].time
-                    wait = max(step / float(self._speed.value), _SHORTEST_WAIT)
-                    self._moment.value = after
-            time.sleep(wait)
-
-
-def _stop(server: Any) -> None:
-    with _silently():
-        server.stop()
-
-
-@contextmanager
-def _silently() -> Iterator[None]:
-    """Without the announcements of servers, which in a notebook are no standard output."""
-    from rich import get_console
-
-    console = get_console()
-    before, console.quiet = console.quiet, True
-    try:
-        yield
-    finally:
-        console.quiet = before
+    def _draw_on(self, api: Any) -> Drawing:
+        return Drawing(api, self._shown, self.motion, self._goals)

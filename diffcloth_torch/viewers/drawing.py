@@ -38,7 +38,17 @@ class Drawing:
     is visible.
     """
 
-    def __init__(self, api: Any, shown: Shown, motion: Motion, goals: Sequence[Goal]) -> None:
+    def __init__(
+        self,
+        api: Any,
+        shown: Shown,
+        motion: Motion,
+        goals: Sequence[Goal],
+        *,
+        bounds: Bounds | None = None,
+        first: int = 0,
+        places: int | None = None,
+    ) -> None:
         """Prepare the nodes; what moves is added by the first `draw`.
 
         Args:
@@ -46,8 +56,12 @@ class Drawing:
             shown: What is shown of the scene.
             motion: Moments, which may become more.
             goals: Shapes beside the scene.
+            bounds: Of everything that will be drawn; None takes those of the motion.
+            first: Place of the first environment, where several drawings share a page.
+            places: Places of all of them; None counts the environments of the motion.
         """
         self._api, self._shown, self._motion, self._goals = api, shown, motion, goals
+        self._first, self._places, self._given = first, places, bounds
         self._cloths: list[list[Any]] = []
         self._bodies: list[list[Any]] = []
         self._colored: dict[tuple[str, int], list[Any]] = {}
@@ -58,8 +72,7 @@ class Drawing:
     def aim(self, server: Any, camera: Camera) -> None:
         """Put the camera of the page where that of pictures would be."""
         low, high = self.bounds
-        count = len(self._motion[0].positions)
-        wide = np.array([*(high - low)[:2] * _SPACING * (self._columns(count) - 1), 0.0])
+        wide = np.array([*(high - low)[:2] * _SPACING * (self._columns() - 1), 0.0])
         low, high = low - wide / 2, high + wide / 2
         radius = float(np.linalg.norm(high - low)) / 2
         position, target = camera.place((low + high) / 2, radius)
@@ -67,6 +80,11 @@ class Drawing:
         view.up, view.position, view.look_at = camera.up, tuple(position), tuple(target)
         view.fov = math.radians(camera.field_of_view)
         view.near, view.far = 1e-3 * radius, 1e3 * radius
+
+    def restart(self, motion: Motion) -> None:
+        """Draw another motion of the same scene from now on."""
+        self._motion = motion
+        self._forget_colored()
 
     def draw(self, k: int, layer: str, vectors: Sequence[str]) -> None:
         """Show moment k.
@@ -92,23 +110,19 @@ class Drawing:
         self._show_arrows(k, vectors)
 
     def _set_up(self) -> None:
-        shown, first = self._shown, self._motion[0]
-        moments = range(len(self._motion))
-        self.bounds = shown.bounds(
-            [x for k in moments for x in self._motion[k].positions],
-            [f for k in moments for f in self._motion[k].frames],
-            self._goals,
-        )
+        first = self._motion[0]
+        self.bounds = self._motion.bounds(self._goals) if self._given is None else self._given
         api = self._api
         api.set_up_direction("+z")
         for e in range(len(first.positions)):
-            root = self._root(e)
-            api.add_frame(root, show_axes=False, position=self._offset(e, len(first.positions)))
+            root = self.root(e)
+            api.add_frame(root, show_axes=False, position=self._offset(e))
             self._cloths.append(self._add_cloths(root, first.positions[e]))
             self._bodies.append(self._add_bodies(root))
             for g, goal in enumerate(self._goals):
                 self._add_goal(f"{root}/goal_{g}", goal)
-        self._add_floor(len(first.positions))
+        if self._first == 0:
+            self._add_floor()
 
     def _add_cloths(self, root: str, positions: FloatArray) -> list[Any]:
         meshes = []
@@ -150,11 +164,11 @@ class Drawing:
             cast_shadow=False,
         )
 
-    def _add_floor(self, count: int) -> None:
+    def _add_floor(self) -> None:
         low, high = self.bounds
         size = self._size
         cell = 10.0 ** math.floor(math.log10(size))
-        width = 2 * size * (1 + self._columns(count))
+        width = 2 * size * (1 + self._columns())
         center = (low + high) / 2
         self._api.add_grid(
             "/floor",
@@ -178,15 +192,19 @@ class Drawing:
         if layer != "plain":
             top = self._motion.top(layer)
             if self._tops.setdefault(layer, top) != top:  # later moments have larger numbers
+                self._forget_colored()
                 self._tops[layer] = top
-                for handle in itertools.chain.from_iterable(self._colored.values()):
-                    handle.remove()
-                self._colored.clear()
             if (layer, k) not in self._colored:
                 self._add_colored(k, layer, visible=True)
         for key, handles in self._colored.items():
             for handle in handles:
                 handle.visible = key == (layer, k)
+
+    def _forget_colored(self) -> None:
+        for handle in itertools.chain.from_iterable(self._colored.values()):
+            handle.remove()
+        self._colored.clear()
+        self._tops.clear()
 
     def _add_colored(self, k: int, layer: str, *, visible: bool) -> None:
         painted = colors(self._motion.values(layer, k), self._motion.top(layer))
@@ -195,7 +213,7 @@ class Drawing:
             for c, name in enumerate(self._shown.scene.cloth_names):
                 rows = slice(self._shown.cloth_starts[c], self._shown.cloth_starts[c + 1])
                 mesh = _colored_mesh(positions[rows], self._shown.cloth_faces[c], painted[e, rows])
-                node = f"{self._root(e)}/{name}/{layer}_{k}"
+                node = f"{self.root(e)}/{name}/{layer}_{k}"
                 handles.append(self._api.add_glb(node, mesh, visible=visible))
         self._colored[layer, k] = handles
 
@@ -230,7 +248,7 @@ class Drawing:
             known.visible = bool(len(points))
             return
         self._arrows[e, what] = self._api.add_arrows(
-            f"{self._root(e)}/{what}",
+            f"{self.root(e)}/{what}",
             points,
             _rgb(_ARROW_COLORS[what]),
             shaft_radius=_SHAFT * self._size,
@@ -247,17 +265,22 @@ class Drawing:
         step = 2.0 ** math.floor(math.log2(_RESOLUTION * self._size))
         return (np.round(positions / step) * step).astype(np.float32)
 
-    def _root(self, e: int) -> str:
-        return f"/environment_{e}"
+    def root(self, e: int) -> str:
+        """Name of the node of an environment, which holds all that is drawn of it."""
+        return f"/environment_{self._first + e}"
 
-    def _columns(self, count: int) -> int:
-        return math.ceil(math.sqrt(count))
+    @property
+    def _count(self) -> int:
+        return len(self._motion[0].positions) if self._places is None else self._places
 
-    def _offset(self, e: int, count: int) -> tuple[float, float, float]:
+    def _columns(self) -> int:
+        return math.ceil(math.sqrt(self._count))
+
+    def _offset(self, e: int) -> tuple[float, float, float]:
         """Where an environment stands: in rows, around the middle."""
         low, high = self.bounds
-        columns = self._columns(count)
-        row, column = divmod(e, columns)
+        columns = self._columns()
+        row, column = divmod(self._first + e, columns)
         middle = (columns - 1) / 2
         x, y = _SPACING * (high - low)[:2] * (column - middle, row - middle)
         return float(x), float(y), 0.0

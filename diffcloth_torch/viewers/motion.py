@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,8 @@ from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.viewers.layers import strain
-from diffcloth_torch.viewers.shown import Shown
+from diffcloth_torch.viewers.look import Goal
+from diffcloth_torch.viewers.shown import Bounds, Shown
 
 __all__ = ["LAYERS", "Moment", "Motion"]
 
@@ -91,6 +93,14 @@ class Motion(list[Moment]):
                 body_forces=environments(shown.forces(state)),
                 gradient=None if gradient is None else environments(gradient.detach().numpy()),
             )
+        )
+
+    def bounds(self, goals: Sequence[Goal]) -> Bounds:
+        """Bounds of all moments, and of shapes beside them."""
+        return self._shown.bounds(
+            [x for moment in self for x in moment.positions],
+            [f for moment in self for f in moment.frames],
+            goals,
         )
 
     def values(self, layer: str, k: int) -> FloatArray:

@@ -346,3 +346,36 @@ class TestResiduals:
 def test_bad_input(call, error, message):
     with pytest.raises(error, match=message):
         call()
+
+
+@pytest.mark.parametrize("method", ["least_squares", "L-BFGS-B", torch.optim.SGD])
+@pytest.mark.parametrize("count", [1, 3])  # fewer residuals than variables are derived backward
+@pytest.mark.parametrize(
+    ("leave", "message"),
+    [
+        (lambda x: x.numpy(), "must compute with torch .* not with NumPy"),
+        (lambda x: np.asarray(x), "must compute with torch .* not with NumPy"),
+        (lambda x: x.detach(), "must depend on the variables"),
+        (lambda x: x.tolist(), "must depend on the variables"),
+        (lambda x: [y.item() for y in x], "must depend on the variables"),
+    ],
+)
+def test_residuals_that_leave_torch_are_refused(strip, method, count, leave, message):
+    """With what torch says of it as the cause, and never with a derivative of zero."""
+
+    def residuals(parameters):
+        state = rollout(strip, complete(strip, parameters), steps=2)[-1]
+        return torch.as_tensor(leave(state.positions[-1]))[:count]
+
+    with pytest.raises(dc.InvalidInput, match=message):
+        dc.fit(START, residuals, method=method, max_evaluations=2)
+
+
+def test_other_errors_of_residuals_are_their_own():
+    def residuals(parameters):
+        if torch._C._are_functorch_transforms_active():
+            raise RuntimeError("my own")
+        return parameters.stretch.reshape(1)
+
+    with pytest.raises(RuntimeError, match=r"^my own$"):
+        dc.fit(START, residuals)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
+from diffcloth_torch.optimize.compared import noting
 from diffcloth_torch.optimize.outlines import _radii
 
 F64 = torch.float64
@@ -275,8 +276,14 @@ class TestOutline:
         cloth, state, _ = self.wavy(0.0, sizes)
         *_, seen = self.wavy(phase, sizes)
         call = {"faces": cloth.faces, "directions": 48}
-        found = dc.residuals.outline([state], [seen], turned=True, **call)
+        with noting() as notes:
+            found = dc.residuals.outline([state], [seen], turned=True, **call)
         assert float(found.abs().max()) < 5e-5
+        # What was seen lies in the scene of the state, on the rim of the wheel there.
+        rim = dc.residuals.outline([state], notes[0].placed, **call)
+        assert float(rim.abs().max()) < 5e-4
+        plain = dc.residuals.outline([state], notes[0].observed, **call)
+        assert phase == 0.0 or float(plain.abs().max()) > 2e-3
         larger = dc.residuals.outline([state], [1.02 * seen], turned=True, **call)
         assert float(larger.mean()) == pytest.approx(-0.02 * 0.1, rel=1e-2)
 

@@ -85,6 +85,39 @@ def test_a_failure_is_a_rejected_trial_and_counted(name):
     assert found.cost < found.history[0].cost
 
 
+def woven(twill):
+    """Residuals that vanish at a twill of 1.5e-4; from 1.92e-4 on it belongs to a material."""
+    material = dc.Material(
+        bending=4e-4, bending_weft=2e-4, bending_twill=twill, poisson=0.3, density=0.2
+    )
+    cloth = dc.Cloth.grid(6, 3, (0.1, 0.2), pins={"edge": range(6)}, material=material)
+    sim = dc.Simulator(dc.Scene([cloth]), 0.02, contact=dc.ContactOptions(self_contact=False))
+    start = sim.initial_state()
+
+    def residuals(parameters):
+        given = sim.parameters().replace(bending_twill=parameters.bending_twill)
+        state = sim.step(start, parameters=given)
+        return 10 * (parameters.bending_twill / 1.5e-4).log().reshape(1) + 0 * state.positions[0, 0]
+
+    return residuals
+
+
+@pytest.mark.parametrize("method", ["least_squares", "L-BFGS-B", partial(torch.optim.Adam, lr=0.2)])
+def test_a_trial_step_beyond_all_materials_is_rejected(method):
+    """No bounds keep it out, which is no reason to end the fit."""
+    variables = {"bending_twill": dc.Variable(5e-4)}
+    found = dc.fit(variables, woven(5e-4), method=method, max_evaluations=40)
+    assert found.failures > 0
+    failures = [trial.failure for trial in found.history if trial.failure]
+    assert all("`bending_twill` must be at least" in failure for failure in failures)
+    assert 1.92e-4 < float(found.values["bending_twill"]) < 2.5e-4
+
+
+def test_first_values_of_no_material_are_refused():
+    with pytest.raises(dc.InvalidInput, match="`bending_twill` must be at least"):
+        dc.fit({"bending_twill": dc.Variable(1e-4)}, woven(5e-4))
+
+
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [

@@ -69,6 +69,13 @@ SHORT = {
         ],
         {"bending": 0.1},
     ),
+    "fit_drape_woven": (
+        [
+            "scene.cloths.disk.shape.edge_length=0.012",
+            "fit.trajectories.shadow.synthetic.changes=[scene.cloths.disk.shape.edge_length=0.006]",
+        ],
+        {"bending": 0.12, "bending_weft": 0.12, "bending_twill": 0.12},
+    ),
 }
 
 
@@ -266,7 +273,7 @@ def test_the_command_refuses_what_is_no_fit(config, tmp_path):
 @pytest.mark.parametrize(
     ("option", "expected"),
     [
-        ([], r"stretch +30 .* [01] of 1\n"),
+        ([], r"stretch +30 .* [01] of 1 \(\d+% to \d+%\); by the bias 9[45]%\n"),
         (["--places"], r"2 numbers, 2 trajectories\n1 of 1 starts end at the same place"),
         (["--compare"], r"tangents +\d+(.*\n)differences +\d+(.*\n)Adam +100(.*\n)CMA-ES +\d+"),
     ],
@@ -281,3 +288,13 @@ def test_the_benchmark_runs(option, expected):
     )
     assert result.returncode == 0, result.stderr
     assert re.search(expected, result.stdout), result.stdout
+
+
+def test_what_a_bias_leaves_is_what_random_intervals_count():
+    from benchmarks.identification import biased_share, shares
+
+    middles = np.random.default_rng(0).standard_normal(100_000)
+    for bias in (0.0, -0.5, 1.96):
+        counted = np.mean(np.abs(middles + bias) < 1.96)
+        assert biased_share(bias, 1.96) == pytest.approx(counted, abs=5e-3)
+    assert shares(36, 40) == "36 of 40 (76% to 97%)"

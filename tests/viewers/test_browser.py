@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -9,11 +10,14 @@ import sys
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 from short_tasks import CONFIGS, DYNAMIC, controls_of
 
 import diffcloth_torch as dc
+from diffcloth_torch.cli import main
 from diffcloth_torch.commands import optimize, run
 from diffcloth_torch.viewers.browser import Browser
+from diffcloth_torch.viewers.fitted import FittedPage, Track
 from diffcloth_torch.viewers.layers import colors, strain
 
 pytest.importorskip("viser")
@@ -26,6 +30,8 @@ CHROMIUM = next(
 )
 
 WIDTH, HEIGHT = 640, 480
+# Without what Chromium says of its drawing, and the axes in the corner.
+FREE = (slice(180, None), slice(80, None))
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +82,14 @@ def screenshot(page, file, seconds):
 
 def is_blue(image):
     return (image[..., 2] - image[..., 0] > 40) & (image[..., 2] > 120)
+
+
+def is_sand(image):
+    return (image[..., 0] - image[..., 2] > 40) & (image[..., 1] > 120)
+
+
+def is_orange(image):
+    return (image[..., 0] - image[..., 2] > 120) & (image[..., 1] < 130)
 
 
 def test_strain_is_that_of_a_stretched_sheet():
@@ -242,6 +256,98 @@ def test_the_command_line_chooses_viewers(tmp_path):
     )
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == ["animation.html", "meshes", "metrics.json"]
+
+
+FIT = """
+task: identify
+simulation: {dt: 0.02, steps: 4}
+scene:
+  cloths:
+    - name: sheet
+      shape: {kind: grid, rows: 3, columns: 3, size: 0.2}
+      pose: {axis: [1, 0, 0], degrees: 90}
+      material: {stretch: 10, density: 0.3}
+      pins: {top: {box: {lower: [-1, -1, 0.09], upper: [1, 1, 0.11]}}}
+fit:
+  variables: {stretch: {value: 4}}
+  trajectories:
+    - {name: rest, equilibrium: true, noise: 1e-3, synthetic: {values: {stretch: 10}}}
+    - {name: fall, steps: [2, 4], noise: 1e-3, synthetic: {values: {stretch: 10}}}
+"""
+
+
+class TestFits:
+    def test_a_fit_writes_the_page_of_its_best_values(self, chromium, tmp_path, monkeypatch):
+        config, out = tmp_path / "hang.yaml", tmp_path / "out"
+        config.write_text(FIT)
+        shown = []
+        show = FittedPage.show
+        monkeypatch.setattr(
+            FittedPage, "show", lambda page, *given: [shown.append(given), show(page, *given)]
+        )
+        result = CliRunner().invoke(
+            main, ["fit", str(config), "--out", str(out), "--viewer", "web"]
+        )
+        assert result.exit_code == 0, result.output
+        found = json.loads((out / "fit.json").read_text())
+        costs = [trial["cost"] for trial in found["history"]]
+        assert len(shown) == sum(
+            cost < min(costs[:k], default=np.inf) for k, cost in enumerate(costs)
+        )
+        # What is shown at last are the residuals at the values that were found.
+        tracks, text = shown[-1]
+        off = [
+            state.positions.numpy() - seen
+            for track in tracks
+            for state, seen in zip(track.states, track.observed, strict=True)
+        ]
+        assert [len(track.states) for track in tracks] == [1, 2]
+        assert 0.5 * sum(((x / 1e-3) ** 2).sum() for x in off) == pytest.approx(found["cost"])
+        assert f"stretch: {found['values']['stretch']:.4g}" in text
+        image = screenshot((out / "animation.html").as_uri(), tmp_path / "fit.png", 3)
+        assert is_blue(image).sum() + is_sand(image).sum() > 3000  # two sheets, of either side
+        assert is_orange(image[FREE]).sum() > 50  # nine points on each
+
+    def test_a_page_follows_a_fit(self, falling, chromium, tmp_path):
+        """Its points are those that were observed, and go where they are observed next."""
+        scene, states = falling
+        still = states[0][0]
+        page = FittedPage([scene], port=8481, camera=dc.Camera(azimuth=0, elevation=40))
+        below = np.array([0.0, 0.0, 0.3])
+        seen = still.positions.numpy() - below
+        seen[:40] = np.nan  # not seen
+        try:
+            page.show([Track([still], [seen])], "first")
+            before = screenshot(page.url, tmp_path / "before.png", 4)
+            page.show([Track([still], [seen - below])], "second")
+            after = screenshot(page.url, tmp_path / "after.png", 4)
+        finally:
+            page.close()
+        rows = [np.flatnonzero(is_orange(im[FREE]).any(axis=1)) for im in (before, after)]
+        assert min(map(len, rows)) > 5
+        assert rows[1].mean() > rows[0].mean() + 20
+        assert [len(points) for points in page.points[0]] == [41]
+        assert is_blue(after).sum() > 1500
+
+    def test_an_outline_is_a_closed_line_below_the_cloth(self, falling):
+        _, states = falling
+        state = states[0][0]
+        square = np.array([[0.2, 0.2], [-0.2, 0.2], [-0.2, -0.2], [0.2, -0.2]])
+        (points,) = Track([state], [square]).points()
+        assert points[:, 2] == pytest.approx(float(state.positions[:, 2].min()))
+        assert np.abs(points[:, :2]).max(axis=1) == pytest.approx(0.2)
+        steps = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
+        assert steps == pytest.approx(0.4 / 8)
+
+    def test_trajectories_must_be_those_of_the_scenes(self, falling):
+        scene, _ = falling
+        with pytest.raises(dc.InvalidInput, match="one for each of 1 scenes, got 0"):
+            FittedPage([scene]).show([])
+
+    def test_what_is_resumed_has_its_viewer_already(self, tmp_path):
+        result = CliRunner().invoke(main, ["fit", "--resume", str(tmp_path), "--viewer", "web"])
+        assert result.exit_code == 2
+        assert "--set or --viewer" in result.output
 
 
 class TestRefused:
