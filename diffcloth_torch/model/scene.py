@@ -19,7 +19,7 @@ from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.quantities import check_parameter
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.robot import Robot
-from diffcloth_torch.model.springs import Springs, make_springs, surfaces_of
+from diffcloth_torch.model.springs import AttachedSurface, Springs, make_springs, surfaces_of
 
 __all__ = ["Scene"]
 
@@ -115,8 +115,7 @@ class Scene:
             a.name or f"attachment{i}" for i, a in enumerate(self.attachments)
         )
         _check_unique(self.attachment_names)
-        surfaces = [body.contact_surface.vertices for body in self.bodies]
-        self.springs = self._springs(surfaces)
+        self.springs = make_springs(self.attachment_names, self.attachments, self._attached())
 
     @property
     def is_dynamic(self) -> bool:
@@ -135,18 +134,13 @@ class Scene:
         ]
         return (*self.cloth_names, *self.body_names, *links)
 
-    def attached_to_meshes(self) -> Springs:
-        """The springs of attachments where smooth bodies touch with their meshes."""
-        if not any(body.smooth for body in self.bodies):
-            return self.springs
-        return self._springs([body.vertices for body in self.bodies])
-
-    def _springs(self, of_bodies: list[FloatArray]) -> Springs:
+    def _attached(self) -> dict[str, AttachedSurface]:
         shaped = [s for robot in self.robots for s in robot.surfaces if s is not None]
         vertices = [cloth.vertices for cloth in self.cloths]
-        vertices += of_bodies + [s.vertices for s in shaped]
-        surfaces = surfaces_of(self.surface_names, vertices, len(self.cloths))
-        return make_springs(self.attachment_names, self.attachments, surfaces)
+        # Of a smooth body, the points that say where it is in the core.
+        vertices += [body.contact_surface.vertices for body in self.bodies]
+        vertices += [s.vertices for s in shaped]
+        return surfaces_of(self.surface_names, vertices, len(self.cloths))
 
     def __repr__(self) -> str:
         robots = f", robots={list(self.robots)}" if self.robots else ""
