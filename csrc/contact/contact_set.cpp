@@ -95,7 +95,8 @@ double ContactModel::area(const Candidate& pair, const RestMeasures& rest) const
 
 double ContactModel::threshold(const Candidate& pair) const {
   if (pair.kind == PairKind::kPointTriangle || pair.b < 0) return 0.0;
-  return mollifier_threshold(rest_.edge_length_sq[pair.a], rest_.edge_length_sq[pair.b]);
+  return mollifier_threshold(rest_.edge_length_sq[pair.a], rest_.edge_length_sq[pair.b],
+                             mesh_.is_round_edge(pair.a) || mesh_.is_round_edge(pair.b));
 }
 
 void ContactModel::pull_back_area(const Contact& k, double area_bar, RestMeasures& rest) const {
@@ -123,7 +124,7 @@ void ContactModel::pull_back(
   bar.thickness[surface_b(pair)] += 0.5 * xi_bar;
   pull_back_area(k, k.coefficient * weight_bar, bar.rest);
   if (!k.mollified) return;
-  // The threshold is 1e-3 |U|^2 |V|^2.
+  // The threshold is a number times |U|^2 |V|^2.
   RestMeasures& rest = bar.rest;
   rest.edge_length_sq[pair.a] += threshold_bar * k.threshold / rest_.edge_length_sq[pair.a];
   rest.edge_length_sq[pair.b] += threshold_bar * k.threshold / rest_.edge_length_sq[pair.b];

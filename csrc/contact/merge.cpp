@@ -434,7 +434,9 @@ void add_edge_terms(const CollisionMesh& mesh,
     const Closest nearest_points = closest(PairKind::kEdgeEdge, corner);
     // So are the ends then, and what they would be merged with; but for the rounding of distances.
     if (nearest_points.d_sq > kClearly * range * range) continue;
-    const bool soft = mollified(corner, mollifier_threshold(edge_length_sq[c], edge_length_sq[e]));
+    const bool is_round = mesh.is_round_edge(c) || mesh.is_round_edge(e);
+    const bool soft =
+        mollified(corner, mollifier_threshold(edge_length_sq[c], edge_length_sq[e], is_round));
     EdgePair(mesh, weights, pair, nearest_points, corner, soft, x, scratch.parts).list_parts(w);
   }
   merge(scratch.parts, range);

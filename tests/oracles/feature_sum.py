@@ -175,7 +175,8 @@ class FeatureSum:
     def mollifier(self, x, c, e):
         rest = self.scene.X
         length_sq = [np.sum((rest[i] - rest[j]) ** 2) for i, j in (c, e)]
-        return kernels.mollifier(x[[*c, *e]], kernels.mollifier_threshold(*length_sq))[0]
+        is_round = any(self.radius[self.scene.surface[edge[0]]] for edge in (c, e))
+        return kernels.mollifier(x[[*c, *e]], kernels.mollifier_threshold(*length_sq, is_round))[0]
 
     def edge_against(self, x, c, s, r):
         """Sum over the sharp edges of body r."""

@@ -215,7 +215,7 @@ void distance_kernels(nb::module_& m) {
       },
       "edge_edge"_a, "x"_a.noconvert());
   m.def("mollifier_threshold", &contact::mollifier_threshold, "rest_length_sq_a"_a,
-        "rest_length_sq_b"_a);
+        "rest_length_sq_b"_a, "is_round"_a = false);
   m.def(
       "mollifier",
       [](const OnePair& x, double eps) {
