@@ -172,6 +172,11 @@ class RigidBody:
         **keywords: Any,
     ) -> RigidBody:
         is_smooth = check_bool("RigidBody: `smooth`", smooth)
+        if is_smooth and primitive.kind not in ("sphere", "capsule"):
+            raise InvalidInput(
+                "RigidBody: `smooth` is for spheres and capsules, got True for a "
+                f"{primitive.kind}, which is exact as a mesh"
+            )
         if is_smooth and keywords.get("motion") == "dynamic":
             keywords = _with_round_mass(primitive, keywords)
         body = cls(*mesh, **keywords)
