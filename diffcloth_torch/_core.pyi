@@ -81,6 +81,7 @@ class Simulator:
         attachment_targets: NDArray[np.int32],
         body_vertices: NDArray[np.float64],
         body_faces: NDArray[np.int32],
+        body_radii: NDArray[np.float64],
         body_vertex_start: NDArray[np.int32],
         self_contact: bool,
         dt: float,

@@ -80,7 +80,7 @@ def test_the_fuzz_sees_what_is_wrong():
     before, where = scene.start, {"step": 0}
     after = scene.simulator.step(before, scene.control(before, 0))
     judge = fuzz_main.SchemeJudge(scene)
-    path = scene.simulator.path(before, scene.control(before, 0)).numpy()
+    path = judge.placed(scene.simulator.path(before, scene.control(before, 0)).numpy())
     fuzz_main._judge(scene, judge, before, after, path, tally, where)
     assert not tally.counts
     faster = after.replace(body_velocities=1.1 * after.body_velocities + 0.1)

@@ -121,6 +121,8 @@ void check_description(const step::Description& d) {
   const std::size_t bodies = d.bodies.vertex_start.size() - 1;
   check_starts("body_vertex_start", d.bodies.vertex_start, bodies, body_vertices);
   check_faces("body_faces", d.body_faces, body_vertices);
+  require(d.body_radii.empty() || d.body_radii.size() == bodies,
+          "`body_radii` must be as many as there are bodies and links");
   for (const auto& pair : d.ignored_pairs) {
     check_indices("ignored_pairs", {pair.begin(), pair.end()}, static_cast<Index>(cloths + bodies));
   }

@@ -157,6 +157,7 @@ void take_surfaces(NamedFields& fields, step::Description& d) {
               .vertex_start = fields.indices("body_vertex_start"),
               .pose = {}};
   d.body_faces = to_faces(fields.indices("body_faces"));
+  if (fields.has("body_radii")) d.body_radii = fields.doubles("body_radii");
   if (fields.has("attachment_start")) d.attachments = take_attachments(fields);
   if (fields.has("primitive_kinds")) d.primitives = take_primitives(fields);
   if (fields.has("surface_names")) d.surface_names = fields.take<Names>("surface_names");

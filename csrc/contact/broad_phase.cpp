@@ -270,14 +270,18 @@ void BroadPhase::collect_pairs(const Sweep& sweep, Scratch& scratch) const {
     const Scratch::Surface& b = scratch.surfaces[r];
     // Rounded up, as the boxes are rounded outward.
     const double range = (1.0 + kOutward) * (sweep.reach[s] + sweep.reach[r]);
-    append_overlaps(trees_[s].vertices, a.vertices, trees_[r].faces, b.faces, range, scratch.stack,
-                    vertex_faces);
+    if (meet(s, r)) {
+      append_overlaps(trees_[s].vertices, a.vertices, trees_[r].faces, b.faces, range,
+                      scratch.stack, vertex_faces);
+    }
     if (s == r) {
       append_self_overlaps(trees_[s].edges, a.edges, range, scratch.stack, edges);
       return;
     }
-    append_overlaps(trees_[r].vertices, b.vertices, trees_[s].faces, a.faces, range, scratch.stack,
-                    vertex_faces);
+    if (meet(r, s)) {
+      append_overlaps(trees_[r].vertices, b.vertices, trees_[s].faces, a.faces, range,
+                      scratch.stack, vertex_faces);
+    }
     append_overlaps(trees_[s].edges, a.edges, trees_[r].edges, b.edges, range, scratch.stack,
                     edges);
   });
@@ -345,8 +349,12 @@ std::optional<std::pair<Index, Index>> BroadPhase::find_intersection(const doubl
   visit_surface_pairs({.x_t0 = x, .x_t1 = x, .reach = reach}, scratch, [&](Index s, Index r) {
     const Scratch::Surface& a = scratch.surfaces[s];
     const Scratch::Surface& b = scratch.surfaces[r];
-    append_overlaps(trees_[s].edges, a.edges, trees_[r].faces, b.faces, 0.0, scratch.stack, pairs);
-    if (s == r) return;
+    // Nothing pierces a skeleton.
+    if (!mesh_.is_round(r)) {
+      append_overlaps(trees_[s].edges, a.edges, trees_[r].faces, b.faces, 0.0, scratch.stack,
+                      pairs);
+    }
+    if (s == r || mesh_.is_round(s)) return;
     append_overlaps(trees_[r].edges, b.edges, trees_[s].faces, a.faces, 0.0, scratch.stack, pairs);
   });
   std::optional<std::pair<Index, Index>> lowest;

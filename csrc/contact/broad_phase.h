@@ -58,7 +58,8 @@ inline Candidate candidate_of_edges(const CollisionMesh& mesh, Index e, Index f)
 ///
 /// Immutable after construction, and safe to share between threads that each have a Scratch. Pairs
 /// are: vertex and face, edge and edge, of surfaces that may touch. Pairs that share a vertex are
-/// left out, as are vertices that belong to no face.
+/// left out, as are vertices that belong to no face, and the faces of round bodies where vertices of
+/// meshes meet them: the skeleton's own vertices and edge meet all faces and edges of the mesh.
 class BroadPhase {
  public:
   /// @param mesh         outlives this
@@ -74,6 +75,11 @@ class BroadPhase {
   };
 
   const SurfaceTrees& trees(Index surface) const { return trees_[surface]; }
+
+  /// Whether vertices of one surface meet the faces of another.
+  bool meet(Index of_vertices, Index of_faces) const {
+    return mesh_.is_round(of_vertices) || !mesh_.is_round(of_faces);
+  }
 
   /// Boxes and lists that a search fills; reuse one to search without allocation.
   struct Scratch {

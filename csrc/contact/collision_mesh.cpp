@@ -9,6 +9,16 @@ namespace diffcloth::contact {
 namespace {
 
 void check(const CollisionMesh& mesh) {
+  if (mesh.radius.size() != static_cast<std::size_t>(mesh.surface_count())) {
+    throw std::invalid_argument("collision mesh: `radius` must have one value a surface");
+  }
+  for (Index s = 0; s < mesh.surface_count(); ++s) {
+    if (!(mesh.radius[s] >= 0.0) || (s < mesh.cloth_count && mesh.radius[s] > 0.0)) {
+      throw std::invalid_argument(
+          "collision mesh: `radius` must be 0 of cloths and at least 0 of bodies, got " +
+          std::to_string(mesh.radius[s]) + " at surface " + std::to_string(s));
+    }
+  }
   for (Index i = 0; i < mesh.vertex_count; ++i) {
     if (mesh.vertex_surface[i] < (i == 0 ? 0 : mesh.vertex_surface[i - 1]) ||
         mesh.vertex_surface[i] >= mesh.surface_count()) {
@@ -29,10 +39,17 @@ void check(const CollisionMesh& mesh) {
     for (const Index v : mesh.faces[f]) {
       if (v < 0 || v >= mesh.vertex_count) refuse("refer to vertices of the mesh");
     }
-    if (i == j || j == k || k == i) refuse("have three different corners");
     const Index surface = mesh.vertex_surface[i];
     if (mesh.vertex_surface[j] != surface || mesh.vertex_surface[k] != surface) {
       refuse("lie on one surface");
+    }
+    if (mesh.is_round(surface)) {
+      if (j != k) refuse("be a point or a segment where their surface is round");
+      if (surface == previous && f > 0 && mesh.vertex_surface[mesh.faces[f - 1][0]] == surface) {
+        refuse("be one where their surface is round");
+      }
+    } else if (i == j || j == k || k == i) {
+      refuse("have three different corners");
     }
     if (surface < previous) refuse("be grouped by surface in ascending order");
     previous = surface;
@@ -43,14 +60,21 @@ void check(const CollisionMesh& mesh) {
 struct HalfEdge {
   Index surface;
   CollisionMesh::Edge edge;
-  Index face;
-  int side;  ///< It joins the corners side and side + 1.
+  Index face;  ///< -1 of a skeleton, which has none
+  int side;    ///< It joins the corners side and side + 1.
 };
 
 std::vector<HalfEdge> sorted_half_edges(const CollisionMesh& mesh) {
   std::vector<HalfEdge> half_edges;
   half_edges.reserve(3 * mesh.faces.size());
   for (std::size_t f = 0; f < mesh.faces.size(); ++f) {
+    if (mesh.is_round(mesh.face_surface[f])) {
+      const auto [v0, v1] = std::minmax(mesh.faces[f][0], mesh.faces[f][1]);
+      if (v0 == v1) continue;
+      half_edges.push_back(
+          {.surface = mesh.face_surface[f], .edge = {v0, v1}, .face = -1, .side = 0});
+      continue;
+    }
     for (int k = 0; k < 3; ++k) {
       const auto [v0, v1] = std::minmax(mesh.faces[f][k], mesh.faces[f][(k + 1) % 3]);
       half_edges.push_back({.surface = mesh.face_surface[f],
@@ -70,12 +94,15 @@ std::vector<HalfEdge> sorted_half_edges(const CollisionMesh& mesh) {
 CollisionMesh::CollisionMesh(std::vector<Face> faces_in,
                              std::vector<Index> vertex_surface_in,
                              Index cloth_count_in,
-                             SurfacePairs touching_in)
+                             SurfacePairs touching_in,
+                             std::vector<double> radius_in)
     : vertex_count(static_cast<Index>(vertex_surface_in.size())),
       cloth_count(cloth_count_in),
       faces(std::move(faces_in)),
       vertex_surface(std::move(vertex_surface_in)),
+      radius(std::move(radius_in)),
       touching(std::move(touching_in)) {
+  if (radius.empty()) radius.assign(static_cast<std::size_t>(surface_count()), 0.0);
   check(*this);
   for (const Index surface : vertex_surface) cloth_vertex_count += surface < cloth_count;
   face_surface.reserve(faces.size());
@@ -83,7 +110,11 @@ CollisionMesh::CollisionMesh(std::vector<Face> faces_in,
     face_surface.push_back(vertex_surface[face[0]]);
     cloth_face_count += face_surface.back() < cloth_count;
   }
-  face_edges.resize(faces.size());
+  is_point_.assign(static_cast<std::size_t>(surface_count()), 0);
+  for (std::size_t f = 0; f < faces.size(); ++f) {
+    is_point_[face_surface[f]] = is_round(face_surface[f]) && faces[f][0] == faces[f][1];
+  }
+  face_edges.assign(faces.size(), {-1, -1, -1});
   for (const HalfEdge& half_edge : sorted_half_edges(*this)) {
     if (edges.empty() || edges.back() != half_edge.edge) {
       edges.push_back(half_edge.edge);
@@ -93,6 +124,7 @@ CollisionMesh::CollisionMesh(std::vector<Face> faces_in,
     } else if (edge_faces.back()[1] < 0) {
       edge_faces.back()[1] = half_edge.face;
     }
+    if (half_edge.face < 0) continue;
     face_edges[half_edge.face][half_edge.side] = static_cast<Index>(edges.size()) - 1;
   }
 }

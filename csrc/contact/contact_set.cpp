@@ -40,11 +40,16 @@ ContactModel::ContactModel(const CollisionMesh& mesh,
       rest_(rest),
       parameters_(std::move(parameters)),
       prescribed_(prescribed) {
-  for (const double t : parameters_.thickness) reach_.push_back(0.5 * (parameters_.d_hat + t));
+  for (std::size_t s = 0; s < parameters_.thickness.size(); ++s) {
+    reach_.push_back(0.5 * (parameters_.d_hat + parameters_.thickness[s]) + mesh.radius[s]);
+  }
 }
 
 double ContactModel::xi(const Candidate& pair) const {
-  return 0.5 * (parameters_.thickness[surface_a(pair)] + parameters_.thickness[surface_b(pair)]);
+  const Index a = surface_a(pair);
+  const Index b = surface_b(pair);
+  return 0.5 * (parameters_.thickness[a] + parameters_.thickness[b]) +
+         (mesh_.radius[a] + mesh_.radius[b]);
 }
 
 double ContactModel::mean_entry(const std::vector<double>& values, const Candidate& pair) const {
@@ -80,6 +85,7 @@ double ContactModel::area(const Candidate& pair) const {
 double ContactModel::area(const Candidate& pair, const RestMeasures& rest) const {
   if (pair.kind == PairKind::kPointTriangle) {
     const Index p = pair.vertices[0];
+    if (is_round_on_cloth(pair)) return rest.face_area[pair.b];
     return p < mesh_.cloth_vertex_count ? rest.vertex_area[p]
                                         : rest.mean_face_area[surface_b(pair)];
   }
@@ -89,7 +95,8 @@ double ContactModel::area(const Candidate& pair, const RestMeasures& rest) const
 
 double ContactModel::threshold(const Candidate& pair) const {
   if (pair.kind == PairKind::kPointTriangle || pair.b < 0) return 0.0;
-  return mollifier_threshold(rest_.edge_length_sq[pair.a], rest_.edge_length_sq[pair.b]);
+  return mollifier_threshold(rest_.edge_length_sq[pair.a], rest_.edge_length_sq[pair.b],
+                             mesh_.is_round_edge(pair.a) || mesh_.is_round_edge(pair.b));
 }
 
 void ContactModel::pull_back_area(const Contact& k, double area_bar, RestMeasures& rest) const {
@@ -101,7 +108,9 @@ void ContactModel::pull_back_area(const Contact& k, double area_bar, RestMeasure
     return;
   }
   const Index p = pair.vertices[0];
-  if (p < mesh_.cloth_vertex_count) {
+  if (is_round_on_cloth(pair)) {
+    rest.face_area[pair.b] += area_bar;
+  } else if (p < mesh_.cloth_vertex_count) {
     rest.vertex_area[p] += area_bar;
   } else {
     rest.mean_face_area[surface_b(pair)] += area_bar;
@@ -115,7 +124,7 @@ void ContactModel::pull_back(
   bar.thickness[surface_b(pair)] += 0.5 * xi_bar;
   pull_back_area(k, k.coefficient * weight_bar, bar.rest);
   if (!k.mollified) return;
-  // The threshold is 1e-3 |U|^2 |V|^2.
+  // The threshold is a number times |U|^2 |V|^2.
   RestMeasures& rest = bar.rest;
   rest.edge_length_sq[pair.a] += threshold_bar * k.threshold / rest_.edge_length_sq[pair.a];
   rest.edge_length_sq[pair.b] += threshold_bar * k.threshold / rest_.edge_length_sq[pair.b];
@@ -147,7 +156,7 @@ std::size_t ContactModel::group_end(const std::vector<Candidate>& candidates,
                                     std::size_t first) const {
   const Candidate& head = candidates[first];
   std::size_t end = first + 1;
-  if (between_cloths(head)) return end;
+  if (is_alone(head)) return end;
   while (end < candidates.size() && candidates[end].kind == head.kind &&
          candidates[end].a == head.a && surface_b(candidates[end]) == surface_b(head)) {
     ++end;
@@ -172,9 +181,9 @@ bool is_beyond(PairKind kind, const Corners& x, double range) {
 
 }  // namespace
 
-void ContactModel::add_cloth_term(const Candidate& pair,
-                                  const double* x,
-                                  std::vector<Term>& out) const {
+void ContactModel::add_own_term(const Candidate& pair,
+                                const double* x,
+                                std::vector<Term>& out) const {
   if (std::ranges::all_of(pair.vertices, [&](Index v) { return prescribed_[v] != 0; })) return;
   const Corners corner = corners(pair.vertices, x);
   const double range = parameters_.d_hat + xi(pair);
@@ -183,14 +192,32 @@ void ContactModel::add_cloth_term(const Candidate& pair,
   if (d_sq < range * range) out.push_back({.pair = pair, .coefficient = 0.25, .d_sq = d_sq});
 }
 
+/// A point of a skeleton against another skeleton. Of two spheres one has the other; a sphere has the capsule,
+/// whose ends do not cover it; two capsules have each other's ends, besides the segments.
+void ContactModel::add_skeleton_term(const Candidate& pair,
+                                     const double* x,
+                                     std::vector<Term>& out) const {
+  const auto& [p, i, j, k] = pair.vertices;
+  const bool is_point_b = i == j;
+  const bool is_point_a = mesh_.is_point(surface_a(pair));
+  if (is_point_b && (!is_point_a || surface_a(pair) > surface_b(pair))) return;
+  const double range = parameters_.d_hat + xi(pair);
+  const double d_sq = closest(pair.kind, corners(pair.vertices, x)).d_sq;
+  if (!(d_sq < range * range)) return;
+  Candidate own = pair;
+  own.b = -1;  // no face has the area
+  out.push_back(
+      {.pair = own, .coefficient = 0.25 * weights_.vertex_area(p, surface_b(pair)), .d_sq = d_sq});
+}
+
 /// Terms of a group of candidates.
 void ContactModel::find_terms(std::span<const Candidate> group,
                               const double* x,
                               MergeScratch& scratch,
                               std::vector<Term>& out) const {
   const Candidate& head = group.front();
-  if (between_cloths(head)) {
-    add_cloth_term(head, x, out);
+  if (is_alone(head)) {
+    add_own_term(head, x, out);
     return;
   }
   const double range = parameters_.d_hat + xi(head);
@@ -202,6 +229,10 @@ void ContactModel::find_terms(std::span<const Candidate> group,
   if (prescribed_a && body_b && prescribed_[head.vertices[3]] != 0) return;
   if (edges) {
     add_edge_terms(mesh_, weights_, group, rest_.edge_length_sq, x, range, 0.5, scratch, out);
+    return;
+  }
+  if (body_b && mesh_.is_round(surface_b(head))) {
+    for (const Candidate& pair : group) add_skeleton_term(pair, x, out);
     return;
   }
   double w = 1.0;
@@ -277,7 +308,7 @@ void ContactModel::measure(const std::vector<Candidate>& candidates,
     out.energies.push_back({.kind = head.kind,
                             .a = head.a,
                             .surface = surface_b(head),
-                            .b = between_cloths(head) ? head.b : -1,
+                            .b = is_alone(head) ? head.b : -1,
                             .value = sum});
   }
 }
@@ -469,8 +500,17 @@ std::array<Index, 3> ContactModel::frame(const Candidate& pair) const {
   }
   const Index a = surface_a(pair);
   const Index b = surface_b(pair);
-  const bool takes_a = b < mesh_.cloth_count || (between_bodies(pair) && prescribed_[v[0]] != 0);
+  const bool takes_a =
+      mesh_.is_round(a) != mesh_.is_round(b) && between_bodies(pair)
+          ? mesh_.is_round(a)
+          : b < mesh_.cloth_count || (between_bodies(pair) && prescribed_[v[0]] != 0);
   return weights_.carriers(takes_a ? a : b);
+}
+
+double ContactModel::first_share(const Candidate& pair) const {
+  const double a = mesh_.radius[surface_a(pair)];
+  const double b = mesh_.radius[surface_b(pair)];
+  return a > 0.0 && b > 0.0 ? a / (a + b) : -1.0;
 }
 
 // B = kappa w m b, contact by contact. Bodies' shares of areas are constant where features do not change.

@@ -33,7 +33,7 @@ struct Contact {
   double coefficient;  ///< share of the area, between bodies an area [m^2]; may be negative
   double weight;       ///< w: coefficient times area [m^2]
   double threshold;    ///< eps of the edge-edge mollifier [m^4]; 0 where there is none
-  double xi;           ///< half the sum of the two thicknesses [m]
+  double xi;           ///< distance of touching: half the sum of the thicknesses, and the radii [m]
   double kappa;        ///< barrier stiffness of the two surfaces [Pa]
   Closest closest;
   Barrier barrier;
@@ -113,6 +113,9 @@ class ContactHessian {
 /// Between two bodies it is over the features of each that a corner of the other meets, and over pairs
 /// of ridges; areas are those of FeatureWeights.
 ///
+/// Round bodies (see CollisionMesh) are larger by their radius than the skeleton that is in the pairs. They
+/// meet faces of cloths, w = A_f / 4, and edges: see FeatureWeights.
+///
 /// Terms that share their nearest features are one contact, whose coefficient is the sum of theirs.
 ///
 /// Positions are those of the whole collision mesh, cloth first, then bodies: 3 doubles a vertex.
@@ -129,11 +132,11 @@ class ContactModel {
   const Parameters& parameters() const { return parameters_; }
   const CollisionMesh& mesh() const { return mesh_; }
 
-  /// Half the distance at which a surface can interact with one of its own thickness:
-  /// (d_hat + thickness) / 2 [m]. A pair can at the sum of both, d_hat + xi.
+  /// Half the distance at which a surface can interact with one of its own kind:
+  /// (d_hat + thickness) / 2 + radius [m]. A pair can at the sum of both, d_hat + xi.
   const std::vector<double>& reach() const { return reach_; }
 
-  /// Half the sum of the thicknesses of a pair's surfaces [m].
+  /// Half the sum of the thicknesses of a pair's surfaces, and their radii [m].
   double xi(const Candidate& pair) const;
 
   /// Barrier stiffness of a pair's surfaces [Pa].
@@ -161,10 +164,17 @@ class ContactModel {
 
   bool between_cloths(const Candidate& pair) const;
 
-  /// Three vertices of one of a pair's surfaces, with which the gap between both turns: of a body, at rest
-  /// rather than moving; between cloths of the triangle, or, of edges that do not cross, of a face at the
+  /// Three vertices of one of a pair's surfaces, with which the gap between both turns: of a body, round
+  /// rather than not, at rest rather than moving; between cloths of the triangle, or, of edges that do not cross, of a face at the
   /// second one.
   std::array<Index, 3> frame(const Candidate& pair) const;
+
+  /// How much of the gap turns with the pair's first surface, the rest with the second: of two round bodies by
+  /// their radii, so that each rolls on its own; negative where all turns with frame().
+  double first_share(const Candidate& pair) const;
+
+  /// Three vertices that say how a body turns.
+  const std::array<Index, 3>& carriers(Index surface) const { return weights_.carriers(surface); }
 
   /// g += grad B.
   void add_gradient(const std::vector<Contact>& contacts, const double* x, double* g) const;
@@ -230,6 +240,16 @@ class ContactModel {
   }
 
  private:
+  /// Whether a pair is of a point of a skeleton and a face of a cloth.
+  bool is_round_on_cloth(const Candidate& pair) const {
+    return pair.kind == PairKind::kPointTriangle && mesh_.is_round_vertex(pair.vertices[0]) &&
+           surface_b(pair) < mesh_.cloth_count;
+  }
+  /// Whether a candidate is a term of its own.
+  bool is_alone(const Candidate& pair) const {
+    return between_cloths(pair) || is_round_on_cloth(pair);
+  }
+  void add_skeleton_term(const Candidate& pair, const double* x, std::vector<Term>& out) const;
   /// Candidates that act together: one, or those of a point or an edge and a body.
   std::size_t group_end(const std::vector<Candidate>& candidates, std::size_t first) const;
   bool between_bodies(const Candidate& pair) const;
@@ -237,7 +257,7 @@ class ContactModel {
                   const double* x,
                   MergeScratch& scratch,
                   std::vector<Term>& out) const;
-  void add_cloth_term(const Candidate& pair, const double* x, std::vector<Term>& out) const;
+  void add_own_term(const Candidate& pair, const double* x, std::vector<Term>& out) const;
   /// Mean of the two entries that a pair's surfaces have among values [S * S].
   double mean_entry(const std::vector<double>& values, const Candidate& pair) const;
   void pull_back_mean_entry(const Candidate& pair, double mean_bar, std::vector<double>& bar) const;

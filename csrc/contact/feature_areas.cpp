@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <numbers>
 #include <utility>
 
 #include <Eigen/Geometry>
@@ -31,6 +32,10 @@ std::vector<std::array<Index, 2>> facets_of_edges(const CollisionMesh& mesh,
                                                   const std::vector<Index>& facet) {
   std::vector<std::array<Index, 2>> result;
   for (const auto& [f, g] : mesh.edge_faces) {
+    if (f < 0) {
+      result.push_back({-1, -1});
+      continue;
+    }
     const Index other = g < 0 ? -1 : facet[g];
     result.push_back({std::min(facet[f], other), std::max(facet[f], other)});
   }
@@ -75,6 +80,12 @@ double angle_at(const double* X, const CollisionMesh::Face& face, int k) {
 
 }  // namespace
 
+double round_area(const CollisionMesh& mesh, const double* X, std::size_t face) {
+  const auto& [i, j, k] = mesh.faces[face];
+  const double r = mesh.radius[mesh.face_surface[face]];
+  return 2.0 * std::numbers::pi * r * (2.0 * r + (row(X, j) - row(X, i)).norm());
+}
+
 FeatureAreas feature_areas(const CollisionMesh& mesh, const double* X, const Bulge& bulge) {
   FeatureAreas result{.vertex = std::vector<double>(mesh.vertex_count, 0.0),
                       .edge = std::vector<double>(mesh.edges.size(), 0.0),
@@ -85,6 +96,7 @@ FeatureAreas feature_areas(const CollisionMesh& mesh, const double* X, const Bul
   std::vector<double> perimeter(mesh.faces.size(), 0.0);
   const auto for_each_corner = [&](auto&& visit) {
     for (std::size_t f = mesh.cloth_face_count; f < mesh.faces.size(); ++f) {
+      if (mesh.is_round_face(static_cast<Index>(f))) continue;
       for (int k = 0; k < 3; ++k) {
         const Index v = mesh.faces[f][k];
         if (bulge.vertex[v] > 0.0) visit(facet[f], v, angle_at(X, mesh.faces[f], k));
@@ -93,6 +105,13 @@ FeatureAreas feature_areas(const CollisionMesh& mesh, const double* X, const Bul
   };
   for (std::size_t f = mesh.cloth_face_count; f < mesh.faces.size(); ++f) {
     const auto& [i, j, k] = mesh.faces[f];
+    if (mesh.is_round_face(static_cast<Index>(f))) {
+      constexpr double kShare = 1.0 / 6.0;
+      const double whole = round_area(mesh, X, f);
+      result.surface[mesh.face_surface[f]] += whole;
+      for (const Index end : {i, j}) result.vertex[end] += 0.5 * kShare * whole;
+      continue;
+    }
     const Vec3 normal = (row(X, j) - row(X, i)).cross(row(X, k) - row(X, i));
     area[facet[f]] += 0.5 * normal.norm();
     result.surface[mesh.face_surface[f]] += 0.5 * normal.norm();
@@ -114,6 +133,10 @@ FeatureAreas feature_areas(const CollisionMesh& mesh, const double* X, const Bul
     }
   }
   for (std::size_t e = mesh.cloth_edge_count; e < mesh.edges.size(); ++e) {
+    if (mesh.is_round_edge(static_cast<Index>(e))) {
+      for (const Index end : mesh.edges[e]) result.edge[e] += result.vertex[end];
+      continue;
+    }
     if (bulge.edge[e] == 0.0) continue;
     for (const Index of : facets[e]) {
       if (of >= 0) result.edge[e] += area[of] * length[ridge[e]] / perimeter[of];

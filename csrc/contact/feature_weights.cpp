@@ -11,6 +11,10 @@
 namespace diffcloth::contact {
 namespace {
 
+/// Sharpness of a segment that is round: edges then have a quarter of their area against it, as vertices
+/// have against a face.
+constexpr float kOfAxis = 0.5F;
+
 double smoothstep(double t) {
   const double u = std::clamp(t, 0.0, 1.0);
   return u * u * (3.0 - 2.0 * u);
@@ -78,7 +82,7 @@ FeatureWeights::Features count_features(const CollisionMesh& mesh,
     if (static_cast<Index>(f) < mesh.cloth_face_count) {
       w.counts[f] = std::ranges::any_of(face, [&](Index v) { return left_out[v] == 0; });
     }
-    if (w.counts[f] == 0) continue;
+    if (w.counts[f] == 0 || mesh.is_round_face(static_cast<Index>(f))) continue;
     for (const Index e : mesh.face_edges[f]) --w.edge[e];
     for (const Index v : face) --w.vertex[v];
   }
@@ -138,12 +142,19 @@ FeatureWeights::FeatureWeights(const CollisionMesh& mesh,
   vertex_area_.assign(areas.vertex.begin() + mesh.cloth_vertex_count, areas.vertex.end());
   surface_area_.assign(areas.surface.begin(), areas.surface.end());
   for (auto e = static_cast<std::size_t>(mesh.cloth_edge_count); e < mesh.edges.size(); ++e) {
-    const double share = std::clamp(2.0 * angles.edge[e] / std::numbers::pi, 0.0, 1.0);
+    const bool is_axis = mesh.is_round_edge(static_cast<Index>(e));
+    is_axis_.push_back(is_axis ? 1 : 0);
+    const double share =
+        is_axis ? 1.0 : std::clamp(2.0 * angles.edge[e] / std::numbers::pi, 0.0, 1.0);
     body_edges_.push_back(
         {.sharpness = static_cast<float>(share), .area = static_cast<float>(areas.edge[e])});
   }
   for (const double length : mean_edge_length(mesh, rest)) {
     for (auto e = mesh.cloth_edge_count; e < static_cast<Index>(mesh.edges.size()); ++e) {
+      if (mesh.is_round_edge(e)) {
+        edge_sharpness_.push_back(kOfAxis);
+        continue;
+      }
       const double width = 2.0 * rest.edge_area[e] / std::sqrt(rest.edge_length_sq[e]);
       const double theta = angles.edge[e];
       edge_sharpness_.push_back(sharpness(theta, 2.0 * theta / std::numbers::pi, length / width));

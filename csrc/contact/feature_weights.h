@@ -40,6 +40,18 @@ namespace diffcloth::contact {
 ///
 /// so that no cut of either body into triangles changes what holds them apart.
 ///
+/// Against the skeleton of a round body, a point p or a segment e = pq, a cloth has the same pressure as
+/// against a face, whatever its triangles are. They lie across the round body as chords, so that it
+/// is their insides that it meets; all of them together have
+///
+///   faces f against the points:     w = A_f / 4   times b(D(p, f))           and the same with q,
+///   edges c against the segment:    w = A_c / 4   times m(c, e) [b(D(c, e)) - b(D(c, p)) - b(D(c, q))],
+///
+/// where the second line is zero beyond the ends, and else takes over from the first. Per face it is
+/// at least a sum of m b(D(c, e)), because no edge is nearer to a point than the face. Against meshes, and
+/// against each other, the ends of a skeleton are corners and the segment is a ridge of its own; of two
+/// skeletons, those of which the other body has no feature that is nearer are left out.
+///
 /// All of these are constants, made once from the rest meshes. Sharpnesses are rounded to single
 /// precision, so that sums of a few of their products are exact, and cancel exactly.
 class FeatureWeights {
@@ -80,6 +92,14 @@ class FeatureWeights {
     return e < cloth_edge_count_ ? 0.0 : continuation_[e - cloth_edge_count_][end];
   }
 
+  /// How much of an end's share is not of a body's edge e itself, against an edge c: half of the continuation;
+  /// of the segment of a round body, all against cloths, whose faces meet the ends, and nothing else.
+  double end_share(bool against_cloth, Index e, int end) const {
+    if (e >= cloth_edge_count_ && is_axis_[e - cloth_edge_count_] != 0)
+      return against_cloth ? 1.0 : 0.0;
+    return 0.5 * continuation(e, end);
+  }
+
   /// min(A_v, area of the surface) of a body's vertex against another body [m^2].
   double vertex_area(Index v, Index surface) const {
     return std::min(vertex_area_[v - cloth_vertex_count_], surface_area_[surface]);
@@ -110,6 +130,7 @@ class FeatureWeights {
   std::vector<float> vertex_sharpness_;             // [cloths * body vertices]
   std::vector<std::array<float, 2>> continuation_;  // [body edges]
   std::vector<Edge> body_edges_;                    // [body edges]
+  std::vector<char> is_axis_;                       // [body edges] segments of round bodies
   std::vector<float> vertex_area_;                  // [body vertices]
   std::vector<float> surface_area_;                 // [surfaces]
 };

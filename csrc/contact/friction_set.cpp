@@ -10,6 +10,7 @@ namespace {
 
 using Entry = FrictionSet::Entry;
 using Frame = FrictionSet::Frame;
+using Part = FrictionSet::Part;
 
 /// A frame is a line where its edges are parallel but for rounding: |m|^2 over |e1|^2 |e2|^2.
 constexpr double kLine = 1e-24;
@@ -17,6 +18,26 @@ constexpr double kLine = 1e-24;
 constexpr double kClose = 0.1;
 /// Squared sine of the angle from which on two edges cross.
 constexpr double kCrossing = 0.2;
+
+void add_part(const Part& part, Entry& entry) { entry.parts[entry.part_count++] = part; }
+
+/// Append three vertices as a frame; what the corners of the pair have among them is theirs.
+void append_frame(const std::array<Index, 3>& frame, double share, Entry& entry) {
+  const auto& v = entry.lag.pair.vertices;
+  const Vec4& c = entry.lag.closest.c;
+  const int first = entry.count;
+  for (int e = 0; e < 3; ++e) {
+    const int p = first + e;
+    entry.points[p] = frame[e];
+    for (int i = 0; i < 4; ++i) {
+      if (v[i] == frame[e]) entry.c[p] += c[i];
+    }
+  }
+  entry.count += 3;
+  add_part(
+      {.first = first, .size = 3, .edges = {first, first + 1, first, first + 2}, .share = share},
+      entry);
+}
 
 /// Let the edges of a pair be the frame.
 void turn_with_edges(Entry& entry) {
@@ -26,7 +47,7 @@ void turn_with_edges(Entry& entry) {
   entry.c = {c[2], c[3], c[0], c[1]};
   entry.frame = 0;
   entry.count = 4;
-  entry.edges = {0, 1, 2, 3};
+  add_part({.first = 0, .size = 4, .edges = {0, 1, 2, 3}, .share = 1.0}, entry);
 }
 
 /// Let three vertices be the frame.
@@ -38,22 +59,29 @@ void turn_with(const std::array<Index, 3>& frame, Entry& entry) {
     entry.points[entry.frame] = v[i];
     entry.c[entry.frame++] = c[i];
   }
-  entry.count = entry.frame + 3;
-  for (int e = 0; e < 3; ++e) {
-    const int p = entry.frame + e;
-    entry.points[p] = frame[e];
-    for (int i = 0; i < 4; ++i) {
-      if (v[i] == frame[e]) entry.c[p] += c[i];
-    }
-  }
-  entry.edges = {entry.frame, entry.frame + 1, entry.frame, entry.frame + 2};
+  entry.count = entry.frame;
+  append_frame(frame, 1.0, entry);
 }
 
-/// The change of s with z, at a frame.
-Vec3 change_of_slip(const Entry& k, const Frame& frame, const double* z) {
-  const Frame edges(k, z);
-  return k.gap(z) - k.a[0] * edges.e1 - k.a[1] * edges.e2 -
-         k.a[2] * (edges.e1.cross(frame.e2) + frame.e1.cross(edges.e2));
+/// Let two round bodies each be a frame; their skeletons are among its vertices.
+void turn_with_both(const ContactModel& model, double share, Entry& entry) {
+  const auto& v = entry.lag.pair.vertices;
+  const std::vector<Index>& surface = model.mesh().vertex_surface;
+  append_frame(model.carriers(surface[v[0]]), share, entry);
+  append_frame(model.carriers(surface[v[3]]), 1.0 - share, entry);
+}
+
+/// The change of s with z, at frames.
+Vec3 change_of_slip(const Entry& k, const std::array<Frame, 2>& frames, const double* z) {
+  Vec3 change = k.gap(z);
+  for (int l = 0; l < k.part_count; ++l) {
+    const Part& part = k.parts[l];
+    const Frame& frame = frames[l];
+    const Frame edges(k, part, z);
+    change = change - part.a[0] * edges.e1 - part.a[1] * edges.e2 -
+             part.a[2] * (edges.e1.cross(frame.e2) + frame.e1.cross(edges.e2));
+  }
+  return change;
 }
 
 /// The matrix of v -> u x v.
@@ -72,10 +100,12 @@ Vec3 FrictionSet::Entry::gap(const double* rows) const {
   return r;
 }
 
-void FrictionSet::Entry::add_edges(const std::array<Vec3, 2>& bar, double* x_bar) const {
+void FrictionSet::Entry::add_edges(const Part& part,
+                                   const std::array<Vec3, 2>& bar,
+                                   double* x_bar) const {
   for (int e = 0; e < 2; ++e) {
-    Eigen::Map<Vec3>(x_bar + 3 * points[edges[2 * e + 1]]) += bar[e];
-    Eigen::Map<Vec3>(x_bar + 3 * points[edges[2 * e]]) -= bar[e];
+    Eigen::Map<Vec3>(x_bar + 3 * points[part.edges[2 * e + 1]]) += bar[e];
+    Eigen::Map<Vec3>(x_bar + 3 * points[part.edges[2 * e]]) -= bar[e];
   }
 }
 
@@ -87,8 +117,8 @@ bool crosses(const Candidate& pair, const double* x) {
   return a.cross(b).squaredNorm() > kCrossing * a.squaredNorm() * b.squaredNorm();
 }
 
-FrictionSet::Frame::Frame(const Entry& k, const double* x)
-    : e1(k.edge(0, x)), e2(k.edge(1, x)), m(e1.cross(e2)) {}
+FrictionSet::Frame::Frame(const Entry& k, const Part& part, const double* x)
+    : e1(k.edge(part, 0, x)), e2(k.edge(part, 1, x)), m(e1.cross(e2)) {}
 
 bool FrictionSet::Frame::is_line() const {
   return !(m.squaredNorm() > kLine * e1.squaredNorm() * e2.squaredNorm());
@@ -121,17 +151,23 @@ FrictionSet::FrictionSet(const ContactModel& model,
                 .c = {},
                 .frame = 0,
                 .count = 0,
-                .edges = {},
-                .turns = false,
-                .a = Vec3::Zero()};
-    if (model.between_cloths(k.pair) && crosses(k.pair, x_start)) {
+                .part_count = 0,
+                .parts = {}};
+    const double share = model.first_share(k.pair);
+    if (share > 0.0) {
+      turn_with_both(model, share, entry);
+    } else if (model.between_cloths(k.pair) && crosses(k.pair, x_start)) {
       turn_with_edges(entry);
     } else {
       turn_with(model.frame(k.pair), entry);
     }
-    const Frame at_start(entry, x_start);
-    entry.turns = !at_start.is_line();
-    if (entry.turns) entry.a = at_start.coordinates(entry.gap(x_start));
+    for (int l = 0; l < entry.part_count; ++l) {
+      Part& part = entry.parts[l];
+      const Frame at_start(entry, part, x_start);
+      part.turns = !at_start.is_line();
+      part.a = Vec3::Zero();
+      if (part.turns) part.a = part.share * at_start.coordinates(entry.gap(x_start));
+    }
     entries_.push_back(entry);
   }
 }
@@ -153,7 +189,7 @@ const FrictionSet::Slips& FrictionSet::slips(const double* x) const {
 }
 
 FrictionSet::Slip FrictionSet::slip(const Entry& k, const double* x) const {
-  const Frame frame(k, x);
+  Slip at;
   // By displacements, of which little is lost: sum_i c_i delta_i less the change of E a.
   std::array<Vec3, 7> delta;
   Vec3 s = Vec3::Zero();
@@ -161,15 +197,20 @@ FrictionSet::Slip FrictionSet::slip(const Entry& k, const double* x) const {
     delta[i] = row(x, k.points[i]) - row(x_start_, k.points[i]);
     s += k.c[i] * delta[i];
   }
-  if (k.turns) {
-    const Vec3 change_1 = delta[k.edges[1]] - delta[k.edges[0]];
-    const Vec3 change_2 = delta[k.edges[3]] - delta[k.edges[2]];
-    const Vec3 e1_start = k.edge(0, x_start_);
-    s -= k.a[0] * change_1 + k.a[1] * change_2 +
-         k.a[2] * (change_1.cross(frame.e2) + e1_start.cross(change_2));
+  for (int l = 0; l < k.part_count; ++l) {
+    const Part& part = k.parts[l];
+    const Frame& frame = at.frames[l] = Frame(k, part, x);
+    if (!part.turns) continue;
+    const Vec3 change_1 = delta[part.edges[1]] - delta[part.edges[0]];
+    const Vec3 change_2 = delta[part.edges[3]] - delta[part.edges[2]];
+    const Vec3 e1_start = k.edge(part, 0, x_start_);
+    s -= part.a[0] * change_1 + part.a[1] * change_2 +
+         part.a[2] * (change_1.cross(frame.e2) + e1_start.cross(change_2));
   }
-  const Vec3 w = tangential(s, k.n);
-  return {.frame = frame, .s = s, .w = w, .law = friction_law(w.norm(), model_->parameters().slip)};
+  at.s = s;
+  at.w = tangential(s, k.n);
+  at.law = friction_law(at.w.norm(), model_->parameters().slip);
+  return at;
 }
 
 double FrictionSet::energy_change(const double* x0, const double* x1) const {
@@ -191,7 +232,10 @@ void FrictionSet::add_gradient(const double* x, double* g) const {
     for (int i = 0; i < k.count; ++i) {
       Eigen::Map<Vec3>(g + 3 * k.points[i]) += k.c[i] * force;
     }
-    k.add_edges(at.frame.pull_back(-k.a, force), g);
+    for (int l = 0; l < k.part_count; ++l) {
+      const Part& part = k.parts[l];
+      k.add_edges(part, at.frames[l].pull_back(-part.a, force), g);
+    }
   }
 }
 
@@ -231,7 +275,7 @@ void FrictionSet::update_duals(const double* x, const double* p, double alpha, c
     const FrictionLaw& law = start[i].law;
     const Vec3& w = start[i].w;
     const Vec3 v = go_on ? duals_[i] : start[i].force();
-    const Vec3 dw = tangential(change_of_slip(entries_[i], start[i].frame, p), entries_[i].n);
+    const Vec3 dw = tangential(change_of_slip(entries_[i], start[i].frames, p), entries_[i].n);
     const Vec3 linear =
         stiffness(i, start[i]) * (w + dw) + (law.f2 / law.f1_over_y * w.dot(dw)) * v;
     duals[i] = v + std::min(alpha, 1.0) * (linear - v);
@@ -255,10 +299,13 @@ FrictionSet::Hessian FrictionSet::hessian(const Entry& k,
   const auto i = static_cast<std::size_t>(&k - entries_.data());
   const Slip& at = slips[i];
   const Mat3 identity = Mat3::Identity();
-  const Mat3 of_e1 = k.a[2] * cross_matrix(at.frame.e2) - k.a[0] * identity;
-  const Mat3 of_e2 = -k.a[2] * cross_matrix(at.frame.e1) - k.a[1] * identity;
-  for (int p = k.frame; p < k.count; ++p) {
-    h.B_[p - k.frame] = k.c[p] * identity + k.sign(0, p) * of_e1 + k.sign(1, p) * of_e2;
+  for (int l = 0; l < k.part_count; ++l) {
+    const Part& part = k.parts[l];
+    const Mat3 of_e1 = part.a[2] * cross_matrix(at.frames[l].e2) - part.a[0] * identity;
+    const Mat3 of_e2 = -part.a[2] * cross_matrix(at.frames[l].e1) - part.a[1] * identity;
+    for (int p = part.first; p < part.first + part.size; ++p) {
+      h.B_[p - k.frame] = k.c[p] * identity + part.sign(0, p) * of_e1 + part.sign(1, p) * of_e2;
+    }
   }
   if (curvature == Curvature::kPositive && k.lambda < 0.0) return h;
   const double strength = k.mu * k.lambda;
@@ -268,37 +315,49 @@ FrictionSet::Hessian FrictionSet::hessian(const Entry& k,
   if (curvature == Curvature::kPrimalDual && !duals_at_.empty()) {
     const Mat3 outer = duals_[i] * at.w.transpose();
     h.core_ += (0.5 * strength * at.law.f2 / at.law.f1_over_y) * (outer + outer.transpose());
-    h.turn_ = (k.a[2] * strength) * duals_[i];
+    for (int l = 0; l < k.part_count; ++l) h.turn_[l] = (k.parts[l].a[2] * strength) * duals_[i];
     return h;
   }
   h.core_ += (strength * at.law.f2) * at.w * at.w.transpose();
-  h.turn_ = (k.a[2] * strength) * at.force();
+  for (int l = 0; l < k.part_count; ++l) h.turn_[l] = (k.parts[l].a[2] * strength) * at.force();
   return h;
+}
+
+Mat3 FrictionSet::Hessian::turning(int p, int q) const {
+  // Between e1 and e2 turn x, between e2 and e1 the opposite.
+  const auto in = [](const Part& part, int i) {
+    return i >= part.first && i < part.first + part.size;
+  };
+  for (int l = 0; l < entry_->part_count; ++l) {
+    const Part& part = entry_->parts[l];
+    if (!in(part, p) || !in(part, q)) continue;
+    return (part.sign(0, p) * part.sign(1, q) - part.sign(1, p) * part.sign(0, q)) *
+           cross_matrix(turn_[l]);
+  }
+  return Mat3::Zero();
 }
 
 void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
   const Entry& k = *entry_;
   const int first = k.frame;
-  const Mat3 cross = cross_matrix(turn_);
-  // Between e1 and e2 turn x, between e2 and e1 the opposite.
-  const auto turning = [&](int p, int q) -> Mat3 {
-    return (k.sign(0, p) * k.sign(1, q) - k.sign(1, p) * k.sign(0, q)) * cross;
-  };
   if (A.any_attached(k.all_points())) {
     std::array<Mat3, 7> jacobians;
     for (int p = 0; p < first; ++p) jacobians[p] = k.c[p] * Mat3::Identity();
     std::copy_n(B_.begin(), k.count - first, jacobians.begin() + first);
     A.add_congruence(k.all_points(), jacobians, core_);
-    if (turn_.isZero(0.0)) return;
-    std::array<Index, 4> frame{};
-    for (int e = 0; e < 4; ++e) frame[e] = k.points[std::min(first + e, k.count - 1)];
-    const int vertices = k.count - first;
-    A.add_stencil(frame, [&](int p, int q) -> Mat3 {
-      return p >= vertices || q >= vertices ? Mat3::Zero() : turning(first + p, first + q);
-    });
+    for (int l = 0; l < k.part_count; ++l) {
+      if (turn_[l].isZero(0.0)) continue;
+      const Part& part = k.parts[l];
+      std::array<Index, 4> frame{};
+      for (int e = 0; e < 4; ++e) frame[e] = k.points[part.first + std::min(e, part.size - 1)];
+      A.add_stencil(frame, [&](int p, int q) -> Mat3 {
+        return p >= part.size || q >= part.size ? Mat3::Zero()
+                                                : turning(part.first + p, part.first + q);
+      });
+    }
     return;
   }
-  std::array<Mat3, 4> core_b;
+  std::array<Mat3, 6> core_b;
   for (int e = 0; e < k.count - first; ++e) core_b[e] = core_.lazyProduct(B_[e]);
   A.add_rows(k.all_points(), [&](int p, int q) -> Mat3 {
     if (p < first && q < first) return (k.c[p] * k.c[q]) * core_;
@@ -318,8 +377,10 @@ void FrictionSet::Hessian::add_product(const double* z, double* y) const {
   for (int p = k.frame; p < k.count; ++p) {
     Eigen::Map<Vec3>(y + 3 * k.points[p]) += B_[p - k.frame].transpose() * force;
   }
-  const Frame turned(k, z);
-  k.add_edges({turn_.cross(turned.e2), turned.e1.cross(turn_)}, y);
+  for (int l = 0; l < k.part_count; ++l) {
+    const Frame turned(k, k.parts[l], z);
+    k.add_edges(k.parts[l], {turn_[l].cross(turned.e2), turned.e1.cross(turn_[l])}, y);
+  }
 }
 
 namespace {
@@ -367,11 +428,11 @@ void pull_back_gap(const Closest& geometry, const Vec3& t_bar, const Vec4& c_bar
 }  // namespace
 
 // phi = mu lambda q(|w|) w . zeta,  q = f1/y,  w = P s,  s = r(x) - E(x) a,  zeta = r(z) - E'(z) a,
-// with E = (e1, e2, m), its change E' with z, and a = E(x_start)^-1 r(x_start).
+// with E = (e1, e2, m), its change E' with z, and a = E(x_start)^-1 share r(x_start); of two parts both.
 //
 //   dphi/dw    = mu lambda (q zeta + f2 (w . zeta) w) =: omega      (f2 = q'/y)
 //   dphi/ds    = P omega,   dphi/dn = -(n.s) omega - (n.omega) s,   dphi/dzeta = mu lambda q w =: eta
-//   dphi/da    = -E^T P omega - E'^T eta,   g = E(x_start)^-T dphi/da
+//   dphi/da    = -E^T P omega - E'^T eta,   g = share E(x_start)^-T dphi/da
 //   dphi/dc_i  = (P omega) . x_i + eta . z_i + g . x_start_i
 //   dphi/dx_start = c_i g, less what the frame's edges have in E(x_start) a
 //
@@ -395,9 +456,15 @@ void FrictionSet::add_mixed(const double* x,
 
     const Slip& at = here[e];
     const FrictionLaw& law = at.law;
-    const Frame change(k, z);
-    const Vec3 m_change = change.e1.cross(at.frame.e2) + at.frame.e1.cross(change.e2);
-    const Vec3 zeta = k.gap(z) - k.a[0] * change.e1 - k.a[1] * change.e2 - k.a[2] * m_change;
+    std::array<Frame, 2> changes;
+    Vec3 zeta = k.gap(z);
+    for (int l = 0; l < k.part_count; ++l) {
+      const Part& part = k.parts[l];
+      const Frame& frame = at.frames[l];
+      Frame& change = changes[l] = Frame(k, part, z);
+      change.m = change.e1.cross(frame.e2) + frame.e1.cross(change.e2);  // not of its own edges
+      zeta = zeta - part.a[0] * change.e1 - part.a[1] * change.e2 - part.a[2] * change.m;
+    }
     const double w_zeta = at.w.dot(zeta);
 
     const double mu_bar = k.lambda * law.f1_over_y * w_zeta;
@@ -412,14 +479,22 @@ void FrictionSet::add_mixed(const double* x,
     const Vec3 omega = strength * (law.f1_over_y * zeta + law.f2 * w_zeta * at.w);
     const Vec3 eta = (strength * law.f1_over_y) * at.w;
     const Vec3 s_bar = tangential(omega, k.n);
-    Vec3 g = -s_bar;
-    if (k.turns) {
-      const Vec3 a_bar(-at.frame.e1.dot(s_bar) - change.e1.dot(eta),
-                       -at.frame.e2.dot(s_bar) - change.e2.dot(eta),
-                       -at.frame.m.dot(s_bar) - m_change.dot(eta));
-      const Frame frame(k, x_start_);
-      g = frame.dual(a_bar);
-      k.add_edges(frame.pull_back(-scale * k.a, g), start_bar);
+    Vec3 g = Vec3::Zero();
+    for (int l = 0; l < k.part_count; ++l) {
+      const Part& part = k.parts[l];
+      if (!part.turns) {
+        g -= part.share * s_bar;
+        continue;
+      }
+      const Frame& frame = at.frames[l];
+      const Frame& change = changes[l];
+      const Vec3 a_bar(-frame.e1.dot(s_bar) - change.e1.dot(eta),
+                       -frame.e2.dot(s_bar) - change.e2.dot(eta),
+                       -frame.m.dot(s_bar) - change.m.dot(eta));
+      const Frame at_start(k, part, x_start_);
+      const Vec3 r_bar = at_start.dual(a_bar);
+      g += part.share * r_bar;
+      k.add_edges(part, at_start.pull_back(-scale * part.a, r_bar), start_bar);
     }
     const Vec3 n_bar = -k.n.dot(at.s) * omega - k.n.dot(omega) * at.s;
     const Vec3 t_bar = tangential(n_bar, k.n) / d;

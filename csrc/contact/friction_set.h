@@ -24,10 +24,15 @@ inline Vec3 tangential(const Vec3& u, const Vec3& n) { return u - n.dot(u) * n; 
 /// that its `frame` belongs to: what turns as one does not slide, and friction has no couple about the
 /// gap. Obstacle vertices take part, so that a moving body drags the cloth.
 ///
+/// Between two round bodies the gap is the sum of both radii and the space between them: it splits by the
+/// radii, and each share turns with its own body, so that they roll on each other.
+///
 /// Q comes from two edges e1 and e2: of three vertices of that surface, or, where the edges of two cloths
 /// cross at an angle, these. With m = e1 x e2,
 ///
-///   Q r(x_start) = a1 e1(x) + a2 e2(x) + a3 m(x),   where a makes it r(x_start) at x_start.
+///   Q r(x_start) = a1 e1(x) + a2 e2(x) + a3 m(x),   where a makes it r(x_start) at x_start,
+///
+/// or the sum of two such terms, one of each body, with a of its share of r(x_start).
 class FrictionSet {
  public:
   FrictionSet() = default;
@@ -41,45 +46,59 @@ class FrictionSet {
   const ContactModel& model() const { return *model_; }
   bool empty() const { return entries_.empty(); }
 
-  struct Entry {
-    Contact lag;
-    Vec3 n;         ///< unit normal at the lag configuration
-    double lambda;  ///< normal force at the lag configuration [N]
-    double mu;
-    /// Corners of the contact, then the vertices of the frame, which between cloths are corners too.
-    std::array<Index, 7> points;
-    std::array<double, 7> c;   ///< of the points
-    int frame;                 ///< where the frame's vertices begin
-    int count;                 ///< of the points: the frame's three or four are the last
+  /// A part of the gap that turns with a frame.
+  struct Part {
+    int first;                 ///< of the frame's vertices among the points
+    int size;                  ///< how many there are: three or four
     std::array<int, 4> edges;  ///< start and end of e1, then of e2, among the points
-    bool turns;                ///< false where the frame was a line at the start: Q is the identity
-    Vec3 a;  ///< the gap at the start in the frame there; zero if it does not turn
-
-    std::span<const Index> all_points() const {
-      return {points.data(), static_cast<std::size_t>(count)};
-    }
-
-    /// e1 or e2 of some rows.
-    Vec3 edge(int e, const double* rows) const {
-      return row(rows, points[edges[2 * e + 1]]) - row(rows, points[edges[2 * e]]);
-    }
-
-    /// sum_i c_i of some rows, which no translation changes: from the first point, as that cancels less.
-    Vec3 gap(const double* rows) const;
-
-    /// Add cotangents of e1 and e2 to those of the frame's vertices.
-    void add_edges(const std::array<Vec3, 2>& bar, double* x_bar) const;
+    double share;              ///< of the gap
+    bool turns = false;        ///< false where the frame was a line at the start: Q is the identity
+    Vec3 a = Vec3::
+        Zero();  ///< its share of the gap at the start in the frame there; zero if it does not turn
 
     /// How often a point counts in e1 or e2: 1 at the end, -1 at the start.
     int sign(int e, int point) const {
       return static_cast<int>(point == edges[2 * e + 1]) - static_cast<int>(point == edges[2 * e]);
     }
   };
+
+  struct Entry {
+    Contact lag;
+    Vec3 n;         ///< unit normal at the lag configuration
+    double lambda;  ///< normal force at the lag configuration [N]
+    double mu;
+    /// Corners of the contact, then the vertices of the frames, which between cloths are corners too.
+    std::array<Index, 7> points;
+    std::array<double, 7> c;  ///< of the points
+    int frame;                ///< where the frames' vertices begin
+    int count;                ///< of the points: the frames' three to six are the last
+    int part_count;           ///< one or two
+    std::array<Part, 2> parts;
+
+    std::span<const Part> all_parts() const {
+      return {parts.data(), static_cast<std::size_t>(part_count)};
+    }
+    std::span<const Index> all_points() const {
+      return {points.data(), static_cast<std::size_t>(count)};
+    }
+
+    /// e1 or e2 of a part, of some rows.
+    Vec3 edge(const Part& part, int e, const double* rows) const {
+      return row(rows, points[part.edges[2 * e + 1]]) - row(rows, points[part.edges[2 * e]]);
+    }
+
+    /// sum_i c_i of some rows, which no translation changes: from the first point, as that cancels less.
+    Vec3 gap(const double* rows) const;
+
+    /// Add cotangents of e1 and e2 of a part to those of the frame's vertices.
+    void add_edges(const Part& part, const std::array<Vec3, 2>& bar, double* x_bar) const;
+  };
   const std::vector<Entry>& entries() const { return entries_; }
 
-  /// e1, e2 and m of an entry's frame.
+  /// e1, e2 and m of a frame of an entry.
   struct Frame {
-    Frame(const Entry& k, const double* x);
+    Frame() = default;
+    Frame(const Entry& k, const Part& part, const double* x);
 
     bool is_line() const;
     Vec3 operator*(const Vec3& a) const { return a[0] * e1 + a[1] * e2 + a[2] * m; }
@@ -97,7 +116,7 @@ class FrictionSet {
 
   /// The displacement s of an entry, its projection w and the law there.
   struct Slip {
-    Frame frame;
+    std::array<Frame, 2> frames;  ///< of the parts
     Vec3 s;
     Vec3 w;
     FrictionLaw law;
@@ -114,8 +133,8 @@ class FrictionSet {
   double energy_change(const double* x0, const double* x1) const;
   void add_gradient(const double* x, double* g) const;
 
-  /// Hessian of one entry: B^T core B, where B dx is the change of s, and what the frame's own turning
-  /// adds: the cross product with `turn` between its vertices.
+  /// Hessian of one entry: B^T core B, where B dx is the change of s, and what a frame's own turning
+  /// adds: the cross product with its `turn` between its vertices.
   class Hessian {
    public:
     void add_to(linalg::BlockMatrix& A) const;
@@ -125,10 +144,13 @@ class FrictionSet {
     friend class FrictionSet;
     explicit Hessian(const Entry& entry) : entry_(&entry) {}
 
+    /// What is between two points where a frame turns.
+    Mat3 turning(int p, int q) const;
+
     const Entry* entry_;
-    std::array<Mat3, 4> B_;  // of the frame's vertices; of all others c I
+    std::array<Mat3, 6> B_;  // of the frames' vertices; of all others c I
     Mat3 core_ = Mat3::Zero();
-    Vec3 turn_ = Vec3::Zero();
+    std::array<Vec3, 2> turn_{Vec3::Zero(), Vec3::Zero()};  // of the parts
   };
 
   /// Of the sign of lambda. kPositive is the quadratic majorant (f1/|w|) P, which does not lose its

@@ -1,6 +1,6 @@
 // How the gradient of lagged friction changes with what it depends on besides x, in the terms of friction_set.h:
 //
-//   grad D = mu lambda q B^T w,   q = f1/|w|,   w = P s,   s = r(x) - E(x) a,   a = E(x_start)^-1 r(x_start).
+//   grad D = mu lambda q B^T w,   q = f1/|w|,   w = P s,   s = r(x) - E(x) a,   a = E(x_start)^-1 share r(x_start).
 //
 // Of each contact everything that belongs to no direction is made once.
 
@@ -14,6 +14,7 @@ namespace {
 
 using Entry = FrictionSet::Entry;
 using Frame = FrictionSet::Frame;
+using Part = FrictionSet::Part;
 
 /// How the normal force changes,  lambda = -2 d kappa w m b'(D).
 class NormalForceDerivative {
@@ -60,7 +61,6 @@ class EntryDerivative {
       : model_(model),
         k_(entry),
         at_(at),
-        start_(entry, x_start),
         normal_force_(entry.lag, distance_sq_gradient(entry.lag.closest), x_lag),
         slides_(entry.lag.closest.parameter_count > 0),
         inv_d_(1.0 / std::sqrt(entry.lag.closest.d_sq)),
@@ -75,11 +75,15 @@ class EntryDerivative {
         corners_start_.col(i) = row(x_start, v[i]) - row(x_start, v[0]);
       }
     }
-    if (!entry.turns) return;
-    to_coordinates_.row(0) = start_.e2.cross(start_.m);
-    to_coordinates_.row(1) = start_.m.cross(start_.e1);
-    to_coordinates_.row(2) = start_.m;
-    to_coordinates_ /= start_.m.squaredNorm();
+    for (int l = 0; l < entry.part_count; ++l) {
+      if (!entry.parts[l].turns) continue;
+      const Frame& start = starts_[l] = Frame(entry, entry.parts[l], x_start);
+      Mat3& to_coordinates = to_coordinates_[l];
+      to_coordinates.row(0) = start.e2.cross(start.m);
+      to_coordinates.row(1) = start.m.cross(start.e1);
+      to_coordinates.row(2) = start.m;
+      to_coordinates /= start.m.squaredNorm();
+    }
   }
 
   void add(const FrictionSet::Tangents& dot, double* y) const {
@@ -101,17 +105,22 @@ class EntryDerivative {
     }
     const Vec3 n_dot = inv_d_ * tangential(t_dot, k_.n);
 
-    // s = r(x) - Q r(x_start), and r(x_start) in its frame.
-    Vec3 a_dot = Vec3::Zero();
-    if (k_.turns) {
-      const Vec3 e1_dot = k_.edge(0, dot.start);
-      const Vec3 e2_dot = k_.edge(1, dot.start);
-      r_dot -= k_.a[0] * e1_dot + k_.a[1] * e2_dot +
-               k_.a[2] * (e1_dot.cross(start_.e2) + start_.e1.cross(e2_dot));
-      a_dot = to_coordinates_.lazyProduct(r_dot);
-      s_dot -= at_.frame * a_dot;
-    } else {
-      s_dot -= r_dot;
+    // s = r(x) - Q r(x_start), and r(x_start) in its frames.
+    std::array<Vec3, 2> a_dot;
+    for (int l = 0; l < k_.part_count; ++l) {
+      const Part& part = k_.parts[l];
+      if (!part.turns) {
+        s_dot -= part.share * r_dot;
+        continue;
+      }
+      const Frame& start = starts_[l];
+      const Vec3 e1_dot = k_.edge(part, 0, dot.start);
+      const Vec3 e2_dot = k_.edge(part, 1, dot.start);
+      const Vec3 of_start =
+          part.share * r_dot - (part.a[0] * e1_dot + part.a[1] * e2_dot +
+                                part.a[2] * (e1_dot.cross(start.e2) + start.e1.cross(e2_dot)));
+      a_dot[l] = to_coordinates_[l].lazyProduct(of_start);
+      s_dot -= at_.frames[l] * a_dot[l];
     }
     const double n_s = k_.n.dot(at_.s);
     const Vec3 w_dot = tangential(s_dot, k_.n) - n_dot.dot(at_.s) * k_.n - n_s * n_dot;
@@ -122,10 +131,13 @@ class EntryDerivative {
     if (dot.parameters != nullptr) along_w += by_parameters(*dot.parameters);
     const Vec3 change = along_w * at_.w + (strength_ * law.f1_over_y) * w_dot;
     for (int i = 0; i < k_.count; ++i) Eigen::Map<Vec3>(y + 3 * k_.points[i]) += k_.c[i] * change;
-    if (!k_.turns) return;
-    const auto [by_a_1, by_a_2] = at_.frame.pull_back(k_.a, change);
-    const auto [by_force_1, by_force_2] = at_.frame.pull_back(a_dot, force_);
-    k_.add_edges({-by_a_1 - by_force_1, -by_a_2 - by_force_2}, y);
+    for (int l = 0; l < k_.part_count; ++l) {
+      const Part& part = k_.parts[l];
+      if (!part.turns) continue;
+      const auto [by_a_1, by_a_2] = at_.frames[l].pull_back(part.a, change);
+      const auto [by_force_1, by_force_2] = at_.frames[l].pull_back(a_dot[l], force_);
+      k_.add_edges(part, {-by_a_1 - by_force_1, -by_a_2 - by_force_2}, y);
+    }
   }
 
  private:
@@ -141,7 +153,7 @@ class EntryDerivative {
   const ContactModel& model_;
   const Entry& k_;
   const FrictionSet::Slip& at_;
-  Frame start_;
+  std::array<Frame, 2> starts_;  ///< of the parts that turn
   NormalForceDerivative normal_force_;
   bool slides_;  ///< whether the nearest points do, on their primitives
   double inv_d_;
@@ -150,7 +162,7 @@ class EntryDerivative {
   Eigen::Matrix<double, 2, 12> beta_;          ///< of the nearest points, where they slide
   Eigen::Matrix<double, 3, 4> corners_;        ///< from the first, at x
   Eigen::Matrix<double, 3, 4> corners_start_;  ///< at x_start
-  Mat3 to_coordinates_;                        ///< E(x_start)^-1, where the frame turns
+  std::array<Mat3, 2> to_coordinates_;         ///< E(x_start)^-1, of the parts that turn
 };
 
 }  // namespace

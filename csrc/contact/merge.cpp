@@ -308,6 +308,7 @@ class EdgePair {
         pair_(pair),
         nearest_points_(nearest_points),
         corner_(corner),
+        against_cloth_(pair.a < mesh.cloth_edge_count),
         soft_(soft),
         x_(x),
         parts_(parts) {}
@@ -315,7 +316,7 @@ class EdgePair {
   void list_parts(double w) {
     push_against_e(-1, w);
     for (const std::int8_t end : {std::int8_t{0}, std::int8_t{1}}) {
-      const double share = 0.5 * weights_.continuation(pair_.a, end);
+      const double share = weights_.end_share(false, pair_.a, end);
       if (share != 0.0) push_against_e(end, -share * w);
     }
   }
@@ -323,7 +324,7 @@ class EdgePair {
  private:
   void push(std::int8_t end_c, std::int8_t end_e, double coefficient, double d_sq) {
     // An end that is not continued has nothing to merge with.
-    if (end_c >= 0 && weights_.continuation(pair_.a, end_c) == 0.0) end_c = -1;
+    if (end_c >= 0 && weights_.end_share(false, pair_.a, end_c) == 0.0) end_c = -1;
     const bool shared = end_e >= 0 && !soft_;
     parts_.push_back({.kind = soft_ ? kMollified : (shared ? kVertex : kEdge),
                       .ends = {end_c, shared ? std::int8_t{-1} : end_e},
@@ -345,7 +346,7 @@ class EdgePair {
     }
     for (const std::int8_t end : {std::int8_t{0}, std::int8_t{1}}) {
       const bool nearest = end == 0 ? at_0 : at_1;
-      const double share = (nearest ? 1.0 : 0.0) - 0.5 * weights_.continuation(pair_.b, end);
+      const double share = (nearest ? 1.0 : 0.0) - weights_.end_share(against_cloth_, pair_.b, end);
       if (share == 0.0) continue;
       if (end_c >= 0) {
         push(end_c, end, coefficient * share, (at[0] - corner_[2 + end]).squaredNorm());
@@ -363,6 +364,7 @@ class EdgePair {
   const Candidate& pair_;
   const Closest& nearest_points_;
   const Corners& corner_;
+  bool against_cloth_;
   bool soft_;
   const double* x_;
   std::vector<Part>& parts_;
@@ -432,7 +434,9 @@ void add_edge_terms(const CollisionMesh& mesh,
     const Closest nearest_points = closest(PairKind::kEdgeEdge, corner);
     // So are the ends then, and what they would be merged with; but for the rounding of distances.
     if (nearest_points.d_sq > kClearly * range * range) continue;
-    const bool soft = mollified(corner, mollifier_threshold(edge_length_sq[c], edge_length_sq[e]));
+    const bool is_round = mesh.is_round_edge(c) || mesh.is_round_edge(e);
+    const bool soft =
+        mollified(corner, mollifier_threshold(edge_length_sq[c], edge_length_sq[e], is_round));
     EdgePair(mesh, weights, pair, nearest_points, corner, soft, x, scratch.parts).list_parts(w);
   }
   merge(scratch.parts, range);

@@ -218,8 +218,8 @@ std::size_t RelativeSearch::find(const Wanted& wanted,
                 if (!has_vertex(mesh.faces[f], v)) offer(candidate_of_vertex(mesh, v, f));
               });
       };
-      find_vertices_and_faces(s, r);
-      if (s != r) find_vertices_and_faces(r, s);
+      if (broad_phase_->meet(s, r)) find_vertices_and_faces(s, r);
+      if (s != r && broad_phase_->meet(r, s)) find_vertices_and_faces(r, s);
       visit(broad_phase_->trees(s).edges, surfaces_[s].edges, edge, broad_phase_->trees(r).edges,
             surfaces_[r].edges, edge, [&](Index i, Index j) {
               const auto [e, f] = std::minmax(i, j);

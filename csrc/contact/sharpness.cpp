@@ -45,6 +45,7 @@ std::vector<char> find_solid(const CollisionMesh& mesh,
   for (auto e = static_cast<std::size_t>(mesh.cloth_edge_count); e < mesh.edges.size(); ++e) {
     const auto& [f, g] = mesh.edge_faces[e];
     const auto edge = static_cast<Index>(e);
+    if (mesh.is_round_edge(edge)) continue;
     if (edge_count[e] != 2 || runs_up(mesh, f, edge) == runs_up(mesh, g, edge)) {
       broken[parts.find(f)] = 1;
     }
@@ -69,6 +70,7 @@ Faces describe(const CollisionMesh& mesh, const double* X) {
   faces.normal.assign(mesh.faces.size(), Vec3::Zero());
   faces.edge_count.assign(mesh.edges.size(), 0);
   for (auto f = static_cast<std::size_t>(mesh.cloth_face_count); f < mesh.faces.size(); ++f) {
+    if (mesh.is_round_face(static_cast<Index>(f))) continue;
     const auto& [i, j, k] = mesh.faces[f];
     const Vec3 e0 = row(X, j) - row(X, i);
     const Vec3 e1 = row(X, k) - row(X, i);
@@ -184,6 +186,7 @@ Bulge bulge(const CollisionMesh& mesh, const double* X) {
                .flat = std::vector<char>(mesh.edges.size(), 0)};
   std::vector<Star> stars(mesh.vertex_count);
   for (auto e = static_cast<std::size_t>(mesh.cloth_edge_count); e < mesh.edges.size(); ++e) {
+    if (mesh.is_round_edge(static_cast<Index>(e))) continue;
     const double theta = dihedral(mesh, X, faces, static_cast<Index>(e));
     result.edge[e] = std::max(theta, 0.0);
     result.flat[e] = theta == 0.0;
@@ -194,6 +197,7 @@ Bulge bulge(const CollisionMesh& mesh, const double* X) {
     for (const Index v : {i, j}) stars[v].lowest = std::min(stars[v].lowest, theta);
   }
   for (auto f = static_cast<std::size_t>(mesh.cloth_face_count); f < mesh.faces.size(); ++f) {
+    if (mesh.is_round_face(static_cast<Index>(f))) continue;
     for (int k = 0; k < 3; ++k) {
       const Index v = mesh.faces[f][k];
       const Vec3 e0 = row(X, mesh.faces[f][(k + 1) % 3]) - row(X, v);

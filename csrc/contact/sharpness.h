@@ -18,8 +18,8 @@ struct Bulge {
   std::vector<char> flat;      ///< [edges] whether it lies inside a plane
 };
 
-/// Angles below 1e-4, the rounding of meshes in single precision, are flat, and 0. The cloth's
-/// entries are 0.
+/// Angles below 1e-4, the rounding of meshes in single precision, are flat, and 0. The entries of cloths
+/// and of round bodies are 0.
 Bulge bulge(const CollisionMesh& mesh, const double* X);
 
 }  // namespace diffcloth::contact

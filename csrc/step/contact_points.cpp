@@ -40,6 +40,9 @@ std::pair<ContactPoint, bool> placed(const contact::ContactModel& model,
   const double distance = way.norm();
   point.normal = distance > 0.0 ? Vec3(way / distance) : Vec3(Vec3::Zero());
   point.gap = distance - c.xi;
+  // From the skeletons of round bodies to their skins.
+  points[0] += model.mesh().radius[point.first] * point.normal;
+  points[1] -= model.mesh().radius[point.second] * point.normal;
   return {point, is_turned};
 }
 

@@ -19,11 +19,15 @@ namespace {
 using contact::Contact;
 using Array = std::vector<double>;
 
-void report_contacts(const std::vector<Contact>& contacts, Report& report) {
+void report_contacts(const contact::CollisionMesh& mesh,
+                     const std::vector<Contact>& contacts,
+                     Report& report) {
   report.contact_count = static_cast<Index>(contacts.size());
   report.minimum_distance = std::numeric_limits<double>::infinity();
   for (const Contact& k : contacts) {
-    report.minimum_distance = std::min(report.minimum_distance, std::sqrt(k.closest.d_sq));
+    const double radii = mesh.radius[mesh.vertex_surface[k.pair.vertices[0]]] +
+                         mesh.radius[mesh.vertex_surface[k.pair.vertices[3]]];
+    report.minimum_distance = std::min(report.minimum_distance, std::sqrt(k.closest.d_sq) - radii);
   }
 }
 
@@ -153,7 +157,7 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
     if (!sum.friction && contacts.empty()) break;
     if (solves < friction_iterations) sum.lag(contacts);
   }
-  report_contacts(sum.contacts(), step.report);
+  report_contacts(problem.scene.collision_mesh, sum.contacts(), step.report);
   report_blockers(problem, x, status, step.report);
   const double reached = step.report.motion_fraction;
   if (reached < 1.0) step.report.root_poses = motion.root_poses(reached);

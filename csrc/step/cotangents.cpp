@@ -66,7 +66,9 @@ void write_rest(const Problem& p, Cotangents& bars, const Gradients& gradients) 
   const std::vector<Index>& start = p.scene.given.cloth_face_start;
   for (Index c = 0; c < p.scene.cloth_count(); ++c) {
     const double share = bars.contact.rest.mean_face_area[c] / (start[c + 1] - start[c]);
-    for (Index f = start[c]; f < start[c + 1]; ++f) rest.area[f] += share;
+    for (Index f = start[c]; f < start[c + 1]; ++f) {
+      rest.area[f] += share + bars.contact.rest.face_area[f];
+    }
   }
   for (std::size_t i = 0; i < rest.vertex_area.size(); ++i) {
     rest.vertex_area[i] += bars.contact.rest.vertex_area[i];

@@ -249,6 +249,16 @@ std::vector<double> stiffness_of_trees(const Scene& scene,
   return result;
 }
 
+/// At half the gap the barrier is softer, in numbers, the larger xi is: what makes up for it where one
+/// surface that kappa was chosen for, or the other one, is round.
+double for_radii(const Scene& scene, Index own, double xi, double radii, double barrier_distance) {
+  if (radii == 0.0) return 1.0;
+  const HalfGap without = at_half_gap(xi, barrier_distance);
+  const HalfGap with = at_half_gap(xi + radii, barrier_distance);
+  return own < scene.cloth_count() ? without.stiffness / with.stiffness
+                                   : without.slope / with.slope;
+}
+
 /// Gap at which the barrier pushes with a pressure, halved until float64 has no more of it [m].
 double gap_under(double pressure, double kappa, double xi, double barrier_distance) {
   double low = 0.0;
@@ -301,13 +311,18 @@ std::vector<double> default_barrier_stiffness(const Scene& scene,
     own.push_back(is_free ? of_trees[tree] : 0.0);
     of_joints.push_back(is_free ? 0.0 : of_trees[tree]);
   }
+  const std::vector<double>& radius = scene.collision_mesh.radius;
+  const double* const thickness = inputs.data(Input::kThickness);
   std::vector<double> result;
   for (Index a = 0; a < surfaces; ++a) {
     for (Index b = 0; b < surfaces; ++b) {
       double kappa = 0.0;
       if (scene.collision_mesh.touching.contains(a, b)) {
-        kappa = std::max(own[a], own[b]);
-        if (kappa == 0.0) kappa = std::max(of_joints[a], of_joints[b]);
+        const double radii = radius[a] + radius[b];
+        const double of_a = for_radii(scene, a, thickness[a], radii, barrier_distance);
+        const double of_b = for_radii(scene, b, thickness[b], radii, barrier_distance);
+        kappa = std::max(of_a * own[a], of_b * own[b]);
+        if (kappa == 0.0) kappa = std::max(of_a * of_joints[a], of_b * of_joints[b]);
       }
       result.push_back(kappa);
     }

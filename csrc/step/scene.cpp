@@ -36,12 +36,18 @@ contact::CollisionMesh make_collision_mesh(const Description& d,
     std::fill(surface.begin() + cloth_vertices + d.bodies.vertex_start[k],
               surface.begin() + cloth_vertices + d.bodies.vertex_start[k + 1], cloths + k);
   }
+  std::vector<double> radius;
+  if (!d.body_radii.empty()) {
+    radius.assign(static_cast<std::size_t>(cloths), 0.0);
+    radius.insert(radius.end(), d.body_radii.begin(), d.body_radii.end());
+  }
   return {std::move(faces), std::move(surface), cloths,
           contact::touching_surfaces({.surface_count = cloths + d.bodies.count(),
                                       .cloth_count = cloths,
                                       .self_contact = d.self_contact,
                                       .body_dynamic = dynamic,
-                                      .ignored = ignored})};
+                                      .ignored = ignored}),
+          std::move(radius)};
 }
 
 /// All surfaces as given: the reference that the collision trees are built from.
@@ -93,7 +99,13 @@ double mean_length(const mesh::RestShape& rest,
   for (const auto& [i, j] : mesh.edges) {
     sum += (row(bodies.vertices.data(), j) - row(bodies.vertices.data(), i)).norm();
   }
-  return sum / static_cast<double>(mesh.edges.size());
+  // Of a round body, the radius.
+  std::size_t count = mesh.edges.size();
+  for (const double radius : mesh.radius) {
+    sum += radius;
+    count += radius > 0.0 ? 1 : 0;
+  }
+  return sum / static_cast<double>(count);
 }
 
 /// Where nothing is said of trees: every body is one, of one link without coordinates.
@@ -255,6 +267,7 @@ bool Scene::has_attached_bodies() const {
 
 contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& rest) {
   contact::RestMeasures m = scene.measures;
+  std::ranges::copy(rest.area, m.face_area.begin());
   std::ranges::copy(rest.vertex_area, m.vertex_area.begin());
   std::ranges::copy(rest.edge_area, m.edge_area.begin());
   std::ranges::copy(rest.edge_length_sq, m.edge_length_sq.begin());
@@ -289,6 +302,7 @@ std::string describe_surface(const Scene& scene, Index surface) {
 std::string describe(const Scene& scene, const char* kind, std::initializer_list<Index> vertices) {
   const Index surface = scene.collision_mesh.vertex_surface[*vertices.begin()];
   const bool is_cloth = surface < scene.cloth_count();
+  if (scene.collision_mesh.is_round(surface)) return describe_surface(scene, surface);
   const Index first = is_cloth ? scene.given.cloth_vertex_start[surface]
                                : scene.cloth_vertex_count() +
                                      scene.given.bodies.vertex_start[surface - scene.cloth_count()];
@@ -309,10 +323,13 @@ std::optional<ClosePair> find_closest(const Scene& scene,
                                       double reach,
                                       const std::vector<contact::Candidate>& candidates) {
   const std::vector<Index>& surface = scene.collision_mesh.vertex_surface;
+  const std::vector<double>& radius = scene.collision_mesh.radius;
   std::optional<ClosePair> closest;
   for (const contact::Candidate& pair : candidates) {
     const auto& v = pair.vertices;
-    const double xi = 0.5 * (thickness[surface[v[0]]] + thickness[surface[v[3]]]);
+    const Index s = surface[v[0]];
+    const Index r = surface[v[3]];
+    const double xi = 0.5 * (thickness[s] + thickness[r]) + (radius[s] + radius[r]);
     const double d = std::sqrt(contact::distance_sq(pair.kind, contact::corners(v, x)));
     if (d - xi > reach || (closest && d - xi >= closest->distance - closest->thickness)) continue;
     closest = {.distance = d, .thickness = xi, .pair = pair};
@@ -326,7 +343,9 @@ std::vector<contact::Candidate> find_near(const Scene& scene,
                                           double reach,
                                           contact::BroadPhase::Scratch& scratch) {
   std::vector<double> half(thickness);
-  for (double& value : half) value = 0.5 * (value + reach);
+  for (std::size_t s = 0; s < half.size(); ++s) {
+    half[s] = 0.5 * (half[s] + reach) + scene.collision_mesh.radius[s];
+  }
   std::vector<contact::Candidate> candidates;
   scene.broad_phase.find(x, x, half, scratch, candidates);
   return candidates;
@@ -391,9 +410,16 @@ std::string find_overlap(const Scene& scene,
   if (!closest) return {};
   const std::string elements = describe_pair(scene, closest->pair);
   if (closest->distance == 0.0) return elements + " touch";
+  const auto& v = closest->pair.vertices;
+  const double radii =
+      mesh.radius[mesh.vertex_surface[v[0]]] + mesh.radius[mesh.vertex_surface[v[3]]];
   std::ostringstream text;
-  text << elements << " are " << closest->distance << " m apart, closer than their thickness "
-       << closest->thickness << " m";
+  if (closest->distance < radii) {
+    text << elements << " overlap by " << radii - closest->distance << " m";
+    return text.str();
+  }
+  text << elements << " are " << closest->distance - radii
+       << " m apart, closer than their thickness " << closest->thickness - radii << " m";
   return text.str();
 }
 

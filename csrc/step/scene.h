@@ -75,8 +75,10 @@ struct Description {
   std::vector<Index> soft_pins;                    ///< [Q]
   AttachmentDescription attachments;
   bodies::BodySet bodies;
-  bodies::MechanismsDescription mechanisms;         ///< empty: every body is a tree of one link
-  std::vector<std::array<Index, 3>> body_faces;     ///< indices into the bodies' vertices
+  bodies::MechanismsDescription mechanisms;      ///< empty: every body is a tree of one link
+  std::vector<std::array<Index, 3>> body_faces;  ///< indices into the bodies' vertices
+  std::vector<double>
+      body_radii;  ///< [surfaces of bodies] of round ones, 0 of others; empty: none [m]
   std::vector<std::array<Index, 2>> ignored_pairs;  ///< pairs of surfaces that never touch
   /// [surfaces of bodies] of those that cloths touch at their nodes, instead of by the barrier;
   /// empty: none
@@ -136,7 +138,7 @@ contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& r
 /// Two primitives near each other, and how far they must be apart at least [m].
 struct ClosePair {
   double distance;
-  double thickness;  ///< mean of that of their surfaces
+  double thickness;  ///< mean of that of their surfaces, and the radii of round ones
   contact::Candidate pair;
 };
 

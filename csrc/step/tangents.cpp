@@ -119,6 +119,7 @@ void fill_contact(const Problem& p, const Tangents& tangents, contact::ContactMo
     for (Index f = start[c]; f < start[c + 1]; ++f) sum += rest.area[f];
     out.rest.mean_face_area[c] = sum / (start[c + 1] - start[c]);
   }
+  std::ranges::copy(rest.area, out.rest.face_area.begin());
   std::ranges::copy(rest.vertex_area, out.rest.vertex_area.begin());
   std::ranges::copy(rest.edge_area, out.rest.edge_area.begin());
   std::ranges::copy(rest.edge_length_sq, out.rest.edge_length_sq.begin());

@@ -143,6 +143,7 @@ class Sphere(Section):
     kind: Literal["sphere"]
     radius: Positive
     subdivisions: Annotated[int, Ge(0), Le(6)] = 3
+    smooth: bool = False
 
 
 class Capsule(Section):
@@ -151,6 +152,7 @@ class Capsule(Section):
     kind: Literal["capsule"]
     radius: Positive
     length: Positive
+    smooth: bool = False
 
 
 class Cylinder(Section):

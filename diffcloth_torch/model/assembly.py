@@ -48,6 +48,8 @@ class Assembly:
         body_vertices: Of the K bodies in their frames, then of the Lc links that have collision
             shapes in theirs [m], shape [V, 3].
         body_faces: Indices into `body_vertices`, shape [G, 3].
+        body_radii: Radius of each of these surfaces, of which `body_vertices` and `body_faces` then
+            have the skeleton; 0 of a mesh [m], shape [K + Lc].
         body_vertex_start: First vertex of each of these surfaces, then V; shape [K + Lc + 1].
         body_face_start: First face of each of these surfaces, then G; shape [K + Lc + 1].
         body_poses: Initial poses of the bodies, shape [K, 7].
@@ -86,6 +88,7 @@ class Assembly:
     springs: Springs
     body_vertices: FloatArray
     body_faces: IndexArray
+    body_radii: FloatArray
     body_vertex_start: IndexArray
     body_face_start: IndexArray
     body_poses: FloatArray
@@ -172,7 +175,10 @@ def assemble(scene: Scene, *, all_nodal: bool = False) -> Assembly:
         for link, surface in enumerate(robot.surfaces)
         if surface is not None
     ]
-    rigid: list[_Surface] = [*scene.bodies, *(surface for _, _, surface in links)]
+    bodies_touch: list[_Surface] = [
+        body if all_nodal else body.contact_surface for body in scene.bodies
+    ]
+    rigid: list[_Surface] = [*bodies_touch, *(surface for _, _, surface in links)]
     body_vertices, body_faces, body_vertex_start, body_face_start = _concatenate(rigid)
     owners = [(k, 0) for k in range(len(scene.bodies))] + [(t, link) for t, link, _ in links]
     surface_mechanism, surface_link = np.array(owners, dtype=np.int32).reshape(-1, 2).T.copy()
@@ -197,6 +203,7 @@ def assemble(scene: Scene, *, all_nodal: bool = False) -> Assembly:
         springs=scene.springs,
         body_vertices=body_vertices,
         body_faces=body_faces,
+        body_radii=np.array([getattr(surface, "radius", 0.0) for surface in rigid]),
         body_vertex_start=body_vertex_start,
         body_face_start=body_face_start,
         body_poses=np.array([body.pose for body in scene.bodies]).reshape(-1, 7),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +31,12 @@ from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import pose_array
 from diffcloth_torch.model.cloth import plane_size
 from diffcloth_torch.model.quantities import check_parameter
+from diffcloth_torch.model.round_bodies import (
+    ContactSurface,
+    Primitive,
+    round_mass,
+    round_surface,
+)
 
 __all__ = ["MOTIONS", "Primitive", "RigidBody"]
 
@@ -49,19 +55,6 @@ _CENTER = "differentiate with respect to Parameters.body_center"
 _INERTIA = "differentiate with respect to Parameters.body_inertia"
 
 
-class Primitive(NamedTuple):
-    """An analytic surface around the origin of a body's frame.
-
-    Attributes:
-        kind: "plane" (z = 0, the solid below), "sphere", "capsule" (along z) or "box".
-        size: In the order of the kinds: nothing; the radius; the radius, and half the length of the
-            cylinder; half the lengths [m]. Padded with zeros.
-    """
-
-    kind: str
-    size: tuple[float, float, float]
-
-
 class RigidBody:
     """A rigid triangle mesh; immutable.
 
@@ -78,6 +71,8 @@ class RigidBody:
         nodal_contact: Whether cloths touch the body at their vertices, with dry friction, instead
             of through the barrier.
         primitive: Analytic surface of the body; None for a given mesh and for a cylinder.
+        smooth: Whether the body touches with its analytic surface, a sphere or a capsule; then
+            `vertices` and `faces` only show it.
         name: Name in the scene; None lets the scene choose one.
     """
 
@@ -93,6 +88,7 @@ class RigidBody:
     inertia: FloatArray = frozen(np.zeros((3, 3)))
     nodal_contact: bool = False
     primitive: Primitive | None = None
+    smooth: bool = False
     name: str | None
 
     def __init__(
@@ -171,12 +167,34 @@ class RigidBody:
         primitive: Primitive,
         mesh: tuple[object, object],
         *,
+        smooth: bool = False,
         nodal_contact: bool = False,
         **keywords: Any,
     ) -> RigidBody:
+        is_smooth = check_bool("RigidBody: `smooth`", smooth)
+        if is_smooth and primitive.kind not in ("sphere", "capsule"):
+            raise InvalidInput(
+                "RigidBody: `smooth` is for spheres and capsules, got True for a "
+                f"{primitive.kind}, which is exact as a mesh"
+            )
+        if is_smooth and keywords.get("motion") == "dynamic":
+            keywords = _with_round_mass(primitive, keywords)
         body = cls(*mesh, **keywords)
         body._set_primitive(primitive, nodal_contact)
+        body.smooth = is_smooth
+        if is_smooth and body.nodal_contact:
+            raise InvalidInput(
+                "RigidBody: `smooth` must not be set with `nodal_contact`, which is with the "
+                "analytic surface by itself"
+            )
         return body
+
+    @property
+    def contact_surface(self) -> ContactSurface:
+        """What the body touches with: its mesh, or the skeleton of its analytic surface."""
+        if not self.smooth or self.primitive is None:
+            return ContactSurface(self.vertices, self.faces, 0.0)
+        return round_surface(self.primitive)
 
     def _set_mass_properties(
         self, *, density: object, mass: object, center: object, inertia: object
@@ -260,43 +278,59 @@ class RigidBody:
         return cls._of(primitive, shapes.box(sides), **keywords)
 
     @classmethod
-    def sphere(cls, radius: float, *, subdivisions: int = 3, **keywords: Any) -> RigidBody:
-        """Make a subdivided icosahedron with its vertices on a sphere around the origin.
+    def sphere(
+        cls, radius: float, *, subdivisions: int = 3, smooth: bool = False, **keywords: Any
+    ) -> RigidBody:
+        """Make a sphere around the origin, a subdivided icosahedron with its vertices on it.
 
         Args:
             radius: Radius of the sphere [m], > 0.
             subdivisions: Times that each triangle is split into four, 0 .. 8; 3 gives 1280 faces.
+            smooth: Whether the sphere itself touches, instead of the triangles. It then rolls as a
+                sphere, has the mass properties of one, and the triangles only show it.
             **keywords: As for `RigidBody`.
         """
         length = check_number("RigidBody.sphere: `radius`", radius, POSITIVE, instead=_POSES)
         check_count("RigidBody.sphere: `subdivisions`", subdivisions, 0, _MOST_SUBDIVISIONS)
         primitive = Primitive("sphere", (length, 0.0, 0.0))
-        return cls._of(primitive, shapes.sphere(length, subdivisions), **keywords)
+        mesh = shapes.sphere(length, subdivisions)
+        return cls._of(primitive, mesh, smooth=smooth, **keywords)
 
     @classmethod
-    def capsule(cls, radius: float, length: float, **keywords: Any) -> RigidBody:
+    def capsule(
+        cls, radius: float, length: float, *, smooth: bool = False, **keywords: Any
+    ) -> RigidBody:
         """Make a cylinder along z, centered at the origin, with half spheres on its ends.
 
         Args:
             radius: Radius of the cylinder and the half spheres [m], > 0.
             length: Length of the cylinder alone [m], > 0; the capsule is 2 radius longer.
+            smooth: Whether the capsule itself touches, instead of triangles, as for `sphere`.
             **keywords: As for `RigidBody`.
         """
         name = "RigidBody.capsule: `{}`"
         r = check_number(name.format("radius"), radius, POSITIVE, instead=_POSES)
         h = check_number(name.format("length"), length, POSITIVE, instead=_POSES)
         primitive = Primitive("capsule", (r, h / 2, 0.0))
-        return cls._of(primitive, shapes.capsule(r, h), **keywords)
+        return cls._of(primitive, shapes.capsule(r, h), smooth=smooth, **keywords)
 
     @classmethod
-    def cylinder(cls, radius: float, length: float, **keywords: Any) -> RigidBody:
+    def cylinder(
+        cls, radius: float, length: float, *, smooth: bool = False, **keywords: Any
+    ) -> RigidBody:
         """Make a closed cylinder along z, centered at the origin.
 
         Args:
             radius: Radius [m], > 0.
             length: Length [m], > 0.
+            smooth: Must be False: a cylinder with flat ends has no smooth surface here.
             **keywords: As for `RigidBody`.
         """
+        if check_bool("RigidBody.cylinder: `smooth`", smooth):
+            raise InvalidInput(
+                "RigidBody.cylinder: `smooth` must be False, as a cylinder has sharp rims; "
+                "RigidBody.capsule can be smooth"
+            )
         name = "RigidBody.cylinder: `{}`"
         r = check_number(name.format("radius"), radius, POSITIVE, instead=_POSES)
         h = check_number(name.format("length"), length, POSITIVE, instead=_POSES)
@@ -317,4 +351,25 @@ class RigidBody:
 
     def __repr__(self) -> str:
         name = "" if self.name is None else f"{self.name!r}, "
-        return f"RigidBody({name}{self.motion}, {len(self.faces)} faces)"
+        smooth = ", smooth" if self.smooth else ""
+        return f"RigidBody({name}{self.motion}, {len(self.faces)} faces{smooth})"
+
+
+def _with_round_mass(primitive: Primitive, keywords: dict[str, Any]) -> dict[str, Any]:
+    """Fill what is not given of the mass properties with those of the analytic body."""
+    density, mass = keywords.get("density"), keywords.get("mass")
+    if (density is None) == (mass is None):
+        return keywords  # refused later
+    volume, moments = round_mass(primitive)
+    if mass is None:
+        mass = volume * check_number("RigidBody: `density`", density, POSITIVE, instead=_MASS)
+    else:
+        mass = check_number("RigidBody: `mass`", mass, POSITIVE, instead=_MASS)
+    given = {name: value for name, value in keywords.items() if value is not None}
+    return {
+        "center": np.zeros(3),
+        "inertia": mass * moments,
+        **given,
+        "mass": mass,
+        "density": None,
+    }

@@ -137,7 +137,9 @@ class Scene:
     def _attached(self) -> dict[str, AttachedSurface]:
         shaped = [s for robot in self.robots for s in robot.surfaces if s is not None]
         vertices = [cloth.vertices for cloth in self.cloths]
-        vertices += [body.vertices for body in self.bodies] + [s.vertices for s in shaped]
+        # Of a smooth body, the points that say where it is in the core.
+        vertices += [body.contact_surface.vertices for body in self.bodies]
+        vertices += [s.vertices for s in shaped]
         return surfaces_of(self.surface_names, vertices, len(self.cloths))
 
     def __repr__(self) -> str:

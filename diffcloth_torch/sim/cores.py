@@ -95,6 +95,7 @@ def make_core(
         attachment_targets=assembly.springs.targets,
         body_vertices=assembly.body_vertices,
         body_faces=assembly.body_faces,
+        body_radii=assembly.body_radii,
         body_vertex_start=assembly.body_vertex_start,
         self_contact=options.contact.self_contact,
         dt=options.dt,

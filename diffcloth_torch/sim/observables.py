@@ -145,7 +145,8 @@ class Observables:
             parameters: Physical parameters; None takes those of the scene.
 
         Returns:
-            Accepted iterates, shape [M, N + V, 3] [m]: cloth vertices, then body vertices.
+            Accepted iterates, shape [M, N + V, 3] [m]: cloth vertices, then body vertices; of
+            smooth bodies the ends of their skeletons, and what says how they turn.
         """
         with torch.no_grad():
             given, batch = self._border.enter(state, control, parameters)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -97,6 +98,8 @@ class Surfaces:
         body_vertices: Vertices of each body in its frame [m], shape [v, 3].
         body_faces: Faces of each body, as indices into its own vertices, shape [g, 3].
         robots: The surfaces of each robot.
+        body_points: What forces act on: `body_vertices`, but of smooth bodies the vertices of their
+            skeletons; None for those of earlier versions, which have no smooth bodies.
     """
 
     cloth_names: list[str]
@@ -105,6 +108,7 @@ class Surfaces:
     body_vertices: list[Tensor]
     body_faces: list[Tensor]
     robots: tuple[LinkSurfaces, ...] = ()
+    body_points: list[Tensor] | None = None
 
     @staticmethod
     def of(scene: Scene, assembly: Assembly) -> Surfaces:
@@ -120,6 +124,12 @@ class Surfaces:
                 LinkSurfaces.of(name, robot)
                 for name, robot in zip(scene.robot_names, scene.robots, strict=True)
             ),
+            body_points=[
+                torch.from_numpy(np.array(assembly.body_vertices[first:last]))
+                for first, last in pairwise(
+                    assembly.body_vertex_start[: assembly.body_count + 1].tolist()
+                )
+            ],
         )
 
     def frames(self, state: Mapping[str, Tensor]) -> ByName:
@@ -151,6 +161,13 @@ class Surfaces:
             meshes |= {n: (v, f) for n, v, f in links if v is not None and f is not None}
         return meshes
 
+    def rigid_points(self) -> dict[str, Tensor]:
+        """What forces act on of each body, then of each link with a shape, in their frames."""
+        points = {name: vertices for name, (vertices, _) in self.rigid_meshes().items()}
+        if self.body_points is not None:
+            points |= dict(zip(self.body_names, self.body_points, strict=True))
+        return points
+
     def surface_frames(self, state: Mapping[str, Tensor]) -> Tensor:
         """Frames of bodies, then of links with a shape, [..., K + Lc, 4, 4]."""
         poses, frames = state["body_poses"], self.frames(state)
@@ -178,12 +195,15 @@ class Surfaces:
         return self.cloth_meshes(state["positions"]) | rigid
 
     def vertices(self, state: Mapping[str, Tensor]) -> Tensor:
-        """Vertices of all surfaces in the world, [..., N + V, 3], in the order of `meshes`.
+        """Cloths and `rigid_points` in the world, [..., N + V, 3], in the order of `meshes`.
 
         Args:
             state: As for `meshes`.
         """
-        return torch.cat([vertices for vertices, _ in self.meshes(state).values()], dim=-2)
+        frames = self.frames(state)
+        cloths = (vertices for vertices, _ in self.cloth_meshes(state["positions"]).values())
+        rigid = (place(points, frames[name]) for name, points in self.rigid_points().items())
+        return torch.cat([*cloths, *rigid], dim=-2)
 
 
 # Earlier versions had these classes there, and saved states name that module.

@@ -108,11 +108,25 @@ class Shown:
         ]
 
     def forces(self, state: State) -> FloatArray:
-        """Contact forces on the vertices of what is drawn of bodies and links [N], [..., v, 3]."""
-        counts = [len(surface.vertices) for surface in self.rigid]
-        shown = np.repeat([surface.shown for surface in self.rigid], counts).astype(bool)
-        forces: FloatArray = state.body_forces.detach().numpy()[..., shown, :]
-        return forces
+        """Contact forces on the vertices of what is drawn of bodies and links [N], [..., v, 3].
+
+        Those on a smooth body are one, at the vertex that faces it.
+        """
+        state = state.detach()
+        counts = [len(points) for points in self._surfaces.rigid_points().values()]
+        forces = torch.split(state.body_forces, counts, dim=-2)
+        frames = self._surfaces.surface_frames(vars(state)).unbind(-3)
+        drawn = [state.body_forces[..., :0, :]]
+        for surface, own, frame in zip(self.rigid, forces, frames, strict=True):
+            if not surface.shown:
+                continue
+            if own.shape[-2] != len(surface.vertices):
+                total = own.sum(dim=-2, keepdim=True)
+                facing = -(place(surface.vertices, frame) * total).sum(dim=-1)
+                row = torch.nn.functional.one_hot(facing.argmax(-1), len(surface.vertices))
+                own = row.unsqueeze(-1) * total
+            drawn.append(own)
+        return torch.cat(drawn, dim=-2).numpy()
 
     def bounds(
         self, positions: Sequence[FloatArray], frames: Sequence[FloatArray], goals: Sequence[Goal]

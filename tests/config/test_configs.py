@@ -183,6 +183,20 @@ def test_nodal_contact_and_its_scheme_are_read(write):
     assert task.scene.bodies[0].nodal_contact
 
 
+@pytest.mark.parametrize("shape", ["sphere, radius: 0.1", "capsule, radius: 0.1, length: 0.2"])
+def test_smooth_bodies_are_read(write, shape):
+    bodies = f"  bodies:\n    - {{name: ball, shape: {{kind: {shape}, smooth: true}},"
+    task = load_task(write(MINIMAL + bodies + " pose: {position: [0, 0, -1]}}\n"))
+    assert task.scene.bodies[0].smooth
+
+
+def test_a_cylinder_is_not_smooth(write):
+    shape = "{kind: cylinder, radius: 0.1, length: 0.2, smooth: true}"
+    bodies = f"  bodies:\n    - {{name: ball, shape: {shape}}}\n"
+    with pytest.raises(InvalidInput, match="smooth"):
+        load_task(write(MINIMAL + bodies))
+
+
 def test_keyframes_must_come_in_order(write):
     body = (
         "{name: b, shape: {kind: box, size: 1}, motion: kinematic, "

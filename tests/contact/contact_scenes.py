@@ -192,6 +192,88 @@ def between_bodies(rng):
     return scene
 
 
+def skeleton(*ends, radius, rng):
+    """A sphere or a capsule by its ends, turned about them at random; what it touches is round."""
+    ends = np.array(ends, dtype=float)
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    carriers = ends[0] + radius * q[: 4 - len(ends)]
+    return np.concatenate([ends, carriers]), np.array([[0, 0, 0] if len(ends) == 1 else [0, 1, 1]])
+
+
+def on_a_round_ball(rng):
+    sphere = skeleton([0.02, 0.01, -0.5], radius=0.5, rng=rng)
+    scene = stack([cloth(6, 0.6, 0.03, rng, 0.01)], [sphere])
+    scene.radius = [0.0, 0.5]
+    return scene
+
+
+def on_a_capsule(rng):
+    """A capsule that ends below the sheet: its side, its end, and what is between."""
+    capsule = skeleton([-0.6, 0.1, -0.24], [0.05, -0.03, -0.2], radius=0.2, rng=rng)
+    scene = stack([cloth(6, 0.6, 0.03, rng, 0.01)], [capsule], body_dynamic=[True])
+    scene.radius = [0.0, 0.2]
+    return scene
+
+
+def on_a_short_capsule(rng):
+    """So short that edges see both ends; thick, and the sheet is pinned in part."""
+    capsule = skeleton([-0.02, 0.03, -0.31], [0.05, 0.01, -0.3], radius=0.3, rng=rng)
+    scene = stack([cloth(6, 0.6, 0.06, rng, 0.01)], [capsule])
+    scene.radius, scene.thickness = [0.0, 0.3], [0.02, 0.03]
+    scene.prescribed[6:24] = True
+    return scene
+
+
+def along_a_capsule(rng):
+    """Edges of the sheet nearly parallel to the axis: mollified."""
+    x, faces = grid(6, 0.6, rng, jitter=0.0)
+    x[:, :2] @= [[1.0, 0.004], [-0.004, 1.0]]
+    capsule = skeleton([-0.5, 0.02, -0.2], [0.5, 0.02, -0.2], radius=0.2, rng=rng)
+    scene = stack([(x, x + [0, 0, 0.04] + 1e-3 * rng.normal(size=x.shape), faces)], [capsule])
+    scene.radius = [0.0, 0.2]
+    return scene
+
+
+def round_on_relief(rng):
+    """A sphere and a capsule on terrain, and on each other."""
+    bodies = [
+        relief(6, 0.9, rng, 0.03),
+        skeleton([0.27, 0.05, 0.17], radius=0.1, rng=rng),
+        skeleton([-0.25, -0.03, 0.19], [0.03, 0.06, 0.16], radius=0.1, rng=rng),
+    ]
+    scene = stack([], bodies, body_dynamic=[False, True, True])
+    scene.radius, scene.thickness = [0.0, 0.1, 0.1], [0.01, 0.0, 0.02]
+    return scene
+
+
+def round_on_a_box(rng):
+    """A capsule across the ridges of a box, with a sphere at its corner."""
+    x, faces = box(0.3)
+    bodies = [
+        skeleton([0.25, -0.1, 0.05], [-0.05, 0.3, 0.06], radius=0.05, rng=rng),
+        (x - [0, 0, 0.03], faces),
+        skeleton([-0.2, -0.19, 0.02], radius=0.04, rng=rng),
+    ]
+    scene = stack([], bodies, body_dynamic=[True, True, False])
+    scene.radius = [0.05, 0.0, 0.04]
+    return scene
+
+
+def round_heap(rng):
+    """Spheres and capsules on each other: across, side by side, and at the ends."""
+    bodies = [
+        skeleton([0.0, 0.0, 0.0], radius=0.1, rng=rng),
+        skeleton([0.25, 0.03, -0.05], radius=0.12, rng=rng),
+        skeleton([-0.2, 0.0, 0.24], [0.2, 0.02, 0.23], radius=0.1, rng=rng),
+        skeleton([-0.1, -0.2, 0.42], [0.08, 0.25, 0.43], radius=0.06, rng=rng),
+        skeleton([-0.22, 0.0017, 0.02], [-0.6, 0.0, 0.01], radius=0.08, rng=rng),
+        skeleton([-0.25, 0.203, 0.02], [-0.55, 0.2, 0.012], radius=0.08, rng=rng),
+    ]
+    scene = stack([], bodies, body_dynamic=[True] * 5 + [False])
+    scene.radius = [0.1, 0.12, 0.1, 0.06, 0.08, 0.08]
+    return scene
+
+
 SCENES = {
     f.__name__: f
     for f in (
@@ -211,6 +293,13 @@ SCENES = {
         boxes_aslant,
         ridges_across,
         between_bodies,
+        on_a_round_ball,
+        on_a_capsule,
+        on_a_short_capsule,
+        along_a_capsule,
+        round_on_relief,
+        round_on_a_box,
+        round_heap,
     )
 }
 

@@ -4,6 +4,7 @@ import itertools
 import os
 from pathlib import Path
 
+import contact_scenes
 import ipctk
 import numpy as np
 import pytest
@@ -500,3 +501,104 @@ def test_near_boxes(level):
             assert bool(bits >> (4 * p + q) & 1) == expected
             found += expected
     assert 0 < found < 200 * 12
+
+
+def round_scene(name, seed=0):
+    drawn = contact_scenes.make(name, seed)
+    return drawn, kernels.BroadPhase(
+        drawn.faces.astype(np.int32),
+        drawn.surface,
+        drawn.cloth_count,
+        True,
+        drawn.x,
+        drawn.body_dynamic,
+        drawn.ignored_pairs,
+        drawn.radius,
+    )
+
+
+def pairs_within(drawn, mesh, x_t0, x_t1, reach, samples=40):
+    """(edge-edge, a, b) that come within reach on a sampled motion; ends of skeletons meet all."""
+    surface, is_round = drawn.surface, np.array(drawn.radius) > 0
+    used = np.unique(drawn.faces)
+    points = [
+        (v, f)
+        for v, f in itertools.product(used, range(len(drawn.faces)))
+        if v not in drawn.faces[f] and (is_round[surface[v]] or not is_round[mesh.face_surface[f]])
+    ]
+    edges = [
+        (e, f)
+        for e, f in itertools.combinations(range(len(mesh.edges)), 2)
+        if not set(mesh.edges[e]) & set(mesh.edges[f])
+    ]
+    found = set()
+    for kind, ids, corners in (
+        (0, points, [[v, *drawn.faces[f]] for v, f in points]),
+        (1, edges, [[*mesh.edges[e], *mesh.edges[f]] for e, f in edges]),
+    ):
+        if not ids:
+            continue
+        corners = np.array(corners)
+        owners = surface[corners[:, [0, 3]]]
+        bodies = {"body_dynamic": drawn.body_dynamic, "ignored_pairs": drawn.ignored_pairs}
+        touches = [may_touch(a, b, drawn.cloth_count, True, **bodies) for a, b in owners]
+        closest = np.full(len(ids), np.inf)
+        for share in np.linspace(0, 1, samples):
+            x = np.ascontiguousarray((x_t0 + share * (x_t1 - x_t0))[corners])
+            closest = np.minimum(closest, np.sqrt(kernels.distance_sq(bool(kind), x)))
+        near = np.array(touches) & (closest <= np.array(reach)[owners].sum(axis=1))
+        found |= {(kind, *map(int, ids[k])) for k in np.flatnonzero(near)}
+    return found
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.05, 0.4], ids=["rest", "slow", "fast"])
+@pytest.mark.parametrize(
+    "name", ["on_a_round_ball", "on_a_capsule", "round_on_relief", "round_on_a_box", "round_heap"]
+)
+def test_nothing_that_comes_within_reach_of_a_skeleton_is_missed(name, speed):
+    drawn, mesh = round_scene(name)
+    rng = np.random.default_rng(3)
+    reach = [0.04 + radius for radius in drawn.radius]
+    for _ in range(3):
+        x_t0 = drawn.x + 0.01 * speed * rng.normal(size=drawn.x.shape)
+        shift = speed * rng.normal(size=(drawn.surface_count, 3))
+        x_t1 = x_t0 + shift[drawn.surface] + 0.02 * speed * rng.normal(size=x_t0.shape)
+        expected = pairs_within(drawn, mesh, x_t0, x_t1, reach)
+        assert len(expected) > 2
+        for found in (mesh.find(x_t0, x_t1, reach), mesh.find_kept(x_t0, x_t1, reach)):
+            assert expected <= {(kind, a, b) for kind, *_, a, b in found.tolist()}
+
+
+def test_a_skeleton_is_where_its_end_or_its_segment_is():
+    """The nearest of the pairs is as near as the whole segment is to the whole triangle."""
+    drawn, mesh = round_scene("on_a_capsule")
+    x, faces = drawn.x, drawn.faces[:-1]
+    ends = x[drawn.faces[-1][:2]]
+    found = mesh.find(x, x, [0.3, 0.5])
+    nearest = min(
+        np.sqrt(kernels.distance_sq(bool(kind), x[None, corners])[0])
+        for kind, *corners, _, _ in found.tolist()
+        if (drawn.surface[corners] == 1).any()
+    )
+    along = ends[0] + np.linspace(0, 1, 4001)[:, None] * (ends[1] - ends[0])
+    sampled = np.inf
+    for f in faces:
+        triangles = np.broadcast_to(x[f], (len(along), 3, 3))
+        ways = trimesh.triangles.closest_point(triangles, along) - along
+        sampled = min(sampled, np.linalg.norm(ways, axis=1).min())
+    assert nearest == pytest.approx(sampled, rel=1e-5)
+    assert nearest <= sampled + 1e-12
+
+
+def test_bad_round_surfaces_are_refused():
+    x = np.eye(4, 3)
+    surface = np.zeros(4, np.int32)
+    for faces, radius, message in (
+        ([[0, 1, 2]], [0.1], "be a point or a segment"),
+        ([[0, 0, 0], [1, 1, 1]], [0.1], "be one where their surface is round"),
+        ([[0, 1, 1]], [0.0], "have three different corners"),
+        ([[0, 1, 1]], [-1.0], "at least 0 of bodies"),
+        ([[0, 1, 1]], [0.1, 0.1], "one value a surface"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            kernels.BroadPhase(np.array(faces, np.int32), surface, 0, True, x, radius=radius)

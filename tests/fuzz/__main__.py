@@ -88,6 +88,10 @@ class SchemeJudge:
     def is_free_path(self, path: np.ndarray) -> bool:
         return self.silent or self._judge.is_free_path(path)
 
+    def placed(self, path: np.ndarray) -> np.ndarray:
+        """A path with the meshes of smooth bodies, or of all bodies where they touch with these."""
+        return path if self.silent else self._judge.placed(path)
+
     def points(self, state: dc.State) -> np.ndarray:
         """Of all surfaces, as a path has them."""
         return self._judge.points(state)
@@ -119,6 +123,7 @@ def _run_scene(seed: int, index: int, tally: Tally, drawing: str, where: dict[st
         where["step"] = k
         control = scene.control(state, k)
         path = _path(scene, state, control)
+        path = None if path is None else judge.placed(path)
         if path is not None and not judge.is_free_path(path):
             tally.line("path", where, "a segment of the path is not free")
         before, state = state, _step(scene, state, control, rng, tally, where)

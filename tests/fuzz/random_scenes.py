@@ -33,6 +33,11 @@ SHAPES: dict[str, Callable[..., dc.RigidBody]] = {
 }
 
 
+def smooth(kind: str, drawn: float) -> dict[str, bool]:
+    """Whether a body is smooth, by a number that is drawn anyway: all else stays what it was."""
+    return {"smooth": drawn > 0} if kind in ("sphere", "capsule") else {}
+
+
 @dataclass(frozen=True)
 class Drives:
     """What the joints and the base of the only robot shall do.
@@ -323,6 +328,7 @@ def draw_bodies(
         extent = 3 * size if kind == "plane" else s
         shift = 0.2 * size * rng.uniform(-1, 1, 2)
         pose = [*shift, -depth - top, *q]
+        surface |= smooth(kind, float(q[0]))
         bodies.append(SHAPES[kind](extent, pose=pose, **surface))
         speed = np.sqrt(G * size)
         linear = speed * rng.uniform(0, 1) * rng.normal(size=3)

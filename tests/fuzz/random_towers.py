@@ -25,6 +25,7 @@ from random_scenes import (
     draw_cloths,
     draw_throw,
     sheet_masses,
+    smooth,
 )
 
 import diffcloth_torch as dc
@@ -169,6 +170,8 @@ def _body(
     side = 1 if rng.random() < 0.7 else -1
     kinds.append(f"dynamic {kind} {next(iter(weight))} {next(iter(weight.values())):.3g}")
 
+    keywords |= smooth(kind, float(q[0]))
+
     def make(pose: list[float]) -> dc.RigidBody:
         return _shape(np.random.default_rng(shape_seed), kind, s, pose=pose, **keywords)
 
@@ -188,6 +191,7 @@ def _prescribed(
     s = 3 * d["size"] if kind == "plane" else d["size"] * rng.uniform(0.3, 1.0)
     keywords = {"motion": motion, **_surface(rng)}
     q = rng.normal(size=4) if kind != "plane" else np.array([1.0, 0.0, 0.0, 0.0])
+    keywords |= smooth(kind, float(q[0]))
     about = SHAPES[kind](s, pose=[0.0, 0.0, 0.0, *q], **keywords)
     height = tower.place(rng, _turned_vertices(about), -1)
     return SHAPES[kind](s, pose=[0.0, 0.0, height, *q], **keywords)

@@ -1,10 +1,11 @@
-"""The gradient of a step against bodies of every shape: open, hollow, round, slivers, moving."""
+"""The gradient of a step against bodies of every shape: open, hollow, smooth, slivers, moving."""
 
 import numpy as np
 import pytest
 import scenes
 import torch
 import trimesh
+from scipy.spatial.transform import Rotation
 from test_step_gradients import CONTACT, check, gradients, make_loss
 
 import diffcloth_torch as dc
@@ -55,6 +56,21 @@ BODIES = {
 }
 
 
+def smooth_ball(**keywords):
+    return dc.RigidBody.sphere(0.6, smooth=True, pose=[0.01, -0.02, -0.6, 1, 0, 0, 0], **keywords)
+
+
+def smooth_capsule(**keywords):
+    """Lying aslant below the sheet, one end of it below its middle."""
+    axis = np.array([0.3, 0.7, 0.02]) / np.linalg.norm([0.3, 0.7, 0.02])
+    turn = Rotation.align_vectors([axis], [[0, 0, 1]])[0].as_quat()[[3, 0, 1, 2]]
+    at = np.array([0.02, 0.03, -0.4]) - 0.15 * axis
+    return dc.RigidBody.capsule(0.4, 0.3, smooth=True, pose=[*at, *turn], **keywords)
+
+
+SMOOTH = {"smooth_ball": smooth_ball, "smooth_capsule": smooth_capsule}
+
+
 def distance(points, triangles):
     return min(
         np.linalg.norm(
@@ -66,21 +82,19 @@ def distance(points, triangles):
 
 def resting(name, *, moving=False, friction_iterations=2, **options):
     """A sheet just above a body that falls and slides onto it."""
-    vertices, faces = BODIES[name]()
     X, cloth_faces = scenes.grid(5, 5, edge=0.06, seed=2)
     X = scenes.turned(X - X.mean(axis=0), [0, 0, 1], 0.4)
     points = X + np.array([0, 0, GAP])
-    while distance(points, vertices[np.asarray(faces)]) < GAP:
-        points[:, 2] += 5e-4
+    motion = "kinematic" if moving else "static"
+    if name in SMOOTH:
+        solid = SMOOTH[name](motion=motion, friction=0.3)
+    else:
+        vertices, faces = BODIES[name]()
+        solid = dc.RigidBody(vertices, np.array(faces), motion=motion, friction=0.3)
+        while distance(points, vertices[np.asarray(faces)]) < GAP:
+            points[:, 2] += 5e-4
     material = scenes.material(cloth_faces, stretch=200.0, drag=1.0)
     cloth = dc.Cloth(points, cloth_faces, rest_positions=X, material=material)
-    solid = dc.RigidBody(
-        vertices,
-        np.array(faces),
-        motion="kinematic" if moving else "static",
-        friction=0.3,
-        thickness=0.0,
-    )
     sim = scenes.simulator([cloth], [solid], friction_iterations=friction_iterations, **options)
     state = sim.initial_state()
     velocity = torch.tensor([0.15, -0.1, -0.3], dtype=F64) + scenes.tensor_noise(
@@ -105,7 +119,7 @@ def without_slip(case):
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["still", "moving"])
-@pytest.mark.parametrize("name", list(BODIES))
+@pytest.mark.parametrize("name", [*BODIES, *SMOOTH])
 def test_every_gradient_is_that_of_the_step(name, moving):
     case = resting(name, moving=moving)
     after = case.step()
@@ -115,7 +129,7 @@ def test_every_gradient_is_that_of_the_step(name, moving):
     check(case, CONTACT, zero=without_slip(case))
 
 
-@pytest.mark.parametrize("name", ["triangle", "dented"])
+@pytest.mark.parametrize("name", ["triangle", "dented", "smooth_capsule"])
 def test_split_steps_too(name):
     case = resting(name, moving=True, scheme="split")
     check(case, CONTACT, zero=without_slip(case))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scenes
 import test_attachment_gradients as attachments
+import test_body_gradients
 import torch
 from bodies import coupled_scenes
 from bodies import test_core_gradients as mechanisms
@@ -46,6 +47,11 @@ def with_origins(name, scheme="coupled"):
 
 def attached(make, scheme):
     case = make(**attachments.SCHEMES[scheme])
+    return inputs_of(case.sim, case.step)
+
+
+def on_body(name):
+    case = test_body_gradients.resting(name, moving=True)
     return inputs_of(case.sim, case.step)
 
 
@@ -122,6 +128,7 @@ STEPS = {
     **{f"pairs-{friction}": (at_pairs, friction) for friction in (0.05, 2.0)},
     **{f"joints-{name}": (with_joints, name) for name in mechanisms.CASES},
     "hanging_at_a_box": (hanging_at_a_box,),
+    **{f"on-{name}": (on_body, name) for name in test_body_gradients.SMOOTH},
     **{f"robot-{base}": (with_a_robot, base) for base in ("fixed", "floating", "kinematic")},
 }
 

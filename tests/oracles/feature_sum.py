@@ -30,6 +30,7 @@ class ContactScene:
     self_contact: bool = True
     body_dynamic: list = field(default_factory=list)
     ignored_pairs: list = field(default_factory=list)
+    radius: list = field(default_factory=list)  # of every surface; empty: none is round
 
     @property
     def surface_count(self):
@@ -46,6 +47,7 @@ class ContactScene:
             "friction": friction.tolist(),
             "body_dynamic": self.body_dynamic,
             "ignored_pairs": self.ignored_pairs,
+            "radius": self.radius,
         } | changes
         return kernels.ContactPotential(
             self.faces.astype(np.int32),
@@ -105,6 +107,7 @@ class FeatureSum:
         potential = scene.potential()
         count = scene.surface_count
         self.thickness = scene.thickness or [0.0] * count
+        self.radius = scene.radius or [0.0] * count
         kappa = np.broadcast_to(scene.kappa, (count, count))
         self.kappa = 0.5 * (kappa + kappa.T)
         self.faces = [
@@ -114,6 +117,8 @@ class FeatureSum:
         self.vertex_area = collections.Counter()
         self.edge_area = collections.Counter()
         for f in scene.faces:
+            if self.radius[scene.surface[f[0]]]:
+                continue
             third = area(*scene.X[f]) / 3
             for k in range(3):
                 self.vertex_area[f[k]] += third
@@ -136,7 +141,7 @@ class FeatureSum:
         self.ridge_area = dict(zip(edges, ridge_area, strict=True))
 
     def barrier(self, d_sq, s, r):
-        xi = 0.5 * (self.thickness[s] + self.thickness[r])
+        xi = 0.5 * (self.thickness[s] + self.thickness[r]) + self.radius[s] + self.radius[r]
         return self.kappa[s, r] * kernels.barrier(d_sq, xi, self.scene.d_hat)
 
     def counted_faces(self, s, p):
@@ -170,7 +175,8 @@ class FeatureSum:
     def mollifier(self, x, c, e):
         rest = self.scene.X
         length_sq = [np.sum((rest[i] - rest[j]) ** 2) for i, j in (c, e)]
-        return kernels.mollifier(x[[*c, *e]], kernels.mollifier_threshold(*length_sq))[0]
+        is_round = any(self.radius[self.scene.surface[edge[0]]] for edge in (c, e))
+        return kernels.mollifier(x[[*c, *e]], kernels.mollifier_threshold(*length_sq, is_round))[0]
 
     def edge_against(self, x, c, s, r):
         """Sum over the sharp edges of body r."""
@@ -194,6 +200,9 @@ class FeatureSum:
             for r in range(scene.cloth_count, len(self.faces)):
                 if [s, r] in scene.ignored_pairs:
                     continue
+                if self.radius[r]:
+                    total += self.cloth_against_round(x, s, r)
+                    continue
                 for p in points:
                     if not scene.prescribed[p] or not self.is_still(r):
                         total += 0.25 * self.vertex_area[p] * self.point_against(x, p, s, r)
@@ -215,7 +224,71 @@ class FeatureSum:
                 total += self.between_bodies(x, s, r)
         return total
 
+    def skeleton(self, s):
+        """The one or two ends of a round body, and its area, that of an end and of the axis."""
+        ends = sorted(set(self.faces[s][0]))
+        length = np.linalg.norm(self.scene.X[ends[-1]] - self.scene.X[ends[0]])
+        whole = 2 * np.pi * self.radius[s] * (2 * self.radius[s] + length)
+        areas = [whole, whole / 6 / len(ends), whole / 6]
+        return ends, *np.float32(areas).astype(float)
+
+    def cloth_against_round(self, x, s, r):
+        """A quarter of every area, against the ends or, where it is nearer, the axis."""
+        scene = self.scene
+        ends, *_ = self.skeleton(r)
+        total = 0.0
+        for p, f in itertools.product(ends, self.faces[s]):
+            if not (scene.prescribed[list(f)].all() and self.is_still(r)):
+                b = self.barrier(ipctk.point_triangle_distance(x[p], *x[list(f)]), s, r)
+                total += 0.25 * area(*scene.X[list(f)]) * b
+        for c in edges_of(self.faces[s]) if len(ends) == 2 else ():
+            if scene.prescribed[list(c)].all() and self.is_still(r):
+                continue
+            d_sq = [ipctk.edge_edge_distance(*x[list(c)], *x[ends])]
+            d_sq += [ipctk.point_edge_distance(x[p], *x[list(c)]) for p in ends]
+            whole, first, second = (self.barrier(d, s, r) for d in d_sq)
+            weight = 0.25 * self.edge_area[c] * self.mollifier(x, c, ends)
+            total += weight * (whole - first - second)
+        return total
+
+    def round_against_mesh(self, x, s, r):
+        """Ends as corners, and the axis as a ridge, of a round body s and a mesh r."""
+        ends, _, corner, axis = self.skeleton(s)
+        corner = min(corner, self.surface_area[r])
+        total = sum(0.25 * corner * self.point_against(x, p, s, r) for p in ends)
+        for c in edges_of(self.faces[r]) if len(ends) == 2 else ():
+            w = float(np.float32(self.ridge_share[c] * min(self.ridge_area[c], axis)))
+            inner = sum(
+                share * self.barrier(distance_sq(x[p], x[ends]), s, r) for p, share in self.parts(c)
+            )
+            total += 0.5 * w * self.mollifier(x, c, ends) * inner
+        return total
+
+    def between_round(self, x, s, r):
+        (a, whole_a, corner_a, axis_a), (b, whole_b, corner_b, axis_b) = (
+            self.skeleton(s),
+            self.skeleton(r),
+        )
+        if len(a) == 2 and len(b) == 1:
+            return self.between_round(x, r, s)
+
+        def against(ends, other, corner, most):
+            """Ends as corners of one, against all of the other."""
+            sums = [self.barrier(distance_sq(x[[p]], x[other]), s, r) for p in ends]
+            return 0.25 * min(corner, most) * sum(sums)
+
+        total = against(a, b, corner_a, whole_b)
+        if len(a) == 1:
+            return total
+        total += against(b, a, corner_b, whole_a)
+        w = 0.5 * min(axis_a, axis_b) * self.mollifier(x, a, b)
+        return total + w * self.barrier(distance_sq(x[a], x[b]), s, r)
+
     def between_bodies(self, x, s, r):
+        if self.radius[s] and self.radius[r]:
+            return self.between_round(x, s, r)
+        if self.radius[s] or self.radius[r]:
+            return self.round_against_mesh(x, *((s, r) if self.radius[s] else (r, s)))
         total = 0.0
         for a, b in ((s, r), (r, s)):
             for v in np.unique(self.faces[a]):

@@ -140,6 +140,21 @@ class Judge:
                     parts.append(mesh.vertices @ turn.T + frame[:3, 3].detach().numpy())
         return np.concatenate(parts)
 
+    def placed(self, path):
+        """Vertices of meshes on a path of the solver, which has four points of smooth bodies."""
+        scene, first = self._sim.scene, sum(len(cloth.vertices) for cloth in self._sim.scene.cloths)
+        parts = [path[:, :first]]
+        for body in scene.bodies:
+            frame = body.contact_surface.vertices
+            own = path[:, first : first + len(frame)]
+            first += len(frame)
+            if body.smooth:
+                edges = (frame[1:] - frame[0]).T
+                shares = np.linalg.solve(edges, (body.vertices - frame[0]).T)
+                own = own[:, :1] + np.einsum("ev,kei->kvi", shares, own[:, 1:] - own[:, :1])
+            parts.append(own)
+        return np.concatenate([*parts, path[:, first:]], axis=1)
+
     def is_free(self, state):
         return not self._ipctk.has_intersections(self.mesh, self.points(state))
 

@@ -72,14 +72,15 @@ contact::CollisionMesh collision_mesh(const Faces& faces,
                                       Index cloth_count,
                                       bool self_contact,
                                       const std::vector<bool>& body_dynamic,
-                                      const std::vector<std::array<Index, 2>>& ignored_pairs) {
+                                      const std::vector<std::array<Index, 2>>& ignored_pairs,
+                                      std::vector<double> radius) {
   std::vector<contact::CollisionMesh::Face> rows(faces.shape(0));
   for (std::size_t f = 0; f < rows.size(); ++f) rows[f] = {faces(f, 0), faces(f, 1), faces(f, 2)};
   std::vector<Index> surface(vertex_surface.data(),
                              vertex_surface.data() + vertex_surface.shape(0));
   contact::SurfacePairs touching =
       touching_surfaces(surface, cloth_count, self_contact, body_dynamic, ignored_pairs);
-  return {std::move(rows), std::move(surface), cloth_count, std::move(touching)};
+  return {std::move(rows), std::move(surface), cloth_count, std::move(touching), std::move(radius)};
 }
 
 void check_rows(const char* name, const Positions& x, const contact::CollisionMesh& mesh) {
@@ -99,9 +100,15 @@ class Search {
          bool self_contact,
          const Positions& x_reference,
          const std::vector<bool>& body_dynamic,
-         const std::vector<std::array<Index, 2>>& ignored_pairs)
-      : mesh_(collision_mesh(
-            faces, vertex_surface, cloth_count, self_contact, body_dynamic, ignored_pairs)),
+         const std::vector<std::array<Index, 2>>& ignored_pairs,
+         std::vector<double> radius)
+      : mesh_(collision_mesh(faces,
+                             vertex_surface,
+                             cloth_count,
+                             self_contact,
+                             body_dynamic,
+                             ignored_pairs,
+                             std::move(radius))),
         broad_phase_(mesh_, checked("x_reference", x_reference)),
         list_(broad_phase_) {}
   Search(const Search&) = delete;
@@ -208,7 +215,7 @@ void distance_kernels(nb::module_& m) {
       },
       "edge_edge"_a, "x"_a.noconvert());
   m.def("mollifier_threshold", &contact::mollifier_threshold, "rest_length_sq_a"_a,
-        "rest_length_sq_b"_a);
+        "rest_length_sq_b"_a, "is_round"_a = false);
   m.def(
       "mollifier",
       [](const OnePair& x, double eps) {
@@ -278,10 +285,12 @@ void collision_kernels(nb::module_& m) {
 
   nb::class_<Search>(m, "BroadPhase")
       .def(nb::init<const Faces&, const Surfaces&, Index, bool, const Positions&,
-                    const std::vector<bool>&, const std::vector<std::array<Index, 2>>&>(),
+                    const std::vector<bool>&, const std::vector<std::array<Index, 2>>&,
+                    std::vector<double>>(),
            "faces"_a.noconvert(), "vertex_surface"_a.noconvert(), "cloth_count"_a, "self_contact"_a,
            "x_reference"_a.noconvert(), "body_dynamic"_a = std::vector<bool>{},
-           "ignored_pairs"_a = std::vector<std::array<Index, 2>>{})
+           "ignored_pairs"_a = std::vector<std::array<Index, 2>>{},
+           "radius"_a = std::vector<double>{})
       .def("find", &Search::find, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "reach"_a)
       .def(
           "find",

@@ -89,8 +89,13 @@ class ContactPotential {
                    contact::SurfacePairs touching,
                    const Positions& X,
                    const std::vector<bool>& prescribed,
-                   contact::Parameters parameters)
-      : mesh_(face_list(faces), std::move(vertex_surface), cloth_count, std::move(touching)),
+                   contact::Parameters parameters,
+                   std::vector<double> radius)
+      : mesh_(face_list(faces),
+              std::move(vertex_surface),
+              cloth_count,
+              std::move(touching),
+              std::move(radius)),
         prescribed_(prescribed.begin(), prescribed.end()),
         weights_(mesh_, X.data(), prescribed_),
         rest_(contact::measure(mesh_, X.data())),
@@ -205,6 +210,7 @@ class ContactPotential {
     if (name == "vertex_area") return rest_.vertex_area;
     if (name == "edge_area") return rest_.edge_area;
     if (name == "edge_length_sq") return rest_.edge_length_sq;
+    if (name == "face_area") return rest_.face_area;
     if (name == "mean_face_area") return rest_.mean_face_area;
     throw nb::value_error(("contact potential: no measure `" + name + "`").c_str());
   }
@@ -285,6 +291,7 @@ class ContactPotential {
     result["vertex_area"] = to_values(bar.rest.vertex_area);
     result["edge_area"] = to_values(bar.rest.edge_area);
     result["edge_length_sq"] = to_values(bar.rest.edge_length_sq);
+    result["face_area"] = to_values(bar.rest.face_area);
     result["mean_face_area"] = to_values(bar.rest.mean_face_area);
     return result;
   }
@@ -300,6 +307,7 @@ class ContactPotential {
     result.rest.vertex_area = list("vertex_area");
     result.rest.edge_area = list("edge_area");
     result.rest.edge_length_sq = list("edge_length_sq");
+    result.rest.face_area = list("face_area");
     result.rest.mean_face_area = list("mean_face_area");
     return result;
   }
@@ -335,7 +343,7 @@ void contact_potentials(nb::module_& m) {
              const std::vector<bool>& prescribed, double d_hat, double slip,
              std::vector<double> thickness, std::vector<double> kappa, std::vector<double> friction,
              const std::vector<bool>& body_dynamic,
-             const std::vector<std::array<Index, 2>>& ignored_pairs) {
+             const std::vector<std::array<Index, 2>>& ignored_pairs, std::vector<double> radius) {
             contact::SurfacePairs touching = touching_surfaces(
                 vertex_surface, cloth_count, self_contact, body_dynamic, ignored_pairs);
             new (self) ContactPotential(faces, std::move(vertex_surface), cloth_count,
@@ -344,12 +352,14 @@ void contact_potentials(nb::module_& m) {
                                          .slip = slip,
                                          .thickness = std::move(thickness),
                                          .kappa = std::move(kappa),
-                                         .friction = std::move(friction)});
+                                         .friction = std::move(friction)},
+                                        std::move(radius));
           },
           "faces"_a, "vertex_surface"_a, "cloth_count"_a, "self_contact"_a, "X"_a, "prescribed"_a,
           "d_hat"_a, "slip"_a, "thickness"_a, "kappa"_a, "friction"_a,
           "body_dynamic"_a = std::vector<bool>{},
-          "ignored_pairs"_a = std::vector<std::array<Index, 2>>{})
+          "ignored_pairs"_a = std::vector<std::array<Index, 2>>{},
+          "radius"_a = std::vector<double>{})
       .def("candidate_count", &ContactPotential::candidate_count, "x"_a)
       .def("energies", &ContactPotential::energies, "x"_a, "other"_a)
       .def("contacts", &ContactPotential::contacts, "x"_a)

@@ -8,13 +8,15 @@ namespace {
 /// Edges that count as parallel at rest and now are this share of |U|^2 |V|^2 apart, squared: an
 /// angle of 1.8 degrees at rest length.
 constexpr double kThreshold = 1e-3;
+/// Likewise against the segment of a round body: 18 degrees.
+constexpr double kRoundThreshold = 0.1;
 
 double cross_sq(const Corners& x) { return Vec3(x[1] - x[0]).cross(x[3] - x[2]).squaredNorm(); }
 
 }  // namespace
 
-double mollifier_threshold(double rest_length_sq_a, double rest_length_sq_b) {
-  return kThreshold * rest_length_sq_a * rest_length_sq_b;
+double mollifier_threshold(double rest_length_sq_a, double rest_length_sq_b, bool is_round) {
+  return (is_round ? kRoundThreshold : kThreshold) * rest_length_sq_a * rest_length_sq_b;
 }
 
 double mollifier(const Corners& x, double eps) {

@@ -6,7 +6,11 @@
 namespace diffcloth::contact {
 
 /// Below which |u x v|^2 an edge-edge pair is mollified: 1e-3 |U|^2 |V|^2 of the rest edges [m^4].
-double mollifier_threshold(double rest_length_sq_a, double rest_length_sq_b);
+///
+/// Against the segment of a round body it is 0.1 |U|^2 |V|^2. The segment is far from what touches the body:
+/// which point of a chord of length l is nearest to it changes from one end to the other as these move by
+/// (l sin)^2 / (2 r) against each other, and the force goes with it.
+double mollifier_threshold(double rest_length_sq_a, double rest_length_sq_b, bool is_round = false);
 
 /// Factor that makes the force of two edges continuous where they become parallel:
 ///

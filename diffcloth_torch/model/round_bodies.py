@@ -1,0 +1,68 @@
+"""Bodies with a surface that has no facets: their skeletons, and their mass properties.
+
+A sphere is all that is within its radius of a point, a capsule likewise of a segment. The core only
+has this skeleton: what touches the body is the radius away from it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from diffcloth_torch.checks import FloatArray, IndexArray, frozen
+
+__all__ = ["ContactSurface", "Primitive", "round_mass", "round_surface"]
+
+
+class Primitive(NamedTuple):
+    """An analytic surface around the origin of a body's frame.
+
+    Attributes:
+        kind: "plane" (z = 0, the solid below), "sphere", "capsule" (along z) or "box".
+        size: In the order of the kinds: nothing; the radius; the radius, and half the length of the
+            cylinder; half the lengths [m]. Padded with zeros.
+    """
+
+    kind: str
+    size: tuple[float, float, float]
+
+
+class ContactSurface(NamedTuple):
+    """What a body touches with.
+
+    Attributes:
+        vertices: Of the mesh, or of a skeleton: its ends, then what says how it turns; four that do
+            not lie in one plane [m], shape [v, 3].
+        faces: Of the mesh; [[0, 0, 0]] of a point, [[0, 1, 1]] of a segment.
+        radius: Of what is round around its skeleton [m]; 0 of a mesh.
+    """
+
+    vertices: FloatArray
+    faces: IndexArray
+    radius: float
+
+
+def round_surface(primitive: Primitive) -> ContactSurface:
+    """The skeleton of a sphere or a capsule."""
+    r, half, _ = primitive.size
+    ends, face = [(0.0, 0.0, 0.0), (0.0, 0.0, r)], [0, 0, 0]
+    if primitive.kind == "capsule":
+        ends, face = [(0.0, 0.0, -half), (0.0, 0.0, half)], [0, 1, 1]
+    vertices = np.array([*ends, (r, 0.0, 0.0), (0.0, r, 0.0)])
+    return ContactSurface(frozen(vertices), np.array([face], dtype=np.int32), r)
+
+
+def round_mass(primitive: Primitive) -> tuple[float, FloatArray]:
+    """Volume [m^3] of a sphere or a capsule, and its inertia per mass about the origin [m^2]."""
+    r, half, _ = primitive.size
+    ball = 4.0 / 3.0 * math.pi * r**3
+    tube = math.pi * r**2 * 2.0 * half
+    share = tube / (ball + tube)  # of the mass
+    along = share * r**2 / 2 + (1 - share) * 2 / 5 * r**2
+    # Half a ball has its center 3/8 r from its flat side.
+    across = share * (r**2 / 4 + half**2 / 3) + (1 - share) * (
+        2 / 5 * r**2 + half**2 + 3 / 4 * r * half
+    )
+    return ball + tube, np.diag([across, across, along])
