@@ -165,8 +165,8 @@ class ContactModel {
   bool between_cloths(const Candidate& pair) const;
 
   /// Three vertices of one of a pair's surfaces, with which the gap between both turns: of a body, round
-  /// rather than not, at rest rather than moving; between cloths of the triangle, or, of edges that do not cross, of a face at the
-  /// second one.
+  /// rather than not, at rest rather than moving; between cloths of the triangle, or, of edges that do not
+  /// cross, of a face at the second one.
   std::array<Index, 3> frame(const Candidate& pair) const;
 
   /// How much of the gap turns with the pair's first surface, the rest with the second: of two round bodies by

@@ -1,6 +1,7 @@
 // How the gradient of lagged friction changes with what it depends on besides x, in the terms of friction_set.h:
 //
-//   grad D = mu lambda q B^T w,   q = f1/|w|,   w = P s,   s = r(x) - E(x) a,   a = E(x_start)^-1 share r(x_start).
+//   grad D = mu lambda q B^T w,   q = f1/|w|,   w = P s,   s = r(x) - E(x) a,
+//   a = E(x_start)^-1 share r(x_start),   of each part.
 //
 // Of each contact everything that belongs to no direction is made once.
 
