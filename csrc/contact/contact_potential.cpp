@@ -5,6 +5,7 @@
 #include <utility>
 
 #include "contact/ccd.h"
+#include "contact/direction_lanes.h"
 
 namespace diffcloth::contact {
 namespace {
@@ -28,6 +29,21 @@ bool moves(std::span<const Index> v, const double* d) {
 
 bool moves(std::span<const Index> v, const Products& products) {
   return std::ranges::any_of(products.z, [&](const double* d) { return moves(v, d); });
+}
+
+/// Multiply Hessians of contacts: call multiply(kernels, z, y) with the rows of directions side by side.
+template <class Multiply>
+void multiply_side_by_side(const Products& products, Index vertex_count, Multiply multiply) {
+  const std::size_t size = 3 * static_cast<std::size_t>(vertex_count);
+  for_direction_groups(products.size(),
+                       [&](const DirectionKernels& kernels, std::size_t first, std::size_t count) {
+                         DirectionRows z(kernels, size);
+                         DirectionRows y(kernels, size);
+                         z.read(products.z.subspan(first, count));
+                         y.read(products.y.subspan(first, count));
+                         multiply(kernels, z.data(), y.data());
+                         y.write(products.y.subspan(first, count));
+                       });
 }
 
 template <class Hessian>
@@ -115,12 +131,13 @@ void ContactPotential::add_hessian(const double* x,
 }
 
 void ContactPotential::add_hessian_products(const double* x, const Products& products) const {
-  for (const Contact& k : contacts_) {
-    const ContactHessian h = model_.hessian(k, x, Curvature::kExact);
-    for (std::size_t l = 0; l < products.size(); ++l) {
-      add_stencil_product(k.pair.vertices, h, products.z[l], products.y[l]);
-    }
-  }
+  multiply_side_by_side(products, model_.mesh().vertex_count,
+                        [&](const DirectionKernels& kernels, const double* z, double* y) {
+                          for (const Contact& k : contacts_) {
+                            const ContactHessian h = model_.hessian(k, x, Curvature::kExact);
+                            kernels.contact_product(h.factors(k.pair.vertices), z, y);
+                          }
+                        });
 }
 
 void ContactPotential::add_held_product(const double* x, const double* z, double* y) const {
@@ -133,14 +150,15 @@ void ContactPotential::add_held_product(const double* x, const double* z, double
 void ContactPotential::add_left_out_products(const double* x,
                                              Curvature curvature,
                                              const Products& products) const {
-  for (const Contact& k : contacts_) {
-    if (!moves(k.pair.vertices, products)) continue;
-    const ContactHessian h = model_.hessian(k, x, curvature);
-    for (std::size_t l = 0; l < products.size(); ++l) {
-      if (!moves(k.pair.vertices, products.z[l])) continue;
-      add_stencil_product(k.pair.vertices, h, products.z[l], products.y[l]);
-    }
-  }
+  if (products.size() == 0) return;
+  multiply_side_by_side(products, model_.mesh().vertex_count,
+                        [&](const DirectionKernels& kernels, const double* z, double* y) {
+                          for (const Contact& k : contacts_) {
+                            if (!moves(k.pair.vertices, products)) continue;
+                            const ContactHessian h = model_.hessian(k, x, curvature);
+                            kernels.contact_product(h.factors(k.pair.vertices), z, y);
+                          }
+                        });
 }
 
 void ContactPotential::accumulate(const double* x, const double* z) {
@@ -171,10 +189,13 @@ void FrictionPotential::add_hessian(const double* x,
 
 void FrictionPotential::add_hessian_products(const double* x, const Products& products) const {
   const FrictionSet::Slips& at = set_.slips(x);
-  for (const FrictionSet::Entry& k : set_.entries()) {
-    const FrictionSet::Hessian h = set_.hessian(k, at, Curvature::kExact);
-    for (std::size_t l = 0; l < products.size(); ++l) h.add_product(products.z[l], products.y[l]);
-  }
+  multiply_side_by_side(products, set_.model().mesh().vertex_count,
+                        [&](const DirectionKernels& kernels, const double* z, double* y) {
+                          for (const FrictionSet::Entry& k : set_.entries()) {
+                            const FrictionSet::Hessian h = set_.hessian(k, at, Curvature::kExact);
+                            kernels.friction_product(h.factors(), z, y);
+                          }
+                        });
 }
 
 void FrictionPotential::add_held_product(const double* x, const double* z, double* y) const {
@@ -188,14 +209,16 @@ void FrictionPotential::add_held_product(const double* x, const double* z, doubl
 void FrictionPotential::add_left_out_products(const double* x,
                                               Curvature curvature,
                                               const Products& products) const {
+  if (products.size() == 0) return;
   const FrictionSet::Slips& at = set_.slips(x);
-  for (const FrictionSet::Entry& k : set_.entries()) {
-    if (!moves(k.all_points(), products)) continue;
-    const FrictionSet::Hessian h = set_.hessian(k, at, curvature);
-    for (std::size_t l = 0; l < products.size(); ++l) {
-      if (moves(k.all_points(), products.z[l])) h.add_product(products.z[l], products.y[l]);
-    }
-  }
+  multiply_side_by_side(products, set_.model().mesh().vertex_count,
+                        [&](const DirectionKernels& kernels, const double* z, double* y) {
+                          for (const FrictionSet::Entry& k : set_.entries()) {
+                            if (!moves(k.all_points(), products)) continue;
+                            const FrictionSet::Hessian h = set_.hessian(k, at, curvature);
+                            kernels.friction_product(h.factors(), z, y);
+                          }
+                        });
 }
 
 void FrictionPotential::accumulate(const double* x, const double* z) {

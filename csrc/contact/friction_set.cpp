@@ -308,6 +308,17 @@ void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
   });
 }
 
+FrictionProduct FrictionSet::Hessian::factors() const {
+  return {.point = entry_->points.data(),
+          .c = entry_->c.data(),
+          .edge = entry_->edges.data(),
+          .frame = entry_->frame,
+          .count = entry_->count,
+          .B = {B_[0].data(), B_[1].data(), B_[2].data(), B_[3].data()},
+          .core = core_.data(),
+          .turn = turn_.data()};
+}
+
 void FrictionSet::Hessian::add_product(const double* z, double* y) const {
   const Entry& k = *entry_;
   Vec3 change = Vec3::Zero();

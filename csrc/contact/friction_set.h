@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "contact/contact_set.h"
+#include "contact/direction_kernels.h"
 #include "contact/friction.h"
 
 namespace diffcloth::contact {
@@ -120,6 +121,9 @@ class FrictionSet {
    public:
     void add_to(linalg::BlockMatrix& A) const;
     void add_product(const double* z, double* y) const;
+
+    /// What products along several directions are made of; of this Hessian and its entry.
+    FrictionProduct factors() const;
 
    private:
     friend class FrictionSet;

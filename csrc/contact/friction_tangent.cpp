@@ -2,10 +2,14 @@
 //
 //   grad D = mu lambda q B^T w,   q = f1/|w|,   w = P s,   s = r(x) - E(x) a,   a = E(x_start)^-1 r(x_start).
 //
-// Of each contact everything that belongs to no direction is made once.
+// Of each contact everything that belongs to no direction is made once; directions go through the rest side by
+// side: see direction_lanes_impl.h.
 
+#include <array>
 #include <cmath>
+#include <vector>
 
+#include "contact/direction_lanes.h"
 #include "contact/distance/mollifier.h"
 #include "contact/friction_set.h"
 
@@ -48,6 +52,54 @@ class NormalForceDerivative {
   double m_eps_ = 0.0;
 };
 
+void copy(const Vec3& from, double* to) { Eigen::Map<Vec3>{to} = from; }
+
+/// What the nearest points make of the motion of the lag configuration, where they slide.
+void fill_sliding(const Entry& k, const double* x, const double* x_start, FrictionTangent& out) {
+  const Closest& geometry = k.lag.closest;
+  Eigen::Matrix<double, 2, 12> beta = beta_jacobian(geometry);
+  if (geometry.parameter_count == 1) beta.row(1).setZero();
+  Eigen::Matrix<double, 3, 4> corners;
+  Eigen::Matrix<double, 3, 4> corners_start;
+  const auto& v = k.lag.pair.vertices;
+  for (int i = 0; i < 4; ++i) {
+    corners.col(i) = row(x, v[i]) - row(x, v[0]);
+    corners_start.col(i) = row(x_start, v[i]) - row(x_start, v[0]);
+  }
+  const Eigen::Matrix<double, 3, 2> moved = corners.lazyProduct(geometry.c_beta);
+  const Eigen::Matrix<double, 3, 2> moved_start = corners_start.lazyProduct(geometry.c_beta);
+  for (int b = 0; b < 2; ++b) {
+    for (int a = 0; a < 12; ++a) out.beta[b][a] = beta(b, a);
+    for (int i = 0; i < 4; ++i) out.c_beta[i][b] = geometry.c_beta(i, b);
+    for (int a = 0; a < 3; ++a) {
+      out.t_beta[a][b] = geometry.s(a, b);
+      out.r_beta[a][b] = moved(a, b);
+      out.r_start_beta[a][b] = moved_start(a, b);
+    }
+  }
+}
+
+/// What the frame makes of the motion of the start, where it turns.
+void fill_frame(const Entry& k,
+                const FrictionSet::Slip& at,
+                const double* x_start,
+                FrictionTangent& out) {
+  const Frame start(k, x_start);
+  const double m_sq = start.m.squaredNorm();
+  copy(start.e2.cross(start.m) / m_sq, out.to_coordinates[0]);
+  copy(start.m.cross(start.e1) / m_sq, out.to_coordinates[1]);
+  copy(start.m / m_sq, out.to_coordinates[2]);
+  copy(start.e1, out.e1_start);
+  copy(start.e2, out.e2_start);
+  copy(k.a, out.a);
+  copy(at.frame.e1, out.e1);
+  copy(at.frame.e2, out.e2);
+  copy(at.frame.m, out.m);
+  const Vec3 force = k.mu * k.lambda * at.force();
+  copy(at.frame.e2.cross(force), out.e2_force);
+  copy(force.cross(at.frame.e1), out.force_e1);
+}
+
 /// The derivative of one contact's friction.
 class EntryDerivative {
  public:
@@ -59,98 +111,47 @@ class EntryDerivative {
                   const double* x_lag)
       : model_(model),
         k_(entry),
-        at_(at),
-        start_(entry, x_start),
-        normal_force_(entry.lag, distance_sq_gradient(entry.lag.closest), x_lag),
-        slides_(entry.lag.closest.parameter_count > 0),
-        inv_d_(1.0 / std::sqrt(entry.lag.closest.d_sq)),
-        strength_(entry.mu * entry.lambda),
-        force_(strength_ * at.force()) {
-    if (slides_) {
-      beta_ = beta_jacobian(entry.lag.closest);
-      if (entry.lag.closest.parameter_count == 1) beta_.row(1).setZero();
-      const auto& v = entry.lag.pair.vertices;
-      for (int i = 0; i < 4; ++i) {
-        corners_.col(i) = row(x, v[i]) - row(x, v[0]);
-        corners_start_.col(i) = row(x_start, v[i]) - row(x_start, v[0]);
-      }
-    }
-    if (!entry.turns) return;
-    to_coordinates_.row(0) = start_.e2.cross(start_.m);
-    to_coordinates_.row(1) = start_.m.cross(start_.e1);
-    to_coordinates_.row(2) = start_.m;
-    to_coordinates_ /= start_.m.squaredNorm();
+        law_(at.law),
+        normal_force_(entry.lag, distance_sq_gradient(entry.lag.closest), x_lag) {
+    const Closest& geometry = entry.lag.closest;
+    const double strength = entry.mu * entry.lambda;
+    kernel.corner = entry.lag.pair.vertices.data();
+    kernel.corner_c = geometry.c.data();
+    kernel.point = entry.points.data();
+    kernel.c = entry.c.data();
+    kernel.edge = entry.edges.data();
+    kernel.count = entry.count;
+    kernel.turns = entry.turns;
+    kernel.slides = geometry.parameter_count > 0;
+    copy(entry.n, kernel.n);
+    kernel.inv_d = 1.0 / std::sqrt(geometry.d_sq);
+    copy(at.s, kernel.s);
+    copy(at.w, kernel.w);
+    kernel.n_s = entry.n.dot(at.s);
+    Eigen::Map<Vec12>{kernel.by_corners} = (entry.mu * law_.f1_over_y) * normal_force_.by_corners;
+    kernel.by_w = strength * law_.f2;
+    kernel.stiffness = strength * law_.f1_over_y;
+    copy(strength * at.force(), kernel.force);
+    if (kernel.slides) fill_sliding(entry, x, x_start, kernel);
+    if (kernel.turns) fill_frame(entry, at, x_start, kernel);
   }
 
-  void add(const FrictionSet::Tangents& dot, double* y) const {
-    const auto& v = k_.lag.pair.vertices;
-    const Closest& geometry = k_.lag.closest;
-    // What the lag configuration gives: c(beta), n = t / d with t = sum_i c_i x_i, and lambda.
-    const Vec12 x_dot = stacked(v, dot.lag);
-    Vec3 t_dot = Vec3::Zero();
-    for (int i = 0; i < 4; ++i) t_dot += geometry.c[i] * x_dot.segment<3>(3 * i);
-    Vec3 s_dot = Vec3::Zero();
-    Vec3 r_dot = k_.gap(dot.start);
-    if (slides_) {
-      const Vec2 beta_dot = beta_.lazyProduct(x_dot);
-      const Vec4 c_dot = geometry.c_beta * beta_dot;
-      t_dot += geometry.s * beta_dot;
-      s_dot = corners_.lazyProduct(c_dot);
-      r_dot += corners_start_.lazyProduct(c_dot);
-      for (int i = 0; i < 4; ++i) Eigen::Map<Vec3>(y + 3 * v[i]) += c_dot[i] * force_;
-    }
-    const Vec3 n_dot = inv_d_ * tangential(t_dot, k_.n);
-
-    // s = r(x) - Q r(x_start), and r(x_start) in its frame.
-    Vec3 a_dot = Vec3::Zero();
-    if (k_.turns) {
-      const Vec3 e1_dot = k_.edge(0, dot.start);
-      const Vec3 e2_dot = k_.edge(1, dot.start);
-      r_dot -= k_.a[0] * e1_dot + k_.a[1] * e2_dot +
-               k_.a[2] * (e1_dot.cross(start_.e2) + start_.e1.cross(e2_dot));
-      a_dot = to_coordinates_.lazyProduct(r_dot);
-      s_dot -= at_.frame * a_dot;
-    } else {
-      s_dot -= r_dot;
-    }
-    const double n_s = k_.n.dot(at_.s);
-    const Vec3 w_dot = tangential(s_dot, k_.n) - n_dot.dot(at_.s) * k_.n - n_s * n_dot;
-
-    const FrictionLaw& law = at_.law;
-    double along_w = k_.mu * normal_force_.by_corners.dot(x_dot) * law.f1_over_y +
-                     strength_ * law.f2 * at_.w.dot(w_dot);
-    if (dot.parameters != nullptr) along_w += by_parameters(*dot.parameters);
-    const Vec3 change = along_w * at_.w + (strength_ * law.f1_over_y) * w_dot;
-    for (int i = 0; i < k_.count; ++i) Eigen::Map<Vec3>(y + 3 * k_.points[i]) += k_.c[i] * change;
-    if (!k_.turns) return;
-    const auto [by_a_1, by_a_2] = at_.frame.pull_back(k_.a, change);
-    const auto [by_force_1, by_force_2] = at_.frame.pull_back(a_dot, force_);
-    k_.add_edges({-by_a_1 - by_force_1, -by_a_2 - by_force_2}, y);
-  }
-
- private:
-  /// What the share of w grows by.
+  /// What the share of w grows by with parameters.
   double by_parameters(const ContactModel::Bar& dot) const {
     const double lambda_dot =
         normal_force_.by_parameters(model_.push_forward(k_.lag, dot), dot.d_hat);
     const double mu_dot = model_.push_forward_mu(k_.lag.pair, dot);
-    return (mu_dot * k_.lambda + k_.mu * lambda_dot) * at_.law.f1_over_y +
-           strength_ * at_.law.f1_over_y_e * dot.slip;
+    return (mu_dot * k_.lambda + k_.mu * lambda_dot) * law_.f1_over_y +
+           k_.mu * k_.lambda * law_.f1_over_y_e * dot.slip;
   }
 
+  FrictionTangent kernel;
+
+ private:
   const ContactModel& model_;
   const Entry& k_;
-  const FrictionSet::Slip& at_;
-  Frame start_;
+  const FrictionLaw& law_;
   NormalForceDerivative normal_force_;
-  bool slides_;  ///< whether the nearest points do, on their primitives
-  double inv_d_;
-  double strength_;
-  Vec3 force_;
-  Eigen::Matrix<double, 2, 12> beta_;          ///< of the nearest points, where they slide
-  Eigen::Matrix<double, 3, 4> corners_;        ///< from the first, at x
-  Eigen::Matrix<double, 3, 4> corners_start_;  ///< at x_start
-  Mat3 to_coordinates_;                        ///< E(x_start)^-1, where the frame turns
 };
 
 }  // namespace
@@ -160,10 +161,33 @@ void FrictionSet::add_tangents(const double* x,
                                std::span<const Tangents> directions,
                                std::span<double* const> y) const {
   const Slips& here = slips(x);
-  for (std::size_t e = 0; e < entries_.size(); ++e) {
-    const EntryDerivative of(*model_, entries_[e], here[e], x, x_start_, x_lag);
-    for (std::size_t l = 0; l < directions.size(); ++l) of.add(directions[l], y[l]);
-  }
+  const std::size_t size = 3 * static_cast<std::size_t>(model_->mesh().vertex_count);
+  for_direction_groups(directions.size(), [&](const DirectionKernels& kernels, std::size_t first,
+                                              std::size_t count) {
+    std::vector<const double*> of_lag;
+    std::vector<const double*> of_start;
+    for (const Tangents& dot : directions.subspan(first, count)) {
+      of_lag.push_back(dot.lag);
+      of_start.push_back(dot.start);
+    }
+    DirectionRows lag(kernels, size);
+    DirectionRows start(kernels, size);
+    DirectionRows out(kernels, size);
+    lag.read(of_lag);
+    start.read(of_start);
+    out.read(y.subspan(first, count));
+    std::array<double, kDirectionLanes> by_parameters{};
+    for (std::size_t e = 0; e < entries_.size(); ++e) {
+      const EntryDerivative of(*model_, entries_[e], here[e], x, x_start_, x_lag);
+      for (std::size_t l = 0; l < count; ++l) {
+        const ContactModel::Bar* const dot = directions[first + l].parameters;
+        if (dot != nullptr) by_parameters[l] = of.by_parameters(*dot);
+      }
+      kernels.friction_tangent(of.kernel, lag.data(), start.data(), by_parameters.data(),
+                               out.data());
+    }
+    out.write(y.subspan(first, count));
+  });
 }
 
 }  // namespace diffcloth::contact
