@@ -80,6 +80,7 @@ void ContactPotential::stand_at(const double* x) {
   } else {
     measure(x, here_);
   }
+  adopted_ = nullptr;
   model_.find(here_.near, x, contacts_);
 }
 
@@ -101,11 +102,11 @@ const Near& ContactPotential::near_at(const double* x, Measured& scratch) const 
 }
 
 void ContactPotential::add_gradient(const double* x, double* g) const {
-  model_.add_gradient(contacts_, x, g);
+  model_.add_gradient(contacts(), x, g);
 }
 
 void ContactPotential::add_couplings(linalg::Couplings& pairs) const {
-  for (const Contact& k : contacts_) add_stencil_couplings(k.pair.vertices, pairs);
+  for (const Contact& k : contacts()) add_stencil_couplings(k.pair.vertices, pairs);
 }
 
 void ContactPotential::add_couplings_near(const double* x, linalg::Couplings& pairs) const {
@@ -125,7 +126,7 @@ void ContactPotential::add_couplings_near(const double* x, linalg::Couplings& pa
 void ContactPotential::add_hessian(const double* x,
                                    Curvature curvature,
                                    linalg::BlockMatrix& A) const {
-  for (const Contact& k : contacts_) {
+  for (const Contact& k : contacts()) {
     A.add_stencil(k.pair.vertices, model_.hessian(k, x, curvature));
   }
 }
@@ -133,7 +134,7 @@ void ContactPotential::add_hessian(const double* x,
 void ContactPotential::add_hessian_products(const double* x, const Products& products) const {
   multiply_side_by_side(products, model_.mesh().vertex_count,
                         [&](const DirectionKernels& kernels, const double* z, double* y) {
-                          for (const Contact& k : contacts_) {
+                          for (const Contact& k : contacts()) {
                             const ContactHessian h = model_.hessian(k, x, Curvature::kExact);
                             kernels.contact_product(h.factors(k.pair.vertices), z, y);
                           }
@@ -141,7 +142,7 @@ void ContactPotential::add_hessian_products(const double* x, const Products& pro
 }
 
 void ContactPotential::add_held_product(const double* x, const double* z, double* y) const {
-  for (const Contact& k : contacts_) {
+  for (const Contact& k : contacts()) {
     if (!model_.is_held(k.pair.vertices)) continue;
     add_stencil_product(k.pair.vertices, model_.hessian(k, x, Curvature::kExact), z, y);
   }
@@ -153,7 +154,7 @@ void ContactPotential::add_left_out_products(const double* x,
   if (products.size() == 0) return;
   multiply_side_by_side(products, model_.mesh().vertex_count,
                         [&](const DirectionKernels& kernels, const double* z, double* y) {
-                          for (const Contact& k : contacts_) {
+                          for (const Contact& k : contacts()) {
                             if (!moves(k.pair.vertices, products)) continue;
                             const ContactHessian h = model_.hessian(k, x, curvature);
                             kernels.contact_product(h.factors(k.pair.vertices), z, y);
@@ -162,7 +163,7 @@ void ContactPotential::add_left_out_products(const double* x,
 }
 
 void ContactPotential::accumulate(const double* x, const double* z) {
-  if (bar_ != nullptr) model_.add_mixed(contacts_, x, z, -1.0, *bar_);
+  if (bar_ != nullptr) model_.add_mixed(contacts(), x, z, -1.0, *bar_);
 }
 
 void ContactPotential::add_tangents(const double* x, std::span<double* const> y) const {
@@ -173,7 +174,7 @@ void ContactPotential::add_tangents(const double* x, std::span<double* const> y)
     dots.push_back(directions_[l]);
     out.push_back(y[l]);
   }
-  if (!dots.empty()) model_.add_tangents(contacts_, x, dots, out);
+  if (!dots.empty()) model_.add_tangents(contacts(), x, dots, out);
 }
 
 void FrictionPotential::add_couplings(linalg::Couplings& pairs) const {
@@ -202,7 +203,7 @@ void FrictionPotential::add_held_product(const double* x, const double* z, doubl
   const FrictionSet::Slips& at = set_.slips(x);
   for (const FrictionSet::Entry& k : set_.entries()) {
     if (!set_.model().is_held(k.all_points())) continue;
-    set_.hessian(k, at, Curvature::kExact).add_product(z, y);
+    set_.add_product(k, at, z, y);
   }
 }
 

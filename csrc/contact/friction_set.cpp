@@ -319,18 +319,26 @@ FrictionProduct FrictionSet::Hessian::factors() const {
           .turn = turn_.data()};
 }
 
-void FrictionSet::Hessian::add_product(const double* z, double* y) const {
-  const Entry& k = *entry_;
-  Vec3 change = Vec3::Zero();
-  for (int p = 0; p < k.frame; ++p) change += k.c[p] * row(z, k.points[p]);
-  for (int p = k.frame; p < k.count; ++p) change += B_[p - k.frame] * row(z, k.points[p]);
-  const Vec3 force = core_ * change;
-  for (int p = 0; p < k.frame; ++p) Eigen::Map<Vec3>(y + 3 * k.points[p]) += k.c[p] * force;
-  for (int p = k.frame; p < k.count; ++p) {
-    Eigen::Map<Vec3>(y + 3 * k.points[p]) += B_[p - k.frame].transpose() * force;
+void FrictionSet::add_product(const Entry& k,
+                              const Slips& slips,
+                              const double* z,
+                              double* y) const {
+  const Slip& at = slips[static_cast<std::size_t>(&k - entries_.data())];
+  const double strength = k.mu * k.lambda;
+  const Vec3 change = change_of_slip(k, at.frame, z);
+  const Vec3 force = strength * (at.law.f1_over_y * tangential(change, k.n) +
+                                 (at.law.f2 * at.w.dot(change)) * at.w);
+  for (int p = 0; p < k.count; ++p) {
+    if (k.c[p] != 0.0) Eigen::Map<Vec3>(y + 3 * k.points[p]) += k.c[p] * force;
   }
+  if (!k.turns) return;
+  auto [e1_bar, e2_bar] = at.frame.pull_back(-k.a, force);
+  // As the frame itself turns.
+  const Vec3 turn = (k.a[2] * strength) * at.force();
   const Frame turned(k, z);
-  k.add_edges({turn_.cross(turned.e2), turned.e1.cross(turn_)}, y);
+  e1_bar += turn.cross(turned.e2);
+  e2_bar += turned.e1.cross(turn);
+  k.add_edges({e1_bar, e2_bar}, y);
 }
 
 namespace {

@@ -33,8 +33,8 @@ class FrictionSet {
  public:
   FrictionSet() = default;
 
-  /// @param contacts  the contacts of the lag configuration
-  /// @param x_start   positions at the start of the step; they outlive this object
+  /// @param contacts  the contacts of the lag configuration; they outlive this object
+  /// @param x_start   positions at the start of the step; likewise
   FrictionSet(const ContactModel& model,
               const std::vector<Contact>& contacts,
               const double* x_start);
@@ -43,7 +43,7 @@ class FrictionSet {
   bool empty() const { return entries_.empty(); }
 
   struct Entry {
-    Contact lag;
+    const Contact& lag;
     Vec3 n;         ///< unit normal at the lag configuration
     double lambda;  ///< normal force at the lag configuration [N]
     double mu;
@@ -120,7 +120,6 @@ class FrictionSet {
   class Hessian {
    public:
     void add_to(linalg::BlockMatrix& A) const;
-    void add_product(const double* z, double* y) const;
 
     /// What products along several directions are made of; of this Hessian and its entry.
     FrictionProduct factors() const;
@@ -145,6 +144,9 @@ class FrictionSet {
   ///
   /// @param at  slips(x); duals are those of has_duals(x)
   Hessian hessian(const Entry& entry, const Slips& at, Curvature curvature) const;
+
+  /// y += the exact Hessian of one entry times z.
+  void add_product(const Entry& entry, const Slips& at, const double* z, double* y) const;
 
   /// Expect the motion from x, where nothing has slipped yet, to another point. The Hessians at x but the
   /// exact one then have q of the slip there: that of a contact at rest knows nothing of sliding. Of bodies
