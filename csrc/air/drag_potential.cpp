@@ -140,6 +140,11 @@ void DragPotential::add_tangent(const double* x, double* y) const {
   const auto by_coefficients = [&](Index f, const Vec3& u) -> Vec3 {
     return across_dot[f] * drag_[f].by_across(u) + along_dot[f] * drag_[f].by_along(u);
   };
+  const auto is_zero = [](double value) { return value == 0.0; };
+  if (with_drag_.empty() && std::ranges::all_of(across_dot, is_zero) &&
+      std::ranges::all_of(along_dot, is_zero)) {
+    return;
+  }
   const std::vector<Derivative>& here = derivatives(x);
   auto next = with_drag_.begin();
   for (std::size_t k = 0; k < flow_.faces.size(); ++k) {

@@ -200,6 +200,7 @@ void tangent(const Scene& scene,
   contact::Detection detection(scene.broad_phase);
   Problem problem(scene, inputs);
   std::vector<Tangents> tangents;
+  tangents.reserve(directions.size());
   std::vector<Forces> forces;
   for (const Direction& direction : directions) {
     tangents.emplace_back(problem, direction.tangents);
