@@ -30,14 +30,21 @@ DragPotential::DragPotential(Flow flow, Index vertex_count, bool of_coefficients
       flow_(std::move(flow)),
       size_(3 * static_cast<std::size_t>(vertex_count)),
       of_coefficients_(of_coefficients) {
-  drag_.reserve(flow_.faces.size());
   for (std::size_t f = 0; f < flow_.faces.size(); ++f) {
-    const Face& face = flow_.faces[f];
-    const Vec3 N = edge(face, 1, flow_.start).cross(edge(face, 2, flow_.start));
-    drag_.emplace_back(N, flow_.across[f], flow_.along[f]);
     if (flow_.across[f] != 0.0 || flow_.along[f] != 0.0)
       with_drag_.push_back(static_cast<Index>(f));
   }
+}
+
+const std::vector<FaceDrag>& DragPotential::drags() const {
+  if (!drags_.empty()) return drags_;
+  drags_.reserve(flow_.faces.size());
+  for (std::size_t f = 0; f < flow_.faces.size(); ++f) {
+    const Face& face = flow_.faces[f];
+    const Vec3 N = edge(face, 1, flow_.start).cross(edge(face, 2, flow_.start));
+    drags_.emplace_back(N, flow_.across[f], flow_.along[f]);
+  }
+  return drags_;
 }
 
 /// u.
@@ -49,7 +56,7 @@ Vec3 DragPotential::velocity(Index f, const double* x) const {
 
 double DragPotential::energy(const double* x) const {
   double sum = 0.0;
-  for (const Index f : with_drag_) sum += drag_[f].power(velocity(f, x));
+  for (const Index f : with_drag_) sum += drags()[f].power(velocity(f, x));
   return flow_.h * sum;
 }
 
@@ -58,14 +65,14 @@ double DragPotential::energy_change(const double* x, const double* to) const {
   for (const Index f : with_drag_) {
     Vec3 moved = Vec3::Zero();
     for (const Index i : flow_.faces[f]) moved += row(to, i) - row(x, i);
-    sum += drag_[f].power_change(velocity(f, x), velocity(f, to), moved / (3.0 * flow_.h));
+    sum += drags()[f].power_change(velocity(f, x), velocity(f, to), moved / (3.0 * flow_.h));
   }
   return flow_.h * sum;
 }
 
 void DragPotential::add_gradient(const double* x, double* g) const {
   for (const Index f : with_drag_) {
-    add_to_corners(flow_.faces[f], drag_[f].force(velocity(f, x)) / 3.0, g);
+    add_to_corners(flow_.faces[f], drags()[f].force(velocity(f, x)) / 3.0, g);
   }
 }
 
@@ -73,7 +80,7 @@ void DragPotential::add_hessian(const double* x,
                                 Curvature /*curvature*/,
                                 linalg::BlockMatrix& A) const {
   for (const Index f : with_drag_) {
-    const Mat3 block = drag_[f].slope(velocity(f, x)) / (9.0 * flow_.h);
+    const Mat3 block = drags()[f].slope(velocity(f, x)) / (9.0 * flow_.h);
     A.add_rows(flow_.faces[f], [&](int /*p*/, int /*q*/) -> const Mat3& { return block; });
   }
 }
@@ -85,7 +92,7 @@ void DragPotential::add_product(Index f, const Mat3& slope, const double* z, dou
 }
 
 void DragPotential::add_hessian_product(const double* x, const double* z, double* y) const {
-  for (const Index f : with_drag_) add_product(f, drag_[f].slope(velocity(f, x)), z, y);
+  for (const Index f : with_drag_) add_product(f, drags()[f].slope(velocity(f, x)), z, y);
 }
 
 void DragPotential::add_held_product(const double* x, const double* z, double* y) const {
@@ -95,14 +102,14 @@ void DragPotential::add_held_product(const double* x, const double* z, double* y
   }
   for (const Index f : *flow_.held) {
     if (flow_.across[f] == 0.0 && flow_.along[f] == 0.0) continue;
-    add_product(f, drag_[f].slope(velocity(f, x)), z, y);
+    add_product(f, drags()[f].slope(velocity(f, x)), z, y);
   }
 }
 
 void DragPotential::accumulate(const double* x, const double* z) {
   // z . grad P = sum_f z_f . grad D_f,  z_f the mean of the corners' z.
   const auto add = [&](Index f) {
-    const FaceDrag& face = drag_[f];
+    const FaceDrag& face = drags()[f];
     const Vec3 u = velocity(f, x);
     const Vec3 z_f = sum_of_corners(flow_.faces[f], z) / 3.0;
     across_bar[f] -= z_f.dot(face.by_across(u));
@@ -129,8 +136,8 @@ const std::vector<DragPotential::Derivative>& DragPotential::derivatives(const d
   derivatives_.reserve(with_drag_.size());
   for (const Index f : with_drag_) {
     const Vec3 u = velocity(f, x);
-    Derivative of{.u = u, .by_velocity = drag_[f].slope(u), .by_frame = {}};
-    for (int k = 0; k < 3; ++k) of.by_frame.col(k) = drag_[f].frame_change(u, Vec3::Unit(k));
+    Derivative of{.u = u, .by_velocity = drags()[f].slope(u), .by_frame = {}};
+    for (int k = 0; k < 3; ++k) of.by_frame.col(k) = drags()[f].frame_change(u, Vec3::Unit(k));
     derivatives_.push_back(of);
   }
   return derivatives_;
@@ -138,7 +145,7 @@ const std::vector<DragPotential::Derivative>& DragPotential::derivatives(const d
 
 void DragPotential::add_tangent(const double* x, double* y) const {
   const auto by_coefficients = [&](Index f, const Vec3& u) -> Vec3 {
-    return across_dot[f] * drag_[f].by_across(u) + along_dot[f] * drag_[f].by_along(u);
+    return across_dot[f] * drags()[f].by_across(u) + along_dot[f] * drags()[f].by_along(u);
   };
   const auto is_zero = [](double value) { return value == 0.0; };
   if (with_drag_.empty() && std::ranges::all_of(across_dot, is_zero) &&

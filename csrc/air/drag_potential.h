@@ -63,6 +63,8 @@ class DragPotential final : public Potential {
     Mat3 by_frame;     ///< of grad D, by N
   };
 
+  /// [F], made when the first one is asked for.
+  const std::vector<FaceDrag>& drags() const;
   Vec3 velocity(Index f, const double* x) const;
   /// Those of all faces with drag at x, which last until another point is asked for.
   const std::vector<Derivative>& derivatives(const double* x) const;
@@ -72,9 +74,9 @@ class DragPotential final : public Potential {
 
   Flow flow_;
   std::size_t size_;              ///< 3 N
-  std::vector<FaceDrag> drag_;    ///< [F]
   std::vector<Index> with_drag_;  ///< faces that have some
   bool of_coefficients_;
+  mutable std::vector<FaceDrag> drags_;
   mutable std::vector<double>
       derivatives_at_;  ///< all vertices of cloths; empty where nothing is known
   mutable std::vector<Derivative> derivatives_;
