@@ -194,7 +194,8 @@ void FrictionPotential::add_hessian_products(const double* x, const Products& pr
                         [&](const DirectionKernels& kernels, const double* z, double* y) {
                           for (const FrictionSet::Entry& k : set_.entries()) {
                             const FrictionSet::Hessian h = set_.hessian(k, at, Curvature::kExact);
-                            kernels.friction_product(h.factors(), z, y);
+                            std::array<Mat3, 4> B;
+                            kernels.friction_product(h.factors(B), z, y);
                           }
                         });
 }
@@ -217,7 +218,8 @@ void FrictionPotential::add_left_out_products(const double* x,
                           for (const FrictionSet::Entry& k : set_.entries()) {
                             if (!moves(k.all_points(), products)) continue;
                             const FrictionSet::Hessian h = set_.hessian(k, at, curvature);
-                            kernels.friction_product(h.factors(), z, y);
+                            std::array<Mat3, 4> B;
+                            kernels.friction_product(h.factors(B), z, y);
                           }
                         });
 }
@@ -226,7 +228,7 @@ void FrictionPotential::accumulate(const double* x, const double* z) {
   const std::size_t size = 3 * static_cast<std::size_t>(set_.model().mesh().vertex_count);
   start_bar.resize(size, 0.0);
   lag_bar.resize(size, 0.0);
-  set_.add_mixed(x, z, x_lag_, -1.0, *bar_, start_bar.data(), lag_bar.data());
+  set_.add_mixed(x, z, x_lag_, -1.0, bar_, start_bar.data(), lag_bar.data());
 }
 
 void FrictionPotential::add_tangents(const double* x, std::span<double* const> y) const {

@@ -128,7 +128,7 @@ class FrictionPotential final : public TouchingPotential {
  public:
   /// @param contacts  of the lag configuration; they outlive the potential
   /// @param x_start   positions at the start of the step; likewise
-  /// @param bar       where accumulate() adds; null where it is never called
+  /// @param bar       where accumulate() adds what parameters get; null where nobody asks for it
   FrictionPotential(const ContactModel& model,
                     const std::vector<Contact>& contacts,
                     const double* x_start,
@@ -168,6 +168,8 @@ class FrictionPotential final : public TouchingPotential {
 
   /// Where the lag configuration lies: accumulate() and add_tangents() need it.
   void set_lag(const double* x_lag) { x_lag_ = x_lag; }
+
+  const FrictionSet& set() const { return set_; }
 
   std::vector<double> start_bar;  ///< of x_start, all vertices; empty until accumulate()
   std::vector<double> lag_bar;    ///< of x_lag, likewise

@@ -251,15 +251,10 @@ bool FrictionSet::has_duals(const double* x) const { return is_at(duals_at_, x);
 FrictionSet::Hessian FrictionSet::hessian(const Entry& k,
                                           const Slips& slips,
                                           Curvature curvature) const {
-  Hessian h(k);
   const auto i = static_cast<std::size_t>(&k - entries_.data());
   const Slip& at = slips[i];
+  Hessian h(k, at);
   const Mat3 identity = Mat3::Identity();
-  const Mat3 of_e1 = k.a[2] * cross_matrix(at.frame.e2) - k.a[0] * identity;
-  const Mat3 of_e2 = -k.a[2] * cross_matrix(at.frame.e1) - k.a[1] * identity;
-  for (int p = k.frame; p < k.count; ++p) {
-    h.B_[p - k.frame] = k.c[p] * identity + k.sign(0, p) * of_e1 + k.sign(1, p) * of_e2;
-  }
   if (curvature == Curvature::kPositive && k.lambda < 0.0) return h;
   const double strength = k.mu * k.lambda;
   const double q = curvature == Curvature::kExact ? at.law.f1_over_y : stiffness(i, at);
@@ -276,9 +271,31 @@ FrictionSet::Hessian FrictionSet::hessian(const Entry& k,
   return h;
 }
 
+std::array<Mat3, 4> FrictionSet::Hessian::frame_changes() const {
+  const Entry& k = *entry_;
+  const Frame& frame = at_->frame;
+  const Mat3 identity = Mat3::Identity();
+  const Mat3 of_e1 = k.a[2] * cross_matrix(frame.e2) - k.a[0] * identity;
+  const Mat3 of_e2 = -k.a[2] * cross_matrix(frame.e1) - k.a[1] * identity;
+  std::array<Mat3, 4> B;
+  for (int p = k.frame; p < k.count; ++p) {
+    B[p - k.frame] = k.c[p] * identity + k.sign(0, p) * of_e1 + k.sign(1, p) * of_e2;
+  }
+  return B;
+}
+
 void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
   const Entry& k = *entry_;
   const int first = k.frame;
+  const std::span<const Index> others = k.all_points().first(static_cast<std::size_t>(first));
+  if (!A.has_any(k.all_points().subspan(others.size()))) {
+    // The frame is of a body whose motion is given.
+    if (!A.any_attached(others)) {
+      A.add_rows(others, [&](int p, int q) -> Mat3 { return (k.c[p] * k.c[q]) * core_; });
+      return;
+    }
+  }
+  const std::array<Mat3, 4> B = frame_changes();
   const Mat3 cross = cross_matrix(turn_);
   // Between e1 and e2 turn x, between e2 and e1 the opposite.
   const auto turning = [&](int p, int q) -> Mat3 {
@@ -287,7 +304,7 @@ void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
   if (A.any_attached(k.all_points())) {
     std::array<Mat3, 7> jacobians;
     for (int p = 0; p < first; ++p) jacobians[p] = k.c[p] * Mat3::Identity();
-    std::copy_n(B_.begin(), k.count - first, jacobians.begin() + first);
+    std::copy_n(B.begin(), k.count - first, jacobians.begin() + first);
     A.add_congruence(k.all_points(), jacobians, core_);
     if (turn_.isZero(0.0)) return;
     std::array<Index, 4> frame{};
@@ -299,22 +316,23 @@ void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
     return;
   }
   std::array<Mat3, 4> core_b;
-  for (int e = 0; e < k.count - first; ++e) core_b[e] = core_.lazyProduct(B_[e]);
+  for (int e = 0; e < k.count - first; ++e) core_b[e] = core_.lazyProduct(B[e]);
   A.add_rows(k.all_points(), [&](int p, int q) -> Mat3 {
     if (p < first && q < first) return (k.c[p] * k.c[q]) * core_;
     if (p < first) return k.c[p] * core_b[q - first];
     if (q < first) return k.c[q] * core_b[p - first].transpose();
-    return B_[p - first].transpose().lazyProduct(core_b[q - first]) + turning(p, q);
+    return B[p - first].transpose().lazyProduct(core_b[q - first]) + turning(p, q);
   });
 }
 
-FrictionProduct FrictionSet::Hessian::factors() const {
+FrictionProduct FrictionSet::Hessian::factors(std::array<Mat3, 4>& B) const {
+  B = frame_changes();
   return {.point = entry_->points.data(),
           .c = entry_->c.data(),
           .edge = entry_->edges.data(),
           .frame = entry_->frame,
           .count = entry_->count,
-          .B = {B_[0].data(), B_[1].data(), B_[2].data(), B_[3].data()},
+          .B = {B[0].data(), B[1].data(), B[2].data(), B[3].data()},
           .core = core_.data(),
           .turn = turn_.data()};
 }
@@ -343,7 +361,8 @@ void FrictionSet::add_product(const Entry& k,
 
 namespace {
 
-/// Pull the cotangent of a normal force back, times scale into `bar`; returns those of the corners.
+/// Pull the cotangent of a normal force back, times scale into `bar` where there is one; returns those of the
+/// corners.
 ///
 ///   d(lambda) = -kappa w (2 d b' dm + m (2 d b'' + b'/d) dD)
 Vec12 pull_back_lambda(const ContactModel& model,
@@ -351,16 +370,13 @@ Vec12 pull_back_lambda(const ContactModel& model,
                        const double* x_lag,
                        double lambda_bar,
                        double scale,
-                       ContactModel::Bar& bar) {
+                       ContactModel::Bar* bar) {
   const double kappa = lag.kappa;
   const double d = std::sqrt(lag.closest.d_sq);
   const double area = lag.weight;
   const double m = lag.mollifier;
   const double b1 = lag.barrier.b1;
   const double per_lambda = -2.0 * d * lambda_bar;
-  model.pull_back_kappa(lag.pair, scale * per_lambda * area * m * b1, bar);
-  bar.d_hat += scale * per_lambda * kappa * area * m * lag.barrier.b1_d_hat;
-  const double xi_bar = per_lambda * kappa * area * m * lag.barrier.b1_xi;
   Vec12 x_bar = (lambda_bar * -kappa * area * m * (2.0 * d * lag.barrier.b2 + b1 / d)) *
                 distance_sq_gradient(lag.closest);
   double threshold_bar = 0.0;
@@ -369,8 +385,12 @@ Vec12 pull_back_lambda(const ContactModel& model,
     threshold_bar = per_lambda * kappa * area * mol.m_eps * b1;
     x_bar += (per_lambda * kappa * area * b1) * mol.gradient;
   }
+  if (bar == nullptr) return x_bar;
+  model.pull_back_kappa(lag.pair, scale * per_lambda * area * m * b1, *bar);
+  bar->d_hat += scale * per_lambda * kappa * area * m * lag.barrier.b1_d_hat;
+  const double xi_bar = per_lambda * kappa * area * m * lag.barrier.b1_xi;
   model.pull_back(lag, scale * per_lambda * kappa * m * b1, scale * threshold_bar, scale * xi_bar,
-                  bar);
+                  *bar);
   return x_bar;
 }
 
@@ -401,7 +421,7 @@ void FrictionSet::add_mixed(const double* x,
                             const double* z,
                             const double* x_lag,
                             double scale,
-                            ContactModel::Bar& bar,
+                            ContactModel::Bar* bar,
                             double* start_bar,
                             double* lag_bar) const {
   const Slips& here = slips(x);
@@ -419,10 +439,12 @@ void FrictionSet::add_mixed(const double* x,
     const Vec3 zeta = k.gap(z) - k.a[0] * change.e1 - k.a[1] * change.e2 - k.a[2] * m_change;
     const double w_zeta = at.w.dot(zeta);
 
-    const double mu_bar = k.lambda * law.f1_over_y * w_zeta;
     const double lambda_bar = k.mu * law.f1_over_y * w_zeta;
-    bar.slip += scale * k.mu * k.lambda * law.f1_over_y_e * w_zeta;
-    model_->pull_back_mu(lag.pair, scale * mu_bar, bar);
+    if (bar != nullptr) {
+      const double mu_bar = k.lambda * law.f1_over_y * w_zeta;
+      bar->slip += scale * k.mu * k.lambda * law.f1_over_y_e * w_zeta;
+      model_->pull_back_mu(lag.pair, scale * mu_bar, *bar);
+    }
 
     Vec12 x_bar = pull_back_lambda(*model_, lag, x_lag, lambda_bar, scale, bar);
 

@@ -121,15 +121,17 @@ class FrictionSet {
    public:
     void add_to(linalg::BlockMatrix& A) const;
 
-    /// What products along several directions are made of; of this Hessian and its entry.
-    FrictionProduct factors() const;
+    /// What products along several directions are made of; of this Hessian, its entry and `B`.
+    FrictionProduct factors(std::array<Mat3, 4>& B) const;
 
    private:
     friend class FrictionSet;
-    explicit Hessian(const Entry& entry) : entry_(&entry) {}
+    Hessian(const Entry& entry, const Slip& at) : entry_(&entry), at_(&at) {}
+    /// B of the frame's vertices; of all others it is c I.
+    std::array<Mat3, 4> frame_changes() const;
 
     const Entry* entry_;
-    std::array<Mat3, 4> B_;  // of the frame's vertices; of all others c I
+    const Slip* at_;
     Mat3 core_ = Mat3::Zero();
     Vec3 turn_ = Vec3::Zero();
   };
@@ -164,13 +166,13 @@ class FrictionSet {
   bool has_duals(const double* x) const;
 
   /// d/d(theta) of phi = z . grad D, times scale: into `bar` for the parameters (friction, slip,
-  /// and, through lambda, kappa, d_hat, thickness, rest shape), into `start_bar` for x_start, and into
+  /// and, through lambda, kappa, d_hat, thickness, rest shape) unless it is null, into `start_bar` for x_start, and into
   /// `lag_bar` for the lag configuration's positions `x_lag`.
   void add_mixed(const double* x,
                  const double* z,
                  const double* x_lag,
                  double scale,
-                 ContactModel::Bar& bar,
+                 ContactModel::Bar* bar,
                  double* start_bar,
                  double* lag_bar) const;
 

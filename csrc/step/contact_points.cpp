@@ -6,8 +6,6 @@
 #include <map>
 #include <utility>
 
-#include "contact/friction_set.h"
-
 namespace diffcloth::step {
 namespace {
 
@@ -78,7 +76,7 @@ double normal_force(const Contact& c) {
 
 std::vector<ContactPoint> contact_points(const Problem& problem,
                                          const std::vector<Contact>& contacts,
-                                         const std::vector<Contact>& lagged,
+                                         const contact::FrictionSet* friction,
                                          const std::vector<double>& x) {
   std::vector<ContactPoint> points;
   if (!problem.contact) return points;
@@ -88,12 +86,11 @@ std::vector<ContactPoint> contact_points(const Problem& problem,
     points.push_back(placed(model, c, x.data()).first);
     points.back().normal_force = normal_force(c);
   }
-  const contact::FrictionSet friction(model, lagged, problem.moved_from().data());
-  if (friction.empty()) return points;
-  const contact::FrictionSet::Slips& slips = friction.slips(x.data());
+  if (friction == nullptr) return points;
+  const contact::FrictionSet::Slips& slips = friction->slips(x.data());
   Places places(contacts);
   for (std::size_t k = 0; k < slips.size(); ++k) {
-    const contact::FrictionSet::Entry& entry = friction.entries()[k];
+    const contact::FrictionSet::Entry& entry = friction->entries()[k];
     const auto [point, is_turned] = placed(model, entry.lag, x.data());
     const std::size_t place = places.find(entry.lag, points.size());
     if (place == points.size()) points.push_back(point);

@@ -1,6 +1,7 @@
 #include "step/forces.h"
 
 #include <algorithm>
+#include <optional>
 #include <tuple>
 #include <utility>
 
@@ -73,6 +74,7 @@ void PairTally::add(Index first, Index second, const Vec3& force) {
 
 void PairTally::add(const std::vector<Contact>& contacts,
                     const std::vector<Contact>& lagged,
+                    const contact::FrictionSet* friction,
                     const std::vector<double>& x) {
   if (!problem_.contact) return;
   const contact::ContactModel& model = *problem_.contact;
@@ -93,11 +95,13 @@ void PairTally::add(const std::vector<Contact>& contacts,
     }
   });
   for_each_pair(model, lagged, [&](const auto& key, const auto& of_pair) {
-    const contact::FrictionSet friction(model, of_pair, problem_.moved_from().data());
-    if (friction.empty()) return;
+    std::optional<contact::FrictionSet> own;
+    const bool is_only_pair = friction != nullptr && of_pair.size() == lagged.size();
+    if (!is_only_pair) own.emplace(model, of_pair, problem_.moved_from().data());
+    const contact::FrictionSet& set = is_only_pair ? *friction : *own;
     PairContacts& pair = of(key.first, key.second);
-    friction.add_gradient(x.data(), g.data());
-    for (const auto& entry : friction.entries()) {
+    set.add_gradient(x.data(), g.data());
+    for (const auto& entry : set.entries()) {
       for (const Index vertex : entry.all_points()) take(pair, vertex);
     }
   });

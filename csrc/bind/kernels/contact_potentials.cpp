@@ -157,7 +157,7 @@ class ContactPotential {
     contact::ContactModel::Bar bar(mesh_);
     Values start_bar = Values::Zero(x.size());
     Values lag_bar = Values::Zero(x.size());
-    set.add_mixed(x.data(), z.data(), x_lag.data(), scale, bar, start_bar.data(), lag_bar.data());
+    set.add_mixed(x.data(), z.data(), x_lag.data(), scale, &bar, start_bar.data(), lag_bar.data());
     nb::dict result = to_dict(bar);
     result["x_start"] = start_bar;
     result["x_lag"] = lag_bar;
