@@ -1,5 +1,6 @@
 #include "air/drag_potential.h"
 
+#include <algorithm>
 #include <utility>
 
 namespace diffcloth::air {
@@ -27,6 +28,7 @@ DragPotential::DragPotential(Flow flow, Index vertex_count, bool of_coefficients
       start_bar(3 * static_cast<std::size_t>(vertex_count), 0.0),
       wind_bar(3, 0.0),
       flow_(std::move(flow)),
+      size_(3 * static_cast<std::size_t>(vertex_count)),
       of_coefficients_(of_coefficients) {
   for (std::size_t f = 0; f < flow_.faces.size(); ++f) {
     if (flow_.across[f] != 0.0 || flow_.along[f] != 0.0)
@@ -34,10 +36,15 @@ DragPotential::DragPotential(Flow flow, Index vertex_count, bool of_coefficients
   }
 }
 
-FaceDrag DragPotential::drag(Index f) const {
-  const Face& face = flow_.faces[f];
-  const Vec3 N = edge(face, 1, flow_.start).cross(edge(face, 2, flow_.start));
-  return {N, flow_.across[f], flow_.along[f]};
+const std::vector<FaceDrag>& DragPotential::drags() const {
+  if (!drags_.empty()) return drags_;
+  drags_.reserve(flow_.faces.size());
+  for (std::size_t f = 0; f < flow_.faces.size(); ++f) {
+    const Face& face = flow_.faces[f];
+    const Vec3 N = edge(face, 1, flow_.start).cross(edge(face, 2, flow_.start));
+    drags_.emplace_back(N, flow_.across[f], flow_.along[f]);
+  }
+  return drags_;
 }
 
 /// u.
@@ -49,7 +56,7 @@ Vec3 DragPotential::velocity(Index f, const double* x) const {
 
 double DragPotential::energy(const double* x) const {
   double sum = 0.0;
-  for (const Index f : with_drag_) sum += drag(f).power(velocity(f, x));
+  for (const Index f : with_drag_) sum += drags()[f].power(velocity(f, x));
   return flow_.h * sum;
 }
 
@@ -58,14 +65,14 @@ double DragPotential::energy_change(const double* x, const double* to) const {
   for (const Index f : with_drag_) {
     Vec3 moved = Vec3::Zero();
     for (const Index i : flow_.faces[f]) moved += row(to, i) - row(x, i);
-    sum += drag(f).power_change(velocity(f, x), velocity(f, to), moved / (3.0 * flow_.h));
+    sum += drags()[f].power_change(velocity(f, x), velocity(f, to), moved / (3.0 * flow_.h));
   }
   return flow_.h * sum;
 }
 
 void DragPotential::add_gradient(const double* x, double* g) const {
   for (const Index f : with_drag_) {
-    add_to_corners(flow_.faces[f], drag(f).force(velocity(f, x)) / 3.0, g);
+    add_to_corners(flow_.faces[f], drags()[f].force(velocity(f, x)) / 3.0, g);
   }
 }
 
@@ -73,23 +80,36 @@ void DragPotential::add_hessian(const double* x,
                                 Curvature /*curvature*/,
                                 linalg::BlockMatrix& A) const {
   for (const Index f : with_drag_) {
-    const Mat3 block = drag(f).slope(velocity(f, x)) / (9.0 * flow_.h);
+    const Mat3 block = drags()[f].slope(velocity(f, x)) / (9.0 * flow_.h);
     A.add_rows(flow_.faces[f], [&](int /*p*/, int /*q*/) -> const Mat3& { return block; });
   }
 }
 
+void DragPotential::add_product(Index f, const Mat3& slope, const double* z, double* y) const {
+  const Vec3 sum = sum_of_corners(flow_.faces[f], z);
+  if (sum.isZero(0.0)) return;
+  add_to_corners(flow_.faces[f], slope * sum / (9.0 * flow_.h), y);
+}
+
 void DragPotential::add_hessian_product(const double* x, const double* z, double* y) const {
-  for (const Index f : with_drag_) {
-    const Vec3 sum = sum_of_corners(flow_.faces[f], z);
-    if (sum.isZero(0.0)) continue;
-    add_to_corners(flow_.faces[f], drag(f).slope(velocity(f, x)) * sum / (9.0 * flow_.h), y);
+  for (const Index f : with_drag_) add_product(f, drags()[f].slope(velocity(f, x)), z, y);
+}
+
+void DragPotential::add_held_product(const double* x, const double* z, double* y) const {
+  if (flow_.held == nullptr) {
+    add_hessian_product(x, z, y);
+    return;
+  }
+  for (const Index f : *flow_.held) {
+    if (flow_.across[f] == 0.0 && flow_.along[f] == 0.0) continue;
+    add_product(f, drags()[f].slope(velocity(f, x)), z, y);
   }
 }
 
 void DragPotential::accumulate(const double* x, const double* z) {
   // z . grad P = sum_f z_f . grad D_f,  z_f the mean of the corners' z.
   const auto add = [&](Index f) {
-    const FaceDrag face = drag(f);
+    const FaceDrag& face = drags()[f];
     const Vec3 u = velocity(f, x);
     const Vec3 z_f = sum_of_corners(flow_.faces[f], z) / 3.0;
     across_bar[f] -= z_f.dot(face.by_across(u));
@@ -107,18 +127,48 @@ void DragPotential::accumulate(const double* x, const double* z) {
   }
 }
 
+const std::vector<DragPotential::Derivative>& DragPotential::derivatives(const double* x) const {
+  if (!derivatives_at_.empty() && std::ranges::equal(derivatives_at_, std::span(x, size_))) {
+    return derivatives_;
+  }
+  derivatives_at_.assign(x, x + size_);
+  derivatives_.clear();
+  derivatives_.reserve(with_drag_.size());
+  for (const Index f : with_drag_) {
+    const Vec3 u = velocity(f, x);
+    Derivative of{.u = u, .by_velocity = drags()[f].slope(u), .by_frame = {}};
+    for (int k = 0; k < 3; ++k) of.by_frame.col(k) = drags()[f].frame_change(u, Vec3::Unit(k));
+    derivatives_.push_back(of);
+  }
+  return derivatives_;
+}
+
 void DragPotential::add_tangent(const double* x, double* y) const {
+  const auto by_coefficients = [&](Index f, const Vec3& u) -> Vec3 {
+    return across_dot[f] * drags()[f].by_across(u) + along_dot[f] * drags()[f].by_along(u);
+  };
+  const auto is_zero = [](double value) { return value == 0.0; };
+  if (with_drag_.empty() && std::ranges::all_of(across_dot, is_zero) &&
+      std::ranges::all_of(along_dot, is_zero)) {
+    return;
+  }
+  const std::vector<Derivative>& here = derivatives(x);
+  auto next = with_drag_.begin();
   for (std::size_t k = 0; k < flow_.faces.size(); ++k) {
     const auto f = static_cast<Index>(k);
-    const bool drags = flow_.across[k] != 0.0 || flow_.along[k] != 0.0;
-    if (!drags && across_dot[k] == 0.0 && along_dot[k] == 0.0) continue;
-    const FaceDrag face = drag(f);
-    const Vec3 u = velocity(f, x);
-    Vec3 change = across_dot[k] * face.by_across(u) + along_dot[k] * face.by_along(u);
+    const bool drags = next != with_drag_.end() && *next == f;
+    const bool changes = across_dot[k] != 0.0 || along_dot[k] != 0.0;
+    if (!drags && !changes) continue;
+    Vec3 change = Vec3::Zero();
     if (drags) {
+      const Derivative& of = here[next - with_drag_.begin()];
+      ++next;
       const Vec3 u_dot =
           -sum_of_corners(flow_.faces[k], start_dot.data()) / (3.0 * flow_.h) - wind_dot;
-      change += face.slope(u) * u_dot + face.frame_change(u, frame_dot(f));
+      change = of.by_velocity * u_dot + of.by_frame * frame_dot(f);
+      if (changes) change += by_coefficients(f, of.u);
+    } else {
+      change = by_coefficients(f, velocity(f, x));
     }
     add_to_corners(flow_.faces[k], change / 3.0, y);
   }

@@ -19,6 +19,8 @@ struct Flow {
   const double* start = nullptr;  ///< [N, 3] x_n [m]
   Vec3 wind = Vec3::Zero();       ///< w [m/s]
   double h = 0.0;                 ///< time step [s]
+  /// Faces with a corner that is no free vertex, if known: add_held_product() takes these alone.
+  const std::vector<Index>* held = nullptr;
 };
 
 /// Drag and lift of faces over one step,
@@ -40,6 +42,7 @@ class DragPotential final : public Potential {
   void add_gradient(const double* x, double* g) const override;
   void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
   void add_hessian_product(const double* x, const double* z, double* y) const override;
+  void add_held_product(const double* x, const double* z, double* y) const override;
   void accumulate(const double* x, const double* z) override;
   void add_tangent(const double* x, double* y) const override;
   void swap_cotangents(CotangentStore& store) override;
@@ -53,14 +56,30 @@ class DragPotential final : public Potential {
   Vec3 wind_dot = Vec3::Zero();
 
  private:
-  FaceDrag drag(Index f) const;
+  /// What derivatives along several directions share of a face.
+  struct Derivative {
+    Vec3 u;
+    Mat3 by_velocity;  ///< of grad D
+    Mat3 by_frame;     ///< of grad D, by N
+  };
+
+  /// [F], made when the first one is asked for.
+  const std::vector<FaceDrag>& drags() const;
   Vec3 velocity(Index f, const double* x) const;
+  /// Those of all faces with drag at x, which last until another point is asked for.
+  const std::vector<Derivative>& derivatives(const double* x) const;
+  void add_product(Index f, const Mat3& slope, const double* z, double* y) const;
   void add_frame_bar(Index f, const Vec3& N_bar);
   Vec3 frame_dot(Index f) const;
 
   Flow flow_;
+  std::size_t size_;              ///< 3 N
   std::vector<Index> with_drag_;  ///< faces that have some
   bool of_coefficients_;
+  mutable std::vector<FaceDrag> drags_;
+  mutable std::vector<double>
+      derivatives_at_;  ///< all vertices of cloths; empty where nothing is known
+  mutable std::vector<Derivative> derivatives_;
 };
 
 }  // namespace diffcloth::air

@@ -5,6 +5,7 @@
 #include <utility>
 
 #include "contact/ccd.h"
+#include "contact/direction_lanes.h"
 
 namespace diffcloth::contact {
 namespace {
@@ -28,6 +29,21 @@ bool moves(std::span<const Index> v, const double* d) {
 
 bool moves(std::span<const Index> v, const Products& products) {
   return std::ranges::any_of(products.z, [&](const double* d) { return moves(v, d); });
+}
+
+/// Multiply Hessians of contacts: call multiply(kernels, z, y) with the rows of directions side by side.
+template <class Multiply>
+void multiply_side_by_side(const Products& products, Index vertex_count, Multiply multiply) {
+  const std::size_t size = 3 * static_cast<std::size_t>(vertex_count);
+  for_direction_groups(products.size(),
+                       [&](const DirectionKernels& kernels, std::size_t first, std::size_t count) {
+                         DirectionRows z(kernels, size);
+                         DirectionRows y(kernels, size);
+                         z.read(products.z.subspan(first, count));
+                         y.read(products.y.subspan(first, count));
+                         multiply(kernels, z.data(), y.data());
+                         y.write(products.y.subspan(first, count));
+                       });
 }
 
 template <class Hessian>
@@ -64,6 +80,7 @@ void ContactPotential::stand_at(const double* x) {
   } else {
     measure(x, here_);
   }
+  adopted_ = nullptr;
   model_.find(here_.near, x, contacts_);
 }
 
@@ -85,11 +102,11 @@ const Near& ContactPotential::near_at(const double* x, Measured& scratch) const 
 }
 
 void ContactPotential::add_gradient(const double* x, double* g) const {
-  model_.add_gradient(contacts_, x, g);
+  model_.add_gradient(contacts(), x, g);
 }
 
 void ContactPotential::add_couplings(linalg::Couplings& pairs) const {
-  for (const Contact& k : contacts_) add_stencil_couplings(k.pair.vertices, pairs);
+  for (const Contact& k : contacts()) add_stencil_couplings(k.pair.vertices, pairs);
 }
 
 void ContactPotential::add_couplings_near(const double* x, linalg::Couplings& pairs) const {
@@ -109,22 +126,23 @@ void ContactPotential::add_couplings_near(const double* x, linalg::Couplings& pa
 void ContactPotential::add_hessian(const double* x,
                                    Curvature curvature,
                                    linalg::BlockMatrix& A) const {
-  for (const Contact& k : contacts_) {
+  for (const Contact& k : contacts()) {
     A.add_stencil(k.pair.vertices, model_.hessian(k, x, curvature));
   }
 }
 
 void ContactPotential::add_hessian_products(const double* x, const Products& products) const {
-  for (const Contact& k : contacts_) {
-    const ContactHessian h = model_.hessian(k, x, Curvature::kExact);
-    for (std::size_t l = 0; l < products.size(); ++l) {
-      add_stencil_product(k.pair.vertices, h, products.z[l], products.y[l]);
-    }
-  }
+  multiply_side_by_side(products, model_.mesh().vertex_count,
+                        [&](const DirectionKernels& kernels, const double* z, double* y) {
+                          for (const Contact& k : contacts()) {
+                            const ContactHessian h = model_.hessian(k, x, Curvature::kExact);
+                            kernels.contact_product(h.factors(k.pair.vertices), z, y);
+                          }
+                        });
 }
 
 void ContactPotential::add_held_product(const double* x, const double* z, double* y) const {
-  for (const Contact& k : contacts_) {
+  for (const Contact& k : contacts()) {
     if (!model_.is_held(k.pair.vertices)) continue;
     add_stencil_product(k.pair.vertices, model_.hessian(k, x, Curvature::kExact), z, y);
   }
@@ -133,18 +151,19 @@ void ContactPotential::add_held_product(const double* x, const double* z, double
 void ContactPotential::add_left_out_products(const double* x,
                                              Curvature curvature,
                                              const Products& products) const {
-  for (const Contact& k : contacts_) {
-    if (!moves(k.pair.vertices, products)) continue;
-    const ContactHessian h = model_.hessian(k, x, curvature);
-    for (std::size_t l = 0; l < products.size(); ++l) {
-      if (!moves(k.pair.vertices, products.z[l])) continue;
-      add_stencil_product(k.pair.vertices, h, products.z[l], products.y[l]);
-    }
-  }
+  if (products.size() == 0) return;
+  multiply_side_by_side(products, model_.mesh().vertex_count,
+                        [&](const DirectionKernels& kernels, const double* z, double* y) {
+                          for (const Contact& k : contacts()) {
+                            if (!moves(k.pair.vertices, products)) continue;
+                            const ContactHessian h = model_.hessian(k, x, curvature);
+                            kernels.contact_product(h.factors(k.pair.vertices), z, y);
+                          }
+                        });
 }
 
 void ContactPotential::accumulate(const double* x, const double* z) {
-  if (bar_ != nullptr) model_.add_mixed(contacts_, x, z, -1.0, *bar_);
+  if (bar_ != nullptr) model_.add_mixed(contacts(), x, z, -1.0, *bar_);
 }
 
 void ContactPotential::add_tangents(const double* x, std::span<double* const> y) const {
@@ -155,7 +174,7 @@ void ContactPotential::add_tangents(const double* x, std::span<double* const> y)
     dots.push_back(directions_[l]);
     out.push_back(y[l]);
   }
-  if (!dots.empty()) model_.add_tangents(contacts_, x, dots, out);
+  if (!dots.empty()) model_.add_tangents(contacts(), x, dots, out);
 }
 
 void FrictionPotential::add_couplings(linalg::Couplings& pairs) const {
@@ -171,38 +190,45 @@ void FrictionPotential::add_hessian(const double* x,
 
 void FrictionPotential::add_hessian_products(const double* x, const Products& products) const {
   const FrictionSet::Slips& at = set_.slips(x);
-  for (const FrictionSet::Entry& k : set_.entries()) {
-    const FrictionSet::Hessian h = set_.hessian(k, at, Curvature::kExact);
-    for (std::size_t l = 0; l < products.size(); ++l) h.add_product(products.z[l], products.y[l]);
-  }
+  multiply_side_by_side(products, set_.model().mesh().vertex_count,
+                        [&](const DirectionKernels& kernels, const double* z, double* y) {
+                          for (const FrictionSet::Entry& k : set_.entries()) {
+                            const FrictionSet::Hessian h = set_.hessian(k, at, Curvature::kExact);
+                            std::array<Mat3, 6> B;
+                            kernels.friction_product(h.factors(B), z, y);
+                          }
+                        });
 }
 
 void FrictionPotential::add_held_product(const double* x, const double* z, double* y) const {
   const FrictionSet::Slips& at = set_.slips(x);
   for (const FrictionSet::Entry& k : set_.entries()) {
     if (!set_.model().is_held(k.all_points())) continue;
-    set_.hessian(k, at, Curvature::kExact).add_product(z, y);
+    set_.add_product(k, at, z, y);
   }
 }
 
 void FrictionPotential::add_left_out_products(const double* x,
                                               Curvature curvature,
                                               const Products& products) const {
+  if (products.size() == 0) return;
   const FrictionSet::Slips& at = set_.slips(x);
-  for (const FrictionSet::Entry& k : set_.entries()) {
-    if (!moves(k.all_points(), products)) continue;
-    const FrictionSet::Hessian h = set_.hessian(k, at, curvature);
-    for (std::size_t l = 0; l < products.size(); ++l) {
-      if (moves(k.all_points(), products.z[l])) h.add_product(products.z[l], products.y[l]);
-    }
-  }
+  multiply_side_by_side(products, set_.model().mesh().vertex_count,
+                        [&](const DirectionKernels& kernels, const double* z, double* y) {
+                          for (const FrictionSet::Entry& k : set_.entries()) {
+                            if (!moves(k.all_points(), products)) continue;
+                            const FrictionSet::Hessian h = set_.hessian(k, at, curvature);
+                            std::array<Mat3, 6> B;
+                            kernels.friction_product(h.factors(B), z, y);
+                          }
+                        });
 }
 
 void FrictionPotential::accumulate(const double* x, const double* z) {
   const std::size_t size = 3 * static_cast<std::size_t>(set_.model().mesh().vertex_count);
   start_bar.resize(size, 0.0);
   lag_bar.resize(size, 0.0);
-  set_.add_mixed(x, z, x_lag_, -1.0, *bar_, start_bar.data(), lag_bar.data());
+  set_.add_mixed(x, z, x_lag_, -1.0, bar_, start_bar.data(), lag_bar.data());
 }
 
 void FrictionPotential::add_tangents(const double* x, std::span<double* const> y) const {

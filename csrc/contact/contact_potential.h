@@ -63,10 +63,10 @@ class ContactPotential final : public TouchingPotential {
   /// at x, on surfaces that move.
   void add_couplings_near(const double* x, linalg::Couplings& pairs) const;
 
-  /// Stand at a point whose contacts are known.
-  void adopt(std::vector<Contact> contacts) {
+  /// Stand at a point whose contacts are known; they outlive the stand.
+  void adopt(const std::vector<Contact>& contacts) {
     candidates_.clear();
-    contacts_ = std::move(contacts);
+    adopted_ = &contacts;
     here_.x.clear();
   }
 
@@ -74,7 +74,9 @@ class ContactPotential final : public TouchingPotential {
   double safe_fraction(const double* x, const double* to) const;
 
   const ContactModel& model() const { return model_; }
-  const std::vector<Contact>& contacts() const { return contacts_; }
+  const std::vector<Contact>& contacts() const {
+    return adopted_ != nullptr ? *adopted_ : contacts_;
+  }
 
   void stand_at(const double* x) override;
   double energy(const double* x) const override;
@@ -115,17 +117,18 @@ class ContactPotential final : public TouchingPotential {
   ContactModel::Bar* bar_;
   std::vector<const ContactModel::Bar*> directions_;
   std::vector<Candidate> candidates_;
-  std::vector<Contact> contacts_;
-  Measured here_;           ///< where the potential stands
+  std::vector<Contact> contacts_;                  ///< that were found
+  const std::vector<Contact>* adopted_ = nullptr;  ///< where the potential stands at these
+  Measured here_;                                  ///< where the potential stands
   mutable Measured trial_;  ///< where the energy was last asked for: often where it stands next
 };
 
 /// Lagged friction as a potential of the displacement over the step. See friction_set.h.
 class FrictionPotential final : public TouchingPotential {
  public:
-  /// @param contacts  of the lag configuration
-  /// @param x_start   positions at the start of the step
-  /// @param bar       where accumulate() adds; null where it is never called
+  /// @param contacts  of the lag configuration; they outlive the potential
+  /// @param x_start   positions at the start of the step; likewise
+  /// @param bar       where accumulate() adds what parameters get; null where nobody asks for it
   FrictionPotential(const ContactModel& model,
                     const std::vector<Contact>& contacts,
                     const double* x_start,
@@ -165,6 +168,8 @@ class FrictionPotential final : public TouchingPotential {
 
   /// Where the lag configuration lies: accumulate() and add_tangents() need it.
   void set_lag(const double* x_lag) { x_lag_ = x_lag; }
+
+  const FrictionSet& set() const { return set_; }
 
   std::vector<double> start_bar;  ///< of x_start, all vertices; empty until accumulate()
   std::vector<double> lag_bar;    ///< of x_lag, likewise

@@ -435,6 +435,16 @@ Vec12 ContactHessian::operator*(const Vec12& z) const {
   return y;
 }
 
+ContactProduct ContactHessian::factors(const std::array<Index, 4>& points) const {
+  return {.point = {points[0], points[1], points[2], points[3]},
+          .count = count_,
+          .left = {left_[0].data(), left_[1].data(), left_[2].data()},
+          .right = {right_[0].data(), right_[1].data(), right_[2].data()},
+          .c = c_.data(),
+          .along = along_,
+          .rest = rest_ ? rest_->data() : nullptr};
+}
+
 void ContactHessian::add(const Vec12& left, const Vec12& right) {
   left_[count_] = left;
   right_[count_++] = right;

@@ -10,6 +10,7 @@
 #include "contact/barrier.h"
 #include "contact/broad_phase.h"
 #include "contact/collision_mesh.h"
+#include "contact/direction_kernels.h"
 #include "contact/distance/closest.h"
 #include "contact/feature_weights.h"
 #include "contact/merge.h"
@@ -85,6 +86,9 @@ class ContactHessian {
  public:
   Mat3 operator()(int p, int q) const;
   Vec12 operator*(const Vec12& z) const;
+
+  /// What products along several directions are made of; of this Hessian.
+  ContactProduct factors(const std::array<Index, 4>& points) const;
 
  private:
   friend class ContactModel;

@@ -295,18 +295,10 @@ bool FrictionSet::has_duals(const double* x) const { return is_at(duals_at_, x);
 FrictionSet::Hessian FrictionSet::hessian(const Entry& k,
                                           const Slips& slips,
                                           Curvature curvature) const {
-  Hessian h(k);
   const auto i = static_cast<std::size_t>(&k - entries_.data());
   const Slip& at = slips[i];
+  Hessian h(k, at);
   const Mat3 identity = Mat3::Identity();
-  for (int l = 0; l < k.part_count; ++l) {
-    const Part& part = k.parts[l];
-    const Mat3 of_e1 = part.a[2] * cross_matrix(at.frames[l].e2) - part.a[0] * identity;
-    const Mat3 of_e2 = -part.a[2] * cross_matrix(at.frames[l].e1) - part.a[1] * identity;
-    for (int p = part.first; p < part.first + part.size; ++p) {
-      h.B_[p - k.frame] = k.c[p] * identity + part.sign(0, p) * of_e1 + part.sign(1, p) * of_e2;
-    }
-  }
   if (curvature == Curvature::kPositive && k.lambda < 0.0) return h;
   const double strength = k.mu * k.lambda;
   const double q = curvature == Curvature::kExact ? at.law.f1_over_y : stiffness(i, at);
@@ -321,6 +313,22 @@ FrictionSet::Hessian FrictionSet::hessian(const Entry& k,
   h.core_ += (strength * at.law.f2) * at.w * at.w.transpose();
   for (int l = 0; l < k.part_count; ++l) h.turn_[l] = (k.parts[l].a[2] * strength) * at.force();
   return h;
+}
+
+std::array<Mat3, 6> FrictionSet::Hessian::frame_changes() const {
+  const Entry& k = *entry_;
+  const Mat3 identity = Mat3::Identity();
+  std::array<Mat3, 6> B;
+  for (int l = 0; l < k.part_count; ++l) {
+    const Part& part = k.parts[l];
+    const Frame& frame = at_->frames[l];
+    const Mat3 of_e1 = part.a[2] * cross_matrix(frame.e2) - part.a[0] * identity;
+    const Mat3 of_e2 = -part.a[2] * cross_matrix(frame.e1) - part.a[1] * identity;
+    for (int p = part.first; p < part.first + part.size; ++p) {
+      B[p - k.frame] = k.c[p] * identity + part.sign(0, p) * of_e1 + part.sign(1, p) * of_e2;
+    }
+  }
+  return B;
 }
 
 Mat3 FrictionSet::Hessian::turning(int p, int q) const {
@@ -340,10 +348,19 @@ Mat3 FrictionSet::Hessian::turning(int p, int q) const {
 void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
   const Entry& k = *entry_;
   const int first = k.frame;
+  const std::span<const Index> others = k.all_points().first(static_cast<std::size_t>(first));
+  if (!A.has_any(k.all_points().subspan(others.size()))) {
+    // The frames are of bodies whose motion is given.
+    if (!A.any_attached(others)) {
+      A.add_rows(others, [&](int p, int q) -> Mat3 { return (k.c[p] * k.c[q]) * core_; });
+      return;
+    }
+  }
+  const std::array<Mat3, 6> B = frame_changes();
   if (A.any_attached(k.all_points())) {
     std::array<Mat3, 7> jacobians;
     for (int p = 0; p < first; ++p) jacobians[p] = k.c[p] * Mat3::Identity();
-    std::copy_n(B_.begin(), k.count - first, jacobians.begin() + first);
+    std::copy_n(B.begin(), k.count - first, jacobians.begin() + first);
     A.add_congruence(k.all_points(), jacobians, core_);
     for (int l = 0; l < k.part_count; ++l) {
       if (turn_[l].isZero(0.0)) continue;
@@ -358,34 +375,63 @@ void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
     return;
   }
   std::array<Mat3, 6> core_b;
-  for (int e = 0; e < k.count - first; ++e) core_b[e] = core_.lazyProduct(B_[e]);
+  for (int e = 0; e < k.count - first; ++e) core_b[e] = core_.lazyProduct(B[e]);
   A.add_rows(k.all_points(), [&](int p, int q) -> Mat3 {
     if (p < first && q < first) return (k.c[p] * k.c[q]) * core_;
     if (p < first) return k.c[p] * core_b[q - first];
     if (q < first) return k.c[q] * core_b[p - first].transpose();
-    return B_[p - first].transpose().lazyProduct(core_b[q - first]) + turning(p, q);
+    return B[p - first].transpose().lazyProduct(core_b[q - first]) + turning(p, q);
   });
 }
 
-void FrictionSet::Hessian::add_product(const double* z, double* y) const {
-  const Entry& k = *entry_;
-  Vec3 change = Vec3::Zero();
-  for (int p = 0; p < k.frame; ++p) change += k.c[p] * row(z, k.points[p]);
-  for (int p = k.frame; p < k.count; ++p) change += B_[p - k.frame] * row(z, k.points[p]);
-  const Vec3 force = core_ * change;
-  for (int p = 0; p < k.frame; ++p) Eigen::Map<Vec3>(y + 3 * k.points[p]) += k.c[p] * force;
-  for (int p = k.frame; p < k.count; ++p) {
-    Eigen::Map<Vec3>(y + 3 * k.points[p]) += B_[p - k.frame].transpose() * force;
+FrictionProduct FrictionSet::Hessian::factors(std::array<Mat3, 6>& B) const {
+  B = frame_changes();
+  FrictionProduct result{.point = entry_->points.data(),
+                         .c = entry_->c.data(),
+                         .frame = entry_->frame,
+                         .count = entry_->count,
+                         .B = {},
+                         .core = core_.data(),
+                         .part_count = entry_->part_count,
+                         .edge = {},
+                         .turn = {}};
+  for (std::size_t p = 0; p < B.size(); ++p) result.B[p] = B[p].data();
+  for (int l = 0; l < entry_->part_count; ++l) {
+    result.edge[l] = entry_->parts[l].edges.data();
+    result.turn[l] = turn_[l].data();
+  }
+  return result;
+}
+
+void FrictionSet::add_product(const Entry& k,
+                              const Slips& slips,
+                              const double* z,
+                              double* y) const {
+  const Slip& at = slips[static_cast<std::size_t>(&k - entries_.data())];
+  const double strength = k.mu * k.lambda;
+  const Vec3 change = change_of_slip(k, at.frames, z);
+  const Vec3 force = strength * (at.law.f1_over_y * tangential(change, k.n) +
+                                 (at.law.f2 * at.w.dot(change)) * at.w);
+  for (int p = 0; p < k.count; ++p) {
+    if (k.c[p] != 0.0) Eigen::Map<Vec3>(y + 3 * k.points[p]) += k.c[p] * force;
   }
   for (int l = 0; l < k.part_count; ++l) {
-    const Frame turned(k, k.parts[l], z);
-    k.add_edges(k.parts[l], {turn_[l].cross(turned.e2), turned.e1.cross(turn_[l])}, y);
+    const Part& part = k.parts[l];
+    if (!part.turns) continue;
+    auto [e1_bar, e2_bar] = at.frames[l].pull_back(-part.a, force);
+    // As the frame itself turns.
+    const Vec3 turn = (part.a[2] * strength) * at.force();
+    const Frame turned(k, part, z);
+    e1_bar += turn.cross(turned.e2);
+    e2_bar += turned.e1.cross(turn);
+    k.add_edges(part, {e1_bar, e2_bar}, y);
   }
 }
 
 namespace {
 
-/// Pull the cotangent of a normal force back, times scale into `bar`; returns those of the corners.
+/// Pull the cotangent of a normal force back, times scale into `bar` where there is one; returns those of the
+/// corners.
 ///
 ///   d(lambda) = -kappa w (2 d b' dm + m (2 d b'' + b'/d) dD)
 Vec12 pull_back_lambda(const ContactModel& model,
@@ -393,16 +439,13 @@ Vec12 pull_back_lambda(const ContactModel& model,
                        const double* x_lag,
                        double lambda_bar,
                        double scale,
-                       ContactModel::Bar& bar) {
+                       ContactModel::Bar* bar) {
   const double kappa = lag.kappa;
   const double d = std::sqrt(lag.closest.d_sq);
   const double area = lag.weight;
   const double m = lag.mollifier;
   const double b1 = lag.barrier.b1;
   const double per_lambda = -2.0 * d * lambda_bar;
-  model.pull_back_kappa(lag.pair, scale * per_lambda * area * m * b1, bar);
-  bar.d_hat += scale * per_lambda * kappa * area * m * lag.barrier.b1_d_hat;
-  const double xi_bar = per_lambda * kappa * area * m * lag.barrier.b1_xi;
   Vec12 x_bar = (lambda_bar * -kappa * area * m * (2.0 * d * lag.barrier.b2 + b1 / d)) *
                 distance_sq_gradient(lag.closest);
   double threshold_bar = 0.0;
@@ -411,8 +454,12 @@ Vec12 pull_back_lambda(const ContactModel& model,
     threshold_bar = per_lambda * kappa * area * mol.m_eps * b1;
     x_bar += (per_lambda * kappa * area * b1) * mol.gradient;
   }
+  if (bar == nullptr) return x_bar;
+  model.pull_back_kappa(lag.pair, scale * per_lambda * area * m * b1, *bar);
+  bar->d_hat += scale * per_lambda * kappa * area * m * lag.barrier.b1_d_hat;
+  const double xi_bar = per_lambda * kappa * area * m * lag.barrier.b1_xi;
   model.pull_back(lag, scale * per_lambda * kappa * m * b1, scale * threshold_bar, scale * xi_bar,
-                  bar);
+                  *bar);
   return x_bar;
 }
 
@@ -443,7 +490,7 @@ void FrictionSet::add_mixed(const double* x,
                             const double* z,
                             const double* x_lag,
                             double scale,
-                            ContactModel::Bar& bar,
+                            ContactModel::Bar* bar,
                             double* start_bar,
                             double* lag_bar) const {
   const Slips& here = slips(x);
@@ -467,10 +514,12 @@ void FrictionSet::add_mixed(const double* x,
     }
     const double w_zeta = at.w.dot(zeta);
 
-    const double mu_bar = k.lambda * law.f1_over_y * w_zeta;
     const double lambda_bar = k.mu * law.f1_over_y * w_zeta;
-    bar.slip += scale * k.mu * k.lambda * law.f1_over_y_e * w_zeta;
-    model_->pull_back_mu(lag.pair, scale * mu_bar, bar);
+    if (bar != nullptr) {
+      const double mu_bar = k.lambda * law.f1_over_y * w_zeta;
+      bar->slip += scale * k.mu * k.lambda * law.f1_over_y_e * w_zeta;
+      model_->pull_back_mu(lag.pair, scale * mu_bar, *bar);
+    }
 
     Vec12 x_bar = pull_back_lambda(*model_, lag, x_lag, lambda_bar, scale, bar);
 

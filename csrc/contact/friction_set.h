@@ -6,6 +6,7 @@
 
 #include "common/friction_law.h"
 #include "contact/contact_set.h"
+#include "contact/direction_kernels.h"
 
 namespace diffcloth::contact {
 
@@ -37,8 +38,8 @@ class FrictionSet {
  public:
   FrictionSet() = default;
 
-  /// @param contacts  the contacts of the lag configuration
-  /// @param x_start   positions at the start of the step; they outlive this object
+  /// @param contacts  the contacts of the lag configuration; they outlive this object
+  /// @param x_start   positions at the start of the step; likewise
   FrictionSet(const ContactModel& model,
               const std::vector<Contact>& contacts,
               const double* x_start);
@@ -63,7 +64,7 @@ class FrictionSet {
   };
 
   struct Entry {
-    Contact lag;
+    const Contact& lag;
     Vec3 n;         ///< unit normal at the lag configuration
     double lambda;  ///< normal force at the lag configuration [N]
     double mu;
@@ -138,17 +139,22 @@ class FrictionSet {
   class Hessian {
    public:
     void add_to(linalg::BlockMatrix& A) const;
-    void add_product(const double* z, double* y) const;
+
+    /// What products along several directions are made of; of this Hessian, its entry and `B`.
+    FrictionProduct factors(std::array<Mat3, 6>& B) const;
 
    private:
     friend class FrictionSet;
-    explicit Hessian(const Entry& entry) : entry_(&entry) {}
+    Hessian(const Entry& entry, const Slip& at) : entry_(&entry), at_(&at) {}
+
+    /// B of the frames' vertices; of all others it is c I.
+    std::array<Mat3, 6> frame_changes() const;
 
     /// What is between two points where a frame turns.
     Mat3 turning(int p, int q) const;
 
     const Entry* entry_;
-    std::array<Mat3, 6> B_;  // of the frames' vertices; of all others c I
+    const Slip* at_;
     Mat3 core_ = Mat3::Zero();
     std::array<Vec3, 2> turn_{Vec3::Zero(), Vec3::Zero()};  // of the parts
   };
@@ -163,6 +169,9 @@ class FrictionSet {
   ///
   /// @param at  slips(x); duals are those of has_duals(x)
   Hessian hessian(const Entry& entry, const Slips& at, Curvature curvature) const;
+
+  /// y += the exact Hessian of one entry times z.
+  void add_product(const Entry& entry, const Slips& at, const double* z, double* y) const;
 
   /// Expect the motion from x, where nothing has slipped yet, to another point. The Hessians at x but the
   /// exact one then have q of the slip there: that of a contact at rest knows nothing of sliding. Of bodies
@@ -180,13 +189,13 @@ class FrictionSet {
   bool has_duals(const double* x) const;
 
   /// d/d(theta) of phi = z . grad D, times scale: into `bar` for the parameters (friction, slip,
-  /// and, through lambda, kappa, d_hat, thickness, rest shape), into `start_bar` for x_start, and into
+  /// and, through lambda, kappa, d_hat, thickness, rest shape) unless it is null, into `start_bar` for x_start, and into
   /// `lag_bar` for the lag configuration's positions `x_lag`.
   void add_mixed(const double* x,
                  const double* z,
                  const double* x_lag,
                  double scale,
-                 ContactModel::Bar& bar,
+                 ContactModel::Bar* bar,
                  double* start_bar,
                  double* lag_bar) const;
 

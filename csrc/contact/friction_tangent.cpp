@@ -3,10 +3,14 @@
 //   grad D = mu lambda q B^T w,   q = f1/|w|,   w = P s,   s = r(x) - E(x) a,
 //   a = E(x_start)^-1 share r(x_start),   of each part.
 //
-// Of each contact everything that belongs to no direction is made once.
+// Of each contact everything that belongs to no direction is made once; directions go through the rest side by
+// side: see direction_lanes_impl.h.
 
+#include <array>
 #include <cmath>
+#include <vector>
 
+#include "contact/direction_lanes.h"
 #include "contact/distance/mollifier.h"
 #include "contact/friction_set.h"
 
@@ -50,6 +54,59 @@ class NormalForceDerivative {
   double m_eps_ = 0.0;
 };
 
+void copy(const Vec3& from, double* to) { Eigen::Map<Vec3>{to} = from; }
+
+/// What the nearest points make of the motion of the lag configuration, where they slide.
+void fill_sliding(const Entry& k, const double* x, const double* x_start, FrictionTangent& out) {
+  const Closest& geometry = k.lag.closest;
+  Eigen::Matrix<double, 2, 12> beta = beta_jacobian(geometry);
+  if (geometry.parameter_count == 1) beta.row(1).setZero();
+  Eigen::Matrix<double, 3, 4> corners;
+  Eigen::Matrix<double, 3, 4> corners_start;
+  const auto& v = k.lag.pair.vertices;
+  for (int i = 0; i < 4; ++i) {
+    corners.col(i) = row(x, v[i]) - row(x, v[0]);
+    corners_start.col(i) = row(x_start, v[i]) - row(x_start, v[0]);
+  }
+  const Eigen::Matrix<double, 3, 2> moved = corners.lazyProduct(geometry.c_beta);
+  const Eigen::Matrix<double, 3, 2> moved_start = corners_start.lazyProduct(geometry.c_beta);
+  for (int b = 0; b < 2; ++b) {
+    for (int a = 0; a < 12; ++a) out.beta[b][a] = beta(b, a);
+    for (int i = 0; i < 4; ++i) out.c_beta[i][b] = geometry.c_beta(i, b);
+    for (int a = 0; a < 3; ++a) {
+      out.t_beta[a][b] = geometry.s(a, b);
+      out.r_beta[a][b] = moved(a, b);
+      out.r_start_beta[a][b] = moved_start(a, b);
+    }
+  }
+}
+
+/// What the frame of a part makes of the motion of the start.
+void fill_part(const Entry& k,
+               const FrictionSet::Part& part,
+               const Frame& frame,
+               const Vec3& force,
+               const double* x_start,
+               FrameTangent& out) {
+  out.edge = part.edges.data();
+  out.turns = part.turns;
+  out.share = part.share;
+  if (!part.turns) return;
+  const Frame start(k, part, x_start);
+  const double m_sq = start.m.squaredNorm();
+  copy(start.e2.cross(start.m) / m_sq, out.to_coordinates[0]);
+  copy(start.m.cross(start.e1) / m_sq, out.to_coordinates[1]);
+  copy(start.m / m_sq, out.to_coordinates[2]);
+  copy(start.e1, out.e1_start);
+  copy(start.e2, out.e2_start);
+  copy(part.a, out.a);
+  copy(frame.e1, out.e1);
+  copy(frame.e2, out.e2);
+  copy(frame.m, out.m);
+  copy(frame.e2.cross(force), out.e2_force);
+  copy(force.cross(frame.e1), out.force_e1);
+}
+
 /// The derivative of one contact's friction.
 class EntryDerivative {
  public:
@@ -61,109 +118,49 @@ class EntryDerivative {
                   const double* x_lag)
       : model_(model),
         k_(entry),
-        at_(at),
-        normal_force_(entry.lag, distance_sq_gradient(entry.lag.closest), x_lag),
-        slides_(entry.lag.closest.parameter_count > 0),
-        inv_d_(1.0 / std::sqrt(entry.lag.closest.d_sq)),
-        strength_(entry.mu * entry.lambda),
-        force_(strength_ * at.force()) {
-    if (slides_) {
-      beta_ = beta_jacobian(entry.lag.closest);
-      if (entry.lag.closest.parameter_count == 1) beta_.row(1).setZero();
-      const auto& v = entry.lag.pair.vertices;
-      for (int i = 0; i < 4; ++i) {
-        corners_.col(i) = row(x, v[i]) - row(x, v[0]);
-        corners_start_.col(i) = row(x_start, v[i]) - row(x_start, v[0]);
-      }
-    }
+        law_(at.law),
+        normal_force_(entry.lag, distance_sq_gradient(entry.lag.closest), x_lag) {
+    const Closest& geometry = entry.lag.closest;
+    const double strength = entry.mu * entry.lambda;
+    kernel.corner = entry.lag.pair.vertices.data();
+    kernel.corner_c = geometry.c.data();
+    kernel.point = entry.points.data();
+    kernel.c = entry.c.data();
+    kernel.count = entry.count;
+    kernel.part_count = entry.part_count;
+    kernel.slides = geometry.parameter_count > 0;
+    copy(entry.n, kernel.n);
+    kernel.inv_d = 1.0 / std::sqrt(geometry.d_sq);
+    copy(at.s, kernel.s);
+    copy(at.w, kernel.w);
+    kernel.n_s = entry.n.dot(at.s);
+    Eigen::Map<Vec12>{kernel.by_corners} = (entry.mu * law_.f1_over_y) * normal_force_.by_corners;
+    kernel.by_w = strength * law_.f2;
+    kernel.stiffness = strength * law_.f1_over_y;
+    const Vec3 force = strength * at.force();
+    copy(force, kernel.force);
+    if (kernel.slides) fill_sliding(entry, x, x_start, kernel);
     for (int l = 0; l < entry.part_count; ++l) {
-      if (!entry.parts[l].turns) continue;
-      const Frame& start = starts_[l] = Frame(entry, entry.parts[l], x_start);
-      Mat3& to_coordinates = to_coordinates_[l];
-      to_coordinates.row(0) = start.e2.cross(start.m);
-      to_coordinates.row(1) = start.m.cross(start.e1);
-      to_coordinates.row(2) = start.m;
-      to_coordinates /= start.m.squaredNorm();
+      fill_part(entry, entry.parts[l], at.frames[l], force, x_start, kernel.part[l]);
     }
   }
 
-  void add(const FrictionSet::Tangents& dot, double* y) const {
-    const auto& v = k_.lag.pair.vertices;
-    const Closest& geometry = k_.lag.closest;
-    // What the lag configuration gives: c(beta), n = t / d with t = sum_i c_i x_i, and lambda.
-    const Vec12 x_dot = stacked(v, dot.lag);
-    Vec3 t_dot = Vec3::Zero();
-    for (int i = 0; i < 4; ++i) t_dot += geometry.c[i] * x_dot.segment<3>(3 * i);
-    Vec3 s_dot = Vec3::Zero();
-    Vec3 r_dot = k_.gap(dot.start);
-    if (slides_) {
-      const Vec2 beta_dot = beta_.lazyProduct(x_dot);
-      const Vec4 c_dot = geometry.c_beta * beta_dot;
-      t_dot += geometry.s * beta_dot;
-      s_dot = corners_.lazyProduct(c_dot);
-      r_dot += corners_start_.lazyProduct(c_dot);
-      for (int i = 0; i < 4; ++i) Eigen::Map<Vec3>(y + 3 * v[i]) += c_dot[i] * force_;
-    }
-    const Vec3 n_dot = inv_d_ * tangential(t_dot, k_.n);
-
-    // s = r(x) - Q r(x_start), and r(x_start) in its frames.
-    std::array<Vec3, 2> a_dot;
-    for (int l = 0; l < k_.part_count; ++l) {
-      const Part& part = k_.parts[l];
-      if (!part.turns) {
-        s_dot -= part.share * r_dot;
-        continue;
-      }
-      const Frame& start = starts_[l];
-      const Vec3 e1_dot = k_.edge(part, 0, dot.start);
-      const Vec3 e2_dot = k_.edge(part, 1, dot.start);
-      const Vec3 of_start =
-          part.share * r_dot - (part.a[0] * e1_dot + part.a[1] * e2_dot +
-                                part.a[2] * (e1_dot.cross(start.e2) + start.e1.cross(e2_dot)));
-      a_dot[l] = to_coordinates_[l].lazyProduct(of_start);
-      s_dot -= at_.frames[l] * a_dot[l];
-    }
-    const double n_s = k_.n.dot(at_.s);
-    const Vec3 w_dot = tangential(s_dot, k_.n) - n_dot.dot(at_.s) * k_.n - n_s * n_dot;
-
-    const FrictionLaw& law = at_.law;
-    double along_w = k_.mu * normal_force_.by_corners.dot(x_dot) * law.f1_over_y +
-                     strength_ * law.f2 * at_.w.dot(w_dot);
-    if (dot.parameters != nullptr) along_w += by_parameters(*dot.parameters);
-    const Vec3 change = along_w * at_.w + (strength_ * law.f1_over_y) * w_dot;
-    for (int i = 0; i < k_.count; ++i) Eigen::Map<Vec3>(y + 3 * k_.points[i]) += k_.c[i] * change;
-    for (int l = 0; l < k_.part_count; ++l) {
-      const Part& part = k_.parts[l];
-      if (!part.turns) continue;
-      const auto [by_a_1, by_a_2] = at_.frames[l].pull_back(part.a, change);
-      const auto [by_force_1, by_force_2] = at_.frames[l].pull_back(a_dot[l], force_);
-      k_.add_edges(part, {-by_a_1 - by_force_1, -by_a_2 - by_force_2}, y);
-    }
-  }
-
- private:
-  /// What the share of w grows by.
+  /// What the share of w grows by with parameters.
   double by_parameters(const ContactModel::Bar& dot) const {
     const double lambda_dot =
         normal_force_.by_parameters(model_.push_forward(k_.lag, dot), dot.d_hat);
     const double mu_dot = model_.push_forward_mu(k_.lag.pair, dot);
-    return (mu_dot * k_.lambda + k_.mu * lambda_dot) * at_.law.f1_over_y +
-           strength_ * at_.law.f1_over_y_e * dot.slip;
+    return (mu_dot * k_.lambda + k_.mu * lambda_dot) * law_.f1_over_y +
+           k_.mu * k_.lambda * law_.f1_over_y_e * dot.slip;
   }
 
+  FrictionTangent kernel;
+
+ private:
   const ContactModel& model_;
   const Entry& k_;
-  const FrictionSet::Slip& at_;
-  std::array<Frame, 2> starts_;  ///< of the parts that turn
+  const FrictionLaw& law_;
   NormalForceDerivative normal_force_;
-  bool slides_;  ///< whether the nearest points do, on their primitives
-  double inv_d_;
-  double strength_;
-  Vec3 force_;
-  Eigen::Matrix<double, 2, 12> beta_;          ///< of the nearest points, where they slide
-  Eigen::Matrix<double, 3, 4> corners_;        ///< from the first, at x
-  Eigen::Matrix<double, 3, 4> corners_start_;  ///< at x_start
-  std::array<Mat3, 2> to_coordinates_;         ///< E(x_start)^-1, of the parts that turn
 };
 
 }  // namespace
@@ -173,10 +170,33 @@ void FrictionSet::add_tangents(const double* x,
                                std::span<const Tangents> directions,
                                std::span<double* const> y) const {
   const Slips& here = slips(x);
-  for (std::size_t e = 0; e < entries_.size(); ++e) {
-    const EntryDerivative of(*model_, entries_[e], here[e], x, x_start_, x_lag);
-    for (std::size_t l = 0; l < directions.size(); ++l) of.add(directions[l], y[l]);
-  }
+  const std::size_t size = 3 * static_cast<std::size_t>(model_->mesh().vertex_count);
+  for_direction_groups(directions.size(), [&](const DirectionKernels& kernels, std::size_t first,
+                                              std::size_t count) {
+    std::vector<const double*> of_lag;
+    std::vector<const double*> of_start;
+    for (const Tangents& dot : directions.subspan(first, count)) {
+      of_lag.push_back(dot.lag);
+      of_start.push_back(dot.start);
+    }
+    DirectionRows lag(kernels, size);
+    DirectionRows start(kernels, size);
+    DirectionRows out(kernels, size);
+    lag.read(of_lag);
+    start.read(of_start);
+    out.read(y.subspan(first, count));
+    std::array<double, kDirectionLanes> by_parameters{};
+    for (std::size_t e = 0; e < entries_.size(); ++e) {
+      const EntryDerivative of(*model_, entries_[e], here[e], x, x_start_, x_lag);
+      for (std::size_t l = 0; l < count; ++l) {
+        const ContactModel::Bar* const dot = directions[first + l].parameters;
+        if (dot != nullptr) by_parameters[l] = of.by_parameters(*dot);
+      }
+      kernels.friction_tangent(of.kernel, lag.data(), start.data(), by_parameters.data(),
+                               out.data());
+    }
+    out.write(y.subspan(first, count));
+  });
 }
 
 }  // namespace diffcloth::contact

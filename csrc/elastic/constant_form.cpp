@@ -12,7 +12,7 @@ double face_factor(const Model& model, Index f) {
   return model.damping[f] == 0.0 ? 1.0 : 1.0 + model.damping[f] / model.h;
 }
 
-double element_factor(const Model& model, Index e) { return 1.0 + model.prepared.damping[e]; }
+double element_factor(const Model& model, Index e) { return 1.0 + model.prepared->damping[e]; }
 
 /// F diag(k_w, k_f) in material axes: the warp resists what its own yarns do, the weft likewise. Shear
 /// adds nothing, which leaves L linear in the stiffnesses; where it is no stiffer than the yarns, the
@@ -162,7 +162,7 @@ void add_element_tangent(const Model& model,
 
 ConstantForm ConstantForm::of_flat_bending(const Model& model,
                                            const linalg::BlockPattern& pattern) {
-  return {pattern, model.topology->vertex_count, model.prepared.constant};
+  return {pattern, model.topology->vertex_count, model.prepared->constant};
 }
 
 ConstantForm::ConstantForm(const Model& model,
@@ -171,7 +171,7 @@ ConstantForm::ConstantForm(const Model& model,
                            const linalg::BlockPattern& pattern)
     : pattern_(&pattern),
       vertex_count_(model.topology->vertex_count),
-      own_values_(model.prepared.constant),
+      own_values_(model.prepared->constant),
       values_(own_values_) {
   for (Index f = 0; f < face_count(model); ++f) {
     const mesh::ShapeGradient& g = model.rest->shape_gradient[f];

@@ -2,8 +2,10 @@
 
 #include <algorithm>
 #include <array>
+#include <memory>
 #include <span>
 #include <stdexcept>
+#include <utility>
 
 #include "elastic/bending.h"
 #include "elastic/elements.h"
@@ -75,24 +77,33 @@ std::vector<StretchBatch> stretch_batches(const Model& model,
   return batches;
 }
 
-void prepare_stretch(Model& model, const Slots& slots) {
+void prepare_stretch(const Model& model, const Slots& slots, Prepared& prepared) {
   std::vector<Index> isotropic;
-  model.prepared.orthotropic.clear();
   for (Index f = 0; f < face_count(model); ++f) {
-    (is_orthotropic(model, f) ? model.prepared.orthotropic : isotropic).push_back(f);
+    (is_orthotropic(model, f) ? prepared.orthotropic : isotropic).push_back(f);
   }
-  model.prepared.stretch = stretch_batches(model, slots, isotropic);
+  prepared.stretch = stretch_batches(model, slots, isotropic);
 }
 
-void prepare_form(Model& model, Index e) {
+void prepare_form(const Model& model, Index e, Prepared& prepared) {
   const double area = model.rest->bending_area[e];
   if (is_plate(model, e) && !plate(model, e).is_isotropic()) {
-    model.prepared.bending[e] = area;
-    model.prepared.form[e] = plate_form(plate(model, e));
+    prepared.bending[e] = area;
+    prepared.form[e] = plate_form(plate(model, e));
   } else {
-    model.prepared.bending[e] = element_mean(model, e, model.bending) * area;
-    model.prepared.form[e] = isotropic_form(element_mean(model, e, model.poisson));
+    prepared.bending[e] = element_mean(model, e, model.bending) * area;
+    prepared.form[e] = isotropic_form(element_mean(model, e, model.poisson));
   }
+}
+
+template <class T>
+std::size_t bytes(const std::vector<T>& values) {
+  return sizeof(T) * values.size();
+}
+
+std::size_t bytes(const Prepared& p) {
+  return bytes(p.bending) + bytes(p.form) + bytes(p.damping) + bytes(p.flat) +
+         bytes(p.curvature_n) + bytes(p.constant) + bytes(p.stretch) + bytes(p.orthotropic);
 }
 
 const StretchKernels& kernels() {
@@ -105,7 +116,7 @@ const StretchKernels& kernels() {
 constexpr double kStiffest = 1e8;
 
 bool is_by_matrix(const Model& model, Index e) {
-  return model.prepared.by_matrix && model.prepared.flat[e] != 0;
+  return model.prepared->by_matrix && model.prepared->flat[e] != 0;
 }
 
 }  // namespace
@@ -168,14 +179,16 @@ Slots slots(const mesh::Topology& topology,
 
 void prepare(Model& model, const Slots& slots) {
   const Index element_count = model.stencils->size();
-  Prepared& prepared = model.prepared;
+  const auto made = std::make_shared<Prepared>();
+  Prepared& prepared = *made;
+  model.prepared = made;
   prepared.bending.resize(element_count);
   prepared.form.resize(element_count);
   prepared.damping.resize(element_count);
   prepared.flat.resize(element_count);
   prepared.curvature_n.resize(element_count);
   prepared.constant.assign(slots.block_count, 0.0);
-  prepare_stretch(model, slots);
+  prepare_stretch(model, slots, prepared);
   prepared.by_matrix = true;
   prepared.bends = false;
   prepared.damped = false;
@@ -185,7 +198,7 @@ void prepare(Model& model, const Slots& slots) {
   }
 
   for (Index e = 0; e < element_count; ++e) {
-    prepare_form(model, e);
+    prepare_form(model, e, prepared);
     const double damping = element_mean(model, e, model.damping);
     prepared.damping[e] = damping == 0.0 ? 0.0 : damping / model.h;
     prepared.flat[e] = damping == 0.0 && model.rest->curvature[e].isZero(0.0);
@@ -202,6 +215,47 @@ void prepare(Model& model, const Slots& slots) {
   const double stiffest = prepared.constant.empty() ? 0.0 : std::ranges::max(prepared.constant);
   prepared.by_matrix = stiffest <= kStiffest * model.least_inertia;
   prepared.bends |= !prepared.by_matrix;
+}
+
+void PreparedCache::prepare(Model& model, const Slots& slots) {
+  // Damping takes numbers from the start of the step.
+  if (std::ranges::any_of(model.damping, [](double value) { return value != 0.0; })) {
+    elastic::prepare(model, slots);
+    return;
+  }
+  const std::array<const std::vector<double>*, kFields> fields = {
+      &model.stretch,      &model.bending,       &model.poisson,      &model.damping,
+      &model.stretch_weft, &model.stretch_shear, &model.bending_weft, &model.bending_twill};
+  const auto is_of_model = [&](const Entry& entry) {
+    if (entry.least_inertia != model.least_inertia) return false;
+    return std::ranges::equal(entry.fields, fields,
+                              [](const auto& kept, const auto* given) { return kept == *given; });
+  };
+  {
+    const std::lock_guard lock(mutex_);
+    const auto entry = std::ranges::find_if(entries_, is_of_model);
+    if (entry != entries_.end()) {
+      entries_.splice(entries_.begin(), entries_, entry);
+      model.prepared = entry->prepared;
+      return;
+    }
+  }
+  elastic::prepare(model, slots);
+  Entry entry{.fields = {},
+              .least_inertia = model.least_inertia,
+              .prepared = model.prepared,
+              .bytes = bytes(*model.prepared)};
+  for (std::size_t k = 0; k < kFields; ++k) {
+    entry.fields[k] = *fields[k];
+    entry.bytes += sizeof(double) * fields[k]->size();
+  }
+  const std::lock_guard lock(mutex_);
+  bytes_ += entry.bytes;
+  entries_.push_front(std::move(entry));
+  while (bytes_ > kCapacity && entries_.size() > 1) {
+    bytes_ -= entries_.back().bytes;
+    entries_.pop_back();
+  }
 }
 
 double stretch_energy(const Model& model, const double* x) {
@@ -221,7 +275,7 @@ double bending_energy(const Model& model, const double* x) {
 }
 
 double energy_change(const Model& model, const double* x0, const double* x1) {
-  const Prepared& prepared = model.prepared;
+  const Prepared& prepared = *model.prepared;
   double total = kernels().energy_change(prepared.stretch.data(), prepared.stretch.size(), x0, x1);
   for (const Index f : prepared.orthotropic) {
     total += orthotropic::energy_change(weave(model, f).scaled(model.rest->area[f]),
@@ -241,7 +295,7 @@ double energy_change(const Model& model, const double* x0, const double* x1) {
 }
 
 void add_gradient(const Model& model, const double* x, double* g) {
-  const Prepared& prepared = model.prepared;
+  const Prepared& prepared = *model.prepared;
   kernels().add_gradient(prepared.stretch.data(), prepared.stretch.size(), x, g);
   for (const Index f : prepared.orthotropic) {
     scatter(model, f, stretch_stress(model, f, face_gradient(model, f, x)), g);
@@ -265,7 +319,7 @@ void add_hessian(const Model& model,
                  const std::vector<Index>& place,
                  double* blocks) {
   const bool positive = curvature == Curvature::kPositive;
-  const Prepared& prepared = model.prepared;
+  const Prepared& prepared = *model.prepared;
   for (Index slot = 0; slot < slots.block_count; ++slot) {
     double* block = blocks + 9 * static_cast<std::ptrdiff_t>(place[slot]);
     const double value = prepared.constant[slot];

@@ -1,6 +1,11 @@
 #pragma once
 
+#include <array>
+#include <cstddef>
 #include <cstdint>
+#include <list>
+#include <memory>
+#include <mutex>
 #include <vector>
 
 #include "common/types.h"
@@ -75,13 +80,39 @@ struct Model {
   const double* x_n = nullptr;              ///< [N, 3] start of the step [m]; only damping needs it
   double least_inertia = 0.0;               ///< smallest M / h^2 of a vertex [N/m]
   const Elements* held = nullptr;  ///< those with a prescribed corner; only backward needs them
-  Prepared prepared;               ///< filled by prepare()
+  std::shared_ptr<const Prepared> prepared;  ///< of prepare()
 };
 
-/// Fill model.prepared. To be called whenever anything in the model has changed.
+/// Make model.prepared. To be called whenever anything in the model has changed.
 ///
 /// @throws std::invalid_argument where damping has no start of the step or no time step
 void prepare(Model& model, const Slots& slots);
+
+/// prepare() for models of one rest shape, which often have the numbers of an earlier one: a step's backward those
+/// of the step, a step those of the step before. Models with damping are prepared anew.
+class PreparedCache {
+ public:
+  PreparedCache() = default;
+  PreparedCache(const PreparedCache&) = delete;
+  PreparedCache& operator=(const PreparedCache&) = delete;
+
+  void prepare(Model& model, const Slots& slots);
+
+ private:
+  static constexpr std::size_t kFields = 8;  ///< of a model, that there are numbers in
+  static constexpr std::size_t kCapacity = std::size_t{8} << 20;  ///< [bytes]
+
+  struct Entry {
+    std::array<std::vector<double>, kFields> fields;
+    double least_inertia;
+    std::shared_ptr<const Prepared> prepared;
+    std::size_t bytes;
+  };
+
+  std::mutex mutex_;
+  std::list<Entry> entries_;  // most recent first
+  std::size_t bytes_ = 0;
+};
 
 /// Energy of the membranes, without damping [J].
 double stretch_energy(const Model& model, const double* x);

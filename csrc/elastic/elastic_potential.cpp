@@ -24,13 +24,13 @@ ElasticPotential::ElasticPotential(const Model& model,
 double ElasticPotential::energy_change(const double* x, const double* to) const {
   for (std::size_t a = 0; a < change_.size(); ++a) change_[a] = to[a] - x[a];
   double change = elastic::energy_change(model_, x, to);
-  if (model_.prepared.by_matrix) change += flat_bending_.energy_change(x, change_.data());
+  if (model_.prepared->by_matrix) change += flat_bending_.energy_change(x, change_.data());
   return change;
 }
 
 void ElasticPotential::add_gradient(const double* x, double* g) const {
   elastic::add_gradient(model_, x, g);
-  if (model_.prepared.by_matrix) flat_bending_.add_product(x, g);
+  if (model_.prepared->by_matrix) flat_bending_.add_product(x, g);
 }
 
 void ElasticPotential::add_hessian(const double* x,
@@ -47,7 +47,7 @@ void ElasticPotential::add_extrapolation(const double* x,
 }
 
 void ElasticPotential::accumulate(const double* x, const double* z) {
-  if (wanted_ == Wanted::kNone && !model_.prepared.damped) return;
+  if (wanted_ == Wanted::kNone && !model_.prepared->damped) return;
   add_mixed(model_, x, negated(z, model_.topology->vertex_count).data(),
             wanted_ == Wanted::kMaterialsAndRest, bar());
 }

@@ -106,7 +106,7 @@ inline Plate plate(const Model& model, Index e) {
 
 inline bending::Element bending_element(const Model& model, Index e) {
   const mesh::BendingStencils& stencils = *model.stencils;
-  const Prepared& prepared = model.prepared;
+  const Prepared& prepared = *model.prepared;
   return {.vertices = stencils.element(e),
           .c = model.rest->curvature_operator.data() + 3 * stencils.start[e],
           .g = &model.rest->shape_gradient[stencils.faces[e][0]],

@@ -130,6 +130,11 @@ class BlockMatrix : public BlockValues {
            std::ranges::any_of(points, [&](Index v) { return is_attached(v); });
   }
 
+  /// Whether one of some points is a row here, or attached to some.
+  bool has_any(std::span<const Index> points) const {
+    return std::ranges::any_of(points, [&](Index v) { return has(v) || is_attached(v); });
+  }
+
   /// this = (this + s other) / (1 + s); both on the same pattern.
   void blend(const BlockMatrix& other, double s);
 

@@ -1,6 +1,7 @@
 #include "linalg/conjugate_gradient.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <utility>
 
@@ -17,17 +18,24 @@ constexpr double kFirstContraction = 0.1;
 constexpr double kAgreement = 1e-4;
 constexpr int kFewIterations = 6;
 
+/// The largest magnitude. Several maxima at once: each would wait for the one before.
+double largest_magnitude(const std::vector<double>& values) {
+  std::array<double, 4> largest{};
+  for (std::size_t k = 0; k < values.size(); ++k) {
+    largest[k % 4] = std::max(largest[k % 4], std::abs(values[k]));
+  }
+  return std::max(std::max(largest[0], largest[1]), std::max(largest[2], largest[3]));
+}
+
 /// The way of one right side.
 struct Descent {
   /// @param b      [size or more]
   /// @param first  [size] what the preconditioner makes of b
-  Descent(const std::vector<double>& b, const std::vector<double>& first)
-      : x(first.size(), 0.0),
-        r(b.begin(), b.begin() + static_cast<std::ptrdiff_t>(first.size())),
-        z(first),
-        p(first),
-        q(first.size()),
-        rz(dot(r, z)) {}
+  Descent(std::vector<double> b, std::vector<double> first)
+      : x(first.size(), 0.0), r(std::move(b)), z(first), p(std::move(first)), q(p.size()) {
+    r.resize(p.size());
+    rz = dot(r, z);
+  }
 
   /// Go to the minimum along p. False where its curvature is not positive.
   bool advance(const BlockValues& A) {
@@ -37,8 +45,10 @@ struct Descent {
   }
 
   /// The same, when q is what the matrix makes of p.
-  bool go() {
-    const double curvature = dot(p, q);
+  bool go() { return go(dot(p, q)); }
+
+  /// The same, with p . q.
+  bool go(double curvature) {
     if (!(curvature > 0.0)) return false;
     const double alpha = rz / curvature;
     for (std::size_t k = 0; k < x.size(); ++k) {
@@ -49,8 +59,10 @@ struct Descent {
   }
 
   /// Turn to the next direction, when z is what the preconditioner makes of r.
-  void turn() {
-    const double next = dot(r, z);
+  void turn() { turn(dot(r, z)); }
+
+  /// The same, with r . z.
+  void turn(double next) {
     const double beta = next / rz;
     last = rz;
     rz = next;
@@ -61,9 +73,36 @@ struct Descent {
   double expected() const { return rz * rz / last; }
 
   std::vector<double> x, r, z, p, q;
-  double rz;
-  double last = rz;  ///< rz before the last iteration
+  double rz = 0.0;
+  double last = 0.0;  ///< rz before the last iteration
 };
+
+/// dot() of two vectors of each of several ways, which need not wait for each other.
+std::vector<double> dots(const std::vector<Descent>& descents,
+                         const std::vector<std::size_t>& of,
+                         std::vector<double> Descent::* a,
+                         std::vector<double> Descent::* b) {
+  std::vector<double> sums(of.size(), 0.0);
+  std::size_t first = 0;
+  for (; first + 4 <= of.size(); first += 4) {
+    std::array<const double*, 4> from_a{};
+    std::array<const double*, 4> from_b{};
+    for (std::size_t l = 0; l < 4; ++l) {
+      from_a[l] = (descents[of[first + l]].*a).data();
+      from_b[l] = (descents[of[first + l]].*b).data();
+    }
+    std::array<double, 4> sum{};
+    const std::size_t size = (descents[of[first]].*a).size();
+    for (std::size_t k = 0; k < size; ++k) {
+      for (std::size_t l = 0; l < 4; ++l) sum[l] += from_a[l][k] * from_b[l][k];
+    }
+    std::ranges::copy(sum, sums.begin() + static_cast<std::ptrdiff_t>(first));
+  }
+  for (; first < of.size(); ++first) {
+    sums[first] = dot(descents[of[first]].*a, descents[of[first]].*b);
+  }
+  return sums;
+}
 
 }  // namespace
 
@@ -134,9 +173,7 @@ std::vector<char> conjugate_gradients(const BlockValues& A,
   std::vector<double> units;
   std::vector<std::vector<double>> right = b;
   for (std::vector<double>& values : right) {
-    double largest = 0.0;
-    for (const double value : values) largest = std::max(largest, std::abs(value));
-    units.push_back(leading_power(largest));
+    units.push_back(leading_power(largest_magnitude(values)));
     for (double& value : values) value /= units.back();
   }
   solve(factor, right, workspace, x);
@@ -145,7 +182,7 @@ std::vector<char> conjugate_gradients(const BlockValues& A,
   std::vector<std::size_t> left;
   std::vector<double> goals;
   for (std::size_t k = 0; k < b.size(); ++k) {
-    descents.emplace_back(right[k], x[k]);
+    descents.emplace_back(std::move(right[k]), x[k]);
     goals.push_back(tolerance * tolerance * descents[k].rz);
     if (descents[k].rz != 0.0) {
       left.push_back(k);
@@ -163,8 +200,10 @@ std::vector<char> conjugate_gradients(const BlockValues& A,
       to.push_back(descents[k].q.data());
     }
     A.add_products(from, to);
+    auto product = dots(descents, left, &Descent::p, &Descent::q);
+    auto next = product.begin();
     std::erase_if(left, [&](std::size_t k) {
-      if (descents[k].go()) return false;
+      if (descents[k].go(*next++)) return false;
       converged[k] = 0;
       return true;
     });
@@ -177,7 +216,9 @@ std::vector<char> conjugate_gradients(const BlockValues& A,
       to.push_back(descents[k].z.data());
     }
     factor.solve(from, to, workspace);
-    for (const std::size_t k : left) descents[k].turn();
+    product = dots(descents, left, &Descent::r, &Descent::z);
+    next = product.begin();
+    for (const std::size_t k : left) descents[k].turn(*next++);
     std::erase_if(left, [&](std::size_t k) { return descents[k].rz <= goals[k]; });
   }
   for (const std::size_t k : left) converged[k] = 0;

@@ -361,6 +361,7 @@ class MultifrontalFactor final : public FactorBackend {
 
     /// Powers of two that the scaled right sides are divided by, so that they have the range of a Real.
     std::array<double, R> unit;
+    std::array<double, R> inverse;
 
     std::size_t count() const { return R == 1 ? 1 : b.size(); }
   };
@@ -377,7 +378,8 @@ class MultifrontalFactor final : public FactorBackend {
     const std::size_t all = own * members(workspace);
     Real* const memory = workspace.reserve<Real>(R * (all + n + s_.passed_size));
     Real* const y = memory + R * all;
-    const Vectors<R> v{.b = b, .x = x, .y = y, .passed = y + R * n, .unit = units<R>(b)};
+    Vectors<R> v{.b = b, .x = x, .y = y, .passed = y + R * n, .unit = units<R>(b), .inverse = {}};
+    for (std::size_t r = 0; r < R; ++r) v.inverse[r] = 1.0 / v.unit[r];
     const auto tasks = static_cast<Index>(s_.tasks.size());
     const auto ready = [&](Index k, const Team::Done& done) {
       if (k < tasks) return has_all(k, [&](Index child) { return done[child] != 0; });
@@ -402,15 +404,19 @@ class MultifrontalFactor final : public FactorBackend {
     std::array<double, R> result;
     result.fill(1.0);
     if (!kIsScaled) return result;
-    for (std::size_t r = 0; r < b.size(); ++r) {
-      double largest = 0.0;
-      for (std::size_t k = 0; k < s_.vertex.size(); ++k) {
+    // A maximum waits for the one before: all sides and coordinates at once.
+    std::array<std::array<double, 3>, R> largest{};
+    for (std::size_t k = 0; k < s_.vertex.size(); ++k) {
+      const std::size_t place = 3 * static_cast<std::size_t>(s_.vertex[k]);
+      for (std::size_t r = 0; r < b.size(); ++r) {
         for (std::size_t i = 0; i < 3; ++i) {
-          const double value = b[r][3 * static_cast<std::size_t>(s_.vertex[k]) + i];
-          largest = std::max(largest, std::abs(value * scale_[3 * k + i]));
+          largest[r][i] = std::max(largest[r][i], std::abs(b[r][place + i] * scale_[3 * k + i]));
         }
       }
-      result[r] = leading_power(largest);
+    }
+    for (std::size_t r = 0; r < b.size(); ++r) {
+      // Their inverses are to be normal numbers.
+      result[r] = std::clamp(leading_power(std::ranges::max(largest[r])), 0x1p-1022, 0x1p1022);
     }
     return result;
   }
@@ -424,7 +430,7 @@ class MultifrontalFactor final : public FactorBackend {
       if constexpr (kIsScaled) {
         const double* const scale = scale_.data() + 3 * static_cast<std::ptrdiff_t>(k);
         for (std::size_t i = 0; i < 3; ++i) {
-          to[R * i + r] = static_cast<Real>(from[i] * scale[i] / v.unit[r]);
+          to[R * i + r] = static_cast<Real>(from[i] * scale[i] * v.inverse[r]);
         }
       } else {
         for (std::size_t i = 0; i < 3; ++i) to[R * i + r] = from[i];

@@ -35,7 +35,8 @@ air::Flow flow(const Problem& p, const Array& normal, const Array& tangential) {
           .along = scaled(tangential, half_density(p)),
           .start = p.start.data(),
           .wind = wind != nullptr ? row(wind, 0) : Vec3(Vec3::Zero()),
-          .h = p.h};
+          .h = p.h,
+          .held = &p.scene.held_elements.faces};
 }
 
 }  // namespace

@@ -6,8 +6,6 @@
 #include <map>
 #include <utility>
 
-#include "contact/friction_set.h"
-
 namespace diffcloth::step {
 namespace {
 
@@ -17,6 +15,33 @@ using contact::Contact;
 using Features = std::pair<contact::Candidate, std::array<Index, 4>>;
 
 Features features(const Contact& contact) { return {contact.pair, contact.pair.vertices}; }
+
+/// Where the points of features are in a list, which have no two points with the same.
+class Places {
+ public:
+  explicit Places(const std::vector<Contact>& contacts) : contacts_(contacts) {}
+
+  /// The place of a contact's features, and a new one at the end where there is none. Solutions follow each other
+  /// closely: most are where one expects them behind the last one, and the others are looked up.
+  std::size_t find(const Contact& contact, std::size_t end) {
+    if (next_ < contacts_.size() && features(contacts_[next_]) == features(contact)) {
+      return next_++;
+    }
+    if (by_features_.empty()) {
+      for (std::size_t k = 0; k < contacts_.size(); ++k) {
+        by_features_.emplace(features(contacts_[k]), k);
+      }
+    }
+    const std::size_t place = by_features_.emplace(features(contact), end).first->second;
+    next_ = place + 1;
+    return place;
+  }
+
+ private:
+  const std::vector<Contact>& contacts_;
+  std::size_t next_ = 0;
+  std::map<Features, std::size_t> by_features_;  // filled when the first one is looked up
+};
 
 /// Where a pair is, with the surface of the smaller index first; and whether that is its second one.
 std::pair<ContactPoint, bool> placed(const contact::ContactModel& model,
@@ -54,32 +79,27 @@ double normal_force(const Contact& c) {
 
 std::vector<ContactPoint> contact_points(const Problem& problem,
                                          const std::vector<Contact>& contacts,
-                                         const std::vector<Contact>& lagged,
+                                         const contact::FrictionSet* friction,
                                          const std::vector<double>& x) {
   std::vector<ContactPoint> points;
   if (!problem.contact) return points;
   const contact::ContactModel& model = *problem.contact;
   points.reserve(contacts.size());
-  std::map<Features, std::size_t> places;
-  const auto add = [&](const Contact& c) {
-    points.push_back(placed(model, c, x.data()).first);
-    places.emplace(features(c), points.size() - 1);
-  };
   for (const Contact& c : contacts) {
-    add(c);
+    points.push_back(placed(model, c, x.data()).first);
     points.back().normal_force = normal_force(c);
   }
-  const contact::FrictionSet friction(model, lagged, problem.moved_from().data());
-  if (friction.empty()) return points;
-  const contact::FrictionSet::Slips& slips = friction.slips(x.data());
+  if (friction == nullptr) return points;
+  const contact::FrictionSet::Slips& slips = friction->slips(x.data());
+  Places places(contacts);
   for (std::size_t k = 0; k < slips.size(); ++k) {
-    const contact::FrictionSet::Entry& entry = friction.entries()[k];
-    if (!places.contains(features(entry.lag))) add(entry.lag);
-    ContactPoint& point = points[places.at(features(entry.lag))];
+    const contact::FrictionSet::Entry& entry = friction->entries()[k];
+    const auto [point, is_turned] = placed(model, entry.lag, x.data());
+    const std::size_t place = places.find(entry.lag, points.size());
+    if (place == points.size()) points.push_back(point);
     // It acts against the motion of the pair's first feature relative to the second one.
     const Vec3 on_b = (entry.mu * entry.lambda) * slips[k].force();
-    const bool is_turned = placed(model, entry.lag, x.data()).second;
-    point.tangential_force += is_turned ? Vec3(-on_b) : on_b;
+    points[place].tangential_force += is_turned ? Vec3(-on_b) : on_b;
   }
   return points;
 }

@@ -2,6 +2,7 @@
 
 #include <vector>
 
+#include "contact/friction_set.h"
 #include "step/problem.h"
 #include "step/report.h"
 
@@ -14,10 +15,10 @@ namespace diffcloth::step {
 /// the contacts of the last but one solution, has points of its own, without a normal force.
 ///
 /// @param contacts  at the solution
-/// @param lagged    those that friction was taken from
+/// @param friction  null where there is none
 std::vector<ContactPoint> contact_points(const Problem& problem,
                                          const std::vector<contact::Contact>& contacts,
-                                         const std::vector<contact::Contact>& lagged,
+                                         const contact::FrictionSet* friction,
                                          const std::vector<double>& x);
 
 }  // namespace diffcloth::step

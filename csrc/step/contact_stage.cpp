@@ -163,8 +163,9 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
   if (reached < 1.0) step.report.root_poses = motion.root_poses(reached);
   if (!step.tape.empty()) *step.tape["solves"] = solves;
   add_forces(problem, sum, x, forces);
-  PairTally(problem, step.report).add(sum.contacts(), sum.lagged(), x);
-  step.report.points = contact_points(problem, sum.contacts(), sum.lagged(), x);
+  const contact::FrictionSet* const friction = sum.friction ? &sum.friction->set() : nullptr;
+  PairTally(problem, step.report).add(sum.contacts(), sum.lagged(), friction, x);
+  step.report.points = contact_points(problem, sum.contacts(), friction, x);
 }
 
 }  // namespace diffcloth::step

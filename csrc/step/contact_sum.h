@@ -38,9 +38,9 @@ class ContactSum {
     return contacts();
   }
 
-  /// Stand where these are the contacts.
-  void adopt(std::vector<contact::Contact> contacts) {
-    if (contact_) contact_->adopt(std::move(contacts));
+  /// Stand where these are the contacts; they outlive the stand.
+  void adopt(const std::vector<contact::Contact>& contacts) {
+    if (contact_) contact_->adopt(contacts);
   }
 
   /// Contacts where the contact potential stands.
@@ -58,7 +58,7 @@ class ContactSum {
   }
 
   /// Contacts that friction is taken from.
-  const std::vector<contact::Contact>& lagged() const { return lagged_; }
+  const std::vector<contact::Contact>& lagged() const { return *lagged_; }
 
   /// Let factors have the couplings of all contacts that there may be on the way from a point: patterns
   /// seldom change then, and remain functions of the point and this one.
@@ -70,15 +70,23 @@ class ContactSum {
   }
 
   /// Take friction from the contacts of a configuration.
-  void lag(const std::vector<contact::Contact>& contacts) {
+  void lag(std::vector<contact::Contact> contacts) {
+    friction.reset();
+    own_lagged_ = std::move(contacts);
+    lag_kept(own_lagged_);
+  }
+
+  /// The same with contacts that outlive the friction.
+  void lag_kept(const std::vector<contact::Contact>& contacts) {
     objective.others = stage_.others;
     friction.reset();
-    lagged_.clear();
+    static const std::vector<contact::Contact> none;
+    lagged_ = &none;
     // Where nothing can touch there are no contacts either.
     if (!problem_.contact || contacts.empty()) return;
     friction.emplace(*problem_.contact, contacts, problem_.moved_from().data(), bar_);
     objective.others.push_back(&*friction);
-    lagged_ = contacts;
+    lagged_ = &contacts;
   }
 
   /// Put the tangents of what barrier and friction depend on into them, along each direction.
@@ -107,7 +115,8 @@ class ContactSum {
   Problem& problem_;
   contact::ContactModel::Bar* bar_;
   std::optional<contact::ContactPotential> contact_;
-  std::vector<contact::Contact> lagged_;
+  std::vector<contact::Contact> own_lagged_;
+  const std::vector<contact::Contact>* lagged_ = &own_lagged_;
 };
 
 }  // namespace diffcloth::step

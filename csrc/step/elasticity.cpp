@@ -57,7 +57,11 @@ elastic::Model make_model(const Problem& p) {
   model.x_n = p.inputs.data(Input::kPositions);
   model.held = &p.scene.held_elements;
   if (!p.masses.empty()) model.least_inertia = std::ranges::min(p.masses) / (p.h * p.h);
-  elastic::prepare(model, p.scene.slots);
+  if (p.rest == &p.scene.rest) {
+    p.scene.prepared.prepare(model, p.scene.slots);
+  } else {
+    elastic::prepare(model, p.scene.slots);
+  }
   return model;
 }
 

@@ -1,6 +1,7 @@
 #include "step/forces.h"
 
 #include <algorithm>
+#include <optional>
 #include <tuple>
 #include <utility>
 
@@ -17,22 +18,25 @@ std::pair<Index, Index> surfaces(const contact::ContactModel& model, const Conta
   return std::minmax(owner[contact.pair.vertices[0]], owner[contact.pair.vertices[3]]);
 }
 
-/// Contacts in an order in which those of one pair follow one another.
-std::vector<Contact> by_pair(const contact::ContactModel& model, std::vector<Contact> contacts) {
-  std::ranges::stable_sort(contacts, {}, [&](const Contact& c) { return surfaces(model, c); });
-  return contacts;
-}
-
-/// Call visit(pair, contacts of it) for every pair.
+/// Call visit(pair, contacts of it) for every pair, in the order of the contacts.
 template <class Visit>
 void for_each_pair(const contact::ContactModel& model,
-                   const std::vector<Contact>& sorted,
+                   const std::vector<Contact>& contacts,
                    Visit&& visit) {
+  const auto of = [&](const Contact& c) { return surfaces(model, c); };
+  if (contacts.empty()) return;
+  const auto pair = of(contacts.front());
+  if (std::ranges::all_of(contacts, [&](const Contact& c) { return of(c) == pair; })) {
+    visit(pair, contacts);
+    return;
+  }
+  std::vector<Contact> sorted = contacts;
+  std::ranges::stable_sort(sorted, {}, of);
   for (auto first = sorted.begin(); first != sorted.end();) {
-    const auto pair = surfaces(model, *first);
-    const auto last = std::find_if(first, sorted.end(),
-                                   [&](const Contact& c) { return surfaces(model, c) != pair; });
-    visit(pair, std::vector<Contact>(first, last));
+    const auto here = of(*first);
+    const auto last =
+        std::find_if(first, sorted.end(), [&](const Contact& c) { return of(c) != here; });
+    visit(here, std::vector<Contact>(first, last));
     first = last;
   }
 }
@@ -70,6 +74,7 @@ void PairTally::add(Index first, Index second, const Vec3& force) {
 
 void PairTally::add(const std::vector<Contact>& contacts,
                     const std::vector<Contact>& lagged,
+                    const contact::FrictionSet* friction,
                     const std::vector<double>& x) {
   if (!problem_.contact) return;
   const contact::ContactModel& model = *problem_.contact;
@@ -81,7 +86,7 @@ void PairTally::add(const std::vector<Contact>& contacts,
     if (owner[vertex] == pair.second && pair.first != pair.second) pair.force -= here;
     here.setZero();
   };
-  for_each_pair(model, by_pair(model, contacts), [&](const auto& key, const auto& of_pair) {
+  for_each_pair(model, contacts, [&](const auto& key, const auto& of_pair) {
     PairContacts& pair = of(key.first, key.second);
     pair.count += static_cast<Index>(of_pair.size());
     model.add_gradient(of_pair, x.data(), g.data());
@@ -89,12 +94,14 @@ void PairTally::add(const std::vector<Contact>& contacts,
       for (const Index vertex : c.pair.vertices) take(pair, vertex);
     }
   });
-  for_each_pair(model, by_pair(model, lagged), [&](const auto& key, const auto& of_pair) {
-    const contact::FrictionSet friction(model, of_pair, problem_.moved_from().data());
-    if (friction.empty()) return;
+  for_each_pair(model, lagged, [&](const auto& key, const auto& of_pair) {
+    std::optional<contact::FrictionSet> own;
+    const bool is_only_pair = friction != nullptr && of_pair.size() == lagged.size();
+    if (!is_only_pair) own.emplace(model, of_pair, problem_.moved_from().data());
+    const contact::FrictionSet& set = is_only_pair ? *friction : *own;
     PairContacts& pair = of(key.first, key.second);
-    friction.add_gradient(x.data(), g.data());
-    for (const auto& entry : friction.entries()) {
+    set.add_gradient(x.data(), g.data());
+    for (const auto& entry : set.entries()) {
       for (const Index vertex : entry.all_points()) take(pair, vertex);
     }
   });

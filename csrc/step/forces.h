@@ -2,6 +2,7 @@
 
 #include <vector>
 
+#include "contact/friction_set.h"
 #include "solver/objective.h"
 #include "step/problem.h"
 #include "step/report.h"
@@ -31,8 +32,10 @@ class PairTally {
   ///
   /// @param contacts  at the solution
   /// @param lagged    those that friction was taken from
+  /// @param friction  of these; null where there are none
   void add(const std::vector<contact::Contact>& contacts,
            const std::vector<contact::Contact>& lagged,
+           const contact::FrictionSet* friction,
            const std::vector<double>& x);
 
   /// Count one contact.

@@ -127,6 +127,7 @@ struct Scene {
   elastic::Slots slots;
   elastic::Elements held_elements;  ///< those with a pinned corner
 
+  mutable elastic::PreparedCache prepared;                    ///< models of `rest`
   mutable solver::PatternCache elastic_patterns;              ///< over the elastic pattern
   mutable solver::PatternCache diagonal_patterns;             ///< over isolated vertices
   mutable projective::ConstantMatrixCache constant_matrices;  ///< over the elastic pattern

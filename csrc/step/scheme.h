@@ -38,7 +38,8 @@ struct Taken {
 /// What a scheme works with going back, for several losses side by side.
 struct Backward : Taken {
   std::span<Cotangents> losses;
-  bool barrier;  ///< whether someone asks for the cotangents of what the barrier is made of
+  bool barrier;   ///< whether someone asks for the cotangents of what the barrier is made of
+  bool friction;  ///< the same of friction, which depends on the barrier
 };
 
 /// What it works with for tangents, along several directions of the inputs side by side.

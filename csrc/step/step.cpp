@@ -16,6 +16,11 @@ bool wants_barrier(const Gradients& gradients) {
       [&](Input input) { return gradients[input] != nullptr; });
 }
 
+bool wants_friction(const Gradients& gradients) {
+  return wants_barrier(gradients) || gradients[Input::kFriction] != nullptr ||
+         gradients[Input::kSlipVelocity] != nullptr;
+}
+
 /// From the cotangents of the outputs to those of the points at the end.
 void read_outputs(const Problem& problem,
                   const Arrays<const double>& cotangents,
@@ -179,7 +184,8 @@ void backward(const Scene& scene,
   scene.scheme->backward(
       {{.problem = problem, .detection = detection, .context = context, .tape = tape, .kept = kept},
        bars,
-       wants_barrier(wanted)});
+       wants_barrier(wanted),
+       wants_friction(wanted)});
   const Turn::Exchange exchange = [&](std::size_t l) { bars[l].exchange(problem); };
   for (std::size_t l = 0; l < losses.size(); ++l) {
     const Turn turn(exchange, l);
@@ -200,6 +206,7 @@ void tangent(const Scene& scene,
   contact::Detection detection(scene.broad_phase);
   Problem problem(scene, inputs);
   std::vector<Tangents> tangents;
+  tangents.reserve(directions.size());
   std::vector<Forces> forces;
   for (const Direction& direction : directions) {
     tangents.emplace_back(problem, direction.tangents);

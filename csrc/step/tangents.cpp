@@ -171,6 +171,9 @@ Array Tangents::per_face(const Problem& p, Input input) const {
 }
 
 Array Tangents::lumped(const Problem& p, Input input, const Array& values) const {
+  if (directions.data(input) == nullptr && rest.area.empty()) {
+    return Array(p.masses.size(), 0.0);
+  }
   Array change = per_face(p, input);
   for (std::size_t f = 0; f < change.size(); ++f) {
     change[f] *= p.rest->area[f];

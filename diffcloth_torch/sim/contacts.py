@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch._saved import allow_loading
@@ -70,22 +72,25 @@ class Contacts:
             surfaces: Names of all surfaces.
             batched: Whether the result has an axis of environments.
         """
-        keys = sorted({(pair[0], pair[1]) for pairs in found for pair in pairs})
-        counts = {key: torch.zeros(len(found), dtype=torch.int64) for key in keys}
-        forces = {key: torch.zeros(len(found), 3, dtype=torch.float64) for key in keys}
+        counts: dict[tuple[int, int], NDArray[np.int64]] = {}
+        forces: dict[tuple[int, int], FloatArray] = {}
         for i, pairs in enumerate(found):
             for first, second, count, force in pairs:
-                counts[first, second][i] += count
-                forces[first, second][i] += torch.tensor(force, dtype=torch.float64)
-        named = {(i, j): (surfaces[i], surfaces[j]) for i, j in keys}
-        every = Contacts(
-            tuple(surfaces),
-            len(found),
-            {named[key]: count for key, count in counts.items()},
-            {named[key]: force for key, force in forces.items()},
-            tuple(map(torch.from_numpy, rows)),
-        )
-        return every if batched else every.select(0)
+                key = (first, second)
+                if key not in counts:
+                    counts[key] = np.zeros(len(found), np.int64)
+                    forces[key] = np.zeros((len(found), 3))
+                counts[key][i] += count
+                forces[key][i] += force
+        names = {key: (surfaces[key[0]], surfaces[key[1]]) for key in sorted(counts)}
+        rows_kept = tuple(map(torch.from_numpy, rows))
+
+        def tensors(values: Mapping[tuple[int, int], NDArray[Any]]) -> dict[Pair, Tensor]:
+            every = {name: torch.from_numpy(values[key]) for key, name in names.items()}
+            return every if batched else {name: tensor[0] for name, tensor in every.items()}
+
+        size = len(found) if batched else None
+        return Contacts(tuple(surfaces), size, tensors(counts), tensors(forces), rows_kept)
 
     def __getitem__(self, pair: Pair) -> PairContact:
         """Contacts of two surfaces.

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from inspect import signature
 
 import numpy as np
 import torch
@@ -127,6 +128,10 @@ class _Evaluate(torch.autograd.Function):
         )
         found = dict(zip(needs, apply_map(linear, saved, cotangents), strict=True))
         return None, *(found.get(name) for name in names)
+
+
+# torch asks for it in every call, and inspect reads a function anew each time unless it is there.
+_Evaluate.forward.__signature__ = signature(_Evaluate.forward)  # type: ignore[attr-defined]
 
 
 def _tangents(ctx, given, saved, directions):

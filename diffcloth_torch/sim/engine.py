@@ -137,7 +137,10 @@ class Engine:
             "soft_pin_targets": given.control["soft_pins"],
         }
         environments = len(outcome.positions)
-        fields = {n: t.expand(environments, *t.shape[1:]) for n, t in fields.items()}
+        fields = {
+            n: t if len(t) == environments else t.expand(environments, *t.shape[1:])
+            for n, t in fields.items()
+        }
         return refuse_gradients(fields, failures_of(outcome.diagnostics)), outcome.diagnostics
 
     def _step_together(

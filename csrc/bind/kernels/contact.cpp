@@ -20,6 +20,7 @@
 #include <nanobind/stl/vector.h>
 
 #include "bind/kernels/kernels.h"
+#include "common/friction_law.h"
 #include "contact/barrier.h"
 #include "contact/box_group.h"
 #include "contact/broad_phase.h"
@@ -28,7 +29,6 @@
 #include "contact/collision_mesh.h"
 #include "contact/distance/closest.h"
 #include "contact/distance/mollifier.h"
-#include "common/friction_law.h"
 #include "contact/nonadjacent_distance.h"
 
 namespace diffcloth::bind {

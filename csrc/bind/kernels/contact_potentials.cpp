@@ -47,9 +47,12 @@ class Friction {
  public:
   Friction(const contact::ContactModel& model,
            const linalg::BlockPattern& pattern,
-           const std::vector<contact::Contact>& lag,
+           std::vector<contact::Contact> lag,
            const Positions& x_start)
-      : pattern_(pattern), x_start_(x_start), potential_(model, lag, x_start_.data(), nullptr) {}
+      : pattern_(pattern),
+        lag_(std::move(lag)),
+        x_start_(x_start),
+        potential_(model, lag_, x_start_.data(), nullptr) {}
   Friction(const Friction&) = delete;
   Friction& operator=(const Friction&) = delete;
 
@@ -76,6 +79,7 @@ class Friction {
 
  private:
   const linalg::BlockPattern& pattern_;
+  std::vector<contact::Contact> lag_;
   Rows3 x_start_;
   contact::FrictionPotential potential_;
 };
@@ -153,11 +157,12 @@ class ContactPotential {
                           const Positions& x,
                           const Positions& z,
                           double scale) {
-    const contact::FrictionSet set(model_, find(x_lag), x_start.data());
+    const std::vector<contact::Contact> lag = find(x_lag);
+    const contact::FrictionSet set(model_, lag, x_start.data());
     contact::ContactModel::Bar bar(mesh_);
     Values start_bar = Values::Zero(x.size());
     Values lag_bar = Values::Zero(x.size());
-    set.add_mixed(x.data(), z.data(), x_lag.data(), scale, bar, start_bar.data(), lag_bar.data());
+    set.add_mixed(x.data(), z.data(), x_lag.data(), scale, &bar, start_bar.data(), lag_bar.data());
     nb::dict result = to_dict(bar);
     result["x_start"] = start_bar;
     result["x_lag"] = lag_bar;
@@ -179,13 +184,14 @@ class ContactPotential {
                          const Positions& x_start,
                          const Positions& x,
                          const nb::dict& dot) {
-    const contact::FrictionSet set(model_, find(x_lag), x_start.data());
+    const std::vector<contact::Contact> lag = find(x_lag);
+    const contact::FrictionSet set(model_, lag, x_start.data());
     const contact::ContactModel::Bar parameters = from_dict(dot);
     const auto start = nb::cast<Values>(dot["x_start"]);
-    const auto lag = nb::cast<Values>(dot["x_lag"]);
+    const auto lag_dot = nb::cast<Values>(dot["x_lag"]);
     Rows3 y = Rows3::Zero(x.rows(), 3);
     const std::array<contact::FrictionSet::Tangents, 1> directions{
-        {{.parameters = &parameters, .start = start.data(), .lag = lag.data()}}};
+        {{.parameters = &parameters, .start = start.data(), .lag = lag_dot.data()}}};
     const std::array out{y.data()};
     set.add_tangents(x.data(), x_lag.data(), directions, out);
     return y;

@@ -181,7 +181,7 @@ class Elastic {
                     const Positions& x1,
                     bool positive) const {
     const elastic::StretchKernels& kernels = elastic::stretch_kernels(level_named(level));
-    const std::vector<elastic::StretchBatch>& batches = model_.prepared.stretch;
+    const std::vector<elastic::StretchBatch>& batches = model_.prepared->stretch;
     const std::vector<double> from = positions("x0", x0);
     const std::vector<double> to = positions("x1", x1);
     std::vector<double> g(from.size(), 0.0);

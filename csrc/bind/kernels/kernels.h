@@ -35,6 +35,9 @@ void contact_kernels(nb::module_& m);
 /// Barrier and friction of a whole mesh, for tests of their derivatives and weights.
 void contact_potentials(nb::module_& m);
 
+/// Derivatives of contacts along several directions, for tests of their bits.
+void direction_kernels(nb::module_& m);
+
 /// Sparse Cholesky factorizations, for tests against independent references and for benchmarks.
 void linalg_kernels(nb::module_& m);
 
