@@ -115,9 +115,9 @@ def test_a_heavy_column_buckles_once_inertia_lets_it(load, dt):
         assert out_of_plane(state) > 1e-2 * length
 
 
-# Pushed sideways in its plane by this load [m/s^2]. It buckles from 9.0991 on; within the default tolerance it may end
-# a little earlier on the way there, so that 9.0992 is flat, too. Curvature is 1e-10 of the diagonal: far below what
-# single precision sees.
+# Pushed sideways in its plane by this load [m/s^2]. It buckles from 9.0991 on; within the default
+# tolerance it may end a little earlier on the way there, so that 9.0992 is flat, too. Curvature is
+# 1e-10 of the diagonal: far below what single precision sees.
 @pytest.mark.parametrize("load", [9.0985, 9.099, 9.0995, 9.1, 9.101, 9.102, 9.103])
 def test_a_strip_about_to_buckle_is_flat_only_where_that_is_a_minimum(load):
     material = dc.Material(stretch=6247.0, bending=7.45e-3)
