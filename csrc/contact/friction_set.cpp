@@ -349,12 +349,10 @@ void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
   const Entry& k = *entry_;
   const int first = k.frame;
   const std::span<const Index> others = k.all_points().first(static_cast<std::size_t>(first));
-  if (!A.has_any(k.all_points().subspan(others.size()))) {
+  if (!A.has_any(k.all_points().subspan(others.size())) && !A.any_attached(others)) {
     // The frames are of bodies whose motion is given.
-    if (!A.any_attached(others)) {
-      A.add_rows(others, [&](int p, int q) -> Mat3 { return (k.c[p] * k.c[q]) * core_; });
-      return;
-    }
+    A.add_rows(others, [&](int p, int q) -> Mat3 { return (k.c[p] * k.c[q]) * core_; });
+    return;
   }
   const std::array<Mat3, 6> B = frame_changes();
   if (A.any_attached(k.all_points())) {

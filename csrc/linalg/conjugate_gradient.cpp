@@ -24,7 +24,7 @@ double largest_magnitude(const std::vector<double>& values) {
   for (std::size_t k = 0; k < values.size(); ++k) {
     largest[k % 4] = std::max(largest[k % 4], std::abs(values[k]));
   }
-  return std::max(std::max(largest[0], largest[1]), std::max(largest[2], largest[3]));
+  return *std::ranges::max_element(largest);
 }
 
 /// The way of one right side.

@@ -201,7 +201,8 @@ solver::Objective Problem::objective(Proximity& inertia_or_nearness,
           .inertia = &inertia_or_nearness,
           .others = std::move(others),
           .chart = chart ? &*chart : nullptr,
-          .patterns = &patterns};
+          .patterns = &patterns,
+          .expected = {}};
 }
 
 linalg::BlockMatrix contact_free_hessian(Problem& p, const double* x, Curvature curvature) {
@@ -236,8 +237,9 @@ std::vector<double> Problem::predicted(const double* cloth_positions) const {
   std::copy_n(cloth_positions, cloth_size, x.begin());
   for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
     if (scene.mechanisms.given().prescribed[c] != 0) continue;
-    const double target = inputs.data(Input::kCoordinateTargets)[c];
-    coordinates.nodes(x)[scene.mechanisms.slot(c)] = chart->within_speed(c, target);
+    double target = inputs.data(Input::kCoordinateTargets)[c];
+    if (chart) target = chart->within_speed(c, target);
+    coordinates.nodes(x)[scene.mechanisms.slot(c)] = target;
   }
   coordinates.place(x);
   for (const Index i : scene.given.pins) {

@@ -171,15 +171,13 @@ Array Tangents::per_face(const Problem& p, Input input) const {
 }
 
 Array Tangents::lumped(const Problem& p, Input input, const Array& values) const {
-  if (directions.data(input) == nullptr && rest.area.empty()) {
-    return Array(p.masses.size(), 0.0);
-  }
+  Array result(p.masses.size(), 0.0);
+  if (directions.data(input) == nullptr && rest.area.empty()) return result;
   Array change = per_face(p, input);
   for (std::size_t f = 0; f < change.size(); ++f) {
     change[f] *= p.rest->area[f];
     if (!rest.area.empty()) change[f] += values[f] * rest.area[f];
   }
-  Array result(p.masses.size(), 0.0);
   for (std::size_t f = 0; f < change.size(); ++f) {
     for (const Index i : p.scene.topology.faces[f]) result[i] += change[f] / 3.0;
   }
