@@ -157,7 +157,7 @@ struct Directions {
     // What the lag configuration gives: the coefficients c, the normal and its force.
     Vector x[4];
     Vector t = zero();
-    Number share = Number{};
+    Number share{};
     for (int i = 0; i < 4; ++i) {
       x[i] = row(lag, of.corner[i]);
       t = sum(t, scaled(of.corner_c[i], x[i]));
