@@ -10,7 +10,7 @@ namespace {
 
 using Entry = FrictionSet::Entry;
 using Frame = FrictionSet::Frame;
-using Part = FrictionSet::Part;
+using GapPart = FrictionSet::GapPart;
 
 /// A frame is a line where its edges are parallel but for rounding: |m|^2 over |e1|^2 |e2|^2.
 constexpr double kLine = 1e-24;
@@ -19,7 +19,7 @@ constexpr double kClose = 0.1;
 /// Squared sine of the angle from which on two edges cross.
 constexpr double kCrossing = 0.2;
 
-void add_part(const Part& part, Entry& entry) { entry.parts[entry.part_count++] = part; }
+void add_part(const GapPart& part, Entry& entry) { entry.parts[entry.part_count++] = part; }
 
 /// Append three vertices as a frame; what the corners of the pair have among them is theirs.
 void append_frame(const std::array<Index, 3>& frame, double share, Entry& entry) {
@@ -75,7 +75,7 @@ void turn_with_both(const ContactModel& model, double share, Entry& entry) {
 Vec3 change_of_slip(const Entry& k, const std::array<Frame, 2>& frames, const double* z) {
   Vec3 change = k.gap(z);
   for (int l = 0; l < k.part_count; ++l) {
-    const Part& part = k.parts[l];
+    const GapPart& part = k.parts[l];
     const Frame& frame = frames[l];
     const Frame edges(k, part, z);
     change = change - part.a[0] * edges.e1 - part.a[1] * edges.e2 -
@@ -100,7 +100,7 @@ Vec3 FrictionSet::Entry::gap(const double* rows) const {
   return r;
 }
 
-void FrictionSet::Entry::add_edges(const Part& part,
+void FrictionSet::Entry::add_edges(const GapPart& part,
                                    const std::array<Vec3, 2>& bar,
                                    double* x_bar) const {
   for (int e = 0; e < 2; ++e) {
@@ -117,7 +117,7 @@ bool crosses(const Candidate& pair, const double* x) {
   return a.cross(b).squaredNorm() > kCrossing * a.squaredNorm() * b.squaredNorm();
 }
 
-FrictionSet::Frame::Frame(const Entry& k, const Part& part, const double* x)
+FrictionSet::Frame::Frame(const Entry& k, const GapPart& part, const double* x)
     : e1(k.edge(part, 0, x)), e2(k.edge(part, 1, x)), m(e1.cross(e2)) {}
 
 bool FrictionSet::Frame::is_line() const {
@@ -162,7 +162,7 @@ FrictionSet::FrictionSet(const ContactModel& model,
       turn_with(model.frame(k.pair), entry);
     }
     for (int l = 0; l < entry.part_count; ++l) {
-      Part& part = entry.parts[l];
+      GapPart& part = entry.parts[l];
       const Frame at_start(entry, part, x_start);
       part.turns = !at_start.is_line();
       part.a = Vec3::Zero();
@@ -198,7 +198,7 @@ FrictionSet::Slip FrictionSet::slip(const Entry& k, const double* x) const {
     s += k.c[i] * delta[i];
   }
   for (int l = 0; l < k.part_count; ++l) {
-    const Part& part = k.parts[l];
+    const GapPart& part = k.parts[l];
     const Frame& frame = at.frames[l] = Frame(k, part, x);
     if (!part.turns) continue;
     const Vec3 change_1 = delta[part.edges[1]] - delta[part.edges[0]];
@@ -233,7 +233,7 @@ void FrictionSet::add_gradient(const double* x, double* g) const {
       Eigen::Map<Vec3>(g + 3 * k.points[i]) += k.c[i] * force;
     }
     for (int l = 0; l < k.part_count; ++l) {
-      const Part& part = k.parts[l];
+      const GapPart& part = k.parts[l];
       k.add_edges(part, at.frames[l].pull_back(-part.a, force), g);
     }
   }
@@ -320,7 +320,7 @@ std::array<Mat3, 6> FrictionSet::Hessian::frame_changes() const {
   const Mat3 identity = Mat3::Identity();
   std::array<Mat3, 6> B;
   for (int l = 0; l < k.part_count; ++l) {
-    const Part& part = k.parts[l];
+    const GapPart& part = k.parts[l];
     const Frame& frame = at_->frames[l];
     const Mat3 of_e1 = part.a[2] * cross_matrix(frame.e2) - part.a[0] * identity;
     const Mat3 of_e2 = -part.a[2] * cross_matrix(frame.e1) - part.a[1] * identity;
@@ -333,11 +333,11 @@ std::array<Mat3, 6> FrictionSet::Hessian::frame_changes() const {
 
 Mat3 FrictionSet::Hessian::turning(int p, int q) const {
   // Between e1 and e2 turn x, between e2 and e1 the opposite.
-  const auto in = [](const Part& part, int i) {
+  const auto in = [](const GapPart& part, int i) {
     return i >= part.first && i < part.first + part.size;
   };
   for (int l = 0; l < entry_->part_count; ++l) {
-    const Part& part = entry_->parts[l];
+    const GapPart& part = entry_->parts[l];
     if (!in(part, p) || !in(part, q)) continue;
     return (part.sign(0, p) * part.sign(1, q) - part.sign(1, p) * part.sign(0, q)) *
            cross_matrix(turn_[l]);
@@ -362,7 +362,7 @@ void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
     A.add_congruence(k.all_points(), jacobians, core_);
     for (int l = 0; l < k.part_count; ++l) {
       if (turn_[l].isZero(0.0)) continue;
-      const Part& part = k.parts[l];
+      const GapPart& part = k.parts[l];
       std::array<Index, 4> frame{};
       for (int e = 0; e < 4; ++e) frame[e] = k.points[part.first + std::min(e, part.size - 1)];
       A.add_stencil(frame, [&](int p, int q) -> Mat3 {
@@ -414,7 +414,7 @@ void FrictionSet::add_product(const Entry& k,
     if (k.c[p] != 0.0) Eigen::Map<Vec3>(y + 3 * k.points[p]) += k.c[p] * force;
   }
   for (int l = 0; l < k.part_count; ++l) {
-    const Part& part = k.parts[l];
+    const GapPart& part = k.parts[l];
     if (!part.turns) continue;
     auto [e1_bar, e2_bar] = at.frames[l].pull_back(-part.a, force);
     // As the frame itself turns.
@@ -504,7 +504,7 @@ void FrictionSet::add_mixed(const double* x,
     std::array<Frame, 2> changes;
     Vec3 zeta = k.gap(z);
     for (int l = 0; l < k.part_count; ++l) {
-      const Part& part = k.parts[l];
+      const GapPart& part = k.parts[l];
       const Frame& frame = at.frames[l];
       Frame& change = changes[l] = Frame(k, part, z);
       change.m = change.e1.cross(frame.e2) + frame.e1.cross(change.e2);  // not of its own edges
@@ -528,7 +528,7 @@ void FrictionSet::add_mixed(const double* x,
     const Vec3 s_bar = tangential(omega, k.n);
     Vec3 g = Vec3::Zero();
     for (int l = 0; l < k.part_count; ++l) {
-      const Part& part = k.parts[l];
+      const GapPart& part = k.parts[l];
       if (!part.turns) {
         g -= part.share * s_bar;
         continue;

@@ -48,7 +48,7 @@ class FrictionSet {
   bool empty() const { return entries_.empty(); }
 
   /// A part of the gap that turns with a frame.
-  struct Part {
+  struct GapPart {
     int first;                 ///< of the frame's vertices among the points
     int size;                  ///< how many there are: three or four
     std::array<int, 4> edges;  ///< start and end of e1, then of e2, among the points
@@ -74,9 +74,9 @@ class FrictionSet {
     int frame;                ///< where the frames' vertices begin
     int count;                ///< of the points: the frames' three to six are the last
     int part_count;           ///< one or two
-    std::array<Part, 2> parts;
+    std::array<GapPart, 2> parts;
 
-    std::span<const Part> all_parts() const {
+    std::span<const GapPart> all_parts() const {
       return {parts.data(), static_cast<std::size_t>(part_count)};
     }
     std::span<const Index> all_points() const {
@@ -84,7 +84,7 @@ class FrictionSet {
     }
 
     /// e1 or e2 of a part, of some rows.
-    Vec3 edge(const Part& part, int e, const double* rows) const {
+    Vec3 edge(const GapPart& part, int e, const double* rows) const {
       return row(rows, points[part.edges[2 * e + 1]]) - row(rows, points[part.edges[2 * e]]);
     }
 
@@ -92,14 +92,14 @@ class FrictionSet {
     Vec3 gap(const double* rows) const;
 
     /// Add cotangents of e1 and e2 of a part to those of the frame's vertices.
-    void add_edges(const Part& part, const std::array<Vec3, 2>& bar, double* x_bar) const;
+    void add_edges(const GapPart& part, const std::array<Vec3, 2>& bar, double* x_bar) const;
   };
   const std::vector<Entry>& entries() const { return entries_; }
 
   /// e1, e2 and m of a frame of an entry.
   struct Frame {
     Frame() = default;
-    Frame(const Entry& k, const Part& part, const double* x);
+    Frame(const Entry& k, const GapPart& part, const double* x);
 
     bool is_line() const;
     Vec3 operator*(const Vec3& a) const { return a[0] * e1 + a[1] * e2 + a[2] * m; }

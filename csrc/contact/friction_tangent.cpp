@@ -19,7 +19,7 @@ namespace {
 
 using Entry = FrictionSet::Entry;
 using Frame = FrictionSet::Frame;
-using Part = FrictionSet::Part;
+using GapPart = FrictionSet::GapPart;
 
 /// How the normal force changes,  lambda = -2 d kappa w m b'(D).
 class NormalForceDerivative {
@@ -83,7 +83,7 @@ void fill_sliding(const Entry& k, const double* x, const double* x_start, Fricti
 
 /// What the frame of a part makes of the motion of the start.
 void fill_part(const Entry& k,
-               const FrictionSet::Part& part,
+               const FrictionSet::GapPart& part,
                const Frame& frame,
                const Vec3& force,
                const double* x_start,
