@@ -3,10 +3,10 @@
 Sheets are jittered in their plane, as exact grids sit on kinks of the contact energy. Each scene
 takes steps that bring it into its regime before anything is timed. `SCENES` are the ordinary ones;
 in `BUCKLING` cloth buckles in many places at once, which costs many iterations; those of `FURTHER`
-have a potential that the others lack. The stiffnesses of `woven-sphere` differ so little from each
-other that its steps are those of `sphere`: what they take longer is the cost of the orthotropic
-kernels. Older versions that `benchmarks.compare` times know `rest_positions` of cloths by its
-earlier name only.
+have a potential, or a body, that the others lack. The stiffnesses of `woven-sphere` differ so
+little from each other that its steps are those of `sphere`: what they take longer is the cost of
+the orthotropic kernels. Older versions that `benchmarks.compare` times know `rest_positions` of
+cloths by its earlier name only.
 """
 
 from __future__ import annotations
@@ -106,13 +106,22 @@ def plane(n: int) -> Scene:
     return Scene(scene, approach=12, speed=(0.8, 0.3, 0.0))
 
 
-def sphere(n: int, material: dc.Material = dc.Material()) -> Scene:  # noqa: B008  # immutable
+def sphere(
+    n: int,
+    material: dc.Material = dc.Material(),  # noqa: B008  # immutable
+    **shape: bool,
+) -> Scene:
     """Drape over a sphere: a part of the vertices in contact, folds between them."""
     vertices, faces = sheet(n)
     vertices += (0.02, 0.03, _gap(n))
-    ball = dc.RigidBody.sphere(0.2, pose=[0, 0, -0.2, 1, 0, 0, 0])
+    ball = dc.RigidBody.sphere(0.2, pose=[0, 0, -0.2, 1, 0, 0, 0], **shape)
     cloth = dc.Cloth(vertices, faces, material=material)
     return Scene(dc.Scene([cloth], [ball]), approach=20)
+
+
+def smooth_sphere(n: int) -> Scene:
+    """The same over the analytic surface."""
+    return sphere(n, smooth=True)
 
 
 def woven_sphere(n: int) -> Scene:
@@ -216,7 +225,11 @@ SCENES: dict[str, Callable[[int], Scene]] = {
     "moving-body": moving_body,
 }
 
-FURTHER: dict[str, Callable[[int], Scene]] = {"air": air, "woven-sphere": woven_sphere}
+FURTHER: dict[str, Callable[[int], Scene]] = {
+    "air": air,
+    "woven-sphere": woven_sphere,
+    "smooth-sphere": smooth_sphere,
+}
 
 BUCKLING: dict[str, Callable[[int], Scene]] = {
     "twist": twist,

@@ -17,7 +17,7 @@ import diffcloth_torch as dc
 
 ROOT = Path(__file__).resolve().parents[1]
 ORDINARY = 7
-SCENES = ORDINARY + 2  # one in air, one of woven cloth
+SCENES = ORDINARY + 3  # one in air, one of woven cloth, one over a smooth ball
 
 
 @pytest.fixture(autouse=True)
@@ -388,8 +388,8 @@ def test_bits_are_the_same_twice_and_others_in_another_scheme():
     assert runs[0].returncode == 0, runs[0].stderr
     assert runs[0].stdout == runs[1].stdout
     lines = [line.split() for line in runs[0].stdout.splitlines()]
-    # Three schemes and a batch, and the same without `projective` of woven cloth.
-    assert len(lines) == 7
+    # Three schemes and a batch, and the same without `projective` of woven cloth and a smooth ball.
+    assert len(lines) == 10
     # At this size the sheet may have left the ball, so that two schemes agree.
     assert len({line[-2] for line in lines}) >= 3
     assert len({line[-1] for line in lines}) >= 3
