@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import pickle
 import re
@@ -290,8 +291,10 @@ def test_the_benchmark_runs(option, expected):
     assert re.search(expected, result.stdout), result.stdout
 
 
-def test_what_a_bias_leaves_is_what_random_intervals_count():
-    from benchmarks.identification import biased_share, shares
+def test_what_a_bias_leaves_is_what_random_intervals_count(monkeypatch):
+    monkeypatch.syspath_prepend(CONFIGS.parent)
+    identification = importlib.import_module("benchmarks.identification")
+    biased_share, shares = identification.biased_share, identification.shares
 
     middles = np.random.default_rng(0).standard_normal(100_000)
     for bias in (0.0, -0.5, 1.96):
