@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from diffcloth_torch.commands import check_folder
 from diffcloth_torch.config.documents import Document, set_values
-from diffcloth_torch.config.viewers import open_fitted
+from diffcloth_torch.config.viewers import ANIMATION, open_fitted
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.optimize.fit import Fit, Trial, fit
@@ -27,7 +27,6 @@ __all__ = ["fit_configuration", "resume_fit"]
 
 # Files in a folder of results. Evaluations lie in a folder, one file for each start.
 _RESULT, _PAGE, _RESUME, _EVALUATIONS = "fit.json", "fit.html", "resume.json", "evaluations"
-_ANIMATION = "animation.html"
 _LARGEST = 1 << 20  # bytes of a configuration
 
 
@@ -58,7 +57,7 @@ def fit_configuration(
         )
     out = check_folder(config, out, overwrite)
     out.mkdir(parents=True, exist_ok=True)
-    for name in (_RESULT, _PAGE, _RESUME, _ANIMATION):
+    for name in (_RESULT, _PAGE, _RESUME, ANIMATION):
         (out / name).unlink(missing_ok=True)
     for file in (out / _EVALUATIONS).glob("start_*.pt"):
         file.unlink()

@@ -77,8 +77,8 @@ class DragPotential final : public Potential {
   std::vector<Index> with_drag_;  ///< faces that have some
   bool of_coefficients_;
   mutable std::vector<FaceDrag> drags_;
-  mutable std::vector<double>
-      derivatives_at_;  ///< all vertices of cloths; empty where nothing is known
+  /// All vertices of cloths; empty where nothing is known.
+  mutable std::vector<double> derivatives_at_;
   mutable std::vector<Derivative> derivatives_;
 };
 

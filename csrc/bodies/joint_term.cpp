@@ -144,10 +144,4 @@ JointForce joint_force(const JointTerm& term, const JointConstants& c, double q)
   return f;
 }
 
-double limited_effort(double a, double limit) {
-  const Excess excess(a, limit);
-  if (excess.r == 0.0) return a;
-  return std::copysign(kLinear * limit + excess.limited(), a);
-}
-
 }  // namespace diffcloth::bodies

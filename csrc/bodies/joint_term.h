@@ -49,9 +49,6 @@ struct JointForce {
   JointRow by{};           ///< derivatives of the slope by the columns of the term, in their order
 };
 
-/// The effort that a drive has that asks for the effort a, under the limit L.
-double limited_effort(double a, double limit);
-
 /// The term at `to` less that at `from`, without cancellation; not finite beyond the end of a limit.
 double joint_energy_change(const JointTerm& term, const JointConstants& c, double from, double to);
 

@@ -38,8 +38,8 @@ struct MechanismsDescription {
   std::vector<double> lower;           ///< [n] limits of free joints; infinite where there are none
   std::vector<double> upper;
   std::vector<double> limit_stiffness;  ///< [n]
-  double limit_zone =
-      0.0;  ///< share of its range that a joint can go beyond a limit; of a speed likewise
+  /// Share of its range that a joint can go beyond a limit, and of a limit of its speed.
+  double limit_zone = 0.0;
   std::vector<double> velocity_stiffness;  ///< [n] see JointConstants
   std::vector<double> velocity_force;      ///< [n]
   std::vector<Index> surface_link;         ///< [surfaces]

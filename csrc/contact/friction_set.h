@@ -54,8 +54,8 @@ class FrictionSet {
     std::array<int, 4> edges;  ///< start and end of e1, then of e2, among the points
     double share;              ///< of the gap
     bool turns = false;        ///< false where the frame was a line at the start: Q is the identity
-    Vec3 a = Vec3::
-        Zero();  ///< its share of the gap at the start in the frame there; zero if it does not turn
+    /// Its share of the gap at the start in the frame there; zero if it does not turn.
+    Vec3 a = Vec3::Zero();
 
     /// How often a point counts in e1 or e2: 1 at the end, -1 at the start.
     int sign(int e, int point) const {
@@ -76,9 +76,6 @@ class FrictionSet {
     int part_count;           ///< one or two
     std::array<GapPart, 2> parts;
 
-    std::span<const GapPart> all_parts() const {
-      return {parts.data(), static_cast<std::size_t>(part_count)};
-    }
     std::span<const Index> all_points() const {
       return {points.data(), static_cast<std::size_t>(count)};
     }
@@ -189,8 +186,8 @@ class FrictionSet {
   bool has_duals(const double* x) const;
 
   /// d/d(theta) of phi = z . grad D, times scale: into `bar` for the parameters (friction, slip,
-  /// and, through lambda, kappa, d_hat, thickness, rest shape) unless it is null, into `start_bar` for x_start, and into
-  /// `lag_bar` for the lag configuration's positions `x_lag`.
+  /// and, through lambda, kappa, d_hat, thickness, rest shape) unless it is null, into `start_bar` for
+  /// x_start, and into `lag_bar` for the lag configuration's positions `x_lag`.
   void add_mixed(const double* x,
                  const double* z,
                  const double* x_lag,

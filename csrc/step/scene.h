@@ -77,8 +77,8 @@ struct Description {
   bodies::BodySet bodies;
   bodies::MechanismsDescription mechanisms;      ///< empty: every body is a tree of one link
   std::vector<std::array<Index, 3>> body_faces;  ///< indices into the bodies' vertices
-  std::vector<double>
-      body_radii;  ///< [surfaces of bodies] of round ones, 0 of others; empty: none [m]
+  /// [surfaces of bodies] of round ones, 0 of others; empty: none [m]
+  std::vector<double> body_radii;
   std::vector<std::array<Index, 2>> ignored_pairs;  ///< pairs of surfaces that never touch
   /// [surfaces of bodies] of those that cloths touch at their nodes, instead of by the barrier;
   /// empty: none

@@ -16,9 +16,10 @@ from diffcloth_torch.viewers.record import Record
 from diffcloth_torch.viewers.several import Viewers
 from diffcloth_torch.viewers.viewer import Viewer
 
-__all__ = ["VIEWERS", "open_fitted", "open_viewers"]
+__all__ = ["ANIMATION", "VIEWERS", "open_fitted", "open_viewers"]
 
-_PAGE = "animation.html"
+ANIMATION = "animation.html"
+"""File that the viewer `web` writes into a folder of results."""
 
 
 def open_viewers(
@@ -51,7 +52,7 @@ def open_fitted(config: RunConfig, scenes: Sequence[Scene], folder: Path) -> Fit
         scenes,
         paints=_paints(config),
         camera=Camera(**config.output.pictures.model_dump()["camera"]),
-        file=folder / _PAGE,
+        file=folder / ANIMATION,
         live=_is_watched(),
     )
 
@@ -91,7 +92,7 @@ def _web(config: RunConfig, scene: Scene, folder: Path, goals: Sequence[Goal]) -
         camera=Camera(**pictures.model_dump()["camera"]),
         # Gradients are given by an optimization alone; without them there are no such arrows.
         arrows=["forces", "gradient"] if pictures.contact_forces else ["gradient"],
-        file=folder / _PAGE,
+        file=folder / ANIMATION,
         live=_is_watched(),
     )
 

@@ -26,7 +26,7 @@ from torch import Tensor
 from diffcloth_torch.checks import LARGEST
 from diffcloth_torch.dynamics.linear import solve
 
-__all__ = ["Bounds", "Drives", "Gains", "fold", "joint_terms", "limited_effort"]
+__all__ = ["Bounds", "Drives", "Gains", "fold", "idle_terms", "joint_terms", "limited_effort"]
 
 # A drive has what it asks for up to this share of its limit; the core has the same number.
 _LINEAR = 0.9
@@ -132,6 +132,12 @@ def joint_terms(
         bounds.slip_rates,
     )
     return torch.stack([row.expand_as(start) for row in rows], dim=-1)
+
+
+def idle_terms(like: Tensor, count: int) -> Tensor:
+    """Rows of joint terms that do nothing, [B, count, 7], for coordinates that are no joints."""
+    row = like.new_tensor([0.0, 0.0, 0.0, LARGEST, LARGEST, 0.0, 1.0])
+    return row.expand(len(like), count, len(row))
 
 
 def fold(

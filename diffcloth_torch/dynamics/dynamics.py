@@ -18,15 +18,9 @@ from diffcloth_torch.dynamics.bodies import (
     predict_bodies,
     turn_sentence,
 )
-from diffcloth_torch.dynamics.drives import Bounds, Gains
+from diffcloth_torch.dynamics.drives import Bounds, Gains, idle_terms
 from diffcloth_torch.dynamics.inertia import Inertia
-from diffcloth_torch.dynamics.robots import (
-    RobotControl,
-    RobotDynamics,
-    RobotPrediction,
-    RobotState,
-    idle_terms,
-)
+from diffcloth_torch.dynamics.robots import RobotControl, RobotDynamics, RobotPrediction, RobotState
 from diffcloth_torch.dynamics.totals import Totals
 from diffcloth_torch.geometry.rotation import (
     quaternion_exp,

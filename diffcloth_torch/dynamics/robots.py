@@ -38,6 +38,7 @@ from diffcloth_torch.dynamics.drives import (
     Drives,
     Gains,
     fold,
+    idle_terms,
     joint_terms,
     limited_effort,
 )
@@ -72,7 +73,7 @@ from diffcloth_torch.model.kinematics import constant, pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.transforms import outside_transforms, plain
 
-__all__ = ["RobotControl", "RobotDynamics", "RobotPrediction", "RobotState", "idle_terms"]
+__all__ = ["RobotControl", "RobotDynamics", "RobotPrediction", "RobotState"]
 
 
 class RobotState(NamedTuple):
@@ -560,12 +561,6 @@ class RobotDynamics:
 
     def _at_joints(self, values: Tensor) -> Tensor:
         return values[..., values.shape[-1] - self.mechanism.joint_count :]
-
-
-def idle_terms(like: Tensor, count: int) -> Tensor:
-    """Rows of joint terms that do nothing, [B, count, 7], for coordinates that are no joints."""
-    row = like.new_tensor([0.0, 0.0, 0.0, LARGEST, LARGEST, 0.0, 1.0])
-    return row.expand(len(like), count, len(row))
 
 
 def _weights(inertia: Inertia, gravity: Tensor) -> Tensor:
