@@ -46,7 +46,7 @@ def main(size: int, steps: int, seconds: float, quick: bool) -> None:
     print(f"\nHeld for {seconds:g} s: creep, and that of the law [mm]")
     for what in ("cloth", "box"):
         for slip in slips:
-            share, way, law = _held(what, slip, seconds)
+            share, way, law = held(what, slip, seconds)
             print(
                 f"{what:6} {share:>6.1%} of its friction, {slip:>6g} m/s: {1e3 * way:.4f}, "
                 f"{1e3 * law:.4f}"
@@ -72,7 +72,7 @@ def _cost(name: str, size: int, steps: int, slip: float) -> tuple[float, float]:
     return median(iterations), median(milliseconds)
 
 
-def _held(what: str, slip: float, seconds: float) -> tuple[float, float, float]:
+def held(what: str, slip: float, seconds: float) -> tuple[float, float, float]:
     """Share of friction that the load needs, creep and that of the law [m]."""
     d_hat, thickness = 1e-3, 0.02 if what == "box" else 0.0
     x = thickness / 2 + GAP * d_hat + 0.01

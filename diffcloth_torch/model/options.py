@@ -45,7 +45,7 @@ class ContactOptions:
     barrier_distance: float | None = None
     barrier_stiffness: float | None = None
     friction_iterations: int = 2
-    slip_velocity: float = 1e-4
+    slip_velocity: float = 1e-5
     self_contact: bool = True
 
     def __post_init__(self) -> None:
