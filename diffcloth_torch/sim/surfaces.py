@@ -200,10 +200,10 @@ class Surfaces:
         Args:
             state: As for `meshes`.
         """
-        frames = self.frames(state)
-        cloths = (vertices for vertices, _ in self.cloth_meshes(state["positions"]).values())
+        positions, frames = state["positions"], self.frames(state)
+        cloths = (vertices for vertices, _ in self.cloth_meshes(positions).values())
         rigid = (place(points, frames[name]) for name, points in self.rigid_points().items())
-        return torch.cat([*cloths, *rigid], dim=-2)
+        return torch.cat([positions[..., :0, :], *cloths, *rigid], dim=-2)
 
 
 # Earlier versions had these classes there, and saved states name that module.

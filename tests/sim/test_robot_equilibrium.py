@@ -194,6 +194,20 @@ def test_a_hand_rests_on_a_floor():
     torch.testing.assert_close(found.base_poses, end.base_poses, rtol=0, atol=1e-6)
 
 
+def test_a_pendulum_without_a_shape_hangs(tmp_path):
+    """The scene has no surface at all."""
+    link = LINK.format(name="bob", center=CENTERS[0], mass=MASSES[0], length=0.2)
+    start, end = link.index("<collision>"), link.index("</link>")
+    hinge = JOINT.format(name="hinge", parent="base", child="bob", at=0)
+    path = tmp_path / "pendulum.urdf"
+    path.write_text(f'<robot name="pendulum">{BASE}{link[:start]}{link[end:]}{hinge}</robot>')
+    robot = dc.Robot.load(path, actuation="torque", joint_positions=0.4)
+    contact = dc.ContactOptions(barrier_distance=2e-3)
+    sim = dc.Simulator(dc.Scene([], [], [robot]), 0.01, contact=contact, solver=TIGHT)
+    hanging = sim.equilibrium(sim.initial_state())
+    assert hanging.joint_positions.item() == pytest.approx(np.pi / 2, abs=1e-8)
+
+
 def test_a_joint_that_nothing_holds_is_named(arm):
     robot = arm(actuation={"shoulder": "pd", "elbow": "torque"},
                 stiffness={"shoulder": 5.0}, damping={"shoulder": 1.0})  # fmt: skip
