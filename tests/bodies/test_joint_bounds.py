@@ -76,9 +76,9 @@ def test_a_joint_sticks_below_its_friction_but_for_the_creep_of_slip(tmp_path, s
     sim = simulator(robot, gravity=(0, 0, 0))
     end = rolled(sim, 30, joint_efforts=tensor(0.6 * share))[-1]
     rate = float(sim.parameters().joint_slip_rates)
-    assert rate == pytest.approx(1e-4 / np.sqrt(INERTIA / MASS), rel=1e-12)
+    assert rate == pytest.approx(1e-5 / np.sqrt(INERTIA / MASS), rel=1e-12)
     creep = np.sign(share) * rate * (1.0 - np.sqrt(1.0 - abs(share)))
-    assert float(end.joint_velocities) == pytest.approx(creep, rel=1e-6)
+    assert float(end.joint_velocities) == pytest.approx(creep, rel=1e-5)
 
 
 @pytest.mark.parametrize("effort", [0.9, -2.0])
@@ -374,7 +374,8 @@ def test_friction_holds_an_arm_where_the_search_begins(tmp_path):
     found = sim.equilibrium(sim.initial_state())
     slip = float(sim.parameters().joint_slip_rates) * H
     share = float(found.joint_positions) / slip
-    assert share * (2.0 - share) == pytest.approx(1.0 / 1.2, rel=1e-6)
+    # It yields by 6e-7 rad, which the solver finds up to its tolerance.
+    assert share * (2.0 - share) == pytest.approx(1.0 / 1.2, rel=1e-5)
     # With less, it falls until friction holds what is left of the weight.
     robot = dc.Robot.load(arm_file(tmp_path, friction=0.5 * WEIGHT), actuation="torque")
     found = simulator(robot).equilibrium(sim.initial_state())
