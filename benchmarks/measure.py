@@ -176,7 +176,8 @@ def tangent_ratios(
     noise = np.random.default_rng(1)
     cotangents = {
         name: np.zeros((1, *result[name].shape))
-        for name in ("body_forces", "contact_forces", "pin_forces")
+        for name in ("body_forces", "contact_forces", "pin_forces", "coordinates")
+        if name in result
     }
     for name in ("positions", "velocities"):
         cotangents[name] = noise.standard_normal((1, *result[name].shape))
@@ -249,6 +250,13 @@ def contact_share(simulator: dc.Simulator, state: dc.State) -> float:
         faces.append(body.faces + start)
         vertices.append(transform(body.vertices, pose))
         start += len(body.vertices)
+    if simulator.scene.robots:
+        meshes = state.meshes()
+        for name in simulator.surfaces[len(simulator.scene.cloths) + len(simulator.scene.bodies) :]:
+            placed, triangles = meshes[name]
+            faces.append(triangles.numpy() + start)
+            vertices.append(placed.numpy())
+            start += len(placed)
     all_vertices, all_faces = np.concatenate(vertices), np.concatenate(faces)
     mesh = ipctk.CollisionMesh(all_vertices, ipctk.edges(all_faces), all_faces)
     collisions = ipctk.NormalCollisions()

@@ -3,8 +3,8 @@
 Sheets are jittered in their plane, as exact grids sit on kinks of the contact energy. Each scene
 takes steps that bring it into its regime before anything is timed. `SCENES` are the ordinary ones;
 in `BUCKLING` cloth buckles in many places at once, which costs many iterations; those of `FURTHER`
-have a potential, or a body, that the others lack. The stiffnesses of `woven-sphere` differ so
-little from each other that its steps are those of `sphere`: what they take longer is the cost of
+have a potential, a body, or a robot, that the others lack. The stiffnesses of `woven-sphere` differ
+so little from each other that its steps are those of `sphere`: what they take longer is the cost of
 the orthotropic kernels. Older versions that `benchmarks.compare` times know `rest_positions` of
 cloths by its earlier name only.
 """
@@ -35,6 +35,7 @@ class Scene:
         speed: Of the cloth at the start [m/s].
         body_speed: Of the bodies, throughout [m/s].
         carry: From the vertices to the velocities [m/s] of those that are pinned; none rest.
+        joint_target: Of the drives of all joints [m]; None without a robot.
     """
 
     scene: dc.Scene
@@ -42,9 +43,14 @@ class Scene:
     speed: tuple[float, float, float] = (0.0, 0.0, 0.0)
     body_speed: tuple[float, float, float] = (0.0, 0.0, 0.0)
     carry: Callable[[Tensor], Tensor] | None = None
+    joint_target: float | None = None
 
     def control(self, state: dc.State) -> dc.Control:
         """Move pins and bodies on by one step; new leaves, so that gradients stop there."""
+        if self.joint_target is not None:
+            return dc.Control(
+                joint_positions=torch.full_like(state.joint_positions, self.joint_target)
+            )
         if self.carry is not None:
             pinned = [v for name in self.scene.cloths[0].pins.values() for v in name]
             held = state.positions.detach()[..., pinned, :]
@@ -134,6 +140,27 @@ def woven_sphere(n: int) -> Scene:
         bending_twill=0.98 * bending,
     )
     return sphere(n, woven)
+
+
+def gripper(n: int, **bounds: float) -> Scene:
+    """Let a hand down on a sheet that is held at two edges, while its drives close its fingers."""
+    vertices, faces = sheet(n)
+    edges = [*range(n), *range(n * (n - 1), n * n)]
+    hand = dc.Robot.load(
+        dc.robots.GRIPPER,
+        base="floating",
+        stiffness=200.0,
+        damping=5.0,
+        pose=[0.013, 0.007, 0.1, 0, 1, 0, 0],  # turned over: its fingers end 1 cm above the sheet
+        **bounds,
+    )
+    scene = dc.Scene([dc.Cloth(vertices, faces, pins={"edges": edges})], robots=[hand])
+    return Scene(scene, approach=12, joint_target=0.01)
+
+
+def limited_gripper(n: int) -> Scene:
+    """The same with friction, and drives at the limits of their efforts and speeds."""
+    return gripper(n, effort_limits=2.0, velocity_limits=0.05, joint_friction=0.2)
 
 
 def self_contact(n: int) -> Scene:
@@ -229,6 +256,8 @@ FURTHER: dict[str, Callable[[int], Scene]] = {
     "air": air,
     "woven-sphere": woven_sphere,
     "smooth-sphere": smooth_sphere,
+    "gripper": gripper,
+    "limited-gripper": limited_gripper,
 }
 
 BUCKLING: dict[str, Callable[[int], Scene]] = {

@@ -5,6 +5,7 @@
     python -m benchmarks.step --scene sphere --scene woven-sphere --size 24
     python -m benchmarks.step --quick                            # seconds
     python -m benchmarks.step --scene hanging --scene air        # what a potential costs
+    python -m benchmarks.step --scene gripper --scene limited-gripper
 
 Times are medians with quartiles, in milliseconds per environment, and medians in EF: one numeric
 factorization of the contact-free Hessian of the same state by `Eigen::SimplicialLDLT`, timed in
@@ -133,7 +134,7 @@ def batch_scaling(timings: list[Timing]) -> dict[str, dict[str, float]]:
 
 
 _HEAD = (
-    f"{'scene':<13}{'size':>6}{'batch':>6}{'threads':>8}  {'forward [ms]':>22}{'[EF]':>7}"
+    f"{'scene':<16}{'size':>6}{'batch':>6}{'threads':>8}  {'forward [ms]':>22}{'[EF]':>7}"
     f"  {'backward [ms]':>20}{'[EF]':>7}{'tangent':>9}{'x 8':>6}"
     f"  {'EF [ms]':>8}{'Newton':>8}{'residual':>10}{'contacts':>9}{'touching':>9}"
 )
@@ -141,7 +142,7 @@ _HEAD = (
 
 def _line(t: Timing) -> str:
     return (
-        f"{t.scene:<13}{t.size:>4}^2{t.batch or 1:>6}{t.threads:>8}  {_spread(t.forward):>22}"
+        f"{t.scene:<16}{t.size:>4}^2{t.batch or 1:>6}{t.threads:>8}  {_spread(t.forward):>22}"
         f"{t.forward_in_ef:>7.2f}  {_spread(t.backward):>20}{t.backward_in_ef:>7.2f}"
         f"{t.tangent:>9.2f}{t.many_tangents:>6.2f}"
         f"  {_number(t.reference.median):>8}{t.iterations:>8.1f}{t.residual:>10.1e}"
@@ -162,10 +163,10 @@ def _phase_table(timings: list[Timing]) -> str:
     """Medians of the phases of forward [ms]."""
     phases = list(timings[0].phases)
     lines = ["Phases of forward, medians [ms per environment]:"]
-    lines.append(f"{'scene':<13}{'size':>6}{'batch':>6}{'threads':>8}" + _cells(phases))
+    lines.append(f"{'scene':<16}{'size':>6}{'batch':>6}{'threads':>8}" + _cells(phases))
     for t in timings:
         cells = [_number(t.phases[phase]) for phase in phases]
-        lines.append(f"{t.scene:<13}{t.size:>4}^2{t.batch or 1:>6}{t.threads:>8}" + _cells(cells))
+        lines.append(f"{t.scene:<16}{t.size:>4}^2{t.batch or 1:>6}{t.threads:>8}" + _cells(cells))
     return "\n".join(lines)
 
 
@@ -180,12 +181,12 @@ def _print_summary(
         print("\nExponent of the time in the number of vertices:")
     for name, e in exponents.items():
         sizes = f"{e['from']}^2 to {e['to']}^2"
-        print(f"{name:<13} {sizes}: forward {e['forward']:.2f}, backward {e['backward']:.2f}")
+        print(f"{name:<16} {sizes}: forward {e['forward']:.2f}, backward {e['backward']:.2f}")
     if scaling:
         print("\nSpeed of a batch over threads, relative to one thread:")
     for name, s in scaling.items():
         print(
-            f"{name:<13} {s['threads']} threads: forward {s['forward']:.2f}, "
+            f"{name:<16} {s['threads']} threads: forward {s['forward']:.2f}, "
             f"backward {s['backward']:.2f}"
         )
 

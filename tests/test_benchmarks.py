@@ -17,7 +17,8 @@ import diffcloth_torch as dc
 
 ROOT = Path(__file__).resolve().parents[1]
 ORDINARY = 7
-SCENES = ORDINARY + 3  # one in air, one of woven cloth, one over a smooth ball
+# One in air, one of woven cloth, one over a smooth ball, two with a gripper.
+SCENES = ORDINARY + 5
 
 
 @pytest.fixture(autouse=True)

@@ -203,6 +203,7 @@ class RobotSection(Section):
     friction: ForAll | None = None
     thickness: ForAll | None = None
     edge_length: Positive | None = None
+    smooth: bool | dict[str, bool] = False
     ignore_contact: list[Names] = []
     trajectory: list[PoseKeyframe] = []
     joint_trajectories: dict[str, Annotated[list[JointKeyframe], Len(1)]] = {}

@@ -223,6 +223,7 @@ _ROBOT_OPTIONS = {
     "friction",
     "thickness",
     "edge_length",
+    "smooth",
     "ignore_contact",
     "name",
 }

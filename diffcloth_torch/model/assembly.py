@@ -172,7 +172,7 @@ def assemble(scene: Scene, *, all_nodal: bool = False) -> Assembly:
     links = [
         (len(scene.bodies) + r, link, surface)
         for r, robot in enumerate(scene.robots)
-        for link, surface in enumerate(robot.surfaces)
+        for link, surface in enumerate(robot.contact_surfaces)
         if surface is not None
     ]
     bodies_touch: list[_Surface] = [

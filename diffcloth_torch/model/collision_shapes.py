@@ -1,21 +1,29 @@
-"""Collision shapes of a robot's links as surfaces: boxes, cylinders, spheres and mesh files."""
+"""Collision shapes of a robot's links as surfaces: boxes, cylinders, spheres and mesh files.
+
+A sphere may touch as what it is. A surface is either that or triangles, so a sphere beside other
+shapes becomes a link of its own, welded to the one that has it.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from diffcloth_torch.checks import FloatArray, check_finite
+from diffcloth_torch.checks import FloatArray, check_bool, check_finite, frozen, texts
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry import shapes
 from diffcloth_torch.geometry.mesh_checks import Surface, surface_arrays
 from diffcloth_torch.geometry.meshes import read_mesh
-from diffcloth_torch.model.urdf import Link, Shape
+from diffcloth_torch.model.round_bodies import ContactSurface, Primitive, round_surface
+from diffcloth_torch.model.urdf import Joint, Link, RobotDescription, Shape
 
-__all__ = ["find_mesh", "link_surface"]
+__all__ = ["RoundLinks", "find_mesh", "link_surface", "with_round_links"]
 
 # An edge length that gives a box, cylinder or sphere more triangles is taken for a mistake.
 _MOST_FACES = 200_000
@@ -23,6 +31,128 @@ _MOST_FACES = 200_000
 _DEFAULT_SUBDIVISIONS = 3  # of a sphere, as for `RigidBody.sphere`
 
 _DETACHED = "pass a detached tensor"
+
+
+class RoundLinks(NamedTuple):
+    """A robot whose links are round or have triangles, not both.
+
+    Attributes:
+        description: The robot, with a link more for every sphere that has been taken out of one;
+            these come last.
+        skeletons: Name of a round link -> what it touches with, in its frame.
+        parts: Name of a link -> names of the links that have been taken out of it.
+    """
+
+    description: RobotDescription
+    skeletons: Mapping[str, ContactSurface]
+    parts: Mapping[str, tuple[str, ...]]
+
+    def with_parts(self, of_links: object) -> object:
+        """Give what a mapping says of a link to its parts, too, unless it names these."""
+        if not isinstance(of_links, Mapping):
+            return of_links
+        of_parts = {p: value for link, value in of_links.items() for p in self.parts.get(link, ())}
+        return of_parts | dict(of_links)
+
+    def pairs_with_parts(self, pairs: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+        """Pairs of links, and of their parts."""
+        return [
+            (p, q)
+            for a, b in pairs
+            for p in (a, *self.parts.get(a, ()))
+            for q in (b, *self.parts.get(b, ()))
+        ]
+
+
+def with_round_links(description: RobotDescription, smooth: object) -> RoundLinks:
+    """Make spheres of a robot round.
+
+    Args:
+        description: The robot.
+        smooth: Whether all spheres are, or name of a link -> whether those of the link are.
+
+    Raises:
+        InvalidInput: If there is no such link, or none of its shapes is a sphere.
+        TypeError: If `smooth` has a wrong type.
+    """
+    label = "Robot.load: `smooth`"
+    names = [link.name for link in description.links]
+    having = [link.name for link in description.links if any(map(_is_sphere, link.shapes))]
+    if isinstance(smooth, Mapping):
+        for name in smooth:
+            if name not in names:
+                raise InvalidInput(f"{label} has the names {texts(names)}; got {name!r}")
+        wanted = {name for name, value in smooth.items() if check_bool(f"{label}[{name!r}]", value)}
+        for name in sorted(wanted.difference(having)):
+            raise InvalidInput(
+                f"{label} is for links with a <sphere>, which are {texts(having)}; got True for "
+                f"{name!r}"
+            )
+    else:
+        wanted = set(having) if check_bool(label, smooth) else set()
+        if smooth and not having:
+            raise InvalidInput(f"{label} must be False where no link has a <sphere>, got True")
+    links: list[Link] = []
+    further: list[Link] = []
+    joints = list(description.joints)
+    skeletons: dict[str, ContactSurface] = {}
+    parts: dict[str, tuple[str, ...]] = {}
+    for link in description.links:
+        if link.name not in wanted:
+            links.append(link)
+            continue
+        spheres = [(k, shape) for k, shape in enumerate(link.shapes) if _is_sphere(shape)]
+        others = tuple(shape for shape in link.shapes if not _is_sphere(shape))
+        if not others:  # the link itself is its first one
+            skeletons[link.name] = _skeleton(spheres[0][1])
+            others = (spheres.pop(0)[1],)
+        links.append(replace(link, shapes=others))
+        for k, shape in spheres:
+            part = _part(link.name, k, shape)
+            skeletons[part.name] = _skeleton(shape)
+            joints.append(_weld(link.name, part.name))
+            further.append(part)
+            parts[link.name] = (*parts.get(link.name, ()), part.name)
+    whole = replace(description, links=(*links, *further), joints=tuple(joints))
+    return RoundLinks(whole, skeletons, parts)
+
+
+def _is_sphere(shape: Shape) -> bool:
+    return shape.kind == "sphere"
+
+
+def _skeleton(shape: Shape) -> ContactSurface:
+    vertices, faces, radius = round_surface(Primitive("sphere", (shape.size[0], 0.0, 0.0)))
+    return ContactSurface(frozen(_in_link(shape, vertices)), faces, radius)
+
+
+def _part(link: str, k: int, sphere: Shape) -> Link:
+    """A link for the sphere k of another one. No link of a file has a name with "/"."""
+    return Link(
+        name=f"{link}/{k}",
+        mass=0.0,
+        center=np.zeros(3),
+        inertia=np.zeros((3, 3)),
+        shapes=(sphere,),
+    )
+
+
+def _weld(parent: str, child: str) -> Joint:
+    return Joint(
+        name=child,
+        type="fixed",
+        parent=parent,
+        child=child,
+        frame=np.eye(4),
+        axis=np.zeros(3),
+        lower=-math.inf,
+        upper=math.inf,
+        viscosity=0.0,
+        effort=math.inf,
+        velocity=math.inf,
+        friction=0.0,
+        mimic=None,
+    )
 
 
 def link_surface(
@@ -62,8 +192,12 @@ def _placed(
             faces = faces[:, ::-1]
     else:
         vertices, faces = _generated(owner, shape, edge_length)
-    placed = vertices @ shape.frame[:3, :3].T + shape.frame[:3, 3]
+    placed = _in_link(shape, vertices)
     return Surface(*surface_arrays(owner, placed, faces, instead=_DETACHED))
+
+
+def _in_link(shape: Shape, vertices: FloatArray) -> FloatArray:
+    return vertices @ shape.frame[:3, :3].T + shape.frame[:3, 3]
 
 
 def _generated(owner: str, shape: Shape, edge_length: float | None) -> shapes.Mesh:

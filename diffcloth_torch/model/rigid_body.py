@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from diffcloth_torch.model.quantities import check_parameter
 from diffcloth_torch.model.round_bodies import (
     ContactSurface,
     Primitive,
-    round_mass,
+    round_solid,
     round_surface,
 )
 
@@ -48,6 +49,11 @@ _SMALLEST_VOLUME = 1e-14
 
 # Of a sphere that begins with 20 triangles.
 _MOST_SUBDIVISIONS = int(math.log(shapes.MOST_FACES / 20, 4))
+
+MassProperties = tuple[float, FloatArray, FloatArray]
+"""Volume, center and inertia for a density of one."""
+
+_MASS_PROPERTIES = ("density", "mass", "center", "inertia")
 
 _POSES = "differentiate with respect to State.body_poses or Control.body_poses"
 _MASS = "differentiate with respect to Parameters.body_mass"
@@ -144,7 +150,8 @@ class RigidBody:
         self.pose = frozen(pose_array("RigidBody: `pose`", pose, instead=_POSES))
         self.friction = check_parameter("RigidBody", "friction", friction)
         self.thickness = check_parameter("RigidBody", "thickness", thickness)
-        self._set_mass_properties(density=density, mass=mass, center=center, inertia=inertia)
+        given = {"density": density, "mass": mass, "center": center, "inertia": inertia}
+        self._set_mass_properties(given)
         self.name = check_name("RigidBody: `name`", name)
         self._set_primitive(None, nodal_contact)
 
@@ -177,11 +184,12 @@ class RigidBody:
                 "RigidBody: `smooth` is for spheres and capsules, got True for a "
                 f"{primitive.kind}, which is exact as a mesh"
             )
-        if is_smooth and keywords.get("motion") == "dynamic":
-            keywords = _with_round_mass(primitive, keywords)
         body = cls(*mesh, **keywords)
         body._set_primitive(primitive, nodal_contact)
         body.smooth = is_smooth
+        if is_smooth:
+            given = {field: keywords.get(field) for field in _MASS_PROPERTIES}
+            body._set_mass_properties(given, round_solid(primitive))
         if is_smooth and body.nodal_contact:
             raise InvalidInput(
                 "RigidBody: `smooth` must not be set with `nodal_contact`, which is with the "
@@ -197,9 +205,10 @@ class RigidBody:
         return round_surface(self.primitive)
 
     def _set_mass_properties(
-        self, *, density: object, mass: object, center: object, inertia: object
+        self, given: Mapping[str, object], solid: MassProperties | None = None
     ) -> None:
-        given = {"density": density, "mass": mass, "center": center, "inertia": inertia}
+        """Take what is given; the rest is that of a solid, by default of the filled mesh."""
+        density, mass, center, inertia = (given[field] for field in _MASS_PROPERTIES)
         if self.motion != "dynamic":
             for field, value in given.items():
                 if value is not None:
@@ -215,7 +224,7 @@ class RigidBody:
         # The mesh is asked only where it must be: it may be open.
         volume, middle, moments = 1.0, np.zeros(3), np.zeros((3, 3))
         if mass is None or center is None or inertia is None:
-            volume, middle, moments = self._filled_mesh()
+            volume, middle, moments = self._filled_mesh() if solid is None else solid
         if mass is None:
             rho = check_number("RigidBody: `density`", density, POSITIVE, instead=_MASS)
             self.mass = rho * volume
@@ -231,7 +240,7 @@ class RigidBody:
         self.center = frozen(middle)
         self.inertia = frozen(check_inertia("RigidBody: `inertia`", moments))
 
-    def _filled_mesh(self) -> tuple[float, FloatArray, FloatArray]:
+    def _filled_mesh(self) -> MassProperties:
         """Volume, center and inertia for a density of one, of a mesh that must be closed."""
         if not is_closed(self.faces):
             raise InvalidInput(
@@ -353,23 +362,3 @@ class RigidBody:
         name = "" if self.name is None else f"{self.name!r}, "
         smooth = ", smooth" if self.smooth else ""
         return f"RigidBody({name}{self.motion}, {len(self.faces)} faces{smooth})"
-
-
-def _with_round_mass(primitive: Primitive, keywords: dict[str, Any]) -> dict[str, Any]:
-    """Fill what is not given of the mass properties with those of the analytic body."""
-    density, mass = keywords.get("density"), keywords.get("mass")
-    if (density is None) == (mass is None):
-        return keywords  # refused later
-    volume, moments = round_mass(primitive)
-    if mass is None:
-        mass = volume * check_number("RigidBody: `density`", density, POSITIVE, instead=_MASS)
-    else:
-        mass = check_number("RigidBody: `mass`", mass, POSITIVE, instead=_MASS)
-    given = {name: value for name, value in keywords.items() if value is not None}
-    return {
-        "center": np.zeros(3),
-        "inertia": mass * moments,
-        **given,
-        "mass": mass,
-        "density": None,
-    }

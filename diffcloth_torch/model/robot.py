@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -36,10 +37,11 @@ from diffcloth_torch.model.chains import (
     link_surfaces,
     make_chain,
 )
-from diffcloth_torch.model.collision_shapes import link_surface
+from diffcloth_torch.model.collision_shapes import link_surface, with_round_links
 from diffcloth_torch.model.kinematics import link_frames, pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.robot_tree import JointBounds, joint_bounds, make_mechanism
+from diffcloth_torch.model.round_bodies import ContactSurface
 from diffcloth_torch.model.urdf import read_urdf
 
 __all__ = ["ACTUATIONS", "BASES", "Robot"]
@@ -66,6 +68,8 @@ class Robot:
     Attributes:
         mechanism: The tree of links and joints.
         surfaces: Collision surface of each of the L links in the link's frame, or None; length L.
+        skeletons: Name of a smooth link -> what it touches with in place of its surface, which only
+            shows it.
         pose: Initial pose of the root link [px, py, pz, qw, qx, qy, qz], shape [7].
         joint_positions: Initial joint positions [rad or m], shape [J].
         stiffness: Stiffness of the drives of "pd" joints [N m/rad or N/m], zero for other joints;
@@ -84,6 +88,8 @@ class Robot:
 
     mechanism: Mechanism
     surfaces: tuple[Surface | None, ...]
+    # A value of its own, for pickles that were made before links could be smooth.
+    skeletons: Mapping[str, ContactSurface] = MappingProxyType({})
     pose: FloatArray
     joint_positions: FloatArray
     stiffness: FloatArray
@@ -115,6 +121,7 @@ class Robot:
         friction: object = 0.4,
         thickness: object = 0.0,
         edge_length: float | None = None,
+        smooth: object = False,
         ignore_contact: Iterable[Sequence[str]] = (),
         name: str | None = None,
     ) -> Robot:
@@ -148,6 +155,10 @@ class Robot:
             thickness: Full thickness of these surfaces [m], >= 0; one value, or link -> value.
             edge_length: Longest edge of the surfaces of boxes, cylinders and spheres [m], > 0. With
                 None a box has 12 triangles, a sphere 1280 and a cylinder about 400.
+            smooth: Whether spheres themselves touch, instead of their triangles; True or False for
+                all, or link -> True or False. A sphere beside other shapes of its link becomes a
+                link "link/k" of its own, the k-th shape of the link counted from 0, which is welded
+                to it, comes after those of the file and has what mappings say of the link.
             ignore_contact: Pairs of names of links that do not collide with each other. Links
                 connected rigidly, or by a single moving joint, never collide.
             name: Name in the scene.
@@ -163,7 +174,10 @@ class Robot:
             edge_length = check_number(
                 "Robot.load: `edge_length`", edge_length, POSITIVE, instead="pass a plain number"
             )
-        description = read_urdf(file)
+        round_links = with_round_links(read_urdf(file), smooth)
+        description = round_links.description
+        names = [link.name for link in description.links]
+        pairs = check_pairs("Robot: `ignore_contact`", ignore_contact, names)
         moving = [joint for joint in description.joints if joint.moves]
         modes = _modes("Robot.load", actuation, [joint.name for joint in moving])
         mechanism = make_mechanism(file, description, base, modes)
@@ -174,6 +188,7 @@ class Robot:
             surfaces,
             np.array([joint.viscosity for joint in moving]),
             joint_bounds(description.joints),
+            skeletons=round_links.skeletons,
             pose=pose,
             joint_positions=joint_positions,
             stiffness=stiffness,
@@ -181,9 +196,9 @@ class Robot:
             effort_limits=effort_limits,
             velocity_limits=velocity_limits,
             joint_friction=joint_friction,
-            friction=friction,
-            thickness=thickness,
-            ignore_contact=ignore_contact,
+            friction=round_links.with_parts(friction),
+            thickness=round_links.with_parts(thickness),
+            ignore_contact=round_links.pairs_with_parts(pairs),
             name=name,
         )
 
@@ -248,6 +263,7 @@ class Robot:
         viscosity: FloatArray,
         bounds: JointBounds,
         *,
+        skeletons: Mapping[str, ContactSurface] | None = None,
         pose: object = None,
         joint_positions: object = None,
         stiffness: object = None,
@@ -262,6 +278,7 @@ class Robot:
     ) -> None:
         self.mechanism = mechanism
         self.surfaces = tuple(surfaces)
+        self.skeletons = dict(skeletons or {})
         self.viscosity = frozen(viscosity)
         self.pose = frozen(pose_array("Robot: `pose`", pose, instead=_POSE))
         joints, links = self.joint_names, self.link_names
@@ -288,6 +305,16 @@ class Robot:
     def link_names(self) -> tuple[str, ...]:
         """Names of the L links, in the order of the file."""
         return self.mechanism.link_names
+
+    @property
+    def contact_surfaces(self) -> tuple[ContactSurface | None, ...]:
+        """What each link touches with: its mesh, or the skeleton of a smooth one; or None."""
+        return tuple(
+            None
+            if mesh is None
+            else self.skeletons.get(name, ContactSurface(mesh.vertices, mesh.faces, 0.0))
+            for name, mesh in zip(self.link_names, self.surfaces, strict=True)
+        )
 
     @property
     def chain(self) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 
 from diffcloth_torch.checks import FloatArray, IndexArray, frozen
 
-__all__ = ["ContactSurface", "Primitive", "round_mass", "round_surface"]
+__all__ = ["ContactSurface", "Primitive", "round_solid", "round_surface"]
 
 
 class Primitive(NamedTuple):
@@ -54,8 +54,8 @@ def round_surface(primitive: Primitive) -> ContactSurface:
     return ContactSurface(frozen(vertices), np.array([face], dtype=np.int32), r)
 
 
-def round_mass(primitive: Primitive) -> tuple[float, FloatArray]:
-    """Volume [m^3] of a sphere or a capsule, and its inertia per mass about the origin [m^2]."""
+def round_solid(primitive: Primitive) -> tuple[float, FloatArray, FloatArray]:
+    """Volume, center and inertia of a sphere or a capsule for a density of one."""
     r, half, _ = primitive.size
     ball = 4.0 / 3.0 * math.pi * r**3
     tube = math.pi * r**2 * 2.0 * half
@@ -65,4 +65,5 @@ def round_mass(primitive: Primitive) -> tuple[float, FloatArray]:
     across = share * (r**2 / 4 + half**2 / 3) + (1 - share) * (
         2 / 5 * r**2 + half**2 + 3 / 4 * r * half
     )
-    return ball + tube, np.diag([across, across, along])
+    volume = ball + tube
+    return volume, np.zeros(3), volume * np.diag([across, across, along])

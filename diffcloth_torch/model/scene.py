@@ -135,9 +135,9 @@ class Scene:
         return (*self.cloth_names, *self.body_names, *links)
 
     def _attached(self) -> dict[str, AttachedSurface]:
-        shaped = [s for robot in self.robots for s in robot.surfaces if s is not None]
+        shaped = [s for robot in self.robots for s in robot.contact_surfaces if s is not None]
         vertices = [cloth.vertices for cloth in self.cloths]
-        # Of a smooth body, the points that say where it is in the core.
+        # Of a smooth one, the points that say where it is in the core.
         vertices += [body.contact_surface.vertices for body in self.bodies]
         vertices += [s.vertices for s in shaped]
         return surfaces_of(self.surface_names, vertices, len(self.cloths))

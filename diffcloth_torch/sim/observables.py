@@ -146,7 +146,7 @@ class Observables:
 
         Returns:
             Accepted iterates, shape [M, N + V, 3] [m]: cloth vertices, then body vertices; of
-            smooth bodies the ends of their skeletons, and what says how they turn.
+            smooth bodies and links the ends of their skeletons, and what says how they turn.
         """
         with torch.no_grad():
             given, batch = self._border.enter(state, control, parameters)

@@ -32,8 +32,8 @@ class Report:
             Dynamics, the largest change of velocity by the residual force. The largest of them if
             there are several solves.
         minimum_distance: Smallest distance between mid-surfaces in contact [m], of smooth bodies
-            between the round surfaces, always above half the sum of their thicknesses; infinite if
-            nothing is within the barrier's reach.
+            and links between the round surfaces, always above half the sum of their thicknesses;
+            infinite if nothing is within the barrier's reach.
         contact_count: Contacts within the barrier distance: pairs of primitives between cloths;
             between a cloth and a body, features that are not hidden behind nearer ones; in
             "projective", vertices that stick or slip.

@@ -44,7 +44,7 @@ class State:
         velocities: Velocities of the cloth vertices [m/s], shape [N, 3].
         body_poses: [px, py, pz, qw, qx, qy, qz] of each body, shape [K, 7].
         soft_pin_targets: Where the soft pins pull [m], shape [Q, 3].
-        body_forces: Forces of contact and attachments on the body vertices, of smooth bodies on
+        body_forces: Forces of contact and attachments on the body vertices, of smooth ones on
             four points that move with them, during the step that led here [N], shape [V, 3].
         time: Time since the initial state [s], shape [].
         report: Report of the step that led here; None in an initial state.

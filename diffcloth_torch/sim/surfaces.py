@@ -98,8 +98,9 @@ class Surfaces:
         body_vertices: Vertices of each body in its frame [m], shape [v, 3].
         body_faces: Faces of each body, as indices into its own vertices, shape [g, 3].
         robots: The surfaces of each robot.
-        body_points: What forces act on: `body_vertices`, but of smooth bodies the vertices of their
-            skeletons; None for those of earlier versions, which have no smooth bodies.
+        body_points: What forces act on, of bodies, then of links with a shape: their vertices, but
+            of smooth ones those of their skeletons. Those of earlier versions have None, or only
+            those of bodies, as nothing else was smooth.
     """
 
     cloth_names: list[str]
@@ -126,9 +127,7 @@ class Surfaces:
             ),
             body_points=[
                 torch.from_numpy(np.array(assembly.body_vertices[first:last]))
-                for first, last in pairwise(
-                    assembly.body_vertex_start[: assembly.body_count + 1].tolist()
-                )
+                for first, last in pairwise(assembly.body_vertex_start.tolist())
             ],
         )
 
@@ -165,7 +164,7 @@ class Surfaces:
         """What forces act on of each body, then of each link with a shape, in their frames."""
         points = {name: vertices for name, (vertices, _) in self.rigid_meshes().items()}
         if self.body_points is not None:
-            points |= dict(zip(self.body_names, self.body_points, strict=True))
+            points |= dict(zip(points, self.body_points, strict=False))
         return points
 
     def surface_frames(self, state: Mapping[str, Tensor]) -> Tensor:

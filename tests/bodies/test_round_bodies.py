@@ -534,6 +534,50 @@ def test_a_loss_has_no_facets():
     assert rough[0] < 0.3 * rough[1], rough
 
 
+def thrown(kind, radius, thickness):
+    """A body thrown onto a sheet, whose mass does not know its radius: a loss, and its gradient."""
+    moments = 1e-3 * np.eye(3)
+    keywords = {"motion": "dynamic", "mass": 0.2, "center": [0, 0, 0], "inertia": moments}
+    keywords |= {"smooth": True, "thickness": thickness, "friction": 0.5}
+    keywords |= {"pose": [0.02, 0.01, 0.085, 0.9, 0.3, 0.2, 0.1]}
+    if kind == "sphere":
+        body = dc.RigidBody.sphere(radius, **keywords)
+    else:
+        body = dc.RigidBody.capsule(radius, 0.06, **keywords)
+    edges = [i for i in range(64) if i % 8 in (0, 7)]
+    material = dc.Material(stretch=100.0, friction=0.5)
+    cloth = dc.Cloth.grid(8, 8, size=0.3, pins={"edges": edges}, material=material)
+    contact = dc.ContactOptions(barrier_distance=5e-3, barrier_stiffness=300.0, slip_velocity=0.02)
+    solver = dc.SolverOptions(tolerance=1e-12, max_iterations=1000)
+    sim = dc.Simulator(dc.Scene([cloth], [body]), 0.005, contact=contact, solver=solver)
+    start = sim.initial_state()
+    speed = torch.tensor([[0.2, 0.1, -1.0, 1.0, 2.0, 3.0]], dtype=F64)
+    state = start.replace(body_velocities=speed)
+    parameters = sim.parameters()
+    given = parameters.thickness.clone().requires_grad_()
+    for _ in range(8):
+        state = sim.step(state, parameters=parameters.replace(thickness=given))
+    assert state.report.contact_count > 3
+    generator = torch.Generator().manual_seed(3)
+    weights = torch.randn(state.positions.shape, dtype=F64, generator=generator)
+    loss = (state.positions * weights).sum() + state.body_poses.cos().sum()
+    (gradient,) = torch.autograd.grad(loss, given)
+    return state.detach(), float(loss.detach()), float(gradient[1])
+
+
+@pytest.mark.parametrize("kind", ["sphere", "capsule"])
+def test_thickness_of_a_body_on_cloth_is_radius(kind):
+    """So that twice the gradient by thickness is that by the radius."""
+    whole, _, gradient = thrown(kind, 0.05, 2e-3)
+    part, _, same = thrown(kind, 0.045, 12e-3)
+    for field in ("positions", "body_poses", "body_velocities", "contact_forces"):
+        torch.testing.assert_close(getattr(whole, field), getattr(part, field), rtol=0, atol=1e-12)
+    assert same == pytest.approx(gradient, rel=1e-9)
+    h = 1e-5
+    found = (thrown(kind, 0.05 + h, 2e-3)[1] - thrown(kind, 0.05 - h, 2e-3)[1]) / (2 * h)
+    assert 2 * gradient == pytest.approx(found, rel=1e-4)
+
+
 @pytest.mark.parametrize("threads", [1, 3])
 def test_bits_do_not_depend_on_threads_or_batches(in_contact, threads):
     sim, state = in_contact

@@ -7,6 +7,7 @@ start, and what falls, is thrown or is driven meets in a few steps.
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ MODES = ("pd", "position", "velocity", "torque")
 BASES = ("fixed", "kinematic", "floating")
 OPENING = (1e-3, 0.0385)  # of the gripper's fingers, within their limits [m]
 GRIPPER_MASS = 0.46  # [kg]
+ROUND_GRIPPER = Path(__file__).resolve().parents[1] / "data" / "round_gripper.urdf"
 
 
 class Tower:
@@ -200,7 +202,10 @@ def _prescribed(
 def _gripper(
     rng: np.random.Generator, d: dict[str, Any], tower: Tower, kinds: list[str]
 ) -> tuple[list[dc.Robot], Drives, list[dc.RigidBody]]:
-    """The package's gripper, turned any way, and now and then a body between its fingers."""
+    """The package's gripper, turned any way, and now and then a body between its fingers.
+
+    In half of the scenes round tips are added to its fingers.
+    """
     base = str(rng.choice(BASES))
     modes = [str(mode) for mode in rng.choice(MODES, 2)]
     hold = rng.random() < 0.5
@@ -221,7 +226,10 @@ def _gripper(
     }
     bounds = _bounds(*rng.spawn(1))  # other draws stay what they are
     options |= bounds
-    hand = dc.Robot.load(dc.robots.GRIPPER, pose=[0.0, 0.0, 0.0, *q], **options)
+    file, round_tips = dc.robots.GRIPPER, bool(q[2] > 0)
+    if round_tips:
+        file, options["smooth"] = ROUND_GRIPPER, True
+    hand = dc.Robot.load(file, pose=[0.0, 0.0, 0.0, *q], **options)
     frames = hand.forward_kinematics(torch.from_numpy(start)).values()
     vertices = np.concatenate(
         [
@@ -231,8 +239,8 @@ def _gripper(
     )
     shift = 0.1 * d["size"] * rng.uniform(-1, 1, 2)
     at = np.array([*shift, tower.place(rng, vertices, side)])
-    d["robot"] = {"base": base, "actuation": modes, "holds": hold, **bounds}
-    hand = dc.Robot.load(dc.robots.GRIPPER, pose=[*at, *q], **options)
+    d["robot"] = {"base": base, "actuation": modes, "holds": hold, "round": round_tips, **bounds}
+    hand = dc.Robot.load(file, pose=[*at, *q], **options)
     held = []
     if hold:
         # Its half diagonal is below the half opening of the fingers.

@@ -642,8 +642,9 @@ def test_the_extra_is_named_where_the_panda_is_missing(monkeypatch):
         dc.robots.panda()
 
 
-def test_the_examples_of_the_docs_run():
+def test_the_examples_of_the_docs_run(tmp_path, monkeypatch):
     panda()
+    monkeypatch.chdir(tmp_path)
     page = (ROOT / "docs" / "robots.md").read_text()
     names = {}
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):

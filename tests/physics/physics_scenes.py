@@ -141,19 +141,23 @@ class Judge:
         return np.concatenate(parts)
 
     def placed(self, path):
-        """Vertices of meshes on a path of the solver, which has four points of smooth bodies."""
+        """Vertices of meshes on a path of the solver, which has four points of what is smooth."""
         scene, first = self._sim.scene, sum(len(cloth.vertices) for cloth in self._sim.scene.cloths)
+        rigid = [(body.vertices, body.contact_surface) for body in scene.bodies]
+        for robot in scene.robots:
+            links = zip(robot.surfaces, robot.contact_surfaces, strict=True)
+            rigid += [(mesh.vertices, touching) for mesh, touching in links if mesh is not None]
         parts = [path[:, :first]]
-        for body in scene.bodies:
-            frame = body.contact_surface.vertices
+        for vertices, (frame, _, radius) in rigid:
             own = path[:, first : first + len(frame)]
             first += len(frame)
-            if body.smooth:
+            if radius > 0:
                 edges = (frame[1:] - frame[0]).T
-                shares = np.linalg.solve(edges, (body.vertices - frame[0]).T)
+                shares = np.linalg.solve(edges, (vertices - frame[0]).T)
                 own = own[:, :1] + np.einsum("ev,kei->kvi", shares, own[:, 1:] - own[:, :1])
             parts.append(own)
-        return np.concatenate([*parts, path[:, first:]], axis=1)
+        assert first == path.shape[1]
+        return np.concatenate(parts, axis=1)
 
     def is_free(self, state):
         return not self._ipctk.has_intersections(self.mesh, self.points(state))
