@@ -107,6 +107,11 @@ __all__ = [
     "where",
 ]
 
+# `import *` reads all of these, and must not fail for want of an extra.
+if find_spec("gymnasium") is None:
+    __all__.remove("envs")
+    __all__.remove("learn")
+
 
 # Imported on first use: torch takes seconds to import, which `diffcloth --help` need not wait for.
 _HOMES = {

@@ -42,6 +42,8 @@ html_theme = "furo"
 html_title = "diffcloth_torch"
 html_show_sphinx = False
 html_copy_source = False
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
@@ -121,6 +123,7 @@ CONTENTS = {
 PICTURE_OF_A_COMMAND = re.compile(
     r"^    diffcloth \w+ configs/(\w+)\.yaml\n\n!\[.*\]\(.*\)$", re.MULTILINE
 )
+PICTURE = re.compile(r"^!\[.*\]\(images/(.*)\)$", re.MULTILINE)
 CARD = """\
 :::{{grid-item-card}} {caption}
 :link: {page}
@@ -128,6 +131,7 @@ CARD = """\
 {text}
 :::
 """
+LANGUAGE = "\nlanguage_info: {name: python, pygments_lexer: ipython3}"
 DOWNLOAD = "{{nb-download}}`This page as a notebook <{page}.ipynb>`\n\n"
 NOT_EXECUTED = """\
 :::{note}
@@ -157,6 +161,8 @@ def add_contents(app, name, source):
         source[0] = f"{head}\n::::{{grid}} 1 2 3 4\n{cards}::::\n{heading}{body}{contents}"
     elif source[0].startswith("---\nfile_format: mystnb"):
         head, title, text = re.split(r"^(# .+\n)", source[0], maxsplit=1, flags=re.MULTILINE)
+        # A kernel tells the language of its cells; where none runs, nothing else does.
+        head = head.replace("\nkernelspec:", LANGUAGE + "\nkernelspec:")
         page = name.rpartition("/")[2]
         note = "" if app.config.nb_execution_mode == "force" else NOT_EXECUTED
         # Examples run a program of the repository, which is not where a notebook goes.
@@ -164,6 +170,8 @@ def add_contents(app, name, source):
         source[0] = f"{head}{title}\n{link}{note}{text}"
     elif name == "docs/gallery":
         source[0] = PICTURE_OF_A_COMMAND.sub(with_replay, source[0])
+        # On a telephone the words in a picture are too small to read.
+        source[0] = PICTURE.sub(r'<a href="../_images/\1">\g<0></a>', source[0])
 
 
 def with_replay(found):

@@ -139,6 +139,22 @@ def test_importing_the_package_warns_of_nothing():
     assert result.stderr == ""
 
 
+def test_everything_is_imported_without_the_extras():
+    code = """
+import sys
+sys.modules["gymnasium"] = None  # as if it were not installed
+from diffcloth_torch import *
+print(sorted({"Cloth", "envs", "learn", "robots"} & set(globals())))
+try:
+    import diffcloth_torch.envs
+except ImportError as error:
+    print(error)
+"""
+    first, last = printed(code).splitlines()
+    assert first == "['Cloth', 'robots']"
+    assert last == "environments need gymnasium: run  pip install 'diffcloth-torch[envs]'"
+
+
 @pytest.mark.parametrize("module", ["matplotlib", "pytorch_kinematics", "pyvista", "trimesh"])
 def test_importing_the_package_leaves_out(module):
     code = f"import sys; from diffcloth_torch import *; print({module!r} in sys.modules)"

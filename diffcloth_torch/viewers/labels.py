@@ -102,17 +102,24 @@ def _break(
 
 
 def overview(images: Sequence[Image], entries: Sequence[Entry]) -> Image:
-    """Arrange pictures of one size in rows, and the legend in all cells that are left.
+    """Arrange pictures of one size in rows, and the legend in the cells that are left.
 
-    No cell is blank: without a legend, a last row that is not full is in the middle.
+    No cell is blank: where the legend would take several and the pictures alone fill all rows, it
+    is a strip below them; without a legend, a last row that is not full is in the middle.
     """
     height, width = images[0].shape[:2]
     columns, rows = _grid(len(images), bool(entries))
-    whole = np.full((_length(rows, height), _length(columns, width), 3), 255, dtype=np.uint8)
+    strip = None
+    if entries and columns * rows > len(images) + 1:
+        alone = _grid(len(images), legend=False)
+        if alone[0] * alone[1] == len(images):
+            columns, rows = alone
+            strip = legend_strip((_length(columns, width), height), entries)
     left = columns * rows - len(images)
     cells: list[Image] = list(images)
-    if entries:
+    if entries and left:
         cells.append(_legend_cell(height, _length(left, width), entries))
+    whole = np.full((_length(rows, height), _length(columns, width), 3), 255, dtype=np.uint8)
     last = (rows - 1) * columns
     indent = 0 if entries else left * (width + _MARGIN) // 2
     for k, image in enumerate(cells):
@@ -120,7 +127,7 @@ def overview(images: Sequence[Image], entries: Sequence[Entry]) -> Image:
         y = row * (height + _MARGIN)
         x = column * (width + _MARGIN) + (indent if k >= last else 0)
         whole[y : y + height, x : x + image.shape[1]] = image
-    return whole
+    return whole if strip is None else np.concatenate([whole, strip])
 
 
 def _length(count: int, size: int) -> int:
