@@ -127,7 +127,7 @@ void ContactPotential::add_hessian(const double* x,
                                    Curvature curvature,
                                    linalg::BlockMatrix& A) const {
   for (const Contact& k : contacts()) {
-    A.add_stencil(k.pair.vertices, model_.hessian(k, x, curvature));
+    model_.hessian(k, x, curvature).add_to(A, k.pair.vertices);
   }
 }
 

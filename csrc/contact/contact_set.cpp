@@ -415,6 +415,23 @@ Mat3 ContactHessian::operator()(int p, int q) const {
   return h;
 }
 
+void ContactHessian::add_to(linalg::BlockMatrix& A, const std::array<Index, 4>& points) const {
+  if (A.any_attached(points)) {
+    A.add_stencil(points, *this);
+    return;
+  }
+  linalg::StencilTerms of;
+  of.terms = count_;
+  for (int k = 0; k < count_; ++k) {
+    of.left[k] = left_[k].data();
+    of.right[k] = right_[k].data();
+  }
+  of.along = along_;
+  of.c = c_.data();
+  if (rest_) of.rest = rest_->data();
+  A.add_terms(points, of);
+}
+
 Mat12 ContactHessian::dense() const {
   Mat12 h;
   for (int p = 0; p < 4; ++p) {

@@ -87,6 +87,9 @@ class ContactHessian {
   Mat3 operator()(int p, int q) const;
   Vec12 operator*(const Vec12& z) const;
 
+  /// Add it to a matrix.
+  void add_to(linalg::BlockMatrix& A, const std::array<Index, 4>& points) const;
+
   /// What products along several directions are made of; of this Hessian.
   ContactProduct factors(const std::array<Index, 4>& points) const;
 

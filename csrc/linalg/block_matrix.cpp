@@ -70,6 +70,19 @@ BlockMatrix::BlockMatrix(std::shared_ptr<const MergedPattern> merged,
                          const Attachments* attachments)
     : BlockValues(std::move(merged)), fixed_(&fixed), attachments_(attachments) {}
 
+void BlockMatrix::add_terms(std::span<const Index> points, const StencilTerms& of) {
+  static const AddStencil add = stencil_kernel(best_level());
+  std::array<Index, kStencilPoints> rows;
+  bool any = false;
+  for (std::size_t p = 0; p < points.size(); ++p) {
+    rows[p] = has(points[p]) ? points[p] : -1;
+    any = any || rows[p] >= 0;
+  }
+  if (!any) return;
+  add(of, rows.data(), merged_->pattern.column_start().data(), merged_->pattern.row().data(),
+      blocks_.data());
+}
+
 void BlockMatrix::add_attached(const std::array<Index, 4>& points, const Mat12& h) {
   motions_.clear();
   const auto find = [&](Index r) -> Motion& {

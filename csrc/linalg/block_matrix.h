@@ -10,6 +10,7 @@
 #include "common/recycled_memory.h"
 #include "linalg/attachments.h"
 #include "linalg/block_pattern.h"
+#include "linalg/stencil_kernels.h"
 
 namespace diffcloth::linalg {
 
@@ -108,6 +109,9 @@ class BlockMatrix : public BlockValues {
       }
     }
   }
+
+  /// The same of a matrix by what it is made of.
+  void add_terms(std::span<const Index> points, const StencilTerms& of);
 
   /// Add the 12x12 matrix of four points, some of which may be attached.
   template <class Block>

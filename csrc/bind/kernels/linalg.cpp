@@ -16,6 +16,7 @@
 #include "linalg/block_matrix.h"
 #include "linalg/cholesky.h"
 #include "linalg/conjugate_gradient.h"
+#include "linalg/stencil_kernels.h"
 
 namespace diffcloth::bind {
 namespace {
@@ -203,6 +204,40 @@ class Factor {
   linalg::CholeskyFactor factor_;
 };
 
+/// Lower blocks of a matrix that couples all vertices, after a stencil has been added to zero.
+std::vector<double> stencil_blocks(const std::string& level,
+                                   Index vertex_count,
+                                   const std::vector<Index>& row,
+                                   const std::vector<std::vector<double>>& left,
+                                   const std::vector<std::vector<double>>& right,
+                                   const std::vector<double>& core,
+                                   double along,
+                                   const std::vector<double>& c,
+                                   const std::vector<double>& rest,
+                                   const std::vector<double>& turn,
+                                   const std::vector<std::vector<double>>& sign) {
+  linalg::StencilTerms of;
+  of.count = static_cast<int>(row.size());
+  of.terms = static_cast<int>(left.size());
+  for (std::size_t k = 0; k < left.size(); ++k) of.left[k] = left[k].data();
+  for (std::size_t k = 0; k < right.size(); ++k) of.right[k] = right[k].data();
+  if (!core.empty()) of.core = core.data();
+  of.along = along;
+  of.c = c.data();
+  if (!rest.empty()) of.rest = rest.data();
+  if (!turn.empty()) of.turn = turn.data();
+  for (std::size_t e = 0; e < sign.size(); ++e) std::ranges::copy(sign[e], of.sign[e]);
+  std::vector<std::pair<Index, Index>> pairs;
+  for (Index i = 0; i < vertex_count; ++i) {
+    for (Index j = 0; j <= i; ++j) pairs.emplace_back(i, j);
+  }
+  const auto pattern = linalg::BlockPattern::from_pairs(vertex_count, std::move(pairs));
+  std::vector<double> blocks(9 * static_cast<std::size_t>(pattern.block_count()), 0.0);
+  linalg::stencil_kernel(level_named(level))(of, row.data(), pattern.column_start().data(),
+                                             pattern.row().data(), blocks.data());
+  return blocks;
+}
+
 }  // namespace
 
 linalg::KernelLevel level_named(const std::string& name) {
@@ -224,6 +259,8 @@ void linalg_kernels(nb::module_& m) {
     for (const linalg::KernelLevel l : supported_levels()) names.emplace_back(linalg::name(l));
     return names;
   });
+  m.def("stencil_blocks", &stencil_blocks, "level"_a, "vertex_count"_a, "row"_a, "left"_a,
+        "right"_a, "core"_a, "along"_a, "c"_a, "rest"_a, "turn"_a, "sign"_a);
   nb::class_<linalg::CholeskyWorkspace>(m, "CholeskyWorkspace")
       .def(nb::init<int>(), "threads"_a = 1)
       .def("bytes", &linalg::CholeskyWorkspace::bytes);

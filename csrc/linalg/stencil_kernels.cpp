@@ -1,0 +1,18 @@
+#include "linalg/stencil_kernels.h"
+
+namespace diffcloth::linalg {
+
+extern const AddStencil kPortableStencil;
+#ifdef DIFFCLOTH_X86_KERNELS
+extern const AddStencil kAvx2Stencil;
+#endif
+
+AddStencil stencil_kernel(KernelLevel level) {
+  check_supported(level);
+#ifdef DIFFCLOTH_X86_KERNELS
+  if (level != KernelLevel::kPortable) return kAvx2Stencil;
+#endif
+  return kPortableStencil;
+}
+
+}  // namespace diffcloth::linalg
