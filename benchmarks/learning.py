@@ -88,9 +88,9 @@ def main(
 
     `plan` is no policy: it optimizes the actions of one episode, whose return it is. `planned` is
     APG whose policy is a plan, a linear function of what it sees, and a network; `apg` has the
-    network alone. `scripted` is the policy made by hand. FoldCloth has two more: `hard`, a plan with hard grasps, and
-    `feedback`, APG with gradients through what it sees. A file keeps what was run, and a run that
-    it has is not made again.
+    network alone. `scripted` is the policy made by hand. FoldCloth has two more: `hard`, a plan
+    with hard grasps, and `feedback`, APG with gradients through what it sees. A file keeps what was
+    run, and a run that it has is not made again.
 
     Prints the median over seeds of the best mean return, how many environment steps and seconds
     of one core each needed to reach the best that PPO reached, and the share of successes at the
