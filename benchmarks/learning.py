@@ -38,19 +38,22 @@ class Job:
 
 
 JOBS = {
-    "FoldCloth": Job("configs/train_fold.yaml", 8, 1400, 2500),
+    # An odd size: a row of vertices lies where the fold shall be, or nobody succeeds.
+    "FoldCloth": Job("configs/train_fold.yaml", 9, 1400, 2500),
     "PushCube": Job("configs/train_push.yaml", 8, 640, 1600),
     "LiftCloth": Job("configs/train_lift.yaml", 6, 600, 1500),
 }
-FIRST_ORDER, FREE = ("apg", "shac", "sapo"), ("ppo", "sac")
+FIRST_ORDER, FREE = ("planned", "apg", "shac", "sapo"), ("ppo", "sac")
 ALGORITHMS = ("scripted", "plan", *FIRST_ORDER, *FREE)
 # Of FoldCloth alone: a plan with hard grasps, and APG with gradients through what it sees.
 VARIANTS = ("hard", "feedback")
 # Of all tasks: APG takes whole episodes, the others halves, whose ends critics value.
 COMMON: dict[str, Any] = {"betas": (0.9, 0.99), "deviation": 0.05, "target_entropy": -2.0}
-APG = {"discount": 1.0, "actor_rate": 4e-3}
+APG: dict[str, Any] = {"discount": 1.0, "actor_rate": 4e-3}
+PLANNED: dict[str, Any] = APG | {"plan_knots": 12, "plan_rate": 0.03, "actor_rate": 6e-4}
 WITH_CRITIC = {"discount": 0.99, "actor_rate": 2e-3}
 NUM_ENVS, FREE_ENVS = 2, 4
+LABELS = {"plan": "plan", "planned": "APG, planned"}
 KNOTS, PLAN_RATE = 10, 0.02  # of a plan: actions that last a tenth of an episode
 EPISODES = 4  # of an evaluation
 
@@ -83,10 +86,11 @@ def main(
 ) -> None:
     """Train with each algorithm and seed, and evaluate without noise on the way.
 
-    `plan` is no policy: it optimizes the actions of one episode, whose return it is. `scripted` is
-    the policy made by hand. FoldCloth has two more: `hard`, a plan with hard grasps, and
-    `feedback`, APG with gradients through what it sees. A file keeps what was run, and a run that
-    it has is not made again.
+    `plan` is no policy: it optimizes the actions of one episode, whose return it is. `planned` is
+    APG whose policy is a plan, a linear function of what it sees, and a network; `apg` has the
+    network alone. `scripted` is the policy made by hand. FoldCloth has two more: `hard`, a plan
+    with hard grasps, and `feedback`, APG with gradients through what it sees. A file keeps what was
+    run, and a run that it has is not made again.
 
     Prints the median over seeds of the best mean return, how many environment steps and seconds
     of one core each needed to reach the best that PPO reached, and the share of successes at the
@@ -161,7 +165,8 @@ def _run(work: tuple[str, str, int, float, int]) -> dict[str, Any]:
     make = partial(envs.make, task, **given)
     first = document["trainer"].get("first_action")
     steps = round(share * (job.free_steps if algorithm in FREE else job.steps))
-    every = steps / (evaluations - 1)
+    # More of them at first, where much changes; none after the last.
+    due = [steps * (k / (evaluations - 1)) ** 2 for k in range(evaluations)] + [math.inf]
     if algorithm == "scripted":
         curve = _scripted(make)
     elif algorithm == "plan":
@@ -170,9 +175,9 @@ def _run(work: tuple[str, str, int, float, int]) -> dict[str, Any]:
         hard = {n: v for n, v in given.items() if n not in ("opens_at", "reach")}
         curve = _plan(partial(envs.make, task, **hard), first, seed, steps)
     elif algorithm in FREE:
-        curve = _free(make, algorithm, seed, steps, every, first)
+        curve = _free(make, algorithm, seed, steps, due, first)
     else:
-        curve = _first_order(make, algorithm, seed, steps, every, first)
+        curve = _first_order(make, algorithm, seed, steps, due, first)
     return {"task": task, "algorithm": algorithm, "seed": seed, "curve": curve}
 
 
@@ -196,7 +201,7 @@ def _first_order(
     algorithm: str,
     seed: int,
     steps: int,
-    every: float,
+    due: Sequence[float],
     first: Sequence[float] | None,
 ) -> list[dict[str, float]]:
     """A policy by gradients, of which the learning rate falls to half."""
@@ -211,14 +216,14 @@ def _first_order(
         first_action=None if first is None else tuple(first),
         seed=seed,
         **COMMON,
-        **(WITH_CRITIC if has_critic else APG),
+        **(WITH_CRITIC if has_critic else PLANNED if algorithm == "planned" else APG),
     )
     trainer = Trainer(make, options, num_envs=NUM_ENVS)
     curve = _Curve(make, trainer.act)
     curve.add(0)
     while trainer.steps < steps:
         trainer.update()
-        if trainer.steps >= every * len(curve.points):
+        if trainer.steps >= due[len(curve.points)]:
             curve.add(trainer.steps)
     return curve.points
 
@@ -287,7 +292,7 @@ def _free(
     algorithm: str,
     seed: int,
     steps: int,
-    every: float,
+    due: Sequence[float],
     first: Sequence[float] | None,
 ) -> list[dict[str, float]]:
     """PPO or SAC from the same first action.
@@ -326,7 +331,7 @@ def _free(
 
     class Evaluate(BaseCallback):  # type: ignore[misc]
         def _on_step(self) -> bool:
-            if self.num_timesteps >= every * len(curve.points):
+            if self.num_timesteps >= due[len(curve.points)]:
                 curve.add(self.num_timesteps)
             return True
 
@@ -370,7 +375,7 @@ def _draw_task(axis: Any, key: str, runs: Sequence[dict[str, Any]]) -> None:
         returns = np.array(
             [np.interp(at, [p[key] for p in c], [p["return"] for p in c]) for c in curves]
         )
-        label = "plan" if algorithm == "plan" else algorithm.upper()
+        label = LABELS.get(algorithm, algorithm.upper())
         axis.plot(at, np.median(returns, axis=0), color=f"C{k}", label=label)
         axis.fill_between(at, returns.min(0), returns.max(0), color=f"C{k}", alpha=0.15)
 

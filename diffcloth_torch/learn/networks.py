@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-__all__ = ["Actor", "Critics", "Scale"]
+__all__ = ["Actor", "Critics", "Plan", "Scale"]
 
 _LIMIT = 5.0  # of a scaled observation
 _QUIET = 0.01  # share of the weights of a last layer that is left at first
@@ -36,10 +36,36 @@ def _quieten(layers: nn.Module) -> Tensor:
     return last.bias.detach()
 
 
+class Plan(nn.Module):
+    """Actions over the time of an episode, and how they follow what is seen, linearly.
+
+    Attributes:
+        knots: Actions before their tanh [K, A] at even times, with lines between them.
+        gains: How they change with scaled observations [A, O].
+    """
+
+    def __init__(self, observations: int, first: Tensor, knots: int) -> None:
+        """Make a plan that is `first` [A] at all times, whatever is seen."""
+        super().__init__()
+        self.knots = nn.Parameter(first.repeat(knots, 1))
+        self.gains = nn.Parameter(torch.zeros(len(first), observations))
+
+    def forward(self, scaled: Tensor, time: Tensor) -> Tensor:
+        """Actions before their tanh [B, A] for observations [B, O] at times in [0, 1], [B]."""
+        count = len(self.knots)
+        away = time[:, None] * (count - 1) - torch.arange(count)
+        shares = (1 - away.abs()).clamp(min=0)
+        result: Tensor = shares @ self.knots + scaled @ self.gains.T
+        return result
+
+
 class Actor(nn.Module):
     """A policy: the tanh of a normal distribution.
 
     The width of the distribution is the same everywhere, or else also depends on what is seen.
+
+    Attributes:
+        plan: What is added to the network's actions; None for nothing.
     """
 
     def __init__(
@@ -50,25 +76,33 @@ class Actor(nn.Module):
         deviation: float,
         *,
         sees_width: bool,
+        knots: int = 0,
     ) -> None:
         """Make a policy whose actions are nearly the first one [A], but for noise."""
         super().__init__()
         self._size = len(first_action)
         self.layers = _layers([observations, *hidden], (2 if sees_width else 1) * self._size)
-        _quieten(self.layers)[: self._size] = first_action.atanh()
+        first = first_action.atanh()
+        self.plan = Plan(observations, first, knots) if knots else None
+        _quieten(self.layers)[: self._size] = torch.zeros_like(first) if knots else first
         self.log_deviation = nn.Parameter(torch.full_like(first_action, math.log(deviation)))
 
-    def forward(self, scaled: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, scaled: Tensor, noise: Tensor, time: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Actions and their entropy.
 
         Args:
             scaled: Observations [B, O].
             noise: Standard normal [B, A]; zeros give the actions of a policy without noise.
+            time: Share of the episode that has passed [B]; where there is a plan.
 
         Returns:
             Actions [B, A], and minus the logarithm of their density [B], whose mean is the entropy.
         """
         mean, *widths = self.layers(scaled).split(self._size, dim=-1)
+        if self.plan is not None:
+            mean = mean + self.plan(scaled, time)
         log_deviation = self.log_deviation.expand_as(mean)
         for width in widths:
             log_deviation = log_deviation + _WIDEST * width.tanh()

@@ -15,7 +15,8 @@ ALGORITHMS = ("apg", "shac", "sapo")
 _LEAST_SHARE = 0.1
 _INFINITE = 1e6  # above every sensible rate
 _POSITIVE = (
-    "actor_rate", "critic_rate", "gradient_norm", "deviation", "temperature", "temperature_rate",
+    "actor_rate", "plan_rate", "critic_rate", "gradient_norm", "deviation", "temperature",
+    "temperature_rate",
 )  # fmt: skip
 
 
@@ -35,8 +36,9 @@ class TrainerOptions:
         trace: Of lambda returns, lambda.
         actor_rate: Learning rate of Adam for the policy.
         critic_rate: The same for the critic.
-        decay_updates: Number of updates over which both fall, linearly, to a tenth; 0 for never.
-        betas: Of both.
+        decay_updates: Number of updates over which these and `plan_rate` fall, linearly, to a
+            tenth; 0 for never.
+        betas: Of Adam for all of them.
         critic_epochs: How often the critic sees each rollout.
         critic_batches: Parts of a rollout between two steps of the critic.
         critic_only: Updates at first that improve the critic alone.
@@ -49,6 +51,11 @@ class TrainerOptions:
         temperature_rate: Learning rate of Adam for its logarithm.
         target_entropy: Mean entropy, per number of an action, that the temperature aims at.
         first_action: Action of the policy at first, between -1 and 1; None for zeros.
+        plan_knots: Number of actions, at even times of an episode and with lines between them, that
+            are learned as a plan. A policy is then the sum of that plan, of a linear function of
+            what it sees, and of its network. The task must observe its "time". 0 for the network
+            alone.
+        plan_rate: Learning rate of Adam for the plan; the linear function has that of the policy.
         hidden: Sizes of hidden layers.
         seed: Of networks, noise and starts.
 
@@ -76,6 +83,8 @@ class TrainerOptions:
     temperature_rate: float = 2e-2
     target_entropy: float = -1.0
     first_action: tuple[float, ...] | None = None
+    plan_knots: int = 0
+    plan_rate: float = 4e-2
     hidden: tuple[int, ...] = (128, 64, 32)
     seed: int = 0
 
@@ -85,7 +94,7 @@ class TrainerOptions:
             raise InvalidInput(f"TrainerOptions: `feedback` must be a bool, got {self.feedback!r}")
         for name in ("horizon", "critic_epochs", "critic_batches", "critics"):
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 1)
-        for name in ("critic_only", "decay_updates", "seed"):
+        for name in ("critic_only", "decay_updates", "plan_knots", "seed"):
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 0)
         for name in ("discount", "trace", "target_rate"):
             _check_number(name, getattr(self, name), lambda v: 0 <= v <= 1, "in [0, 1]")

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from diffcloth_torch.envs.env import EnvState
 from diffcloth_torch.envs.gym import ClothVectorEnv
+from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.learn.networks import Actor, Critics, Scale
 from diffcloth_torch.learn.options import TrainerOptions
 
@@ -52,7 +53,9 @@ class Policy(torch.nn.Module):
             options.hidden,
             options.deviation,
             sees_width=options.has_entropy,
+            knots=options.plan_knots,
         )
+        self._time = _place_of_time(env) if options.plan_knots else None
         critics = options.critics if options.has_entropy else 1
         self.critics = Critics(observations, options.hidden, critics)
         self.targets = Critics(observations, options.hidden, critics)
@@ -70,8 +73,24 @@ class Policy(torch.nn.Module):
         """Actions [B, A] for observations [B, O], with standard normal noise [B, A] or without."""
         if noise is None:
             noise = torch.zeros(1)
-        actions: Tensor = self.actor(self.scale(observation), noise)[0]
-        return actions
+        return self.act(observation, noise)[0]
+
+    def act(self, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions [B, A], and minus the logarithm of their density [B]; see `Actor`."""
+        time = None if self._time is None else observation[:, self._time]
+        actions, entropy = self.actor(self.scale(observation), noise, time)
+        return actions, entropy
+
+
+def _place_of_time(env: ClothVectorEnv) -> int:
+    slices = env.task.observation_slices
+    if "time" not in slices:
+        raise InvalidInput(
+            f"TrainerOptions: `plan_knots` must be 0 for {env.task.name}, "
+            'which does not observe its "time"'
+        )
+    place: int = slices["time"].start
+    return place
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +159,7 @@ def roll_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
     discount, total = torch.ones(count), torch.zeros(count)
     for t, noise in enumerate(piece.noise):
         seen = observation.detach()
-        actions, entropy = policy.actor(policy.scale(observation if o.feedback else seen), noise)
+        actions, entropy = policy.act(observation if o.feedback else seen, noise)
         observation, reward, terminated, truncated, info = env.step(actions)
         ended = terminated | truncated
         after = info["obs_before_reset"]

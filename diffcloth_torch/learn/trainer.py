@@ -96,9 +96,12 @@ class Trainer:
             torch.manual_seed(o.seed)
             self.policy = Policy(self._env, o)
         self._places = [self._begin(range(k, k + self._chunk)) for k in self._chunks]
-        self._actor_steps = torch.optim.Adam(
-            self.policy.actor.parameters(), lr=o.actor_rate, betas=o.betas
-        )
+        plan = self.policy.actor.plan
+        knots = [] if plan is None else [plan.knots]
+        others = [p for p in self.policy.actor.parameters() if all(p is not k for k in knots)]
+        groups = [{"params": others, "lr": o.actor_rate}]
+        groups += [{"params": knots, "lr": o.plan_rate}] if knots else []
+        self._actor_steps = torch.optim.Adam(groups, betas=o.betas)
         self._critic_steps = torch.optim.Adam(
             self.policy.critics.parameters(), lr=o.critic_rate, betas=o.betas
         )
@@ -135,9 +138,11 @@ class Trainer:
             return self._update()
 
     def _update(self) -> dict[str, float]:
-        share = self.options.rate_share(self.updates)
-        self._actor_steps.param_groups[0]["lr"] = share * self.options.actor_rate
-        self._critic_steps.param_groups[0]["lr"] = share * self.options.critic_rate
+        o, share = self.options, self.options.rate_share(self.updates)
+        rates = o.actor_rate, o.plan_rate
+        for group, rate in zip(self._actor_steps.param_groups, rates, strict=False):
+            group["lr"] = share * rate
+        self._critic_steps.param_groups[0]["lr"] = share * o.critic_rate
         rollouts = self._rollouts()
         log = {"loss": sum(r.loss for r in rollouts)}
         learns = not self.options.has_critic or self.updates >= self.options.critic_only

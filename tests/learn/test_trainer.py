@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from processes import threads
@@ -16,7 +17,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.learn import Trainer, TrainerOptions
 from diffcloth_torch.learn import rollouts as rollouts_module
 from diffcloth_torch.learn import trainer as trainer_module
-from diffcloth_torch.learn.networks import Actor
+from diffcloth_torch.learn.networks import Actor, Plan
 from diffcloth_torch.learn.rollouts import Policy
 from diffcloth_torch.learn.trainer import _lambda_returns, _Rows
 
@@ -73,9 +74,11 @@ class TestGradient:
         trainer._noise.set_state(noise)
         return found
 
-    @pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
-    def test_is_that_of_differences(self, algorithm):
-        options = replace(self.OPTIONS, algorithm=algorithm, temperature=0.02)
+    @pytest.mark.parametrize(
+        ("algorithm", "knots"), [("apg", 0), ("apg", 3), ("shac", 0), ("sapo", 0), ("sapo", 3)]
+    )
+    def test_is_that_of_differences(self, algorithm, knots):
+        options = replace(self.OPTIONS, algorithm=algorithm, temperature=0.02, plan_knots=knots)
         trainer = self.trainer(options)
         found = self.rollout(trainer)
         scale = torch.stack([g.norm() for g in found.gradients]).norm()
@@ -122,6 +125,74 @@ class TestGradient:
         )
         assert with_it.loss == without.loss
         assert not torch.allclose(with_it.gradients[0], without.gradients[0], rtol=1e-2)
+
+
+class TestPlan:
+    """Of a policy that is a plan, a linear function of what it sees, and a network."""
+
+    def test_draws_lines_between_its_knots(self):
+        plan = Plan(3, torch.tensor([0.5, -1.0]), 3)
+        with torch.no_grad():
+            plan.knots.copy_(torch.tensor([[0.0, 1.0], [2.0, -1.0], [3.0, 5.0]]))
+            plan.gains.copy_(torch.tensor([[1.0, 0.0, 0.0], [0.0, 2.0, -1.0]]))
+        time = torch.tensor([0.0, 0.25, 0.5, 0.6, 1.0])
+        seen = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
+        for axis, knots in enumerate(plan.knots.detach().T):
+            lines = np.interp(time, [0.0, 0.5, 1.0], knots)
+            expected = torch.from_numpy(lines).float() + seen @ plan.gains[axis].detach()
+            torch.testing.assert_close(plan(seen, time)[:, axis].detach(), expected)
+
+    def test_begins_with_the_first_action_at_all_times(self):
+        for knots in (1, 4):
+            options = TrainerOptions(horizon=3, first_action=HOLD, plan_knots=knots)
+            trainer = Trainer(fold(), options, num_envs=2)
+            observation, _ = trainer._env.reset(seed=0)
+            for _ in range(8):
+                action = trainer.act(observation)
+                torch.testing.assert_close(
+                    action, torch.tensor(HOLD).expand(2, -1), atol=0.05, rtol=0
+                )
+                observation, *_ = trainer._env.step(action)
+
+    def test_sees_the_time(self):
+        """The plan moves with the time of the environment, and nothing else does here."""
+        trainer = Trainer(fold(), TrainerOptions("apg", horizon=3, plan_knots=9), num_envs=2)
+        plan = trainer.policy.actor.plan
+        with torch.no_grad():
+            trainer.policy.actor.layers[-1].weight.zero_()
+            plan.knots.copy_(torch.linspace(0, 1, 9)[:, None].expand(-1, 8))
+        observation, _ = trainer._env.reset(seed=0)
+        for k in range(8):
+            action = trainer.act(observation)
+            torch.testing.assert_close(action, torch.full((2, 8), k / 8).tanh())
+            observation, *_ = trainer._env.step(action)
+
+    def test_has_a_rate_of_its_own(self):
+        options = TrainerOptions(
+            "apg", horizon=8, first_action=HOLD, plan_knots=3, plan_rate=0.3, actor_rate=0.01,
+            decay_updates=2,
+        )  # fmt: skip
+        trainer = Trainer(fold(), options, num_envs=2)
+        before = state_of(trainer)
+        trainer.update()
+        after = state_of(trainer)
+        for name, rate in (("knots", 0.3), ("gains", 0.01)):
+            moved = (after[f"actor.plan.{name}"] - before[f"actor.plan.{name}"]).abs().max()
+            assert float(moved) == pytest.approx(rate, rel=0.01)  # the first step of Adam
+        trainer.update()
+        rates = [group["lr"] for group in trainer._actor_steps.param_groups]
+        assert rates == pytest.approx([0.55 * 0.01, 0.55 * 0.3])
+
+    def test_needs_a_time(self, monkeypatch):
+        real = FoldCloth.features
+
+        def timeless(task, env):
+            return {n: f for n, f in real(task, env).items() if n != "time"}
+
+        monkeypatch.setattr(FoldCloth, "features", timeless)
+        Trainer(fold(), TrainerOptions(horizon=3), num_envs=2)
+        with pytest.raises(InvalidInput, match="`plan_knots` must be 0 for FoldCloth"):
+            Trainer(fold(), TrainerOptions(horizon=3, plan_knots=2), num_envs=2)
 
 
 def test_lambda_returns_are_those_of_the_recursion():
@@ -220,9 +291,11 @@ def rollouts_rows(h, count, generator):
     return Rows
 
 
-@pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
-def test_a_training_that_is_loaded_goes_on_with_the_same_bits(tmp_path, algorithm):
-    options = TrainerOptions(algorithm=algorithm, horizon=3, first_action=HOLD, decay_updates=4)
+@pytest.mark.parametrize(("algorithm", "knots"), [("apg", 3), ("shac", 0), ("sapo", 0)])
+def test_a_training_that_is_loaded_goes_on_with_the_same_bits(tmp_path, algorithm, knots):
+    options = TrainerOptions(
+        algorithm=algorithm, horizon=3, first_action=HOLD, decay_updates=4, plan_knots=knots
+    )
     one = Trainer(fold(), options, num_envs=4, chunk=2)
     one.update()
     one.update()
@@ -345,6 +418,8 @@ def test_noise_and_scale_of_a_policy():
             "`algorithm` must be one of 'apg', 'shac', 'sapo'",
         ),
         (lambda: TrainerOptions(critics=0), "`critics` must be"),
+        (lambda: TrainerOptions(plan_knots=-1), "`plan_knots` must be"),
+        (lambda: TrainerOptions(plan_rate=0.0), "`plan_rate` must be positive, got 0.0"),
         (lambda: TrainerOptions(temperature=0.0), "`temperature` must be positive, got 0.0"),
         (lambda: TrainerOptions(target_entropy=float("inf")), "`target_entropy` must be finite"),
         (lambda: TrainerOptions(deviation="wide"), "`deviation` must be positive, got 'wide'"),
