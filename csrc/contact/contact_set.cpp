@@ -416,7 +416,8 @@ Mat3 ContactHessian::operator()(int p, int q) const {
 }
 
 void ContactHessian::add_to(linalg::BlockMatrix& A, const std::array<Index, 4>& points) const {
-  if (A.any_attached(points)) {
+  // Features of skeletons, and of no other surface, repeat their last point.
+  if (A.any_attached(points) || points[2] == points[3]) {
     A.add_stencil(points, *this);
     return;
   }
