@@ -17,6 +17,7 @@ from diffcloth_torch import _kernels as kernels
 
 G = 9.81
 D_HAT = 1e-3
+DEFAULT = dc.SolverOptions()
 BARRIER = dc.ContactOptions(barrier_distance=D_HAT)
 
 
@@ -43,7 +44,7 @@ def pill(at, slope, **keywords):
     return dc.RigidBody.capsule(0.05, 0.2, smooth=True, pose=[*at, *quaternion(across)], **keywords)
 
 
-def rolled(bodies, seconds, dt, solver=dc.SolverOptions()):
+def rolled(bodies, seconds, dt, solver=DEFAULT):
     sim = dc.Simulator(dc.Scene([], bodies), dt, contact=BARRIER, solver=solver)
     with torch.no_grad():
         return sim, sim.rollout(sim.initial_state(), steps=round(seconds / dt))
