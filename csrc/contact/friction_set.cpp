@@ -354,8 +354,8 @@ void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
     A.add_rows(others, [&](int p, int q) -> Mat3 { return (k.c[p] * k.c[q]) * core_; });
     return;
   }
+  const std::array<Mat3, 6> B = frame_changes();
   if (k.count > linalg::kStencilPoints || A.any_attached(k.all_points())) {
-    const std::array<Mat3, 6> B = frame_changes();
     std::array<Mat3, 7> jacobians;
     for (int p = 0; p < first; ++p) jacobians[p] = k.c[p] * Mat3::Identity();
     std::copy_n(B.begin(), k.count - first, jacobians.begin() + first);
@@ -374,33 +374,20 @@ void FrictionSet::Hessian::add_to(linalg::BlockMatrix& A) const {
   }
   // As between cloths: one part of the gap turns with vertices of one of them.
   const GapPart& part = k.parts[0];
-  const Frame& frame = at_->frames[0];
-  constexpr int kPadded = 16;
-  std::array<std::array<double, kPadded>, 3> change{};  // of s with the points
-  for (int p = 0; p < k.count; ++p) {
-    for (int b = 0; b < 3; ++b) change[b][3 * p + b] = k.c[p];
-  }
+  Eigen::Matrix<double, 3, 16, Eigen::RowMajor> change;  // of s with the points
+  change.setZero();
   linalg::StencilTerms of;
-  for (int e = 0; e < 2; ++e) {
-    const double along = part.a[e];
-    const Vec3 turn = (e == 0 ? part.a[2] : -part.a[2]) * (e == 0 ? frame.e2 : frame.e1);
-    for (int end = 0; end < 2; ++end) {
-      const int p = part.edges[2 * e + end];
-      const double sign = end == 1 ? 1.0 : -1.0;
-      of.sign[e][p] = sign;
-      // The cross product with the turn, less `along` of the point itself.
-      for (int b = 0; b < 3; ++b) change[b][3 * p + b] -= sign * along;
-      change[0][3 * p + 1] -= sign * turn[2];
-      change[0][3 * p + 2] += sign * turn[1];
-      change[1][3 * p] += sign * turn[2];
-      change[1][3 * p + 2] -= sign * turn[0];
-      change[2][3 * p] -= sign * turn[1];
-      change[2][3 * p + 1] += sign * turn[0];
+  for (int p = 0; p < k.count; ++p) {
+    if (p < first) {
+      change.block<3, 3>(0, 3 * p).diagonal().setConstant(k.c[p]);
+      continue;
     }
+    change.block<3, 3>(0, 3 * p) = B[p - first];
+    for (int e = 0; e < 2; ++e) of.sign[e][p] = part.sign(e, p);
   }
   of.count = k.count;
   of.terms = 3;
-  for (int b = 0; b < 3; ++b) of.left[b] = change[b].data();
+  for (int b = 0; b < 3; ++b) of.left[b] = change.row(b).data();
   of.core = core_.data();
   of.turn = turn_[0].data();
   A.add_terms(k.all_points(), of);
