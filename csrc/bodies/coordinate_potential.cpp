@@ -292,6 +292,16 @@ void CoordinatePotential::update_duals(const double* x,
                    nodes(to) + 3 * static_cast<std::ptrdiff_t>(mechanisms_.node_count()));
 }
 
+double CoordinatePotential::force_change(const double* x, const double* p) const {
+  double largest = 0.0;
+  visit_joints([&](Index, Index slot, const JointTerm& term, const JointConstants& constants) {
+    if (!(term.friction > 0.0)) return;
+    const double sticking = joint_force(term, constants, nodes(x)[slot]).sticking;
+    largest = std::max(largest, sticking / term.friction * std::abs(nodes(p)[slot]));
+  });
+  return largest;
+}
+
 bool CoordinatePotential::has_duals(const double* x) const {
   return !duals_at_.empty() && std::equal(duals_at_.begin(), duals_at_.end(), nodes(x));
 }

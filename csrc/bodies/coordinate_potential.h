@@ -43,6 +43,7 @@ class CoordinatePotential final : public Potential {
   void accumulate(const double* x, const double* z) override;
   void add_tangent(const double* x, double* y) const override;
   void update_duals(const double* x, const double* p, double alpha, const double* to) override;
+  double force_change(const double* x, const double* p) const override;
   bool has_duals(const double* x) const override;
   void swap_cotangents(CotangentStore& store) override {
     store.exchange(target_bar);

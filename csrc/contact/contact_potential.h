@@ -154,6 +154,9 @@ class FrictionPotential final : public TouchingPotential {
     set_.update_duals(x, p, alpha, to);
   }
   bool has_duals(const double* x) const override { return set_.has_duals(x); }
+  double force_change(const double* x, const double* p) const override {
+    return set_.force_change(x, p);
+  }
 
   /// Expect the motion from the start of the step to another point: see FrictionSet::expect().
   void expect(const double* x, const double* to) { set_.expect(x, to); }

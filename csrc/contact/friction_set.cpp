@@ -290,6 +290,16 @@ void FrictionSet::update_duals(const double* x, const double* p, double alpha, c
   keep_duals_at(to);
 }
 
+double FrictionSet::force_change(const double* x, const double* p) const {
+  const Slips& here = slips(x);
+  double largest = 0.0;
+  for (std::size_t i = 0; i < entries_.size(); ++i) {
+    const Vec3 dw = tangential(change_of_slip(entries_[i], here[i].frames, p), entries_[i].n);
+    largest = std::max(largest, here[i].law.f1_over_y * dw.norm());
+  }
+  return largest;
+}
+
 bool FrictionSet::has_duals(const double* x) const { return is_at(duals_at_, x); }
 
 FrictionSet::Hessian FrictionSet::hessian(const Entry& k,

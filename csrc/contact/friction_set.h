@@ -185,6 +185,10 @@ class FrictionSet {
 
   bool has_duals(const double* x) const;
 
+  /// Largest change of a friction force along a small change p of all points, as a share of mu lambda: of
+  /// what sticks the change of its slip over half of eps_v h.
+  double force_change(const double* x, const double* p) const;
+
   /// d/d(theta) of phi = z . grad D, times scale: into `bar` for the parameters (friction, slip,
   /// and, through lambda, kappa, d_hat, thickness, rest shape) unless it is null, into `start_bar` for
   /// x_start, and into `lag_bar` for the lag configuration's positions `x_lag`.

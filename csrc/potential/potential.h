@@ -71,6 +71,10 @@ class Potential {
                             double /*alpha*/,
                             const double* /*to*/) {}
 
+  /// Largest change of its forces along a small change p of all points, as a share of what they can be at
+  /// most; of potentials without such a bound none.
+  virtual double force_change(const double* /*x*/, const double* /*p*/) const { return 0.0; }
+
   /// Whether there are duals of this point.
   virtual bool has_duals(const double* /*x*/) const { return false; }
 

@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <stdexcept>
 
 namespace diffcloth::solver {
 namespace {
@@ -134,35 +133,28 @@ void Directions::leave() {
   confirmed_ = false;
 }
 
-Directions::Direction Directions::next() {
+std::optional<Directions::Direction> Directions::next() {
   leave();
   const bool nearby = s_ == 0.0 && last_.factor != nullptr;
   const double* x = walk_.x().data();
-  if (nearby && chord()) return {.kind = Kind::kChord, .first = 1.0};
+  if (nearby && chord()) return Direction{.kind = Kind::kChord, .first = 1.0};
   const bool has_duals = walk_.f.has_duals(x);
   const Curvature curvature = has_duals ? Curvature::kPrimalDual : Curvature::kExact;
   linalg::BlockMatrix H = walk_.system.assemble(x, curvature, walk_.g());
   if (s_ == 0.0) {
     bool indefinite = false;
     if (nearby && is_near() && iterate(H, indefinite))
-      return {.kind = Kind::kIterated, .first = 1.0};
+      return Direction{.kind = Kind::kIterated, .first = 1.0};
     if (indefinite) {
       ++walk_.context.counts->negative_curvature;
     } else if (refactor(H)) {
-      if (!has_duals) return {.kind = Kind::kFactored, .first = 1.0};
+      if (!has_duals) return Direction{.kind = Kind::kFactored, .first = 1.0};
       leave();  // it says nothing of the exact one
-      return {.kind = Kind::kPrimalDual, .first = 1.0};
+      return Direction{.kind = Kind::kPrimalDual, .first = 1.0};
     }
     s_ = kFirstShare;
   }
-  const std::optional<Direction> damped =
-      damp(H, walk_.system.assemble(x, Curvature::kPositive, walk_.g()));
-  if (!damped) {
-    throw std::domain_error(
-        "the projected Hessian is not positive definite: the stiffnesses of "
-        "the scene differ by more than float64 can hold");
-  }
-  return *damped;
+  return damp(H, walk_.system.assemble(x, Curvature::kPositive, walk_.g()));
 }
 
 std::optional<Directions::Direction> Directions::next_extrapolated() {

@@ -44,11 +44,10 @@ class Directions {
     double first;  ///< fraction to try first: above 1 where a damped step should be longer
   };
 
-  /// Compute the next direction into p().
-  Direction next();
+  /// Compute the next direction into p(). None where rounding leaves no positive definite Hessian.
+  std::optional<Direction> next();
 
   /// The same, of Hessians with extrapolated stresses; factored, as excursions need exact directions.
-  /// None where rounding leaves no positive definite one.
   std::optional<Direction> next_extrapolated();
 
   /// Compute the direction of the exact Hessian, factored here. False where it is indefinite.

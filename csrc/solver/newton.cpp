@@ -17,6 +17,9 @@ namespace {
 constexpr double kSettled = 0.1;
 /// The same of a certified step, whose end would have to be certified again: that is another factorization.
 constexpr double kSettledFactored = 0.25;
+/// A step that changes friction by more than this share of the largest is taken, however short it is: from
+/// no force to the largest, what sticks slips by a few times the tolerance.
+constexpr double kForceChange = 1e-3;
 /// Unless it would not shrink by this much: then rounding is all that is left of it.
 constexpr double kShrinks = 0.5;
 /// A step below this share of the coordinates is lost in their rounding.
@@ -53,6 +56,7 @@ class Descent {
   enum class Next : std::uint8_t { kGoOn, kStop };
 
   Next proceed();
+  Status too_stiff();
   Next settle();
   Status look();
   Next take(const Directions::Direction& direction);
@@ -62,6 +66,7 @@ class Descent {
   }
   Next escape();
   Next no_way(const Directions::Direction& direction, double step, SearchResult result);
+  bool is_settled(double step, double share) const;
   bool idles(double step, const Search& search);
   Next go(const Directions::Direction& direction);
   Search walk_along(const Directions::Direction& direction);
@@ -115,6 +120,12 @@ Descent::Next Descent::settle() {
   settling_ = false;
   if (!directions_.certify()) return escape();
   return take({.kind = Kind::kFactored, .first = 1.0});
+}
+
+/// Whether a step below the goal is not worth taking.
+bool Descent::is_settled(double step, double share) const {
+  return step <= share * goal_ &&
+         walk_.f.force_change(walk_.x().data(), directions_.p().data()) <= kForceChange;
 }
 
 /// Whether steps have stopped to shrink while their gain drowns in rounding.
@@ -216,8 +227,8 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
   } else if (step < goal_) {
     if (direction.kind != Kind::kFactored) {
       settling_ = true;
-      if (step <= kSettled * goal_) return Next::kGoOn;
-    } else if (step <= kSettledFactored * goal_ || step > kShrinks * settled_step_) {
+      if (is_settled(step, kSettled)) return Next::kGoOn;
+    } else if (is_settled(step, kSettledFactored) || step > kShrinks * settled_step_) {
       return stop(Status::kConverged);
     } else {
       settled_step_ = step;
@@ -245,11 +256,17 @@ Descent::Next Descent::go(const Directions::Direction& direction) {
   return Next::kGoOn;
 }
 
+/// There is no Newton step to measure.
+Status Descent::too_stiff() {
+  residual_ = std::numeric_limits<double>::infinity();
+  return Status::kTooStiff;
+}
+
 /// What is here when the iterations are used up: the residual of this very point.
 Status Descent::look() {
   if (away_) walk_.back(excursion_.start);
   const bool minimum = directions_.certify();
-  if (!minimum) directions_.next();
+  if (!minimum && !directions_.next()) return too_stiff();
   const double step = walk_.displacement(directions_.p());
   residual_ = step / walk_.f.h;
   if (step >= goal_) return Status::kIterationLimit;
@@ -257,9 +274,10 @@ Status Descent::look() {
 }
 
 Descent::Next Descent::proceed() {
-  if (!away_) return take(directions_.next());
-  const std::optional<Directions::Direction> direction = directions_.next_extrapolated();
-  return direction ? take(*direction) : come_back();
+  const std::optional<Directions::Direction> direction =
+      away_ ? directions_.next_extrapolated() : directions_.next();
+  if (direction) return take(*direction);
+  return away_ ? come_back() : stop(too_stiff());
 }
 
 Status Descent::run() {

@@ -12,6 +12,7 @@ enum class Status : std::uint8_t {
   kIterationLimit,  ///< the step's iterations are used up
   kRoundingFloor,   ///< rounding hides any further decrease
   kBlocked,         ///< every direction is blocked by collisions
+  kTooStiff,        ///< rounding leaves no positive definite Hessian, not even of the projected one
   kSaddle,          ///< the gradient vanishes where the Hessian is indefinite, and nothing is lower
   kUnsolved,        ///< friction at nodes: no way leads on, and no solution was found
   kInfeasibleMotion,

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <algorithm>
 #include <vector>
 
 #include "bodies/coordinate_potential.h"
@@ -61,6 +62,13 @@ struct Objective {
 
   void update_duals(const double* x, const double* p, double alpha, const double* to) const {
     for_each([&](Potential& q) { q.update_duals(x, p, alpha, to); });
+  }
+
+  /// Largest change of bounded forces along a small change p of all points, as a share of the bound.
+  double force_change(const double* x, const double* p) const {
+    double change = 0.0;
+    for_each([&](const Potential& q) { change = std::max(change, q.force_change(x, p)); });
+    return change;
   }
 
   /// Whether a potential has duals of this point, so that the Hessian kPrimalDual is not the exact one.

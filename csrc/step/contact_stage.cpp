@@ -80,6 +80,9 @@ std::string_view words(solver::Status status) {
       return "rounding hides any further decrease: the floor of float64 for this scene";
     case solver::Status::kBlocked:
       return "surfaces are so close that rounding lets none of them move";
+    case solver::Status::kTooStiff:
+      return "not even the projected Hessian is positive definite: stiffnesses differ by more than "
+             "float64 can hold";
     case solver::Status::kSaddle:
       return "at a saddle, and no lower point was found from there";
     case solver::Status::kUnsolved:

@@ -54,6 +54,7 @@ GRADIENT_SHARE = 0.1  # of the scenes
 MOVING = ("body_velocities", "joint_velocities", "base_velocities")  # fields of a state
 OUTPUTS = ("positions", "body_poses", "joint_positions", "base_poses")
 ROUNDING = 1e-10  # of momentum, a thousandth of which is seen
+ERROR = 1e-3  # of momentum, relative: a contact's stiffness may exceed M/h^2 greatly
 SUSPECT = 1e-3  # relative error of a gradient; right ones are below 2e-4
 
 
@@ -278,7 +279,8 @@ def _check_momentum(
     forces += [pull.force(x, where["step"], dt)[None] for pull in scene.pulls]
     faces, start = scene.simulator._assembly.faces, before.positions.numpy()
     forces.append(scene.air.force(faces, start, x, where["step"], dt)[None])
-    _compare(had, has, forces, "cloths", tally, where)
+    left = m.sum() * scene.simulator.solver.tolerance / scene.simulator.dt
+    _compare(had, has, forces, left, "cloths", tally, where)
 
 
 def _check_bodies(
@@ -298,25 +300,30 @@ def _check_bodies(
                 body.mass * state.body_velocities[[row], :3].numpy() / sim.dt for state in states
             )
             forces = after.body_forces.numpy()[sim.slices[name]]
-            _compare(had, has, [body.mass * gravity, forces], name, tally, where)
+            left = body.mass * sim.solver.tolerance / sim.dt
+            _compare(had, has, [body.mass * gravity, forces], left, name, tally, where)
 
 
 def _compare(
     had: np.ndarray,
     has: np.ndarray,
     forces: list[np.ndarray],
+    left: float,
     what: str,
     tally: Tally,
     where: dict[str, Any],
 ) -> None:
-    """Momentum before and after, over the time step, against forces; relative to all of them."""
+    """Momentum before and after, over the time step, against forces.
+
+    The error is relative to all of them, and to the force that the tolerance of the solver may leave.
+    """
     gain = has - had
     size = sum(np.abs(part).sum() for part in (gain, *forces))
     size += ROUNDING * (np.abs(had) + np.abs(has)).sum()  # for what flies on as it did
+    size += left / ERROR
     rest = gain.sum(axis=0) - sum(part.sum(axis=0) for part in forces)
-    # Solves end within the tolerance of 1e-6 m/s; a contact's stiffness may exceed M/h^2 greatly.
     error = np.abs(rest).max() / max(size, 1e-300)
-    if error > 1e-3:
+    if error > ERROR:
         tally.line("momentum", where, f"{what}: relative error {error:.3g}")
 
 

@@ -133,3 +133,18 @@ def test_an_environment_outside_the_loss_is_not_solved_for():
     assert not after.report.converged
     (gradient,) = torch.autograd.grad(after.positions, x, torch.zeros_like(x))
     assert not gradient.any()
+
+
+def test_stiffnesses_that_float64_cannot_hold_fail_where_they_are():
+    sim = falling(max_iterations=200)
+    stretch = sim.parameters().stretch.expand(3).clone()
+    stretch[FAILED] = 1e22
+    v = 1e-3 * velocities(sim)
+    state = sim.initial_state(3).replace(velocities=v)
+    after = sim.step(state, None, sim.parameters().replace(stretch=stretch))
+    assert after.report.status == ("converged", "not_converged", "converged")
+    assert torch.isinf(after.report.residual[FAILED])  # there is no Newton step
+    assert torch.equal(after.positions[0], sim.step(state[0]).positions)
+    throwing = falling(max_iterations=200, throw=True)
+    with pytest.raises(dc.NotConverged, match=r"environments \[1\].*float64 can hold"):
+        throwing.step(state, None, throwing.parameters().replace(stretch=stretch))
