@@ -315,7 +315,7 @@ def _compare(
 ) -> None:
     """Momentum before and after, over the time step, against forces.
 
-    The error is relative to all of them, and to the force that the tolerance of the solver may leave.
+    The error is relative to all of them, and to the force that the solver's tolerance may leave.
     """
     gain = has - had
     size = sum(np.abs(part).sum() for part in (gain, *forces))
