@@ -18,7 +18,6 @@ MOST_FACES = 4_000_000
 """Of a generated mesh: more than any step could take, and refused before they take the memory."""
 
 # Segments around a capsule and rings on each of its caps: 5 degrees off a true circle at most.
-_CAPSULE_SEGMENTS = 32
 _CAPSULE_RINGS = 8
 
 # Rings on an end of a cylinder: 6 vertices on the first, 6 more on each next, 30 on its rim.
@@ -171,17 +170,27 @@ def _split_in_four(vertices: FloatArray, faces: NDArray[np.int64]) -> Mesh:
     return points / np.linalg.norm(points, axis=1, keepdims=True), split
 
 
-def capsule(radius: float, length: float) -> Mesh:
-    """Cylinder of a length along z between two half spheres around its ends."""
-    polar = np.linspace(0, np.pi / 2, _CAPSULE_RINGS + 1)[1:]
+def capsule(radius: float, length: float, rings: int = _CAPSULE_RINGS, rows: int = 1) -> Mesh:
+    """Cylinder of a length along z between two half spheres around its ends.
+
+    Args:
+        radius: Radius [m].
+        length: Length of the cylinder alone [m].
+        rings: Rings on each half sphere, around its tip; four times as many segments on each.
+        rows: Rows of quadrilaterals along the cylinder.
+    """
+    segments = 4 * rings
+    polar = np.linspace(0, np.pi / 2, rings + 1)[1:]
     upper = [(radius * np.sin(t), length / 2 + radius * np.cos(t)) for t in polar]
-    profile = np.array(upper + [(r, -z) for r, z in reversed(upper)])  # radius and z of each ring
-    around = 2 * np.pi * np.arange(_CAPSULE_SEGMENTS) / _CAPSULE_SEGMENTS
+    side = [(radius, z) for z in np.linspace(length / 2, -length / 2, rows + 1)[1:-1]]
+    lower = [(r, -z) for r, z in reversed(upper)]
+    around = 2 * np.pi * np.arange(segments) / segments
     circle = np.stack([np.cos(around), np.sin(around)], axis=-1)
-    rings = [np.column_stack([r * circle, np.full(_CAPSULE_SEGMENTS, z)]) for r, z in profile]
+    profile = upper + side + lower  # radius and z of each ring
+    points = [np.column_stack([r * circle, np.full(segments, z)]) for r, z in profile]
     tip = length / 2 + radius
-    vertices = np.concatenate([*rings, [[0.0, 0.0, tip], [0.0, 0.0, -tip]]])
-    return vertices, _lathe_faces(len(profile))
+    vertices = np.concatenate([*points, [[0.0, 0.0, tip], [0.0, 0.0, -tip]]])
+    return vertices, _lathe_faces(len(profile), segments)
 
 
 def cylinder(radius: float, length: float, rings: int = _CYLINDER_RINGS, rows: int = 0) -> Mesh:
@@ -234,15 +243,15 @@ def _disk(rings: int) -> Mesh:
     return np.concatenate(points), np.array(faces)
 
 
-def _lathe_faces(ring_count: int) -> NDArray[np.int64]:
-    here = np.arange(_CAPSULE_SEGMENTS)
-    there = (here + 1) % _CAPSULE_SEGMENTS
-    top = ring_count * _CAPSULE_SEGMENTS
+def _lathe_faces(ring_count: int, segments: int) -> NDArray[np.int64]:
+    here = np.arange(segments)
+    there = (here + 1) % segments
+    top = ring_count * segments
     faces = [np.stack([here, there, np.full_like(here, top)], axis=-1)]
     for ring in range(ring_count - 1):
-        up, down = ring * _CAPSULE_SEGMENTS, (ring + 1) * _CAPSULE_SEGMENTS
+        up, down = ring * segments, (ring + 1) * segments
         faces.append(np.stack([down + here, down + there, up + there], axis=-1))
         faces.append(np.stack([down + here, up + there, up + here], axis=-1))
-    last = top - _CAPSULE_SEGMENTS
+    last = top - segments
     faces.append(np.stack([last + there, last + here, np.full_like(here, top + 1)], axis=-1))
     return np.concatenate(faces)

@@ -1,7 +1,7 @@
-"""Collision shapes of a robot's links as surfaces: boxes, cylinders, spheres and mesh files.
+"""Collision shapes of a robot's links as surfaces: boxes, round shapes, cylinders and mesh files.
 
-A sphere may touch as what it is. A surface is either that or triangles, so a sphere beside other
-shapes becomes a link of its own, welded to the one that has it.
+A sphere or a capsule may touch as what it is. A surface is either that or triangles, so a round
+shape beside others becomes a link of its own, welded to the one that has it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from diffcloth_torch.model.urdf import Joint, Link, RobotDescription, Shape
 
 __all__ = ["RoundLinks", "find_mesh", "link_surface", "with_round_links"]
 
-# An edge length that gives a box, cylinder or sphere more triangles is taken for a mistake.
+# An edge length that gives a shape more triangles is taken for a mistake.
 _MOST_FACES = 200_000
 
 _DEFAULT_SUBDIVISIONS = 3  # of a sphere, as for `RigidBody.sphere`
@@ -37,8 +37,8 @@ class RoundLinks(NamedTuple):
     """A robot whose links are round or have triangles, not both.
 
     Attributes:
-        description: The robot, with a link more for every sphere that has been taken out of one;
-            these come last.
+        description: The robot, with a link more for every round shape that has been taken out of
+            one; these come last.
         skeletons: Name of a round link -> what it touches with, in its frame.
         parts: Name of a link -> names of the links that have been taken out of it.
     """
@@ -65,19 +65,19 @@ class RoundLinks(NamedTuple):
 
 
 def with_round_links(description: RobotDescription, smooth: object) -> RoundLinks:
-    """Make spheres of a robot round.
+    """Make spheres and capsules of a robot round.
 
     Args:
         description: The robot.
-        smooth: Whether all spheres are, or name of a link -> whether those of the link are.
+        smooth: Whether all of them are, or name of a link -> whether those of the link are.
 
     Raises:
-        InvalidInput: If there is no such link, or none of its shapes is a sphere.
+        InvalidInput: If there is no such link, or none of its shapes is a sphere or a capsule.
         TypeError: If `smooth` has a wrong type.
     """
     label = "Robot.load: `smooth`"
     names = [link.name for link in description.links]
-    having = [link.name for link in description.links if any(map(_is_sphere, link.shapes))]
+    having = [link.name for link in description.links if any(map(_is_round, link.shapes))]
     if isinstance(smooth, Mapping):
         for name in smooth:
             if name not in names:
@@ -85,13 +85,15 @@ def with_round_links(description: RobotDescription, smooth: object) -> RoundLink
         wanted = {name for name, value in smooth.items() if check_bool(f"{label}[{name!r}]", value)}
         for name in sorted(wanted.difference(having)):
             raise InvalidInput(
-                f"{label} is for links with a <sphere>, which are {texts(having)}; got True for "
-                f"{name!r}"
+                f"{label} is for links with a <sphere> or <capsule>, which are {texts(having)}; "
+                f"got True for {name!r}"
             )
     else:
         wanted = set(having) if check_bool(label, smooth) else set()
         if smooth and not having:
-            raise InvalidInput(f"{label} must be False where no link has a <sphere>, got True")
+            raise InvalidInput(
+                f"{label} must be False where no link has a <sphere> or <capsule>, got True"
+            )
     links: list[Link] = []
     further: list[Link] = []
     joints = list(description.joints)
@@ -101,13 +103,13 @@ def with_round_links(description: RobotDescription, smooth: object) -> RoundLink
         if link.name not in wanted:
             links.append(link)
             continue
-        spheres = [(k, shape) for k, shape in enumerate(link.shapes) if _is_sphere(shape)]
-        others = tuple(shape for shape in link.shapes if not _is_sphere(shape))
+        found = [(k, shape) for k, shape in enumerate(link.shapes) if _is_round(shape)]
+        others = tuple(shape for shape in link.shapes if not _is_round(shape))
         if not others:  # the link itself is its first one
-            skeletons[link.name] = _skeleton(spheres[0][1])
-            others = (spheres.pop(0)[1],)
+            skeletons[link.name] = _skeleton(found[0][1])
+            others = (found.pop(0)[1],)
         links.append(replace(link, shapes=others))
-        for k, shape in spheres:
+        for k, shape in found:
             part = _part(link.name, k, shape)
             skeletons[part.name] = _skeleton(shape)
             joints.append(_weld(link.name, part.name))
@@ -117,23 +119,24 @@ def with_round_links(description: RobotDescription, smooth: object) -> RoundLink
     return RoundLinks(whole, skeletons, parts)
 
 
-def _is_sphere(shape: Shape) -> bool:
-    return shape.kind == "sphere"
+def _is_round(shape: Shape) -> bool:
+    return shape.kind in ("sphere", "capsule")
 
 
 def _skeleton(shape: Shape) -> ContactSurface:
-    vertices, faces, radius = round_surface(Primitive("sphere", (shape.size[0], 0.0, 0.0)))
+    half = shape.size[1] / 2 if shape.kind == "capsule" else 0.0
+    vertices, faces, radius = round_surface(Primitive(shape.kind, (shape.size[0], half, 0.0)))
     return ContactSurface(frozen(_in_link(shape, vertices)), faces, radius)
 
 
-def _part(link: str, k: int, sphere: Shape) -> Link:
-    """A link for the sphere k of another one. No link of a file has a name with "/"."""
+def _part(link: str, k: int, shape: Shape) -> Link:
+    """A link for the round shape k of another one. No link of a file has a name with "/"."""
     return Link(
         name=f"{link}/{k}",
         mass=0.0,
         center=np.zeros(3),
         inertia=np.zeros((3, 3)),
-        shapes=(sphere,),
+        shapes=(shape,),
     )
 
 
@@ -164,7 +167,7 @@ def link_surface(
         link: The link.
         file: URDF file of the link.
         mesh_root: Folder that mesh files must lie in.
-        edge_length: Longest edge of boxes, cylinders and spheres [m]; None lets the shape choose.
+        edge_length: Longest edge of all shapes but meshes [m]; None lets the shape choose.
     """
     if not link.shapes:
         return None
@@ -201,12 +204,14 @@ def _in_link(shape: Shape, vertices: FloatArray) -> FloatArray:
 
 
 def _generated(owner: str, shape: Shape, edge_length: float | None) -> shapes.Mesh:
-    """Mesh of a box, sphere or cylinder around its own origin."""
+    """Mesh of any other shape around its own origin."""
     if edge_length is None:
         if shape.kind == "box":
             return shapes.box(np.array(shape.size))
         if shape.kind == "sphere":
             return shapes.sphere(shape.size[0], _DEFAULT_SUBDIVISIONS)
+        if shape.kind == "capsule":
+            return shapes.capsule(shape.size[0], shape.size[1])
         return shapes.cylinder(shape.size[0], shape.size[1])
     too_many = InvalidInput(
         f"{owner}: `edge_length` must leave a {shape.kind} of size {shape.size} m at most "
@@ -226,6 +231,11 @@ def _generated(owner: str, shape: Shape, edge_length: float | None) -> shapes.Me
             raise too_many
         return shapes.box(np.array(shape.size), segments.astype(int).tolist())
     radius, length = shape.size
+    if shape.kind == "capsule":
+        rings, rows = np.ceil(cut * np.array([radius * math.pi / 2, length]))
+        if 8 * rings * (2 * rings + rows) > _MOST_FACES:
+            raise too_many
+        return shapes.capsule(radius, length, int(rings), int(rows))
     # Of 6 n segments around, each is below 2 pi r / (6 n); edges on the ends are below 1.2 r / n.
     rings = max(1.0, np.ceil(cut * radius * math.pi / 3))
     rows = np.ceil(cut * length)

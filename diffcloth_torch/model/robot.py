@@ -153,8 +153,8 @@ class Robot:
             friction: Friction coefficient of the surfaces of links [-], >= 0; one value, or link ->
                 value.
             thickness: Full thickness of these surfaces [m], >= 0; one value, or link -> value.
-            edge_length: Longest edge of the surfaces of boxes, cylinders and spheres [m], > 0. With
-                None a box has 12 triangles, a sphere 1280 and a cylinder about 400.
+            edge_length: Longest edge of the surfaces of all shapes but meshes [m], > 0. With None a
+                box has 12 triangles, a sphere 1280, a capsule 1024 and a cylinder about 400.
             smooth: Whether spheres themselves touch, instead of their triangles; True or False for
                 all, or link -> True or False. A sphere beside other shapes of its link becomes a
                 link "link/k" of its own, the k-th shape of the link counted from 0, which is welded

@@ -40,10 +40,10 @@ class Shape:
     """A collision shape of a link.
 
     Attributes:
-        kind: "box", "cylinder", "sphere" or "mesh".
+        kind: "box", "cylinder", "sphere", "capsule" or "mesh".
         frame: Its frame in the link's frame, shape [4, 4].
-        size: Lengths of a box; radius and length of a cylinder; radius of a sphere [m]; scale of a
-            mesh along its axes.
+        size: Lengths of a box; radius and length of a cylinder, also of that in a capsule; radius
+            of a sphere [m]; scale of a mesh along its axes.
         filename: File name of a mesh, as written in the file; empty for other shapes.
     """
 
@@ -219,6 +219,7 @@ _SIZES = {
     "box": ("size",),
     "cylinder": ("radius", "length"),
     "sphere": ("radius",),
+    "capsule": ("radius", "length"),
     "mesh": ("scale",),
 }
 

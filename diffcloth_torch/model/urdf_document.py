@@ -14,7 +14,7 @@ from diffcloth_torch.errors import InvalidInput
 __all__ = ["JOINT_TYPES", "SHAPES", "reduced"]
 
 JOINT_TYPES = ("fixed", "revolute", "continuous", "prismatic")
-SHAPES = ("box", "cylinder", "sphere", "mesh")
+SHAPES = ("box", "cylinder", "sphere", "capsule", "mesh")
 
 _LONGEST_WORD = 1000
 
@@ -51,6 +51,7 @@ _GEOMETRY = _Element(
         "box": _Child(_Element({"size": _Attribute(3, accepted=Range(0.0))}, {})),
         "cylinder": _Child(_Element({"radius": _SIZE, "length": _SIZE}, {})),
         "sphere": _Child(_Element({"radius": _SIZE}, {})),
+        "capsule": _Child(_Element({"radius": _SIZE, "length": _SIZE}, {})),
         "mesh": _Child(_Element({"filename": _NAME, "scale": _Attribute(3, "1 1 1")}, {})),
     },
 )

@@ -106,7 +106,7 @@ def test_what_is_said_of_a_link_is_said_of_its_spheres(tmp_path):
 @pytest.mark.parametrize(
     ("shapes", "smooth", "error", "message"),
     [
-        (ROD, True, dc.InvalidInput, "`smooth` must be False where no link has a <sphere>"),
+        (ROD, True, dc.InvalidInput, "must be False where no link has a <sphere> or <cap"),
         (ROD + TIP, {"base": True}, dc.InvalidInput, "which are 'finger'; got True for 'base'"),
         (ROD + TIP, {"hand": True}, dc.InvalidInput, "has the names 'base', 'finger'; got 'hand'"),
         (ROD + TIP, {"finger": 1}, TypeError, r"`smooth`\['finger'\] must be True or False, got i"),
@@ -163,6 +163,51 @@ def test_a_ball_that_is_a_link_rolls_as_one_that_is_a_body(tmp_path):
     turn = Rotation.from_quat(np.roll(of_link.base_poses[0, 3:].numpy(), -1))
     center = of_link.base_poses[0, :3].numpy() + turn.apply([0.1, 0, 0])
     np.testing.assert_allclose(center, of_body.body_poses[1, :3], atol=1e-8)
+    torch.testing.assert_close(wrench_of_link[:3], wrench_of_body[:3], rtol=1e-4, atol=1e-6)
+
+
+def test_a_capsule_that_is_a_link_rolls_as_one_that_is_a_body(tmp_path):
+    """Down a slope, slantwise, off the origin of the link's frame and turned in it."""
+    slope = Rotation.from_euler("y", 0.3)
+    plane = dc.RigidBody.plane(4.0, pose=[0, 0, 0, *quaternion(slope)], friction=0.6)
+    lies = slope * Rotation.from_euler("z", 0.4) * Rotation.from_euler("x", math.pi / 2)
+    at = slope.apply([0, 0, RADIUS + D_HAT / 2])
+    body = dc.RigidBody.capsule(
+        RADIUS,
+        0.1,
+        smooth=True,
+        motion="dynamic",
+        density=500,
+        friction=0.6,
+        pose=[*at, *quaternion(lies)],
+    )
+    across, along = float(body.inertia[0, 0]), float(body.inertia[2, 2])
+    path = tmp_path / "pill.urdf"
+    # In the link's frame it lies along x.
+    path.write_text(
+        f'<robot name="test"><link name="pill"><inertial><origin xyz="0.1 0 0"/>'
+        f'<mass value="{body.mass!r}"/><inertia ixx="{along!r}" iyy="{across!r}" izz="{across!r}" '
+        'ixy="0" ixz="0" iyz="0"/></inertial><collision><origin xyz="0.1 0 0" '
+        f'rpy="0 {math.pi / 2!r} 0"/><geometry><capsule radius="{RADIUS}" length="0.1"/>'
+        "</geometry></collision></link></robot>"
+    )
+    frame = lies * Rotation.from_euler("y", -math.pi / 2)
+    pose = [*(at - frame.apply([0.1, 0, 0])), *quaternion(frame)]
+    link = dc.Robot.load(path, base="floating", smooth=True, name="robot", friction=0.6, pose=pose)
+    assert link.contact_surfaces[0].radius == RADIUS
+    ends = []
+    for scene in (dc.Scene([], [plane, body]), dc.Scene([], [plane], [link])):
+        sim = dc.Simulator(scene, 0.005, contact=BARRIER, solver=TIGHT)
+        with torch.no_grad():
+            end = sim.rollout(sim.initial_state(), steps=40)[-1]
+        ends.append((end, sim.contact_wrenches(end)[sim.surfaces[1]]))
+    (of_body, wrench_of_body), (of_link, wrench_of_link) = ends
+    velocity = of_body.body_velocities[1]
+    assert float(velocity[3:].norm()) * RADIUS > 0.1
+    turn = Rotation.from_quat(np.roll(of_link.base_poses[0, 3:].numpy(), -1))
+    center = of_link.base_poses[0, :3].numpy() + turn.apply([0.1, 0, 0])
+    np.testing.assert_allclose(center, of_body.body_poses[1, :3], atol=1e-8)
+    torch.testing.assert_close(of_link.base_velocities[0], velocity, rtol=1e-6, atol=1e-6)
     torch.testing.assert_close(wrench_of_link[:3], wrench_of_body[:3], rtol=1e-4, atol=1e-6)
 
 

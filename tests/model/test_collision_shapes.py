@@ -44,6 +44,7 @@ SHAPES = {
     "cylinder": ('<cylinder radius="0.1" length="0.5"/>', np.pi * 0.1**2 * 0.5),
     "disk": ('<cylinder radius="0.2" length="0.01"/>', np.pi * 0.2**2 * 0.01),
     "sphere": ('<sphere radius="0.1"/>', 4 / 3 * np.pi * 0.1**3),
+    "capsule": ('<capsule radius="0.1" length="0.3"/>', np.pi * (0.1**2 * 0.3 + 4 / 3 * 0.1**3)),
 }
 
 
