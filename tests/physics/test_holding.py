@@ -1,9 +1,11 @@
 """What a grip holds stays there, with the default slip velocity."""
 
 import importlib
+import math
 from pathlib import Path
 
 import pytest
+import torch
 
 import diffcloth_torch as dc
 
@@ -18,3 +20,27 @@ def test_it_moves_by_less_than_a_tenth_of_a_millimeter_in_a_minute(what, monkeyp
     _, sunk, law = sticking.held(what, dc.ContactOptions().slip_velocity, MINUTE)
     assert abs(sunk) < 1e-4
     assert law < 1e-4
+
+
+def test_a_box_creeps_by_the_law_at_the_default_tolerance():
+    """The tolerance is a third of the creep: a solve goes on for forces that change with slip."""
+    slope, mu, gap = 0.25, 0.5, 5e-4
+    turn = [math.cos(slope / 2), 0.0, math.sin(slope / 2), 0.0]
+    up = 0.02 + gap
+    plane = dc.RigidBody.plane(4.0, pose=[0, 0, 0, *turn], friction=mu)
+    box = dc.RigidBody.box(
+        [0.08, 0.08, 0.04],
+        motion="dynamic",
+        mass=0.2,
+        friction=mu,
+        pose=[up * math.sin(slope), 0, up * math.cos(slope), *turn],
+    )
+    sim = dc.Simulator(
+        dc.Scene([], [plane, box]), 0.01, contact=dc.ContactOptions(barrier_distance=2 * gap)
+    )
+    with torch.no_grad():
+        end = sim.rollout(sim.initial_state(), steps=300)[-1]
+    down = torch.tensor([math.cos(slope), 0.0, -math.sin(slope)], dtype=torch.float64)
+    speed = float(end.body_velocities[1, :3] @ down)
+    law = dc.ContactOptions().slip_velocity * (1 - math.sqrt(1 - math.tan(slope) / mu))
+    assert speed == pytest.approx(law, rel=1e-4)
