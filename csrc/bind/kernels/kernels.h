@@ -26,6 +26,9 @@ linalg::KernelLevel level_named(const std::string& name);
 /// Drag of faces, for tests against its formula and differences.
 void air_kernels(nb::module_& m);
 
+/// What bodies are made of, for tests against independent references.
+void body_kernels(nb::module_& m);
+
 /// Threads, for tests of what happens when they fail or are interrupted.
 void common_kernels(nb::module_& m);
 

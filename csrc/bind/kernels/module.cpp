@@ -6,6 +6,7 @@ NB_MODULE(_kernels, m) {
   m.doc() = "Single kernels of the C++ core, exposed for tests and benchmarks.";
 
   diffcloth::bind::air_kernels(m);
+  diffcloth::bind::body_kernels(m);
   diffcloth::bind::direction_kernels(m);
   diffcloth::bind::common_kernels(m);
   diffcloth::bind::contact_kernels(m);
