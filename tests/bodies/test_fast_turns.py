@@ -106,10 +106,18 @@ def test_gradients_of_a_step_that_touches_while_it_turns_fast(turn):
         assert gradient[1, i] == pytest.approx(float(slope), rel=1e-3, abs=1e-4)
 
 
-def test_a_body_by_itself_turns_exactly():
+@pytest.mark.parametrize(
+    ("inertia", "spin"),
+    [
+        ([0.2, 1.0, 1.1], [2.0, 1.5, -1.7]),
+        # No body's, but symmetric: its momentum turns so fast that all terms of the series count.
+        ([0.009, 0.057, 1.0], [-2.2, 1.6, -0.54]),
+    ],
+)
+def test_a_body_by_itself_turns_exactly(inertia, spin):
     """At 3 rad a step as in many small steps; with what it keeps."""
-    J = torch.diag(torch.tensor([0.2, 1.0, 1.1], dtype=F64))[None, None]
-    spin = torch.tensor([2.0, 1.5, -1.7], dtype=F64)
+    J = torch.diag(torch.tensor(inertia, dtype=F64))[None, None]
+    spin = torch.tensor(spin, dtype=F64)
     momentum = (J[0, 0] @ spin).expand(1, 1, 3)
     once, _ = free_turns(J, momentum, 1.0)
     turn = torch.eye(3, dtype=F64)

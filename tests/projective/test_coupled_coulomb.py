@@ -47,3 +47,13 @@ def test_impulses_and_velocities_obey_the_law(m, friction, condition):
         assert cases[0] > 0
         assert cases[2] > 0
         assert (cases[1] > 0) == (friction > 0.0)
+
+
+@pytest.mark.parametrize("friction", [0.3, 1.0])
+def test_newtons_method_ends_what_twenty_sweeps_began(friction):
+    """Sweeps alone take up to eighty; a sweep too many says that the law is obeyed."""
+    for seed in range(5):
+        W, q, normals = contacts(40, seed, 30.0)
+        _kernels.solve_coulomb(
+            W.ravel().tolist(), q.ravel().tolist(), normals.ravel().tolist(), friction, 1e-12, 21
+        )

@@ -185,6 +185,13 @@ def test_a_sheet_sticks_without_creep_below_its_friction_angle_and_slides_above(
     )
 
 
+@pytest.mark.parametrize("tolerance", np.geomspace(1e-2, 1e-9, 8))
+def test_what_is_left_of_a_step_is_below_the_tolerance(tolerance):
+    for case in CASES:
+        after = on_body("sphere", case, tolerance=float(tolerance))()
+        assert after.report.residual <= tolerance
+
+
 def test_a_slide_accelerates_as_coulomb_says():
     # mu .49 on tan(theta) = .5: a = g (sin - mu cos) = .087743 m/s^2.
     sim, state, down = patch(0.49, np.arctan(0.5))
@@ -231,6 +238,19 @@ def test_stopping_distance_and_its_gradients(v_0, mu):
     d_speed, d_friction = torch.autograd.grad(distance, (speed, friction))
     assert d_speed.item() == pytest.approx(h * steps, rel=1e-6)
     assert d_friction.item() == pytest.approx(-0.5 * h * h * G * steps * (steps + 1), rel=1e-6)
+
+
+def test_nothing_holds_what_falls_straight_down_on_a_smooth_floor():
+    """Without friction it slips even where it has not slipped: its tangential velocity stays its own."""
+    sim, state, _ = patch(0.0)
+    velocities = torch.zeros_like(state.velocities)
+    velocities[:, 2] = -0.1
+    velocities.requires_grad_()
+    after = sim.step(state.replace(velocities=velocities))
+    assert counts(after) == (0, 0, 9)
+    weights = sim.vertex_masses() / sim.vertex_masses().sum()
+    (gradient,) = torch.autograd.grad(weights @ after.positions[:, 0], velocities)
+    torch.testing.assert_close(gradient[:, 0], DT * weights, rtol=1e-9, atol=0)
 
 
 def test_a_floor_bears_the_weight_and_no_more():
@@ -311,6 +331,21 @@ def test_an_obstacle_carries_what_sticks_to_it():
     )
 
 
+@pytest.mark.parametrize("missing", [1e-9, 0.1, 0.24, -0.01])
+def test_what_arrives_at_the_very_end_of_a_step_touches(missing):
+    """The floor stops a sheet that would enter in the last quarter of the step, and no other."""
+    sim, state, _ = patch(0.5)
+    gap, speed = 1e-3, 1.0
+    # Free fall would end this share of the way below where it touches.
+    way = DT * (speed + DT * G)
+    x = state.positions.clone()
+    x[:, 2] = gap + way * (1 - missing)
+    velocities = torch.zeros_like(x)
+    velocities[:, 2] = -speed
+    after = sim.step(state.replace(positions=x, velocities=velocities))
+    assert sum(counts(after)) == (9 if missing > 0 else 0)
+
+
 def test_a_body_touches_halfway_whatever_the_sign_of_its_quaternion():
     """A box passes by and turns: only halfway is it at the sheet."""
     sheet = dc.Cloth.grid(3, 3, size=(0.1, 0.1), pose=[0, 0, 0.045, 1, 0, 0, 0])
@@ -327,6 +362,10 @@ def test_a_body_touches_halfway_whatever_the_sign_of_its_quaternion():
     )
     state = sim.initial_state()
     assert counts(sim.step(state)) == (0, 0, 0)
+
+    def height(end):
+        return (sim.step(state, dc.Control(body_poses=end)).positions[:, 2] ** 2).sum()
+
     found = []
     for sign in (1.0, -1.0):
         end = torch.tensor([[0.5, -0.01, 0.01, 1.0, 0.07, 0.1, -0.4]], dtype=F64)
@@ -334,6 +373,10 @@ def test_a_body_touches_halfway_whatever_the_sign_of_its_quaternion():
         end.requires_grad_()
         after = sim.step(state, dc.Control(body_poses=end))
         (gradient,) = torch.autograd.grad((after.positions[:, 2] ** 2).sum(), end)
+        # Tangents are the transpose.
+        direction = tensor_noise((1, 7), 1.0, 3)
+        _, change = torch.func.jvp(height, (end.detach(),), (direction,))
+        torch.testing.assert_close(change, (gradient * direction).sum(), rtol=1e-8, atol=0)
         gradient[0, 3:] *= sign
         found.append((after.positions.detach(), gradient))
     assert counts(after)[2] > 4

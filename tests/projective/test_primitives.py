@@ -22,7 +22,12 @@ def nearest(kind, point):
 @pytest.mark.parametrize("kind", SOLIDS)
 def test_the_nearest_point_is_that_of_a_search(kind):
     charts, inside = SOLIDS[kind][1]
-    for y in np.random.default_rng(0).uniform(-1.0, 1.0, (25, 3)):
+    rng = np.random.default_rng(0)
+    # Few of those around a solid are inside, where its sides differ in other signs.
+    within = [y for y in rng.uniform(-0.6, 0.6, (400, 3)) if inside(y)][:15]
+    assert (np.sign(within).min(0) < 0).all()
+    assert len(within) == 15
+    for y in [*rng.uniform(-1.0, 1.0, (25, 3)), *within]:
         distance, normal, point, *_ = nearest(kind, y)
         expected = oracle.nearest_point(charts, y)
         sign = -1.0 if inside(y) else 1.0
