@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bodies.core_mechanisms import DT, CoreScene, chain, one_body
+from bodies.core_mechanisms import DT, CoreScene, chain, one_body, trees
 
 OUTPUTS = (
     *("positions", "velocities", "body_forces", "contact_forces", "pin_forces"),
@@ -228,3 +228,52 @@ def world_pose(frame, q):
     turn = Rotation.from_rotvec(q[3:])
     x, y, z, w = (turn * Rotation.from_quat([x, y, z, w])).as_quat()
     return [*(q[:3] + turn.apply(frame[:3])), w, x, y, z]
+
+
+@pytest.mark.parametrize("name", ["positions", "coordinates", "body_poses", "coordinate_targets"])
+def test_tangents_are_the_transpose_of_gradients(case, name):
+    """Also where friction counts motion from points that are inputs of their own."""
+    scene, arrays, cotangents, gradients = case
+    direction = np.random.default_rng(4).standard_normal(arrays[name].shape)
+    result = scene.forward(arrays, tape=True)
+    tape = {key: array for key, array in result.items() if key.startswith("tape_")}
+    given = {name: direction[None]}
+    change = scene.core.tangent(arrays, tape, result["kept"], given, 1, 1)
+    along = sum((change[key][0] * cotangents[key]).sum() for key in OUTPUTS)
+    assert along == pytest.approx((gradients[name] * direction).sum(), rel=1e-8, abs=1e-10)
+
+
+@pytest.mark.parametrize("what", ["body", "joint"])
+def test_what_is_prescribed_turns_along_its_arc(what):
+    """By a third of a turn in a step, far from the cloth: no straight way, which would cut through."""
+    angle = 2.0
+    if what == "body":
+        scene = CoreScene(one_body(free=False), BOXES[:1])
+        start = [5.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+        end = [5.0, 0.0, 0.0, np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)]
+        arrays = scene.inputs(body_poses=[start], body_targets=[end])
+    else:
+        joint = {"lower": [-np.inf], "upper": [np.inf], "limit_stiffness": [0.0]}
+        axes = [[0, 0, 0], [0, 0, 1]]
+        tree = trees(
+            False, [0, 1], [np.eye(4)] * 2, axes, [-1, 0], [0, 1], [0, 0], prescribed=[1], **joint
+        )
+        scene = CoreScene(tree, [[0.02] * 3, BOXES[0]])
+        frame = [5.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+        arrays = scene.inputs(
+            body_poses=[frame],
+            body_targets=[frame],
+            coordinates=[0.0],
+            coordinate_ends=[angle],
+            coordinate_targets=[0.0],
+            coordinate_metric=[1.0],
+        )
+    ways = scene.core.path(arrays)
+    arms = ways[:, -8:, :2] - [5.0, 0.0]
+    assert len(ways) > 2
+    radius = np.linalg.norm(arms[0], axis=1)
+    middle = np.linalg.norm(arms[1:] + arms[:-1], axis=2) / 2
+    # The middle of a chord of ten degrees.
+    assert (middle > (np.cos(np.radians(5.0)) - 1e-9) * radius).all()
+    turned = np.arccos((arms[0] * arms[-1]).sum(1) / radius**2)
+    np.testing.assert_allclose(turned, angle, atol=1e-9)

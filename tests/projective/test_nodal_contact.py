@@ -241,7 +241,7 @@ def test_stopping_distance_and_its_gradients(v_0, mu):
 
 
 def test_nothing_holds_what_falls_straight_down_on_a_smooth_floor():
-    """Without friction it slips even where it has not slipped: its tangential velocity stays its own."""
+    """Without friction it slips even where it has not slipped: its velocity along it is its own."""
     sim, state, _ = patch(0.0)
     velocities = torch.zeros_like(state.velocities)
     velocities[:, 2] = -0.1
