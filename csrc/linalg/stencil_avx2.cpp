@@ -2,6 +2,8 @@
 // Only CMakeLists.txt's flags for this file allow it.
 #ifdef __AVX2__
 
+#include "linalg/slot_by_halves.h"
+
 namespace diffcloth::linalg {
 namespace {
 constexpr int kPack = 4;

@@ -1,6 +1,9 @@
-// The arithmetic of AddStencil, written once over vectors of `kPack` doubles, which the file that includes this
-// one defines. Everything here is in an anonymous namespace, for the reason given in
-// linalg/dense_kernels_impl.h.
+// The arithmetic of AddStencil, written once over vectors of `kPack` doubles, for a file that defines in its
+// anonymous namespace, before it includes this one, kPack and
+//
+//   slot_of(start, rows, i, j)  see BlockPattern::slot()
+//
+// Everything here is in an anonymous namespace, for the reason given in linalg/dense_kernels_impl.h.
 
 #pragma once
 
@@ -22,26 +25,26 @@ using Stored = double __attribute__((vector_size(8 * kPack), aligned(8), may_ali
 DIFFCLOTH_INLINE Pack load(const double* from) { return *reinterpret_cast<const Stored*>(from); }
 DIFFCLOTH_INLINE void store(double* to, const Pack& from) { *reinterpret_cast<Stored*>(to) = from; }
 
-/// See BlockPattern::slot(). Columns differ in length, and a loop that ends somewhere else each time costs more
-/// than steps that do nothing.
-DIFFCLOTH_INLINE std::ptrdiff_t slot_of(const std::int32_t* start,
-                                        const std::int32_t* rows,
-                                        std::int32_t i,
-                                        std::int32_t j) {
-  constexpr int kSteps = 5;  // enough for 31 blocks
-  const std::int32_t* first = rows + start[j];
-  std::int32_t count = start[j + 1] - start[j];
-  while (__builtin_expect(count >= (1 << kSteps), 0)) {
-    const std::int32_t half = (count + 1) / 2;
-    first += half * static_cast<std::int32_t>(first[half - 1] < i);
-    count -= half;
+/// Numbers 0 1 2 0 and 1 2 0 1 of a point, or 0 0 0 1 and 1 1 2 2 of another: their products are the first eight of
+/// a block, which its columns, one behind the other, make.
+using Four = double __attribute__((vector_size(32)));
+using StoredFour = double __attribute__((vector_size(32), aligned(8), may_alias));
+struct Eight {
+  Four v[2];
+};
+
+/// Three numbers that are followed, or preceded, by another one, in the order of rows or of columns.
+template <bool kPreceded>
+DIFFCLOTH_INLINE void spread(const double* from, bool rows, Eight& to) {
+  const StoredFour& v = *reinterpret_cast<const StoredFour*>(kPreceded ? from - 1 : from);
+  constexpr int k = kPreceded ? 1 : 0;
+  if (rows) {
+    to.v[0] = Four{v[k], v[k + 1], v[k + 2], v[k]};
+    to.v[1] = Four{v[k + 1], v[k + 2], v[k], v[k + 1]};
+  } else {
+    to.v[0] = Four{v[k], v[k], v[k], v[k + 1]};
+    to.v[1] = Four{v[k + 1], v[k + 1], v[k + 2], v[k + 2]};
   }
-  for (int step = 0; step < kSteps; ++step) {
-    const std::int32_t half = (count + 1) / 2;
-    first += half * static_cast<std::int32_t>(first[half - static_cast<int>(half > 0)] < i);
-    count -= half;
-  }
-  return first - rows;
 }
 
 /// kSize numbers a vector, of kPoints points.
@@ -52,24 +55,26 @@ DIFFCLOTH_INLINE void add(const StencilTerms& of,
                           const std::int32_t* rows,
                           double* blocks) {
   // A matrix is larger than the nearest cache: where its blocks are is told early.
-  double* to_block[kPoints][kPoints];
+  double* to_block[kPoints][kPoints] = {};
+#pragma GCC unroll 5
   for (int p = 0; p < kPoints; ++p) {
+#pragma GCC unroll 5
     for (int q = 0; q <= p; ++q) {
       if (row[p] < 0 || row[q] < 0) continue;
       const std::int32_t i = row[p] > row[q] ? row[p] : row[q];
       const std::int32_t j = row[p] > row[q] ? row[q] : row[p];
-      double* const block = blocks + 9 * slot_of(start, rows, i, j);
+      // A column begins on the diagonal.
+      double* const block = blocks + 9 * (p == q ? start[j] : slot_of(start, rows, i, j));
       to_block[p][q] = block;
       __builtin_prefetch(block);
       __builtin_prefetch(block + 8);
     }
   }
-  constexpr int kPacks = kSize / kPack;
   double made[3][kSize];
   const double* right[3] = {of.right[0], of.right[1], of.right[2]};
   if (of.core != nullptr) {
     for (int k = 0; k < 3; ++k) {
-      for (int l = 0; l < kPacks; ++l) {
+      for (int l = 0; l < kSize / kPack; ++l) {
         Pack sum = of.core[k] * load(of.left[0] + kPack * l);
         for (int m = 1; m < 3; ++m) sum += of.core[3 * m + k] * load(of.left[m] + kPack * l);
         store(made[k] + kPack * l, sum);
@@ -77,36 +82,46 @@ DIFFCLOTH_INLINE void add(const StencilTerms& of,
       right[k] = made[k];
     }
   }
-  double h[3 * kPoints][kSize];  // column by column
-  for (int q = 0; q < kPoints; ++q) {
-    if (row[q] < 0) continue;
-    for (int b = 0; b < 3; ++b) {
-      double* const column = h[3 * q + b];
-      Pack sum[kPacks] = {};
-      for (int k = 0; k < of.terms; ++k) {
-        const double by = right[k][3 * q + b];
-        for (int l = 0; l < kPacks; ++l) sum[l] += by * load(of.left[k] + kPack * l);
-      }
-      if (of.rest != nullptr) {
-        for (int l = 0; l < kPacks; ++l) {
-          sum[l] += load(of.rest + 12 * (3 * q + b) + kPack * l);
-        }
-      }
-      for (int l = 0; l < kPacks; ++l) store(column + kPack * l, sum[l]);
+  Eight as_row[kPoints][3];
+  Eight as_column[kPoints][3];
+#pragma GCC unroll 3
+  for (int k = 0; k < 3; ++k) {
+    if (k >= of.terms) break;
+#pragma GCC unroll 4
+    for (int p = 0; p < kPoints - 1; ++p) {
+      spread<false>(of.left[k] + 3 * p, true, as_row[p][k]);
+      spread<false>(right[k] + 3 * p, false, as_column[p][k]);
     }
+    spread<true>(of.left[k] + 3 * (kPoints - 1), true, as_row[kPoints - 1][k]);
+    spread<true>(right[k] + 3 * (kPoints - 1), false, as_column[kPoints - 1][k]);
   }
+#pragma GCC unroll 5
   for (int p = 0; p < kPoints; ++p) {
+#pragma GCC unroll 5
     for (int q = 0; q <= p; ++q) {
       if (row[p] < 0 || row[q] < 0) continue;
       // Which of both is the row is as good as random, so that there are no branches.
       const bool is_lower = row[p] >= row[q];
       const int r = is_lower ? p : q;
       const int c = is_lower ? q : p;
-      const double* const from = h[3 * c] + 3 * r;
-      double* const to = to_block[p][q];
-      for (int b = 0; b < 3; ++b) {
-        for (int a = 0; a < 3; ++a) to[3 * b + a] += from[kSize * b + a];
+      Four sum[2] = {};
+      double last = 0.0;
+      for (int k = 0; k < of.terms; ++k) {
+        for (int l = 0; l < 2; ++l) sum[l] += as_column[c][k].v[l] * as_row[r][k].v[l];
+        last += right[k][3 * c + 2] * of.left[k][3 * r + 2];
       }
+      if (of.rest != nullptr) {
+        const double* const from = of.rest + 36 * c + 3 * r;
+        sum[0] += Four{from[0], from[1], from[2], from[12]};
+        sum[1] += Four{from[13], from[14], from[24], from[25]};
+        last += from[26];
+      }
+      double* const to = to_block[p][q];
+      for (int l = 0; l < 2; ++l) {
+        auto& stored = *reinterpret_cast<StoredFour*>(to + 4 * l);
+        stored = stored + sum[l];
+      }
+      to[8] += last;
       if (of.along != 0.0) {
         const double along = of.along * of.c[p] * of.c[q];
         for (int a = 0; a < 3; ++a) to[4 * a] += along;

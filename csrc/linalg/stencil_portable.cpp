@@ -1,5 +1,7 @@
 // Matrices of stencils in vectors of two doubles, which every 64-bit processor has.
 
+#include "linalg/slot_by_halves.h"
+
 namespace diffcloth::linalg {
 namespace {
 constexpr int kPack = 2;
