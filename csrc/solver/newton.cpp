@@ -304,9 +304,7 @@ bool start_from(Walk& walk, const std::vector<double>& guess) {
     Eigen::Map<Vec3>(held.data() + 3 * point) = row(walk.x().data(), point);
   }
   coordinates.place(held);
-  if (walk.f.energy_without_contact(guess.data()) > walk.f.energy_without_contact(held.data())) {
-    return false;
-  }
+  if (walk.f.energy_change_without_contact(held.data(), guess.data()) > 0.0) return false;
   std::vector<double> change(guess.size());
   for (std::size_t a = 0; a < guess.size(); ++a) change[a] = guess[a] - walk.x()[a];
   if (coordinates.largest_fraction(walk.x(), change) < 1.0 || walk.watch(guess) < 1.0) return false;

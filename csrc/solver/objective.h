@@ -21,7 +21,8 @@ struct Objective {
   double h;       ///< time step [s]
   double length;  ///< mean edge of the cloths [m]
   Proximity* inertia;
-  std::vector<Potential*> others;                ///< everything but inertia and contact
+  std::vector<Potential*> others;                ///< everything but inertia, friction and contact
+  Potential* friction = nullptr;                 ///< null where nothing touched
   contact::ContactPotential* contact = nullptr;  ///< null where nothing can touch
   bodies::CoordinatePotential* chart = nullptr;  ///< of free coordinates; null where there are none
   PatternCache* patterns;
@@ -33,6 +34,7 @@ struct Objective {
     visit(static_cast<Potential&>(*inertia));
     if (chart != nullptr) visit(static_cast<Potential&>(*chart));
     for (Potential* potential : others) visit(*potential);
+    if (friction != nullptr) visit(*friction);
     if (contact != nullptr) visit(static_cast<Potential&>(*contact));
   }
 
@@ -47,16 +49,17 @@ struct Objective {
     return e;
   }
 
-  double energy_without_contact(const double* x) const {
-    double e = inertia->energy(x);
-    if (chart != nullptr) e += chart->energy(x);
-    for (const Potential* p : others) e += p->energy(x);
-    return e;
-  }
-
   double energy_change(const double* x, const double* to) const {
     double change = 0.0;
     for_each([&](const Potential& p) { change += p.energy_change(x, to); });
+    return change;
+  }
+
+  /// The same without friction and contact.
+  double energy_change_without_contact(const double* x, const double* to) const {
+    double change = inertia->energy_change(x, to);
+    if (chart != nullptr) change += chart->energy_change(x, to);
+    for (const Potential* p : others) change += p->energy_change(x, to);
     return change;
   }
 
