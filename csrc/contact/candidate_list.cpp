@@ -4,7 +4,7 @@
 #include <array>
 #include <cmath>
 
-#include "contact/distance/separation.h"
+#include "contact/separation_lanes.h"
 
 namespace diffcloth::contact {
 namespace {
@@ -32,9 +32,23 @@ struct Travel {
   double largest = 0.0;
 };
 
-double distance_at(const double* x, const Candidate& pair) {
-  const auto& [i, j, k, l] = pair.vertices;
-  return std::sqrt(distance_sq(pair.kind, {row(x, i), row(x, j), row(x, k), row(x, l)}));
+/// Distances of sorted pairs at x [m].
+void measure_distances(const std::vector<Candidate>& pairs,
+                       const double* x,
+                       std::vector<double>& out) {
+  static const SquaredDistances measure = squared_distances(linalg::best_level());
+  constexpr std::ptrdiff_t kStride = sizeof(Candidate) / sizeof(Index);
+  static_assert(sizeof(Candidate) % sizeof(Index) == 0);
+  out.resize(pairs.size());
+  const auto middle = std::ranges::find(pairs, PairKind::kEdgeEdge, &Candidate::kind);
+  const auto run = [&](auto first, auto last) {
+    if (first == last) return;
+    measure(first->kind == PairKind::kEdgeEdge, x, first->vertices.data(), kStride, last - first,
+            out.data() + (first - pairs.begin()));
+  };
+  run(pairs.begin(), middle);
+  run(middle, pairs.end());
+  for (double& d : out) d = std::sqrt(d);
 }
 
 /// NaN counts as the largest of all.
@@ -134,17 +148,21 @@ void CandidateList::build_near(const double* x_t0, double approach, BroadPhase::
 void CandidateList::keep_near_ones(Kept& kept) const {
   const CollisionMesh& mesh = broad_phase_->mesh();
   const double* const x = kept.reference.data();
-  kept.distance.clear();
+  measure_distances(kept.pairs, x, kept.distance);
   kept.surfaces.clear();
-  std::erase_if(kept.pairs, [&](const Candidate& pair) {
-    const double distance = distance_at(x, pair);
+  std::size_t count = 0;
+  for (std::size_t k = 0; k < kept.pairs.size(); ++k) {
+    const Candidate& pair = kept.pairs[k];
+    const double distance = kept.distance[k];
     const Index s = mesh.vertex_surface[pair.vertices[0]];
     const Index r = mesh.vertex_surface[pair.vertices[3]];
-    if (distance > reach_[s] + reach_[r] + 2.0 * (kept.skin + rounding_)) return true;
-    kept.distance.push_back(distance);
+    if (distance > reach_[s] + reach_[r] + 2.0 * (kept.skin + rounding_)) continue;
     kept.surfaces.push_back(s * mesh.surface_count() + r);
-    return false;
-  });
+    kept.distance[count] = distance;
+    kept.pairs[count++] = pair;
+  }
+  kept.distance.resize(count);
+  kept.pairs.resize(count);
   kept.pairs.shrink_to_fit();  // often to next to nothing
 }
 
@@ -236,11 +254,16 @@ void CandidateList::find_at(const double* x,
   with_skin_.clear();
   for (const double value : reach) with_skin_.push_back(value + kMore * widened);
   broad_phase_->find_at_rest(x, with_skin_, scratch, out);
-  std::erase_if(out, [&](const Candidate& pair) {
-    const double limit = range[mesh.vertex_surface[pair.vertices[0]] * count +
-                               mesh.vertex_surface[pair.vertices[3]]];
-    return limit < 0.0 || distance_at(x, pair) > limit;
-  });
+  std::vector<double> distance;
+  measure_distances(out, x, distance);
+  std::size_t kept = 0;
+  for (std::size_t k = 0; k < out.size(); ++k) {
+    const std::array<Index, 4>& v = out[k].vertices;
+    const double limit = range[mesh.vertex_surface[v[0]] * count + mesh.vertex_surface[v[3]]];
+    if (limit < 0.0 || distance[k] > limit) continue;
+    out[kept++] = out[k];
+  }
+  out.resize(kept);
 }
 
 void CandidateList::find(const double* x_t0,

@@ -188,7 +188,7 @@ void ContactModel::add_own_term(const Candidate& pair,
   const Corners corner = corners(pair.vertices, x);
   const double range = parameters_.d_hat + xi(pair);
   if (is_beyond(pair.kind, corner, range)) return;
-  const double d_sq = closest(pair.kind, corner).d_sq;
+  const double d_sq = closest_points(pair.kind, corner).d_sq;
   if (d_sq < range * range) out.push_back({.pair = pair, .coefficient = 0.25, .d_sq = d_sq});
 }
 
@@ -202,7 +202,7 @@ void ContactModel::add_skeleton_term(const Candidate& pair,
   const bool is_point_a = mesh_.is_point(surface_a(pair));
   if (is_point_b && (!is_point_a || surface_a(pair) > surface_b(pair))) return;
   const double range = parameters_.d_hat + xi(pair);
-  const double d_sq = closest(pair.kind, corners(pair.vertices, x)).d_sq;
+  const double d_sq = closest_points(pair.kind, corners(pair.vertices, x)).d_sq;
   if (!(d_sq < range * range)) return;
   Candidate own = pair;
   own.b = -1;  // no face has the area

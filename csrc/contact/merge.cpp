@@ -101,7 +101,8 @@ Projection project(const CollisionMesh& mesh,
     }
     result = Projection::kOnFlatBorder;
   }
-  const Closest geometry = closest(PairKind::kPointTriangle, {p, row(x, i), row(x, j), row(x, k)});
+  const ClosestPoints geometry =
+      closest_points(PairKind::kPointTriangle, {p, row(x, i), row(x, j), row(x, k)});
   if (geometry.parameter_count != 2) return Projection::kOutside;
   d_sq = geometry.d_sq;
   return result;
@@ -180,13 +181,13 @@ void sort_unique(Values& values) {
 //
 // So the nearest feature counts once, however a surface is cut into triangles; all others cancel.
 
-/// The faces of a group that are within range of a point, and their edges and vertices.
-void find_features(const CollisionMesh& mesh,
-                   const FeatureWeights::Features& features,
-                   std::span<const Candidate> group,
-                   const double* x,
-                   double range,
-                   MergeScratch& scratch) {
+/// The faces of a group that are within range of a point, and their edges.
+void find_faces_and_edges(const CollisionMesh& mesh,
+                          const FeatureWeights::Features& features,
+                          std::span<const Candidate> group,
+                          const double* x,
+                          double range,
+                          MergeScratch& scratch) {
   const Vec3 p = row(x, group.front().a);
   auto& [faces, edges, vertices, parts] = scratch;
   faces.clear();
@@ -205,13 +206,32 @@ void find_features(const CollisionMesh& mesh,
   edges.clear();
   for (const Index e : vertices) edges.push_back(nearest_on_edge(mesh, e, p, x));
   vertices.clear();
+}
+
+void find_vertices(const CollisionMesh& mesh, MergeScratch& scratch) {
+  auto& [faces, edges, vertices, parts] = scratch;
   for (const Index f : faces) {
     vertices.insert(vertices.end(), mesh.faces[f].begin(), mesh.faces[f].end());
   }
   sort_unique(vertices);
 }
 
-/// What a point has against each of the features that find_features() has found.
+/// What a point has against faces alone.
+void list_face_parts(const CollisionMesh& mesh,
+                     const FeatureWeights::Features& features,
+                     const Vec3& p,
+                     const double* x,
+                     MergeScratch& scratch) {
+  scratch.parts.clear();
+  for (const Index f : scratch.faces) {
+    double d_sq = 0.0;
+    if (project(mesh, features, f, p, x, d_sq) != Projection::kInside) continue;
+    scratch.parts.push_back(
+        {.kind = kFace, .ends = {-1, -1}, .id = f, .coefficient = 1.0, .d_sq = d_sq});
+  }
+}
+
+/// What a point has against each of the features that have been found.
 void list_point_parts(const CollisionMesh& mesh,
                       const FeatureWeights::Features& features,
                       const Vec3& p,
@@ -298,7 +318,7 @@ class EdgePair {
   EdgePair(const CollisionMesh& mesh,
            const FeatureWeights& weights,
            const Candidate& pair,
-           const Closest& nearest_points,
+           const ClosestPoints& nearest_points,
            const Corners& corner,
            bool soft,
            const double* x,
@@ -337,7 +357,8 @@ class EdgePair {
   void push_against_e(std::int8_t end_c, double coefficient) {
     Corners at = corner_;
     if (end_c >= 0) at[0] = at[1] = corner_[end_c];
-    const Closest whole = end_c >= 0 ? closest(PairKind::kEdgeEdge, at) : nearest_points_;
+    const ClosestPoints whole =
+        end_c >= 0 ? closest_points(PairKind::kEdgeEdge, at) : nearest_points_;
     const bool at_0 = whole.c[3] == 0.0;
     const bool at_1 = whole.c[2] == 0.0;
     if (!at_0 && !at_1) {
@@ -362,7 +383,7 @@ class EdgePair {
   const CollisionMesh& mesh_;
   const FeatureWeights& weights_;
   const Candidate& pair_;
-  const Closest& nearest_points_;
+  const ClosestPoints& nearest_points_;
   const Corners& corner_;
   bool against_cloth_;
   bool soft_;
@@ -401,9 +422,17 @@ void add_point_terms(const CollisionMesh& mesh,
                      std::vector<Term>& out) {
   const Index point = group.front().a;
   const Vec3 p = row(x, point);
-  find_features(mesh, features, group, x, range, scratch);
+  find_faces_and_edges(mesh, features, group, x, range, scratch);
   if (scratch.faces.empty()) return;
-  list_point_parts(mesh, features, p, x, scratch);
+  // What no edge is near to, no vertex is, and inside of a face it has nothing else.
+  const bool is_inside = std::ranges::all_of(
+      scratch.edges, [&](const NearEdge& e) { return e.d_sq > kClearly * range * range; });
+  if (is_inside) {
+    list_face_parts(mesh, features, p, x, scratch);
+  } else {
+    find_vertices(mesh, scratch);
+    list_point_parts(mesh, features, p, x, scratch);
+  }
   merge(scratch.parts, range);
   for (Part& part : scratch.parts) {
     move_to_plane(mesh, features, scratch.faces, p, x, part);
@@ -431,7 +460,7 @@ void add_edge_terms(const CollisionMesh& mesh,
     const auto& v = pair.vertices;
     const Corners corner{row(x, v[0]), row(x, v[1]), row(x, v[2]), row(x, v[3])};
     if (is_beyond(corner, range)) continue;
-    const Closest nearest_points = closest(PairKind::kEdgeEdge, corner);
+    const ClosestPoints nearest_points = closest_points(PairKind::kEdgeEdge, corner);
     // So are the ends then, and what they would be merged with; but for the rounding of distances.
     if (nearest_points.d_sq > kClearly * range * range) continue;
     const bool is_round = mesh.is_round_edge(c) || mesh.is_round_edge(e);

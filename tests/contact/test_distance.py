@@ -143,6 +143,24 @@ def test_distances_are_those_of_exact_arithmetic(edge_edge, pairs):
 
 
 @pytest.mark.parametrize("edge_edge", KINDS)
+@pytest.mark.parametrize("pairs", [all_regions, degenerate_pairs])
+def test_distances_of_many_pairs_are_those_of_each(edge_edge, pairs):
+    x = np.array([*pairs(edge_edge), *random_pairs(301, seed=5)])
+    alone = kernels.distance_sq(edge_edge, x)
+    levels = kernels.kernel_levels()
+    many = [kernels.distances_sq(level, edge_edge, x) for level in levels]
+    size_sq = np.array([scale_sq(pair) for pair in x])
+    assert np.all(np.abs(many[0] - alone) <= 1e-14 * np.sqrt(size_sq * alone) + 1e-28 * size_sq)
+    for level, distances in zip(levels, many, strict=True):
+        assert distances.tobytes() == many[0].tobytes(), level
+        # Whatever pairs are beside it, and where there are none.
+        shifted = kernels.distances_sq(level, edge_edge, x[3:])
+        assert shifted.tobytes() == distances[3:].tobytes(), level
+        one = kernels.distances_sq(level, edge_edge, x[-1:])
+        assert one.tobytes() == distances[-1:].tobytes(), level
+
+
+@pytest.mark.parametrize("edge_edge", KINDS)
 def test_distances_agree_with_ipctk(edge_edge):
     reference = ipctk.edge_edge_distance if edge_edge else ipctk.point_triangle_distance
     x = random_pairs(500, seed=0)
@@ -150,6 +168,19 @@ def test_distances_agree_with_ipctk(edge_edge):
     np.testing.assert_allclose(kernels.distance_sq(edge_edge, x), expected, rtol=1e-10)
     classified = np.array([kernels.closest(edge_edge, pair)[6] for pair in x])
     np.testing.assert_allclose(classified, expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("edge_edge", KINDS)
+@pytest.mark.parametrize("pairs", [all_regions, degenerate_pairs])
+def test_closest_points_have_the_bits_of_the_closest_vector(edge_edge, pairs):
+    counts = set()
+    for x in [*pairs(edge_edge), *random_pairs(300, seed=5)]:
+        c, count, *_, d_sq = kernels.closest(edge_edge, x)
+        points = kernels.closest_points(edge_edge, x)
+        assert points[0].tobytes() == c.tobytes()
+        assert points[1:] == (count, d_sq)
+        counts.add(count)
+    assert counts == {0, 1, 2}
 
 
 @pytest.mark.parametrize("edge_edge", KINDS)

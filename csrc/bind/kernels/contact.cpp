@@ -2,6 +2,7 @@
 #include <array>
 #include <cstddef>
 #include <limits>
+#include <numeric>
 #include <optional>
 #include <string>
 #include <tuple>
@@ -30,6 +31,7 @@
 #include "contact/distance/closest.h"
 #include "contact/distance/mollifier.h"
 #include "contact/nonadjacent_distance.h"
+#include "contact/separation_lanes.h"
 
 namespace diffcloth::bind {
 namespace {
@@ -197,6 +199,14 @@ void distance_kernels(nb::module_& m) {
       },
       "edge_edge"_a, "x"_a.noconvert());
   m.def(
+      "closest_points",
+      [](bool edge_edge, const OnePair& x) {
+        const contact::ClosestPoints pair =
+            contact::closest_points(kind_of(edge_edge), corners(x.data()));
+        return std::tuple(pair.c, pair.parameter_count, pair.d_sq);
+      },
+      "edge_edge"_a, "x"_a.noconvert());
+  m.def(
       "distance_sq_derivatives",
       [](bool edge_edge, const OnePair& x) {
         const contact::Closest pair = contact::closest(kind_of(edge_edge), corners(x.data()));
@@ -204,6 +214,18 @@ void distance_kernels(nb::module_& m) {
                           contact::distance_sq_hessian(pair), contact::beta_jacobian(pair));
       },
       "edge_edge"_a, "x"_a.noconvert());
+  m.def(
+      "distances_sq",
+      [](const std::string& level, bool edge_edge, const Pairs& x) {
+        std::vector<Index> corners(4 * x.shape(0));
+        std::iota(corners.begin(), corners.end(), 0);
+        Eigen::VectorXd out(x.shape(0));
+        const auto count = static_cast<std::ptrdiff_t>(x.shape(0));
+        contact::squared_distances(level_named(level))(edge_edge, x.data(), corners.data(), 4,
+                                                       count, out.data());
+        return out;
+      },
+      "level"_a, "edge_edge"_a, "x"_a.noconvert());
   m.def(
       "distance_sq",
       [](bool edge_edge, const Pairs& x) {

@@ -84,64 +84,100 @@ double border(const Vec3& e0, const Vec3& e1, const Vec3& w, double n_sq) {
 
 Nearest nearer(const Nearest& p, const Nearest& q) { return q.d_sq < p.d_sq ? q : p; }
 
-Closest point_triangle(const Corners& x) {
+/// Closest points inside a triangle, or inside both of two edges.
+struct Inner {
+  Vec3 s0, s1;  ///< the two edges
+  double n_sq;  ///< |s0 x s1|^2
+  double a, b;  ///< the parameters
+  Vec3 t;
+};
+
+bool find_in_triangle(const Corners& x, Inner& out) {
   const Vec3 e0 = x[2] - x[1];
   const Vec3 e1 = x[3] - x[1];
   const Vec3 w = x[0] - x[1];
   const Vec3 n = e0.cross(e1);
   const double n_sq = n.squaredNorm();
-  if (n_sq > kParallel * e0.squaredNorm() * e1.squaredNorm()) {
-    const double b0 = w.cross(e1).dot(n) / n_sq;
-    const double b1 = e0.cross(w).dot(n) / n_sq;
-    if (std::min({b0, b1, 1 - b0 - b1}) > -border(e0, e1, w, n_sq)) {
-      Closest out = empty();
-      out.c << 1, -(1 - b0 - b1), -b0, -b1;
-      out.parameter_count = 2;
-      out.c_beta.col(0) << 0, 1, -1, 0;
-      out.c_beta.col(1) << 0, 1, 0, -1;
-      out.s.col(0) = -e0;
-      out.s.col(1) = -e1;
-      out.M_inv = inverse_metric(e0, e1, n_sq);
-      out.t = w - b0 * e0 - b1 * e1;
-      out.d_sq = out.t.squaredNorm();
-      return out;
-    }
-  }
-  const Nearest e01 = point_edge(x, 0, 1, 2);
-  const Nearest e12 = point_edge(x, 0, 2, 3);
-  const Nearest e20 = point_edge(x, 0, 3, 1);
-  return from_point_edge(x, nearer(nearer(e01, e12), e20), 1);
+  if (!(n_sq > kParallel * e0.squaredNorm() * e1.squaredNorm())) return false;
+  const double b0 = w.cross(e1).dot(n) / n_sq;
+  const double b1 = e0.cross(w).dot(n) / n_sq;
+  if (!(std::min({b0, b1, 1 - b0 - b1}) > -border(e0, e1, w, n_sq))) return false;
+  out = {.s0 = e0, .s1 = e1, .n_sq = n_sq, .a = b0, .b = b1, .t = w - b0 * e0 - b1 * e1};
+  return true;
 }
 
-Closest edge_edge(const Corners& x) {
+bool find_between_edges(const Corners& x, Inner& out) {
   const Vec3 u = x[1] - x[0];
   const Vec3 v = x[3] - x[2];
   const Vec3 w = x[0] - x[2];
   const Vec3 n = u.cross(v);
   const double n_sq = n.squaredNorm();
-  if (n_sq >= kParallel * u.squaredNorm() * v.squaredNorm() && n_sq > 0) {
-    const double s = v.cross(w).dot(n) / n_sq;
-    const double t = u.cross(w).dot(n) / n_sq;
-    if (s > 0 && s < 1 && t > 0 && t < 1) {
-      Closest out = empty();
-      out.c << 1 - s, s, -(1 - t), -t;
-      out.parameter_count = 2;
-      out.c_beta.col(0) << -1, 1, 0, 0;
-      out.c_beta.col(1) << 0, 0, 1, -1;
-      out.s.col(0) = u;
-      out.s.col(1) = -v;
-      out.M_inv = inverse_metric(u, -v, n_sq);
-      out.t = w + s * u - t * v;
-      out.d_sq = out.t.squaredNorm();
-      return out;
-    }
-  }
+  if (!(n_sq >= kParallel * u.squaredNorm() * v.squaredNorm() && n_sq > 0)) return false;
+  const double s = v.cross(w).dot(n) / n_sq;
+  const double t = u.cross(w).dot(n) / n_sq;
+  if (!(s > 0 && s < 1 && t > 0 && t < 1)) return false;
+  out = {.s0 = u, .s1 = v, .n_sq = n_sq, .a = s, .b = t, .t = w + s * u - t * v};
+  return true;
+}
+
+Vec4 triangle_weights(const Inner& in) { return {1, -(1 - in.a - in.b), -in.a, -in.b}; }
+Vec4 edge_weights(const Inner& in) { return {1 - in.a, in.a, -(1 - in.b), -in.b}; }
+
+Nearest nearest_side(const Corners& x) {
+  const Nearest e01 = point_edge(x, 0, 1, 2);
+  const Nearest e12 = point_edge(x, 0, 2, 3);
+  const Nearest e20 = point_edge(x, 0, 3, 1);
+  return nearer(nearer(e01, e12), e20);
+}
+
+Nearest nearest_end(const Corners& x) {
   const Nearest a0 = point_edge(x, 0, 2, 3);
   const Nearest a1 = point_edge(x, 1, 2, 3);
   const Nearest b0 = point_edge(x, 2, 0, 1);
   const Nearest b1 = point_edge(x, 3, 0, 1);
-  const Nearest nearest = nearer(nearer(a0, a1), nearer(b0, b1));
-  return from_point_edge(x, nearest, nearest.vertex < 2 ? 1 : -1);
+  return nearer(nearer(a0, a1), nearer(b0, b1));
+}
+
+/// Whether the vertex belongs to the first primitive: +1, or -1.
+double sign_of(PairKind kind, const Nearest& nearest) {
+  return kind == PairKind::kPointTriangle || nearest.vertex < 2 ? 1.0 : -1.0;
+}
+
+Closest point_triangle(const Corners& x) {
+  Inner in;
+  if (!find_in_triangle(x, in)) {
+    return from_point_edge(x, nearest_side(x), 1);
+  }
+  Closest out = empty();
+  out.c = triangle_weights(in);
+  out.parameter_count = 2;
+  out.c_beta.col(0) << 0, 1, -1, 0;
+  out.c_beta.col(1) << 0, 1, 0, -1;
+  out.s.col(0) = -in.s0;
+  out.s.col(1) = -in.s1;
+  out.M_inv = inverse_metric(in.s0, in.s1, in.n_sq);
+  out.t = in.t;
+  out.d_sq = out.t.squaredNorm();
+  return out;
+}
+
+Closest edge_edge(const Corners& x) {
+  Inner in;
+  if (!find_between_edges(x, in)) {
+    const Nearest nearest = nearest_end(x);
+    return from_point_edge(x, nearest, sign_of(PairKind::kEdgeEdge, nearest));
+  }
+  Closest out = empty();
+  out.c = edge_weights(in);
+  out.parameter_count = 2;
+  out.c_beta.col(0) << -1, 1, 0, 0;
+  out.c_beta.col(1) << 0, 0, 1, -1;
+  out.s.col(0) = in.s0;
+  out.s.col(1) = -in.s1;
+  out.M_inv = inverse_metric(in.s0, -in.s1, in.n_sq);
+  out.t = in.t;
+  out.d_sq = out.t.squaredNorm();
+  return out;
 }
 
 /// G = d(s . t)/dx: rows (3 i .. 3 i + 2) of column a are c_i s_a + c'_(a,i) t.
@@ -165,6 +201,28 @@ Closest closest(PairKind kind, const Corners& x) {
       return edge_edge(x);
   }
   __builtin_unreachable();
+}
+
+ClosestPoints closest_points(PairKind kind, const Corners& x) {
+  const bool is_face = kind == PairKind::kPointTriangle;
+  Inner in;
+  if (is_face ? find_in_triangle(x, in) : find_between_edges(x, in)) {
+    return {.c = is_face ? triangle_weights(in) : edge_weights(in),
+            .parameter_count = 2,
+            .d_sq = in.t.squaredNorm()};
+  }
+  const Nearest nearest = is_face ? nearest_side(x) : nearest_end(x);
+  const double sign = sign_of(kind, nearest);
+  ClosestPoints out{.c = Vec4::Zero(), .parameter_count = 0, .d_sq = nearest.d_sq};
+  out.c[nearest.vertex] = sign;
+  if (nearest.a == 0 || nearest.a == 1) {
+    out.c[nearest.a == 0 ? nearest.e0 : nearest.e1] = -sign;
+  } else {
+    out.c[nearest.e0] = -sign * (1 - nearest.a);
+    out.c[nearest.e1] = -sign * nearest.a;
+    out.parameter_count = 1;
+  }
+  return out;
 }
 
 Vec12 distance_sq_gradient(const Closest& pair) {

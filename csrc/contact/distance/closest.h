@@ -39,6 +39,15 @@ struct Closest {
 /// |u|^2 |v|^2 are parallel and never of type line-line.
 Closest closest(PairKind kind, const Corners& x);
 
+/// What closest() finds of where the closest points lie, with its bits, and not how they move: that costs as much
+/// again.
+struct ClosestPoints {
+  Vec4 c;
+  int parameter_count;
+  double d_sq;  ///< [m^2]
+};
+ClosestPoints closest_points(PairKind kind, const Corners& x);
+
 /// Gradient of the squared distance, corner by corner [m].
 Vec12 distance_sq_gradient(const Closest& pair);
 
