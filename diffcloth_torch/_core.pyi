@@ -62,6 +62,7 @@ class Kept: ...
 class Simulator:
     largest_factor_bytes: int
     factor_bytes: int
+    last_turns: list[tuple[int, float]]
     def __init__(
         self,
         *,

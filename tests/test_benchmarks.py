@@ -396,6 +396,23 @@ def test_bits_are_the_same_twice_and_others_in_another_scheme():
     assert len({line[-1] for line in lines}) >= 3
 
 
+def test_uneven_batches_are_shared_as_evenly_as_costs_tell():
+    uneven = importlib.import_module("benchmarks.uneven")
+    assert uneven.makespan([1.0, 1.0, 2.0]) == 3.0
+    assert uneven.makespan([2.0, 1.0, 1.0]) == 2.0
+    assert uneven.best_makespan([3.0, 3.0, 2.0, 2.0, 2.0]) == 6.0
+    assert uneven.makespan([3.0, 3.0, 2.0, 2.0, 2.0]) == 7.0
+    options = ("--size", "8", "--environments", "4", "--steps", "1")
+    command = [sys.executable, "-m", "benchmarks.uneven", *options]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    seconds, *ratios = result.stdout.splitlines()
+    assert len(seconds.split(":")[1].split()) == 4
+    found = {name: float(rest.split(",")[0]) for name, rest in (r.split(": ") for r in ratios)}
+    assert found["cost"] <= found["best"] <= 2.0
+    assert found["batch"] <= found["best"]
+
+
 def test_energy_of_fast_turns_is_counted():
     command = [sys.executable, "-m", "benchmarks.turns", "--throws", "1"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -73,27 +73,34 @@ using PullBack = std::function<void(
     std::size_t environment, std::span<const step::Loss>, int threads, const Checkpoint&)>;
 
 /// Gradients of the inputs that are needed, from cotangents of all losses and environments.
+///
+/// @param costs  what a loss is expected to take in each environment
+/// @param turns  out: of the portions of losses
 nb::dict pull_back_all(const InputArrays& arrays,
                        const Saved& bars,
                        std::size_t losses,
                        const std::vector<std::string>& needs,
                        int threads,
+                       const std::vector<double>& costs,
+                       std::vector<Turn>& turns,
                        const PullBack& pull_back) {
   nb::dict out;
   std::vector<Wanted> wanted = make_gradients(arrays, losses, needs, out);
   // A loss that does not depend on an environment has zeros there: that step may even have failed.
   const std::vector<Portion> portions = make_portions(
       arrays.environments, losses, [&](std::size_t row) { return bars.is_zero(row); });
-  for_environments(portions.size(), threads, [&](Index i, const Checkpoint& checkpoint) {
-    const auto& [e, rows] = portions[static_cast<std::size_t>(i)];
-    std::vector<step::Loss> of_rows;
-    for (const std::size_t row : rows) {
-      of_rows.push_back({.cotangents = bars.environment(row), .gradients = {}});
-      step::Gradients& gradients = of_rows.back().gradients;
-      for (Wanted& w : wanted) gradients.data[w.input] = w.at(row);
-    }
-    pull_back(e, of_rows, threads_each(portions.size(), threads), checkpoint);
-  });
+  const std::vector<double> expected = expected_costs(portions, costs);
+  turns = for_environments(
+      portions.size(), threads, expected, [&](Index i, const Checkpoint& checkpoint) {
+        const auto& [e, rows] = portions[static_cast<std::size_t>(i)];
+        std::vector<step::Loss> of_rows;
+        for (const std::size_t row : rows) {
+          of_rows.push_back({.cotangents = bars.environment(row), .gradients = {}});
+          step::Gradients& gradients = of_rows.back().gradients;
+          for (Wanted& w : wanted) gradients.data[w.input] = w.at(row);
+        }
+        pull_back(e, of_rows, threads_each(portions.size(), threads), checkpoint);
+      });
   for (const Wanted& w : wanted) w.sum(arrays.environments);
   return out;
 }
@@ -123,7 +130,7 @@ nb::dict Simulator::backward(const nb::dict& inputs,
   const Saved tapes = taken_steps(b, tape, kept);
   const Saved bars(outputs_, losses * b, "", cotangents);
   return pull_back_all(
-      arrays, bars, losses, needs, threads,
+      arrays, bars, losses, needs, threads, kept.costs, last_turns_,
       [&](std::size_t e, std::span<const step::Loss> of_losses, int each, const Checkpoint& check) {
         step::backward(scene_, arrays.environment(e), tapes.environment(e),
                        *kept.tickets[e]->find(), of_losses, each, check);
@@ -141,8 +148,10 @@ nb::dict Simulator::energy_backward(const nb::dict& inputs,
     parts.push_back({.name = nb::cast<std::string>(name), .shape = {}});
   }
   const Saved bars(parts, losses * arrays.environments, "", cotangents);
+  const std::vector<double> alike(arrays.environments, 1.0);
+  std::vector<Turn> turns;
   return pull_back_all(
-      arrays, bars, losses, needs, threads,
+      arrays, bars, losses, needs, threads, alike, turns,
       [&](std::size_t e, std::span<const step::Loss> of_losses, int, const Checkpoint&) {
         step::pull_back_energy(scene_, arrays.environment(e), of_losses);
       });

@@ -1,6 +1,8 @@
 #include "bind/environments.h"
 
 #include <algorithm>
+#include <atomic>
+#include <chrono>
 
 #include "bind/bind.h"
 #include "bind/without_gil.h"
@@ -8,9 +10,19 @@
 
 namespace diffcloth::bind {
 
-void for_environments(std::size_t count,
-                      int threads,
-                      const std::function<void(Index, const Checkpoint&)>& body) {
+std::vector<Turn> for_environments(std::size_t count,
+                                   int threads,
+                                   std::span<const double> costs,
+                                   const std::function<void(Index, const Checkpoint&)>& body) {
+  using Clock = std::chrono::steady_clock;
+  std::vector<Turn> turns(count);
+  std::atomic<int> begun{0};
+  const auto timed = [&](Index i, const Checkpoint& checkpoint) {
+    turns[i].place = begun.fetch_add(1);
+    const Clock::time_point begin = Clock::now();
+    body(i, checkpoint);
+    turns[i].seconds = std::chrono::duration<double>(Clock::now() - begin).count();
+  };
   Interrupt interrupt([] {
     if (is_abandoned()) return true;
     const nb::gil_scoped_acquire gil;
@@ -18,10 +30,11 @@ void for_environments(std::size_t count,
   });
   try {
     const WithoutGil nogil;
-    parallel_for(static_cast<Index>(count), threads, interrupt, body);
+    parallel_for(static_cast<Index>(count), threads, costs, interrupt, timed);
   } catch (const Interrupted&) {
     throw nb::python_error();  // the error that the signal handler has set
   }
+  return turns;
 }
 
 int threads_each(std::size_t count, int threads) {

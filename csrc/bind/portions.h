@@ -12,6 +12,10 @@ struct Portion {
   std::vector<std::size_t> rows;  ///< loss or direction * environments + environment
 };
 
+/// What each portion is expected to take, from what one row of its environment does, in any unit.
+std::vector<double> expected_costs(const std::vector<Portion>& portions,
+                                   const std::vector<double>& of_environments);
+
 /// All rows but those that are zero, environment by environment.
 std::vector<Portion> make_portions(std::size_t environments,
                                    std::size_t count,

@@ -21,14 +21,18 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   const Outputs outputs(outputs_, {b}, "", out);
   const Outputs tapes(tape ? tape_ : std::vector<step::Field>(), {b}, "tape_", out);
   std::vector<step::Report> reports(b);
-  KeptSteps kept{.tickets = decltype(KeptSteps::tickets)(b)};
-  for_environments(b, threads, [&](Index i, const Checkpoint& checkpoint) {
+  KeptSteps kept{.tickets = decltype(KeptSteps::tickets)(b), .costs = std::vector<double>(b)};
+  const std::vector<double> expected = step_seconds_;  // another call may write while this one runs
+  last_turns_ = for_environments(b, threads, expected, [&](Index i, const Checkpoint& checkpoint) {
     const auto e = static_cast<std::size_t>(i);
     step::Kept found;
     reports[e] = step::forward(scene_, arrays.environment(e), checkpoint, outputs.environment(e),
                                tapes.environment(e), found, threads_each(b, threads), nullptr);
     if (tape) kept.tickets[e] = factors_.insert(std::move(found));
+    kept.costs[e] = scene_.vertex_count() + reports[e].contact_count;
   });
+  step_seconds_.resize(b);
+  std::ranges::transform(last_turns_, step_seconds_.begin(), &Turn::seconds);
   if (tape) out["kept"] = nb::cast(std::move(kept));
   out["numbers"] = to_lists(reports);
   nb::list messages;
@@ -45,7 +49,7 @@ nb::object Simulator::path(const nb::dict& inputs) {
   nb::dict unused;
   const Outputs outputs(outputs_, {1}, "", unused);
   std::vector<std::vector<double>> path;
-  for_environments(1, 1, [&](Index, const Checkpoint& checkpoint) {
+  for_environments(1, 1, {}, [&](Index, const Checkpoint& checkpoint) {
     step::Kept kept;
     step::forward(scene_, arrays.environment(0), checkpoint, outputs.environment(0), {}, kept, 1,
                   &path);

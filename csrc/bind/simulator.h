@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "bind/arrays.h"
+#include "bind/environments.h"
 #include "bind/field_arrays.h"
 #include "step/factor_cache.h"
 #include "step/fields.h"
@@ -18,6 +19,7 @@ namespace diffcloth::bind {
 /// What a step with a tape keeps for its backward, environment by environment: given up with the tape.
 struct KeptSteps {
   std::vector<std::shared_ptr<step::FactorCache::Ticket>> tickets;
+  std::vector<double> costs;  ///< of a derivative, in any unit
 };
 
 /// A scene as Python holds it: each call takes the arrays of all environments.
@@ -61,6 +63,9 @@ class Simulator {
   void forget_factors() { factors_.clear(); }
   std::size_t factor_bytes() const { return factors_.bytes(); }
 
+  /// Of the environments of the last forward(), or of the portions of the last derivative.
+  const std::vector<Turn>& last_turns() const { return last_turns_; }
+
  private:
   /// The tapes of steps that forward() took, checked.
   Saved taken_steps(std::size_t environments, const nb::dict& tape, const KeptSteps& kept) const;
@@ -69,6 +74,11 @@ class Simulator {
   std::vector<step::Field> outputs_;
   std::vector<step::Field> tape_;
   step::FactorCache factors_;
+
+  // Read and written with the GIL. What a step took is the best guess of what the next one will take,
+  // and decides nothing but the order in which threads take environments.
+  std::vector<double> step_seconds_;
+  std::vector<Turn> last_turns_;
 };
 
 }  // namespace diffcloth::bind

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include <nanobind/nanobind.h>
+#include <nanobind/stl/pair.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
@@ -41,6 +42,12 @@ nb::dict abilities_of_schemes() {
     abilities["metrics"] = scheme->has_metrics();
     result[std::string(scheme->name()).c_str()] = abilities;
   }
+  return result;
+}
+
+std::vector<std::pair<int, double>> places_and_seconds(const Simulator& simulator) {
+  std::vector<std::pair<int, double>> result;
+  for (const auto& [place, seconds] : simulator.last_turns()) result.emplace_back(place, seconds);
   return result;
 }
 
@@ -91,6 +98,9 @@ void simulator(nb::module_& m) {
            "Drop the factors kept for backward; they are made again when needed.")
       .def_prop_ro("factor_bytes", &Simulator::factor_bytes,
                    "What the factors kept for backward take up; at most `largest_factor_bytes`.")
+      .def_prop_ro("last_turns", &places_and_seconds,
+                   "For each environment of the last step, or portion of the last derivative, how "
+                   "many began before it, and the seconds that it took.")
       .def_prop_ro_static("largest_factor_bytes",
                           [](nb::handle) { return step::FactorCache::kBytes; });
   m.attr("input_names") = names_of(step::kInputTable);

@@ -89,26 +89,33 @@ using PushForward = std::function<void(
 
 /// Tangents of the outputs [directions, environments, ...] along all directions. Those of an environment
 /// whose inputs do not change are zero: that step may even have failed.
+///
+/// @param costs  what a direction is expected to take in each environment
+/// @param turns  out: of the portions of directions
 nb::dict push_forward_all(const InputArrays& arrays,
                           const std::vector<step::Field>& fields,
                           const nb::dict& tangents,
                           std::size_t directions,
                           int threads,
+                          const std::vector<double>& costs,
+                          std::vector<Turn>& turns,
                           const PushForward& push_forward) {
   const TangentArrays given(arrays, tangents, directions);
   nb::dict out;
   const Outputs outputs(fields, {directions, arrays.environments}, "", out);
   const std::vector<Portion> portions = make_portions(
       arrays.environments, directions, [&](std::size_t row) { return given.is_zero(row); });
-  for_environments(portions.size(), threads, [&](Index i, const Checkpoint& checkpoint) {
-    const auto& [e, rows] = portions[static_cast<std::size_t>(i)];
-    std::vector<step::Direction> of_rows;
-    of_rows.reserve(rows.size());
-    for (const std::size_t row : rows) {
-      of_rows.push_back({.tangents = given.row(row), .outputs = outputs.environment(row)});
-    }
-    push_forward(e, of_rows, threads_each(portions.size(), threads), checkpoint);
-  });
+  const std::vector<double> expected = expected_costs(portions, costs);
+  turns = for_environments(
+      portions.size(), threads, expected, [&](Index i, const Checkpoint& checkpoint) {
+        const auto& [e, rows] = portions[static_cast<std::size_t>(i)];
+        std::vector<step::Direction> of_rows;
+        of_rows.reserve(rows.size());
+        for (const std::size_t row : rows) {
+          of_rows.push_back({.tangents = given.row(row), .outputs = outputs.environment(row)});
+        }
+        push_forward(e, of_rows, threads_each(portions.size(), threads), checkpoint);
+      });
   return out;
 }
 
@@ -122,7 +129,7 @@ nb::dict Simulator::tangent(const nb::dict& inputs,
                             int threads) {
   const InputArrays arrays(scene_, inputs, true);
   const Saved tapes = taken_steps(arrays.environments, tape, kept);
-  return push_forward_all(arrays, outputs_, tangents, directions, threads,
+  return push_forward_all(arrays, outputs_, tangents, directions, threads, kept.costs, last_turns_,
                           [&](std::size_t e, std::span<const step::Direction> of_environment,
                               int each, const Checkpoint& checkpoint) {
                             step::tangent(scene_, arrays.environment(e), tapes.environment(e),
@@ -140,8 +147,10 @@ nb::dict Simulator::energy_tangent(const nb::dict& inputs,
   for (const auto& [name, value] : step::stored_energy(scene_, arrays.environment(0))) {
     parts.push_back({.name = name, .shape = {}});
   }
+  const std::vector<double> alike(arrays.environments, 1.0);
+  std::vector<Turn> turns;
   return push_forward_all(
-      arrays, parts, tangents, directions, threads,
+      arrays, parts, tangents, directions, threads, alike, turns,
       [&](std::size_t e, std::span<const step::Direction> of_environment, int, const Checkpoint&) {
         step::push_forward_energy(scene_, arrays.environment(e), of_environment);
       });

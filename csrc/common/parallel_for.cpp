@@ -7,7 +7,9 @@
 #include <cstddef>
 #include <cstdlib>
 #include <exception>
+#include <functional>
 #include <mutex>
+#include <numeric>
 #include <system_error>
 #include <thread>
 #include <vector>
@@ -43,11 +45,22 @@ void wait_for_others(const int& running,  // guarded by the mutex
 
 }  // namespace
 
+std::vector<Index> most_expensive_first(Index count, std::span<const double> costs) {
+  std::vector<Index> order(static_cast<std::size_t>(count));
+  std::iota(order.begin(), order.end(), Index{0});
+  if (std::ssize(costs) == count) {
+    std::ranges::stable_sort(order, std::greater{}, [&](Index i) { return costs[i]; });
+  }
+  return order;
+}
+
 void parallel_for(Index count,
                   int threads,
+                  std::span<const double> costs,
                   Interrupt& interrupt,
                   const std::function<void(Index, const Checkpoint&)>& body) {
   const int workers = std::clamp(threads, 1, std::max<int>(count, 1));
+  const std::vector<Index> order = most_expensive_first(count, costs);
   std::vector<std::exception_ptr> errors(static_cast<std::size_t>(count));
   std::atomic<Index> next{0};
   std::mutex mutex;
@@ -56,7 +69,8 @@ void parallel_for(Index count,
 
   const auto work = [&](bool is_caller) {
     const Checkpoint checkpoint(interrupt, is_caller);
-    for (Index i = next.fetch_add(1); i < count; i = next.fetch_add(1)) {
+    for (Index k = next.fetch_add(1); k < count; k = next.fetch_add(1)) {
+      const Index i = order[k];
       try {
         checkpoint.check();
         body(i, checkpoint);

@@ -36,6 +36,20 @@ def test_the_first_failure_by_index_is_raised_once_all_have_ended(threads):
     assert sum(run(6, threads, 0.0)) == 6
 
 
+def test_the_most_expensive_begin():
+    order = _kernels.order_of_environments
+    assert order(5, 1, [1.0, 3.0, 0.0, 3.0, 2.0]) == [1, 3, 4, 0, 2]
+    assert order(4, 1, []) == [0, 1, 2, 3]
+    assert order(4, 1, [0.0, 1.0]) == [0, 1, 2, 3]  # of another batch
+    assert sorted(order(5, 3, [1.0, 3.0, 0.0, 3.0, 2.0])) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_the_first_failure_by_index_is_raised_in_any_order(threads):
+    with pytest.raises(ValueError, match="environment 1"):
+        _kernels.order_of_environments(6, threads, [0.0, 1.0, 5.0, 3.0, 4.0, 2.0], [2, 4, 1])
+
+
 WITHOUT_THREADS = """
     import threading
     import torch

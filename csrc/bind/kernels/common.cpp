@@ -34,7 +34,7 @@ std::vector<int> run_environments(int count,
   std::vector<std::thread::id> taken_by(static_cast<std::size_t>(count));
   std::atomic<int> others{0};
   const auto end = Clock::now() + std::chrono::duration<double>(seconds);
-  for_environments(static_cast<std::size_t>(count), threads,
+  for_environments(static_cast<std::size_t>(count), threads, {},
                    [&](Index i, const Checkpoint& checkpoint) {
                      const bool is_caller = std::this_thread::get_id() == caller;
                      taken_by[i] = std::this_thread::get_id();
@@ -96,11 +96,30 @@ std::vector<std::pair<int, int>> run_team(const std::vector<std::vector<int>>& b
   return taken;
 }
 
+/// The order in which so many bodies of these costs begin; `failing` ones throw.
+std::vector<int> order_of_environments(std::size_t count,
+                                       int threads,
+                                       const std::vector<double>& costs,
+                                       const std::vector<int>& failing) {
+  std::vector<int> order(count);
+  const std::vector<Turn> turns =
+      for_environments(count, threads, costs, [&](Index i, const Checkpoint&) {
+        if (std::ranges::find(failing, i) != failing.end()) {
+          throw std::invalid_argument("environment " + std::to_string(i));
+        }
+      });
+  for (std::size_t i = 0; i < count; ++i) order[turns[i].place] = static_cast<int>(i);
+  return order;
+}
+
 }  // namespace
 
 void common_kernels(nb::module_& m) {
   m.def("run_team", &run_team, "before"_a, "threads"_a, "seconds"_a = 0.0, "repeats"_a = 1,
         "Run works on a team; returns the member that did each, and its turn.");
+  m.def("order_of_environments", &order_of_environments, "count"_a, "threads"_a, "costs"_a,
+        "failing"_a = std::vector<int>{},
+        "Run bodies of these expected costs; returns the order in which they begin.");
   m.def("run_environments", &run_environments, "count"_a, "threads"_a, "seconds"_a,
         "failing"_a = std::vector<int>{},
         "Run bodies that wait; returns how many each thread took, the caller's first.");
