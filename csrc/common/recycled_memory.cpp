@@ -3,9 +3,15 @@
 #include <algorithm>
 #include <array>
 #include <bit>
+#include <cstdlib>
 #include <iterator>
 #include <mutex>
 #include <new>
+#include <utility>
+
+#ifdef __GLIBC__
+#include <malloc.h>
+#endif
 
 namespace diffcloth {
 
@@ -23,6 +29,17 @@ constexpr std::size_t kLargest = std::size_t{1} << 24;
 
 /// What is kept at most, of all sizes [bytes].
 constexpr std::size_t kKept = std::size_t{1} << 25;
+
+/// From here on it is worth the time to look for memory that is free before more is taken [bytes].
+constexpr std::size_t kHuge = std::size_t{1} << 27;
+
+/// Give what is free to the system, where the C library would hold on to it: small arrays, and those of
+/// some megabytes.
+void return_free_memory() {
+#ifdef __GLIBC__
+  malloc_trim(0);
+#endif
+}
 
 bool is_recycled(std::size_t bytes) { return bytes >= kSmallest && bytes <= kLargest; }
 
@@ -94,6 +111,40 @@ void* take_recycled(std::size_t bytes) {
 
 void give_back(void* memory, std::size_t bytes) noexcept {
   if (!is_recycled(bytes) || !unused().keep(memory, rounded(bytes))) free(memory);
+}
+
+SpareRoom::~SpareRoom() { free(memory_); }
+
+void* SpareRoom::take(std::size_t bytes) {
+  if (bytes <= kLargest) return take_recycled(bytes);
+  const std::size_t wanted = rounded(bytes);
+  void* spare = nullptr;
+  {
+    const std::lock_guard lock(mutex_);
+    spare = std::exchange(memory_, nullptr);
+    if (std::exchange(bytes_, 0) == wanted) return spare;
+  }
+  free(spare);  // never both at once
+  if (wanted >= kHuge) return_free_memory();
+  return allocate(wanted);
+}
+
+void SpareRoom::give_back(void* memory, std::size_t bytes) noexcept {
+  if (bytes <= kLargest) {
+    diffcloth::give_back(memory, bytes);
+    return;
+  }
+  {
+    const std::lock_guard lock(mutex_);
+    std::swap(memory_, memory);
+    bytes_ = rounded(bytes);
+  }
+  free(memory);
+}
+
+std::size_t SpareRoom::bytes() const {
+  const std::lock_guard lock(mutex_);
+  return bytes_;
 }
 
 }  // namespace diffcloth

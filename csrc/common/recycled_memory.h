@@ -1,6 +1,8 @@
 #pragma once
 
 #include <cstddef>
+#include <memory>
+#include <mutex>
 
 namespace diffcloth {
 
@@ -13,6 +15,28 @@ void* take_recycled(std::size_t bytes);
 
 /// @param bytes  as they were asked for
 void give_back(void* memory, std::size_t bytes) noexcept;
+
+/// Room for the next of the arrays that are too large for that, while a step goes on: the last one that
+/// was given back. Its owner needed it a moment ago, so the step takes no more memory at any time.
+class SpareRoom {
+ public:
+  SpareRoom() = default;
+  ~SpareRoom();
+  SpareRoom(const SpareRoom&) = delete;
+  SpareRoom& operator=(const SpareRoom&) = delete;
+
+  /// As take_recycled() and give_back(). May be called from any number of threads.
+  void* take(std::size_t bytes);
+  void give_back(void* memory, std::size_t bytes) noexcept;
+
+  /// What lies there [bytes].
+  std::size_t bytes() const;
+
+ private:
+  mutable std::mutex mutex_;
+  void* memory_ = nullptr;  ///< guarded, as is its size
+  std::size_t bytes_ = 0;
+};
 
 /// The same for containers.
 template <typename T>

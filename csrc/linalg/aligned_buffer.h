@@ -13,7 +13,11 @@ class AlignedBuffer {
  public:
   AlignedBuffer() = default;
   explicit AlignedBuffer(std::size_t size)
-      : data_(size == 0 ? nullptr : static_cast<T*>(take_recycled(size * sizeof(T))), {size}) {}
+      : data_(size == 0 ? nullptr : static_cast<T*>(take_recycled(size * sizeof(T))), {size, {}}) {}
+
+  /// In the room of a step, where what is large finds the memory of what was there before.
+  AlignedBuffer(std::size_t size, const std::shared_ptr<SpareRoom>& room)
+      : data_(size == 0 ? nullptr : static_cast<T*>(room->take(size * sizeof(T))), {size, room}) {}
 
   T* data() { return data_.get(); }
   const T* data() const { return data_.get(); }
@@ -23,10 +27,17 @@ class AlignedBuffer {
  private:
   struct GiveBack {
     std::size_t size;
-    void operator()(T* p) const { give_back(p, size * sizeof(T)); }
+    std::weak_ptr<SpareRoom> room;  // of a step that may have ended
+    void operator()(T* p) const {
+      if (const std::shared_ptr<SpareRoom> open = room.lock()) {
+        open->give_back(p, size * sizeof(T));
+      } else {
+        give_back(p, size * sizeof(T));
+      }
+    }
   };
 
-  std::unique_ptr<T, GiveBack> data_{nullptr, {0}};
+  std::unique_ptr<T, GiveBack> data_{nullptr, {0, {}}};
 };
 
 }  // namespace diffcloth::linalg

@@ -6,6 +6,7 @@
 #include <string>
 #include <vector>
 
+#include "common/recycled_memory.h"
 #include "linalg/block_pattern.h"
 #include "linalg/dense_kernels.h"
 #include "linalg/elimination_tree.h"
@@ -43,7 +44,9 @@ class AnalysisBackend {
   AnalysisBackend& operator=(const AnalysisBackend&) = delete;
 
   /// @param precision  that is asked for; a backend may have doubles only
-  virtual std::unique_ptr<FactorBackend> make_factor(Precision precision) const = 0;
+  /// @param room       for what is large
+  virtual std::unique_ptr<FactorBackend> make_factor(
+      Precision precision, const std::shared_ptr<SpareRoom>& room) const = 0;
   virtual Index dimension() const = 0;
   virtual std::size_t nonzeros() const = 0;
   virtual double flops() const = 0;

@@ -93,8 +93,9 @@ std::size_t CholeskyAnalysis::nonzeros() const { return backend_->nonzeros(); }
 double CholeskyAnalysis::flops() const { return backend_->flops(); }
 
 CholeskyFactor::CholeskyFactor(std::shared_ptr<const CholeskyAnalysis> analysis,
-                               Precision precision)
-    : analysis_(std::move(analysis)), backend_(analysis_->backend().make_factor(precision)) {}
+                               Precision precision,
+                               const std::shared_ptr<SpareRoom>& room)
+    : analysis_(std::move(analysis)), backend_(analysis_->backend().make_factor(precision, room)) {}
 
 CholeskyFactor::~CholeskyFactor() = default;
 

@@ -54,11 +54,15 @@ class CholeskyWorkspace {
 
   Team& team() { return team_; }
 
+  /// For factors that are made while this one lives.
+  const std::shared_ptr<SpareRoom>& room() const { return room_; }
+
  private:
   void* reserve_bytes(std::size_t size);
 
   AlignedBuffer<std::byte> buffer_;
   Team team_;
+  std::shared_ptr<SpareRoom> room_ = std::make_shared<SpareRoom>();
 };
 
 /// Where the time of multifrontal factorizations went on the caller's thread [s].
@@ -116,8 +120,10 @@ class CholeskyAnalysis {
 class CholeskyFactor {
  public:
   /// @param precision  that is asked for; backends other than ours have doubles only
+  /// @param room       for what is large, of the workspace that is used with it; else its own
   explicit CholeskyFactor(std::shared_ptr<const CholeskyAnalysis> analysis,
-                          Precision precision = Precision::kDouble);
+                          Precision precision = Precision::kDouble,
+                          const std::shared_ptr<SpareRoom>& room = std::make_shared<SpareRoom>());
   ~CholeskyFactor();
   CholeskyFactor(const CholeskyFactor&) = delete;
   CholeskyFactor& operator=(const CholeskyFactor&) = delete;

@@ -231,7 +231,8 @@ class CholmodAnalysis final : public AnalysisBackend {
     });
   }
 
-  std::unique_ptr<FactorBackend> make_factor(Precision /*precision*/) const override {
+  std::unique_ptr<FactorBackend> make_factor(
+      Precision /*precision*/, const std::shared_ptr<SpareRoom>& /*room*/) const override {
     return std::make_unique<CholmodFactor>(structure_);
   }
   Index dimension() const override { return structure_.matrix.dimension(); }

@@ -96,7 +96,8 @@ class EigenAnalysis final : public AnalysisBackend {
     flops_ = factor.flops();
   }
 
-  std::unique_ptr<FactorBackend> make_factor(Precision /*precision*/) const override {
+  std::unique_ptr<FactorBackend> make_factor(
+      Precision /*precision*/, const std::shared_ptr<SpareRoom>& /*room*/) const override {
     return std::make_unique<EigenFactor>(matrix_);
   }
   Index dimension() const override { return matrix_.dimension(); }

@@ -117,8 +117,10 @@ const FrontKernels<float>& fronts(const DenseKernels& kernels, float /*precision
 template <class Real>
 class MultifrontalFactor final : public FactorBackend {
  public:
-  MultifrontalFactor(const Symbolic& symbolic, const DenseKernels& kernels)
-      : s_(symbolic), kernels_(fronts(kernels, Real{})), factor_(symbolic.factor_size) {}
+  MultifrontalFactor(const Symbolic& symbolic,
+                     const DenseKernels& kernels,
+                     const std::shared_ptr<SpareRoom>& room)
+      : s_(symbolic), kernels_(fronts(kernels, Real{})), factor_(symbolic.factor_size, room) {}
 
   Verdict compute(const double* blocks,
                   CholeskyWorkspace& workspace,
@@ -544,13 +546,14 @@ class MultifrontalAnalysis final : public AnalysisBackend {
   MultifrontalAnalysis(Elimination elimination, KernelLevel level)
       : elimination_(std::move(elimination)), kernels_(dense_kernels(level)) {}
 
-  std::unique_ptr<FactorBackend> make_factor(Precision precision) const override {
+  std::unique_ptr<FactorBackend> make_factor(
+      Precision precision, const std::shared_ptr<SpareRoom>& room) const override {
     if (precision == Precision::kSingle) {
       return std::make_unique<MultifrontalFactor<float>>(singles_.get<float>(elimination_),
-                                                         kernels_);
+                                                         kernels_, room);
     }
     return std::make_unique<MultifrontalFactor<double>>(doubles_.get<double>(elimination_),
-                                                        kernels_);
+                                                        kernels_, room);
   }
   Index dimension() const override { return 3 * elimination_.graph.size(); }
   std::size_t nonzeros() const override { return doubles_.get<double>(elimination_).nonzeros; }

@@ -67,7 +67,7 @@ Factor LinearSystem::factor(const linalg::BlockValues& matrix,
     const Stopwatch::Scope scope(watch_, Phase::kAnalysis);
     const AnalyzedPattern::Found found = pattern_->analysis();
     counts_.analyses += found.is_new ? 1 : 0;
-    factor = std::make_shared<linalg::CholeskyFactor>(found.analysis, precision);
+    factor = std::make_shared<linalg::CholeskyFactor>(found.analysis, precision, workspace_.room());
   }
   const Stopwatch::Scope scope(watch_, Phase::kFactorization);
   ++counts_.factorizations;

@@ -3,6 +3,7 @@
 import sys
 
 import pytest
+import torch
 from processes import threads
 
 import diffcloth_torch as dc
@@ -24,3 +25,20 @@ def test_threads_ask_the_system_for_no_more_pages():
         faults = getrusage(RUSAGE_SELF).ru_minflt - faults
     # A factor and its matrix alone take up 700 pages, in each of 8 environments and 5 steps.
     assert faults < 8 * 5 * 100
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="counts pages as Linux does")
+def test_factors_of_a_step_share_their_pages():
+    from resource import RUSAGE_SELF, getrusage
+
+    n = 100
+    cloth = dc.Cloth.grid(n, n, pins={"corners": [0, n - 1]})
+    sim = dc.Simulator(dc.Scene([cloth]), 0.01)
+    with threads(1), torch.no_grad():
+        state = sim.step(sim.initial_state())
+        faults = getrusage(RUSAGE_SELF).ru_minflt
+        state = sim.step(state)
+        faults = getrusage(RUSAGE_SELF).ru_minflt - faults
+    of_one = 50e6 / 4096  # a factor of this mesh takes up more
+    assert state.report.counts["factorizations"] >= 3
+    assert faults < 2.4 * of_one
