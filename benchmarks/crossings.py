@@ -44,7 +44,10 @@ class Crossings:
 
     def count(self, state: dc.State) -> int:
         """Number of pairs of triangles without a common vertex that intersect."""
-        points = self.points(state)
+        return self.count_points(self.points(state))
+
+    def count_points(self, points: NDArray[np.float64]) -> int:
+        """The same where the vertices of cloths, then bodies, are there."""
         mesh = ipctk.CollisionMesh(points, self._edges, self._faces)
         mesh.can_collide = self._can_collide
         if not ipctk.has_intersections(mesh, points):

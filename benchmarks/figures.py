@@ -2,13 +2,16 @@
 
     python -m benchmarks.figures --against "the first version=../first"
     python -m benchmarks.figures --newton ../peer/bin/python ...    # see benchmarks.peers
+    python -m benchmarks.figures --forward-peers NEWTON MUJOCO    # these peers alone, again
     python -m benchmarks.figures --draw    # the page alone, again
 
 `--against` names another checkout with a built package, and may be repeated: all scenes are timed
 with it and this checkout side by side, as by `benchmarks.compare`. Then this checkout alone is
 timed by phases, as by `benchmarks.step`, and with several losses in one backward. `--newton` is the
 Python of an environment with Newton, which is timed beside us as by `benchmarks.peers`. What was
-measured is in docs/performance.json, of which page and plots are made.
+measured is in docs/performance.json, of which page and plots are made. `--forward-peers` times
+what `benchmarks.forward_peers` does, with the Pythons of its two environments, and leaves the rest
+of the records as it is.
 
 `--cpu` counts processor time, on a machine that others use too; then threads are left out, as
 processor time says nothing of them.
@@ -33,6 +36,7 @@ import torch
 from tqdm import tqdm
 
 import diffcloth_torch as dc
+from benchmarks import forward_peers
 from benchmarks.compare import BATCH, POOLS, ROOT, Row, time_row
 from benchmarks.measure import time_steps
 from benchmarks.peers import time_all
@@ -67,21 +71,42 @@ Records = dict[str, Any]
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="Python of an environment that has Newton.",
 )
+@click.option(
+    "--forward-peers",
+    "forward",
+    nargs=2,
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    metavar="NEWTON MUJOCO",
+    help="Measure these alone: Pythons of environments that have Newton and MuJoCo.",
+)
 @click.option("--cpu", is_flag=True, help="Processor time instead of wall-clock time.")
 @click.option("--quick", is_flag=True, help="Tiny sheets: shows that it runs.")
 @click.option("--draw", is_flag=True, help="Measure nothing: draw what was measured before.")
 @click.option("--docs", default=ROOT / "docs", type=click.Path(path_type=Path, file_okay=False))
 def main(
-    others: tuple[str, ...], newton: Path | None, cpu: bool, quick: bool, draw: bool, docs: Path
+    others: tuple[str, ...],
+    newton: Path | None,
+    forward: tuple[Path, Path] | None,
+    cpu: bool,
+    quick: bool,
+    draw: bool,
+    docs: Path,
 ) -> None:
     file = docs / RECORDS
-    if draw:
+    if draw or forward:
         if not file.exists():
-            raise click.UsageError(f"--draw needs {file}, which a run without it writes")
+            option = "--draw" if draw else "--forward-peers"
+            raise click.UsageError(f"{option} needs {file}, which a run without it writes")
+        if forward and not draw:
+            records = json.loads(file.read_text())
+            records["forward_peers"] = measure_forward_peers(*forward)
+            file.write_text(json.dumps(records, indent=1) + "\n")
     else:
+        kept_peers = json.loads(file.read_text()).get("forward_peers") if file.exists() else None
         file.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory() as kept:
             measured = measure(_folders(others), newton, cpu, quick, Path(kept))
+        measured["forward_peers"] = kept_peers
         file.write_text(json.dumps(measured, indent=1) + "\n")
     records = json.loads(file.read_text())
     (docs / "images").mkdir(exist_ok=True)
@@ -159,6 +184,16 @@ def measure(
     records["load"].append(round(os.getloadavg()[0], 1))
     records["minutes"] = round((time.perf_counter() - start) / 60, 1)
     return records
+
+
+def measure_forward_peers(newton: Path, mujoco: Path) -> Records:
+    """What `benchmarks.forward_peers` says, and when."""
+    torch.set_num_threads(1)
+    return {
+        "date": date.today().isoformat(),
+        "processor": _processor(),
+        "rows": list(forward_peers.time_all(newton, mujoco, PHASE_SIZES[0])),
+    }
 
 
 def _phases(name: str, size: int, steps: int, kept: Path) -> Records:
@@ -341,6 +376,9 @@ def page(records: Records, plots: list[tuple[str, str]]) -> str:
     parts += ["## One environment on two threads", _SHARED_TEXT, shared]
     if records["peers"]:
         parts += ["## Compared with Newton", _PEER_TEXT, _peer_table(records["peers"])]
+    if records.get("forward_peers"):
+        parts += ["## Compared with VBD and MuJoCo", _forward_peer_text(records["forward_peers"])]
+        parts += [_forward_peer_table(records["forward_peers"]["rows"])]
     return "\n\n".join(parts) + "\n"
 
 
@@ -459,6 +497,26 @@ def _peer_table(rows: list[Records]) -> str:
         line += [_number(r["forward"]), _number(r["backward"])]
         lines.append([*line, f"{r['gradient_error']:.1e}", f"{r['depth']:.2g}"])
     return _table([*head, "depth [mm]"], lines)
+
+
+def _forward_peer_text(found: Records) -> str:
+    return f"""\
+Newton's Vertex Block Descent and MuJoCo's flex have no gradients. Forward alone, the same 15 frames
+at 60 Hz, and a sheet whose upper half falls on the lower one; `python -m benchmarks.forward_peers`
+says how, with which settings, and what differs. Measured on {found["date"]} ({found["processor"]});
+times are processor times of a frame. `crossings` are pairs of triangles of the sheet that intersect
+and `inside` are vertices within the body, both the most of any frame; `depth` is the largest depth
+of the sheet inside the body, and `stretch` the longest edge over its length at rest."""
+
+
+def _forward_peer_table(rows: list[Records]) -> str:
+    head = ["scene", "size", "by", "substeps", "forward [ms]", "crossings", "inside"]
+    lines = []
+    for r in rows:
+        line = [r["scene"], r["size"], r["by"], r["substeps"], _number(r["forward"])]
+        line += [r["crossings"], r["inside"]]
+        lines.append([*line, f"{r['depth']:.2g}", f"{r['stretch']:.2f}"])
+    return _table([*head, "depth [mm]", "stretch"], lines)
 
 
 def _table(head: list[str], rows: list[list[Any]]) -> str:

@@ -201,6 +201,28 @@ def test_our_side_of_a_peer(name):
         assert peers.depth(told, low) > 0.02
 
 
+@pytest.mark.parametrize("name", ["hanging", "plane", "sphere", "self-contact"])
+def test_our_side_of_a_peer_without_gradients(name):
+    peers = importlib.import_module("benchmarks.forward_peers")
+    told = peers.scene(name, 8)
+    found = peers.time_ours(told)
+    assert len(found["frames"]) == told["frames"] + 1
+    judged = peers.judge(told, found)
+    assert (judged["crossings"], judged["inside"], judged["depth"]) == (0, 0, 0.0)
+    assert 1.0 <= judged["stretch"] < 1.5
+    # What judges can say no: to an edge through the sheet, and to a sheet that is lower.
+    if told["body"] is None:
+        x = np.array(told["rest"])
+        x[1, 2] += 0.1
+        x[0] = (0.25, 0.25, -0.1)
+        assert peers.judge(told, {**found, "frames": [x]})["crossings"] > 0
+    else:
+        low = {**found, "frames": [x - [0.0, 0.0, 0.1] for x in found["frames"]]}
+        assert peers.judge(told, low)["inside"] > 0
+        assert peers.judge(told, low)["depth"] > 20.0
+    assert told["mass"] == pytest.approx(told["density"], rel=1e-9)  # of one square meter
+
+
 def test_the_page_of_figures_is_that_of_its_records(tmp_path):
     """Nobody has edited the page, nor forgotten to draw it again."""
     for name in ("performance.json", "performance.md"):
