@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from diffcloth_torch.checks import check_choice, check_count
 from diffcloth_torch.errors import InvalidInput
 
-__all__ = ["ALGORITHMS", "TrainerOptions"]
+__all__ = ["ALGORITHMS", "SCALES", "TrainerOptions"]
 
 ALGORITHMS = ("apg", "shac", "sapo")
+SCALES = ("number", "tensor")
 _LEAST_SHARE = 0.1
 _INFINITE = 1e6  # above every sensible rate
 _POSITIVE = (
@@ -38,6 +39,9 @@ class TrainerOptions:
         critic_rate: The same for the critic.
         decay_updates: Number of updates over which these and `plan_rate` fall, linearly, to a
             tenth; 0 for never.
+        scale: What Adam divides the steps of the policy by. "number": a scale for each number, as
+            usual, so that all of them move equally fast. "tensor": one scale for all numbers of a
+            tensor, such as the knots of a plan, so that what counts little moves little.
         betas: Of Adam for all of them.
         critic_epochs: How often the critic sees each rollout.
         critic_batches: Parts of a rollout between two steps of the critic.
@@ -71,6 +75,7 @@ class TrainerOptions:
     actor_rate: float = 2e-3
     critic_rate: float = 2e-3
     decay_updates: int = 0
+    scale: str = "number"
     betas: tuple[float, float] = (0.7, 0.95)
     critic_epochs: int = 16
     critic_batches: int = 4
@@ -90,6 +95,7 @@ class TrainerOptions:
 
     def __post_init__(self) -> None:
         check_choice("TrainerOptions: `algorithm`", self.algorithm, ALGORITHMS)
+        check_choice("TrainerOptions: `scale`", self.scale, SCALES)
         if not isinstance(self.feedback, bool):
             raise InvalidInput(f"TrainerOptions: `feedback` must be a bool, got {self.feedback!r}")
         for name in ("horizon", "critic_epochs", "critic_batches", "critics"):

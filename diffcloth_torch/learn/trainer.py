@@ -22,6 +22,7 @@ from torch import Tensor
 from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.learn.adam import TensorAdam
 from diffcloth_torch.learn.options import TrainerOptions
 from diffcloth_torch.learn.rollouts import (
     MakeEnv,
@@ -101,7 +102,8 @@ class Trainer:
         others = [p for p in self.policy.actor.parameters() if all(p is not k for k in knots)]
         groups = [{"params": others, "lr": o.actor_rate}]
         groups += [{"params": knots, "lr": o.plan_rate}] if knots else []
-        self._actor_steps = torch.optim.Adam(groups, betas=o.betas)
+        adam = TensorAdam if o.scale == "tensor" else torch.optim.Adam
+        self._actor_steps = adam(groups, betas=o.betas)
         self._critic_steps = torch.optim.Adam(
             self.policy.critics.parameters(), lr=o.critic_rate, betas=o.betas
         )

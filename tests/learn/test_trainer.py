@@ -17,6 +17,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.learn import Trainer, TrainerOptions
 from diffcloth_torch.learn import rollouts as rollouts_module
 from diffcloth_torch.learn import trainer as trainer_module
+from diffcloth_torch.learn.adam import TensorAdam
 from diffcloth_torch.learn.networks import Actor, Plan
 from diffcloth_torch.learn.rollouts import Policy
 from diffcloth_torch.learn.trainer import _lambda_returns, _Rows
@@ -195,6 +196,70 @@ class TestPlan:
             Trainer(fold(), TrainerOptions(horizon=3, plan_knots=2), num_envs=2)
 
 
+class TestTensorAdam:
+    """Adam with one scale for each tensor."""
+
+    def test_is_adam_where_numbers_are_alone(self):
+        """Beside Adam of torch, whose tensors of one number have a scale of their own, too."""
+        ours, theirs = (
+            [torch.tensor([0.3], requires_grad=True), torch.tensor(-2.0, requires_grad=True)]
+            for _ in range(2)
+        )
+        rates = 0.1, 0.02
+        optimizers = (
+            TensorAdam(
+                [{"params": [p], "lr": r} for p, r in zip(ours, rates, strict=True)], (0.8, 0.9)
+            ),
+            torch.optim.Adam(
+                [{"params": [p], "lr": r} for p, r in zip(theirs, rates, strict=True)],
+                betas=(0.8, 0.9),
+            ),
+        )
+        for _ in range(20):
+            for parameters, optimizer in zip((ours, theirs), optimizers, strict=True):
+                optimizer.zero_grad()
+                (3 * (parameters[0] - 1).square().sum() + parameters[1].sin()).backward()
+                optimizer.step()
+        for a, b in zip(ours, theirs, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
+        assert abs(float(ours[0].detach()) - 0.3) > 0.3
+
+    def test_is_the_recursion(self):
+        first, second, rate = 0.7, 0.9, 0.05
+        generator = np.random.default_rng(0)
+        x = generator.standard_normal((3, 4)).astype(np.float32)
+        parameter = torch.tensor(x, requires_grad=True)
+        optimizer = TensorAdam([{"params": [parameter], "lr": rate}], betas=(first, second))
+        expected, mean, square = x.astype(np.float64), np.zeros((3, 4)), 0.0
+        for k in range(1, 8):
+            gradient = generator.standard_normal((3, 4)) * [1.0, 10.0, 0.1, 0.0]
+            parameter.grad = torch.tensor(gradient, dtype=torch.float32)
+            optimizer.step()
+            mean = first * mean + (1 - first) * gradient
+            square = second * square + (1 - second) * np.mean(gradient**2)
+            expected -= rate * mean / (1 - first**k) / np.sqrt(square / (1 - second**k))
+        np.testing.assert_allclose(parameter.detach(), expected, rtol=1e-4, atol=1e-5)
+
+    def test_moves_little_what_counts_little(self):
+        """The first step is along the gradient, where that of Adam has the same size everywhere."""
+        moved = {}
+        for scale in ("number", "tensor"):
+            options = TrainerOptions(
+                "apg", horizon=8, first_action=HOLD, plan_knots=3, plan_rate=0.1, scale=scale
+            )
+            trainer = Trainer(fold(), options, num_envs=2)
+            before = trainer.policy.actor.plan.knots.detach().clone()
+            trainer.update()
+            plan = trainer.policy.actor.plan
+            gradient = plan.knots.grad
+            moved[scale] = plan.knots.detach() - before
+        assert float(gradient.abs().max()) > 10 * float(gradient.abs().min())
+        torch.testing.assert_close(
+            moved["tensor"], -0.1 * gradient / gradient.square().mean().sqrt(), rtol=1e-3, atol=1e-5
+        )
+        torch.testing.assert_close(moved["number"], -0.1 * gradient.sign(), rtol=0.01, atol=1e-4)
+
+
 def test_lambda_returns_are_those_of_the_recursion():
     generator = torch.Generator().manual_seed(0)
     h, count, gamma, trace = 7, 3, 0.9, 0.8
@@ -291,11 +356,15 @@ def rollouts_rows(h, count, generator):
     return Rows
 
 
-@pytest.mark.parametrize(("algorithm", "knots"), [("apg", 3), ("shac", 0), ("sapo", 0)])
-def test_a_training_that_is_loaded_goes_on_with_the_same_bits(tmp_path, algorithm, knots):
+@pytest.mark.parametrize(
+    ("algorithm", "knots", "scale"),
+    [("apg", 3, "number"), ("apg", 3, "tensor"), ("shac", 0, "tensor"), ("sapo", 0, "number")],
+)
+def test_a_training_that_is_loaded_goes_on_with_the_same_bits(tmp_path, algorithm, knots, scale):
     options = TrainerOptions(
-        algorithm=algorithm, horizon=3, first_action=HOLD, decay_updates=4, plan_knots=knots
-    )
+        algorithm=algorithm, horizon=3, first_action=HOLD, decay_updates=4, plan_knots=knots,
+        scale=scale,
+    )  # fmt: skip
     one = Trainer(fold(), options, num_envs=4, chunk=2)
     one.update()
     one.update()
@@ -419,6 +488,7 @@ def test_noise_and_scale_of_a_policy():
         ),
         (lambda: TrainerOptions(critics=0), "`critics` must be"),
         (lambda: TrainerOptions(plan_knots=-1), "`plan_knots` must be"),
+        (lambda: TrainerOptions(scale="row"), "`scale` must be one of 'number', 'tensor'"),
         (lambda: TrainerOptions(plan_rate=0.0), "`plan_rate` must be positive, got 0.0"),
         (lambda: TrainerOptions(temperature=0.0), "`temperature` must be positive, got 0.0"),
         (lambda: TrainerOptions(target_entropy=float("inf")), "`target_entropy` must be finite"),
