@@ -459,6 +459,23 @@ def test_it_improves(algorithm):
     assert after > 0.8 * before
 
 
+def test_a_plan_with_one_scale_improves_faster():
+    """Steps along the gradient lift the corner while steps of one size also pull elsewhere."""
+    found = {}
+    for scale in ("number", "tensor"):
+        options = TrainerOptions(
+            "apg", horizon=10, plan_knots=5, plan_rate=0.03, actor_rate=3e-4, deviation=0.05,
+            scale=scale,
+        )  # fmt: skip
+        trainer = Trainer(lift_corner, options, num_envs=2)
+        before, _, _ = trainer.evaluate(4)
+        for _ in range(8):
+            trainer.update()
+        found[scale], _, _ = trainer.evaluate(4)
+    assert found["tensor"] > 0.4 * before
+    assert found["tensor"] > 0.65 * found["number"]
+
+
 def test_noise_and_scale_of_a_policy():
     env = fold()(num_envs=3)
     policy = Policy(env, TrainerOptions(first_action=HOLD, deviation=0.2))
