@@ -45,12 +45,14 @@ JOBS = {
 }
 FIRST_ORDER, FREE = ("planned", "apg", "shac", "sapo"), ("ppo", "sac")
 ALGORITHMS = ("scripted", "plan", *FIRST_ORDER, *FREE)
-# Of FoldCloth alone: a plan with hard grasps, and APG with gradients through what it sees.
-VARIANTS = ("hard", "feedback")
+# Of FoldCloth alone: a plan with hard grasps, APG with gradients through what it sees, and a
+# planned policy with one scale for each tensor.
+VARIANTS = ("hard", "feedback", "scaled")
 # Of all tasks: APG takes whole episodes, the others halves, whose ends critics value.
 COMMON: dict[str, Any] = {"betas": (0.9, 0.99), "deviation": 0.05, "target_entropy": -2.0}
 APG: dict[str, Any] = {"discount": 1.0, "actor_rate": 4e-3}
 PLANNED: dict[str, Any] = APG | {"plan_knots": 12, "plan_rate": 0.03, "actor_rate": 6e-4}
+SCALED: dict[str, Any] = PLANNED | {"scale": "tensor", "plan_rate": 0.02, "actor_rate": 3e-4}
 WITH_CRITIC = {"discount": 0.99, "actor_rate": 2e-3}
 NUM_ENVS, FREE_ENVS = 2, 4
 LABELS = {"plan": "plan", "planned": "APG, planned"}
@@ -88,9 +90,9 @@ def main(
 
     `plan` is no policy: it optimizes the actions of one episode, whose return it is. `planned` is
     APG whose policy is a plan, a linear function of what it sees, and a network; `apg` has the
-    network alone. `scripted` is the policy made by hand. FoldCloth has two more: `hard`, a plan
-    with hard grasps, and `feedback`, APG with gradients through what it sees. A file keeps what was
-    run, and a run that it has is not made again.
+    network alone. `scripted` is the policy made by hand. FoldCloth has three more: `hard`, a plan
+    with hard grasps, `feedback`, APG with gradients through what it sees, and `scaled`, `planned`
+    with the scale "tensor". A file keeps what was run, and a run that it has is not made again.
 
     Prints the median over seeds of the best mean return, how many environment steps and seconds
     of one core each needed to reach the best that PPO reached, and the share of successes at the
@@ -208,6 +210,7 @@ def _first_order(
     episode = make(num_envs=1).task.horizon
     has_critic = algorithm in ("shac", "sapo")
     horizon = episode // 2 if has_critic else episode
+    of_apg = {"planned": PLANNED, "scaled": SCALED}.get(algorithm, APG)
     options = TrainerOptions(
         algorithm=algorithm if has_critic else "apg",
         feedback=algorithm == "feedback",
@@ -216,7 +219,7 @@ def _first_order(
         first_action=None if first is None else tuple(first),
         seed=seed,
         **COMMON,
-        **(WITH_CRITIC if has_critic else PLANNED if algorithm == "planned" else APG),
+        **(WITH_CRITIC if has_critic else of_apg),
     )
     trainer = Trainer(make, options, num_envs=NUM_ENVS)
     curve = _Curve(make, trainer.act)
