@@ -245,7 +245,7 @@ def test_tangents_are_the_transpose_of_gradients(case, name):
 
 @pytest.mark.parametrize("what", ["body", "joint"])
 def test_what_is_prescribed_turns_along_its_arc(what):
-    """By a third of a turn in a step, far from the cloth: no straight way, which would cut through."""
+    """By a third of a turn in a step, far from the cloth: no straight way through the body."""
     angle = 2.0
     if what == "body":
         scene = CoreScene(one_body(free=False), BOXES[:1])
