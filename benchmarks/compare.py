@@ -82,7 +82,14 @@ class Medians:
 class Side:
     """A process that steps one package."""
 
-    def __init__(self, package: Path, row: Row, kept: Path, processor_time: bool) -> None:
+    def __init__(
+        self,
+        package: Path,
+        row: Row,
+        kept: Path,
+        processor_time: bool,
+        slip_velocity: float | None,
+    ) -> None:
         cores = sorted(os.sched_getaffinity(0))[-row.threads :]
         worker = Path(__file__).with_name("worker.py")
         self._process = subprocess.Popen(
@@ -93,7 +100,8 @@ class Side:
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
         )
         self._name = package
-        given = {"package": str(package), "cores": cores, "processor_time": processor_time}
+        given: dict[str, Any] = {"package": str(package), "cores": cores}
+        given |= {"processor_time": processor_time, "slip_velocity": slip_velocity}
         given["kept"] = str(kept_file(kept, row.scene, row.size, row.batch))
         self._send(json.dumps({**asdict(row), **given}))
         self.ready = self._receive()
@@ -132,6 +140,11 @@ class Side:
 @click.option("--steps", type=click.IntRange(min=1), help="Timed steps; by default fewer if large.")
 @click.option("--batch/--no-batch", default=True, help="Also time batches of 8.")
 @click.option("--cpu", is_flag=True, help="Processor time, for a machine that others use too.")
+@click.option(
+    "--slip-velocity",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Of both [m/s]; by default that of each version, which was 1e-3, then 1e-4, now 1e-5.",
+)
 @click.option("--json", "out", type=click.Path(path_type=Path, dir_okay=False))
 def main(
     against: Path,
@@ -140,6 +153,7 @@ def main(
     steps: int | None,
     batch: bool,
     cpu: bool,
+    slip_velocity: float | None,
     out: Path | None,
 ) -> None:
     names, given = scenes or tuple(ALL), sorted(sizes or SIZES)
@@ -152,7 +166,7 @@ def main(
     for row in tqdm(rows, disable=None, leave=False):
         timed = steps or (20 if row.size <= 24 else 10 if row.size <= 48 else 5)
         with TemporaryDirectory() as kept:
-            ours, theirs = time_row(row, against, Path(kept), timed, cpu)
+            ours, theirs = time_row(row, against, Path(kept), timed, cpu, slip_velocity)
         results.append((row, ours, theirs))
         tqdm.write(_line(row, ours, theirs))
     if not cpu:
@@ -166,7 +180,12 @@ def main(
 
 
 def time_row(
-    row: Row, against: Path, kept: Path, steps: int, processor_time: bool
+    row: Row,
+    against: Path,
+    kept: Path,
+    steps: int,
+    processor_time: bool,
+    slip_velocity: float | None = None,
 ) -> tuple[Medians, Medians]:
     """Medians of this checkout and of the other, which take their steps in turn.
 
@@ -175,7 +194,7 @@ def time_row(
     with contextlib.ExitStack() as stack:
         sides = []
         for package in (ROOT, against):
-            sides.append(Side(package, row, kept, processor_time))
+            sides.append(Side(package, row, kept, processor_time, slip_velocity))
             stack.callback(sides[-1].close)
         samples: tuple[list[dict[str, Any]], ...] = ([], [])
         for k in range(WARM_UP + steps):

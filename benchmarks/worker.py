@@ -47,7 +47,13 @@ def timed_steps(row: dict[str, Any]) -> Any:
 
     torch.set_num_threads(row["threads"])
     scene = (SCENES | BUCKLING)[row["scene"]](row["size"])
-    simulator = dc.Simulator(scene.scene, DT, solver=dc.SolverOptions(throw=False))
+    given = {} if row["slip_velocity"] is None else {"slip_velocity": row["slip_velocity"]}
+    simulator = dc.Simulator(
+        scene.scene,
+        DT,
+        contact=dc.ContactOptions(**given),
+        solver=dc.SolverOptions(throw=False),
+    )
     state = in_regime(simulator, scene, row["batch"], Path(row["kept"]))
     generator = torch.Generator().manual_seed(1)
     yield {"core": dc.build_info()["factorization"]}
