@@ -37,13 +37,13 @@ struct Eight {
 template <bool kPreceded>
 DIFFCLOTH_INLINE void spread(const double* from, bool rows, Eight& to) {
   const StoredFour& v = *reinterpret_cast<const StoredFour*>(kPreceded ? from - 1 : from);
-  constexpr int k = kPreceded ? 1 : 0;
+  constexpr int kFirst = kPreceded ? 1 : 0;
   if (rows) {
-    to.v[0] = Four{v[k], v[k + 1], v[k + 2], v[k]};
-    to.v[1] = Four{v[k + 1], v[k + 2], v[k], v[k + 1]};
+    to.v[0] = Four{v[kFirst], v[kFirst + 1], v[kFirst + 2], v[kFirst]};
+    to.v[1] = Four{v[kFirst + 1], v[kFirst + 2], v[kFirst], v[kFirst + 1]};
   } else {
-    to.v[0] = Four{v[k], v[k], v[k], v[k + 1]};
-    to.v[1] = Four{v[k + 1], v[k + 1], v[k + 2], v[k + 2]};
+    to.v[0] = Four{v[kFirst], v[kFirst], v[kFirst], v[kFirst + 1]};
+    to.v[1] = Four{v[kFirst + 1], v[kFirst + 1], v[kFirst + 2], v[kFirst + 2]};
   }
 }
 
