@@ -39,7 +39,7 @@ class Job:
 
 JOBS = {
     # An odd size: a row of vertices lies where the fold shall be, or nobody succeeds.
-    "FoldCloth": Job("configs/train_fold.yaml", 9, 1400, 2500),
+    "FoldCloth": Job("configs/train_fold.yaml", 9, 1400, 10_000),
     "PushCube": Job("configs/train_push.yaml", 8, 640, 1600),
     "LiftCloth": Job("configs/train_lift.yaml", 6, 600, 1500),
 }
