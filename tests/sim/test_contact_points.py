@@ -7,6 +7,7 @@ import pytest
 import scenes
 import torch
 from bodies import coupled_scenes
+from scipy.spatial.transform import Rotation
 
 import diffcloth_torch as dc
 
@@ -97,6 +98,34 @@ def test_points_lie_on_their_surfaces():
     half = torch.from_numpy(np.array(box.vertices)).max(dim=0).values
     assert (local.abs() <= half + 1e-9).all()
     assert ((local.abs() - half).abs().min(dim=-1).values < 1e-9).all()
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_points_on_two_round_bodies_lie_on_both(order):
+    radii, centers = (0.05, 0.03), ([0.0, 0.0, 0.0], [0.0, 0.02, 0.0785])
+    balls = [
+        dc.RigidBody.sphere(r, smooth=True, pose=[*at, 1, 0, 0, 0], name=name, motion=motion)
+        for r, at, name, motion in zip(radii, centers, "ab", ("static", "kinematic"), strict=True)
+    ]
+    # A capsule that falls on both.
+    pill = dc.RigidBody.capsule(
+        0.02, 0.1, smooth=True, motion="dynamic", mass=0.1, pose=[0.0, 0.075, 0.03, 1, 0, 0, 0]
+    )
+    bodies = [*balls, pill][::order]
+    sim = dc.Simulator(dc.Scene([], bodies), 0.01, contact=dc.ContactOptions(barrier_distance=8e-3))
+    with torch.no_grad():
+        state = sim.step(sim.initial_state())
+    contacts = sim.contacts(state)
+    assert len(contacts.points) == 2
+    for (first, second), ends in zip(contacts.pairs, contacts.points, strict=True):
+        for k, end in ((first, ends[0]), (second, ends[1])):
+            axis = state.body_poses[k, :3]
+            if bodies[k] is pill:
+                turn = Rotation.from_quat(state.body_poses[k, [4, 5, 6, 3]].numpy())
+                way = torch.from_numpy(turn.apply([0.0, 0.0, 1.0]))
+                axis = axis + ((end - axis) @ way).clamp(-0.05, 0.05) * way
+            radius = 0.02 if bodies[k] is pill else radii["ab".index(bodies[k].name)]
+            assert float((end - axis).norm()) == pytest.approx(radius, rel=1e-12)
 
 
 @pytest.mark.parametrize("friction", [0.2, 0.5])
