@@ -18,9 +18,6 @@ body, both the most of any frame. `stretch` is the longest edge over its length 
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -75,19 +72,8 @@ def scene(name: str, size: int) -> Records:
 
 def _edge_hinge(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
     """Mean torque of the hinges of a plate, over their angle and length [N]: 3 D l / area."""
-    opposite: dict[tuple[int, int], list[int]] = {}
-    for a, b, c in faces.tolist():
-        for i, j, k in ((a, b, c), (b, c, a), (c, a, b)):
-            opposite.setdefault((min(i, j), max(i, j)), []).append(k)
-    values = []
-    for (i, j), others in opposite.items():
-        if len(others) == 2:
-            edge = vertices[j] - vertices[i]
-            area = sum(
-                float(np.linalg.norm(np.cross(edge, vertices[k] - vertices[i]))) for k in others
-            )
-            values.append(3 * peers.MATERIAL.bending * float(np.linalg.norm(edge)) / (area / 2))
-    return float(np.mean(values))
+    lengths, areas = peers.hinges(vertices, faces)
+    return float(np.mean(3 * peers.MATERIAL.bending * lengths / areas))
 
 
 def time_ours(told: Records) -> Records:
@@ -124,23 +110,6 @@ def time_ours(told: Records) -> Records:
     }
 
 
-def time_peer(told: Records, python: Path, worker: str) -> Records:
-    """The same by a peer, in its own environment, on one core."""
-    core = min(os.sched_getaffinity(0))
-    file = Path(__file__).with_name(worker)
-    result = subprocess.run(
-        [python, str(file)],
-        input=json.dumps(told),
-        capture_output=True,
-        text=True,
-        check=False,
-        preexec_fn=lambda: os.sched_setaffinity(0, [core]),
-    )
-    if result.returncode != 0:
-        raise click.ClickException(f"{file.name} failed:\n{result.stderr}")
-    return json.loads(result.stdout.splitlines()[-1])
-
-
 def judge(told: Records, found: Records) -> Records:
     """Crossings, vertices inside, depth [mm], and stretch, each the worst of all frames."""
     frames = np.array(found["frames"], dtype=float)
@@ -173,13 +142,16 @@ def time_all(newton: Path, mujoco: Path, size: int) -> Iterator[Records]:
         told = scene(name, size)
         runs = [
             ("ours", lambda told=told: time_ours(told)),
-            ("Newton, VBD", lambda told=told: time_peer(told, newton, "vbd_worker.py")),
-            ("MuJoCo", lambda told=told: time_peer(told, mujoco, "mujoco_worker.py")),
+            ("Newton, VBD", lambda told=told: peers.time_peer(told, newton, "vbd_worker.py")),
+            ("MuJoCo", lambda told=told: peers.time_peer(told, mujoco, "mujoco_worker.py")),
         ]
         if told["folds"]:
             frictionless = {**told, "ipc": True}
             runs.append(
-                ("MuJoCo, ipc", lambda t=frictionless: time_peer(t, mujoco, "mujoco_worker.py"))
+                (
+                    "MuJoCo, ipc",
+                    lambda t=frictionless: peers.time_peer(t, mujoco, "mujoco_worker.py"),
+                )
             )
         for who, run in runs:
             found = run()

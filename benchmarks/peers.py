@@ -41,7 +41,7 @@ SINGLE_DIFFERENCE_STEPS = (1e-1, 3e-2, 1e-2, 3e-3)  # in single precision
 MATERIAL = dc.Material(friction=0.4)
 CONTACT_DAMPING = 0.1  # of the peer's penalty [N s/m]: a third of critical, one vertex on it
 RADIUS = 0.2  # of the sphere [m]
-WORKER = Path(__file__).with_name("newton_worker.py")
+WORKER = "newton_worker.py"
 
 Records = dict[str, Any]
 
@@ -89,23 +89,25 @@ def scene(name: str, size: int) -> Records:
     }
 
 
-def _hinge(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
-    """Mean torque of the peer's hinges, over their angle and squared length, of a plate [N/m]."""
-    corners: dict[tuple[int, int], list[int]] = {}
+def hinges(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lengths of the edges between two triangles [m], and areas of the two together [m^2]."""
+    opposite: dict[tuple[int, int], list[int]] = {}
     for a, b, c in faces.tolist():
         for i, j, k in ((a, b, c), (b, c, a), (c, a, b)):
-            corners.setdefault((min(i, j), max(i, j)), []).append(k)
-    values = []
-    for (i, j), opposite in corners.items():
-        if len(opposite) == 2:
-            edge = vertices[j] - vertices[i]
-            length = np.linalg.norm(edge)
-            heights = [
-                np.linalg.norm(np.cross(edge, vertices[k] - vertices[i])) / length for k in opposite
-            ]
-            area = length * sum(heights) / 2
-            values.append(3 * MATERIAL.bending / (area * np.mean(heights)))
-    return float(np.mean(values))
+            opposite.setdefault((min(i, j), max(i, j)), []).append(k)
+    inner = np.array([(*edge, *others) for edge, others in opposite.items() if len(others) == 2])
+    start, end, *others = (vertices[inner[:, i]] for i in range(4))
+    edge = end - start
+    twice = sum(np.linalg.norm(np.cross(edge, other - start), axis=-1) for other in others)
+    return np.linalg.norm(edge, axis=-1), twice / 2
+
+
+def _hinge(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
+    """Mean torque of the peer's hinges, over their angle and squared length, of a plate [N/m]."""
+    lengths, areas = hinges(vertices, faces)
+    return float(np.mean(3 * MATERIAL.bending * lengths / areas**2))
 
 
 def time_ours(told: Records) -> Records:
@@ -159,11 +161,11 @@ def time_ours(told: Records) -> Records:
     }
 
 
-def time_newton(told: Records, python: Path) -> Records:
-    """The same by Newton, in its own environment, on one core."""
+def time_peer(told: Records, python: Path, worker: str) -> Records:
+    """The same by a peer, in its own environment, on one core."""
     core = min(os.sched_getaffinity(0))
     result = subprocess.run(
-        [python, str(WORKER)],
+        [python, str(Path(__file__).with_name(worker))],
         input=json.dumps(told),
         capture_output=True,
         text=True,
@@ -171,7 +173,7 @@ def time_newton(told: Records, python: Path) -> Records:
         preexec_fn=lambda: os.sched_setaffinity(0, [core]),
     )
     if result.returncode != 0:
-        raise click.ClickException(f"{WORKER.name} failed:\n{result.stderr}")
+        raise click.ClickException(f"{worker} failed:\n{result.stderr}")
     return json.loads(result.stdout.splitlines()[-1])
 
 
@@ -204,7 +206,7 @@ def time_all(newton: Path, size: int) -> Iterator[Records]:
     """A row for each scene and each of the two, as they come."""
     for name in SCENES:
         told = scene(name, size)
-        for who, found in (("ours", time_ours(told)), ("Newton", time_newton(told, newton))):
+        for who, found in (("ours", time_ours(told)), ("Newton", time_peer(told, newton, WORKER))):
             yield {
                 "scene": name,
                 "size": size,
