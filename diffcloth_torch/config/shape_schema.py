@@ -161,6 +161,7 @@ class Cylinder(Section):
     kind: Literal["cylinder"]
     radius: Positive
     length: Positive
+    rings: Annotated[int, Ge(1), Le(100)] = 5
 
 
 class Plane(Section):

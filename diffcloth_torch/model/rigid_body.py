@@ -49,6 +49,7 @@ _SMALLEST_VOLUME = 1e-14
 
 # Of a sphere that begins with 20 triangles.
 _MOST_SUBDIVISIONS = int(math.log(shapes.MOST_FACES / 20, 4))
+_MOST_RINGS = 100
 
 MassProperties = tuple[float, FloatArray, FloatArray]
 """Volume, center and inertia for a density of one."""
@@ -325,25 +326,28 @@ class RigidBody:
 
     @classmethod
     def cylinder(
-        cls, radius: float, length: float, *, smooth: bool = False, **keywords: Any
+        cls, radius: float, length: float, *, rings: int = 5, smooth: bool = False, **keywords: Any
     ) -> RigidBody:
-        """Make a closed cylinder along z, centered at the origin.
+        """Make a closed cylinder along z, centered at the origin, with its vertices on it.
 
         Args:
             radius: Radius [m], > 0.
             length: Length [m], > 0.
+            rings: Rings of triangles on each end, 1 .. 100; a sixth of the number of flat sides.
+                With 5 it rolls 2 to 7 % too slowly, with 10 less than 1 %.
             smooth: Must be False: a cylinder with flat ends has no smooth surface here.
             **keywords: As for `RigidBody`.
         """
         if check_bool("RigidBody.cylinder: `smooth`", smooth):
             raise InvalidInput(
-                "RigidBody.cylinder: `smooth` must be False, as a cylinder has sharp rims; "
-                "RigidBody.capsule can be smooth"
+                "RigidBody.cylinder: `smooth` must be False, as a cylinder has sharp rims; with "
+                "`rings=10` it rolls nearly as a round one, and RigidBody.capsule can be smooth"
             )
         name = "RigidBody.cylinder: `{}`"
         r = check_number(name.format("radius"), radius, POSITIVE, instead=_POSES)
         h = check_number(name.format("length"), length, POSITIVE, instead=_POSES)
-        return cls(*shapes.cylinder(r, h), **keywords)
+        check_count(name.format("rings"), rings, 1, _MOST_RINGS)
+        return cls(*shapes.cylinder(r, h, rings), **keywords)
 
     @classmethod
     def plane(cls, size: object, **keywords: Any) -> RigidBody:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -188,6 +189,14 @@ def test_smooth_bodies_are_read(write, shape):
     bodies = f"  bodies:\n    - {{name: ball, shape: {{kind: {shape}, smooth: true}},"
     task = load_task(write(MINIMAL + bodies + " pose: {position: [0, 0, -1]}}\n"))
     assert task.scene.bodies[0].smooth
+
+
+def test_a_cylinder_has_as_many_sides_as_asked_for(write):
+    shape = "{kind: cylinder, radius: 0.1, length: 0.2, rings: 8}"
+    body = f"  bodies:\n    - {{name: can, shape: {shape}, pose: {{position: [0, 0, -1]}}}}\n"
+    (can,) = load_task(write(MINIMAL + body)).scene.bodies
+    on_rim = (can.vertices[:, 2] == 0.1) & (np.hypot(*can.vertices.T[:2]) > 0.0999)
+    assert on_rim.sum() == 48
 
 
 def test_a_cylinder_is_not_smooth(write):

@@ -225,3 +225,6 @@ def test_a_cylinder_is_one():
     np.testing.assert_allclose(body.vertices[:, 2].max(), 0.2)
     with pytest.raises(dc.InvalidInput, match=r"RigidBody.cylinder: `length` must be .*> 0"):
         dc.RigidBody.cylinder(0.1, 0.0)
+    with pytest.raises(dc.InvalidInput, match=r"RigidBody.cylinder: `rings` must be at least 1"):
+        dc.RigidBody.cylinder(0.1, 0.4, rings=0)
+    assert len(dc.RigidBody.cylinder(0.1, 0.1, rings=8).faces) == 2 * 6 * 8**2 + 2 * 48
