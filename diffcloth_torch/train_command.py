@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Iterable
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from tqdm import tqdm
 from diffcloth_torch import envs
 from diffcloth_torch.commands import check_folder
 from diffcloth_torch.config.documents import read_document, set_values
-from diffcloth_torch.config.train_schema import TrainConfig, WorkersSection
+from diffcloth_torch.config.train_schema import TrainConfig, TryoutSection, WorkersSection
 from diffcloth_torch.config.validation import validate
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import read_regular_file
@@ -63,10 +64,11 @@ def train(
     if job.writes:
         check_folder(config, out, overwrite)
         out.mkdir(parents=True, exist_ok=True)
-        for file in [out / _RESULT, out / _RESUME, out / _POLICY, *(out / _EVENTS).glob("*")]:
+        for file in (out / _RESULT, out / _RESUME, out / _POLICY):
             file.unlink(missing_ok=True)
-        document = section.model_dump(mode="json", exclude_unset=True)
-        write_metrics(out / _RESUME, {"config": document, "source": str(config.resolve())})
+        if (out / _EVENTS).is_dir():
+            shutil.rmtree(out / _EVENTS)
+        job.write_resume(out)
     return job.run(out, [])
 
 
@@ -86,11 +88,13 @@ def resume_training(folder: Path) -> str:
         saved = json.loads(read_regular_file(file, _LARGEST))
         document, source = saved["config"], Path(saved["source"])
         history: list[dict[str, Any]] = []
+        tried: list[dict[str, Any]] = []
         if (folder / _RESULT).is_file():
-            history = json.loads((folder / _RESULT).read_text())["evaluations"]
+            result = json.loads((folder / _RESULT).read_text())
+            history, tried = result["evaluations"], result.get("tried", [])
     except (ValueError, KeyError, TypeError) as error:
         raise InvalidInput(f"--resume: {file} is not what `diffcloth train` wrote") from error
-    job = _Job(_check(document, source), source)
+    job = _Job(_check(document, source), source, tried)
     if (folder / _POLICY).is_file():
         job.trainer.load(folder / _POLICY)
     return job.run(folder, [e for e in history if e["updates"] <= job.trainer.updates])
@@ -107,14 +111,19 @@ def _check(document: dict[str, Any], source: Path) -> TrainConfig:
 class _Job:
     """A training: its trainer, its workers, and what it has found so far."""
 
-    def __init__(self, section: TrainConfig, source: Path) -> None:
-        self.section = section
-        where = f"{source}: `trainer`"
-        options = _named(where, TrainerOptions, section.trainer)
+    def __init__(
+        self, section: TrainConfig, source: Path, tried: list[dict[str, Any]] | None = None
+    ) -> None:
+        self.section, self._source = section, source.resolve()
+        self._options = _named(f"{source}: `trainer`", TrainerOptions, section.trainer)
         self._workers = _workers(section.workers)
         self.writes = not isinstance(self._workers, Ranks) or self._workers.rank == 0
-        env = section.environment
-        self.trainer = Trainer(
+        self.trainer = self._make(self._options)
+        self._tried: list[dict[str, Any]] = tried or []
+
+    def _make(self, options: TrainerOptions) -> Trainer:
+        section, env = self.section, self.section.environment
+        return Trainer(
             partial(envs.make, env.name, **env.options),
             options,
             num_envs=section.num_envs,
@@ -123,73 +132,136 @@ class _Job:
             threads=section.workers.threads,
         )
 
+    def write_resume(self, out: Path) -> None:
+        """Write what `--resume` begins with."""
+        document = self.section.model_dump(mode="json", exclude_unset=True)
+        write_metrics(out / _RESUME, {"config": document, "source": str(self._source)})
+
     def run(self, out: Path, evaluations: list[dict[str, Any]]) -> str:
         """Learn until the end, and write what was found."""
+        before = time.perf_counter() - (evaluations[-1]["seconds"] if evaluations else 0.0)
+        try:
+            if self.section.tryout is not None:
+                evaluations = self._try_out(out, self.section.tryout, before)
+            states = self._learn(self.section.updates, evaluations, before, out / _EVENTS, out)
+        except KeyboardInterrupt as error:
+            kept = evaluations[-1]["updates"] if evaluations else 0
+            raise KeyboardInterrupt(
+                f"after {self.trainer.updates} updates, of which {kept} are kept: go on with  "
+                f"diffcloth train --resume {out}"
+            ) from error
+        finally:
+            if self._workers is not None:
+                self._workers.close()
+        if not states:
+            return f"nothing is left to do: {self.trainer.updates} updates are done"
+        if self.writes:
+            self._film(out, states)
+        end = evaluations[-1]
+        seeds = [each["seed"] for each in self._tried]
+        best = f"seed {self.trainer.options.seed}, the best of {seeds}: " if seeds else ""
+        return best + (
+            f"{end['steps']} environment steps in {end['seconds']:.0f} s: return "
+            f"{evaluations[0]['return']:.4g} -> {end['return']:.4g}, "
+            f"success {end['success']:.0%}; results are in {out}"
+        )
+
+    def _try_out(self, out: Path, tryout: TryoutSection, before: float) -> list[dict[str, Any]]:
+        """Let each seed learn for a while; from then on this is a training of the best one.
+
+        Returns:
+            Its evaluations.
+        """
+        found = []
+        for seed in tryout.seeds:
+            self.trainer = self._make(replace(self._options, seed=seed))
+            evaluations: list[dict[str, Any]] = []
+            updates = min(tryout.updates, self.section.updates)
+            self._learn(updates, evaluations, before, out / _EVENTS / f"seed_{seed}")
+            self._tried.append({"seed": seed, **evaluations[-1]})
+            found.append((self.trainer, evaluations))
+            if self._succeeds(evaluations):
+                break
+        # The first of those that are equal.
+        self.trainer, evaluations = max(found, key=lambda each: each[1][-1]["return"])
+        trained = {**self.section.trainer, "seed": self.trainer.options.seed}
+        self.section = self.section.model_copy(update={"trainer": trained, "tryout": None})
+        if self.writes:
+            # What is resumed must be a training with this seed before there is its policy.
+            self.write_resume(out)
+            self._write(out, evaluations)
+        return evaluations
+
+    def _learn(
+        self,
+        updates: int,
+        evaluations: list[dict[str, Any]],
+        before: float,
+        log: Path,
+        out: Path | None = None,
+    ) -> list[State]:
+        """Learn until so many updates are done or enough episodes succeed.
+
+        Args:
+            updates: Those at the end.
+            evaluations: So far; more are appended.
+            before: When the training began.
+            log: Folder of TensorBoard's events.
+            out: Folder in which each evaluation and its policy are kept.
+
+        Returns:
+            The states of the last evaluation, none if nothing was left to do.
+        """
         from torch.utils.tensorboard import SummaryWriter
 
         trainer, section = self.trainer, self.section
-        events: Any = None
-        if self.writes:
-            events = SummaryWriter(out / _EVENTS, purge_step=trainer.steps)
+        events: Any = SummaryWriter(log, purge_step=trainer.steps) if self.writes else None
         bar = tqdm(
-            total=section.updates,
+            total=updates,
             initial=trainer.updates,
-            desc="train",
+            desc="train" if section.tryout is None else f"seed {trainer.options.seed}",
             disable=None if self.writes else True,
         )
         states: list[State] = []
-        before = time.perf_counter() - (evaluations[-1]["seconds"] if evaluations else 0.0)
         try:
-            while not evaluations or trainer.updates < section.updates:
+            while not evaluations or (
+                trainer.updates < updates and not self._succeeds(evaluations)
+            ):
                 if evaluations:
-                    log = trainer.update()
+                    scalars = trainer.update()
                     bar.update()
-                    for name, value in log.items() if events else ():
+                    for name, value in scalars.items() if events else ():
                         events.add_scalar(name, value, trainer.steps)
-                    is_last = trainer.updates == section.updates
+                    is_last = trainer.updates == updates
                     if trainer.updates % section.evaluate_every and not is_last:
                         continue
                 states, found = self._evaluate()
                 evaluations.append(found | {"seconds": time.perf_counter() - before})
                 bar.set_postfix({"return": f"{found['return']:.4g}"})
-                if events:
-                    self._write(out, evaluations, events)
-                if section.until_success is not None and found["success"] >= section.until_success:
-                    break
-        except KeyboardInterrupt as error:
-            kept = evaluations[-1]["updates"] if evaluations else 0
-            raise KeyboardInterrupt(
-                f"after {trainer.updates} updates, of which {kept} are kept: go on with  "
-                f"diffcloth train --resume {out}"
-            ) from error
+                for name in ("return", "success") if events else ():
+                    events.add_scalar(f"evaluation/{name}", found[name], trainer.steps)
+                if self.writes and out is not None:
+                    self._write(out, evaluations)
         finally:
             bar.close()
             if events:
                 events.close()
-            if self._workers is not None:
-                self._workers.close()
-        if not states:
-            return f"nothing is left to do: {trainer.updates} updates are done"
-        if self.writes:
-            self._film(out, states)
-        end = evaluations[-1]
-        return (
-            f"{end['steps']} environment steps in {end['seconds']:.0f} s: return "
-            f"{evaluations[0]['return']:.4g} -> {end['return']:.4g}, "
-            f"success {end['success']:.0%}; results are in {out}"
-        )
+        return states
+
+    def _succeeds(self, evaluations: list[dict[str, Any]]) -> bool:
+        enough = self.section.until_success
+        return enough is not None and bool(evaluations[-1]["success"] >= enough)
 
     def _evaluate(self) -> tuple[list[State], dict[str, Any]]:
         value, success, states = self.trainer.evaluate(self.section.episodes)
         counts = {"updates": self.trainer.updates, "steps": self.trainer.steps}
         return states, counts | {"return": value, "success": success}
 
-    def _write(self, out: Path, evaluations: list[dict[str, Any]], events: Any) -> None:
-        for name in ("return", "success"):
-            events.add_scalar(f"evaluation/{name}", evaluations[-1][name], self.trainer.steps)
+    def _write(self, out: Path, evaluations: list[dict[str, Any]]) -> None:
         # The policy last: `--resume` goes on from it, and what was found until then must be there.
         config = self.section.model_dump(mode="json")
-        write_metrics(out / _RESULT, {"config": config, "evaluations": evaluations})
+        result = {"config": config, "evaluations": evaluations, "tried": self._tried}
+        write_metrics(out / _RESULT, result)
         with replace_file(out / _POLICY) as file:
             self.trainer.save(file)
 

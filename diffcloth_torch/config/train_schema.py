@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from annotated_types import Ge
+from annotated_types import Ge, MinLen
 
 from diffcloth_torch.config.schema import PictureSection
 from diffcloth_torch.config.section import Section
 
-__all__ = ["EnvironmentSection", "TrainConfig", "WorkersSection"]
+__all__ = ["EnvironmentSection", "TrainConfig", "TryoutSection", "WorkersSection"]
 
 Count = Annotated[int, Ge(1)]
 
@@ -29,12 +29,20 @@ class WorkersSection(Section):
     threads: Count = 1
 
 
+class TryoutSection(Section):
+    """Seeds that each learn for a few updates; the best of them goes on."""
+
+    seeds: Annotated[list[Annotated[int, Ge(0)]], MinLen(2)]
+    updates: Count
+
+
 class TrainConfig(Section):
     """Environments, the options of `TrainerOptions`, and how long to learn.
 
     The policy is evaluated, and kept, at first, after each `evaluate_every` updates and at the end,
     in `episodes` episodes of their own. With `until_success` training ends before its last update,
-    as soon as that share of them succeeds.
+    as soon as that share of them succeeds. With `tryout` the seed of `trainer` is the one with the
+    largest return after the updates there, which count as the first ones.
     """
 
     task: Literal["train"]
@@ -46,6 +54,7 @@ class TrainConfig(Section):
     evaluate_every: Count = 10
     episodes: Count = 8
     until_success: Annotated[float, Ge(0)] | None = None
+    tryout: TryoutSection | None = None
     workers: WorkersSection = WorkersSection()
     viewers: list[Literal["record", "web"]] = ["record"]
     pictures: PictureSection = PictureSection()

@@ -98,6 +98,74 @@ def test_success_ends_it(config, tmp_path):
     assert [e["updates"] for e in record["evaluations"]] == [0]
 
 
+TRYOUT = ("--set", "tryout={seeds: [0, 1, 2], updates: 2}")
+
+
+def same_policies(a, b):
+    a, b = policy(a), policy(b)
+    return a["counts"] == b["counts"] and all(
+        torch.equal(tensor, b["policy"][name]) for name, tensor in a["policy"].items()
+    )
+
+
+def test_the_best_of_several_seeds_goes_on_as_if_it_had_been_alone(config, tmp_path):
+    out = tmp_path / "out"
+    result = call(config, "--out", out, *TRYOUT)
+    assert result.exit_code == 0, result.output
+    record = json.loads((out / "train.json").read_text())
+    tried = record["tried"]
+    assert [(each["seed"], each["updates"]) for each in tried] == [(0, 2), (1, 2), (2, 2)]
+    best = max(tried, key=lambda each: each["return"])
+    assert f"seed {best['seed']}, the best of [0, 1, 2]" in result.output
+    assert [e["updates"] for e in record["evaluations"]] == [0, 2, 4]
+    assert record["evaluations"][1]["return"] == best["return"]
+    for seed in range(3):
+        alone = tmp_path / f"alone_{seed}"
+        assert call(config, "--out", alone, "--set", f"trainer.seed={seed}").exit_code == 0
+        evaluations = json.loads((alone / "train.json").read_text())["evaluations"]
+        assert evaluations[1]["return"] == tried[seed]["return"]
+        assert same_policies(out, alone) == (seed == best["seed"])
+    assert {f.name for f in (out / "events").iterdir() if f.is_dir()} == {
+        "seed_0", "seed_1", "seed_2"
+    }  # fmt: skip
+    assert call(config, "--out", out, "--overwrite").exit_code == 0
+    assert not [f for f in (out / "events").iterdir() if f.is_dir()]
+
+
+@pytest.mark.parametrize("at", [3, 8], ids=["while seeds are tried", "after that"])
+def test_an_interrupted_tryout_goes_on_with_the_same_bits(config, tmp_path, monkeypatch, at):
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert call(config, "--out", whole, *TRYOUT).exit_code == 0
+    real, calls = Trainer.update, []
+
+    def update(trainer):
+        calls.append(trainer.updates)
+        if len(calls) == at:
+            raise KeyboardInterrupt
+        return real(trainer)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "update", update)
+        result = call(config, "--out", cut, *TRYOUT)
+    assert result.exit_code == 130
+    assert f"of which {0 if at == 3 else 2} are kept" in result.output
+    result = call("--resume", cut)
+    assert result.exit_code == 0, result.output
+    assert same_policies(whole, cut)
+    tried = [json.loads((f / "train.json").read_text())["tried"] for f in (whole, cut)]
+    assert [e["return"] for e in tried[0]] == [e["return"] for e in tried[1]]
+
+
+def test_a_seed_that_succeeds_is_the_last_one(config, tmp_path):
+    out = tmp_path / "out"
+    result = call(config, "--out", out, "--set", "until_success=0.0", *TRYOUT)
+    assert result.exit_code == 0, result.output
+    record = json.loads((out / "train.json").read_text())
+    assert [each["seed"] for each in record["tried"]] == [0]
+    assert [e["updates"] for e in record["evaluations"]] == [0]
+    assert "nothing is left" in call("--resume", out).output
+
+
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [
@@ -109,6 +177,8 @@ def test_success_ends_it(config, tmp_path):
         ("workers.kind=dask", "workers.kind"),
         ("workers.kind=ranks", "under torchrun"),
         ("updates=0", "updates"),
+        ("tryout={seeds: [1], updates: 2}", "tryout.seeds"),
+        ("tryout={seeds: [1, -1], updates: 2}", "tryout.seeds"),
     ],
 )
 def test_bad_configurations(config, tmp_path, assignment, message):
