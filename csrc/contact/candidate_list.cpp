@@ -3,8 +3,10 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <numeric>
+#include <utility>
 
-#include "contact/separation_lanes.h"
+#include "contact/pair_distances.h"
 
 namespace diffcloth::contact {
 namespace {
@@ -32,23 +34,26 @@ struct Travel {
   double largest = 0.0;
 };
 
-/// Distances of sorted pairs at x [m].
-void measure_distances(const std::vector<Candidate>& pairs,
-                       const double* x,
-                       std::vector<double>& out) {
-  static const SquaredDistances measure = squared_distances(linalg::best_level());
-  constexpr std::ptrdiff_t kStride = sizeof(Candidate) / sizeof(Index);
-  static_assert(sizeof(Candidate) % sizeof(Index) == 0);
-  out.resize(pairs.size());
-  const auto middle = std::ranges::find(pairs, PairKind::kEdgeEdge, &Candidate::kind);
-  const auto run = [&](auto first, auto last) {
-    if (first == last) return;
-    measure(first->kind == PairKind::kEdgeEdge, x, first->vertices.data(), kStride, last - first,
-            out.data() + (first - pairs.begin()));
+/// Sort in what has been appended behind `middle` sorted pairs, each once.
+void sort_in(std::size_t middle, Found& found) {
+  std::vector<std::size_t> order(found.pairs.size() - middle);
+  if (order.empty()) return;
+  std::iota(order.begin(), order.end(), middle);
+  std::ranges::sort(order, {}, [&](std::size_t k) -> const Candidate& { return found.pairs[k]; });
+  Found all;
+  all.pairs.reserve(found.pairs.size());
+  all.apart.reserve(found.pairs.size());
+  const auto take = [&](std::size_t k) {
+    if (!all.pairs.empty() && all.pairs.back() == found.pairs[k]) return;
+    all.push(found.pairs[k], found.apart[k]);
   };
-  run(pairs.begin(), middle);
-  run(middle, pairs.end());
-  for (double& d : out) d = std::sqrt(d);
+  std::size_t first = 0;
+  for (const std::size_t k : order) {
+    while (first < middle && found.pairs[first] <= found.pairs[k]) take(first++);
+    take(k);
+  }
+  while (first < middle) take(first++);
+  std::swap(found, all);
 }
 
 /// NaN counts as the largest of all.
@@ -90,8 +95,10 @@ double CandidateList::measure_approach(const double* reference,
   approach_.assign(count * count, 0.0);
   double result = 0.0;
   // Along a straight motion displacements are largest at one of its ends.
-  for (const double* x : {x_t0, x_t1}) {
+  for (const auto& [x, mean] : {std::pair(x_t0, &mean_t0_), std::pair(x_t1, &mean_t1_)}) {
     const std::vector<Travel> moved = motions(mesh, reference, x);
+    mean->clear();
+    for (const Travel& travel : moved) mean->push_back(travel.mean);
     for (std::size_t s = 0; s < count; ++s) {
       for (std::size_t r = 0; r < count; ++r) {
         if (!mesh.touching.contains(static_cast<Index>(s), static_cast<Index>(r))) continue;
@@ -139,7 +146,8 @@ void CandidateList::build_near(const double* x_t0, double approach, BroadPhase::
                           reach_.empty() ? 0.0 : kThinnest * std::ranges::min(reach_), wide_.skin);
   with_skin_.clear();
   for (const double value : reach_) with_skin_.push_back(value + near_.skin);
-  find_wide(x_t0, x_t0, with_skin_, near_.skin, scratch, near_.pairs);
+  find_wide(x_t0, x_t0, with_skin_, near_.skin, scratch, found_);
+  near_.pairs = found_.pairs;
   keep_near_ones(near_);
 }
 
@@ -148,12 +156,12 @@ void CandidateList::build_near(const double* x_t0, double approach, BroadPhase::
 void CandidateList::keep_near_ones(Kept& kept) const {
   const CollisionMesh& mesh = broad_phase_->mesh();
   const double* const x = kept.reference.data();
-  measure_distances(kept.pairs, x, kept.distance);
+  kept.distance = distances_sq(kept.pairs, x);
   kept.surfaces.clear();
   std::size_t count = 0;
   for (std::size_t k = 0; k < kept.pairs.size(); ++k) {
     const Candidate& pair = kept.pairs[k];
-    const double distance = kept.distance[k];
+    const double distance = std::sqrt(kept.distance[k]);
     const Index s = mesh.vertex_surface[pair.vertices[0]];
     const Index r = mesh.vertex_surface[pair.vertices[3]];
     if (distance > reach_[s] + reach_[r] + 2.0 * (kept.skin + rounding_)) continue;
@@ -164,14 +172,34 @@ void CandidateList::keep_near_ones(Kept& kept) const {
   kept.distance.resize(count);
   kept.pairs.resize(count);
   kept.pairs.shrink_to_fit();  // often to next to nothing
+  kept.middle = first_of_edges(kept.pairs);
 }
 
-/// Of what is kept, what may come within reach; approach_ is what measure_approach() has found for it.
+/// How much vertices have moved against the means of their surfaces, and these against each other.
+void CandidateList::measure_deviations() {
+  const CollisionMesh& mesh = broad_phase_->mesh();
+  const auto count = static_cast<std::size_t>(mesh.surface_count());
+  deviation_.resize(static_cast<std::size_t>(mesh.vertex_count));
+  for (Index v = 0; v < mesh.vertex_count; ++v) {
+    const Index s = mesh.vertex_surface[v];
+    deviation_[v] = std::sqrt(std::max((row(u_t0_.data(), v) - mean_t0_[s]).squaredNorm(),
+                                       (row(u_t1_.data(), v) - mean_t1_[s]).squaredNorm()));
+  }
+  mean_apart_.resize(count * count);
+  for (std::size_t s = 0; s < count; ++s) {
+    for (std::size_t r = 0; r < count; ++r) {
+      mean_apart_[s * count + r] =
+          std::max((mean_t0_[s] - mean_t0_[r]).norm(), (mean_t1_[s] - mean_t1_[r]).norm());
+    }
+  }
+}
+
+/// Of what is kept, what may come within reach, by what measure_approach() has found for it.
 void CandidateList::cull(const Kept& kept,
                          const double* x_t0,
                          const double* x_t1,
                          std::span<const double> reach,
-                         std::vector<Candidate>& out) {
+                         Found& out) {
   const std::size_t size = kept.reference.size();
   u_t0_.resize(size);
   u_t1_.resize(size);
@@ -183,16 +211,33 @@ void CandidateList::cull(const Kept& kept,
   for (const double a : reach) {
     for (const double b : reach) together.push_back(a + b + 2.0 * rounding_);
   }
+  measure_deviations();
+  const auto spare = [&](Index k) { return kept.distance[k] - together[kept.surfaces[k]]; };
+  // A surface counts as near as its fastest part; few of its pairs are: by bounds on how their corners move
+  // before those corners are compared. Which pairs are is as good as random: all are written, and kept by
+  // counting on.
+  maybe_.resize(kept.pairs.size());
+  Index count = 0;
+  for (Index k = 0; k < static_cast<Index>(kept.pairs.size()); ++k) {
+    maybe_[count] = k;
+    count += static_cast<Index>(!(spare(k) > approach_[kept.surfaces[k]]));
+  }
+  const auto largest = [&](auto... v) { return std::max({deviation_[v]...}); };
+  const Index before = count;
+  count = 0;
+  for (Index i = 0; i < before; ++i) {
+    const Index k = maybe_[i];
+    const auto& [a, b, c, d] = kept.pairs[k].vertices;
+    const double deviation =
+        k < kept.middle ? deviation_[a] + largest(b, c, d) : largest(a, b) + largest(c, d);
+    maybe_[count] = k;
+    count += static_cast<Index>(!(spare(k) > deviation + mean_apart_[kept.surfaces[k]]));
+  }
   out.clear();
-  for (std::size_t k = 0; k < kept.pairs.size(); ++k) {
-    const Index s = kept.surfaces[k];
-    const double spare = kept.distance[k] - together[s];
-    if (spare > approach_[s]) continue;
-    // A surface counts as near as its fastest part; few of its pairs are.
-    if (spare > 0.0 && spare * spare > approach_sq(kept.pairs[k], u_t0_.data(), u_t1_.data())) {
-      continue;
-    }
-    out.push_back(kept.pairs[k]);
+  for (const Index k : std::span(maybe_).first(count)) {
+    const double moved = std::sqrt(approach_sq(kept.pairs[k], u_t0_.data(), u_t1_.data()));
+    if (spare(k) > moved) continue;
+    out.push(kept.pairs[k], kept.distance[k] - 2.0 * rounding_ - moved);
   }
 }
 
@@ -204,14 +249,14 @@ void CandidateList::find_wide(const double* x_t0,
                               std::span<const double> reach,
                               double widened,
                               BroadPhase::Scratch& scratch,
-                              std::vector<Candidate>& out) {
+                              Found& out) {
   const double approach = measure_approach(wide_.reference.data(), x_t0, x_t1);
   cull(wide_, x_t0, x_t1, reach, out);
   const double least = 2.0 * (wide_.skin - widened) - rounding_;
   if (approach <= least) return;
   if (!has_parts_) relative_search_.start(wide_.reference.data());
   has_parts_ = true;
-  const auto middle = static_cast<std::ptrdiff_t>(out.size());
+  const std::size_t middle = out.pairs.size();
   looked_at_ += relative_search_.find({.reference = wide_.reference.data(),
                                        .x_t0 = x_t0,
                                        .x_t1 = x_t1,
@@ -221,9 +266,7 @@ void CandidateList::find_wide(const double* x_t0,
                                        .least = std::max(least, 0.0),
                                        .rounding = 2.0 * (rounding_ + kRounding * approach)},
                                       scratch, out);
-  std::sort(out.begin() + middle, out.end());
-  std::inplace_merge(out.begin(), out.begin() + middle, out.end());
-  out.erase(std::unique(out.begin(), out.end()), out.end());
+  sort_in(middle, out);
 }
 
 void CandidateList::find_at(const double* x,
@@ -254,13 +297,12 @@ void CandidateList::find_at(const double* x,
   with_skin_.clear();
   for (const double value : reach) with_skin_.push_back(value + kMore * widened);
   broad_phase_->find_at_rest(x, with_skin_, scratch, out);
-  std::vector<double> distance;
-  measure_distances(out, x, distance);
+  const std::vector<double> d_sq = distances_sq(out, x);
   std::size_t kept = 0;
   for (std::size_t k = 0; k < out.size(); ++k) {
     const std::array<Index, 4>& v = out[k].vertices;
     const double limit = range[mesh.vertex_surface[v[0]] * count + mesh.vertex_surface[v[3]]];
-    if (limit < 0.0 || distance[k] > limit) continue;
+    if (limit < 0.0 || std::sqrt(d_sq[k]) > limit) continue;
     out[kept++] = out[k];
   }
   out.resize(kept);
@@ -270,7 +312,7 @@ void CandidateList::find(const double* x_t0,
                          const double* x_t1,
                          std::span<const double> reach,
                          BroadPhase::Scratch& scratch,
-                         std::vector<Candidate>& out) {
+                         Found& out) {
   if (!std::ranges::equal(reach, reach_)) {
     wide_.reference.clear();
     near_.reference.clear();
@@ -282,7 +324,8 @@ void CandidateList::find(const double* x_t0,
   }
   const double approach = measure_approach(x_t0, x_t0, x_t1);
   if (!std::isfinite(approach)) {
-    broad_phase_->find(x_t0, x_t1, reach, scratch, out);
+    broad_phase_->find(x_t0, x_t1, reach, scratch, out.pairs);
+    out.apart.assign(out.pairs.size(), 0.0);
     return;
   }
   const bool is_worn = kWorn * looked_at_ > wide_.pairs.size();

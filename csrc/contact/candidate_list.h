@@ -34,14 +34,16 @@ class CandidateList {
   }
 
   /// Pairs of the broad phase, sorted; every pair that comes within the sum of the two reaches at
-  /// any time of the straight motion is among them.
+  /// any time of the straight motion is among them. How far apart they stay at least is known by how near
+  /// they have been, and how far they have moved against each other since: most pairs of a short motion
+  /// need no more to be known to stay apart.
   ///
   /// @param reach  [surfaces] [m]
   void find(const double* x_t0,
             const double* x_t1,
             std::span<const double> reach,
             BroadPhase::Scratch& scratch,
-            std::vector<Candidate>& out);
+            Found& out);
 
   /// The pairs of wanted surfaces whose distance at a point is at most the sum of the two reaches, widened;
   /// sorted. Quick where the list was made. The list stays as it is.
@@ -65,6 +67,7 @@ class CandidateList {
     double skin = 0.0;              // of each surface [m]
     std::vector<Candidate> pairs;
     std::vector<double> distance;  // at the reference [m]
+    std::ptrdiff_t middle = 0;     // where the pairs of edges begin
     std::vector<Index> surfaces;   // which pair of surfaces
   };
 
@@ -75,17 +78,18 @@ class CandidateList {
              BroadPhase::Scratch& scratch);
   void build_near(const double* x_t0, double approach, BroadPhase::Scratch& scratch);
   void keep_near_ones(Kept& kept) const;
+  void measure_deviations();
   void cull(const Kept& kept,
             const double* x_t0,
             const double* x_t1,
             std::span<const double> reach,
-            std::vector<Candidate>& out);
+            Found& out);
   void find_wide(const double* x_t0,
                  const double* x_t1,
                  std::span<const double> reach,
                  double widened,
                  BroadPhase::Scratch& scratch,
-                 std::vector<Candidate>& out);
+                 Found& out);
 
   const BroadPhase* broad_phase_;
   RelativeSearch relative_search_;
@@ -95,9 +99,15 @@ class CandidateList {
   Kept near_;
   bool has_parts_ = false;        // relative_search_ has started at the reference of wide_
   std::size_t looked_at_ = 0;     // by searches beside wide_
-  std::vector<double> approach_;  // [surfaces^2] scratch of measure_approach()
-  std::vector<double> u_t0_;      // scratch of cull(): displacements since the reference
+  std::vector<double> approach_;  // [surfaces^2] of measure_approach()
+  std::vector<Vec3> mean_t0_;     // [surfaces] likewise: mean displacements since the reference
+  std::vector<Vec3> mean_t1_;
+  std::vector<double> u_t0_;  // scratch of cull(): displacements since the reference
   std::vector<double> u_t1_;
+  std::vector<double> deviation_;   // of the vertices from those means, at most
+  std::vector<double> mean_apart_;  // [surfaces^2] how much two of them differ, at most
+  std::vector<Index> maybe_;
+  Found found_;
   std::vector<double> with_skin_;  // [surfaces] scratch
   Index builds_ = 0;
 };

@@ -73,6 +73,12 @@ double certified_time(
 
 }  // namespace
 
+double harmless_distance(double xi, double d_hat, double largest) {
+  // A search goes on by more than kSettled then, whatever it is that rounds.
+  constexpr double kClearly = 10.0;
+  return xi + kGapLeft * d_hat + kClearly * kPositionRounding * largest;
+}
+
 double safe_step(PairKind kind,
                  const Corners& x_t0,
                  const Corners& x_t1,

@@ -28,4 +28,9 @@ double safe_step(PairKind kind,
                  double d_hat,
                  double limit = 1.0);
 
+/// A pair that stays farther apart than this on all of a motion is not the first: its safe_step() is the limit.
+///
+/// @param largest  of the coordinates at both ends [m]
+double harmless_distance(double xi, double d_hat, double largest);
+
 }  // namespace diffcloth::contact

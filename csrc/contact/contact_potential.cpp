@@ -1,6 +1,7 @@
 #include "contact/contact_potential.h"
 
 #include <algorithm>
+#include <cmath>
 #include <span>
 #include <utility>
 
@@ -54,11 +55,26 @@ void add_stencil_product(const Stencil& v, const Hessian& h, const double* d, do
 
 }  // namespace
 
+double ContactPotential::largest_coordinate(const double* x) const {
+  const auto size = 3 * static_cast<std::ptrdiff_t>(model_.mesh().vertex_count);
+  double largest = 0.0;
+  for (std::ptrdiff_t a = 0; a < size; ++a) largest = std::max(largest, std::abs(x[a]));
+  return largest;
+}
+
 double ContactPotential::safe_fraction(const double* x, const double* to) const {
   double alpha = 1.0;
-  for (const Candidate& pair : candidates_) {
-    alpha = safe_step(pair.kind, corners(pair.vertices, x), corners(pair.vertices, to),
-                      model_.xi(pair), model_.parameters().d_hat, alpha);
+  const double largest = std::max(largest_coordinate(x), largest_coordinate(to));
+  const double d_hat = model_.parameters().d_hat;
+  const double most = 2.0 * std::ranges::max(model_.reach()) - d_hat;  // of any xi
+  const double harmless_to_all = harmless_distance(most, d_hat, largest);
+  for (std::size_t k = 0; k < found_.pairs.size(); ++k) {
+    if (found_.apart[k] > harmless_to_all) continue;
+    const Candidate& pair = found_.pairs[k];
+    const double xi = model_.xi(pair);
+    if (found_.apart[k] > harmless_distance(xi, d_hat, largest)) continue;
+    alpha = safe_step(pair.kind, corners(pair.vertices, x), corners(pair.vertices, to), xi, d_hat,
+                      alpha);
     if (alpha == 0.0) break;
   }
   return alpha;
@@ -70,7 +86,7 @@ bool ContactPotential::is_at(const Measured& measured, const double* x) const {
 
 void ContactPotential::measure(const double* x, Measured& out) const {
   out.x.assign(x, x + 3 * static_cast<std::ptrdiff_t>(model_.mesh().vertex_count));
-  model_.measure(candidates_, x, out.near);
+  model_.measure(found_.pairs, x, out.near);
 }
 
 void ContactPotential::stand_at(const double* x) {

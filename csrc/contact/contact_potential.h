@@ -44,7 +44,7 @@ class ContactPotential final : public TouchingPotential {
 
   /// Find every pair that comes within reach on the straight motion x -> to.
   void watch(const double* x, const double* to) {
-    detection_.candidates.find(x, to, model_.reach(), detection_.scratch, candidates_);
+    detection_.candidates.find(x, to, model_.reach(), detection_.scratch, found_);
   }
 
   /// Stand at a point that a motion leads from.
@@ -55,7 +55,8 @@ class ContactPotential final : public TouchingPotential {
 
   /// Stand at a point that no motion leads from: its pairs alone, without a list for later.
   void look_at(const double* x) {
-    detection_.broad_phase.find_at_rest(x, model_.reach(), detection_.scratch, candidates_);
+    detection_.broad_phase.find_at_rest(x, model_.reach(), detection_.scratch, found_.pairs);
+    found_.apart.assign(found_.pairs.size(), 0.0);
     stand_at(x);
   }
 
@@ -65,7 +66,7 @@ class ContactPotential final : public TouchingPotential {
 
   /// Stand at a point whose contacts are known; they outlive the stand.
   void adopt(const std::vector<Contact>& contacts) {
-    candidates_.clear();
+    found_.clear();
     adopted_ = &contacts;
     here_.x.clear();
   }
@@ -108,6 +109,7 @@ class ContactPotential final : public TouchingPotential {
     std::vector<double> x;  ///< all vertices; empty where nothing is known
     Near near;
   };
+  double largest_coordinate(const double* x) const;
   bool is_at(const Measured& measured, const double* x) const;
   void measure(const double* x, Measured& out) const;
   const Near& near_at(const double* x, Measured& scratch) const;
@@ -116,7 +118,7 @@ class ContactPotential final : public TouchingPotential {
   Detection& detection_;
   ContactModel::Bar* bar_;
   std::vector<const ContactModel::Bar*> directions_;
-  std::vector<Candidate> candidates_;
+  Found found_;                                    ///< by the last watch()
   std::vector<Contact> contacts_;                  ///< that were found
   const std::vector<Contact>* adopted_ = nullptr;  ///< where the potential stands at these
   Measured here_;                                  ///< where the potential stands

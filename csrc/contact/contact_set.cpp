@@ -9,6 +9,7 @@
 
 #include "common/outer_product.h"
 #include "contact/distance/mollifier.h"
+#include "contact/pair_distances.h"
 
 namespace diffcloth::contact {
 
@@ -164,31 +165,12 @@ std::size_t ContactModel::group_end(const std::vector<Candidate>& candidates,
   return end;
 }
 
-namespace {
-
-/// Whether two primitives are farther apart than `range` along an axis.
-bool is_beyond(PairKind kind, const Corners& x, double range) {
-  const int first_of_b = kind == PairKind::kPointTriangle ? 1 : 2;
-  for (int k = 0; k < 3; ++k) {
-    const double a0 = x[0][k];
-    const double a1 = x[first_of_b - 1][k];
-    const double b0 = std::min({x[first_of_b][k], x[2][k], x[3][k]});
-    const double b1 = std::max({x[first_of_b][k], x[2][k], x[3][k]});
-    if (std::min(a0, a1) > b1 + range || b0 > std::max(a0, a1) + range) return true;
-  }
-  return false;
-}
-
-}  // namespace
-
 void ContactModel::add_own_term(const Candidate& pair,
                                 const double* x,
                                 std::vector<Term>& out) const {
   if (std::ranges::all_of(pair.vertices, [&](Index v) { return prescribed_[v] != 0; })) return;
-  const Corners corner = corners(pair.vertices, x);
   const double range = parameters_.d_hat + xi(pair);
-  if (is_beyond(pair.kind, corner, range)) return;
-  const double d_sq = closest_points(pair.kind, corner).d_sq;
+  const double d_sq = closest_points(pair.kind, corners(pair.vertices, x)).d_sq;
   if (d_sq < range * range) out.push_back({.pair = pair, .coefficient = 0.25, .d_sq = d_sq});
 }
 
@@ -278,12 +260,31 @@ Contact ContactModel::contact(const Term& term, const double* x) const {
   return k;
 }
 
-void ContactModel::measure(const std::vector<Candidate>& candidates,
-                           const double* x,
-                           Near& out) const {
+/// Those of sorted candidates that are within reach at x, and few more.
+std::vector<Candidate> ContactModel::near_ones(const std::vector<Candidate>& candidates,
+                                               const double* x) const {
+  // More than what distances differ by that are measured otherwise.
+  constexpr double kClearly = 1.0 + 1e-6;
+  std::vector<double> range_sq;  // of each pair of surfaces
+  for (const double a : reach_) {
+    for (const double b : reach_) range_sq.push_back(kClearly * (a + b) * (a + b));
+  }
+  const std::vector<double> d_sq = distances_sq(candidates, x);
+  std::vector<Candidate> near;
+  near.reserve(candidates.size());
+  for (std::size_t k = 0; k < candidates.size(); ++k) {
+    const Candidate& pair = candidates[k];
+    const Index surfaces = surface_a(pair) * mesh_.surface_count() + surface_b(pair);
+    if (!(d_sq[k] > range_sq[surfaces])) near.push_back(pair);
+  }
+  return near;
+}
+
+void ContactModel::measure(const std::vector<Candidate>& all, const double* x, Near& out) const {
   constexpr double kInfinity = std::numeric_limits<double>::infinity();
   out.terms.clear();
   out.energies.clear();
+  const std::vector<Candidate> candidates = near_ones(all, x);
   MergeScratch scratch;
   for (std::size_t first = 0, last = 0; first < candidates.size(); first = last) {
     last = group_end(candidates, first);

@@ -256,6 +256,7 @@ class ContactModel {
   bool is_alone(const Candidate& pair) const {
     return between_cloths(pair) || is_round_on_cloth(pair);
   }
+  std::vector<Candidate> near_ones(const std::vector<Candidate>& candidates, const double* x) const;
   void add_skeleton_term(const Candidate& pair, const double* x, std::vector<Term>& out) const;
   /// Candidates that act together: one, or those of a point or an edge and a body.
   std::size_t group_end(const std::vector<Candidate>& candidates, std::size_t first) const;

@@ -176,9 +176,7 @@ void RelativeSearch::fit_displacements(const Wanted& wanted, Index s) {
   });
 }
 
-std::size_t RelativeSearch::find(const Wanted& wanted,
-                                 BroadPhase::Scratch& scratch,
-                                 std::vector<Candidate>& out) {
+std::size_t RelativeSearch::find(const Wanted& wanted, BroadPhase::Scratch& scratch, Found& out) {
   const CollisionMesh& mesh = broad_phase_->mesh();
   const double least_sq = wanted.least * wanted.least;
   for (Index s = 0; s < mesh.surface_count(); ++s) fit_displacements(wanted, s);
@@ -196,9 +194,9 @@ std::size_t RelativeSearch::find(const Wanted& wanted,
         const auto& v = pair.vertices;
         const Corners corner{row(wanted.reference, v[0]), row(wanted.reference, v[1]),
                              row(wanted.reference, v[2]), row(wanted.reference, v[3])};
-        const double spare = std::sqrt(distance_sq(pair.kind, corner)) - range - wanted.rounding;
-        if (spare > 0.0 && spare * spare > moved_sq) return;
-        out.push_back(pair);
+        const double distance = std::sqrt(distance_sq(pair.kind, corner)) - wanted.rounding;
+        const double apart = distance - std::sqrt(moved_sq);
+        if (apart <= range) out.push(pair, apart);
       };
       const auto visit = [&](const BoxTree& tree_a, const Parts& a, const auto& corners_a,
                              const BoxTree& tree_b, const Parts& b, const auto& corners_b,

@@ -8,6 +8,21 @@
 
 namespace diffcloth::contact {
 
+/// Pairs that may come near each other on a motion.
+struct Found {
+  std::vector<Candidate> pairs;
+  std::vector<double> apart;  ///< at every time of the motion their distance is at least this [m]
+
+  void clear() {
+    pairs.clear();
+    apart.clear();
+  }
+  void push(const Candidate& pair, double at_least) {
+    pairs.push_back(pair);
+    apart.push_back(at_least);
+  }
+};
+
 /// Square of how much the two primitives of a pair can have come closer in two displacements, at most:
 /// the largest change of a vector between their corners. That between any two of their points is a
 /// mean of those.
@@ -40,7 +55,7 @@ class RelativeSearch {
   /// come within the sum of the two reaches at any time of the motion; in any order, and some others.
   ///
   /// @return how many pairs of leaves were looked at
-  std::size_t find(const Wanted& wanted, BroadPhase::Scratch& scratch, std::vector<Candidate>& out);
+  std::size_t find(const Wanted& wanted, BroadPhase::Scratch& scratch, Found& out);
 
  private:
   /// Boxes around a part: its positions at the reference, and its displacements at both ends.

@@ -118,9 +118,9 @@ Report forward(const Scene& scene,
     // One list for this, the contacts at the start, and the way to where inertia leads.
     const std::vector<double> guess = problem.predicted(problem.inertia.target().data());
     detection.candidates.prepare(x, guess.data(), reach, detection.scratch);
-    std::vector<contact::Candidate> candidates;
-    detection.candidates.find(x, x, reach, detection.scratch, candidates);
-    report.message = find_overlap(scene, x, problem.contact->parameters().thickness, candidates,
+    contact::Found found;
+    detection.candidates.find(x, x, reach, detection.scratch, found);
+    report.message = find_overlap(scene, x, problem.contact->parameters().thickness, found.pairs,
                                   detection.scratch);
     if (!report.message.empty()) {
       report.result = Result::kIntersectingStart;

@@ -1,5 +1,6 @@
 """Candidates that are kept between searches miss nothing, and are few near the end of a solve."""
 
+import ipctk
 import numpy as np
 import pytest
 from test_broad_phase import CROWD, crowd, grid, kernels, merged, scene
@@ -57,6 +58,30 @@ def test_no_pair_that_comes_within_reach_is_missed(search, scale, common):
     if scale == 1e-5:
         assert mesh.builds - builds <= 2
         assert found_count < 1.5 * close_count
+
+
+@pytest.mark.parametrize("common", [0.0, 5.0], ids=["still", "flying"])
+@pytest.mark.parametrize("scale", [1e-4, 1e-3, 1e-2, 1e-1])
+def test_pairs_stay_as_far_apart_as_they_say(search, scale, common):
+    """From lists of any age; ipctk measures how near each pair comes."""
+    x, mesh, surface, _ = search
+    rng = np.random.default_rng(int(1e6 * scale))
+    cloths = (surface < 2)[:, None]
+    at, checked = x + 0.003 * rng.normal(size=x.shape), 0
+    for _ in range(6):
+        step = scale * rng.normal(size=x.shape) * cloths
+        step += common * scale * rng.normal(size=3) * cloths
+        pairs, apart = mesh.find_kept(at, at + step, REACH), mesh.apart
+        for pair, least in zip(pairs[::5], apart[::5], strict=True):
+            measure = (ipctk.point_triangle_distance, ipctk.edge_edge_distance)[pair[0]]
+            d_sq = [measure(*(at + t * step)[pair[1:5]]) for t in np.linspace(0, 1, 17)]
+            # Distances of coordinates around 1 round by 1e-15.
+            assert min(d_sq) ** 0.5 >= least - 1e-14
+            # No bound is slack by more than what two corners have moved since the list was made.
+            assert min(d_sq) ** 0.5 - least < 60 * scale * (1 + common)
+            checked += least > 0
+        at = at + step
+    assert checked > 20 or scale > 1e-3
 
 
 def test_what_moves_alone_brings_its_own_pairs_alone(search):

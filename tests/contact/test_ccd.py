@@ -172,3 +172,24 @@ def test_motions_that_are_not_numbers_are_not_certified(broken):
     y[2, 1] = broken
     assert one(POINT_TRIANGLE, x, y) == 0
     assert one(POINT_TRIANGLE, y, x) == 0
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, 1e3], ids=["thin", "thick", "far"])
+def test_what_stays_beyond_the_harmless_distance_is_never_the_first(share):
+    """And what ends a little nearer is: a point that moves to a triangle, and crossing edges."""
+    d_hat, xi = 1e-3, 1e-3 * min(share, 1.0)
+    offset = np.array([0.3, 0.3, 0.4]) * (1.0 if share < 2 else share)
+    corners = {
+        False: [[0.2, 0.2, 0], [0, 0, 0], [1, 0, 0], [0, 1, 0]],
+        True: [[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0]],
+    }
+    for edges, x in corners.items():
+        moves = np.zeros((4, 3))
+        moves[: 2 if edges else 1, 2] = 1.0
+        largest = np.abs(x + offset).max()
+        harmless = kernels.harmless_distance(xi, d_hat, largest)
+        # Positions round by 1e-16 of the largest.
+        for end, is_first in ((harmless + 1e-15 * largest, False), (harmless - 0.01 * d_hat, True)):
+            x_t0, x_t1 = (np.array(x) + offset + z * moves for z in (xi + 2 * d_hat, end))
+            step = kernels.safe_step(edges, x_t0[None], x_t1[None], xi, d_hat)[0]
+            assert (step < 1.0) == is_first

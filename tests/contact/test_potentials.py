@@ -6,6 +6,8 @@ import pytest
 import trimesh
 from oracles.feature_sum import FeatureSum
 
+from diffcloth_torch import _kernels as kernels
+
 NAMES = list(contact_scenes.SCENES)
 MEASURES = ("vertex_area", "edge_area", "edge_length_sq", "face_area", "mean_face_area")
 
@@ -27,6 +29,31 @@ def difference(f, x, d, step):
 
 def directions(shape, count=4, seed=3):
     return np.random.default_rng(seed).normal(size=(count, *shape))
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e-3, 1e-2, 0.1])
+@pytest.mark.parametrize("name", ["on_relief", "on_a_ball", "crumpled"])
+def test_the_safe_fraction_is_the_least_of_all_pairs(name, scale):
+    """On a walk, whose pairs are kept: those that are left out as harmless are."""
+    scene = contact_scenes.make(name)
+    potential = scene.potential()
+    mesh = kernels.BroadPhase(
+        scene.faces.astype(np.int32), scene.surface, scene.cloth_count, scene.self_contact, scene.X
+    )
+    rng = np.random.default_rng(4)
+    at, fractions = scene.x, []
+    for _ in range(12):
+        to = at + scale * rng.normal(size=at.shape) * ~scene.prescribed[:, None]
+        steps = [1.0]
+        pairs = mesh.find(at, to, 0.2)
+        for kind in (0, 1):
+            corners = pairs[pairs[:, 0] == kind, 1:5]
+            steps += list(kernels.safe_step(bool(kind), at[corners], to[corners], 0.0, scene.d_hat))
+        fractions.append(potential.safe_fraction(at, to))
+        # A search ends where it goes on by less than 1e-12 of the time.
+        assert fractions[-1] == pytest.approx(min(steps), rel=1e-11)
+        at = at + 0.9 * fractions[-1] * (to - at)
+    assert (min(fractions) < 1) == (scale > 1e-3)
 
 
 @pytest.mark.parametrize("seed", range(2))

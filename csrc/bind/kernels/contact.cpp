@@ -135,7 +135,8 @@ class Search {
                       const Positions& x_t1,
                       const std::vector<double>& reach) {
     check_reach(reach);
-    list_.find(checked("x_t0", x_t0), checked("x_t1", x_t1), reach, scratch_, candidates_);
+    list_.find(checked("x_t0", x_t0), checked("x_t1", x_t1), reach, scratch_, found_);
+    candidates_ = found_.pairs;
     return rows();
   }
 
@@ -148,6 +149,11 @@ class Search {
     const std::vector<char> flags(wanted.begin(), wanted.end());
     list_.find_at(checked("x", x), reach, widened, flags, scratch_, candidates_);
     return rows();
+  }
+
+  /// How far apart the pairs of the last find_kept() stay at least.
+  Eigen::VectorXd apart() const {
+    return Eigen::Map<const Eigen::VectorXd>(found_.apart.data(), found_.apart.size());
   }
 
   Index builds() const { return list_.builds(); }
@@ -187,6 +193,7 @@ class Search {
   contact::CandidateList list_;
   contact::BroadPhase::Scratch scratch_;
   std::vector<contact::Candidate> candidates_;
+  contact::Found found_;
 };
 
 void distance_kernels(nb::module_& m) {
@@ -302,6 +309,8 @@ void collision_kernels(nb::module_& m) {
       "edge_edge"_a, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "xi"_a,
       "d_hat"_a = std::numeric_limits<double>::infinity());
 
+  m.def("harmless_distance", &contact::harmless_distance, "xi"_a, "d_hat"_a, "largest"_a);
+
   m.def("near_boxes", &near_boxes, "level"_a, "boxes"_a.noconvert(), "range"_a,
         "Which of the first four boxes, [8, 2, 3], are near which of the other four: bits.");
 
@@ -323,6 +332,7 @@ void collision_kernels(nb::module_& m) {
       .def("find_at_rest", &Search::find_at_rest, "x"_a.noconvert(), "reach"_a)
       .def("find_kept", &Search::find_kept, "x_t0"_a.noconvert(), "x_t1"_a.noconvert(), "reach"_a)
       .def("find_at", &Search::find_at, "x"_a.noconvert(), "reach"_a, "widened"_a, "wanted"_a)
+      .def_prop_ro("apart", &Search::apart)
       .def_prop_ro("builds", &Search::builds)
       .def("find_intersection", &Search::find_intersection, "x"_a.noconvert())
       .def("smallest_nonadjacent_distance", &Search::smallest_nonadjacent_distance,

@@ -206,6 +206,13 @@ class ContactPotential {
     return barrier;
   }
 
+  /// Fraction of a motion that is free of collisions, found among pairs that are kept between calls.
+  double safe_fraction(const Positions& x, const Positions& to) {
+    if (!barrier_) barrier_.emplace(model_, detection_, nullptr);
+    barrier_->watch(x.data(), to.data());
+    return barrier_->safe_fraction(x.data(), to.data());
+  }
+
   /// Friction with the contacts of x_lag, of what has moved since x_start.
   std::unique_ptr<Friction> friction(const Positions& x_lag, const Positions& x_start) {
     return std::make_unique<Friction>(model_, pattern_, find(x_lag), x_start);
@@ -367,6 +374,7 @@ void contact_potentials(nb::module_& m) {
           "ignored_pairs"_a = std::vector<std::array<Index, 2>>{},
           "radius"_a = std::vector<double>{})
       .def("candidate_count", &ContactPotential::candidate_count, "x"_a)
+      .def("safe_fraction", &ContactPotential::safe_fraction, "x"_a, "to"_a)
       .def("energies", &ContactPotential::energies, "x"_a, "other"_a)
       .def("contacts", &ContactPotential::contacts, "x"_a)
       .def("mixed", &ContactPotential::mixed, "x"_a, "z"_a, "scale"_a = 1.0)
