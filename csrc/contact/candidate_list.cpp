@@ -233,12 +233,15 @@ void CandidateList::cull(const Kept& kept,
     maybe_[count] = k;
     count += static_cast<Index>(!(spare(k) > deviation + mean_apart_[kept.surfaces[k]]));
   }
-  out.clear();
+  out.resize(count);
+  std::size_t found = 0;
   for (const Index k : std::span(maybe_).first(count)) {
     const double moved = std::sqrt(approach_sq(kept.pairs[k], u_t0_.data(), u_t1_.data()));
-    if (spare(k) > moved) continue;
-    out.push(kept.pairs[k], kept.distance[k] - 2.0 * rounding_ - moved);
+    out.pairs[found] = kept.pairs[k];
+    out.apart[found] = kept.distance[k] - 2.0 * rounding_ - moved;
+    found += static_cast<std::size_t>(!(spare(k) > moved));
   }
+  out.resize(found);
 }
 
 /// What may come within reach, from the wide list and beside it.

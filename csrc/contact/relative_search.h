@@ -17,6 +17,10 @@ struct Found {
     pairs.clear();
     apart.clear();
   }
+  void resize(std::size_t count) {
+    pairs.resize(count);
+    apart.resize(count);
+  }
   void push(const Candidate& pair, double at_least) {
     pairs.push_back(pair);
     apart.push_back(at_least);

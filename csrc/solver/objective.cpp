@@ -13,6 +13,17 @@ linalg::Couplings beyond_base(const Objective& f, linalg::Couplings points) {
   return linalg::beyond(f.patterns->base(), f.coordinates->couplings_of_rows(std::move(points)));
 }
 
+/// Sorted couplings of both.
+linalg::Couplings united(const linalg::Couplings& a, const linalg::Couplings& b) {
+  linalg::Couplings all;
+  all.reserve(a.size() + b.size());
+  const auto by_column = [](const auto& p, const auto& q) {
+    return std::tie(p.second, p.first) < std::tie(q.second, q.first);
+  };
+  std::ranges::set_union(a, b, std::back_inserter(all), by_column);
+  return all;
+}
+
 }  // namespace
 
 std::vector<double> Objective::metric() const {
@@ -34,16 +45,17 @@ double Objective::largest_fraction(const std::vector<double>& x,
 
 linalg::Couplings Objective::couplings() const {
   linalg::Couplings points;
-  for_each([&](const Potential& p) { p.add_couplings(points); });
-  linalg::Couplings here = beyond_base(*this, std::move(points));
-  if (expected.empty()) return here;
-  linalg::Couplings all;
-  all.reserve(expected.size() + here.size());
-  const auto by_column = [](const auto& a, const auto& b) {
-    return std::tie(a.second, a.first) < std::tie(b.second, b.first);
-  };
-  std::ranges::set_union(expected, here, std::back_inserter(all), by_column);
-  return all;
+  for_each([&](const Potential& p) {
+    if (&p != friction) p.add_couplings(points);
+  });
+  const linalg::Couplings here = united(expected, beyond_base(*this, std::move(points)));
+  if (friction == nullptr) return here;
+  if (!of_friction) {
+    linalg::Couplings of_its_points;
+    friction->add_couplings(of_its_points);
+    of_friction = beyond_base(*this, std::move(of_its_points));
+  }
+  return united(here, *of_friction);
 }
 
 void Objective::expect(linalg::Couplings points) {

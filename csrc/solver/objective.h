@@ -1,6 +1,7 @@
 #pragma once
 
 #include <algorithm>
+#include <optional>
 #include <vector>
 
 #include "bodies/coordinate_potential.h"
@@ -27,6 +28,14 @@ struct Objective {
   bodies::CoordinatePotential* chart = nullptr;  ///< of free coordinates; null where there are none
   PatternCache* patterns;
   linalg::Couplings expected;  ///< of rows beyond the base pattern, sorted: always in couplings()
+
+  /// Those of friction alone, which last as long as it does; empty until they are asked for.
+  mutable std::optional<linalg::Couplings> of_friction = {};
+
+  void take_friction(Potential* potential) {
+    friction = potential;
+    of_friction.reset();
+  }
 
   /// Every potential in a fixed order.
   template <class Visit>

@@ -78,14 +78,14 @@ class ContactSum {
 
   /// The same with contacts that outlive the friction.
   void lag_kept(const std::vector<contact::Contact>& contacts) {
-    objective.friction = nullptr;
+    objective.take_friction(nullptr);
     friction.reset();
     static const std::vector<contact::Contact> none;
     lagged_ = &none;
     // Where nothing can touch there are no contacts either.
     if (!problem_.contact || contacts.empty()) return;
     friction.emplace(*problem_.contact, contacts, problem_.moved_from().data(), bar_);
-    objective.friction = &*friction;
+    objective.take_friction(&*friction);
     lagged_ = &contacts;
   }
 
