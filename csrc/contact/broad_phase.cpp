@@ -225,7 +225,7 @@ void BroadPhase::fit(const Sweep& sweep, Index surface, const Vec3& frame, Scrat
         swept(point_box(sweep.x_t0, v), point_box(sweep.x_t1, v), frame, sweep.reach[surface]);
   }
   const std::vector<Box>& of_vertex = scratch.vertex_boxes;
-  trees.vertices.fit(boxes.vertices, [&](Index v) { return of_vertex[v]; });
+  if (sweep.of_vertices) trees.vertices.fit(boxes.vertices, [&](Index v) { return of_vertex[v]; });
   trees.edges.fit(boxes.edges, [&](Index e) {
     const auto& [i, j] = mesh_.edges[e];
     return united(of_vertex[i], of_vertex[j]);
@@ -346,7 +346,8 @@ std::optional<std::pair<Index, Index>> BroadPhase::find_intersection(const doubl
                                                                      Scratch& scratch) const {
   const std::vector<double> reach(trees_.size(), 0.0);
   PairList pairs;  // of an edge and a face: many, and not wanted at every step
-  visit_surface_pairs({.x_t0 = x, .x_t1 = x, .reach = reach}, scratch, [&](Index s, Index r) {
+  const Sweep sweep{.x_t0 = x, .x_t1 = x, .reach = reach, .of_vertices = false};
+  visit_surface_pairs(sweep, scratch, [&](Index s, Index r) {
     const Scratch::Surface& a = scratch.surfaces[s];
     const Scratch::Surface& b = scratch.surfaces[r];
     // Nothing pierces a skeleton.
@@ -357,12 +358,16 @@ std::optional<std::pair<Index, Index>> BroadPhase::find_intersection(const doubl
     if (s == r || mesh_.is_round(s)) return;
     append_overlaps(trees_[r].edges, b.edges, trees_[s].faces, a.faces, 0.0, scratch.stack, pairs);
   });
+  filter(pairs, [&](const IndexPair& pair) {
+    const auto& [i, j] = mesh_.edges[pair[0]];
+    const CollisionMesh::Face& face = mesh_.faces[pair[1]];
+    return !(has_vertex(face, i) | has_vertex(face, j));
+  });
   std::optional<std::pair<Index, Index>> lowest;
   for (const auto& [e, f] : pairs) {
     const auto& [i, j] = mesh_.edges[e];
     const CollisionMesh::Face& face = mesh_.faces[f];
     if (lowest && *lowest < std::pair(e, f)) continue;
-    if (has_vertex(face, i) || has_vertex(face, j)) continue;
     if (pierces(row(x, i), row(x, j), row(x, face[0]), row(x, face[1]), row(x, face[2]))) {
       lowest = {e, f};
     }

@@ -160,6 +160,7 @@ class BroadPhase {
     const double* x_t0;
     const double* x_t1;
     std::span<const double> reach;
+    bool of_vertices = true;  ///< whether pairs of a vertex are looked for
   };
 
   void measure_motion(const Sweep& sweep, Scratch& scratch) const;
