@@ -1,7 +1,6 @@
 #include "contact/contact_potential.h"
 
 #include <algorithm>
-#include <cmath>
 #include <span>
 #include <utility>
 
@@ -57,9 +56,7 @@ void add_stencil_product(const Stencil& v, const Hessian& h, const double* d, do
 
 double ContactPotential::largest_coordinate(const double* x) const {
   const auto size = 3 * static_cast<std::ptrdiff_t>(model_.mesh().vertex_count);
-  double largest = 0.0;
-  for (std::ptrdiff_t a = 0; a < size; ++a) largest = std::max(largest, std::abs(x[a]));
-  return largest;
+  return size == 0 ? 0.0 : Eigen::Map<const Eigen::ArrayXd>(x, size).abs().maxCoeff();
 }
 
 double ContactPotential::safe_fraction(const double* x, const double* to) const {

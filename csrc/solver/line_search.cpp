@@ -11,6 +11,8 @@ constexpr double kArmijo = 1e-4;
 constexpr double kWolfeSlope = 0.8;
 /// Relative size of a change of energy that rounding can fake.
 constexpr double kEnergyNoise = 1e-11;
+/// A change of so many times that, by what is known of the energy, is larger whatever friction has done.
+constexpr double kClearly = 1e3;
 /// Halvings of the step: beyond, it is lost in the rounding of the coordinates.
 constexpr int kBacktracks = 40;
 
@@ -25,7 +27,10 @@ Trial farthest(Walk& walk, const std::vector<double>& p, double first) {
   return trial;
 }
 
-double noise(const Walk& walk) { return kEnergyNoise * std::abs(walk.f.energy(walk.x().data())); }
+bool drowns(Walk& walk, double change) {
+  if (std::abs(change) > kEnergyNoise * kClearly * walk.extent()) return false;
+  return std::abs(change) <= kEnergyNoise * std::abs(walk.energy());
+}
 
 Search search(Walk& walk, const std::vector<double>& p, Trial trial) {
   Search result;
@@ -35,7 +40,6 @@ Search search(Walk& walk, const std::vector<double>& p, Trial trial) {
   }
   const double slope = dot(walk.g(), p);
   const std::vector<double> start = walk.x();
-  double smallest = -1.0;  // not needed before a trial fails
 
   for (; result.backtracks < kBacktracks; ++result.backtracks, trial.alpha *= 0.5) {
     walk.context.checkpoint->check();
@@ -49,13 +53,10 @@ Search search(Walk& walk, const std::vector<double>& p, Trial trial) {
       trial.gain = walk.change(trial.to);
     }
     const bool decreased = trial.gain <= trial.enough(slope);
-    if (!decreased) {
-      if (smallest < 0.0) smallest = noise(walk);
-      if (!(std::abs(trial.gain) <= smallest)) continue;
-    }
+    if (!decreased && !drowns(walk, trial.gain)) continue;
     if (decreased) {
       walk.f.update_duals(start.data(), p.data(), trial.alpha, trial.to.data());
-      walk.go(trial.to);
+      walk.go(trial.to, trial.gain);
       walk.refresh();
     } else if (!walk.go_if_flat(trial.to, p, kWolfeSlope * std::abs(slope))) {
       continue;

@@ -34,8 +34,8 @@ struct Trial {
 /// The largest collision-free fraction of p, at most the first.
 Trial farthest(Walk& walk, const std::vector<double>& p, double first);
 
-/// The smallest change of the objective that rounding cannot fake, where the walk stands [J].
-double noise(const Walk& walk);
+/// Whether rounding can fake a change of the objective, where the walk stands.
+bool drowns(Walk& walk, double change);
 
 /// Walk along p by the largest collision-free fraction that decreases the objective enough
 /// (Armijo), or, where the change drowns in rounding, flattens its slope (approximate Wolfe).

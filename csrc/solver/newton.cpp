@@ -168,7 +168,8 @@ Search Descent::walk_along(const Directions::Direction& direction) {
   // The next step relaxes what this one stretches, but not what it drives into barriers.
   const bool touches = walk_.f.contact != nullptr && !walk_.f.contact->contacts().empty();
   const bool far = !touches || walk_.displacement(p) > kFar * walk_.f.length;
-  if (wait_ == 0 && direction.kind != Kind::kDamped && far && rises && trial.gain > noise(walk_)) {
+  if (wait_ == 0 && direction.kind != Kind::kDamped && far && rises && trial.gain > 0.0 &&
+      !drowns(walk_, trial.gain)) {
     excursion_ = {.start = walk_.place(),
                   .p = p,
                   .direction = direction,

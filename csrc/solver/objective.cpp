@@ -48,7 +48,7 @@ linalg::Couplings Objective::couplings() const {
   for_each([&](const Potential& p) {
     if (&p != friction) p.add_couplings(points);
   });
-  const linalg::Couplings here = united(expected, beyond_base(*this, std::move(points)));
+  linalg::Couplings here = united(expected, beyond_base(*this, std::move(points)));
   if (friction == nullptr) return here;
   if (!of_friction) {
     linalg::Couplings of_its_points;

@@ -30,7 +30,7 @@ struct Objective {
   linalg::Couplings expected;  ///< of rows beyond the base pattern, sorted: always in couplings()
 
   /// Those of friction alone, which last as long as it does; empty until they are asked for.
-  mutable std::optional<linalg::Couplings> of_friction = {};
+  mutable std::optional<linalg::Couplings> of_friction;
 
   void take_friction(Potential* potential) {
     friction = potential;

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <optional>
 #include <vector>
 
 #include "common/interrupt.h"
@@ -115,7 +116,28 @@ class Walk {
   void go(const std::vector<double>& to) {
     x_ = to;
     record();
+    forget_energy();
   }
+
+  /// The same where the change of the objective is known.
+  void go(const std::vector<double>& to, double change) {
+    const double before = extent_;
+    go(to);
+    extent_ = before + std::abs(change);
+  }
+
+  /// The objective where the walk stands.
+  double energy() {
+    if (!energy_) {
+      energy_ = f.energy(x_.data());
+      extent_ = std::abs(*energy_);
+    }
+    return *energy_;
+  }
+
+  /// The size of the objective when it was last asked for, and of all that it has changed by since: without
+  /// the work of friction, which energies leave out. Infinity where that is not known.
+  double extent() const { return extent_; }
 
   /// Where the walk stands, to come back to.
   struct Place {
@@ -129,6 +151,7 @@ class Walk {
   /// Be back at a place, as if nothing had been walked since.
   void back(const Place& place) {
     x_ = place.x;
+    forget_energy();
     if (context.path != nullptr) context.path->resize(place.steps);
     watch(x_);
     refresh();
@@ -149,6 +172,7 @@ class Walk {
     refresh();
     if (dot(g_, p) <= bound) {
       record();
+      forget_energy();
       return true;
     }
     x_.swap(x_before);
@@ -166,12 +190,18 @@ class Walk {
   }
 
  private:
+  void forget_energy() {
+    energy_.reset();
+    extent_ = std::numeric_limits<double>::infinity();
+  }
   void record() {
     if (context.path != nullptr) context.path->push_back(x_);
   }
 
   std::vector<double>& x_;
   std::vector<double> g_;
+  std::optional<double> energy_;
+  double extent_ = std::numeric_limits<double>::infinity();
 };
 
 }  // namespace diffcloth::solver

@@ -202,7 +202,8 @@ solver::Objective Problem::objective(Proximity& inertia_or_nearness,
           .others = std::move(others),
           .chart = chart ? &*chart : nullptr,
           .patterns = &patterns,
-          .expected = {}};
+          .expected = {},
+          .of_friction = {}};
 }
 
 linalg::BlockMatrix contact_free_hessian(Problem& p, const double* x, Curvature curvature) {
