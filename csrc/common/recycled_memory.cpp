@@ -12,12 +12,20 @@
 #ifdef __GLIBC__
 #include <malloc.h>
 #endif
+#ifdef __linux__
+#include <sys/mman.h>
+#endif
 
 namespace diffcloth {
 
 namespace {
 
-constexpr std::align_val_t kAlignment{64};
+constexpr std::size_t kLine = 64;
+
+/// Arrays of some huge pages begin with one: they take a five hundredth of the page faults, and of the
+/// processor's tables of pages [bytes].
+constexpr std::size_t kHugePage = std::size_t{1} << 21;
+constexpr std::size_t kWorthHugePages = 2 * kHugePage;
 
 /// Arrays below are as quick from the allocator, those above too dear to keep [bytes].
 constexpr std::size_t kSmallest = std::size_t{1} << 16;
@@ -46,12 +54,24 @@ bool is_recycled(std::size_t bytes) { return bytes >= kSmallest && bytes <= kLar
 /// Up to an eighth more than asked for: contact changes the sizes of matrices a little, and what held
 /// one is to hold the next.
 std::size_t rounded(std::size_t bytes) {
-  const std::size_t step = std::bit_floor(bytes) / 8;
+  const std::size_t step = std::max(std::bit_floor(bytes) / 8, kLine);
   return (bytes + step - 1) / step * step;
 }
 
-void* allocate(std::size_t bytes) { return ::operator new(bytes, kAlignment); }
-void free(void* memory) noexcept { ::operator delete(memory, kAlignment); }
+std::align_val_t alignment(std::size_t bytes) {
+  return std::align_val_t{bytes < kWorthHugePages ? kLine : kHugePage};
+}
+
+void* allocate(std::size_t bytes) {
+  void* const memory = ::operator new(bytes, alignment(bytes));
+#ifdef MADV_HUGEPAGE
+  // Where the system has none it stays as it is.
+  if (bytes >= kWorthHugePages) madvise(memory, bytes / kHugePage * kHugePage, MADV_HUGEPAGE);
+#endif
+  return memory;
+}
+
+void free(void* memory, std::size_t bytes) noexcept { ::operator delete(memory, alignment(bytes)); }
 
 /// Memory that nobody uses. Who finds it locked goes to the system instead: that is no dearer than to
 /// wait, and in a forked process the lock may belong to a thread that is not there.
@@ -61,7 +81,7 @@ class Unused {
     const std::unique_lock lock(mutex_, std::try_to_lock);
     if (!lock) return nullptr;
     for (std::size_t k = count_; k-- > 0;) {  // the last that came is the one that caches remember
-      if (blocks_[k].bytes == bytes) return remove(k);
+      if (blocks_[k].bytes == bytes) return remove(k).memory;
     }
     return nullptr;
   }
@@ -70,7 +90,10 @@ class Unused {
   bool keep(void* memory, std::size_t bytes) noexcept {
     const std::unique_lock lock(mutex_, std::try_to_lock);
     if (!lock) return false;
-    while (bytes_ + bytes > kKept || count_ == blocks_.size()) free(remove(0));
+    while (bytes_ + bytes > kKept || count_ == blocks_.size()) {
+      const Block oldest = remove(0);
+      free(oldest.memory, oldest.bytes);
+    }
     blocks_[count_++] = {.memory = memory, .bytes = bytes};
     bytes_ += bytes;
     return true;
@@ -82,12 +105,12 @@ class Unused {
     std::size_t bytes;
   };
 
-  void* remove(std::size_t k) noexcept {
+  Block remove(std::size_t k) noexcept {
     const Block block = blocks_[k];
     std::move(blocks_.begin() + k + 1, blocks_.begin() + count_, blocks_.begin() + k);
     --count_;
     bytes_ -= block.bytes;
-    return block.memory;
+    return block;
   }
 
   std::mutex mutex_;
@@ -104,27 +127,30 @@ Unused& unused() {
 }  // namespace
 
 void* take_recycled(std::size_t bytes) {
-  if (!is_recycled(bytes)) return allocate(bytes);
-  void* const memory = unused().take(rounded(bytes));
-  return memory != nullptr ? memory : allocate(rounded(bytes));
+  const std::size_t size = rounded(bytes);
+  void* const memory = is_recycled(bytes) ? unused().take(size) : nullptr;
+  return memory != nullptr ? memory : allocate(size);
 }
 
 void give_back(void* memory, std::size_t bytes) noexcept {
-  if (!is_recycled(bytes) || !unused().keep(memory, rounded(bytes))) free(memory);
+  const std::size_t size = rounded(bytes);
+  if (!is_recycled(bytes) || !unused().keep(memory, size)) free(memory, size);
 }
 
-SpareRoom::~SpareRoom() { free(memory_); }
+SpareRoom::~SpareRoom() { free(memory_, bytes_); }
 
 void* SpareRoom::take(std::size_t bytes) {
   if (bytes <= kLargest) return take_recycled(bytes);
   const std::size_t wanted = rounded(bytes);
   void* spare = nullptr;
+  std::size_t size = 0;
   {
     const std::lock_guard lock(mutex_);
     spare = std::exchange(memory_, nullptr);
-    if (std::exchange(bytes_, 0) == wanted) return spare;
+    size = std::exchange(bytes_, 0);
   }
-  free(spare);  // never both at once
+  if (size == wanted) return spare;
+  free(spare, size);  // never both at once
   if (wanted >= kHuge) return_free_memory();
   return allocate(wanted);
 }
@@ -134,12 +160,13 @@ void SpareRoom::give_back(void* memory, std::size_t bytes) noexcept {
     diffcloth::give_back(memory, bytes);
     return;
   }
+  std::size_t size = rounded(bytes);
   {
     const std::lock_guard lock(mutex_);
     std::swap(memory_, memory);
-    bytes_ = rounded(bytes);
+    std::swap(bytes_, size);
   }
-  free(memory);
+  free(memory, size);
 }
 
 std::size_t SpareRoom::bytes() const {

@@ -32,6 +32,38 @@ def test_the_seconds_of_a_report_are_those_of_the_step():
     assert min(untold) < 0.06, untold
 
 
+LARGE_ARRAYS = """
+    import resource
+    import torch
+    from benchmarks.scenes import hanging
+    import diffcloth_torch as dc
+
+    def faults():
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+
+    torch.set_num_threads(1)
+    scene = hanging(96)
+    sim = dc.Simulator(scene.scene, 0.01)
+    state = sim.initial_state()
+    with torch.no_grad():
+        state = sim.step(state)
+        before = faults()
+        state = sim.step(state)
+    print(faults() - before)
+"""
+
+
+def _lends_huge_pages() -> bool:
+    path = Path("/sys/kernel/mm/transparent_hugepage/enabled")
+    return path.exists() and "[never]" not in path.read_text()
+
+
+@pytest.mark.skipif(not _lends_huge_pages(), reason="asks the system for huge pages")
+def test_large_arrays_are_asked_of_the_system_in_huge_pages():
+    # 1,000; with pages of 4 KiB 28,000, of which each matrix takes 2,600.
+    assert float(run_python(LARGE_ARRAYS, cwd=ROOT)) < 8000
+
+
 SELF_CONTACT = """
     import ctypes
     import os
