@@ -395,18 +395,32 @@ struct Fronts {
     call.template operator()<Width>();
   }
 
+  /// c -= L y for W columns, `ld` apart: few at a time, as memory is read fastest along columns.
+  template <int W>
+  static void subtract_columns(
+      const Real* l, std::ptrdiff_t ld, int length, const Real* y, Real* c) {
+    Pack y_j[W];
+    for (int j = 0; j < W; ++j) y_j[j] = broadcast(y[j]);
+    for (int row = 0; row < length; row += kLanes) {
+      Pack sum = load(c + row);
+      for (int j = 0; j < W; ++j) sum = subtract_product_of(sum, load(l + j * ld + row), y_j[j]);
+      store(c + row, sum);
+    }
+  }
+
   static void forward(const Front& front, const Real* panel, Real* c) {
     for (int column = 0; column < front.columns; column += kLanes) {
       const int width = front.columns - column < kLanes ? front.columns - column : kLanes;
+      const int below = column + kLanes;
       const Real* const l = panel + front.panel().place(0, column);
       const std::ptrdiff_t ld = front.panel().stride(column);
       with_triangle(width, [&]<int Width> { solve_triangle<Width>(l + column, ld, c + column); });
-      for (int row = column + kLanes; row < front.ld; row += kLanes) {
-        Pack sum = load(c + row);
-        for (int j = 0; j < width; ++j) {
-          sum = subtract_product_of(sum, load(l + j * ld + row), broadcast(c[column + j]));
-        }
-        store(c + row, sum);
+      int j = 0;
+      for (; j + 4 <= width; j += 4) {
+        subtract_columns<4>(l + j * ld + below, ld, front.ld - below, c + column + j, c + below);
+      }
+      for (; j < width; ++j) {
+        subtract_columns<1>(l + j * ld + below, ld, front.ld - below, c + column + j, c + below);
       }
     }
   }
