@@ -179,6 +179,7 @@ void take_options(NamedFields& fields, step::Description& d) {
   if (fields.has("large_factor")) {  // only tests say it
     d.options.large_factor = fields.take<std::size_t>("large_factor");
   }
+  if (fields.has("dear_factor")) d.options.dear_factor = fields.take<double>("dear_factor");
 }
 
 }  // namespace

@@ -12,6 +12,9 @@ constexpr double kChordContraction = 0.1;
 /// new factor would be cheaper.
 constexpr int kIterations = 8;
 constexpr double kForcing = 0.03;
+/// The same of a dear factor: an iteration takes as long as so many operations per entry.
+constexpr double kOperationsPerIteration = 80.0;
+constexpr double kForcingOfDear = 0.01;
 /// Near a solution full steps with the exact Hessian move nothing by more than this share of an edge.
 constexpr double kNear = 0.03;
 /// Share s of the projection after an indefinite Hessian; its growth while the blend is indefinite;
@@ -89,6 +92,15 @@ bool Directions::is_near() const {
   return chord_allowed_ && last_step_ <= kNear * walk_.f.length;
 }
 
+double Directions::operations_per_entry() const {
+  const linalg::CholeskyAnalysis& analysis = *last_.factor->analysis();
+  return analysis.flops() / static_cast<double>(analysis.nonzeros());
+}
+
+bool Directions::is_dear() const {
+  return last_.factor != nullptr && operations_per_entry() > walk_.context.options.dear_factor;
+}
+
 bool Directions::is_far() const { return walk_.displacement(p_) > kNear * walk_.f.length; }
 
 double Directions::curvature_along(const linalg::BlockMatrix& H) const {
@@ -100,8 +112,18 @@ double Directions::curvature_along(const linalg::BlockMatrix& H) const {
 }
 
 bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
+  if (!is_near() && !(chord_allowed_ && is_dear())) return false;
+  double forcing = kForcing;
+  int iterations = kIterations;
+  if (is_dear()) {
+    // Far from the solution what is left of the direction is to be no longer than it may be near there.
+    const double far = walk_.displacement(p_) / (kNear * walk_.f.length);
+    forcing = kForcingOfDear / std::max(far, 1.0);
+    const auto worth = static_cast<int>(operations_per_entry() / kOperationsPerIteration);
+    iterations = std::max(kIterations, worth);
+  }
   const linalg::Convergence result =
-      walk_.system.solve(H, *last_.factor, walk_.g(), kForcing, kIterations, p_);
+      walk_.system.solve(H, *last_.factor, walk_.g(), forcing, iterations, p_);
   indefinite = result == linalg::Convergence::kNegativeCurvature;
   if (result != linalg::Convergence::kConverged) return false;
   ++walk_.context.counts->exact;
@@ -143,8 +165,7 @@ std::optional<Directions::Direction> Directions::next() {
   linalg::BlockMatrix H = walk_.system.assemble(x, curvature, walk_.g());
   if (s_ == 0.0) {
     bool indefinite = false;
-    if (nearby && is_near() && iterate(H, indefinite))
-      return Direction{.kind = Kind::kIterated, .first = 1.0};
+    if (nearby && iterate(H, indefinite)) return Direction{.kind = Kind::kIterated, .first = 1.0};
     if (indefinite) {
       ++walk_.context.counts->negative_curvature;
     } else if (refactor(H)) {

@@ -24,15 +24,16 @@ enum class Kind : std::uint8_t {
 
 /// The next direction of a minimization, as cheap as what the last ones have shown allows.
 ///
-/// In this order: a chord step with the last exact factor while that contracts; near the solution
-/// conjugate gradients on the exact Hessian with that factor; a new factor. Where the exact Hessian H is
-/// not positive definite, A(s) = (H + s P) / (1 + s) with its projection P; s falls while steps gain what
-/// they promise. After a step across a kink of friction H is the primal-dual Hessian, which remembers the
-/// other side; it certifies nothing. All constants are free of units.
+/// In this order: a chord step with the last exact factor while that contracts; near the solution, and where
+/// a factor is dear after any full step, conjugate gradients on the exact Hessian with that factor; a new
+/// factor. Where the exact Hessian H is not positive definite, A(s) = (H + s P) / (1 + s) with its
+/// projection P; s falls while steps gain what they promise. After a step across a kink of friction H is the
+/// primal-dual Hessian, which remembers the other side; it certifies nothing. All constants are free of units.
 ///
 /// Of several minima a step shall end in one that does not flip with the last bits of its start, so that no
-/// direction may amplify those: not an inexact one far from the solution, whose error depends on where
-/// iterations end, nor one along which A(s) is barely definite, so that the step is long and any length.
+/// direction may amplify those: not one far from the solution with a larger error than near it, as that
+/// depends on where iterations end, nor one along which A(s) is barely definite, so that the step is long and
+/// any length.
 class Directions {
  public:
   /// @param nearby  factor of an exact Hessian that may be close; may be null
@@ -63,6 +64,9 @@ class Directions {
 
   /// Of the point where certify() or confirm() was true last.
   const Certificate& certificate() const { return last_; }
+
+  /// Whether another factor would take many times as long as a solve with the last one.
+  bool is_dear() const;
 
   /// The share of the projection in damped directions.
   double share() const { return s_; }
@@ -113,13 +117,16 @@ class Directions {
   /// Whether this is near a solution, or the solve has just begun, with the factor of the one before.
   bool is_near() const;
 
+  /// Operations that a factor took for each of its entries; a solve takes a fixed number.
+  double operations_per_entry() const;
+
   /// Whether p() leads away from here.
   bool is_far() const;
 
   /// p^T H p.
   double curvature_along(const linalg::BlockMatrix& H) const;
 
-  /// Go on from there to that of the exact Hessian H, by conjugate gradients.
+  /// Go on from there to that of the exact Hessian H, by conjugate gradients, where those are worth trying.
   bool iterate(const linalg::BlockMatrix& H, bool& indefinite);
 
   /// The direction of a matrix and its slope; false where the matrix is not positive definite.

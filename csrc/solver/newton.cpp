@@ -67,6 +67,7 @@ class Descent {
   Next escape();
   Next no_way(const Directions::Direction& direction, double step, SearchResult result);
   bool is_settled(double step, double share) const;
+  bool may_end(const Directions::Direction& direction, double step) const;
   bool idles(double step, const Search& search);
   Next go(const Directions::Direction& direction);
   Search walk_along(const Directions::Direction& direction);
@@ -126,6 +127,13 @@ Descent::Next Descent::settle() {
 bool Descent::is_settled(double step, double share) const {
   return step <= share * goal_ &&
          walk_.f.force_change(walk_.x().data(), directions_.p().data()) <= kForceChange;
+}
+
+/// Whether the end of a step below the goal is to be certified. A chord is often shorter than the step
+/// that it stands for: where that leaves more than may be left, a dear factor would be made twice.
+bool Descent::may_end(const Directions::Direction& direction, double step) const {
+  const bool doubtful = direction.kind == Kind::kChord && step > kSettledFactored * goal_;
+  return !(doubtful && directions_.is_dear());
 }
 
 /// Whether steps have stopped to shrink while their gain drowns in rounding.
@@ -227,7 +235,7 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
     }
   } else if (step < goal_) {
     if (direction.kind != Kind::kFactored) {
-      settling_ = true;
+      settling_ = may_end(direction, step);
       if (is_settled(step, kSettled)) return Next::kGoOn;
     } else if (is_settled(step, kSettledFactored) || step > kShrinks * settled_step_) {
       return stop(Status::kConverged);

@@ -20,6 +20,9 @@ struct Options {
   int max_iterations;  ///< of a step, over all its solves
   /// A factor of more than this is dropped before the next one is made [bytes].
   std::size_t large_factor = std::size_t{64} << 20;
+  /// A factor of more operations per entry, of a sheet of 140 x 140 vertices or more, is dear beside the
+  /// solves with it, which are bounded by memory.
+  double dear_factor = 800.0;
 };
 
 /// What a step has seen of factorizations in single precision that fail.
