@@ -85,16 +85,17 @@ void BlockMatrix::add_terms(std::span<const Index> points, const StencilTerms& o
 
 void BlockMatrix::add_attached(const std::array<Index, 4>& points, const Mat12& h) {
   motions_.clear();
+  const Eigen::Matrix<double, 12, 3> none = Eigen::Matrix<double, 12, 3>::Zero();
   const auto find = [&](Index r) -> Motion& {
     for (Motion& known : motions_) {
       if (known.row == r) return known;
     }
-    motions_.push_back({.row = r, .point = -1, .g = Eigen::Matrix<double, 12, 3>::Zero()});
+    motions_.push_back({.row = r, .point = -1, .g = none});
     return motions_.back();
   };
   for (int p = 0; p < 4; ++p) {
     if (has(points[p])) {
-      motions_.push_back({.row = points[p], .point = p, .g = {}});
+      motions_.push_back({.row = points[p], .point = p, .g = none});
     } else if (is_attached(points[p])) {
       for (const auto* e = attachments_->begin(points[p]); e != attachments_->end(points[p]); ++e) {
         find(e->row).g.block<3, 3>(3 * p, 0) += e->jacobian;
