@@ -20,7 +20,7 @@ struct Options {
   int max_iterations;  ///< of a step, over all its solves
   /// A factor of more than this is dropped before the next one is made [bytes].
   std::size_t large_factor = std::size_t{64} << 20;
-  /// A factor of more operations per entry, of a sheet of 140 x 140 vertices or more, is dear beside the
+  /// A factor of more operations per entry, of a sheet of 150 x 150 vertices or more, is dear beside the
   /// solves with it, which are bounded by memory.
   double dear_factor = 800.0;
 };
