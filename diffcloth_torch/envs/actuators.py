@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from diffcloth_torch.checks import check_count
+from diffcloth_torch.checks import ANY_NUMBER, NON_NEGATIVE, POSITIVE, check_count, check_number
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.rotation import quaternion_exp, quaternion_multiply
 from diffcloth_torch.model.attachment import Attachment
@@ -22,6 +22,7 @@ __all__ = ["Actuator", "Forces", "Hand", "Pickers", "Tools", "Twist", "Velocitie
 Tools = dict[str, Tensor]
 """What an actuator keeps from one transition to the next, [B, ...] each."""
 
+_NUMBER = "pass a number"
 _NOTHING = -1  # what an open picker holds
 
 
@@ -92,12 +93,14 @@ class Pickers(Actuator):
         Raises:
             InvalidInput: If a value is not accepted.
         """
-        if not -1.0 <= opens_at < 1.0:
+        self.opens_at = check_number("Pickers: `opens_at`", opens_at, ANY_NUMBER, instead=_NUMBER)
+        if not -1.0 <= self.opens_at < 1.0:
             raise InvalidInput(f"Pickers: `opens_at` must be in [-1, 1), got {opens_at}")
-        self.opens_at = float(opens_at)
         self.count = check_count("Pickers: `count`", count, 1)
         self.size = 4 * count
-        self.stride, self.reach, self.floor = stride, reach, floor
+        self.stride = check_number("Pickers: `stride`", stride, POSITIVE, instead=_NUMBER)
+        self.reach = check_number("Pickers: `reach`", reach, NON_NEGATIVE, instead=_NUMBER)
+        self.floor = check_number("Pickers: `floor`", floor, ANY_NUMBER, instead=_NUMBER)
         self._vertices = len(cloth.vertices)
         self.attachments = tuple(
             Attachment((str(cloth.name), range(self._vertices)), stiffness=stiffness, name=name)

@@ -13,13 +13,15 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from diffcloth_torch.checks import check_count
+from diffcloth_torch.checks import check_choice, check_count
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.sim.controls import Parameters
 
 __all__ = ["ClothVectorEnv"]
 
+_AUTORESETS = (AutoresetMode.SAME_STEP.value, AutoresetMode.DISABLED.value)
+_LARGEST_SEED = 2**64 - 1
 _FLOAT = torch.float32  # at the border; float64 inside
 
 
@@ -69,10 +71,10 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
             InvalidInput: If an argument is not accepted.
         """
         self.num_envs = check_count("make: `num_envs`", num_envs, 1)
-        mode = AutoresetMode(autoreset_mode)
-        if mode is AutoresetMode.NEXT_STEP:
-            raise InvalidInput("make: `autoreset_mode` must be SAME_STEP or DISABLED, got NextStep")
-        self.metadata = {"autoreset_mode": mode, "render_modes": []}
+        if isinstance(autoreset_mode, AutoresetMode):
+            autoreset_mode = autoreset_mode.value
+        check_choice("make: `autoreset_mode`", autoreset_mode, _AUTORESETS)
+        self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": []}
         self.task = task
         self.parameters: Parameters | None = None
         size = task.observation(task.example()).shape[-1]
@@ -80,7 +82,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         self.single_action_space = Box(-1.0, 1.0, (task.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._first_seed = seed
+        self._first_seed = None if seed is None else _checked_seed("make: `seed`", seed)
         self._generators: list[torch.Generator] | None = None
 
     def reset(
@@ -165,16 +167,17 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         self.env_state = env_state
         return self._observe(env_state)
 
-    def _seeded(self, seed: int | Sequence[int] | None) -> list[torch.Generator]:
+    def _seeded(self, seed: object) -> list[torch.Generator]:
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
         count = self.num_envs
-        if isinstance(seed, Sequence):
+        if isinstance(seed, Sequence) and not isinstance(seed, str):
             if len(seed) != count:
                 raise InvalidInput(f"reset: `seed` must have {count} numbers, got {len(seed)}")
-            keys = [[int(s)] for s in seed]
+            keys = [[_checked_seed(f"reset: `seed[{i}]`", s)] for i, s in enumerate(seed)]
         else:
-            keys = [[int(seed), i] for i in range(count)]
+            first = _checked_seed("reset: `seed`", seed)
+            keys = [[first, i] for i in range(count)]
         words = [np.random.SeedSequence(key).generate_state(1, np.uint64)[0] for key in keys]
         return [torch.Generator().manual_seed(int(word >> np.uint64(1))) for word in words]
 
@@ -249,3 +252,7 @@ def register(name: str) -> None:
         vector_entry_point="diffcloth_torch.envs:make",
         kwargs={"task": name},
     )
+
+
+def _checked_seed(name: str, seed: object) -> int:
+    return check_count(name, seed, 0, _LARGEST_SEED)

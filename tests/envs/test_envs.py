@@ -258,18 +258,33 @@ def test_scripts_succeed(name):
         (lambda: envs.make("FoldCloth", 0), "`num_envs` must be"),
         (lambda: make("FoldCloth", observation="images"), "`observation` must be"),
         (lambda: envs.make("FoldCloth", size=2), "`size` must be"),
-        (lambda: make("FoldCloth", autoreset_mode="NextStep"), "SAME_STEP or DISABLED"),
+        (lambda: make("FoldCloth", autoreset_mode="NextStep"), "'SameStep', 'Disabled'"),
+        (lambda: make("FoldCloth", autoreset_mode="never"), "`autoreset_mode` must be"),
+        (lambda: make("FoldCloth", seed=-1), "make: `seed` must be at least 0, got -1"),
+        (lambda: make("FoldCloth", reach=-1.0), "`reach` must be finite and >= 0"),
+        (lambda: make("FoldCloth", reach=float("nan")), "`reach` must be"),
+        (lambda: make("FoldCloth", opens_at=1.0), r"`opens_at` must be in \[-1, 1\)"),
         (lambda: make("FoldCloth").step(torch.zeros(2, 8)), r"call reset\(\) first"),
         (lambda: begun().step(torch.zeros(2, 7)), r"must have shape \[2, 8\], got \[2, 7\]"),
         (lambda: begun().step(torch.full((2, 8), torch.nan)), "environment 0 are not"),
         (lambda: begun().reset(options={"mask": 1}), "only reset_mask"),
         (lambda: begun().reset(options={"reset_mask": [True]}), r"booleans \[2\]"),
         (lambda: begun().reset(seed=[1]), "must have 2 numbers"),
+        (lambda: begun().reset(seed=-3), "reset: `seed` must be at least 0, got -3"),
+        (lambda: begun().reset(seed=[1, -1]), r"`seed\[1\]` must be at least 0, got -1"),
     ],
 )
 def test_bad_input(call, message):
     with pytest.raises(dc.InvalidInput, match=message):
         call()
+
+
+@pytest.mark.parametrize("seed", ["a", "12", 1.5, True])
+def test_seeds_are_integers(seed):
+    with pytest.raises(TypeError, match="`seed` must be an integer"):
+        make("FoldCloth", seed=seed)
+    with pytest.raises(TypeError, match="`seed` must be an integer"):
+        begun().reset(seed=seed)
 
 
 def begun():
