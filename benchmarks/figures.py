@@ -298,7 +298,8 @@ def _draw_ratios(records: Records, file: Path) -> None:
         axis.axhline(1.0, color="black", linewidth=0.8)
         axis.set_title(part)
     axes[0].set_ylabel("times faster than")
-    axes[0].legend(fontsize=7)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=7, loc="outside lower center", ncols=3)  # beside no bar
     _save(figure, file)
 
 
