@@ -30,7 +30,8 @@ class SimulationError(RuntimeError):
 
     Attributes:
         report: Report of the failed step, or None if no step was taken.
-        environments: Indices of the environments that failed; (0,) without a batch axis.
+        environments: Indices of the environments that failed in this way, (0,) without a
+            batch axis; `report.status` tells of all.
     """
 
     def __init__(
