@@ -224,7 +224,9 @@ def _refuse(name: str, values: FloatArray, wrong: NDArray[np.bool_], accepted: s
         raise InvalidInput(f"{name} must be {accepted}, got {values[tuple(at)]:g}{where}")
 
 
-def check_number(name: str, value: object, accepted: Range, *, instead: str) -> float:
+def check_number(
+    name: str, value: object, accepted: Range, *, instead: str = "pass a plain number"
+) -> float:
     """Require one number in a range."""
     array = float_array(name, value, instead=instead)
     check_shape(name, array.shape, [()])

@@ -22,7 +22,6 @@ __all__ = ["Actuator", "Forces", "Hand", "Pickers", "Tools", "Twist", "Velocitie
 Tools = dict[str, Tensor]
 """What an actuator keeps from one transition to the next, [B, ...] each."""
 
-_NUMBER = "pass a number"
 _NOTHING = -1  # what an open picker holds
 
 
@@ -93,14 +92,14 @@ class Pickers(Actuator):
         Raises:
             InvalidInput: If a value is not accepted.
         """
-        self.opens_at = check_number("Pickers: `opens_at`", opens_at, ANY_NUMBER, instead=_NUMBER)
+        self.opens_at = check_number("Pickers: `opens_at`", opens_at, ANY_NUMBER)
         if not -1.0 <= self.opens_at < 1.0:
             raise InvalidInput(f"Pickers: `opens_at` must be in [-1, 1), got {opens_at}")
         self.count = check_count("Pickers: `count`", count, 1)
         self.size = 4 * count
-        self.stride = check_number("Pickers: `stride`", stride, POSITIVE, instead=_NUMBER)
-        self.reach = check_number("Pickers: `reach`", reach, NON_NEGATIVE, instead=_NUMBER)
-        self.floor = check_number("Pickers: `floor`", floor, ANY_NUMBER, instead=_NUMBER)
+        self.stride = check_number("Pickers: `stride`", stride, POSITIVE)
+        self.reach = check_number("Pickers: `reach`", reach, NON_NEGATIVE)
+        self.floor = check_number("Pickers: `floor`", floor, ANY_NUMBER)
         self._vertices = len(cloth.vertices)
         self.attachments = tuple(
             Attachment((str(cloth.name), range(self._vertices)), stiffness=stiffness, name=name)

@@ -95,9 +95,7 @@ class SolverOptions:
     elastic: str = "newton"
 
     def __post_init__(self) -> None:
-        tolerance = check_number(
-            "SolverOptions: `tolerance`", self.tolerance, POSITIVE, instead="pass a plain number"
-        )
+        tolerance = check_number("SolverOptions: `tolerance`", self.tolerance, POSITIVE)
         object.__setattr__(self, "tolerance", tolerance)
         iterations = check_count("SolverOptions: `max_iterations`", self.max_iterations, 1)
         object.__setattr__(self, "max_iterations", iterations)

@@ -171,9 +171,7 @@ class Robot:
         file = as_path("Robot.load: `path`", path)
         check_choice("Robot.load: `base`", base, BASES)
         if edge_length is not None:
-            edge_length = check_number(
-                "Robot.load: `edge_length`", edge_length, POSITIVE, instead="pass a plain number"
-            )
+            edge_length = check_number("Robot.load: `edge_length`", edge_length, POSITIVE)
         round_links = with_round_links(read_urdf(file), smooth)
         description = round_links.description
         names = [link.name for link in description.links]

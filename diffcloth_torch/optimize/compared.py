@@ -112,4 +112,4 @@ def checked_points(name: str, value: object) -> FloatArray:
 
 def checked_noise(owner: str, noise: float) -> float:
     """A standard deviation; refuses what is not a positive number."""
-    return check_number(f"{owner}: `noise`", noise, POSITIVE, instead="pass a plain number")
+    return check_number(f"{owner}: `noise`", noise, POSITIVE)

@@ -180,7 +180,7 @@ def descend(
     check_count("descend: `failures`", failures, 0)
     for name, value in (("clip", clip), ("stop_below", stop_below)):
         if value is not None:
-            check_number(f"descend: `{name}`", value, POSITIVE, instead="pass a plain number")
+            check_number(f"descend: `{name}`", value, POSITIVE)
     _check_variables(variables, per_environment)
     loop = _Loop(
         variables=variables,

@@ -238,13 +238,12 @@ def _options(
         raise InvalidInput(
             f'fit: `loss` must be "linear" unless `method` is "least_squares", got {loss!r}'
         )
-    instead = "pass a plain number"
     return Options(
         method=method,
         loss=loss,
-        loss_scale=check_number("fit: `loss_scale`", loss_scale, POSITIVE, instead=instead),
+        loss_scale=check_number("fit: `loss_scale`", loss_scale, POSITIVE),
         max_evaluations=check_count("fit: `max_evaluations`", max_evaluations, 1),
-        tolerance=check_number("fit: `tolerance`", tolerance, POSITIVE, instead=instead),
+        tolerance=check_number("fit: `tolerance`", tolerance, POSITIVE),
     )
 
 

@@ -82,7 +82,7 @@ class Capture:
 
     def steps(self, dt: float) -> list[int]:
         """The step of a simulation nearest to each frame, at least one: its states are seen."""
-        check_number("Capture.steps: `dt`", dt, POSITIVE, instead="pass a plain number")
+        check_number("Capture.steps: `dt`", dt, POSITIVE)
         return [max(round(float(time) / dt), 1) for time in self.times]
 
     def between(self, first: float, last: float) -> Capture:
@@ -119,7 +119,7 @@ def read_capture(
     """
     owner = "rgbench.read_capture"
     root = as_path(f"{owner}: `folder`", folder)
-    late = check_number(f"{owner}: `delay`", delay, NON_NEGATIVE, instead="pass a plain number")
+    late = check_number(f"{owner}: `delay`", delay, NON_NEGATIVE)
     if not root.is_dir():
         raise InvalidInput(f"{owner}: `folder` must be a folder, got {str(root)!r}")
     arms = {}

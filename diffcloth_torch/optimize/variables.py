@@ -63,7 +63,7 @@ class Variable:
 
     def __post_init__(self) -> None:
         numbers = float_array("Variable: `value`", self.value).copy()
-        check_number("Variable: `spread`", self.spread, _SPREADS, instead="pass a plain number")
+        check_number("Variable: `spread`", self.spread, _SPREADS)
         check_finite("Variable: `value`", numbers)
         if not numbers.size:
             raise InvalidInput("Variable: `value` must be one or more numbers, got none")

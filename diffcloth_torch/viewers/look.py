@@ -81,7 +81,7 @@ class Camera:
         for name, accepted in _ACCEPTED.items():
             value = getattr(self, name)
             if value is not None:
-                check_number(f"Camera: `{name}`", value, accepted, instead="pass a plain number")
+                check_number(f"Camera: `{name}`", value, accepted)
         if not np.any(np.asarray(self.up)):
             raise InvalidInput("Camera: `up` must be a direction, got zeros")
         if self.position is not None and self.target is not None:
