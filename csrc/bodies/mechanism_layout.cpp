@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <ranges>
 #include <utility>
 
 #include "bodies/mechanism_eval.h"
@@ -106,6 +107,19 @@ std::vector<std::vector<Index>> Mechanisms::cliques() const {
     std::vector<Index> nodes;
     for (Index k = tree.first_node; k < tree.last_node; ++k) nodes.push_back(k);
     result.push_back(std::move(nodes));
+  }
+  return result;
+}
+
+std::vector<Mechanisms::FreeBody> Mechanisms::free_bodies() const {
+  std::vector<FreeBody> result;
+  for (const Tree& tree : trees_) {
+    constexpr Index kRigid = 6;
+    if (!tree.free || tree.last_coordinate - tree.first_coordinate != kRigid) continue;
+    const auto nodes = std::views::iota(tree.first_node, tree.last_node);
+    if (std::ranges::any_of(nodes, [&](Index node) { return is_prescribed(node); })) continue;
+    result.push_back(
+        {.first_node = tree.first_node, .last_node = tree.last_node, .surfaces = tree.surfaces});
   }
   return result;
 }

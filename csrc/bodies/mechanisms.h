@@ -81,6 +81,13 @@ class Mechanisms {
   /// Nodes of each tree, whose coordinates depend on each other.
   std::vector<std::vector<Index>> cliques() const;
 
+  /// A tree that is one rigid body in free flight: six coordinates, which no joint, drive or limit knows.
+  struct FreeBody {
+    Index first_node, last_node;
+    std::vector<Index> surfaces;  ///< among those of bodies
+  };
+  std::vector<FreeBody> free_bodies() const;
+
   /// Whether a surface belongs to these trees, and whether it moves with free coordinates.
   bool has_surface(Index surface) const { return surface_[surface].tree >= 0; }
   bool is_dynamic(Index surface) const { return surface_[surface].dynamic; }

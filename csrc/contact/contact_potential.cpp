@@ -59,8 +59,8 @@ double ContactPotential::largest_coordinate(const double* x) const {
   return size == 0 ? 0.0 : Eigen::Map<const Eigen::ArrayXd>(x, size).abs().maxCoeff();
 }
 
-double ContactPotential::safe_fraction(const double* x, const double* to) const {
-  double alpha = 1.0;
+template <class Visit>
+void ContactPotential::visit_approaching(const double* x, const double* to, Visit&& visit) const {
   const double largest = std::max(largest_coordinate(x), largest_coordinate(to));
   const double d_hat = model_.parameters().d_hat;
   const double most = 2.0 * std::ranges::max(model_.reach()) - d_hat;  // of any xi
@@ -70,11 +70,36 @@ double ContactPotential::safe_fraction(const double* x, const double* to) const 
     const Candidate& pair = found_.pairs[k];
     const double xi = model_.xi(pair);
     if (found_.apart[k] > harmless_distance(xi, d_hat, largest)) continue;
-    alpha = safe_step(pair.kind, corners(pair.vertices, x), corners(pair.vertices, to), xi, d_hat,
-                      alpha);
-    if (alpha == 0.0) break;
+    if (!visit(pair, xi)) return;
   }
+}
+
+double ContactPotential::safe_fraction(const double* x, const double* to) const {
+  double alpha = 1.0;
+  visit_approaching(x, to, [&](const Candidate& pair, double xi) {
+    alpha = safe_step(pair.kind, corners(pair.vertices, x), corners(pair.vertices, to), xi,
+                      model_.parameters().d_hat, alpha);
+    return alpha != 0.0;
+  });
   return alpha;
+}
+
+std::vector<char> ContactPotential::meeting(const double* x, const double* to) const {
+  const std::vector<Index>& surface = model_.mesh().vertex_surface;
+  std::vector<char> meets(model_.reach().size(), 0);
+  const auto mark = [&](const Candidate& pair) {
+    meets[surface[pair.vertices[0]]] = meets[surface[pair.vertices[3]]] = 1;
+  };
+  visit_approaching(x, to, [&](const Candidate& pair, double xi) {
+    const double safe = safe_step(pair.kind, corners(pair.vertices, x), corners(pair.vertices, to),
+                                  xi, model_.parameters().d_hat, 1.0);
+    if (safe < 1.0) mark(pair);
+    return true;
+  });
+  Near there;
+  model_.measure(found_.pairs, to, there);
+  for (const Term& term : there.terms) mark(term.pair);
+  return meets;
 }
 
 bool ContactPotential::is_at(const Measured& measured, const double* x) const {

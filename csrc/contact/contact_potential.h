@@ -74,6 +74,9 @@ class ContactPotential final : public TouchingPotential {
   /// Fraction of the watched motion x -> to that is certified free of collisions.
   double safe_fraction(const double* x, const double* to) const;
 
+  /// The surfaces that collide on the watched motion x -> to, or are in contact at its end.  [surfaces]
+  std::vector<char> meeting(const double* x, const double* to) const;
+
   const ContactModel& model() const { return model_; }
   const std::vector<Contact>& contacts() const {
     return adopted_ != nullptr ? *adopted_ : contacts_;
@@ -110,6 +113,9 @@ class ContactPotential final : public TouchingPotential {
     Near near;
   };
   double largest_coordinate(const double* x) const;
+  /// Visit the pairs that may collide on the watched motion x -> to, and their xi, as long as it is wanted.
+  template <class Visit>
+  void visit_approaching(const double* x, const double* to, Visit&& visit) const;
   bool is_at(const Measured& measured, const double* x) const;
   void measure(const double* x, Measured& out) const;
   const Near& near_at(const double* x, Measured& scratch) const;

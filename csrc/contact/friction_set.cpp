@@ -169,19 +169,30 @@ FrictionSet::FrictionSet(const ContactModel& model,
       if (part.turns) part.a = part.share * at_start.coordinates(entry.gap(x_start));
     }
     entries_.push_back(entry);
+    points_.insert(points_.end(), entry.points.begin(), entry.points.begin() + entry.count);
   }
+  std::ranges::sort(points_);
+  const auto repeated = std::ranges::unique(points_);
+  points_.erase(repeated.begin(), repeated.end());
 }
 
-bool FrictionSet::is_at(const std::vector<double>& point, const double* x) const {
-  return !point.empty() && std::equal(point.begin(), point.end(), x);
+bool FrictionSet::is_at(const std::vector<Vec3>& place, const double* x) const {
+  return !place.empty() &&
+         std::ranges::equal(place, points_, [&](const Vec3& p, Index v) { return p == row(x, v); });
+}
+
+void FrictionSet::take_place(const double* x, std::vector<Vec3>& place) const {
+  place.clear();
+  place.reserve(points_.size());
+  for (const Index v : points_) place.emplace_back(row(x, v));
 }
 
 const FrictionSet::Slips& FrictionSet::slips(const double* x) const {
-  if (is_at(kept_[last_].x, x)) return kept_[last_].slips;
+  if (is_at(kept_[last_].place, x)) return kept_[last_].slips;
   last_ = 1 - last_;
   Kept& here = kept_[last_];
-  if (is_at(here.x, x)) return here.slips;
-  here.x.assign(x, x + 3 * static_cast<std::ptrdiff_t>(model_->mesh().vertex_count));
+  if (is_at(here.place, x)) return here.slips;
+  take_place(x, here.place);
   here.slips.clear();
   here.slips.reserve(entries_.size());
   for (const Entry& k : entries_) here.slips.push_back(slip(k, x));
@@ -254,11 +265,7 @@ void FrictionSet::expect(const double* x, const double* to) {
   }
   if (!any) return expected_.clear();
   duals_.assign(entries_.size(), Vec3::Zero());
-  keep_duals_at(x);
-}
-
-void FrictionSet::keep_duals_at(const double* x) {
-  duals_at_.assign(x, x + 3 * static_cast<std::ptrdiff_t>(model_->mesh().vertex_count));
+  take_place(x, duals_at_);
 }
 
 double FrictionSet::stiffness(std::size_t entry, const Slip& at) const {
@@ -287,7 +294,7 @@ void FrictionSet::update_duals(const double* x, const double* p, double alpha, c
   duals_at_.clear();
   if (!any) return;
   duals_ = std::move(duals);
-  keep_duals_at(to);
+  take_place(to, duals_at_);
 }
 
 double FrictionSet::force_change(const double* x, const double* p) const {

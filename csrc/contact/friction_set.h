@@ -216,12 +216,12 @@ class FrictionSet {
  private:
   /// What is kept of a point.
   struct Kept {
-    std::vector<double> x;  ///< all vertices; empty where nothing is known
+    std::vector<Vec3> place;  ///< of points_; empty where nothing is known
     Slips slips;
   };
-  bool is_at(const std::vector<double>& point, const double* x) const;
+  bool is_at(const std::vector<Vec3>& place, const double* x) const;
+  void take_place(const double* x, std::vector<Vec3>& place) const;
   Slip slip(const Entry& entry, const double* x) const;
-  void keep_duals_at(const double* x);
   /// q of the Hessians that are not exact.
   double stiffness(std::size_t entry, const Slip& at) const;
 
@@ -230,7 +230,8 @@ class FrictionSet {
   std::vector<Entry> entries_;
   mutable std::array<Kept, 2> kept_;
   mutable std::size_t last_ = 0;  // of these
-  std::vector<double> duals_at_;  // all vertices; empty where there are none
+  std::vector<Index> points_;     // of all entries, ascending
+  std::vector<Vec3> duals_at_;    // place of the duals; empty where there are none
   std::vector<Vec3> duals_;       // of the entries
   std::vector<double> expected_;  // q of the entries; empty where nothing is expected
 };

@@ -217,6 +217,13 @@ double Coordinates::largest_fraction(const std::vector<double>& x,
   return fraction;
 }
 
+bool Coordinates::is_curved(const std::vector<double>& dx) const {
+  const double* const first = nodes(dx);
+  return is_curved() &&
+         std::any_of(first, first + 3 * static_cast<std::ptrdiff_t>(mechanisms_->node_count()),
+                     [](double change) { return change != 0.0; });
+}
+
 double Coordinates::displacement(const std::vector<double>& dx) const {
   double result = largest(dx.data(), dx.data() + node_offset());
   const std::vector<double>& lever = mechanisms_->lever();

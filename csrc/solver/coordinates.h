@@ -41,6 +41,8 @@ class Coordinates {
 
   /// Whether points do not all move on straight lines.
   bool is_curved() const { return mechanisms_->has_free(); }
+  /// The same of one change of all points.
+  bool is_curved(const std::vector<double>& dx) const;
 
   /// The point of a row, and whether it is an unknown.
   Index point(Index row) const {

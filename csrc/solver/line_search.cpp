@@ -44,7 +44,7 @@ Search search(Walk& walk, const std::vector<double>& p, Trial trial) {
   for (; result.backtracks < kBacktracks; ++result.backtracks, trial.alpha *= 0.5) {
     walk.context.checkpoint->check();
     if (result.backtracks > 0) {
-      if (walk.f.coordinates->is_curved()) {
+      if (walk.f.coordinates->is_curved(p)) {
         trial.alpha = walk.watch(p, trial.alpha, trial.to);
         if (!(trial.alpha > 0.0)) break;
       } else {

@@ -301,8 +301,55 @@ Status Descent::run() {
   }
 }
 
-/// Start from the guess instead of x where that is better and the straight way there free of contact.
+using FreeBodies = std::vector<const bodies::Mechanisms::FreeBody*>;
+
+/// Leave out those that meet something on the straight motion from where the walk stands.
+void leave_out_meeting(Walk& walk, const std::vector<double>& to, FreeBodies& bodies) {
+  if (walk.f.contact == nullptr || bodies.empty()) return;
+  walk.watch(to);
+  const std::vector<char> meets = walk.f.contact->meeting(walk.x().data(), to.data());
+  std::erase_if(bodies, [&](const auto* body) {
+    return std::ranges::any_of(body->surfaces, [&](Index s) { return meets[s] != 0; });
+  });
+}
+
+/// Where the walk stands, but for the free bodies that come to their places in the guess without meeting
+/// anything: nothing else knows of these, so that what else there is should not wait for them.
+std::vector<double> with_flown_bodies(Walk& walk, const std::vector<double>& guess) {
+  const std::vector<double>& start = walk.x();
+  const Coordinates& coordinates = *walk.f.coordinates;
+  const auto numbers = [&](const bodies::Mechanisms::FreeBody& body) {
+    const std::ptrdiff_t vertices = coordinates.vertex_count();
+    return std::pair{3 * (vertices + body.first_node), 3 * (vertices + body.last_node)};
+  };
+  FreeBodies flying;
+  std::vector<double> change(start.size(), 0.0);
+  for (const bodies::Mechanisms::FreeBody& body : walk.f.free_bodies) {
+    const auto [first, last] = numbers(body);
+    for (std::ptrdiff_t a = first; a < last; ++a) change[a] = guess[a] - start[a];
+    if (coordinates.largest_fraction(start, change) >= 1.0) flying.push_back(&body);
+    std::fill(change.begin() + first, change.begin() + last, 0.0);
+  }
+  leave_out_meeting(walk, guess, flying);
+  while (!flying.empty()) {
+    std::vector<double> flown = start;
+    for (const auto* body : flying) {
+      const auto [first, last] = numbers(*body);
+      std::copy(guess.begin() + first, guess.begin() + last, flown.begin() + first);
+    }
+    coordinates.place(flown);
+    // What stays behind may be in the way of what would have followed it.
+    const std::size_t before = flying.size();
+    leave_out_meeting(walk, flown, flying);
+    if (flying.size() == before) return flown;
+  }
+  return start;
+}
+
+/// Start from the guess instead of x where that is better and the straight way there free of contact; or
+/// at least free bodies that meet nothing.
 bool start_from(Walk& walk, const std::vector<double>& guess) {
+  const std::vector<double> flown = with_flown_bodies(walk, guess);
   // Where inertia alone would collapse the cloth (long steps, forces on light vertices), the start
   // of the step with pins at their ends is the better place to begin.
   std::vector<double> held = guess;
@@ -310,19 +357,22 @@ bool start_from(Walk& walk, const std::vector<double>& guess) {
   for (Index i = 0; i < coordinates.row_count(); ++i) {
     if (!coordinates.is_free(i)) continue;
     const Index point = coordinates.point(i);
-    Eigen::Map<Vec3>(held.data() + 3 * point) = row(walk.x().data(), point);
+    Eigen::Map<Vec3>(held.data() + 3 * point) = row(flown.data(), point);
   }
   coordinates.place(held);
-  if (walk.f.energy_change_without_contact(held.data(), guess.data()) > 0.0) return false;
-  std::vector<double> change(guess.size());
-  for (std::size_t a = 0; a < guess.size(); ++a) change[a] = guess[a] - walk.x()[a];
-  if (coordinates.largest_fraction(walk.x(), change) < 1.0 || walk.watch(guess) < 1.0) return false;
-  if (walk.f.contact != nullptr) {
+  const auto is_better_and_free = [&] {
+    if (walk.f.energy_change_without_contact(held.data(), guess.data()) > 0.0) return false;
+    std::vector<double> change(guess.size());
+    for (std::size_t a = 0; a < guess.size(); ++a) change[a] = guess[a] - walk.x()[a];
+    if (coordinates.largest_fraction(walk.x(), change) < 1.0 || walk.watch(guess) < 1.0)
+      return false;
+    if (walk.f.contact == nullptr) return true;
     walk.f.contact->stand_at(guess.data());
-    if (!walk.f.contact->contacts().empty()) return false;
-  }
-  walk.go(guess);
-  return true;
+    return walk.f.contact->contacts().empty();
+  };
+  const bool taken = is_better_and_free();
+  if (taken || flown != walk.x()) walk.go(taken ? guess : flown);
+  return taken;
 }
 
 }  // namespace

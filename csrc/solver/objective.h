@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <optional>
+#include <span>
 #include <vector>
 
 #include "bodies/coordinate_potential.h"
@@ -26,6 +27,8 @@ struct Objective {
   Potential* friction = nullptr;                 ///< null where nothing touched
   contact::ContactPotential* contact = nullptr;  ///< null where nothing can touch
   bodies::CoordinatePotential* chart = nullptr;  ///< of free coordinates; null where there are none
+  /// Bodies of which nothing but contact and `chart`, a quadratic form for them, knows.
+  std::span<const bodies::Mechanisms::FreeBody> free_bodies;
   PatternCache* patterns;
   linalg::Couplings expected;  ///< of rows beyond the base pattern, sorted: always in couplings()
 

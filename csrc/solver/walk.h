@@ -90,10 +90,12 @@ class Walk {
     // On a curve each fraction has a chord of its own: the safe part of one says little more about the
     // next than where to try.
     constexpr double kShorter = 0.9;
+    // But what bends far from there makes no difference.
+    constexpr double kBarelyShorter = 1.0 - 1e-9;
     constexpr int kTrials = 60;
     f.coordinates->retract(x_, p, alpha, to);
     double safe = watch(to);
-    if (!f.coordinates->is_curved()) {
+    if (!f.coordinates->is_curved(p)) {
       if (safe < 1.0) {
         alpha *= safe;
         f.coordinates->retract(x_, p, alpha, to);
@@ -102,7 +104,7 @@ class Walk {
     }
     for (int k = 0; safe < 1.0; ++k) {
       if (!(safe > 0.0) || k == kTrials) return 0.0;
-      alpha *= kShorter * safe;
+      alpha *= (k == 0 ? kBarelyShorter : kShorter) * safe;
       f.coordinates->retract(x_, p, alpha, to);
       safe = watch(to);
     }

@@ -201,6 +201,7 @@ solver::Objective Problem::objective(Proximity& inertia_or_nearness,
           .inertia = &inertia_or_nearness,
           .others = std::move(others),
           .chart = chart ? &*chart : nullptr,
+          .free_bodies = scene.free_bodies,
           .patterns = &patterns,
           .expected = {},
           .of_friction = {}};

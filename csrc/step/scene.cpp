@@ -227,6 +227,23 @@ linalg::BlockPattern with_nodes(Index cloth_vertex_count,
   return {cloth_vertex_count + mechanisms.node_count(), cliques};
 }
 
+/// Free bodies that no spring holds: without contact, inertia and the given forces alone move them.
+std::vector<bodies::Mechanisms::FreeBody> find_free_bodies(const Description& d,
+                                                           const bodies::Mechanisms& mechanisms,
+                                                           const contact::CollisionMesh& mesh) {
+  std::vector<char> attached(mesh.surface_count(), 0);
+  for (const Index i : d.attachments.point) attached[mesh.vertex_surface[i]] = 1;
+  std::vector<bodies::Mechanisms::FreeBody> result = mechanisms.free_bodies();
+  const auto cloths = static_cast<Index>(d.bending_models.size());
+  for (auto& body : result) {
+    for (Index& surface : body.surfaces) surface += cloths;
+  }
+  std::erase_if(result, [&](const bodies::Mechanisms::FreeBody& body) {
+    return std::ranges::any_of(body.surfaces, [&](Index s) { return attached[s] != 0; });
+  });
+  return result;
+}
+
 }  // namespace
 
 Scene::Scene(Description description)
@@ -240,6 +257,7 @@ Scene::Scene(Description description)
       rest(mesh::rest_shape(topology, stencils, given.rest_positions.data())),
       mechanisms(complete(given), given.bodies),
       collision_mesh(make_collision_mesh(given, mechanisms)),
+      free_bodies(find_free_bodies(given, mechanisms, collision_mesh)),
       mean_edge(mean_length(rest, collision_mesh, given.bodies)),
       prescribed(make_prescribed(given, mechanisms)),
       measures(contact::measure(collision_mesh, all_rest_positions(given).data())),

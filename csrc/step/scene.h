@@ -117,6 +117,8 @@ struct Scene {
   mesh::RestShape rest;  ///< of given.rest_positions
   bodies::Mechanisms mechanisms;
   contact::CollisionMesh collision_mesh;
+  std::vector<bodies::Mechanisms::FreeBody>
+      free_bodies;                          ///< that nothing is attached to; surfaces of the scene
   double mean_edge;                         ///< of the cloths at rest, else of the bodies [m]
   std::vector<char> prescribed;             ///< [points] pins, bodies, ...: see solver::Coordinates
   contact::RestMeasures measures;           ///< of given.rest_positions and the bodies

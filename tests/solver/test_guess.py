@@ -42,3 +42,45 @@ def test_a_guess_behind_a_surface_is_not_taken():
     path, predicted = falling(gap=0.01, speed=3.0)
     assert not visits(path, predicted)
     assert path[..., 2].min() > 0
+
+
+def flights(*, height=0.3, speed=0.0, turn=0.0, attached=False):
+    """A cube that flies beside a sheet in contact: how far it has come at each point of the path.
+
+    Returns:
+        Of all of its free motion, at the points of the path after the start; of its vertices the
+        least.
+    """
+    floor = dc.RigidBody.plane(4.0)
+    pose = [1.0, 0, height, 1, 0, 0, 0]
+    cube = dc.RigidBody.box(0.1, motion="dynamic", mass=1.0, pose=pose, name="cube")
+    sheet = dc.Cloth.grid(5, 5, size=0.2, pose=[0, 0, 0.5 * D_HAT, 1, 0, 0, 0])
+    spring = dc.Attachment(("cube", [0.0, 0.0, 0.0]), stiffness=1e3)
+    scene = dc.Scene([sheet], [floor, cube], attachments=[spring] if attached else [])
+    contact = dc.ContactOptions(barrier_distance=D_HAT)
+    sim = dc.Simulator(scene, H, contact=contact)
+    state = sim.initial_state()
+    velocities = state.body_velocities.clone()
+    velocities[1, 0], velocities[1, 2], velocities[1, 5] = 0.5, -speed, turn / H
+    state = state.replace(body_velocities=velocities)
+    control = dc.Control(attachments=torch.tensor([pose[:3]])) if attached else None
+    path = sim.path(state, control)[:, -8:]
+
+    alone = dc.Scene([], [dc.RigidBody.box(0.1, motion="dynamic", mass=1.0, pose=pose)])
+    other = dc.Simulator(alone, H)
+    flown = other.path(other.initial_state().replace(body_velocities=velocities[1:]))[-1, -8:]
+    assert sim.step(state, control).report.contact_count > 0
+    return ((path[1:] - path[0]).norm(dim=-1) / (flown - path[0]).norm(dim=-1)).amin(dim=-1)
+
+
+def test_a_free_body_that_meets_nothing_flies_at_once():
+    assert torch.allclose(flights(), torch.ones(1, dtype=torch.float64), atol=1e-12)
+    assert (flights(turn=0.5) - 1).abs().max() < 1e-12
+
+
+def test_a_free_body_that_would_end_behind_a_surface_does_not():
+    assert flights(height=0.05 + 0.01, speed=3.0)[0] < 0.99
+
+
+def test_a_body_on_a_spring_does_not():
+    assert flights(attached=True)[0] < 0.99
