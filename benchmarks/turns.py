@@ -1,13 +1,19 @@
-"""How much energy contact gives to bodies that turn fast.
+"""How much energy contact gives to bodies that turn.
 
-    python -m benchmarks.turns            # a minute
+    python -m benchmarks.turns            # two minutes
     python -m benchmarks.turns --quick    # seconds
 
-Boxes of three shapes are thrown on a floor without gravity, with a first turn of so many radians a
-step. The columns: steps in contact; throws that are refused in the end, as the box turned by more
-than 1 rad before or after a step; steps in which the kinetic and the stored energy together rise by
-more than a thousandth of the kinetic energy; the largest rise over the kinetic energy, negative
-where all steps lose.
+Two tables. In the first, boxes of three shapes are thrown on a floor without gravity, with a
+first turn of so many radians a step. The columns: steps in contact; throws that are refused in
+the end, as the box turned by more than 1 rad before or after a step; steps in which the kinetic
+and the stored energy together rise by more than a thousandth of the kinetic energy; the largest
+rise over the kinetic energy, negative where all steps lose.
+
+In the second, balls that are meshes roll on a level floor for `--seconds`. The corner that
+carries the weight gives g h^2 / (1.4 r) of the kinetic energy of a solid ball in a step, whatever
+its speed: the force acts where the corner is at the end of the step, a little behind the middle
+of its arc. The columns: faces; time step; radians a step; steps; rises as before; the largest of
+them; that formula; the energy at the end over that at the start.
 """
 
 from __future__ import annotations
@@ -28,6 +34,10 @@ SIZES = {
 }
 TURNS = (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)  # [rad]
 STEPS = 8
+RADIUS, GRAVITY = 0.05, 9.81
+SUBDIVISIONS = (1, 2, 3)
+TIME_STEPS = (0.01, 0.005, 0.0025)  # [s]
+SPEEDS = (5.0, 20.0)  # [rad/s]
 
 
 def thrown(
@@ -52,6 +62,49 @@ def thrown(
     return simulator, simulator.initial_state().replace(body_velocities=velocities)
 
 
+def energy(simulator: dc.Simulator, state: dc.State) -> float:
+    """Kinetic and stored [J]."""
+    return float(simulator.kinetic_energy(state)) + float(simulator.energy(state))
+
+
+def rolling(subdivisions: int, dt: float, speed: float) -> tuple[int, dc.Simulator, dc.State]:
+    """The number of faces of a ball that rolls on a floor, and its start."""
+    gap = 5e-4
+    pose = [0, 0, RADIUS + gap, 1, 0, 0, 0]
+    ball = dc.RigidBody.sphere(
+        RADIUS, subdivisions=subdivisions, motion="dynamic", density=500, pose=pose
+    )
+    simulator = dc.Simulator(
+        dc.Scene([], [dc.RigidBody.plane(100.0), ball]),
+        dt,
+        contact=dc.ContactOptions(barrier_distance=2 * gap),
+    )
+    velocities = torch.zeros(2, 6, dtype=torch.float64)
+    velocities[1, 0], velocities[1, 4] = speed * (RADIUS + gap), speed
+    start = simulator.initial_state().replace(body_velocities=velocities)
+    return len(ball.faces), simulator, start
+
+
+def roll(subdivisions: int, dt: float, speed: float, seconds: float) -> str:
+    """A line of the second table."""
+    faces, simulator, state = rolling(subdivisions, dt, speed)
+    start = before = energy(simulator, state)
+    found = []
+    for _ in range(round(seconds / dt)):
+        kinetic = float(simulator.kinetic_energy(state))
+        with torch.no_grad():
+            state = simulator.step(state)
+        after = energy(simulator, state)
+        found.append((after - before) / kinetic)
+        before = after
+    risen = sum(rise > 1e-3 for rise in found)
+    formula = GRAVITY * dt**2 / (1.4 * RADIUS)
+    return (
+        f"{faces:6}{1e3 * dt:7.1f}{speed * dt:7.3f}{len(found):7}{risen:7}"
+        f"{max(found):10.4f}{formula:9.4f}{before / start:8.3f}"
+    )
+
+
 def rises(size: tuple[float, float, float], turn: float, throws: int) -> Iterator[float | None]:
     """Of each step in contact the rise of energy over the kinetic energy; None where refused."""
     for seed in range(throws):
@@ -61,7 +114,7 @@ def rises(size: tuple[float, float, float], turn: float, throws: int) -> Iterato
             continue
         for _ in range(STEPS):
             kinetic = float(simulator.kinetic_energy(state))
-            before = kinetic + float(simulator.energy(state))
+            before = energy(simulator, state)
             try:
                 with torch.no_grad():
                     state = simulator.step(state)
@@ -69,15 +122,15 @@ def rises(size: tuple[float, float, float], turn: float, throws: int) -> Iterato
                 yield None
                 break
             if state.body_forces.any():
-                after = float(simulator.kinetic_energy(state)) + float(simulator.energy(state))
-                yield (after - before) / kinetic
+                yield (energy(simulator, state) - before) / kinetic
 
 
 @click.command(help=__doc__.splitlines()[0])
 @click.option("--throws", default=80, show_default=True, help="Of each shape and turn.")
-@click.option("--quick", is_flag=True, help="8 throws.")
-def main(throws: int, quick: bool) -> None:
-    """Print a line for each shape and turn."""
+@click.option("--seconds", default=0.8, type=click.FloatRange(min=0.05), help="Of each roll.")
+@click.option("--quick", is_flag=True, help="8 throws, and one ball for a moment.")
+def main(throws: int, seconds: float, quick: bool) -> None:
+    """Print a line for each shape and turn, and for each ball."""
     torch.set_num_threads(1)
     click.echo(f"{'shape':16}{'rad':>5}{'steps':>7}{'refused':>9}{'rise':>6}{'largest':>10}")
     for shape, size in SIZES.items():
@@ -88,6 +141,14 @@ def main(throws: int, quick: bool) -> None:
             risen = sum(rise > 1e-3 for rise in taken)
             refused = len(found) - len(taken)
             click.echo(f"{shape:16}{turn:5.1f}{len(taken):7}{refused:9}{risen:6}{largest:>10}")
+    click.echo(
+        f"\n{'faces':>6}{'h [ms]':>7}{'rad':>7}{'steps':>7}{'rise':>7}{'largest':>10}{'formula':>9}"
+        f"{'end':>8}"
+    )
+    for subdivisions in SUBDIVISIONS[:1] if quick else SUBDIVISIONS:
+        for dt in TIME_STEPS[:1] if quick else TIME_STEPS:
+            for speed in SPEEDS:
+                click.echo(roll(subdivisions, dt, speed, 10 * dt if quick else seconds))
 
 
 if __name__ == "__main__":

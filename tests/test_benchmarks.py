@@ -436,9 +436,16 @@ def test_uneven_batches_are_shared_as_evenly_as_costs_tell():
 
 
 def test_energy_of_fast_turns_is_counted():
-    command = [sys.executable, "-m", "benchmarks.turns", "--throws", "1"]
+    command = [sys.executable, "-m", "benchmarks.turns", "--throws", "1", "--seconds", "0.05"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
-    rows = [line.split() for line in result.stdout.splitlines()[1:]]
+    thrown, rolled = result.stdout.split("\n\n")
+    rows = [line.split() for line in thrown.splitlines()[1:]]
     assert len(rows) == 18
     assert sum(int(row[-4]) for row in rows) > 10  # steps
+    rows = [line.split() for line in rolled.splitlines()[1:]]
+    assert [row[0] for row in rows[::6]] == ["80", "320", "1280"]
+    for _, dt, _, steps, _, largest, formula, _ in rows:
+        assert int(steps) == round(50 / float(dt))
+        assert float(formula) == pytest.approx(9.81 * (float(dt) / 1e3) ** 2 / 0.07, abs=1e-4)
+        assert -1 < float(largest) < 2 * float(formula) + 1e-3
