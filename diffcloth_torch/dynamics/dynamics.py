@@ -333,10 +333,17 @@ class Dynamics:
             ),
         }
 
+    def too_fast(self, prediction: Prediction) -> dict[int, str]:
+        """Environments in which robots are too fast for a time step -> a sentence about one."""
+        found: dict[int, str] = {}
+        for robot, own in zip(self._robots, prediction.robots, strict=True):
+            found |= robot.too_fast(own)
+        return found
+
     def turned_too_far(
         self, prediction: Prediction, after: Fields, forces: Tensor
     ) -> dict[int, str]:
-        """Dynamic bodies that turn further in a step than contact resolves.
+        """Dynamic bodies and robots that turn further in a step than it, or contact, resolves.
 
         Args:
             prediction: Prediction of the step.
@@ -345,17 +352,18 @@ class Dynamics:
 
         Returns:
             Environment -> a sentence with its first such body, the speed, and a sufficient time
-            step.
+            step; or with the robot.
         """
+        found = self.too_fast(prediction)
         bodies = prediction.bodies
         if bodies is None:
-            return {}
+            return found
         on_vertex = forces.detach()[:, self._on_free].abs().sum(-1)
         touched = torch.zeros_like(bodies.speed).index_add(1, self._body_of_vertex, on_vertex) > 0
         end = after["body_velocities"].detach()[:, self._free, 3:].norm(dim=-1)
         speed = torch.maximum(bodies.speed, end)
         lost = touched & ~(self.dt * speed <= MOST_TURN_IN_CONTACT)
-        how, found = "touches something and may", {}
+        how = "touches something and may"
         for environment, body in reversed(lost.nonzero().tolist()):
             found[environment] = turn_sentence(
                 f"body {self._free_names[body]!r}",

@@ -26,6 +26,7 @@ M/h^2: see `weights.py`.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -58,7 +59,6 @@ from diffcloth_torch.dynamics.jacobians import ROOT, DifferentialKinematics, roo
 from diffcloth_torch.dynamics.linear import solve, times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.dynamics.weights import WeightBound
-from diffcloth_torch.errors import SimulationError
 from diffcloth_torch.geometry.products import product
 from diffcloth_torch.geometry.rotation import (
     nearer_quaternion,
@@ -74,6 +74,9 @@ from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.transforms import outside_transforms, plain
 
 __all__ = ["RobotControl", "RobotDynamics", "RobotPrediction", "RobotState"]
+
+# Turn in a step [rad] beyond which a motion over it is not the only one, and energy is not kept.
+_MOST_TURN = math.pi
 
 
 class RobotState(NamedTuple):
@@ -128,6 +131,8 @@ class RobotPrediction(NamedTuple):
         pose: Pose of its root's frame at the start, [B, 7].
         known: nu if it is prescribed, zero elsewhere; [B, 6 + J].
         given: M(q_n) nu_n + h tau(q_n), [B, 6 + J].
+        lost: Which environments have no such motion, as the robot is too fast for the time step: it
+            stays where it is there; [B].
     """
 
     root_start: Tensor
@@ -143,6 +148,7 @@ class RobotPrediction(NamedTuple):
     pose: Tensor
     known: Tensor
     given: Tensor
+    lost: Tensor
 
 
 class _Configuration(NamedTuple):
@@ -204,6 +210,14 @@ class RobotDynamics:
         solved = [i for i in range(ROOT + joints) if i < ROOT or not prescribed[i - ROOT]]
         self._solved = torch.tensor([i for i in solved if i >= first], dtype=torch.long)
         self._unknown = self._solved - first
+        # Radians of the links by each joint; those of prismatic ones are none.
+        turns = np.zeros(joints)
+        for kind, dof, multiplier in zip(
+            mechanism.kind, mechanism.dof, mechanism.multiplier, strict=True
+        ):
+            if kind == "revolute" and dof >= 0:
+                turns[dof] = max(turns[dof], abs(multiplier))
+        self._turns = torch.from_numpy(turns) * ~self._prescribed
         self._free_motion = robot_motion(mechanism, self._solved, dt)
         self._weight = weight
         self._weight_bound = WeightBound(self._kinematics) if weight == "bounded" else None
@@ -246,8 +260,9 @@ class RobotDynamics:
         if self._has_dynamics:
             here = self._motion(inertia, start)
             given = self._given(inertia, here, state, control, drives, gravity, contact)
+        lost = torch.zeros(len(state.joints), dtype=torch.bool)
         if len(self._solved) and self._weight is None:
-            velocity = self._solve(inertia, start, known, given)
+            velocity, lost = self._solve(inertia, start, known, given)
         end = self._moved(start, velocity, self._dt)
         joints = torch.where(self._prescribed, ends, end.joints)
         coordinates, free = state.joints, joints
@@ -290,6 +305,7 @@ class RobotDynamics:
             pose=state.pose,
             known=known,
             given=given,
+            lost=lost,
         )
 
     def end_at(self, prediction: RobotPrediction, pose: Tensor) -> RobotPrediction:
@@ -479,8 +495,8 @@ class RobotDynamics:
         start: _Configuration,
         known: Tensor,
         given: Tensor,
-    ) -> Tensor:
-        """Velocities nu over the step without contact."""
+    ) -> tuple[Tensor, Tensor]:
+        """Velocities nu over the step without contact; where there are none, [B], zero."""
         h, solved = self._dt, self._solved
 
         def residual(velocity: Tensor, *inputs: Tensor) -> Tensor:
@@ -496,17 +512,24 @@ class RobotDynamics:
             return residual(complete(x, inputs[-2]), *inputs)[..., solved]
 
         x, found = solve_motion(self._free_motion, inertia, start, known, given)
-        self._check(found)
-        return complete(attach_root(of_solved, x, (*inertia, *start, known, given)), known)
+        lost = ~found | ~(self._largest_turn(complete(x, known)) <= _MOST_TURN)
+        x = torch.where(lost[:, None], 0.0, x)
+        return complete(attach_root(of_solved, x, (*inertia, *start, known, given)), known), lost
 
-    def _check(self, found: Tensor) -> None:
-        lost = torch.nonzero(~found)[:, 0].tolist()
-        if lost:
-            raise SimulationError(
-                f"step: the velocities of robot {self.mechanism.name!r} are too large for a time "
-                f"step of {self._dt:g} s; its links may turn by about a radian in it",
-                environments=lost,
-            )
+    def _largest_turn(self, velocity: Tensor) -> Tensor:
+        """Largest turn that a floating base or a joint makes by itself in a step [rad], [B]."""
+        velocity = plain(velocity)
+        of_base = velocity[..., 3:ROOT].norm(dim=-1) * self._floats
+        of_joints = (self._turns * velocity[..., ROOT:]).abs()
+        return self._dt * torch.cat([of_base[..., None], of_joints], dim=-1).amax(dim=-1)
+
+    def too_fast(self, prediction: RobotPrediction) -> dict[int, str]:
+        """Environment without a motion by itself -> a sentence."""
+        sentence = (
+            f"the velocities of robot {self.mechanism.name!r} are too large for a time step of "
+            f"{self._dt:g} s; no joint, and no base, may turn by more than half a turn in it"
+        )
+        return dict.fromkeys(prediction.lost.nonzero()[:, 0].tolist(), sentence)
 
     def _end(
         self,

@@ -13,6 +13,7 @@ from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.dynamics import Dynamics, Prediction
 from diffcloth_torch.dynamics.limits import limit_stiffness
 from diffcloth_torch.dynamics.totals import Totals
+from diffcloth_torch.errors import TurnedTooFar
 from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.options import SCHEMES, ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import Fields
@@ -25,7 +26,7 @@ from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.masses import cloth_totals
 from diffcloth_torch.sim.motion import ended_poses, held_targets, prescribed_motion, with_rows
 from diffcloth_torch.sim.staggered import Staggered
-from diffcloth_torch.sim.step import TURNED, Constant, Outcome, take_step
+from diffcloth_torch.sim.step import INTERSECTING, TURNED, Constant, Outcome, take_step
 from diffcloth_torch.sim.surfaces import Surfaces
 from diffcloth_torch.transforms import is_differentiated
 
@@ -156,14 +157,16 @@ class Engine:
         if origins is not None:
             inputs["friction_origins"] = origins
         outcome = take_step(self.core, inputs, self.constants)
-        check(outcome.diagnostics)
         if self.dynamics is None or prediction is None:
+            check(outcome.diagnostics)
             return outcome, self._moved(given, outcome.diagnostics["ended"])
+        if INTERSECTING in outcome.diagnostics["status"]:
+            check(outcome.diagnostics)
         after = self._advanced(self.dynamics, prediction, outcome)
         far = self.dynamics.turned_too_far(prediction, after, outcome.body_forces)
         if far:
             mark(outcome.diagnostics, far, TURNED)
-            check(outcome.diagnostics)
+        check(outcome.diagnostics)
         return outcome, {**after, "joint_targets": self._held_targets(given)}
 
     def _moved(self, given: Given, ended: Mapping[int, FloatArray]) -> Fields:
@@ -208,7 +211,11 @@ class Engine:
         with failing_as("path"):
             if self._staggered is not None:
                 return self._staggered.path(given, self.core_inputs(given, None), check)
-            return self.core.path(arrays_of(self.core_inputs(given, self.predict(given))))
+            prediction = self.predict(given)
+            if self.dynamics is not None and prediction is not None:
+                for environment, sentence in self.dynamics.too_fast(prediction).items():
+                    raise TurnedTooFar(f"path: {sentence}", environments=[environment])
+            return self.core.path(arrays_of(self.core_inputs(given, prediction)))
 
     def predict(self, given: Given, joint_origins: Tensor | None = None) -> Prediction | None:
         """Predict bodies and robots without contact; None if all are bodies on prescribed poses."""

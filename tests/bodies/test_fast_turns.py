@@ -225,3 +225,75 @@ def test_the_environment_that_turns_too_fast_is_named():
     with pytest.raises(dc.SimulationError, match="'marble' turns") as error:
         sim.step(dc.stack([slow, fast]))
     assert error.value.environments == (1,)
+
+
+ARM = """
+<robot name="arm">
+  <link name="base"/>
+  <link name="upper">
+    <inertial><origin xyz="0.1 0 0"/><mass value="0.5"/>
+      <inertia ixx="1e-4" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <link name="lower">
+    <inertial><origin xyz="0.05 0.02 0"/><mass value="0.2"/>
+      <inertia ixx="1e-4" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial>
+  </link>
+  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/>
+    <origin xyz="0 0 1.5"/><axis xyz="0 1 0"/></joint>
+  <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
+    <origin xyz="0.2 0 0"/><axis xyz="0 1 0.3"/></joint>
+</robot>
+"""
+
+
+@pytest.mark.parametrize("coupling", ["monolithic", "rigid_to_cloth", "cloth_to_rigid"])
+def test_a_robot_that_is_too_fast_by_itself_is_a_value_of_its_environment(tmp_path, coupling):
+    """It raised for the whole batch."""
+    file = tmp_path / "arm.urdf"
+    file.write_text(ARM)
+    arm = dc.Robot.load(file, actuation="torque", name="arm")
+    scene = dc.Scene(
+        [dc.Cloth.grid(3, 3)], [dc.RigidBody.plane(4, pose=[0, 0, -1, 1, 0, 0, 0])], [arm]
+    )
+    sim = dc.Simulator(scene, 0.01, coupling=coupling)
+    silent = dc.Simulator(scene, 0.01, coupling=coupling, solver=dc.SolverOptions(throw=False))
+    one = sim.initial_state()
+    slow = one.replace(joint_velocities=torch.tensor([3.0, -1.0], dtype=F64))
+    fast = one.replace(joint_velocities=torch.tensor([4000.0, -1200.0], dtype=F64))
+    start = dc.stack([slow, fast, slow])
+    rates = start.joint_velocities.clone().requires_grad_()
+    after = silent.step(start.replace(joint_velocities=rates))
+    assert after.report.status == ("converged", "turned_too_far", "converged")
+    alone = sim.step(slow)
+    for k in (0, 2):
+        assert torch.equal(after.joint_positions[k], alone.joint_positions)
+        assert torch.equal(after.positions[k], alone.positions)
+    assert torch.isfinite(after.joint_positions).all()
+    (gradient,) = torch.autograd.grad(after.joint_positions[::2].sum(), rates, retain_graph=True)
+    assert gradient[::2].all()
+    assert not gradient[1].any()
+    with pytest.raises(dc.TurnedTooFar, match=r"environments \[1\]"):
+        after.joint_positions.sum().backward()
+    with pytest.raises(dc.TurnedTooFar, match="robot 'arm' are too large") as error:
+        sim.step(start)
+    assert error.value.environments == (1,)
+    assert error.value.report.status == after.report.status
+    with pytest.raises(dc.TurnedTooFar, match="robot 'arm'"):
+        sim.path(fast)
+
+
+def test_an_error_tells_of_failures_of_every_kind():
+    """It told nothing of what turns too far where another environment failed in another way."""
+    sheet = dc.Cloth.grid(3, 3, size=0.1, pose=[1, 0, 0.1, 1, 0, 0, 0], pins={"all": range(9)})
+    sim, rolls = rolling(0.1)
+    scene = dc.Scene([sheet], sim.scene.bodies, gravity=sim.scene.gravity)
+    sim = dc.Simulator(scene, H, contact=sim.contact)
+    start = dc.stack([sim.initial_state()] * 3)
+    velocities = rolls.body_velocities.expand(3, -1, -1).clone()
+    velocities[1] *= 20
+    pins = start.positions.clone()
+    pins[2, :, 2] -= 0.2  # through the floor
+    with pytest.raises(dc.InfeasibleMotion) as error:
+        sim.step(start.replace(body_velocities=velocities), dc.Control(pins=pins))
+    assert error.value.environments == (2,)
+    assert error.value.report.status == ("converged", "turned_too_far", "infeasible_motion")
