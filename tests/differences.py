@@ -16,7 +16,9 @@ _CENTRAL = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 _FORWARD = ((0, -25 / 12), (1, 4), (2, -3), (3, 4 / 3), (4, -1 / 4))
 
 # Where a difference misses, other steps are tried: rounding wants larger, kinks want smaller ones.
-_SWEEP = (1.0, 0.25, 4.0, 0.0625, 16.0, 1 / 64, 1 / 256, 1 / 1024, 8.0, 32.0)
+_SWEEP = (1.0, 0.25, 4.0, 0.0625, 16.0, 1 / 64, 1 / 256, 1 / 1024, 1 / 4096, 8.0, 32.0)
+# A derivative that differences still resolve to five digits, beside the noise of a solve.
+_RESOLVED = 1e-8
 
 
 def directions(tensor: torch.Tensor, generator: torch.Generator) -> Iterator[torch.Tensor]:
@@ -64,6 +66,8 @@ def mismatch(
     """
     expected = float((gradient * d).sum())
     scale = float((gradient * d).norm())
+    if scale:
+        scale = max(scale, _RESOLVED)
     best = np.inf
     for factor in _SWEEP:
         try:

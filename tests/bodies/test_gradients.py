@@ -60,6 +60,9 @@ NOTHING = {
 }
 ADDED = ("body_center", "link_center")
 
+# Smaller derivatives, as by velocities of what is prescribed a step later, drown in the noise of
+# solves.
+RESOLVED = 1e-6
 # Steps of the differences, as shares of those directions: the best counts.
 SWEEP = (1e-3, 2e-4, 4e-5, 5e-3, 8e-6)
 
@@ -144,7 +147,8 @@ class Chain:
         best = float("inf")
         for step in SWEEP:
             found = difference(value, zero, one, step)
-            best = min(best, abs(found - float(terms.sum())) / float(terms.norm()))
+            size = max(float(terms.norm()), RESOLVED)
+            best = min(best, abs(found - float(terms.sum())) / size)
             if best < 1e-6:
                 break
         return best
