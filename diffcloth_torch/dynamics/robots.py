@@ -12,6 +12,10 @@ symplectic: by itself a robot neither gains nor loses energy in the long run. It
 at nu_n and M(q_n) solve the first line. The velocity of a base or joint with prescribed motion is
 known.
 
+The objective of the core is quadratic about that motion, with the metric M(q_n+1)/h^2. A robot that
+something holds at rest instead would not feel its weight there, but that and velocity products of
+the fall: hundredths of it, of the order of h^2. So M changes a little: see `_change_at_rest`.
+
 **Advance.** After the step the velocities nu over it follow from its two ends, and the second
 line turns them into nu_n+1. A robot that did not move has no velocity, whatever holds it. If motion
 is prescribed, nu_n+1 is nu, and tau lacks an effort tau_c. Both lines together, with the forces f
@@ -77,6 +81,8 @@ __all__ = ["RobotControl", "RobotDynamics", "RobotPrediction", "RobotState"]
 
 # Turn in a step [rad] beyond which a motion over it is not the only one, and energy is not kept.
 _MOST_TURN = math.pi
+# Turn in a step [rad] that a fall must exceed to count as one.
+_LITTLE_TURN = 1e-6
 
 
 class RobotState(NamedTuple):
@@ -218,6 +224,9 @@ class RobotDynamics:
             if kind == "revolute" and dof >= 0:
                 turns[dof] = max(turns[dof], abs(multiplier))
         self._turns = torch.from_numpy(turns) * ~self._prescribed
+        # Joints whose fall turns links. What floats falls as a whole, without turning.
+        turning = [ROOT + j for j in np.flatnonzero(turns * ~prescribed) if not self._floats]
+        self._turning = torch.tensor(turning, dtype=torch.long)
         self._free_motion = robot_motion(mechanism, self._solved, dt)
         self._weight = weight
         self._weight_bound = WeightBound(self._kinematics) if weight == "bounded" else None
@@ -277,9 +286,15 @@ class RobotDynamics:
             predicted = quaternion_multiply(quaternion_exp(turn), quaternion)
             offset = -times(end.rotation, local)
             root_start = root_end = torch.cat([offset, predicted], dim=-1)
-        inertial, force = self._inertial(inertia, end), None
+        mass, force = self._mass(inertia, end), None
+        if len(self._turning) and self._weight is None:
+            change = self._change_at_rest(inertia, start, mass, velocity, known, given, state)
+            change = torch.where(lost[:, None, None], 0.0, change)
+            columns = torch.zeros_like(mass[..., self._solved])
+            mass = mass.index_add(-1, self._solved, columns.index_add(-2, self._solved, change))
+        rows = slice(mass.shape[-1] - self.coordinate_count, None)
+        inertial = mass[..., rows, rows] / self._dt**2
         if len(self._solved) and self._weight is not None:
-            rows = slice(given.shape[-1] - self.coordinate_count, None)
             inertial = inertial + self._weight_stiffness(inertia, start, gravity)[..., rows, rows]
             force = (given / self._dt)[..., rows]
         metric, target = fold(drives, inertial, free, state.joints, self._dt, self._unknown, force)
@@ -459,14 +474,59 @@ class RobotDynamics:
             acting = acting + self._generalized(here, contact)
         return momentum(here, inertia, self._velocity(state)) + self._dt * acting
 
-    def _inertial(self, inertia: Inertia, at: _Configuration) -> Tensor:
-        """M/h^2 of the coordinates, [B, n, n]."""
-        n = self.coordinate_count
+    def _mass(self, inertia: Inertia, at: _Configuration) -> Tensor:
+        """M, zero of a robot that is not dynamic; [B, 6 + J, 6 + J]."""
         if not self.mechanism.is_dynamic:
-            return at.joints.new_zeros(len(at.joints), n, n)
-        mass = mass_matrix(self._motion(inertia, at), inertia)
-        rows = slice(mass.shape[-1] - n, None)
-        return mass[..., rows, rows] / self._dt**2
+            size = ROOT + self.mechanism.joint_count
+            return at.joints.new_zeros(len(at.joints), size, size)
+        return mass_matrix(self._motion(inertia, at), inertia)
+
+    def _change_at_rest(
+        self,
+        inertia: Inertia,
+        start: _Configuration,
+        mass: Tensor,
+        velocity: Tensor,
+        known: Tensor,
+        given: Tensor,
+        state: RobotState,
+    ) -> Tensor:
+        """What makes M balance the forces on a robot that stays at rest, [B, s, s].
+
+        By itself a robot moves by velocities d of its s unknown ones. One that something holds
+        should lack the impulse y that would let it, but M d has the velocity products of a fall
+        that does not happen: M d = y - e. The symmetric change U of rank two,
+
+            U = (e w^T + w e^T) / k - (e . d) w w^T / k^2,   w = M d,  k = d . w,
+
+        gives (M + U) d = y, and changes nothing across d and M^-1 e. It counts by the share of the
+        kinetic energy that one step of the forces gives: a robot that moves has such products.
+        """
+        h, solved = self._dt, self._solved
+        needed = given
+        if self._prescribed.any() or self.mechanism.base == "kinematic":
+            middle = self._motion(inertia, self._moved(start, known, h / 2))
+            ahead = momentum(middle, inertia, known)
+            needed = given + h / 2 * slope(self._kinematics, middle, known) - ahead
+        M = mass[..., solved[:, None], solved]
+        d = velocity[..., solved]
+        w = times(M, d)
+        e = needed[..., solved] - w
+        # Twice kinetic energies: of the fall, of what a step of the forces adds, and of the motion.
+        now = known.index_copy(-1, solved, self._velocity(state)[..., solved])
+        added = d - now[..., solved]
+        turning = mass.diagonal(dim1=-2, dim2=-1)[..., self._turning].sum(-1)
+        little = (_LITTLE_TURN / h) ** 2 * turning
+        k = (d * w).sum(-1) + little
+        gain = (added * times(M, added)).sum(-1)
+        share = gain / (gain + (now * times(mass, now)).sum(-1) + little)
+        # A change by more than half could leave M indefinite.
+        size_sq = (e * solve(M, e)).sum(-1) / k
+        share = share / (1 + (4 * size_sq) ** 4) ** 0.125
+        w = w / k[..., None]
+        outer = e[..., :, None] * w[..., None, :]
+        along = (e * d).sum(-1)[..., None, None] * w[..., :, None] * w[..., None, :]
+        return share[..., None, None] * (outer + outer.transpose(-1, -2) - along)
 
     def _weight_stiffness(self, inertia: Inertia, start: _Configuration, gravity: Tensor) -> Tensor:
         """K of the weight at the start, without a graph, [B, 6 + J, 6 + J]."""

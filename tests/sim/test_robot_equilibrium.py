@@ -161,7 +161,7 @@ def test_a_batch_of_arms_has_the_bits_of_each(arm):
 
 
 def test_a_rollout_ends_there(arm):
-    """But for what a step adds to the weight, which is of the order of its length squared."""
+    """At any time step: velocity products of a fall had moved its end by the order of h squared."""
     errors = []
     for dt in (0.02, 0.01):
         robot = arm(stiffness=4.0, damping=0.5)
@@ -173,8 +173,7 @@ def test_a_rollout_ends_there(arm):
         with torch.no_grad():
             end = sim.rollout(sim.initial_state(), parameters=given, steps=int(4 / dt))[-1]
         errors.append(float((end.joint_positions - found.joint_positions).abs().max()))
-    assert errors[1] < 1e-4
-    assert errors[0] / errors[1] > 2.5
+    assert max(errors) < 1e-7
 
 
 def test_a_hand_rests_on_a_floor():
@@ -188,7 +187,8 @@ def test_a_hand_rests_on_a_floor():
     found = sim.equilibrium(sim.initial_state())
     weight = float(sim.parameters().link_mass.sum()) * 9.81
     force = found.body_forces[sim.slices["floor"]].sum(0)
-    torch.testing.assert_close(force, torch.tensor([0, 0, -weight], dtype=F64), rtol=0, atol=1e-6)
+    expected = torch.tensor([0, 0, -weight], dtype=F64)
+    torch.testing.assert_close(force, expected, rtol=0, atol=1e-6 * weight)
     with torch.no_grad():
         end = sim.rollout(sim.initial_state(), steps=600)[-1]
     torch.testing.assert_close(found.base_poses, end.base_poses, rtol=0, atol=1e-6)
