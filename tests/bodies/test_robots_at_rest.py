@@ -111,6 +111,39 @@ def test_a_floor_carries_a_limp_arm(tmp_path, dt):
     assert found == pytest.approx(G * arm / (elbow + 0.2 * fore), rel=1e-6)
 
 
+@pytest.mark.parametrize("dt", [0.02, 0.005])
+def test_drives_on_a_base_that_stands_carry_the_weight(tmp_path, dt):
+    """It floats, and falls as a whole; its floor holds it."""
+    file = write(tmp_path, ["revolute", "revolute"], rpy="0 0 0")
+    foot = """<link name="base"><inertial><mass value="5"/>
+      <inertia ixx="1e-2" iyy="1e-2" izz="1e-2" ixy="0" ixz="0" iyz="0"/></inertial>
+      <collision><geometry><box size="0.3 0.2 0.1"/></geometry></collision></link>"""
+    file.write_text(file.read_text().replace('<link name="base"/>', foot))
+    wanted = {"joint0": 0.3, "joint1": 0.5}
+    robot = dc.Robot.load(
+        file,
+        base="floating",
+        pose=[0, 0, 0.0515, 1, 0, 0, 0],
+        stiffness=100.0,
+        damping=5.0,
+        joint_positions=wanted,
+        name="arm",
+    )
+    contact = dc.ContactOptions(barrier_distance=2e-3)
+    solver = dc.SolverOptions(tolerance=1e-9)
+    floor = dc.RigidBody.plane(2.0)
+    sim = dc.Simulator(dc.Scene([], [floor], [robot]), dt, contact=contact, solver=solver)
+    state = rest(sim, sim.control(joint_positions=torch.tensor([0.3, 0.5], dtype=F64)), 6)
+    assert state.joint_velocities.abs().max() < 1e-8
+    real, _, pitch, _ = state.base_poses.reshape(-1)[3:].tolist()
+    a = 2 * math.atan2(pitch, real) + state.joint_positions[0].item()
+    b = a + state.joint_positions[1].item()
+    elbow = -0.4 * G * 0.1 * math.cos(b)
+    shoulder = elbow - G * (0.5 * 0.1 + 0.4 * 0.2) * math.cos(a)
+    expected = torch.tensor([shoulder, elbow], dtype=F64)
+    torch.testing.assert_close(state.joint_efforts, expected, rtol=1e-6, atol=0)
+
+
 @pytest.mark.parametrize("gravity", [(0, 0, 0), (0, 0, -G)], ids=["none", "weight"])
 @pytest.mark.parametrize("moving", [False, True], ids=["rests", "moves"])
 def test_gradients_are_those_of_differences(tmp_path, gravity, moving):
