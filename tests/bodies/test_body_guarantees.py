@@ -114,7 +114,7 @@ def test_a_box_thrown_at_a_curtain_never_passes_through(coupling, pins, mass, sp
         # At 100 m/s the cloth may spin it beyond what a step takes.
         assert not refused or speed == 100.0
         # The cloth is 15 times as heavy: it stops the box.
-        assert states[-1].body_velocities[0, 0] < 0.5 * speed
+        assert refused or states[-1].body_velocities[0, 0] < 0.5 * speed
 
 
 @pytest.mark.parametrize("effort", [2.0, 50.0])
