@@ -306,8 +306,7 @@ using FreeBodies = std::vector<const bodies::Mechanisms::FreeBody*>;
 /// Leave out those that meet something on the straight motion from where the walk stands.
 void leave_out_meeting(Walk& walk, const std::vector<double>& to, FreeBodies& bodies) {
   if (walk.f.contact == nullptr || bodies.empty()) return;
-  walk.watch(to);
-  const std::vector<char> meets = walk.f.contact->meeting(walk.x().data(), to.data());
+  const std::vector<char> meets = walk.meeting(to);
   std::erase_if(bodies, [&](const auto* body) {
     return std::ranges::any_of(body->surfaces, [&](Index s) { return meets[s] != 0; });
   });

@@ -81,6 +81,13 @@ class Walk {
     return f.contact->safe_fraction(x_.data(), to.data());
   }
 
+  /// The surfaces that meet something on the straight motion to a point; what is watched is that motion.
+  std::vector<char> meeting(const std::vector<double>& to) {
+    const Stopwatch::Scope scope(*context.watch, Phase::kDetection);
+    f.contact->watch(x_.data(), to.data());
+    return f.contact->meeting(x_.data(), to.data());
+  }
+
   /// Go along a change of all points, by the fraction alpha or less, as far as the straight motion of
   /// every point to where it ends is free of collisions; what is watched is that motion.
   ///
