@@ -216,17 +216,12 @@ class RobotDynamics:
         solved = [i for i in range(ROOT + joints) if i < ROOT or not prescribed[i - ROOT]]
         self._solved = torch.tensor([i for i in solved if i >= first], dtype=torch.long)
         self._unknown = self._solved - first
-        # Radians of the links by each joint; those of prismatic ones are none.
-        turns = np.zeros(joints)
-        for kind, dof, multiplier in zip(
-            mechanism.kind, mechanism.dof, mechanism.multiplier, strict=True
-        ):
-            if kind == "revolute" and dof >= 0:
-                turns[dof] = max(turns[dof], abs(multiplier))
-        self._turns = torch.from_numpy(turns) * ~self._prescribed
+        # Radians of each link by the joints that forces move, [A, J].
+        kinematics = self._kinematics
+        self._turns = kinematics.revolute * kinematics.leaders[0].abs() * ~self._prescribed
         # Joints whose fall turns links. What floats falls as a whole, without turning.
-        turning = [ROOT + j for j in np.flatnonzero(turns * ~prescribed) if not self._floats]
-        self._turning = torch.tensor(turning, dtype=torch.long)
+        turning = ROOT + torch.nonzero(self._turns.any(0))[:, 0]
+        self._turning = turning[:0] if self._floats else turning
         self._free_motion = robot_motion(mechanism, self._solved, dt)
         self._weight = weight
         self._weight_bound = WeightBound(self._kinematics) if weight == "bounded" else None
@@ -580,7 +575,7 @@ class RobotDynamics:
         """Largest turn that a floating base or a joint makes by itself in a step [rad], [B]."""
         velocity = plain(velocity)
         of_base = velocity[..., 3:ROOT].norm(dim=-1) * self._floats
-        of_joints = (self._turns * velocity[..., ROOT:]).abs()
+        of_joints = times(self._turns, velocity[..., ROOT:]).abs()
         return self._dt * torch.cat([of_base[..., None], of_joints], dim=-1).amax(dim=-1)
 
     def too_fast(self, prediction: RobotPrediction) -> dict[int, str]:
