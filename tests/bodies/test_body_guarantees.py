@@ -113,8 +113,10 @@ def test_a_box_thrown_at_a_curtain_never_passes_through(coupling, pins, mass, sp
     if coupling == "monolithic" and mass == 0.002:
         # At 100 m/s the cloth may spin it beyond what a step takes.
         assert not refused or speed == 100.0
-        # The cloth is 15 times as heavy: it stops the box.
-        assert refused or states[-1].body_velocities[0, 0] < 0.5 * speed
+        # The cloth is 15 times as heavy: it stops the box, if that has come there.
+        came = states[-1].body_poses[0, 0] > states[0].body_poses[0, 0]
+        assert came or refused
+        assert not came or states[-1].body_velocities[0, 0] < 0.5 * speed
 
 
 @pytest.mark.parametrize("effort", [2.0, 50.0])
