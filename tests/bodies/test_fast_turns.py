@@ -246,6 +246,22 @@ ARM = """
 """
 
 
+@pytest.mark.parametrize("elbow", [-0.3, 0.5, 1.0])
+@pytest.mark.parametrize("turn", [0.5, 1.0, 1.5])
+def test_an_arm_that_spins_freely_keeps_its_energy(tmp_path, turn, elbow):
+    file = tmp_path / "arm.urdf"
+    file.write_text(ARM)
+    arm = dc.Robot.load(file, actuation="torque", name="arm")
+    contact = dc.ContactOptions(barrier_distance=1e-3)
+    sim = dc.Simulator(dc.Scene([], [], [arm], gravity=(0, 0, 0)), 0.01, contact=contact)
+    rates = torch.tensor([turn / sim.dt, elbow * turn / sim.dt], dtype=F64)
+    start = sim.initial_state().replace(joint_velocities=rates)
+    with torch.no_grad():
+        states = sim.rollout(start, steps=40)
+    energies = torch.stack([sim.kinetic_energy(state) for state in states])
+    assert (energies / sim.kinetic_energy(start) - 1).abs().max() < 0.012
+
+
 @pytest.mark.parametrize("coupling", ["monolithic", "rigid_to_cloth", "cloth_to_rigid"])
 def test_a_robot_that_is_too_fast_by_itself_is_a_value_of_its_environment(tmp_path, coupling):
     """It raised for the whole batch."""
