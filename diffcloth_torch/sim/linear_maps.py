@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from diffcloth_torch.checks import is_dense
 from diffcloth_torch.errors import InvalidInput
@@ -47,8 +48,7 @@ def apply_map(
 ) -> tuple[Tensor, ...]:
     """Results for vectors, which a `vmap` may give an axis more."""
     if not any(map(torch._C._functorch.is_legacy_batchedtensor, vectors)):
-        results: tuple[Tensor, ...] = _Apply.apply(linear, *saved, *vectors)
-        return results
+        return _apply(linear, *saved, *vectors)
     # `is_grads_batched` and vectorized Jacobians still use the older vmap, which knows no rule of
     # a Function: take its batch axis off and put it on again.
     level = vmap_level()
@@ -57,10 +57,22 @@ def apply_map(
         for v in vectors
         if torch._C._functorch.is_legacy_batchedtensor(v)
     )
-    results = _Apply.apply(
+    results = _apply(
         linear, *saved, *(torch._remove_batch_dim(v, level, count, 0) for v in vectors)
     )
     return tuple(torch._add_batch_dim(result, 0, level) for result in results)
+
+
+def _apply(linear: LinearMap, *tensors: Tensor) -> tuple[Tensor, ...]:
+    """Results that know what they depend on, unless nothing can differentiate them."""
+    is_watched = (
+        torch.is_grad_enabled()
+        or forward_ad._current_level >= 0
+        or torch._C._are_functorch_transforms_active()
+    )
+    apply = _Apply.apply if is_watched else _Apply.forward
+    results: tuple[Tensor, ...] = apply(linear, *tensors)
+    return results
 
 
 def vmap_level() -> int:
