@@ -140,33 +140,6 @@ void scatter_geometry(const Element& element,
   }
 }
 
-/// The 3x3 matrix W_p with w = sum_p W_p R^T dx_p.
-Mat3 rotation_block(const Frame& frame, const mesh::ShapeGradient& g, Index p) {
-  const Vec2 h = frame.S_inv * g.row(p).transpose();
-  Mat3 W;
-  W << 0.0, 0.0, h(1), 0.0, 0.0, -h(0), -g(p, 1) / frame.t, g(p, 0) / frame.t, 0.0;
-  return W;
-}
-
-using BaseBlocks = std::array<std::array<Mat3, 3>, 3>;
-
-/// Blocks [p][q] among the base triangle, in the body frame, of the part that the second derivative
-/// of the frame contributes.
-BaseBlocks geometric_blocks(const Element& element, const BodyState& state) {
-  const Mat3 torque = geometric_torque(element, state);
-  BaseBlocks blocks;
-  for (Index q = 0; q < 3; ++q) {
-    const Mat3 W = rotation_block(state.frame, *element.g, q);
-    for (int k = 0; k < 3; ++k) {
-      Mat32 K = Mat32::Zero();
-      K.row(k) = element.g->row(q);
-      const Mat32 V = frame_stress_geometric(state, torque, K, W.col(k));
-      for (Index p = 0; p < 3; ++p) blocks[p][q].col(k) = V * element.g->row(p).transpose();
-    }
-  }
-  return blocks;
-}
-
 }  // namespace
 
 Mat3 body_curvature(const Element& element, const double* x) {
@@ -179,81 +152,16 @@ double energy(const Element& element, const double* x) {
   return 0.5 * element.weight * (s * element.form).cwiseProduct(s).sum();
 }
 
-double energy_change(const Element& element, const double* x0, const double* x1) {
+double flat_energy_change(const Element& element, const double* x0, const double* x1) {
   const Mat3 Y0 = second_derivatives(element, x0);
   const Mat3 dY = second_derivatives_change(element, x0, x1);
-  const Mat3 Q = element.weight * element.form;
-  if (element.flat) return 0.5 * ((2.0 * Y0 + dY) * Q).cwiseProduct(dY).sum();
-
-  const Mat3 R0 = frame(base_gradient(element, x0)).R;
-  const Mat3 R1 = frame(base_gradient(element, x1)).R;
-  const auto term = [&](const Mat3& b) {
-    const Mat3 s0 = Y0 - R0 * b;
-    const Mat3 ds = dY - (R1 - R0) * b;
-    return 0.5 * ((2.0 * s0 + ds) * Q).cwiseProduct(ds).sum();
-  };
-  double change = term(*element.b);
-  if (element.damping != 0.0) change += element.damping * term(*element.b_n);
-  return change;
+  return 0.5 * element.weight * ((2.0 * Y0 + dY) * element.form).cwiseProduct(dY).sum();
 }
 
-void add_gradient(const Element& element, const double* x, double* g) {
-  if (element.flat) {
-    const Mat3 q = second_derivatives(element, x) * (element.weight * element.form);
-    for (Index i = 0; i < element.size(); ++i) {
-      Eigen::Map<Vec3>(g + 3 * element.vertices[i]) += q * element.weights(i);
-    }
-    return;
-  }
-  const BodyState state = body_state(element, x);
-  const Mat3& R = state.frame.R;
-  scatter(element, R * state.q_total(), R * frame_stress(state), g);
-}
-
-// With J_i(ab) = c_ab,i I + [b_ab]x W_i the derivative of s_ab, Gauss-Newton's block in the body
-// frame is, for each of the two terms of the energy,
-//
-//   sum Q_ab,cd J_i(ab)^T J_j(cd) = (c_i^T Q c_j) I + [m_i]x W_j - W_i^T [m_j]x + W_i^T B W_j,
-//   m_i = b Q c_i,   B = tr(b Q b^T) I - b Q b^T.
-void add_hessian(const Element& element,
-                 std::span<const Index> slots,
-                 const double* x,
-                 bool positive,
-                 double* blocks) {
-  const BodyState state = body_state(element, x);
-  const Mat3& R = state.frame.R;
-  const Mat3& b = *element.b;
-  Mat3 bQ = b * state.Q;
-  Mat3 B = -bQ * b.transpose();
-  if (element.damping != 0.0) {
-    const Mat3 bQ_n = element.damping * *element.b_n * state.Q;
-    B -= bQ_n * element.b_n->transpose();
-    bQ += bQ_n;
-  }
-  B.diagonal().array() -= B.trace();
-
-  std::array<Mat3, 3> W;
-  for (Index p = 0; p < 3; ++p) W[p] = rotation_block(state.frame, *element.g, p);
-  BaseBlocks geometric;
-  if (!positive) geometric = geometric_blocks(element, state);
-
+void add_flat_gradient(const Element& element, const double* x, double* g) {
+  const Mat3 q = second_derivatives(element, x) * (element.weight * element.form);
   for (Index i = 0; i < element.size(); ++i) {
-    const Vec3 Qc = (1.0 + element.damping) * (state.Q * element.weights(i));
-    const Mat3 m_i = cross_matrix(bQ * element.weights(i));
-    for (Index j = 0; j <= i; ++j) {
-      Mat3 block = Qc.dot(element.weights(j)) * Mat3::Identity();
-      if (j < 3) {
-        block += m_i * W[j];
-        if (i < 3) {
-          const Mat3 m_j = cross_matrix(bQ * element.weights(j));
-          block += W[i].transpose() * (B * W[j] - m_j);
-          if (!positive) block += geometric[i][j];
-        }
-        block = R * block * R.transpose();
-      }
-      linalg::add_block(blocks, slots[linalg::lower(i, j)],
-                        element.vertices[i] < element.vertices[j], block);
-    }
+    Eigen::Map<Vec3>(g + 3 * element.vertices[i]) += q * element.weights(i);
   }
 }
 
@@ -269,7 +177,7 @@ void add_constant(const Element& element, std::span<const Index> slots, double* 
 
 void add_hessian_product(const Element& element, const double* x, const double* z, double* y) {
   if (element.flat) {
-    add_gradient(element, z, y);  // linear
+    add_flat_gradient(element, z, y);  // linear
     return;
   }
   const BodyState state = body_state(element, x);

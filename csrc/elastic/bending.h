@@ -37,22 +37,16 @@ Mat3 body_curvature(const Element& element, const double* x);
 /// Energy without damping.
 double energy(const Element& element, const double* x);
 
-/// Energy at x1 minus energy at x0, damping included, from differences of positions.
-double energy_change(const Element& element, const double* x0, const double* x1);
+// The energy of elements that are not flat, its gradient and its Hessian are in bending_lanes.h.
 
-/// g += the gradient.
-void add_gradient(const Element& element, const double* x, double* g);
+/// Energy of a flat element at x1 minus that at x0, from differences of positions.
+double flat_energy_change(const Element& element, const double* x0, const double* x1);
 
-/// blocks += the Hessian of an element that is not flat. The projected one is Gauss-Newton's.
-///
-/// @param slots  of the lower-triangle pairs of the element's vertices
-void add_hessian(const Element& element,
-                 std::span<const Index> slots,
-                 const double* x,
-                 bool positive,
-                 double* blocks);
+/// g += the gradient of a flat element.
+void add_flat_gradient(const Element& element, const double* x, double* g);
 
-/// constant[slot] += weight c_i^T Q c_j: the Hessian of a flat element is this times I.
+/// constant[slot] += weight c_i^T Q c_j: the Hessian of a flat element is this times I, and that of another one,
+/// without damping, has this much of I.
 void add_constant(const Element& element, std::span<const Index> slots, double* constant);
 
 /// y += H z.

@@ -103,11 +103,17 @@ std::size_t bytes(const std::vector<T>& values) {
 
 std::size_t bytes(const Prepared& p) {
   return bytes(p.bending) + bytes(p.form) + bytes(p.damping) + bytes(p.flat) +
-         bytes(p.curvature_n) + bytes(p.constant) + bytes(p.stretch) + bytes(p.orthotropic);
+         bytes(p.curvature_n) + bytes(p.constant) + bytes(p.identity) + bytes(p.stretch) +
+         bytes(p.bent.batches) + bytes(p.bent.points) + bytes(p.orthotropic);
 }
 
-const StretchKernels& kernels() {
+const StretchKernels& stretch_here() {
   static const StretchKernels& best = stretch_kernels(linalg::best_level());
+  return best;
+}
+
+const BendingKernels& bending_here() {
+  static const BendingKernels& best = bending_kernels(linalg::best_level());
   return best;
 }
 
@@ -115,8 +121,13 @@ const StretchKernels& kernels() {
 /// rounding that turn cloth: each element by itself has none.
 constexpr double kStiffest = 1e8;
 
-bool is_by_matrix(const Model& model, Index e) {
-  return model.prepared->by_matrix && model.prepared->flat[e] != 0;
+/// Visit the elements that are flat and not of the matrix.
+template <class Visit>
+void for_stiff_elements(const Model& model, Visit&& visit) {
+  if (model.prepared->by_matrix) return;
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    if (model.prepared->flat[e] != 0) visit(bending_element(model, e));
+  }
 }
 
 }  // namespace
@@ -190,13 +201,13 @@ void prepare(Model& model, const Slots& slots) {
   prepared.constant.assign(slots.block_count, 0.0);
   prepare_stretch(model, slots, prepared);
   prepared.by_matrix = true;
-  prepared.bends = false;
   prepared.damped = false;
   for (Index f = 0; f < face_count(model); ++f) prepared.damped |= is_damped(model, f);
   if (prepared.damped && (model.x_n == nullptr || !(model.h > 0.0))) {
     throw std::invalid_argument("elastic: damping needs the start of the step and a time step > 0");
   }
 
+  std::vector<Index> bent;
   for (Index e = 0; e < element_count; ++e) {
     prepare_form(model, e, prepared);
     const double damping = element_mean(model, e, model.damping);
@@ -206,7 +217,7 @@ void prepare(Model& model, const Slots& slots) {
     if (element.flat) {
       bending::add_constant(element, bending_slots(slots, e), prepared.constant.data());
     } else {
-      prepared.bends = true;
+      bent.push_back(e);
     }
     if (damping != 0.0) {
       prepared.curvature_n[e] = bending::body_curvature(element, model.x_n);
@@ -214,7 +225,13 @@ void prepare(Model& model, const Slots& slots) {
   }
   const double stiffest = prepared.constant.empty() ? 0.0 : std::ranges::max(prepared.constant);
   prepared.by_matrix = stiffest <= kStiffest * model.least_inertia;
-  prepared.bends |= !prepared.by_matrix;
+  prepared.identity = prepared.constant;
+  for (const Index e : bent) {
+    bending::Element element = bending_element(model, e);
+    element.weight *= 1.0 + element.damping;
+    bending::add_constant(element, bending_slots(slots, e), prepared.identity.data());
+  }
+  prepared.bent = bending_batches(model, slots, std::move(bent));
 }
 
 void PreparedCache::prepare(Model& model, const Slots& slots) {
@@ -276,7 +293,8 @@ double bending_energy(const Model& model, const double* x) {
 
 double energy_change(const Model& model, const double* x0, const double* x1) {
   const Prepared& prepared = *model.prepared;
-  double total = kernels().energy_change(prepared.stretch.data(), prepared.stretch.size(), x0, x1);
+  double total =
+      stretch_here().energy_change(prepared.stretch.data(), prepared.stretch.size(), x0, x1);
   for (const Index f : prepared.orthotropic) {
     total += orthotropic::energy_change(weave(model, f).scaled(model.rest->area[f]),
                                         face_gradient(model, f, x0), face_gradient(model, f, x1),
@@ -288,15 +306,17 @@ double energy_change(const Model& model, const double* x0, const double* x1) {
         model, f, face_gradient(model, f, x0), face_gradient(model, f, x1),
         face_gradient_change(model, f, x0, x1), face_gradient(model, f, model.x_n));
   }
-  for (Index e = 0; prepared.bends && e < model.stencils->size(); ++e) {
-    if (!is_by_matrix(model, e)) total += bending::energy_change(bending_element(model, e), x0, x1);
-  }
+  total += bending_here().energy_change(prepared.bent.batches.data(), prepared.bent.batches.size(),
+                                        prepared.bent.points.data(), x0, x1);
+  for_stiff_elements(model, [&](const bending::Element& element) {
+    total += bending::flat_energy_change(element, x0, x1);
+  });
   return total;
 }
 
 void add_gradient(const Model& model, const double* x, double* g) {
   const Prepared& prepared = *model.prepared;
-  kernels().add_gradient(prepared.stretch.data(), prepared.stretch.size(), x, g);
+  stretch_here().add_gradient(prepared.stretch.data(), prepared.stretch.size(), x, g);
   for (const Index f : prepared.orthotropic) {
     scatter(model, f, stretch_stress(model, f, face_gradient(model, f, x)), g);
   }
@@ -307,9 +327,10 @@ void add_gradient(const Model& model, const double* x, double* g) {
         damping_stress(model, f, face_gradient(model, f, x), face_gradient(model, f, model.x_n)),
         g);
   }
-  for (Index e = 0; prepared.bends && e < model.stencils->size(); ++e) {
-    if (!is_by_matrix(model, e)) bending::add_gradient(bending_element(model, e), x, g);
-  }
+  bending_here().add_gradient(prepared.bent.batches.data(), prepared.bent.batches.size(),
+                              prepared.bent.points.data(), x, g);
+  for_stiff_elements(
+      model, [&](const bending::Element& element) { bending::add_flat_gradient(element, x, g); });
 }
 
 void add_hessian(const Model& model,
@@ -322,13 +343,13 @@ void add_hessian(const Model& model,
   const Prepared& prepared = *model.prepared;
   for (Index slot = 0; slot < slots.block_count; ++slot) {
     double* block = blocks + 9 * static_cast<std::ptrdiff_t>(place[slot]);
-    const double value = prepared.constant[slot];
+    const double value = prepared.identity[slot];
     block[0] += value;
     block[4] += value;
     block[8] += value;
   }
-  kernels().add_hessian(prepared.stretch.data(), prepared.stretch.size(), x, positive, place.data(),
-                        blocks);
+  stretch_here().add_hessian(prepared.stretch.data(), prepared.stretch.size(), x, positive,
+                             place.data(), blocks);
   const auto add_face = [&](Index f, const std::array<Mat3, 6>& element) {
     add_face_blocks(model.topology->faces[f],
                     slots.stretch.data() + 6 * static_cast<std::ptrdiff_t>(f), place, element,
@@ -344,13 +365,8 @@ void add_hessian(const Model& model,
     add_face(f, damping_hessian(model, f, face_gradient(model, f, x),
                                 face_gradient(model, f, model.x_n), positive));
   }
-  std::vector<Index> places;
-  for (Index e = 0; prepared.bends && e < model.stencils->size(); ++e) {
-    if (prepared.flat[e] != 0) continue;
-    places.clear();
-    for (const Index slot : bending_slots(slots, e)) places.push_back(place[slot]);
-    bending::add_hessian(bending_element(model, e), places, x, positive, blocks);
-  }
+  bending_here().add_hessian(prepared.bent.batches.data(), prepared.bent.batches.size(),
+                             prepared.bent.points.data(), x, positive, place.data(), blocks);
 }
 
 std::vector<Mat2> extrapolated_stresses(const Model& model, const double* x, const double* to) {

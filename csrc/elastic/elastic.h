@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "common/types.h"
+#include "elastic/bending_batches.h"
 #include "elastic/stretch_lanes.h"
 #include "linalg/block_pattern.h"
 #include "mesh/rest_shape.h"
@@ -54,11 +55,12 @@ struct Prepared {
   std::vector<std::uint8_t> flat;     ///< [B] no rest curvature and no damping: a constant Hessian
   std::vector<Mat3> curvature_n;      ///< [B] body-frame curvature at x_n, where damped
   std::vector<double> constant;       ///< [slots] sum of the flat elements' Hessians, times I
+  std::vector<double> identity;       ///< [slots] the same of what all elements' have of I
   std::vector<StretchBatch> stretch;  ///< of isotropic faces
+  BendingBatches bent;                ///< elements that are not flat
   std::vector<Index> orthotropic;     ///< all others, ascending
   bool damped = false;                ///< some face has damping
   bool by_matrix = true;  ///< energy and gradient of flat elements are those of their matrix
-  bool bends = false;     ///< some element is evaluated by itself
 };
 
 /// The elastic energy of all cloths and its damping over one step.

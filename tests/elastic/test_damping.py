@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from elastic_meshes import STEP, differences, grid, model, on_cylinder, rigid
 
+from diffcloth_torch import _kernels
+
 PARAMETERS = {"stretch": 100.0, "bending": 0.5, "poisson": 0.3}
 DAMPING = 0.02  # [s], of the order of the time step
 RNG = np.random.default_rng(6)
@@ -78,3 +80,21 @@ def test_damping_without_a_time_step_is_refused():
     one = np.ones(len(faces))
     with pytest.raises(ValueError, match="damping needs the start of the step"):
         elastic.set_parameters(one, one, 0 * one, one, 0.0, X)
+
+
+@pytest.mark.parametrize("bending_model", MODELS)
+@pytest.mark.parametrize("positive", [False, True])
+def test_instructions_do_not_change_a_bit(positive, bending_model):
+    """Bent at rest, degenerate; of several sizes, with a batch that is not full of each."""
+    X, faces = rests(True)
+    x_n = X + 0.1 * RNG.normal(size=X.shape)
+    x0 = x_n + 0.1 * RNG.normal(size=X.shape)
+    x0[1] = x0[0]
+    x1 = x0 + 0.1 * RNG.normal(size=X.shape)
+    damped = model(X, faces, bending_model, damping=DAMPING, x_n=x_n, **PARAMETERS)
+    results = [damped.bending(level, x0, x1, positive) for level in _kernels.kernel_levels()]
+    assert np.abs(results[0][2]).max() > 0.0
+    for change, gradient, blocks in results[1:]:
+        assert change == results[0][0]
+        np.testing.assert_array_equal(gradient, results[0][1])
+        np.testing.assert_array_equal(blocks, results[0][2])

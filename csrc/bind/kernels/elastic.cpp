@@ -194,6 +194,25 @@ class Elastic {
         rows_array(g), owned(blocks.data(), {blocks.size() / 9, 9}));
   }
 
+  /// The same of bending that is not flat; the Hessian's blocks without their multiples of the identity.
+  nb::tuple bending(const std::string& level,
+                    const Positions& x0,
+                    const Positions& x1,
+                    bool positive) const {
+    const elastic::BendingKernels& kernels = elastic::bending_kernels(level_named(level));
+    const auto& [batches, points] = model_.prepared->bent;
+    const std::vector<double> from = positions("x0", x0);
+    const std::vector<double> to = positions("x1", x1);
+    std::vector<double> g(from.size(), 0.0);
+    std::vector<double> blocks(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
+    kernels.add_gradient(batches.data(), batches.size(), points.data(), from.data(), g.data());
+    kernels.add_hessian(batches.data(), batches.size(), points.data(), from.data(), positive,
+                        own_places().data(), blocks.data());
+    return nb::make_tuple(kernels.energy_change(batches.data(), batches.size(), points.data(),
+                                                from.data(), to.data()),
+                          rows_array(g), owned(blocks.data(), {blocks.size() / 9, 9}));
+  }
+
   /// (row, column) of every block, in the order of hessian_blocks().
   IndexArray block_pairs() const {
     std::vector<std::int32_t> pairs;
@@ -482,6 +501,8 @@ void elastic_kernels(nb::module_& m) {
            "bending"_a.noconvert(), "poisson"_a.noconvert(), "damping"_a.noconvert(), "h"_a,
            "x_n"_a.noconvert().none())
       .def("stretch", &Elastic::stretch, "level"_a, "x0"_a.noconvert(), "x1"_a.noconvert(),
+           "positive"_a = false)
+      .def("bending", &Elastic::bending, "level"_a, "x0"_a.noconvert(), "x1"_a.noconvert(),
            "positive"_a = false)
       .def("extrapolated_hessian", &Elastic::extrapolated_hessian, "x0"_a.noconvert(),
            "x"_a.noconvert(), "positive"_a)

@@ -1,0 +1,541 @@
+// The arithmetic of BendingKernels, written once: see stretch_lanes_impl.h.
+
+#pragma once
+
+#include <cstddef>
+
+#include "elastic/bending_lanes.h"
+#include "elastic/polar_lanes_impl.h"
+
+// NOLINTBEGIN(modernize-avoid-c-arrays)
+
+#define DIFFCLOTH_INLINE inline __attribute__((always_inline))
+
+namespace diffcloth::elastic {
+namespace {
+
+constexpr int kLanes = kBendingLanes;
+
+/// N numbers of each lane.
+template <int N>
+struct Lanes {
+  alignas(64) double at[N][kLanes];
+};
+
+/// A vector of one lane.
+struct Vector {
+  double at[3];
+};
+
+DIFFCLOTH_INLINE Vector cross(const Vector& a, const Vector& b) {
+  return {{a.at[1] * b.at[2] - a.at[2] * b.at[1], a.at[2] * b.at[0] - a.at[0] * b.at[2],
+           a.at[0] * b.at[1] - a.at[1] * b.at[0]}};
+}
+
+template <int N>
+DIFFCLOTH_INLINE Vector vector_at(const double (&values)[N][kLanes], int column, int l) {
+  return {{values[3 * column][l], values[3 * column + 1][l], values[3 * column + 2][l]}};
+}
+
+template <int N>
+DIFFCLOTH_INLINE void put(const Vector& v, int column, int l, double (&values)[N][kLanes]) {
+  for (int k = 0; k < 3; ++k) values[3 * column + k][l] = v.at[k];
+}
+
+/// weight Q of one lane.
+struct Form {
+  double at[3][3];
+};
+
+DIFFCLOTH_INLINE Form form_of(const BendingBatch& batch, int l) {
+  const double (&Q)[6][kLanes] = batch.Q;
+  return {{{Q[0][l], Q[1][l], Q[3][l]}, {Q[1][l], Q[2][l], Q[4][l]}, {Q[3][l], Q[4][l], Q[5][l]}}};
+}
+
+/// Columns of a 3x3 matrix of one lane.
+struct Matrix {
+  Vector column[3];
+};
+
+template <int N>
+DIFFCLOTH_INLINE Matrix matrix_at(const double (&values)[N][kLanes], int l) {
+  return {{vector_at(values, 0, l), vector_at(values, 1, l), vector_at(values, 2, l)}};
+}
+
+/// scale M Q
+DIFFCLOTH_INLINE Matrix times_form(double scale, const Matrix& M, const Form& Q) {
+  Matrix result;
+  for (int a = 0; a < 3; ++a) {
+    for (int k = 0; k < 3; ++k) {
+      result.column[a].at[k] =
+          scale * (M.column[0].at[k] * Q.at[0][a] + M.column[1].at[k] * Q.at[1][a] +
+                   M.column[2].at[k] * Q.at[2][a]);
+    }
+  }
+  return result;
+}
+
+DIFFCLOTH_INLINE Matrix difference(const Matrix& a, const Matrix& b) {
+  Matrix result;
+  for (int c = 0; c < 3; ++c) {
+    for (int k = 0; k < 3; ++k) result.column[c].at[k] = a.column[c].at[k] - b.column[c].at[k];
+  }
+  return result;
+}
+
+DIFFCLOTH_INLINE Matrix sum(const Matrix& a, const Matrix& b) {
+  Matrix result;
+  for (int c = 0; c < 3; ++c) {
+    for (int k = 0; k < 3; ++k) result.column[c].at[k] = a.column[c].at[k] + b.column[c].at[k];
+  }
+  return result;
+}
+
+/// R M with the columns r1, r2, n of R.
+DIFFCLOTH_INLINE Matrix turned(const Matrix& R, const Matrix& M) {
+  Matrix result;
+  for (int a = 0; a < 3; ++a) {
+    const Vector& m = M.column[a];
+    for (int k = 0; k < 3; ++k) {
+      result.column[a].at[k] =
+          R.column[0].at[k] * m.at[0] + R.column[1].at[k] * m.at[1] + R.column[2].at[k] * m.at[2];
+    }
+  }
+  return result;
+}
+
+/// R^T M
+DIFFCLOTH_INLINE Matrix turned_back(const Matrix& R, const Matrix& M) {
+  Matrix result;
+  for (int a = 0; a < 3; ++a) {
+    for (int k = 0; k < 3; ++k) result.column[a].at[k] = dot(R.column[k].at, M.column[a].at);
+  }
+  return result;
+}
+
+DIFFCLOTH_INLINE double inner(const Matrix& a, const Matrix& b) {
+  double result = 0.0;
+  for (int c = 0; c < 3; ++c) result += dot(a.column[c].at, b.column[c].at);
+  return result;
+}
+
+/// Y, and the sides of the base triangle.
+struct Shape {
+  Lanes<9> Y;
+  Lanes<6> sides;
+};
+
+/// Of offsets from the first vertices: offset(v, v0, k) for two vertices and a coordinate.
+template <class Offset>
+DIFFCLOTH_INLINE void gather(const BendingBatch& batch,
+                             const BendingPoint* points,
+                             Offset&& offset,
+                             Shape& shape) {
+  for (int k = 0; k < 9; ++k) {
+    for (int l = 0; l < kLanes; ++l) shape.Y.at[k][l] = 0.0;
+  }
+  const BendingPoint* const first = points + batch.first;
+  for (int i = 1; i < batch.points; ++i) {
+    const BendingPoint& point = first[i];
+    Lanes<3> side;
+    for (int l = 0; l < kLanes; ++l) {
+      for (int k = 0; k < 3; ++k) side.at[k][l] = offset(point.vertex[l], first->vertex[l], k);
+    }
+    for (int a = 0; a < 3; ++a) {
+      for (int k = 0; k < 3; ++k) {
+        for (int l = 0; l < kLanes; ++l) shape.Y.at[3 * a + k][l] += side.at[k][l] * point.c[a][l];
+      }
+    }
+    if (i > 2) continue;
+    for (int k = 0; k < 3; ++k) {
+      for (int l = 0; l < kLanes; ++l) shape.sides.at[3 * (i - 1) + k][l] = side.at[k][l];
+    }
+  }
+}
+
+DIFFCLOTH_INLINE void gather_at(const BendingBatch& batch,
+                                const BendingPoint* points,
+                                const double* x,
+                                Shape& shape) {
+  const auto offset = [x](std::ptrdiff_t v, std::ptrdiff_t v0, int k) {
+    return x[3 * v + k] - x[3 * v0 + k];
+  };
+  gather(batch, points, offset, shape);
+}
+
+DIFFCLOTH_INLINE Polar polar_at(const BendingBatch& batch, const Lanes<6>& sides, int l) {
+  Gradient F;
+  for (int k = 0; k < 3; ++k) {
+    F.a[k] = sides.at[k][l] * batch.g[0][l] + sides.at[3 + k][l] * batch.g[2][l];
+    F.b[k] = sides.at[k][l] * batch.g[1][l] + sides.at[3 + k][l] * batch.g[3][l];
+  }
+  return polar_of(F);
+}
+
+DIFFCLOTH_INLINE Matrix rotation_of(const Polar& polar) {
+  Matrix R;
+  for (int k = 0; k < 3; ++k) {
+    R.column[0].at[k] = polar.r1[k];
+    R.column[1].at[k] = polar.r2[k];
+    R.column[2].at[k] = polar.n[k];
+  }
+  return R;
+}
+
+/// weight / 2 (|s1 Q|^2 - |s0 Q|^2) in world axes, of s = Y - R b.
+DIFFCLOTH_INLINE double change_of_term(const Matrix& Y0,
+                                       const Matrix& dY,
+                                       const Matrix& R0,
+                                       const Matrix& dR,
+                                       const Matrix& b,
+                                       const Form& Q) {
+  const Matrix s0 = difference(Y0, turned(R0, b));
+  const Matrix ds = difference(dY, turned(dR, b));
+  return 0.5 * inner(times_form(1.0, sum(sum(s0, s0), ds), Q), ds);
+}
+
+double energy_change(const BendingBatch* batches,
+                     std::size_t count,
+                     const BendingPoint* points,
+                     const double* x0,
+                     const double* x1) {
+  double total = 0.0;
+  for (const BendingBatch* batch = batches; batch != batches + count; ++batch) {
+    Shape start;
+    Shape end;
+    Shape change;
+    gather_at(*batch, points, x0, start);
+    gather_at(*batch, points, x1, end);
+    const auto moved = [x0, x1](std::ptrdiff_t v, std::ptrdiff_t v0, int k) {
+      return (x1[3 * v + k] - x0[3 * v + k]) - (x1[3 * v0 + k] - x0[3 * v0 + k]);
+    };
+    gather(*batch, points, moved, change);
+    alignas(64) double energy[kLanes];
+    for (int l = 0; l < kLanes; ++l) {
+      const Matrix R0 = rotation_of(polar_at(*batch, start.sides, l));
+      const Matrix R1 = rotation_of(polar_at(*batch, end.sides, l));
+      const Matrix dR = difference(R1, R0);
+      const Matrix Y0 = matrix_at(start.Y.at, l);
+      const Matrix dY = matrix_at(change.Y.at, l);
+      const Form Q = form_of(*batch, l);
+      const double rest = change_of_term(Y0, dY, R0, dR, matrix_at(batch->b, l), Q);
+      const double damped = change_of_term(Y0, dY, R0, dR, matrix_at(batch->b_n, l), Q);
+      energy[l] = rest + batch->damping[l] * damped;
+    }
+    for (int l = 0; l < batch->size; ++l) total += energy[l];
+  }
+  return total;
+}
+
+/// Work conjugates of the curvature in the body frame, of both terms, and the torque on the frame.
+struct Stress {
+  Matrix q, q_n;
+  Vector tau;
+};
+
+DIFFCLOTH_INLINE Stress
+stress_of(const BendingBatch& batch, const Matrix& R, const Matrix& Y, const Form& Q, int l) {
+  const Matrix b = matrix_at(batch.b, l);
+  const Matrix b_n = matrix_at(batch.b_n, l);
+  const Matrix curvature = turned_back(R, Y);
+  Stress result;
+  result.q = times_form(1.0, difference(curvature, b), Q);
+  result.q_n = times_form(batch.damping[l], difference(curvature, b_n), Q);
+  result.tau = {{0.0, 0.0, 0.0}};
+  for (int a = 0; a < 3; ++a) {
+    const Vector of_rest = cross(b.column[a], result.q.column[a]);
+    const Vector of_start = cross(b_n.column[a], result.q_n.column[a]);
+    for (int k = 0; k < 3; ++k) result.tau.at[k] += of_rest.at[k] + of_start.at[k];
+  }
+  return result;
+}
+
+void add_gradient(const BendingBatch* batches,
+                  std::size_t count,
+                  const BendingPoint* points,
+                  const double* x,
+                  double* g) {
+  for (const BendingBatch* batch = batches; batch != batches + count; ++batch) {
+    Shape shape;
+    gather_at(*batch, points, x, shape);
+    Lanes<9> Y_bar;
+    Lanes<6> F_bar;
+    for (int l = 0; l < kLanes; ++l) {
+      const Polar polar = polar_at(*batch, shape.sides, l);
+      const Matrix R = rotation_of(polar);
+      const Stress stress = stress_of(*batch, R, matrix_at(shape.Y.at, l), form_of(*batch, l), l);
+      const Matrix q = turned(R, sum(stress.q, stress.q_n));
+      for (int a = 0; a < 3; ++a) put(q.column[a], a, l, Y_bar.at);
+      const double in_plane = stress.tau.at[2] / polar.t;
+      const double out_1 = polar.s11 * stress.tau.at[1] - polar.s12 * stress.tau.at[0];
+      const double out_2 = polar.s12 * stress.tau.at[1] - polar.s22 * stress.tau.at[0];
+      for (int k = 0; k < 3; ++k) {
+        F_bar.at[k][l] = out_1 * polar.n[k] - in_plane * polar.r2[k];
+        F_bar.at[3 + k][l] = out_2 * polar.n[k] + in_plane * polar.r1[k];
+      }
+    }
+    for (int i = 0; i < batch->points; ++i) {
+      const BendingPoint& point = points[batch->first + i];
+      Lanes<3> force;
+      for (int k = 0; k < 3; ++k) {
+        for (int l = 0; l < kLanes; ++l) {
+          force.at[k][l] = Y_bar.at[k][l] * point.c[0][l] + Y_bar.at[3 + k][l] * point.c[1][l] +
+                           Y_bar.at[6 + k][l] * point.c[2][l];
+        }
+      }
+      if (i < 3) {
+        for (int k = 0; k < 3; ++k) {
+          for (int l = 0; l < kLanes; ++l) {
+            const double g_u = i == 0 ? -(batch->g[0][l] + batch->g[2][l]) : batch->g[2 * i - 2][l];
+            const double g_v = i == 0 ? -(batch->g[1][l] + batch->g[3][l]) : batch->g[2 * i - 1][l];
+            force.at[k][l] += F_bar.at[k][l] * g_u + F_bar.at[3 + k][l] * g_v;
+          }
+        }
+      }
+      for (int l = 0; l < batch->size; ++l) {
+        double* const to = g + 3 * static_cast<std::ptrdiff_t>(point.vertex[l]);
+        for (int k = 0; k < 3; ++k) to[k] += force.at[k][l];
+      }
+    }
+  }
+}
+
+/// What the Hessians of eight elements are made of; vectors are in the body frame unless they say otherwise.
+struct Parts {
+  Lanes<9> R;
+  Lanes<9> bQ;  ///< (b + damping b_n) Q
+  Lanes<9> bQ_world;
+  Lanes<9> C;      ///< B - T
+  Lanes<6> g;      ///< of the corners p, two each
+  Lanes<6> h;      ///< S^-1 g_p
+  Lanes<3> gamma;  ///< g_p . rho with rho = S^-1 (-tau_2, tau_1)
+  Lanes<3> eta;    ///< h_p . (tau_1, tau_2)
+  Lanes<1> inv_t;
+  Lanes<1> in_plane;  ///< tau_3 / t
+  Lanes<9> alpha;     ///< world: A_p = alpha_p n^T + n epsilon_p^T
+  Lanes<9> epsilon;
+};
+
+DIFFCLOTH_INLINE void find_parts(const BendingBatch& batch,
+                                 const Shape& shape,
+                                 bool positive,
+                                 Parts& parts) {
+  const double exact = positive ? 0.0 : 1.0;
+  for (int l = 0; l < kLanes; ++l) {
+    const Polar polar = polar_at(batch, shape.sides, l);
+    const Matrix R = rotation_of(polar);
+    const Form Q = form_of(batch, l);
+    const Stress stress = stress_of(batch, R, matrix_at(shape.Y.at, l), Q, l);
+    const Matrix b = matrix_at(batch.b, l);
+    const Matrix b_n = matrix_at(batch.b_n, l);
+    const Matrix of_rest = times_form(1.0, b, Q);
+    const Matrix of_start = times_form(batch.damping[l], b_n, Q);
+    const Matrix bQ = sum(of_rest, of_start);
+    const Matrix world = turned(R, bQ);
+    // B' + T', and then their traces: T has the other sign.
+    double M[3][3];
+    double trace = 0.0;
+    for (int i = 0; i < 3; ++i) {
+      for (int j = 0; j < 3; ++j) {
+        double gauss_newton = 0.0;
+        double geometric = 0.0;
+        for (int a = 0; a < 3; ++a) {
+          gauss_newton += of_rest.column[a].at[i] * b.column[a].at[j] +
+                          of_start.column[a].at[i] * b_n.column[a].at[j];
+          geometric += stress.q.column[a].at[i] * b.column[a].at[j] +
+                       stress.q_n.column[a].at[i] * b_n.column[a].at[j];
+        }
+        M[i][j] = gauss_newton + exact * geometric;
+      }
+      trace += M[i][i];
+    }
+    for (int j = 0; j < 3; ++j) {
+      put(R.column[j], j, l, parts.R.at);
+      put(bQ.column[j], j, l, parts.bQ.at);
+      put(world.column[j], j, l, parts.bQ_world.at);
+      for (int i = 0; i < 3; ++i) parts.C.at[3 * j + i][l] = (i == j ? trace : 0.0) - M[i][j];
+    }
+    const Vector& tau = stress.tau;
+    const double inv_t = 1.0 / polar.t;
+    parts.inv_t.at[0][l] = inv_t;
+    parts.in_plane.at[0][l] = tau.at[2] * inv_t;
+    const double g[3][2] = {{-(batch.g[0][l] + batch.g[2][l]), -(batch.g[1][l] + batch.g[3][l])},
+                            {batch.g[0][l], batch.g[1][l]},
+                            {batch.g[2][l], batch.g[3][l]}};
+    for (int p = 0; p < 3; ++p) {
+      const double h_u = polar.s11 * g[p][0] + polar.s12 * g[p][1];
+      const double h_v = polar.s12 * g[p][0] + polar.s22 * g[p][1];
+      parts.g.at[2 * p][l] = g[p][0];
+      parts.g.at[2 * p + 1][l] = g[p][1];
+      parts.h.at[2 * p][l] = h_u;
+      parts.h.at[2 * p + 1][l] = h_v;
+      parts.gamma.at[p][l] = h_v * tau.at[0] - h_u * tau.at[1];
+      parts.eta.at[p][l] = h_u * tau.at[0] + h_v * tau.at[1];
+      for (int k = 0; k < 3; ++k) {
+        parts.alpha.at[3 * p + k][l] = h_v * polar.r1[k] - h_u * polar.r2[k];
+        parts.epsilon.at[3 * p + k][l] = (g[p][0] * polar.r2[k] - g[p][1] * polar.r1[k]) * inv_t;
+      }
+    }
+  }
+}
+
+/// (b + damping b_n) Q c of one vertex.
+DIFFCLOTH_INLINE Vector moment(const Lanes<9>& bQ, const BendingPoint& point, int l) {
+  Vector m;
+  for (int k = 0; k < 3; ++k) {
+    m.at[k] = bQ.at[k][l] * point.c[0][l] + bQ.at[3 + k][l] * point.c[1][l] +
+              bQ.at[6 + k][l] * point.c[2][l];
+  }
+  return m;
+}
+
+/// A block of the Hessian column by column.
+using Block = double[9][kLanes];
+
+/// Of corners i and j of the base triangle.
+DIFFCLOTH_INLINE void base_block(
+    const Parts& parts, const BendingPoint* corners, int i, int j, bool positive, Block& block) {
+  const double exact = positive ? 0.0 : 1.0;
+  for (int l = 0; l < kLanes; ++l) {
+    const Vector m_i = moment(parts.bQ, corners[i], l);
+    const Vector m_j = moment(parts.bQ, corners[j], l);
+    const double inv_t = parts.inv_t.at[0][l];
+    const double gi[2] = {parts.g.at[2 * i][l], parts.g.at[2 * i + 1][l]};
+    const double gj[2] = {parts.g.at[2 * j][l], parts.g.at[2 * j + 1][l]};
+    const double hi[2] = {parts.h.at[2 * i][l], parts.h.at[2 * i + 1][l]};
+    const double hj[2] = {parts.h.at[2 * j][l], parts.h.at[2 * j + 1][l]};
+    const double wi[2] = {-gi[1] * inv_t, gi[0] * inv_t};  // the last row of d omega / d x_i
+    const double wj[2] = {-gj[1] * inv_t, gj[0] * inv_t};
+    double M[3][3];
+    // [m_i]x A_j - A_i^T [m_j]x
+    const double corner_i = -(m_i.at[0] * hj[0] + m_i.at[1] * hj[1]);
+    const double corner_j = -(m_j.at[0] * hi[0] + m_j.at[1] * hi[1]);
+    M[0][0] = m_i.at[1] * wj[0] + m_j.at[1] * wi[0];
+    M[0][1] = m_i.at[1] * wj[1] - m_j.at[0] * wi[0];
+    M[1][0] = m_j.at[1] * wi[1] - m_i.at[0] * wj[0];
+    M[1][1] = -(m_i.at[0] * wj[1] + m_j.at[0] * wi[1]);
+    M[0][2] = m_i.at[2] * hj[0];
+    M[1][2] = m_i.at[2] * hj[1];
+    M[2][0] = m_j.at[2] * hi[0];
+    M[2][1] = m_j.at[2] * hi[1];
+    M[2][2] = corner_i + corner_j;
+    // A_i^T C A_j: rows and columns of C that A has.
+    const Matrix C = matrix_at(parts.C.at, l);
+    double CA[3][3];
+    for (int k = 0; k < 3; ++k) {
+      CA[k][0] = C.column[2].at[k] * wj[0];
+      CA[k][1] = C.column[2].at[k] * wj[1];
+      CA[k][2] = C.column[0].at[k] * hj[1] - C.column[1].at[k] * hj[0];
+    }
+    for (int k = 0; k < 3; ++k) {
+      M[0][k] += wi[0] * CA[2][k];
+      M[1][k] += wi[1] * CA[2][k];
+      M[2][k] += hi[1] * CA[0][k] - hi[0] * CA[1][k];
+    }
+    // The second derivative of the rotation.
+    const double in_plane = exact * parts.in_plane.at[0][l];
+    const double gamma_i = exact * parts.gamma.at[i][l];
+    const double gamma_j = exact * parts.gamma.at[j][l];
+    const double eta_i = exact * parts.eta.at[i][l];
+    const double across = in_plane * inv_t * (gi[0] * gj[1] + gi[1] * gj[0]);
+    const double along = in_plane * inv_t * (gi[0] * gj[0] - gi[1] * gj[1]);
+    M[0][0] -= across;
+    M[0][1] += along;
+    M[1][0] += along;
+    M[1][1] += across;
+    M[0][2] += hj[0] * gamma_i;
+    M[1][2] += hj[1] * gamma_i;
+    M[2][0] += gamma_j * hi[0] + eta_i * wj[0];
+    M[2][1] += gamma_j * hi[1] + eta_i * wj[1];
+    M[2][2] -= in_plane * (hj[1] * gi[0] - hj[0] * gi[1]);
+    // R M R^T
+    const Matrix R = matrix_at(parts.R.at, l);
+    double RM[3][3];
+    for (int a = 0; a < 3; ++a) {
+      for (int k = 0; k < 3; ++k) {
+        RM[a][k] =
+            R.column[0].at[a] * M[0][k] + R.column[1].at[a] * M[1][k] + R.column[2].at[a] * M[2][k];
+      }
+    }
+    for (int b = 0; b < 3; ++b) {
+      for (int a = 0; a < 3; ++a) {
+        block[3 * b + a][l] = RM[a][0] * R.column[0].at[b] + RM[a][1] * R.column[1].at[b] +
+                              RM[a][2] * R.column[2].at[b];
+      }
+    }
+  }
+}
+
+/// Of a vertex beyond the base triangle and its corner j: [m]x A_j in world axes.
+DIFFCLOTH_INLINE void outer_block(const Parts& parts,
+                                  const BendingPoint& point,
+                                  int j,
+                                  Block& block) {
+  for (int l = 0; l < kLanes; ++l) {
+    const Vector n = vector_at(parts.R.at, 2, l);
+    const Vector m = moment(parts.bQ_world, point, l);
+    const Vector across = cross(m, n);
+    const Vector along = cross(m, vector_at(parts.alpha.at, j, l));
+    const Vector epsilon = vector_at(parts.epsilon.at, j, l);
+    for (int b = 0; b < 3; ++b) {
+      for (int a = 0; a < 3; ++a) {
+        block[3 * b + a][l] = along.at[a] * n.at[b] + across.at[a] * epsilon.at[b];
+      }
+    }
+  }
+}
+
+DIFFCLOTH_INLINE void scatter(const BendingPoint& point,
+                              int j,
+                              int size,
+                              const Block& block,
+                              const std::int32_t* place,
+                              double* blocks) {
+  for (int l = 0; l < size; ++l) {
+    double* const to = blocks + 9 * static_cast<std::ptrdiff_t>(place[point.slot[j][l]]);
+    if (point.above[j][l]) {
+      for (int b = 0; b < 3; ++b) {
+        for (int a = 0; a < 3; ++a) to[3 * a + b] += block[3 * b + a][l];
+      }
+    } else {
+      for (int k = 0; k < 9; ++k) to[k] += block[k][l];
+    }
+  }
+}
+
+void add_hessian(const BendingBatch* batches,
+                 std::size_t count,
+                 const BendingPoint* points,
+                 const double* x,
+                 bool positive,
+                 const std::int32_t* place,
+                 double* blocks) {
+  for (const BendingBatch* batch = batches; batch != batches + count; ++batch) {
+    Shape shape;
+    Parts parts;
+    gather_at(*batch, points, x, shape);
+    find_parts(*batch, shape, positive, parts);
+    const BendingPoint* const first = points + batch->first;
+    alignas(64) Block block;
+    for (int i = 0; i < batch->points; ++i) {
+      for (int j = 0; j < 3 && j <= i; ++j) {
+        if (i < 3) {
+          base_block(parts, first, i, j, positive, block);
+        } else {
+          outer_block(parts, first[i], j, block);
+        }
+        scatter(first[i], j, batch->size, block, place, blocks);
+      }
+    }
+  }
+}
+
+constexpr BendingKernels kBendingKernels{
+    .energy_change = energy_change, .add_gradient = add_gradient, .add_hessian = add_hessian};
+
+}  // namespace
+}  // namespace diffcloth::elastic
+
+#undef DIFFCLOTH_INLINE
+
+// NOLINTEND(modernize-avoid-c-arrays)
