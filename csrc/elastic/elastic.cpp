@@ -12,6 +12,7 @@
 #include "elastic/extrapolation.h"
 #include "elastic/face_terms.h"
 #include "elastic/frame.h"
+#include "elastic/orthotropic_damping.h"
 #include "elastic/orthotropic_stretch.h"
 
 namespace diffcloth::elastic {
@@ -77,12 +78,33 @@ std::vector<StretchBatch> stretch_batches(const Model& model,
   return batches;
 }
 
+/// Those of them that are damped.
+std::vector<DampingBatch> damping_batches(const Model& model,
+                                          const Slots& slots,
+                                          const std::vector<Index>& damped) {
+  std::vector<DampingBatch> result;
+  for (const StretchBatch& faces : stretch_batches(model, slots, damped)) {
+    DampingBatch& batch = result.emplace_back(DampingBatch{.faces = faces, .start = {}});
+    const std::size_t first = kStretchLanes * (result.size() - 1);
+    for (int l = 0; l < kStretchLanes; ++l) {
+      const Index f = damped[first + static_cast<std::size_t>(std::min(l, faces.size - 1))];
+      const Mat32 F = face_gradient(model, f, model.x_n);
+      for (int k = 0; k < 6; ++k) batch.start[k][l] = F.data()[k];
+      batch.faces.weight[l] *= model.damping[f] / model.h;
+    }
+  }
+  return result;
+}
+
 void prepare_stretch(const Model& model, const Slots& slots, Prepared& prepared) {
   std::vector<Index> isotropic;
+  std::vector<Index> damped;
   for (Index f = 0; f < face_count(model); ++f) {
     (is_orthotropic(model, f) ? prepared.orthotropic : isotropic).push_back(f);
+    if (is_damped(model, f) && !is_orthotropic(model, f)) damped.push_back(f);
   }
   prepared.stretch = stretch_batches(model, slots, isotropic);
+  prepared.damping_of_stretch = damping_batches(model, slots, damped);
 }
 
 void prepare_form(const Model& model, Index e, Prepared& prepared) {
@@ -104,7 +126,8 @@ std::size_t bytes(const std::vector<T>& values) {
 std::size_t bytes(const Prepared& p) {
   return bytes(p.bending) + bytes(p.form) + bytes(p.damping) + bytes(p.flat) +
          bytes(p.curvature_n) + bytes(p.constant) + bytes(p.identity) + bytes(p.stretch) +
-         bytes(p.bent.batches) + bytes(p.bent.points) + bytes(p.orthotropic);
+         bytes(p.damping_of_stretch) + bytes(p.bent.batches) + bytes(p.bent.points) +
+         bytes(p.orthotropic);
 }
 
 const StretchKernels& stretch_here() {
@@ -199,13 +222,13 @@ void prepare(Model& model, const Slots& slots) {
   prepared.flat.resize(element_count);
   prepared.curvature_n.resize(element_count);
   prepared.constant.assign(slots.block_count, 0.0);
-  prepare_stretch(model, slots, prepared);
   prepared.by_matrix = true;
   prepared.damped = false;
   for (Index f = 0; f < face_count(model); ++f) prepared.damped |= is_damped(model, f);
   if (prepared.damped && (model.x_n == nullptr || !(model.h > 0.0))) {
     throw std::invalid_argument("elastic: damping needs the start of the step and a time step > 0");
   }
+  prepare_stretch(model, slots, prepared);
 
   std::vector<Index> bent;
   for (Index e = 0; e < element_count; ++e) {
@@ -300,10 +323,12 @@ double energy_change(const Model& model, const double* x0, const double* x1) {
                                         face_gradient(model, f, x0), face_gradient(model, f, x1),
                                         face_gradient_change(model, f, x0, x1));
   }
-  for (Index f = 0; prepared.damped && f < face_count(model); ++f) {
+  total += stretch_here().damping_energy_change(prepared.damping_of_stretch.data(),
+                                                prepared.damping_of_stretch.size(), x0, x1);
+  for (const Index f : prepared.orthotropic) {
     if (!is_damped(model, f)) continue;
-    total += damping_energy_change(
-        model, f, face_gradient(model, f, x0), face_gradient(model, f, x1),
+    total += orthotropic_damping::energy_change(
+        damping_weave(model, f), face_gradient(model, f, x0), face_gradient(model, f, x1),
         face_gradient_change(model, f, x0, x1), face_gradient(model, f, model.x_n));
   }
   total += bending_here().energy_change(prepared.bent.batches.data(), prepared.bent.batches.size(),
@@ -320,12 +345,14 @@ void add_gradient(const Model& model, const double* x, double* g) {
   for (const Index f : prepared.orthotropic) {
     scatter(model, f, stretch_stress(model, f, face_gradient(model, f, x)), g);
   }
-  for (Index f = 0; prepared.damped && f < face_count(model); ++f) {
+  stretch_here().add_damping_gradient(prepared.damping_of_stretch.data(),
+                                      prepared.damping_of_stretch.size(), x, g);
+  for (const Index f : prepared.orthotropic) {
     if (!is_damped(model, f)) continue;
-    scatter(
-        model, f,
-        damping_stress(model, f, face_gradient(model, f, x), face_gradient(model, f, model.x_n)),
-        g);
+    scatter(model, f,
+            orthotropic_damping::stress(damping_weave(model, f), face_gradient(model, f, x),
+                                        face_gradient(model, f, model.x_n)),
+            g);
   }
   bending_here().add_gradient(prepared.bent.batches.data(), prepared.bent.batches.size(),
                               prepared.bent.points.data(), x, g);
@@ -360,10 +387,14 @@ void add_hessian(const Model& model,
                                      model.rest->shape_gradient[f], face_gradient(model, f, x),
                                      positive));
   }
-  for (Index f = 0; prepared.damped && f < face_count(model); ++f) {
+  stretch_here().add_damping_hessian(prepared.damping_of_stretch.data(),
+                                     prepared.damping_of_stretch.size(), x, positive, place.data(),
+                                     blocks);
+  for (const Index f : prepared.orthotropic) {
     if (!is_damped(model, f)) continue;
-    add_face(f, damping_hessian(model, f, face_gradient(model, f, x),
-                                face_gradient(model, f, model.x_n), positive));
+    add_face(f, orthotropic_damping::hessian(damping_weave(model, f), model.rest->shape_gradient[f],
+                                             face_gradient(model, f, x),
+                                             face_gradient(model, f, model.x_n), positive));
   }
   bending_here().add_hessian(prepared.bent.batches.data(), prepared.bent.batches.size(),
                              prepared.bent.points.data(), x, positive, place.data(), blocks);

@@ -57,9 +57,10 @@ struct Prepared {
   std::vector<double> constant;       ///< [slots] sum of the flat elements' Hessians, times I
   std::vector<double> identity;       ///< [slots] the same of what all elements' have of I
   std::vector<StretchBatch> stretch;  ///< of isotropic faces
-  BendingBatches bent;                ///< elements that are not flat
-  std::vector<Index> orthotropic;     ///< all others, ascending
-  bool damped = false;                ///< some face has damping
+  std::vector<DampingBatch> damping_of_stretch;  ///< of isotropic faces that have any
+  BendingBatches bent;                           ///< elements that are not flat
+  std::vector<Index> orthotropic;                ///< all others, ascending
+  bool damped = false;                           ///< some face has damping
   bool by_matrix = true;  ///< energy and gradient of flat elements are those of their matrix
 };
 

@@ -17,11 +17,11 @@ double damping_weight(const Model& model, Index f) {
   return model.damping[f] / model.h * stretch_weight(model, f);
 }
 
+}  // namespace
+
 Weave damping_weave(const Model& model, Index f) {
   return stretch_weave(model, f).scaled(model.damping[f] / model.h);
 }
-
-}  // namespace
 
 double stretch_energy(const Model& model, Index f, const Mat32& F) {
   if (is_orthotropic(model, f)) return orthotropic::energy(stretch_weave(model, f), F);
@@ -43,40 +43,12 @@ Mat32 stretch_stress_change(const Model& model, Index f, const Mat32& F, const M
   return stretch::stress_change(stretch_weight(model, f), F, G);
 }
 
-double damping_energy_change(const Model& model,
-                             Index f,
-                             const Mat32& F0,
-                             const Mat32& F1,
-                             const Mat32& dF,
-                             const Mat32& F_n) {
-  if (is_orthotropic(model, f)) {
-    return orthotropic_damping::energy_change(damping_weave(model, f), F0, F1, dF, F_n);
-  }
-  return damping::energy_change(damping_weight(model, f), F0, F1, dF, F_n);
-}
-
-Mat32 damping_stress(const Model& model, Index f, const Mat32& F, const Mat32& F_n) {
-  if (is_orthotropic(model, f)) {
-    return orthotropic_damping::stress(damping_weave(model, f), F, F_n);
-  }
-  return damping::stress(damping_weight(model, f), F, F_n);
-}
-
 Mat32 damping_stress_change(
     const Model& model, Index f, const Mat32& F, const Mat32& F_n, const Mat32& G) {
   if (is_orthotropic(model, f)) {
     return orthotropic_damping::stress_change(damping_weave(model, f), F, F_n, G);
   }
   return damping::stress_change(damping_weight(model, f), F, F_n, G);
-}
-
-std::array<Mat3, 6> damping_hessian(
-    const Model& model, Index f, const Mat32& F, const Mat32& F_n, bool positive) {
-  const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
-  if (is_orthotropic(model, f)) {
-    return orthotropic_damping::hessian(damping_weave(model, f), g, F, F_n, positive);
-  }
-  return damping::hessian(damping_weight(model, f), g, F, F_n, positive);
 }
 
 }  // namespace diffcloth::elastic

@@ -1,9 +1,8 @@
 #pragma once
 
-#include <array>
-
 #include "elastic/elastic.h"
 #include "elastic/frame.h"
+#include "elastic/weave.h"
 
 namespace diffcloth::elastic {
 
@@ -21,20 +20,10 @@ Mat2 second_stress(const Model& model, Index f, const Mat32& F);
 /// Change of dE/dF along a change G of F.
 Mat32 stretch_stress_change(const Model& model, Index f, const Mat32& F, const Mat32& G);
 
-double damping_energy_change(const Model& model,
-                             Index f,
-                             const Mat32& F0,
-                             const Mat32& F1,
-                             const Mat32& dF,
-                             const Mat32& F_n);
-
-Mat32 damping_stress(const Model& model, Index f, const Mat32& F, const Mat32& F_n);
+/// The stiffnesses of an orthotropic face's damping.
+Weave damping_weave(const Model& model, Index f);
 
 Mat32 damping_stress_change(
     const Model& model, Index f, const Mat32& F, const Mat32& F_n, const Mat32& G);
-
-/// Blocks as in stretch_lanes.h.
-std::array<Mat3, 6> damping_hessian(
-    const Model& model, Index f, const Mat32& F, const Mat32& F_n, bool positive);
 
 }  // namespace diffcloth::elastic

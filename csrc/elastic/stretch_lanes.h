@@ -23,9 +23,15 @@ struct StretchBatch {
   double weight[kStretchLanes];           ///< k_s A [N m]
 };
 
+/// The same of triangles that are damped: see damping.h.
+struct DampingBatch {
+  StretchBatch faces;              ///< with k_d k_s A / h as weight
+  double start[6][kStretchLanes];  ///< F at the start of the step, column by column
+};
+
 // NOLINTEND(modernize-avoid-c-arrays)
 
-/// The stretch of many triangles, E of stretch.h, in lanes.
+/// The stretch of many triangles, E of stretch.h, and its damping in lanes.
 ///
 /// Only sums, products, quotients and roots, each rounded once, in one order: every level has the same
 /// bits.
@@ -57,6 +63,26 @@ struct StretchKernels {
                       bool positive,
                       const std::int32_t* place,
                       double* blocks);
+
+  // The same three of damping.
+
+  double (*damping_energy_change)(const DampingBatch* batches,
+                                  std::size_t count,
+                                  const double* x0,
+                                  const double* x1);
+
+  void (*add_damping_gradient)(const DampingBatch* batches,
+                               std::size_t count,
+                               const double* x,
+                               double* g);
+
+  /// The projected one keeps the positive part of C - C_n.
+  void (*add_damping_hessian)(const DampingBatch* batches,
+                              std::size_t count,
+                              const double* x,
+                              bool positive,
+                              const std::int32_t* place,
+                              double* blocks);
 };
 
 /// @throws std::invalid_argument  where this processor or build has none of that level

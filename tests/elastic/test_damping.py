@@ -92,9 +92,10 @@ def test_instructions_do_not_change_a_bit(positive, bending_model):
     x0[1] = x0[0]
     x1 = x0 + 0.1 * RNG.normal(size=X.shape)
     damped = model(X, faces, bending_model, damping=DAMPING, x_n=x_n, **PARAMETERS)
-    results = [damped.bending(level, x0, x1, positive) for level in _kernels.kernel_levels()]
-    assert np.abs(results[0][2]).max() > 0.0
-    for change, gradient, blocks in results[1:]:
-        assert change == results[0][0]
-        np.testing.assert_array_equal(gradient, results[0][1])
-        np.testing.assert_array_equal(blocks, results[0][2])
+    for evaluate in (damped.bending, damped.stretch):
+        results = [evaluate(level, x0, x1, positive) for level in _kernels.kernel_levels()]
+        assert np.abs(results[0][2]).max() > 0.0
+        for change, gradient, blocks in results[1:]:
+            assert change == results[0][0]
+            np.testing.assert_array_equal(gradient, results[0][1])
+            np.testing.assert_array_equal(blocks, results[0][2])

@@ -175,7 +175,7 @@ class Elastic {
     return owned(blocks.data(), {blocks.size() / 9, 9});
   }
 
-  /// Stretch alone by the kernels of a level: change of the energy, gradient and Hessian's blocks.
+  /// Stretch and its damping alone by the kernels of a level: change of the energy, gradient and Hessian's blocks.
   nb::tuple stretch(const std::string& level,
                     const Positions& x0,
                     const Positions& x1,
@@ -189,9 +189,13 @@ class Elastic {
     kernels.add_gradient(batches.data(), batches.size(), from.data(), g.data());
     kernels.add_hessian(batches.data(), batches.size(), from.data(), positive, own_places().data(),
                         blocks.data());
-    return nb::make_tuple(
-        kernels.energy_change(batches.data(), batches.size(), from.data(), to.data()),
-        rows_array(g), owned(blocks.data(), {blocks.size() / 9, 9}));
+    double change = kernels.energy_change(batches.data(), batches.size(), from.data(), to.data());
+    const std::vector<elastic::DampingBatch>& damped = model_.prepared->damping_of_stretch;
+    kernels.add_damping_gradient(damped.data(), damped.size(), from.data(), g.data());
+    kernels.add_damping_hessian(damped.data(), damped.size(), from.data(), positive,
+                                own_places().data(), blocks.data());
+    change += kernels.damping_energy_change(damped.data(), damped.size(), from.data(), to.data());
+    return nb::make_tuple(change, rows_array(g), owned(blocks.data(), {blocks.size() / 9, 9}));
   }
 
   /// The same of bending that is not flat; the Hessian's blocks without their multiples of the identity.
