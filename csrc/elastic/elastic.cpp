@@ -259,15 +259,18 @@ void prepare(Model& model, const Slots& slots) {
 
 void PreparedCache::prepare(Model& model, const Slots& slots) {
   // Damping takes numbers from the start of the step.
-  if (std::ranges::any_of(model.damping, [](double value) { return value != 0.0; })) {
-    elastic::prepare(model, slots);
-    return;
+  const bool damped = std::ranges::any_of(model.damping, [](double value) { return value != 0.0; });
+  std::vector<double> start;
+  if (damped && model.x_n != nullptr) {
+    start.assign(model.x_n,
+                 model.x_n + 3 * static_cast<std::ptrdiff_t>(model.topology->vertex_count));
+    start.push_back(model.h);
   }
   const std::array<const std::vector<double>*, kFields> fields = {
       &model.stretch,      &model.bending,       &model.poisson,      &model.damping,
       &model.stretch_weft, &model.stretch_shear, &model.bending_weft, &model.bending_twill};
   const auto is_of_model = [&](const Entry& entry) {
-    if (entry.least_inertia != model.least_inertia) return false;
+    if (entry.least_inertia != model.least_inertia || entry.start != start) return false;
     return std::ranges::equal(entry.fields, fields,
                               [](const auto& kept, const auto* given) { return kept == *given; });
   };
@@ -283,8 +286,10 @@ void PreparedCache::prepare(Model& model, const Slots& slots) {
   elastic::prepare(model, slots);
   Entry entry{.fields = {},
               .least_inertia = model.least_inertia,
+              .start = std::move(start),
               .prepared = model.prepared,
               .bytes = bytes(*model.prepared)};
+  entry.bytes += bytes(entry.start);
   for (std::size_t k = 0; k < kFields; ++k) {
     entry.fields[k] = *fields[k];
     entry.bytes += sizeof(double) * fields[k]->size();

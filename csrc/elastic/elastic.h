@@ -92,7 +92,7 @@ struct Model {
 void prepare(Model& model, const Slots& slots);
 
 /// prepare() for models of one rest shape, which often have the numbers of an earlier one: a step's backward those
-/// of the step, a step those of the step before. Models with damping are prepared anew.
+/// of the step, a step those of the step before; with damping, whose numbers are of one step, only the former.
 class PreparedCache {
  public:
   PreparedCache() = default;
@@ -108,6 +108,7 @@ class PreparedCache {
   struct Entry {
     std::array<std::vector<double>, kFields> fields;
     double least_inertia;
+    std::vector<double> start;  ///< x_n and h of a model with damping
     std::shared_ptr<const Prepared> prepared;
     std::size_t bytes;
   };
