@@ -96,6 +96,11 @@ def air(n: int) -> Scene:
     return hanging(n, normal_drag=1.5, tangential_drag=0.03)
 
 
+def damped(n: int) -> Scene:
+    """Swing down like `hanging`, damped as the sheets of the configurations are."""
+    return hanging(n, damping=0.01)
+
+
 def stiff(n: int) -> Scene:
     """Hang upright by two corners, so stiff that the sheet buckles: free of contact."""
     pins = {"corners": [n * (n - 1), n * n - 1]}
@@ -128,6 +133,11 @@ def sphere(
 def smooth_sphere(n: int) -> Scene:
     """The same over the analytic surface."""
     return sphere(n, smooth=True)
+
+
+def damped_sphere(n: int) -> Scene:
+    """Drape over a sphere, damped."""
+    return sphere(n, dc.Material(damping=0.01))
 
 
 def woven_sphere(n: int) -> Scene:
@@ -253,6 +263,8 @@ SCENES: dict[str, Callable[[int], Scene]] = {
 }
 
 FURTHER: dict[str, Callable[[int], Scene]] = {
+    "damped": damped,
+    "damped-sphere": damped_sphere,
     "air": air,
     "woven-sphere": woven_sphere,
     "smooth-sphere": smooth_sphere,

@@ -4,7 +4,7 @@
     python -m benchmarks.step --scene sphere --size 24 --size 48
     python -m benchmarks.step --scene sphere --scene woven-sphere --size 24
     python -m benchmarks.step --quick                            # seconds
-    python -m benchmarks.step --scene hanging --scene air        # what a potential costs
+    python -m benchmarks.step --scene hanging --scene air --scene damped    # what a potential costs
     python -m benchmarks.step --scene gripper --scene limited-gripper
 
 Times are medians with quartiles, in milliseconds per environment, and medians in EF: one numeric

@@ -52,7 +52,7 @@ OWN = {"stiff-sheets": stiff_sheets, "sheet-on-moving-box": sheet_on_moving_box}
 TIMED = (
     "hanging", "stiff", "plane", "sphere", "self-contact", "two-sheets", "moving-body",
     "twist", "crumple", "impact",
-    "air", "woven-sphere", "smooth-sphere", "gripper", "limited-gripper",
+    "damped", "damped-sphere", "air", "woven-sphere", "smooth-sphere", "gripper", "limited-gripper",
 )  # fmt: skip
 FAR = {
     "one": [box(30.0, 3.0, 0.0, side=0.5, mass=95.0)],
