@@ -306,6 +306,21 @@ def test_each_cloth_touches_at_its_own_thickness_and_friction(thick):
     torch.testing.assert_close(one[:, 0], (1.0 - friction * (0.1 + DT * G)).expand(9))
 
 
+@pytest.mark.parametrize("thick_first", [True, False])
+def test_a_vertex_touches_the_body_whose_band_it_is_deepest_in(thick_first):
+    """It is nearer to the surface of a thin wall, but deeper in the band of a thick floor."""
+    floor = dc.RigidBody.plane(1.0, thickness=0.04, nodal_contact=True)
+    wall = dc.RigidBody.plane(
+        1.0, pose=[-1e-3, 0, 0, 1, 0, 1, 0], thickness=4e-3, nodal_contact=True
+    )
+    sheet = dc.Cloth.grid(3, 3, size=(0.1, 0.1), pose=[0.05, 0, 0.01, 1, 0, 0, 0])
+    bodies = [floor, wall] if thick_first else [wall, floor]
+    sim = dc.Simulator(dc.Scene([sheet], bodies), DT, scheme="projective")
+    after = sim.step(sim.initial_state())
+    assert counts(after)[1] == 9
+    assert after.report.contacts["cloth0", f"body{1 - thick_first}"].count == 9
+
+
 def test_an_obstacle_carries_what_sticks_to_it():
     sim, state, _ = patch(0.8)
     body = sim.scene.bodies[0]

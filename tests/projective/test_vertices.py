@@ -85,3 +85,49 @@ def test_self_contact_is_what_the_options_say():
         )
         after = sim.step(sim.initial_state())
         assert (sum(counts(after)) > 0) == self_contact
+
+
+def corner_over_patch(gap, at=(0.0, 0.0), coarse_first=True, bodies=()):
+    """A corner of a coarse sheet, of radius 0.05, near the middle of a patch of radius 0.01."""
+    patch = dc.Cloth.grid(3, 3, size=(0.04, 0.04))
+    corner = dc.Cloth.grid(2, 2, size=(0.1, 0.1))
+    offset = np.array([*at, gap]) - np.array(corner.vertices).min(0)
+    cloths = [dc.Cloth(np.array(corner.vertices) + offset, corner.faces), patch]
+    if not coarse_first:
+        cloths.reverse()
+    sim = dc.Simulator(
+        dc.Scene(cloths, bodies, gravity=(0.0, 0.0, 0.0)),
+        DT,
+        scheme="projective",
+        contact=dc.ContactOptions(self_contact=False),
+    )
+    return sim, sim.initial_state()
+
+
+@pytest.mark.parametrize("coarse_first", [True, False])
+def test_vertices_touch_where_the_spheres_of_both_meet(coarse_first):
+    for gap, count in ((0.0595, 1), (0.0605, 0)):
+        sim, state = corner_over_patch(gap, coarse_first=coarse_first)
+        assert sum(counts(sim.step(state))) == count
+
+
+@pytest.mark.parametrize(("x", "y"), [(-0.013, -0.013), (0.013, 0.013), (0.013, -0.013)])
+def test_a_vertex_touches_the_one_that_it_is_deepest_in(x, y):
+    sim, state = corner_over_patch(0.05, (x, y))
+    velocities = torch.zeros_like(state.velocities)
+    velocities[:4, 2] = -0.1
+    after = sim.step(state.replace(velocities=velocities))
+    assert sum(counts(after)) == 1
+    touched = after.contact_forces[4:].norm(dim=1).argmax()
+    target = torch.tensor([x, y], dtype=F64)
+    assert touched == (state.positions[4:, :2] - target).norm(dim=1).argmin()
+
+
+def test_a_vertex_that_touches_a_body_touches_no_other_vertex():
+    floor = dc.RigidBody.plane(
+        1.0, pose=[0, 0, -9e-4, 1, 0, 0, 0], thickness=2e-3, nodal_contact=True
+    )
+    sim, state = corner_over_patch(0.055, bodies=[floor])
+    after = sim.step(state)
+    assert sum(counts(after)) == 9
+    assert after.report.contacts["cloth0", "cloth1"].count == 0
