@@ -77,6 +77,17 @@ def test_the_same_values_give_the_same_matrix_on_any_thread():
     assert not np.array_equal(results[0], results[1])
 
 
+@pytest.mark.parametrize("entry", [0, 57, -1])
+def test_matrices_that_differ_in_one_entry_are_told_apart(entry):
+    pairs = grid_graph(6, 6)
+    matrices = _kernels.ConstantMatrices(pairs, np.zeros(36, bool))
+    values, _ = random_values(pairs)
+    other = values.copy()
+    other[entry] *= 1 + 1e-15
+    assert other[entry] != values[entry]
+    assert matrices.find(other) is not matrices.find(values)
+
+
 def test_what_is_forgotten_is_made_again_with_the_same_bits():
     """More matrices than the cache keeps: 32 MiB, and each takes up its values alone 1 MB."""
     pairs = grid_graph(100, 100)
