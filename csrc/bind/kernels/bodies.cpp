@@ -1,10 +1,13 @@
+#include <array>
 #include <cstddef>
 
 #include <nanobind/eigen/dense.h>
+#include <nanobind/stl/array.h>
 
 #include "bind/arrays.h"
 #include "bind/kernels/kernels.h"
 #include "bodies/exponential.h"
+#include "bodies/joint_term.h"
 
 namespace diffcloth::bind {
 namespace {
@@ -28,11 +31,32 @@ nb::object exponential(const Vec3& w) {
   return out.array;
 }
 
+/// The term of a joint with 1/100 s, a zone of 1/100, k = 40 and F = 0.2: its change between two
+/// coordinates, and its slope and curvature at the second.
+std::array<double, 3> joint_term(const std::array<double, bodies::kJointColumns>& row,
+                                 double from,
+                                 double to) {
+  const bodies::JointTerm term{.origin = row[0],
+                               .effort = row[1],
+                               .stiffness = row[2],
+                               .effort_limit = row[3],
+                               .velocity_limit = row[4],
+                               .friction = row[5],
+                               .slip_rate = row[6]};
+  const bodies::JointConstants constants{
+      .h = 0.01, .zone = 0.01, .velocity_stiffness = 40.0, .velocity_force = 0.2};
+  const bodies::JointForce force = bodies::joint_force(term, constants, to);
+  return {bodies::joint_energy_change(term, constants, from, to), force.slope,
+          force.curvature + force.sticking + force.turning * force.friction};
+}
+
 }  // namespace
 
 void body_kernels(nb::module_& m) {
   m.def("exponential", &exponential, "w"_a,
         "The rotation by a vector, its three first and its nine second derivatives.");
+  m.def("joint_term", &joint_term, "row"_a, "start"_a, "end"_a,
+        "Change of a joint's term, and its slope and curvature at the end.");
 }
 
 }  // namespace diffcloth::bind
