@@ -243,7 +243,7 @@ def test_tangents_are_the_transpose_of_gradients(case, name):
     assert along == pytest.approx((gradients[name] * direction).sum(), rel=1e-8, abs=1e-10)
 
 
-@pytest.mark.parametrize("what", ["body", "joint"])
+@pytest.mark.parametrize("what", ["body", "joint", "mimic", "both"])
 def test_what_is_prescribed_turns_along_its_arc(what):
     """By a third of a turn in a step, far from the cloth: no straight way through the body."""
     angle = 2.0
@@ -255,16 +255,19 @@ def test_what_is_prescribed_turns_along_its_arc(what):
     else:
         joint = {"lower": [-np.inf], "upper": [np.inf], "limit_stiffness": [0.0]}
         axes = [[0, 0, 0], [0, 0, 1]]
+        times = [0, 4 if what == "mimic" else 1]
         tree = trees(
-            False, [0, 1], [np.eye(4)] * 2, axes, [-1, 0], [0, 1], [0, 0], prescribed=[1], **joint
+            False, [0, 1], [np.eye(4)] * 2, axes, [-1, 0], times, [0, 0], prescribed=[1], **joint
         )
         scene = CoreScene(tree, [[0.02] * 3, BOXES[0]])
         frame = [5.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+        of_root = angle / 2 if what == "both" else 0.0
+        end = [5.0, 0.0, 0.0, np.cos(of_root / 2), 0.0, 0.0, np.sin(of_root / 2)]
         arrays = scene.inputs(
             body_poses=[frame],
-            body_targets=[frame],
+            body_targets=[end],
             coordinates=[0.0],
-            coordinate_ends=[angle],
+            coordinate_ends=[(angle - of_root) / times[1]],
             coordinate_targets=[0.0],
             coordinate_metric=[1.0],
         )

@@ -7,7 +7,7 @@ from scipy.linalg import expm
 kernels = pytest.importorskip("diffcloth_torch._kernels", reason="built with DIFFCLOTH_KERNELS")
 
 # None, small ones, to both sides of where the series ends, and large ones [rad].
-TURNS = [0.0, 1e-9, 1e-3, 0.3, 0.4999, 0.5001, 0.9, 2.0, 3.1, 5.0]
+TURNS = [0.0, 1e-9, 1e-3, 0.3, 0.4999, 0.5001, 0.9, 1.5, 2.0, 3.1, 5.0]
 
 
 def cross(w):
