@@ -121,6 +121,15 @@ def test_one_input_alone_gets_the_gradient_of_all_together(case):
         assert_same(gradients(case, leaves(case, (name,))), {name: together[name]})
 
 
+@pytest.mark.parametrize("name", ["parameters.friction", "parameters.slip_velocity"])
+def test_what_friction_is_made_of_gets_its_gradient_alone_too(name):
+    """Where a sheet sticks the slip counts; where it slides its gradient is zero."""
+    case = scenes.regime("sticking")
+    together = gradients(case, leaves(case))[name]
+    assert together.any()
+    assert_same(gradients(case, leaves(case, (name,))), {name: together})
+
+
 def test_an_unused_output_has_no_part(coupled):
     values = leaves(coupled)
     after = coupled.step(values)
