@@ -7,6 +7,7 @@ import scenes
 import torch
 from differences import directions, mismatch
 
+import diffcloth_torch as dc
 from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.model.quantities import PARAMETERS
 
@@ -444,6 +445,37 @@ def test_a_body_that_only_turns_has_a_gradient_beyond_one_portion():
     a, b = case.state.body_poses[0, 3:], case.control["body_poses"][0, 3:]
     cosine = float((a @ b).abs() / (a.norm() * b.norm()))
     assert np.degrees(2 * np.arccos(cosine)) > 20
+
+
+def test_a_cloth_elsewhere_changes_no_derivative_by_the_rest_shape():
+    """A corner presses a face of the other one: its weight is the mean area of that one's faces."""
+    case = scenes.poking()
+    (cloth,), (box,) = case.sim.scene.cloths, case.sim.scene.bodies
+    elsewhere = dc.Cloth.grid(3, 3, size=(0.3, 0.3), pose=[9, 0, 0, 1, 0, 0, 0])
+    both = scenes.simulator([elsewhere, cloth], [box])
+    start, generator = both.initial_state(), torch.Generator().manual_seed(3)
+    state = start.replace(
+        positions=torch.cat([start.positions[:9], case.state.positions]),
+        velocities=torch.cat([start.velocities[:9], case.state.velocities]),
+        body_poses=case.state.body_poses,
+    )
+    weights, direction = torch.randn(2, 36, 3, dtype=F64, generator=generator)
+    found = []
+    for sim, begin in ((case.sim, case.state), (both, state)):
+        rest = sim.parameters().rest_positions
+
+        def loss(own, sim=sim, begin=begin, rest=rest):
+            given = sim.parameters().replace(rest_positions=torch.cat([rest[:-36], own]))
+            after = sim.step(begin, dc.Control(**case.control), given)
+            return (weights * (after.positions[-36:] - case.state.positions)).sum()
+
+        own = rest[-36:].clone().requires_grad_()
+        value = loss(own)
+        (gradient,) = torch.autograd.grad(value, own)
+        _, change = torch.func.jvp(loss, (rest[-36:],), (direction,))
+        found.append((value, gradient, change))
+    for alone, joined in zip(*found, strict=True):
+        torch.testing.assert_close(joined, alone, rtol=1e-7, atol=1e-9)
 
 
 def test_friction_iterations_change_the_step():
