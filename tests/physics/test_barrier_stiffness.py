@@ -13,6 +13,7 @@ F64 = torch.float64
 DT = 0.01
 G = 9.81
 FLOOR = dc.RigidBody.plane(2.0, name="floor")
+TURN = [1, 0, 0, 0]
 
 
 def sheet(points=8, height=0.05, **material):
@@ -159,6 +160,50 @@ def test_a_heavy_box_lands_beside_a_cloth():
     assert 0.45 * reach < state.body_poses[1, 2] - 0.05 < 0.8 * reach
     wrenches = sim.contact_wrenches(state)
     assert wrenches["box"][2] == pytest.approx(100.0 * G, rel=1e-5)
+
+
+@pytest.mark.parametrize("radius", [0.005, 0.05, 0.5])
+def test_a_smooth_ball_rests_at_half_the_barrier_distance(radius):
+    reach = 4e-3
+    ball = dc.RigidBody.sphere(
+        radius, smooth=True, motion="dynamic", mass=0.7, pose=[0, 0, radius + 0.6 * reach, *TURN]
+    )
+    sim = simulator([], [FLOOR, ball], barrier_distance=reach)
+    gap = rolled(sim, 40)[-1].body_poses[1, 2].item() - radius
+    assert gap == pytest.approx(0.5 * reach, rel=1e-6)
+
+
+@pytest.mark.parametrize("thickness", [0.0, 4e-3, 2e-2])
+def test_a_box_rests_above_half_the_barrier_distance_whatever_its_thickness(thickness):
+    reach = 4e-3
+    floor = dc.RigidBody.plane(2.0, thickness=thickness)
+    place = [0, 0, 0.05 + thickness + 0.6 * reach, *TURN]
+    body = dc.RigidBody.box(0.1, motion="dynamic", mass=0.7, thickness=thickness, pose=place)
+    sim = simulator([], [floor, body], barrier_distance=reach)
+    gap = rolled(sim, 40)[-1].body_poses[1, 2].item() - 0.05 - thickness
+    # Corners and the ridges between them share the weight.
+    assert 0.65 * reach < gap < 0.8 * reach
+
+
+def test_a_joint_needs_what_the_mass_at_its_farthest_point_needs(tmp_path):
+    """An arm twice as large and no heavier has the same mass there, on four times the area."""
+    found = []
+    for size in (1.0, 2.0):
+        path = tmp_path / "arm.urdf"
+        inertia = 0.01 * size**2
+        box = f"{0.1 * size} {0.2 * size} {0.1 * size}"
+        at = f'<origin xyz="{0.4 * size} 0 0"/>'
+        path.write_text(f"""<robot name="arm"><link name="base"/><link name="arm">
+          <inertial>{at}<mass value="2"/><inertia ixx="{inertia}" iyy="{inertia}"
+            izz="{inertia}" ixy="0" ixz="0" iyz="0"/></inertial>
+          <collision>{at}<geometry><box size="{box}"/></geometry></collision></link>
+          <joint name="hinge" type="revolute"><parent link="base"/><child link="arm"/>
+          <axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="0" velocity="0"/></joint>
+          </robot>""")
+        robot = dc.Robot.load(path, name="hand", pose=[0, 0, 1, *TURN], actuation="torque")
+        sim = simulator([], [FLOOR], [robot], barrier_distance=4e-3)
+        found.append(pairs(sim)["hand/arm", "floor"])
+    assert found[1] == pytest.approx(found[0] / 4, rel=1e-9)
 
 
 @pytest.mark.parametrize("masses", [(0.5, 60.0), (60.0, 0.5)], ids=["light below", "heavy below"])
