@@ -625,6 +625,22 @@ def test_what_overlaps_at_the_start_is_named(kind, height):
         dc.Simulator(scene, 0.01)
 
 
+@pytest.mark.parametrize("apart", [0.25, 0.35])
+def test_two_of_them_overlap_by_what_their_radii_say(apart):
+    balls = [
+        dc.RigidBody.sphere(
+            radius, smooth=True, motion="dynamic", mass=0.3, pose=[x, 0, 0, 1, 0, 0, 0]
+        )
+        for radius, x in ((0.1, 0.0), (0.2, apart))
+    ]
+    options = dc.ContactOptions(barrier_distance=2e-3)
+    if apart > 0.3:
+        dc.Simulator(dc.Scene([], balls), 0.01, contact=options)
+        return
+    with pytest.raises(dc.IntersectingState, match=r"overlap by 0.05 m"):
+        dc.Simulator(dc.Scene([], balls), 0.01, contact=options)
+
+
 def test_something_can_be_attached_to_it():
     """At a point of its frame, wherever it turns to."""
     ball = dc.RigidBody.sphere(

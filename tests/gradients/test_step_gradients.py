@@ -487,6 +487,14 @@ def test_friction_iterations_change_the_step():
     assert 1e-7 < (x2 - x3).abs().max() < (x1 - x2).abs().max()
 
 
+def test_what_lands_feels_friction_in_the_same_step():
+    """Nothing touches at its start: the second solve takes friction from the end of the first."""
+    one, two = (scenes.regime("landing", friction_iterations=k) for k in (1, 2))
+    values = one.inputs()
+    a, b = (case.step(values).contact_forces for case in (one, two))
+    assert (a - b).abs().max() > 0.01 * a.abs().max()
+
+
 def test_scenes_are_differentiable_in_everything():
     """No input is forgotten by these tests."""
     sim = scenes.regime("woven_pinned").sim
