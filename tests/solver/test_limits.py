@@ -94,3 +94,15 @@ def test_a_sheet_that_whips_converges_by_default():
             held[:, 2] += 0.4 * np.sin(10 * np.pi * (k + 1) * h)
             state = sim.step(state, dc.Control(pins=held))
             assert state.report.converged
+
+
+def test_a_body_stays_where_its_motion_has_ended():
+    sim, state, control = pushed(max_iterations=2, throw=False)
+    after = sim.step(state, control)
+    fraction = after.report.motion_fraction
+    assert 0.2 < fraction < 1
+    turn = 0.3 * fraction
+    pose = state.body_poses[0].clone()
+    pose[1] += 0.12 * fraction
+    pose[3:] = torch.tensor([np.cos(turn), 0.0, 0.0, np.sin(turn)], dtype=F64)
+    torch.testing.assert_close(after.body_poses[0], pose, rtol=0, atol=1e-12)
