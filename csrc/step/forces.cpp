@@ -67,9 +67,9 @@ PairContacts& PairTally::of(Index first, Index second) {
 }
 
 void PairTally::add(Index first, Index second, const Vec3& force) {
-  PairContacts& pair = of(std::min(first, second), std::max(first, second));
+  PairContacts& pair = of(first, second);
   ++pair.count;
-  if (first != second) pair.force += first < second ? force : Vec3(-force);
+  if (first != second) pair.force += force;
 }
 
 void PairTally::add(const std::vector<Contact>& contacts,

@@ -38,7 +38,7 @@ class PairTally {
            const contact::FrictionSet* friction,
            const std::vector<double>& x);
 
-  /// Count one contact.
+  /// Count one contact of two surfaces, the smaller first.
   ///
   /// @param force  of the first on the second [N]
   void add(Index first, Index second, const Vec3& force);
