@@ -85,7 +85,7 @@ class AddedMassWatch:
         if (
             springs
             or self._layout.robots
-            or any(control[name].any() for name in ("forces", "body_wrenches"))
+            or any(control[name].any() for name in ("forces", "body_wrenches", "wind"))
         ):
             return False
         pins = state["positions"][:, self._layout.pins]

@@ -169,6 +169,37 @@ def test_a_light_body_warns_once(coupling):
         sim.step(state)
 
 
+@STAGGERED
+@pytest.mark.parametrize("source", ["wind", "forces", "body_wrenches", "body_poses"])
+def test_what_is_driven_from_outside_does_not_gain_by_the_coupling(coupling, source):
+    """A sheet and what lies under it are pressed together, without a warning."""
+    airy = dc.Material(stretch=200.0, density=0.2, normal_drag=1.0)
+    sheet = dc.Cloth.grid(5, 5, 0.3, material=airy, pose=[0, 0, 0.055, 1, 0, 0, 0])
+    bodies = [
+        dc.RigidBody.box(0.1, motion="dynamic", mass=2.0, pose=[-0.08, 0, 0, 1, 0, 0, 0]),
+        dc.RigidBody.box(0.1, motion="kinematic", pose=[0.08, 0, 0, 1, 0, 0, 0]),
+    ]
+    sim = dc.Simulator(
+        dc.Scene([sheet], bodies, gravity=(0, 0, 0)),
+        DT,
+        coupling=coupling,
+        contact=dc.ContactOptions(barrier_distance=0.004),
+    )
+    state = sim.initial_state()
+    rise = torch.tensor([[0.0] * 7, [0, 0, 5e-4, 0, 0, 0, 0]], dtype=F64)
+    lift = torch.tensor([[0, 0, 30.0, 0, 0, 0], [0.0] * 6], dtype=F64)
+    down = torch.tensor([0, 0, -0.02], dtype=F64).repeat(25, 1)
+    given = {"forces": down, "body_wrenches": lift, "wind": torch.tensor([0, 0, -8.0])}
+    touched = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(20):
+            given["body_poses"] = state.body_poses + rise
+            state = sim.step(state, sim.control(**{source: given[source]}))
+            touched |= bool(state.body_forces.any())
+    assert touched
+
+
 # A heavy carriage without a shape, which a light plate hangs on.
 PLATE = """<robot name="plate">
   <link name="rail"><inertial><mass value="1"/>{moments}</inertial></link>
