@@ -108,27 +108,24 @@ def joint_terms(
     bounds: Bounds,
     start: Tensor,
     origins: Tensor,
-    forced: Tensor,
     dt: float,
 ) -> Tensor:
-    """Rows of the core's joint terms, [B, J, 7]; those of prescribed joints do nothing.
+    """Rows of the core's joint terms, [B, J, 7]; it ignores those of prescribed joints.
 
     Args:
         drives: Drives of the joints.
         bounds: Their limits and friction.
         start: q_n, [B, J].
         origins: Values from which friction counts motion, [B, J].
-        forced: Which joints are moved by forces, [J].
         dt: h [s].
     """
-    none = torch.full_like(start, LARGEST)
     rows = (
         origins,
         drives.asked_efforts(start, origins, dt),
         drives.stiffness + drives.damping / dt,
-        none if drives.limits is None else drives.limits,
-        torch.where(forced, bounds.velocities, none),
-        forced * bounds.friction,
+        torch.full_like(start, LARGEST) if drives.limits is None else drives.limits,
+        bounds.velocities,
+        bounds.friction,
         bounds.slip_rates,
     )
     return torch.stack([row.expand_as(start) for row in rows], dim=-1)

@@ -296,9 +296,7 @@ class RobotDynamics:
         terms = None
         if bounds is not None:
             slid_from = state.joints if origins is None else origins
-            of_joints = joint_terms(
-                drives, bounds, state.joints, slid_from, ~self._prescribed, self._dt
-            )
+            of_joints = joint_terms(drives, bounds, state.joints, slid_from, self._dt)
             roots = coordinates.shape[-1] - state.joints.shape[-1]
             terms = torch.cat([idle_terms(of_joints, roots), of_joints], dim=1)
         return RobotPrediction(
