@@ -227,6 +227,23 @@ def test_the_environment_that_turns_too_fast_is_named():
     assert error.value.environments == (1,)
 
 
+def test_the_environments_of_what_turns_too_far_by_itself_are_named():
+    """With the first such body in the first of them."""
+    boxes = [
+        dc.RigidBody.box(0.1, motion="dynamic", mass=1.0, pose=[k, 0, 0, 1, 0, 0, 0], name=name)
+        for k, name in enumerate(("one", "other"))
+    ]
+    contact = dc.ContactOptions(barrier_distance=1e-3)
+    sim = dc.Simulator(dc.Scene([], boxes, gravity=(0, 0, 0)), H, contact=contact)
+    state = sim.initial_state(4)
+    state.body_velocities[..., 5] = (
+        torch.tensor([[10, 20], [15000, 16000], [5, 6], [30, 17000]], dtype=F64) / H
+    )
+    with pytest.raises(dc.TurnedTooFar, match=r"'one' turns at 1.88e\+06 rad/s") as error:
+        sim.step(state)
+    assert error.value.environments == (1, 3)
+
+
 ARM = """
 <robot name="arm">
   <link name="base"/>

@@ -1,5 +1,6 @@
 """Bodies and robots of a scene together: rows, limits, and couplings in two solves."""
 
+import re
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -155,6 +156,36 @@ def test_the_last_places_of_what_is_prescribed_are_those_of_the_start():
     assert not torch.equal(last["joint_positions"][:, 1], state["joint_positions"][:, 1])
 
 
+ROLLER = """
+<robot name="roller">
+  <link name="wheel"><inertial><origin xyz="0 0.3 0"/><mass value="0.5"/>{moments}</inertial></link>
+  <link name="trunk"><inertial><origin xyz="0.1 0 0.2"/><mass value="2"/>{moments}</inertial></link>
+  <joint name="hub" type="continuous"><parent link="trunk"/><child link="wheel"/></joint>
+</robot>"""
+
+
+def test_the_last_place_of_a_base_is_that_of_its_root_link(tmp_path):
+    """Whatever the order of links in the file: the root turns about its own center of mass."""
+    path = tmp_path / "roller.urdf"
+    moments = '<inertia ixx="1e-2" iyy="1e-2" izz="1e-2" ixy="0" ixz="0" iyz="0"/>'
+    path.write_text(ROLLER.format(moments=moments))
+    robot = dc.Robot.load(path, base="floating", actuation="torque")
+    scene = dc.Scene([], [], [robot])
+    assembly = assemble(scene)
+    state, _ = fields(assembly, 0)
+    spin = torch.tensor([[[0, 0, 0, 1.0, -2.0, 3.0]]], dtype=F64)
+    last = Dynamics(assembly, H).last_places(
+        {**state, "base_velocities": spin}, parameters_of(scene, assembly)
+    )
+    center = tensor([0.1, 0, 0.2])
+    here, before = (
+        pose[0, 0, :3] + rotate(torch.nn.functional.normalize(pose[0, 0, 3:], dim=0), center)
+        for pose in (state["base_poses"], last["base_poses"])
+    )
+    assert not torch.equal(state["base_poses"], last["base_poses"])
+    torch.testing.assert_close(before, here, rtol=0, atol=1e-14)
+
+
 def test_fields_of_the_state_after(world):
     assembly, dynamics, parameters, state, control = world
     p = dynamics.predict(state, control, parameters)
@@ -196,6 +227,27 @@ def test_what_turns_fast_may_not_be_touched(world, speed):
     assert not far(on[0])
     spun = {**after, "body_velocities": 1.2 * after["body_velocities"]}
     assert "body 'a' turns at" in far(on[0], spun)[0]
+
+
+def test_of_several_that_turn_too_far_the_first_is_told_of(world):
+    """With its own speed, the larger of those before and after, and a time step that is enough.
+
+    Forces that cancel touch too.
+    """
+    assembly, dynamics, parameters, state, control = world
+    spins = tensor([[0, 0, 0], [0, 2.0 / H, 0], [0, 0, 0], [0, 3.0 / H, 0]])
+    state = {**state, "body_velocities": torch.nn.functional.pad(spins, (3, 0))[None]}
+    p = dynamics.predict(state, control, parameters)
+    forces = torch.zeros(1, len(assembly.body_vertices), 3, dtype=F64)
+    after = dynamics.advance(p, p.coordinate_targets, forces)
+    after = {**after, "body_velocities": 2.0 * after["body_velocities"]}
+    for k in (1, 3):
+        forces[0, int(assembly.body_vertex_start[k])] = tensor([1.0, -1.5, 0.2])
+    (sentence,) = dynamics.turned_too_far(p, after, forces).values()
+    assert sentence.startswith("body 'a' turns at")
+    speed = after["body_velocities"][0, 1, 3:].norm()
+    assert f"at {speed:.3g} rad/s" in sentence
+    assert 0.98 < speed * float(re.search(r"at most (\S+) s", sentence)[1]) < 1.0
 
 
 @pytest.mark.parametrize("by", ["kick", "prediction"])
