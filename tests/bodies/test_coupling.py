@@ -13,6 +13,7 @@ from differences import directions, mismatch
 from physics.physics_scenes import Judge
 
 import diffcloth_torch as dc
+from diffcloth_torch.robots import GRIPPER
 
 DT = 0.002
 COUPLINGS = ("rigid_to_cloth", "cloth_to_rigid")
@@ -222,7 +223,8 @@ def test_a_light_link_is_warned_of_by_its_name(coupling, tmp_path):
     robot = dc.Robot.load(path, base="fixed", pose=pose, actuation="torque", name="arm")
     sim, _ = trampoline(coupling)
     away = dc.RigidBody.box(0.1, motion="dynamic", mass=2.0, pose=[3, 0, 0, 1, 0, 0, 0], name="far")
-    scene = dc.Scene(sim.scene.cloths, [away], [robot])
+    other = dc.Robot.load(GRIPPER, actuation="torque", pose=[6, 0, 0, 1, 0, 0, 0], name="other")
+    scene = dc.Scene(sim.scene.cloths, [away], [other, robot])
     sim = dc.Simulator(scene, DT, coupling=coupling, contact=sim.contact)
     # Of the sheet, 13 times as heavy as the plate, counts what is in the plate's box.
     words = r"the added-mass number of 'arm/plate' is about \d(\.\d)?, above 0\.5"

@@ -1,10 +1,14 @@
 """Limits of efforts and speeds of joints, and their Coulomb friction, against closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 import diffcloth_torch as dc
+from diffcloth_torch.dynamics.limits import ZONE, limit_stiffness, slip_rates
+from diffcloth_torch.model.assembly import assemble
 
 F64 = torch.float64
 TIGHT = dc.SolverOptions(tolerance=1e-10)
@@ -196,6 +200,56 @@ def test_a_drive_goes_as_fast_as_it_may(tmp_path):
     assert speeds.max() < 1.5 * 1.01
     assert (speeds > 1.49).sum() == 60
     assert float(states[-1].joint_positions) < 1.2
+
+
+# --- What scales limits and slip ------------------------------------------------------------------
+
+
+def test_limits_and_slip_rates_know_all_that_a_joint_carries_where_it_starts(tmp_path):
+    """By hand, of two arms; the elbow of the second is bent."""
+    bent, inertias = 2.0, np.array([0.01, 0.02, 0.03])
+    arms = [
+        dc.Robot.load(arm_file(tmp_path, len(q)), actuation="torque", joint_positions=q)
+        for q in ([0.3], [0.3, bent])
+    ]
+    assembly = replace(assemble(dc.Scene([], robots=arms)), joint_armature=inertias)
+    far = np.sqrt(0.4**2 + CENTER**2 + 2 * 0.4 * CENTER * np.cos(bent))
+    moments = inertias + INERTIA + [0, OWN + MASS * far**2, 0]
+    masses, ways = MASS * np.array([1, 2, 1]), MASS * (CENTER + np.array([0, far, 0]))
+    rates = slip_rates(assembly, 0.1)
+    np.testing.assert_allclose(rates, 0.1 * np.sqrt(masses / moments), rtol=1e-12)
+    stiffness = limit_stiffness(assembly, H, np.array([0, 3.0, -4.0]))
+    np.testing.assert_allclose(stiffness.velocities, moments / H**2, rtol=1e-12)
+    np.testing.assert_allclose(stiffness.forces, 30 * 5.0 * ways, rtol=1e-12)
+    width = ZONE * 40
+    expected = stiffness.velocities + stiffness.forces / width
+    np.testing.assert_allclose(stiffness.positions, expected, rtol=1e-12)
+
+
+def test_arms_in_one_scene_have_limits_and_friction_of_their_own(tmp_path):
+    """In steps, and where they come to rest."""
+    arms, moves = [], []
+    for k, (links, friction) in enumerate(((1, 0.3), (2, [1.5, 0.8]))):
+        path = arm_file(tmp_path, links, effort=1 + k, velocity=1.2 + k, friction=friction)
+        pose = [0, 3 * k, 0, 1, 0, 0, 0]
+        q = [1.3, -0.1][:links]
+        drive = {"stiffness": 4.0, "damping": 0.05, "name": f"arm{k}"}
+        arms.append(dc.Robot.load(path, pose=pose, joint_positions=q, **drive))
+        moves.append({"joint_efforts": tensor(*[2.0, -0.4][:links])})
+    together = dc.Scene([], robots=arms)
+    sims = [
+        dc.Simulator(scene, H, contact=dc.ContactOptions(barrier_distance=1e-3), solver=TIGHT)
+        for scene in (together, *(dc.Scene([], robots=[arm]) for arm in arms))
+    ]
+    given = [{"joint_efforts": torch.cat([m["joint_efforts"] for m in moves])}, *moves]
+    ends = []
+    for sim, move in zip(sims, given, strict=True):
+        control = sim.control(**move)
+        steps = sim.rollout(sim.initial_state(), [control] * 12)[-1]
+        rest = sim.equilibrium(sim.initial_state(), control)
+        ends.append((steps.joint_positions, steps.joint_velocities, rest.joint_positions))
+    for both, *own in zip(*ends, strict=True):
+        torch.testing.assert_close(both, torch.cat(own), rtol=0, atol=1e-9)
 
 
 # --- Joints that mimic ----------------------------------------------------------------------------
