@@ -458,6 +458,22 @@ def test_robots_step_in_turn_as_together_where_nothing_touches(coupling, tmp_pat
 
 
 @STAGGERED
+def test_what_is_prescribed_passes_through_what_is_prescribed(coupling):
+    """A hand goes through a wall, beside a sheet and a box that fall."""
+    hand = dc.Robot.load(GRIPPER, base="kinematic", actuation="position", name="hand")
+    sheet = dc.Cloth.grid(3, 3, 0.2, pose=[0, 0, 2, 1, 0, 0, 0])
+    box = dc.RigidBody.box(0.1, motion="dynamic", mass=2.0, pose=[3, 0, 0, 1, 0, 0, 0])
+    wall = dc.RigidBody.box([0.01, 1, 1], pose=[0.5, 0, 0, 1, 0, 0, 0])
+    sim = dc.Simulator(dc.Scene([sheet], [box, wall], [hand]), DT, coupling=coupling)
+    state = sim.initial_state()
+    beyond = state.base_poses + torch.tensor([1.0, 0, 0, 0, 0, 0, 0], dtype=F64)
+    after = sim.step(state, sim.control(base_poses=beyond))
+    assert after.report.motion_fraction == 1.0
+    assert torch.equal(after.base_poses, beyond)
+    assert not after.body_forces.any()
+
+
+@STAGGERED
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
 def test_gradients_through_contact_are_those_of_differences(coupling, scheme):
     sim, start = trampoline(coupling, scheme=scheme)
