@@ -312,7 +312,13 @@ def _resting(given: Given) -> Given:
     """The same inputs at rest, without damping, drag and limits of speeds: none acts there."""
     state, parameters = given.state, given.parameters
     still = {n: torch.zeros_like(t) for n, t in state.items() if n.endswith("velocities")}
-    resisting = ("damping", "normal_drag", "tangential_drag")
+    resisting = (
+        "damping",
+        "normal_drag",
+        "tangential_drag",
+        "joint_damping",
+        "joint_viscosity",
+    )
     none = {n: 0.0 * t for n, t in parameters.items() if n in resisting}
     if "joint_velocity_limits" in parameters:
         none["joint_velocity_limits"] = torch.full_like(

@@ -70,6 +70,22 @@ def test_an_arm_sags_on_its_drives(arm, stiffness):
     assert not found.joint_velocities.any()
 
 
+def test_what_resists_motion_changes_nothing_at_rest(arm):
+    """Neither the equilibrium nor the way there."""
+    sim = alone(arm(stiffness=8.0, damping=1.0))
+    ends = []
+    for size in (0.0, 100.0):
+        given = {
+            name: torch.full((2,), size, dtype=F64, requires_grad=True)
+            for name in ("joint_damping", "joint_viscosity")
+        }
+        found = sim.equilibrium(sim.initial_state(), None, sim.parameters().replace(**given))
+        gradients = torch.autograd.grad(found.joint_positions.sum(), list(given.values()))
+        assert not any(gradient.any() for gradient in gradients)
+        ends.append((found.report.iterations, *found.joint_positions.tolist()))
+    assert ends[0] == ends[1]
+
+
 def test_an_arm_without_drives_hangs(arm):
     """Also from a start at which the weight has nearly no moment, above the axis."""
     start = {"shoulder": -1.5, "elbow": 0.3}
@@ -208,12 +224,25 @@ def test_a_pendulum_without_a_shape_hangs(tmp_path):
     assert hanging.joint_positions.item() == pytest.approx(np.pi / 2, abs=1e-8)
 
 
-def test_a_joint_that_nothing_holds_is_named(arm):
+@pytest.mark.parametrize("viscosity", [0.0, 0.1])
+def test_a_joint_that_nothing_holds_is_named(arm, viscosity):
+    """A joint that resists its motion yields to a force without end, too."""
     robot = arm(actuation={"shoulder": "pd", "elbow": "torque"},
                 stiffness={"shoulder": 5.0}, damping={"shoulder": 1.0})  # fmt: skip
     sim = alone(robot, gravity=(0, 9.81, 0))  # along the axes
+    drag = torch.full((2,), viscosity, dtype=F64)
     with pytest.raises(dc.SimulationError, match="joint 'arm/elbow' is free to move"):
-        sim.equilibrium(sim.initial_state())
+        sim.equilibrium(sim.initial_state(), None, sim.parameters().replace(joint_viscosity=drag))
+
+
+def test_the_environment_whose_joint_nothing_holds_is_named(arm):
+    """With that joint, though another yields more elsewhere; a damper alone does not hold it."""
+    sim = alone(arm(stiffness=5.0, damping=1.0), gravity=(0, 9.81, 0))
+    gains = torch.tensor([[2.0, 50.0], [50.0, 0.0], [2.0, 50.0], [50.0, 0.0]], dtype=F64)
+    parameters = sim.parameters().replace(joint_stiffness=gains)
+    with pytest.raises(dc.SimulationError, match="joint 'arm/elbow' is free to move") as error:
+        sim.equilibrium(sim.initial_state(4), None, parameters)
+    assert error.value.environments == (1, 3)
 
 
 def test_a_hand_that_floats_is_named():
