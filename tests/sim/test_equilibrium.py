@@ -305,6 +305,21 @@ def test_environments_of_a_batch_are_those_alone():
         assert torch.equal(batch.body_forces[k], alone.body_forces)
 
 
+def test_what_resists_motion_changes_nothing_at_rest():
+    """Neither the equilibrium nor the way there, which the report tells all of."""
+    sim = cantilever()
+    names, ends = ("damping", "normal_drag", "tangential_drag"), []
+    for size in (0.0, 50.0):
+        given = {n: torch.tensor(size, dtype=F64, requires_grad=True) for n in names}
+        found = sim.equilibrium(sim.initial_state(), None, sim.parameters().replace(**given))
+        gradients = torch.autograd.grad(found.positions.sum(), list(given.values()))
+        assert not any(gradient.any() for gradient in gradients)
+        ends.append((found.report.iterations, found.positions.tolist()))
+    assert ends[0] == ends[1]
+    again = sim.equilibrium(found, None, sim.parameters())
+    assert again.report.iterations < found.report.iterations
+
+
 def test_split_finds_the_same_one():
     alike = [s.equilibrium(s.initial_state()).positions for s in (drape(), drape("split"))]
     assert torch.equal(*alike)
@@ -315,6 +330,20 @@ def test_what_falls_is_named():
     sim = dc.Simulator(dc.Scene([sheet]), 0.01)
     with pytest.raises(dc.SimulationError, match="equilibrium: 'sheet' is free to move"):
         sim.equilibrium(sim.initial_state())
+
+
+def test_the_environments_in_which_something_falls_are_named():
+    """It falls from a sheet that holds it elsewhere."""
+    sheet = dc.Cloth.grid(3, 3, (0.2, 0.2), pins={"all": range(9)}, name="sheet")
+    box = dc.RigidBody.box(
+        0.1, motion="dynamic", mass=0.01, pose=[0, 0, 0.06, 1, 0, 0, 0], name="box"
+    )
+    sim = dc.Simulator(dc.Scene([sheet], [box]), 0.01)
+    state = sim.initial_state(4)
+    state.body_poses[1::2, 0, 0] = 1.0
+    with pytest.raises(dc.SimulationError, match="'box' is free to move") as error:
+        sim.equilibrium(state)
+    assert error.value.environments == (1, 3)
 
 
 def test_what_may_slide_is_named():

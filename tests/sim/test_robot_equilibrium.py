@@ -105,6 +105,23 @@ def test_efforts_of_prescribed_joints_hold_the_weight(arm):
     np.testing.assert_allclose(found.joint_efforts.numpy(), -moments(joints), atol=1e-8)
 
 
+def test_a_joint_that_keeps_a_velocity_stays_with_a_gradient(arm):
+    """It rests where the search begins, and carries the other one along."""
+    actuation = {"shoulder": "velocity", "elbow": "pd"}
+    sim = alone(arm(actuation=actuation, stiffness={"elbow": 2.0}, damping={"elbow": 1.0}))
+
+    def elbow(shoulder):
+        start = torch.cat([shoulder, torch.zeros(1, dtype=F64)])
+        found = sim.equilibrium(sim.initial_state().replace(joint_positions=start))
+        assert torch.equal(found.joint_positions[:1], shoulder)
+        return found.joint_positions[1]
+
+    given = torch.tensor([0.4], dtype=F64)
+    exact, differences = slopes(elbow, given, torch.ones(1, dtype=F64), 1e-5)
+    assert abs(exact) > 0.01
+    assert exact == pytest.approx(differences, rel=1e-6)
+
+
 def slopes(loss, value, way, step):
     leaf = value.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(loss(leaf), leaf)
