@@ -117,6 +117,16 @@ def test_each_part_is_what_its_name_says():
     assert sim.energy(start, twice, parts=True)["contact"].item() == pytest.approx(2 * barrier)
 
 
+def test_a_control_moves_the_soft_pins_and_their_energy():
+    cloth = dc.Cloth.grid(3, 3, size=0.2, soft_pins={"all": range(9)}, pin_stiffness=70.0)
+    sim = dc.Simulator(dc.Scene([cloth]), DT)
+    state = sim.initial_state()
+    way = torch.tensor([0.1, -0.2, 0.3], dtype=F64)
+    away = sim.control(soft_pins=state.positions + way, forces=torch.ones(9, 3))
+    energy = sim.energy(state, control=away, parts=True)["soft_pins"]
+    assert energy.item() == pytest.approx(9 * 0.5 * 70 * (way @ way).item(), rel=1e-12)
+
+
 def test_bending_is_a_part_of_its_own():
     cloth = dc.Cloth.grid(5, 5, size=0.2, material=dc.Material(bending=1e-3))
     sim = dc.Simulator(dc.Scene([cloth], gravity=WEIGHTLESS), DT)

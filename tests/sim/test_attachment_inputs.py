@@ -151,6 +151,16 @@ def test_a_control_refuses(sim, control, message):
         sim.step(sim.initial_state(), dc.Control(**tensors))
 
 
+def test_no_environment_is_pulled_to_a_target_that_is_not_set(sim):
+    weights = torch.zeros(3, 2, dtype=F64)
+    released = sim.control(attachment_weights={"picker": weights})
+    sim.step(sim.initial_state(3), released)
+    weights[2, 1] = 0.5
+    pulled = sim.control(attachment_weights={"picker": weights})
+    with pytest.raises(dc.InvalidInput, match="must set the target of 'picker'"):
+        sim.step(sim.initial_state(3), pulled)
+
+
 def test_what_a_control_does_not_say(sim):
     """Without a target a picker is released; with one it pulls with all of its stiffness."""
     state = sim.initial_state()

@@ -323,3 +323,21 @@ def test_a_scene_of_micrometers_is_refused_with_a_tolerance_that_it_works_with()
         assert state.report.converged
     assert 0 < state.report.minimum_distance <= sim.parameters().barrier_distance
     assert (state.positions - sim.initial_state().positions)[..., :2].abs().max() < 1e-8
+
+
+def test_a_rest_shape_without_area_is_refused_in_every_environment(sim):
+    rest = sim.parameters().rest_positions.repeat(3, 1, 1)
+    rest[2, 0] = rest[2, 1]
+    with pytest.raises(dc.InvalidInput, match="rest_positions"):
+        sim.step(sim.initial_state(3), None, sim.parameters().replace(rest_positions=rest))
+
+
+def test_a_cloth_may_be_finer_than_a_body_is_thick():
+    """Only cloths must not reach from one of their parts to the next."""
+    floor = dc.RigidBody.plane(4.0, thickness=0.3, pose=[0, 0, -1, 1, 0, 0, 0], name="floor")
+    scene = dc.Scene([dc.Cloth.grid(5, 5, 0.2, name="sheet")], [floor])
+    sim = dc.Simulator(scene, 0.01, contact=dc.ContactOptions(barrier_distance=0.005))
+    thick = {"floor": torch.tensor(0.4, dtype=F64)}
+    sim.step(sim.initial_state(), None, dc.Parameters(thickness=thick))
+    with pytest.raises(dc.InvalidInput, match="below half the smallest distance"):
+        sim.step(sim.initial_state(), None, dc.Parameters(thickness={"sheet": thick["floor"]}))

@@ -522,6 +522,17 @@ def test_one_value_per_environment_or_per_cloth_must_be_told_apart(sim):
     sim.step(sim.initial_state(FACES), None, parameters.replace(stretch=500.0))
 
 
+def test_one_value_of_one_environment_and_one_cloth_is_both():
+    sheet = dc.Cloth(np.eye(3), [[0, 1, 2]], name="sheet")  # of one face
+    sim = dc.Simulator(dc.Scene([sheet]), DT)
+    heavy = torch.tensor([0.7], dtype=F64)
+    ends = [
+        sim.step(sim.initial_state(1), None, dc.Parameters(density=density))
+        for density in (0.7, heavy, heavy[None], {"sheet": heavy}, {"sheet": heavy[None]})
+    ]
+    assert all(same(ends[0], end) for end in ends[1:])
+
+
 def test_the_simulators_own_parameters_are_never_ambiguous():
     cloths = [
         dc.Cloth.grid(2, 2, material=dc.Material(stretch=s), pose=[0, 0, s, 1, 0, 0, 0])
@@ -864,6 +875,22 @@ def test_checkpoints_change_no_bit(sim, every, callable_controls):
     assert all(same(a, b) for a, b in zip(states, again, strict=True))
     assert torch.equal(x, x_again)
     assert torch.equal(gravity, gravity_again)
+
+
+def test_arrays_may_be_used_again_behind_a_checkpoint(sim):
+    """A rollout copies what is no tensor: its steps are repeated as they were."""
+    gradients = []
+    for edited in (False, True):
+        x = moved(sim).positions.requires_grad_()
+        forces = np.full((VERTICES, 3), 1e-3)
+        states = sim.rollout(
+            moved(sim).replace(positions=x), [dc.Control(forces=forces)] * 2, checkpoint_every=1
+        )
+        if edited:
+            forces[:] = 0.1
+        states[-1].positions.square().sum().backward()
+        gradients.append(x.grad)
+    assert torch.equal(*gradients)
 
 
 def test_an_edit_in_place_is_noticed_behind_a_checkpoint(sim):

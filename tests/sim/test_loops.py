@@ -89,6 +89,8 @@ def test_batches_have_the_pairs_of_their_environments(landed):
     assert torch.equal(again["sheet", "box"].force, contacts.force)
     mixed = dc.where(torch.tensor([False, True]), both, both[0])
     assert torch.equal(mixed.report.contacts["sheet", "box"].force[0], contacts.force[0])
+    in_order = [("sheet", "box"), ("box", "floor")]
+    assert list(both.report.contacts) == list(again) == list(mixed.report.contacts) == in_order
 
 
 def test_a_report_with_contacts_is_saved_and_loaded(landed, tmp_path):

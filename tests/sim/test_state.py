@@ -101,6 +101,16 @@ def test_where_resets_environments_to_one_state():
         assert torch.equal(getattr(mixed, name)[1], getattr(start, name))
 
 
+@pytest.mark.parametrize("is_first", [True, False])
+def test_where_takes_the_status_of_one_state_for_all(is_first):
+    batch, one = dc.stack([make(0), make(1)]), make(2)
+    one = one.replace(report=dc.Report(False, 9, 0.5, 1.0, 2, 1.0, {"solve": 0.1}))
+    mask = torch.tensor([True, False])
+    mixed = dc.where(mask, one, batch) if is_first else dc.where(~mask, batch, one)
+    assert mixed.report.status == ("not_converged", "converged")
+    assert mixed.report.iterations.tolist() == [9, 1]
+
+
 @pytest.mark.parametrize(
     ("call", "error", "message"),
     [
