@@ -218,7 +218,7 @@ class RobotDynamics:
         self._unknown = self._solved - first
         # Radians of each link by the joints that forces move, [A, J].
         kinematics = self._kinematics
-        self._turns = kinematics.revolute * kinematics.leaders[0].abs() * ~self._prescribed
+        self._turns = kinematics.revolute * kinematics.leaders[0] * ~self._prescribed
         # Joints whose fall turns links. What floats falls as a whole, without turning.
         turning = ROOT + torch.nonzero(self._turns.any(0))[:, 0]
         self._turning = turning[:0] if self._floats else turning
