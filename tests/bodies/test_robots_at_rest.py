@@ -144,6 +144,28 @@ def test_drives_on_a_base_that_stands_carry_the_weight(tmp_path, dt):
     torch.testing.assert_close(state.joint_efforts, expected, rtol=1e-6, atol=0)
 
 
+@pytest.mark.parametrize("speed", [0.05, 0.2, 1.0])
+def test_an_arm_sags_alike_on_a_base_that_glides(tmp_path, speed):
+    """Steady motion changes nothing, up to what a step leaves of velocity products."""
+    file, ways = write(tmp_path, ["revolute", "revolute"]), []
+    glide = speed * torch.tensor([1.0, 0.0, 0.5], dtype=F64)
+    for base in ("fixed", "kinematic"):
+        robot = dc.Robot.load(file, base=base, stiffness=30.0, damping=0.5, name="arm")
+        contact = dc.ContactOptions(barrier_distance=1e-3)
+        sim = dc.Simulator(dc.Scene([], [], [robot]), 0.01, contact=contact)
+        start = sim.initial_state()
+        if base == "kinematic":
+            start.base_velocities[0, :3] = glide
+
+        def moved_on(k, state, base=base):
+            step = torch.nn.functional.pad(0.01 * glide * (base == "kinematic"), (0, 4))
+            return dc.Control(base_poses=state.base_poses + step)
+
+        ways.append(sim.rollout(start, moved_on, steps=30).joint_positions)
+    assert ways[0].abs().max() > 0.06
+    torch.testing.assert_close(*ways, rtol=0, atol=1e-4)
+
+
 @pytest.mark.parametrize("gravity", [(0, 0, 0), (0, 0, -G)], ids=["none", "weight"])
 @pytest.mark.parametrize("moving", [False, True], ids=["rests", "moves"])
 def test_gradients_are_those_of_differences(tmp_path, gravity, moving):

@@ -164,12 +164,16 @@ ROLLER = """
 </robot>"""
 
 
-def test_the_last_place_of_a_base_is_that_of_its_root_link(tmp_path):
-    """Whatever the order of links in the file: the root turns about its own center of mass."""
-    path = tmp_path / "roller.urdf"
+def roller(folder, base):
+    path = folder / "roller.urdf"
     moments = '<inertia ixx="1e-2" iyy="1e-2" izz="1e-2" ixy="0" ixz="0" iyz="0"/>'
     path.write_text(ROLLER.format(moments=moments))
-    robot = dc.Robot.load(path, base="floating", actuation="torque")
+    return dc.Robot.load(path, base=base, actuation="torque")
+
+
+def test_the_last_place_of_a_base_is_that_of_its_root_link(tmp_path):
+    """Whatever the order of links in the file: the root turns about its own center of mass."""
+    robot = roller(tmp_path, "floating")
     scene = dc.Scene([], [], [robot])
     assembly = assemble(scene)
     state, _ = fields(assembly, 0)
@@ -184,6 +188,26 @@ def test_the_last_place_of_a_base_is_that_of_its_root_link(tmp_path):
     )
     assert not torch.equal(state["base_poses"], last["base_poses"])
     torch.testing.assert_close(before, here, rtol=0, atol=1e-14)
+
+
+def test_a_motion_that_ends_early_is_one_that_was_to_end_there(tmp_path):
+    scene = dc.Scene([], make_scene().bodies, [roller(tmp_path, "kinematic")])
+    assembly = assemble(scene)
+    dynamics, parameters = Dynamics(assembly, H), parameters_of(scene, assembly)
+    state, control = fields(assembly, 2)
+    there = {
+        name: state[name] + 0.4 * (control[name] - state[name])
+        for name in ("body_poses", "base_poses")
+    }
+    asked = dynamics.predict(state, control, parameters)
+    ended = dynamics.end_at(asked, torch.cat(list(there.values()), dim=1))
+    expected = dynamics.predict(state, control | there, parameters)
+    forces = tensor(np.random.default_rng(2).normal(size=(1, len(assembly.body_vertices), 3)))
+    found, wanted = (
+        dynamics.advance(p, asked.coordinate_targets, forces) for p in (ended, expected)
+    )
+    for name, values in wanted.items():
+        torch.testing.assert_close(found[name], values, rtol=0, atol=1e-12, msg=name)
 
 
 def test_fields_of_the_state_after(world):
@@ -545,8 +569,9 @@ def test_added_mass_numbers(world):
     frames[0, 4:, 2, 3] = 50.0
     masses = tensor([[0, 0.5, 0, 2.0, 1, 1, 1]])
     # Three vertices: at body "a" (half a side of 0.1 and the reach of 0.01), just beyond, far away.
-    at = frames[0, 1, :3, 3]
-    positions = (at + tensor([[0.109, 0, 0.1], [0.111, 0, 0], [9, 9, 9]]))[None]
+    turned = torch.linalg.matrix_exp(tensor([[0, -0.5, 0], [0.5, 0, 0], [0, 0, 0]]))
+    frames[0, 1, :3, :3], at = turned, frames[0, 1, :3, 3]
+    positions = (at + tensor([[0.109, 0, 0.1], [0.111, 0, 0], [9, 9, 9]]) @ turned.T)[None]
     forces = torch.zeros(1, len(assembly.body_vertices), 3, dtype=F64)
     forces[0, assembly.body_vertex_start[1], 2] = -6.0
     forces[0, assembly.body_vertex_start[0], 2] = 6.0

@@ -1,5 +1,7 @@
 """The stiffness of weight: a second derivative, and its bound in other configurations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -75,3 +77,15 @@ def test_the_bound_is_above_it_in_all_configurations(name):
         assert np.linalg.eigvalsh(bound - exact).min() > -1e-9 * bound.max()
         largest = max(largest, np.linalg.eigvalsh(exact).max())
     assert largest > 0.05 * bound.max()  # it is not far too large
+
+
+def test_the_bound_knows_how_far_links_are_from_the_center_of_the_root():
+    """A root turns about it, here far from its origin, where the other link is."""
+    rng = np.random.default_rng(6)
+    mechanism = make(["fixed", "revolute"], [-1, 0], base="floating", rng=rng)
+    center = np.array([[5.0, 0.0, 0.0], [0.05, 0.0, 0.0]])
+    mechanism = replace(mechanism, center=center, mass=np.array([0.01, 2.0]))
+    bound = stiffness(mechanism, "bounded", configuration(mechanism, rng))
+    for _ in range(50):
+        exact = stiffness(mechanism, "exact", configuration(mechanism, rng))
+        assert np.linalg.eigvalsh(bound - exact).min() > -1e-9 * bound.max()

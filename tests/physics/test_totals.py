@@ -258,6 +258,22 @@ def test_a_pendulum_by_hand(tmp_path):
     assert sim.energy(state, parts=True)["gravity"].item() == pytest.approx(2 * G * 0.5, rel=1e-12)
 
 
+def test_a_base_that_is_fixed_has_no_velocity(tmp_path):
+    """Whatever the state says: neither its energy nor a step takes notice."""
+    path = tmp_path / "pendulum.urdf"
+    path.write_text(PENDULUM)
+    hinge = dc.Robot.load(path, actuation="torque", base="fixed", name="pendulum")
+    contact = dc.ContactOptions(barrier_distance=0.01)
+    sim = dc.Simulator(dc.Scene([], robots=[hinge]), DT, contact=contact)
+    state = sim.initial_state().replace(joint_velocities=torch.tensor([3.0], dtype=F64))
+    other = state.replace(base_velocities=torch.ones(1, 6, dtype=F64))
+    assert torch.equal(sim.kinetic_energy(state), sim.kinetic_energy(other))
+    assert torch.equal(sim.momentum(state), sim.momentum(other))
+    after, also = sim.step(state), sim.step(other)
+    assert torch.equal(after.joint_velocities, also.joint_velocities)
+    assert not also.base_velocities.any()
+
+
 def test_drives_of_prescribed_joints_have_no_inertia(sim):
     """They are part of what prescribes them: the first finger's position is, the second's not."""
     state = moved(sim)

@@ -80,6 +80,13 @@ def test_wrenches_act_at_the_placed_vertices(state):
         np.testing.assert_allclose(found, [*forces[rows].sum(0).tolist(), *torque], atol=1e-13)
 
 
+def test_wrenches_of_forces_on_other_vertices_are_refused(state):
+    sim, now = state
+    for forces in (now.body_forces[1:], now.body_forces[:, :2], now.body_forces[None]):
+        with pytest.raises(dc.InvalidInput, match=r"`state\.body_forces`"):
+            sim.contact_wrenches(now.replace(body_forces=forces))
+
+
 def test_placing_is_differentiable():
     vertices = torch.rand(5, 3, dtype=F64)
     frames = torch.eye(4, dtype=F64).repeat(2, 1, 1) + 0.1 * torch.rand(2, 4, 4, dtype=F64)
