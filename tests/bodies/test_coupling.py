@@ -201,6 +201,29 @@ def test_what_is_driven_from_outside_does_not_gain_by_the_coupling(coupling, sou
     assert touched
 
 
+@STAGGERED
+def test_what_a_floor_gives_back_is_no_gain_of_the_coupling(coupling):
+    """A box bounces on a floor, with a sheet on it."""
+    sheet = dc.Cloth.grid(5, 5, 0.3, pose=[0, 0, 0.1085, 1, 0, 0, 0])
+    bodies = [
+        dc.RigidBody.plane(2.0),
+        dc.RigidBody.box(0.1, motion="dynamic", mass=2.0, pose=[0, 0, 0.055, 1, 0, 0, 0]),
+    ]
+    contact = dc.ContactOptions(barrier_distance=0.004)
+    sim = dc.Simulator(dc.Scene([sheet], bodies), DT, coupling=coupling, contact=contact)
+    state = sim.initial_state()
+    state.velocities[:, 2] = state.body_velocities[1, 2] = -0.3
+    speeds, touched = [], False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(30):
+            state = sim.step(state)
+            speeds.append(float(state.body_velocities[1, 2]))
+            touched |= speeds[-1] > 0 and bool(state.contact_forces.any())
+    assert max(speeds) > 0.05
+    assert touched
+
+
 # A heavy carriage without a shape, which a light plate hangs on.
 PLATE = """<robot name="plate">
   <link name="rail"><inertial><mass value="1"/>{moments}</inertial></link>
