@@ -259,6 +259,20 @@ def test_a_joint_beyond_the_zone_of_its_limit_is_refused(layout, scene):
         state_fields(layout, at(0.1, 1.8 + 0.029, 0.0, 0.01, 0.02))
 
 
+def test_the_joint_beyond_its_limit_is_named_in_any_environment(layout, scene):
+    state = make_state(scene, (4,))
+    joints = state.joint_positions.clone()
+    joints[3, TURN] = 1.9
+    with pytest.raises(dc.InvalidInput, match=r"'arm/turn', got 1\.9 at \[1\]"):
+        state_fields(layout, state.replace(joint_positions=joints))
+    targets = joints.clone()
+    targets[3, TURN] = -1.5
+    with pytest.raises(
+        dc.InvalidInput, match=r"-1 and 1\.8 of 'arm/turn', got -1\.5 in the row \[1\]"
+    ):
+        complete(layout, scene, dc.Control(joint_positions=targets), (4,))
+
+
 def test_a_base_without_orientation_is_refused(layout, scene):
     state = make_state(scene)
     with pytest.raises(dc.InvalidInput, match=r"`state.base_poses` .*quaternion"):

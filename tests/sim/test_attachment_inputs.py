@@ -151,6 +151,25 @@ def test_a_control_refuses(sim, control, message):
         sim.step(sim.initial_state(), dc.Control(**tensors))
 
 
+def test_each_attachment_pulls_to_its_own_targets():
+    """What they store, by hand; they may be set together or by name."""
+    first = dc.Attachment(("sheet", [0, 2]), stiffness=5.0, name="first")
+    between = dc.Attachment(("sheet", 4), ("box", [0, 0, 0]), stiffness=0.1)
+    second = dc.Attachment(("sheet", [1, 3, 5]), stiffness=[1.0, 2.0, 3.0], name="second")
+    sim = dc.Simulator(scene(first, between, second), 0.01)
+    state = sim.initial_state()
+    ways = 0.01 * torch.arange(15, dtype=F64).reshape(5, 3)
+    targets = state.positions[[0, 2, 1, 3, 5]] + ways
+    together = sim.control(attachments=targets)
+    by_name = sim.control(attachments={"second": targets[2:], "first": targets[:2]})
+    stiffness = torch.tensor([5.0, 5.0, 1.0, 2.0, 3.0], dtype=F64)
+    pulled = 0.5 * stiffness @ ways.square().sum(1)
+    rest = sim.energy(state, parts=True)["attachments"]
+    for control in (together, by_name):
+        found = sim.energy(state, control=control, parts=True)["attachments"]
+        torch.testing.assert_close(found - rest, pulled, rtol=1e-12, atol=0)
+
+
 def test_no_environment_is_pulled_to_a_target_that_is_not_set(sim):
     weights = torch.zeros(3, 2, dtype=F64)
     released = sim.control(attachment_weights={"picker": weights})
