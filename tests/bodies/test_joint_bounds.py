@@ -467,6 +467,20 @@ def test_gradients_of_an_equilibrium_by_limits_friction_and_start(tmp_path):
             assert float(gradient[k]) == pytest.approx(found, rel=1e-5, abs=1e-6), (n, k)
 
 
+def test_an_arm_rests_on_its_limit_where_a_rollout_leaves_it(tmp_path):
+    """The barrier there is that of the time step, not of the long steps of the search."""
+    path = arm_file(tmp_path)
+    path.write_text(path.read_text().replace('upper="20"', 'upper="0.3"'))
+    sim = simulator(dc.Robot.load(path, actuation="torque"))
+    slow = sim.parameters().replace(joint_viscosity=tensor(0.5))
+    with torch.no_grad():
+        end = sim.rollout(sim.initial_state(), parameters=slow, steps=150)[-1]
+        found = sim.equilibrium(sim.initial_state(), None, slow)
+    beyond, expected = (float(state.joint_positions) - 0.3 for state in (found, end))
+    assert beyond > 0.01
+    assert beyond == pytest.approx(expected, rel=1e-6)
+
+
 def test_a_limit_of_the_speed_does_not_slow_the_way_to_an_equilibrium(tmp_path):
     ends = []
     for velocity in (0, 0.1):
