@@ -341,3 +341,14 @@ def test_a_cloth_may_be_finer_than_a_body_is_thick():
     sim.step(sim.initial_state(), None, dc.Parameters(thickness=thick))
     with pytest.raises(dc.InvalidInput, match="below half the smallest distance"):
         sim.step(sim.initial_state(), None, dc.Parameters(thickness={"sheet": thick["floor"]}))
+
+
+def test_the_barrier_leaves_room_for_the_thickest_cloth():
+    thin = dc.Cloth.grid(5, 5)
+    apart = dc.Simulator(dc.Scene([thin]), 0.01)._core.smallest_nonadjacent_distance()
+    thick = dc.Cloth.grid(
+        5, 5, material=dc.Material(thickness=0.4 * apart), pose=[0, 0, 5, 1, 0, 0, 0]
+    )
+    for cloths in ([thin, thick], [thick, thin]):
+        distance = dc.Simulator(dc.Scene(cloths), 0.01).parameters().barrier_distance
+        assert distance.item() == pytest.approx(0.05 * apart, rel=1e-12)

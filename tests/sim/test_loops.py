@@ -226,6 +226,19 @@ def test_named_values_of_faces_and_vertices(sim):
     assert not torch.equal(plain.positions, other.positions)
 
 
+def test_faces_that_are_not_named_keep_the_value_of_their_cloth():
+    cloths = [
+        dc.Cloth.grid(n, n, material=dc.Material(density=d), pose=[0, 0, n, 1, 0, 0, 0], name=name)
+        for n, d, name in ((5, 0.1, "large"), (3, 0.3, "small"))
+    ]
+    sim = dc.Simulator(dc.Scene(cloths), 0.01)
+    given = dc.Parameters(density={"small": torch.linspace(0.5, 1.0, 8, dtype=F64)})
+    before, after = sim.vertex_masses(), sim.vertex_masses(given)
+    large, small = sim.slices.values()
+    torch.testing.assert_close(after[large], before[large], rtol=1e-14, atol=0)
+    assert (after[small] > 1.5 * before[small]).all()
+
+
 def test_gradients_reach_named_values_and_batches_have_their_own(sim):
     mass = torch.tensor([0.5, 2.0], dtype=F64, requires_grad=True)
     given = sim.parameters().replace(
