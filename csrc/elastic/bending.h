@@ -13,8 +13,9 @@ namespace diffcloth::elastic::bending {
 /// the base triangle, its curvature in the frame it carries along is R^T Y, and
 ///
 ///   E = weight / 2 [ <s Q, s> + damping <s_n Q, s_n> ],   s = R^T Y - b,  s_n = R^T Y - b_n,
-/// Q a form of bending_form.h, b the rest curvature and b_n the curvature at the start of the step: both terms are exactly
-/// invariant under rigid motion. Where b = 0 and damping = 0 the energy is quadratic in x. In a
+///
+/// Q a form of bending_form.h, b the rest curvature and b_n the curvature at the start of the step: both terms
+/// are exactly invariant under rigid motion. Where b = 0 and damping = 0 the energy is quadratic in x. In a
 /// hinge only the row uu is not zero, and nu has no effect.
 struct Element {
   std::span<const Index> vertices;  ///< the base triangle first
