@@ -131,9 +131,7 @@ DIFFCLOTH_INLINE void gather(const BendingBatch& batch,
                              const BendingPoint* points,
                              Offset&& offset,
                              Shape& shape) {
-  for (int k = 0; k < 9; ++k) {
-    for (int l = 0; l < kLanes; ++l) shape.Y.at[k][l] = 0.0;
-  }
+  shape.Y = {};
   const BendingPoint* const first = points + batch.first;
   for (int i = 1; i < batch.points; ++i) {
     const BendingPoint& point = first[i];
