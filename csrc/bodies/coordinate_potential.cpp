@@ -72,15 +72,8 @@ void CoordinatePotential::visit_joints(Visit&& visit) const {
   const MechanismsDescription& given = mechanisms_.given();
   for (Index c = 0; c < mechanisms_.coordinate_count(); ++c) {
     if (given.prescribed[c] != 0) continue;
-    const double* const t = joints_ + static_cast<std::ptrdiff_t>(kJointColumns) * c;
-    const JointTerm term{.origin = t[0],
-                         .effort = t[1],
-                         .stiffness = t[2],
-                         .effort_limit = t[3],
-                         .velocity_limit = t[4],
-                         .friction = t[5],
-                         .slip_rate = t[6]};
-    visit(c, mechanisms_.slot(c), term,
+    const double* const row = joints_ + static_cast<std::ptrdiff_t>(kJointColumns) * c;
+    visit(c, mechanisms_.slot(c), joint_term(row),
           JointConstants{.h = h_,
                          .zone = given.limit_zone,
                          .velocity_stiffness = given.velocity_stiffness[c],

@@ -30,6 +30,17 @@ struct JointTerm {
 inline constexpr int kJointColumns = 7;
 using JointRow = std::array<double, kJointColumns>;
 
+/// The term of a row, whose columns are its fields in their order.
+inline JointTerm joint_term(const double* row) {
+  return {.origin = row[0],
+          .effort = row[1],
+          .stiffness = row[2],
+          .effort_limit = row[3],
+          .velocity_limit = row[4],
+          .friction = row[5],
+          .slip_rate = row[6]};
+}
+
 /// What does not change with the inputs.
 struct JointConstants {
   double h;                   ///< [s]

@@ -33,16 +33,8 @@ nb::object exponential(const Vec3& w) {
 
 /// The term of a joint with 1/100 s, a zone of 1/100, k = 40 and F = 0.2: its change between two
 /// coordinates, and its slope and curvature at the second.
-std::array<double, 3> joint_term(const std::array<double, bodies::kJointColumns>& row,
-                                 double from,
-                                 double to) {
-  const bodies::JointTerm term{.origin = row[0],
-                               .effort = row[1],
-                               .stiffness = row[2],
-                               .effort_limit = row[3],
-                               .velocity_limit = row[4],
-                               .friction = row[5],
-                               .slip_rate = row[6]};
+std::array<double, 3> joint_term(const bodies::JointRow& row, double from, double to) {
+  const bodies::JointTerm term = bodies::joint_term(row.data());
   const bodies::JointConstants constants{
       .h = 0.01, .zone = 0.01, .velocity_stiffness = 40.0, .velocity_force = 0.2};
   const bodies::JointForce force = bodies::joint_force(term, constants, to);
