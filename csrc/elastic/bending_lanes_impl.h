@@ -303,7 +303,7 @@ struct Parts {
   Lanes<9> R;
   Lanes<9> bQ;  ///< (b + damping b_n) Q
   Lanes<9> bQ_world;
-  Lanes<9> C;      ///< B - T
+  Lanes<9> C;      ///< tr(M) I - M of bending_lanes.h
   Lanes<6> g;      ///< of the corners p, two each
   Lanes<6> h;      ///< S^-1 g_p
   Lanes<3> gamma;  ///< g_p . rho with rho = S^-1 (-tau_2, tau_1)
@@ -330,7 +330,6 @@ DIFFCLOTH_INLINE void find_parts(const BendingBatch& batch,
     const Matrix of_start = times_form(batch.damping[l], b_n, Q);
     const Matrix bQ = sum(of_rest, of_start);
     const Matrix world = turned(R, bQ);
-    // B' + T', and then their traces: T has the other sign.
     double M[3][3];
     double trace = 0.0;
     for (int i = 0; i < 3; ++i) {
@@ -464,20 +463,21 @@ DIFFCLOTH_INLINE void base_block(
   }
 }
 
-/// Of a vertex beyond the base triangle and its corner j: [m]x A_j in world axes.
-DIFFCLOTH_INLINE void outer_block(const Parts& parts,
-                                  const BendingPoint& point,
-                                  int j,
-                                  Block& block) {
+/// Of a vertex beyond the base triangle and each corner j of that: [m]x A_j in world axes.
+DIFFCLOTH_INLINE void outer_blocks(const Parts& parts,
+                                   const BendingPoint& point,
+                                   Block (&blocks)[3]) {
   for (int l = 0; l < kLanes; ++l) {
     const Vector n = vector_at(parts.R.at, 2, l);
     const Vector m = moment(parts.bQ_world, point, l);
     const Vector across = cross(m, n);
-    const Vector along = cross(m, vector_at(parts.alpha.at, j, l));
-    const Vector epsilon = vector_at(parts.epsilon.at, j, l);
-    for (int b = 0; b < 3; ++b) {
-      for (int a = 0; a < 3; ++a) {
-        block[3 * b + a][l] = along.at[a] * n.at[b] + across.at[a] * epsilon.at[b];
+    for (int j = 0; j < 3; ++j) {
+      const Vector along = cross(m, vector_at(parts.alpha.at, j, l));
+      const Vector epsilon = vector_at(parts.epsilon.at, j, l);
+      for (int b = 0; b < 3; ++b) {
+        for (int a = 0; a < 3; ++a) {
+          blocks[j][3 * b + a][l] = along.at[a] * n.at[b] + across.at[a] * epsilon.at[b];
+        }
       }
     }
   }
@@ -514,15 +514,15 @@ void add_hessian(const BendingBatch* batches,
     gather_at(*batch, points, x, shape);
     find_parts(*batch, shape, positive, parts);
     const BendingPoint* const first = points + batch->first;
-    alignas(64) Block block;
+    alignas(64) Block row[3];
     for (int i = 0; i < batch->points; ++i) {
+      if (i < 3) {
+        for (int j = 0; j <= i; ++j) base_block(parts, first, i, j, positive, row[j]);
+      } else {
+        outer_blocks(parts, first[i], row);
+      }
       for (int j = 0; j < 3 && j <= i; ++j) {
-        if (i < 3) {
-          base_block(parts, first, i, j, positive, block);
-        } else {
-          outer_block(parts, first[i], j, block);
-        }
-        scatter(first[i], j, batch->size, block, place, blocks);
+        scatter(first[i], j, batch->size, row[j], place, blocks);
       }
     }
   }

@@ -53,6 +53,20 @@ DIFFCLOTH_INLINE void gather_change(const StretchBatch& batch,
   }
 }
 
+/// The sides at both ends of a motion, and their change.
+struct Motion {
+  Sides start, end, change;
+};
+
+DIFFCLOTH_INLINE void gather_motion(const StretchBatch& batch,
+                                    const double* x0,
+                                    const double* x1,
+                                    Motion& motion) {
+  gather_sides(batch, x0, motion.start);
+  gather_sides(batch, x1, motion.end);
+  gather_change(batch, x0, x1, motion.change);
+}
+
 DIFFCLOTH_INLINE Gradient gradient(const StretchBatch& batch, const Sides& sides, int l) {
   Gradient F;
   for (int k = 0; k < 3; ++k) {
@@ -80,17 +94,13 @@ double energy_change(const StretchBatch* batches,
                      const double* x1) {
   double total = 0.0;
   for (const StretchBatch* batch = batches; batch != batches + count; ++batch) {
-    Sides start;
-    Sides end;
-    Sides change;
-    gather_sides(*batch, x0, start);
-    gather_sides(*batch, x1, end);
-    gather_change(*batch, x0, x1, change);
+    Motion motion;
+    gather_motion(*batch, x0, x1, motion);
     alignas(64) double energy[kLanes];
     for (int l = 0; l < kLanes; ++l) {
-      const Gradient F0 = gradient(*batch, start, l);
-      const Gradient F1 = gradient(*batch, end, l);
-      const Gradient dF = gradient(*batch, change, l);
+      const Gradient F0 = gradient(*batch, motion.start, l);
+      const Gradient F1 = gradient(*batch, motion.end, l);
+      const Gradient dF = gradient(*batch, motion.change, l);
       const Polar p0 = polar_of(F0);
       const Polar p1 = polar_of(F1);
       double work = 0.0;
@@ -278,17 +288,13 @@ double damping_energy_change(const DampingBatch* batches,
                              const double* x1) {
   double total = 0.0;
   for (const DampingBatch* batch = batches; batch != batches + count; ++batch) {
-    Sides start;
-    Sides end;
-    Sides change;
-    gather_sides(batch->faces, x0, start);
-    gather_sides(batch->faces, x1, end);
-    gather_change(batch->faces, x0, x1, change);
+    Motion motion;
+    gather_motion(batch->faces, x0, x1, motion);
     alignas(64) double energy[kLanes];
     for (int l = 0; l < kLanes; ++l) {
-      const Gradient F0 = gradient(batch->faces, start, l);
-      const Gradient F1 = gradient(batch->faces, end, l);
-      const Strain dC = strain_change(gradient(batch->faces, change, l), F1, F0);
+      const Gradient F0 = gradient(batch->faces, motion.start, l);
+      const Gradient F1 = gradient(batch->faces, motion.end, l);
+      const Strain dC = strain_change(gradient(batch->faces, motion.change, l), F1, F0);
       const Strain e0 = strain_of(*batch, F0, l);
       const Strain e1 = strain_of(*batch, F1, l);
       energy[l] = (0.125 * batch->faces.weight[l]) *
