@@ -17,8 +17,8 @@ from benchmarks.extra import require
 from benchmarks.scenes import DT, Scene, in_regime
 
 try:
+    from diffcloth_torch.core_functions import as_array
     from diffcloth_torch.geometry.poses import transform
-    from diffcloth_torch.sim.core_functions import as_array
 except ModuleNotFoundError:  # in the first version, which we compare with
     from diffcloth_torch.poses import transform
     from diffcloth_torch.step import as_array

@@ -32,30 +32,33 @@ def abandon_calls() -> None: ...
 def parked_threads() -> list[int]: ...
 def are_within(arrays: list[NDArray[np.float64]], largest: float) -> bool: ...
 def have_quaternions(poses: NDArray[np.float64], shortest: float) -> bool: ...
-def free_turns(
-    inertia: NDArray[np.float64], momentum: NDArray[np.float64], time: float, with_rates: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]: ...
 
-class FreeMotion:
-    def __init__(
-        self,
-        *,
-        parent: list[int],
-        order: list[int],
-        kind: list[int],
-        offset: NDArray[np.float64],
-        axis: NDArray[np.float64],
-        dof: list[int],
-        multiplier: NDArray[np.float64],
-        constant: NDArray[np.float64],
-        joint_count: int,
-        solved: list[int],
-        root_moves: bool,
-        dt: float,
-    ) -> None: ...
-    def solve(
-        self, *arrays: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]: ...
+class SmoothFunction:
+    def values(self, inputs: Arrays, threads: int) -> Arrays: ...
+    def gradients(
+        self, inputs: Arrays, cotangents: Arrays, losses: int, needs: list[str], threads: int
+    ) -> Arrays: ...
+    def tangents(self, inputs: Arrays, directions: Arrays, count: int, threads: int) -> Arrays: ...
+
+def robot_functions(
+    *,
+    parent: list[int],
+    order: list[int],
+    kind: list[int],
+    offset: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    dof: list[int],
+    multiplier: NDArray[np.float64],
+    constant: NDArray[np.float64],
+    base: int,
+    actuation: list[int],
+    vertex_link: list[int],
+    points: NDArray[np.float64],
+    dt: float,
+    largest: float,
+    is_at_rest: bool,
+) -> tuple[SmoothFunction, SmoothFunction]: ...
+def body_functions(count: int, dt: float) -> tuple[SmoothFunction, SmoothFunction]: ...
 
 class Kept: ...
 

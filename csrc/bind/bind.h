@@ -9,8 +9,8 @@ namespace nb = nanobind;
 /// `build_info()`: what this core was built with.
 void build_info(nb::module_& m);
 
-/// Velocities of a robot or of a body over a step without contact.
-void free_motion(nb::module_& m);
+/// Bodies and robots over a step, but for what the solver does.
+void dynamics(nb::module_& m);
 
 /// The simulator's handle: forward and backward of a step.
 void simulator(nb::module_& m);

@@ -11,7 +11,7 @@ NB_MODULE(_core, m) {
   m.doc() = "C++ core of diffcloth_torch. The public interface is the Python package.";
 
   diffcloth::bind::build_info(m);
-  diffcloth::bind::free_motion(m);
+  diffcloth::bind::dynamics(m);
   diffcloth::bind::simulator(m);
   m.def("abandon_calls", &diffcloth::bind::abandon_calls,
         "From now on no call comes back to Python, but in this thread.");

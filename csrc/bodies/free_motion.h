@@ -2,75 +2,74 @@
 
 #include <vector>
 
-#include <Eigen/Core>
-
-#include "bodies/mechanisms.h"
+#include "bodies/tree.h"
 
 namespace diffcloth::bodies {
 
-/// Velocities nu = (dc/dt, omega, dq/dt) of a tree of links over a step of which only what is given
-/// knows anything: those with
+/// Where the root and the joints are. The place of the root's center of mass is not needed here.
+template <class T>
+struct Configuration {
+  Matrix3<T> rotation;  ///< of the root
+  VectorX<T> joints;
+};
+
+/// The configuration after a time at constant velocities.
+///
+/// @param root_moves  whether the root follows its velocity, or stays
+template <class T>
+Configuration<T> moved(const Configuration<T>& start,
+                       const VectorX<T>& nu,
+                       double time,
+                       bool root_moves) {
+  const auto joints = static_cast<Eigen::Index>(start.joints.size());
+  Configuration<T> end = start;
+  end.joints += T(time) * nu.tail(joints);
+  if (!root_moves) return end;
+  const Vector3<T> turn = T(time) * nu.template segment<3>(3);
+  end.rotation = quaternion_matrix<T>(quaternion_exp<T>(turn)) * start.rotation;
+  return end;
+}
+
+/// Velocities nu of a tree over a step of which only what is given knows anything: those with
 ///
 ///   r(nu) = p(q_mid, nu) - h/2 s(q_mid, nu) - given = 0
 ///
 /// in the rows that are solved for, where p is the momentum, s = dT/dq the slope of the kinetic energy
-/// at constant nu, and q_mid the middle of the step. The root link is described by its center of mass
-/// c and orientation R.
-///
-/// The equation, its derivatives and what follows from them are in diffcloth_torch/dynamics; here it
-/// is solved, which takes a few evaluations of many small products.
-class FreeMotion {
- public:
-  /// @param links       any order; a coordinate is the place of a joint among the J
-  /// @param order       of the links, parents before their children
-  /// @param solved      rows of nu that are unknown
-  /// @param root_moves  whether the root follows its velocity, or stays
-  FreeMotion(std::vector<Link> links,
-             std::vector<Index> order,
-             Index joint_count,
-             std::vector<Index> solved,
-             bool root_moves,
-             double dt);
+/// at constant nu, and q_mid the middle of the step.
+template <class T>
+struct FreeMotion {
+  const Tree& tree;
+  const std::vector<Index>& solved;  ///< rows of nu that are unknown
+  bool root_moves;
+  double dt;
+  TreeInertia<T> inertia;
+  Configuration<T> start;
+  VectorX<T> known;  ///< nu where it is prescribed, zero elsewhere
+  VectorX<T> given;
 
-  /// One environment: arrays of the sizes in brackets, matrices row after row.
-  struct Given {
-    const double* mass;           ///< [L] kg
-    const double* center;         ///< [L, 3] in the links' frames, m
-    const double* inertia;        ///< [L, 3, 3] about the centers, in the links' axes, kg m^2
-    const double* armature;       ///< [J] kg m^2 or kg
-    const double* root_center;    ///< [3] at the start
-    const double* root_rotation;  ///< [3, 3]
-    const double* joints;         ///< [J]
-    const double* known;          ///< [6 + J] nu where it is prescribed, zero elsewhere
-    const double* momentum;       ///< [6 + J]
-  };
+  VectorX<T> complete(const VectorX<T>& x) const {
+    VectorX<T> nu = known;
+    for (std::size_t k = 0; k < solved.size(); ++k) nu[solved[k]] = x[static_cast<Index>(k)];
+    return nu;
+  }
 
-  /// Solve by Broyden's method from the velocities that M(q_n) alone would give.
-  ///
-  /// @param velocities  [solved]
-  /// @return whether they were found
-  bool solve(const Given& given, double* velocities) const;
-
-  Index link_count() const { return static_cast<Index>(links_.size()); }
-  Index joint_count() const { return joint_count_; }
-  Index solved_count() const { return static_cast<Index>(solved_.size()); }
-
- private:
-  struct Configuration;
-  struct Rates;
-
-  Configuration start(const Given& given) const;
-  Configuration middle(const Given& given, const Eigen::VectorXd& nu) const;
-  Rates rates(const Given& given, const Configuration& at, const Eigen::VectorXd& nu) const;
-  Eigen::VectorXd residual(const Given& given, const Eigen::VectorXd& nu) const;
-  Eigen::VectorXd complete(const Given& given, const Eigen::VectorXd& solved) const;
-
-  std::vector<Link> links_;
-  std::vector<Index> order_;
-  Index joint_count_;
-  std::vector<Index> solved_;
-  bool root_moves_;
-  double dt_;
+  VectorX<T> residual(const VectorX<T>& x) const {
+    const VectorX<T> nu = complete(x);
+    const Configuration<T> middle = moved<T>(start, nu, 0.5 * dt, root_moves);
+    const TreeRates<T> at =
+        rates<T>(tree, inertia, place<T>(tree, inertia, middle.rotation, middle.joints), nu);
+    VectorX<T> r(static_cast<Index>(solved.size()));
+    for (std::size_t k = 0; k < solved.size(); ++k) {
+      const Index i = solved[k];
+      r[static_cast<Index>(k)] = at.momentum[i] - T(0.5 * dt) * at.slope[i] - given[i];
+    }
+    return r;
+  }
 };
+
+/// Solve by Broyden's method from the velocities that M(q_n) alone would give.
+///
+/// @return whether they were found
+bool solve(const FreeMotion<double>& motion, Eigen::VectorXd& x);
 
 }  // namespace diffcloth::bodies

@@ -16,19 +16,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffcloth_torch.dynamics.free_motion import free_turns
-from diffcloth_torch.dynamics.linear import solve, times
+from diffcloth_torch.dynamics.functions import body_functions, outputs_of
+from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.errors import TurnedTooFar
-from diffcloth_torch.geometry.products import product
-from diffcloth_torch.geometry.rotation import (
-    nearer_quaternion,
-    quaternion_exp,
-    quaternion_log,
-    quaternion_matrix,
-    quaternion_multiply,
-    torque_from_moment,
-)
 from diffcloth_torch.model.kinematics import pose_frame
 
 __all__ = [
@@ -64,20 +55,18 @@ class BodyPrediction(NamedTuple):
         coordinates: Coordinates at the start, [B, K, 6].
         target: t, [B, K, 6].
         metric: A, [B, K, 6, 6].
-        inertia: Masses, centers and inertias of the bodies.
-        poses: Poses at the start, [B, K, 7].
         momentum: Angular momentum without contact, [B, K, 3].
         speed: Speed of rotation at the start with that momentum, [B, K] rad/s.
+        inputs: Masses, centers, inertias and poses at the start, as for the core's functions.
     """
 
     frames: Tensor
     coordinates: Tensor
     target: Tensor
     metric: Tensor
-    inertia: BodyInertia
-    poses: Tensor
     momentum: Tensor
     speed: Tensor
+    inputs: dict[str, Tensor]
 
 
 def predict_bodies(
@@ -100,37 +89,20 @@ def predict_bodies(
         dt: h [s].
         names: Names of the bodies, for messages.
     """
-    quaternion = torch.nn.functional.normalize(poses[..., 3:], dim=-1)
-    rotation = quaternion_matrix(quaternion)
-    back = rotation.transpose(-1, -2)
-    center = poses[..., :3] + times(rotation, inertia.center)
-    speed = velocities[..., :3] + dt * (
-        gravity[..., None, :] + wrenches[..., :3] / inertia.mass[..., None]
-    )
-    # In body axes at the start.
-    spin = times(back, velocities[..., 3:])
-    momentum = times(inertia.inertia, spin) + dt * times(back, wrenches[..., 3:])
-    turn, is_found = free_turns(inertia.inertia, momentum, dt)
-    omega = solve(inertia.inertia.expand(*spin.shape, 3), momentum)
+    shared = {
+        "mass": inertia.mass,
+        "center": inertia.center,
+        "inertia": inertia.inertia,
+        "poses": poses,
+    }
+    own = {"velocities": velocities, "wrenches": wrenches, "gravity": gravity}
+    prediction, _ = body_functions(poses.shape[-2], dt)
+    found = outputs_of(prediction, shared | own)
+    speed = found.pop("speed").detach()
+    is_found = found.pop("found").detach() > 0
     if not is_found.all():
-        _refuse_turns(~is_found, omega.detach().norm(dim=-1), dt, names)
-    predicted = quaternion_multiply(quaternion, turn)
-    turned = quaternion_matrix(predicted)
-    moments = product(product(turned, inertia.inertia), turned.transpose(-1, -2))
-    zeros = torch.zeros_like(spin)
-    mass = inertia.mass[..., None, None] * torch.eye(3, dtype=moments.dtype)
-    mass, none = mass.expand_as(moments), torch.zeros_like(moments)
-    metric = torch.cat([torch.cat([mass, none], -1), torch.cat([none, moments], -1)], dim=-2)
-    return BodyPrediction(
-        frames=torch.cat([-times(turned, inertia.center), predicted], dim=-1),
-        coordinates=torch.cat([center, -times(rotation, quaternion_log(turn))], dim=-1),
-        target=torch.cat([center + dt * speed, zeros], dim=-1),
-        metric=metric / dt**2,
-        inertia=inertia,
-        poses=poses,
-        momentum=times(rotation, momentum),
-        speed=omega.detach().norm(dim=-1),
-    )
+        _refuse_turns(~is_found, speed, dt, names)
+    return BodyPrediction(**found, speed=speed, inputs=shared)
 
 
 def turn_sentence(name: str, speed: float, dt: float, most: float, how: str) -> str:
@@ -189,19 +161,15 @@ def advance_bodies(
         kick: Forces at the centers and torques that change velocities only, [B, K, 6].
         dt: h [s].
     """
-    inertia = prediction.inertia
-    center, turn = torch.split(coordinates, 3, dim=-1)
-    predicted = prediction.frames[..., 3:]
-    quaternion = quaternion_multiply(quaternion_exp(turn), predicted)
-    rotation = quaternion_matrix(quaternion)
-    moment = times(prediction.metric[..., 3:, 3:], turn)
-    torque = torque_from_moment(turn, moment)
-    rate = (center - prediction.coordinates[..., :3]) / dt
+    _, advance = body_functions(coordinates.shape[-2], dt)
+    own = {
+        "frames": prediction.frames,
+        "coordinates": prediction.coordinates,
+        "metric": prediction.metric,
+        "momentum": prediction.momentum,
+        "reached": coordinates,
+    }
     if kick is not None:
-        torque = torque + kick[..., 3:]
-        rate = rate + dt * kick[..., :3] / inertia.mass[..., None]
-    momentum = times(rotation.transpose(-1, -2), prediction.momentum + dt * torque)
-    spin = solve(inertia.inertia.expand_as(rotation), momentum)
-    sign = nearer_quaternion(quaternion, prediction.poses[..., 3:])
-    poses = torch.cat([center - times(rotation, inertia.center), sign], dim=-1)
-    return poses, torch.cat([rate, times(rotation, spin)], dim=-1)
+        own["kick"] = kick
+    found = outputs_of(advance, prediction.inputs | own)
+    return found["poses"], found["velocities"]

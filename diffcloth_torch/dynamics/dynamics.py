@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from diffcloth_torch.checks import LARGEST
 from diffcloth_torch.dynamics.bodies import (
     MOST_TURN_IN_CONTACT,
     BodyInertia,
@@ -18,9 +19,15 @@ from diffcloth_torch.dynamics.bodies import (
     predict_bodies,
     turn_sentence,
 )
-from diffcloth_torch.dynamics.drives import Bounds, Gains, idle_terms
 from diffcloth_torch.dynamics.inertia import Inertia
-from diffcloth_torch.dynamics.robots import RobotControl, RobotDynamics, RobotPrediction, RobotState
+from diffcloth_torch.dynamics.robots import (
+    Bounds,
+    Gains,
+    RobotControl,
+    RobotDynamics,
+    RobotPrediction,
+    RobotState,
+)
 from diffcloth_torch.dynamics.totals import Totals
 from diffcloth_torch.geometry.rotation import (
     quaternion_exp,
@@ -201,7 +208,7 @@ class Dynamics:
         b = bodies
         terms = [c.terms for c in robots if c.terms is not None]
         if terms:
-            terms.insert(0, idle_terms(terms[0], self._widths[0]))
+            terms.insert(0, _idle_terms(terms[0], self._widths[0]))
         return Prediction(
             body_poses=torch.cat([start, *(c.root_start[:, None] for c in robots)], dim=1),
             body_targets=torch.cat([end, *(c.root_end[:, None] for c in robots)], dim=1),
@@ -306,7 +313,7 @@ class Dynamics:
             wrenches = None
             if kick is not None:
                 turned = quaternion_multiply(quaternion_exp(own[..., 3:]), bodies.frames[..., 3:])
-                wrenches = self._wrenches(turned, bodies.inertia.center, kick)
+                wrenches = self._wrenches(turned, bodies.inputs["center"], kick)
             moved, rates = advance_bodies(bodies, own, wrenches, self.dt)
             poses = poses.index_copy(1, self._free, moved)
             velocities = velocities.index_copy(1, self._free, rates)
@@ -493,6 +500,12 @@ class Dynamics:
 
 def _indices(values: Iterable[int]) -> Tensor:
     return torch.tensor(list(values), dtype=torch.long)
+
+
+def _idle_terms(like: Tensor, count: int) -> Tensor:
+    """Rows of joint terms that do nothing, [B, count, 7], for coordinates that are no joints."""
+    row = like.new_tensor([0.0, 0.0, 0.0, LARGEST, LARGEST, 0.0, 1.0])
+    return row.expand(len(like), count, len(row))
 
 
 def _rows(parameters: Fields, name: str, rows: slice, *shape: int) -> Tensor:

@@ -5,15 +5,8 @@ and inertia in world axes W_l = diag(m 1, R I R^T):
 
     M = sum_l J_l^T W_l J_l,   p = M nu = sum_l J_l^T h_l,   h_l = W_l V_l.
 
-Let joint j turn about the axis z through the point o, and let F and N be the momentum and the
-angular momentum about o of all links that it carries. Then p_j = z . N (z . F if it slides). A turn
-of the joint moves all links that it carries and no others, so the kinetic energy T = p . nu / 2
-grows with its value, at constant rates, by
-
-    dT/dq_j = dz/dt . N + z . (F x do/dt),   dz/dt = omega x z      (dz/dt . F where it slides).
-
-Lagrange's equations are dp/dt = dT/dq + forces. Those of the root's rotation, in world axes, have
-the same form if its slope is (P x dc/dt), with the momentum P of all.
+This serves energies, momenta and constants. Steps take the same from recursions along the tree in
+the core (`csrc/bodies/tree.h`).
 """
 
 from __future__ import annotations
@@ -25,7 +18,6 @@ from torch import Tensor
 
 from diffcloth_torch.dynamics.jacobians import DifferentialKinematics, Frames
 from diffcloth_torch.dynamics.linear import times
-from diffcloth_torch.dynamics.totals import about_origin
 from diffcloth_torch.geometry.products import product
 
 __all__ = [
@@ -35,8 +27,6 @@ __all__ = [
     "link_momenta",
     "mass_matrix",
     "momentum",
-    "slope",
-    "wrenches_of_forces",
 ]
 
 
@@ -100,59 +90,10 @@ def momentum(motion: Motion, inertia: Inertia, velocity: Tensor) -> Tensor:
     return generalized_force(motion, of_links) + _at_joints(inertia.armature) * velocity
 
 
-def slope(kinematics: DifferentialKinematics, motion: Motion, velocity: Tensor) -> Tensor:
-    """dT/dq of the kinetic energy at constant velocities nu [B, 6 + J], likewise.
-
-    Args:
-        kinematics: The mechanism.
-        motion: Configuration of its links.
-        velocity: nu.
-    """
-    frames = motion.frames
-    twists = times(motion.jacobian, velocity[..., None, :])  # [B, L, 6]
-    momenta = link_momenta(motion, velocity)
-    linear = momenta[..., :3]
-    carried = about_origin(frames.centers, momenta)
-    # Of all links that each joint carries, first about the origin, then about the pivot.
-    F, N = torch.split(product(kinematics.hanging, carried), 3, dim=-1)
-    N = N - torch.linalg.cross(frames.pivots, F)
-    rate, omega = torch.split(twists[..., kinematics.moving, :], 3, dim=-1)
-    arms = frames.pivots - frames.centers[..., kinematics.moving, :]
-    pivot_rate = rate + torch.linalg.cross(omega, arms)
-    axis_rate = torch.linalg.cross(omega, frames.axes)
-    turning = (axis_rate * N + frames.axes * torch.linalg.cross(F, pivot_rate)).sum(-1)
-    sliding = (axis_rate * F).sum(-1)
-    rows = torch.lerp(sliding, turning, kinematics.revolute[:, 0]).unsqueeze(-2)
-    joints = product(rows, kinematics.leaders)[..., 0, :]
-    root_rate = velocity[..., :3]
-    root = torch.linalg.cross(linear.sum(-2), root_rate)
-    return torch.cat([torch.zeros_like(root_rate), root, joints], dim=-1)
-
-
 def generalized_force(motion: Motion, wrenches: Tensor) -> Tensor:
     """sum_l J_l^T f_l of forces at the links' centers and torques, [B, L, 6] -> [B, 6 + J]."""
     columns = motion.jacobian.flatten(-3, -2)
     return product(wrenches.flatten(-2).unsqueeze(-2), columns).squeeze(-2)
-
-
-def wrenches_of_forces(frames: Frames, links: Tensor, points: Tensor, forces: Tensor) -> Tensor:
-    """Force and torque about the center of each link, from forces at points on them.
-
-    Args:
-        frames: Frames of the links.
-        links: Index of each point's link, shape [V].
-        points: Points in the frames of their links [m], shape [V, 3].
-        forces: Forces in world axes [N], shape [B, V, 3].
-
-    Returns:
-        Wrenches in N and N m, shape [B, L, 6].
-    """
-    poses = frames.poses[..., links, :, :]
-    placed = times(poses[..., :3, :3], points) + poses[..., :3, 3]
-    arms = placed - frames.centers[..., links, :]
-    parts = torch.cat([forces, torch.linalg.cross(arms, forces)], dim=-1)
-    zeros = parts.new_zeros(*parts.shape[:-2], frames.centers.shape[-2], 6)
-    return zeros.index_add(-2, links, parts)
 
 
 def _at_joints(values: Tensor) -> Tensor:

@@ -51,7 +51,6 @@ class DifferentialKinematics:
         moving: Links whose joint to the parent moves, length A.
         reach: Whether joint a carries link l, as 0 or 1, shape [L, A].
         revolute: Whether joint a turns, as 0 or 1, shape [A, 1].
-        hanging: Transpose of `reach`, shape [1, A, L].
         leaders: Matrix from the values of the J joints to those of the A joints, shape [1, A, J].
     """
 
@@ -67,7 +66,6 @@ class DifferentialKinematics:
         turns = np.array([kind == "revolute" for kind in mechanism.kind])
 
         self.reach = constant(reach[:, self.moving])
-        self.hanging = constant(reach[:, self.moving].T)[None]
         self.revolute = constant(turns[self.moving, None])
         self.leaders = constant(leaders[self.moving])[None]
         self._kinematics = Kinematics(mechanism)

@@ -14,7 +14,8 @@ known.
 
 The objective of the core is quadratic about that motion, with the metric M(q_n+1)/h^2. A robot that
 something holds at rest instead would not feel its weight there, but that and velocity products of
-the fall: hundredths of it, of the order of h^2. So M changes a little: see `_change_at_rest`.
+the fall: hundredths of it, of the order of h^2. So M changes a little: see `add_change_at_rest` in
+`csrc/bodies/robot_prediction.cpp`, where all of this is evaluated.
 
 **Advance.** After the step the velocities nu over it follow from its two ends, and the second
 line turns them into nu_n+1. A robot that did not move has no velocity, whatever holds it. If motion
@@ -23,6 +24,21 @@ of contact, give this effort from the change of momentum:
 
     M(q_n+1) nu_n+1 - M(q_n) nu_n = h (s(q_mid, nu) + tau(q_n) + f(q_n+1) + tau_c).
 
+**Drives.** A joint under `pd` adds to the objective, with q_n its value at the start of the step,
+
+    1/2 kp (q - q_t)^2 + kd/(2h) (q - q_n - h qd_t)^2 + d/(2h) (q - q_n)^2,
+
+so its drive acts at the end of the step, implicitly and without a bound on the gains. Under
+`torque` there is only the last term, the joint's own viscosity.
+
+That is a drive that has whatever effort it asks for. Under a limit L, of an effort a it has only
+
+    s(a) = a for |a| <= 0.9 L,    sign(a) (0.9 L + 0.1 L r / sqrt(1 + r^2)) beyond,
+
+with the excess r = (|a| - 0.9 L) / (0.1 L). This has two continuous derivatives, and its slope
+never vanishes. What a drive lacks, a - s(a), is part of the term of a joint, which the solver
+evaluates (see csrc/bodies/joint_term.h), as are a limit of the speed and Coulomb friction.
+
 **At rest.** A step that looks for an equilibrium is long, and tau(q_n) would lead far away in it.
 Such a step predicts no motion; it counts tau(q_n) as a force and adds a stiffness of the weight to
 M/h^2: see `weights.py`.
@@ -30,7 +46,6 @@ M/h^2: see `weights.py`.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -38,51 +53,17 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.checks import LARGEST
-from diffcloth_torch.dynamics.drives import (
-    Bounds,
-    Drives,
-    Gains,
-    fold,
-    idle_terms,
-    joint_terms,
-    limited_effort,
-)
-from diffcloth_torch.dynamics.free_motion import robot_motion, solve_motion
-from diffcloth_torch.dynamics.implicit import attach_root, jacobian_of
-from diffcloth_torch.dynamics.inertia import (
-    Inertia,
-    Motion,
-    generalized_force,
-    link_momenta,
-    mass_matrix,
-    momentum,
-    slope,
-    wrenches_of_forces,
-)
-from diffcloth_torch.dynamics.jacobians import ROOT, DifferentialKinematics, root_frame
-from diffcloth_torch.dynamics.linear import solve, times
+from diffcloth_torch.dynamics.functions import outputs_of, robot_functions
+from diffcloth_torch.dynamics.inertia import Inertia, Motion, link_momenta, momentum
+from diffcloth_torch.dynamics.jacobians import ROOT, DifferentialKinematics
+from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
-from diffcloth_torch.dynamics.weights import WeightBound
-from diffcloth_torch.geometry.products import product
-from diffcloth_torch.geometry.rotation import (
-    nearer_quaternion,
-    pose_velocities,
-    quaternion_exp,
-    quaternion_log,
-    quaternion_matrix,
-    quaternion_multiply,
-    rotation_exp,
-)
+from diffcloth_torch.dynamics.weights import Configuration, WeightSpring
+from diffcloth_torch.geometry.rotation import pose_velocities, quaternion_matrix
 from diffcloth_torch.model.kinematics import constant, pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
-from diffcloth_torch.transforms import outside_transforms, plain
 
-__all__ = ["RobotControl", "RobotDynamics", "RobotPrediction", "RobotState"]
-
-# Turn in a step [rad] beyond which a motion over it is not the only one, and energy is not kept.
-_MOST_TURN = math.pi
-# Turn in a step [rad] that a fall must exceed to count as one.
-_LITTLE_TURN = 1e-6
+__all__ = ["Bounds", "Gains", "RobotControl", "RobotDynamics", "RobotPrediction", "RobotState"]
 
 
 class RobotState(NamedTuple):
@@ -120,6 +101,36 @@ class RobotControl(NamedTuple):
     efforts: Tensor
 
 
+class Gains(NamedTuple):
+    """Gains of each joint, [B or 1, J].
+
+    Attributes:
+        stiffness: kp [N m/rad or N/m].
+        damping: kd [N m s/rad or N s/m].
+        viscosity: d of the joint itself, in the same unit.
+    """
+
+    stiffness: Tensor
+    damping: Tensor
+    viscosity: Tensor
+
+
+class Bounds(NamedTuple):
+    """What each joint can do and what resists it, [B or 1, J].
+
+    Attributes:
+        efforts: L [N m or N].
+        velocities: Largest speed [rad/s or m/s].
+        friction: Coulomb friction [N m or N].
+        slip_rates: Speed at which sticking turns into sliding [rad/s or m/s].
+    """
+
+    efforts: Tensor
+    velocities: Tensor
+    friction: Tensor
+    slip_rates: Tensor
+
+
 class RobotPrediction(NamedTuple):
     """The prediction of a robot, for the core and for `RobotDynamics.advance`.
 
@@ -131,14 +142,12 @@ class RobotPrediction(NamedTuple):
         target: t, [B, n].
         metric: A, [B, n, n].
         terms: Rows of the core's joint terms, [B, n, 7]; None if the scene has none.
-        inertia: Masses and inertias of links and joints.
-        drives: Gains and targets of the joints.
-        start: Configuration of the robot at the start.
-        pose: Pose of its root's frame at the start, [B, 7].
+        velocity: nu over the step, [B, 6 + J].
         known: nu if it is prescribed, zero elsewhere; [B, 6 + J].
         given: M(q_n) nu_n + h tau(q_n), [B, 6 + J].
         lost: Which environments have no such motion, as the robot is too fast for the time step: it
             stays where it is there; [B].
+        inputs: Arrays of the core's function that `advance` has in common with the prediction.
     """
 
     root_start: Tensor
@@ -148,21 +157,11 @@ class RobotPrediction(NamedTuple):
     target: Tensor
     metric: Tensor
     terms: Tensor | None
-    inertia: Inertia
-    drives: Drives
-    start: _Configuration
-    pose: Tensor
+    velocity: Tensor
     known: Tensor
     given: Tensor
     lost: Tensor
-
-
-class _Configuration(NamedTuple):
-    """Center of mass [B, 3] and orientation [B, 3, 3] of the root link, joints [B, J]."""
-
-    center: Tensor
-    rotation: Tensor
-    joints: Tensor
+    inputs: dict[str, Tensor]
 
 
 class RobotDynamics:
@@ -192,41 +191,19 @@ class RobotDynamics:
             points: These vertices, in the frames of their links [m], shape [V, 3].
             weight: As for `Dynamics`.
         """
-        self.mechanism, self._kinematics, self._dt = (
-            mechanism,
-            DifferentialKinematics(mechanism),
-            dt,
-        )
+        self.mechanism, self._dt = mechanism, dt
+        self._kinematics = DifferentialKinematics(mechanism)
         self.root = self._kinematics.root
-        self._links, self._points = links, points
-        self._floats = mechanism.base == "floating"
-        joints = mechanism.joint_count
-        self.coordinate_count = joints + ROOT * self._floats
-
-        prescribed = ~mechanism.forced
-        self._prescribed = torch.from_numpy(prescribed)
-        base = torch.zeros(ROOT * self._floats, dtype=torch.bool)
+        self._prescribed = torch.from_numpy(~mechanism.forced)
+        base = torch.zeros(ROOT * (mechanism.base == "floating"), dtype=torch.bool)
         self.prescribed = torch.cat([base, self._prescribed])
-        self._modes = {
-            mode: torch.tensor([m == mode for m in mechanism.actuation], dtype=torch.float64)
-            for mode in ("position", "velocity", "pd")
-        }
-        # The unknowns, among the entries of nu and among the coordinates.
-        first = ROOT - ROOT * self._floats
-        solved = [i for i in range(ROOT + joints) if i < ROOT or not prescribed[i - ROOT]]
-        self._solved = torch.tensor([i for i in solved if i >= first], dtype=torch.long)
-        self._unknown = self._solved - first
-        # Radians of each link by the joints that forces move, [A, J].
-        kinematics = self._kinematics
-        self._turns = kinematics.revolute * kinematics.leaders[0] * ~self._prescribed
-        # Joints whose fall turns links. What floats falls as a whole, without turning.
-        turning = ROOT + torch.nonzero(self._turns.any(0))[:, 0]
-        self._turning = turning[:0] if self._floats else turning
-        self._free_motion = robot_motion(mechanism, self._solved, dt)
-        self._weight = weight
-        self._weight_bound = WeightBound(self._kinematics) if weight == "bounded" else None
-        # Without joints, nobody needs the efforts that hold a prescribed base.
-        self._has_dynamics = mechanism.is_dynamic or joints > 0
+        self.coordinate_count = len(self.prescribed)
+        self._prediction, self._advance = robot_functions(
+            mechanism, dt, links, points, LARGEST, is_at_rest=weight is not None
+        )
+        self._weight = None
+        if weight is not None and mechanism.is_dynamic:
+            self._weight = WeightSpring(self._kinematics, is_bound=weight == "bounded")
         self._own_inertia = None if mechanism.is_dynamic else _inertia_of_prescribed(mechanism)
 
     def predict(
@@ -253,76 +230,56 @@ class RobotDynamics:
             origins: Values of the joints from which friction counts motion, [B, J]; those at the
                 start by default.
         """
-        drives = self._drives(gains, control, bounds)
-        inertia = self._acting(inertia)
-        local = inertia.center[..., self._kinematics.root, :]
-        quaternion = torch.nn.functional.normalize(state.pose[..., 3:], dim=-1)
-        start = _Configuration(*_placed(state.pose[..., :3], quaternion, local), state.joints)
-        known, ends = self._prescribed_motion(start, quaternion, control, local)
-
-        velocity = given = known
-        if self._has_dynamics:
-            here = self._motion(inertia, start)
-            given = self._given(inertia, here, state, control, drives, gravity, contact)
-        lost = torch.zeros(len(state.joints), dtype=torch.bool)
-        if len(self._solved) and self._weight is None:
-            velocity, lost = self._solve(inertia, start, known, given)
-        end = self._moved(start, velocity, self._dt)
-        joints = torch.where(self._prescribed, ends, end.joints)
-        coordinates, free = state.joints, joints
-        root_start, root_end = state.pose, state.pose
-        if self.mechanism.base == "kinematic":
-            root_end = control.pose
-        if self._floats:
-            turn = self._dt * velocity[..., 3:ROOT]
-            coordinates = torch.cat([start.center, -turn, state.joints], dim=-1)
-            free = torch.cat([end.center, torch.zeros_like(turn), joints], dim=-1)
-            ends = torch.cat([coordinates[..., :ROOT], ends], dim=-1)
-            predicted = quaternion_multiply(quaternion_exp(turn), quaternion)
-            offset = -times(end.rotation, local)
-            root_start = root_end = torch.cat([offset, predicted], dim=-1)
-        mass, force = self._mass(inertia, end), None
-        if len(self._turning) and self._weight is None:
-            change = self._change_at_rest(inertia, start, mass, velocity, known, given, state)
-            change = torch.where(lost[:, None, None], 0.0, change)
-            columns = torch.zeros_like(mass[..., self._solved])
-            mass = mass.index_add(-1, self._solved, columns.index_add(-2, self._solved, change))
-        rows = slice(mass.shape[-1] - self.coordinate_count, None)
-        inertial = mass[..., rows, rows] / self._dt**2
-        if len(self._solved) and self._weight is not None:
-            inertial = inertial + self._weight_stiffness(inertia, start, gravity)[..., rows, rows]
-            force = (given / self._dt)[..., rows]
-        metric, target = fold(drives, inertial, free, state.joints, self._dt, self._unknown, force)
-        terms = None
+        inertia = inertia if self._own_inertia is None else self._own_inertia
+        shared = {
+            "mass": inertia.mass,
+            "center": inertia.center,
+            "inertia": inertia.inertia,
+            "armature": inertia.armature,
+            "stiffness": gains.stiffness,
+            "damping": gains.damping,
+            "viscosity": gains.viscosity,
+            "targets": control.joints,
+            "target_rates": control.rates,
+            "efforts": control.efforts,
+            "pose": state.pose,
+            "joints": state.joints,
+        }
+        own = {
+            "velocity": state.velocity,
+            "rates": state.rates,
+            "end_pose": control.pose,
+            "wrench": control.wrench,
+            "gravity": gravity,
+        }
+        if contact is not None:
+            own["contact"] = contact
+        if self._weight is not None:
+            at = Configuration.of(state.pose, inertia.center[..., self.root, :], state.joints)
+            own["weight_stiffness"] = self._weight.stiffness(at, inertia, gravity)
         if bounds is not None:
-            slid_from = state.joints if origins is None else origins
-            of_joints = joint_terms(drives, bounds, state.joints, slid_from, self._dt)
-            roots = coordinates.shape[-1] - state.joints.shape[-1]
-            terms = torch.cat([idle_terms(of_joints, roots), of_joints], dim=1)
+            shared["effort_limits"] = bounds.efforts
+            own["velocity_limits"] = bounds.velocities
+            own["friction"] = bounds.friction
+            own["slip_rates"] = bounds.slip_rates
+        if origins is not None:
+            own["origins"] = origins
+        found = outputs_of(self._prediction, shared | own)
+        terms, lost = found.pop("terms"), found.pop("lost")
         return RobotPrediction(
-            root_start=root_start,
-            root_end=root_end,
-            coordinates=coordinates,
-            ends=ends,
-            target=target,
-            metric=metric,
-            terms=terms,
-            inertia=inertia,
-            drives=drives,
-            start=start,
-            pose=state.pose,
-            known=known,
-            given=given,
-            lost=lost,
+            **found,
+            terms=None if bounds is None else terms,
+            lost=lost.detach() > 0,
+            inputs=shared,
         )
 
     def end_at(self, prediction: RobotPrediction, pose: Tensor) -> RobotPrediction:
         """Change a prediction so that a prescribed base ends at another pose, [B, 7]."""
         if self.mechanism.base != "kinematic":
             return prediction
-        quaternion = torch.nn.functional.normalize(prediction.pose[..., 3:], dim=-1)
-        local = prediction.inertia.center[..., self._kinematics.root, :]
-        root = self._base_rates(prediction.start, quaternion, pose, local)
+        center = prediction.inputs["center"][..., self.root, :]
+        start = _placed(prediction.inputs["pose"], center)
+        root = pose_velocities(start, _placed(pose, center), self._dt)
         known = torch.cat([root, prediction.known[..., ROOT:]], dim=-1)
         return prediction._replace(root_end=pose, known=known)
 
@@ -341,33 +298,20 @@ class RobotDynamics:
             contact: Forces on the vertices in the solution of the step, [B, V, 3] N.
             kick: Further forces, which change velocities only.
         """
-        pose, known, start = prediction.root_end, prediction.known, prediction.start
-        inertia, joints = prediction.inertia, coordinates
-        local = inertia.center[..., self._kinematics.root, :]
-        if self._floats:
-            center, turn, joints = torch.split(coordinates, [3, 3, joints.shape[-1] - ROOT], dim=-1)
-            predicted = prediction.root_end[..., 3:]
-            last = quaternion_exp(turn)
-            quaternion = quaternion_multiply(last, predicted)
-            first = quaternion_exp(-prediction.coordinates[..., 3:ROOT])
-            turned = quaternion_log(quaternion_multiply(last, first))
-            rotation = quaternion_matrix(quaternion)
-            end = _Configuration(center, rotation, joints)
-            quaternion = nearer_quaternion(quaternion, prediction.pose[..., 3:])
-            pose = torch.cat([center - times(rotation, local), quaternion], dim=-1)
-            root_rate = torch.cat([center - start.center, turned], dim=-1) / self._dt
-        else:
-            root_rate = known[..., :ROOT]
-            end = self._moved(start, known, self._dt)._replace(joints=joints)
-        over = torch.cat([root_rate, (joints - start.joints) / self._dt], dim=-1)
-
-        efforts = prediction.drives.applied_efforts(start.joints, joints, self._dt)
-        velocity = over
-        if self._has_dynamics:
-            velocity, held = self._end(prediction, end, over, contact, kick)
-            efforts = torch.where(self._prescribed, held, efforts)
-        root_velocity, rates = torch.split(velocity, [ROOT, velocity.shape[-1] - ROOT], dim=-1)
-        return RobotState(pose, root_velocity, joints, rates), efforts
+        own = {
+            "root_end": prediction.root_end,
+            "coordinates": prediction.coordinates,
+            "known": prediction.known,
+            "given": prediction.given,
+            "reached": coordinates,
+            "contact": contact,
+        }
+        if kick is not None:
+            own["kick"] = kick
+        found = outputs_of(self._advance, prediction.inputs | own)
+        joints = coordinates[..., self.coordinate_count - self.mechanism.joint_count :]
+        after = RobotState(found["pose"], found["velocity"], joints, found["rates"])
+        return after, found["efforts"]
 
     def totals(self, state: RobotState, inertia: Inertia, gravity: Tensor) -> Totals:
         """Momentum and energy of a state; zero if the robot is not dynamic.
@@ -405,177 +349,6 @@ class RobotDynamics:
             root = torch.zeros_like(root)
         return torch.cat([root, state.rates], dim=-1)
 
-    def _drives(self, gains: Gains, control: RobotControl, bounds: Bounds | None) -> Drives:
-        """Set gains and targets to zero that the actuation of a joint does not use."""
-        pd, force = self._modes["pd"], ~self._prescribed
-        asked = applied = force * control.efforts
-        limits = None
-        if bounds is not None:
-            # What is applied to a joint without a drive has its limit here. A drive has it for all
-            # that it asks for; the prediction takes what alone would be within.
-            applied = torch.where(force, limited_effort(asked, bounds.efforts), asked)
-            asked = torch.where(pd > 0, asked, applied)
-            limits = torch.where(pd > 0, bounds.efforts, LARGEST)
-        return Drives(
-            stiffness=pd * gains.stiffness,
-            damping=pd * gains.damping,
-            viscosity=force * gains.viscosity,
-            positions=pd * control.joints,
-            velocities=pd * control.rates,
-            asked=asked,
-            efforts=applied,
-            limits=limits,
-        )
-
-    def _prescribed_motion(
-        self, start: _Configuration, quaternion: Tensor, control: RobotControl, local: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Velocities nu, zero unless prescribed, and the joints' values at the end."""
-        h, joints = self._dt, start.joints
-        position, velocity = self._modes["position"], self._modes["velocity"]
-        rates = position * (control.joints - joints) / h + velocity * control.rates
-        # A position target is reached exactly, not to the rounding of its velocity.
-        ends = torch.where(position > 0, control.joints, joints + h * rates)
-        root = torch.zeros_like(start.center).repeat(1, 2)
-        if self.mechanism.base == "kinematic":
-            root = self._base_rates(start, quaternion, control.pose, local)
-        return torch.cat([root, rates], dim=-1), ends
-
-    def _base_rates(
-        self, start: _Configuration, quaternion: Tensor, end: Tensor, local: Tensor
-    ) -> Tensor:
-        """Velocities [B, 6] of the root that lead to a pose of its frame."""
-        target = torch.nn.functional.normalize(end[..., 3:], dim=-1)
-        center, _ = _placed(end[..., :3], target, local)
-        between = torch.cat([start.center, quaternion], -1), torch.cat([center, target], -1)
-        return pose_velocities(*between, self._dt)
-
-    def _given(
-        self,
-        inertia: Inertia,
-        here: Motion,
-        state: RobotState,
-        control: RobotControl,
-        drives: Drives,
-        gravity: Tensor,
-        contact: Tensor | None,
-    ) -> Tensor:
-        """M(q_n) nu_n + h tau(q_n), [B, 6 + J]."""
-        acting = torch.cat([control.wrench, drives.efforts], dim=-1)
-        acting = acting + generalized_force(here, _weights(inertia, gravity))
-        if contact is not None:
-            acting = acting + self._generalized(here, contact)
-        return momentum(here, inertia, self._velocity(state)) + self._dt * acting
-
-    def _mass(self, inertia: Inertia, at: _Configuration) -> Tensor:
-        """M, zero of a robot that is not dynamic; [B, 6 + J, 6 + J]."""
-        if not self.mechanism.is_dynamic:
-            size = ROOT + self.mechanism.joint_count
-            return at.joints.new_zeros(len(at.joints), size, size)
-        return mass_matrix(self._motion(inertia, at), inertia)
-
-    def _change_at_rest(
-        self,
-        inertia: Inertia,
-        start: _Configuration,
-        mass: Tensor,
-        velocity: Tensor,
-        known: Tensor,
-        given: Tensor,
-        state: RobotState,
-    ) -> Tensor:
-        """What makes M balance the forces on a robot that stays at rest, [B, s, s].
-
-        By itself a robot moves by velocities d of its s unknown ones. One that something holds
-        should lack the impulse y that would let it, but M d has the velocity products of a fall
-        that does not happen: M d = y - e. The symmetric change U of rank two,
-
-            U = (e w^T + w e^T) / k - (e . d) w w^T / k^2,   w = M d,  k = d . w,
-
-        gives (M + U) d = y, and changes nothing across d and M^-1 e. It counts by the share of the
-        kinetic energy that one step of the forces gives: a robot that moves has such products.
-        """
-        h, solved = self._dt, self._solved
-        needed = given
-        if self._prescribed.any() or self.mechanism.base == "kinematic":
-            middle = self._motion(inertia, self._moved(start, known, h / 2))
-            ahead = momentum(middle, inertia, known)
-            needed = given + h / 2 * slope(self._kinematics, middle, known) - ahead
-        M = mass[..., solved[:, None], solved]
-        d = velocity[..., solved]
-        w = times(M, d)
-        e = needed[..., solved] - w
-        # Twice kinetic energies: of the fall, of what a step of the forces adds, and of the motion.
-        now = known.index_copy(-1, solved, self._velocity(state)[..., solved])
-        added = d - now[..., solved]
-        turning = mass.diagonal(dim1=-2, dim2=-1)[..., self._turning].sum(-1)
-        little = (_LITTLE_TURN / h) ** 2 * turning
-        k = (d * w).sum(-1) + little
-        gain = (added * times(M, added)).sum(-1)
-        share = gain / (gain + (now * times(mass, now)).sum(-1) + little)
-        # A change by more than half could leave M indefinite.
-        size_sq = (e * solve(M, e)).sum(-1) / k
-        share = share / (1 + (4 * size_sq) ** 4) ** 0.125
-        w = w / k[..., None]
-        outer = e[..., :, None] * w[..., None, :]
-        along = (e * d).sum(-1)[..., None, None] * w[..., :, None] * w[..., None, :]
-        return share[..., None, None] * (outer + outer.transpose(-1, -2) - along)
-
-    def _weight_stiffness(self, inertia: Inertia, start: _Configuration, gravity: Tensor) -> Tensor:
-        """K of the weight at the start, without a graph, [B, 6 + J, 6 + J]."""
-        inertia, start, gravity = (
-            Inertia(*map(plain, inertia)),
-            _Configuration(*map(plain, start)),
-            plain(gravity),
-        )
-
-        def pull(x: Tensor) -> Tensor:
-            motion = self._motion(inertia, self._moved(start, x, 1.0))
-            return generalized_force(motion, _weights(inertia, gravity))
-
-        with torch.no_grad(), outside_transforms():
-            if self._weight_bound is not None:
-                frames = self._motion(inertia, start).frames
-                return torch.diag_embed(self._weight_bound.stiffness(frames, inertia, gravity))
-            still = start.joints.new_zeros(len(start.joints), ROOT + self.mechanism.joint_count)
-            slopes = jacobian_of(pull)(still)
-            # The moments of a turn are those of its rotation vector but for a skew part.
-            return -(slopes + slopes.transpose(-1, -2)) / 2
-
-    def _solve(
-        self,
-        inertia: Inertia,
-        start: _Configuration,
-        known: Tensor,
-        given: Tensor,
-    ) -> tuple[Tensor, Tensor]:
-        """Velocities nu over the step without contact; where there are none, [B], zero."""
-        h, solved = self._dt, self._solved
-
-        def residual(velocity: Tensor, *inputs: Tensor) -> Tensor:
-            weights, begin, wanted = Inertia(*inputs[:4]), _Configuration(*inputs[4:7]), inputs[-1]
-            middle = self._motion(weights, self._moved(begin, velocity, h / 2))
-            ahead = momentum(middle, weights, velocity)
-            return ahead - h / 2 * slope(self._kinematics, middle, velocity) - wanted
-
-        def complete(x: Tensor, known: Tensor) -> Tensor:
-            return known.expand(*x.shape[:-1], known.shape[-1]).index_copy(-1, solved, x)
-
-        def of_solved(x: Tensor, *inputs: Tensor) -> Tensor:
-            return residual(complete(x, inputs[-2]), *inputs)[..., solved]
-
-        x, found = solve_motion(self._free_motion, inertia, start, known, given)
-        lost = ~found | ~(self._largest_turn(complete(x, known)) <= _MOST_TURN)
-        x = torch.where(lost[:, None], 0.0, x)
-        return complete(attach_root(of_solved, x, (*inertia, *start, known, given)), known), lost
-
-    def _largest_turn(self, velocity: Tensor) -> Tensor:
-        """Largest turn that a floating base or a joint makes by itself in a step [rad], [B]."""
-        velocity = plain(velocity)
-        of_base = velocity[..., 3:ROOT].norm(dim=-1) * self._floats
-        of_joints = times(self._turns, velocity[..., ROOT:]).abs()
-        return self._dt * torch.cat([of_base[..., None], of_joints], dim=-1).amax(dim=-1)
-
     def too_fast(self, prediction: RobotPrediction) -> dict[int, str]:
         """Environment without a motion by itself -> a sentence."""
         sentence = (
@@ -583,65 +356,6 @@ class RobotDynamics:
             f"{self._dt:g} s; no joint, and no base, may turn by more than half a turn in it"
         )
         return dict.fromkeys(prediction.lost.nonzero()[:, 0].tolist(), sentence)
-
-    def _end(
-        self,
-        prediction: RobotPrediction,
-        end: _Configuration,
-        over: Tensor,
-        contact: Tensor,
-        kick: Tensor | None,
-    ) -> tuple[Tensor, Tensor]:
-        """Velocities nu at the end of a step, from those over it, and efforts that held joints."""
-        h, solved, inertia = self._dt, self._solved, prediction.inertia
-        placed = self._motion(inertia, end)
-        middle = self._motion(inertia, self._moved(prediction.start, over, h / 2))
-        rate = slope(self._kinematics, middle, over)
-        impulse = None if kick is None else h * self._generalized(placed, kick)
-        velocity = over
-        if len(solved):
-            ahead = momentum(middle, inertia, over) + h / 2 * rate
-            if impulse is not None:
-                ahead = ahead + impulse
-            change = (ahead - momentum(placed, inertia, over))[..., solved]
-            mass = mass_matrix(placed, inertia)[..., solved[:, None], solved]
-            velocity = over.index_add(-1, solved, solve(mass, change))
-        if not self._prescribed.any():
-            return velocity, over.new_zeros(())
-        missing = momentum(placed, inertia, velocity) - prediction.given
-        if impulse is not None:
-            missing = missing - impulse
-        held = missing / h - rate - self._generalized(placed, contact)
-        return velocity, self._at_joints(held)
-
-    def _moved(self, start: _Configuration, velocity: Tensor, time: float) -> _Configuration:
-        """Configuration after moving at constant velocities."""
-        joints = start.joints + time * velocity[..., ROOT:]
-        if self.mechanism.base == "fixed":
-            return start._replace(joints=joints)
-        turn = rotation_exp(time * velocity[..., 3:ROOT])
-        return _Configuration(
-            start.center + time * velocity[..., :3], product(turn, start.rotation), joints
-        )
-
-    def _motion(self, inertia: Inertia, at: _Configuration) -> Motion:
-        local = inertia.center[..., self._kinematics.root, :]
-        return Motion.at(
-            self._kinematics, inertia, root_frame(at.center, at.rotation, local), at.joints
-        )
-
-    def _generalized(self, motion: Motion, forces: Tensor) -> Tensor:
-        """Generalized forces [B, 6 + J] of forces on the vertices, [B, V, 3]."""
-        wrenches = wrenches_of_forces(motion.frames, self._links, self._points, forces)
-        return generalized_force(motion, wrenches)
-
-    def _at_joints(self, values: Tensor) -> Tensor:
-        return values[..., values.shape[-1] - self.mechanism.joint_count :]
-
-
-def _weights(inertia: Inertia, gravity: Tensor) -> Tensor:
-    """The weight of each link as a wrench about its center, [B, L, 6]."""
-    return inertia.mass[..., None] * torch.nn.functional.pad(gravity, (0, 3))[..., None, :]
 
 
 def _inertia_of_prescribed(mechanism: Mechanism) -> Inertia:
@@ -657,7 +371,8 @@ def _inertia_of_prescribed(mechanism: Mechanism) -> Inertia:
     return Inertia(*(constant(array)[None] for array in arrays))
 
 
-def _placed(position: Tensor, quaternion: Tensor, local: Tensor) -> tuple[Tensor, Tensor]:
-    """Center of mass and orientation of a link whose frame is at a pose."""
-    rotation = quaternion_matrix(quaternion)
-    return position + times(rotation, local), rotation
+def _placed(pose: Tensor, local: Tensor) -> Tensor:
+    """Pose [.., 7] of a link's center of mass, from that of its frame; its quaternion is unit."""
+    quaternion = torch.nn.functional.normalize(pose[..., 3:], dim=-1)
+    center = pose[..., :3] + times(quaternion_matrix(quaternion), local)
+    return torch.cat([center, quaternion], dim=-1)

@@ -14,7 +14,6 @@ from torch import Tensor
 __all__ = [
     "integrate_poses",
     "interpolate_poses",
-    "nearer_quaternion",
     "pose_velocities",
     "quaternion_exp",
     "quaternion_log",
@@ -23,7 +22,6 @@ __all__ = [
     "rotate",
     "rotation_exp",
     "row_velocities",
-    "torque_from_moment",
 ]
 
 # Below this angle [rad] the exponential is summed as a series; its first neglected terms are
@@ -209,37 +207,3 @@ def quaternion_matrix(quaternion: Tensor) -> Tensor:
 def rotation_exp(rotation_vector: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of rotation vectors [..., 3] [rad], smooth at zero too."""
     return quaternion_matrix(quaternion_exp(rotation_vector))
-
-
-def torque_from_moment(rotation_vector: Tensor, moment: Tensor) -> Tensor:
-    """Torque that does the work of a generalized force on a rotation vector.
-
-    Where w changes by dw, R = exp(w) R_0 rotates in the world by J(w) dw, with the left Jacobian J
-    of the exponential. A force Q with the work Q . dw is thus the torque
-
-        J(w)^-T Q = Q + w x Q / 2 + b w x (w x Q),    b = (1 - (a/2) cot(a/2)) / a^2,  a = |w|.
-
-    Args:
-        rotation_vector: w [rad], shorter than 2 pi; shape [..., 3].
-        moment: Q [N m], shape [..., 3].
-
-    Returns:
-        Torques in world axes [N m], shape [..., 3].
-    """
-    w = rotation_vector
-    angle_sq = (w * w).sum(-1, keepdim=True)
-    near_zero = angle_sq < _SERIES_ANGLE**2
-    half = torch.where(near_zero, 1.0, angle_sq / 4).sqrt()
-    s = torch.where(near_zero, angle_sq, 0.0)
-    # The first neglected term is 3e-9 0.1^10.
-    series = 1 / 12 + s * (1 / 720 + s * (1 / 30240 + s * (1 / 1209600 + s / 47900160)))
-    b = torch.where(near_zero, series, (1 - half / torch.tan(half)) / (4 * half * half))
-    turned = torch.linalg.cross(w, moment)
-    torque: Tensor = moment + turned / 2 + b * torch.linalg.cross(w, turned)
-    return torque
-
-
-def nearer_quaternion(quaternion: Tensor, other: Tensor) -> Tensor:
-    """Return q or -q, which are one rotation: the one nearer to `other`; shapes [..., 4]."""
-    opposite = (quaternion * other).sum(-1, keepdim=True) < 0
-    return torch.where(opposite, -quaternion, quaternion)

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from diffcloth_torch.core_functions import as_array
 from diffcloth_torch.model.defaults import check_barrier
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.sim.control_fields import control_fields
 from diffcloth_torch.sim.controls import Control, Parameters
-from diffcloth_torch.sim.core_functions import as_array
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.parameter_fields import parameter_fields
 from diffcloth_torch.sim.state import State

@@ -11,12 +11,12 @@ import torch
 
 from diffcloth_torch import _core
 from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.core_functions import as_array
 from diffcloth_torch.dynamics.limits import LimitStiffness
 from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Fields
 from diffcloth_torch.model.springs import Springs
-from diffcloth_torch.sim.core_functions import as_array
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.step import Constant
 from diffcloth_torch.sim.trees import tree_arguments

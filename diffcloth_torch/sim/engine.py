@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.core_functions import failing_as
 from diffcloth_torch.dynamics.dynamics import Dynamics, Prediction
 from diffcloth_torch.dynamics.limits import limit_stiffness
 from diffcloth_torch.dynamics.totals import Totals
@@ -19,7 +20,6 @@ from diffcloth_torch.model.options import SCHEMES, ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.border import Given
-from diffcloth_torch.sim.core_functions import failing_as
 from diffcloth_torch.sim.cores import CoreOptions, arrays_of, core_inputs, make_core
 from diffcloth_torch.sim.failures import failures_of, mark, refuse_gradients
 from diffcloth_torch.sim.layout import Layout

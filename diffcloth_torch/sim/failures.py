@@ -13,8 +13,8 @@ from diffcloth_torch.errors import (
     SimulationError,
     TurnedTooFar,
 )
+from diffcloth_torch.linear_maps import vmap_level
 from diffcloth_torch.model.quantities import Fields
-from diffcloth_torch.sim.linear_maps import vmap_level
 from diffcloth_torch.sim.step import CONVERGED, INFEASIBLE, TURNED, UNCONVERGED
 from diffcloth_torch.transforms import is_differentiated, same_rows
 

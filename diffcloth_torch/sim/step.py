@@ -34,14 +34,14 @@ from torch import Tensor
 
 from diffcloth_torch import _core
 from diffcloth_torch._exit import note_caller
-from diffcloth_torch.errors import SimulationError
-from diffcloth_torch.sim.core_functions import (
+from diffcloth_torch.core_functions import (
     Arrays,
     CoreFunction,
     as_array,
     evaluate,
     failing_as,
 )
+from diffcloth_torch.errors import SimulationError
 from diffcloth_torch.transforms import is_differentiated
 
 __all__ = [

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch import _core
+from diffcloth_torch.core_functions import Arrays, CoreFunction, as_array, evaluate
 from diffcloth_torch.model.quantities import Fields
-from diffcloth_torch.sim.core_functions import Arrays, CoreFunction, as_array, evaluate
 from diffcloth_torch.transforms import is_differentiated
 
 __all__ = ["stored_energy"]

@@ -6,7 +6,7 @@ import torch
 from coupled_scenes import F64
 
 import diffcloth_torch as dc
-from diffcloth_torch.dynamics.free_motion import free_turns
+from diffcloth_torch import _kernels
 from diffcloth_torch.geometry.rotation import quaternion_matrix
 
 H = 0.008
@@ -119,12 +119,15 @@ def test_a_body_by_itself_turns_exactly(inertia, spin):
     J = torch.diag(torch.tensor(inertia, dtype=F64))[None, None]
     spin = torch.tensor(spin, dtype=F64)
     momentum = (J[0, 0] @ spin).expand(1, 1, 3)
-    once, _ = free_turns(J, momentum, 1.0)
+
+    def turned(momentum, time):
+        quaternion, _, _ = _kernels.free_turns(J.numpy(), momentum.numpy(), time)
+        return quaternion_matrix(torch.from_numpy(quaternion))[0]
+
+    whole = turned(momentum, 1.0)
     turn = torch.eye(3, dtype=F64)
     for _ in range(50):
-        part, _ = free_turns(J, (turn.T @ momentum[0, 0]).expand(1, 1, 3), 0.02)
-        turn = turn @ quaternion_matrix(part)[0, 0]
-    whole = quaternion_matrix(once)[0, 0]
+        turn = turn @ turned(turn.T @ momentum[0, 0], 0.02)
     torch.testing.assert_close(whole, turn, rtol=0, atol=1e-13)
     local = whole.T @ momentum[0, 0]
     energy = local @ torch.linalg.solve(J[0, 0], local) / 2
@@ -134,9 +137,23 @@ def test_a_body_by_itself_turns_exactly(inertia, spin):
 def test_derivatives_of_a_free_turn():
     rng = np.random.default_rng(1)
     root = rng.normal(size=(2, 3, 3))
-    J = torch.tensor(root @ root.transpose(0, 2, 1) + np.eye(3))[None].requires_grad_()
-    momentum = torch.tensor(rng.normal(size=(1, 2, 3)) * 4).requires_grad_()
-    assert torch.autograd.gradcheck(lambda *given: free_turns(*given, 0.7)[0], (J, momentum))
+    given = np.concatenate(
+        [
+            (root @ root.transpose(0, 2, 1) + np.eye(3)).reshape(2, 9),
+            rng.normal(size=(2, 3)) * 4,
+        ],
+        axis=1,
+    )
+
+    def turns(given):
+        parts = np.ascontiguousarray(given[:, :9]), np.ascontiguousarray(given[:, 9:])
+        return _kernels.free_turns(*parts, 0.7)
+
+    _, rates, found = turns(given)
+    assert found.all()
+    for i, unit in enumerate(1e-6 * np.eye(12)):
+        expected = (turns(given + unit)[0] - turns(given - unit)[0]) / 2e-6
+        np.testing.assert_allclose(rates[:, :, i], expected, rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("turn", [1.8, 4.0])

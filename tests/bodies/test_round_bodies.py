@@ -299,7 +299,7 @@ PARAMETERS = {
     "slip_velocity": 1e-6,
     "rest_positions": 1e-6,
     "body_mass": 1e-6,
-    "body_inertia": 1e-9,
+    "body_inertia": 1e-4,
 }
 
 

@@ -12,14 +12,13 @@ from mechanisms import (
     random_configuration,
     tensor,
 )
+from reference import slope, wrenches_of_forces
 
 from diffcloth_torch.dynamics.inertia import (
     Motion,
     generalized_force,
     mass_matrix,
     momentum,
-    slope,
-    wrenches_of_forces,
 )
 from diffcloth_torch.dynamics.jacobians import DifferentialKinematics, root_frame
 from diffcloth_torch.geometry.rotation import quaternion_matrix, rotation_exp

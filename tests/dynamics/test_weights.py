@@ -7,8 +7,8 @@ import pytest
 import torch
 from mechanisms import F64, inertia_of, make, random_configuration
 
-from diffcloth_torch.dynamics.robots import RobotDynamics, _Configuration
-from diffcloth_torch.geometry.rotation import quaternion_matrix
+from diffcloth_torch.dynamics.jacobians import DifferentialKinematics
+from diffcloth_torch.dynamics.weights import Configuration, WeightSpring, _moved
 
 TREES = {
     "chain": (["fixed", *["revolute"] * 4], [-1, 0, 1, 2, 3], None),
@@ -16,26 +16,26 @@ TREES = {
     "mimic": (["fixed", *["revolute"] * 3], [-1, 0, 1, 2], {3: (1, -1.5, 0.2)}),
     "slide": (["fixed", "revolute", "prismatic"], [-1, 0, 1], None),
 }
-NO_CONTACT = torch.zeros(0, dtype=torch.long), torch.zeros(0, 3, dtype=F64)
 GRAVITY = torch.tensor([[1.0, -2.0, -9.0]], dtype=F64)
 
 
 def stiffness(mechanism, weight, at):
-    robot = RobotDynamics(mechanism, 1.0, *NO_CONTACT, weight)
-    return robot._weight_stiffness(inertia_of(mechanism), at, GRAVITY)[0].numpy()
+    spring = WeightSpring(DifferentialKinematics(mechanism), is_bound=weight == "bounded")
+    return spring.stiffness(at, inertia_of(mechanism), GRAVITY)[0].numpy()
 
 
 def energy(mechanism, at, x):
     """Of the weight, after a motion x of the root and the joints."""
-    robot = RobotDynamics(mechanism, 1.0, *NO_CONTACT)
-    inertia = inertia_of(mechanism)
-    centers = robot._motion(inertia, robot._moved(at, x, 1.0)).frames.centers
+    kinematics, inertia = DifferentialKinematics(mechanism), inertia_of(mechanism)
+    spring = WeightSpring(kinematics, is_bound=False)
+    centers = spring.motion(_moved(kinematics, at, x), inertia).frames.centers
     return -(inertia.mass[..., None] * centers * GRAVITY[:, None]).sum()
 
 
 def configuration(mechanism, rng):
     pose, joints, _ = random_configuration(mechanism, rng)
-    return _Configuration(pose[:, :3], quaternion_matrix(pose[:, 3:]), joints)
+    center = inertia_of(mechanism).center[:, mechanism.root]
+    return Configuration.of(pose, center, joints)
 
 
 @pytest.mark.parametrize("name", TREES)

@@ -7,12 +7,10 @@ import pytest
 import torch
 
 from diffcloth_torch.geometry.rotation import (
-    nearer_quaternion,
     quaternion_exp,
     quaternion_log,
     quaternion_matrix,
     rotation_exp,
-    torque_from_moment,
 )
 
 F64 = torch.float64
@@ -48,19 +46,6 @@ def test_logarithm_is_the_inverse(angle):
     torch.testing.assert_close(jacobian, torch.eye(3, dtype=F64), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-4, 0.0999999, 0.1000001, 1.0, 3.0, 5.0])
-def test_torque_does_the_work_of_a_moment(angle):
-    """Against the left Jacobian by differentiation: exp(w + dw) = exp(J dw) exp(w)."""
-    w, moment = angle * AXIS, tensor([0.3, 1.0, -0.5])
-    derivative = torch.autograd.functional.jacobian(rotation_exp, w)  # [3, 3, dw]
-    turns = torch.einsum("ijk,lj->ilk", derivative, rotation_exp(w))
-    J = torch.stack([turns[2, 1], turns[0, 2], turns[1, 0]])
-    torque = torque_from_moment(w, moment)
-    torch.testing.assert_close(J.T @ torque, moment, rtol=0, atol=1e-13)
-    inputs = (w.clone().requires_grad_(), moment.clone().requires_grad_())
-    assert torch.autograd.gradcheck(torque_from_moment, inputs, rtol=1e-7, atol=1e-9)
-
-
 def test_matrices_of_quaternions_are_rotations():
     rng = np.random.default_rng(0)
     q = torch.nn.functional.normalize(tensor(rng.normal(size=(20, 4))), dim=-1)
@@ -68,11 +53,3 @@ def test_matrices_of_quaternions_are_rotations():
     torch.testing.assert_close(M @ M.mT, torch.eye(3, dtype=F64).expand(20, 3, 3))
     torch.testing.assert_close(torch.linalg.det(M), torch.ones(20, dtype=F64))
     torch.testing.assert_close(quaternion_matrix(-q), M, rtol=0, atol=0)
-
-
-def test_the_nearer_of_two_signs():
-    q = torch.nn.functional.normalize(
-        tensor([[0.1, 0.2, -0.3, 0.9], [0.5, 0.5, 0.5, -0.5]]), dim=-1
-    )
-    torch.testing.assert_close(nearer_quaternion(-q, q + 0.01), q, rtol=0, atol=0)
-    torch.testing.assert_close(nearer_quaternion(q, q + 0.01), q, rtol=0, atol=0)

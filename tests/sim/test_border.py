@@ -6,8 +6,8 @@ import torch
 
 import diffcloth_torch as dc
 from diffcloth_torch import _core
+from diffcloth_torch.core_functions import as_array
 from diffcloth_torch.sim import cores
-from diffcloth_torch.sim.core_functions import as_array
 from diffcloth_torch.sim.step import _OUTPUTS, diagnostics_of
 
 F64 = torch.float64

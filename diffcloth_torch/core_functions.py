@@ -16,7 +16,7 @@ from torch import Tensor
 from diffcloth_torch import _core
 from diffcloth_torch._exit import note_caller
 from diffcloth_torch.errors import InvalidInput, SimulationError
-from diffcloth_torch.sim.linear_maps import LinearMap, apply_map
+from diffcloth_torch.linear_maps import LinearMap, apply_map
 from diffcloth_torch.transforms import numbers_of, same_rows
 
 __all__ = ["Arrays", "CoreFunction", "as_array", "evaluate", "failing_as"]

@@ -1,0 +1,130 @@
+// The state of a robot after a step that is solved: see diffcloth_torch/dynamics/robots.py.
+
+#include <algorithm>
+
+#include "bodies/robot.h"
+
+namespace diffcloth::bodies {
+namespace {
+
+class Advance final : public TemplatedFunction<Advance>, private Robot {
+ public:
+  explicit Advance(const RobotModel& model)
+      : TemplatedFunction(inputs_of(model), outputs_of(model)), Robot(model) {}
+
+  template <class T>
+  void of(Inputs<T> in, Outputs<T> out) const {
+    const double h = model_.dt;
+    const Index joints = joint_count();
+    std::vector<T> armature;
+    const TreeInertia<T> inertia = acting(in, armature);
+    const Start<T> start = this->start(in);
+    const T* const reached = in[kReached] + (floats_ ? kRoot : 0);
+    const VectorX<T> known = vector(in[kKnown], size());
+    VectorX<T> over = known;
+    Configuration<T> end = moved<T>(start.configuration, known, h, root_moves_);
+    end.joints = vector(reached, joints);
+    std::copy_n(in[kRootEnd], 7, out[kEndPose]);
+    if (floats_) {
+      const Vector3<T> center = vector3(in[kReached]);
+      const Vector3<T> turn = vector3(in[kReached] + 3);
+      const T* const predicted = in[kRootEnd] + 3;
+      const Quaternion4<T> last = quaternion_exp<T>(turn);
+      const Quaternion4<T> quaternion = quaternion_multiply<T>(
+          last, Quaternion4<T>(predicted[0], predicted[1], predicted[2], predicted[3]));
+      const Quaternion4<T> first = quaternion_exp<T>(vector3(in[kFirst] + 3));
+      end.rotation = quaternion_matrix<T>(quaternion);
+      over.template head<3>() = (center - start.center) / T(h);
+      over.template segment<3>(3) = turn_between<T>(first, last) / T(h);
+      const Vector3<T> place = center + end.rotation * start.back;
+      const T* const before = in[kPose] + 3;
+      put<T>(place,
+             nearer_quaternion<T>(quaternion,
+                                  Quaternion4<T>(before[0], before[1], before[2], before[3])),
+             out[kEndPose]);
+    }
+    over.tail(joints) = (end.joints - start.configuration.joints) / T(h);
+    const std::vector<Drive<T>> drives = this->drives(in);
+    for (Index j = 0; j < joints; ++j) {
+      const T asked = drives[j].effort(in[kJoints][j], end.joints[j], h);
+      const bool is_limited = in[kEffortLimits] != nullptr;
+      out[kAppliedEfforts][j] = is_limited ? limited_effort<T>(asked, drives[j].limit) : asked;
+    }
+    VectorX<T> nu = over;
+    if (has_dynamics_) {
+      nu = last_velocity(in, inertia, start.configuration, end, over, out[kAppliedEfforts]);
+    }
+    std::copy_n(nu.data(), kRoot, out[kEndVelocity]);
+    std::copy_n(nu.data() + kRoot, joints, out[kEndRates]);
+  }
+
+ private:
+  enum Input : std::uint8_t {
+    kRootEnd = kSharedCount,
+    kFirst,
+    kKnown,
+    kGiven,
+    kReached,
+    kContact,
+    kKick
+  };
+  enum Output : std::uint8_t { kEndPose, kEndVelocity, kEndRates, kAppliedEfforts };
+
+  static std::vector<Array> inputs_of(const RobotModel& model) {
+    const std::size_t all = model.tree.size();
+    const std::size_t n = model.tree.joint_count + (model.base == Base::kFloating ? kRoot : 0);
+    const std::size_t V = model.vertex_link.size();
+    std::vector<Array> inputs = shared_inputs(model);
+    const std::vector<Array> own = {
+        {"root_end", {7}}, {"coordinates", {n}}, {"known", {all}},      {"given", {all}},
+        {"reached", {n}},  {"contact", {V, 3}},  {"kick", {V, 3}, true}};
+    inputs.insert(inputs.end(), own.begin(), own.end());
+    return inputs;
+  }
+
+  static std::vector<Array> outputs_of(const RobotModel& model) {
+    const std::size_t J = model.tree.joint_count;
+    return {{"pose", {7}}, {"velocity", {6}}, {"rates", {J}}, {"efforts", {J}}};
+  }
+
+  /// Velocities nu at the end of a step, from those over it; puts the efforts that held joints.
+  template <class T>
+  VectorX<T> last_velocity(Inputs<T> in,
+                           const TreeInertia<T>& inertia,
+                           const Configuration<T>& start,
+                           const Configuration<T>& end,
+                           const VectorX<T>& over,
+                           T* efforts) const {
+    const double h = model_.dt;
+    const std::vector<Placed<T>> placed = place_at(inertia, end);
+    const TreeRates<T> middle = this->middle(inertia, start, over);
+    VectorX<T> impulse = VectorX<T>::Zero(size());
+    if (in[kKick] != nullptr) impulse = T(h) * of_vertices(placed, in[kKick]);
+    VectorX<T> nu = over;
+    if (!solved_.empty()) {
+      const VectorX<T> momentum = rates<T>(model_.tree, inertia, placed, over).momentum;
+      const VectorX<T> change = middle.momentum + T(0.5 * h) * middle.slope + impulse - momentum;
+      const MatrixX<T> mass = mass_matrix<T>(model_.tree, inertia, placed);
+      const VectorX<T> by = solve(pick<T>(mass, solved_), pick<T>(change, solved_));
+      for (std::size_t i = 0; i < solved_.size(); ++i) {
+        nu[solved_[i]] += by[static_cast<Index>(i)];
+      }
+    }
+    if (!has_prescribed_) return nu;
+    const VectorX<T> missing =
+        rates<T>(model_.tree, inertia, placed, nu).momentum - vector(in[kGiven], size()) - impulse;
+    const VectorX<T> held = missing / T(h) - middle.slope - of_vertices(placed, in[kContact]);
+    for (Index j = 0; j < joint_count(); ++j) {
+      if (is_forced_[j] == 0) efforts[j] = held[kRoot + j];
+    }
+    return nu;
+  }
+};
+
+}  // namespace
+
+std::unique_ptr<SmoothFunction> robot_advance(const RobotModel& model) {
+  return std::make_unique<Advance>(model);
+}
+
+}  // namespace diffcloth::bodies

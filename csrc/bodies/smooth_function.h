@@ -1,0 +1,78 @@
+#pragma once
+
+#include <cstddef>
+#include <functional>
+#include <numeric>
+#include <span>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "common/recorded.h"
+
+namespace diffcloth::bodies {
+
+/// A function of arrays of numbers, whose derivatives follow from a recording of its operations.
+class SmoothFunction {
+ public:
+  struct Array {
+    std::string name;
+    std::vector<std::size_t> shape;
+    bool is_optional = false;
+
+    std::size_t size() const {
+      return std::accumulate(shape.begin(), shape.end(), std::size_t{1}, std::multiplies<>());
+    }
+  };
+
+  /// The arrays of one environment; null where an optional one is not given.
+  template <class T>
+  using Inputs = std::span<const T* const>;
+  template <class T>
+  using Outputs = std::span<T* const>;
+
+  virtual ~SmoothFunction() = default;
+
+  virtual void evaluate(Inputs<double> in, Outputs<double> out) const = 0;
+  virtual void evaluate(Inputs<Recorded> in, Outputs<Recorded> out) const = 0;
+
+  const std::vector<Array>& inputs() const { return inputs_; }
+  const std::vector<Array>& outputs() const { return outputs_; }
+
+ protected:
+  SmoothFunction(std::vector<Array> inputs, std::vector<Array> outputs)
+      : inputs_(std::move(inputs)), outputs_(std::move(outputs)) {}
+
+ private:
+  std::vector<Array> inputs_, outputs_;
+};
+
+/// A function where it has been evaluated, with the derivatives by some of its inputs.
+class Linearized {
+ public:
+  /// @param varies  [inputs] which are variables; the others are constants
+  Linearized(const SmoothFunction& function,
+             SmoothFunction::Inputs<double> in,
+             const std::vector<char>& varies);
+
+  /// Gradients by the variables, one array after the other, from cotangents of the outputs likewise.
+  ///
+  /// @param cotangents  [outputs]; null where zero
+  /// @param gradients   [inputs]; null for constants
+  void pull_back(std::span<const double* const> cotangents, std::span<double* const> gradients);
+
+  /// Tangents of the outputs from those of the variables.
+  ///
+  /// @param given     [inputs]; null where zero
+  /// @param tangents  [outputs]
+  void push_forward(std::span<const double* const> given, std::span<double* const> tangents);
+
+ private:
+  const SmoothFunction& function_;
+  const std::vector<char>& varies_;
+  Recording recording_;
+  std::vector<std::vector<Recorded>> outputs_;
+  std::vector<double> change_;  // of each result, or by it
+};
+
+}  // namespace diffcloth::bodies

@@ -1,0 +1,67 @@
+#pragma once
+
+#include <algorithm>
+#include <utility>
+
+#include "bodies/rotations.h"
+#include "bodies/smooth_function.h"
+
+namespace diffcloth::bodies {
+
+/// Both evaluations of a function from one template, Derived::of.
+template <class Derived>
+class TemplatedFunction : public SmoothFunction {
+ public:
+  void evaluate(Inputs<double> in, Outputs<double> out) const final { self().of(in, out); }
+  void evaluate(Inputs<Recorded> in, Outputs<Recorded> out) const final { self().of(in, out); }
+
+ protected:
+  using SmoothFunction::SmoothFunction;
+
+ private:
+  const Derived& self() const { return static_cast<const Derived&>(*this); }
+};
+
+// Parts of arrays as matrices, and back.
+
+template <class T>
+Eigen::Matrix<T, Eigen::Dynamic, 1> vector(const T* numbers, Index size) {
+  return Eigen::Map<const Eigen::Matrix<T, Eigen::Dynamic, 1>>(numbers, size);
+}
+
+template <class T>
+Vector3<T> vector3(const T* numbers) {
+  return {numbers[0], numbers[1], numbers[2]};
+}
+
+/// From rows.
+template <class T>
+Matrix3<T> matrix3(const T* numbers) {
+  return Eigen::Map<const Eigen::Matrix<T, 3, 3, Eigen::RowMajor>>(numbers);
+}
+
+/// The unit quaternion of a pose [7].
+template <class T>
+Quaternion4<T> orientation(const T* pose) {
+  return normalized<T>(Quaternion4<T>(pose[3], pose[4], pose[5], pose[6]));
+}
+
+/// A vector and its negative, as results of their own: what goes back to both cancels to the last bit
+/// where they are turned alike, as it would not one number after the other.
+template <class T>
+std::pair<Vector3<T>, Vector3<T>> both_ways(const Vector3<T>& v) {
+  return {T(1.0) * v, -v};
+}
+
+template <class T, class Values>
+void put(const Values& values, T* out) {
+  std::copy_n(values.data(), values.size(), out);
+}
+
+template <class T>
+void put(const Vector3<T>& position, const Quaternion4<T>& quaternion, T* pose) {
+  put(position, pose);
+  put(quaternion, pose + 3);
+}
+
+}  // namespace diffcloth::bodies

@@ -1,0 +1,124 @@
+"""Functions of bodies and robots over a step, which the core evaluates, as operations of torch.
+
+The core records the operations of an evaluation and goes back along them, so that a gradient takes
+a few evaluations however many inputs there are. There is no second derivative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffcloth_torch import _core
+from diffcloth_torch.core_functions import Arrays, CoreFunction, as_array, evaluate
+from diffcloth_torch.model.mechanism import JOINT_KINDS, Mechanism
+from diffcloth_torch.model.robot import ACTUATIONS, BASES
+from diffcloth_torch.transforms import is_differentiated
+
+__all__ = ["body_functions", "outputs_of", "robot_functions"]
+
+# Environments that a thread takes; fewer do not pay for it.
+_EACH = 16
+
+
+@cache
+def body_functions(count: int, dt: float) -> tuple[_core.SmoothFunction, _core.SmoothFunction]:
+    """Prediction of so many free bodies, and their state once the step is solved.
+
+    Args:
+        count: K.
+        dt: h [s].
+    """
+    return _core.body_functions(count, dt)
+
+
+def robot_functions(
+    mechanism: Mechanism,
+    dt: float,
+    links: Tensor,
+    points: Tensor,
+    largest: float,
+    *,
+    is_at_rest: bool,
+) -> tuple[_core.SmoothFunction, _core.SmoothFunction]:
+    """Prediction of a robot, and its state once the step is solved.
+
+    Args:
+        mechanism: Links and joints of the robot.
+        dt: h [s].
+        links: Index of the link of each vertex that may be in contact, shape [V].
+        points: These vertices, in the frames of their links [m], shape [V, 3].
+        largest: Limits that are none.
+        is_at_rest: Whether steps lead to an equilibrium.
+    """
+    return _core.robot_functions(
+        parent=mechanism.parent.tolist(),
+        order=list(mechanism.order),
+        kind=[JOINT_KINDS.index(kind) for kind in mechanism.kind],
+        offset=np.array(mechanism.offset),
+        axis=np.array(mechanism.axis),
+        dof=mechanism.dof.tolist(),
+        multiplier=np.array(mechanism.multiplier),
+        constant=np.array(mechanism.constant),
+        base=BASES.index(mechanism.base),
+        actuation=[ACTUATIONS.index(mode) for mode in mechanism.actuation],
+        vertex_link=links.tolist(),
+        points=np.array(points.numpy()),
+        dt=dt,
+        largest=largest,
+        is_at_rest=is_at_rest,
+    )
+
+
+def outputs_of(function: _core.SmoothFunction, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Outputs [B, ...] by their names, with a graph if an input has one.
+
+    Args:
+        function: What is evaluated.
+        inputs: Its arrays [B or 1, ...] by their names, without optional ones that are not given.
+    """
+    if not is_differentiated(inputs.values()):
+        arrays = {name: as_array(tensor) for name, tensor in inputs.items()}
+        values = function.values(arrays, _threads(arrays.values()))
+        return {name: torch.from_numpy(array) for name, array in values.items()}
+    operation = _Operation(function, tuple(inputs))
+    results = evaluate(operation, tuple(inputs.values()))
+    return dict(zip(operation.outputs, results, strict=True))
+
+
+class _Operation(CoreFunction):
+    owner = "step"
+
+    def __init__(self, function: _core.SmoothFunction, names: tuple[str, ...]) -> None:
+        super().__init__(names)
+        self._function = function
+        self.outputs: tuple[str, ...] = ()
+
+    def values(self, inputs: Arrays) -> tuple[Tensor, ...]:
+        values = self._function.values(inputs, _threads(inputs.values()))
+        self.outputs = tuple(values)
+        return tuple(torch.from_numpy(array) for array in values.values())
+
+    def tangents(self, inputs: Arrays, tape: Arrays, given: Arrays, count: int) -> list[Tensor]:
+        threads = _threads(inputs.values())
+        tangents = self._function.tangents(inputs, given, count, threads)
+        return [torch.from_numpy(tangents[name]) for name in self.outputs]
+
+    def gradients(
+        self, inputs: Arrays, tape: Arrays, cotangents: list[Tensor], needs: list[str]
+    ) -> list[Tensor]:
+        given = dict(zip(self.outputs, map(as_array, cotangents), strict=True))
+        losses, threads = len(cotangents[0]), _threads(inputs.values())
+        gradients = self._function.gradients(inputs, given, losses, needs, threads)
+        return [
+            torch.from_numpy(gradients[name]).reshape(losses, *inputs[name].shape) for name in needs
+        ]
+
+
+def _threads(arrays: Iterable[np.ndarray]) -> int:
+    environments = max(map(len, arrays))
+    return min(torch.get_num_threads(), max(1, environments // _EACH))
