@@ -199,6 +199,18 @@ void require(bool holds, const char* what) {
   if (!holds) refuse(what);
 }
 
+// In the order of their names in Python.
+constexpr std::array kBases{bodies::Base::kFixed, bodies::Base::kKinematic,
+                            bodies::Base::kFloating};
+constexpr std::array kActuations{bodies::Actuation::kPosition, bodies::Actuation::kVelocity,
+                                 bodies::Actuation::kTorque, bodies::Actuation::kDrive};
+
+template <class Table>
+auto at(const Table& table, Index i, const char* what) {
+  require(i >= 0 && std::cmp_less(i, table.size()), what);
+  return table[i];
+}
+
 bodies::Tree to_tree(const std::vector<Index>& parent,
                      const std::vector<Index>& order,
                      const std::vector<Index>& kind,
@@ -251,16 +263,14 @@ nb::object robot_functions(const std::vector<Index>& parent,
                            bool is_at_rest) {
   bodies::RobotModel model{.tree = to_tree(parent, order, kind, offset, axis, dof, multiplier,
                                            constant, static_cast<Index>(actuation.size())),
-                           .base = static_cast<bodies::Base>(base),
+                           .base = at(kBases, base, "dynamics: `base` is out of range"),
                            .vertex_link = vertex_link,
                            .points = to_vector(points),
                            .dt = dt,
                            .largest = largest,
                            .is_at_rest = is_at_rest};
-  require(base >= 0 && base < 3, "dynamics: `base` is out of range");
   for (const Index mode : actuation) {
-    require(mode >= 0 && mode < 4, "dynamics: `actuation` is out of range");
-    model.actuation.push_back(static_cast<bodies::Actuation>(mode));
+    model.actuation.push_back(at(kActuations, mode, "dynamics: `actuation` is out of range"));
   }
   require(model.points.size() == 3 * vertex_link.size(), "dynamics: `points` must be [V, 3]");
   for (const Index l : vertex_link) {

@@ -429,8 +429,8 @@ class Prediction final : public TemplatedFunction<Prediction>, private Robot {
                          drive.viscosity * moved / T(h) - (drive.asked - drive.applied);
       metric(first + j, first + j) += drive.stiffness + (drive.damping + drive.viscosity) / T(h);
     }
-    std::vector<Index> unknown;  // among the coordinates
-    for (const Index i : solved_) unknown.push_back(i - (size() - coordinate_count()));
+    std::vector<Index> unknown = solved_;
+    for (Index& i : unknown) i -= size() - coordinate_count();  // among the coordinates
     const VectorX<T> shift = solve(pick<T>(metric, unknown), pick<T>(pull, unknown));
     for (std::size_t i = 0; i < unknown.size(); ++i) {
       predicted[unknown[i]] -= shift[static_cast<Index>(i)];

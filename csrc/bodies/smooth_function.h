@@ -16,9 +16,12 @@ namespace diffcloth::bodies {
 class SmoothFunction {
  public:
   struct Array {
+    Array(std::string name, std::vector<std::size_t> shape, bool is_optional = false)
+        : name(std::move(name)), shape(std::move(shape)), is_optional(is_optional) {}
+
     std::string name;
-    std::vector<std::size_t> shape;
-    bool is_optional = false;
+    std::vector<std::size_t> shape;  ///< of one environment
+    bool is_optional;
 
     std::size_t size() const {
       return std::accumulate(shape.begin(), shape.end(), std::size_t{1}, std::multiplies<>());

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <utility>
+#include <vector>
 
 #include "bodies/rotations.h"
 #include "bodies/smooth_function.h"
@@ -15,10 +16,11 @@ class TemplatedFunction : public SmoothFunction {
   void evaluate(Inputs<double> in, Outputs<double> out) const final { self().of(in, out); }
   void evaluate(Inputs<Recorded> in, Outputs<Recorded> out) const final { self().of(in, out); }
 
- protected:
-  using SmoothFunction::SmoothFunction;
-
  private:
+  friend Derived;
+  TemplatedFunction(std::vector<Array> inputs, std::vector<Array> outputs)
+      : SmoothFunction(std::move(inputs), std::move(outputs)) {}
+
   const Derived& self() const { return static_cast<const Derived&>(*this); }
 };
 

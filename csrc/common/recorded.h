@@ -154,6 +154,7 @@ struct NumTraits<diffcloth::Recorded> : NumTraits<double> {
   using Real = diffcloth::Recorded;
   using NonInteger = diffcloth::Recorded;
   using Nested = diffcloth::Recorded;
+  // NOLINTBEGIN(readability-identifier-naming): Eigen's names
   enum {
     IsComplex = 0,
     IsInteger = 0,
@@ -163,6 +164,7 @@ struct NumTraits<diffcloth::Recorded> : NumTraits<double> {
     AddCost = 3,
     MulCost = 3
   };
+  // NOLINTEND(readability-identifier-naming)
 };
 
 }  // namespace Eigen
