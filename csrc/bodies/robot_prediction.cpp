@@ -217,8 +217,7 @@ class Prediction final : public TemplatedFunction<Prediction>, private Robot {
   }
 
   bool turns(const Link& link) const {
-    return link.kind == JointKind::kRevolute && is_forced_[link.coordinate] != 0 &&
-           link.multiplier != 0.0;
+    return link.kind == JointKind::kRevolute && is_forced_[link.coordinate] != 0;
   }
 
   /// Coordinates at the start, those that are prescribed at the end, and frames of the root.

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch import _core
+from diffcloth_torch._exit import note_caller
 from diffcloth_torch.core_functions import Arrays, CoreFunction, as_array, evaluate
 from diffcloth_torch.model.mechanism import JOINT_KINDS, Mechanism
 from diffcloth_torch.model.robot import ACTUATIONS, BASES
@@ -81,6 +82,7 @@ def outputs_of(function: _core.SmoothFunction, inputs: Mapping[str, Tensor]) -> 
         function: What is evaluated.
         inputs: Its arrays [B or 1, ...] by their names, without optional ones that are not given.
     """
+    note_caller()
     if not is_differentiated(inputs.values()):
         arrays = {name: as_array(tensor) for name, tensor in inputs.items()}
         values = function.values(arrays, _threads(arrays.values()))

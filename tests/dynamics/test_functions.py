@@ -56,7 +56,9 @@ class Robot:
         self.dynamics = RobotDynamics(self.mechanism, H, links, points)
         drawn = [random_configuration(self.mechanism, np.random.default_rng(s)) for s in range(3)]
         pose, joints, nu = (torch.cat(parts) for parts in zip(*drawn, strict=True))
-        self.state = RobotState(pose, speed * nu[:, :6], joints, speed * nu[:, 6:])
+        # That of a fixed base is ignored.
+        velocity = tensor(rng.normal(size=(3, 6))) if base == "fixed" else speed * nu[:, :6]
+        self.state = RobotState(pose, velocity, joints, speed * nu[:, 6:])
         self.inertia = inertia_of(self.mechanism, rng.uniform(0.1, 0.2, J))
         end = pose.clone()
         if base == "kinematic":

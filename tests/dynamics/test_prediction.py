@@ -18,7 +18,7 @@ from mechanisms import (
 )
 
 from diffcloth_torch.dynamics.bodies import BodyInertia, advance_bodies, predict_bodies
-from diffcloth_torch.dynamics.inertia import Motion, momentum
+from diffcloth_torch.dynamics.inertia import Motion, mass_matrix, momentum
 from diffcloth_torch.dynamics.jacobians import DifferentialKinematics
 from diffcloth_torch.dynamics.robots import Gains, RobotControl, RobotDynamics, RobotState
 from diffcloth_torch.errors import SimulationError
@@ -568,3 +568,64 @@ def test_bodies_have_the_same_bits_alone_and_in_a_batch():
         rows = [t[i : i + 1].clone().requires_grad_() for t in (poses, velocities, offset)]
         for a, b in zip(go(*rows), together, strict=True):
             assert torch.equal(a[0], b[i])
+
+
+@pytest.mark.parametrize(("turn", "is_lost"), [(3.0, False), (3.3, True)])
+@pytest.mark.parametrize("base", ["fixed", "floating"])
+def test_half_a_turn_in_a_step_is_the_limit(base, turn, is_lost):
+    """Of a joint; and of a base, which turns here by itself."""
+    mechanism = make(*TREES["body" if base == "floating" else "chain"], base=base,
+                     rng=np.random.default_rng(0))  # fmt: skip
+    if base == "floating":
+        mechanism = replace(mechanism, inertia=np.eye(3)[None], center=np.zeros((1, 3)))
+        velocity = tensor([[0, 0, 0, turn / H, 0, 0]])
+        chain = make_chain(mechanism)
+        state = at_rest(chain, velocity=velocity)
+    else:  # one joint, so that its speed stays
+        mechanism = pendulum(lengths=(1.0,), masses=(1.0,))
+        chain = make_chain(mechanism)
+        state = at_rest(chain, rates=tensor([[turn / H]]))
+    p, _, _ = step(chain, state, gravity=0 * GRAVITY)
+    assert bool(p.lost) == is_lost
+    assert p.velocity.any() != is_lost
+
+
+def test_a_robot_that_is_too_fast_has_a_finite_metric():
+    """Its environment fails; the solver is given numbers there, too."""
+    chain = make_chain(make(*TREES["chain"], rng=np.random.default_rng(0)))
+    rates = tensor([[1e200, 0, 0], [1.0, 2.0, 3.0]])
+    state = at_rest(chain, joints=tensor([[0.1, 0.2, 0.3]]).expand(2, 3), rates=rates)
+    state = state._replace(pose=AT_ORIGIN.expand(2, 7), velocity=torch.zeros(2, 6, dtype=F64))
+    joints = state.joints.clone().requires_grad_()
+    p, after, _ = step(chain, state._replace(joints=joints))
+    assert p.lost.tolist() == [True, False]
+    assert p.metric.isfinite().all()
+    # A loss of the other environment has a gradient that is finite everywhere.
+    (gradient,) = torch.autograd.grad(after.rates[1].sum() + p.metric[1].sum(), joints)
+    assert not gradient[0].any()
+    assert gradient[1].isfinite().all()
+    assert gradient[1].any()
+
+
+@pytest.mark.parametrize("h", [0.05, 0.2, 0.4])
+def test_the_metric_of_a_long_fall_from_rest_is_positive(h):
+    """What makes it balance the forces at rest changes it by less than itself."""
+    rng = np.random.default_rng(3)
+    chain = RobotDynamics(pendulum((1.0, 0.5, 0.5), (1.0, 1.0, 1.0)), h, NO_LINKS, NO_POINTS)
+    for _ in range(20):
+        joints = tensor(rng.uniform(-1.5, 1.5, (1, 3)))
+        p, _, _ = step(chain, at_rest(chain, joints))
+        if p.lost:
+            continue
+        mass = mass_at(chain, joints + h * p.velocity[:, 6:])
+        root = torch.linalg.inv(torch.linalg.cholesky(mass))
+        shares = torch.linalg.eigvalsh(root @ (h**2 * p.metric[0]) @ root.T)
+        assert shares.min() > 0.2
+
+
+def mass_at(chain, joints):
+    """M of the joints of a fixed chain, [J, J]."""
+    inertia = inertia_of(chain.mechanism)
+    kinematics = DifferentialKinematics(chain.mechanism)
+    motion = Motion.at(kinematics, inertia, frame_of(AT_ORIGIN), joints)
+    return mass_matrix(motion, inertia)[0, 6:, 6:]
