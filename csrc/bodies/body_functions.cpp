@@ -61,7 +61,6 @@ std::pair<Quaternion4<Recorded>, bool> free_turn_of(const Matrix3<Recorded>& J,
   Quaternion4<Recorded> result;
   for (int i = 0; i < 4; ++i) {
     result[i] = turn[i];
-    if (!found) continue;
     // Adds zero.
     for (int j = 0; j < 12; ++j) result[i] += rate[i][j] * (given[j] - numbers[j]);
   }
