@@ -11,26 +11,28 @@
 namespace diffcloth::bodies {
 namespace {
 
-constexpr std::size_t kCoordinates = 6;
+constexpr std::size_t kBodyCoordinates = 6;
 
 /// Inputs that both functions have.
-enum Shared : std::uint8_t { kMass, kCenter, kInertia, kPoses, kSharedCount };
+struct OfBodies {
+  enum Input : std::uint8_t { kMass, kCenter, kInertia, kPoses, kSharedCount };
+};
 
-using Arrays = std::vector<SmoothFunction::Array>;
+using BodyArrays = std::vector<SmoothFunction::Array>;
 
 /// Of all bodies, from shapes that each has.
-Arrays of_bodies(std::size_t bodies, Arrays arrays) {
+BodyArrays of_bodies(std::size_t bodies, BodyArrays arrays) {
   for (SmoothFunction::Array& array : arrays) array.shape.insert(array.shape.begin(), bodies);
   return arrays;
 }
 
-Arrays with_shared(std::size_t bodies, const Arrays& own) {
-  Arrays inputs = {{"mass", {}}, {"center", {3}}, {"inertia", {3, 3}}, {"poses", {7}}};
+BodyArrays with_shared(std::size_t bodies, const BodyArrays& own) {
+  BodyArrays inputs = {{"mass", {}}, {"center", {3}}, {"inertia", {3, 3}}, {"poses", {7}}};
   inputs.insert(inputs.end(), own.begin(), own.end());
   return of_bodies(bodies, inputs);
 }
 
-Arrays with_gravity(Arrays inputs) {
+BodyArrays with_gravity(BodyArrays inputs) {
   inputs.push_back({"gravity", {3}});
   return inputs;
 }
@@ -67,16 +69,16 @@ std::pair<Quaternion4<Recorded>, bool> free_turn_of(const Matrix3<Recorded>& J,
   return {result, found};
 }
 
-class Prediction final : public TemplatedFunction<Prediction> {
+class BodyPrediction final : public TemplatedFunction<BodyPrediction>, private OfBodies {
  public:
-  Prediction(std::size_t bodies, double dt)
+  BodyPrediction(std::size_t bodies, double dt)
       : TemplatedFunction(
             with_gravity(with_shared(bodies, {{"velocities", {6}}, {"wrenches", {6}}})),
             of_bodies(bodies,
                       {{"frames", {7}},
-                       {"coordinates", {kCoordinates}},
-                       {"target", {kCoordinates}},
-                       {"metric", {kCoordinates, kCoordinates}},
+                       {"coordinates", {kBodyCoordinates}},
+                       {"target", {kBodyCoordinates}},
+                       {"metric", {kBodyCoordinates, kBodyCoordinates}},
                        {"momentum", {3}},
                        {"speed", {}},
                        {"found", {}}})),
@@ -106,18 +108,18 @@ class Prediction final : public TemplatedFunction<Prediction> {
       const Matrix3<T> moments = turned * Matrix3<T>(J * turned.transpose());
 
       put<T>(Vector3<T>(turned * back), predicted, out[kFrames] + 7 * k);
-      T* const coordinates = out[kOwnCoordinates] + kCoordinates * k;
+      T* const coordinates = out[kOwnCoordinates] + kBodyCoordinates * k;
       put(center, coordinates);
       put(Vector3<T>(-(R * quaternion_log<T>(turn))), coordinates + 3);
-      T* const target = out[kTarget] + kCoordinates * k;
+      T* const target = out[kTarget] + kBodyCoordinates * k;
       put(Vector3<T>(center + T(dt_) * speed), target);
       std::fill_n(target + 3, 3, T(0.0));
-      T* const metric = out[kMetric] + kCoordinates * kCoordinates * k;
-      std::fill_n(metric, kCoordinates * kCoordinates, T(0.0));
+      T* const metric = out[kMetric] + kBodyCoordinates * kBodyCoordinates * k;
+      std::fill_n(metric, kBodyCoordinates * kBodyCoordinates, T(0.0));
       for (std::size_t i = 0; i < 3; ++i) {
-        metric[kCoordinates * i + i] = mass / T(dt_ * dt_);
+        metric[kBodyCoordinates * i + i] = mass / T(dt_ * dt_);
         for (std::size_t j = 0; j < 3; ++j) {
-          metric[kCoordinates * (3 + i) + 3 + j] = moments(i, j) / T(dt_ * dt_);
+          metric[kBodyCoordinates * (3 + i) + 3 + j] = moments(i, j) / T(dt_ * dt_);
         }
       }
       put(Vector3<T>(R * momentum), out[kMomentum] + 3 * k);
@@ -127,7 +129,7 @@ class Prediction final : public TemplatedFunction<Prediction> {
   }
 
  private:
-  enum Input : std::uint8_t { kVelocities = kSharedCount, kWrenches, kGravity };
+  enum OwnInput : std::uint8_t { kVelocities = kSharedCount, kWrenches, kGravity };
   enum Output : std::uint8_t {
     kFrames,
     kOwnCoordinates,
@@ -150,16 +152,16 @@ class Prediction final : public TemplatedFunction<Prediction> {
   double dt_;
 };
 
-class Advance final : public TemplatedFunction<Advance> {
+class BodyAdvance final : public TemplatedFunction<BodyAdvance>, private OfBodies {
  public:
-  Advance(std::size_t bodies, double dt)
+  BodyAdvance(std::size_t bodies, double dt)
       : TemplatedFunction(with_shared(bodies,
                                       {{"frames", {7}},
-                                       {"coordinates", {kCoordinates}},
-                                       {"metric", {kCoordinates, kCoordinates}},
+                                       {"coordinates", {kBodyCoordinates}},
+                                       {"metric", {kBodyCoordinates, kBodyCoordinates}},
                                        {"momentum", {3}},
-                                       {"reached", {kCoordinates}},
-                                       {"kick", {kCoordinates}, true}}),
+                                       {"reached", {kBodyCoordinates}},
+                                       {"kick", {kBodyCoordinates}, true}}),
                           of_bodies(bodies, {{"poses", {7}}, {"velocities", {6}}})),
         bodies_(bodies),
         dt_(dt) {}
@@ -167,7 +169,7 @@ class Advance final : public TemplatedFunction<Advance> {
   template <class T>
   void of(Inputs<T> in, Outputs<T> out) const {
     for (std::size_t k = 0; k < bodies_; ++k) {
-      const T* const reached = in[kReached] + kCoordinates * k;
+      const T* const reached = in[kReached] + kBodyCoordinates * k;
       const Vector3<T> center = vector3(reached);
       const Vector3<T> turn = vector3(reached + 3);
       const T* const predicted = in[kFrames] + 7 * k + 3;
@@ -175,18 +177,18 @@ class Advance final : public TemplatedFunction<Advance> {
           quaternion_exp<T>(turn),
           Quaternion4<T>(predicted[0], predicted[1], predicted[2], predicted[3]));
       const Matrix3<T> R = quaternion_matrix<T>(quaternion);
-      const T* const metric = in[kMetric] + kCoordinates * kCoordinates * k;
+      const T* const metric = in[kMetric] + kBodyCoordinates * kBodyCoordinates * k;
       Vector3<T> moment = Vector3<T>::Zero();
       for (std::size_t i = 0; i < 3; ++i) {
         for (std::size_t j = 0; j < 3; ++j) {
-          moment[i] += metric[kCoordinates * (3 + i) + 3 + j] * turn[j];
+          moment[i] += metric[kBodyCoordinates * (3 + i) + 3 + j] * turn[j];
         }
       }
       Vector3<T> torque = torque_from_moment<T>(turn, moment);
-      const T* const before = in[kFirst] + kCoordinates * k;
+      const T* const before = in[kFirst] + kBodyCoordinates * k;
       Vector3<T> rate = (center - vector3(before)) / T(dt_);
       if (in[kKick] != nullptr) {
-        const T* const kick = in[kKick] + kCoordinates * k;
+        const T* const kick = in[kKick] + kBodyCoordinates * k;
         torque += vector3(kick + 3);
         rate += T(dt_) * vector3(kick) / in[kMass][k];
       }
@@ -205,7 +207,14 @@ class Advance final : public TemplatedFunction<Advance> {
   }
 
  private:
-  enum Input : std::uint8_t { kFrames = kSharedCount, kFirst, kMetric, kMomentum, kReached, kKick };
+  enum OwnInput : std::uint8_t {
+    kFrames = kSharedCount,
+    kFirst,
+    kMetric,
+    kMomentum,
+    kReached,
+    kKick
+  };
   enum Output : std::uint8_t { kEndPoses, kEndVelocities };
 
   std::size_t bodies_;
@@ -215,11 +224,11 @@ class Advance final : public TemplatedFunction<Advance> {
 }  // namespace
 
 std::unique_ptr<SmoothFunction> body_prediction(std::size_t bodies, double dt) {
-  return std::make_unique<Prediction>(bodies, dt);
+  return std::make_unique<BodyPrediction>(bodies, dt);
 }
 
 std::unique_ptr<SmoothFunction> body_advance(std::size_t bodies, double dt) {
-  return std::make_unique<Advance>(bodies, dt);
+  return std::make_unique<BodyAdvance>(bodies, dt);
 }
 
 }  // namespace diffcloth::bodies

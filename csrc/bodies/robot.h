@@ -26,24 +26,6 @@ T limited_effort(const T& asked, const T& limit) {
   return sign * (kLinear * limit + bent);
 }
 
-/// Names of inputs that both functions have; those that only one has stand behind them.
-enum RobotInput : std::uint8_t {
-  kMass,
-  kCenter,
-  kInertia,
-  kArmature,
-  kStiffness,
-  kDamping,
-  kViscosity,
-  kTargets,
-  kTargetRates,
-  kEfforts,
-  kEffortLimits,
-  kPose,
-  kJoints,
-  kSharedCount
-};
-
 /// Gains and targets of a joint, zero if its actuation does not use them.
 template <class T>
 struct Drive {
@@ -76,6 +58,24 @@ class Robot {
   }
 
  protected:
+  /// Names of inputs that both functions have; those that only one has stand behind them.
+  enum RobotInput : std::uint8_t {
+    kMass,
+    kCenter,
+    kInertia,
+    kArmature,
+    kStiffness,
+    kDamping,
+    kViscosity,
+    kTargets,
+    kTargetRates,
+    kEfforts,
+    kEffortLimits,
+    kPose,
+    kJoints,
+    kSharedCount
+  };
+
   Index joint_count() const { return model_.tree.joint_count; }
   Index size() const { return model_.tree.size(); }
   Index link_count() const { return static_cast<Index>(model_.tree.links.size()); }

@@ -7,9 +7,9 @@
 namespace diffcloth::bodies {
 namespace {
 
-class Advance final : public TemplatedFunction<Advance>, private Robot {
+class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot {
  public:
-  explicit Advance(const RobotModel& model)
+  explicit RobotAdvance(const RobotModel& model)
       : TemplatedFunction(inputs_of(model), outputs_of(model)), Robot(model) {}
 
   template <class T>
@@ -124,7 +124,7 @@ class Advance final : public TemplatedFunction<Advance>, private Robot {
 }  // namespace
 
 std::unique_ptr<SmoothFunction> robot_advance(const RobotModel& model) {
-  return std::make_unique<Advance>(model);
+  return std::make_unique<RobotAdvance>(model);
 }
 
 }  // namespace diffcloth::bodies

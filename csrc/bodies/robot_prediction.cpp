@@ -69,9 +69,9 @@ struct FoundMotion {
   bool is_lost = false;
 };
 
-class Prediction final : public TemplatedFunction<Prediction>, private Robot {
+class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private Robot {
  public:
-  explicit Prediction(const RobotModel& model)
+  explicit RobotPrediction(const RobotModel& model)
       : TemplatedFunction(inputs_of(model), outputs_of(model)), Robot(model) {
     // Joints whose fall turns links. What floats falls as a whole, without turning.
     for (const Link& link : model.tree.links) {
@@ -465,7 +465,7 @@ class Prediction final : public TemplatedFunction<Prediction>, private Robot {
 }  // namespace
 
 std::unique_ptr<SmoothFunction> robot_prediction(const RobotModel& model) {
-  return std::make_unique<Prediction>(model);
+  return std::make_unique<RobotPrediction>(model);
 }
 
 }  // namespace diffcloth::bodies
