@@ -168,12 +168,10 @@ class Judge:
 
     def _is_free_motion(self, a, b, depth=6):
         # Both collision detections err on the safe side, each where the other need not (Tight
-        # Inclusion at tiny gaps, additive CCD in fast motion), and both less in short motions, and
-        # in those that begin near something instead of ending there.
+        # Inclusion at tiny gaps, additive CCD in fast motion), and both less in short motions.
         ipctk = self._ipctk
         if any(
-            ipctk.is_step_collision_free(self.mesh, *ends, narrow_phase_ccd=ccd)
-            for ends in ((a, b), (b, a))
+            ipctk.is_step_collision_free(self.mesh, a, b, narrow_phase_ccd=ccd)
             for ccd in (
                 ipctk.AdditiveCCD(max_iterations=1_000, conservative_rescaling=0.99),
                 ipctk.TightInclusionCCD(max_iterations=1_000),
