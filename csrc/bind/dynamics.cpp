@@ -26,16 +26,22 @@ using bodies::SmoothFunction;
 
 [[noreturn]] void refuse(const std::string& what) { throw nb::value_error(what.c_str()); }
 
+/// The place of an array among those of a function; their number if there is none of that name.
+std::size_t find(const std::vector<SmoothFunction::Array>& arrays, const std::string& name) {
+  std::size_t i = 0;
+  while (i < arrays.size() && arrays[i].name != name) ++i;
+  return i;
+}
+
 /// Arrays of all environments by the names of a function, with one row for each or one for all,
 /// behind `leading` axes.
 class Rows {
  public:
   Rows(const std::vector<SmoothFunction::Array>& arrays, const nb::dict& given, std::size_t leading)
-      : arrays_(arrays), given_(arrays.size()), copies_(arrays.size(), 0), leading_(leading) {
+      : arrays_(arrays), given_(arrays.size()), copies_(arrays.size(), 0) {
     for (const auto [key, value] : given) {
       const auto name = nb::cast<std::string>(key);
-      std::size_t i = 0;
-      while (i < arrays.size() && arrays[i].name != name) ++i;
+      const std::size_t i = find(arrays, name);
       if (i == arrays.size()) refuse("dynamics: unknown array `" + name + "`");
       given_[i] = nb::cast<Doubles>(value);
       copies_[i] = given_[i].ndim() <= leading ? 0 : given_[i].shape(leading);
@@ -85,7 +91,6 @@ class Rows {
   const std::vector<SmoothFunction::Array>& arrays_;
   std::vector<Doubles> given_;
   std::vector<std::size_t> copies_;
-  std::size_t leading_;
   std::size_t environments_ = 1;
 };
 
@@ -138,8 +143,7 @@ nb::dict gradients(const SmoothFunction& function,
   std::vector<char> varies(count, 0);
   std::vector<std::vector<double>> parts(count);  // [environments, losses, size]
   for (const std::string& name : needs) {
-    std::size_t i = 0;
-    while (i < count && function.inputs()[i].name != name) ++i;
+    const std::size_t i = find(function.inputs(), name);
     if (i == count || given.copies(i) == 0) refuse("dynamics: no input `" + name + "`");
     varies[i] = 1;
     parts[i].resize(environments * losses * function.inputs()[i].size());
@@ -149,6 +153,7 @@ nb::dict gradients(const SmoothFunction& function,
     for (std::size_t loss = 0; loss < losses; ++loss) {
       std::vector<double*> own(count, nullptr);
       for (std::size_t i = 0; i < count; ++i) {
+        if (varies[i] == 0) continue;
         own[i] = parts[i].data() + (e * losses + loss) * function.inputs()[i].size();
       }
       at.pull_back(from.row(e, loss), own);
@@ -211,27 +216,11 @@ auto at(const Table& table, Index i, const char* what) {
   return table[i];
 }
 
-bodies::Tree to_tree(const std::vector<Index>& parent,
-                     const std::vector<Index>& order,
-                     const std::vector<Index>& kind,
-                     const Doubles& offset,
-                     const Doubles& axis,
-                     const std::vector<Index>& dof,
-                     const Doubles& multiplier,
-                     const Doubles& constant,
-                     Index joint_count) {
+bodies::Tree to_tree(const LinkArrays& arrays, const std::vector<Index>& order, Index joint_count) {
+  const std::vector<Index>& parent = arrays.parent;
   const std::size_t count = parent.size();
-  bodies::Tree tree{.links = to_links({.tree = std::vector<Index>(count, 0),
-                                       .parent = parent,
-                                       .kind = kind,
-                                       .offset = to_vector(offset),
-                                       .axis = to_vector(axis),
-                                       .coordinate = dof,
-                                       .multiplier = to_vector(multiplier),
-                                       .constant = to_vector(constant)},
-                                      joint_count),
-                    .order = order,
-                    .joint_count = joint_count};
+  bodies::Tree tree{
+      .links = to_links(arrays, joint_count), .order = order, .joint_count = joint_count};
   constexpr const char* kOrder =
       "dynamics: `order` must hold every link once, parents before their children";
   require(count > 0 && order.size() == count, kOrder);
@@ -261,8 +250,15 @@ nb::object robot_functions(const std::vector<Index>& parent,
                            double dt,
                            double largest,
                            bool is_at_rest) {
-  bodies::RobotModel model{.tree = to_tree(parent, order, kind, offset, axis, dof, multiplier,
-                                           constant, static_cast<Index>(actuation.size())),
+  const LinkArrays links{.tree = std::vector<Index>(parent.size(), 0),
+                         .parent = parent,
+                         .kind = kind,
+                         .offset = to_vector(offset),
+                         .axis = to_vector(axis),
+                         .coordinate = dof,
+                         .multiplier = to_vector(multiplier),
+                         .constant = to_vector(constant)};
+  bodies::RobotModel model{.tree = to_tree(links, order, static_cast<Index>(actuation.size())),
                            .base = at(kBases, base, "dynamics: `base` is out of range"),
                            .vertex_link = vertex_link,
                            .points = to_vector(points),

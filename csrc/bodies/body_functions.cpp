@@ -172,10 +172,8 @@ class BodyAdvance final : public TemplatedFunction<BodyAdvance>, private OfBodie
       const T* const reached = in[kReached] + kBodyCoordinates * k;
       const Vector3<T> center = vector3(reached);
       const Vector3<T> turn = vector3(reached + 3);
-      const T* const predicted = in[kFrames] + 7 * k + 3;
-      const Quaternion4<T> quaternion = quaternion_multiply<T>(
-          quaternion_exp<T>(turn),
-          Quaternion4<T>(predicted[0], predicted[1], predicted[2], predicted[3]));
+      const Quaternion4<T> quaternion =
+          quaternion_multiply<T>(quaternion_exp<T>(turn), vector4(in[kFrames] + 7 * k + 3));
       const Matrix3<T> R = quaternion_matrix<T>(quaternion);
       const T* const metric = in[kMetric] + kBodyCoordinates * kBodyCoordinates * k;
       Vector3<T> moment = Vector3<T>::Zero();
@@ -196,10 +194,8 @@ class BodyAdvance final : public TemplatedFunction<BodyAdvance>, private OfBodie
       const MatrixX<T> J = matrix3(in[kInertia] + 9 * k);
       const VectorX<T> local = R.transpose() * momentum;
       const Vector3<T> spin = solve(J, local);
-      const T* const last = in[kPoses] + 7 * k + 3;
       const Vector3<T> place = center - R * vector3(in[kCenter] + 3 * k);
-      put<T>(place,
-             nearer_quaternion<T>(quaternion, Quaternion4<T>(last[0], last[1], last[2], last[3])),
+      put<T>(place, nearer_quaternion<T>(quaternion, vector4(in[kPoses] + 7 * k + 3)),
              out[kEndPoses] + 7 * k);
       put(rate, out[kEndVelocities] + 6 * k);
       put(Vector3<T>(R * spin), out[kEndVelocities] + 6 * k + 3);

@@ -20,22 +20,15 @@ double largest(const VectorXd& x) { return x.size() == 0 ? 0.0 : x.cwiseAbs().ma
 }  // namespace
 
 bool solve(const FreeMotion<double>& motion, VectorXd& x) {
-  const auto n = static_cast<Index>(motion.solved.size());
   const Configuration<double>& start = motion.start;
   const std::vector<Placed<double>> here =
       place(motion.tree, motion.inertia, start.rotation, start.joints);
   // Without velocity products, but for those of what is prescribed.
   const VectorXd carried = rates(motion.tree, motion.inertia, here, motion.known).momentum;
-  const Eigen::MatrixXd M = mass_matrix(motion.tree, motion.inertia, here);
-  Eigen::MatrixXd mass(n, n);
-  VectorXd rest(n);
-  for (Index j = 0; j < n; ++j) {
-    const Index row = motion.solved[j];
-    for (Index i = 0; i < n; ++i) mass(i, j) = M(motion.solved[i], row);
-    rest[j] = motion.given[row] - carried[row];
-  }
-  Eigen::MatrixXd H = mass.inverse();
-  x = H * rest;
+  const Eigen::MatrixXd mass = mass_matrix(motion.tree, motion.inertia, here);
+  const VectorXd rest = motion.given - carried;
+  Eigen::MatrixXd H = pick(mass, motion.solved).inverse();
+  x = H * pick(rest, motion.solved);
 
   const double scale = std::max(largest(x), largest(motion.known));
   double last = std::numeric_limits<double>::infinity();

@@ -2,6 +2,7 @@
 
 #include <vector>
 
+#include "bodies/small_solve.h"
 #include "bodies/tree.h"
 
 namespace diffcloth::bodies {
@@ -30,6 +31,18 @@ Configuration<T> moved(const Configuration<T>& start,
   return end;
 }
 
+/// Momentum and slope of constant velocities at the middle of a step.
+template <class T>
+TreeRates<T> rates_at_middle(const Tree& tree,
+                             const TreeInertia<T>& inertia,
+                             const Configuration<T>& start,
+                             const VectorX<T>& nu,
+                             double dt,
+                             bool root_moves) {
+  const Configuration<T> middle = moved<T>(start, nu, 0.5 * dt, root_moves);
+  return rates<T>(tree, inertia, place<T>(tree, inertia, middle.rotation, middle.joints), nu);
+}
+
 /// Velocities nu of a tree over a step of which only what is given knows anything: those with
 ///
 ///   r(nu) = p(q_mid, nu) - h/2 s(q_mid, nu) - given = 0
@@ -55,15 +68,9 @@ struct FreeMotion {
 
   VectorX<T> residual(const VectorX<T>& x) const {
     const VectorX<T> nu = complete(x);
-    const Configuration<T> middle = moved<T>(start, nu, 0.5 * dt, root_moves);
-    const TreeRates<T> at =
-        rates<T>(tree, inertia, place<T>(tree, inertia, middle.rotation, middle.joints), nu);
-    VectorX<T> r(static_cast<Index>(solved.size()));
-    for (std::size_t k = 0; k < solved.size(); ++k) {
-      const Index i = solved[k];
-      r[static_cast<Index>(k)] = at.momentum[i] - T(0.5 * dt) * at.slope[i] - given[i];
-    }
-    return r;
+    const TreeRates<T> at = rates_at_middle<T>(tree, inertia, start, nu, dt, root_moves);
+    const VectorX<T> r = at.momentum - T(0.5 * dt) * at.slope - given;
+    return pick(r, solved);
   }
 };
 

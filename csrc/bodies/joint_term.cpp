@@ -9,14 +9,12 @@
 namespace diffcloth::bodies {
 namespace {
 
-/// A drive has what it asks for up to this share of its limit.
-constexpr double kLinear = 0.9;
-
-/// An effort beyond the linear part, a = sign (kLinear L + w r), is limited to sign (kLinear L + w r / s).
+/// An effort beyond the linear part, a = sign (kLinearShare L + w r), is limited to
+/// sign (kLinearShare L + w r / s).
 struct Excess {
   Excess(double a, double limit)
-      : w((1.0 - kLinear) * limit),
-        r(std::max(std::abs(a) - kLinear * limit, 0.0) / w),
+      : w((1.0 - kLinearShare) * limit),
+        r(std::max(std::abs(a) - kLinearShare * limit, 0.0) / w),
         s(std::sqrt(1.0 + r * r)) {}
 
   double limited() const { return w * r / s; }
@@ -114,7 +112,7 @@ JointForce joint_force(const JointTerm& term, const JointConstants& c, double q)
     by_effort = lost;
     by_stiffness = -d * lost;
     // s(a) is homogeneous in a and L.
-    const double limited = sign * (kLinear * term.effort_limit + excess.limited());
+    const double limited = sign * (kLinearShare * term.effort_limit + excess.limited());
     by_effort_limit = -(limited - a * excess.slope()) / term.effort_limit;
   }
 

@@ -41,6 +41,9 @@ inline JointTerm joint_term(const double* row) {
           .slip_rate = row[6]};
 }
 
+/// A drive has what it asks for up to this share of its limit.
+inline constexpr double kLinearShare = 0.9;
+
 /// What does not change with the inputs.
 struct JointConstants {
   double h;                   ///< [s]

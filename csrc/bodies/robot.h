@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "bodies/free_motion.h"
+#include "bodies/joint_term.h"
 #include "bodies/robot_functions.h"
 #include "bodies/small_solve.h"
 #include "bodies/templated_function.h"
@@ -17,13 +18,11 @@ namespace diffcloth::bodies {
 template <class T>
 T limited_effort(const T& asked, const T& limit) {
   using std::sqrt;
-  // A drive has what it asks for up to this share of its limit; joint_term has the same number.
-  constexpr double kLinear = 0.9;
   const double sign = asked < T(0.0) ? -1.0 : 1.0;
-  const T excess = (sign * asked - kLinear * limit) / ((1.0 - kLinear) * limit);
+  const T excess = (sign * asked - kLinearShare * limit) / ((1.0 - kLinearShare) * limit);
   if (!(excess > T(0.0))) return asked;
-  const T bent = (1.0 - kLinear) * limit * excess / sqrt(1.0 + excess * excess);
-  return sign * (kLinear * limit + bent);
+  const T bent = (1.0 - kLinearShare) * limit * excess / sqrt(1.0 + excess * excess);
+  return sign * (kLinearShare * limit + bent);
 }
 
 /// Gains and targets of a joint, zero if its actuation does not use them.
@@ -79,7 +78,7 @@ class Robot {
   Index joint_count() const { return model_.tree.joint_count; }
   Index size() const { return model_.tree.size(); }
   Index link_count() const { return static_cast<Index>(model_.tree.links.size()); }
-  Index coordinate_count() const { return joint_count() + (floats_ ? kRoot : 0); }
+  Index coordinate_count() const { return model_.coordinate_count(); }
   bool is_dynamic() const { return floats_ || has_forced_; }
   bool is_drive(Index j) const { return model_.actuation[j] == Actuation::kDrive; }
   bool is_torque(Index j) const { return model_.actuation[j] == Actuation::kTorque; }
@@ -163,13 +162,12 @@ class Robot {
     return place<T>(model_.tree, inertia, at.rotation, at.joints);
   }
 
-  /// Momentum and slope of velocities that lead to the middle of the step.
+  /// Momentum and slope of velocities at the middle of the step.
   template <class T>
   TreeRates<T> middle(const TreeInertia<T>& inertia,
                       const Configuration<T>& start,
                       const VectorX<T>& nu) const {
-    const Configuration<T> at = moved<T>(start, nu, 0.5 * model_.dt, root_moves_);
-    return rates<T>(model_.tree, inertia, place_at(inertia, at), nu);
+    return rates_at_middle<T>(model_.tree, inertia, start, nu, model_.dt, root_moves_);
   }
 
   /// Generalized forces of forces on the vertices, [V, 3].

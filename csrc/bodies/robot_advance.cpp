@@ -28,20 +28,14 @@ class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot
     if (floats_) {
       const Vector3<T> center = vector3(in[kReached]);
       const Vector3<T> turn = vector3(in[kReached] + 3);
-      const T* const predicted = in[kRootEnd] + 3;
       const Quaternion4<T> last = quaternion_exp<T>(turn);
-      const Quaternion4<T> quaternion = quaternion_multiply<T>(
-          last, Quaternion4<T>(predicted[0], predicted[1], predicted[2], predicted[3]));
+      const Quaternion4<T> quaternion = quaternion_multiply<T>(last, vector4(in[kRootEnd] + 3));
       const Quaternion4<T> first = quaternion_exp<T>(vector3(in[kFirst] + 3));
       end.rotation = quaternion_matrix<T>(quaternion);
       over.template head<3>() = (center - start.center) / T(h);
       over.template segment<3>(3) = turn_between<T>(first, last) / T(h);
       const Vector3<T> place = center + end.rotation * start.back;
-      const T* const before = in[kPose] + 3;
-      put<T>(place,
-             nearer_quaternion<T>(quaternion,
-                                  Quaternion4<T>(before[0], before[1], before[2], before[3])),
-             out[kEndPose]);
+      put<T>(place, nearer_quaternion<T>(quaternion, vector4(in[kPose] + 3)), out[kEndPose]);
     }
     over.tail(joints) = (end.joints - start.configuration.joints) / T(h);
     const std::vector<Drive<T>> drives = this->drives(in);
@@ -72,7 +66,7 @@ class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot
 
   static std::vector<Array> inputs_of(const RobotModel& model) {
     const std::size_t all = model.tree.size();
-    const std::size_t n = model.tree.joint_count + (model.base == Base::kFloating ? kRoot : 0);
+    const std::size_t n = model.coordinate_count();
     const std::size_t V = model.vertex_link.size();
     std::vector<Array> inputs = shared_inputs(model);
     const std::vector<Array> own = {

@@ -24,6 +24,10 @@ struct RobotModel {
   double dt = 0.0;
   double largest = 0.0;     ///< a limit that is none
   bool is_at_rest = false;  ///< steps that look for an equilibrium
+
+  Index coordinate_count() const {
+    return tree.joint_count + (base == Base::kFloating ? kRoot : 0);
+  }
 };
 
 /// A robot over one step by itself, and its state after the step is solved: for their equations see

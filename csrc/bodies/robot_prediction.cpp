@@ -15,7 +15,6 @@ namespace {
 constexpr double kMostTurn = std::numbers::pi;
 /// Turn in a step [rad] that a fall must exceed to count as one.
 constexpr double kLittleTurn = 1e-6;
-constexpr std::size_t kTermRow = 7;  ///< numbers of a joint's term: see joint_term.h
 
 /// The equation of a motion with the same numbers of another type, all of them constants.
 template <class T>
@@ -176,10 +175,6 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
     kLost
   };
 
-  static std::size_t coordinates_of(const RobotModel& model) {
-    return model.tree.joint_count + (model.base == Base::kFloating ? kRoot : 0);
-  }
-
   static std::vector<Array> inputs_of(const RobotModel& model) {
     const std::size_t J = model.tree.joint_count;
     const std::size_t all = model.tree.size();
@@ -201,7 +196,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
   }
 
   static std::vector<Array> outputs_of(const RobotModel& model) {
-    const std::size_t n = coordinates_of(model);
+    const std::size_t n = model.coordinate_count();
     const std::size_t all = model.tree.size();
     return {{"root_start", {7}},
             {"root_end", {7}},
@@ -209,7 +204,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
             {"ends", {n}},
             {"target", {n}},
             {"metric", {n, n}},
-            {"terms", {n, kTermRow}},
+            {"terms", {n, kJointColumns}},
             {"velocity", {all}},
             {"known", {all}},
             {"given", {all}},
@@ -440,12 +435,11 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
   template <class T>
   void put_terms(Inputs<T> in, const std::vector<Drive<T>>& drives, T* rows) const {
     const Index first = coordinate_count() - joint_count();
-    for (Index i = 0; i < first; ++i, rows += kTermRow) {  // a root has no joint
-      const std::array<double, kTermRow> idle{0.0, 0.0, 0.0, model_.largest, model_.largest,
-                                              0.0, 1.0};
+    for (Index i = 0; i < first; ++i, rows += kJointColumns) {  // a root has no joint
+      const JointRow idle{0.0, 0.0, 0.0, model_.largest, model_.largest, 0.0, 1.0};
       std::ranges::copy(idle, rows);
     }
-    for (Index j = 0; j < joint_count(); ++j, rows += kTermRow) {
+    for (Index j = 0; j < joint_count(); ++j, rows += kJointColumns) {
       const Drive<T>& drive = drives[j];
       const T& start = in[kJoints][j];
       const T& origin = in[kOrigins] != nullptr ? in[kOrigins][j] : start;

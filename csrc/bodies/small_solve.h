@@ -3,6 +3,7 @@
 #include <Eigen/LU>
 
 #include "bodies/tree.h"
+#include "common/recorded.h"
 
 namespace diffcloth::bodies {
 

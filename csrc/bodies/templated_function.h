@@ -36,6 +36,11 @@ Vector3<T> vector3(const T* numbers) {
   return {numbers[0], numbers[1], numbers[2]};
 }
 
+template <class T>
+Eigen::Matrix<T, 4, 1> vector4(const T* numbers) {
+  return {numbers[0], numbers[1], numbers[2], numbers[3]};
+}
+
 /// From rows.
 template <class T>
 Matrix3<T> matrix3(const T* numbers) {
@@ -45,7 +50,7 @@ Matrix3<T> matrix3(const T* numbers) {
 /// The unit quaternion of a pose [7].
 template <class T>
 Quaternion4<T> orientation(const T* pose) {
-  return normalized<T>(Quaternion4<T>(pose[3], pose[4], pose[5], pose[6]));
+  return normalized<T>(vector4(pose + 3));
 }
 
 /// A vector and its negative, as results of their own: what goes back to both cancels to the last bit
