@@ -1,6 +1,5 @@
 """A step of a robot costs the same however long the rollout before it, with a graph too."""
 
-import statistics
 import time
 
 import pytest
@@ -28,11 +27,11 @@ def rollout(base, steps, **options):
 
 @pytest.fixture
 def solves(monkeypatch):
-    """Times at which the core was called, in order."""
+    """What this thread had computed when it called the core [s], in order."""
     times, solve = [], engine.take_step
 
     def timed(*args, **keywords):
-        times.append(time.perf_counter())
+        times.append(time.thread_time())
         return solve(*args, **keywords)
 
     monkeypatch.setattr(engine, "take_step", timed)
@@ -43,11 +42,15 @@ def solves(monkeypatch):
 @pytest.mark.parametrize("checkpoint_every", [None, STEPS, 30])
 def test_the_last_step_of_a_rollout_takes_the_time_of_the_first(base, checkpoint_every, solves):
     rollout(base, WINDOW, checkpoint_every=checkpoint_every)  # what torch does once
-    solves.clear()
-    rollout(base, STEPS, checkpoint_every=checkpoint_every)
-    assert len(solves) == STEPS
-    steps = torch.tensor(solves, dtype=torch.float64).diff().tolist()
-    first, last = statistics.median(steps[:WINDOW]), statistics.median(steps[-WINDOW:])
+    rollouts = []
+    for _ in range(3):
+        solves.clear()
+        rollout(base, STEPS, checkpoint_every=checkpoint_every)
+        assert len(solves) == STEPS
+        rollouts.append(torch.tensor(solves, dtype=torch.float64).diff())
+    # The fastest of three is free of whatever else the machine had to do.
+    steps = torch.stack(rollouts).amin(0)
+    first, last = steps[:WINDOW].median(), steps[-WINDOW:].median()
     assert last < 2 * first
 
 
