@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <span>
+#include <utility>
 
 #include "elastic/elements.h"
 #include "linalg/block_pattern.h"
@@ -20,10 +21,7 @@ void put_element(const Model& model, Index e, int l, bool counts, BendingBatch& 
     for (int a = 0; a < 2; ++a) batch.g[2 * (p - 1) + a][l] = (*element.g)(p, a);
   }
   batch.damping[l] = element.damping;
-  for (k = 0; k < 9; ++k) {
-    batch.b[k][l] = element.b->data()[k];
-    batch.b_n[k][l] = element.damping == 0.0 ? 0.0 : element.b_n->data()[k];
-  }
+  for (k = 0; k < 9; ++k) batch.b[k][l] = element.b->data()[k];
 }
 
 void put_points(const Model& model, const Slots& slots, Index e, int l, BendingPoint* points) {
@@ -68,7 +66,19 @@ BendingBatches bending_batches(const Model& model,
     }
     first += batch.size;
   }
+  result.elements = std::move(elements);
   return result;
+}
+
+void put_start_curvatures(const std::vector<Mat3>& curvatures, BendingBatches& bent) {
+  const Index* elements = bent.elements.data();
+  for (BendingBatch& batch : bent.batches) {
+    for (int l = 0; l < kBendingLanes; ++l) {
+      const Mat3& b_n = curvatures[elements[std::min(l, batch.size - 1)]];
+      for (int k = 0; k < 9; ++k) batch.b_n[k][l] = b_n.data()[k];
+    }
+    elements += batch.size;
+  }
 }
 
 }  // namespace diffcloth::elastic

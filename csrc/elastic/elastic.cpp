@@ -78,33 +78,33 @@ std::vector<StretchBatch> stretch_batches(const Model& model,
   return batches;
 }
 
-/// Those of them that are damped.
-std::vector<DampingBatch> damping_batches(const Model& model,
-                                          const Slots& slots,
-                                          const std::vector<Index>& damped) {
-  std::vector<DampingBatch> result;
-  for (const StretchBatch& faces : stretch_batches(model, slots, damped)) {
-    DampingBatch& batch = result.emplace_back(DampingBatch{.faces = faces, .start = {}});
-    const std::size_t first = kStretchLanes * (result.size() - 1);
+/// The face in a lane of a batch of damped ones.
+Index damped_face(const Prepared& prepared, std::size_t batch, int lane) {
+  const std::int32_t last = prepared.damping_of_stretch[batch].faces.size - 1;
+  return prepared.damped[kStretchLanes * batch + static_cast<std::size_t>(std::min(lane, last))];
+}
+
+/// Those of them that are damped, without the start of the step.
+void prepare_damping_of_stretch(const Model& model, const Slots& slots, Prepared& prepared) {
+  for (const StretchBatch& faces : stretch_batches(model, slots, prepared.damped)) {
+    prepared.damping_of_stretch.push_back(DampingBatch{.faces = faces, .start = {}});
+  }
+  for (std::size_t b = 0; b < prepared.damping_of_stretch.size(); ++b) {
     for (int l = 0; l < kStretchLanes; ++l) {
-      const Index f = damped[first + static_cast<std::size_t>(std::min(l, faces.size - 1))];
-      const Mat32 F = face_gradient(model, f, model.x_n);
-      for (int k = 0; k < 6; ++k) batch.start[k][l] = F.data()[k];
-      batch.faces.weight[l] *= model.damping[f] / model.h;
+      prepared.damping_of_stretch[b].faces.weight[l] *=
+          model.damping[damped_face(prepared, b, l)] / model.h;
     }
   }
-  return result;
 }
 
 void prepare_stretch(const Model& model, const Slots& slots, Prepared& prepared) {
   std::vector<Index> isotropic;
-  std::vector<Index> damped;
   for (Index f = 0; f < face_count(model); ++f) {
     (is_orthotropic(model, f) ? prepared.orthotropic : isotropic).push_back(f);
-    if (is_damped(model, f) && !is_orthotropic(model, f)) damped.push_back(f);
+    if (is_damped(model, f) && !is_orthotropic(model, f)) prepared.damped.push_back(f);
   }
   prepared.stretch = stretch_batches(model, slots, isotropic);
-  prepared.damping_of_stretch = damping_batches(model, slots, damped);
+  prepare_damping_of_stretch(model, slots, prepared);
 }
 
 void prepare_form(const Model& model, Index e, Prepared& prepared) {
@@ -118,6 +118,21 @@ void prepare_form(const Model& model, Index e, Prepared& prepared) {
   }
 }
 
+/// What damping takes from the start of the step. The rest of `prepared` is that of the model.
+void prepare_start(const Model& model, Prepared& prepared) {
+  for (std::size_t b = 0; b < prepared.damping_of_stretch.size(); ++b) {
+    for (int l = 0; l < kStretchLanes; ++l) {
+      const Mat32 F = face_gradient(model, damped_face(prepared, b, l), model.x_n);
+      for (int k = 0; k < 6; ++k) prepared.damping_of_stretch[b].start[k][l] = F.data()[k];
+    }
+  }
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    if (prepared.damping[e] == 0.0) continue;
+    prepared.curvature_n[e] = bending::body_curvature(bending_element(model, e), model.x_n);
+  }
+  put_start_curvatures(prepared.curvature_n, prepared.bent);
+}
+
 template <class T>
 std::size_t bytes(const std::vector<T>& values) {
   return sizeof(T) * values.size();
@@ -126,8 +141,8 @@ std::size_t bytes(const std::vector<T>& values) {
 std::size_t bytes(const Prepared& p) {
   return bytes(p.bending) + bytes(p.form) + bytes(p.damping) + bytes(p.flat) +
          bytes(p.curvature_n) + bytes(p.constant) + bytes(p.identity) + bytes(p.stretch) +
-         bytes(p.damping_of_stretch) + bytes(p.bent.batches) + bytes(p.bent.points) +
-         bytes(p.orthotropic);
+         bytes(p.damping_of_stretch) + bytes(p.damped) + bytes(p.bent.batches) +
+         bytes(p.bent.points) + bytes(p.bent.elements) + bytes(p.orthotropic);
 }
 
 const StretchKernels& stretch_here() {
@@ -220,12 +235,11 @@ void prepare(Model& model, const Slots& slots) {
   prepared.form.resize(element_count);
   prepared.damping.resize(element_count);
   prepared.flat.resize(element_count);
-  prepared.curvature_n.resize(element_count);
+  prepared.curvature_n.assign(element_count, Mat3::Zero());
   prepared.constant.assign(slots.block_count, 0.0);
   prepared.by_matrix = true;
-  prepared.damped = false;
-  for (Index f = 0; f < face_count(model); ++f) prepared.damped |= is_damped(model, f);
-  if (prepared.damped && (model.x_n == nullptr || !(model.h > 0.0))) {
+  for (Index f = 0; f < face_count(model); ++f) prepared.has_damping |= is_damped(model, f);
+  if (prepared.has_damping && (model.x_n == nullptr || !(model.h > 0.0))) {
     throw std::invalid_argument("elastic: damping needs the start of the step and a time step > 0");
   }
   prepare_stretch(model, slots, prepared);
@@ -242,9 +256,6 @@ void prepare(Model& model, const Slots& slots) {
     } else {
       bent.push_back(e);
     }
-    if (damping != 0.0) {
-      prepared.curvature_n[e] = bending::body_curvature(element, model.x_n);
-    }
   }
   const double stiffest = prepared.constant.empty() ? 0.0 : std::ranges::max(prepared.constant);
   prepared.by_matrix = stiffest <= kStiffest * model.least_inertia;
@@ -255,37 +266,50 @@ void prepare(Model& model, const Slots& slots) {
     bending::add_constant(element, bending_slots(slots, e), prepared.identity.data());
   }
   prepared.bent = bending_batches(model, slots, std::move(bent));
+  prepare_start(model, prepared);
 }
 
 void PreparedCache::prepare(Model& model, const Slots& slots) {
   // Damping takes numbers from the start of the step.
   const bool damped = std::ranges::any_of(model.damping, [](double value) { return value != 0.0; });
+  const double h = damped ? model.h : 0.0;
   std::vector<double> start;
   if (damped && model.x_n != nullptr) {
     start.assign(model.x_n,
                  model.x_n + 3 * static_cast<std::ptrdiff_t>(model.topology->vertex_count));
-    start.push_back(model.h);
   }
   const std::array<const std::vector<double>*, kFields> fields = {
       &model.stretch,      &model.bending,       &model.poisson,      &model.damping,
       &model.stretch_weft, &model.stretch_shear, &model.bending_weft, &model.bending_twill};
   const auto is_of_model = [&](const Entry& entry) {
-    if (entry.least_inertia != model.least_inertia || entry.start != start) return false;
+    if (entry.least_inertia != model.least_inertia || entry.h != h) return false;
     return std::ranges::equal(entry.fields, fields,
                               [](const auto& kept, const auto* given) { return kept == *given; });
   };
+  const auto is_the_same = [&](const Entry& entry) {
+    return entry.start == start && is_of_model(entry);
+  };
+  std::shared_ptr<const Prepared> of_other_start;
   {
     const std::lock_guard lock(mutex_);
-    const auto entry = std::ranges::find_if(entries_, is_of_model);
-    if (entry != entries_.end()) {
-      entries_.splice(entries_.begin(), entries_, entry);
-      model.prepared = entry->prepared;
+    if (const auto same = std::ranges::find_if(entries_, is_the_same); same != entries_.end()) {
+      entries_.splice(entries_.begin(), entries_, same);
+      model.prepared = same->prepared;
       return;
     }
+    const auto other = std::ranges::find_if(entries_, is_of_model);
+    if (other != entries_.end()) of_other_start = other->prepared;
   }
-  elastic::prepare(model, slots);
+  if (of_other_start != nullptr && !start.empty()) {
+    const auto made = std::make_shared<Prepared>(*of_other_start);
+    model.prepared = made;
+    prepare_start(model, *made);
+  } else {
+    elastic::prepare(model, slots);
+  }
   Entry entry{.fields = {},
               .least_inertia = model.least_inertia,
+              .h = h,
               .start = std::move(start),
               .prepared = model.prepared,
               .bytes = bytes(*model.prepared)};

@@ -53,14 +53,15 @@ struct Prepared {
   std::vector<Mat3> form;             ///< [B]
   std::vector<double> damping;        ///< [B] k_d / h [-]
   std::vector<std::uint8_t> flat;     ///< [B] no rest curvature and no damping: a constant Hessian
-  std::vector<Mat3> curvature_n;      ///< [B] body-frame curvature at x_n, where damped
+  std::vector<Mat3> curvature_n;      ///< [B] body-frame curvature at x_n, zero if not damped
   std::vector<double> constant;       ///< [slots] sum of the flat elements' Hessians, times I
   std::vector<double> identity;       ///< [slots] the same of what all elements' have of I
   std::vector<StretchBatch> stretch;  ///< of isotropic faces
   std::vector<DampingBatch> damping_of_stretch;  ///< of isotropic faces that have any
+  std::vector<Index> damped;                     ///< these faces, ascending
   BendingBatches bent;                           ///< elements that are not flat
   std::vector<Index> orthotropic;                ///< all others, ascending
-  bool damped = false;                           ///< some face has damping
+  bool has_damping = false;                      ///< some face has any
   bool by_matrix = true;  ///< energy and gradient of flat elements are those of their matrix
 };
 
@@ -92,7 +93,7 @@ struct Model {
 void prepare(Model& model, const Slots& slots);
 
 /// prepare() for models of one rest shape, which often have the numbers of an earlier one: a step's backward those
-/// of the step, a step those of the step before; with damping, whose numbers are of one step, only the former.
+/// of the step, a step those of the step before, but for what damping takes from the start of the step.
 class PreparedCache {
  public:
   PreparedCache() = default;
@@ -108,7 +109,8 @@ class PreparedCache {
   struct Entry {
     std::array<std::vector<double>, kFields> fields;
     double least_inertia;
-    std::vector<double> start;  ///< x_n and h of a model with damping
+    double h;                   ///< of a model with damping, otherwise zero
+    std::vector<double> start;  ///< x_n, likewise, otherwise empty
     std::shared_ptr<const Prepared> prepared;
     std::size_t bytes;
   };

@@ -206,7 +206,7 @@ void add_mixed(const Model& model, const double* x, const double* z, bool with_r
 
 void add_tangent(
     const Model& model, const double* x, const Bar& dot, const Changing& changing, double* y) {
-  const bool damped = model.prepared->damped && changing.start;
+  const bool damped = model.prepared->has_damping && changing.start;
   if (!changing.materials && !changing.rest && !damped) return;
   const auto add = is_woven(model) ? add_woven_tangent : add_face_tangent;
   for (Index f = 0; f < face_count(model); ++f) add(model, f, x, dot, changing, y);

@@ -47,7 +47,7 @@ void ElasticPotential::add_extrapolation(const double* x,
 }
 
 void ElasticPotential::accumulate(const double* x, const double* z) {
-  if (wanted_ == Wanted::kNone && !model_.prepared->damped) return;
+  if (wanted_ == Wanted::kNone && !model_.prepared->has_damping) return;
   add_mixed(model_, x, negated(z, model_.topology->vertex_count).data(),
             wanted_ == Wanted::kMaterialsAndRest, bar());
 }

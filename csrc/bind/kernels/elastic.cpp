@@ -204,7 +204,8 @@ class Elastic {
                     const Positions& x1,
                     bool positive) const {
     const elastic::BendingKernels& kernels = elastic::bending_kernels(level_named(level));
-    const auto& [batches, points] = model_.prepared->bent;
+    const std::vector<elastic::BendingBatch>& batches = model_.prepared->bent.batches;
+    const std::vector<elastic::BendingPoint>& points = model_.prepared->bent.points;
     const std::vector<double> from = positions("x0", x0);
     const std::vector<double> to = positions("x1", x1);
     std::vector<double> g(from.size(), 0.0);
