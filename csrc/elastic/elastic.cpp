@@ -10,10 +10,9 @@
 #include "elastic/bending.h"
 #include "elastic/elements.h"
 #include "elastic/extrapolation.h"
+#include "elastic/face_batches.h"
 #include "elastic/face_terms.h"
 #include "elastic/frame.h"
-#include "elastic/orthotropic_damping.h"
-#include "elastic/orthotropic_stretch.h"
 
 namespace diffcloth::elastic {
 namespace {
@@ -44,67 +43,16 @@ void add_face_blocks(const std::array<Index, 3>& face,
   }
 }
 
-/// Isotropic triangles in lanes, in their order.
-std::vector<StretchBatch> stretch_batches(const Model& model,
-                                          const Slots& slots,
-                                          const std::vector<Index>& isotropic) {
-  const auto count = static_cast<Index>(isotropic.size());
-  std::vector<StretchBatch> batches((count + kStretchLanes - 1) / kStretchLanes);
-  for (std::size_t b = 0; b < batches.size(); ++b) {
-    StretchBatch& batch = batches[b];
-    const auto first = static_cast<Index>(b) * kStretchLanes;
-    batch.size = std::min(kStretchLanes, count - first);
-    for (int l = 0; l < kStretchLanes; ++l) {
-      const Index f = isotropic[first + std::min(l, batch.size - 1)];
-      const std::array<Index, 3>& face = model.topology->faces[f];
-      const mesh::ShapeGradient& g = model.rest->shape_gradient[f];
-      const Index* const face_slots = slots.stretch.data() + 6 * static_cast<std::ptrdiff_t>(f);
-      std::array<int, 3> corner{0, 1, 2};
-      std::ranges::sort(corner, {}, [&](int p) { return face[p]; });
-      int k = 0;
-      for (int p = 0; p < 3; ++p) {
-        batch.vertex[p][l] = face[corner[p]];
-        for (int q = 0; q <= p; ++q, ++k) {
-          const auto [low, high] = std::minmax(corner[p], corner[q]);
-          batch.slot[k][l] = face_slots[linalg::lower(high, low)];
-        }
-      }
-      for (int p = 1; p < 3; ++p) {
-        for (int a = 0; a < 2; ++a) batch.g[2 * (p - 1) + a][l] = g(corner[p], a);
-      }
-      batch.weight[l] = l < batch.size ? stretch_weight(model, f) : 0.0;
-    }
-  }
-  return batches;
-}
-
-/// The face in a lane of a batch of damped ones.
-Index damped_face(const Prepared& prepared, std::size_t batch, int lane) {
-  const std::int32_t last = prepared.damping_of_stretch[batch].faces.size - 1;
-  return prepared.damped[kStretchLanes * batch + static_cast<std::size_t>(std::min(lane, last))];
-}
-
-/// Those of them that are damped, without the start of the step.
-void prepare_damping_of_stretch(const Model& model, const Slots& slots, Prepared& prepared) {
-  for (const StretchBatch& faces : stretch_batches(model, slots, prepared.damped)) {
-    prepared.damping_of_stretch.push_back(DampingBatch{.faces = faces, .start = {}});
-  }
-  for (std::size_t b = 0; b < prepared.damping_of_stretch.size(); ++b) {
-    for (int l = 0; l < kStretchLanes; ++l) {
-      prepared.damping_of_stretch[b].faces.weight[l] *=
-          model.damping[damped_face(prepared, b, l)] / model.h;
-    }
-  }
-}
-
 void prepare_stretch(const Model& model, const Slots& slots, Prepared& prepared) {
   std::vector<Index> isotropic;
+  std::vector<Index> orthotropic;
   for (Index f = 0; f < face_count(model); ++f) {
-    (is_orthotropic(model, f) ? prepared.orthotropic : isotropic).push_back(f);
-    if (is_damped(model, f) && !is_orthotropic(model, f)) prepared.damped.push_back(f);
+    (is_orthotropic(model, f) ? orthotropic : isotropic).push_back(f);
+    if (is_damped(model, f)) prepared.damped.push_back(f);
   }
   prepared.stretch = stretch_batches(model, slots, isotropic);
-  prepare_damping_of_stretch(model, slots, prepared);
+  prepared.woven = woven_batches(model, slots, orthotropic);
+  prepared.damping_of_stretch = damping_batches(model, slots, prepared.damped);
 }
 
 void prepare_form(const Model& model, Index e, Prepared& prepared) {
@@ -120,12 +68,7 @@ void prepare_form(const Model& model, Index e, Prepared& prepared) {
 
 /// What damping takes from the start of the step. The rest of `prepared` is that of the model.
 void prepare_start(const Model& model, Prepared& prepared) {
-  for (std::size_t b = 0; b < prepared.damping_of_stretch.size(); ++b) {
-    for (int l = 0; l < kStretchLanes; ++l) {
-      const Mat32 F = face_gradient(model, damped_face(prepared, b, l), model.x_n);
-      for (int k = 0; k < 6; ++k) prepared.damping_of_stretch[b].start[k][l] = F.data()[k];
-    }
-  }
+  put_start_gradients(model, prepared.damped, prepared.damping_of_stretch);
   for (Index e = 0; e < model.stencils->size(); ++e) {
     if (prepared.damping[e] == 0.0) continue;
     prepared.curvature_n[e] = bending::body_curvature(bending_element(model, e), model.x_n);
@@ -142,7 +85,7 @@ std::size_t bytes(const Prepared& p) {
   return bytes(p.bending) + bytes(p.form) + bytes(p.damping) + bytes(p.flat) +
          bytes(p.curvature_n) + bytes(p.constant) + bytes(p.identity) + bytes(p.stretch) +
          bytes(p.damping_of_stretch) + bytes(p.damped) + bytes(p.bent.batches) +
-         bytes(p.bent.points) + bytes(p.bent.elements) + bytes(p.orthotropic);
+         bytes(p.bent.points) + bytes(p.bent.elements) + bytes(p.woven);
 }
 
 const StretchKernels& stretch_here() {
@@ -347,19 +290,9 @@ double energy_change(const Model& model, const double* x0, const double* x1) {
   const Prepared& prepared = *model.prepared;
   double total =
       stretch_here().energy_change(prepared.stretch.data(), prepared.stretch.size(), x0, x1);
-  for (const Index f : prepared.orthotropic) {
-    total += orthotropic::energy_change(weave(model, f).scaled(model.rest->area[f]),
-                                        face_gradient(model, f, x0), face_gradient(model, f, x1),
-                                        face_gradient_change(model, f, x0, x1));
-  }
+  total += stretch_here().woven_energy_change(prepared.woven.data(), prepared.woven.size(), x0, x1);
   total += stretch_here().damping_energy_change(prepared.damping_of_stretch.data(),
                                                 prepared.damping_of_stretch.size(), x0, x1);
-  for (const Index f : prepared.orthotropic) {
-    if (!is_damped(model, f)) continue;
-    total += orthotropic_damping::energy_change(
-        damping_weave(model, f), face_gradient(model, f, x0), face_gradient(model, f, x1),
-        face_gradient_change(model, f, x0, x1), face_gradient(model, f, model.x_n));
-  }
   total += bending_here().energy_change(prepared.bent.batches.data(), prepared.bent.batches.size(),
                                         prepared.bent.points.data(), x0, x1);
   for_stiff_elements(model, [&](const bending::Element& element) {
@@ -371,18 +304,9 @@ double energy_change(const Model& model, const double* x0, const double* x1) {
 void add_gradient(const Model& model, const double* x, double* g) {
   const Prepared& prepared = *model.prepared;
   stretch_here().add_gradient(prepared.stretch.data(), prepared.stretch.size(), x, g);
-  for (const Index f : prepared.orthotropic) {
-    scatter(model, f, stretch_stress(model, f, face_gradient(model, f, x)), g);
-  }
+  stretch_here().add_woven_gradient(prepared.woven.data(), prepared.woven.size(), x, g);
   stretch_here().add_damping_gradient(prepared.damping_of_stretch.data(),
                                       prepared.damping_of_stretch.size(), x, g);
-  for (const Index f : prepared.orthotropic) {
-    if (!is_damped(model, f)) continue;
-    scatter(model, f,
-            orthotropic_damping::stress(damping_weave(model, f), face_gradient(model, f, x),
-                                        face_gradient(model, f, model.x_n)),
-            g);
-  }
   bending_here().add_gradient(prepared.bent.batches.data(), prepared.bent.batches.size(),
                               prepared.bent.points.data(), x, g);
   for_stiff_elements(
@@ -406,25 +330,11 @@ void add_hessian(const Model& model,
   }
   stretch_here().add_hessian(prepared.stretch.data(), prepared.stretch.size(), x, positive,
                              place.data(), blocks);
-  const auto add_face = [&](Index f, const std::array<Mat3, 6>& element) {
-    add_face_blocks(model.topology->faces[f],
-                    slots.stretch.data() + 6 * static_cast<std::ptrdiff_t>(f), place, element,
-                    blocks);
-  };
-  for (const Index f : prepared.orthotropic) {
-    add_face(f, orthotropic::hessian(weave(model, f).scaled(model.rest->area[f]),
-                                     model.rest->shape_gradient[f], face_gradient(model, f, x),
-                                     positive));
-  }
+  stretch_here().add_woven_hessian(prepared.woven.data(), prepared.woven.size(), x, positive,
+                                   place.data(), blocks);
   stretch_here().add_damping_hessian(prepared.damping_of_stretch.data(),
                                      prepared.damping_of_stretch.size(), x, positive, place.data(),
                                      blocks);
-  for (const Index f : prepared.orthotropic) {
-    if (!is_damped(model, f)) continue;
-    add_face(f, orthotropic_damping::hessian(damping_weave(model, f), model.rest->shape_gradient[f],
-                                             face_gradient(model, f, x),
-                                             face_gradient(model, f, model.x_n), positive));
-  }
   bending_here().add_hessian(prepared.bent.batches.data(), prepared.bent.batches.size(),
                              prepared.bent.points.data(), x, positive, place.data(), blocks);
 }

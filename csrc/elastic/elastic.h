@@ -57,10 +57,10 @@ struct Prepared {
   std::vector<double> constant;       ///< [slots] sum of the flat elements' Hessians, times I
   std::vector<double> identity;       ///< [slots] the same of what all elements' have of I
   std::vector<StretchBatch> stretch;  ///< of isotropic faces
-  std::vector<DampingBatch> damping_of_stretch;  ///< of isotropic faces that have any
+  std::vector<WovenBatch> woven;      ///< of all others
+  std::vector<DampingBatch> damping_of_stretch;  ///< of faces that have any
   std::vector<Index> damped;                     ///< these faces, ascending
   BendingBatches bent;                           ///< elements that are not flat
-  std::vector<Index> orthotropic;                ///< all others, ascending
   bool has_damping = false;                      ///< some face has any
   bool by_matrix = true;  ///< energy and gradient of flat elements are those of their matrix
 };

@@ -9,15 +9,17 @@
 namespace diffcloth::elastic {
 namespace {
 
-Weave stretch_weave(const Model& model, Index f) {
-  return weave(model, f).scaled(model.rest->area[f]);
-}
-
 double damping_weight(const Model& model, Index f) {
   return model.damping[f] / model.h * stretch_weight(model, f);
 }
 
 }  // namespace
+
+Weave stretch_weave(const Model& model, Index f) {
+  if (is_orthotropic(model, f)) return weave(model, f).scaled(model.rest->area[f]);
+  const double k = stretch_weight(model, f);
+  return {.warp = k, .weft = k, .shear = k, .axis = Vec2::UnitX()};
+}
 
 Weave damping_weave(const Model& model, Index f) {
   return stretch_weave(model, f).scaled(model.damping[f] / model.h);

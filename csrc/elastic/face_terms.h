@@ -20,7 +20,10 @@ Mat2 second_stress(const Model& model, Index f, const Mat32& F);
 /// Change of dE/dF along a change G of F.
 Mat32 stretch_stress_change(const Model& model, Index f, const Mat32& F, const Mat32& G);
 
-/// The stiffnesses of an orthotropic face's damping.
+/// The stiffnesses of a face, times its area; an isotropic one has three equal ones, along its rest frame.
+Weave stretch_weave(const Model& model, Index f);
+
+/// The same of its damping.
 Weave damping_weave(const Model& model, Index f);
 
 Mat32 damping_stress_change(

@@ -13,25 +13,37 @@ namespace diffcloth::elastic {
 /// Triangles that go through the arithmetic of stretch side by side.
 inline constexpr int kStretchLanes = 8;
 
-/// Eight triangles, or fewer: the lanes behind the last one repeat it, without weight. The corners of
-/// each are in ascending order, so that its blocks are all in a lower triangle.
-struct StretchBatch {
+/// Eight triangles, or fewer: the lanes behind the last one repeat it. The corners of each are in
+/// ascending order, so that its blocks are all in a lower triangle.
+struct FaceBatch {
   std::int32_t size;                      ///< lanes that count
   std::int32_t vertex[3][kStretchLanes];  ///< ascending
   std::int32_t slot[6][kStretchLanes];    ///< of the pairs (0,0), (1,0), (1,1), (2,0), (2,1), (2,2)
   double g[4][kStretchLanes];             ///< shape gradients of corners 1 and 2 [1/m]
-  double weight[kStretchLanes];           ///< k_s A [N m]
 };
 
-/// The same of triangles that are damped: see damping.h.
+/// Isotropic triangles: see stretch.h.
+struct StretchBatch {
+  FaceBatch faces;
+  double weight[kStretchLanes];  ///< k_s A [N m]
+};
+
+/// Woven triangles: see orthotropic_stretch.h.
+struct WovenBatch {
+  FaceBatch faces;                     ///< with shape gradients in material axes
+  double stiffness[3][kStretchLanes];  ///< k_w, k_wf and k_f, times A [N m]
+};
+
+/// Triangles that are damped, woven or, with three equal stiffnesses, not: see orthotropic_damping.h.
 struct DampingBatch {
-  StretchBatch faces;              ///< with k_d k_s A / h as weight
-  double start[6][kStretchLanes];  ///< F at the start of the step, column by column
+  WovenBatch woven;  ///< with stiffnesses times k_d / h
+  double start[6]
+              [kStretchLanes];  ///< F at the start of the step in the same axes, column by column
 };
 
 // NOLINTEND(modernize-avoid-c-arrays)
 
-/// The stretch of many triangles, E of stretch.h, and its damping in lanes.
+/// The stretch of many triangles and its damping in lanes.
 ///
 /// Only sums, products, quotients and roots, each rounded once, in one order: every level has the same
 /// bits.
@@ -64,7 +76,32 @@ struct StretchKernels {
                       const std::int32_t* place,
                       double* blocks);
 
-  // The same three of damping.
+  // The same three of woven triangles. The energy changes by
+  //
+  //   dE = 1/2 <K o (e0 + e1), dS>,   (S0 + S1) dS + dS (S0 + S1) = 2 (C1 - C0).
+
+  double (*woven_energy_change)(const WovenBatch* batches,
+                                std::size_t count,
+                                const double* x0,
+                                const double* x1);
+
+  void (*add_woven_gradient)(const WovenBatch* batches,
+                             std::size_t count,
+                             const double* x,
+                             double* g);
+
+  /// The Hessian is, in the frame of R, the second stress out of plane, and in plane a form of four numbers. The
+  /// projected one clamps the eigenvalues of both at zero.
+  void (*add_woven_hessian)(const WovenBatch* batches,
+                            std::size_t count,
+                            const double* x,
+                            bool positive,
+                            const std::int32_t* place,
+                            double* blocks);
+
+  // The same three of damping,
+  //
+  //   H_pq = 1/2 [ (g_p^T W g_q) I + F M_pq F^T ],   M_pq a = K o (a g_q^T + g_q a^T) g_p,   W = K o (C - C_n).
 
   double (*damping_energy_change)(const DampingBatch* batches,
                                   std::size_t count,
@@ -76,7 +113,7 @@ struct StretchKernels {
                                const double* x,
                                double* g);
 
-  /// The projected one keeps the positive part of C - C_n.
+  /// The projected one keeps the positive part of W.
   void (*add_damping_hessian)(const DampingBatch* batches,
                               std::size_t count,
                               const double* x,

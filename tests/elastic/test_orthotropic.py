@@ -17,6 +17,8 @@ from elastic_meshes import (
     rigid,
 )
 
+from diffcloth_torch import _kernels
+
 K_W, K_F, K_WF = 100.0, 40.0, 7.0  # [N/m]
 STRETCH = {"stretch": K_W, "stretch_weft": K_F, "stretch_shear": K_WF}
 ANGLE = 0.6  # of the warp to the first side
@@ -105,6 +107,53 @@ def test_projected_hessian_clamps_the_eigenvalues_of_an_element(state):
     else:
         assert np.linalg.eigvalsh(positive - exact)[0] > floor
         assert np.abs(positive - exact).max() > 1e-3 * K_W
+
+
+@pytest.mark.parametrize("ratio", [1.0 + 1e-9, 10.0, 1e4])
+def test_projected_hessian_is_that_of_the_eigenvalues_of_the_form_of_f(ratio):
+    """H = B^T h B with the map B from motions of the corners to changes of F, 6 x 9."""
+    X, _ = TRIANGLE
+    rng = np.random.default_rng(8)
+    to_gradient = np.linalg.inv((X[1:, :2] - X[0, :2]).T)
+    shapes = np.vstack([-to_gradient.sum(axis=0), to_gradient])
+    B = np.kron(shapes.T, np.eye(3))
+    below = 0
+    for _ in range(200):
+        k = K_W * ratio ** rng.uniform(-1, 1, 3)
+        values = dict(zip(STRETCH, k, strict=True))
+        elastic = model(*TRIANGLE, angles=rng.uniform(-3, 3, 1), **values)
+        x = X @ np.diag([*rng.uniform(0.1, 1.3, 2), 1.0]) + 0.05 * rng.normal(size=X.shape)
+        inverse = np.linalg.pinv(B)
+        form = inverse.T @ elastic.hessian(x, False) @ inverse
+        y, V = np.linalg.eigh(form)
+        expected = B.T @ (V @ np.diag(np.maximum(y, 0)) @ V.T) @ B
+        # What is left of an eigenvalue is of the size that rounding has beside the largest.
+        np.testing.assert_allclose(elastic.hessian(x, True), expected, atol=1e-9 * np.abs(y).max())
+        below += y[0] < -1e-2 * k.min()
+    assert below > 50
+
+
+@pytest.mark.parametrize("positive", [False, True])
+@pytest.mark.parametrize("damped", [0.0, 1.0])
+def test_instructions_do_not_change_a_bit(positive, damped):
+    """Compressed, degenerate, a part isotropic, a part damped; with batches that are not full."""
+    X, faces = MESHES["jittered"](6, 4)
+    rng = np.random.default_rng(9)
+    values = random_materials(rng, len(faces), damped, woven=True)
+    values["damping"][::3] = 0.0
+    for name in ("stretch_weft", "stretch_shear"):
+        values[name][:5] = values["stretch"][:5]
+    x_n = X + 0.1 * rng.normal(size=X.shape)
+    x0 = X * [0.8, 1.1, 1.0] + 0.2 * rng.normal(size=X.shape)
+    x0[1] = x0[0]
+    x1 = x0 + 0.1 * rng.normal(size=X.shape)
+    elastic = model(X, faces, x_n=x_n, **values)
+    assert (len(faces) - 5) % 8 != 0
+    results = [elastic.stretch(level, x0, x1, positive) for level in _kernels.kernel_levels()]
+    for change, gradient, blocks in results[1:]:
+        assert change == results[0][0]
+        np.testing.assert_array_equal(gradient, results[0][1])
+        np.testing.assert_array_equal(blocks, results[0][2])
 
 
 @pytest.mark.parametrize("positive", [False, True])

@@ -190,6 +190,11 @@ class Elastic {
     kernels.add_hessian(batches.data(), batches.size(), from.data(), positive, own_places().data(),
                         blocks.data());
     double change = kernels.energy_change(batches.data(), batches.size(), from.data(), to.data());
+    const std::vector<elastic::WovenBatch>& woven = model_.prepared->woven;
+    kernels.add_woven_gradient(woven.data(), woven.size(), from.data(), g.data());
+    kernels.add_woven_hessian(woven.data(), woven.size(), from.data(), positive,
+                              own_places().data(), blocks.data());
+    change += kernels.woven_energy_change(woven.data(), woven.size(), from.data(), to.data());
     const std::vector<elastic::DampingBatch>& damped = model_.prepared->damping_of_stretch;
     kernels.add_damping_gradient(damped.data(), damped.size(), from.data(), g.data());
     kernels.add_damping_hessian(damped.data(), damped.size(), from.data(), positive,
