@@ -109,6 +109,17 @@ def test_projected_hessian_clamps_the_eigenvalues_of_an_element(state):
         assert np.abs(positive - exact).max() > 1e-3 * K_W
 
 
+@pytest.mark.parametrize("height", [0.0, 1e-12, 1e-6])
+def test_energy_changes_between_degenerate_triangles(height):
+    flat = np.array([[0.0, 0, 0], [1, 0, 0], [0.5, height, 0]])
+    longer = np.array([[0.0, 0, 0], [1.3, 0, 0], [0.4, 0, height]])
+    point = 1e-10 * flat
+    elastic = woven_triangle()
+    for x0, x1 in ((flat, longer), (longer, flat), (flat, point), (point, flat), (flat, flat)):
+        change = elastic.energy(x1) - elastic.energy(x0)
+        assert elastic.energy_change(x0, x1) == pytest.approx(change, abs=1e-12 * K_W)
+
+
 @pytest.mark.parametrize("ratio", [1.0 + 1e-9, 10.0, 1e4])
 def test_projected_hessian_is_that_of_the_eigenvalues_of_the_form_of_f(ratio):
     """H = B^T h B with the map B from motions of the corners to changes of F, 6 x 9."""
