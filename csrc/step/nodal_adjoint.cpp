@@ -152,7 +152,10 @@ void NodalStage::backward(const Backward& step,
   const ForcesBar forces = pull_back_forces(problem_, contacts_, at, f.coordinates->size(), bars);
   Array b = g;
   system.clear_fixed(b);
-  if (forces.any) H.add_product(forces.eta.data(), b.data());
+  if (forces.any) {
+    const Array change = system.hessian_product(at, forces.eta);
+    for (std::size_t a = 0; a < b.size(); ++a) b[a] += change[a];
+  }
   system.project(at, b);
   const Array lambda = solve_derivative(system, at, H, *factor, true, b);
 
@@ -161,8 +164,7 @@ void NodalStage::backward(const Backward& step,
   for (std::size_t a = 0; a < z.size(); ++a) z[a] -= forces.eta[a];
   Array z_points(x.size(), 0.0);
   f.coordinates->add_rows(z, z_points);
-  Array change(z.size(), 0.0);
-  H.add_product(z.data(), change.data());
+  Array change = system.hessian_product(at, z);
   for (std::size_t a = 0; a < change.size(); ++a) change[a] = g[a] - change[a];
   Array q(x.size(), 0.0);
   f.coordinates->add_rows(change, q);

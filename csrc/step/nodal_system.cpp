@@ -148,6 +148,16 @@ void NodalSystem::couple(const Point& at, Array& v) const {
   clear_fixed(v);
 }
 
+Array NodalSystem::hessian_product(const Point& at, const Array& v) const {
+  Array points(at.x.size(), 0.0);
+  f_.coordinates->add_rows(v, points);
+  Array product;
+  f_.hessian_product(at.x.data(), points.data(), product);
+  Array rows;
+  f_.coordinates->take_rows(product, rows);
+  return rows;
+}
+
 void NodalSystem::couple_transposed(const Point& at, Array& v) const {
   for (std::size_t k = 0; k < contacts_.size(); ++k) {
     const NodalContact& c = contacts_[k];

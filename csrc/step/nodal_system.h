@@ -69,6 +69,9 @@ class NodalSystem {
 
   void clear_fixed(std::vector<double>& v) const;
 
+  /// H v at all rows. The matrix of the fixed ones has elasticity alone: see linalg/block_matrix.h.
+  std::vector<double> hessian_product(const Point& at, const std::vector<double>& v) const;
+
   /// v = L v.
   void couple(const Point& at, std::vector<double>& v) const;
 

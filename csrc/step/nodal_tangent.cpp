@@ -147,20 +147,22 @@ Array NodalStage::tangent(const Pushforward& step,
   }
   Array theta(x.size(), 0.0);
   f.for_each([&](const Potential& p) { p.add_tangent(x.data(), theta.data()); });
-  Array gradient_change;
-  f.coordinates->take_rows(theta, gradient_change);
-  const Array theta_rows = gradient_change;
-  H.add_product(d.data(), gradient_change.data());
-  Array b = gradient_change;
+  Array theta_rows;
+  f.coordinates->take_rows(theta, theta_rows);
+  const auto gradient_change = [&](const Array& rows) {
+    Array change = system.hessian_product(at, rows);
+    for (std::size_t a = 0; a < change.size(); ++a) change[a] += theta_rows[a];
+    return change;
+  };
+  Array b = gradient_change(d);
   system.couple(at, b);
   for (std::size_t a = 0; a < b.size(); ++a) b[a] = law_change[a] - b[a];
   system.project(at, b);
   Array dz = solve_derivative(system, at, H, *factor, false, b);
   for (std::size_t a = 0; a < dz.size(); ++a) dz[a] += d[a];
 
-  gradient_change = theta_rows;
-  H.add_product(dz.data(), gradient_change.data());
-  add_force_tangents(problem_, contacts_, at, frames, gradient_change, step.forces[direction]);
+  add_force_tangents(problem_, contacts_, at, frames, gradient_change(dz),
+                     step.forces[direction]);
   Array dx = tangents.ends;
   f.coordinates->put_rows(dz.data(), dx);
   f.coordinates->carry(x, dx);
