@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.transforms import has_derivative, numbers_of
 
 __all__ = [
     "ANY_NUMBER",
@@ -41,6 +43,7 @@ __all__ = [
     "index_array",
     "is_dense",
     "refuse_gradient",
+    "refuse_threads",
     "texts",
 ]
 
@@ -107,8 +110,8 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def refuse_gradient(name: str, value: object, instead: str) -> None:
-    """Refuse a tensor that requires a gradient where none can flow."""
-    if isinstance(value, Tensor) and value.requires_grad:
+    """Refuse a tensor that is being differentiated where no derivative can flow."""
+    if isinstance(value, Tensor) and has_derivative(value):
         raise InvalidInput(
             f"{name} must not require a gradient: none flows there; {instead} instead"
         )
@@ -118,7 +121,7 @@ def float_array(name: str, value: object, *, instead: str = "pass a detached ten
     """Copy numbers into a new float64 array; promotes without loss and refuses everything else."""
     refuse_gradient(name, value, instead)
     if isinstance(value, Tensor):
-        return np.array(float_tensor(name, value).numpy(), dtype=np.float64, order="C")
+        return np.array(numbers_of(float_tensor(name, value)), dtype=np.float64, order="C")
     array = _array(name, value, "numbers")
     if array.dtype.kind not in "fiu" or array.dtype.itemsize > _FLOAT64_BYTES:
         raise TypeError(
@@ -158,7 +161,7 @@ def _array(name: str, value: object, content: str) -> NDArray[Any]:
         )
     if isinstance(value, Tensor):
         _require_dense(name, value)
-        value = value.detach()
+        value = numbers_of(value)
     try:
         return np.asarray(value)
     except (ValueError, RuntimeError) as error:  # ragged lists; tensors with a graph inside lists
@@ -262,6 +265,18 @@ def check_choice(name: str, value: object, accepted: Sequence[str]) -> str:
     if value not in accepted:
         raise InvalidInput(f"{name} must be one of {texts(accepted)}, got {value!r}")
     return value
+
+
+def refuse_threads(name: str, workers: object) -> None:
+    """Refuse executors that run in this process: torch has one number of threads for all of them.
+
+    Nor do forward derivatives of torch know of other threads.
+    """
+    if isinstance(workers, ThreadPoolExecutor):
+        raise InvalidInput(
+            f"{name} must be processes or other machines, got threads of this process, which "
+            "share what torch keeps for all of them"
+        )
 
 
 def check_name(name: str, value: object) -> str | None:

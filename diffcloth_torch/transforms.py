@@ -18,6 +18,7 @@ from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack as 
 from torch.autograd import forward_ad
 
 __all__ = [
+    "has_derivative",
     "is_differentiated",
     "is_plain",
     "numbers_of",
@@ -27,6 +28,7 @@ __all__ = [
 ]
 
 _CLOSE = 1e-13  # relative; batched products round by their batch
+_ONE_TRANSFORM = 2  # most interpreters of one: `jacfwd` is a vmap of a jvp
 
 
 def is_plain(tensor: Tensor) -> bool:
@@ -80,6 +82,28 @@ def numbers_of(tensor: Tensor) -> NDArray[np.float64]:
     value = plain(tensor)
     with outside_transforms():
         return value.numpy()
+
+
+def has_derivative(tensor: Tensor) -> bool:
+    """Whether a tensor is being differentiated; one that is made inside a transform need not be.
+
+    Inside transforms of transforms it is not known, and taken as true.
+    """
+    level = forward_ad._current_level
+    unpack: Any = forward_ad.unpack_dual
+    if tensor.requires_grad or (level >= 0 and unpack(tensor).tangent is not None):
+        return True
+    if is_plain(tensor):
+        return False
+    if len(torch._C._functorch.get_interpreter_stack() or []) > _ONE_TRANSFORM:
+        return True
+    value = tensor
+    with outside_transforms():
+        while not is_plain(value):
+            value = torch._C._functorch.get_unwrapped(value)
+            if value.requires_grad:
+                return True
+    return False
 
 
 def is_differentiated(tensors: Iterable[Tensor]) -> bool:

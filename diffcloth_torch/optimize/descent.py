@@ -29,10 +29,14 @@ from diffcloth_torch.optimize.evaluation import (
 from diffcloth_torch.optimize.progress import Progress
 from diffcloth_torch.optimize.rows import Rows
 
-__all__ = ["Descent", "Optimizers", "descend"]
+__all__ = ["Descent", "Optimizers", "TrialError", "descend"]
 
 Optimizers = torch.optim.Optimizer | Callable[[list[Tensor]], torch.optim.Optimizer]
 """An optimizer of the variables, or what makes one of them."""
+
+
+class TrialError(SimulationError):
+    """Raised by `simulate` or `loss` of `descend` to have a trial taken back, whatever failed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +201,7 @@ def descend(
         while len(loop.history) < iterations and not _good_enough(loop.found, stop_below):
             try:
                 evaluation = evaluate(simulate, loss, variables, per_environment)
-            except (InfeasibleMotion, NotConverged, TurnedTooFar) as error:
+            except (InfeasibleMotion, NotConverged, TurnedTooFar, TrialError) as error:
                 loop.go_back(error)
                 bar.failed(len(loop.failures))
                 continue

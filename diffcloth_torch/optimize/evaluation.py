@@ -118,6 +118,8 @@ def evaluate(
     start = time.perf_counter()
     states = simulate(variables)
     values = loss(states)
+    if not isinstance(values, Tensor):
+        raise TypeError(f"descend: `loss` must return a tensor, got {type(values).__name__}")
     _check_shape(values, states)
     failures = _failures(states)
     total, own = _total(values, failures)
@@ -127,6 +129,8 @@ def evaluate(
             f"are `per_environment`; got {list(values.shape)}"
         )
     between = time.perf_counter()
+    if not total.requires_grad:
+        raise InvalidInput("descend: `loss` must depend on `variables`, and depends on none")
     total.backward()  # type: ignore[no-untyped-call]
     succeeded = len(own) - len(failures)
     for name, tensor in variables.items():

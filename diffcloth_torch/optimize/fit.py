@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -18,15 +19,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.checks import POSITIVE, FloatArray, check_choice, check_count, check_number
+from diffcloth_torch.checks import (
+    POSITIVE,
+    FloatArray,
+    check_choice,
+    check_count,
+    check_number,
+    refuse_threads,
+)
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.fit_page import Page, write_page
 from diffcloth_torch.optimize.methods import METHODS, Method, Options
-from diffcloth_torch.optimize.problem import Residuals, Trial, parameters_of, trajectories
+from diffcloth_torch.optimize.problem import FAILURES, Residuals, Trial, parameters_of, trajectories
 from diffcloth_torch.optimize.starts import Job, Stage, Start, judge, run_all
-from diffcloth_torch.optimize.uncertainty import Direction, uncertainty_of
+from diffcloth_torch.optimize.uncertainty import Direction, noise_of, uncertainty_of
 from diffcloth_torch.optimize.variables import Space, Variable
 from diffcloth_torch.sim.controls import Parameters
 
@@ -40,7 +48,8 @@ class Fit:
     """The best of all starts.
 
     Standard errors follow from J^T J at the solution, with the noise that the residuals show, and
-    from the priors.
+    from the priors. Where there are no more residuals than numbers they show none, and count as
+    what they are meant to be: in units of their noise.
 
     Attributes:
         parameters: Parameters that hold the variables, None elsewhere.
@@ -56,7 +65,8 @@ class Fit:
         message: How it ended.
         starts: Where each start ended, and why not at the best place.
         held_out: Root mean square of the residuals of each trajectory that was kept out of the fit:
-            about one if the model is right and the noise is known.
+            about one if the model is right and the noise is known; one infinite number if the
+            simulation fails there.
         history: All evaluations, start after start.
         compared: The residuals of the last stage, and those kept out, for the report.
     """
@@ -87,7 +97,8 @@ class Fit:
 
         It has the values with their intervals, the correlation, the residuals over time, the worst
         marker, the first and the last values beside what was observed, and the starts. For this,
-        the residuals are evaluated at the first and at the last values.
+        the residuals are evaluated at the last values, and at the first ones of the first start
+        that could be simulated.
 
         Args:
             path: File that ends in ".html".
@@ -104,7 +115,7 @@ class Fit:
             Page(
                 names=self.names,
                 values=self.values,
-                first=self.starts[0].first,
+                first=next(s.first for s in self.starts if np.isfinite(s.cost)),
                 intervals=self.intervals,
                 correlation=self.correlation,
                 unidentifiable=[str(direction) for direction in self.unidentifiable],
@@ -159,9 +170,10 @@ def fit(
         max_evaluations: Of the residuals, for each stage of each start.
         tolerance: Relative change of the cost or the variables at which a stage ends.
         hold_out: Residuals of trajectories that are kept out of the fit, as `residuals`.
-        workers: Number of processes for the starts, 0 for none, or an executor. The result has the
-            same bits for any number. `residuals` must then be a function of a module or another
-            object that can be pickled, and a script needs `if __name__ == "__main__":`.
+        workers: Number of processes for the starts, 0 for none, or an executor of processes. The
+            result has the same bits for any number. `residuals` must then be a function of a module
+            or another object that can be pickled, and a script needs
+            `if __name__ == "__main__":`.
         resume: Folder that keeps all evaluations. A fit that was interrupted takes them from there,
             and ends with the same bits; delete it if `residuals` change.
         progress: Called after each evaluation; of starts in processes, when they have ended.
@@ -178,6 +190,7 @@ def fit(
     _require_scipy()
     check_count("fit: `starts`", starts, 1)
     check_count("fit: `seed`", seed, 0)
+    refuse_threads("fit: `workers`", workers)
     if not isinstance(workers, Executor):
         check_count("fit: `workers`", workers, 0)
     for name, function in (("hold_out", hold_out), ("progress", progress)):
@@ -186,6 +199,7 @@ def fit(
     space = Space(variables)
     if hold_out is not None:
         _check_signature(hold_out, space)
+        _errors(hold_out, space.values(torch.from_numpy(space.first)))  # refused before the fit
     job = Job(
         space=space,
         stages=_stages(residuals, space),
@@ -199,7 +213,8 @@ def fit(
     best = min(ends, key=lambda end: end.cost)
     if best.failure is not None:
         raise next(end.failure for end in reversed(ends) if end.failure is not None)
-    found = uncertainty_of(space, best.theta, best.jacobian, best.residuals)
+    noise = noise_of(best.residuals, len(space), loss, job.options.loss_scale)
+    found = uncertainty_of(space, best.theta, best.jacobian, noise)
     values = space.values(torch.from_numpy(np.array(best.theta)))
     return Fit(
         parameters=parameters_of(values),
@@ -311,8 +326,15 @@ def _folder(resume: str | Path | None) -> Path | None:
 
 
 def _errors(residuals: Residuals, values: Mapping[str, Tensor]) -> list[float]:
-    with torch.no_grad():
-        return [float(part.square().mean().sqrt()) for part in trajectories(residuals, values)]
+    try:
+        with torch.no_grad():
+            parts = trajectories(residuals, values)
+    except FAILURES:
+        return [math.inf]
+    for k, part in enumerate(parts):
+        if not part.numel():
+            raise InvalidInput(f"fit: `hold_out` must return numbers, trajectory {k} has none")
+    return [float(part.square().mean().sqrt()) for part in parts]
 
 
 def _require_scipy() -> None:

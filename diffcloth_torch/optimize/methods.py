@@ -12,7 +12,7 @@ from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import SimulationError
-from diffcloth_torch.optimize.descent import descend
+from diffcloth_torch.optimize.descent import TrialError, descend
 from diffcloth_torch.optimize.problem import Problem
 
 __all__ = ["METHODS", "Method", "Options", "Solution", "solve"]
@@ -113,7 +113,7 @@ def _least_squares(
         theta=end.x,
         cost=float(end.cost),
         residuals=end.fun,
-        jacobian=end.jac,
+        jacobian=problem.jacobian(end.x),  # that of SciPy has the weights of the loss
         success=bool(end.success),
         message=str(end.message),
     )
@@ -172,9 +172,7 @@ def _by_torch(
         found = problem.cost_and_gradient(at)
         if found is None:
             failure = problem.failure(at)
-            if not isinstance(failure, SimulationError):
-                raise SimulationError(str(failure)) from failure  # from which `descend` goes back
-            raise failure
+            raise TrialError(str(failure)) from failure
         cost, gradient = found
         costs.append(cost)
         if cost < best[0]:

@@ -235,7 +235,7 @@ class Problem:
                 failure="" if failure is None else f"{type(failure).__name__}: {failure}",
             )
         elif record["failure"]:
-            failure = SimulationError(record["failure"])
+            failure = SimulationError(record["failure"].partition(": ")[2])
         values: FloatArray = record["found"].numpy()
         trial = Trial(
             start=self._start,

@@ -46,7 +46,8 @@ def markers(
     Args:
         states: T states without a batch axis, one for each observation.
         observed: Positions [m], shape [T, m, 3]; NaN where a marker was not seen.
-        weights: Weight of each marker, >= 0, shape [m] or [T, m]; 1 by default.
+        weights: Weight of each marker, >= 0, shape [m] or [T, m]; 1 by default. One of zero was
+            not seen.
         vertices: Indices of the m marked vertices; None means all.
         noise: Standard deviation of an observation [m], > 0.
 
@@ -71,12 +72,14 @@ def markers(
     known = np.where(np.isnan(seen), 0.0, seen)
     check_finite(f"{owner}: `observed`, where it is not NaN,", known)
     difference = (positions - torch.from_numpy(known)) / checked_noise(owner, noise)
+    known_rows = ~np.isnan(seen)
     if weights is not None:
         given = float_array(f"{owner}: `weights`", weights)
         check_shape(f"{owner}: `weights`", given.shape, [seen.shape[1:2], seen.shape[:2]])
         check_range(f"{owner}: `weights`", given, NON_NEGATIVE)
         difference = difference * torch.from_numpy(given)[..., None]
-    mask = torch.from_numpy(~np.isnan(seen))
+        known_rows &= given[..., None] > 0.0
+    mask = torch.from_numpy(known_rows)
     marked = range(positions.shape[1]) if rows is None else rows.tolist()
     note(
         Comparison(

@@ -10,7 +10,7 @@ import numpy as np
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.optimize.variables import Space
 
-__all__ = ["Direction", "Uncertainty", "uncertainty_of"]
+__all__ = ["Direction", "Noise", "Uncertainty", "noise_of", "uncertainty_of"]
 
 # Standard error of a direction, in sizes of its variables, from which on it is not known at all.
 _UNSURE = 1.0
@@ -55,19 +55,59 @@ class Uncertainty(NamedTuple):
     deviations: FloatArray
 
 
+class Noise(NamedTuple):
+    """Standard deviation of the residuals.
+
+    Attributes:
+        deviation: The deviation.
+        freedom: In how many residuals it shows; infinite where it is that which was given.
+    """
+
+    deviation: float
+    freedom: float
+
+
+def noise_of(residuals: FloatArray, numbers: int, loss: str, scale: float) -> Noise:
+    """The noise that the residuals of a fit show; one where they are too few to show any.
+
+    With the influence psi of a residual, half the derivative of a loss by it, the numbers spread as
+    with residuals of the variance  sum psi^2 / (M - p) / (mean psi')^2:  Huber, Robust Statistics,
+    1981, chapter 7. With the loss "linear" psi is the residual.
+    """
+    freedom = len(residuals) - numbers
+    if freedom < 1:
+        return Noise(1.0, np.inf)
+    influence, slope = _influence(residuals, loss, scale)
+    deviation = np.sqrt(float(influence @ influence) / freedom) / max(float(slope.mean()), _TINY)
+    return Noise(float(deviation), freedom)
+
+
+def _influence(residuals: FloatArray, loss: str, scale: float) -> tuple[FloatArray, FloatArray]:
+    """Half the derivative of each square's loss, as SciPy has it, and its own derivative."""
+    z = np.square(residuals / scale)
+    if loss == "linear":
+        first, second = np.ones_like(z), np.zeros_like(z)
+    elif loss == "soft_l1":
+        first, second = (1 + z) ** -0.5, -0.5 * (1 + z) ** -1.5
+    elif loss == "huber":
+        far = np.maximum(z, 1.0)
+        first, second = far**-0.5, np.where(z > 1.0, -0.5 * far**-1.5, 0.0)
+    elif loss == "cauchy":
+        first, second = 1 / (1 + z), -1 / np.square(1 + z)
+    else:
+        first, second = 1 / (1 + z * z), -2 * z / np.square(1 + z * z)
+    return first * residuals, first + 2 * z * second
+
+
 def uncertainty_of(
-    space: Space, theta: FloatArray, jacobian: FloatArray, residuals: FloatArray
+    space: Space, theta: FloatArray, jacobian: FloatArray, found: Noise
 ) -> Uncertainty:
-    """Standard errors at the solution, from the noise that the residuals show and from the priors.
+    """Standard errors at the solution, from the noise of the residuals and from the priors.
 
     With the variance s^2 of the residuals and the precisions P of the priors, the covariance is
-    (J^T J / s^2 + P^2)^-1. Where residuals are too few to show the noise, and priors make up for
-    them, s is one: the noise that was given.
+    (J^T J / s^2 + P^2)^-1.
     """
-    count, p = jacobian.shape
-    freedom = count - p
-    given = freedom < 1 and bool(space.precisions.any())
-    noise = 1.0 if given else np.sqrt(float(residuals @ residuals) / max(freedom, 1))
+    noise = found.deviation
     # In sizes of the variables, so that directions compare.
     units = space.units(theta)
     priors = np.diag(space.precisions * units)
@@ -78,7 +118,7 @@ def uncertainty_of(
     rates = space.rates(theta)
     covariance = rates[:, None] * of_theta * rates
     deviations = np.sqrt(np.diag(covariance))
-    reach = _reach(np.inf if given else max(freedom, 1))
+    reach = _reach(found.freedom)
     return Uncertainty(
         covariance=covariance,
         correlation=_correlation(covariance, deviations),

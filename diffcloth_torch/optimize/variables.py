@@ -292,6 +292,8 @@ def _axis(name: str, variable: Variable, first: int) -> _Axis:
             _check_positive(f"fit: variables[{name!r}], the mean of `prior`,", prior[0])
     if known is not None:
         check_range(f"fit: variables[{name!r}], `value`", numbers, known.accepted)
+        if prior is not None:
+            check_range(f"fit: variables[{name!r}], the mean of `prior`", prior[0], known.accepted)
     if variable.bounds is not None:
         low, high = variable.bounds
         if known is not None and not known.accepted.low <= low < high <= known.accepted.high:
