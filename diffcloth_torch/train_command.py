@@ -36,6 +36,7 @@ __all__ = ["resume_training", "train"]
 _RESULT, _RESUME, _POLICY, _EVENTS = "train.json", "resume.json", "policy.pt", "events"
 _VIDEO = "evaluation"
 _LARGEST = 1 << 20  # bytes of a configuration
+_NOT_THERE = ("num_envs", "seed", "autoreset_mode")  # what a trainer decides
 
 
 def train(
@@ -64,7 +65,7 @@ def train(
     if job.writes:
         check_folder(config, out, overwrite)
         out.mkdir(parents=True, exist_ok=True)
-        for file in (out / _RESULT, out / _RESUME, out / _POLICY):
+        for file in (out / _RESULT, out / _RESUME, out / _POLICY, *out.glob(f"{_VIDEO}.*")):
             file.unlink(missing_ok=True)
         if (out / _EVENTS).is_dir():
             shutil.rmtree(out / _EVENTS)
@@ -123,6 +124,12 @@ class _Job:
 
     def _make(self, options: TrainerOptions) -> Trainer:
         section, env = self.section, self.section.environment
+        for name in _NOT_THERE:
+            if name in env.options:
+                raise InvalidInput(
+                    f"{self._source.name}: `environment.options` may not have {name!r}: "
+                    "`num_envs` and the seed of `trainer` say it"
+                )
         return Trainer(
             partial(envs.make, env.name, **env.options),
             options,
@@ -140,10 +147,12 @@ class _Job:
     def run(self, out: Path, evaluations: list[dict[str, Any]]) -> str:
         """Learn until the end, and write what was found."""
         before = time.perf_counter() - (evaluations[-1]["seconds"] if evaluations else 0.0)
+        states: list[State] = []
         try:
             if self.section.tryout is not None:
-                evaluations = self._try_out(out, self.section.tryout, before)
-            states = self._learn(self.section.updates, evaluations, before, out / _EVENTS, out)
+                states, evaluations = self._try_out(out, self.section.tryout, before)
+            last = self._learn(self.section.updates, evaluations, before, out / _EVENTS, out)
+            states = last or states
         except KeyboardInterrupt as error:
             kept = evaluations[-1]["updates"] if evaluations else 0
             raise KeyboardInterrupt(
@@ -166,31 +175,33 @@ class _Job:
             f"success {end['success']:.0%}; results are in {out}"
         )
 
-    def _try_out(self, out: Path, tryout: TryoutSection, before: float) -> list[dict[str, Any]]:
+    def _try_out(
+        self, out: Path, tryout: TryoutSection, before: float
+    ) -> tuple[list[State], list[dict[str, Any]]]:
         """Let each seed learn for a while; from then on this is a training of the best one.
 
         Returns:
-            Its evaluations.
+            The states of its last evaluation, and all its evaluations.
         """
         found = []
         for seed in tryout.seeds:
             self.trainer = self._make(replace(self._options, seed=seed))
             evaluations: list[dict[str, Any]] = []
             updates = min(tryout.updates, self.section.updates)
-            self._learn(updates, evaluations, before, out / _EVENTS / f"seed_{seed}")
+            states = self._learn(updates, evaluations, before, out / _EVENTS / f"seed_{seed}")
             self._tried.append({"seed": seed, **evaluations[-1]})
-            found.append((self.trainer, evaluations))
+            found.append((self.trainer, states, evaluations))
             if self._succeeds(evaluations):
                 break
         # The first of those that are equal.
-        self.trainer, evaluations = max(found, key=lambda each: each[1][-1]["return"])
+        self.trainer, states, evaluations = max(found, key=lambda each: each[2][-1]["return"])
         trained = {**self.section.trainer, "seed": self.trainer.options.seed}
         self.section = self.section.model_copy(update={"trainer": trained, "tryout": None})
         if self.writes:
             # What is resumed must be a training with this seed before there is its policy.
             self.write_resume(out)
             self._write(out, evaluations)
-        return evaluations
+        return states, evaluations
 
     def _learn(
         self,

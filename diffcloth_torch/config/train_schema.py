@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from annotated_types import Ge, MinLen
+from annotated_types import Ge, Le, MinLen
 
 from diffcloth_torch.config.schema import PictureSection
 from diffcloth_torch.config.section import Section
@@ -53,7 +53,7 @@ class TrainConfig(Section):
     updates: Count = 100
     evaluate_every: Count = 10
     episodes: Count = 8
-    until_success: Annotated[float, Ge(0)] | None = None
+    until_success: Annotated[float, Ge(0), Le(1)] | None = None
     tryout: TryoutSection | None = None
     workers: WorkersSection = WorkersSection()
     viewers: list[Literal["record", "web"]] = ["record"]

@@ -86,8 +86,12 @@ def make(task: str | Task, num_envs: int = 1, **options: Any) -> ClothVectorEnv:
         accepted = _options(TASKS[task])
         for name in options:
             check_choice(f"make: an option of {task}", name, (*accepted, *_OF_BATCH))
-        task = TASKS[task](**options)
-    elif options:
+        task, options = TASKS[task](**options), {}
+    given: Any = task
+    if not isinstance(given, Task):
+        kind = given.__name__ if isinstance(given, type) else type(given).__name__
+        raise TypeError(f"make: `task` must be a name or a Task, got {kind}")
+    if options:
         raise InvalidInput(f"make: {', '.join(options)} cannot be given with a task of your own")
     return ClothVectorEnv(task, num_envs, **batch)
 

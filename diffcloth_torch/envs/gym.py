@@ -119,8 +119,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             InvalidInput: If the actions have another shape or are not finite, or nothing was reset.
         """
-        if self._generators is None:
-            raise InvalidInput("step: call reset() first")
+        self._require_start("step")
         after = self.task.transition(self.env_state, self._actions(actions), self.parameters)
         reward = self.task.reward(after)
         observation = self._observe(after)
@@ -143,11 +142,13 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
 
     def scripted_actions(self) -> Tensor:
         """Actions of the policy made by hand, for the present state, [B, A]."""
+        self._require_start("scripted_actions")
         with torch.no_grad():
             return self.task.scripted(self.env_state).to(_FLOAT)
 
     def clear_grad(self) -> None:
         """Cut the graph of the present state: gradients of later rewards end here."""
+        self._require_start("clear_grad")
         self.env_state = self.env_state.detach()
 
     def initialize_trajectory(self) -> Tensor:
@@ -161,11 +162,20 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
 
     def resume(self, env_state: EnvState, generator_states: Sequence[Tensor]) -> Tensor:
         """Go on from a state and generators that were kept; gives the observation [B, O]."""
+        for name, given in (("env_state", env_state), ("generator_states", generator_states)):
+            if len(given) != self.num_envs:
+                raise InvalidInput(
+                    f"resume: `{name}` must be of {self.num_envs} environments, got {len(given)}"
+                )
         self._generators = [torch.Generator() for _ in generator_states]
         for generator, state in zip(self._generators, generator_states, strict=True):
             generator.set_state(state)
         self.env_state = env_state
         return self._observe(env_state)
+
+    def _require_start(self, owner: str) -> None:
+        if self._generators is None:
+            raise InvalidInput(f"{owner}: call reset() first")
 
     def _seeded(self, seed: object) -> list[torch.Generator]:
         if seed is None:
@@ -215,7 +225,11 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         return {"success": success, "failed": env.failed, "elapsed": env.elapsed}
 
     def _actions(self, given: Any) -> Tensor:
+        if not isinstance(given, Tensor | np.ndarray | Sequence) or isinstance(given, str):
+            raise TypeError(f"step: `actions` must be numbers, got {type(given).__name__}")
         actions = torch.as_tensor(given)
+        if actions.is_complex() or actions.dtype == torch.bool:
+            raise TypeError(f"step: `actions` must be real numbers, got {actions.dtype}")
         expected = (self.num_envs, self.task.action_size)
         if actions.shape != expected:
             raise InvalidInput(
@@ -252,6 +266,17 @@ def register(name: str) -> None:
         vector_entry_point="diffcloth_torch.envs:make",
         kwargs={"task": name},
     )
+
+
+def begins_anew(name: str, env: ClothVectorEnv) -> ClothVectorEnv:
+    """Require environments that begin anew in the step in which they end."""
+    mode = env.metadata["autoreset_mode"]
+    if mode is not AutoresetMode.SAME_STEP:
+        raise InvalidInput(
+            f"{name} must begin anew in the step in which it ends: "
+            f'autoreset_mode "SameStep", got {mode.value!r}'
+        )
+    return env
 
 
 def _checked_seed(name: str, seed: object) -> int:

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from diffcloth_torch.envs.gym import ClothVectorEnv
+from diffcloth_torch.envs.gym import ClothVectorEnv, begins_anew
 
 __all__ = ["RslRlEnv"]
 
@@ -27,7 +27,7 @@ class RslRlEnv:
 
     def __init__(self, env: ClothVectorEnv, *, seed: int | None = None) -> None:
         """Take environments that begin anew by themselves, and begin."""
-        self.env = env
+        self.env = begins_anew("RslRlEnv: `env`", env)
         self.num_envs, self.num_actions = env.num_envs, env.task.action_size
         self.max_episode_length = env.task.horizon
         self.device = torch.device("cpu")

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from diffcloth_torch.envs.gym import ClothVectorEnv
+from diffcloth_torch.envs.gym import ClothVectorEnv, begins_anew
 
 __all__ = ["StableBaselinesEnv"]
 
@@ -22,7 +22,7 @@ class StableBaselinesEnv(VecEnv):
 
     def __init__(self, env: ClothVectorEnv) -> None:
         """Take environments that begin anew in the step in which they end."""
-        self.env = env
+        self.env = begins_anew("StableBaselinesEnv: `env`", env)
         self._actions: NDArray[np.float32] | None = None
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 

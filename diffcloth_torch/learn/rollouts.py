@@ -127,7 +127,8 @@ class Rollout:
         after: Observations after it, before a new start [h, n, O].
         rewards: [h, n].
         entropies: Of the actions: minus the logarithm of their density [h, n].
-        terminated: Whether it failed [h, n].
+        terminated: Whether it ended its episode before the horizon [h, n].
+        failed: Whether the simulation failed in it [h, n].
         ended: Whether an episode ended with it [h, n].
         success: Whether the task was done after it [h, n].
         end: Where the environments are.
@@ -141,6 +142,7 @@ class Rollout:
     rewards: Tensor
     entropies: Tensor
     terminated: Tensor
+    failed: Tensor
     ended: Tensor
     success: Tensor
     end: EnvState
@@ -171,7 +173,7 @@ def roll_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
             value = policy.targets(policy.scale(after)).mean(dim=0)
             total = total + torch.where(closes, discount * value, 0.0)
         discount = torch.where(ended, 1.0, discount)
-        success = info.get("final_info", info)["success"]
+        final = info.get("final_info", info)
         rows.append(
             {
                 "seen": seen,
@@ -179,8 +181,9 @@ def roll_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
                 "rewards": reward.detach(),
                 "entropies": entropy.detach(),
                 "terminated": terminated,
+                "failed": final["failed"],
                 "ended": ended,
-                "success": success,
+                "success": final["success"],
             }
         )
     loss = -piece.share / horizon * total.sum()

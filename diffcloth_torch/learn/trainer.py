@@ -19,9 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.checks import check_count
+from diffcloth_torch.checks import check_count, refuse_threads
 from diffcloth_torch.envs.env import EnvState, Task
-from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.envs.gym import begins_anew
+from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.learn.adam import TensorAdam
 from diffcloth_torch.learn.options import TrainerOptions
 from diffcloth_torch.learn.rollouts import (
@@ -82,9 +83,11 @@ class Trainer:
         check_count("Trainer: `num_envs`", num_envs, 1)
         if num_envs % self._chunk:
             raise InvalidInput(f"Trainer: `chunk` must divide {num_envs}, got {chunk}")
-        self._make_env, self._workers, self._threads = make_env, workers, threads
+        refuse_threads("Trainer: `workers`", workers)
+        self._make_env, self._workers = make_env, workers
+        self._threads = check_count("Trainer: `threads`", threads, 1)
         self._pickled = b"" if workers is None else _pickled(make_env)
-        self._env = make_env(num_envs=self._chunk)
+        self._env = begins_anew("Trainer: `make_env`", make_env(num_envs=self._chunk))
         self._count = num_envs
         actions, first = self.task.action_size, self.options.first_action
         if first is not None and len(first) != actions:
@@ -151,7 +154,7 @@ class Trainer:
         log["gradient_norm"] = self._step_actor(rollouts, learns)
         rows = _Rows(rollouts)
         log["reward"] = float(rows.rewards.mean())
-        log["failed"] = float(rows.terminated.float().mean())
+        log["failed"] = float(rows.failed.float().mean())
         log["entropy"] = float(rows.entropies.mean()) / self.task.action_size
         if self.options.has_critic:
             log["critic_loss"] = self._fit_critics(rows)
@@ -194,6 +197,7 @@ class Trainer:
         torch.save(
             {
                 "options": asdict(self.options),
+                "task": self._described,
                 "counts": [self.steps, self.updates],
                 "return": self._return,
                 "noise": self._noise.get_state(),
@@ -211,9 +215,16 @@ class Trainer:
         """Go on with what a file has, to the same bits.
 
         Raises:
-            InvalidInput: If it is of other options, or of environments in other chunks.
+            InvalidInput: If it is of another task, of other options, or of environments in other
+                chunks, or no such file.
         """
-        kept: dict[str, Any] = torch.load(path, weights_only=True)
+        kept: Any = torch.load(path, weights_only=True)
+        if not isinstance(kept, dict) or not {"task", "options", "places"} <= kept.keys():
+            raise InvalidInput(f"Trainer.load: {path} must be a file of `Trainer.save`")
+        if kept["task"] != self._described:
+            raise InvalidInput(
+                f"Trainer.load: {path} is of {kept['task']}, not of {self._described}"
+            )
         if kept["options"] != asdict(self.options):
             raise InvalidInput(f"Trainer.load: {path} was written with other options")
         sizes = [len(generators) for _, generators in kept["places"]]
@@ -229,6 +240,20 @@ class Trainer:
         self._return = kept["return"]
         self._noise.set_state(kept["noise"])
         self._places = [(EnvState(*parts), generators) for parts, generators in kept["places"]]
+
+    @property
+    def _described(self) -> dict[str, Any]:
+        """What a file of another task differs in."""
+        task = self.task
+        sizes = {n: [s.start, s.stop] for n, s in task.observation_slices.items()}
+        return {
+            "name": task.name,
+            "actions": task.action_size,
+            "observations": sizes,
+            "horizon": task.horizon,
+            "substeps": task.substeps,
+            "vertices": len(task.simulator.initial_state().positions),
+        }
 
     @property
     def _optimizers(self) -> tuple[torch.optim.Optimizer, ...]:
@@ -276,9 +301,13 @@ class Trainer:
             for rollout in rollouts:
                 gradient += rollout.gradients[k]
             parameter.grad = gradient
-        norm = torch.nn.utils.clip_grad_norm_(
-            self.policy.actor.parameters(), self.options.gradient_norm, error_if_nonfinite=True
-        )
+        parameters = list(self.policy.actor.parameters())
+        norm = torch.nn.utils.clip_grad_norm_(parameters, self.options.gradient_norm)
+        if not bool(torch.isfinite(norm)):
+            raise SimulationError(
+                f"Trainer.update: the gradient of update {self.updates} is not finite; a square "
+                "root or a norm in a reward has no derivative at 0"
+            )
         if learns:
             self._actor_steps.step()
         return float(norm)
@@ -338,7 +367,7 @@ class _Rows:
         self.seen, self.after = all_of("seen"), all_of("after")
         self.rewards, self.entropies = all_of("rewards"), all_of("entropies")
         self.terminated, self.ended = all_of("terminated"), all_of("ended")
-        self.success = all_of("success")
+        self.failed, self.success = all_of("failed"), all_of("success")
 
 
 def _lambda_returns(

@@ -25,7 +25,7 @@ _REPEATS = 3  # of pieces whose process or actor died, before the error is passe
 
 
 class Workers(Protocol):
-    """What makes pieces of work; every `concurrent.futures.Executor` is one."""
+    """What makes pieces of work; an executor of `concurrent.futures` is one, but of threads."""
 
     def map(self, function: Callable[[Any], Any], items: Any, /) -> Iterable[Any]:
         """Results of a function for items, in their order."""

@@ -55,6 +55,8 @@ def test_stable_baselines_learns():
     sb3 = pytest.importorskip("stable_baselines3")
     from diffcloth_torch.envs.stable_baselines import StableBaselinesEnv
 
+    with pytest.raises(InvalidInput, match="StableBaselinesEnv: `env` must begin anew"):
+        StableBaselinesEnv(envs.make("FoldCloth", 2, size=SMALL, autoreset_mode="Disabled"))
     env = StableBaselinesEnv(envs.make("FoldCloth", 2, size=SMALL, horizon=4))
     env.seed(3)
     first = env.reset()
@@ -73,6 +75,8 @@ def test_what_rsl_rl_asks_for():
     pytest.importorskip("tensordict")
     from diffcloth_torch.envs.rsl_rl import RslRlEnv
 
+    with pytest.raises(InvalidInput, match="RslRlEnv: `env` must begin anew"):
+        RslRlEnv(envs.make("FoldCloth", 2, size=SMALL, autoreset_mode="Disabled"))
     env = RslRlEnv(envs.make("FoldCloth", 2, size=SMALL, horizon=2), seed=0)
     assert env.get_observations()["policy"].shape[0] == env.num_envs == 2
     for _ in range(2):

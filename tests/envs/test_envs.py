@@ -224,6 +224,8 @@ def test_a_kept_state_goes_on_with_the_same_bits():
     kept = env.env_state, env.generator_states()
     other = make("FoldCloth", 2, horizon=4)
     other.resume(*kept)
+    with pytest.raises(dc.InvalidInput, match="`generator_states` must be of 2 environments, got"):
+        other.resume(kept[0], kept[1][:1])
     for k in range(3, 6):  # past a new start
         expected = env.step(actions_of(env, k))
         found = other.step(actions_of(other, k))
@@ -265,6 +267,8 @@ def test_scripts_succeed(name):
         (lambda: make("FoldCloth", reach=float("nan")), "`reach` must be"),
         (lambda: make("FoldCloth", opens_at=1.0), r"`opens_at` must be in \[-1, 1\)"),
         (lambda: make("FoldCloth").step(torch.zeros(2, 8)), r"call reset\(\) first"),
+        (lambda: make("FoldCloth").clear_grad(), r"clear_grad: call reset\(\) first"),
+        (lambda: make("FoldCloth").scripted_actions(), r"scripted_actions: call reset\(\) first"),
         (lambda: begun().step(torch.zeros(2, 7)), r"must have shape \[2, 8\], got \[2, 7\]"),
         (lambda: begun().step(torch.full((2, 8), torch.nan)), "environment 0 are not"),
         (lambda: begun().reset(options={"mask": 1}), "only reset_mask"),
@@ -276,6 +280,21 @@ def test_scripts_succeed(name):
 )
 def test_bad_input(call, message):
     with pytest.raises(dc.InvalidInput, match=message):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: envs.make(3), "`task` must be a name or a Task, got int"),
+        (lambda: envs.make(envs.TASKS["FoldCloth"]), "must be a name or a Task, got FoldCloth"),
+        (lambda: begun().step("up"), "`actions` must be numbers, got str"),
+        (lambda: begun().step(None), "`actions` must be numbers, got NoneType"),
+        (lambda: begun().step(torch.zeros(2, 8) * 1j), "`actions` must be real numbers"),
+    ],
+)
+def test_input_of_other_types(call, message):
+    with pytest.raises(TypeError, match=message):
         call()
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from processes import threads
 import diffcloth_torch as dc
 from diffcloth_torch import envs
 from diffcloth_torch.envs.fold_cloth import FoldCloth
-from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.learn import Trainer, TrainerOptions
 from diffcloth_torch.learn import rollouts as rollouts_module
 from diffcloth_torch.learn import trainer as trainer_module
@@ -385,6 +387,46 @@ def test_other_options_and_chunks_do_not_load(tmp_path):
         Trainer(fold(), TrainerOptions(horizon=3), num_envs=2, chunk=1).load(tmp_path / "policy.pt")
 
 
+def test_files_of_other_tasks_do_not_load(tmp_path):
+    options = TrainerOptions(horizon=3)
+    Trainer(fold(), options).save(tmp_path / "policy.pt")
+    others = [
+        partial(envs.make, "FoldClothDiagonal", size=6),
+        partial(envs.make, "FoldCloth", size=5),
+        partial(envs.make, "FoldCloth", size=6, horizon=7),
+        partial(envs.make, "DropCloth", size=6),
+    ]
+    for make in others:
+        with pytest.raises(InvalidInput, match=r"policy.pt is of .*'name': 'FoldCloth'"):
+            Trainer(make, options).load(tmp_path / "policy.pt")
+    torch.save({"policy": 3}, tmp_path / "other.pt")
+    with pytest.raises(InvalidInput, match=r"must be a file of `Trainer\.save`"):
+        Trainer(fold(), options).load(tmp_path / "other.pt")
+
+
+def test_an_end_that_is_no_failure_is_not_counted_as_one(monkeypatch):
+    trainer = Trainer(fold(), TrainerOptions(algorithm="apg", horizon=3), num_envs=2)
+    monkeypatch.setattr(FoldCloth, "terminal", lambda task, env: env.elapsed == 2)
+    log = trainer.update()
+    assert log["failed"] == 0.0
+    assert "return" in log
+
+
+def test_a_gradient_that_is_not_finite_ends_the_training():
+    class Rooted(FoldCloth):
+        name = "Rooted"
+
+        def reward(self, env):
+            still = env.state.velocities - env.state.velocities
+            return super().reward(env) - still.square().sum(dim=(-1, -2)).sqrt()
+
+    def make(num_envs):
+        return envs.make(Rooted(size=6, **SOFT), num_envs)
+
+    with pytest.raises(SimulationError, match="the gradient of update 0 is not finite"):
+        Trainer(make, TrainerOptions(algorithm="apg", horizon=3)).update()
+
+
 def test_threads_outside_do_not_matter():
     found = []
     for count in (1, 2):
@@ -419,7 +461,7 @@ def test_a_failed_environment_ends_its_episode_and_has_no_gradient(monkeypatch):
     def step(env, actions):
         observation, reward, terminated, truncated, info = real(env, actions)
         terminated = torch.tensor([True, False])
-        info["final_info"] = {"success": info["success"]}
+        info["final_info"] = {"success": info["success"], "failed": terminated}
         return observation, reward, terminated, truncated, info
 
     monkeypatch.setattr(rollouts_module.ClothVectorEnv, "step", step)
@@ -521,6 +563,15 @@ def test_noise_and_scale_of_a_policy():
         (lambda: TrainerOptions(first_action=(1.0,)), r"`first_action\[0\]` must be between"),
         (lambda: Trainer(fold(), TrainerOptions(first_action=(0.0,))), "must have 8 numbers"),
         (lambda: Trainer(fold(), num_envs=4, chunk=3), "`chunk` must divide 4, got 3"),
+        (lambda: Trainer(fold(), threads=0), "`threads` must be at least 1, got 0"),
+        (
+            lambda: Trainer(fold(), workers=ThreadPoolExecutor(1)),
+            "`workers` must be processes or other machines",
+        ),
+        (
+            lambda: Trainer(partial(envs.make, "FoldCloth", size=6, autoreset_mode="Disabled")),
+            "`make_env` must begin anew in the step in which it ends",
+        ),
         (lambda: envs.make("FoldCloth", bend=1), "an option of FoldCloth must be one of"),
         (lambda: envs.make("FoldCloth", opens_at=1.0), r"`opens_at` must be in \[-1, 1\)"),
     ],
