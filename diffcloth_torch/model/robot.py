@@ -17,6 +17,7 @@ from diffcloth_torch.checks import (
     FloatArray,
     Range,
     check_choice,
+    check_finite,
     check_name,
     check_number,
     check_pairs,
@@ -43,6 +44,7 @@ from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.robot_tree import JointBounds, joint_bounds, make_mechanism
 from diffcloth_torch.model.round_bodies import ContactSurface
 from diffcloth_torch.model.urdf import read_urdf
+from diffcloth_torch.transforms import numbers_of
 
 __all__ = ["ACTUATIONS", "BASES", "Robot"]
 
@@ -347,6 +349,7 @@ class Robot:
             raise InvalidInput(
                 f"{owner}: `joint_positions` must have shape [.., {joints}], got {list(q.shape)}"
             )
+        check_finite(f"{owner}: `joint_positions`", numbers_of(q))
         return q
 
     def forward_kinematics(
@@ -369,7 +372,9 @@ class Robot:
             raise InvalidInput(
                 f"forward_kinematics: `base_pose` must have shape [.., 7], got {list(pose.shape)}"
             )
-        check_quaternions("forward_kinematics: `base_pose`", pose.detach().numpy())
+        numbers = numbers_of(pose)
+        check_finite("forward_kinematics: `base_pose`", numbers)
+        check_quaternions("forward_kinematics: `base_pose`", numbers)
         try:
             np.broadcast_shapes(q.shape[:-1], pose.shape[:-1])
         except ValueError as error:

@@ -312,8 +312,11 @@ def _environments(index: Any, size: int) -> int | slice | Tensor:
         if not -size <= index < size:
             raise InvalidInput(f"state[i]: `i` must be in 0 .. {size - 1}, got {index}")
         return int(index)
-    if not isinstance(index, Sequence | np.ndarray | Tensor) or isinstance(index, str):
-        raise TypeError(f"state[i]: `i` must be an integer, got {type(index).__name__}")
+    if not isinstance(index, Sequence | np.ndarray | Tensor) or isinstance(index, str | tuple):
+        raise TypeError(
+            "state[i]: `i` must be an integer, a slice, a list or a tensor, got "
+            f"{type(index).__name__}"
+        )
     rows = torch.as_tensor(index) if len(index) else torch.zeros(0, dtype=torch.int64)
     if rows.is_floating_point() or rows.is_complex() or rows.ndim != 1:
         raise TypeError(

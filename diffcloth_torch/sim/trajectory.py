@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from typing import Any, SupportsIndex, overload
 
@@ -62,7 +64,10 @@ class Trajectory(list[State]):
         """
         for i, state in enumerate(self):
             check_state(f"Trajectory.save: the state [{i}]", state)
-        torch.save(list(self.detach()), as_path("Trajectory.save: `path`", path))
+        file = as_path("Trajectory.save: `path`", path)
+        if not file.parent.is_dir():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(file.parent))
+        torch.save(list(self.detach()), file)
 
     @staticmethod
     def load(path: str | Path) -> Trajectory:

@@ -15,6 +15,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from diffcloth_torch.checks import check_count
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.viewers.look import Camera
 from diffcloth_torch.viewers.motion import LAYERS, Motion
@@ -98,6 +99,7 @@ class Page(ABC):
             InvalidInput: If a package is missing, or an argument is not accepted.
         """
         self._viser = require_viser()
+        check_count("show: `port`", port, 0, 65535)
         if color not in LAYERS:
             raise InvalidInput(f"show: `color` must be one of {', '.join(LAYERS)}, got {color!r}")
         for arrow in arrows:
