@@ -34,6 +34,9 @@ constexpr int kExcursion = 6;
 constexpr double kFree = 0.3;
 /// In contact an excursion begins with a step of more than this share of an edge.
 constexpr double kFar = 0.03;
+/// Its steps are of fewer edges of the cloths; without cloths there is none. A body that friction alone
+/// holds would be led around what it rests on, to where it falls without end.
+constexpr double kFarthest = 10.0;
 /// Steps of a solve before the first excursion: most solves end sooner.
 constexpr int kPatience = 8;
 /// After an excursion in vain the next steps are ordinary ones, twice as many as the last time, at most
@@ -72,6 +75,7 @@ class Descent {
   Next go(const Directions::Direction& direction);
   Search walk_along(const Directions::Direction& direction);
   Search wander(const Trial& trial);
+  bool is_near(const std::vector<double>& p) const;
   Next come_back();
 
   Walk& walk_;
@@ -165,6 +169,12 @@ Descent::Next Descent::no_way(const Directions::Direction& direction,
   return stop(result == SearchResult::kBlocked ? Status::kBlocked : Status::kRoundingFloor);
 }
 
+/// Whether an excursion may go so far.
+bool Descent::is_near(const std::vector<double>& p) const {
+  return walk_.f.coordinates->cloth_vertex_count() > 0 &&
+         walk_.displacement(p) < kFarthest * walk_.f.length;
+}
+
 /// Walk along the direction. Where the full step would raise the objective it may begin an excursion.
 Search Descent::walk_along(const Directions::Direction& direction) {
   const std::vector<double>& p = directions_.p();
@@ -176,8 +186,8 @@ Search Descent::walk_along(const Directions::Direction& direction) {
   // The next step relaxes what this one stretches, but not what it drives into barriers.
   const bool touches = walk_.f.contact != nullptr && !walk_.f.contact->contacts().empty();
   const bool far = !touches || walk_.displacement(p) > kFar * walk_.f.length;
-  if (wait_ == 0 && direction.kind != Kind::kDamped && far && rises && trial.gain > 0.0 &&
-      !drowns(walk_, trial.gain)) {
+  if (wait_ == 0 && direction.kind != Kind::kDamped && far && is_near(p) && rises &&
+      trial.gain > 0.0 && !drowns(walk_, trial.gain)) {
     excursion_ = {.start = walk_.place(),
                   .p = p,
                   .direction = direction,
@@ -194,6 +204,7 @@ Search Descent::walk_along(const Directions::Direction& direction) {
 Search Descent::wander(const Trial& trial) {
   const double balance = excursion_.balance + trial.gain;
   const bool ends = trial.alpha > 0.0 && balance <= excursion_.enough;
+  if (!is_near(directions_.p())) return {.result = SearchResult::kNoGain};
   if (!ends && !(trial.alpha > kFree && std::isfinite(balance) && excursion_.steps < kExcursion)) {
     return {.result = SearchResult::kNoGain};
   }

@@ -161,8 +161,7 @@ Array NodalStage::tangent(const Pushforward& step,
   Array dz = solve_derivative(system, at, H, *factor, false, b);
   for (std::size_t a = 0; a < dz.size(); ++a) dz[a] += d[a];
 
-  add_force_tangents(problem_, contacts_, at, frames, gradient_change(dz),
-                     step.forces[direction]);
+  add_force_tangents(problem_, contacts_, at, frames, gradient_change(dz), step.forces[direction]);
   Array dx = tangents.ends;
   f.coordinates->put_rows(dz.data(), dx);
   f.coordinates->carry(x, dx);

@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import math
 from pathlib import Path
 
 import numpy as np
@@ -327,6 +328,27 @@ def test_what_resists_motion_changes_nothing_at_rest():
 def test_split_finds_the_same_one():
     alike = [s.equilibrium(s.initial_state()).positions for s in (drape(), drape("split"))]
     assert torch.equal(*alike)
+
+
+@pytest.mark.parametrize("with_cloth", [False, True])
+@pytest.mark.parametrize("degrees", [5, 10, 30, 44, 60, 80])
+def test_a_box_that_is_tilted_comes_to_lie_on_its_table(degrees, with_cloth):
+    """Friction alone holds it along the table, and beyond the rim there is nothing."""
+    angle = math.radians(degrees)
+    height = 0.05 * math.sqrt(2) * math.cos(math.radians(45 - degrees)) + 0.002
+    turned = [math.cos(angle / 2), math.sin(angle / 2), 0, 0]
+    box = dc.RigidBody.box(
+        0.1, motion="dynamic", mass=1.0, pose=[0, 0, height, *turned], friction=0.4
+    )
+    table = dc.RigidBody.plane(4.0, friction=0.4)
+    hangs = dc.Cloth.grid(4, 4, 0.2, pose=[1, 1, 1, 1, 0, 0, 0], pins={"edge": [0, 1, 2, 3]})
+    scene = dc.Scene([hangs] if with_cloth else [], [table, box])
+    contact = dc.ContactOptions(barrier_distance=0.003)
+    sim = dc.Simulator(scene, 0.01, contact=contact)
+    end = sim.equilibrium(sim.initial_state()).body_poses[1]
+    assert float(end[0].abs()) < 1e-3
+    assert float(end[1].abs()) < 0.1
+    assert 0.05 < float(end[2]) < 0.053
 
 
 def test_what_falls_is_named():
