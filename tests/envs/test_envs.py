@@ -191,6 +191,19 @@ def test_resets_by_mask_leave_the_others_alone():
     assert info["elapsed"].tolist() == [0, 2, 0]
 
 
+def test_the_next_start_of_an_environment_does_not_depend_on_those_of_others():
+    starts = []
+    for resets in ([0, 0], [0], []):  # of environment 0, before one of environment 1
+        env = make("FoldCloth", 2)
+        env.reset(seed=0)
+        for i in [*resets, 1]:
+            mask = torch.arange(2) == i
+            observation, _ = env.reset(options={"reset_mask": mask})
+        starts.append(observation[1])
+    assert torch.equal(starts[0], starts[1])
+    assert torch.equal(starts[0], starts[2])
+
+
 def test_failure_changes_no_bit_of_the_others():
     """Hand 1 is driven into the table; it begins anew."""
     results = []

@@ -261,6 +261,32 @@ def test_an_environment_that_failed_goes_back_half_way_and_the_others_go_on():
     ]
 
 
+def test_the_best_rows_are_those_of_the_smallest_losses():
+    """Steps that are too long for the last environment, whose loss rises."""
+    rates = torch.tensor([0.9, 1.6, 2.3], dtype=F64)
+    x = leaf(0.0, 0.0, 0.0)
+    seen = []
+
+    def loss(states):
+        losses = 0.5 * rates * (x - 1.0) ** 2
+        seen.append((x.detach().clone(), losses.detach()))
+        return losses
+
+    found = dc.descend(
+        lambda variables: [state_of(variables["a"])],
+        loss,
+        {"a": x},
+        partial(torch.optim.SGD, lr=1.0),
+        iterations=6,
+        per_environment=["a"],
+    )
+    losses = torch.stack([values for _, values in seen])
+    best = losses.argmin(dim=0).tolist()
+    assert best == [5, 5, 0]
+    assert torch.equal(found.best_losses, losses.amin(dim=0))
+    assert found.best_rows["a"].tolist() == [float(seen[k][0][i]) for i, k in enumerate(best)]
+
+
 def test_an_environment_that_fails_too_often_ends_the_loop():
     calls = iter([99.0, 0.0, 0.0, 0.0, 0.0])
 

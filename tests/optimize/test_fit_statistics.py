@@ -158,6 +158,27 @@ def test_a_report_begins_at_the_first_start_that_could_be_simulated(tmp_path):
     assert (tmp_path / "fit.html").stat().st_size > 0
 
 
+def test_random_starts_lie_between_the_bounds():
+    given = {
+        "a": dc.Variable(1.0, bounds=(0.9, 1.05), scale="log", spread=100.0),
+        "b": dc.Variable(2.0, bounds=(1.5, 2.5)),
+    }
+    found = dc.fit(given, fit_to(TRUTH).compared[0], starts=20, max_evaluations=1)
+    for name, (low, high) in (("a", (0.9, 1.05)), ("b", (1.5, 2.5))):
+        firsts = [float(start.first[name]) for start in found.starts[1:]]
+        assert low < min(firsts) < max(firsts) < high
+        assert max(firsts) - min(firsts) > 0.5 * (high - low)
+
+
+@pytest.mark.parametrize(("bounds", "is_known"), [((-1e3, 1e3), True), ((-1.0, 1.0), False)])
+def test_a_number_is_unknown_whose_error_is_half_its_range(bounds, is_known):
+    """A single observation of the number 0 with a standard error of 2."""
+    given = {"shift": dc.Variable(0.0, bounds=bounds)}
+    found = dc.fit(given, lambda parameters, values: values["shift"].reshape(1) / 2)
+    assert found.covariance[0, 0] == pytest.approx(4.0)
+    assert bool(found.unidentifiable) is not is_known
+
+
 def test_threads_and_priors_outside_a_range_are_refused():
     residuals = fit_to(TRUTH).compared[0]
     with (
