@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch import robots
+from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Hand, Tools
 from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import uniform
@@ -44,10 +45,11 @@ class HandTask(Task):
         """Build the scene.
 
         Args:
-            size: Vertices along a side of the cloth.
+            size: Vertices along a side of the cloth, >= 4.
             horizon: Transitions of an episode.
             substeps: Time steps of a transition, of .02 s each.
         """
+        check_count(f"{self.name}: `size`", size, 4)
         material = Material(
             stretch=200, bending=1e-4, density=0.2, damping=0.01, thickness=8e-4, friction=0.8
         )

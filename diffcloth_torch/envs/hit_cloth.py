@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Tools, Twist
 from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import follow, uniform
@@ -42,10 +43,11 @@ class HitCloth(Task):
         """Build the scene.
 
         Args:
-            size: Vertices along a side of the sheet, of 1 m.
+            size: Vertices along a side of the sheet, of 1 m, >= 4.
             horizon: Transitions of an episode.
             substeps: Time steps of a transition, of .02 s each.
         """
+        check_count(f"{self.name}: `size`", size, 4)
         sheet = Cloth.grid(
             size,
             size,

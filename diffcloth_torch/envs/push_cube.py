@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Tools, Velocities
 from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import uniform
@@ -38,10 +39,11 @@ class PushCube(Task):
         """Build the scene.
 
         Args:
-            size: Vertices along a side of the sheet.
+            size: Vertices along a side of the sheet, >= 4.
             horizon: Transitions of an episode.
             substeps: Time steps of a transition, of .02 s each.
         """
+        check_count(f"{self.name}: `size`", size, 4)
         sheet = Cloth.grid(
             size,
             size,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Forces, Tools
 from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import uniform
@@ -42,10 +43,11 @@ class TwoCloths(Task):
         """Build the scene.
 
         Args:
-            size: Each strip has 5 vertices across and 2 size + 7 along: 31 by default.
+            size: Each strip has 5 vertices across and 2 size + 7 along: 31 by default; >= 4.
             horizon: Transitions of an episode.
             substeps: Time steps of a transition, of .02 s each.
         """
+        check_count(f"{self.name}: `size`", size, 4)
         columns = 2 * size + 7
         flat, bent, faces = strip(_LENGTH, _WIDTH, _ROWS, columns, 180.0, 0.05, 0.5)
         material = Material(stretch=300, bending=1e-5, density=0.2, damping=0.01, friction=0.3)

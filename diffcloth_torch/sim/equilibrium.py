@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.checks import LARGEST
-from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.errors import InvalidInput, SimulationError, TurnedTooFar
 from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import Fields
@@ -118,6 +118,7 @@ class Equilibria:
             InvalidInput: If the scene or the control has something for which no equilibrium is
                 defined.
             SimulationError: If something is free to move.
+            TurnedTooFar: If a body turns too far on the way.
         """
         self._refuse(given)
         given = _resting(given)
@@ -127,7 +128,15 @@ class Equilibria:
 
         def step(length: float, at: Given, anchor: Tensor, turned: Tensor | None) -> _Found:
             given = _slower(at, length)
-            found = _Found(*self._engine(length).step(given, check, anchor, turned))
+            try:
+                found = _Found(*self._engine(length).step(given, check, anchor, turned))
+            except TurnedTooFar as error:  # its time step is that of the search
+                raise TurnedTooFar(
+                    "equilibrium: a body turns further on the way to rest than a step resolves; "
+                    "begin nearer to rest, as at the end of a rollout",
+                    report=error.report,
+                    environments=error.environments,
+                ) from error
             iterations.add_(torch.tensor(found.diagnostics["iterations"]))
             return found
 

@@ -22,7 +22,16 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry import shapes
 
-__all__ = ["FORCE_COLOR", "GOAL_COLOR", "Camera", "Goal", "Paint", "Pictures", "marker"]
+__all__ = [
+    "FORCE_COLOR",
+    "GOAL_COLOR",
+    "Camera",
+    "Goal",
+    "Paint",
+    "Pictures",
+    "checked_camera",
+    "marker",
+]
 
 _FRONT_COLORS = ("#2a6f97", "#c8553d", "#5b7f4b", "#7d5a8c")
 _BACK_COLORS = ("#f2c078", "#f3dcc0", "#e3dcae", "#e0cfe8")
@@ -190,6 +199,14 @@ class Goal:
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int32]
+
+
+def checked_camera(owner: str, camera: Camera | None) -> Camera:
+    """The camera, or the one that is meant by None."""
+    given: object = camera
+    if given is not None and not isinstance(given, Camera):
+        raise TypeError(f"{owner}: `camera` must be a Camera or None, got {type(given).__name__}")
+    return Camera() if camera is None else camera
 
 
 def marker(position: NDArray[np.float64], radius: float) -> Goal:

@@ -11,7 +11,7 @@ import numpy as np
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.state import State
-from diffcloth_torch.viewers.look import Camera, Pictures
+from diffcloth_torch.viewers.look import Camera, Pictures, checked_camera
 from diffcloth_torch.viewers.record import Record
 
 __all__ = ["check_states", "render"]
@@ -61,7 +61,12 @@ def render(
         raise InvalidInput(f"render: the folder of `path` must exist, got {str(path)!r}")
     shown = [states] if isinstance(states, State) else list(states)
     check_states("render", scene, shown)
-    if len(size) != 2 or any(n % 2 or not 64 <= n <= 4096 for n in size):
+    given: object = size
+    if (
+        not isinstance(given, Sequence)
+        or len(size) != 2
+        or any(n % 2 or not 64 <= n <= 4096 for n in size)
+    ):
         raise InvalidInput(f"render: `size` must be two even numbers in 64 .. 4096, got {size}")
     if moments < 1:
         raise InvalidInput(f"render: `moments` must be at least 1, got {moments}")
@@ -75,7 +80,7 @@ def render(
         sheet=moments if kind == "png" else 0,
         labels=labels,
         contact_forces=contact_forces,
-        camera=Camera() if camera is None else camera,
+        camera=checked_camera("render", camera),
     )
     real_time = _real_time(shown)
     with Record(

@@ -12,7 +12,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.viewers.browser import Browser
-from diffcloth_torch.viewers.look import Camera, Goal
+from diffcloth_torch.viewers.look import Camera, Goal, checked_camera
 from diffcloth_torch.viewers.render import check_states
 
 __all__ = ["show"]
@@ -65,6 +65,10 @@ def show(
         )
     if "gradient" in arrows and gradients is None:
         raise InvalidInput("show: `arrows` has 'gradient', which needs `gradients`")
+    for k, goal in enumerate(goals):
+        given: object = goal
+        if not isinstance(given, Goal):
+            raise TypeError(f"show: `goals[{k}]` must be a Goal, got {type(given).__name__}")
     file = None if path is None else Path(path)
     if file is not None and (file.suffix != ".html" or not file.parent.is_dir()):
         raise InvalidInput(
@@ -74,7 +78,7 @@ def show(
         scene,
         port=port,
         goals=goals,
-        camera=Camera() if camera is None else camera,
+        camera=checked_camera("show", camera),
         color=color,
         arrows=arrows,
     )

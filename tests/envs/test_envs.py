@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
@@ -272,7 +274,10 @@ def test_scripts_succeed(name):
         (lambda: envs.make("Fold"), "`task` must be"),
         (lambda: envs.make("FoldCloth", 0), "`num_envs` must be"),
         (lambda: make("FoldCloth", observation="images"), "`observation` must be"),
-        (lambda: envs.make("FoldCloth", size=2), "`size` must be"),
+        *(
+            (partial(envs.make, name, size=3), f"{name}: `size` must be at least 4, got 3")
+            for name in NAMES
+        ),
         (lambda: make("FoldCloth", autoreset_mode="NextStep"), "'SameStep', 'Disabled'"),
         (lambda: make("FoldCloth", autoreset_mode="never"), "`autoreset_mode` must be"),
         (lambda: make("FoldCloth", seed=-1), "make: `seed` must be at least 0, got -1"),

@@ -351,6 +351,18 @@ def test_a_box_that_is_tilted_comes_to_lie_on_its_table(degrees, with_cloth):
     assert 0.05 < float(end[2]) < 0.053
 
 
+def test_the_time_step_of_the_search_is_not_told(monkeypatch):
+    def turns(self, *arguments):
+        raise dc.TurnedTooFar("step: take a time step of at most 0.06 s", environments=[2])
+
+    sim = dc.Simulator(dc.Scene([dc.Cloth.grid(3, 3, pins={"corner": [0]})]), 0.01)
+    monkeypatch.setattr(equilibrium.Engine, "step", turns)
+    with pytest.raises(dc.TurnedTooFar, match="equilibrium: a body turns further on the") as raised:
+        sim.equilibrium(sim.initial_state())
+    assert raised.value.environments == (2,)
+    assert "time step" not in str(raised.value)
+
+
 def test_what_falls_is_named():
     sheet = dc.Cloth.grid(4, 4, (0.2, 0.2), name="sheet")
     sim = dc.Simulator(dc.Scene([sheet]), 0.01)

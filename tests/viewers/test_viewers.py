@@ -361,6 +361,8 @@ class TestRender:
             pytest.param({"states": [3]}, TypeError, r"got int at \[0\]", id="type"),
             pytest.param({"moments": 0}, dc.InvalidInput, "`moments`", id="moments"),
             pytest.param({"size": (161, 120)}, dc.InvalidInput, "two even numbers", id="size"),
+            pytest.param({"size": 160}, dc.InvalidInput, "two even numbers", id="one size"),
+            pytest.param({"camera": 3}, TypeError, "`camera` must be a Camera", id="camera"),
             pytest.param({"fps": 0}, dc.InvalidInput, "`fps`", id="fps"),
         ],
     )
