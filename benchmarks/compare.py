@@ -31,7 +31,7 @@ from typing import Any
 import click
 from tqdm import tqdm
 
-from benchmarks.scenes import BUCKLING, SCENES, kept_file
+from benchmarks.scenes import BUCKLING, FURTHER, SCENES, kept_file
 
 ALL = SCENES | BUCKLING
 ROOT = Path(__file__).resolve().parents[1]
@@ -135,7 +135,7 @@ class Side:
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     help="Folder with the other package.",
 )
-@click.option("--scene", "scenes", multiple=True, type=click.Choice(list(ALL)))
+@click.option("--scene", "scenes", multiple=True, type=click.Choice(list(ALL | FURTHER)))
 @click.option("--size", "sizes", multiple=True, type=click.IntRange(min=4), help="Vertices a side.")
 @click.option("--steps", type=click.IntRange(min=1), help="Timed steps; by default fewer if large.")
 @click.option("--batch/--no-batch", default=True, help="Also time batches of 8.")

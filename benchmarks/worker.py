@@ -43,10 +43,10 @@ def timed_steps(row: dict[str, Any]) -> Any:
     import torch
 
     import diffcloth_torch as dc
-    from benchmarks.scenes import BUCKLING, DT, SCENES, in_regime
+    from benchmarks.scenes import BUCKLING, DT, FURTHER, SCENES, in_regime
 
     torch.set_num_threads(row["threads"])
-    scene = (SCENES | BUCKLING)[row["scene"]](row["size"])
+    scene = (SCENES | BUCKLING | FURTHER)[row["scene"]](row["size"])
     given = {} if row["slip_velocity"] is None else {"slip_velocity": row["slip_velocity"]}
     simulator = dc.Simulator(
         scene.scene,
