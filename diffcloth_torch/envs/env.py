@@ -90,6 +90,8 @@ class Task(ABC):
     def __init__(
         self, simulator: Simulator, actuator: Actuator, *, horizon: int, substeps: int
     ) -> None:
+        if not isinstance(getattr(self, "name", None), str):
+            raise InvalidInput(f"{type(self).__name__}: a task must have a `name`")
         if simulator.solver.throw:
             raise InvalidInput(
                 f"{self.name}: `simulator` must have SolverOptions(throw=False): one environment "
@@ -122,9 +124,13 @@ class Task(ABC):
     def success(self, env: EnvState) -> Tensor:
         """Whether the task is done [B]."""
 
-    @abstractmethod
-    def scripted(self, env: EnvState) -> Tensor:
-        """Actions [B, A] of a policy made by hand, which shows that the task can be done."""
+    def scripted(self, env: EnvState) -> Tensor:  # a task may have none
+        """Actions [B, A] of a policy made by hand, which shows that the task can be done.
+
+        Raises:
+            InvalidInput: If the task has none.
+        """
+        raise InvalidInput(f"{self.name}: it has no scripted policy")
 
     def terminal(self, env: EnvState) -> Tensor:
         """Whether an episode ends before its horizon [B]: where a step failed."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from diffcloth_torch.checks import check_choice, check_count
 from diffcloth_torch.envs.env import EnvState, Task
-from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.sim.controls import Parameters
 
 __all__ = ["ClothVectorEnv"]
@@ -77,7 +77,8 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": []}
         self.task = task
         self.parameters: Parameters | None = None
-        size = task.observation(task.example()).shape[-1]
+        with torch.no_grad():
+            size = _tried(task)
         self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (task.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -118,10 +119,12 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
 
         Raises:
             InvalidInput: If the actions have another shape or are not finite, or nothing was reset.
+            SimulationError: If a reward is not finite.
         """
         self._require_start("step")
         after = self.task.transition(self.env_state, self._actions(actions), self.parameters)
         reward = self.task.reward(after)
+        _check_rewards(self.task, reward, after.failed)
         observation = self._observe(after)
         if bool(after.failed.any()):
             reward = torch.where(after.failed, reward.detach(), reward)
@@ -257,6 +260,51 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         if self._generators is None:
             raise InvalidInput("reset: `reset_mask` needs environments that have begun")
         return mask
+
+
+def _tried(task: Task) -> int:
+    """Try what a task computes on one start; gives the size of its observations."""
+    example = task.example()
+    for name, feature in task.features(example).items():
+        _check(task, f"features[{name!r}]", feature, [1, -1], torch.is_floating_point)
+    _check(task, "reward", task.reward(example), [1], torch.is_floating_point)
+    for name in ("success", "terminal"):
+        _check(task, name, getattr(task, name)(example), [1], lambda t: t.dtype == torch.bool)
+    if type(task).scripted is not Task.scripted:
+        actions = task.scripted(example)
+        _check(task, "scripted", actions, [1, task.action_size], torch.is_floating_point)
+    return int(task.observation(example).shape[-1])
+
+
+def _check(
+    task: Task, name: str, value: object, shape: list[int], is_kind: Callable[[Tensor], bool]
+) -> None:
+    """Require a finite tensor of a shape, of which -1 is any length, and of a kind."""
+    words = "booleans" if name in ("success", "terminal") else "finite floats"
+    text = str(["B", *shape[1:]]).replace("'", "").replace("-1", "n")
+    right = (
+        isinstance(value, Tensor)
+        and len(value.shape) == len(shape)
+        and all(n in (-1, m) for n, m in zip(shape, value.shape, strict=True))
+        and is_kind(value)
+        and bool(torch.isfinite(value).all())
+    )
+    if not right:
+        got = type(value).__name__
+        if isinstance(value, Tensor):
+            got = f"{value.dtype} {list(value.shape)} for B = 1"
+            got += "" if bool(torch.isfinite(value).all()) else " with NaN or infinity"
+        raise InvalidInput(f"{task.name}: `{name}` must give {words} {text}, got {got}")
+
+
+def _check_rewards(task: Task, reward: Tensor, failed: Tensor) -> None:
+    wrong = ~torch.isfinite(reward) & ~failed
+    if bool(wrong.any()):
+        row = int(wrong.nonzero()[0])
+        raise SimulationError(
+            f"{task.name}: the reward of environment {row} is {float(reward[row].detach())}",
+            environments=wrong.nonzero()[:, 0].tolist(),
+        )
 
 
 def register(name: str) -> None:

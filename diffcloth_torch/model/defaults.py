@@ -29,6 +29,8 @@ __all__ = [
 # elements of the rest mesh that are not neighbors. Beyond one half of the latter, the surface would
 # repel itself at rest.
 _PART_OF_EDGE = 0.1
+# Share of the barrier distance that edges ask for, below which what is no neighbor is taken to touch.
+_TOUCHING = 1e-6
 _PART_OF_NONADJACENT = 0.45
 _LARGEST_PART_OF_NONADJACENT = 0.5
 
@@ -147,12 +149,35 @@ def choose_barrier_distance(
     thickness = max(cloth.material.thickness for cloth in scene.cloths)
     limit = _PART_OF_NONADJACENT * nonadjacent_distance - thickness
     if limit <= 0:
+        _refuse_coincident(scene)
         raise InvalidInput(
             f"Simulator: `material.thickness` of a cloth must be below {_PART_OF_NONADJACENT} of "
             "the smallest distance between elements of its rest mesh that are not neighbors, "
             f"{_PART_OF_NONADJACENT * nonadjacent_distance:g} m, got {thickness:g}"
         )
+    if limit < _TOUCHING * distance:
+        raise InvalidInput(
+            f"Simulator: elements of the rest mesh of a cloth that are not neighbors are "
+            f"{nonadjacent_distance:.3g} m apart: they touch or cross; move them apart, or give "
+            "`rest_positions` in which they do not"
+        )
     return min(distance, limit)
+
+
+def _refuse_coincident(scene: Scene) -> None:
+    """Refuse cloths with two vertices at one place, which are no hem but two cut edges."""
+    for name, cloth in zip(scene.cloth_names, scene.cloths, strict=True):
+        _, first, inverse = np.unique(
+            cloth.rest_positions, axis=0, return_index=True, return_inverse=True
+        )
+        twins = np.flatnonzero(first[inverse.reshape(-1)] != np.arange(len(inverse.reshape(-1))))
+        if len(twins):
+            twin = int(twins[0])
+            raise InvalidInput(
+                f"Simulator: vertices {first[inverse.reshape(-1)[twin]]} and {twin} of cloth "
+                f"{name!r} are at one place in its rest mesh, and self-contact keeps them apart; "
+                "merge vertices of a file that coincide before you load it"
+            )
 
 
 def check_barrier(

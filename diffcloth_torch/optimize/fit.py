@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -63,6 +64,7 @@ class Fit:
         cost: Half the sum of their squares and of those of the priors.
         success: Whether the solver converged.
         message: How it ended.
+        at_bounds: Names of the numbers that ended at a bound, where intervals mean little.
         starts: Where each start ended, and why not at the best place.
         held_out: Root mean square of the residuals of each trajectory that was kept out of the fit:
             about one if the model is right and the noise is known; one infinite number if the
@@ -82,6 +84,7 @@ class Fit:
     cost: float
     success: bool
     message: str
+    at_bounds: list[str]
     starts: list[Start]
     held_out: list[float]
     history: list[Trial] = field(repr=False)
@@ -215,6 +218,8 @@ def fit(
         raise next(end.failure for end in reversed(ends) if end.failure is not None)
     noise = noise_of(best.residuals, len(space), loss, job.options.loss_scale)
     found = uncertainty_of(space, best.theta, best.jacobian, noise)
+    at_bounds = space.at_bounds(best.theta)
+    _warn_of_bounds(variables, space, at_bounds)
     values = space.values(torch.from_numpy(np.array(best.theta)))
     return Fit(
         parameters=parameters_of(values),
@@ -227,7 +232,8 @@ def fit(
         residuals=best.residuals,
         cost=best.cost,
         success=best.success,
-        message=best.message,
+        message=best.message + "".join(f"; {name} is at its bound" for name in at_bounds),
+        at_bounds=at_bounds,
         starts=judge(job, ends, best, found.deviations),
         held_out=[] if hold_out is None else _errors(hold_out, values),
         history=[trial for end in ends for trial in end.history],
@@ -335,6 +341,21 @@ def _errors(residuals: Residuals, values: Mapping[str, Tensor]) -> list[float]:
         if not part.numel():
             raise InvalidInput(f"fit: `hold_out` must return numbers, trajectory {k} has none")
     return [float(part.square().mean().sqrt()) for part in parts]
+
+
+def _warn_of_bounds(
+    variables: Mapping[str, Variable], space: Space, at_bounds: Sequence[str]
+) -> None:
+    """Warn of numbers that ended at a bound which nobody gave."""
+    for name in space.default_bounds:
+        here = [n for n in at_bounds if n.partition("[")[0] == name]
+        if here:
+            warnings.warn(
+                f"fit: {', '.join(here)} ended a factor of 1000 from where it began, and goes no "
+                "further without `bounds`; give them, or a better first value",
+                UserWarning,
+                stacklevel=3,
+            )
 
 
 def _require_scipy() -> None:

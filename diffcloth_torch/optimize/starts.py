@@ -240,8 +240,8 @@ def _apart(space: Space, end: End, best: End, deviations: FloatArray) -> str:
     name = space.names[int(far.argmax())]
     if not end.success:
         return f"it had not converged after {len(end.history)} evaluations, {name} most of all"
-    bound = ((end.theta <= space.low + 1e-6) | (end.theta >= space.high - 1e-6)).nonzero()[0]
-    at = f", with {space.names[bound[0]]} at its bound" if len(bound) else ""
+    bounds = space.at_bounds(end.theta)
+    at = f", with {bounds[0]} at its bound" if bounds else ""
     return f"another minimum: cost {end.cost:.6g} instead of {best.cost:.6g}, {name} differs{at}"
 
 

@@ -30,6 +30,7 @@ __all__ = ["Space", "Variable"]
 
 _SCALES = ("log", "linear")
 _SPREADS = Range(1.0)
+_AT_BOUND = 1e-6  # of theta
 _REACH = 1e3  # factor of what is positive, to both sides of its first value, without bounds
 
 
@@ -93,6 +94,7 @@ class _Axis:
     high: float
     spread: float
     prior: tuple[FloatArray, FloatArray] | None
+    is_default: bool
 
 
 class Space:
@@ -182,6 +184,16 @@ class Space:
             numbers = theta[axis.rows].reshape(axis.shape)
             free[axis.name] = numbers.exp() if axis.log else numbers
         return {name: free.get(name, self._kept.get(name)) for name in self.all_variables}  # type: ignore[misc]
+
+    def at_bounds(self, theta: FloatArray) -> list[str]:
+        """Names of the numbers at their lowest or highest value."""
+        here = (theta <= self.low + _AT_BOUND) | (theta >= self.high - _AT_BOUND)
+        return [name for name, is_here in zip(self.names, here, strict=True) if is_here]
+
+    @property
+    def default_bounds(self) -> list[str]:
+        """Variables whose bounds are a factor from their first value, as none were given."""
+        return [axis.name for axis in self._axes if axis.log and axis.is_default]
 
     def rates(self, theta: FloatArray) -> FloatArray:
         """Derivative of each number by its theta."""
@@ -316,6 +328,7 @@ def _axis(name: str, variable: Variable, first: int) -> _Axis:
         high=high,
         spread=variable.spread,
         prior=prior,
+        is_default=variable.bounds is None,
     )
 
 

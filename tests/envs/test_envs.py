@@ -330,6 +330,56 @@ def begun():
     return env
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("reward", torch.tensor(1.0), r"`reward` must give finite floats \['?B'?\], got"),
+        ("reward", torch.zeros(1, 1), r"got torch.float32 \[1, 1\] for B = 1"),
+        ("reward", torch.tensor([torch.nan]), "with NaN or infinity"),
+        ("reward", torch.tensor([True]), "got torch.bool"),
+        ("reward", None, "got NoneType"),
+        ("success", torch.zeros(1), r"`success` must give booleans \[B\], got torch.float32"),
+        ("terminal", torch.zeros(2) > 1, "`terminal` must give booleans"),
+        ("features", {"x": torch.zeros(1)}, r"`features\['x'\]` must give finite floats \[B, n\]"),
+        ("features", {"x": torch.full((1, 2), torch.inf)}, "with NaN or infinity"),
+        ("scripted", torch.zeros(1, 3), r"`scripted` must give finite floats \[B, 8\]"),
+    ],
+)
+def test_what_a_task_gives_is_tried(name, value, message):
+    wrong = type("Wrong", (envs.TASKS["FoldCloth"],), {"name": "Wrong", name: lambda s, e: value})
+    with pytest.raises(dc.InvalidInput, match=message):
+        envs.make(wrong(size=SMALL))
+
+
+def test_a_reward_that_becomes_nan_is_named():
+    class Late(envs.TASKS["FoldCloth"]):
+        name = "Late"
+
+        def reward(self, env):
+            late = (env.elapsed > 1) & (torch.arange(len(env)) == 1)
+            return super().reward(env) + torch.where(late, torch.nan, 0.0)
+
+    env = envs.make(Late(size=SMALL), 2)
+    env.reset(seed=0)
+    env.step(np.zeros((2, 8)))
+    with pytest.raises(dc.SimulationError, match="Late: the reward of environment 1 is nan"):
+        env.step(np.zeros((2, 8)))
+
+
+def test_a_task_needs_a_name_and_no_script():
+    class Plain(envs.TASKS["FoldCloth"]):
+        name = "Plain"
+        scripted = Task.scripted
+
+    env = envs.make(Plain(size=SMALL), 2)
+    env.reset(seed=0)
+    with pytest.raises(dc.InvalidInput, match="Plain: it has no scripted policy"):
+        env.scripted_actions()
+    Plain.name = None
+    with pytest.raises(dc.InvalidInput, match="Plain: a task must have a `name`"):
+        Plain(size=SMALL)
+
+
 def test_a_task_of_ones_own():
     class Lift(envs.TASKS["FoldCloth"]):
         name = "Lift"

@@ -158,6 +158,23 @@ def test_a_report_begins_at_the_first_start_that_could_be_simulated(tmp_path):
     assert (tmp_path / "fit.html").stat().st_size > 0
 
 
+@pytest.mark.parametrize("first", [1e-4, 1e-3])
+def test_a_number_that_ends_at_a_bound_is_named(first):
+    residuals = fit_to(TRUTH).compared[0]
+    given = {"a": dc.Variable(2.0, bounds=(2.0, 9.0)), "b": dc.Variable(first, scale="log")}
+    with pytest.warns(UserWarning, match="b ended a factor of 1000 from where it began"):
+        found = dc.fit(given, residuals)
+    assert float(found.values["b"]) == pytest.approx(1000 * first)
+    assert "b" in found.at_bounds
+    assert "b is at its bound" in found.message
+
+
+def test_nothing_is_said_of_numbers_between_their_bounds(recwarn):
+    found = fit_to(TRUTH)
+    assert found.at_bounds == []
+    assert not [w for w in recwarn if "factor of 1000" in str(w.message)]
+
+
 def test_random_starts_lie_between_the_bounds():
     given = {
         "a": dc.Variable(1.0, bounds=(0.9, 1.05), scale="log", spread=100.0),
