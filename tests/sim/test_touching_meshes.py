@@ -27,7 +27,7 @@ def test_vertices_at_one_place_are_named():
 
 @pytest.mark.parametrize("gap", [1e-12, 1e-9])
 def test_layers_that_touch_are_refused_by_their_distance(gap):
-    layers = np.vstack([VERTICES, VERTICES + [0, 0, gap]])
+    layers = np.vstack([VERTICES, VERTICES + np.array([0, 0, gap])])
     message = f"elements of the rest mesh of a cloth that are not neighbors are {gap:g} m apart"
     with pytest.raises(dc.InvalidInput, match=message):
         simulator(layers, np.vstack([FACES, FACES + 16]))
