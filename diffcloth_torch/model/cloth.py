@@ -133,7 +133,7 @@ class Cloth:
     def load(
         cls, path: str | Path, *, scale: float = 1.0, pose: object = None, **keywords: Any
     ) -> Cloth:
-        """Read an .obj, .ply or .stl file; vertex `i` of an .obj or .ply is vertex `i` of the cloth.
+        """Read an .obj, .ply or .stl file; but for .stl, vertex `i` of it is that of the cloth.
 
         Args:
             path: Mesh file of triangles.

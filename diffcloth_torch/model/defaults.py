@@ -29,10 +29,10 @@ __all__ = [
 # elements of the rest mesh that are not neighbors. Beyond one half of the latter, the surface would
 # repel itself at rest.
 _PART_OF_EDGE = 0.1
-# Share of the barrier distance that edges ask for, below which what is no neighbor is taken to touch.
-_TOUCHING = 1e-6
 _PART_OF_NONADJACENT = 0.45
 _LARGEST_PART_OF_NONADJACENT = 0.5
+# Below this share of the distance that edges ask for, elements that are no neighbors touch.
+_TOUCHING = 1e-6
 
 
 def has_contact(scene: Scene, contact: ContactOptions) -> bool:
