@@ -222,7 +222,7 @@ DIFFCLOTH_INLINE void negative_parts(const WovenForms& forms, NegativeParts& par
       y[l] = next;
     }
     bool is_done = true;
-    for (int l = 0; l < kLanes; ++l) is_done = is_done && !(left[l] > 0.0);
+    for (const double step : left) is_done = is_done && !(step > 0.0);
     if (is_done) break;
   }
   for (int l = 0; l < kLanes; ++l) {
