@@ -126,8 +126,6 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         reward = self.task.reward(after)
         _check_rewards(self.task, reward, after.failed)
         observation = self._observe(after)
-        if bool(after.failed.any()):
-            reward = torch.where(after.failed, reward.detach(), reward)
         terminated = self.task.terminal(after)
         truncated = (after.elapsed >= self.task.horizon) & ~terminated
         info = self._info(after)
@@ -217,10 +215,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         return EnvState.where(mask, spread, env)
 
     def _observe(self, env: EnvState) -> Tensor:
-        observation = self.task.observation(env)
-        if bool(env.failed.any()):
-            observation = torch.where(env.failed[:, None], observation.detach(), observation)
-        return observation.to(_FLOAT)
+        return self.task.observation(env).to(_FLOAT)
 
     def _info(self, env: EnvState) -> dict[str, Any]:
         with torch.no_grad():

@@ -148,7 +148,12 @@ def test_what_failed_has_no_graph_and_the_others_have(monkeypatch):
     env.step(actions)
     fails[0] = False
     assert env.env_state.failed.tolist() == [False, True]
-    for tensor in (env.env_state.state.positions, env.env_state.tools["points"]):
+    for tensor in (
+        env.env_state.state.positions,
+        env.env_state.tools["points"],
+        env.task.reward(env.env_state),
+        env.task.observation(env.env_state),
+    ):
         (gradient,) = torch.autograd.grad(tensor.sum(), actions, retain_graph=True)
         assert gradient[0].any()
         assert not gradient[1].any()

@@ -193,6 +193,25 @@ def test_resets_by_mask_leave_the_others_alone():
     assert info["elapsed"].tolist() == [0, 2, 0]
 
 
+def test_no_environment_begins_as_one_of_the_next_seed():
+    env = make("FoldCloth", 2)
+    first, second = (env.reset(seed=seed)[0] for seed in (3, 4))
+    assert not torch.equal(first[1], second[0])
+    assert not torch.equal(first[0], first[1])
+
+
+def test_a_failure_at_the_horizon_ends_an_episode_once(monkeypatch):
+    from diffcloth_torch.envs import env as module
+
+    monkeypatch.setattr(module, "failures", lambda state: torch.tensor([False, True]))
+    env = make("FoldCloth", 2, horizon=1)
+    env.reset(seed=0)
+    _, _, terminated, truncated, info = env.step(actions_of(env, 0))
+    assert terminated.tolist() == [False, True]
+    assert truncated.tolist() == [True, False]
+    assert info["_final_obs"].tolist() == [True, True]
+
+
 def test_the_next_start_of_an_environment_does_not_depend_on_those_of_others():
     starts = []
     for resets in ([0, 0], [0], []):  # of environment 0, before one of environment 1
