@@ -381,6 +381,23 @@ class Dynamics:
             )
         return found
 
+    def joint_weights(self, state: Fields, parameters: Fields) -> Tensor:
+        """What the weight of dynamic robots exerts at the joints, [B, J] N m or N.
+
+        Args:
+            state: Fields of a state, each with a leading axis B.
+            parameters: As for `predict`.
+        """
+        gravity = parameters["gravity"].reshape(-1, 3)
+        none = state["joint_positions"].new_zeros(len(state["joint_positions"]), 0)
+        own = [
+            robot.joint_weights(
+                self._robot_state(i, state), self._robot_inertia(i, parameters), gravity
+            )
+            for i, robot in enumerate(self._robots)
+        ]
+        return torch.cat([none, *own], dim=-1)
+
     def totals(self, state: Fields, parameters: Fields) -> Totals:
         """Momentum and energy of dynamic bodies and robots.
 

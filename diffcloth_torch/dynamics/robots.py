@@ -54,7 +54,13 @@ from torch import Tensor
 
 from diffcloth_torch.checks import LARGEST
 from diffcloth_torch.dynamics.functions import outputs_of, robot_functions
-from diffcloth_torch.dynamics.inertia import Inertia, Motion, link_momenta, momentum
+from diffcloth_torch.dynamics.inertia import (
+    Inertia,
+    Motion,
+    generalized_force,
+    link_momenta,
+    momentum,
+)
 from diffcloth_torch.dynamics.jacobians import ROOT, DifferentialKinematics
 from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
@@ -312,6 +318,20 @@ class RobotDynamics:
         joints = coordinates[..., self.coordinate_count - self.mechanism.joint_count :]
         after = RobotState(found["pose"], found["velocity"], joints, found["rates"])
         return after, found["efforts"]
+
+    def joint_weights(self, state: RobotState, inertia: Inertia, gravity: Tensor) -> Tensor:
+        """What the weight exerts at the joints, [B, J] N m or N; zero if the robot is not dynamic.
+
+        Args:
+            state: State of the robot, whose velocities do not matter.
+            inertia: Masses and inertias of links and joints.
+            gravity: [B or 1, 3] m/s^2.
+        """
+        if not self.mechanism.is_dynamic:
+            return torch.zeros_like(state.joints)
+        motion = Motion.at(self._kinematics, inertia, pose_frame(state.pose), state.joints)
+        weights = torch.nn.functional.pad(gravity, (0, 3))[..., None, :]
+        return generalized_force(motion, inertia.mass[..., None] * weights)[..., ROOT:]
 
     def totals(self, state: RobotState, inertia: Inertia, gravity: Tensor) -> Totals:
         """Momentum and energy of a state; zero if the robot is not dynamic.

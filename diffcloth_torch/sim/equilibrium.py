@@ -149,7 +149,10 @@ class Equilibria:
                 here = self._descend(here, lambda at: step(_GROWTH[-1], at, *anchor))
             here = self._probe(here, lambda at: step(_PROBED, at, *anchor))
             here, unsettled = self._settle(here, lambda at: step(_LAST, at, *anchor))
-        fields, diagnostics = step(_LAST, self._begun(given, here.state), origins, joints)
+        begun = self._begun(given, here.state)
+        fields, diagnostics = step(_LAST, begun, origins, joints)
+        if self._settles:
+            fields = fields | {"joint_efforts": self._efforts(begun, fields)}
         if unsettled:
             alternate = dict.fromkeys(unsettled, "friction and normal forces alternate")
             mark(diagnostics, alternate, UNCONVERGED)
@@ -209,15 +212,36 @@ class Equilibria:
             )
 
     def _begun(self, given: Given, state: Fields) -> Given:
-        """The given inputs, at a state that was found; what its robots hold keeps its graph."""
-        names, layout = ("joint_positions", "base_poses"), self._layout
-        held = (layout.permissions.at_rates, ~layout.permissions.floating)
-        kept = {
-            n: torch.where(mask.reshape(-1, *[1] * (t.dim() - 2)), given.state[n], t)
-            for n, mask in zip(names, held, strict=True)
-            if (t := state.get(n)) is not None
-        }
+        """The given inputs, at a state that was found; what its robots hold keeps its graph.
+
+        That is where the control has it, as the weight of robots is that of the start of a step.
+        """
+        permissions = self._layout.permissions
+        kept = {n: t for n, t in given.state.items() if n == "joint_targets"}
+        if (joints := state.get("joint_positions")) is not None:
+            joints = torch.where(permissions.at_rates, given.state["joint_positions"], joints)
+            targets = given.control["joint_positions"]
+            kept["joint_positions"] = torch.where(permissions.at_positions, targets, joints)
+        if (poses := state.get("base_poses")) is not None:
+            floating = permissions.floating[:, None]
+            kept["base_poses"] = torch.where(floating, poses, given.control["base_poses"])
         return given._replace(state=state | kept)
+
+    def _efforts(self, begun: Given, fields: Fields) -> Tensor:
+        """Efforts of the last step, those of prescribed joints with the weight of its end.
+
+        The step has the weight of its start, which is the same but has no graph where joints and
+        bases are free.
+        """
+        dynamics = self._engine(_LAST).dynamics
+        assert dynamics is not None  # some robot is dynamic
+        end = begun.state | {n: fields[n] for n in ("joint_positions", "base_poses")}
+        change = dynamics.joint_weights(begun.state, begun.parameters) - dynamics.joint_weights(
+            end, begun.parameters
+        )
+        permissions = self._layout.permissions
+        held = permissions.at_rates | permissions.at_positions
+        return fields["joint_efforts"] + torch.where(held, change, 0.0)
 
     def _descend(self, here: Given, step: Callable[[Given], _Found]) -> Given:
         """Repeat a step until robots are near an equilibrium."""

@@ -35,6 +35,7 @@ class Permissions:
         actuation: Actuation of each joint, length J.
         driven: Which joints have a pd drive, shape [J].
         at_rates: Which joints have prescribed velocities, shape [J].
+        at_positions: Which joints have prescribed positions, shape [J].
         floating: Which robots have a floating base, shape [R].
         settable: Field of a control -> which joints it can set, shape [J].
         massive: "body" or "link" -> which of them are dynamic and have mass, [K] or [L].
@@ -59,6 +60,9 @@ class Permissions:
         self.actuation = tuple(mode for robot in robots for mode in robot.actuation)
         self.driven = torch.tensor([mode == "pd" for mode in self.actuation], dtype=torch.bool)
         self.at_rates = torch.tensor([m == "velocity" for m in self.actuation], dtype=torch.bool)
+        self.at_positions = torch.tensor(
+            [m == "position" for m in self.actuation], dtype=torch.bool
+        )
         self.floating = torch.tensor([r.base == "floating" for r in robots], dtype=torch.bool)
         self.settable = {
             field: np.array([mode in modes for mode in self.actuation], dtype=bool)

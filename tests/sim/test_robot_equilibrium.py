@@ -283,3 +283,85 @@ def test_torques_on_bases_and_velocities_of_joints_are_refused(arm):
     wrench = torch.tensor([[0, 0, 1.0, 0.1, 0, 0]], dtype=F64)
     with pytest.raises(dc.InvalidInput, match="base_wrenches` must have no torques"):
         floating.equilibrium(floating.initial_state(), floating.control(base_wrenches=wrench))
+
+
+def turned(pose, angle):
+    """The pose after a turn about y."""
+    half = torch.tensor([np.cos(angle / 2), 0, np.sin(angle / 2), 0], dtype=F64)
+    return torch.cat([pose[:3], half])
+
+
+@pytest.mark.parametrize("angle", [0.2, 0.8, 1.5])
+def test_a_base_that_a_control_turns_is_where_the_weight_counts(arm, angle):
+    sim = alone(arm(base="kinematic", actuation="pd", stiffness=5.0, damping=0.1))
+    start = sim.initial_state()
+    control = sim.control(base_poses={"arm": turned(start.base_poses[0], angle)})
+    end = sim.equilibrium(start, control)
+    again = sim.equilibrium(end)
+    torch.testing.assert_close(again.joint_positions, end.joint_positions, rtol=0, atol=1e-9)
+    expected = -5.0 * end.joint_positions
+    torch.testing.assert_close(end.joint_efforts, expected, rtol=1e-7, atol=0)
+    joints = end.joint_positions.clone()
+    joints[0] += angle
+    np.testing.assert_allclose(end.joint_efforts, -moments(joints.numpy()), rtol=1e-7)
+
+
+MIXED = {"shoulder": "pd", "elbow": "position"}, {"shoulder": "position", "elbow": "pd"}
+
+
+@pytest.mark.parametrize("name", ["targets", "base", "stiffness", "gravity", "link_mass", "held"])
+@pytest.mark.parametrize("actuation", [*MIXED, "position", {**MIXED[0], "elbow": "velocity"}])
+def test_derivatives_by_what_is_prescribed_and_of_its_efforts(arm, actuation, name):
+    dynamic = actuation != "position"
+    gains = {"stiffness": 5.0, "damping": 0.1} if dynamic else {}
+    start = {"shoulder": 0.3, "elbow": 0.2}
+    robot = arm(base="kinematic", actuation=actuation, joint_positions=start, **gains)
+    # Something that forces move, far away.
+    corners = {"corners": [0, 2]}
+    sheet = dc.Cloth.grid(3, 3, 0.2, pose=[5, 0, 0, 1, 0, 0, 0], pins=corners)
+    sim = dc.Simulator(dc.Scene([sheet], [], [robot]), 0.01, solver=TIGHT)
+    state, parameters = sim.initial_state(), sim.parameters()
+    given = {
+        "targets": state.joint_positions,
+        "base": turned(state.base_poses[0], 0.4),
+        "held": state.joint_positions,
+        "gravity": parameters.gravity,
+    }
+    if dynamic:
+        given |= {"stiffness": parameters.joint_stiffness, "link_mass": parameters.link_mass}
+    if name not in given or (name == "targets" and "velocity" in str(actuation)):
+        pytest.skip("a robot that forces do not move has no such parameter, or no such target")
+
+    def outputs(value):
+        new = {**given, name: value}
+        fields = {"gravity": new["gravity"]}
+        if dynamic:
+            fields |= {"joint_stiffness": new["stiffness"], "link_mass": new["link_mass"]}
+        options = {"base_poses": {"arm": new["base"]}}
+        if name == "targets":
+            options["joint_positions"] = new["targets"]
+        end = sim.equilibrium(
+            state.replace(joint_positions=new["held"]),
+            sim.control(**options),
+            parameters.replace(**fields),
+        )
+        weights = torch.tensor([1.0, 2.0], dtype=F64)
+        return torch.stack([(weights * t).sum() for t in (end.joint_positions, end.joint_efforts)])
+
+    at = given[name].detach().clone().requires_grad_()
+    direction = torch.linspace(0.5, 1.0, at.numel(), dtype=F64).reshape(at.shape)
+    if name in ("stiffness", "link_mass"):
+        direction = direction * at.detach()
+    if name == "base":
+        direction = torch.tensor([0, 0, 0, 0, 0.3, 0.5, 0.1], dtype=F64)
+    rows = torch.autograd.grad(
+        outputs(at), at, torch.eye(2, dtype=F64), is_grads_batched=True, materialize_grads=True
+    )[0]
+    backward = (rows * direction).reshape(2, -1).sum(dim=1)
+    _, forward = torch.func.jvp(outputs, (at.detach(),), (direction,))
+    with torch.no_grad():
+        high, low = (outputs(at + s * 1e-5 * direction) for s in (1, -1))
+    differences = (high - low) / 2e-5
+    torch.testing.assert_close(backward, differences, rtol=1e-5, atol=1e-7)
+    torch.testing.assert_close(forward, backward, rtol=1e-9, atol=1e-12)
+    assert differences[1].abs() > 1e-3 or (name == "held" and dynamic)
