@@ -34,8 +34,9 @@ constexpr int kExcursion = 6;
 constexpr double kFree = 0.3;
 /// In contact an excursion begins with a step of more than this share of an edge.
 constexpr double kFar = 0.03;
-/// Its steps are of fewer edges of the cloths; without cloths there is none. A body that friction alone
-/// holds would be led around what it rests on, to where it falls without end.
+/// Bodies and links go less than so many edges of the cloths in each of its steps, and without cloths there
+/// is none. A body that friction alone holds would be led around what it rests on, to where it falls
+/// without end.
 constexpr double kFarthest = 10.0;
 /// Steps of a solve before the first excursion: most solves end sooner.
 constexpr int kPatience = 8;
@@ -171,8 +172,12 @@ Descent::Next Descent::no_way(const Directions::Direction& direction,
 
 /// Whether an excursion may go so far.
 bool Descent::is_near(const std::vector<double>& p) const {
-  return walk_.f.coordinates->cloth_vertex_count() > 0 &&
-         walk_.displacement(p) < kFarthest * walk_.f.length;
+  const Coordinates& coordinates = *walk_.f.coordinates;
+  const double farthest = kFarthest * walk_.f.length;
+  for (Index i = coordinates.cloth_vertex_count(); i < coordinates.vertex_count(); ++i) {
+    if (!(row(p.data(), i).squaredNorm() < farthest * farthest)) return false;
+  }
+  return coordinates.cloth_vertex_count() > 0;
 }
 
 /// Walk along the direction. Where the full step would raise the objective it may begin an excursion.
