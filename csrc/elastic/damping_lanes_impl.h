@@ -126,15 +126,10 @@ void add_damping_hessian(const DampingBatch* batches,
                          bool positive,
                          const std::int32_t* place,
                          double* blocks) {
-  alignas(64) double h[54][kLanes];
-  for (const DampingBatch* batch = batches; batch != batches + count; ++batch) {
-    if (positive) {
-      damping_hessians<true>(*batch, x, h);
-    } else {
-      damping_hessians<false>(*batch, x, h);
-    }
-    scatter_blocks(batch->woven.faces, h, place, blocks);
-  }
+  add_hessians(
+      batches, count, x, positive, place, blocks,
+      [](const DampingBatch& batch) -> const FaceBatch& { return batch.woven.faces; },
+      damping_hessians<false>, damping_hessians<true>);
 }
 
 }  // namespace

@@ -32,14 +32,6 @@ inline Mat32 face_gradient(const Model& model,
   return deformation_gradient(g, row(x, face[0]), row(x, face[1]), row(x, face[2]));
 }
 
-/// That of x1 - x0, whose differences are taken first.
-inline Mat32 face_gradient_change(const Model& model, Index f, const double* x0, const double* x1) {
-  const std::array<Index, 3>& face = model.topology->faces[f];
-  return deformation_gradient(model.rest->shape_gradient[f], row(x1, face[0]) - row(x0, face[0]),
-                              row(x1, face[1]) - row(x0, face[1]),
-                              row(x1, face[2]) - row(x0, face[2]));
-}
-
 /// y_p += P g_p over the corners of a face.
 inline void scatter(
     const Model& model, Index f, const Mat32& P, const mesh::ShapeGradient& g, double* y) {

@@ -102,6 +102,31 @@ DIFFCLOTH_INLINE void scatter_blocks(const FaceBatch& batch,
   }
 }
 
+/// blocks += the Hessians of batches, exact or projected.
+///
+/// @param faces  (batch) -> its triangles
+/// @param exact  (batch, x, h) puts the blocks of a batch; `projected` likewise
+template <class Batch, class Faces, class Exact, class Projected>
+DIFFCLOTH_INLINE void add_hessians(const Batch* batches,
+                                   std::size_t count,
+                                   const double* x,
+                                   bool positive,
+                                   const std::int32_t* place,
+                                   double* blocks,
+                                   Faces faces,
+                                   Exact exact,
+                                   Projected projected) {
+  alignas(64) double h[54][kLanes];
+  for (const Batch* batch = batches; batch != batches + count; ++batch) {
+    if (positive) {
+      projected(*batch, x, h);
+    } else {
+      exact(*batch, x, h);
+    }
+    scatter_blocks(faces(*batch), h, place, blocks);
+  }
+}
+
 }  // namespace
 }  // namespace diffcloth::elastic
 

@@ -30,11 +30,6 @@ double stretch_energy(const Model& model, Index f, const Mat32& F) {
   return stretch::energy(stretch_weight(model, f), F);
 }
 
-Mat32 stretch_stress(const Model& model, Index f, const Mat32& F) {
-  if (is_orthotropic(model, f)) return orthotropic::stress(stretch_weave(model, f), F);
-  return stretch::stress(stretch_weight(model, f), F);
-}
-
 Mat2 second_stress(const Model& model, Index f, const Mat32& F) {
   if (is_orthotropic(model, f)) return orthotropic::second_stress(stretch_weave(model, f), F);
   return stretch::second_stress(stretch_weight(model, f), F);

@@ -11,9 +11,6 @@ namespace diffcloth::elastic {
 
 double stretch_energy(const Model& model, Index f, const Mat32& F);
 
-/// dE/dF.
-Mat32 stretch_stress(const Model& model, Index f, const Mat32& F);
-
 /// T with dE/dF = F T.
 Mat2 second_stress(const Model& model, Index f, const Mat32& F);
 

@@ -155,15 +155,10 @@ void add_hessian(const StretchBatch* batches,
                  bool positive,
                  const std::int32_t* place,
                  double* blocks) {
-  alignas(64) double h[54][kLanes];
-  for (const StretchBatch* batch = batches; batch != batches + count; ++batch) {
-    if (positive) {
-      hessians<true>(*batch, x, h);
-    } else {
-      hessians<false>(*batch, x, h);
-    }
-    scatter_blocks(batch->faces, h, place, blocks);
-  }
+  add_hessians(
+      batches, count, x, positive, place, blocks,
+      [](const StretchBatch& batch) -> const FaceBatch& { return batch.faces; }, hessians<false>,
+      hessians<true>);
 }
 
 constexpr StretchKernels kKernels{.energy_change = energy_change,

@@ -313,15 +313,10 @@ void add_woven_hessian(const WovenBatch* batches,
                        bool positive,
                        const std::int32_t* place,
                        double* blocks) {
-  alignas(64) double h[54][kLanes];
-  for (const WovenBatch* batch = batches; batch != batches + count; ++batch) {
-    if (positive) {
-      woven_hessians<true>(*batch, x, h);
-    } else {
-      woven_hessians<false>(*batch, x, h);
-    }
-    scatter_blocks(batch->faces, h, place, blocks);
-  }
+  add_hessians(
+      batches, count, x, positive, place, blocks,
+      [](const WovenBatch& batch) -> const FaceBatch& { return batch.faces; },
+      woven_hessians<false>, woven_hessians<true>);
 }
 
 }  // namespace
