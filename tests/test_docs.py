@@ -41,6 +41,14 @@ def test_the_reference_has_every_public_name():
     assert sorted(named) == sorted(dc.__all__)
 
 
+@pytest.mark.parametrize("module", ["envs", "learn"])
+def test_the_reference_has_every_name_of_a_module(module):
+    pages = "\n".join(page.read_text() for page in ROOT.glob("docs/reference/*.md"))
+    named = re.findall(rf"^\.\. auto\w+:: diffcloth_torch\.{module}\.(?:\w+\.)?(\w+)$", pages, re.M)
+    missing = set(importlib.import_module(f"diffcloth_torch.{module}").__all__) - set(named)
+    assert not missing
+
+
 def test_the_stand_in_of_the_core_is_like_the_core():
     """The site is built with what `_core.pyi` declares in its place."""
     declarations = ROOT / "diffcloth_torch" / "_core.pyi"
