@@ -1,6 +1,7 @@
 #include "solver/motion.h"
 
 #include <algorithm>
+#include <cmath>
 #include <ranges>
 
 #include "solver/line_search.h"
@@ -94,7 +95,7 @@ bool has_arrived(const Walk& walk, const std::vector<double>& ends) {
   return true;
 }
 
-/// A point on the way, and the fraction of the whole motion there.
+/// A point on the way, and the fraction of the whole motion there, less than one.
 struct Stop {
   Walk::Place place;
   double fraction;
@@ -126,7 +127,9 @@ double arrive(Walk& walk, const PrescribedMotion& motion) {
     double checked = 1.0;
     std::vector<Stop> way;  // in this portion
     for (int iteration = 1; remaining > 0.0; ++iteration) {
-      way.push_back({.place = walk.place(), .fraction = (k + 1.0 - remaining) / portions});
+      // What is left may drown in rounding, where things approach one another without end.
+      const double fraction = std::min((k + 1.0 - remaining) / portions, std::nextafter(1.0, 0.0));
+      way.push_back({.place = walk.place(), .fraction = fraction});
       if (!walk.spend()) return halt(walk, motion, way);
       const double alpha = joint_step(walk, ends);
       remaining *= 1.0 - alpha;

@@ -107,7 +107,13 @@ def raise_on_failure(
             numbers = (
                 f"iterations {diagnostics['iterations'][first]}, residual "
                 f"{diagnostics['residual'][first]:.3g} m/s, motion fraction "
-                f"{diagnostics['motion_fraction'][first]:.3g}"
+                f"{_share(diagnostics['motion_fraction'][first])}"
             )
             text = f"step: {place}{sentence} ({detail + '; ' if detail else ''}{numbers})"
             raise error(text, report=report, environments=environments)
+
+
+def _share(fraction: float) -> str:
+    """Three digits; what is less than one does not read as one."""
+    left = 1.0 - fraction
+    return f"1 - {left:.1g}" if 0.0 < left < 1e-3 else f"{fraction:.3g}"

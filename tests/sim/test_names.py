@@ -103,3 +103,17 @@ def test_what_is_pressed_too_hard_is_named(load):
     message = "so close that rounding lets none of them move: cloth 'mat', body 'floor'"
     with pytest.raises(dc.NotConverged, match=message):
         simulator.step(simulator.initial_state(), dc.Control(forces=forces))
+
+
+def test_a_motion_to_a_gap_of_zero_is_refused():
+    """The way there is never at its end; neither its message nor its report says that it is."""
+    floor = dc.RigidBody.box([1, 1, 0.1], pose=[0, 0, -0.05, 1, 0, 0, 0])
+    lid = dc.RigidBody.box([1, 1, 0.1], pose=[0.01, 0.02, 0.15, 1, 0, 0, 0], motion="kinematic")
+    cloth = dc.Cloth.grid(5, 5, size=0.4, pose=[0, 0, 0.05, 1, 0, 0, 0])
+    simulator = dc.Simulator(dc.Scene([cloth], [floor, lid]), DT)
+    state = simulator.initial_state()
+    poses = state.body_poses.clone()
+    poses[1, 2] = 0.05
+    with pytest.raises(dc.InfeasibleMotion, match=r"motion fraction 1 - \d") as caught:
+        simulator.step(state, dc.Control(body_poses=poses))
+    assert caught.value.report.motion_fraction < 1
