@@ -56,6 +56,7 @@ def _targets(layout: Layout, control: Control) -> dict[str, Tensor | dict[str, T
         else:
             tensor = _target(field, field, given, shape)
             _check_rows(layout, field, numbers_of(tensor))
+            layout.permissions.refuse_unused(field, tensor)
             checked[field] = tensor
     return checked
 

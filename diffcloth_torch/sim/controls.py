@@ -33,8 +33,8 @@ class Control:
             [N, N m], shape [K, 6], or body -> wrench [6]; must be zero for a body that is not
             dynamic.
         joint_positions: Targets of position and pd joints [rad or m], shape [J], or "robot/joint"
-            (or "joint" if that is unique) -> number; rows of other joints are ignored, and pd
-            joints that are not named keep their last target.
+            (or "joint" if that is unique) -> number; rows of other joints are ignored, here and in
+            the next two, and pd joints that are not named keep their last target.
         joint_velocities: Targets of velocity and pd joints [rad/s or m/s], shape [J], or likewise
             by name; zero by default.
         joint_efforts: Efforts of torque joints, and efforts added to those of pd drives [N m or N],

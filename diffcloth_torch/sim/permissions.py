@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.checks import FloatArray, refuse_gradient
 from diffcloth_torch.dynamics.limits import ZONE
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.assembly import Assembly
@@ -84,6 +85,13 @@ class Permissions:
                 f"{' or '.join(map(repr, _MODES[field]))}; that of {name!r} is "
                 f"{self.actuation[joint]!r}"
             )
+
+    def refuse_unused(self, field: str, values: Tensor) -> None:
+        """Refuse to differentiate by a field of which no joint of the scene takes a row."""
+        if field in _MODES and len(self.actuation) and not self.settable[field].any():
+            modes = " or ".join(map(repr, _MODES[field]))
+            remedy = f"have a joint of the actuation {modes}, or pass a detached tensor"
+            refuse_gradient(f"control: `{field}`", values, remedy)
 
 
 def _joined(arrays: Sequence[FloatArray]) -> FloatArray:

@@ -134,6 +134,23 @@ def test_a_batch_takes_shared_and_own_values(layout, scene):
         complete(layout, scene, dc.Control(joint_efforts=rows(2, 5)), batch=(3,))
 
 
+@pytest.mark.parametrize("actuation", ["position", "velocity", "torque"])
+def test_a_gradient_by_what_moves_no_joint_is_refused(actuation):
+    robot = dc.Robot.load(dc.robots.GRIPPER, actuation=actuation)
+    cloth = dc.Cloth.grid(2, 2, size=0.1, pose=[1, 0, 0, 1, 0, 0, 0])
+    layout = Layout(assemble(dc.Scene([cloth], robots=[robot])))
+    own = {"position": "joint_positions", "velocity": "joint_velocities", "torque": "joint_efforts"}
+    for field in own.values():
+        values = torch.zeros(2, dtype=F64)
+        check_control(layout, dc.Control(**{field: values}))
+        control = dc.Control(**{field: values.requires_grad_()})
+        if field == own[actuation]:
+            check_control(layout, control)
+        else:
+            with pytest.raises(dc.InvalidInput, match=f"`{field}` must not require a gradient"):
+                check_control(layout, control)
+
+
 @pytest.mark.parametrize("named", [True, False])
 def test_gradients_reach_what_was_given_and_what_is_held(layout, scene, named):
     given = torch.tensor([0.1, 0.4, 0.0, 0.0, 0.0], dtype=torch.float32, requires_grad=True)
