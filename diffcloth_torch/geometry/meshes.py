@@ -153,6 +153,8 @@ def _read_stl(path: Path, data: bytes) -> tuple[FloatArray, Indices]:
         raise InvalidInput(f"{path}: the file is empty")
     try:
         soup = load_stl(io.BytesIO(data))
+        if "vertices" not in soup:
+            raise ValueError("it has neither the header of a binary file nor a solid of text")
         corners = np.asarray(soup["vertices"], dtype=np.float64)[np.asarray(soup["faces"])]
         points = corners.reshape(-1, 3)
     except MemoryError:

@@ -327,7 +327,10 @@ def _folder(resume: str | Path | None) -> Path | None:
     if resume is None:
         return None
     folder = as_path("fit: `resume`", resume)
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InvalidInput(f"fit: `resume` must be a folder, got {str(folder)!r}") from error
     return folder
 
 

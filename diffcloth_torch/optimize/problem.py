@@ -256,6 +256,9 @@ class Problem:
             raise InvalidInput(
                 f"fit: `residuals` must return finite numbers, got {float(found[at]):g} at [{at}]"
             )
+        self._check_count(found)
+
+    def _check_count(self, found: Tensor) -> None:
         if self._count not in (0, len(found)):
             raise InvalidInput(
                 "fit: `residuals` must return as many numbers in every call, got "
@@ -281,7 +284,9 @@ class Problem:
             raise InvalidInput(
                 f"fit: `residuals` must depend on the variables that are free, {_NO_DERIVATIVE}"
             )
-        return self._with_priors(parts, theta)
+        found = self._with_priors(parts, theta)
+        self._check_count(found)
+        return found
 
     def _with_priors(self, parts: Sequence[Tensor], theta: Tensor) -> Tensor:
         found = [part.reshape(-1).to(torch.float64) for part in parts]

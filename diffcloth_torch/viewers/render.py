@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
+from diffcloth_torch.checks import POSITIVE, check_count, check_number
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.files import as_path
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.viewers.look import Camera, Pictures, checked_camera
 from diffcloth_torch.viewers.record import Record
 
-__all__ = ["check_states", "render"]
+__all__ = ["checked_states", "render"]
 
 _ONE_STATE_FPS = 25.0
 
@@ -53,25 +53,23 @@ def render(
             how to install it.
         TypeError: If `states` contains other objects than states.
     """
-    path = Path(path)
+    path = as_path("render: `path`", path)
     kind = path.suffix.lower().removeprefix(".")
     if kind not in ("mp4", "gif", "png"):
         raise InvalidInput(f"render: `path` must end in .mp4, .gif or .png, got {str(path)!r}")
     if not path.parent.is_dir():
         raise InvalidInput(f"render: the folder of `path` must exist, got {str(path)!r}")
-    shown = [states] if isinstance(states, State) else list(states)
-    check_states("render", scene, shown)
+    shown = checked_states("render", scene, states)
     given: object = size
     if (
         not isinstance(given, Sequence)
         or len(size) != 2
-        or any(n % 2 or not 64 <= n <= 4096 for n in size)
+        or not all(n in range(64, 4097, 2) for n in size)
     ):
         raise InvalidInput(f"render: `size` must be two even numbers in 64 .. 4096, got {size}")
-    if moments < 1:
-        raise InvalidInput(f"render: `moments` must be at least 1, got {moments}")
-    if fps is not None and not 0 < fps < np.inf:
-        raise InvalidInput(f"render: `fps` must be greater than 0, got {fps}")
+    moments = check_count("render: `moments`", moments, 1)
+    if fps is not None:
+        fps = check_number("render: `fps`", fps, POSITIVE)
 
     video: Literal["mp4", "gif", "none"] = "mp4" if kind == "mp4" else "gif"
     pictures = Pictures(
@@ -94,21 +92,25 @@ def render(
             record.show(state)
 
 
-def check_states(
-    owner: str, scene: Scene, states: Sequence[State], *, batches: bool = False
-) -> None:
-    """Refuse states that are not of a scene.
+def checked_states(
+    owner: str, scene: Scene, states: State | Sequence[State], *, batches: bool = False
+) -> list[State]:
+    """List states, and refuse those that are not of a scene.
 
     Args:
         owner: What the messages begin with.
         scene: The scene.
-        states: What was given.
+        states: What was given, one state or several.
         batches: Whether states may have a batch axis, all of them the same.
 
     Raises:
         InvalidInput: If there is no state, or one is of another shape.
         TypeError: If something is no state.
     """
+    given: object = states
+    if not isinstance(given, State | Iterable):
+        raise TypeError(f"{owner}: `states` must be states, got {type(given).__name__}")
+    states = [states] if isinstance(states, State) else list(states)
     if not states:
         raise InvalidInput(f"{owner}: `states` must hold at least one state")
     vertices = sum(len(cloth.vertices) for cloth in scene.cloths)
@@ -134,6 +136,7 @@ def check_states(
                     f"{owner}: states[{i}] must be of this scene, whose `{name}` have shape "
                     f"{list(shape)}, got {list(got)}"
                 )
+    return states
 
 
 def _real_time(states: Sequence[State]) -> float:

@@ -9,11 +9,12 @@ from pathlib import Path
 from torch import Tensor
 
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.files import as_path
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.viewers.browser import Browser
 from diffcloth_torch.viewers.look import Camera, Goal, checked_camera
-from diffcloth_torch.viewers.render import check_states
+from diffcloth_torch.viewers.render import checked_states
 
 __all__ = ["show"]
 
@@ -57,8 +58,7 @@ def show(
             how to install it.
         TypeError: If `states` contains other objects than states.
     """
-    shown = [states] if isinstance(states, State) else list(states)
-    check_states("show", scene, shown, batches=True)
+    shown = checked_states("show", scene, states, batches=True)
     if gradients is not None and len(gradients) != len(shown):
         raise InvalidInput(
             f"show: `gradients` must be one for each of {len(shown)} states, got {len(gradients)}"
@@ -69,7 +69,7 @@ def show(
         given: object = goal
         if not isinstance(given, Goal):
             raise TypeError(f"show: `goals[{k}]` must be a Goal, got {type(given).__name__}")
-    file = None if path is None else Path(path)
+    file = None if path is None else as_path("show: `path`", path)
     if file is not None and (file.suffix != ".html" or not file.parent.is_dir()):
         raise InvalidInput(
             f"show: `path` must end in .html, in an existing folder, got {str(path)!r}"

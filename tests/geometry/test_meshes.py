@@ -143,6 +143,14 @@ def test_stl_corners_are_merged_in_the_order_of_the_file(tmp_path):
     np.testing.assert_array_equal(faces, FACES)
 
 
+@pytest.mark.parametrize("content", [b"no solid", bytes(range(256)) * 2])
+def test_bytes_that_are_no_stl_are_refused(tmp_path, content):
+    path = tmp_path / "a.stl"
+    path.write_bytes(content)
+    with pytest.raises(dc.InvalidInput, match="neither the header of a binary file nor a solid"):
+        read_mesh(path)
+
+
 @pytest.mark.parametrize("name", ["empty.stl", "mesh.gltf"])
 def test_other_files_are_refused(tmp_path, name):
     (tmp_path / name).write_bytes(b"")

@@ -201,6 +201,7 @@ def test_a_late_and_biased_sensor_is_found():
             dc.InvalidInput,
             "it leaves out decay, offset",
         ),
+        (lambda: dc.fit(VARIABLES, residuals, resume=__file__), dc.InvalidInput, "a folder"),
         (lambda: dc.fit(VARIABLES, residuals, workers=-1), dc.InvalidInput, "`workers`"),
         (lambda: dc.Variable(1.0, spread=1.0), dc.InvalidInput, "`spread` must be finite and > 1"),
     ],
@@ -208,6 +209,15 @@ def test_a_late_and_biased_sensor_is_found():
 def test_bad_input(call, error, message):
     with pytest.raises(error, match=message):
         call()
+
+
+def test_residuals_that_change_their_length_while_they_are_differentiated_are_refused():
+    def growing(parameters, values):
+        found = residuals(parameters, values)
+        return found if not torch.is_grad_enabled() else [*found, found[0][:1]]
+
+    with pytest.raises(dc.InvalidInput, match="as many numbers in every call"):
+        dc.fit(VARIABLES, growing, method="L-BFGS-B")
 
 
 class TestOutline:
