@@ -173,6 +173,54 @@ def test_a_smooth_ball_rests_at_half_the_barrier_distance(radius):
     assert gap == pytest.approx(0.5 * reach, rel=1e-6)
 
 
+def at_half_gap(xi, reach):
+    """Slope and curvature of the barrier by the gap, from its formula."""
+    gap = torch.tensor(0.5 * reach, dtype=F64, requires_grad=True)
+    sigma = (xi + gap) ** 2 - xi**2
+    s = 2 * xi * reach + reach**2
+    barrier = -reach / s**2 * (sigma - s) ** 2 * torch.log(sigma / s)
+    (slope,) = torch.autograd.grad(barrier, gap, create_graph=True)
+    (curvature,) = torch.autograd.grad(slope, gap)
+    return slope.item(), curvature.item()
+
+
+@pytest.mark.parametrize(("mass", "of"), [(1e-3, "cloth0"), (50.0, "ball")])
+def test_a_radius_takes_nothing_from_what_a_surface_needs(mass, of):
+    """Beside thickness of its own: a cloth needs a curvature at half the gap, a body a slope."""
+    reach, radius, thicknesses = 3e-3, 0.04, {"cloth0": 2e-3, "ball": 7e-3}
+    ball = dc.RigidBody.sphere(
+        radius,
+        smooth=True,
+        motion="dynamic",
+        mass=mass,
+        thickness=thicknesses["ball"],
+        pose=[0, 0, 1, *TURN],
+        name="ball",
+    )
+    sim = simulator([sheet(thickness=thicknesses["cloth0"])], [FLOOR, ball], barrier_distance=reach)
+    found = pairs(sim)
+    xi, kind = thicknesses[of], 1 if of == "cloth0" else 0
+    with_radius, without = (at_half_gap(xi + r, reach)[kind] for r in (radius, 0.0))
+    if of == "cloth0":
+        need = found["cloth0", "cloth0"] * without
+    else:  # its weight, on a sixth of its area of which a vertex counts a quarter
+        area = 4 * np.pi * radius**2
+        need = mass * G / (0.25 * area / 6)
+    assert abs(found["cloth0", "ball"] * with_radius) == pytest.approx(need, rel=1e-9)
+
+
+def test_without_gravity_a_body_needs_what_stops_it_within_a_step():
+    """As much as with a gravity that falls through the barrier distance, from rest, in a step."""
+    reach = 4e-3
+    found = []
+    for g in (0.0, reach / DT**2):
+        bodies = [FLOOR, box(0.7, 0, 0, 0.2, name="box")]
+        scene = dc.Scene([], bodies, gravity=[0.0, -g, 0.0])
+        sim = dc.Simulator(scene, DT, contact=dc.ContactOptions(barrier_distance=reach))
+        found.append(pairs(sim)["box", "floor"])
+    assert found[0] == pytest.approx(found[1], rel=1e-12)
+
+
 @pytest.mark.parametrize("thickness", [0.0, 4e-3, 2e-2])
 def test_a_box_rests_above_half_the_barrier_distance_whatever_its_thickness(thickness):
     reach = 4e-3
