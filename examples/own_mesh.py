@@ -9,8 +9,8 @@ import torch
 
 import diffcloth_torch as dc
 
-# The mesh, in meters, falls onto a floor that is as far below it as the barrier reaches, whatever
-# its size, and slides along x until friction stops it.
+# The mesh, in meters, falls onto a floor that is as far below it as the barrier reaches, and slides
+# along x until friction stops it.
 cloth = dc.Cloth.load(sys.argv[1], material=dc.Material(stretch=300, friction=0.4), name="cloth")
 low, high = cloth.vertices.min(axis=0), cloth.vertices.max(axis=0)
 x, y = (low + high)[:2] / 2
