@@ -365,3 +365,41 @@ def test_derivatives_by_what_is_prescribed_and_of_its_efforts(arm, actuation, na
     torch.testing.assert_close(backward, differences, rtol=1e-5, atol=1e-7)
     torch.testing.assert_close(forward, backward, rtol=1e-9, atol=1e-12)
     assert differences[1].abs() > 1e-3 or (name == "held" and dynamic)
+
+
+@pytest.mark.parametrize("table", [None, -1.0])
+def test_what_a_hand_holds_by_friction_stays_in_it(table):
+    """Long steps must not begin where inertia alone would lead: out of the grip, which closes."""
+    hand = dc.Robot.load(
+        dc.robots.GRIPPER,
+        pose=[0, 0, 0.5, 0, 1, 0, 0],
+        joint_positions=0.0085,
+        actuation="pd",
+        stiffness=200.0,
+        damping=5.0,
+        friction=0.8,
+        name="hand",
+    )
+    box = dc.RigidBody.box(
+        [0.02, 0.06, 0.04],
+        motion="dynamic",
+        density=1000,
+        pose=[0, 0, 0.43, 1, 0, 0, 0],
+        friction=0.8,
+    )
+    below = [] if table is None else [dc.RigidBody.plane(2.0, pose=[0, 0, table, 1, 0, 0, 0])]
+    scene = dc.Scene([], [box, *below], robots=[hand])
+    contact = dc.ContactOptions(barrier_distance=1e-3)
+    close = dc.Control(joint_positions=torch.full((2,), 0.02, dtype=F64))
+    simulator = dc.Simulator(scene, 0.01, contact=contact, solver=TIGHT)
+    with torch.no_grad():
+        held = simulator.rollout(simulator.initial_state(), [close] * 60)[-1]
+        found = simulator.equilibrium(held, close)
+        # Without the grip it would fall by .39 m.
+        longer = dc.Simulator(scene, 0.2, contact=contact, solver=TIGHT).step(held, close)
+    assert (found.body_poses[0] - held.body_poses[0]).abs().max() < 2e-6
+    assert (longer.body_poses[0] - held.body_poses[0]).abs().max() < 5e-6
+    for state in (found, longer):
+        wrenches = simulator.contact_wrenches(state)
+        hold = wrenches["hand/left_finger"][2] + wrenches["hand/right_finger"][2]
+        assert hold == pytest.approx(-0.048 * 9.81, rel=1e-4)
