@@ -9,8 +9,8 @@ first term vanishes: the steps descend to a stable minimum of the other terms (p
 continuation), and the last one is Newton's method without inertia, certified like every step. In
 all steps friction counts motion from the state x_0 where the search begins, so that contacts that
 stick there keep sticking. Friction uses the normal forces of the previous solution, and the weight
-of robots their configuration there: the last step is repeated until these no longer change. Its
-adjoint is that of the equilibrium.
+of robots their configuration there: the last step is repeated until these no longer change. The
+equilibrium is a fixed point of that step, and has its derivative (`fixed_point`).
 
 References:
     Kelley and Keyes, "Convergence analysis of pseudo-transient continuation", SIAM Journal on
@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from diffcloth_torch.checks import LARGEST
 from diffcloth_torch.errors import InvalidInput, SimulationError, TurnedTooFar
@@ -36,14 +37,16 @@ from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.border import Given
 from diffcloth_torch.sim.engine import Check, Engine
 from diffcloth_torch.sim.failures import failures_of, mark, refuse_gradients
+from diffcloth_torch.sim.fixed_point import Linearization, as_fixed_point, at_values
 from diffcloth_torch.sim.free_modes import refuse_free_modes, surface_of_vertex
 from diffcloth_torch.sim.layout import Layout
-from diffcloth_torch.sim.step import UNCONVERGED
-from diffcloth_torch.transforms import numbers_of, outside_transforms, plain
+from diffcloth_torch.sim.step import CONVERGED, UNCONVERGED
+from diffcloth_torch.transforms import is_differentiated, numbers_of, outside_transforms, plain
 
 __all__ = ["Equilibria"]
 
 Diagnostics = dict[str, Any]
+Anchor = tuple[Tensor, Tensor | None]
 
 # Lengths of the steps, in time steps of the simulator. In the last one inertia is below rounding
 # compared to any stiffness; modes without stiffness are found in the one before, where inertia
@@ -51,6 +54,9 @@ Diagnostics = dict[str, Any]
 _GROWTH = (1e1, 1e2, 1e3)
 _PROBED = 1e5
 _LAST = 1e8
+
+# Fields of a state that an equilibrium finds.
+_MOVING = ("positions", "body_poses", "joint_positions", "base_poses")
 
 # Robots settle in steps that count their weight with an upper bound of its stiffness, until nothing
 # moves by more than this share of the scene; then in those with the stiffness itself.
@@ -75,6 +81,20 @@ class _Found(NamedTuple):
 
     fields: Fields
     diagnostics: Diagnostics
+
+
+class _Settled(NamedTuple):
+    """A state at which another last step changes nothing.
+
+    Attributes:
+        here: The state.
+        alternating: Environments in which friction does not settle.
+        touching: In which environments something is in contact, [B].
+    """
+
+    here: Given
+    alternating: list[int]
+    touching: Tensor
 
 
 class Equilibria:
@@ -126,7 +146,13 @@ class Equilibria:
         joints = given.state.get("joint_positions")
         iterations = torch.zeros(len(given.state["positions"]), dtype=torch.long)
 
-        def step(length: float, at: Given, anchor: Tensor, turned: Tensor | None) -> _Found:
+        def step(
+            length: float,
+            at: Given,
+            anchor: Tensor,
+            turned: Tensor | None,
+            counted: Tensor | None = None,
+        ) -> _Found:
             given = _slower(at, length)
             try:
                 found = _Found(*self._engine(length).step(given, check, anchor, turned))
@@ -137,7 +163,8 @@ class Equilibria:
                     report=error.report,
                     environments=error.environments,
                 ) from error
-            iterations.add_(torch.tensor(found.diagnostics["iterations"]))
+            spent = torch.tensor(found.diagnostics["iterations"])
+            iterations.add_(spent if counted is None else torch.where(counted, spent, 0))
             return found
 
         with torch.no_grad(), outside_transforms():
@@ -146,15 +173,25 @@ class Equilibria:
             for length in _GROWTH:
                 here = self._from(here, step(length, here, *anchor))
             if self._settles:
-                here = self._descend(here, lambda at: step(_GROWTH[-1], at, *anchor))
+                here = self._descend(here, lambda at, far: step(_GROWTH[-1], at, *anchor, far))
             here = self._probe(here, lambda at: step(_PROBED, at, *anchor))
-            here, unsettled = self._settle(here, lambda at: step(_LAST, at, *anchor))
+            settled = self._settle(here, lambda at, on: step(_LAST, at, *anchor, on))
+            here = settled.here
+
+        def uncounted(at: Given, anchor: Anchor) -> Fields:
+            none = torch.zeros_like(iterations, dtype=torch.bool)
+            return step(_LAST, at, *anchor, none).fields
+
         begun = self._begun(given, here.state)
+        if is_differentiated(t for part in given for t in part.values()):
+            begun = self._with_derivative(
+                given, here, settled.touching, uncounted, (origins, joints)
+            )
         fields, diagnostics = step(_LAST, begun, origins, joints)
         if self._settles:
             fields = fields | {"joint_efforts": self._efforts(begun, fields)}
-        if unsettled:
-            alternate = dict.fromkeys(unsettled, "friction and normal forces alternate")
+        if settled.alternating:
+            alternate = dict.fromkeys(settled.alternating, "friction and normal forces alternate")
             mark(diagnostics, alternate, UNCONVERGED)
             check(diagnostics)
             fields = refuse_gradients(fields, failures_of(diagnostics))
@@ -227,6 +264,35 @@ class Equilibria:
             kept["base_poses"] = torch.where(floating, poses, given.control["base_poses"])
         return given._replace(state=state | kept)
 
+    def _with_derivative(
+        self,
+        given: Given,
+        here: Given,
+        touching: Tensor,
+        step: Callable[[Given, Anchor], Fields],
+        anchor: Anchor,
+    ) -> Given:
+        """The start of the last step, with the derivative of a start that is also its end."""
+        begun = self._begun(given, here.state)
+        if not touching.any():  # nothing else that a step has at its start matters at its end
+            return begun
+        still = {n: here.state[n] for n in _MOVING if n in here.state}
+        numbers = Given(*({n: plain(t) for n, t in part.items()} for part in given))
+        at = plain(anchor[0]), None if anchor[1] is None else plain(anchor[1])
+        linearization = Linearization(
+            lambda moving: step(self._begun(numbers, here.state | moving), at), still, touching
+        )
+        if forward_ad._current_level < 0:
+            fields = step(begun, anchor)
+            moving = as_fixed_point({n: fields[n] for n in still}, linearization, still)
+            return self._begun(given, here.state | moving)
+        terms = linearization.terms()
+        for k in range(int(terms.max())):
+            fields = step(begun, anchor)
+            moving = at_values({n: fields[n] for n in still}, still)
+            begun = _only(terms > k, self._begun(given, here.state | moving), begun)
+        return begun
+
     def _efforts(self, begun: Given, fields: Fields) -> Tensor:
         """Efforts of the last step, those of prescribed joints with the weight of its end.
 
@@ -243,11 +309,11 @@ class Equilibria:
         held = permissions.at_rates | permissions.at_positions
         return fields["joint_efforts"] + torch.where(held, change, 0.0)
 
-    def _descend(self, here: Given, step: Callable[[Given], _Found]) -> Given:
-        """Repeat a step until robots are near an equilibrium."""
+    def _descend(self, here: Given, step: Callable[[Given, Tensor], _Found]) -> Given:
+        """Repeat a step until robots are near an equilibrium, in each environment by itself."""
         far = torch.ones(len(here.state["positions"]), dtype=torch.bool)
         for _ in range(_DESCENTS):
-            after = _only(far, self._from(here, step(here)), here)
+            after = _only(far, self._from(here, step(here, far)), here)
             moved = self._moved(here.state, after.state)
             here, far = after, (moved > _NEAR * self._size).any(dim=-1)
             if not far.any():
@@ -265,8 +331,7 @@ class Equilibria:
 
     def _from(self, here: Given, found: _Found) -> Given:
         """Make the start of the next step, unless something is falling."""
-        names = ("positions", "body_poses", "joint_positions", "base_poses")
-        after = {n: found.fields[n].detach() for n in names if n in here.state}
+        after = {n: found.fields[n].detach() for n in _MOVING if n in here.state}
         surfaces = self._engine(_LAST).surfaces
         moved = (surfaces.vertices(here.state | after) - surfaces.vertices(here.state)).norm(dim=-1)
         fallen = ~(moved < _FALLEN * self._size)
@@ -280,22 +345,27 @@ class Equilibria:
             )
         return here._replace(state=here.state | after)
 
-    def _settle(self, here: Given, step: Callable[[Given], _Found]) -> tuple[Given, list[int]]:
-        """Repeat the last step until friction has settled, a limited number of times."""
+    def _settle(self, here: Given, step: Callable[[Given, Tensor], _Found]) -> _Settled:
+        """Repeat the last step until friction has settled, a limited number of times.
+
+        In each environment by itself: what others are like, and whether they fail, is no matter.
+        """
         slip = here.parameters.get("slip_velocity")
-        enough = self._dt * self._solver.tolerance
+        enough = torch.tensor([self._dt * self._solver.tolerance], dtype=torch.float64)
         if slip is not None:
-            enough = max(enough, _SETTLED * self._dt * float(slip.min()))
+            enough = torch.maximum(enough, _SETTLED * self._dt * slip.flatten())
         moves = torch.ones(len(here.state["positions"]), dtype=torch.bool)
         for _ in range(_REPEATS):
-            found = step(here)
+            found = step(here, moves)
             after = _only(moves, self._from(here, found), here)
-            moves = (self._moved(here.state, after.state) > enough).any(dim=-1)
+            moves = (self._moved(here.state, after.state) > enough[:, None]).any(dim=-1)
+            moves &= torch.tensor(found.diagnostics["status"]) == CONVERGED
             here = after
-            if not moves.any() or any(found.diagnostics["status"]):
+            if not moves.any():
                 break
-        unsettled: list[int] = moves.nonzero()[:, 0].tolist()
-        return here, unsettled
+        failed = torch.tensor(found.diagnostics["status"]) != CONVERGED
+        touching = torch.tensor(found.diagnostics["contact_count"]) > 0
+        return _Settled(here, moves.nonzero()[:, 0].tolist(), touching & ~failed)
 
     def _probe(self, here: Given, step: Callable[[Given], _Found]) -> Given:
         """Take a step, and refuse things that a push moves without end: the Hessian is singular."""

@@ -319,8 +319,9 @@ class Simulator(Observables):
             parameters: Physical parameters; None takes those of the scene.
 
         Returns:
-            The state at rest, at the time of `state`. Gradients are those of the equilibrium: one
-            linear solve for each friction iteration of its last step.
+            The state at rest, at the time of `state`. Gradients are those of the equilibrium, at
+            which friction and normal forces have settled: backward and forward repeat the
+            derivative of its last step until that settles, too.
 
         Raises:
             IntersectingState: If surfaces intersect in `state`.

@@ -10,6 +10,7 @@ import pytest
 import torch
 from scipy.integrate import solve_bvp
 from scipy.optimize import brentq
+from torch.utils.checkpoint import checkpoint
 
 import diffcloth_torch as dc
 from diffcloth_torch.sim import equilibrium
@@ -292,6 +293,94 @@ def test_gradients_by_pins_forces_and_the_state():
             ends = [loss(given | {name: value + sign * step * way}) for sign in (1, -1)]
         slope = float((gradient * way).sum())
         assert slope == pytest.approx(float(ends[0] - ends[1]) / (2 * step), rel=1e-4), name
+
+
+def pulled_box():
+    """A box on a sheet that its rim holds, pulled over it by a spring; friction is far from settled
+    after the friction iterations of one step."""
+    n = 7
+    rim = [i for i in range(n * n) if i // n in (0, n - 1) or i % n in (0, n - 1)]
+    cloth = dc.Cloth.grid(n, n, 0.3, pins={"rim": rim}, material=dc.Material(friction=0.8))
+    box = dc.RigidBody.box(
+        [0.05, 0.04, 0.03],
+        motion="dynamic",
+        mass=0.1,
+        friction=0.8,
+        pose=[0.005, 0.003, 0.0185, 1, 0, 0, 0],
+        name="box",
+    )
+    pull = dc.Attachment(("box", [0, 0, 0]), stiffness=5.0, name="pull")
+    scene = dc.Scene([cloth], [box], attachments=[pull])
+    simulator = dc.Simulator(scene, 0.01, solver=dc.SolverOptions(tolerance=1e-10))
+    control = dc.Control(attachments={"pull": torch.tensor([[0.085, 0.01, 0.1]], dtype=F64)})
+    return simulator, simulator.initial_state(), control
+
+
+@pytest.mark.parametrize("name", ["barrier_distance", "friction", "gravity"])
+def test_gradients_count_how_friction_and_normal_forces_settle(name):
+    simulator, state, control = pulled_box()
+    given = simulator.parameters()
+    value = getattr(given, name)
+
+    def place(tensor):
+        found = simulator.equilibrium(state, control, given.replace(**{name: tensor}))
+        return found.body_poses[0, :3].sum()
+
+    leaf = value.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(place(leaf), leaf)
+    backward = (gradient * value).sum().item()
+    step = 1e-4
+    difference = (place(value * (1 + step)) - place(value * (1 - step))).item() / (2 * step)
+    assert backward == pytest.approx(difference, rel=1e-3)
+    tangent = torch.func.jvp(place, (value,), (value,))[1].item()
+    assert tangent == pytest.approx(backward, rel=1e-8)
+    torch.testing.assert_close(torch.func.jacfwd(place)(value), gradient, rtol=1e-8, atol=1e-12)
+    assert torch.equal(torch.func.grad(place)(value), gradient)
+    again = value.clone().requires_grad_()
+    checkpoint(place, again, use_reentrant=False).backward()
+    assert torch.equal(again.grad, gradient)
+
+
+def test_gradients_in_a_batch_are_those_alone_where_only_some_are_in_contact():
+    n = 8
+    cloth = dc.Cloth.grid(n, n, 0.3, pins={"edge": range(n)}, pose=[0, 0, 0.032, 1, 0, 0, 0])
+    box = dc.RigidBody.box([0.1, 0.5, 0.06], motion="kinematic")
+    contact = dc.ContactOptions(barrier_distance=2e-3)
+    simulator = dc.Simulator(dc.Scene([cloth], [box]), 0.01, contact=contact, solver=TIGHT)
+    touching = simulator.initial_state()
+    far = touching.body_poses.clone()
+    far[0, 2] = -1.0
+    states = [touching, touching.replace(body_poses=far)]
+
+    def gradients(state, batch):
+        given = simulator.parameters()
+        given = given.replace(gravity=given.gravity.expand(*batch, 3).clone().requires_grad_())
+        found = simulator.equilibrium(state, None, given)
+        both = torch.stack([found.positions.sum(), found.positions[..., -1, :].sum()])
+        one = torch.autograd.grad(both.sum(), given.gravity, retain_graph=True)[0]
+        several = torch.autograd.grad(
+            both, given.gravity, torch.eye(2, dtype=F64), is_grads_batched=True
+        )[0]
+        torch.testing.assert_close(several.sum(dim=0), one, rtol=1e-9, atol=1e-12)
+        return found, one
+
+    together, shared = gradients(dc.stack(states), (2,))
+    assert (together.report.contact_count > 0).tolist() == [True, False]
+    for k, alone in enumerate(states):
+        found, own = gradients(alone, ())
+        assert torch.equal(found.positions, together.positions[k])
+        assert torch.equal(own, shared[k])
+        assert found.report.iterations == together.report.iterations[k]
+
+
+def test_slip_velocities_and_failures_of_others_change_no_bit():
+    simulator, state, control = pulled_box()
+    given = simulator.parameters().replace(slip_velocity=torch.tensor(1e-2, dtype=F64))
+    alone = simulator.equilibrium(state, control, given)
+    finer = given.replace(slip_velocity=torch.tensor([1e-2, 1e-6], dtype=F64))
+    beside = simulator.equilibrium(dc.stack([state, state]), control, finer)
+    assert torch.equal(beside.positions[0], alone.positions)
+    assert beside.report.iterations[0] == alone.report.iterations
 
 
 def test_environments_of_a_batch_are_those_alone():
