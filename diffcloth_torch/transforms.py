@@ -19,6 +19,7 @@ from torch.autograd import forward_ad
 
 __all__ = [
     "has_derivative",
+    "in_backward_transform",
     "is_differentiated",
     "is_plain",
     "numbers_of",
@@ -82,6 +83,12 @@ def numbers_of(tensor: Tensor) -> NDArray[np.float64]:
     value = plain(tensor)
     with outside_transforms():
         return value.numpy()
+
+
+def in_backward_transform() -> bool:
+    """Whether `torch.func.grad`, `vjp` or `jacrev` is at work."""
+    stack = torch._C._functorch.get_interpreter_stack() or []
+    return any(level.key() == torch._C._functorch.TransformType.Grad for level in stack)
 
 
 def has_derivative(tensor: Tensor) -> bool:

@@ -153,6 +153,27 @@ HalfGap at_half_gap(double xi, double barrier_distance) {
   return {.slope = -2.0 * d * b.b1, .stiffness = 4.0 * d * d * b.b2 + 2.0 * b.b1};
 }
 
+/// Takes springs with a length at rest out of the weights, and returns what they add to the trace of the
+/// Hessian of each vertex as if they had none. Their Hessian depends on where their ends are, which the rest
+/// positions of several cloths do not say; shorter than at rest it is not even positive.
+std::vector<double> take_out_long_springs(const Scene& scene,
+                                          const Inputs& inputs,
+                                          std::vector<double>& weights) {
+  const AttachmentDescription& springs = scene.given.attachments;
+  std::vector<double> traces(scene.cloth_vertex_count(), 0.0);
+  for (std::size_t a = 0; a < weights.size(); ++a) {
+    if (springs.rest_length[a] == 0.0) continue;
+    const double k = weights[a] * inputs.data(Input::kSpringStiffness)[a];
+    weights[a] = 0.0;
+    for (Index e = springs.start[a]; e < springs.start[a + 1]; ++e) {
+      const double c = springs.coefficient[e];
+      if (springs.point[e] < scene.cloth_vertex_count())
+        traces[springs.point[e]] += 3.0 * k * c * c;
+    }
+  }
+  return traces;
+}
+
 /// kappa = c d_hat mean(H_ii) / (eta w_mean) of each cloth, c = 5; eta = d_hat b''(gap) at a gap of
 /// d_hat / 2 between surfaces as thick as the cloth.
 std::vector<double> stiffness_of_cloths(const Scene& scene,
@@ -164,6 +185,12 @@ std::vector<double> stiffness_of_cloths(const Scene& scene,
   Inputs at_rest = inputs;
   at_rest.views[static_cast<std::size_t>(Input::kPositions)].data =
       scene.given.rest_positions.data();
+  const double* const given_weights = inputs.data(Input::kSpringWeights);
+  std::vector<double> weights(given_weights,
+                              given_weights + scene.given.attachments.rest_length.size());
+  const std::vector<double> of_springs = take_out_long_springs(scene, inputs, weights);
+  if (!weights.empty())
+    at_rest.views[static_cast<std::size_t>(Input::kSpringWeights)].data = weights.data();
   Problem p(scene, at_rest);
   std::vector<double> x = p.start;  // bodies, too
   std::copy_n(scene.given.rest_positions.data(), p.cloth_size, x.begin());
@@ -177,7 +204,8 @@ std::vector<double> stiffness_of_cloths(const Scene& scene,
     for (Index i = start[c]; i < start[c + 1]; ++i) {
       trace += Eigen::Map<const Mat3>(hessian.blocks() +
                                       9 * static_cast<std::ptrdiff_t>(pattern.column_start()[i]))
-                   .trace();
+                   .trace() +
+               of_springs[i];
       area += p.rest->vertex_area[i];
     }
     const Index n = start[c + 1] - start[c];

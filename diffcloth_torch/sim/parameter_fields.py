@@ -26,6 +26,7 @@ from diffcloth_torch.transforms import numbers_of
 
 __all__ = ["check_parameters", "default_fields", "parameter_fields"]
 
+_ROUNDING = 1e-12  # of an eigenvalue, relative to the largest
 _BENDING = ("bending", "bending_weft", "bending_twill", "poisson")
 
 
@@ -103,17 +104,30 @@ def _check_values(layout: Layout, name: str, values: FloatArray, default: FloatA
                 check_areas("parameters", name, shape, layout.assembly.faces)
         return
     if name in ("body_mass", "link_mass"):
-        _refuse_row(layout, name, values == 0.0, "> 0")
+        _refuse_rows(layout, name, values == 0.0, "> 0", layout.permissions.massive)
     elif name in ("body_inertia", "link_inertia"):
-        symmetric = (values + np.swapaxes(values, -1, -2)) / 2
-        wrong = np.linalg.eigvalsh(symmetric)[..., 0] <= 0.0
-        _refuse_row(layout, name, wrong, "positive definite")
+        least, _, largest = np.moveaxis(np.linalg.eigvalsh(_symmetric(values)), -1, 0)
+        massive, dynamic = layout.permissions.massive, layout.permissions.dynamic
+        _refuse_rows(layout, name, least <= 0.0, "positive definite", massive)
+        # What has no mass in its file may be given some.
+        wrong = least < -_ROUNDING * np.abs(largest)
+        _refuse_rows(layout, name, wrong, "positive semi-definite", dynamic)
 
 
-def _refuse_row(layout: Layout, name: str, wrong: NDArray[np.bool_], accepted: str) -> None:
-    """Refuse wrong values of dynamic bodies or links with mass; others do not matter."""
+def _symmetric(values: FloatArray) -> FloatArray:
+    return (values + np.swapaxes(values, -1, -2)) / 2
+
+
+def _refuse_rows(
+    layout: Layout,
+    name: str,
+    wrong: NDArray[np.bool_],
+    accepted: str,
+    of: Mapping[str, NDArray[np.bool_]],
+) -> None:
+    """Refuse wrong values of some bodies or links; those of others do not matter."""
     owner = name.partition("_")[0]
-    wrong = wrong & layout.permissions.massive[owner]
+    wrong = wrong & of[owner]
     if not wrong.any():
         return
     row = int(np.argwhere(wrong)[0][-1])

@@ -39,6 +39,7 @@ class Permissions:
         at_positions: Which joints have prescribed positions, shape [J].
         floating: Which robots have a floating base, shape [R].
         settable: Field of a control -> which joints it can set, shape [J].
+        dynamic: "body" or "link" -> which of them are dynamic, [K] or [L].
         massive: "body" or "link" -> which of them are dynamic and have mass, [K] or [L].
         lower: Lower limits [rad or m], shape [J].
         upper: Upper limits, likewise.
@@ -69,6 +70,7 @@ class Permissions:
             field: np.array([mode in modes for mode in self.actuation], dtype=bool)
             for field, modes in _MODES.items()
         }
+        self.dynamic = {"body": _dynamic(bodies), "link": _dynamic(robots)}
         self.massive = {"body": _massive(bodies), "link": _massive(robots)}
         self.lower = _joined([robot.lower for robot in robots])
         self.upper = _joined([robot.upper for robot in robots])
@@ -99,9 +101,14 @@ def _joined(arrays: Sequence[FloatArray]) -> FloatArray:
     return joined
 
 
-def _massive(mechanisms: Sequence[Mechanism]) -> NDArray[np.bool_]:
-    parts = [(m.mass > 0.0) & m.is_dynamic for m in mechanisms]
+def _dynamic(mechanisms: Sequence[Mechanism]) -> NDArray[np.bool_]:
+    parts = [np.full(len(m.mass), m.is_dynamic) for m in mechanisms]
     return np.concatenate([np.empty(0, dtype=bool), *parts])
+
+
+def _massive(mechanisms: Sequence[Mechanism]) -> NDArray[np.bool_]:
+    parts = [m.mass > 0.0 for m in mechanisms]
+    return np.concatenate([np.empty(0, dtype=bool), *parts]) & _dynamic(mechanisms)
 
 
 def _unless(base: str, mechanisms: Sequence[Mechanism], why: Sequence[str]) -> list[str]:

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
@@ -15,6 +16,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.sim.controls import Control, Parameters, tensors_of
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.sim.trajectory import Trajectory
+from diffcloth_torch.transforms import in_backward_transform, numbers_of
 
 __all__ = ["Controls", "StepParameters", "roll_out"]
 
@@ -54,6 +56,11 @@ def roll_out(
     if checkpoint_every is None:
         return Trajectory(advance(state, 0, count))
     check_count("rollout: `checkpoint_every`", checkpoint_every, 1)
+    if in_backward_transform():
+        raise InvalidInput(
+            "rollout: `checkpoint_every` must be None inside torch.func.grad, vjp and jacrev, "
+            "where torch has no checkpoints; call torch.autograd.grad instead"
+        )
     states: list[State] = []
     for first in range(0, count, checkpoint_every):
         last = min(first + checkpoint_every, count)
@@ -105,7 +112,7 @@ def _digests(record: Control | Parameters | None) -> Digests:
         entries = value if isinstance(value, Mapping) else {None: value}
         for key, entry in entries.items():
             if entry is not None:
-                numbers = torch.as_tensor(entry).detach().to(torch.float64).contiguous().numpy()
+                numbers = np.asarray(numbers_of(torch.as_tensor(entry)), dtype=np.float64)
                 content = hashlib.blake2b(numbers.tobytes(), digest_size=16).digest()
                 name = field if key is None else f"{field}[{key!r}]"
                 digests[name] = repr(numbers.shape).encode() + content

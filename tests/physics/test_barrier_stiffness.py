@@ -221,6 +221,26 @@ def test_without_gravity_a_body_needs_what_stops_it_within_a_step():
     assert found[0] == pytest.approx(found[1], rel=1e-12)
 
 
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+@pytest.mark.parametrize("width", [0.3, 0.3001, 0.301])
+def test_the_length_of_a_spring_and_where_a_scene_is_are_no_matter(width, shift):
+    """Springs that are shorter than at rest push sideways: seams had defaults below zero."""
+
+    def defaults(rest_length, shift):
+        front = dc.Cloth.grid(6, 6, 0.3, pose=[shift, 0, 0, *TURN])
+        back = dc.Cloth.grid(6, 6, width, pose=[shift, 0, 0.02, *TURN])
+        ball = dc.RigidBody.sphere(0.05, pose=[shift, 0, -0.06, *TURN])
+        edge, length = range(6), {"stiffness": 3000.0, "rest_length": rest_length}
+        seam = dc.Attachment(("cloth0", edge), ("cloth1", edge), **length)
+        hook = dc.Attachment(("body0", [0, 0, 0.05]), ("cloth0", [14]), **length)
+        scene = dc.Scene([front, back], [ball], attachments=[seam, hook])
+        return dc.Simulator(scene, DT).parameters().barrier_stiffness
+
+    without = defaults(0.0, 0.0)
+    assert (without > 1e3).all()
+    torch.testing.assert_close(defaults(5e-3, shift), without, rtol=1e-12, atol=0)
+
+
 @pytest.mark.parametrize("thickness", [0.0, 4e-3, 2e-2])
 def test_a_box_rests_above_half_the_barrier_distance_whatever_its_thickness(thickness):
     reach = 4e-3
