@@ -370,7 +370,7 @@ class Dynamics:
         end = after["body_velocities"].detach()[:, self._free, 3:].norm(dim=-1)
         speed = torch.maximum(bodies.speed, end)
         lost = touched & ~(self.dt * speed <= MOST_TURN_IN_CONTACT)
-        how = "touches something and may"
+        how = "touches something, or is attached to it, and may"
         for environment, body in reversed(lost.nonzero().tolist()):
             found[environment] = turn_sentence(
                 f"body {self._free_names[body]!r}",

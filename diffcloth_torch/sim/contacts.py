@@ -164,14 +164,20 @@ class Contacts:
         """Contacts of `a` where `mask` is true, else of `b`."""
 
         def mix(x: Tensor, y: Tensor) -> Tensor:
-            rows = max(x.ndim, y.ndim, 1)
-            return torch.where(mask.reshape(-1, *[1] * (rows - 1)), x, y)
+            return torch.where(mask.reshape(-1, *[1] * (x.ndim - 1)), x, y)
 
         rows: tuple[Tensor, ...] = ()
         if a.rows and b.rows:
             chosen = [(a if is_a else b).rows for is_a in mask.tolist()]
             rows = tuple(own[i if len(own) > 1 else 0] for i, own in enumerate(chosen))
-        return _combined(mix, [a, b], len(mask), rows)
+        parts = [part._expanded(len(mask)) for part in (a, b)]
+        return _combined(mix, parts, len(mask), rows)
+
+    def _expanded(self, size: int) -> Contacts:
+        """Contacts of a batch; of a single state, its own in each environment."""
+        if self.batch_size is not None:
+            return self
+        return self._map(lambda tensor: tensor.expand(size, *tensor.shape), size, self.rows)
 
     def _map(
         self, function: Callable[[Tensor], Tensor], size: int | None, rows: tuple[Tensor, ...]

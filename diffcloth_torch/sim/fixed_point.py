@@ -62,16 +62,18 @@ class Linearization:
         is_one = len(vectors[0]) == 1
         masked = [self.masked(v) for _, v in pairs]
         with outside_transforms():
-            products = torch.autograd.grad(
+            products: tuple[Tensor | None, ...] = torch.autograd.grad(
                 [f for f, _ in pairs],
                 list(self._x.values()),
                 [v[0] for v in masked] if is_one else masked,
                 retain_graph=True,
                 is_grads_batched=not is_one,
                 allow_unused=True,
-                materialize_grads=True,
             )
-        return [self.masked(p[None] if is_one else p) for p in products]
+        return [
+            torch.zeros_like(v) if p is None else self.masked(p.reshape(v.shape))
+            for v, p in zip(vectors, products, strict=True)
+        ]
 
     def terms(self) -> Tensor:
         """How many powers of dS/dx are not small, in each environment, [B]."""

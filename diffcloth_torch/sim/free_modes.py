@@ -17,6 +17,7 @@ __all__ = ["refuse_free_modes", "surface_of_vertex"]
 
 # A mode is free if a velocity moves it by this fraction of its way without forces.
 _FREE = 0.5
+_PROBES = 16
 _AXES = "xyz"
 _OUTPUTS = ("positions", "body_poses", "joint_positions", "base_poses")
 
@@ -41,24 +42,39 @@ def refuse_free_modes(
     if not outputs:
         return
     generator = torch.Generator().manual_seed(0)
-    signs = [2.0 * torch.randint(2, t.shape, generator=generator).double() - 1.0 for t in outputs]
+    signs = [
+        2.0 * torch.randint(2, (_PROBES, *t.shape), generator=generator).double() - 1.0
+        for t in outputs
+    ]
     inputs = pushes | forces
-    responses = torch.autograd.grad(
-        outputs, list(inputs.values()), signs, allow_unused=True, materialize_grads=True
+    found: tuple[Tensor | None, ...] = torch.autograd.grad(
+        outputs,
+        list(inputs.values()),
+        signs,
+        is_grads_batched=True,
+        allow_unused=True,
     )
-    modes = dict(zip(inputs, responses, strict=True))
+    responses = {
+        n: torch.zeros(_PROBES, *t.shape, dtype=torch.float64) if r is None else r
+        for (n, t), r in zip(inputs.items(), found, strict=True)
+    }
     for field in pushes:
-        count = modes[field][0].numel() ** 0.5  # a rigid mode spreads its push
-        free = modes[field].flatten(1).norm(dim=1) * count > _FREE * length
+        sizes = responses[field].flatten(2).norm(dim=2)
+        # Some signs see little of a mode, so their mean square tells.
+        mean = sizes.square().mean(dim=0).sqrt()
+        count = responses[field][0, 0].numel() ** 0.5  # a rigid mode spreads its push
+        free = mean * count > _FREE * length
         if not free.any():
             continue
         environments: list[int] = free.nonzero()[:, 0].tolist()
+        first = environments[0]
+        clearest = int(sizes[:, first].argmax())
+        modes = {n: r[clearest, first] for n, r in responses.items()}
         named = field
         if field in ("joint_velocities", "base_velocities"):
-            largest = {n: float(modes[n][environments[0]].abs().max()) for n in forces}
-            named = max(largest, key=largest.__getitem__)
+            named = max(forces, key=lambda n: float(modes[n].abs().max()))
         raise SimulationError(
-            f"equilibrium: {_sentence(layout, named, modes[named][environments[0]])}; nothing "
+            f"equilibrium: {_sentence(layout, named, modes[named])}; nothing "
             "holds it, so that there is no single equilibrium; pin it, or give it friction",
             environments=environments,
         )

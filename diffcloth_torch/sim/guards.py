@@ -1,4 +1,4 @@
-"""A wrapper of a simulator's larger methods: for lack of memory, and for `torch.compile`."""
+"""A wrapper of a simulator's methods: for lack of memory, `torch.compile`, and default devices."""
 
 from __future__ import annotations
 
@@ -29,10 +29,13 @@ def _uncompiled(method: Callable[P, T]) -> Callable[P, T]:
 
 
 def guarded(method: Callable[P, T]) -> Callable[P, T]:
-    """Raise torch's lack of memory as MemoryError, like NumPy and the core."""
+    """Compute on the CPU; raise torch's lack of memory as MemoryError, like NumPy and the core."""
 
     @wraps(method)
     def call(*args: P.args, **keywords: P.kwargs) -> T:
+        if torch.get_default_device().type != "cpu":  # of the user's own tensors, not of a state's
+            with torch.device("cpu"):
+                return call(*args, **keywords)
         try:
             return _uncompiled(method)(*args, **keywords)
         except RuntimeError as error:

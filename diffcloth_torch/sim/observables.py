@@ -17,6 +17,7 @@ from diffcloth_torch.sim.border import Border, Given
 from diffcloth_torch.sim.contact_points import ContactPoints, refuse_gradient
 from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.engine import Check, Engine
+from diffcloth_torch.sim.guards import guarded
 from diffcloth_torch.sim.links import contact_wrenches, link_velocities
 from diffcloth_torch.sim.masses import vertex_masses
 from diffcloth_torch.sim.outcome import make_report, raise_on_failure
@@ -38,6 +39,7 @@ class Observables:
     _engine: Engine
     _border: Border
 
+    @guarded
     def link_poses(self, state: State) -> dict[str, Tensor]:
         """Return the frames of the links of all robots, differentiable in the state.
 
@@ -51,6 +53,7 @@ class Observables:
         fields, batch = self._border.state(state)
         return without_axes(self._engine.surfaces.link_frames(fields), batch)
 
+    @guarded
     def link_velocities(
         self, state: State, parameters: Parameters | None = None
     ) -> dict[str, Tensor]:
@@ -71,6 +74,7 @@ class Observables:
         velocities = link_velocities(self._engine.layout, fields, centers)
         return without_axes(velocities, batch)
 
+    @guarded
     def contact_wrenches(
         self, state: State, parameters: Parameters | None = None
     ) -> dict[str, Tensor]:
@@ -95,6 +99,7 @@ class Observables:
         frames = engine.surfaces.frames(fields)
         return without_axes(contact_wrenches(engine.layout, frames, forces, *centers), batch)
 
+    @guarded
     def contacts(self, state: State) -> ContactPoints:
         """Return where surfaces touch at the end of the step that led to a state, and how hard.
 
@@ -127,6 +132,7 @@ class Observables:
         points = ContactPoints.of(rows, self.surfaces, batched=batch is not None)
         return refuse_gradient(points, list(fields.values()))
 
+    @guarded
     def path(
         self,
         state: State,
@@ -156,6 +162,7 @@ class Observables:
                 )
             return torch.from_numpy(self._engine.path(given, self._check(batched=False)))
 
+    @guarded
     def vertex_masses(
         self, parameters: Parameters | None = None, *, batch_size: int | None = None
     ) -> Tensor:
@@ -174,6 +181,7 @@ class Observables:
         physical = self._border.parameters(parameters, batch_size)
         return without_axis(vertex_masses(self._engine.assembly, physical), batch_size)
 
+    @guarded
     def momentum(self, state: State, parameters: Parameters | None = None) -> Tensor:
         """Return the momentum of everything that has mass, differentiable in both arguments.
 
@@ -191,6 +199,7 @@ class Observables:
         totals, batch = self._totals(state, parameters)
         return without_axis(totals.momentum, batch)
 
+    @guarded
     def kinetic_energy(self, state: State, parameters: Parameters | None = None) -> Tensor:
         """Return the kinetic energy of what `momentum` includes, differentiable in both arguments.
 
@@ -226,6 +235,7 @@ class Observables:
         parts: Literal[True],
     ) -> dict[str, Tensor]: ...
 
+    @guarded
     def energy(
         self,
         state: State,

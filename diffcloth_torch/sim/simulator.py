@@ -78,6 +78,7 @@ class Simulator(Observables):
     slices: dict[str, slice]
     joint_slices: dict[str, slice]
 
+    @guarded
     def __init__(
         self,
         scene: Scene,
@@ -197,6 +198,7 @@ class Simulator(Observables):
         }
         return State(**copies, report=None, _surfaces=self._engine.surfaces)
 
+    @guarded
     def control(
         self,
         *,
@@ -255,6 +257,7 @@ class Simulator(Observables):
         )
         return check_control(self._layout, control)
 
+    @guarded
     def parameters(self) -> Parameters:
         """Copy the parameters of the scene to new tensors; change them with `.replace(...)`."""
         copies = {name: tensor.clone() for name, tensor in self._defaults.items()}
