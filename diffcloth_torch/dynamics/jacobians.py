@@ -117,7 +117,7 @@ def _rigid(arms: Tensor) -> Tensor:
     return torch.cat([upper, _LOWER.expand_as(upper)], dim=-2)
 
 
-_EYE = torch.eye(3, dtype=torch.float64)
-_LOWER = torch.eye(6, dtype=torch.float64)[3:]
+_EYE = torch.eye(3, dtype=torch.float64, device="cpu")
+_LOWER = torch.eye(6, dtype=torch.float64, device="cpu")[3:]
 # CROSS a is the matrix of the cross product a x, row after row.
 CROSS = torch.linalg.cross(_EYE[:, None, :], _EYE[None, :, :]).permute(2, 1, 0).reshape(9, 3)

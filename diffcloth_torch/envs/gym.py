@@ -17,6 +17,7 @@ from diffcloth_torch.checks import check_choice, check_count
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.sim.controls import Parameters
+from diffcloth_torch.sim.guards import on_cpu
 
 __all__ = ["ClothVectorEnv"]
 
@@ -51,6 +52,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
     metadata: dict[str, Any]
     env_state: EnvState
 
+    @on_cpu
     def __init__(
         self,
         task: Task,
@@ -86,6 +88,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         self._first_seed = None if seed is None else _checked_seed("make: `seed`", seed)
         self._generators: list[torch.Generator] | None = None
 
+    @on_cpu
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Tensor, dict[str, Any]]:
@@ -108,6 +111,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
             self.env_state = self._with_starts(self.env_state, mask)
         return self._observe(self.env_state), self._info(self.env_state)
 
+    @on_cpu
     def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Take a transition in all environments.
 
@@ -141,6 +145,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         self.env_state = after
         return observation, reward.to(_FLOAT), terminated, truncated, info
 
+    @on_cpu
     def scripted_actions(self) -> Tensor:
         """Actions of the policy made by hand, for the present state, [B, A]."""
         self._require_start("scripted_actions")
@@ -152,6 +157,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         self._require_start("clear_grad")
         self.env_state = self.env_state.detach()
 
+    @on_cpu
     def initialize_trajectory(self) -> Tensor:
         """Cut the graph, and give the observation [B, O] to go on from."""
         self.clear_grad()
@@ -161,6 +167,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         """States of the generators of starts, to go on with later: see `resume`."""
         return [generator.get_state() for generator in self._generators or []]
 
+    @on_cpu
     def resume(self, env_state: EnvState, generator_states: Sequence[Tensor]) -> Tensor:
         """Go on from a state and generators that were kept; gives the observation [B, O]."""
         for name, given in (("env_state", env_state), ("generator_states", generator_states)):

@@ -15,7 +15,7 @@ from diffcloth_torch.sim.state import State
 
 __all__ = ["HangCloth"]
 
-_PEG = torch.tensor([0.3, 0.0, 0.2], dtype=torch.float64)  # between the pegs [m]
+_PEG = torch.tensor([0.3, 0.0, 0.2], dtype=torch.float64, device="cpu")  # between the pegs [m]
 _TIP = 0.075  # from the frame of the hand to between its fingers [m]
 _CLOSE = 0.06  # distance of a cloth that hangs [m]
 

@@ -32,6 +32,7 @@ _SERIES_ANGLE = 0.1
 _SERIES = torch.tensor(
     [[(-1) ** k / math.factorial(2 * k + i) for k in range(1, 5)] for i in range(2)],
     dtype=torch.float64,
+    device="cpu",
 )
 
 # sin(a / 2) below which a logarithm takes a / sin(a / 2) = 2, right to rounding.
@@ -40,10 +41,10 @@ _SMALLEST_SINE = 1e-9
 
 # The entries of a rotation matrix are twice a product of two entries of its quaternion plus or
 # minus another, less one on the diagonal; products of (w, x, y, z) are numbered row after row.
-_FIRST = torch.tensor([0, 6, 7, 6, 0, 11, 7, 11, 0])
-_SECOND = torch.tensor([5, 3, 2, 3, 10, 1, 2, 1, 15])
-_SIGN = torch.tensor([1, -1, 1, 1, 1, -1, -1, 1, 1], dtype=torch.float64)
-_IDENTITY = torch.eye(3, dtype=torch.float64).flatten()
+_FIRST = torch.tensor([0, 6, 7, 6, 0, 11, 7, 11, 0], device="cpu")
+_SECOND = torch.tensor([5, 3, 2, 3, 10, 1, 2, 1, 15], device="cpu")
+_SIGN = torch.tensor([1, -1, 1, 1, 1, -1, -1, 1, 1], dtype=torch.float64, device="cpu")
+_IDENTITY = torch.eye(3, dtype=torch.float64, device="cpu").flatten()
 
 
 def quaternion_exp(rotation_vector: Tensor) -> Tensor:

@@ -91,4 +91,4 @@ def constant(array: FloatArray) -> Tensor:
     return torch.from_numpy(np.array(array, dtype=np.float64))
 
 
-_LAST_ROW = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
+_LAST_ROW = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64, device="cpu")

@@ -14,6 +14,7 @@ from torch import Tensor
 from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.checks import FloatArray, texts
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.sim.guards import on_cpu
 
 __all__ = ["Contacts", "PairContact"]
 
@@ -92,6 +93,7 @@ class Contacts:
         size = len(found) if batched else None
         return Contacts(tuple(surfaces), size, tensors(counts), tensors(forces), rows_kept)
 
+    @on_cpu
     def __getitem__(self, pair: Pair) -> PairContact:
         """Contacts of two surfaces.
 

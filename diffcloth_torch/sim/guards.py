@@ -8,8 +8,9 @@ from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
 import torch
+from torch.utils import _device
 
-__all__ = ["guarded"]
+__all__ = ["guarded", "on_cpu"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -28,14 +29,26 @@ def _uncompiled(method: Callable[P, T]) -> Callable[P, T]:
     return _UNCOMPILED[method]
 
 
+def on_cpu(function: Callable[P, T]) -> Callable[P, T]:
+    """Make tensors on the CPU, also where a user's default device is another one."""
+
+    @wraps(function)
+    def call(*args: P.args, **keywords: P.kwargs) -> T:
+        # None unless a default has been set; torch's public question takes some microseconds.
+        if _device.CURRENT_DEVICE is None:
+            return function(*args, **keywords)
+        with torch.device("cpu"):
+            return function(*args, **keywords)
+
+    return call
+
+
 def guarded(method: Callable[P, T]) -> Callable[P, T]:
     """Compute on the CPU; raise torch's lack of memory as MemoryError, like NumPy and the core."""
 
     @wraps(method)
+    @on_cpu
     def call(*args: P.args, **keywords: P.kwargs) -> T:
-        if torch.get_default_device().type != "cpu":  # of the user's own tensors, not of a state's
-            with torch.device("cpu"):
-                return call(*args, **keywords)
         try:
             return _uncompiled(method)(*args, **keywords)
         except RuntimeError as error:

@@ -17,6 +17,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import write_mesh
 from diffcloth_torch.model.quantities import STATE, shape_of
 from diffcloth_torch.reprs import field_text, record_text
+from diffcloth_torch.sim.guards import on_cpu
 from diffcloth_torch.sim.report import Report, outcome_text
 
 # Saved states name them here, where they once were.
@@ -131,6 +132,7 @@ class State:
         """Copy that shares no memory; gradients flow to the original."""
         return self._map(lambda tensor: tensor.clone(), self.report)
 
+    @on_cpu
     def meshes(self) -> dict[str, tuple[Tensor, Tensor]]:
         """Place all surfaces in the world: cloths, bodies, and links that have collision shapes.
 
@@ -152,6 +154,7 @@ class State:
             )
         return self._surfaces
 
+    @on_cpu
     def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> State:
         """Select one environment of a batch, without the batch axis, or several as a batch.
 
@@ -214,6 +217,7 @@ _TENSORS = tuple(STATE)
 _ADDED = _TENSORS[_TENSORS.index("body_velocities") :]
 
 
+@on_cpu
 def stack(states: Sequence[State]) -> State:
     """Combine states without a batch axis into a batch; gradients flow to each of them.
 
@@ -245,6 +249,7 @@ def stack(states: Sequence[State]) -> State:
     return State(**tensors, report=report, _surfaces=states[0]._surfaces)
 
 
+@on_cpu
 def where(mask: Tensor, a: State, b: State) -> State:
     """Take environment `i` from `a` if `mask[i]` is true, else from `b`.
 
