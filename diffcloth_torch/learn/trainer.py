@@ -9,6 +9,7 @@ References:
 
 from __future__ import annotations
 
+import hashlib
 import pickle
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -23,6 +24,7 @@ from diffcloth_torch.checks import check_count, refuse_threads
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.envs.gym import begins_anew
 from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.files import as_path
 from diffcloth_torch.learn.adam import TensorAdam
 from diffcloth_torch.learn.options import TrainerOptions
 from diffcloth_torch.learn.rollouts import (
@@ -34,7 +36,7 @@ from diffcloth_torch.learn.rollouts import (
     roll_out_remotely,
     threads_of_torch,
 )
-from diffcloth_torch.learn.workers import Workers
+from diffcloth_torch.learn.workers import Ranks, Workers
 from diffcloth_torch.sim.state import State
 
 __all__ = ["Trainer"]
@@ -78,12 +80,28 @@ class Trainer:
         Raises:
             InvalidInput: If an argument is not accepted.
         """
-        self.options = options or TrainerOptions()
+        self.options = TrainerOptions() if options is None else options
+        given: object = self.options
+        if not isinstance(given, TrainerOptions):
+            raise TypeError(
+                f"Trainer: `options` must be TrainerOptions, got {type(given).__name__}"
+            )
+        if not callable(make_env):
+            raise TypeError(
+                f"Trainer: `make_env` must be a function that makes environments, got {make_env!r}"
+            )
         self._chunk = num_envs if chunk is None else check_count("Trainer: `chunk`", chunk, 1)
         check_count("Trainer: `num_envs`", num_envs, 1)
         if num_envs % self._chunk:
             raise InvalidInput(f"Trainer: `chunk` must divide {num_envs}, got {chunk}")
         refuse_threads("Trainer: `workers`", workers)
+        if workers is not None and (
+            isinstance(workers, type) or not callable(getattr(workers, "map", None))
+        ):
+            raise TypeError(
+                "Trainer: `workers` must have `map`, as dc.learn.Processes(2) and executors do, "
+                f"got {workers!r}"
+            )
         self._make_env, self._workers = make_env, workers
         self._threads = check_count("Trainer: `threads`", threads, 1)
         self._pickled = b"" if workers is None else _pickled(make_env)
@@ -193,7 +211,14 @@ class Trainer:
         return float(total.mean()), float(success.float().mean()), states
 
     def save(self, path: str | Path) -> None:
-        """Write all that goes on to a file; it loads with `weights_only`."""
+        """Write all that goes on to a file; it loads with `weights_only`.
+
+        Raises:
+            InvalidInput: If its folder does not exist.
+        """
+        path = as_path("Trainer.save: `path`", path)
+        if not path.parent.is_dir():
+            raise InvalidInput(f"Trainer.save: the folder of `path` must exist, got {str(path)!r}")
         torch.save(
             {
                 "options": asdict(self.options),
@@ -218,7 +243,15 @@ class Trainer:
             InvalidInput: If it is of another task, of other options, or of environments in other
                 chunks, or no such file.
         """
-        kept: Any = torch.load(path, weights_only=True)
+        path = as_path("Trainer.load: `path`", path)
+        if not path.is_file():
+            raise InvalidInput(f"Trainer.load: `path` must be a file, got {str(path)!r}")
+        try:
+            kept: Any = torch.load(path, weights_only=True)
+        except (OSError, MemoryError):
+            raise
+        except Exception as error:  # whatever unpickling makes of bytes that are not its own
+            raise InvalidInput(f"Trainer.load: {path} must be a file of `Trainer.save`") from error
         if not isinstance(kept, dict) or not {"task", "options", "places"} <= kept.keys():
             raise InvalidInput(f"Trainer.load: {path} must be a file of `Trainer.save`")
         if kept["task"] != self._described:
@@ -273,7 +306,16 @@ class Trainer:
         pieces = self._pieces()
         if self._workers is None:
             return [roll_out(self._env, piece) for piece in pieces]
+        if isinstance(self._workers, Ranks):
+            self._workers.require_same("options and weights", self._digest())
         return list(self._workers.map(roll_out_remotely, [(self._pickled, p) for p in pieces]))
+
+    def _digest(self) -> bytes:
+        """Of what decides on an update beside the environments."""
+        digest = hashlib.blake2b(repr((self.options, self._count, self._chunk)).encode())
+        for tensor in self.policy.state_dict().values():
+            digest.update(tensor.contiguous().numpy().tobytes())
+        return digest.digest()
 
     def _pieces(self) -> list[Piece]:
         o = self.options

@@ -7,13 +7,15 @@ Each has `map(function, items)`, which gives the results in the order of the ite
 from __future__ import annotations
 
 import math
+import pickle
+import traceback
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
-from diffcloth_torch.checks import check_count
+from diffcloth_torch.checks import NON_NEGATIVE, check_count, check_number
 from diffcloth_torch.errors import InvalidInput
 
 __all__ = ["Jobs", "Processes", "Ranks", "RayActors", "Workers"]
@@ -30,6 +32,33 @@ class Workers(Protocol):
     def map(self, function: Callable[[Any], Any], items: Any, /) -> Iterable[Any]:
         """Results of a function for items, in their order."""
         ...
+
+
+class _Portable(Generic[A, B]):
+    """A function whose exceptions reach other processes; what cannot be pickled becomes text."""
+
+    def __init__(self, function: Callable[[A], B]) -> None:
+        self._function = function
+
+    def __call__(self, item: A) -> B:
+        try:
+            return self._function(item)
+        except Exception as error:
+            portable = _portable(error)
+            if portable is error:
+                raise
+            raise portable from None
+
+
+def _portable(error: Exception) -> Exception:
+    try:
+        copy = pickle.loads(pickle.dumps(error))
+    except Exception:  # whatever its class does with arguments that are not its own
+        copy = None
+    if type(copy) is type(error):
+        return error
+    text = "".join(traceback.format_exception(error))
+    return RuntimeError(f"a worker raised {type(error).__qualname__}: {error}\n{text}")
 
 
 class Processes:
@@ -51,7 +80,7 @@ class Processes:
                 # Processes that are spawned inherit no thread or lock.
                 self._pool = ProcessPoolExecutor(self._count, mp_context=get_context("spawn"))
             try:
-                return list(self._pool.map(function, items))
+                return list(self._pool.map(_Portable(function), items))
             except BrokenProcessPool:
                 self.close()
                 if repeat == _REPEATS:
@@ -99,6 +128,7 @@ class RayActors:
             InvalidInput: If Ray is not there.
         """
         check_count("RayActors: `count`", count, 1)
+        check_number("RayActors: `cores`", cores, NON_NEGATIVE)
         try:
             import ray
         except ModuleNotFoundError as error:
@@ -119,11 +149,15 @@ class RayActors:
 
         Raises:
             RayActorError: If actors die again and again.
+            InvalidInput: If they have been closed.
         """
         from ray.util import ActorPool
 
+        if not self.actors:
+            raise InvalidInput("RayActors: they have been closed; make new ones")
         pool: Any = ActorPool(self.actors)
-        return list(pool.map(lambda actor, item: actor.call.remote(function, item), items))
+        call = _Portable(function)
+        return list(pool.map(lambda actor, item: actor.call.remote(call, item), items))
 
     def close(self) -> None:
         """End the actors."""
@@ -172,7 +206,7 @@ class Ranks:
             try:
                 made.append((function(item), None))
             except Exception as error:  # all processes must learn of it, or they would wait
-                made.append((None, error))
+                made.append((None, _portable(error)))
         gathered: list[Any] = [None] * self.size
         dist.all_gather_object(gathered, made)
         results = []
@@ -182,6 +216,23 @@ class Ranks:
                 raise failure
             results.append(result)
         return results
+
+    def require_same(self, what: str, digest: bytes) -> None:
+        """Require all processes to have the same digest of something.
+
+        Raises:
+            InvalidInput: If they do not, in every process.
+        """
+        import torch.distributed as dist
+
+        digests: list[Any] = [None] * self.size
+        dist.all_gather_object(digests, digest)
+        others = [rank for rank, other in enumerate(digests) if other != digests[0]]
+        if others:
+            raise InvalidInput(
+                f"Ranks: {what} must be the same in all processes, those of ranks {others} differ "
+                "from rank 0; seeds of each environment follow from the one of the options"
+            )
 
     def close(self) -> None:
         """Leave the job."""

@@ -178,7 +178,7 @@ def fit(
             or another object that can be pickled, and a script needs
             `if __name__ == "__main__":`.
         resume: Folder that keeps all evaluations. A fit that was interrupted takes them from there,
-            and ends with the same bits; delete it if `residuals` change.
+            and ends with the same bits. Residuals that differ where they began are refused.
         progress: Called after each evaluation; of starts in processes, when they have ended.
 
     Returns:

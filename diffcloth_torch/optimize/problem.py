@@ -158,13 +158,33 @@ class Problem:
         return len(self._known)
 
     def require(self, theta: FloatArray) -> None:
-        """Evaluate at a start, where a failure ends it."""
+        """Evaluate at a start, where a failure ends it.
+
+        Also where it has been kept: residuals of other observations must not go on with it.
+        """
+        kept = self._memory.recall("residuals", self._stage, theta)
         found = self._trial(theta)
+        if kept is not None:
+            self._require_kept(theta, kept)
         if isinstance(found, FAILURES):
             raise found
         self._count = len(found)
         if self._count == self.prior_count:
             raise InvalidInput("fit: `residuals` must return at least one number, got none")
+
+    def _require_kept(self, theta: FloatArray, kept: Mapping[str, Any]) -> None:
+        try:
+            with torch.no_grad():
+                now = self._call(torch.from_numpy(np.array(theta)))
+        except FAILURES as error:
+            same = kept["failure"] == _text(error)
+        else:
+            same = not kept["failure"] and torch.equal(now, kept["found"])
+        if not same:
+            raise InvalidInput(
+                "fit: `resume`: `residuals` are not what they were when the fit was interrupted: "
+                "the observations or the simulation have changed; delete the folder to begin anew"
+            )
 
     def residuals(self, theta: FloatArray) -> FloatArray:
         """Residuals [M]; infinite where the simulation fails: the solver rejects that step."""
@@ -232,7 +252,7 @@ class Problem:
                 theta,
                 found=found,
                 seconds=time.perf_counter() - begin,
-                failure="" if failure is None else f"{type(failure).__name__}: {failure}",
+                failure="" if failure is None else _text(failure),
             )
         elif record["failure"]:
             failure = SimulationError(record["failure"].partition(": ")[2])
@@ -323,6 +343,10 @@ def _check_derivative(found: Tensor) -> None:
             "fit: `residuals` must have finite derivatives, got infinite ones or NaN; a square "
             "root or a norm has none at 0"
         )
+
+
+def _text(failure: Failure) -> str:
+    return f"{type(failure).__name__}: {failure}"
 
 
 def _key(theta: Tensor) -> bytes:

@@ -402,6 +402,12 @@ def test_files_of_other_tasks_do_not_load(tmp_path):
     torch.save({"policy": 3}, tmp_path / "other.pt")
     with pytest.raises(InvalidInput, match=r"must be a file of `Trainer\.save`"):
         Trainer(fold(), options).load(tmp_path / "other.pt")
+    (tmp_path / "junk.pt").write_bytes(b"junk")
+    for name, message in (("junk.pt", "a file of `Trainer.save`"), ("none.pt", "must be a file")):
+        with pytest.raises(InvalidInput, match=message):
+            Trainer(fold(), options).load(tmp_path / name)
+    with pytest.raises(InvalidInput, match="the folder of `path` must exist"):
+        Trainer(fold(), options).save(tmp_path / "no" / "a.pt")
 
 
 def test_an_end_that_is_no_failure_is_not_counted_as_one(monkeypatch):

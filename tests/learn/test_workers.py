@@ -106,6 +106,28 @@ def test_what_a_process_that_dies_did_not_finish_is_made_again(tmp_path):
         workers.close()
 
 
+class TwoArgumentsError(Exception):
+    """Its pickle cannot be read, as it keeps one argument of two."""
+
+    def __init__(self, what, where):
+        super().__init__(f"{what} in {where}")
+
+
+def fail(item):
+    raise TwoArgumentsError("no cloth", item)
+
+
+def test_what_a_piece_raises_is_told_whatever_its_class():
+    workers = Processes(1)
+    try:
+        with pytest.raises(RuntimeError, match="raised TwoArgumentsError: no cloth in 3"):
+            workers.map(fail, [3])
+        with pytest.raises(ZeroDivisionError):
+            workers.map(divide, [0])
+    finally:
+        workers.close()
+
+
 @pytest.mark.filterwarnings("ignore")
 class TestRay:
     @pytest.fixture(scope="class")
@@ -160,7 +182,7 @@ SCRIPT = """
 import hashlib, sys
 sys.path.insert(0, {folder!r})
 import torch
-from test_workers import train
+from test_workers import MAKE, InvalidInput, TrainerOptions, Trainer, fail, train
 from diffcloth_torch.learn import Ranks
 workers = Ranks()
 state, logs = train(workers)
@@ -177,6 +199,16 @@ try:
     workers.map(refuse, [0, 1, 2])
 except ValueError as error:
     sys.stdout.write("all " + str(error) + "\\n")
+    sys.stdout.flush()
+try:
+    workers.map(fail, [0, 1])
+except RuntimeError as error:
+    sys.stdout.write("told " * ("TwoArgumentsError" in str(error)) + "\\n")
+    sys.stdout.flush()
+try:
+    Trainer(MAKE, TrainerOptions(seed=workers.rank), num_envs=2, chunk=1, workers=workers).update()
+except InvalidInput as error:
+    sys.stdout.write("ranks " * ("must be the same in all processes" in str(error)) + "\\n")
     sys.stdout.flush()
 workers.close()
 """
@@ -196,6 +228,8 @@ def test_ranks_of_torchrun(tmp_path, here):
     bits = hashlib.sha256(b"".join(t.numpy().tobytes() for t in here[0].values())).hexdigest()
     assert result.stdout.split("\n").count(f"bits {bits}") == 2
     assert result.stdout.count("all one refuses") == 2
+    assert result.stdout.count("told ") == 2
+    assert result.stdout.count("ranks ") == 2
 
 
 def test_ranks_need_a_job():
@@ -206,5 +240,12 @@ def test_ranks_need_a_job():
 def test_what_cannot_be_sent_is_refused():
     with pytest.raises(InvalidInput, match="can be pickled"):
         Trainer(lambda num_envs: MAKE(num_envs=num_envs), OPTIONS, workers=Processes(1))
+    for workers in (2, Processes):
+        with pytest.raises(TypeError, match="`workers` must have `map`"):
+            Trainer(MAKE, OPTIONS, workers=workers)
+    with pytest.raises(TypeError, match="`options` must be TrainerOptions, got int"):
+        Trainer(MAKE, 3)
+    with pytest.raises(TypeError, match="`make_env` must be a function"):
+        Trainer(3, OPTIONS)
     with pytest.raises(InvalidInput, match="`count`"):
         Processes(0)

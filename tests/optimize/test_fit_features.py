@@ -35,6 +35,10 @@ def residuals(parameters, values):
     return [((curve(values) - SEEN) / NOISE)[::2]]
 
 
+def other_residuals(parameters, values):
+    return [residuals(parameters, values)[0] + 1.0]
+
+
 def kept_out(parameters, values):
     return [((curve(values) - SEEN) / NOISE)[1::2]]
 
@@ -162,7 +166,9 @@ def test_an_interrupted_fit_goes_on_with_the_same_bits(tmp_path):
     assert bits(again) == bits(whole)
     before = len(calls)
     dc.fit(VARIABLES, counted, starts=2, resume=tmp_path)
-    assert len(calls) == before, "all is remembered"
+    assert len(calls) == before + 2, "all is remembered, and tried once for each start"
+    with pytest.raises(dc.InvalidInput, match="residuals` are not what they were"):
+        dc.fit(VARIABLES, other_residuals, starts=2, resume=tmp_path)
     with pytest.raises(dc.InvalidInput, match="belongs to other variables or options"):
         dc.fit(VARIABLES, residuals, loss="huber", resume=tmp_path)
     (tmp_path / "start_0.pt").write_bytes(b"something else")
