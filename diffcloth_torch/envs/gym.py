@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -267,7 +267,13 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
 def _tried(task: Task) -> int:
     """Try what a task computes on one start; gives the size of its observations."""
     example = task.example()
-    for name, feature in task.features(example).items():
+    features: Any = task.features(example)
+    if not isinstance(features, Mapping):
+        raise InvalidInput(
+            f"{task.name}: `features` must be a mapping of names to tensors, got "
+            f"{type(features).__name__}"
+        )
+    for name, feature in features.items():
         _check(task, f"features[{name!r}]", feature, [1, -1], torch.is_floating_point)
     _check(task, "reward", task.reward(example), [1], torch.is_floating_point)
     for name in ("success", "terminal"):

@@ -14,7 +14,7 @@ __all__ = ["ALGORITHMS", "SCALES", "TrainerOptions"]
 ALGORITHMS = ("apg", "shac", "sapo")
 SCALES = ("number", "tensor")
 _LEAST_SHARE = 0.1
-_INFINITE = 1e6  # above every sensible rate
+_LARGEST = 1e6  # above every sensible rate
 _POSITIVE = (
     "actor_rate", "plan_rate", "critic_rate", "gradient_norm", "deviation", "temperature",
     "temperature_rate",
@@ -104,8 +104,9 @@ class TrainerOptions:
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 0)
         for name in ("discount", "trace", "target_rate"):
             _check_number(name, getattr(self, name), lambda v: 0 <= v <= 1, "in [0, 1]")
+        accepted = f"positive and below {_LARGEST:g}"
         for name in _POSITIVE:
-            _check_number(name, getattr(self, name), lambda v: 0 < v < _INFINITE, "positive")
+            _check_number(name, getattr(self, name), lambda v: 0 < v < _LARGEST, accepted)
         _check_number("target_entropy", self.target_entropy, math.isfinite, "finite")
         for name in ("betas", "hidden", "first_action"):
             value = getattr(self, name)

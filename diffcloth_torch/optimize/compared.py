@@ -84,6 +84,8 @@ def positions_of(owner: str, states: Sequence[State]) -> Tensor:
     given: Any = states
     if isinstance(given, State):
         raise TypeError(f"{owner}: `states` must be a list of State, got one State")
+    if not isinstance(given, Sequence):
+        raise TypeError(f"{owner}: `states` must be a list of State, got {type(given).__name__}")
     if not len(given):
         raise InvalidInput(f"{owner}: `states` must be one or more, got none")
     for k, state in enumerate(given):

@@ -322,7 +322,11 @@ def _environments(index: Any, size: int) -> int | slice | Tensor:
             "state[i]: `i` must be an integer, a slice, a list or a tensor, got "
             f"{type(index).__name__}"
         )
-    rows = torch.as_tensor(index) if len(index) else torch.zeros(0, dtype=torch.int64)
+    try:
+        is_empty = isinstance(index, Sequence) and not len(index)
+        rows = torch.zeros(0, dtype=torch.int64) if is_empty else torch.as_tensor(index)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"state[i]: `i` must be integers or a mask, got {index!r}") from error
     if rows.is_floating_point() or rows.is_complex() or rows.ndim != 1:
         raise TypeError(
             "state[i]: `i` must be integers or a mask, of one axis, got "

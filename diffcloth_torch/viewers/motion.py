@@ -72,6 +72,11 @@ class Motion(list[Moment]):
         Raises:
             InvalidInput: If the gradient has another shape.
         """
+        given: object = gradient
+        if given is not None and not isinstance(given, Tensor):
+            raise TypeError(
+                f"show: `gradients`[{len(self)}] must be a tensor, got {type(given).__name__}"
+            )
         if gradient is not None and gradient.shape != state.positions.shape:
             raise InvalidInput(
                 f"show: `gradients`[{len(self)}] must have shape {list(state.positions.shape)}, "

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
+import torch
+
 from diffcloth_torch.checks import POSITIVE, check_count, check_number
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path
@@ -63,8 +65,8 @@ def render(
     given: object = size
     if (
         not isinstance(given, Sequence)
-        or len(size) != 2
-        or not all(n in range(64, 4097, 2) for n in size)
+        or [*map(type, size)] != [int, int]
+        or any(n % 2 or not 64 <= n <= 4096 for n in size)
     ):
         raise InvalidInput(f"render: `size` must be two even numbers in 64 .. 4096, got {size}")
     moments = check_count("render: `moments`", moments, 1)
@@ -113,7 +115,11 @@ def checked_states(
     states = [states] if isinstance(states, State) else list(states)
     if not states:
         raise InvalidInput(f"{owner}: `states` must hold at least one state")
+    shown: object = scene
+    if not isinstance(shown, Scene):
+        raise TypeError(f"{owner}: `scene` must be a Scene, got {type(shown).__name__}")
     vertices = sum(len(cloth.vertices) for cloth in scene.cloths)
+    joints = sum(len(robot.joint_names) for robot in scene.robots)
     for i, state in enumerate(states):
         if not isinstance(state, State):
             raise TypeError(
@@ -128,7 +134,12 @@ def checked_states(
                 f"got {size}"
             )
         lead = () if size is None else (size,)
-        shapes = {"positions": (*lead, vertices, 3), "body_poses": (*lead, len(scene.bodies), 7)}
+        shapes = {
+            "positions": (*lead, vertices, 3),
+            "body_poses": (*lead, len(scene.bodies), 7),
+            "joint_positions": (*lead, joints),
+            "base_poses": (*lead, len(scene.robots), 7),
+        }
         for name, shape in shapes.items():
             got = tuple(getattr(state, name).shape)
             if got != shape:
@@ -136,6 +147,8 @@ def checked_states(
                     f"{owner}: states[{i}] must be of this scene, whose `{name}` have shape "
                     f"{list(shape)}, got {list(got)}"
                 )
+            if not torch.isfinite(getattr(state, name)).all():
+                raise InvalidInput(f"{owner}: states[{i}] must be finite, its `{name}` are not")
     return states
 
 

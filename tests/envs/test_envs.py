@@ -359,6 +359,7 @@ def begun():
         ("reward", None, "got NoneType"),
         ("success", torch.zeros(1), r"`success` must give booleans \[B\], got torch.float32"),
         ("terminal", torch.zeros(2) > 1, "`terminal` must give booleans"),
+        ("features", torch.zeros(1), "`features` must be a mapping of names to tensors"),
         ("features", {"x": torch.zeros(1)}, r"`features\['x'\]` must give finite floats \[B, n\]"),
         ("features", {"x": torch.full((1, 2), torch.inf)}, "with NaN or infinity"),
         ("scripted", torch.zeros(1, 3), r"`scripted` must give finite floats \[B, 8\]"),

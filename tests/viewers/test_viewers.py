@@ -359,6 +359,8 @@ class TestRender:
             pytest.param({"path": "no/a.png"}, dc.InvalidInput, "folder of `path`", id="folder"),
             pytest.param({"states": []}, dc.InvalidInput, "at least one state", id="none"),
             pytest.param({"states": [3]}, TypeError, r"got int at \[0\]", id="type"),
+            pytest.param({"size": (64.0, 66.0)}, dc.InvalidInput, "two even numbers", id="float"),
+            pytest.param({"size": "ab"}, dc.InvalidInput, "two even numbers", id="words"),
             pytest.param({"states": 3}, TypeError, "`states` must be states", id="no states"),
             pytest.param({"moments": 1.5}, TypeError, "`moments`", id="share of a moment"),
             pytest.param({"size": (64.5, 66)}, dc.InvalidInput, "two even numbers", id="share"),
@@ -385,6 +387,16 @@ class TestRender:
             dc.render(scene, [states[0], other], tmp_path / "a.png")
         with pytest.raises(dc.InvalidInput, match=r"states\[0\] is a batch"):
             dc.render(scene, dc.stack(states), tmp_path / "a.png")
+        with pytest.raises(TypeError, match="`scene` must be a Scene, got Simulator"):
+            dc.render(dc.Simulator(scene, 0.01), states, tmp_path / "a.png")
+        wrong = states[0].positions.clone()
+        wrong[1, 2] = float("nan")
+        with pytest.raises(dc.InvalidInput, match=r"states\[0\] must be finite, its `positions`"):
+            dc.render(scene, states[0].replace(positions=wrong), tmp_path / "a.png")
+        hand = dc.Robot.load(dc.robots.GRIPPER, actuation="position")
+        other = dc.Scene(scene.cloths, scene.bodies, [hand])
+        with pytest.raises(dc.InvalidInput, match="whose `joint_positions` have shape"):
+            dc.render(other, states[0], tmp_path / "a.png")
 
 
 def test_a_missing_package_is_named_before_anything_runs(make_task, tmp_path, monkeypatch):
