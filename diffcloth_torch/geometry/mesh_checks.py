@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,14 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.errors import InvalidInput
 
-__all__ = ["Surface", "check_areas", "check_manifold", "surface_arrays", "unique_edges"]
+__all__ = [
+    "Surface",
+    "check_areas",
+    "check_manifold",
+    "surface_arrays",
+    "unique_edges",
+    "warn_of_cuts",
+]
 
 
 class Surface(NamedTuple):
@@ -48,6 +56,28 @@ def surface_arrays(
     _check_distinct(owner, triangles)
     check_areas(owner, "vertices", points, triangles)
     return frozen(points), frozen(triangles)
+
+
+def warn_of_cuts(owner: str, vertices: FloatArray, faces: IndexArray) -> None:
+    """Warn of an edge whose two faces have vertices of their own at the same places."""
+    places, inverse = np.unique(vertices, axis=0, return_inverse=True)
+    if len(places) == len(vertices):
+        return
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges, counts = np.unique(edges, axis=0, return_counts=True)
+    rims = edges[counts == 1]
+    where = np.sort(inverse.reshape(-1)[rims], axis=1)
+    _, first, again = np.unique(where, axis=0, return_index=True, return_inverse=True)
+    twins = np.flatnonzero(first[again.reshape(-1)] != np.arange(len(rims)))
+    if not twins.size:
+        return
+    one, other = rims[first[again.reshape(-1)[twins[0]]]].tolist(), rims[twins[0]].tolist()
+    warnings.warn(
+        f"{owner}: the vertices {one} and {other} are at the same places: an edge is cut, contact "
+        "takes its two sides for rims, and what slides over it is pushed away; merge vertices that "
+        "coincide, as with merge_vertices() of trimesh",
+        stacklevel=3,
+    )
 
 
 def _check_distinct(owner: str, faces: IndexArray) -> None:

@@ -27,7 +27,7 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry import shapes
 from diffcloth_torch.geometry.mass_properties import check_inertia, is_closed, mass_properties
-from diffcloth_torch.geometry.mesh_checks import surface_arrays
+from diffcloth_torch.geometry.mesh_checks import surface_arrays, warn_of_cuts
 from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import pose_array
 from diffcloth_torch.model.cloth import plane_size
@@ -147,6 +147,7 @@ class RigidBody:
             TypeError: If an argument has a wrong type.
         """
         self.vertices, self.faces = surface_arrays("RigidBody", vertices, faces, instead=_POSES)
+        warn_of_cuts("RigidBody", self.vertices, self.faces)
         self.motion = check_choice("RigidBody: `motion`", motion, MOTIONS)
         self.pose = frozen(pose_array("RigidBody: `pose`", pose, instead=_POSES))
         self.friction = check_parameter("RigidBody", "friction", friction)
