@@ -331,8 +331,7 @@ void leave_out_meeting(Walk& walk, const std::vector<double>& to, FreeBodies& bo
 /// Whether friction resists the way from where the walk stands. What a grip holds, say, is not to begin
 /// where inertia alone would lead, out of the grip: its fingers would close behind it.
 bool is_resisted(const Walk& walk, const std::vector<double>& to) {
-  return walk.f.friction != nullptr &&
-         walk.f.friction->energy_change(walk.x().data(), to.data()) > 0.0;
+  return walk.f.friction->energy_change(walk.x().data(), to.data()) > 0.0;
 }
 
 /// Where the walk stands, but for the free bodies that come to their places in the guess without meeting
@@ -359,7 +358,8 @@ std::vector<double> with_flown_bodies(Walk& walk, const std::vector<double>& gue
   for (const bodies::Mechanisms::FreeBody& body : walk.f.free_bodies) {
     const auto [first, last] = numbers(body);
     for (std::ptrdiff_t a = first; a < last; ++a) change[a] = guess[a] - start[a];
-    if (coordinates.largest_fraction(start, change) >= 1.0 && !is_resisted(walk, with({&body})))
+    if (coordinates.largest_fraction(start, change) >= 1.0 &&
+        (walk.f.friction == nullptr || !is_resisted(walk, with({&body}))))
       flying.push_back(&body);
     std::fill(change.begin() + first, change.begin() + last, 0.0);
   }
@@ -390,7 +390,7 @@ bool start_from(Walk& walk, const std::vector<double>& guess) {
   coordinates.place(held);
   const auto is_better_and_free = [&] {
     if (walk.f.energy_change_without_contact(held.data(), guess.data()) > 0.0) return false;
-    if (is_resisted(walk, guess)) return false;
+    if (walk.f.friction != nullptr && is_resisted(walk, guess)) return false;
     std::vector<double> change(guess.size());
     for (std::size_t a = 0; a < guess.size(); ++a) change[a] = guess[a] - walk.x()[a];
     if (coordinates.largest_fraction(walk.x(), change) < 1.0 || walk.watch(guess) < 1.0)
