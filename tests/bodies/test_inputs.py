@@ -334,6 +334,32 @@ def test_a_bad_parameter_is_refused(layout, defaults, name, row, value, message)
         parameter_fields(layout, wrong, default_fields(defaults), None)
 
 
+def test_a_link_that_is_given_mass_needs_an_inertia_that_is_not_negative(tmp_path):
+    names, mass = ("base", "arm", "tip"), '<inertial><mass value="1"/>{}</inertial>'
+    inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    parts = [f'<link name="{n}">{mass.format(inertia) if n != "tip" else ""}</link>' for n in names]
+    parts += [
+        f'<joint name="{a}{b}" type="{kind}"><parent link="{a}"/><child link="{b}"/></joint>'
+        for a, b, kind in (("base", "arm", "continuous"), ("arm", "tip", "fixed"))
+    ]
+    path = tmp_path / "arm.urdf"
+    path.write_text(f'<robot name="arm">{"".join(parts)}</robot>')
+    robot = dc.Robot.load(path, actuation="torque")
+    scene = dc.Scene([], robots=[robot])
+    simulator = dc.Simulator(scene, 0.01, contact=dc.ContactOptions(barrier_distance=1e-3))
+    given = simulator.parameters()
+    tip = list(robot.link_names).index("tip")
+    mass = with_row(given.link_mass, tip, 0.2)
+    for scale, is_accepted in ((0.02, True), (0.0, True), (-0.02, False)):
+        inertia = with_row(given.link_inertia, tip, scale * torch.eye(3, dtype=F64))
+        changed = given.replace(link_mass=mass, link_inertia=inertia)
+        if is_accepted:
+            simulator.step(simulator.initial_state(), None, changed)
+            continue
+        with pytest.raises(dc.InvalidInput, match="must be positive semi-definite in the row"):
+            simulator.step(simulator.initial_state(), None, changed)
+
+
 def test_rows_of_what_forces_do_not_move_are_free(layout, defaults):
     given = dc.Parameters(
         body_mass=with_row(defaults["body_mass"], 0, 7.0),

@@ -90,3 +90,23 @@ def test_the_same_control_in_other_words_is_the_same(sim):
     plain, y = rolled(sim, [dc.Control(pins=shifted(sim, 1e-3))] * STEPS)
     assert torch.equal(gradient, torch.autograd.grad(plain, y)[0])
     assert len(asked) > STEPS
+
+
+def test_tangents_go_through_functions_and_checkpoints(sim):
+    """Forward needs no checkpoint, but a rollout that has some is differentiated all the same."""
+    start, at = torch.tensor(0.1, dtype=F64), sim.initial_state()
+
+    def moved(force, every):
+        def push(k, state):
+            return dc.Control(forces=force * torch.ones_like(at.positions))
+
+        return sim.rollout(at, push, steps=STEPS, checkpoint_every=every)[-1].positions.sum()
+
+    one = torch.ones((), dtype=F64)
+    plain = torch.func.jvp(lambda f: moved(f, None), (start,), (one,))[1]
+    assert plain != 0
+    assert torch.equal(torch.func.jvp(lambda f: moved(f, 2), (start,), (one,))[1], plain)
+    assert torch.equal(torch.func.jacfwd(lambda f: moved(f, 2))(start), plain)
+    assert torch.func.grad(lambda f: moved(f, None))(start) == pytest.approx(plain.item())
+    with pytest.raises(dc.InvalidInput, match="`checkpoint_every` must be None inside"):
+        torch.func.grad(lambda f: moved(f, 2))(start)
