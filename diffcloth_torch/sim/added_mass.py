@@ -164,7 +164,7 @@ class AddedMassWatch:
                 f"what a body touches is heavy or stiff against it: {sign}; "
                 'use coupling="monolithic", or a smaller dt',
                 AddedMassWarning,
-                stacklevel=7,
+                stacklevel=9,  # beyond the simulator and its wrapper
             )
 
     def _surface_masses(self, parameters: Fields) -> Tensor:

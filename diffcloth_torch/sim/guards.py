@@ -47,10 +47,12 @@ def guarded(method: Callable[P, T]) -> Callable[P, T]:
     """Compute on the CPU; raise torch's lack of memory as MemoryError, like NumPy and the core."""
 
     @wraps(method)
-    @on_cpu
     def call(*args: P.args, **keywords: P.kwargs) -> T:
         try:
-            return _uncompiled(method)(*args, **keywords)
+            if _device.CURRENT_DEVICE is None:
+                return _uncompiled(method)(*args, **keywords)
+            with torch.device("cpu"):
+                return _uncompiled(method)(*args, **keywords)
         except RuntimeError as error:
             if "can't allocate memory" in str(error):
                 raise MemoryError(f"{method.__name__}: {error}") from error

@@ -27,7 +27,7 @@ from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.cores import constants
 from diffcloth_torch.sim.engine import Engine
 from diffcloth_torch.sim.equilibrium import Equilibria
-from diffcloth_torch.sim.guards import guarded
+from diffcloth_torch.sim.guards import guarded, on_cpu
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.observables import Observables
 from diffcloth_torch.sim.outcome import make_report
@@ -78,7 +78,7 @@ class Simulator(Observables):
     slices: dict[str, slice]
     joint_slices: dict[str, slice]
 
-    @guarded
+    @on_cpu
     def __init__(
         self,
         scene: Scene,

@@ -169,7 +169,7 @@ def check_start(engine: Engine, start: Given) -> None:
             f"Simulator: the barrier will throw surfaces apart: {elements} start {gap:.3g} m "
             f"apart, while at rest their gap would be about {rest_gap:.3g} m; start with more, "
             "or give a smaller `contact.barrier_distance`",
-            stacklevel=3,
+            stacklevel=4,  # beyond the simulator and its wrapper
         )
 
 
