@@ -168,7 +168,7 @@ class Equilibria:
             return found
 
         with torch.no_grad(), outside_transforms():
-            here = Given(*({n: plain(t) for n, t in part.items()} for part in given))
+            here = _plain(given)
             anchor = plain(origins), None if joints is None else plain(joints)
             for length in _GROWTH:
                 here = self._from(here, step(length, here, *anchor))
@@ -277,7 +277,7 @@ class Equilibria:
         if not touching.any():  # nothing else that a step has at its start matters at its end
             return begun
         still = {n: here.state[n] for n in _MOVING if n in here.state}
-        numbers = Given(*({n: plain(t) for n, t in part.items()} for part in given))
+        numbers = _plain(given)
         at = plain(anchor[0]), None if anchor[1] is None else plain(anchor[1])
         linearization = Linearization(
             lambda moving: step(self._begun(numbers, here.state | moving), at), still, touching
@@ -394,6 +394,11 @@ def _only(mask: Tensor, after: Given, before: Given) -> Given:
         for name, t in after.state.items()
     }
     return after._replace(state=state)
+
+
+def _plain(given: Given) -> Given:
+    """The numbers of the inputs, without graph or tangent."""
+    return Given(*({n: plain(t) for n, t in part.items()} for part in given))
 
 
 def _leaf(values: Tensor) -> Tensor:

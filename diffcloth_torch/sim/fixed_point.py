@@ -77,9 +77,11 @@ class Linearization:
 
     def terms(self) -> Tensor:
         """How many powers of dS/dx are not small, in each environment, [B]."""
-        generator = np.random.default_rng(0)  # `torch.vmap` refuses random numbers of torch
+        # `torch.vmap` refuses random numbers of torch. All environments have the same ones.
+        generator = np.random.default_rng(0)
         vectors = [
-            torch.from_numpy(generator.standard_normal((1, *x.shape))) for x in self._x.values()
+            torch.from_numpy(generator.standard_normal(x.shape[1:])).expand(1, *x.shape)
+            for x in self._x.values()
         ]
         counts = torch.zeros(len(self.acts), dtype=torch.long)
         first = _size(vectors)[0]
@@ -122,10 +124,8 @@ class _FixedPoint(CoreFunction):
 
     def tangents(self, inputs: Arrays, tape: Arrays, given: Arrays, count: int) -> list[Tensor]:
         assert self._linearization is None  # it has no products with dS/dx
-        return [
-            torch.from_numpy(given[n]) if n in given else torch.zeros(count, *self._at[n].shape)
-            for n in self.names
-        ]
+        zeros = {n: torch.zeros(count, *t.shape, dtype=torch.float64) for n, t in self._at.items()}
+        return [torch.from_numpy(given[n]) if n in given else zeros[n] for n in self.names]
 
     def gradients(
         self, inputs: Arrays, tape: Arrays, cotangents: list[Tensor], needs: list[str]

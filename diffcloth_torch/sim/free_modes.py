@@ -42,8 +42,11 @@ def refuse_free_modes(
     if not outputs:
         return
     generator = torch.Generator().manual_seed(0)
+    # The same in all environments, so that what is refused alone is refused in a batch.
     signs = [
-        2.0 * torch.randint(2, (_PROBES, *t.shape), generator=generator).double() - 1.0
+        (2.0 * torch.randint(2, (_PROBES, 1, *t.shape[1:]), generator=generator).double() - 1.0)
+        .expand(-1, len(t), *t.shape[1:])
+        .contiguous()
         for t in outputs
     ]
     inputs = pushes | forces

@@ -373,6 +373,21 @@ def test_gradients_in_a_batch_are_those_alone_where_only_some_are_in_contact():
         assert found.report.iterations == together.report.iterations[k]
 
 
+def test_tangents_in_a_batch_are_those_alone():
+    simulator, state, control = pulled_box()
+    given = simulator.parameters()
+
+    def places(states, friction):
+        found = simulator.equilibrium(states, control, given.replace(friction=friction))
+        return found.body_poses[..., 0, :]
+
+    at = (given.friction,)
+    _, alone = torch.func.jvp(lambda f: places(state, f), at, at)
+    _, both = torch.func.jvp(lambda f: places(dc.stack([state, state]), f), at, at)
+    assert alone.abs().max() > 1e-4
+    assert torch.equal(both, torch.stack([alone, alone]))
+
+
 def test_slip_velocities_and_failures_of_others_change_no_bit():
     simulator, state, control = pulled_box()
     given = simulator.parameters().replace(slip_velocity=torch.tensor(1e-2, dtype=F64))
