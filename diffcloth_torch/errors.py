@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Sequence
+from types import FrameType
 from typing import Any
 
 __all__ = [
@@ -69,3 +72,18 @@ class TurnedTooFar(SimulationError):  # noqa: N818
 
 class AddedMassWarning(UserWarning):
     """In a staggered coupling, a body or a link is too light for the cloth that it touches."""
+
+
+def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line outside of the package, and of torch, that called it."""
+    frame = sys._getframe(1)
+    level = 2  # of that frame
+    while frame.f_back is not None and _is_inside(frame):
+        frame = frame.f_back
+        level += 1
+    warnings.warn(message, category, stacklevel=level)
+
+
+def _is_inside(frame: FrameType) -> bool:
+    module: str = frame.f_globals.get("__name__", "")
+    return module.partition(".")[0] in ("diffcloth_torch", "torch")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from diffcloth_torch.checks import (
     frozen,
     index_array,
 )
-from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.errors import InvalidInput, warn_caller
 
 __all__ = [
     "Surface",
@@ -72,11 +71,10 @@ def warn_of_cuts(owner: str, vertices: FloatArray, faces: IndexArray) -> None:
     if not twins.size:
         return
     one, other = rims[first[again.reshape(-1)[twins[0]]]].tolist(), rims[twins[0]].tolist()
-    warnings.warn(
+    warn_caller(
         f"{owner}: the vertices {one} and {other} are at the same places: an edge is cut, contact "
         "takes its two sides for rims, and what slides over it is pushed away; merge vertices that "
         "coincide, as with merge_vertices() of trimesh",
-        stacklevel=3,
     )
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import inspect
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -28,7 +27,7 @@ from diffcloth_torch.checks import (
     check_number,
     refuse_threads,
 )
-from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.errors import InvalidInput, warn_caller
 from diffcloth_torch.files import as_path
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.fit_page import Page, write_page
@@ -353,11 +352,9 @@ def _warn_of_bounds(
     for name in space.default_bounds:
         here = [n for n in at_bounds if n.partition("[")[0] == name]
         if here:
-            warnings.warn(
+            warn_caller(
                 f"fit: {', '.join(here)} ended a factor of 1000 from where it began, and goes no "
                 "further without `bounds`; give them, or a better first value",
-                UserWarning,
-                stacklevel=3,
             )
 
 

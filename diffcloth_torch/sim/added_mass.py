@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import torch
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from diffcloth_torch.dynamics.dynamics import Dynamics
 from diffcloth_torch.dynamics.staggering import StaggeredStep, added_mass_numbers
-from diffcloth_torch.errors import AddedMassWarning
+from diffcloth_torch.errors import AddedMassWarning, warn_caller
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.sim.border import Given
 from diffcloth_torch.sim.cores import Core, arrays_of, rigid_inputs
@@ -159,12 +158,11 @@ class AddedMassWatch:
                     f"the added-mass number of {name!r} is about {float(numbers[worst]):.2g}, "
                     f"above {_LARGEST_ADDED_MASS:g}"
                 )
-            warnings.warn(
+            warn_caller(
                 f"step: the coupling {self._coupling!r} gets inaccurate, and then unstable, where "
                 f"what a body touches is heavy or stiff against it: {sign}; "
                 'use coupling="monolithic", or a smaller dt',
                 AddedMassWarning,
-                stacklevel=9,  # beyond the simulator and its wrapper
             )
 
     def _surface_masses(self, parameters: Fields) -> Tensor:

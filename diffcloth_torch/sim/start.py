@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -11,7 +9,7 @@ from torch import Tensor
 
 from diffcloth_torch.checks import POSITIVE, check_number
 from diffcloth_torch.dynamics.limits import slip_rates
-from diffcloth_torch.errors import IntersectingState, InvalidInput
+from diffcloth_torch.errors import IntersectingState, InvalidInput, warn_caller
 from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.defaults import choose_barrier_distance
 from diffcloth_torch.model.options import ContactOptions
@@ -165,11 +163,10 @@ def check_start(engine: Engine, start: Given) -> None:
     close = engine.core.find_close_start(inputs)
     if close is not None and close[1] < _DEEP * close[2]:
         elements, gap, rest_gap = close
-        warnings.warn(
+        warn_caller(
             f"Simulator: the barrier will throw surfaces apart: {elements} start {gap:.3g} m "
             f"apart, while at rest their gap would be about {rest_gap:.3g} m; start with more, "
             "or give a smaller `contact.barrier_distance`",
-            stacklevel=4,  # beyond the simulator and its wrapper
         )
 
 
