@@ -135,13 +135,15 @@ class ContactPotential final : public TouchingPotential {
 class FrictionPotential final : public TouchingPotential {
  public:
   /// @param contacts  of the lag configuration; they outlive the potential
-  /// @param x_start   positions at the start of the step; likewise
+  /// @param x_lag     positions of the lag configuration
+  /// @param x_start   positions at the start of the step; they outlive the potential
   /// @param bar       where accumulate() adds what parameters get; null where nobody asks for it
   FrictionPotential(const ContactModel& model,
                     const std::vector<Contact>& contacts,
+                    const double* x_lag,
                     const double* x_start,
                     ContactModel::Bar* bar)
-      : set_(model, contacts, x_start), bar_(bar) {}
+      : set_(model, contacts, x_lag, x_start), bar_(bar) {}
 
   double energy(const double* /*x*/) const override { return 0.0; }
   double energy_change(const double* x, const double* to) const override {

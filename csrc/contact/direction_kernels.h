@@ -40,10 +40,12 @@ struct FrictionProduct {
 struct FrameTangent {
   const int* edge;
   bool turns;
-  double share;  ///< of the gap
-  double a[3];   ///< that share of the gap at the start in the frame there
-  double e1_start[3], e2_start[3];
-  double to_coordinates[3][3];      ///< E(x_start)^-1
+  double share;       ///< of the gap
+  double a[3], b[3];  ///< that share of t in the frame at x_L, and of r' in that at x_start
+  double extension_by_lag[2][3], extension_by_start[2][3];  ///< by both edges
+  double e1_start[3], e2_start[3], e1_lag[3], e2_lag[3];
+  double to_lag[3][3];              ///< E_L^-1
+  double turn[3][3];                ///< E_L E(x_start)^-1
   double e1[3], e2[3], m[3];        ///< the frame at x
   double e2_force[3], force_e1[3];  ///< e2 x force, force x e1
 };
@@ -64,6 +66,8 @@ struct FrictionTangent {
   double r_start_beta[3][2];  ///< the same at x_start
   double n[3];
   double inv_d;
+  double extension;  ///< l, and by what it changes
+  double extension_by_t[3], extension_by_n[3], extension_by_r[3];
   FrameTangent part[2];
   double s[3], w[3];
   double n_s;             ///< n . s

@@ -144,6 +144,14 @@ struct Directions {
     }
   }
 
+  /// a1 e1 + a2 e2 + a3 m.
+  static DIFFCLOTH_INLINE Vector combined(const double (&a)[3],
+                                          const Vector& e1,
+                                          const Vector& e2,
+                                          const Vector& m) {
+    return sum(sum(scaled(a[0], e1), scaled(a[1], e2)), scaled(a[2], m));
+  }
+
   static DIFFCLOTH_INLINE Vector by_beta(const double (&by)[3][2], const Number (&beta)[2]) {
     return {{by[0][0] * beta[0] + by[0][1] * beta[1], by[1][0] * beta[0] + by[1][1] * beta[1],
              by[2][0] * beta[0] + by[2][1] * beta[1]}};
@@ -186,24 +194,44 @@ struct Directions {
     }
     const Vector n = scaled(of.inv_d, tangential(t, of.n));
 
-    // s = r(x) - Q r(x_start), and r(x_start) in its frames.
+    // r' = r(x_start) + l n.
+    Number extension =
+        dot(of.extension_by_t, t) + dot(of.extension_by_n, n) + dot(of.extension_by_r, r);
+    for (int l = 0; l < of.part_count; ++l) {
+      const FrameTangent& part = of.part[l];
+      if (!part.turns) continue;
+      for (int e = 0; e < 2; ++e) {
+        extension += dot(part.extension_by_lag[e], edge(lag, of.point, part.edge + 2 * e));
+        extension += dot(part.extension_by_start[e], edge(start, of.point, part.edge + 2 * e));
+      }
+    }
+    r = sum(r, sum(along(of.n, extension), scaled(of.extension, n)));
+
+    // s = r(x) - E(x) a - E_L b, with t and r' in the frames.
     Vector a[2];
     for (int l = 0; l < of.part_count; ++l) {
       const FrameTangent& part = of.part[l];
       a[l] = zero();
-      Vector own = scaled(part.share, r);
       if (!part.turns) {
-        s = minus(s, own);
+        s = minus(s, scaled(part.share, r));
         continue;
       }
-      const Vector e1 = edge(start, of.point, part.edge);
-      const Vector e2 = edge(start, of.point, part.edge + 2);
-      const Vector m = sum(cross(e1, part.e2_start), cross(part.e1_start, e2));
-      own =
-          minus(own, sum(sum(scaled(part.a[0], e1), scaled(part.a[1], e2)), scaled(part.a[2], m)));
-      for (int k = 0; k < 3; ++k) a[l].at[k] = dot(part.to_coordinates[k], own);
+      const Vector e1 = edge(lag, of.point, part.edge);
+      const Vector e2 = edge(lag, of.point, part.edge + 2);
+      const Vector m = sum(cross(e1, part.e2_lag), cross(part.e1_lag, e2));
+      const Vector own_t = minus(scaled(part.share, t), combined(part.a, e1, e2, m));
+      for (int k = 0; k < 3; ++k) a[l].at[k] = dot(part.to_lag[k], own_t);
       s = minus(s, sum(sum(along(part.e1, a[l].at[0]), along(part.e2, a[l].at[1])),
                        along(part.m, a[l].at[2])));
+
+      const Vector e1_start = edge(start, of.point, part.edge);
+      const Vector e2_start = edge(start, of.point, part.edge + 2);
+      const Vector m_start = sum(cross(e1_start, part.e2_start), cross(part.e1_start, e2_start));
+      const Vector own_r =
+          minus(scaled(part.share, r), combined(part.b, e1_start, e2_start, m_start));
+      Vector turned;
+      for (int k = 0; k < 3; ++k) turned.at[k] = dot(part.turn[k], own_r);
+      s = minus(s, sum(combined(part.b, e1, e2, m), turned));
     }
     const Vector w =
         minus(minus(tangential(s, of.n), along(of.n, dot(of.s, n))), scaled(of.n_s, n));

@@ -16,6 +16,9 @@ using GapPart = FrictionSet::GapPart;
 constexpr double kLine = 1e-24;
 /// Duals that are all this close to the forces at the point are of no further use: Newton's method converges.
 constexpr double kClose = 0.1;
+/// How much of the normal is along itself at least where it turns with the gap: no gap gets longer than by
+/// twice what it lacks, however the frame of a cloth turns in a step.
+constexpr double kLeastAlong = 0.5;
 /// Squared sine of the angle from which on two edges cross.
 constexpr double kCrossing = 0.2;
 
@@ -84,6 +87,18 @@ Vec3 change_of_slip(const Entry& k, const std::array<Frame, 2>& frames, const do
   return change;
 }
 
+/// Q v, from the start to x.
+Vec3 turned(const Entry& k, const Vec3& v, const double* x_start, const double* x) {
+  Vec3 result = Vec3::Zero();
+  for (int l = 0; l < k.part_count; ++l) {
+    const GapPart& part = k.parts[l];
+    const Vec3 own =
+        part.turns ? Vec3(Frame(k, part, x) * Frame(k, part, x_start).coordinates(v)) : v;
+    result += part.share * own;
+  }
+  return result;
+}
+
 /// The matrix of v -> u x v.
 Mat3 cross_matrix(const Vec3& u) {
   return Mat3{{0.0, -u[2], u[1]}, {u[2], 0.0, -u[0]}, {-u[1], u[0], 0.0}};
@@ -132,12 +147,17 @@ Vec3 FrictionSet::Frame::dual(const Vec3& a) const {
   return (a[0] * e2.cross(m) + a[1] * m.cross(e1) + a[2] * m) / m.squaredNorm();
 }
 
+Vec3 FrictionSet::Frame::transposed(const Vec3& f) const {
+  return {e1.dot(f), e2.dot(f), m.dot(f)};
+}
+
 std::array<Vec3, 2> FrictionSet::Frame::pull_back(const Vec3& a, const Vec3& f) const {
   return {a[0] * f + a[2] * e2.cross(f), a[1] * f + a[2] * f.cross(e1)};
 }
 
 FrictionSet::FrictionSet(const ContactModel& model,
                          const std::vector<Contact>& contacts,
+                         const double* x_lag,
                          const double* x_start)
     : model_(&model), x_start_(x_start) {
   entries_.reserve(contacts.size());
@@ -163,11 +183,22 @@ FrictionSet::FrictionSet(const ContactModel& model,
     }
     for (int l = 0; l < entry.part_count; ++l) {
       GapPart& part = entry.parts[l];
-      const Frame at_start(entry, part, x_start);
-      part.turns = !at_start.is_line();
-      part.a = Vec3::Zero();
-      if (part.turns) part.a = part.share * at_start.coordinates(entry.gap(x_start));
+      const Frame lag(entry, part, x_lag);
+      part.turns = !Frame(entry, part, x_start).is_line() && !lag.is_line();
+      if (part.turns) part.a = part.share * lag.coordinates(k.closest.t);
     }
+    const Vec3 r = entry.gap(x_start);
+    const double along = entry.n.dot(turned(entry, entry.n, x_start, x_lag));
+    entry.extension =
+        (d - entry.n.dot(turned(entry, r, x_start, x_lag))) / std::max(along, kLeastAlong);
+    entry.s_start = r - turned(entry, r + entry.extension * entry.n, x_start, x_lag);
+    for (int l = 0; l < entry.part_count; ++l) {
+      const GapPart& part = entry.parts[l];
+      entry.s_start -= Frame(entry, part, x_start) * part.a;
+    }
+    const bool is_start = std::ranges::all_of(
+        entry.all_points(), [&](Index v) { return row(x_lag, v) == row(x_start, v); });
+    if (!is_start) entry.w_start = tangential(entry.s_start, entry.n);
     entries_.push_back(entry);
     points_.insert(points_.end(), entry.points.begin(), entry.points.begin() + entry.count);
   }
@@ -218,8 +249,8 @@ FrictionSet::Slip FrictionSet::slip(const Entry& k, const double* x) const {
     s -= part.a[0] * change_1 + part.a[1] * change_2 +
          part.a[2] * (change_1.cross(frame.e2) + e1_start.cross(change_2));
   }
-  at.s = s;
-  at.w = tangential(s, k.n);
+  at.s = k.s_start + s;
+  at.w = k.w_start + tangential(s, k.n);
   at.law = friction_law(at.w.norm(), model_->parameters().slip);
   return at;
 }
@@ -236,17 +267,17 @@ double FrictionSet::energy_change(const double* x0, const double* x1) const {
 
 void FrictionSet::add_gradient(const double* x, double* g) const {
   const Slips& here = slips(x);
-  for (std::size_t e = 0; e < entries_.size(); ++e) {
-    const Entry& k = entries_[e];
-    const Slip& at = here[e];
-    const Vec3 force = (k.mu * k.lambda) * at.force();
-    for (int i = 0; i < k.count; ++i) {
-      Eigen::Map<Vec3>(g + 3 * k.points[i]) += k.c[i] * force;
-    }
-    for (int l = 0; l < k.part_count; ++l) {
-      const GapPart& part = k.parts[l];
-      k.add_edges(part, at.frames[l].pull_back(-part.a, force), g);
-    }
+  for (std::size_t e = 0; e < entries_.size(); ++e) add_gradient(entries_[e], here[e], g);
+}
+
+void FrictionSet::add_gradient(const Entry& k, const Slip& at, double* g) const {
+  const Vec3 force = (k.mu * k.lambda) * at.force();
+  for (int i = 0; i < k.count; ++i) {
+    Eigen::Map<Vec3>(g + 3 * k.points[i]) += k.c[i] * force;
+  }
+  for (int l = 0; l < k.part_count; ++l) {
+    const GapPart& part = k.parts[l];
+    k.add_edges(part, at.frames[l].pull_back(-part.a, force), g);
   }
 }
 
@@ -500,18 +531,60 @@ void pull_back_gap(const Closest& geometry, const Vec3& t_bar, const Vec4& c_bar
 
 }  // namespace
 
-// phi = mu lambda q(|w|) w . zeta,  q = f1/y,  w = P s,  s = r(x) - E(x) a,  zeta = r(z) - E'(z) a,
-// with E = (e1, e2, m), its change E' with z, and a = E(x_start)^-1 share r(x_start); of two parts both.
+// With what the lag configuration has marked by L, Q = E_L E(x_start)^-1, and r" = r' but for a frame that turns
+// so far that n . Q n has its least value, where it is r(x_start):
+//
+//   l max(n . Q n, 1/2) = d - n . Q r(x_start)
+//   dl = (n . dt - dn . (Q r" + l Q^T n) - n . Q dr - n . dQ r") / (n . Q n),   dr of r(x_start),
+//   n . dQ r" = n . dE_L a" - E(x_start)^-T E_L^T n . dE(x_start) a"
+//
+// without the term l Q^T n in the second case.
+FrictionSet::ExtensionDerivative FrictionSet::extension_derivative(const Entry& k,
+                                                                   const double* x_lag) const {
+  const Vec3& n = k.n;
+  const double along = n.dot(turned(k, n, x_start_, x_lag));
+  const bool is_exact = along >= kLeastAlong;
+  const double scale = 1.0 / std::max(along, kLeastAlong);
+  const double extension = is_exact ? k.extension : 0.0;
+  const Vec3 r = k.gap(x_start_) + extension * n;
+
+  ExtensionDerivative by;
+  Vec3 back = Vec3::Zero();  // Q^T n
+  for (int l = 0; l < k.part_count; ++l) {
+    const GapPart& part = k.parts[l];
+    by.by_lag_edges[l].fill(Vec3::Zero());
+    by.by_start_edges[l].fill(Vec3::Zero());
+    if (!part.turns) {
+      back += part.share * n;
+      continue;
+    }
+    const Frame lag(k, part, x_lag);
+    const Frame start(k, part, x_start_);
+    const Vec3 a = part.share * start.coordinates(r);
+    const Vec3 n_back = start.dual(lag.transposed(n));
+    back += part.share * n_back;
+    by.by_lag_edges[l] = lag.pull_back(-scale * a, n);
+    by.by_start_edges[l] = start.pull_back(scale * a, n_back);
+  }
+  by.by_t = scale * n;
+  by.by_n = -scale * (turned(k, r, x_start_, x_lag) + extension * back);
+  by.by_r = -scale * back;
+  return by;
+}
+
+// phi = mu lambda q(|w|) w . zeta,  q = f1/y,  w = P s,  s = r(x) - E(x) a - E_L b,  zeta = r(z) - E'(z) a,
+// with E = (e1, e2, m), its change E' with z, a = E_L^-1 share t and b = E(x_start)^-1 share r'; of two parts both.
 //
 //   dphi/dw    = mu lambda (q zeta + f2 (w . zeta) w) =: omega      (f2 = q'/y)
 //   dphi/ds    = P omega,   dphi/dn = -(n.s) omega - (n.omega) s,   dphi/dzeta = mu lambda q w =: eta
-//   dphi/da    = -E^T P omega - E'^T eta,   g = share E(x_start)^-T dphi/da
-//   dphi/dc_i  = (P omega) . x_i + eta . z_i + g . x_start_i
-//   dphi/dx_start = c_i g, less what the frame's edges have in E(x_start) a
+//   dphi/da    = -E^T P omega - E'^T eta,   dphi/dt = share y,   y = E_L^-T dphi/da
+//   dphi/db    = -E_L^T P omega,   dphi/dr' = g = share E(x_start)^-T dphi/db
+//   dphi/dl    = n . g,   dphi/dn += l g,   dphi/dr(x_start) = g + (n . g) dl/dr =: h
+//   dphi/dc_i  = (P omega) . x_i + eta . z_i + h . x_start_i,   dphi/dx_start = c_i h
 //
+// less what the edges of frames have in E_L a, E_L b and E(x_start) b, and what l has of them,
 // and the lag configuration moves c through d(beta) = J dx, n through dn = P dt / d with
 // dt = sum c_i dx_i + s d(beta), and lambda as pull_back_lambda() says.
-// Where the frame was a line, Q is the identity.
 void FrictionSet::add_mixed(const double* x,
                             const double* z,
                             const double* x_lag,
@@ -555,6 +628,8 @@ void FrictionSet::add_mixed(const double* x,
     const Vec3 eta = (strength * law.f1_over_y) * at.w;
     const Vec3 s_bar = tangential(omega, k.n);
     Vec3 g = Vec3::Zero();
+    Vec3 t_bar = Vec3::Zero();
+    const Vec3 longer = k.gap(x_start_) + k.extension * k.n;
     for (int l = 0; l < k.part_count; ++l) {
       const GapPart& part = k.parts[l];
       if (!part.turns) {
@@ -566,13 +641,30 @@ void FrictionSet::add_mixed(const double* x,
       const Vec3 a_bar(-frame.e1.dot(s_bar) - change.e1.dot(eta),
                        -frame.e2.dot(s_bar) - change.e2.dot(eta),
                        -frame.m.dot(s_bar) - change.m.dot(eta));
-      const Frame at_start(k, part, x_start_);
-      const Vec3 r_bar = at_start.dual(a_bar);
+      const Frame lag_frame(k, part, x_lag);
+      const Frame start(k, part, x_start_);
+      const Vec3 y = lag_frame.dual(a_bar);
+      const Vec3 b = part.share * start.coordinates(longer);
+      const Vec3 r_bar = start.dual(lag_frame.transposed(-s_bar));
+      t_bar += part.share * y;
       g += part.share * r_bar;
-      k.add_edges(part, at_start.pull_back(-scale * part.a, r_bar), start_bar);
+      k.add_edges(part, lag_frame.pull_back(-scale * part.a, y), lag_bar);
+      k.add_edges(part, lag_frame.pull_back(-scale * b, s_bar), lag_bar);
+      k.add_edges(part, start.pull_back(-scale * b, r_bar), start_bar);
     }
-    const Vec3 n_bar = -k.n.dot(at.s) * omega - k.n.dot(omega) * at.s;
-    const Vec3 t_bar = tangential(n_bar, k.n) / d;
+    const ExtensionDerivative by = extension_derivative(k, x_lag);
+    const double extension_bar = k.n.dot(g);
+    for (int l = 0; l < k.part_count; ++l) {
+      const auto scaled = [&](const std::array<Vec3, 2>& edges) -> std::array<Vec3, 2> {
+        return {scale * extension_bar * edges[0], scale * extension_bar * edges[1]};
+      };
+      k.add_edges(k.parts[l], scaled(by.by_lag_edges[l]), lag_bar);
+      k.add_edges(k.parts[l], scaled(by.by_start_edges[l]), start_bar);
+    }
+    const Vec3 n_bar =
+        -k.n.dot(at.s) * omega - k.n.dot(omega) * at.s + k.extension * g + extension_bar * by.by_n;
+    t_bar += tangential(n_bar, k.n) / d + extension_bar * by.by_t;
+    g += extension_bar * by.by_r;
     Vec4 c_bar;
     for (int i = 0; i < 4; ++i) {
       const auto from_first = [&](const double* rows) -> Vec3 {

@@ -18,12 +18,17 @@ inline Vec3 tangential(const Vec3& u, const Vec3& n) { return u - n.dot(u) * n; 
 
 /// Lagged friction: sum over contacts of mu lambda f0(|w|; e)  [J],
 ///
-///   w = (I - n n^T) s,   s = r(x) - Q r(x_start),   r(x) = sum_i c_i x_i,   e = eps_v h,
+///   w = (I - n n^T) s,   s = r(x) - Q(x) Q_L^-1 t - Q_L r',   r(x) = sum_i c_i x_i,   e = eps_v h,
 ///
-/// with c, n and the normal force lambda = -kappa w m b'(D) 2 d [N] of the lag configuration held
-/// fixed. r is the vector from one contact point to the other, and Q turns it as the surface turns
-/// that its `frame` belongs to: what turns as one does not slide, and friction has no couple about the
-/// gap. Obstacle vertices take part, so that a moving body drags the cloth.
+/// with c, n, the gap t = r(x_L) and the normal force lambda = -kappa w m b'(D) 2 d [N] of the lag
+/// configuration x_L held fixed. r is the vector from one contact point to the other, and Q(x) turns it, from the
+/// start of the step, as the surface turns that its `frame` belongs to: what turns as one does not slide.
+/// Obstacle vertices take part, so that a moving body drags the cloth.
+///
+/// At x_L, w is what is left across n of t - Q_L r', where r' = r(x_start) + l n is the gap at the start, as long
+/// as to leave n . (t - Q_L r') = 0: that the gap opened or closed is not sliding. Around x_L, it is t that turns.
+/// Both contact points get the force f1 w / |w|, and the frame the couple of -t with it, so that friction has no
+/// moment there.
 ///
 /// Between two round bodies the gap is the sum of both radii and the space between them: it splits by the
 /// radii, and each share turns with its own body, so that they roll on each other.
@@ -31,17 +36,19 @@ inline Vec3 tangential(const Vec3& u, const Vec3& n) { return u - n.dot(u) * n; 
 /// Q comes from two edges e1 and e2: of three vertices of that surface, or, where the edges of two cloths
 /// cross at an angle, these. With m = e1 x e2,
 ///
-///   Q r(x_start) = a1 e1(x) + a2 e2(x) + a3 m(x),   where a makes it r(x_start) at x_start,
+///   Q(x) Q_L^-1 t = a1 e1(x) + a2 e2(x) + a3 m(x),   where a makes it t at x_L,
 ///
-/// or the sum of two such terms, one of each body, with a of its share of r(x_start).
+/// or the sum of two such terms, one of each body, with a of its share of t; Q_L r' likewise.
 class FrictionSet {
  public:
   FrictionSet() = default;
 
   /// @param contacts  the contacts of the lag configuration; they outlive this object
-  /// @param x_start   positions at the start of the step; likewise
+  /// @param x_lag     positions of the lag configuration
+  /// @param x_start   positions at the start of the step; they outlive this object
   FrictionSet(const ContactModel& model,
               const std::vector<Contact>& contacts,
+              const double* x_lag,
               const double* x_start);
 
   const ContactModel& model() const { return *model_; }
@@ -53,8 +60,8 @@ class FrictionSet {
     int size;                  ///< how many there are: three or four
     std::array<int, 4> edges;  ///< start and end of e1, then of e2, among the points
     double share;              ///< of the gap
-    bool turns = false;        ///< false where the frame was a line at the start: Q is the identity
-    /// Its share of the gap at the start in the frame there; zero if it does not turn.
+    bool turns = false;  ///< false where the frame is a line at x_start or x_L: Q is the identity
+    /// Its share of t in the frame at x_L; zero if it does not turn.
     Vec3 a = Vec3::Zero();
 
     /// How often a point counts in e1 or e2: 1 at the end, -1 at the start.
@@ -68,6 +75,10 @@ class FrictionSet {
     Vec3 n;         ///< unit normal at the lag configuration
     double lambda;  ///< normal force at the lag configuration [N]
     double mu;
+    double extension = 0.0;       ///< l, of the gap at the start along n [m]
+    Vec3 s_start = Vec3::Zero();  ///< s at the start
+    /// w there: nothing has slipped if the lag configuration is the start, to the last bit.
+    Vec3 w_start = Vec3::Zero();
     /// Corners of the contact, then the vertices of the frames, which between cloths are corners too.
     std::array<Index, 7> points;
     std::array<double, 7> c;  ///< of the points
@@ -102,6 +113,8 @@ class FrictionSet {
     Vec3 operator*(const Vec3& a) const { return a[0] * e1 + a[1] * e2 + a[2] * m; }
     /// The coordinates of a vector.
     Vec3 coordinates(const Vec3& r) const;
+    /// The dot products with a vector.
+    Vec3 transposed(const Vec3& f) const;
     /// sum_k a_k of the dual vectors.
     Vec3 dual(const Vec3& a) const;
     /// Cotangents of e1 and e2 where f is that of this * a.
@@ -130,6 +143,8 @@ class FrictionSet {
 
   double energy_change(const double* x0, const double* x1) const;
   void add_gradient(const double* x, double* g) const;
+  /// Of one entry, where it has this slip.
+  void add_gradient(const Entry& entry, const Slip& at, double* g) const;
 
   /// Hessian of one entry: B^T core B, where B dx is the change of s, and what a frame's own turning
   /// adds: the cross product with its `turn` between its vertices.
@@ -212,6 +227,17 @@ class FrictionSet {
                     const double* x_lag,
                     std::span<const Tangents> directions,
                     std::span<double* const> y) const;
+
+  /// How the extension of an entry's gap changes: the dot products of all these with the changes of the gap
+  /// t of the lag configuration, of n, of r(x_start), and of the edges of the parts.
+  struct ExtensionDerivative {
+    Vec3 by_t;
+    Vec3 by_n;
+    Vec3 by_r;
+    std::array<std::array<Vec3, 2>, 2> by_lag_edges;
+    std::array<std::array<Vec3, 2>, 2> by_start_edges;
+  };
+  ExtensionDerivative extension_derivative(const Entry& entry, const double* x_lag) const;
 
  private:
   /// What is kept of a point.

@@ -1,7 +1,7 @@
 // How the gradient of lagged friction changes with what it depends on besides x, in the terms of friction_set.h:
 //
-//   grad D = mu lambda q B^T w,   q = f1/|w|,   w = P s,   s = r(x) - E(x) a,
-//   a = E(x_start)^-1 share r(x_start),   of each part.
+//   grad D = mu lambda q B^T w,   q = f1/|w|,   w = P s,   s = r(x) - E(x) a - E_L b,
+//   a = E_L^-1 share t,   b = E(x_start)^-1 share r',   r' = r(x_start) + l n,   of each part.
 //
 // Of each contact everything that belongs to no direction is made once; directions go through the rest side by
 // side: see direction_lanes_impl.h.
@@ -81,25 +81,30 @@ void fill_sliding(const Entry& k, const double* x, const double* x_start, Fricti
   }
 }
 
-/// What the frame of a part makes of the motion of the start.
+/// What the frame of a part makes of the motion of the lag configuration and the start.
 void fill_part(const Entry& k,
                const FrictionSet::GapPart& part,
                const Frame& frame,
                const Vec3& force,
                const double* x_start,
+               const double* x_lag,
                FrameTangent& out) {
   out.edge = part.edges.data();
   out.turns = part.turns;
   out.share = part.share;
   if (!part.turns) return;
   const Frame start(k, part, x_start);
-  const double m_sq = start.m.squaredNorm();
-  copy(start.e2.cross(start.m) / m_sq, out.to_coordinates[0]);
-  copy(start.m.cross(start.e1) / m_sq, out.to_coordinates[1]);
-  copy(start.m / m_sq, out.to_coordinates[2]);
+  const Frame lag(k, part, x_lag);
+  for (int b = 0; b < 3; ++b) {
+    copy(lag.dual(Vec3::Unit(b)), out.to_lag[b]);
+    copy(start.dual(lag.transposed(Vec3::Unit(b))), out.turn[b]);
+  }
   copy(start.e1, out.e1_start);
   copy(start.e2, out.e2_start);
+  copy(lag.e1, out.e1_lag);
+  copy(lag.e2, out.e2_lag);
   copy(part.a, out.a);
+  copy(part.share * start.coordinates(k.gap(x_start) + k.extension * k.n), out.b);
   copy(frame.e1, out.e1);
   copy(frame.e2, out.e2);
   copy(frame.m, out.m);
@@ -113,6 +118,7 @@ class EntryDerivative {
   EntryDerivative(const ContactModel& model,
                   const Entry& entry,
                   const FrictionSet::Slip& at,
+                  const FrictionSet::ExtensionDerivative& by,
                   const double* x,
                   const double* x_start,
                   const double* x_lag)
@@ -140,8 +146,16 @@ class EntryDerivative {
     const Vec3 force = strength * at.force();
     copy(force, kernel.force);
     if (kernel.slides) fill_sliding(entry, x, x_start, kernel);
+    kernel.extension = entry.extension;
+    copy(by.by_t, kernel.extension_by_t);
+    copy(by.by_n, kernel.extension_by_n);
+    copy(by.by_r, kernel.extension_by_r);
     for (int l = 0; l < entry.part_count; ++l) {
-      fill_part(entry, entry.parts[l], at.frames[l], force, x_start, kernel.part[l]);
+      for (int e = 0; e < 2; ++e) {
+        copy(by.by_lag_edges[l][e], kernel.part[l].extension_by_lag[e]);
+        copy(by.by_start_edges[l][e], kernel.part[l].extension_by_start[e]);
+      }
+      fill_part(entry, entry.parts[l], at.frames[l], force, x_start, x_lag, kernel.part[l]);
     }
   }
 
@@ -187,7 +201,8 @@ void FrictionSet::add_tangents(const double* x,
     out.read(y.subspan(first, count));
     std::array<double, kDirectionLanes> by_parameters{};
     for (std::size_t e = 0; e < entries_.size(); ++e) {
-      const EntryDerivative of(*model_, entries_[e], here[e], x, x_start_, x_lag);
+      const EntryDerivative of(*model_, entries_[e], here[e],
+                               extension_derivative(entries_[e], x_lag), x, x_start_, x_lag);
       for (std::size_t l = 0; l < count; ++l) {
         const ContactModel::Bar* const dot = directions[first + l].parameters;
         if (dot != nullptr) by_parameters[l] = of.by_parameters(*dot);

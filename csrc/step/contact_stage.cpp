@@ -127,7 +127,7 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
   };
   const std::vector<Contact>& at_start = sum.contacts_at_start(x);
   keep(0, at_start);
-  sum.lag(at_start);
+  sum.lag(x, at_start);
   if (sum.friction && problem.origins.empty())
     sum.friction->expect(x.data(), problem.coasting().data());
   {
@@ -158,7 +158,7 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
     keep(solves, contacts);
     // Without contact before and after, another solve would be the same one.
     if (!sum.friction && contacts.empty()) break;
-    if (solves < friction_iterations) sum.lag(contacts);
+    if (solves < friction_iterations) sum.lag(x, contacts);
   }
   report_contacts(problem.scene.collision_mesh, sum.contacts(), step.report);
   report_blockers(problem, x, status, step.report);
@@ -167,7 +167,7 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
   if (!step.tape.empty()) *step.tape["solves"] = solves;
   add_forces(problem, sum, x, forces);
   const contact::FrictionSet* const friction = sum.friction ? &sum.friction->set() : nullptr;
-  PairTally(problem, step.report).add(sum.contacts(), sum.lagged(), friction, x);
+  PairTally(problem, step.report).add(sum.contacts(), friction, x);
   step.report.points = contact_points(problem, sum.contacts(), friction, x);
 }
 

@@ -57,9 +57,6 @@ class ContactSum {
     return potentials;
   }
 
-  /// Contacts that friction is taken from.
-  const std::vector<contact::Contact>& lagged() const { return *lagged_; }
-
   /// Let factors have the couplings of all contacts that there may be on the way from a point: patterns
   /// seldom change then, and remain functions of the point and this one.
   void expect_contacts_near(const std::vector<double>& x) {
@@ -70,23 +67,20 @@ class ContactSum {
   }
 
   /// Take friction from the contacts of a configuration.
-  void lag(std::vector<contact::Contact> contacts) {
+  void lag(const std::vector<double>& x, std::vector<contact::Contact> contacts) {
     friction.reset();
     own_lagged_ = std::move(contacts);
-    lag_kept(own_lagged_);
+    lag_kept(x, own_lagged_);
   }
 
   /// The same with contacts that outlive the friction.
-  void lag_kept(const std::vector<contact::Contact>& contacts) {
+  void lag_kept(const std::vector<double>& x, const std::vector<contact::Contact>& contacts) {
     objective.take_friction(nullptr);
     friction.reset();
-    static const std::vector<contact::Contact> none;
-    lagged_ = &none;
     // Where nothing can touch there are no contacts either.
     if (!problem_.contact || contacts.empty()) return;
-    friction.emplace(*problem_.contact, contacts, problem_.moved_from().data(), bar_);
+    friction.emplace(*problem_.contact, contacts, x.data(), problem_.moved_from().data(), bar_);
     objective.take_friction(&*friction);
-    lagged_ = &contacts;
   }
 
   /// Put the tangents of what barrier and friction depend on into them, along each direction.
@@ -116,7 +110,6 @@ class ContactSum {
   contact::ContactModel::Bar* bar_;
   std::optional<contact::ContactPotential> contact_;
   std::vector<contact::Contact> own_lagged_;
-  const std::vector<contact::Contact>* lagged_ = &own_lagged_;
 };
 
 }  // namespace diffcloth::step

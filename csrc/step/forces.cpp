@@ -1,7 +1,6 @@
 #include "step/forces.h"
 
 #include <algorithm>
-#include <optional>
 #include <tuple>
 #include <utility>
 
@@ -73,7 +72,6 @@ void PairTally::add(Index first, Index second, const Vec3& force) {
 }
 
 void PairTally::add(const std::vector<Contact>& contacts,
-                    const std::vector<Contact>& lagged,
                     const contact::FrictionSet* friction,
                     const std::vector<double>& x) {
   if (!problem_.contact) return;
@@ -94,17 +92,15 @@ void PairTally::add(const std::vector<Contact>& contacts,
       for (const Index vertex : c.pair.vertices) take(pair, vertex);
     }
   });
-  for_each_pair(model, lagged, [&](const auto& key, const auto& of_pair) {
-    std::optional<contact::FrictionSet> own;
-    const bool is_only_pair = friction != nullptr && of_pair.size() == lagged.size();
-    if (!is_only_pair) own.emplace(model, of_pair, problem_.moved_from().data());
-    const contact::FrictionSet& set = is_only_pair ? *friction : *own;
-    PairContacts& pair = of(key.first, key.second);
-    set.add_gradient(x.data(), g.data());
-    for (const auto& entry : set.entries()) {
-      for (const Index vertex : entry.all_points()) take(pair, vertex);
-    }
-  });
+  if (friction == nullptr) return;
+  const contact::FrictionSet::Slips& slips = friction->slips(x.data());
+  for (std::size_t k = 0; k < slips.size(); ++k) {
+    const contact::FrictionSet::Entry& entry = friction->entries()[k];
+    const auto [first, second] = surfaces(model, entry.lag);
+    PairContacts& pair = of(first, second);
+    friction->add_gradient(entry, slips[k], g.data());
+    for (const Index vertex : entry.all_points()) take(pair, vertex);
+  }
 }
 
 }  // namespace diffcloth::step

@@ -31,10 +31,8 @@ class PairTally {
   /// Count the contacts of a solution, and add the forces of barrier and friction there.
   ///
   /// @param contacts  at the solution
-  /// @param lagged    those that friction was taken from
-  /// @param friction  of these; null where there are none
+  /// @param friction  of the contacts that it was taken from; null where there are none
   void add(const std::vector<contact::Contact>& contacts,
-           const std::vector<contact::Contact>& lagged,
            const contact::FrictionSet* friction,
            const std::vector<double>& x);
 

@@ -219,3 +219,85 @@ def test_gradients_of_a_grip_that_turns_are_those_of_differences():
             slope = (end(theta + tensor(d)) - end(theta - tensor(d))) / (2 * step)
         assert slope.item() == pytest.approx(found[i].item(), rel=1e-4)
         assert found[i] != 0
+
+
+@pytest.mark.parametrize("gap", [0.002, 0.012, 0.028])
+def test_a_ball_that_strikes_at_a_slant_turns_by_its_radius(gap):
+    """Whatever is left of the gap when the step begins; friction is that of sliding."""
+    radius, mass, inertia, friction, dt = 0.04, 0.3, 0.5, 0.3, 0.01
+    ball = dc.RigidBody.sphere(
+        radius,
+        smooth=True,
+        motion="dynamic",
+        mass=mass,
+        inertia=inertia * np.eye(3),
+        center=[0, 0, 0],
+        friction=friction,
+        pose=[0.001, 0.002, radius + gap, 1, 0, 0, 0],
+    )
+    floor = dc.RigidBody.plane(20.0, friction=friction, pose=[0.013, 0.027, 0, 1, 0, 0, 0])
+    sim = dc.Simulator(
+        dc.Scene([], [ball, floor], gravity=(0, 0, 0)),
+        dt,
+        contact=dc.ContactOptions(barrier_distance=1e-3),
+        solver=dc.SolverOptions(tolerance=1e-9),
+    )
+    state = sim.initial_state()
+    velocities = torch.zeros_like(state.body_velocities)
+    velocities[0] = tensor([5.0, 0, -3.0, 0, 0, 0])
+    state = sim.step(state.replace(body_velocities=velocities))
+    change = state.body_velocities[0] - velocities[0]
+    left = state.body_poses[0, 2].item() - radius
+    assert change[2] > 0.1  # it has struck
+    assert -change[0] == pytest.approx(friction * change[2].item(), rel=1e-2)
+    lever = inertia * change[4] / (mass * -change[0])
+    assert lever == pytest.approx(radius + left, rel=1e-3)
+
+
+@pytest.mark.parametrize("turn", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("smooth", [True, False])
+def test_friction_about_a_body_that_spins_is_that_of_its_radius(smooth, turn):
+    """What a free plate loses at a ball that spins against it, the ball gains."""
+    radius, friction, dt = 0.05, 0.3, 0.01
+    ball = dc.RigidBody.sphere(
+        radius,
+        smooth=smooth,
+        motion="dynamic",
+        density=500.0,
+        friction=friction,
+        pose=[0.001, 0.002, radius + 6e-4, 1, 0, 0, 0],
+    )
+    plate = dc.RigidBody.box(
+        (0.5, 0.5, 0.1),
+        motion="dynamic",
+        density=100.0,
+        friction=friction,
+        pose=[0.013, 0.027, -0.05, 1, 0, 0, 0],
+    )
+    sim = dc.Simulator(
+        dc.Scene([], [ball, plate], gravity=(0, 0, 0)),
+        dt,
+        contact=dc.ContactOptions(barrier_distance=1e-3, friction_iterations=8),
+        solver=dc.SolverOptions(tolerance=1e-9),
+    )
+    state = sim.initial_state()
+    velocities = torch.zeros_like(state.body_velocities)
+    velocities[0] = tensor([0, 0, -0.3, 0, turn / dt, 0])
+    state = state.replace(body_velocities=velocities)
+    masses = sim.parameters().body_mass[:, None]
+    created, taken = torch.zeros(3, dtype=F64), 0.0
+    for _ in range(4):
+        after = sim.step(state)
+        # Angular momentum is about places at the end, where the velocities at the start did not
+        # lead.
+        drift = (
+            dt
+            * masses
+            * torch.linalg.cross(after.body_velocities[:, :3], state.body_velocities[:, :3])
+        )
+        created += (sim.momentum(after) - sim.momentum(state))[3:] - drift.sum(0)
+        taken += abs((after.body_velocities[1, 0] - state.body_velocities[1, 0]).item())
+        state = after
+    taken *= masses[1].item() * radius
+    assert taken > 1e-4
+    assert created.norm() < 1e-6 * taken

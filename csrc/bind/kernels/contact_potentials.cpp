@@ -48,11 +48,12 @@ class Friction {
   Friction(const contact::ContactModel& model,
            const linalg::BlockPattern& pattern,
            std::vector<contact::Contact> lag,
+           const Positions& x_lag,
            const Positions& x_start)
       : pattern_(pattern),
         lag_(std::move(lag)),
         x_start_(x_start),
-        potential_(model, lag_, x_start_.data(), nullptr) {}
+        potential_(model, lag_, x_lag.data(), x_start_.data(), nullptr) {}
   Friction(const Friction&) = delete;
   Friction& operator=(const Friction&) = delete;
 
@@ -158,7 +159,7 @@ class ContactPotential {
                           const Positions& z,
                           double scale) {
     const std::vector<contact::Contact> lag = find(x_lag);
-    const contact::FrictionSet set(model_, lag, x_start.data());
+    const contact::FrictionSet set(model_, lag, x_lag.data(), x_start.data());
     contact::ContactModel::Bar bar(mesh_);
     Values start_bar = Values::Zero(x.size());
     Values lag_bar = Values::Zero(x.size());
@@ -185,7 +186,7 @@ class ContactPotential {
                          const Positions& x,
                          const nb::dict& dot) {
     const std::vector<contact::Contact> lag = find(x_lag);
-    const contact::FrictionSet set(model_, lag, x_start.data());
+    const contact::FrictionSet set(model_, lag, x_lag.data(), x_start.data());
     const contact::ContactModel::Bar parameters = from_dict(dot);
     const auto start = nb::cast<Values>(dot["x_start"]);
     const auto lag_dot = nb::cast<Values>(dot["x_lag"]);
@@ -215,7 +216,7 @@ class ContactPotential {
 
   /// Friction with the contacts of x_lag, of what has moved since x_start.
   std::unique_ptr<Friction> friction(const Positions& x_lag, const Positions& x_start) {
-    return std::make_unique<Friction>(model_, pattern_, find(x_lag), x_start);
+    return std::make_unique<Friction>(model_, pattern_, find(x_lag), x_lag, x_start);
   }
 
   /// A rest measure by its name, to be changed by differences.

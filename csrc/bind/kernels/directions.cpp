@@ -48,12 +48,22 @@ struct Noise {
     fill(of.r_start_beta);
     fill(of.n);
     fill(of.inv_d);
+    fill(of.extension);
+    fill(of.extension_by_t);
+    fill(of.extension_by_n);
+    fill(of.extension_by_r);
     for (contact::FrameTangent& part : of.part) {
       fill(part.share);
       fill(part.a);
+      fill(part.b);
+      fill(part.extension_by_lag);
+      fill(part.extension_by_start);
       fill(part.e1_start);
       fill(part.e2_start);
-      fill(part.to_coordinates);
+      fill(part.e1_lag);
+      fill(part.e2_lag);
+      fill(part.to_lag);
+      fill(part.turn);
       fill(part.e1);
       fill(part.e2);
       fill(part.m);
