@@ -52,7 +52,7 @@ BODIES = {
     "terrain": terrain,
     "slivers": slivers,
     "ball": lambda: ball(0.0),
-    "dented": lambda: ball(0.002),
+    "dented": lambda: ball(0.0025),
 }
 
 

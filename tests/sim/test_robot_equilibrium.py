@@ -140,7 +140,9 @@ def onto_a_sheet(arm, **options):
     robot = arm(stiffness=3.0, damping=1.0, pose=[0, 0, 0.3, 1, 0, 0, 0], **options)
     corners = {"corners": [0, 9, 90, 99]}
     sheet = dc.Cloth.grid(10, 10, (0.5, 0.5), pose=[0.35, 0, 0.15, 1, 0, 0, 0], pins=corners)
-    return dc.Simulator(dc.Scene([sheet], [], [robot]), 0.01, solver=TIGHT)
+    # What slid there is at the edge of its friction: changes of 1e-5 stay within this slip.
+    contact = dc.ContactOptions(slip_velocity=1e-3)
+    return dc.Simulator(dc.Scene([sheet], [], [robot]), 0.01, contact=contact, solver=TIGHT)
 
 
 def test_gradients_of_an_arm_that_presses_on_a_sheet(arm):
