@@ -58,6 +58,8 @@ class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot
     kFirst,
     kKnown,
     kGiven,
+    kTarget,
+    kMetric,
     kReached,
     kContact,
     kKick
@@ -70,7 +72,8 @@ class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot
     const std::size_t V = model.vertex_link.size();
     std::vector<Array> inputs = shared_inputs(model);
     const std::vector<Array> own = {
-        {"root_end", {7}}, {"coordinates", {n}}, {"known", {all}},      {"given", {all}},
+        {"root_end", {7}}, {"coordinates", {n}}, {"known", {all}},
+        {"given", {all}},  {"target", {n}},      {"metric", {n, n}},
         {"reached", {n}},  {"contact", {V, 3}},  {"kick", {V, 3}, true}};
     inputs.insert(inputs.end(), own.begin(), own.end());
     return inputs;
@@ -79,6 +82,22 @@ class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot
   static std::vector<Array> outputs_of(const RobotModel& model) {
     const std::size_t J = model.tree.joint_count;
     return {{"pose", {7}}, {"velocity", {6}}, {"rates", {J}}, {"efforts", {J}}};
+  }
+
+  /// Force and torque at the root for which the solve moved it from the prediction: those of contact, but for
+  /// what the solve leaves of its tolerance, which they would have by the stiffness of contact.
+  template <class T>
+  VectorX<T> on_root(Inputs<T> in) const {
+    const Index n = coordinate_count();
+    VectorX<T> force = VectorX<T>::Zero(kRoot);
+    for (Index i = 0; i < kRoot; ++i) {
+      for (Index j = 0; j < n; ++j) {
+        force[i] += in[kMetric][i * n + j] * (in[kReached][j] - in[kTarget][j]);
+      }
+    }
+    const Vector3<T> moment = force.template tail<3>();
+    force.template tail<3>() = torque_from_moment<T>(vector3(in[kReached] + 3), moment);
+    return force;
   }
 
   /// Velocities nu at the end of a step, from those over it; puts the efforts that held joints.
@@ -97,7 +116,13 @@ class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot
     VectorX<T> nu = over;
     if (!solved_.empty()) {
       const VectorX<T> momentum = rates<T>(model_.tree, inertia, placed, over).momentum;
-      const VectorX<T> change = middle.momentum + T(0.5 * h) * middle.slope + impulse - momentum;
+      VectorX<T> change = middle.momentum + T(0.5 * h) * middle.slope + impulse - momentum;
+      if (floats_) {
+        // Of the whole robot: what joints exert on each other moves it nowhere.
+        const VectorX<T> outside =
+            vector(in[kGiven], size()) + T(h) * middle.slope + impulse - momentum;
+        change.template head<kRoot>() = outside.template head<kRoot>() + T(h) * on_root(in);
+      }
       const MatrixX<T> mass = mass_matrix<T>(model_.tree, inertia, placed);
       const VectorX<T> by = solve(pick<T>(mass, solved_), pick<T>(change, solved_));
       for (std::size_t i = 0; i < solved_.size(); ++i) {

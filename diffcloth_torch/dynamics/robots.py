@@ -24,6 +24,10 @@ of contact, give this effort from the change of momentum:
 
     M(q_n+1) nu_n+1 - M(q_n) nu_n = h (s(q_mid, nu) + tau(q_n) + f(q_n+1) + tau_c).
 
+The rows of a floating root are those of the whole robot, without any tau_c: they say what nu_n+1 is
+there, with the f for which the solve moved the root from the prediction. The metric of the solve is
+not M all along the way, and what joints exert on each other would move the robot by what it differs.
+
 **Drives.** A joint under `pd` adds to the objective, with q_n its value at the start of the step,
 
     1/2 kp (q - q_t)^2 + kd/(2h) (q - q_n - h qd_t)^2 + d/(2h) (q - q_n)^2,
@@ -309,6 +313,8 @@ class RobotDynamics:
             "coordinates": prediction.coordinates,
             "known": prediction.known,
             "given": prediction.given,
+            "target": prediction.target,
+            "metric": prediction.metric,
             "reached": coordinates,
             "contact": contact,
         }

@@ -70,7 +70,7 @@ def test_forces_of_cloth_box_and_gripper_cancel(coupling, base, friction):
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_a_floating_gripper_takes_up_the_impulse_of_contact(coupling):
-    """Up to terms of first order in the time step, half a percent here."""
+    """To rounding, whatever its joints do."""
     sim, state = coupled_scenes.in_contact(coupling, "floating")
     given, control = coupled_scenes.parameters(sim), coupled_scenes.control(sim)
     weight = given.link_mass.sum() * given.gravity
@@ -86,7 +86,8 @@ def test_a_floating_gripper_takes_up_the_impulse_of_contact(coupling):
             pushed = sum(wrench[:3] for name, wrench in wrenches.items() if "hand" in name)
             gained = (momentum(after) - momentum(state)) / DT
             missing = gained - pushed - weight - control.base_wrenches[0, :3]
-            assert missing.norm() < 5e-3 * pushed.norm()
+            assert pushed.norm() > 0.01
+            assert missing.norm() < EXACT
             state = after
 
 
@@ -194,3 +195,47 @@ def test_boxes_that_collide_keep_their_momentum(friction):
         assert ((mass * state.body_velocities[:, :3]).sum(0) - first).abs().max() < EXACT
         touched += bool(state.body_forces.any())
     assert touched
+
+
+SWIMMER = """<robot name="swimmer">
+<link name="trunk"><inertial><mass value="1"/>
+<inertia ixx="1e-3" iyy="2e-3" izz="1.5e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="arm"><inertial><origin xyz=".2 .01 .03"/><mass value=".8"/>
+<inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="fin"><inertial><origin xyz=".1 0 0"/><mass value=".3"/>
+<inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="shoulder" type="revolute"><parent link="trunk"/><child link="arm"/>
+<axis xyz="0 .2 1"/><limit lower="-3" upper="1.2" effort="4" velocity="6"/></joint>
+<joint name="wrist" type="revolute"><parent link="arm"/><child link="fin"/>
+<origin xyz=".3 0 0"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="0"/></joint>
+</robot>"""
+
+
+@pytest.mark.parametrize("actuation", ["pd", ("pd", "position"), ("torque", "velocity")])
+def test_a_robot_in_empty_space_swims_nowhere(tmp_path, actuation):
+    """Strokes that are not the same there and back, into limits of efforts, speeds and joints."""
+    path = tmp_path / "swimmer.urdf"
+    path.write_text(SWIMMER)
+    robot = dc.Robot.load(
+        path, base="floating", actuation=actuation, stiffness=50.0, damping=1.0, name="r"
+    )
+    scene = dc.Scene([], robots=[robot], gravity=(0, 0, 0))
+    spun = []
+    for dt in (0.02, 0.01):
+        sim = dc.Simulator(scene, dt, solver=dc.SolverOptions(tolerance=1e-10))
+        state = sim.initial_state()
+        largest = 0.0
+        for k in range(round(2.0 / dt)):
+            stroke = [[1.2, 0.6], [-1.0, 0.6], [1.2, -0.4], [0.0, 0.0]][int(k * dt / 0.5)]
+            turn = torch.tensor(stroke, dtype=F64)
+            control = dc.Control(
+                joint_positions=turn, joint_velocities=0.2 * turn, joint_efforts=turn
+            )
+            state = sim.step(state, control)
+            linear, angular = sim.momentum(state).split(3)
+            assert linear.abs().max() < EXACT
+            largest = max(largest, angular.norm().item())
+        spun.append(largest)
+    # Angular momentum to the order of the step, beside .05 of a stroke.
+    assert spun[0] < 1e-3
+    assert spun[1] < 0.7 * spun[0]
