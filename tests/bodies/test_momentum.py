@@ -207,7 +207,8 @@ SWIMMER = """<robot name="swimmer">
 <joint name="shoulder" type="revolute"><parent link="trunk"/><child link="arm"/>
 <axis xyz="0 .2 1"/><limit lower="-3" upper="1.2" effort="4" velocity="6"/></joint>
 <joint name="wrist" type="revolute"><parent link="arm"/><child link="fin"/>
-<origin xyz=".3 0 0"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="0"/></joint>
+<origin xyz=".3 0 0"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="1" velocity="0"/></joint>
 </robot>"""
 
 
