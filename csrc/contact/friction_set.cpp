@@ -87,16 +87,8 @@ Vec3 change_of_slip(const Entry& k, const std::array<Frame, 2>& frames, const do
   return change;
 }
 
-/// Q v, from the start to x.
-Vec3 turned(const Entry& k, const Vec3& v, const double* x_start, const double* x) {
-  Vec3 result = Vec3::Zero();
-  for (int l = 0; l < k.part_count; ++l) {
-    const GapPart& part = k.parts[l];
-    const Vec3 own =
-        part.turns ? Vec3(Frame(k, part, x) * Frame(k, part, x_start).coordinates(v)) : v;
-    result += part.share * own;
-  }
-  return result;
+std::array<Vec3, 2> sum(const std::array<Vec3, 2>& a, const std::array<Vec3, 2>& b) {
+  return {a[0] + b[0], a[1] + b[1]};
 }
 
 /// The matrix of v -> u x v.
@@ -113,6 +105,18 @@ Vec3 FrictionSet::Entry::gap(const double* rows) const {
     if (c[i] != 0.0) r += c[i] * (row(rows, points[i]) - origin);
   }
   return r;
+}
+
+Vec3 FrictionSet::Entry::turned(const Vec3& v) const {
+  Vec3 result = Vec3::Zero();
+  for (int l = 0; l < part_count; ++l) result += parts[l].share * (parts[l].turn * v);
+  return result;
+}
+
+Vec3 FrictionSet::Entry::turned_back(const Vec3& v) const {
+  Vec3 result = Vec3::Zero();
+  for (int l = 0; l < part_count; ++l) result += parts[l].share * (parts[l].turn.transpose() * v);
+  return result;
 }
 
 void FrictionSet::Entry::add_edges(const GapPart& part,
@@ -151,6 +155,12 @@ Vec3 FrictionSet::Frame::transposed(const Vec3& f) const {
   return {e1.dot(f), e2.dot(f), m.dot(f)};
 }
 
+Mat3 FrictionSet::Frame::turn_to(const Frame& other) const {
+  return (other.e1 * e2.cross(m).transpose() + other.e2 * m.cross(e1).transpose() +
+          other.m * m.transpose()) /
+         m.squaredNorm();
+}
+
 std::array<Vec3, 2> FrictionSet::Frame::pull_back(const Vec3& a, const Vec3& f) const {
   return {a[0] * f + a[2] * e2.cross(f), a[1] * f + a[2] * f.cross(e1)};
 }
@@ -181,20 +191,26 @@ FrictionSet::FrictionSet(const ContactModel& model,
     } else {
       turn_with(model.frame(k.pair), entry);
     }
+    std::array<Frame, 2> starts;
     for (int l = 0; l < entry.part_count; ++l) {
       GapPart& part = entry.parts[l];
       const Frame lag(entry, part, x_lag);
-      part.turns = !Frame(entry, part, x_start).is_line() && !lag.is_line();
-      if (part.turns) part.a = part.share * lag.coordinates(k.closest.t);
+      const Frame& start = starts[l] = Frame(entry, part, x_start);
+      part.turns = !start.is_line() && !lag.is_line();
+      if (!part.turns) continue;
+      part.a = part.share * lag.coordinates(k.closest.t);
+      part.turn = start.turn_to(lag);
     }
     const Vec3 r = entry.gap(x_start);
-    const double along = entry.n.dot(turned(entry, entry.n, x_start, x_lag));
-    entry.extension =
-        (d - entry.n.dot(turned(entry, r, x_start, x_lag))) / std::max(along, kLeastAlong);
-    entry.s_start = r - turned(entry, r + entry.extension * entry.n, x_start, x_lag);
+    const double along = entry.n.dot(entry.turned(entry.n));
+    entry.extension = (d - entry.n.dot(entry.turned(r))) / std::max(along, kLeastAlong);
+    const Vec3 longer = r + entry.extension * entry.n;
+    entry.s_start = r - entry.turned(longer);
     for (int l = 0; l < entry.part_count; ++l) {
-      const GapPart& part = entry.parts[l];
-      entry.s_start -= Frame(entry, part, x_start) * part.a;
+      GapPart& part = entry.parts[l];
+      if (!part.turns) continue;
+      part.b = part.share * starts[l].coordinates(longer);
+      entry.s_start -= starts[l] * part.a;
     }
     const bool is_start = std::ranges::all_of(
         entry.all_points(), [&](Index v) { return row(x_lag, v) == row(x_start, v); });
@@ -531,43 +547,37 @@ void pull_back_gap(const Closest& geometry, const Vec3& t_bar, const Vec4& c_bar
 
 }  // namespace
 
-// With what the lag configuration has marked by L, Q = E_L E(x_start)^-1, and r" = r' but for a frame that turns
-// so far that n . Q n has its least value, where it is r(x_start):
+// With what the lag configuration has marked by L, Q = E_L E(x_start)^-1 of each part, and r" = r' but for a frame
+// that turns so far that n . Q n has its least value, where it is r(x_start):
 //
 //   l max(n . Q n, 1/2) = d - n . Q r(x_start)
 //   dl = (n . dt - dn . (Q r" + l Q^T n) - n . Q dr - n . dQ r") / (n . Q n),   dr of r(x_start),
-//   n . dQ r" = n . dE_L a" - E(x_start)^-T E_L^T n . dE(x_start) a"
+//   n . dQ r" = n . dE_L b" - Q^T n . dE(x_start) b",   b" = E(x_start)^-1 share r",
 //
 // without the term l Q^T n in the second case.
 FrictionSet::ExtensionDerivative FrictionSet::extension_derivative(const Entry& k,
                                                                    const double* x_lag) const {
   const Vec3& n = k.n;
-  const double along = n.dot(turned(k, n, x_start_, x_lag));
-  const bool is_exact = along >= kLeastAlong;
-  const double scale = 1.0 / std::max(along, kLeastAlong);
+  const Vec3 turned = k.turned(n);
+  const Vec3 back = k.turned_back(n);
+  const bool is_exact = n.dot(turned) >= kLeastAlong;
+  const double scale = 1.0 / std::max(n.dot(turned), kLeastAlong);
   const double extension = is_exact ? k.extension : 0.0;
-  const Vec3 r = k.gap(x_start_) + extension * n;
 
   ExtensionDerivative by;
-  Vec3 back = Vec3::Zero();  // Q^T n
   for (int l = 0; l < k.part_count; ++l) {
     const GapPart& part = k.parts[l];
     by.by_lag_edges[l].fill(Vec3::Zero());
     by.by_start_edges[l].fill(Vec3::Zero());
-    if (!part.turns) {
-      back += part.share * n;
-      continue;
-    }
-    const Frame lag(k, part, x_lag);
+    if (!part.turns) continue;
     const Frame start(k, part, x_start_);
-    const Vec3 a = part.share * start.coordinates(r);
-    const Vec3 n_back = start.dual(lag.transposed(n));
-    back += part.share * n_back;
-    by.by_lag_edges[l] = lag.pull_back(-scale * a, n);
-    by.by_start_edges[l] = start.pull_back(scale * a, n_back);
+    Vec3 b = part.b;
+    if (!is_exact) b -= part.share * start.coordinates(k.extension * n);
+    by.by_lag_edges[l] = Frame(k, part, x_lag).pull_back(-scale * b, n);
+    by.by_start_edges[l] = start.pull_back(scale * b, part.turn.transpose() * n);
   }
   by.by_t = scale * n;
-  by.by_n = -scale * (turned(k, r, x_start_, x_lag) + extension * back);
+  by.by_n = -scale * (k.turned(k.gap(x_start_) + extension * n) + extension * back);
   by.by_r = -scale * back;
   return by;
 }
@@ -577,12 +587,13 @@ FrictionSet::ExtensionDerivative FrictionSet::extension_derivative(const Entry& 
 //
 //   dphi/dw    = mu lambda (q zeta + f2 (w . zeta) w) =: omega      (f2 = q'/y)
 //   dphi/ds    = P omega,   dphi/dn = -(n.s) omega - (n.omega) s,   dphi/dzeta = mu lambda q w =: eta
-//   dphi/da    = -E^T P omega - E'^T eta,   dphi/dt = share y,   y = E_L^-T dphi/da
-//   dphi/db    = -E_L^T P omega,   dphi/dr' = g = share E(x_start)^-T dphi/db
-//   dphi/dl    = n . g,   dphi/dn += l g,   dphi/dr(x_start) = g + (n . g) dl/dr =: h
+//   dphi/da = -E^T P omega - E'^T eta,   dphi/dt = share y + beta n,   y = E_L^-T dphi/da
+//   dphi/d(Q r') = -V = -(P omega + beta n),   beta = -(P omega) . Q n / (n . Q n) by what l does
+//   dphi/dr(x_start) = -Q^T V =: h,   dphi/dn += l h - beta Q r'
 //   dphi/dc_i  = (P omega) . x_i + eta . z_i + h . x_start_i,   dphi/dx_start = c_i h
 //
-// less what the edges of frames have in E_L a, E_L b and E(x_start) b, and what l has of them,
+// less what the edges of frames have in E_L a, Q b and E(x_start) b; where n . Q n has its least value, l does not
+// change with it (see extension_derivative()),
 // and the lag configuration moves c through d(beta) = J dx, n through dn = P dt / d with
 // dt = sum c_i dx_i + s d(beta), and lambda as pull_back_lambda() says.
 void FrictionSet::add_mixed(const double* x,
@@ -627,51 +638,43 @@ void FrictionSet::add_mixed(const double* x,
     const Vec3 omega = strength * (law.f1_over_y * zeta + law.f2 * w_zeta * at.w);
     const Vec3 eta = (strength * law.f1_over_y) * at.w;
     const Vec3 s_bar = tangential(omega, k.n);
-    Vec3 g = Vec3::Zero();
-    Vec3 t_bar = Vec3::Zero();
-    const Vec3 longer = k.gap(x_start_) + k.extension * k.n;
+    const Vec3 n_turned = k.turned(k.n);
+    const double along = k.n.dot(n_turned);
+    const double beta = -s_bar.dot(n_turned) / std::max(along, kLeastAlong);
+    const Vec3 V = s_bar + beta * k.n;
+    const Vec3 h = -k.turned_back(V);
+    Vec3 n_bar = -k.n.dot(at.s) * omega - k.n.dot(omega) * at.s + k.extension * h -
+                 beta * k.turned(k.gap(x_start_) + k.extension * k.n);
+    Vec3 t_bar = beta * k.n;
     for (int l = 0; l < k.part_count; ++l) {
       const GapPart& part = k.parts[l];
-      if (!part.turns) {
-        g -= part.share * s_bar;
-        continue;
-      }
+      if (!part.turns) continue;
       const Frame& frame = at.frames[l];
       const Frame& change = changes[l];
-      const Vec3 a_bar(-frame.e1.dot(s_bar) - change.e1.dot(eta),
-                       -frame.e2.dot(s_bar) - change.e2.dot(eta),
-                       -frame.m.dot(s_bar) - change.m.dot(eta));
       const Frame lag_frame(k, part, x_lag);
       const Frame start(k, part, x_start_);
-      const Vec3 y = lag_frame.dual(a_bar);
-      const Vec3 b = part.share * start.coordinates(longer);
-      const Vec3 r_bar = start.dual(lag_frame.transposed(-s_bar));
+      const Vec3 y = lag_frame.dual(Vec3(-frame.transposed(s_bar) - change.transposed(eta)));
       t_bar += part.share * y;
-      g += part.share * r_bar;
-      k.add_edges(part, lag_frame.pull_back(-scale * part.a, y), lag_bar);
-      k.add_edges(part, lag_frame.pull_back(-scale * b, s_bar), lag_bar);
-      k.add_edges(part, start.pull_back(-scale * b, r_bar), start_bar);
+      std::array<Vec3, 2> lag_edges = lag_frame.pull_back(-scale * part.a, y);
+      lag_edges = sum(lag_edges, lag_frame.pull_back(-scale * part.b, V));
+      std::array<Vec3, 2> start_edges = start.pull_back(scale * part.b, part.turn.transpose() * V);
+      if (along < kLeastAlong) {
+        const Vec3 b = (scale * beta * part.share) * start.coordinates(k.extension * k.n);
+        lag_edges = sum(lag_edges, lag_frame.pull_back(b, k.n));
+        start_edges = sum(start_edges, start.pull_back(-b, part.turn.transpose() * k.n));
+      }
+      k.add_edges(part, lag_edges, lag_bar);
+      k.add_edges(part, start_edges, start_bar);
     }
-    const ExtensionDerivative by = extension_derivative(k, x_lag);
-    const double extension_bar = k.n.dot(g);
-    for (int l = 0; l < k.part_count; ++l) {
-      const auto scaled = [&](const std::array<Vec3, 2>& edges) -> std::array<Vec3, 2> {
-        return {scale * extension_bar * edges[0], scale * extension_bar * edges[1]};
-      };
-      k.add_edges(k.parts[l], scaled(by.by_lag_edges[l]), lag_bar);
-      k.add_edges(k.parts[l], scaled(by.by_start_edges[l]), start_bar);
-    }
-    const Vec3 n_bar =
-        -k.n.dot(at.s) * omega - k.n.dot(omega) * at.s + k.extension * g + extension_bar * by.by_n;
-    t_bar += tangential(n_bar, k.n) / d + extension_bar * by.by_t;
-    g += extension_bar * by.by_r;
+    if (along < kLeastAlong) n_bar += (k.extension * beta) * (n_turned + k.turned_back(k.n));
+    t_bar += tangential(n_bar, k.n) / d;
     Vec4 c_bar;
     for (int i = 0; i < 4; ++i) {
       const auto from_first = [&](const double* rows) -> Vec3 {
         return row(rows, v[i]) - row(rows, v[0]);
       };
-      c_bar[i] = s_bar.dot(from_first(x)) + eta.dot(from_first(z)) + g.dot(from_first(x_start_));
-      Eigen::Map<Vec3>(start_bar + 3 * v[i]) += scale * geometry.c[i] * g;
+      c_bar[i] = s_bar.dot(from_first(x)) + eta.dot(from_first(z)) + h.dot(from_first(x_start_));
+      Eigen::Map<Vec3>(start_bar + 3 * v[i]) += scale * geometry.c[i] * h;
     }
     pull_back_gap(geometry, t_bar, c_bar, x_bar);
     for (int i = 0; i < 4; ++i) {

@@ -61,8 +61,10 @@ class FrictionSet {
     std::array<int, 4> edges;  ///< start and end of e1, then of e2, among the points
     double share;              ///< of the gap
     bool turns = false;  ///< false where the frame is a line at x_start or x_L: Q is the identity
-    /// Its share of t in the frame at x_L; zero if it does not turn.
+    /// Its share of t in the frame at x_L, and of r' in that at the start; zero if it does not turn.
     Vec3 a = Vec3::Zero();
+    Vec3 b = Vec3::Zero();
+    Mat3 turn = Mat3::Identity();  ///< Q from the start to x_L
 
     /// How often a point counts in e1 or e2: 1 at the end, -1 at the start.
     int sign(int e, int point) const {
@@ -96,6 +98,10 @@ class FrictionSet {
       return row(rows, points[part.edges[2 * e + 1]]) - row(rows, points[part.edges[2 * e]]);
     }
 
+    /// Q v from the start to x_L, and Q^T v.
+    Vec3 turned(const Vec3& v) const;
+    Vec3 turned_back(const Vec3& v) const;
+
     /// sum_i c_i of some rows, which no translation changes: from the first point, as that cancels less.
     Vec3 gap(const double* rows) const;
 
@@ -117,6 +123,8 @@ class FrictionSet {
     Vec3 transposed(const Vec3& f) const;
     /// sum_k a_k of the dual vectors.
     Vec3 dual(const Vec3& a) const;
+    /// The matrix that takes e1, e2 and m to those of another frame.
+    Mat3 turn_to(const Frame& other) const;
     /// Cotangents of e1 and e2 where f is that of this * a.
     std::array<Vec3, 2> pull_back(const Vec3& a, const Vec3& f) const;
 

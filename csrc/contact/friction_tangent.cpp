@@ -96,15 +96,18 @@ void fill_part(const Entry& k,
   const Frame start(k, part, x_start);
   const Frame lag(k, part, x_lag);
   for (int b = 0; b < 3; ++b) {
-    copy(lag.dual(Vec3::Unit(b)), out.to_lag[b]);
-    copy(start.dual(lag.transposed(Vec3::Unit(b))), out.turn[b]);
+    copy(part.turn.row(b), out.turn[b]);
   }
+  const double m_sq = lag.m.squaredNorm();
+  copy(lag.e2.cross(lag.m) / m_sq, out.to_lag[0]);
+  copy(lag.m.cross(lag.e1) / m_sq, out.to_lag[1]);
+  copy(lag.m / m_sq, out.to_lag[2]);
   copy(start.e1, out.e1_start);
   copy(start.e2, out.e2_start);
   copy(lag.e1, out.e1_lag);
   copy(lag.e2, out.e2_lag);
   copy(part.a, out.a);
-  copy(part.share * start.coordinates(k.gap(x_start) + k.extension * k.n), out.b);
+  copy(part.b, out.b);
   copy(frame.e1, out.e1);
   copy(frame.e2, out.e2);
   copy(frame.m, out.m);
