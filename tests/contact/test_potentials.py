@@ -376,6 +376,23 @@ def test_friction_has_no_couple(name, angle, amount):
     np.testing.assert_allclose(couple, 0, atol=1e-12 * np.abs(g).sum())
 
 
+@pytest.mark.parametrize(("degrees", "face"), [(8, True), (25, True), (30, False), (70, False)])
+def test_gaps_between_edges_turn_with_a_face_where_these_are_nearly_parallel(degrees, face):
+    """A face takes the couple of friction about the gap with its third vertex, too."""
+    edge = np.array([[-0.22, 0, 0], [0.22, 0, 0], [0.02, 0.01, 0.3]])
+    angle = np.radians(degrees)
+    turned = edge @ trimesh.transformations.rotation_matrix(angle, [0, 0, 1])[:3, :3].T
+    other = edge * [1, -1, -1] - [0, 0, 0.05]
+    faces = np.array([[0, 1, 2]])
+    scene = contact_scenes.stack([(edge, turned, faces), (edge, other, faces)], [])
+    scene.kappa = np.full((2, 2), 3.0)
+    x = scene.x.copy()
+    x[:3] += [0.01, 0.02, 0]
+    g = scene.potential().friction(scene.x, scene.x).gradient(x)
+    assert np.abs(g[:2]).max() > 1e-6
+    assert np.abs(g[5]).any() == face
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_energies_are_comparable_between_positions(name):
     """Entry by entry they change no more than the positions do."""
