@@ -315,6 +315,20 @@ def test_nothing_is_expected_where_all_sticks():
     np.testing.assert_array_equal(positive, exact)
 
 
+@pytest.mark.parametrize("name", ["pinned_under_a_body", "on_a_capsule", "boxes_aslant"])
+def test_nothing_is_expected_of_bodies_that_forces_move(name):
+    """What they hold often sticks, wherever inertia alone would take it."""
+    scene = contact_scenes.make(name)
+    friction = scene.potential(slip=1e-6).friction(scene.x, scene.x)
+    slide = np.zeros_like(scene.x)
+    slide[scene.surface == 0] = [2e-3, 1e-3, 0.0]
+    assert np.abs(friction.gradient(scene.x + slide)).max() > 1e-4  # it would slide
+    exact = friction.hessian(scene.x)
+    expects, h, _ = friction.expecting(scene.x, scene.x + slide)
+    assert not expects
+    np.testing.assert_array_equal(h, exact)
+
+
 def test_duals_remember_the_other_side_of_a_kink():
     """A slip that turns round: no curvature along it, but twice the majorant's with duals."""
     scene = contact_scenes.make("two_cloths")
