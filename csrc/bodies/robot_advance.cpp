@@ -84,8 +84,10 @@ class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot
     return {{"pose", {7}}, {"velocity", {6}}, {"rates", {J}}, {"efforts", {J}}};
   }
 
-  /// Force and torque at the root for which the solve moved it from the prediction: those of contact, but for
-  /// what the solve leaves of its tolerance, which they would have by the stiffness of contact.
+  /// Force and torque at the root for which the solve moved it from the prediction: minus the gradient of all that
+  /// acts on the surfaces of the robot, contact and attachments, at a minimizer. What the tolerance leaves of the
+  /// residual is part of it, as velocities by momentum are then those by places; forces of contact would have it
+  /// times their stiffness.
   template <class T>
   VectorX<T> on_root(Inputs<T> in) const {
     const Index n = coordinate_count();
@@ -117,11 +119,15 @@ class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot
     if (!solved_.empty()) {
       const VectorX<T> momentum = rates<T>(model_.tree, inertia, placed, over).momentum;
       VectorX<T> change = middle.momentum + T(0.5 * h) * middle.slope + impulse - momentum;
-      if (floats_) {
-        // Of the whole robot: what joints exert on each other moves it nowhere.
-        const VectorX<T> outside =
-            vector(in[kGiven], size()) + T(h) * middle.slope + impulse - momentum;
-        change.template head<kRoot>() = outside.template head<kRoot>() + T(h) * on_root(in);
+      if (floats_ && !model_.is_at_rest) {
+        // Of the whole robot, which what joints exert on each other gives none. Its angular momentum is about a
+        // center that moves past the momentum that is given; the levers of all other forces are those of the end.
+        const Vector3<T> given = vector3(in[kGiven]);
+        const Vector3<T> velocity = over.template head<3>();
+        VectorX<T> outside = vector(in[kGiven], kRoot) + T(h) * on_root(in);
+        outside.template tail<3>() += T(h) * given.cross(velocity);
+        change.template head<kRoot>() =
+            outside + impulse.template head<kRoot>() - momentum.template head<kRoot>();
       }
       const MatrixX<T> mass = mass_matrix<T>(model_.tree, inertia, placed);
       const VectorX<T> by = solve(pick<T>(mass, solved_), pick<T>(change, solved_));

@@ -266,11 +266,11 @@ void FrictionPotential::accumulate(const double* x, const double* z) {
   const std::size_t size = 3 * static_cast<std::size_t>(set_.model().mesh().vertex_count);
   start_bar.resize(size, 0.0);
   lag_bar.resize(size, 0.0);
-  set_.add_mixed(x, z, x_lag_, -1.0, bar_, start_bar.data(), lag_bar.data());
+  set_.add_mixed(x, z, -1.0, bar_, start_bar.data(), lag_bar.data());
 }
 
 void FrictionPotential::add_tangents(const double* x, std::span<double* const> y) const {
-  set_.add_tangents(x, x_lag_, directions_, y);
+  set_.add_tangents(x, directions_, y);
 }
 
 }  // namespace diffcloth::contact

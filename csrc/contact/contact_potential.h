@@ -135,15 +135,15 @@ class ContactPotential final : public TouchingPotential {
 class FrictionPotential final : public TouchingPotential {
  public:
   /// @param contacts  of the lag configuration; they outlive the potential
-  /// @param x_lag     positions of the lag configuration
-  /// @param x_start   positions at the start of the step; they outlive the potential
+  /// @param x_start   positions at the start of the step; likewise
+  /// @param x_lag     those of the lag configuration, which accumulate() and add_tangents() read again
   /// @param bar       where accumulate() adds what parameters get; null where nobody asks for it
   FrictionPotential(const ContactModel& model,
                     const std::vector<Contact>& contacts,
-                    const double* x_lag,
                     const double* x_start,
+                    const double* x_lag,
                     ContactModel::Bar* bar)
-      : set_(model, contacts, x_lag, x_start), bar_(bar) {}
+      : set_(model, contacts, x_start, x_lag), bar_(bar) {}
 
   double energy(const double* /*x*/) const override { return 0.0; }
   double energy_change(const double* x, const double* to) const override {
@@ -179,9 +179,6 @@ class FrictionPotential final : public TouchingPotential {
     directions_ = std::move(directions);
   }
 
-  /// Where the lag configuration lies: accumulate() and add_tangents() need it.
-  void set_lag(const double* x_lag) { x_lag_ = x_lag; }
-
   const FrictionSet& set() const { return set_; }
 
   std::vector<double> start_bar;  ///< of x_start, all vertices; empty until accumulate()
@@ -189,7 +186,6 @@ class FrictionPotential final : public TouchingPotential {
 
  private:
   FrictionSet set_;
-  const double* x_lag_ = nullptr;
   ContactModel::Bar* bar_;
   std::vector<FrictionSet::Tangents> directions_;
 };

@@ -17,7 +17,7 @@ constexpr double kLine = 1e-24;
 /// Duals that are all this close to the forces at the point are of no further use: Newton's method converges.
 constexpr double kClose = 0.1;
 /// How much of the normal is along itself at least where it turns with the gap: no gap gets longer than by
-/// twice what it lacks, however the frame of a cloth turns in a step.
+/// twice what it lacks, however its frame turns in a step. The slip has a kink there in x_start and x_lag.
 constexpr double kLeastAlong = 0.5;
 /// Squared sine of the angle from which on two edges cross.
 constexpr double kCrossing = 0.2;
@@ -167,9 +167,9 @@ std::array<Vec3, 2> FrictionSet::Frame::pull_back(const Vec3& a, const Vec3& f) 
 
 FrictionSet::FrictionSet(const ContactModel& model,
                          const std::vector<Contact>& contacts,
-                         const double* x_lag,
-                         const double* x_start)
-    : model_(&model), x_start_(x_start) {
+                         const double* x_start,
+                         const double* x_lag)
+    : model_(&model), x_start_(x_start), x_lag_(x_lag) {
   entries_.reserve(contacts.size());
   for (const Contact& k : contacts) {
     const double d = std::sqrt(k.closest.d_sq);
@@ -186,7 +186,7 @@ FrictionSet::FrictionSet(const ContactModel& model,
     const double share = model.first_share(k.pair);
     if (share > 0.0) {
       turn_with_both(model, share, entry);
-    } else if (model.between_cloths(k.pair) && crosses(k.pair, x_start)) {
+    } else if (model.between_cloths(k.pair) && crosses(k.pair, x_start) && crosses(k.pair, x_lag)) {
       turn_with_edges(entry);
     } else {
       turn_with(model.frame(k.pair), entry);
@@ -555,8 +555,7 @@ void pull_back_gap(const Closest& geometry, const Vec3& t_bar, const Vec4& c_bar
 //   n . dQ r" = n . dE_L b" - Q^T n . dE(x_start) b",   b" = E(x_start)^-1 share r",
 //
 // without the term l Q^T n in the second case.
-FrictionSet::ExtensionDerivative FrictionSet::extension_derivative(const Entry& k,
-                                                                   const double* x_lag) const {
+FrictionSet::ExtensionDerivative FrictionSet::extension_derivative(const Entry& k) const {
   const Vec3& n = k.n;
   const Vec3 turned = k.turned(n);
   const Vec3 back = k.turned_back(n);
@@ -573,7 +572,7 @@ FrictionSet::ExtensionDerivative FrictionSet::extension_derivative(const Entry& 
     const Frame start(k, part, x_start_);
     Vec3 b = part.b;
     if (!is_exact) b -= part.share * start.coordinates(k.extension * n);
-    by.by_lag_edges[l] = Frame(k, part, x_lag).pull_back(-scale * b, n);
+    by.by_lag_edges[l] = Frame(k, part, x_lag_).pull_back(-scale * b, n);
     by.by_start_edges[l] = start.pull_back(scale * b, part.turn.transpose() * n);
   }
   by.by_t = scale * n;
@@ -598,7 +597,6 @@ FrictionSet::ExtensionDerivative FrictionSet::extension_derivative(const Entry& 
 // dt = sum c_i dx_i + s d(beta), and lambda as pull_back_lambda() says.
 void FrictionSet::add_mixed(const double* x,
                             const double* z,
-                            const double* x_lag,
                             double scale,
                             ContactModel::Bar* bar,
                             double* start_bar,
@@ -631,7 +629,7 @@ void FrictionSet::add_mixed(const double* x,
       model_->pull_back_mu(lag.pair, scale * mu_bar, *bar);
     }
 
-    Vec12 x_bar = pull_back_lambda(*model_, lag, x_lag, lambda_bar, scale, bar);
+    Vec12 x_bar = pull_back_lambda(*model_, lag, x_lag_, lambda_bar, scale, bar);
 
     // The frame at the start, c and n.
     const double strength = k.mu * k.lambda;
@@ -651,7 +649,7 @@ void FrictionSet::add_mixed(const double* x,
       if (!part.turns) continue;
       const Frame& frame = at.frames[l];
       const Frame& change = changes[l];
-      const Frame lag_frame(k, part, x_lag);
+      const Frame lag_frame(k, part, x_lag_);
       const Frame start(k, part, x_start_);
       const Vec3 y = lag_frame.dual(Vec3(-frame.transposed(s_bar) - change.transposed(eta)));
       t_bar += part.share * y;

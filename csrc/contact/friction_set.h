@@ -44,12 +44,12 @@ class FrictionSet {
   FrictionSet() = default;
 
   /// @param contacts  the contacts of the lag configuration; they outlive this object
-  /// @param x_lag     positions of the lag configuration
-  /// @param x_start   positions at the start of the step; they outlive this object
+  /// @param x_start   positions at the start of the step; likewise
+  /// @param x_lag     those of the lag configuration, which add_mixed() and add_tangents() read again
   FrictionSet(const ContactModel& model,
               const std::vector<Contact>& contacts,
-              const double* x_lag,
-              const double* x_start);
+              const double* x_start,
+              const double* x_lag);
 
   const ContactModel& model() const { return *model_; }
   bool empty() const { return entries_.empty(); }
@@ -214,10 +214,9 @@ class FrictionSet {
 
   /// d/d(theta) of phi = z . grad D, times scale: into `bar` for the parameters (friction, slip,
   /// and, through lambda, kappa, d_hat, thickness, rest shape) unless it is null, into `start_bar` for
-  /// x_start, and into `lag_bar` for the lag configuration's positions `x_lag`.
+  /// x_start, and into `lag_bar` for x_lag.
   void add_mixed(const double* x,
                  const double* z,
-                 const double* x_lag,
                  double scale,
                  ContactModel::Bar* bar,
                  double* start_bar,
@@ -232,7 +231,6 @@ class FrictionSet {
 
   /// y += d/d(theta) (grad D) theta_dot along each direction: add_mixed(), transposed.
   void add_tangents(const double* x,
-                    const double* x_lag,
                     std::span<const Tangents> directions,
                     std::span<double* const> y) const;
 
@@ -245,7 +243,6 @@ class FrictionSet {
     std::array<std::array<Vec3, 2>, 2> by_lag_edges;
     std::array<std::array<Vec3, 2>, 2> by_start_edges;
   };
-  ExtensionDerivative extension_derivative(const Entry& entry, const double* x_lag) const;
 
  private:
   /// What is kept of a point.
@@ -253,6 +250,7 @@ class FrictionSet {
     std::vector<Vec3> place;  ///< of points_; empty where nothing is known
     Slips slips;
   };
+  ExtensionDerivative extension_derivative(const Entry& entry) const;
   bool is_at(const std::vector<Vec3>& place, const double* x) const;
   void take_place(const double* x, std::vector<Vec3>& place) const;
   Slip slip(const Entry& entry, const double* x) const;
@@ -261,6 +259,7 @@ class FrictionSet {
 
   const ContactModel* model_ = nullptr;
   const double* x_start_ = nullptr;
+  const double* x_lag_ = nullptr;
   std::vector<Entry> entries_;
   mutable std::array<Kept, 2> kept_;
   mutable std::size_t last_ = 0;  // of these

@@ -183,7 +183,6 @@ class EntryDerivative {
 }  // namespace
 
 void FrictionSet::add_tangents(const double* x,
-                               const double* x_lag,
                                std::span<const Tangents> directions,
                                std::span<double* const> y) const {
   const Slips& here = slips(x);
@@ -204,8 +203,8 @@ void FrictionSet::add_tangents(const double* x,
     out.read(y.subspan(first, count));
     std::array<double, kDirectionLanes> by_parameters{};
     for (std::size_t e = 0; e < entries_.size(); ++e) {
-      const EntryDerivative of(*model_, entries_[e], here[e],
-                               extension_derivative(entries_[e], x_lag), x, x_start_, x_lag);
+      const EntryDerivative of(*model_, entries_[e], here[e], extension_derivative(entries_[e]), x,
+                               x_start_, x_lag_);
       for (std::size_t l = 0; l < count; ++l) {
         const ContactModel::Bar* const dot = directions[first + l].parameters;
         if (dot != nullptr) by_parameters[l] = of.by_parameters(*dot);

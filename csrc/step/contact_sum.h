@@ -79,7 +79,7 @@ class ContactSum {
     friction.reset();
     // Where nothing can touch there are no contacts either.
     if (!problem_.contact || contacts.empty()) return;
-    friction.emplace(*problem_.contact, contacts, x.data(), problem_.moved_from().data(), bar_);
+    friction.emplace(*problem_.contact, contacts, problem_.moved_from().data(), x.data(), bar_);
     objective.take_friction(&*friction);
   }
 

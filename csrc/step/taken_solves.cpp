@@ -40,7 +40,6 @@ void TakenSolves::stand(std::size_t k) {
   x_lag_ = at(k);
   x_ = at(k + 1);
   sum_.lag_kept(x_lag_, contacts_at(k, x_lag_));
-  if (sum_.friction) sum_.friction->set_lag(x_lag_.data());
   sum_.adopt(contacts_at(k + 1, x_));
   step_.problem.coordinates.stand_at(x_.data());
   const std::size_t place = first_factor_ + k;

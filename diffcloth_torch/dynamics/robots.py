@@ -26,7 +26,7 @@ of contact, give this effort from the change of momentum:
 
 The rows of a floating root are those of the whole robot, without any tau_c: they say what nu_n+1 is
 there, with the f for which the solve moved the root from the prediction. The metric of the solve is
-not M all along the way, and by what it differs the joints would move the robot as a whole.
+not M all along the way, and by what it differs the joints would give the robot momentum.
 
 **Drives.** A joint under `pd` adds to the objective, with q_n its value at the start of the step,
 

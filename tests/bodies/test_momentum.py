@@ -203,7 +203,8 @@ SWIMMER = """<robot name="swimmer">
 <link name="arm"><inertial><origin xyz=".2 .01 .03"/><mass value=".8"/>
 <inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>
 <link name="fin"><inertial><origin xyz=".1 0 0"/><mass value=".3"/>
-<inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><origin xyz=".1 0 0"/><geometry><box size=".1 .06 .04"/></geometry></collision></link>
 <joint name="shoulder" type="revolute"><parent link="trunk"/><child link="arm"/>
 <axis xyz="0 .2 1"/><limit lower="-3" upper="1.2" effort="4" velocity="6"/></joint>
 <joint name="wrist" type="revolute"><parent link="arm"/><child link="fin"/>
@@ -212,31 +213,70 @@ SWIMMER = """<robot name="swimmer">
 </robot>"""
 
 
-@pytest.mark.parametrize("actuation", ["pd", ("pd", "position"), ("torque", "velocity")])
-def test_a_robot_in_empty_space_swims_nowhere(tmp_path, actuation):
-    """Strokes that are not the same there and back, into limits of efforts, speeds and joints."""
+def swimmer(tmp_path, dt, bodies=(), **options):
     path = tmp_path / "swimmer.urdf"
     path.write_text(SWIMMER)
-    robot = dc.Robot.load(
-        path, base="floating", actuation=actuation, stiffness=50.0, damping=1.0, name="r"
+    robot = dc.Robot.load(path, base="floating", stiffness=50.0, damping=1.0, name="r", **options)
+    return dc.Simulator(
+        dc.Scene([], bodies, [robot], gravity=(0, 0, 0)),
+        dt,
+        contact=dc.ContactOptions(barrier_distance=2e-3, friction_iterations=8),
+        solver=dc.SolverOptions(tolerance=1e-10),
     )
-    scene = dc.Scene([], robots=[robot], gravity=(0, 0, 0))
-    spun = []
+
+
+def center_of_mass(sim, state):
+    given = sim.parameters()
+    frames = torch.stack(list(sim.link_poses(state).values()))
+    places = (frames[:, :3, :3] @ given.link_center[..., None])[..., 0] + frames[:, :3, 3]
+    return (given.link_mass[:, None] * places).sum(0) / given.link_mass.sum()
+
+
+def stroke(time):
+    """Not the same there and back, into limits of efforts, speeds and joints."""
+    turn = torch.tensor([[1.2, 0.6], [-1.0, 0.6], [1.2, -0.4], [0.0, 0.0]][int(time / 0.5)])
+    turn = turn.to(F64)
+    return dc.Control(joint_positions=turn, joint_velocities=0.2 * turn, joint_efforts=turn)
+
+
+@pytest.mark.parametrize("actuation", ["pd", ("pd", "position"), ("torque", "velocity")])
+def test_a_robot_in_empty_space_keeps_its_momentum(tmp_path, actuation):
+    """All six numbers; its center of mass goes astray by what the metric of a solve is off."""
+    astray = []
     for dt in (0.02, 0.01):
-        sim = dc.Simulator(scene, dt, solver=dc.SolverOptions(tolerance=1e-10))
+        sim = swimmer(tmp_path, dt, actuation=actuation)
         state = sim.initial_state()
-        largest = 0.0
+        start, center = sim.momentum(state), center_of_mass(sim, state)
         for k in range(round(2.0 / dt)):
-            stroke = [[1.2, 0.6], [-1.0, 0.6], [1.2, -0.4], [0.0, 0.0]][int(k * dt / 0.5)]
-            turn = torch.tensor(stroke, dtype=F64)
-            control = dc.Control(
-                joint_positions=turn, joint_velocities=0.2 * turn, joint_efforts=turn
-            )
-            state = sim.step(state, control)
-            linear, angular = sim.momentum(state).split(3)
-            assert linear.abs().max() < EXACT
-            largest = max(largest, angular.norm().item())
-        spun.append(largest)
-    # Angular momentum to the order of the step, beside .05 of a stroke.
-    assert spun[0] < 1e-3
-    assert spun[1] < 0.7 * spun[0]
+            state = sim.step(state, stroke(k * dt))
+            assert (sim.momentum(state) - start).abs().max() < EXACT
+        astray.append((center_of_mass(sim, state) - center).norm().item())
+    assert astray[0] < 0.025
+    assert astray[1] < 0.25 * astray[0]
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_a_robot_that_strikes_a_box_keeps_their_momentum(tmp_path, friction):
+    box = dc.RigidBody.box(
+        (0.1, 0.2, 0.1),
+        motion="dynamic",
+        density=100.0,
+        friction=friction,
+        pose=[0.4, 0.15, 0.01, 1, 0.1, 0.05, -0.1],
+    )
+    sim = swimmer(tmp_path, 0.01, [box], friction=friction)
+    state = sim.initial_state()
+    thrown = torch.tensor([[0.1, -0.5, 0.05, 1.0, 2.0, -3.0]], dtype=F64)
+    state = state.replace(body_velocities=thrown)
+    mass, touched = sim.parameters().body_mass[0], False
+    for k in range(60):
+        after = sim.step(state, stroke(k * 0.01))
+        # Bodies have their momentum about places at the end.
+        was, now = state.body_velocities[0, :3], after.body_velocities[0, :3]
+        change = sim.momentum(after) - sim.momentum(state)
+        change[3:] -= 0.01 * mass * cross(now, was)
+        assert change.abs().max() < 1e-7
+        touched = touched or after.report.contact_count > 0
+        state = after
+    assert touched
+    assert (state.body_velocities - thrown).norm() > 0.05

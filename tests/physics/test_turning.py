@@ -171,7 +171,8 @@ def test_two_boxes_that_spin_as_one_keep_their_spin(barrier_distance):
     assert rates[0] == pytest.approx(rates[1].item(), abs=1e-3)
 
 
-def test_gradients_of_a_grip_that_turns_are_those_of_differences():
+@pytest.mark.parametrize("turn", [0.2, 0.8])
+def test_gradients_of_a_grip_that_turns_are_those_of_differences(turn):
     """Of where a box ends that slips a little, by the turn, the pressing pose and friction."""
     d_hat = 2e-3
     x = 0.025 + 0.01 + 0.5 * d_hat
@@ -211,7 +212,7 @@ def test_gradients_of_a_grip_that_turns_are_those_of_differences():
             + (state.body_velocities[1:] * tensor([1, -2, 3, 0.1, 0.2, 0.3])).sum()
         )
 
-    theta = tensor([0.2, 0.05, 0.3]).requires_grad_()
+    theta = tensor([turn, 0.05, 0.3]).requires_grad_()
     (found,) = torch.autograd.grad(end(theta), theta)
     for i, step in enumerate((1e-6, 1e-5, 1e-5)):
         d = step * np.eye(3)[i]

@@ -405,3 +405,41 @@ def test_what_a_hand_holds_by_friction_stays_in_it(table):
         wrenches = simulator.contact_wrenches(state)
         hold = wrenches["hand/left_finger"][2] + wrenches["hand/right_finger"][2]
         assert hold == pytest.approx(-0.048 * 9.81, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "actuation", [("pd", "position"), ("position", "pd"), ("position", "position")]
+)
+def test_efforts_of_an_arm_that_hangs_follow_its_targets(arm, actuation):
+    """A floating base, which nothing but springs holds: its rows of momentum say nothing there."""
+    points = [
+        [0.02, 0.015, 0.015],
+        [0.28, 0.015, -0.015],
+        [0.15, -0.015, 0.015],
+        [0.1, 0.01, -0.01],
+    ]
+    robot = arm(base="floating", actuation=actuation, stiffness=30.0, damping=1.0)
+    springs = dc.Attachment(("arm/upper", points), stiffness=300.0, name="hang")
+    sim = dc.Simulator(
+        dc.Scene([], [], [robot], attachments=[springs]),
+        0.01,
+        contact=dc.ContactOptions(barrier_distance=2e-3),
+        solver=TIGHT,
+    )
+    start = sim.initial_state()
+    frame = sim.link_poses(start)["arm/upper"]
+    held = torch.tensor(points, dtype=F64) @ frame[:3, :3].T + frame[:3, 3]
+    held = held + torch.tensor([0, 0, 0.02], dtype=F64)
+
+    def efforts(targets):
+        control = dc.Control(joint_positions=targets, attachments={"hang": held})
+        return sim.equilibrium(start, control).joint_efforts
+
+    targets, step = torch.tensor([0.3, -0.5], dtype=F64), 1e-4
+    found = torch.autograd.functional.jacobian(efforts, targets)
+    with torch.no_grad():
+        ways = step * torch.eye(2, dtype=F64)
+        columns = [(efforts(targets + w) - efforts(targets - w)) / (2 * step) for w in ways]
+    expected = torch.stack(columns, 1)
+    assert expected.abs().max() > 0.1
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)

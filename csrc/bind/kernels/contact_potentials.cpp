@@ -48,12 +48,13 @@ class Friction {
   Friction(const contact::ContactModel& model,
            const linalg::BlockPattern& pattern,
            std::vector<contact::Contact> lag,
-           const Positions& x_lag,
-           const Positions& x_start)
+           const Positions& x_start,
+           const Positions& x_lag)
       : pattern_(pattern),
         lag_(std::move(lag)),
         x_start_(x_start),
-        potential_(model, lag_, x_lag.data(), x_start_.data(), nullptr) {}
+        x_lag_(x_lag),
+        potential_(model, lag_, x_start_.data(), x_lag_.data(), nullptr) {}
   Friction(const Friction&) = delete;
   Friction& operator=(const Friction&) = delete;
 
@@ -82,6 +83,7 @@ class Friction {
   const linalg::BlockPattern& pattern_;
   std::vector<contact::Contact> lag_;
   Rows3 x_start_;
+  Rows3 x_lag_;
   contact::FrictionPotential potential_;
 };
 
@@ -159,11 +161,11 @@ class ContactPotential {
                           const Positions& z,
                           double scale) {
     const std::vector<contact::Contact> lag = find(x_lag);
-    const contact::FrictionSet set(model_, lag, x_lag.data(), x_start.data());
+    const contact::FrictionSet set(model_, lag, x_start.data(), x_lag.data());
     contact::ContactModel::Bar bar(mesh_);
     Values start_bar = Values::Zero(x.size());
     Values lag_bar = Values::Zero(x.size());
-    set.add_mixed(x.data(), z.data(), x_lag.data(), scale, &bar, start_bar.data(), lag_bar.data());
+    set.add_mixed(x.data(), z.data(), scale, &bar, start_bar.data(), lag_bar.data());
     nb::dict result = to_dict(bar);
     result["x_start"] = start_bar;
     result["x_lag"] = lag_bar;
@@ -186,7 +188,7 @@ class ContactPotential {
                          const Positions& x,
                          const nb::dict& dot) {
     const std::vector<contact::Contact> lag = find(x_lag);
-    const contact::FrictionSet set(model_, lag, x_lag.data(), x_start.data());
+    const contact::FrictionSet set(model_, lag, x_start.data(), x_lag.data());
     const contact::ContactModel::Bar parameters = from_dict(dot);
     const auto start = nb::cast<Values>(dot["x_start"]);
     const auto lag_dot = nb::cast<Values>(dot["x_lag"]);
@@ -194,7 +196,7 @@ class ContactPotential {
     const std::array<contact::FrictionSet::Tangents, 1> directions{
         {{.parameters = &parameters, .start = start.data(), .lag = lag_dot.data()}}};
     const std::array out{y.data()};
-    set.add_tangents(x.data(), x_lag.data(), directions, out);
+    set.add_tangents(x.data(), directions, out);
     return y;
   }
 
@@ -216,7 +218,7 @@ class ContactPotential {
 
   /// Friction with the contacts of x_lag, of what has moved since x_start.
   std::unique_ptr<Friction> friction(const Positions& x_lag, const Positions& x_start) {
-    return std::make_unique<Friction>(model_, pattern_, find(x_lag), x_lag, x_start);
+    return std::make_unique<Friction>(model_, pattern_, find(x_lag), x_start, x_lag);
   }
 
   /// A rest measure by its name, to be changed by differences.
