@@ -120,12 +120,12 @@ class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot
       const VectorX<T> momentum = rates<T>(model_.tree, inertia, placed, over).momentum;
       VectorX<T> change = middle.momentum + T(0.5 * h) * middle.slope + impulse - momentum;
       if (floats_ && !model_.is_at_rest) {
-        // Of the whole robot, which what joints exert on each other gives none. Its angular momentum is about a
-        // center that moves past the momentum that is given; the levers of all other forces are those of the end.
-        const Vector3<T> given = vector3(in[kGiven]);
-        const Vector3<T> velocity = over.template head<3>();
+        // Of the whole robot, which what joints exert on each other gives none. The angular momentum is about a
+        // center that moves past the momentum.
         VectorX<T> outside = vector(in[kGiven], kRoot) + T(h) * on_root(in);
-        outside.template tail<3>() += T(h) * given.cross(velocity);
+        const Vector3<T> linear = outside.template head<3>();
+        const Vector3<T> velocity = over.template head<3>();
+        outside.template tail<3>() += T(h) * linear.cross(velocity);
         change.template head<kRoot>() =
             outside + impulse.template head<kRoot>() - momentum.template head<kRoot>();
       }
