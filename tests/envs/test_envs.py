@@ -85,11 +85,13 @@ def test_gradients_of_a_return_are_those_of_differences(name):
     direction = torch.randn(leaf.shape, generator=noise, dtype=torch.float64)
     # Not beyond the limits of actions, where they are cut.
     direction = direction * (leaf.detach().abs() < 0.95)
-    eps = 1e-6
+    expected = float((gradient * direction).sum())
+    errors = []
     with torch.no_grad():
-        ahead, behind = (total(leaf + sign * eps * direction) for sign in (1, -1))
-    slope = float(ahead - behind) / (2 * eps)
-    assert float((gradient * direction).sum()) == pytest.approx(slope, rel=2e-4, abs=1e-7)
+        for eps in (1e-6, 1e-7):  # kinks want smaller steps, rounding wants larger ones
+            ahead, behind = (total(leaf + sign * eps * direction) for sign in (1, -1))
+            errors.append(abs(float(ahead - behind) / (2 * eps) - expected))
+    assert min(errors) < max(2e-4 * abs(expected), 1e-7)
     assert float(gradient.norm()) > 0
 
 
