@@ -165,24 +165,22 @@ std::array<Vec3, 2> FrictionSet::Frame::pull_back(const Vec3& a, const Vec3& f) 
   return {a[0] * f + a[2] * e2.cross(f), a[1] * f + a[2] * f.cross(e1)};
 }
 
+FrictionSet::Entry::Entry(const Contact& contact, double coefficient)
+    : lag(contact), mu(coefficient) {
+  const double d = std::sqrt(lag.closest.d_sq);
+  n = lag.closest.t / d;
+  lambda = -lag.kappa * lag.weight * lag.mollifier * lag.barrier.b1 * 2.0 * d;
+}
+
 FrictionSet::FrictionSet(const ContactModel& model,
                          const std::vector<Contact>& contacts,
                          const double* x_start,
                          const double* x_lag)
     : model_(&model), x_start_(x_start), x_lag_(x_lag) {
   entries_.reserve(contacts.size());
+  Index last = -1;
   for (const Contact& k : contacts) {
-    const double d = std::sqrt(k.closest.d_sq);
-    Entry entry{.lag = k,
-                .n = k.closest.t / d,
-                .lambda = -k.kappa * k.weight * k.mollifier * k.barrier.b1 * 2.0 * d,
-                .mu = model.mu(k.pair),
-                .points = {},
-                .c = {},
-                .frame = 0,
-                .count = 0,
-                .part_count = 0,
-                .parts = {}};
+    Entry& entry = entries_.emplace_back(k, model.mu(k.pair));
     const double share = model.first_share(k.pair);
     if (share > 0.0) {
       turn_with_both(model, share, entry);
@@ -203,7 +201,8 @@ FrictionSet::FrictionSet(const ContactModel& model,
     }
     const Vec3 r = entry.gap(x_start);
     const double along = entry.n.dot(entry.turned(entry.n));
-    entry.extension = (d - entry.n.dot(entry.turned(r))) / std::max(along, kLeastAlong);
+    entry.extension =
+        (std::sqrt(k.closest.d_sq) - entry.n.dot(entry.turned(r))) / std::max(along, kLeastAlong);
     const Vec3 longer = r + entry.extension * entry.n;
     entry.s_start = r - entry.turned(longer);
     for (int l = 0; l < entry.part_count; ++l) {
@@ -215,12 +214,15 @@ FrictionSet::FrictionSet(const ContactModel& model,
     const bool is_start = std::ranges::all_of(
         entry.all_points(), [&](Index v) { return row(x_lag, v) == row(x_start, v); });
     if (!is_start) entry.w_start = tangential(entry.s_start, entry.n);
-    entries_.push_back(entry);
-    points_.insert(points_.end(), entry.points.begin(), entry.points.begin() + entry.count);
+    last = std::max(last, std::ranges::max(entry.all_points()));
   }
-  std::ranges::sort(points_);
-  const auto repeated = std::ranges::unique(points_);
-  points_.erase(repeated.begin(), repeated.end());
+  std::vector<char> takes_part(static_cast<std::size_t>(last) + 1, 0);
+  for (const Entry& k : entries_) {
+    for (const Index v : k.all_points()) takes_part[v] = 1;
+  }
+  for (Index v = 0; v <= last; ++v) {
+    if (takes_part[v] != 0) points_.push_back(v);
+  }
 }
 
 bool FrictionSet::is_at(const std::vector<Vec3>& place, const double* x) const {

@@ -73,21 +73,24 @@ class FrictionSet {
   };
 
   struct Entry {
+    /// A contact of the lag configuration, which nothing turns with yet.
+    Entry(const Contact& contact, double coefficient);
+
     const Contact& lag;
-    Vec3 n;         ///< unit normal at the lag configuration
-    double lambda;  ///< normal force at the lag configuration [N]
+    Vec3 n;               ///< unit normal at the lag configuration
+    double lambda = 0.0;  ///< normal force at the lag configuration [N]
     double mu;
     double extension = 0.0;       ///< l, of the gap at the start along n [m]
     Vec3 s_start = Vec3::Zero();  ///< s at the start
     /// w there: nothing has slipped if the lag configuration is the start, to the last bit.
     Vec3 w_start = Vec3::Zero();
     /// Corners of the contact, then the vertices of the frames, which between cloths are corners too.
-    std::array<Index, 7> points;
-    std::array<double, 7> c;  ///< of the points
-    int frame;                ///< where the frames' vertices begin
-    int count;                ///< of the points: the frames' three to six are the last
-    int part_count;           ///< one or two
-    std::array<GapPart, 2> parts;
+    std::array<Index, 7> points = {};
+    std::array<double, 7> c = {};  ///< of the points
+    int frame = 0;                 ///< where the frames' vertices begin
+    int count = 0;                 ///< of the points: the frames' three to six are the last
+    int part_count = 0;            ///< one or two
+    std::array<GapPart, 2> parts = {};
 
     std::span<const Index> all_points() const {
       return {points.data(), static_cast<std::size_t>(count)};
