@@ -329,9 +329,13 @@ def test_nothing_is_expected_of_bodies_that_forces_move(name):
     np.testing.assert_array_equal(h, exact)
 
 
-def test_duals_remember_the_other_side_of_a_kink():
-    """A slip that turns round: no curvature along it, but twice the majorant's with duals."""
-    scene = contact_scenes.make("two_cloths")
+@pytest.mark.parametrize("name", ["two_cloths", "on_a_lump", "on_relief"])
+def test_duals_remember_the_other_side_of_a_kink(name):
+    """A slip that turns round: no curvature along it, but twice the majorant's with duals.
+
+    The majorant is without contacts whose weight is negative, from which duals would take.
+    """
+    scene = contact_scenes.make(name)
     potential = scene.potential(slip=1e-6)
     slide = np.zeros_like(scene.x)
     slide[scene.surface == 0] = [2e-3, 1e-3, 0.0]
@@ -390,21 +394,58 @@ def test_friction_has_no_couple(name, angle, amount):
     np.testing.assert_allclose(couple, 0, atol=1e-12 * np.abs(g).sum())
 
 
-@pytest.mark.parametrize(("degrees", "face"), [(8, True), (25, True), (30, False), (70, False)])
-def test_gaps_between_edges_turn_with_a_face_where_these_are_nearly_parallel(degrees, face):
-    """A face takes the couple of friction about the gap with its third vertex, too."""
+@pytest.mark.parametrize(
+    ("start", "lag", "face"),
+    [
+        (8, 8, True),
+        (25, 25, True),
+        (30, 30, False),
+        (70, 70, False),
+        (25, 70, True),
+        (70, 25, True),
+        (30, 70, False),
+    ],
+)
+def test_gaps_between_edges_turn_with_a_face_where_these_are_nearly_parallel(start, lag, face):
+    """A face takes the couple of friction about the gap with its third vertex, too.
+
+    It is that where edges cross at angles of `start` and `lag` degrees, and either is small.
+    """
     edge = np.array([[-0.22, 0, 0], [0.22, 0, 0], [0.02, 0.01, 0.3]])
-    angle = np.radians(degrees)
-    turned = edge @ trimesh.transformations.rotation_matrix(angle, [0, 0, 1])[:3, :3].T
     other = edge * [1, -1, -1] - [0, 0, 0.05]
     faces = np.array([[0, 1, 2]])
-    scene = contact_scenes.stack([(edge, turned, faces), (edge, other, faces)], [])
-    scene.kappa = np.full((2, 2), 3.0)
+
+    def at(degrees):
+        turn = trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 0, 1])
+        scene = contact_scenes.stack(
+            [(edge, edge @ turn[:3, :3].T, faces), (edge, other, faces)], []
+        )
+        scene.kappa = np.full((2, 2), 3.0)
+        return scene
+
+    scene = at(lag)
     x = scene.x.copy()
     x[:3] += [0.01, 0.02, 0]
-    g = scene.potential().friction(scene.x, scene.x).gradient(x)
+    g = scene.potential().friction(scene.x, at(start).x).gradient(x)
     assert np.abs(g[:2]).max() > 1e-6
     assert np.abs(g[5]).any() == face
+
+
+@pytest.mark.parametrize("where", ["start", "lag"])
+def test_a_face_that_is_a_line_turns_no_gap(where):
+    """Its vertices do not say how it turns; friction there goes without."""
+    edge = np.array([[-0.22, 0, 0], [0.22, 0, 0], [0.02, 0.01, 0.3]])
+    faces = np.array([[0, 1, 2]])
+    below = edge * [1, -1, -1]
+    scene = contact_scenes.stack([(edge, edge, faces), (below, below - [0, 0, 0.05], faces)], [])
+    scene.kappa = np.full((2, 2), 3.0)
+    flat = scene.x.copy()
+    flat[5] = 0.5 * (flat[3] + flat[4])
+    start, lag = (flat, scene.x) if where == "start" else (scene.x, flat)
+    friction = scene.potential(slip=1e-9).friction(lag, start)
+    g = friction.gradient(start + np.array([0.01, 0.02, 0.03]))
+    assert np.abs(g).max() > 1e-6
+    np.testing.assert_allclose(g.sum(axis=0), 0, atol=1e-13)
 
 
 @pytest.mark.parametrize("name", NAMES)
