@@ -486,8 +486,9 @@ The differentiable cloth of Newton (`pip install newton`) on the same processor 
 substeps in single precision, with penalties where a vertex meets a body. Both simulate 15 frames at
 60 Hz from the same start; `python -m benchmarks.peers` describes how. Times are processor times of
 a frame. `gradient` is the error of each gradient against differences of its own loss; where
-vertices bounce, differences of Newton's loss depend on their step. `depth` is the largest depth of
-the sheet inside the body."""
+vertices bounce, differences of Newton's loss depend on their step. Those of ours are the gradient
+as long as they do not cross to another minimum of a step ([Branches](notes/branches.md)), which on
+the sphere may be as near as 1e-7 m/s. `depth` is the largest depth of the sheet inside the body."""
 
 
 def _peer_table(rows: list[Records]) -> str:

@@ -36,7 +36,7 @@ SCENES = ("hanging", "plane", "sphere")
 DT = 1 / 60  # [s]
 FRAMES = 15
 REPEATS = 3
-DIFFERENCE_STEPS = (1e-3, 1e-4, 1e-5, 1e-6)  # of velocities [m/s]
+DIFFERENCE_STEPS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)  # of velocities [m/s]
 SINGLE_DIFFERENCE_STEPS = (1e-1, 3e-2, 1e-2, 3e-3)  # in single precision
 MATERIAL = dc.Material(friction=0.4)
 CONTACT_DAMPING = 0.1  # of the peer's penalty [N s/m]: a third of critical, one vertex on it
