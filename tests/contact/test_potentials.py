@@ -394,6 +394,17 @@ def test_friction_has_no_couple(name, angle, amount):
     np.testing.assert_allclose(couple, 0, atol=1e-12 * np.abs(g).sum())
 
 
+def edge_to_edge(degrees):
+    """Two triangles whose first edges cross at an angle, one above the other."""
+    edge = np.array([[-0.22, 0, 0], [0.22, 0, 0], [0.02, 0.01, 0.3]])
+    faces = np.array([[0, 1, 2]])
+    turn = trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 0, 1])[:3, :3]
+    other = edge * [1, -1, -1] - [0, 0, 0.05]
+    scene = contact_scenes.stack([(edge, edge @ turn.T, faces), (edge, other, faces)], [])
+    scene.kappa = np.full((2, 2), 3.0)
+    return scene
+
+
 @pytest.mark.parametrize(
     ("start", "lag", "face"),
     [
@@ -411,22 +422,10 @@ def test_gaps_between_edges_turn_with_a_face_where_these_are_nearly_parallel(sta
 
     It is that where edges cross at angles of `start` and `lag` degrees, and either is small.
     """
-    edge = np.array([[-0.22, 0, 0], [0.22, 0, 0], [0.02, 0.01, 0.3]])
-    other = edge * [1, -1, -1] - [0, 0, 0.05]
-    faces = np.array([[0, 1, 2]])
-
-    def at(degrees):
-        turn = trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 0, 1])
-        scene = contact_scenes.stack(
-            [(edge, edge @ turn[:3, :3].T, faces), (edge, other, faces)], []
-        )
-        scene.kappa = np.full((2, 2), 3.0)
-        return scene
-
-    scene = at(lag)
+    scene = edge_to_edge(lag)
     x = scene.x.copy()
     x[:3] += [0.01, 0.02, 0]
-    g = scene.potential().friction(scene.x, at(start).x).gradient(x)
+    g = scene.potential().friction(scene.x, edge_to_edge(start).x).gradient(x)
     assert np.abs(g[:2]).max() > 1e-6
     assert np.abs(g[5]).any() == face
 
@@ -434,11 +433,7 @@ def test_gaps_between_edges_turn_with_a_face_where_these_are_nearly_parallel(sta
 @pytest.mark.parametrize("where", ["start", "lag"])
 def test_a_face_that_is_a_line_turns_no_gap(where):
     """Its vertices do not say how it turns; friction there goes without."""
-    edge = np.array([[-0.22, 0, 0], [0.22, 0, 0], [0.02, 0.01, 0.3]])
-    faces = np.array([[0, 1, 2]])
-    below = edge * [1, -1, -1]
-    scene = contact_scenes.stack([(edge, edge, faces), (below, below - [0, 0, 0.05], faces)], [])
-    scene.kappa = np.full((2, 2), 3.0)
+    scene = edge_to_edge(0)
     flat = scene.x.copy()
     flat[5] = 0.5 * (flat[3] + flat[4])
     start, lag = (flat, scene.x) if where == "start" else (scene.x, flat)
