@@ -9,9 +9,10 @@
 Where cloth buckles a step has several minima. Which one it ends in shall be a function of its start
 that does not flip with the last bits: gradients, optimizers and differences all rest on that. So
 the states of a trajectory are recorded, and each is stepped again from starts whose vertices differ
-at random, all by the same size, which is drawn between `--least` and `--most` for each start. A
-jump is an end with a vertex more than 0.1 mm away from where the recorded start ends. Ordinary ends
-differ by a few times what their starts do (`growth`, the median).
+at random, all by the same size, which is drawn between `--least` and `--most` for each start. In
+`held-or-moved` the starts are equal, and a body that is held still in one moves by that size in the
+other. A jump is an end with a vertex more than 0.1 mm away from where the recorded start ends.
+Ordinary ends differ by a few times what their starts do (`growth`, the median).
 
 jumps       starts that end elsewhere, of all
 failed      of these and of the recorded states, those whose step does not converge; none is a jump
@@ -47,11 +48,13 @@ class Trial:
         scene: By the number of vertices a side.
         dt: Time step [s].
         tolerance: Of the solver [m/s].
+        nudged: Whether the ends of the bodies' motions differ, instead of the starts of the cloths.
     """
 
     scene: Callable[[int], Scene]
     dt: float = DT
     tolerance: float = dc.SolverOptions().tolerance
+    nudged: bool = False
 
     def simulator(self, scene: Scene) -> dc.Simulator:
         return dc.Simulator(
@@ -82,10 +85,23 @@ def thrown(n: int, stretch: float = dc.Material().stretch) -> Scene:
     return Scene(dc.Scene([cloth], [ball]), approach=6, speed=(0.5, 0.2, -1.0))
 
 
+def draped(n: int) -> Scene:
+    """Lay a damped sheet of .5 m over a dented ellipsoid, a kinematic body that is held still."""
+    vertices, faces = sheet(n)
+    ball = dc.RigidBody.sphere(0.12)
+    shape = np.array(ball.vertices) * (1.0, 1.0, 1.6)
+    shape += np.random.default_rng(0).uniform(-0.002, 0.002, shape.shape)
+    placed = 0.5 * vertices + (0.0, 0.0, shape[:, 2].max() + 0.02)
+    cloth = dc.Cloth(placed, faces, material=dc.Material(damping=0.01))
+    body = dc.RigidBody(shape, np.array(ball.faces), motion="kinematic")
+    return Scene(dc.Scene([cloth], [body]), approach=0)
+
+
 TRIALS: dict[str, Trial] = {
     "thrown": Trial(thrown, 1 / 60),
     "thrown-1e-9": Trial(thrown, 1 / 60, 1e-9),
     "thrown-stiff": Trial(lambda n: thrown(n, 1e4), 1 / 60),
+    "held-or-moved": Trial(draped, nudged=True, tolerance=1e-10),
     **{name: Trial(SCENES[name]) for name in ("sphere", "self-contact", "two-sheets")},
     **{name: Trial(scene) for name, scene in BUCKLING.items()},
 }
@@ -153,6 +169,13 @@ def record(simulator: dc.Simulator, scene: Scene, steps: int, kept: Path | None)
     return states
 
 
+def nudged(state: dc.State, shift: torch.Tensor) -> dc.Control:
+    """Move the bodies from where they are by next to nothing [m]."""
+    poses = state.body_poses.clone()
+    poses[:, :3] += shift
+    return dc.Control(body_poses=poses)
+
+
 def count_jumps(
     name: str,
     size: int,
@@ -179,8 +202,11 @@ def count_jumps(
                 # All that a start draws, whatever becomes of it: others do not depend on that.
                 distance = np.exp(random.uniform(*np.log(range_of_sizes)))
                 noise = torch.from_numpy(random.uniform(-1, 1, tuple(state.positions.shape)))
-                beside = state.replace(positions=state.positions + distance * noise)
-                other = simulator.step(beside, control)
+                if trial.nudged:
+                    other = simulator.step(state, nudged(state, distance * noise[0]))
+                else:
+                    beside = state.replace(positions=state.positions + distance * noise)
+                    other = simulator.step(beside, control)
                 failed += not other.report.converged
                 if not (end.report.converged and other.report.converged):
                     continue

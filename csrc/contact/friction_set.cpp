@@ -96,6 +96,14 @@ Mat3 cross_matrix(const Vec3& u) {
   return Mat3{{0.0, -u[2], u[1]}, {u[2], 0.0, -u[0]}, {-u[1], u[0], 0.0}};
 }
 
+/// Point of the segment from a to b that is nearest to the origin.
+Vec3 nearest_to_origin(const Vec3& a, const Vec3& b) {
+  const Vec3 along = b - a;
+  const double length_sq = along.squaredNorm();
+  const double t = length_sq > 0.0 ? std::clamp(-a.dot(along) / length_sq, 0.0, 1.0) : 0.0;
+  return a + t * along;
+}
+
 }  // namespace
 
 Vec3 FrictionSet::Entry::gap(const double* rows) const {
@@ -300,17 +308,25 @@ void FrictionSet::add_gradient(const Entry& k, const Slip& at, double* g) const 
 }
 
 void FrictionSet::expect(const double* x, const double* to) {
-  const FrictionLaw at_rest = friction_law(0.0, model_->parameters().slip);
+  // Prescribed points may have moved by any fraction t of their motion while the cloth slips: the slip is
+  // w(t) = w(0) + t (w(1) - w(0)).
+  std::vector<double> held(points_.empty() ? 0
+                                           : 3 * (static_cast<std::size_t>(points_.back()) + 1));
+  for (const Index v : points_) {
+    Eigen::Map<Vec3>(held.data() + 3 * v) = row(model_->is_held({&v, 1}) ? x : to, v);
+  }
+  const double slip_scale = model_->parameters().slip;
+  const FrictionLaw at_rest = friction_law(0.0, slip_scale);
   bool any = false;
   for (const Entry& k : entries_) {
-    const Slip there = slip(k, to);
-    const auto is_driven = [&](Index v) {
-      return model_->is_held({&v, 1}) && row(x, v) != row(to, v);
-    };
-    const bool is_known = !model_->is_of_moving_body(k.lag.pair.vertices) &&
-                          std::ranges::none_of(k.lag.pair.vertices, is_driven);
-    expected_.push_back(is_known ? there.law.f1_over_y : at_rest.f1_over_y);
-    any = any || (is_known && there.force().norm() > kClose);
+    if (model_->is_of_moving_body(k.lag.pair.vertices)) {
+      expected_.push_back(at_rest.f1_over_y);
+      continue;
+    }
+    const Vec3 w = nearest_to_origin(slip(k, held.data()).w, slip(k, to).w);
+    const FrictionLaw there = friction_law(w.norm(), slip_scale);
+    expected_.push_back(there.f1_over_y);
+    any = any || there.f1_over_y * w.norm() > kClose;
   }
   if (!any) return expected_.clear();
   duals_.assign(entries_.size(), Vec3::Zero());

@@ -12,8 +12,6 @@ namespace {
 /// A motion is stuck when this many iterations move it by less than this fraction.
 constexpr int kStuckIterations = 20;
 constexpr double kStuckProgress = 1e-3;
-/// A joint step that leaves more than this share of the motion is followed by a relaxation.
-constexpr double kStopped = 0.5;
 
 /// Change of what is prescribed to its ends, and of what follows it; zero elsewhere.
 std::vector<double> prescribed_change(const Walk& walk, const std::vector<double>& ends) {
@@ -46,26 +44,13 @@ void add_coupling(const Objective& f,
   });
 }
 
-/// One joint step towards the ends. Returns the fraction of the remaining motion that it covers.
-double joint_step(Walk& walk, const std::vector<double>& ends) {
-  const std::vector<double> d = prescribed_change(walk, ends);
-  const linalg::BlockMatrix matrix =
-      walk.system.assemble(walk.x().data(), Curvature::kPositive, walk.g());
-  std::vector<double> b = walk.g();
-  add_coupling(walk.f, matrix, walk.x(), d, b);
-  // Positive by construction, M/h^2 plus positive semi-definite parts, but for rounding.
-  const Factor factor = walk.system.factor(matrix);
-  if (!factor) return 0.0;
-  ++walk.context.counts->projected;
-  std::vector<double> p;
-  walk.system.solve(*factor, b, p);
-  for (std::size_t a = 0; a < p.size(); ++a) p[a] += d[a];
-
+/// Go along the change p by its collision-free fraction, towards the ends. Returns that fraction.
+double follow(Walk& walk, const std::vector<double>& ends, const std::vector<double>& p) {
   std::vector<double> to;
   const double alpha = walk.watch(p, std::min(1.0, walk.f.largest_fraction(walk.x(), p)), to);
   if (!(alpha > 0.0)) return 0.0;
   if (alpha == 1.0) {
-    // To the bit; what follows has been placed by nodes that differ from these by rounding.
+    // To the bit: vertices of links follow nodes that differ from these ends by rounding.
     for (Index i = 0; i < walk.f.coordinates->point_count(); ++i) {
       if (walk.f.coordinates->prescribed()[i] == 0) continue;
       for (Index a = 3 * i; a < 3 * i + 3; ++a) to[a] = ends[a];
@@ -77,22 +62,31 @@ double joint_step(Walk& walk, const std::vector<double>& ends) {
   return alpha;
 }
 
-void relax(Walk& walk) {
+/// Descend with the projected Hessian P, then go towards the ends. Returns the fraction of the remaining
+/// motion d that is covered.
+///
+///   P p = -g        along a line search, prescribed points at rest
+///   P q = -P_xo d   jointly with d
+///
+/// Their sum is the joint Newton step. Separately, q and d vanish together, so that the end is a continuous
+/// function of d, at d = 0 as well.
+double descend_and_follow(Walk& walk, const std::vector<double>& ends) {
   const linalg::BlockMatrix matrix =
       walk.system.assemble(walk.x().data(), Curvature::kPositive, walk.g());
+  // Positive by construction, M/h^2 plus positive semi-definite parts, but for rounding.
   const Factor factor = walk.system.factor(matrix);
-  if (!factor) return;
+  if (!factor) return 0.0;
+  ++walk.context.counts->projected;
+  const std::vector<double> d = prescribed_change(walk, ends);
+  std::vector<double> b(d.size(), 0.0);
+  add_coupling(walk.f, matrix, walk.x(), d, b);
   std::vector<double> p;
+  std::vector<double> q;
   walk.system.solve(*factor, walk.g(), p);
+  walk.system.solve(*factor, b, q);
+  for (std::size_t a = 0; a < q.size(); ++a) q[a] += d[a];
   search(walk, p, farthest(walk, p, 1.0));
-}
-
-bool has_arrived(const Walk& walk, const std::vector<double>& ends) {
-  for (Index i = 0; i < walk.f.coordinates->point_count(); ++i) {
-    if (walk.f.coordinates->prescribed()[i] == 0) continue;
-    if (row(walk.x().data(), i) != row(ends.data(), i)) return false;
-  }
-  return true;
+  return follow(walk, ends, q);
 }
 
 /// A point on the way, and the fraction of the whole motion there, less than one.
@@ -122,7 +116,6 @@ double arrive(Walk& walk, const PrescribedMotion& motion) {
   std::vector<double> ends(walk.x());
   for (int k = 0; k < portions; ++k) {
     motion.at((k + 1.0) / portions, ends.data());
-    if (has_arrived(walk, ends)) continue;
     double remaining = 1.0;
     double checked = 1.0;
     std::vector<Stop> way;  // in this portion
@@ -131,13 +124,12 @@ double arrive(Walk& walk, const PrescribedMotion& motion) {
       const double fraction = std::min((k + 1.0 - remaining) / portions, std::nextafter(1.0, 0.0));
       way.push_back({.place = walk.place(), .fraction = fraction});
       if (!walk.spend()) return halt(walk, motion, way);
-      const double alpha = joint_step(walk, ends);
+      const double alpha = descend_and_follow(walk, ends);
       remaining *= 1.0 - alpha;
       if (iteration % kStuckIterations == 0) {
         if (checked - remaining < kStuckProgress) return halt(walk, motion, way);
         checked = remaining;
       }
-      if (alpha < kStopped) relax(walk);
     }
   }
   return 1.0;

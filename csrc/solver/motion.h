@@ -17,11 +17,12 @@ class PrescribedMotion {
   virtual void at(double fraction, double* x) const = 0;
 };
 
-/// Walk what is prescribed to its ends, the unknowns along with it.
+/// Move the prescribed points to their ends, the unknowns along with them.
 ///
-/// Joint Newton: H_xx p = -(g + H_xo do), both moved by the same collision-free fraction. No energy
-/// is compared on the way, as the prescribed motion does work; a blocked step is followed by a
-/// relaxation of the free vertices, which reopens the gaps that it has closed.
+/// An iteration descends with the projected Hessian, prescribed points at rest, then follows the prescribed
+/// motion by the same Hessian as far as that is free of collisions (descend_and_follow()). It compares no
+/// energies while the prescribed points move, as their motion does work. Even a motion of length zero takes
+/// one iteration: the start of a solve does not depend on whether something moves.
 ///
 /// Where there is no way on, the walk goes back to the last point at which all that is prescribed can have
 /// the place that its motion gives it: between the ends of a portion, bodies that turn are distorted.

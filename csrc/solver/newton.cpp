@@ -408,17 +408,17 @@ bool start_from(Walk& walk, const std::vector<double>& guess) {
 
 Outcome minimize(const Objective& objective,
                  std::vector<double>& x,
-                 const PrescribedMotion& motion,
-                 const std::vector<double>* guess,
+                 const Departure* departure,
                  Factor nearby,
                  Context& context) {
   Walk walk(objective, x, context);
   Outcome outcome;
-  const bool guessed = guess != nullptr && motion.portions() == 1 && start_from(walk, *guess);
+  const bool guessed = departure != nullptr && departure->motion.portions() == 1 &&
+                       start_from(walk, departure->guess);
   if (!guessed) walk.watch(x);
   walk.refresh();
-  if (!guessed) {
-    outcome.motion_fraction = arrive(walk, motion);
+  if (departure != nullptr && !guessed) {
+    outcome.motion_fraction = arrive(walk, departure->motion);
     if (outcome.motion_fraction < 1.0) {
       outcome.status = Status::kInfeasibleMotion;
       return outcome;

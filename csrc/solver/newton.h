@@ -25,21 +25,31 @@ struct Outcome {
   Certificate certificate;       ///< at the solution, where converged
 };
 
-/// Find a local minimum of the objective near x, moving the prescribed vertices to their ends.
+/// How the first solve of a step leaves the start of the step.
+struct Departure {
+  const PrescribedMotion& motion;
+  /// Point to begin at if the straight way there is certified free of contact; prescribed points at their
+  /// ends.
+  const std::vector<double>& guess;
+};
+
+/// Find a local minimum of the objective near x.
 ///
-/// @param x       in: a feasible start, prescribed vertices at the start of their motion; out: the
-///                last feasible iterate, whatever the status. The potentials stand there.
-/// @param guess   where to start instead if the straight way there is certified free of contact
-///                (prescribed vertices at their ends); may be null
-/// @param nearby  factor of an exact Hessian of a similar objective near x; may be null
+/// A solve with a departure begins at the guess, or descends with the projected Hessian and follows the
+/// prescribed motion (arrive()), by one rule for all motions: the result is a continuous function of the
+/// motion where the motion vanishes.
+///
+/// @param x          in: a feasible start; out: the last feasible iterate, whatever the status. The
+///                   potentials stand there.
+/// @param departure  null where the prescribed points of x are at their ends
+/// @param nearby     factor of an exact Hessian of a similar objective near x; may be null
 ///
 /// Every segment of the polyline of accepted iterates is free of collisions. Converged means that at
 /// x itself the exact Hessian is positive definite, by its factor, and the Newton step below the
 /// tolerance: a local minimum, not a saddle.
 Outcome minimize(const Objective& objective,
                  std::vector<double>& x,
-                 const PrescribedMotion& motion,
-                 const std::vector<double>* guess,
+                 const Departure* departure,
                  Factor nearby,
                  Context& context);
 

@@ -136,13 +136,13 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
   }
   // Everything at its end, unknowns where inertia alone (or x^D) would put them.
   const Array first_guess = problem.predicted(guess);
+  const solver::Departure departure{.motion = motion, .guess = first_guess};
   solver::Factor factor;
   int solves = 0;
   solver::Status status = solver::Status::kConverged;
   while (solves < friction_iterations) {
-    const solver::Outcome outcome =
-        solver::minimize(sum.objective, x, motion, solves == 0 ? &first_guess : nullptr,
-                         std::move(factor), step.context);
+    const solver::Outcome outcome = solver::minimize(
+        sum.objective, x, solves == 0 ? &departure : nullptr, std::move(factor), step.context);
     status = outcome.status;
     merge(outcome, step.report);
     step.kept.add(outcome.certificate);

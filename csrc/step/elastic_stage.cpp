@@ -7,7 +7,6 @@
 #include "projective/local_global.h"
 #include "solver/newton.h"
 #include "step/contact_stage.h"
-#include "step/motion.h"
 
 namespace diffcloth::step {
 namespace {
@@ -45,9 +44,9 @@ void solve_by_newton(Problem& problem,
   // Its way is no motion of the cloth.
   auto* const path = std::exchange(step.context.path, nullptr);
   const solver::Outcome outcome =
-      nodes.has_contacts() ? nodes.solve(step.context, x)
-                           : solver::minimize(objective(problem), x, GeodesicMotion(problem),
-                                              nullptr, nullptr, step.context);
+      nodes.has_contacts()
+          ? nodes.solve(step.context, x)
+          : solver::minimize(objective(problem), x, nullptr, nullptr, step.context);
   step.context.path = path;
   merge(outcome, step.report);
   step.kept.add(outcome.certificate);
