@@ -19,7 +19,7 @@ namespace diffcloth::elastic {
 /// F(u) the gradient of a displacement u and Y(u) its second derivatives. It is the Hessian of the
 /// energy of all cloths less what depends on how triangles turn: no smaller than the Hessian of the
 /// stretch, equal to it in flat bending and springs without a rest length, and no smaller in others. For
-/// damping and for curved rest shapes it is a
+/// damping, for curved rest shapes and for woven cloth whose shear is stiffer than a yarn it is a
 /// positive matrix of the right size, which is all that a solve with it needs.
 ///
 /// The points of springs are those of the cloths alone: bodies stay where they are. Without springs to

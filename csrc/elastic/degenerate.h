@@ -10,4 +10,7 @@ inline constexpr double kDegenerate = 1e-8;
 /// Area ratio below which a frame need not be orthonormal to rounding.
 inline constexpr double kNearlyDegenerate = 1e-4;
 
+/// Length below which a vector has no direction: its square is not a normal number any more.
+inline constexpr double kShortest = 1e-150;
+
 }  // namespace diffcloth::elastic

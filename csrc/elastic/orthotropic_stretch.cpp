@@ -1,91 +1,74 @@
 #include "elastic/orthotropic_stretch.h"
 
-#include "elastic/symmetric2.h"
+#include <algorithm>
+#include <cmath>
+
+#include "elastic/stretch.h"
 
 namespace diffcloth::elastic::orthotropic {
 namespace {
 
-/// S = sqrt(C) in material axes; the area ratio is not floored here.
-Mat2 root(const Mat32& F, const Frame& polar) {
-  Mat2 S = F.transpose() * F;
-  S.diagonal().array() += polar.d;
-  return S / polar.t;
-}
+/// A yarn of a triangle: y / |y|, which is zero where y is, and |y|.
+struct Yarn {
+  Vec3 direction;
+  double length;
 
-Mat2 strain(const Mat32& F, const Frame& polar) { return root(F, polar) - Mat2::Identity(); }
+  explicit Yarn(const Vec3& y) : direction(y / std::max(y.norm(), kShortest)), length(y.norm()) {}
 
-/// omega with S T - T S = omega J.
-double commutator(const Mat2& S, const Mat2& T) {
-  return S(0, 1) * (T(0, 0) - T(1, 1)) - T(0, 1) * (S(0, 0) - S(1, 1));
-}
-
-Mat2 quarter_turn() {
-  Mat2 J;
-  J << 0.0, -1.0, 1.0, 0.0;
-  return J;
-}
-
-/// A triangle in material axes at one F.
-struct State {
-  Frame polar;
-  Mat2 S;
-  double omega;
-  Mat2 B;       ///< R^T dE/dF
-  Mat2 second;  ///< S^-1 B
+  /// 1 - 1 / |y|, finite.
+  double tension() const { return 1.0 - 1.0 / std::max(length, kDegenerate); }
 };
 
-State state_at(const Weave& weave, const Mat32& F) {
-  State state;
-  state.polar = frame(F);
-  state.S = root(F, state.polar);
-  const Mat2 T = weave.times(state.S - Mat2::Identity());
-  state.omega = commutator(state.S, T);
-  state.B = T + state.omega / state.polar.t * quarter_turn();
-  state.second = symmetric_part(state.polar.S_inv * state.B);
-  return state;
-}
-
-/// The in-plane part of R^T d(dE/dF) along the in-plane part K of R^T dF. With the rotation w of the
-/// frame, dS = K - w J S and d(R B) = R (w J B + dB).
-Mat2 in_plane_change(const Weave& weave, const State& state, const Mat2& K) {
-  const double t = state.polar.t;
-  const Mat2 J = quarter_turn();
-  const double w = (K(1, 0) - K(0, 1)) / t;
-  const Mat2 dS = symmetric_part(K - w * J * state.S);
-  const Mat2 dT = weave.times(dS);
-  const Mat2 T = state.B - state.omega / t * J;
-  const double d_omega = commutator(dS, T) + commutator(state.S, dT);
-  const double d_ratio = (d_omega - state.omega / t * dS.trace()) / t;
-  return w * J * state.B + dT + d_ratio * J;
-}
+/// Stiffnesses of the springs along the yarns, beside the isotropic energy.
+Vec2 of_yarns(const Weave& weave) { return {weave.warp - weave.shear, weave.weft - weave.shear}; }
 
 }  // namespace
 
 double energy(const Weave& weave, const Mat32& F_rest) {
   const Mat32 F = F_rest * weave.axes();
-  const Mat2 e = strain(F, frame(F));
-  return 0.5 * weave.times(e).cwiseProduct(e).sum();
+  const double warp = F.col(0).norm();
+  const double weft = F.col(1).norm();
+  const double product = F.col(0).dot(F.col(1));
+  const double d = F.col(0).cross(F.col(1)).norm();
+  const double t = std::sqrt(warp * warp + weft * weft + 2.0 * d);
+  const double below = (warp * weft + d) * (warp + weft + t);
+  const double turned = 2.0 * product * product / std::max(below, kShortest);
+  return 0.5 * weave.warp * (warp - 1.0) * (warp - 1.0) +
+         0.5 * weave.weft * (weft - 1.0) * (weft - 1.0) + weave.shear * turned;
 }
 
 Mat32 stress(const Weave& weave, const Mat32& F_rest) {
   const Mat2 Q = weave.axes();
-  const State state = state_at(weave, F_rest * Q);
-  return state.polar.R.leftCols<2>() * state.B * Q.transpose();
+  const Mat32 F = F_rest * Q;
+  const Vec2 k = of_yarns(weave);
+  Mat32 P;
+  for (int i = 0; i < 2; ++i) {
+    const Yarn yarn(F.col(i));
+    P.col(i) = k(i) * (yarn.length - 1.0) * yarn.direction;
+  }
+  return stretch::stress(weave.shear, F_rest) + P * Q.transpose();
 }
 
 Mat2 second_stress(const Weave& weave, const Mat32& F_rest) {
   const Mat2 Q = weave.axes();
-  return Q * state_at(weave, F_rest * Q).second * Q.transpose();
+  const Mat32 F = F_rest * Q;
+  const Vec2 tension(Yarn(F.col(0)).tension(), Yarn(F.col(1)).tension());
+  const Vec2 of_springs = of_yarns(weave).cwiseProduct(tension);
+  return stretch::second_stress(weave.shear, F_rest) + Q * of_springs.asDiagonal() * Q.transpose();
 }
 
 Mat32 stress_change(const Weave& weave, const Mat32& F_rest, const Mat32& G_rest) {
   const Mat2 Q = weave.axes();
-  const State state = state_at(weave, F_rest * Q);
-  const Mat32 K = state.polar.R.transpose() * (G_rest * Q);
+  const Mat32 F = F_rest * Q;
+  const Mat32 G = G_rest * Q;
+  const Vec2 k = of_yarns(weave);
   Mat32 change;
-  change.topRows<2>() = in_plane_change(weave, state, K.topRows<2>());
-  change.row(2) = K.row(2) * state.second;
-  return state.polar.R * change * Q.transpose();
+  for (int i = 0; i < 2; ++i) {
+    const Yarn yarn(F.col(i));
+    const Vec3 along = yarn.direction.dot(G.col(i)) * yarn.direction;
+    change.col(i) = k(i) * (yarn.tension() * (G.col(i) - along) + along);
+  }
+  return stretch::stress_change(weave.shear, F_rest, G_rest) + change * Q.transpose();
 }
 
 }  // namespace diffcloth::elastic::orthotropic

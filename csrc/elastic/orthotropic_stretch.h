@@ -6,17 +6,22 @@
 
 namespace diffcloth::elastic::orthotropic {
 
-/// Stretch energy of one woven triangle. With S = sqrt(F^T F) in material axes and e = S - I,
+/// Stretch energy of one woven triangle. With w and f the columns of F along the yarns, R = [r_w, r_f] the
+/// polar factor and t = tr S,
 ///
-///   E = A / 2 (k_w e_ww^2 + k_f e_ff^2 + 2 k_wf e_wf^2),
+///   E = A [ k_w / 2 (|w| - 1)^2 + k_f / 2 (|f| - 1)^2 + k_wf (|w| + |f| - t) ].
 ///
-/// which is that of stretch.h where the three are equal. With T = A K o e, t = tr S, R the polar
-/// factor of F and J the rotation by 90 degrees,
+/// The yarns are springs, each along itself. The last term is k_wf times what turns the yarns from r_w and
+/// r_f, |w| (1 - cos) + |f| (1 - cos): it is at least 0, and 0 where the yarns are at right angles, whatever
+/// their lengths. So shear never lengthens a yarn at the price of k_wf alone, and a tension T along a yarn
+/// strains it by T / k and stiffens its shear. To second order in small strain the term is k_wf e_wf^2.
 ///
-///   dE/dF = R B,   B = T + (omega / t) J,   omega J = S T - T S,
+/// It is the isotropic energy of stretch.h with k_wf, and springs of the stiffnesses k_w - k_wf and
+/// k_f - k_wf along the yarns, whatever their signs:
 ///
-/// because dS solves S dS + dS S = dC. Nothing is divided by the area ratio, so degenerate
-/// triangles stay finite. The second stress is S^-1 B, symmetric.
+///   dE/dF = A [ k_wf (F - R) + (k_y - k_wf) (1 - 1 / |y|) y ],   y = w in its column, y = f in its own.
+///
+/// Without cancellation |w| + |f| - t = 2 (w.f)^2 / ((|w| |f| + d) (|w| + |f| + t)), d = |w x f|.
 ///
 /// Changes of energy, gradients and Hessians of many triangles are in stretch_lanes.h. All functions here
 /// take a weave times the area of the triangle, and F in its rest frame. Stresses are linear in the weave.

@@ -78,7 +78,9 @@ struct StretchKernels {
 
   // The same three of woven triangles. The energy changes by
   //
-  //   dE = 1/2 <K o (e0 + e1), dS>,   (S0 + S1) dS + dS (S0 + S1) = 2 (C1 - C0).
+  //   dE = k_w (a0 + a1 - 2) / 2 da + k_f (b0 + b1 - 2) / 2 db + k_wf (da + db - dt),   a = |w|, b = |f|,
+  //
+  // with the changes of lengths and of t from those of their squares.
 
   double (*woven_energy_change)(const WovenBatch* batches,
                                 std::size_t count,
@@ -90,8 +92,9 @@ struct StretchKernels {
                              const double* x,
                              double* g);
 
-  /// The Hessian is, in the frame of R, the second stress out of plane, and in plane a form of four numbers. The
-  /// projected one clamps the eigenvalues of both at zero.
+  /// The Hessian is, in the frame of R, the second stress out of plane, and in plane a diagonal less a square, along the
+  /// yarns and across them. The projected one is exact where no yarn is so short that its force alone turns it, so
+  /// wherever the Hessian is positive; elsewhere it is no smaller than the Hessian.
   void (*add_woven_hessian)(const WovenBatch* batches,
                             std::size_t count,
                             const double* x,

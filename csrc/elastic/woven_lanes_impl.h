@@ -17,11 +17,34 @@
 namespace diffcloth::elastic {
 namespace {
 
-/// e = S - I, whose area ratio is not floored.
-DIFFCLOTH_INLINE Symmetric strain_of(const Polar& p) {
-  const double inv_t = 1.0 / p.t;
-  return {
-      .uu = (p.c11 + p.d) * inv_t - 1.0, .uv = p.c12 * inv_t, .vv = (p.c22 + p.d) * inv_t - 1.0};
+DIFFCLOTH_INLINE void cross(const double* a, const double* b, double* result) {
+  result[0] = a[1] * b[2] - a[2] * b[1];
+  result[1] = a[2] * b[0] - a[0] * b[2];
+  result[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/// Lengths of the yarns, the normal w x f, its length and tr S.
+struct Lengths {
+  double warp, weft;
+  double normal[3];
+  double d, t;
+};
+
+DIFFCLOTH_INLINE Lengths lengths_of(const Gradient& F) {
+  Lengths q;
+  const double c11 = dot(F.a, F.a);
+  const double c22 = dot(F.b, F.b);
+  cross(F.a, F.b, q.normal);
+  q.warp = __builtin_sqrt(c11);
+  q.weft = __builtin_sqrt(c22);
+  q.d = __builtin_sqrt(dot(q.normal, q.normal));
+  q.t = __builtin_sqrt(c11 + c22 + 2.0 * q.d);
+  return q;
+}
+
+/// b - a from b^2 - a^2.
+DIFFCLOTH_INLINE double change_of_root(double of_squares, double a, double b) {
+  return of_squares / larger(a + b, kShortest);
 }
 
 double woven_energy_change(const WovenBatch* batches,
@@ -36,53 +59,36 @@ double woven_energy_change(const WovenBatch* batches,
     for (int l = 0; l < kLanes; ++l) {
       const Gradient F0 = gradient(batch->faces, motion.start, l);
       const Gradient F1 = gradient(batch->faces, motion.end, l);
+      const Gradient dF = gradient(batch->faces, motion.change, l);
       const Stiffness K = stiffness_of(*batch, l);
-      const Polar p0 = polar_of(F0);
-      const Polar p1 = polar_of(F1);
-      const Symmetric e0 = strain_of(p0);
-      const Symmetric e1 = strain_of(p1);
-      // M dS + dS M = 2 Y  has the solution  dS = (Y + adj(M) Y adj(M) / det M) / tr M.
-      const Symmetric Y = change_of_square(gradient(batch->faces, motion.change, l), F1, F0);
-      const Symmetric twice_mean = sum(e0, e1);
-      const double m_uu = twice_mean.uu + 2.0;
-      const double m_uv = twice_mean.uv;
-      const double m_vv = twice_mean.vv + 2.0;
-      const double a_u = m_vv * Y.uu - m_uv * Y.uv;  // adj(M) Y
-      const double a_v = m_vv * Y.uv - m_uv * Y.vv;
-      const double b_u = m_uu * Y.uv - m_uv * Y.uu;
-      const double b_v = m_uu * Y.vv - m_uv * Y.uv;
-      const double inv_det = 1.0 / (m_uu * m_vv - m_uv * m_uv);
-      const double scale = 1.0 / (m_uu + m_vv);
-      const Symmetric dS = {.uu = scale * (Y.uu + inv_det * (a_u * m_vv - a_v * m_uv)),
-                            .uv = scale * (Y.uv + inv_det * (a_v * m_uu - a_u * m_uv)),
-                            .vv = scale * (Y.vv + inv_det * (b_v * m_uu - b_u * m_uv))};
-      const double regular = product(times(K, twice_mean), dS);
-      const double difference = product(times(K, e1), e1) - product(times(K, e0), e0);
-      const bool is_regular = smaller(p0.d, p1.d) >= kNearlyDegenerate;
-      energy[l] = 0.5 * (is_regular ? regular : difference);
+      const Lengths q0 = lengths_of(F0);
+      const Lengths q1 = lengths_of(F1);
+      Gradient twice;  // the mean of F0 and F1
+      for (int k = 0; k < 3; ++k) {
+        twice.a[k] = F0.a[k] + F1.a[k];
+        twice.b[k] = F0.b[k] + F1.b[k];
+      }
+      double turned[3];
+      double sheared[3];
+      cross(dF.a, twice.b, turned);
+      cross(twice.a, dF.b, sheared);
+      double twice_d_sq = 0.0;
+      for (int k = 0; k < 3; ++k) {
+        twice_d_sq += (turned[k] + sheared[k]) * (q0.normal[k] + q1.normal[k]);
+      }
+      const double c11 = dot(dF.a, twice.a);
+      const double c22 = dot(dF.b, twice.b);
+      const double warp = change_of_root(c11, q0.warp, q1.warp);
+      const double weft = change_of_root(c22, q0.weft, q1.weft);
+      const double twice_d = change_of_root(twice_d_sq, q0.d, q1.d);
+      const double t = change_of_root(c11 + c22 + twice_d, q0.t, q1.t);
+      const double of_warp = 0.5 * (K.warp * ((q0.warp - 1.0) + (q1.warp - 1.0)));
+      const double of_weft = 0.5 * (K.weft * ((q0.weft - 1.0) + (q1.weft - 1.0)));
+      energy[l] = of_warp * warp + of_weft * weft + K.shear * ((warp + weft) - t);
     }
     for (int l = 0; l < batch->faces.size; ++l) total += energy[l];
   }
   return total;
-}
-
-/// A triangle at one F. B = R^T dE/dF, and r = omega / t is what makes it not symmetric.
-struct WovenState {
-  Symmetric e, T;
-  double r;
-  double b11, b12, b21, b22;
-};
-
-DIFFCLOTH_INLINE WovenState state_of(const Stiffness& K, const Polar& p) {
-  WovenState s;
-  s.e = strain_of(p);
-  s.T = times(K, s.e);
-  s.r = (s.e.uv * (s.T.uu - s.T.vv) - s.T.uv * (s.e.uu - s.e.vv)) / p.t;
-  s.b11 = s.T.uu;
-  s.b12 = s.T.uv - s.r;
-  s.b21 = s.T.uv + s.r;
-  s.b22 = s.T.vv;
-  return s;
 }
 
 void add_woven_gradient(const WovenBatch* batches, std::size_t count, const double* x, double* g) {
@@ -92,11 +98,16 @@ void add_woven_gradient(const WovenBatch* batches, std::size_t count, const doub
     gather_sides(faces, x, sides);
     alignas(64) double force[6][kLanes];
     for (int l = 0; l < kLanes; ++l) {
-      const Polar p = polar_of(gradient(faces, sides, l));
-      const WovenState s = state_of(stiffness_of(*batch, l), p);
+      const Gradient F = gradient(faces, sides, l);
+      const Polar p = polar_of(F);
+      const Stiffness K = stiffness_of(*batch, l);
+      const double warp = __builtin_sqrt(p.c11);
+      const double weft = __builtin_sqrt(p.c22);
+      const double of_warp = (K.warp - K.shear) * ((warp - 1.0) / larger(warp, kShortest));
+      const double of_weft = (K.weft - K.shear) * ((weft - 1.0) / larger(weft, kShortest));
       for (int k = 0; k < 3; ++k) {
-        const double a = p.r1[k] * s.b11 + p.r2[k] * s.b21;
-        const double b = p.r1[k] * s.b12 + p.r2[k] * s.b22;
+        const double a = K.shear * (F.a[k] - p.r1[k]) + of_warp * F.a[k];
+        const double b = K.shear * (F.b[k] - p.r2[k]) + of_weft * F.b[k];
         force[k][l] = a * faces.g[0][l] + b * faces.g[1][l];
         force[3 + k][l] = a * faces.g[2][l] + b * faces.g[3][l];
       }
@@ -105,52 +116,27 @@ void add_woven_gradient(const WovenBatch* batches, std::size_t count, const doub
   }
 }
 
-// The in-plane part of the Hessian is a form of changes along R of F's columns. Beside warp, weft and shear, which
-// change S alone, stands the rotation J^T / sqrt(2): there the form is an arrow,
+// In the frame of R, w = (w_1, w_2) |w| and f = (f_1, f_2) |f| with unit vectors. A change of F in plane is that of
+// each yarn along itself, with the stiffness k_y, and across, with
 //
-//   diag(k_w, k_f, k_wf), bordered by z = (z_w, z_f, z_s) and h.
+//   m_y = k_wf + (k_y - k_wf) (1 - 1 / |y|),
 //
-// Its last column is the change of R^T dE/dF with the rotation. The frame turns at the rate w = -sqrt(2) / t, and
-// with b = w S_uv and a = -w (S_uu - S_vv) / 2
+// less what turns the frame: the form is
 //
-//   dS = [[b, a], [a, -b]],   d omega = a (T_uu - T_vv) - 2 b T_uv + b (k_w + k_f) S_uv - a k_wf (S_uu - S_vv),
-//   d(dE/dF) = R (w J B + K o dS + (d omega / t) J).
-struct Arrow {
-  double z[3];
-  double h;
-};
+//   diag(k_w, m_w, k_f, m_f) - rho e e^T,   e = (w_2, w_1, -f_1, f_2),   rho = k_wf / t,   |e|^2 = 2.
+//
+// Where the Hessian is positive all m_y are. The projection raises them to zero, and removes the one negative
+// eigenvalue that is left. So it is exact where no m_y is negative, and no smaller than the Hessian anywhere.
 
-DIFFCLOTH_INLINE Arrow arrow_of(const Stiffness& K, const Polar& p, const WovenState& s) {
-  const double inv_t = 1.0 / p.t;
-  const double w = -__builtin_sqrt(2.0) * inv_t;
-  const double difference = s.e.uu - s.e.vv;
-  const double b = w * s.e.uv;
-  const double a = -0.5 * w * difference;
-  const double d_omega = a * (s.T.uu - s.T.vv) - 2.0 * (b * s.T.uv) +
-                         b * (K.warp + K.weft) * s.e.uv - a * K.shear * difference;
-  const double both = K.shear * a;
-  const double ratio = d_omega * inv_t;
-  const double c12 = both - w * s.b22 - ratio;
-  const double c21 = both + w * s.b11 + ratio;
-  const double half = __builtin_sqrt(0.5);
-  return {.z = {K.warp * b - w * s.b21, w * s.b12 - K.weft * b, half * (c12 + c21)},
-          .h = half * (c12 - c21)};
-}
-
-/// What arrows are to be relieved of: value v v^T with v = (vector, 1), where value <= 0.
-struct NegativeParts {
-  alignas(64) double value[kLanes];
-  alignas(64) double vector[3][kLanes];
-};
-
-/// The frame of each triangle, the arrow of its form and its second stress.
+/// The frame of each triangle, its form in plane and its second stress.
 struct WovenForms {
   alignas(64) double r1[3][kLanes];
   alignas(64) double r2[3][kLanes];
   alignas(64) double n[3][kLanes];
-  alignas(64) double k[3][kLanes];  ///< k_w, k_f, k_wf
-  alignas(64) double z[3][kLanes];
-  alignas(64) double h[kLanes];
+  alignas(64) double w[2][kLanes];
+  alignas(64) double f[2][kLanes];
+  alignas(64) double diagonal[4][kLanes];  ///< k_w, m_w, k_f, m_f
+  alignas(64) double rho[kLanes];
   alignas(64) double second[3][kLanes];  ///< uu, uv, vv
 };
 
@@ -161,100 +147,116 @@ DIFFCLOTH_INLINE void forms_of(const WovenBatch& batch, const double* x, WovenFo
   for (int l = 0; l < kLanes; ++l) {
     const Polar p = polar_of(gradient(batch.faces, sides, l));
     const Stiffness K = stiffness_of(batch, l);
-    const WovenState s = state_of(K, p);
-    const Arrow arrow = arrow_of(K, p, s);
-    // The second stress is the symmetric part of S^-1 B.
-    const Symmetric exact = {
-        .uu = p.s11 * s.b11 + p.s12 * s.b21,
-        .uv = 0.5 * ((p.s11 * s.b12 + p.s12 * s.b22) + (p.s12 * s.b11 + p.s22 * s.b21)),
-        .vv = p.s12 * s.b12 + p.s22 * s.b22};
+    // S t has the directions of the yarns in its columns. A yarn without one lies along its own axis.
+    const double w1 = larger(p.c11 + p.d, kShortest);
+    const double f2 = larger(p.c22 + p.d, kShortest);
+    const double inv_w = 1.0 / __builtin_sqrt(w1 * w1 + p.c12 * p.c12);
+    const double inv_f = 1.0 / __builtin_sqrt(f2 * f2 + p.c12 * p.c12);
+    const double warp = larger(__builtin_sqrt(p.c11), kDegenerate);
+    const double weft = larger(__builtin_sqrt(p.c22), kDegenerate);
+    const double of_warp = (K.warp - K.shear) * (1.0 - 1.0 / warp);
+    const double of_weft = (K.weft - K.shear) * (1.0 - 1.0 / weft);
+    const Symmetric exact = {.uu = K.shear * (1.0 - p.s11) + of_warp,
+                             .uv = -(K.shear * p.s12),
+                             .vv = K.shear * (1.0 - p.s22) + of_weft};
     const Symmetric second = Positive ? positive_part(exact) : exact;
     for (int k = 0; k < 3; ++k) {
       forms.r1[k][l] = p.r1[k];
       forms.r2[k][l] = p.r2[k];
       forms.n[k][l] = p.n[k];
-      forms.z[k][l] = arrow.z[k];
     }
-    forms.h[l] = arrow.h;
-    forms.k[0][l] = K.warp;
-    forms.k[1][l] = K.weft;
-    forms.k[2][l] = K.shear;
+    forms.w[0][l] = w1 * inv_w;
+    forms.w[1][l] = p.c12 * inv_w;
+    forms.f[0][l] = p.c12 * inv_f;
+    forms.f[1][l] = f2 * inv_f;
+    const double across_warp = K.shear + of_warp;
+    const double across_weft = K.shear + of_weft;
+    forms.diagonal[0][l] = K.warp;
+    forms.diagonal[1][l] = Positive ? larger(across_warp, 0.0) : across_warp;
+    forms.diagonal[2][l] = K.weft;
+    forms.diagonal[3][l] = Positive ? larger(across_weft, 0.0) : across_weft;
+    forms.rho[l] = K.shear / p.t;
     forms.second[0][l] = second.uu;
     forms.second[1][l] = second.uv;
     forms.second[2][l] = second.vv;
   }
 }
 
+/// What raises the negative eigenvalue of each form to zero: value v v^T, v by columns of F along r1 and r2.
+struct NegativeParts {
+  alignas(64) double value[kLanes];
+  alignas(64) double warp[2][kLanes];
+  alignas(64) double weft[2][kLanes];
+};
+
 /// Relative step below which the next one of Newton's method is below rounding.
 constexpr double kSmallStep = 1e-8;
-constexpr int kMostSteps = 200;  // each at least doubles y until the largest k_j has no part
+/// Part of rho that counts as zero.
+constexpr double kNoPart = 1e-16;
+constexpr int kMostSteps = 100;
 
-/// The negative eigenvalue of each arrow and its vector, where there is one: only one, as K is positive. It is the
-/// root of
+/// The negative eigenvalue -s of each form is the root of
 ///
-///   f(y) = h - y - sum_j z_j^2 / (k_j - y),
+///   h(s) = 1 / sum_j e_j^2 / (d_j + s) = rho,
 ///
-/// which falls and is concave up to the least k_j. Newton's method goes down to the root from the eigenvalue with the
-/// largest k_j for all; where f(0) >= 0, y stays zero.
+/// which rises and is concave, so that Newton's method goes up to the root from a bound below it: h is no larger than
+/// the mean of d_j + s over two. Where h(0) >= rho there is none, and s stays what counts as zero.
 DIFFCLOTH_INLINE void negative_parts(const WovenForms& forms, NegativeParts& parts) {
-  alignas(64) double y[kLanes];
+  alignas(64) double e_sq[4][kLanes];
+  alignas(64) double s[kLanes];
   for (int l = 0; l < kLanes; ++l) {
-    const double most = larger(larger(forms.k[0][l], forms.k[1][l]), forms.k[2][l]);
-    const double z_sq = forms.z[0][l] * forms.z[0][l] + forms.z[1][l] * forms.z[1][l] +
-                        forms.z[2][l] * forms.z[2][l];
-    const double mean = 0.5 * (forms.h[l] + most);
-    const double away = 0.5 * (forms.h[l] - most);
-    y[l] = smaller(mean - __builtin_sqrt(away * away + z_sq), 0.0);
+    e_sq[0][l] = forms.w[1][l] * forms.w[1][l];
+    e_sq[1][l] = forms.w[0][l] * forms.w[0][l];
+    e_sq[2][l] = forms.f[0][l] * forms.f[0][l];
+    e_sq[3][l] = forms.f[1][l] * forms.f[1][l];
+    double mean = 0.0;
+#pragma GCC unroll 4
+    for (int j = 0; j < 4; ++j) mean += 0.5 * (e_sq[j][l] * forms.diagonal[j][l]);
+    s[l] = larger(2.0 * forms.rho[l] - mean, kNoPart * forms.rho[l]);
   }
   for (int i = 0; i < kMostSteps; ++i) {
     alignas(64) double left[kLanes];  // of the step, beside what is small
     for (int l = 0; l < kLanes; ++l) {
-      double f = forms.h[l] - y[l];
-      double slope = -1.0;
-#pragma GCC unroll 3
-      for (int j = 0; j < 3; ++j) {
-        const double v = forms.z[j][l] / (forms.k[j][l] - y[l]);
-        f -= forms.z[j][l] * v;
-        slope -= v * v;
+      double sum = 0.0;
+      double slope = 0.0;
+#pragma GCC unroll 4
+      for (int j = 0; j < 4; ++j) {
+        const double inverse = 1.0 / (forms.diagonal[j][l] + s[l]);
+        const double v = e_sq[j][l] * inverse;
+        sum += v;
+        slope += v * inverse;
       }
-      const double next = smaller(y[l] - f / slope, 0.0);
-      left[l] = (y[l] - next) + kSmallStep * next;
-      y[l] = next;
+      const double next = s[l] + sum * (forms.rho[l] * sum - 1.0) / slope;
+      const double least = larger(next, kNoPart * forms.rho[l]);
+      left[l] = (least - s[l]) - kSmallStep * least;
+      s[l] = least;
     }
     bool is_done = true;
     for (const double step : left) is_done = is_done && !(step > 0.0);
     if (is_done) break;
   }
   for (int l = 0; l < kLanes; ++l) {
-    double norm_sq = 1.0;
-#pragma GCC unroll 3
-    for (int j = 0; j < 3; ++j) {
-      const double v = forms.z[j][l] / (y[l] - forms.k[j][l]);
-      parts.vector[j][l] = v;
-      norm_sq += v * v;
+    double v[4];
+    double norm_sq = 0.0;
+#pragma GCC unroll 4
+    for (int j = 0; j < 4; ++j) {
+      v[j] = 1.0 / (forms.diagonal[j][l] + s[l]);
+      norm_sq += e_sq[j][l] * v[j] * v[j];
     }
-    parts.value[l] = y[l] / norm_sq;
+    parts.value[l] = s[l] / norm_sq;
+    parts.warp[0][l] = (v[0] - v[1]) * (forms.w[0][l] * forms.w[1][l]);
+    parts.warp[1][l] = e_sq[0][l] * v[0] + e_sq[1][l] * v[1];
+    parts.weft[0][l] = -(e_sq[2][l] * v[2] + e_sq[3][l] * v[3]);
+    parts.weft[1][l] = (v[3] - v[2]) * (forms.f[0][l] * forms.f[1][l]);
   }
 }
 
-/// What of the arrow meets the two changes of F that a corner makes along r1 and r2.
-struct CornerChange {
-  double turn[2];  ///< along the rotation
-  double bent[2];  ///< along z, and half of h along the rotation
-  double cut[2];   ///< along the vector of the negative part
-};
-
-DIFFCLOTH_INLINE CornerChange
-corner_change(double u, double v, const WovenForms& forms, const NegativeParts& parts, int l) {
-  const double half = __builtin_sqrt(0.5);
-  CornerChange c;
-  c.turn[0] = half * v;
-  c.turn[1] = -(half * u);
-  c.bent[0] = forms.z[0][l] * u + forms.z[2][l] * (half * v) + (0.5 * forms.h[l]) * c.turn[0];
-  c.bent[1] = forms.z[1][l] * v + forms.z[2][l] * (half * u) + (0.5 * forms.h[l]) * c.turn[1];
-  c.cut[0] = parts.vector[0][l] * u + (parts.vector[2][l] + 1.0) * (half * v);
-  c.cut[1] = parts.vector[1][l] * v + (parts.vector[2][l] - 1.0) * (half * u);
-  return c;
+/// The form of changes of one yarn in plane: m I + (k - m) y y^T.
+DIFFCLOTH_INLINE Symmetric form_of_yarn(double along, double across, double y1, double y2) {
+  const double excess = along - across;
+  return {.uu = across + excess * (y1 * y1),
+          .uv = excess * (y1 * y2),
+          .vv = across + excess * (y2 * y2)};
 }
 
 template <bool Positive>
@@ -269,25 +271,33 @@ DIFFCLOTH_INLINE void woven_hessians(const WovenBatch& batch,
   for (int l = 0; l < kLanes; ++l) {
     const double u[3] = {-(faces.g[0][l] + faces.g[2][l]), faces.g[0][l], faces.g[2][l]};
     const double v[3] = {-(faces.g[1][l] + faces.g[3][l]), faces.g[1][l], faces.g[3][l]};
-    CornerChange c[3];
+    const Symmetric warp =
+        form_of_yarn(forms.diagonal[0][l], forms.diagonal[1][l], forms.w[0][l], forms.w[1][l]);
+    const Symmetric weft =
+        form_of_yarn(forms.diagonal[2][l], forms.diagonal[3][l], forms.f[0][l], forms.f[1][l]);
+    const double rho = forms.rho[l];
+    double raised[3][2];
 #pragma GCC unroll 3
-    for (int i = 0; i < 3; ++i) c[i] = corner_change(u[i], v[i], forms, parts, l);
-    const double warp = forms.k[0][l];
-    const double weft = forms.k[1][l];
-    const double shear = 0.5 * forms.k[2][l];
+    for (int i = 0; i < 3; ++i) {
+#pragma GCC unroll 2
+      for (int a = 0; a < 2; ++a) raised[i][a] = parts.warp[a][l] * u[i] + parts.weft[a][l] * v[i];
+    }
     int k = 0;
 #pragma GCC unroll 3
     for (int i = 0; i < 3; ++i) {
 #pragma GCC unroll 3
       for (int j = 0; j <= i; ++j, k += 9) {
-        double m[2][2] = {{warp * (u[i] * u[j]) + shear * (v[i] * v[j]), shear * (v[i] * u[j])},
-                          {shear * (u[i] * v[j]), weft * (v[i] * v[j]) + shear * (u[i] * u[j])}};
+        const double uu = u[i] * u[j];
+        const double vv = v[i] * v[j];
+        const double uv = warp.uv * uu + weft.uv * vv;
+        double m[2][2] = {{warp.uu * uu + (weft.uu - rho) * vv, uv + rho * (v[i] * u[j])},
+                          {uv + rho * (u[i] * v[j]), (warp.vv - rho) * uu + weft.vv * vv}};
+        if (Positive) {
 #pragma GCC unroll 2
-        for (int a = 0; a < 2; ++a) {
+          for (int a = 0; a < 2; ++a) {
+            const double scaled = parts.value[l] * raised[i][a];
 #pragma GCC unroll 2
-          for (int b = 0; b < 2; ++b) {
-            m[a][b] += c[i].bent[a] * c[j].turn[b] + c[i].turn[a] * c[j].bent[b] -
-                       parts.value[l] * (c[i].cut[a] * c[j].cut[b]);
+            for (int b = 0; b < 2; ++b) m[a][b] += scaled * raised[j][b];
           }
         }
         const double normal = u[i] * (forms.second[0][l] * u[j] + forms.second[1][l] * v[j]) +

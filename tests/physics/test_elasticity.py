@@ -79,6 +79,39 @@ def test_rigid_motion_and_folding_cost_no_membrane_energy():
     assert abs(sim.energy(state.replace(positions=tensor(fold)))) < 1e-12 * k_s * area
 
 
+@pytest.mark.parametrize("over", [1.5, 5.0])
+@pytest.mark.parametrize("yarn", ["warp", "weft"])
+@pytest.mark.parametrize("name", ["tablecloth", "denim", "blanket"])
+def test_a_dead_load_along_a_yarn_strains_it_by_its_stiffness(name, yarn, over):
+    """T / k, whatever the shear, and with straight sides.
+
+    A strain that grows quadratically with shear, S_ww - 1 = |w| cos - 1, lets a strip shear by
+    itself from T = 2 k_wf (1 + T / k) on. Loads are multiples of it, up to a strain of 0.6.
+    """
+    material = dc.fabrics.material(name)
+    k = material.stretch if yarn == "warp" else material.stretch_weft
+    ratio = 2 * material.stretch_shear / k
+    tension = k * min(over * ratio / (1 - ratio), 0.6)
+    rows, columns, length, width = 7, 18, 0.3, 0.12
+    direction = [1.0, 0.0, 0.0] if yarn == "warp" else [0.0, 1.0, 0.0]
+    ends = np.arange(rows)[:, None] * columns + [0, columns - 1]
+    cloth = dc.Cloth.grid(
+        *(rows, columns, (length, width)),
+        material=material,
+        directions=direction,
+        pins={"clamp": ends[:, 0]},
+    )
+    loads = np.zeros((rows * columns, 3))
+    loads[ends[:, 1], 0] = tension * width / (rows - 1)
+    loads[ends[[0, -1], 1], 0] /= 2
+    sim = make_sim(cloth, 0.01, tolerance=1e-8)
+    rest = sim.equilibrium(sim.initial_state(), dc.Control(forces=tensor(loads)))
+    assert rest.report.iterations < 60
+    x = rest.positions.numpy() - cloth.vertices
+    np.testing.assert_allclose(x[ends[:, 1], 0] / length, tension / k, rtol=1e-6)
+    assert np.abs(x[:, 1:]).max() < 1e-6 * length
+
+
 def test_a_strip_stretches_under_its_own_weight():
     # Elongation w L^2 / (2 k_s), exactly so for rows of lumped weight. The lumped masses of the
     # corners are uneven, but by reciprocity the mean of the end's displacement, weighted as an even
