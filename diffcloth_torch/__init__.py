@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from diffcloth_torch import envs, fabrics, learn, robots
     from diffcloth_torch.errors import (
         AddedMassWarning,
+        BarrierStartWarning,
         InfeasibleMotion,
         IntersectingState,
         InvalidInput,
@@ -66,6 +67,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AddedMassWarning",
     "Attachment",
+    "BarrierStartWarning",
     "Camera",
     "Cloth",
     "ContactOptions",
@@ -117,6 +119,7 @@ if find_spec("gymnasium") is None:
 _HOMES = {
     "errors": (
         "AddedMassWarning",
+        "BarrierStartWarning",
         "InfeasibleMotion",
         "IntersectingState",
         "InvalidInput",

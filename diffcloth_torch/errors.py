@@ -10,6 +10,7 @@ from typing import Any
 
 __all__ = [
     "AddedMassWarning",
+    "BarrierStartWarning",
     "InadmissibleMaterial",
     "InfeasibleMotion",
     "IntersectingState",
@@ -72,6 +73,10 @@ class TurnedTooFar(SimulationError):  # noqa: N818
 
 class AddedMassWarning(UserWarning):
     """In a staggered coupling, a body or a link is too light for the cloth that it touches."""
+
+
+class BarrierStartWarning(UserWarning):
+    """Surfaces start so deep in the barrier that it throws them apart; the message names them."""
 
 
 def warn_caller(message: str, category: type[Warning] = UserWarning) -> None:

@@ -106,11 +106,22 @@ nb::object Simulator::find_overlap(const nb::dict& inputs) const {
   return text.empty() ? nb::none() : nb::cast(text);
 }
 
-nb::object Simulator::find_close_start(const nb::dict& inputs) const {
+nb::list Simulator::find_throws(const nb::dict& inputs, int threads) const {
   const InputArrays arrays(scene_, inputs);
-  const auto found = step::find_close_start(scene_, arrays.environment(0));
-  if (!found) return nb::none();
-  return nb::make_tuple(found->elements, found->gap, found->rest_gap);
+  std::vector<std::optional<step::Throw>> found(arrays.environments);
+  for_environments(found.size(), threads, {}, [&](Index i, const Checkpoint&) {
+    const auto e = static_cast<std::size_t>(i);
+    found[e] = step::find_throw(scene_, arrays.environment(e));
+  });
+  nb::list result;
+  for (const auto& one : found) {
+    if (one) {
+      result.append(nb::make_tuple(one->elements, one->gap, one->barrier_distance, one->speed));
+    } else {
+      result.append(nb::none());
+    }
+  }
+  return result;
 }
 
 double Simulator::reference_factorization_seconds(const nb::dict& inputs, int repeats) const {

@@ -58,7 +58,7 @@ class Simulator {
   double smallest_nonadjacent_distance() const;
   nb::object default_barrier_stiffness(const nb::dict& inputs, double barrier_distance) const;
   nb::object find_overlap(const nb::dict& inputs) const;
-  nb::object find_close_start(const nb::dict& inputs) const;
+  nb::list find_throws(const nb::dict& inputs, int threads) const;
   double reference_factorization_seconds(const nb::dict& inputs, int repeats) const;
   void forget_factors() { factors_.clear(); }
   std::size_t factor_bytes() const { return factors_.bytes(); }

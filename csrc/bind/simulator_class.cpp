@@ -91,9 +91,10 @@ void simulator(nb::module_& m) {
            "Seconds of one factorization of the contact-free Hessian by Eigen, for benchmarks.")
       .def("find_overlap", &Simulator::find_overlap, "inputs"_a,
            "Where surfaces overlap at the start of the first environment's step, or None.")
-      .def("find_close_start", &Simulator::find_close_start, "inputs"_a,
-           "Elements that are closest at the start of the first environment's step, their gap and "
-           "the one at rest [m], or None.")
+      .def("find_throws", &Simulator::find_throws, "inputs"_a, "threads"_a,
+           "Of each environment, the surfaces that the barrier throws apart fastest from the start "
+           "of a step: their nearest elements, the gap and the barrier distance [m], and the speed "
+           "[m/s]; or None.")
       .def("forget_factors", &Simulator::forget_factors,
            "Drop the factors kept for backward; they are made again when needed.")
       .def_prop_ro("factor_bytes", &Simulator::factor_bytes,

@@ -287,43 +287,7 @@ double for_radii(const Scene& scene, Index own, double xi, double radii, double 
                                    : without.slope / with.slope;
 }
 
-/// Gap at which the barrier pushes with a pressure, halved until float64 has no more of it [m].
-double gap_under(double pressure, double kappa, double xi, double barrier_distance) {
-  double low = 0.0;
-  double high = barrier_distance;
-  constexpr int kHalvings = 60;
-  for (int i = 0; i < kHalvings; ++i) {
-    const double gap = 0.5 * (low + high);
-    const double d = xi + gap;
-    const double slope = -2.0 * d * contact::barrier_derivatives(d * d, xi, barrier_distance).b1;
-    // A vertex's weight is a quarter of its area, as in the stiffness above.
-    (0.25 * kappa * slope > pressure ? low : high) = gap;
-  }
-  return high;
-}
-
 }  // namespace
-
-std::optional<CloseStart> find_close_start(const Scene& scene, const Inputs& inputs) {
-  if (inputs.data(Input::kBarrierStiffness) == nullptr || scene.cloth_count() == 0) return {};
-  const double reach = inputs.data(Input::kBarrierDistance)[0];
-  const double* first = inputs.data(Input::kThickness);
-  const std::vector<double> thickness(first, first + scene.surface_count());
-  const Problem problem(scene, inputs);
-  contact::BroadPhase::Scratch scratch;
-  const double* const x = problem.start.data();
-  const auto candidates = find_near(scene, x, thickness, reach, scratch);
-  const auto closest = find_closest(scene, x, thickness, reach, candidates);
-  if (!closest || !problem.contact) return {};
-  const double gravity = row(inputs.data(Input::kGravity), 0).norm();
-  const double pressure = std::ranges::max(problem.density) * gravity;
-  return CloseStart{
-      .elements = describe_pair(scene, closest->pair),
-      .gap = closest->distance - closest->thickness,
-      .rest_gap =
-          gap_under(pressure, problem.contact->kappa(closest->pair), closest->thickness, reach),
-  };
-}
 
 std::vector<double> default_barrier_stiffness(const Scene& scene,
                                               const Inputs& inputs,

@@ -7,40 +7,8 @@
 #include "contact/friction_set.h"
 
 namespace diffcloth::step {
-namespace {
 
 using contact::Contact;
-
-/// Surfaces of a contact, the smaller first.
-std::pair<Index, Index> surfaces(const contact::ContactModel& model, const Contact& contact) {
-  const auto& owner = model.mesh().vertex_surface;
-  return std::minmax(owner[contact.pair.vertices[0]], owner[contact.pair.vertices[3]]);
-}
-
-/// Call visit(pair, contacts of it) for every pair, in the order of the contacts.
-template <class Visit>
-void for_each_pair(const contact::ContactModel& model,
-                   const std::vector<Contact>& contacts,
-                   Visit&& visit) {
-  const auto of = [&](const Contact& c) { return surfaces(model, c); };
-  if (contacts.empty()) return;
-  const auto pair = of(contacts.front());
-  if (std::ranges::all_of(contacts, [&](const Contact& c) { return of(c) == pair; })) {
-    visit(pair, contacts);
-    return;
-  }
-  std::vector<Contact> sorted = contacts;
-  std::ranges::stable_sort(sorted, {}, of);
-  for (auto first = sorted.begin(); first != sorted.end();) {
-    const auto here = of(*first);
-    const auto last =
-        std::find_if(first, sorted.end(), [&](const Contact& c) { return of(c) != here; });
-    visit(here, std::vector<Contact>(first, last));
-    first = last;
-  }
-}
-
-}  // namespace
 
 void add_pin_forces(const Problem& problem,
                     const solver::Objective& objective,

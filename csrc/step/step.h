@@ -85,15 +85,17 @@ void tangent(const Scene& scene,
 /// Where surfaces overlap at the start of the step, or are closer than their thickness; else empty.
 std::string find_overlap(const Scene& scene, const Inputs& inputs);
 
-/// The closest pair of the start of the step within the barrier's reach.
-struct CloseStart {
-  std::string elements;
-  double gap;       ///< between the surfaces [m]
-  double rest_gap;  ///< at which the barrier carries the heaviest cloth's own weight [m]
+/// Two surfaces that the barrier throws apart from the start of a step.
+struct Throw {
+  std::string elements;     ///< the nearest ones of both
+  double gap;               ///< between them [m]
+  double barrier_distance;  ///< d_hat [m]
+  double speed;             ///< the largest of a point that it moves [m/s]
 };
 
-/// Absent where nothing is within the barrier's reach, or nothing can touch.
-std::optional<CloseStart> find_close_start(const Scene& scene, const Inputs& inputs);
+/// The pair of surfaces that the barrier throws apart fastest if everything rests at the start of a step;
+/// absent where the barrier moves nothing. See throw.cpp.
+std::optional<Throw> find_throw(const Scene& scene, const Inputs& inputs);
 
 /// Parts of an energy by their names [J].
 using Energies = std::vector<std::pair<const char*, double>>;

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
+
 from diffcloth_torch.core_functions import as_array
 from diffcloth_torch.model.defaults import check_barrier
 from diffcloth_torch.model.quantities import Fields
@@ -33,6 +35,12 @@ class Given(NamedTuple):
     state: Fields
     control: Fields
     parameters: Fields
+
+    def at_rest(self) -> Given:
+        """The same with zero velocities."""
+        names = (name for name in self.state if name.endswith("velocities"))
+        still = {name: torch.zeros_like(self.state[name]) for name in names}
+        return self._replace(state=self.state | still)
 
 
 class Border:

@@ -418,8 +418,7 @@ def _kinds(robot: Mechanism) -> list[str]:
 
 def _resting(given: Given) -> Given:
     """The same inputs at rest, without damping, drag and limits of speeds: none acts there."""
-    state, parameters = given.state, given.parameters
-    still = {n: torch.zeros_like(t) for n, t in state.items() if n.endswith("velocities")}
+    parameters = given.parameters
     resisting = (
         "damping",
         "normal_drag",
@@ -432,7 +431,7 @@ def _resting(given: Given) -> Given:
         none["joint_velocity_limits"] = torch.full_like(
             parameters["joint_velocity_limits"], LARGEST
         )
-    return given._replace(state=state | still, parameters=parameters | none)
+    return given.at_rest()._replace(parameters=parameters | none)
 
 
 def _slower(given: Given, length: float) -> Given:

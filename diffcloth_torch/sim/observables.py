@@ -291,11 +291,9 @@ class Observables:
 
     def _at_rest(self, given: Given) -> Fields:
         """Inputs of the core where nothing moves: energy is that of where things are."""
-        velocities = [name for name in given.state if name.endswith("velocities")]
-        still = {name: torch.zeros_like(given.state[name]) for name in velocities}
         weightless = {"gravity": torch.zeros_like(given.parameters["gravity"])}
         prediction = self._engine.predict(
-            given._replace(state=given.state | still, parameters=given.parameters | weightless)
+            given.at_rest()._replace(parameters=given.parameters | weightless)
         )
         return self._engine.core_inputs(given, prediction)
 

@@ -35,6 +35,7 @@ from diffcloth_torch.sim.parameter_fields import check_parameters, default_field
 from diffcloth_torch.sim.rollout import Controls, StepParameters, roll_out
 from diffcloth_torch.sim.schemes import check_scheme
 from diffcloth_torch.sim.start import (
+    StartWatch,
     check_gains,
     check_start,
     check_time_step,
@@ -91,8 +92,8 @@ class Simulator(Observables):
     ) -> None:
         """Prepare the solver, and choose the barrier parameters that are not given.
 
-        A scene that starts deep inside the barrier causes a warning, because the barrier will throw
-        its surfaces apart.
+        The first step from a state that no step has led to warns where the barrier throws surfaces
+        apart (`BarrierStartWarning`).
 
         Args:
             scene: The scene.
@@ -151,6 +152,7 @@ class Simulator(Observables):
             solver=solver,
         )
         self._core = self._engine.core
+        self._start_watch = StartWatch(self._engine)
         self._equilibria = Equilibria(
             scene, self._layout, dt=self.dt, scheme=scheme, contact=contact, solver=solver
         )
@@ -294,6 +296,7 @@ class Simulator(Observables):
             TypeError: If a tensor of the state is not float64 on the CPU.
         """
         given, batch = self._border.enter(state, control, parameters)
+        self._start_watch.look_at(state, given, batch)
         fields, diagnostics = self._engine.step(given, self._check(batched=batch is not None))
         return State(
             **without_axes(fields, batch),

@@ -1,4 +1,4 @@
-"""Before the first step: the initial state, the choice of the barrier, and checks."""
+"""Before the first step: the initial state, the choice of the barrier, and checks of both."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ from torch import Tensor
 
 from diffcloth_torch.checks import POSITIVE, check_number
 from diffcloth_torch.dynamics.limits import slip_rates
-from diffcloth_torch.errors import IntersectingState, InvalidInput, warn_caller
+from diffcloth_torch.errors import (
+    BarrierStartWarning,
+    IntersectingState,
+    InvalidInput,
+    warn_caller,
+)
 from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.defaults import choose_barrier_distance
 from diffcloth_torch.model.options import ContactOptions
@@ -20,8 +25,11 @@ from diffcloth_torch.sim.cores import arrays_of
 from diffcloth_torch.sim.engine import Engine
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.parameter_fields import default_fields
+from diffcloth_torch.sim.state import State
+from diffcloth_torch.transforms import outside_transforms, plain
 
 __all__ = [
+    "StartWatch",
     "check_gains",
     "check_start",
     "check_time_step",
@@ -31,9 +39,8 @@ __all__ = [
     "initial_tensors",
 ]
 
-# A start is deep inside the barrier below this fraction of the gap at rest: the barrier then throws
-# a sheet up by several barrier distances.
-_DEEP = 0.25
+# Slower throws are no fault of a start: a cloth that falls gets as fast in a millisecond. [m/s]
+_SLOW = 0.01
 
 # Largest error of a step when its solver stops: in a scene of micrometers the default tolerance
 # would be as long as the barrier.
@@ -147,26 +154,62 @@ def check_tolerance(tolerance: float, distance: float, dt: float) -> None:
 
 
 def check_start(engine: Engine, start: Given) -> None:
-    """Refuse surfaces that overlap, and warn of surfaces that the barrier would throw apart.
+    """Refuse surfaces that overlap.
 
     Args:
         engine: Engine of the scene.
         start: The initial state, with a control that holds.
     """
-    inputs = arrays_of(engine.core_inputs(start, engine.predict(start)))
-    overlap = engine.core.find_overlap(inputs)
+    overlap = engine.core.find_overlap(arrays_of(engine.core_inputs(start, engine.predict(start))))
     if overlap is not None:
         raise IntersectingState(
             f"Simulator: surfaces of the scene overlap: {overlap}; move them apart",
             environments=(0,),
         )
-    close = engine.core.find_close_start(inputs)
-    if close is not None and close[1] < _DEEP * close[2]:
-        elements, gap, rest_gap = close
+
+
+class StartWatch:
+    """Looks at the first state of a simulator that no step has led to, and warns of throws there.
+
+    Where a step has led, surfaces may rest in the barrier, or rebound: only a start can be wrong.
+    """
+
+    def __init__(self, engine: Engine) -> None:
+        """Keep the engine of the scene."""
+        self._engine = engine
+        self._looked = False
+
+    def look_at(self, state: State, given: Given, batch: int | None) -> None:
+        """Warn if the barrier throws something apart.
+
+        Args:
+            state: Where a step starts.
+            given: It, with control and parameters, checked.
+            batch: Its batch size, None without a batch axis.
+        """
+        if self._looked or state.report is not None:
+            return
+        self._looked = True
+        with torch.no_grad(), outside_transforms():
+            numbers = Given(*({n: plain(t) for n, t in fields.items()} for fields in given))
+            at_rest = numbers.at_rest()
+            inputs = self._engine.core_inputs(at_rest, self._engine.predict(at_rest))
+            throws = self._engine.core.find_throws(arrays_of(inputs), torch.get_num_threads())
+        fast = {
+            i: throw for i, throw in enumerate(throws) if throw is not None and throw[3] > _SLOW
+        }
+        if not fast:
+            return
+        worst = max(fast, key=lambda i: fast[i][3])
+        elements, gap, distance, speed = fast[worst]
+        place = "" if batch is None else f"in environment {worst} of {list(fast)}, "
         warn_caller(
-            f"Simulator: the barrier will throw surfaces apart: {elements} start {gap:.3g} m "
-            f"apart, while at rest their gap would be about {rest_gap:.3g} m; start with more, "
-            "or give a smaller `contact.barrier_distance`",
+            f"step: the barrier throws apart what starts inside of it: {place}{elements} are "
+            f"{gap:.3g} m apart, {gap / distance:.2g} of the barrier distance {distance:.3g} m, "
+            f"and the energy stored there gives about {speed:.2g} m/s; start them "
+            f"{distance - gap:.2g} m further apart, or give a `contact.barrier_distance` of at "
+            f"most {gap:.3g} m",
+            BarrierStartWarning,
         )
 
 

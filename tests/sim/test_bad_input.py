@@ -275,36 +275,6 @@ def test_surfaces_that_touch_name_their_elements(position):
     assert "thickness" not in str(raised.value)
 
 
-def sheet_on_a_floor(gap, size=1.0, **contact):
-    sheet = dc.Cloth.grid(6, 6, size, pose=[0, 0, gap, 1, 0, 0, 0])
-    scene = dc.Scene([sheet], [dc.RigidBody.plane(3 * size)])
-    return dc.Simulator(scene, 0.01, contact=dc.ContactOptions(**contact))
-
-
-def test_a_start_deep_inside_the_barrier_warns_with_the_gap_at_rest():
-    contact = {"barrier_distance": 0.02, "barrier_stiffness": 5.0}
-    with pytest.warns(UserWarning, match="throw surfaces apart") as warned:
-        sheet_on_a_floor(0.001, **contact)
-    text = str(warned[0].message)
-    assert re.search(
-        r"cloth 'cloth0' vertex \(\d+\) and body 'body0' face \(.*\) start 0.001 m apart", text
-    )
-    assert warned[0].filename == __file__
-    # Where the sheet comes to rest says whether that gap is the right one.
-    sim = sheet_on_a_floor(0.018, **contact)
-    state = sim.initial_state()
-    for _ in range(80):
-        state = sim.step(state)
-    assert state.velocities.abs().max() < 1e-3
-    said = float(re.search(r"gap would be about (\S+) m", text)[1])
-    assert state.report.minimum_distance == pytest.approx(said, rel=0.01)
-
-
-def test_a_start_that_is_not_deep_does_not_warn():
-    for gap in (0.006, 0.02, 0.5):
-        sheet_on_a_floor(gap, barrier_distance=0.02)
-
-
 # --- Small scenes --------------------------------------------------------------------------------
 
 

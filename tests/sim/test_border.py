@@ -119,7 +119,7 @@ def test_an_input_of_another_size_is_refused(sim, inputs, forward, name, kind):
         lambda: sim._core.stored_energy(bad),
         lambda: energy_backward(sim, bad),
         lambda: sim._core.find_overlap(bad),
-        lambda: sim._core.find_close_start(bad),
+        lambda: sim._core.find_throws(bad, 1),
         lambda: sim._core.path(bad),
         lambda: sim._core.default_barrier_stiffness(bad, 0.01),
         lambda: sim._core.reference_factorization_seconds(bad, 1),

@@ -20,6 +20,7 @@ F64 = torch.float64
 PUBLIC = {
     "AddedMassWarning": "",
     "Attachment": "",
+    "BarrierStartWarning": "",
     "Camera": "place azimuth elevation zoom target distance position up field_of_view",
     "Cloth": "load grid",
     "ContactOptions": (
