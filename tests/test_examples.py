@@ -20,6 +20,9 @@ import diffcloth_torch as dc
 ROOT = Path(__file__).resolve().parents[1]
 SHARED_CLOTH = ROOT.parent / "shared" / "data" / "cloth"
 
+# What users start from is not thrown by the barrier.
+pytestmark = pytest.mark.filterwarnings("error::diffcloth_torch.BarrierStartWarning")
+
 
 @pytest.fixture
 def own_mesh(tmp_path):

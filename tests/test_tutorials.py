@@ -66,3 +66,4 @@ def test_a_page_runs_in_an_empty_folder(page, tmp_path):
     )
     client.execute()
     assert any(cell.get("outputs") for cell in notebook.cells)
+    assert "BarrierStartWarning" not in str(notebook.cells)

@@ -20,7 +20,7 @@ from diffcloth_torch.sim.state import State
 __all__ = ["PushCube"]
 
 _SIDE, _CUBE = 0.3, 0.1  # [m]
-_HEIGHT = 0.5 * _CUBE + 0.004  # of the center of the cube [m]
+_GAP = 0.004  # below the cube, at least [m]
 _DT, _SPEED = 0.02, 0.4  # [s], [m/s] of the pins
 _BRAKING = 0.1  # time in which a scripted cube comes to rest [s]
 _CLOSE = 0.03  # distance to the target that succeeds [m]
@@ -53,13 +53,15 @@ class PushCube(Task):
             material=Material(stretch=200, bending=1e-4, density=0.5, damping=5e-3, friction=0.3),
             pins={"left": [size * (size - 1)], "right": [size * size - 1]},
         )
+        # Outside of the barrier, whose default is a tenth of an edge.
+        gap = max(_GAP, 0.1 * _SIDE / (size - 1))
         cube = RigidBody.box(
             _CUBE,
             motion="dynamic",
             mass=0.03,
             friction=0.15,
             name="cube",
-            pose=[0, 0, _HEIGHT, 1, 0, 0, 0],
+            pose=[0, 0, 0.5 * _CUBE + gap, 1, 0, 0, 0],
         )
         floor = RigidBody.plane(4.0, friction=0.15, name="floor")
         simulator = Simulator(Scene([sheet], [cube, floor]), _DT, solver=SolverOptions(throw=False))

@@ -409,6 +409,20 @@ def test_the_shipped_configurations_fit_the_schema(path):
     assert math.isfinite(config.simulation.dt)
 
 
+@pytest.mark.filterwarnings("error::diffcloth_torch.BarrierStartWarning")
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_no_shipped_configuration_is_thrown_by_the_barrier(path):
+    if "equilibrium: true" in path.read_text():
+        pytest.skip("fits take equilibria of it, and no step")
+    if path.stem == "panda_pick":
+        try:
+            dc.robots.panda()
+        except ImportError as error:
+            pytest.skip(str(error))
+    simulator = load_task(path, []).simulator
+    assert simulator.step(simulator.initial_state()).report.converged
+
+
 # --- From Python ---------------------------------------------------------------------------------
 
 

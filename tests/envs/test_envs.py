@@ -16,6 +16,9 @@ from diffcloth_torch.envs.env import Task
 NAMES = tuple(envs.TASKS)
 SMALL = 6  # vertices along a side
 
+# What users start from is not thrown by the barrier.
+pytestmark = pytest.mark.filterwarnings("error::diffcloth_torch.BarrierStartWarning")
+
 
 def make(name, num_envs=2, **options):
     return envs.make(name, num_envs, size=SMALL, **options)
