@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch.checks import POSITIVE, check_number
+from diffcloth_torch.core_functions import failing_as
 from diffcloth_torch.dynamics.limits import slip_rates
 from diffcloth_torch.errors import (
     BarrierStartWarning,
@@ -194,7 +195,8 @@ class StartWatch:
             numbers = Given(*({n: plain(t) for n, t in fields.items()} for fields in given))
             at_rest = numbers.at_rest()
             inputs = self._engine.core_inputs(at_rest, self._engine.predict(at_rest))
-            throws = self._engine.core.find_throws(arrays_of(inputs), torch.get_num_threads())
+            with failing_as("step"):
+                throws = self._engine.core.find_throws(arrays_of(inputs), torch.get_num_threads())
         fast = {
             i: throw for i, throw in enumerate(throws) if throw is not None and throw[3] > _SLOW
         }
