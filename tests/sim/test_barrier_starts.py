@@ -279,6 +279,27 @@ def test_what_rests_in_the_barrier_does_not_warn(how):
     assert warnings_of(dc.Simulator(scene, 0.01, contact=FINE), deeper)[1]
 
 
+def test_a_stack_that_rests_in_the_barrier_does_not_warn():
+    scene = dc.Scene([], [FLOOR, box(2.1e-3, 1.0), box(0.0542, 2.0)])
+    simulator = dc.Simulator(scene, 0.01, contact=FINE)
+    states, texts = warnings_of(simulator, simulator.initial_state(), 80)
+    assert not texts
+    rest = states[-1]
+    assert rest.report.minimum_distance < 1.5e-3
+    assert rest.body_velocities.abs().max() < 1e-3
+    bare = rest.replace(report=None)
+    assert not warnings_of(dc.Simulator(scene, 0.01, contact=FINE), bare)[1]
+    # What carries the upper box is too much for the lower one alone.
+    poses = bare.body_poses.clone()
+    poses[2, 2] += 0.1
+    lighter = bare.replace(body_poses=poses)
+    states, texts = warnings_of(dc.Simulator(scene, 0.01, contact=FINE), lighter, 3)
+    measured = max(float(s.body_velocities[1, 2]) for s in states)
+    assert measured > 0.01
+    assert measured / 2 < speed_in(texts[0]) < 2 * measured
+    assert "body 'floor'" in texts[0]
+
+
 def test_a_state_that_a_step_returned_does_not_warn():
     simulator = dc.Simulator(dc.Scene([sheet(1e-3)], [FLOOR]), 0.01, contact=FINE)
     with pytest.warns(dc.BarrierStartWarning):
