@@ -24,7 +24,7 @@
 //
 // its first step ends where  mu s^2 / 2 + E(s) - l s  is least. What is stored there, down to where push and
 // load balance, becomes kinetic energy at most. So the speed is that of implicit Euler, which dissipates most
-// of the energy where a step is longer than the barrier takes: with default barrier stiffnesses, 99 %.
+// of the energy where a step is longer than the barrier takes: 99 % at 10 ms with a default barrier stiffness.
 
 namespace diffcloth::step {
 namespace {
