@@ -37,7 +37,7 @@ def _ending_in_a_sentence(command: C) -> C:
 
             try:
                 click.echo(command(**arguments))
-            except (InvalidInput, TypeError, OSError) as error:
+            except (InvalidInput, TypeError, OSError, ImportError) as error:
                 _end(error, _BAD_INPUT, debug)
             except SimulationError as error:
                 _end(error, _SIMULATION_FAILED, debug)
@@ -194,12 +194,8 @@ def train(viewers: tuple[str, ...], assignments: tuple[str, ...], **arguments: A
     if viewers:
         assignments = (*assignments, f"viewers=[{','.join(viewers)}]")
     arguments["assignments"] = assignments
-    try:
-        from diffcloth_torch.train_command import resume_training, train
-    except ImportError as error:  # its message says what to install
-        from diffcloth_torch.errors import InvalidInput
+    from diffcloth_torch.train_command import resume_training, train
 
-        raise InvalidInput(str(error)) from error
     return _begin_or_resume(arguments, train, resume_training)
 
 

@@ -115,6 +115,7 @@ def test_build_info_names_every_part():
         "flags",
         "processor",
         "eigen",
+        "instructions",
         "factorization",
         "blas",
     }

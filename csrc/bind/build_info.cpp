@@ -4,6 +4,7 @@
 
 #include "bind/bind.h"
 #include "linalg/cholesky.h"
+#include "linalg/kernel_level.h"
 
 namespace diffcloth::bind {
 
@@ -18,6 +19,7 @@ void build_info(nb::module_& m) {
         result["flags"] = info.flags;
         result["processor"] = info.processor;
         result["eigen"] = info.eigen;
+        result["instructions"] = linalg::name(linalg::chosen_level());
         result["factorization"] = linalg::factorization_name();
         result["blas"] = info.blas;
         return result;

@@ -2,6 +2,7 @@
 
 #include "bind/bind.h"
 #include "bind/without_gil.h"
+#include "linalg/kernel_level.h"
 
 NB_MODULE(_core, m) {
   namespace nb = nanobind;
@@ -9,6 +10,7 @@ NB_MODULE(_core, m) {
   // nothing that its user should read about.
   nb::set_leak_warnings(false);
   m.doc() = "C++ core of diffcloth_torch. The public interface is the Python package.";
+  diffcloth::linalg::chosen_level();  // an import fails where the environment names no level
 
   diffcloth::bind::build_info(m);
   diffcloth::bind::dynamics(m);

@@ -23,7 +23,7 @@ constexpr double kOutward = 1e-15;
 constexpr double kAcross = 1e-14;
 
 NearBoxes near_boxes_here() {
-  static const NearBoxes best = near_boxes(linalg::best_level());
+  static const NearBoxes best = near_boxes(linalg::chosen_level());
   return best;
 }
 

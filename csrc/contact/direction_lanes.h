@@ -28,7 +28,7 @@ class DirectionRows {
 /// Call f(kernels, first, count) for directions first .. first + count - 1, as many at once as there are lanes.
 template <class Call>
 void for_direction_groups(std::size_t directions, Call call) {
-  const DirectionLevel& best = direction_kernels(linalg::best_level());
+  const DirectionLevel& best = direction_kernels(linalg::chosen_level());
   for (std::size_t first = 0; first < directions;) {
     const std::size_t left = directions - first;
     const std::size_t count = left < kDirectionLanes ? left : kDirectionLanes;

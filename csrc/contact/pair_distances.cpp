@@ -12,7 +12,7 @@ std::ptrdiff_t first_of_edges(const std::vector<Candidate>& pairs) {
 }
 
 std::vector<double> distances_sq(const std::vector<Candidate>& pairs, const double* x) {
-  static const SquaredDistances measure = squared_distances(linalg::best_level());
+  static const SquaredDistances measure = squared_distances(linalg::chosen_level());
   constexpr std::ptrdiff_t kStride = sizeof(Candidate) / sizeof(Index);
   static_assert(sizeof(Candidate) % sizeof(Index) == 0);
   std::vector<double> result(pairs.size());

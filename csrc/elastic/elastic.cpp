@@ -89,12 +89,12 @@ std::size_t bytes(const Prepared& p) {
 }
 
 const StretchKernels& stretch_here() {
-  static const StretchKernels& best = stretch_kernels(linalg::best_level());
+  static const StretchKernels& best = stretch_kernels(linalg::chosen_level());
   return best;
 }
 
 const BendingKernels& bending_here() {
-  static const BendingKernels& best = bending_kernels(linalg::best_level());
+  static const BendingKernels& best = bending_kernels(linalg::chosen_level());
   return best;
 }
 

@@ -71,7 +71,7 @@ BlockMatrix::BlockMatrix(std::shared_ptr<const MergedPattern> merged,
     : BlockValues(std::move(merged)), fixed_(&fixed), attachments_(attachments) {}
 
 void BlockMatrix::add_terms(std::span<const Index> points, const StencilTerms& of) {
-  static const AddStencil add = stencil_kernel(best_level());
+  static const AddStencil add = stencil_kernel(chosen_level());
   std::array<Index, kStencilPoints> rows;
   bool any = false;
   for (std::size_t p = 0; p < points.size(); ++p) {
@@ -167,7 +167,7 @@ void BlockValues::add_products(std::span<const double* const> x, std::span<doubl
 namespace {
 
 const DenseKernels& kernels() {
-  static const DenseKernels& best = dense_kernels(best_level());
+  static const DenseKernels& best = dense_kernels(chosen_level());
   return best;
 }
 

@@ -68,7 +68,8 @@ Backend default_backend() {
 
 std::string factorization_name() {
   const std::string own = name(default_backend());
-  return default_backend() == Backend::kMultifrontal ? own + " (" + name(best_level()) + ")" : own;
+  return default_backend() == Backend::kMultifrontal ? own + " (" + name(chosen_level()) + ")"
+                                                     : own;
 }
 
 void* CholeskyWorkspace::reserve_bytes(std::size_t size) {

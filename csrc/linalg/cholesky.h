@@ -74,7 +74,7 @@ struct CholeskySeconds {
 
 /// What only tests and benchmarks choose.
 struct CholeskyOptions {
-  KernelLevel level = best_level();  ///< of our own kernels
+  KernelLevel level = chosen_level();  ///< of our own kernels
   Ordering ordering = Ordering::kAutomatic;
 };
 

@@ -1,5 +1,6 @@
 #include "linalg/kernel_level.h"
 
+#include <cstdlib>
 #include <stdexcept>
 
 namespace diffcloth::linalg {
@@ -34,12 +35,32 @@ void check_supported(KernelLevel level) {
   }
 }
 
-KernelLevel best_level() {
-  static const KernelLevel best = [] {
-    if (supported(KernelLevel::kAvx512)) return KernelLevel::kAvx512;
-    return supported(KernelLevel::kAvx2) ? KernelLevel::kAvx2 : KernelLevel::kPortable;
+std::vector<KernelLevel> supported_levels() {
+  using enum KernelLevel;
+  std::vector<KernelLevel> levels;
+  for (const KernelLevel level : {kPortable, kAvx2, kAvx512}) {
+    if (supported(level)) levels.push_back(level);
+  }
+  return levels;
+}
+
+KernelLevel level_named(const std::string& name, const std::string& argument) {
+  std::string names;
+  for (const KernelLevel level : supported_levels()) {
+    if (name == linalg::name(level)) return level;
+    names.append(names.empty() ? "" : ", ").append(linalg::name(level));
+  }
+  throw std::invalid_argument(argument + " must be one of " + names +
+                              ", which this build and this processor have, got '" + name + "'");
+}
+
+KernelLevel chosen_level() {
+  static const KernelLevel chosen = [] {
+    const char* const variable = "DIFFCLOTH_INSTRUCTIONS";
+    const char* const named = std::getenv(variable);
+    return named == nullptr ? supported_levels().back() : level_named(named, variable);
   }();
-  return best;
+  return chosen;
 }
 
 }  // namespace diffcloth::linalg

@@ -37,15 +37,6 @@ linalg::Backend backend_named(const std::string& name) {
                               "'");
 }
 
-std::vector<linalg::KernelLevel> supported_levels() {
-  using enum linalg::KernelLevel;
-  std::vector<linalg::KernelLevel> result;
-  for (const linalg::KernelLevel level : {kPortable, kAvx2, kAvx512}) {
-    if (linalg::supported(level)) result.push_back(level);
-  }
-  return result;
-}
-
 linalg::Ordering ordering_named(const std::string& name) {
   using enum linalg::Ordering;
   for (const linalg::Ordering ordering : {kAutomatic, kMinimumDegree, kNestedDissection}) {
@@ -79,8 +70,9 @@ struct Analysis {
     analysis = std::make_shared<linalg::CholeskyAnalysis>(
         pattern, std::vector<char>(fixed.data(), fixed.data() + fixed.shape(0)),
         backend_named(backend),
-        linalg::CholeskyOptions{.level = level.empty() ? linalg::best_level() : level_named(level),
-                                .ordering = ordering_named(ordering)});
+        linalg::CholeskyOptions{
+            .level = level.empty() ? linalg::chosen_level() : level_named(level),
+            .ordering = ordering_named(ordering)});
   }
 };
 
@@ -241,10 +233,7 @@ std::vector<double> stencil_blocks(const std::string& level,
 }  // namespace
 
 linalg::KernelLevel level_named(const std::string& name) {
-  for (const linalg::KernelLevel level : supported_levels()) {
-    if (name == linalg::name(level)) return level;
-  }
-  throw std::invalid_argument("`level` must be one of this machine's, got '" + name + "'");
+  return linalg::level_named(name, "`level`");
 }
 
 void linalg_kernels(nb::module_& m) {
@@ -256,7 +245,8 @@ void linalg_kernels(nb::module_& m) {
   });
   m.def("kernel_levels", [] {
     std::vector<std::string> names;
-    for (const linalg::KernelLevel l : supported_levels()) names.emplace_back(linalg::name(l));
+    for (const linalg::KernelLevel l : linalg::supported_levels())
+      names.emplace_back(linalg::name(l));
     return names;
   });
   m.def("stencil_blocks", &stencil_blocks, "level"_a, "vertex_count"_a, "row"_a, "left"_a,
