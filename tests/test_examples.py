@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
+from public_data import public
 
 import diffcloth_torch as dc
 
 ROOT = Path(__file__).resolve().parents[1]
-SHARED_CLOTH = ROOT.parent / "shared" / "data" / "cloth"
 
 # What users start from is not thrown by the barrier.
 pytestmark = pytest.mark.filterwarnings("error::diffcloth_torch.BarrierStartWarning")
@@ -117,12 +117,8 @@ def test_example_of_the_readme(own_mesh, monkeypatch):
 @pytest.mark.slow
 def test_example_of_the_readme_on_meshes_of_any_size():
     """From 30 cm to 70 m: it falls on the floor, stays, and slides less with more friction."""
-    if not SHARED_CLOTH.is_dir():
-        if os.environ.get("CI"):
-            pytest.fail(f"the test data is absent: {SHARED_CLOTH}")
-        pytest.skip("the test data is absent: ../shared/data/cloth")
     code = example_of_the_readme()
-    meshes = sorted(SHARED_CLOTH.glob("*.obj"))
+    meshes = sorted(public("cloth").glob("*.obj"))
     assert len(meshes) >= 5
     for mesh in meshes:
         names = {}
@@ -142,12 +138,14 @@ def test_example_of_the_readme_is_the_script():
     assert body.replace("sys.argv[1]", '"shirt.obj"') == code
 
 
+@pytest.mark.rounding
 def test_optimize_push(capsys):
     names = runpy.run_path(str(ROOT / "examples/optimize_push.py"))
     assert abs(names["error"].item()) < 1e-3  # [m], from 44 mm
     assert capsys.readouterr().out.count("speed") == 8
 
 
+@pytest.mark.rounding
 def test_fit_friction():
     names = runpy.run_path(str(ROOT / "examples/fit_friction.py"))
     # Of the data, but for the time step; the first guess is 0.1.
@@ -155,6 +153,7 @@ def test_fit_friction():
     assert names["found"].best.loss < 1e-3 * names["found"].first.loss
 
 
+@pytest.mark.rounding
 def test_optimize_batch():
     found = runpy.run_path(str(ROOT / "examples/optimize_batch.py"))["found"]
     assert found.best_losses.max() < 5e-3  # [m], each from its own guess

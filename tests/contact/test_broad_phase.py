@@ -1,21 +1,15 @@
 """Candidates, intersections and the smallest distance of a mesh: against brute force and ipctk."""
 
 import itertools
-import os
-from pathlib import Path
 
 import contact_scenes
 import ipctk
 import numpy as np
 import pytest
 import trimesh
+from public_data import public
 
 from diffcloth_torch import _kernels as kernels
-
-DATA = Path(__file__).parents[3] / "shared" / "data"
-needs_data = pytest.mark.skipif(
-    not DATA.exists() and "CI" not in os.environ, reason="the public meshes are not here"
-)
 
 
 def grid(n, rng, height=0.0):
@@ -416,7 +410,6 @@ def test_a_tip_next_to_a_face_is_judged_exactly(height, expected):
     assert (mesh.find_intersection(x) is not None) == expected
 
 
-@needs_data
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
@@ -427,16 +420,15 @@ def test_a_tip_next_to_a_face_is_judged_exactly(height, expected):
     ],
 )
 def test_public_pairs_are_judged_as_labeled(name, expected):
-    mesh = trimesh.load(DATA / "pairs" / f"{name}.ply", process=False)
+    mesh = trimesh.load(public(f"pairs/{name}.ply"), process=False)
     x, faces = np.array(mesh.vertices, float), np.array(mesh.faces, np.int32)
     assert self_intersects(x, faces) == expected
     assert ipctk_intersects(x, faces) == expected
 
 
-@needs_data
 def test_a_closing_thick_cloth_must_not_arrive():
     """Two layers that pass through each other: the safe step over the candidates is below one."""
-    meshes = [trimesh.load(DATA / "pairs" / f"thick-cloth_t{k}.ply", process=False) for k in (0, 1)]
+    meshes = [trimesh.load(public(f"pairs/thick-cloth_t{k}.ply"), process=False) for k in (0, 1)]
     x_t0, x_t1 = (np.array(mesh.vertices, float) for mesh in meshes)
     faces = np.array(meshes[0].faces, np.int32)
     mesh = kernels.BroadPhase(faces, np.zeros(len(x_t0), np.int32), 1, True, x_t0)

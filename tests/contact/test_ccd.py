@@ -1,23 +1,16 @@
 """Continuous collision detection: exact public queries, sampled motions, the promise at rest."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
+from public_data import public
 
 from diffcloth_torch import _kernels as kernels
 
-QUERIES = Path(__file__).parents[3] / "shared" / "data" / "ccd_queries_unit.npz"
 POINT_TRIANGLE, EDGE_EDGE = False, True
 KINDS = [
     pytest.param(POINT_TRIANGLE, id="point-triangle"),
     pytest.param(EDGE_EDGE, id="edge-edge"),
 ]
-
-needs_queries = pytest.mark.skipif(
-    not QUERIES.exists() and "CI" not in os.environ, reason="the public queries are not here"
-)
 
 
 def smallest_distance(edge_edge, x_t0, x_t1, until, samples=400):
@@ -30,11 +23,10 @@ def smallest_distance(edge_edge, x_t0, x_t1, until, samples=400):
     return np.sqrt(closest_sq)
 
 
-@needs_queries
 @pytest.mark.parametrize("edge_edge", KINDS)
 def test_no_exact_collision_is_missed(edge_edge):
     name = "edge_edge" if edge_edge else "vertex_face"
-    with np.load(QUERIES) as queries:
+    with np.load(public("ccd_queries_unit.npz")) as queries:
         x_t0, x_t1, hit = (queries[f"{name}_{part}"] for part in ("t0", "t1", "hit"))
     t = kernels.safe_step(edge_edge, x_t0, x_t1, 0.0)
     assert hit.sum() > 50

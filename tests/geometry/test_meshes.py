@@ -1,27 +1,17 @@
 """Mesh files, mesh checks and simple shapes: nothing is reordered, dropped or repaired."""
 
-import os
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from public_data import public
 
 import diffcloth_torch as dc
 from diffcloth_torch.geometry.meshes import read_mesh, write_mesh
 
-DATA = Path(__file__).parents[3] / "shared" / "data"
-
 VERTICES = np.array([[0.1, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 1 / 3], [7, 8, 9]])
 FACES = np.array([[0, 1, 2], [2, 1, 3]])
-
-
-def data(name):
-    if not DATA.is_dir():
-        assert "CI" not in os.environ, f"{DATA} is missing in CI"
-        pytest.skip(f"the public test data are not at {DATA}")
-    return DATA / name
 
 
 def volume(body):
@@ -169,15 +159,15 @@ def test_other_files_are_refused(tmp_path, name):
 def test_public_meshes_are_read_as_trimesh_reads_them(name, counts):
     """Without processing, trimesh keeps these clean meshes in order."""
     trimesh = pytest.importorskip("trimesh")
-    vertices, faces = read_mesh(data(name))
-    reference = trimesh.load_mesh(data(name), process=False, maintain_order=True)
+    vertices, faces = read_mesh(public(name))
+    reference = trimesh.load_mesh(public(name), process=False, maintain_order=True)
     assert len(vertices) == counts
     np.testing.assert_allclose(vertices, reference.vertices, rtol=1e-7)  # float32 in one of them
     np.testing.assert_array_equal(faces, reference.faces)
 
 
 def test_the_sock_makes_a_cloth_whose_pins_keep_their_vertices():
-    path = data("cloth/diffcloth_sock482.obj")
+    path = public("cloth/diffcloth_sock482.obj")
     cloth = dc.Cloth.load(path, scale=0.1, pins={"toe": [3, 17]})
     lines = [line.split() for line in path.read_text().splitlines() if line.startswith("v ")]
     expected = 0.1 * np.array([float(word) for word in lines[17][1:4]])

@@ -1,15 +1,12 @@
 """URDF files for tests: written from a few words, or random; and Pinocchio's view of them."""
 
 import math
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
+from public_data import public
 
 import diffcloth_torch as dc
-
-DATA = Path(__file__).parents[3] / "shared" / "data" / "robots"
 
 INERTIAL = (
     '<inertial><origin xyz="0.01 0.02 0.03" rpy="0.4 0.5 0.6"/><mass value="2"/>'
@@ -18,10 +15,7 @@ INERTIAL = (
 
 
 def data(name):
-    if not DATA.is_dir():
-        assert "CI" not in os.environ, f"{DATA} is missing in CI"
-        pytest.skip(f"the public test data are not at {DATA}")
-    return DATA / name
+    return public(f"robots/{name}")
 
 
 def panda():

@@ -1,8 +1,5 @@
 """No intersection ever, however fast things move: in frames, on the path, judged by ipctk."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -14,6 +11,7 @@ from physics_scenes import (
     solver_path,
     tensor,
 )
+from public_data import public
 
 import diffcloth_torch as dc
 
@@ -190,21 +188,11 @@ def test_pins_driven_into_a_body_are_infeasible():
 
 # --- Public meshes -------------------------------------------------------------------------------
 
-DATA = Path(__file__).parents[3] / "shared" / "data"
-
-
-def data(name):
-    path = DATA / name
-    if not path.exists():
-        assert "CI" not in os.environ, f"{DATA} is missing in CI"
-        pytest.skip(f"{path} is missing")
-    return path
-
 
 def test_two_layers_thrown_at_each_other_stop():
     # The straight motion from t0 to t1 makes the layers pass through each other.
-    before = dc.Cloth.load(data("pairs/thick-cloth_t0.ply"))
-    target = dc.Cloth.load(data("pairs/thick-cloth_t1.ply"))
+    before = dc.Cloth.load(public("pairs/thick-cloth_t0.ply"))
+    target = dc.Cloth.load(public("pairs/thick-cloth_t1.ply"))
     sim = dc.Simulator(dc.Scene([before], gravity=(0, 0, 0)), DT)
     judge = Judge(sim)
     state = sim.initial_state()
@@ -216,15 +204,15 @@ def test_two_layers_thrown_at_each_other_stop():
 
 
 def test_a_sock_falls_on_a_cow():
-    sock = dc.Cloth.load(data("cloth/diffcloth_sock482.obj"))
+    sock = dc.Cloth.load(public("cloth/diffcloth_sock482.obj"))
     size = np.ptp(sock.vertices, axis=0).max()
-    sock = dc.Cloth.load(data("cloth/diffcloth_sock482.obj"), scale=0.4 / size)
-    cow = dc.RigidBody.load(data("obstacles/spot.ply"), scale=0.3)
+    sock = dc.Cloth.load(public("cloth/diffcloth_sock482.obj"), scale=0.4 / size)
+    cow = dc.RigidBody.load(public("obstacles/spot.ply"), scale=0.3)
     low, high = sock.vertices.min(axis=0), sock.vertices.max(axis=0)
     top = cow.vertices[:, 2].max()
     shift = [*(-0.5 * (low + high))[:2], top - low[2] + 5e-3]
     sock = dc.Cloth.load(
-        data("cloth/diffcloth_sock482.obj"), scale=0.4 / size, pose=[*shift, 1, 0, 0, 0]
+        public("cloth/diffcloth_sock482.obj"), scale=0.4 / size, pose=[*shift, 1, 0, 0, 0]
     )
     sim = dc.Simulator(dc.Scene([sock], [cow]), DT)
     judge = Judge(sim)

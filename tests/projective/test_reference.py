@@ -1,24 +1,17 @@
 """The baseline against a trajectory of the original DiffCloth, and gradients of a slide."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 from nodal_scenes import counts
+from public_data import public
 
 import diffcloth_torch as dc
-
-DATA = Path(__file__).parents[3] / "shared" / "data" / "reference" / "diffcloth_sphere.npz"
 
 
 @pytest.fixture(scope="module")
 def reference():
-    if not DATA.is_file():
-        assert "CI" not in os.environ, f"{DATA} is missing in CI"
-        pytest.skip(f"the trajectory is not at {DATA}")
-    return np.load(DATA)
+    return np.load(public("reference/diffcloth_sphere.npz"))
 
 
 def simulator(reference, tolerance, **options):

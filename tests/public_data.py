@@ -1,0 +1,21 @@
+"""Public meshes, robots and recordings, which tests read from beside the clone."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+def public(name: str) -> Path:
+    """A file or a folder of the data; where it is absent, the test is skipped, and fails in CI.
+
+    The reason has the first folder alone, so that pytest shows one line for each of them.
+    """
+    path = DATA / name
+    if not path.exists():
+        reason = f"needs ../shared/data/{Path(name).parts[0]}, which no clone contains"
+        assert "CI" not in os.environ, reason
+        pytest.skip(reason)
+    return path
