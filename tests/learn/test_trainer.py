@@ -14,6 +14,8 @@ from processes import threads
 
 import diffcloth_torch as dc
 from diffcloth_torch import envs
+from diffcloth_torch.envs.actuators import Velocities
+from diffcloth_torch.envs.env import Task, lengths
 from diffcloth_torch.envs.fold_cloth import FoldCloth
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.learn import Trainer, TrainerOptions
@@ -495,26 +497,82 @@ def lift_corner(num_envs):
     return envs.make(LiftCorner(size=6, horizon=10, **SOFT), num_envs)
 
 
+class CarryStrip(Task):
+    """The held edge of a strip that hangs freely is to be 6 cm away, where it is in view.
+
+    The distance is a smooth function of every action, so that no training waits for a first
+    success, which would come sooner or later with the rounding.
+    """
+
+    name = "CarryStrip"
+    held = (0, 1)  # vertices
+
+    def __init__(self):
+        strip = dc.Cloth.grid(4, 2, size=(0.02, 0.08), pins={"held": self.held}, name="strip")
+        simulator = dc.Simulator(
+            dc.Scene([strip]),
+            0.02,
+            contact=dc.ContactOptions(self_contact=False),
+            solver=dc.SolverOptions(throw=False),
+        )
+        hand = Velocities({"strip/held": self.held}, dt=0.02, speed=0.5)
+        super().__init__(simulator, hand, horizon=10, substeps=1)
+
+    def draw(self, generator):
+        aim = torch.tensor([0.05, -0.03, 0.02], dtype=torch.float64)
+        return {"goal": aim + 0.01 * torch.randn(3, generator=generator, dtype=torch.float64)}
+
+    def place(self, drawn):
+        state = self.simulator.initial_state(len(drawn["goal"]))
+        drawn["goal"] = drawn["goal"] + state.positions[:, self.held].mean(dim=1)
+        return state, {}
+
+    def away(self, env):
+        return (env.state.positions[:, self.held].mean(dim=1) - env.drawn["goal"]) / 0.05
+
+    def features(self, env):
+        return {"away": self.away(env), "time": env.elapsed[:, None].double() / self.horizon}
+
+    def reward(self, env):
+        return -lengths(self.away(env))
+
+    def success(self, env):
+        return self.reward(env) > -0.1
+
+
+def carry_strip(num_envs):
+    return envs.make(CarryStrip(), num_envs)
+
+
+# After nine updates the return is .45 to .53 of the first one: five seeds of each algorithm, each
+# with the rounding of AVX-512 and of AVX2, which agree to .001.
+@pytest.mark.rounding
+@pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
-def test_it_improves(algorithm):
-    options = TrainerOptions(algorithm=algorithm, horizon=10, actor_rate=4e-3, deviation=0.05)
-    trainer = Trainer(lift_corner, options, num_envs=4)
+def test_it_improves(algorithm, seed):
+    options = TrainerOptions(
+        algorithm=algorithm, horizon=10, actor_rate=4e-3, deviation=0.05, seed=seed
+    )
+    trainer = Trainer(carry_strip, options, num_envs=4)
     before, _, states = trainer.evaluate(4)
     assert len(states) == 10
-    updates = {"apg": 15, "shac": 20, "sapo": 35}  # for which entropy counts, too
-    for _ in range(updates[algorithm]):
+    for _ in range(9):
         trainer.update()
     after, _, _ = trainer.evaluate(4)
-    assert after > 0.8 * before
+    assert after > 0.7 * before
 
 
-def test_a_plan_with_one_scale_improves_faster():
+# Of four seeds: where one scale serves a tensor the return is .32 to .34 of the first one, and .49
+# to .61 of the return where each number has its own.
+@pytest.mark.rounding
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_plan_with_one_scale_improves_faster(seed):
     """Steps along the gradient lift the corner while steps of one size also pull elsewhere."""
     found = {}
     for scale in ("number", "tensor"):
         options = TrainerOptions(
             "apg", horizon=10, plan_knots=5, plan_rate=0.03, actor_rate=3e-4, deviation=0.05,
-            scale=scale,
+            scale=scale, seed=seed,
         )  # fmt: skip
         trainer = Trainer(lift_corner, options, num_envs=2)
         before, _, _ = trainer.evaluate(4)
@@ -522,7 +580,7 @@ def test_a_plan_with_one_scale_improves_faster():
             trainer.update()
         found[scale], _, _ = trainer.evaluate(4)
     assert found["tensor"] > 0.4 * before
-    assert found["tensor"] > 0.65 * found["number"]
+    assert found["tensor"] > 0.75 * found["number"]
 
 
 def test_noise_and_scale_of_a_policy():

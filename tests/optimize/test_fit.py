@@ -60,6 +60,7 @@ TRUTH = {"stretch": 60.0, "bending": 4e-4}
 START = {"stretch": dc.Variable(30.0), "bending": dc.Variable(2e-4)}
 
 
+@pytest.mark.rounding
 def test_the_true_values_are_in_their_intervals(strip):
     """In nearly all of ten seeds; the fit is that of SciPy with differences."""
     hits = dict.fromkeys(TRUTH, 0)
@@ -75,6 +76,7 @@ def test_the_true_values_are_in_their_intervals(strip):
     assert all(count >= 8 for count in hits.values()), hits  # 95 % of ten, less what chance takes
 
 
+@pytest.mark.rounding
 def test_without_noise_the_truth_is_found(strip):
     residuals = residuals_of(strip, observe(strip, 0, noise=0.0, **TRUTH))
     found = dc.fit(START, residuals)
@@ -177,6 +179,7 @@ def test_values_of_starts_and_several_trajectories(strip):
     assert float(found.parameters.bending) == 3e-4
 
 
+@pytest.mark.rounding
 def test_starts_end_at_one_place_and_repeat(strip):
     residuals = residuals_of(strip, observe(strip, 1, **TRUTH))
     found = dc.fit(START, residuals, starts=3, seed=4)

@@ -12,6 +12,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 NEAR = (1e-9, 1e-7)  # [m]
 
+pytestmark = pytest.mark.rounding
+
 
 @pytest.fixture
 def branches(monkeypatch):

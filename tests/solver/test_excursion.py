@@ -6,6 +6,8 @@ import torch
 
 import diffcloth_torch as dc
 
+pytestmark = pytest.mark.rounding
+
 
 def falling_sheet(velocity: tuple[float, ...]) -> tuple[dc.Simulator, dc.State]:
     """5 mm of a sheet held by a corner, thrown by more than its size in one step.

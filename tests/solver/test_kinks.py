@@ -10,6 +10,8 @@ import diffcloth_torch as dc
 
 ROOT = Path(__file__).resolve().parents[2]
 
+pytestmark = pytest.mark.rounding
+
 
 @pytest.mark.parametrize(("name", "most"), [("crumple", 30), ("twist", 45)])
 def test_slips_that_turn_round_do_not_zigzag(monkeypatch, name, most):

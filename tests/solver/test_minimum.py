@@ -16,6 +16,8 @@ from diffcloth_torch import _kernels
 G = 9.81
 DEFAULT = dc.Material()
 
+pytestmark = pytest.mark.rounding
+
 
 @dataclass
 class Sheet:

@@ -220,6 +220,7 @@ def test_a_scene_in_units_of_powers_of_two_has_the_same_bits(name, units):
 
 
 # A sheet that buckles takes another way, or to another minimum, after any rounding.
+@pytest.mark.rounding
 @pytest.mark.parametrize("units", ROUNDED, ids=label)
 @pytest.mark.parametrize("name", [name for name in SCENES if name != "buckling"])
 def test_a_scene_in_units_of_powers_of_ten_behaves_the_same(name, units):

@@ -45,6 +45,7 @@ def test_gradients_of_all_actions_are_those_of_finite_differences(short, rng):
         assert slope == pytest.approx(difference, rel=1e-4, abs=1e-10), name
 
 
+@pytest.mark.rounding
 @pytest.mark.parametrize("short", SHORT)
 def test_a_few_iterations_of_each_task_lower_the_loss(short):
     found = optimize(short.load("optimizer.iterations=3"))

@@ -99,6 +99,7 @@ def test_the_gradient_of_the_actions_is_that_of_finite_differences():
     assert actions["linear"].grad[0, 1].item() == pytest.approx(difference, rel=1e-3)
 
 
+@pytest.mark.rounding
 def test_a_few_iterations_lower_the_loss():
     found = optimize(small_hit("optimizer.iterations=4"))
     assert found.best.loss < found.first.loss

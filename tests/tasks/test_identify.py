@@ -80,6 +80,7 @@ SHORT = {
 }
 
 
+@pytest.mark.rounding
 @pytest.mark.parametrize("name", SHORT)
 def test_what_is_known_is_found_on_a_coarser_mesh(name):
     changes, shares = SHORT[name]
