@@ -498,7 +498,7 @@ def lift_corner(num_envs):
 
 
 class CarryStrip(Task):
-    """The held edge of a strip that hangs freely is to be 6 cm away, where it is in view.
+    """A strip hangs from its upper edge, which a hand moves; its center is to be 6 cm away.
 
     The distance is a smooth function of every action, so that no training waits for a first
     success, which would come sooner or later with the rounding.
@@ -508,7 +508,10 @@ class CarryStrip(Task):
     held = (0, 1)  # vertices
 
     def __init__(self):
-        strip = dc.Cloth.grid(4, 2, size=(0.02, 0.08), pins={"held": self.held}, name="strip")
+        upright = [0.0, 0.0, 0.0, 0.5**0.5, -(0.5**0.5), 0.0, 0.0]
+        strip = dc.Cloth.grid(
+            4, 2, size=(0.02, 0.08), pins={"held": self.held}, name="strip", pose=upright
+        )
         simulator = dc.Simulator(
             dc.Scene([strip]),
             0.02,
@@ -524,11 +527,11 @@ class CarryStrip(Task):
 
     def place(self, drawn):
         state = self.simulator.initial_state(len(drawn["goal"]))
-        drawn["goal"] = drawn["goal"] + state.positions[:, self.held].mean(dim=1)
+        drawn["goal"] = drawn["goal"] + state.positions.mean(dim=1)
         return state, {}
 
     def away(self, env):
-        return (env.state.positions[:, self.held].mean(dim=1) - env.drawn["goal"]) / 0.05
+        return (env.state.positions.mean(dim=1) - env.drawn["goal"]) / 0.05
 
     def features(self, env):
         return {"away": self.away(env), "time": env.elapsed[:, None].double() / self.horizon}
@@ -544,8 +547,8 @@ def carry_strip(num_envs):
     return envs.make(CarryStrip(), num_envs)
 
 
-# After nine updates the return is .45 to .53 of the first one: five seeds of each algorithm, each
-# with the rounding of AVX-512 and of AVX2, which agree to .001.
+# After nine updates the return is .46 to .53 of the first one, over seeds and algorithms; with the
+# rounding of portable instructions and of AVX-512 it is the same to .001.
 @pytest.mark.rounding
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
