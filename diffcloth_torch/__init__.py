@@ -11,6 +11,7 @@ Units are SI, z is up, quaternions are (w, x, y, z), and everything is float64 o
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,10 +27,9 @@ if find_spec("diffcloth_torch._core") is None:
     )
 
 from diffcloth_torch._saved import let_saved_states_load, register_classes
+from diffcloth_torch.operations import called
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from diffcloth_torch import envs, fabrics, learn, robots
     from diffcloth_torch.errors import (
         AddedMassWarning,
@@ -158,6 +158,7 @@ def build_info() -> dict[str, Any]:
     return dict(_core.build_info())
 
 
+@called("load_config")
 def load_config(path: str | Path, assignments: Iterable[str] = ()) -> LoadedConfig:
     """Read a configuration of the command line, and build its scene, simulator and task.
 
@@ -180,8 +181,9 @@ def load_config(path: str | Path, assignments: Iterable[str] = ()) -> LoadedConf
     from diffcloth_torch.tasks.registry import load_task
     from diffcloth_torch.tasks.task import LoadedConfig
 
-    changes: list[Any] = [*assignments]
-    if isinstance(assignments, str) or not all(isinstance(change, str) for change in changes):
+    given: Any = assignments
+    changes: list[Any] = [*given] if isinstance(given, Iterable) else [None]
+    if isinstance(given, str) or not all(isinstance(change, str) for change in changes):
         raise TypeError(
             f'load_config: `assignments` must be a list of "key=value", got {assignments!r}'
         )

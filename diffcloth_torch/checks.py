@@ -21,6 +21,7 @@ from diffcloth_torch.transforms import has_derivative, numbers_of
 __all__ = [
     "ANY_NUMBER",
     "LARGEST",
+    "LARGEST_COUNT",
     "NON_NEGATIVE",
     "POISSON",
     "POSITIVE",
@@ -52,7 +53,7 @@ IndexArray = NDArray[np.int32]
 
 _FLOAT64_BYTES = 8
 # Counts reach the core as 32-bit integers.
-_LARGEST_COUNT = 2**31 - 1
+LARGEST_COUNT = 2**31 - 1
 _LARGEST_SHOWN = 10**30
 # Integers are accepted where a float is meant; float16, bfloat16 and float32 widen without loss.
 _PROMOTABLE = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
@@ -237,7 +238,7 @@ def check_number(
     return float(array)
 
 
-def check_count(name: str, value: object, minimum: int, maximum: int = _LARGEST_COUNT) -> int:
+def check_count(name: str, value: object, minimum: int, maximum: int = LARGEST_COUNT) -> int:
     """Require an integer of at least `minimum` and at most `maximum`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name} must be an integer, got {type(value).__name__}")

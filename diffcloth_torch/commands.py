@@ -17,7 +17,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloth_torch import build_info
+from diffcloth_torch import build_info, cpu
 from diffcloth_torch.config.documents import set_values
 from diffcloth_torch.config.viewers import open_viewers
 from diffcloth_torch.errors import InvalidInput, SimulationError
@@ -170,7 +170,7 @@ def resume(folder: Path, assignments: Iterable[str] = ()) -> str:
         )
     _check_places(folder)
     try:
-        saved = torch.load(file, weights_only=True)
+        saved = torch.load(file, map_location=cpu.DEVICE, weights_only=True)
         document, source = saved["config"], Path(saved["source"])
         start = {name: tensor.requires_grad_() for name, tensor in saved["start"].items()}
         record = saved["found"]

@@ -22,6 +22,8 @@ def as_path(name: str, value: object) -> Path:
     """Require text or a path object."""
     if not isinstance(value, str | Path):
         raise TypeError(f"{name} must be a string or a Path, got {type(value).__name__}")
+    if "\0" in str(value):
+        raise InvalidInput(f"{name} must have no NUL, as no path has, got {str(value)!r}")
     return Path(value)
 
 

@@ -12,6 +12,7 @@ from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEv
 
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import read_regular_file
+from diffcloth_torch.operations import operation
 
 __all__ = ["Document", "read_document", "resolve_path", "set_values"]
 
@@ -22,6 +23,8 @@ Document = dict[str, Any]
 _LARGEST_CONFIG_BYTES = 1 << 20
 _MOST_VALUES = 100_000  # aliases written out
 _DEEPEST = 50
+
+_SET = "--set"  # of the command line
 
 
 def read_document(path: str | Path) -> Document:
@@ -128,11 +131,13 @@ def set_values(document: Document, assignments: Iterable[str]) -> Document:
     for assignment in assignments:
         key, equals, text = assignment.partition("=")
         if not equals or not key:
-            raise InvalidInput(f"--set: must be key=value, got {assignment!r}")
+            raise InvalidInput(f"{operation(_SET)}: must be key=value, got {assignment!r}")
         try:
             value = _parse(text)
         except ValueError as error:
-            raise InvalidInput(f"--set {key}: the value is not YAML: {_one_line(error)}") from error
+            raise InvalidInput(
+                f"{operation(_SET)}: `{key}`: the value is not YAML: {_one_line(error)}"
+            ) from error
         *parents, last = key.split(".")
         place: Any = changed
         for part in parents:
@@ -142,7 +147,7 @@ def set_values(document: Document, assignments: Iterable[str]) -> Document:
         elif isinstance(place, dict):
             place[last] = value
         else:
-            raise InvalidInput(f"--set {key}: `{last}` lies below a plain value")
+            raise InvalidInput(f"{operation(_SET)}: `{key}`: `{last}` lies below a plain value")
     return changed
 
 
@@ -157,7 +162,7 @@ def _descend(key: str, place: Any, part: str) -> Any:
         return place[_item(key, place, part)]
     if isinstance(place, dict):
         return place.setdefault(part, {})  # a section that the file leaves at its defaults
-    raise InvalidInput(f"--set {key}: `{part}` lies below a plain value")
+    raise InvalidInput(f"{operation(_SET)}: `{key}`: `{part}` lies below a plain value")
 
 
 def _item(key: str, items: list[Any], part: str) -> int:
@@ -168,7 +173,9 @@ def _item(key: str, items: list[Any], part: str) -> int:
         return int(part)
     named = [str(name) for name in names if name is not None]
     accepted = ", ".join([f"0 .. {len(items) - 1}", *named]) if items else "none, it is empty"
-    raise InvalidInput(f"--set {key}: the items of the list are {accepted}; got `{part}`")
+    raise InvalidInput(
+        f"{operation(_SET)}: `{key}`: the items of the list are {accepted}; got `{part}`"
+    )
 
 
 def resolve_path(config: Path, root: str, given: str) -> Path:

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.config.scene_schema import JointKeyframe, Selection
 from diffcloth_torch.config.shape_schema import PinKeyframe, RotationSection
 from diffcloth_torch.errors import InvalidInput
@@ -58,8 +59,8 @@ def moved(start: Tensor, keyframes: Sequence[PinKeyframe], times: Tensor) -> Ten
         frames = []
     frames += [(frame.time, frame.displacement, quaternion(frame)) for frame in keyframes]
     poses = interpolate_poses(
-        torch.tensor([time for time, _, _ in frames], dtype=torch.float64),
-        torch.tensor(np.array([[*move, *turn] for _, move, turn in frames])),
+        cpu.tensor([time for time, _, _ in frames]),
+        cpu.tensor(np.array([[*move, *turn] for _, move, turn in frames])),
         times,
     )
     center = start.mean(dim=0)

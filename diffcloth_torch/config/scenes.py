@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloth_torch import fabrics, robots
+from diffcloth_torch import cpu, fabrics, robots
 from diffcloth_torch.config import shapes
 from diffcloth_torch.config.attachments import attachment, attachment_motions
 from diffcloth_torch.config.documents import resolve_path
@@ -111,10 +111,13 @@ def _cloth(section: ClothSection, root: str, source: Path) -> Cloth:
     elif shape.kind == "strip":
         rest, start, faces = _generated(section.name, strip, _given(shape))
     else:
-        start, faces = read_mesh(resolve_path(source, root, shape.path))
+        start, faces = read_mesh(resolve_path(source, root, shape.path), f"{section.name}: `path`")
         start = rest = shape.scale * start
         if shape.rest is not None:
-            rest = shape.scale * read_mesh(resolve_path(source, root, shape.rest))[0]
+            rest = (
+                shape.scale
+                * read_mesh(resolve_path(source, root, shape.rest), f"{section.name}: `rest`")[0]
+            )
     vertices = transform(start, pose_array(section.pose))
     options: dict[str, Any] = section.model_dump(
         include={"pin_stiffness", "bending_model", "directions"}, exclude_none=True
@@ -239,8 +242,8 @@ def prescribed_poses(section: BodySection | RobotSection, dt: float, steps: int)
         keyframes = []
     keyframes += [(keyframe.time, pose_array(keyframe)) for keyframe in section.trajectory]
     return interpolate_poses(
-        torch.tensor([time for time, _ in keyframes], dtype=torch.float64),
-        torch.tensor(np.array([pose for _, pose in keyframes])),
+        cpu.tensor([time for time, _ in keyframes]),
+        cpu.tensor(np.array([pose for _, pose in keyframes])),
         _step_times(dt, steps),
     )
 
@@ -279,7 +282,7 @@ def prescribed_motions(config: RunConfig, scene: Scene, steps: int) -> Trajector
 def steady_wind(config: RunConfig) -> Tensor | None:
     """Velocity of the air in every step, shape [3]."""
     wind = config.scene.air.wind
-    return None if wind is None else torch.tensor(wind, dtype=torch.float64)
+    return None if wind is None else cpu.tensor(wind)
 
 
 def step_control(
@@ -299,7 +302,7 @@ def _pin_motions(config: RunConfig, scene: Scene, times: Tensor) -> Trajectories
     for section, cloth in zip(config.scene.cloths, scene.cloths, strict=True):
         for name, keyframes in section.pin_trajectories.items():
             field = "pins" if name in cloth.pins else "soft_pins"
-            start = torch.tensor(cloth.vertices[getattr(cloth, field)[name]])
+            start = cpu.tensor(cloth.vertices[getattr(cloth, field)[name]])
             motions[field][f"{section.name}/{name}"] = moved(start, keyframes, times)
     return motions
 
@@ -336,4 +339,4 @@ def _joint_field(robot_name: str, joint: str, robot: Robot) -> tuple[str, float]
 
 
 def _step_times(dt: float, steps: int) -> Tensor:
-    return dt * torch.arange(1, steps + 1, dtype=torch.float64)
+    return dt * cpu.arange(1, steps + 1, dtype=torch.float64)

@@ -21,6 +21,7 @@ from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.errors import TurnedTooFar
 from diffcloth_torch.model.kinematics import pose_frame
+from diffcloth_torch.operations import operation
 
 __all__ = [
     "MOST_TURN_IN_CONTACT",
@@ -128,7 +129,7 @@ def _refuse_turns(lost: Tensor, speed: Tensor, dt: float, names: Sequence[str]) 
     name = f"body {names[body]!r}" if names else f"body {body}"
     sentence = turn_sentence(name, float(speed[first, body]), dt, _MOST_TURN, "may")
     environments = lost.any(-1).nonzero()[:, 0].tolist()
-    raise TurnedTooFar(f"step: {sentence}", environments=environments)
+    raise TurnedTooFar(f"{operation()}: {sentence}", environments=environments)
 
 
 def body_totals(poses: Tensor, velocities: Tensor, inertia: BodyInertia, gravity: Tensor) -> Totals:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import LARGEST
 from diffcloth_torch.dynamics.bodies import (
     MOST_TURN_IN_CONTACT,
@@ -127,14 +128,14 @@ class Dynamics:
         self._moved = _indices(k for k in range(K) if mechanisms[k].base == "kinematic")
         self._free_names = [mechanisms[k].name for k in self._free]
         surface_of_vertex = torch.repeat_interleave(
-            torch.tensor(assembly.body_vertex_start.tolist()).diff()
+            cpu.tensor(assembly.body_vertex_start.tolist(), dtype=torch.int64).diff()
         )
         owner = torch.from_numpy(assembly.surface_mechanism).long()[surface_of_vertex]
         link = torch.from_numpy(assembly.surface_link).long()[surface_of_vertex]
         vertices = torch.from_numpy(assembly.body_vertices)
 
-        row = torch.full((len(mechanisms),), -1).index_copy(
-            0, self._free, torch.arange(len(self._free))
+        row = cpu.full((len(mechanisms),), -1, dtype=torch.int64).index_copy(
+            0, self._free, cpu.arange(len(self._free))
         )[owner]  # of a vertex's body among the dynamic ones
         self._on_free = torch.nonzero(row >= 0)[:, 0]
         self._body_of_vertex = row[self._on_free]
@@ -143,7 +144,7 @@ class Dynamics:
         self._robots: list[RobotDynamics] = []
         self._robot_rows: list[tuple[slice, slice, Tensor]] = []  # joints, links, vertices
         self._widths = [6 * len(self._free)]  # lengths of the parts of the coordinates
-        held = [torch.zeros(6 * len(self._free), dtype=torch.bool)]
+        held = [cpu.zeros(6 * len(self._free), dtype=torch.bool)]
         joints = links = 0
         for t in range(K, len(mechanisms)):
             mechanism = mechanisms[t]
@@ -516,7 +517,7 @@ class Dynamics:
 
 
 def _indices(values: Iterable[int]) -> Tensor:
-    return torch.tensor(list(values), dtype=torch.long)
+    return cpu.tensor(list(values), dtype=torch.long)
 
 
 def _idle_terms(like: Tensor, count: int) -> Tensor:
@@ -529,7 +530,7 @@ def _rows(parameters: Fields, name: str, rows: slice, *shape: int) -> Tensor:
     """Rows of a parameter; zeros if the scene lacks it because nothing with it is dynamic."""
     if name in parameters:
         return parameters[name][:, rows]
-    return torch.zeros(1, rows.stop - rows.start, *shape, dtype=torch.float64)
+    return cpu.zeros(1, rows.stop - rows.start, *shape)
 
 
 def _symmetric(matrices: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.geometry.products import product
 from diffcloth_torch.model.kinematics import Kinematics, constant, joined_frame
@@ -117,7 +118,7 @@ def _rigid(arms: Tensor) -> Tensor:
     return torch.cat([upper, _LOWER.expand_as(upper)], dim=-2)
 
 
-_EYE = torch.eye(3, dtype=torch.float64, device="cpu")
-_LOWER = torch.eye(6, dtype=torch.float64, device="cpu")[3:]
+_EYE = cpu.eye(3)
+_LOWER = cpu.eye(6)[3:]
 # CROSS a is the matrix of the cross product a x, row after row.
 CROSS = torch.linalg.cross(_EYE[:, None, :], _EYE[None, :, :]).permute(2, 1, 0).reshape(9, 3)

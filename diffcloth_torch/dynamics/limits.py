@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.inertia import Inertia, Motion, mass_matrix
 from diffcloth_torch.dynamics.jacobians import ROOT, DifferentialKinematics
@@ -116,7 +117,7 @@ def _of_joints(mechanism: Mechanism, start: FloatArray, armature: FloatArray) ->
     arrays = (mechanism.mass, mechanism.center, mechanism.inertia, armature)
     inertia = Inertia(*(torch.from_numpy(np.array(a))[None] for a in arrays))
     joints = torch.from_numpy(np.array(start))[None]
-    motion = Motion.at(kinematics, inertia, torch.eye(4, dtype=torch.float64)[None], joints)
+    motion = Motion.at(kinematics, inertia, cpu.eye(4)[None], joints)
     moments = mass_matrix(motion, inertia)[0].diagonal()[ROOT:].numpy()
     pulls = motion.weighted[0, :, :3, ROOT:].norm(dim=1).sum(0).numpy()
     return _Inertia(moments, pulls, _carried(mechanism))

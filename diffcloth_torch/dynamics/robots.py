@@ -56,6 +56,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import LARGEST
 from diffcloth_torch.dynamics.functions import outputs_of, robot_functions
 from diffcloth_torch.dynamics.inertia import (
@@ -205,7 +206,7 @@ class RobotDynamics:
         self._kinematics = DifferentialKinematics(mechanism)
         self.root = self._kinematics.root
         self._prescribed = torch.from_numpy(~mechanism.forced)
-        base = torch.zeros(ROOT * (mechanism.base == "floating"), dtype=torch.bool)
+        base = cpu.zeros(ROOT * (mechanism.base == "floating"), dtype=torch.bool)
         self.prescribed = torch.cat([base, self._prescribed])
         self.coordinate_count = len(self.prescribed)
         self._prediction, self._advance = robot_functions(

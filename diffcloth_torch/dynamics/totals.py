@@ -7,6 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
+
 __all__ = ["Totals", "about_origin", "ordered_sum"]
 
 
@@ -46,7 +48,7 @@ class Totals(NamedTuple):
     @staticmethod
     def zero(environments: int) -> Totals:
         """Make the totals of a scene in which nothing moves."""
-        zeros = torch.zeros(environments, 6, dtype=torch.float64)
+        zeros = cpu.zeros(environments, 6)
         return Totals(zeros, zeros[:, 0], zeros[:, 0])
 
     def plus(self, other: Totals) -> Totals:

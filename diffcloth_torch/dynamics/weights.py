@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 
+from diffcloth_torch import cpu
 from diffcloth_torch.dynamics.inertia import Inertia, Motion, generalized_force
 from diffcloth_torch.dynamics.jacobians import ROOT, DifferentialKinematics, Frames, root_frame
 from diffcloth_torch.dynamics.linear import times
@@ -129,14 +130,14 @@ class _WeightBound:
         below[np.arange(len(kinematics.moving)), kinematics.moving] = False
         axes = np.concatenate([np.repeat(path[None], 3, axis=0), path & below[:, None, :]])
         self._between = constant(axes)  # [3 + A, L, L]
-        self._carried = torch.cat([torch.ones(3, count), kinematics.reach.T]).double()
-        self._turns = torch.cat([torch.ones(3), kinematics.revolute[:, 0]]).double()
+        self._carried = torch.cat([cpu.ones(3, count), kinematics.reach.T])
+        self._turns = torch.cat([cpu.ones(3), kinematics.revolute[:, 0]])
         leaders = kinematics.leaders[0].abs()
-        self._sizes = torch.zeros(3 + leaders.shape[0], 3 + leaders.shape[1], dtype=torch.float64)
-        self._sizes[:3, :3] = torch.eye(3)
+        self._sizes = cpu.zeros(3 + leaders.shape[0], 3 + leaders.shape[1])
+        self._sizes[:3, :3] = cpu.eye(3)
         self._sizes[3:, 3:] = leaders
         parent = torch.from_numpy(np.array(mechanism.parent)).long()
-        self._parent = torch.where(parent < 0, torch.arange(count), parent)
+        self._parent = torch.where(parent < 0, cpu.arange(count), parent)
         self._root = mechanism.root
 
     def stiffness(self, frames: Frames, inertia: Inertia, gravity: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from diffcloth_torch.envs.push_cube import PushCube
 from diffcloth_torch.envs.spread_cloth import FlingCloth, SpreadCloth
 from diffcloth_torch.envs.two_cloths import TwoCloths
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.sim.guards import on_cpu
+from diffcloth_torch.operations import called
 
 try:
     from diffcloth_torch.envs.gym import ClothVectorEnv, register
@@ -69,7 +69,7 @@ TASKS: dict[str, type[Task]] = {
 _OF_BATCH = ("seed", "autoreset_mode")
 
 
-@on_cpu
+@called("make")
 def make(task: str | Task, num_envs: int = 1, **options: Any) -> ClothVectorEnv:
     """Make environments of a task.
 

@@ -9,7 +9,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import one_hot
 
-from diffcloth_torch.checks import ANY_NUMBER, NON_NEGATIVE, POSITIVE, check_count, check_number
+from diffcloth_torch import cpu
+from diffcloth_torch.checks import (
+    ANY_NUMBER,
+    LARGEST_COUNT,
+    NON_NEGATIVE,
+    POSITIVE,
+    check_count,
+    check_number,
+    index_array,
+)
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.rotation import quaternion_exp, quaternion_multiply
 from diffcloth_torch.model.attachment import Attachment
@@ -100,6 +109,10 @@ class Pickers(Actuator):
         self.stride = check_number("Pickers: `stride`", stride, POSITIVE)
         self.reach = check_number("Pickers: `reach`", reach, NON_NEGATIVE)
         self.floor = check_number("Pickers: `floor`", floor, ANY_NUMBER)
+        given: object = cloth
+        if not isinstance(given, Cloth):
+            raise TypeError(f"Pickers: `cloth` must be a Cloth, got {type(given).__name__}")
+        stiffness = check_number("Pickers: `stiffness`", stiffness, POSITIVE)
         self._vertices = len(cloth.vertices)
         self.attachments = tuple(
             Attachment((str(cloth.name), range(self._vertices)), stiffness=stiffness, name=name)
@@ -113,7 +126,7 @@ class Pickers(Actuator):
     def start(self, points: Tensor, held: Tensor | None = None) -> Tools:
         """Pickers at points [B, P, 3], open, or closed on vertices [B, P] that are there."""
         if held is None:
-            held = torch.full(points.shape[:2], _NOTHING)
+            held = cpu.full(points.shape[:2], _NOTHING, dtype=torch.int64)
         return {
             "points": points,
             "held": held,
@@ -177,8 +190,15 @@ class Velocities(Actuator):
             dt: Time step [s].
             speed: Largest velocity along an axis [m/s].
         """
-        self._pins = {name: list(indices) for name, indices in pins.items()}
-        self._dt, self.speed = dt, speed
+        given: object = pins
+        if not isinstance(given, Mapping):
+            raise TypeError(f"Velocities: `pins` must be by name, got {type(given).__name__}")
+        self._pins = {
+            name: index_array(f"Velocities: `pins[{name!r}]`", indices, LARGEST_COUNT).tolist()
+            for name, indices in pins.items()
+        }
+        self._dt = check_number("Velocities: `dt`", dt, POSITIVE)
+        self.speed = check_number("Velocities: `speed`", speed, NON_NEGATIVE)
         self.size = 3 * len(self._pins)
 
     def act(
@@ -234,7 +254,7 @@ class Twist(Actuator):
     def __init__(self, body: str, row: int, *, dt: float, speed: float, spin: float) -> None:
         """Choose the body, by its name and its row in `State.body_poses`."""
         self._body, self._row, self._dt = body, row, dt
-        self.speeds = torch.tensor([speed] * 3 + [spin] * 3, dtype=torch.float64)
+        self.speeds = cpu.tensor([speed] * 3 + [spin] * 3)
 
     def act(
         self, tools: Tools, state: State, actions: Tensor, substeps: int
@@ -269,7 +289,7 @@ class Hand(Actuator):
     ) -> None:
         """Choose the only robot of a scene, and the joints of its fingers, by "robot/joint"."""
         self._robot, self._joints, self._dt = robot, list(joints), dt
-        self.speeds = torch.tensor([speed] * 3 + [spin] * 3, dtype=torch.float64)
+        self.speeds = cpu.tensor([speed] * 3 + [spin] * 3)
         self.effort = effort
 
     def act(

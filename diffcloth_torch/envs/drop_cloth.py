@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Tools
 from diffcloth_torch.envs.env import EnvState, lengths
 from diffcloth_torch.envs.sheets import HEIGHT, SIDE, SheetTask, follow, uniform
@@ -42,7 +43,7 @@ class DropCloth(SheetTask):
     def tools(self, positions: Tensor, drawn: Mapping[str, Tensor]) -> Tools:
         """Pickers that hold the upper corners."""
         corners = self.beginnings()
-        held = torch.tensor(corners).expand(len(positions), -1)
+        held = cpu.tensor(corners, dtype=torch.int64).expand(len(positions), -1)
         return self.pickers.start(positions[:, corners], held)
 
     def distance(self, env: EnvState) -> Tensor:
@@ -64,7 +65,7 @@ class DropCloth(SheetTask):
         corners, edge = self.beginnings(), [self.vertex(0, 0), self.vertex(-1, 0)]
         foot, out = start[:, edge], goal[:, corners] - goal[:, edge]
         foot = torch.cat([foot[..., :2], torch.full_like(foot[..., 2:], HEIGHT)], dim=-1)
-        up = torch.tensor([0.0, 0.0, SIDE], dtype=torch.float64)
+        up = cpu.tensor([0.0, 0.0, SIDE])
         # What has been laid down and what still hangs are together as long as the sheet.
         shares = [k / 6 for k in range(7)]
         laid = [foot + share * out + (1 - share) * up for share in shares]

@@ -14,9 +14,11 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Actuator, Tools
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.controls import Parameters
 from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State, where
@@ -94,12 +96,12 @@ class Task(ABC):
             raise InvalidInput(f"{type(self).__name__}: a task must have a `name`")
         if simulator.solver.throw:
             raise InvalidInput(
-                f"{self.name}: `simulator` must have SolverOptions(throw=False): one environment "
-                "that fails must not end the others"
+                f"{operation(self.name)}: `simulator` must have SolverOptions(throw=False): one "
+                "environment that fails must not end the others"
             )
         self.simulator, self.actuator = simulator, actuator
-        self.horizon = check_count(f"{self.name}: `horizon`", horizon, 1)
-        self.substeps = check_count(f"{self.name}: `substeps`", substeps, 1)
+        self.horizon = check_count(f"{operation(self.name)}: `horizon`", horizon, 1)
+        self.substeps = check_count(f"{operation(self.name)}: `substeps`", substeps, 1)
 
     @abstractmethod
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
@@ -150,8 +152,8 @@ class Task(ABC):
             state,
             tools,
             drawn,
-            torch.zeros(count, dtype=torch.int64),
-            torch.zeros(count, dtype=torch.bool),
+            cpu.zeros(count, dtype=torch.int64),
+            cpu.zeros(count, dtype=torch.bool),
         )
 
     def transition(
@@ -191,20 +193,20 @@ class Task(ABC):
     def observation_slices(self) -> dict[str, slice]:
         """Name of a feature -> its place in an observation."""
         sizes = {n: f.shape[-1] for n, f in self.features(self.example()).items()}
-        ends = torch.tensor(list(sizes.values())).cumsum(0).tolist()
+        ends = cpu.tensor(list(sizes.values()), dtype=torch.int64).cumsum(0).tolist()
         return {
             n: slice(end - size, end) for (n, size), end in zip(sizes.items(), ends, strict=True)
         }
 
     def example(self) -> EnvState:
         """A start of one environment, which shows the shapes of everything."""
-        return self.initial(torch.Generator().manual_seed(0), 1)
+        return self.initial(cpu.generator().manual_seed(0), 1)
 
 
 def failures(state: State) -> Tensor:
     """Environments whose last step failed [B]."""
     report: Any = state.report
-    return torch.tensor([status != "converged" for status in report.status])
+    return cpu.tensor([status != "converged" for status in report.status], dtype=torch.bool)
 
 
 def lengths(vectors: Tensor) -> Tensor:

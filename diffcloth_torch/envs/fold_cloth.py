@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.envs.env import EnvState, lengths
 from diffcloth_torch.envs.sheets import SIDE, SheetTask, arc, follow
 
@@ -28,8 +29,8 @@ class FoldCloth(SheetTask):
 
     def pairs(self) -> tuple[Tensor, Tensor]:
         """Vertices that move, and the ones on which they are to lie."""
-        rows = torch.arange(self.side)[:, None]
-        columns = torch.arange(self.side // 2)
+        rows = cpu.arange(self.side)[:, None]
+        columns = cpu.arange(self.side // 2)
         kept = rows * self.side + columns
         moved = rows * self.side + self.side - 1 - columns
         return moved.flatten(), kept.flatten()
@@ -57,14 +58,14 @@ class FoldCloth(SheetTask):
     def scripted(self, env: EnvState) -> Tensor:
         """Close on the corners, carry them over in an arc, put them down, let go."""
         start = env.drawn["start"]
-        low = torch.tensor([0.0, 0.0, 0.016], dtype=torch.float64)
+        low = cpu.tensor([0.0, 0.0, 0.016])
         here, there = start[:, self.beginnings()], start[:, self.ends()] + low
         carried = arc(here, there, self.lift * SIDE, 8)
         end = 5 + 8 * self.pace
         times = [4, *(5 + self.pace * k for k in range(1, 9)), end + 2, end + 6]
         points = [here, *carried, there, there + 4 * low]
         wanted, grasp = follow(env, times, points, [-1.0, *[1.0] * 9, -1.0])
-        closes = torch.tensor(self.closes)
+        closes = cpu.tensor(self.closes, dtype=torch.bool)
         return self.moves_to(
             env,
             torch.where(closes[:, None], wanted, env.tools["points"]),
@@ -88,7 +89,7 @@ class FoldClothDiagonal(FoldCloth):
     def pairs(self) -> tuple[Tensor, Tensor]:
         """Vertices that move, and the ones on which they are to lie."""
         n = self.side
-        row, column = torch.meshgrid(torch.arange(n), torch.arange(n), indexing="ij")
+        row, column = torch.meshgrid(cpu.arange(n), cpu.arange(n), indexing="ij")
         moves = row + column > n - 1
         moved = row[moves] * n + column[moves]
         kept = (n - 1 - column[moves]) * n + n - 1 - row[moves]

@@ -13,11 +13,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from diffcloth_torch.checks import check_choice, check_count
+from diffcloth_torch import cpu
+from diffcloth_torch.checks import check_choice, check_count, check_shape, float_tensor
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.controls import Parameters
-from diffcloth_torch.sim.guards import on_cpu
 
 __all__ = ["ClothVectorEnv"]
 
@@ -52,7 +53,6 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
     metadata: dict[str, Any]
     env_state: EnvState
 
-    @on_cpu
     def __init__(
         self,
         task: Task,
@@ -72,10 +72,15 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             InvalidInput: If an argument is not accepted.
         """
-        self.num_envs = check_count("make: `num_envs`", num_envs, 1)
+        owner = operation("ClothVectorEnv")
+        given: object = task
+        if not isinstance(given, Task):
+            kind = given.__name__ if isinstance(given, type) else type(given).__name__
+            raise TypeError(f"{owner}: `task` must be a Task, got {kind}")
+        self.num_envs = check_count(f"{owner}: `num_envs`", num_envs, 1)
         if isinstance(autoreset_mode, AutoresetMode):
             autoreset_mode = autoreset_mode.value
-        check_choice("make: `autoreset_mode`", autoreset_mode, _AUTORESETS)
+        check_choice(f"{owner}: `autoreset_mode`", autoreset_mode, _AUTORESETS)
         self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": []}
         self.task = task
         self.parameters: Parameters | None = None
@@ -85,10 +90,9 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         self.single_action_space = Box(-1.0, 1.0, (task.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._first_seed = None if seed is None else _checked_seed("make: `seed`", seed)
+        self._first_seed = None if seed is None else _checked_seed(f"{owner}: `seed`", seed)
         self._generators: list[torch.Generator] | None = None
 
-    @on_cpu
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Tensor, dict[str, Any]]:
@@ -111,7 +115,6 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
             self.env_state = self._with_starts(self.env_state, mask)
         return self._observe(self.env_state), self._info(self.env_state)
 
-    @on_cpu
     def step(self, actions: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, dict[str, Any]]:
         """Take a transition in all environments.
 
@@ -145,7 +148,6 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         self.env_state = after
         return observation, reward.to(_FLOAT), terminated, truncated, info
 
-    @on_cpu
     def scripted_actions(self) -> Tensor:
         """Actions of the policy made by hand, for the present state, [B, A]."""
         self._require_start("scripted_actions")
@@ -157,7 +159,6 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         self._require_start("clear_grad")
         self.env_state = self.env_state.detach()
 
-    @on_cpu
     def initialize_trajectory(self) -> Tensor:
         """Cut the graph, and give the observation [B, O] to go on from."""
         self.clear_grad()
@@ -167,15 +168,28 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         """States of the generators of starts, to go on with later: see `resume`."""
         return [generator.get_state() for generator in self._generators or []]
 
-    @on_cpu
     def resume(self, env_state: EnvState, generator_states: Sequence[Tensor]) -> Tensor:
         """Go on from a state and generators that were kept; gives the observation [B, O]."""
+        known: object = env_state
+        if not isinstance(known, EnvState):
+            raise TypeError(f"resume: `env_state` must be an EnvState, got {type(known).__name__}")
+        states: Any = generator_states
+        if not isinstance(states, Sequence):
+            raise TypeError(
+                f"resume: `generator_states` must be a list, got {type(states).__name__}"
+            )
+        for i, state in enumerate(states):
+            if not isinstance(state, Tensor) or state.dtype != torch.uint8 or not state.is_cpu:
+                raise TypeError(
+                    f"resume: `generator_states[{i}]` must be the state of a generator, got "
+                    f"{type(state).__name__}"
+                )
         for name, given in (("env_state", env_state), ("generator_states", generator_states)):
             if len(given) != self.num_envs:
                 raise InvalidInput(
                     f"resume: `{name}` must be of {self.num_envs} environments, got {len(given)}"
                 )
-        self._generators = [torch.Generator() for _ in generator_states]
+        self._generators = [cpu.generator() for _ in generator_states]
         for generator, state in zip(self._generators, generator_states, strict=True):
             generator.set_state(state)
         self.env_state = env_state
@@ -197,7 +211,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
             first = _checked_seed("reset: `seed`", seed)
             keys = [[first, i] for i in range(count)]
         words = [np.random.SeedSequence(key).generate_state(1, np.uint64)[0] for key in keys]
-        return [torch.Generator().manual_seed(int(word >> np.uint64(1))) for word in words]
+        return [cpu.generator().manual_seed(int(word >> np.uint64(1))) for word in words]
 
     def _started(self, environments: Sequence[int]) -> EnvState:
         generators = self._generators or []
@@ -210,8 +224,8 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
             return env
         # Only these draw, so that others do not depend on when these end.
         fresh = self._started(chosen)
-        rows = torch.zeros(self.num_envs, dtype=torch.int64)
-        rows[chosen] = torch.arange(len(chosen))
+        rows = cpu.zeros(self.num_envs, dtype=torch.int64)
+        rows[chosen] = cpu.arange(len(chosen))
         spread = EnvState(
             fresh.state[rows],
             {name: t[rows] for name, t in fresh.tools.items()},
@@ -230,34 +244,32 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         return {"success": success, "failed": env.failed, "elapsed": env.elapsed}
 
     def _actions(self, given: Any) -> Tensor:
-        if not isinstance(given, Tensor | np.ndarray | Sequence) or isinstance(given, str):
-            raise TypeError(f"step: `actions` must be numbers, got {type(given).__name__}")
-        actions = torch.as_tensor(given)
-        if actions.is_complex() or actions.dtype == torch.bool:
-            raise TypeError(f"step: `actions` must be real numbers, got {actions.dtype}")
-        expected = (self.num_envs, self.task.action_size)
-        if actions.shape != expected:
-            raise InvalidInput(
-                f"step: `actions` must have shape {list(expected)}, got {list(actions.shape)}"
-            )
+        actions = float_tensor("step: `actions`", given)
+        check_shape("step: `actions`", actions.shape, [(self.num_envs, self.task.action_size)])
         if not bool(torch.isfinite(actions).all()):
             row = int((~torch.isfinite(actions)).any(dim=-1).nonzero()[0])
             raise InvalidInput(
                 f"step: `actions` must be finite, those of environment {row} are not"
             )
-        return actions.to(torch.float64)
+        return actions
 
     def _reset_mask(self, options: dict[str, Any] | None) -> Tensor | None:
+        given: object = {} if options is None else options
+        if not isinstance(given, Mapping):
+            raise TypeError(f"reset: `options` must be a dict, got {type(given).__name__}")
         unknown = set(options or {}) - {"reset_mask"}
         if unknown:
             raise InvalidInput(f"reset: `options` must have only reset_mask, got {sorted(unknown)}")
         if not options or options["reset_mask"] is None:
             return None
-        mask = torch.as_tensor(options["reset_mask"])
-        if mask.dtype != torch.bool or mask.shape != (self.num_envs,):
+        try:
+            mask = cpu.as_tensor(options["reset_mask"])
+        except (TypeError, ValueError) as error:
+            raise TypeError(f"reset: `reset_mask` must be booleans: {error}") from error
+        if mask.dtype != torch.bool or mask.shape != (self.num_envs,) or not mask.is_cpu:
             raise InvalidInput(
-                f"reset: `reset_mask` must be booleans [{self.num_envs}], "
-                f"got {mask.dtype} {list(mask.shape)}"
+                f"reset: `reset_mask` must be booleans [{self.num_envs}] on the CPU, "
+                f"got {mask.dtype} {list(mask.shape)} on {mask.device}"
             )
         if self._generators is None:
             raise InvalidInput("reset: `reset_mask` needs environments that have begun")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from diffcloth_torch import robots
+from diffcloth_torch import cpu, robots
 from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Hand, Tools
 from diffcloth_torch.envs.env import EnvState, Task, lengths
@@ -21,6 +21,7 @@ from diffcloth_torch.model.options import SolverOptions
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.robot import Robot
 from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State
 
@@ -49,7 +50,7 @@ class HandTask(Task):
             horizon: Transitions of an episode.
             substeps: Time steps of a transition, of .02 s each.
         """
-        check_count(f"{self.name}: `size`", size, 4)
+        check_count(f"{operation(self.name)}: `size`", size, 4)
         material = Material(
             stretch=200, bending=1e-4, density=0.2, damping=0.01, thickness=8e-4, friction=0.8
         )
@@ -78,7 +79,7 @@ class HandTask(Task):
         hand = Hand("gripper", _JOINTS, dt=_DT)
         super().__init__(simulator, hand, horizon=horizon, substeps=substeps)
         self.hand = hand
-        some = torch.linspace(0, size - 1, 4).round().long()
+        some = cpu.linspace(0, size - 1, 4).round().long()
         self._rows = (some[:, None] * size + some).flatten()
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
@@ -103,7 +104,7 @@ class HandTask(Task):
             "base": state.base_poses[:, 0],
             "joint_positions": state.joint_positions,
             "joint_velocities": state.joint_velocities,
-            "time": (env.elapsed / self.horizon).to(torch.float64)[:, None],
+            "time": env.elapsed.double()[:, None] / self.horizon,
         }
 
     def towards(self, env: EnvState, twist: Tensor) -> Tensor:
@@ -127,7 +128,7 @@ class LiftCloth(HandTask):
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Also the goal, 6 to 12 cm above the table."""
-        goal = torch.tensor([-0.03, 0.0, _TOP + 0.09], dtype=torch.float64)
+        goal = cpu.tensor([-0.03, 0.0, _TOP + 0.09])
         return super().draw(generator) | {"goal": goal + uniform(generator, 3, -0.03, 0.03)}
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
@@ -145,7 +146,7 @@ class LiftCloth(HandTask):
 
     def scripted(self, env: EnvState) -> Tensor:
         """Close, then bring the center of the cloth to the goal."""
-        twist = torch.cat([0.3 * self._away(env), torch.zeros(len(env), 3)], dim=-1)
+        twist = torch.cat([0.3 * self._away(env), cpu.zeros(len(env), 3)], dim=-1)
         return self.towards(env, twist)
 
     def _away(self, env: EnvState) -> Tensor:
@@ -167,9 +168,9 @@ class GraspCloth(HandTask):
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
         """Also the target: the cloth hanging from the edge that is held."""
         state, tools = super().place(drawn)
-        quarter = torch.tensor([0.5**0.5, 0.0, 0.5**0.5, 0.0], dtype=torch.float64)
-        center = torch.tensor([0.02, 0.0, _TOP], dtype=torch.float64)
-        at = torch.tensor([-0.03, 0.05, 0.25], dtype=torch.float64)
+        quarter = cpu.tensor([0.5**0.5, 0.0, 0.5**0.5, 0.0])
+        center = cpu.tensor([0.02, 0.0, _TOP])
+        at = cpu.tensor([-0.03, 0.05, 0.25])
         drawn["target"] = rotate(quarter, state.positions - center) + at
         base = drawn["base"]
         drawn["target_base"] = torch.cat(
@@ -202,6 +203,6 @@ class GraspCloth(HandTask):
 
 def twist_to(base: Tensor, target: Tensor) -> Tensor:
     """Translation and rotation vector [B, 6] from poses [B, 7] to others."""
-    inverse = base[:, 3:] * torch.tensor([1.0, -1.0, -1.0, -1.0])
+    inverse = base[:, 3:] * cpu.tensor([1.0, -1.0, -1.0, -1.0])
     turn = quaternion_log(quaternion_multiply(target[:, 3:], inverse))
     return torch.cat([target[:, :3] - base[:, :3], turn], dim=-1)

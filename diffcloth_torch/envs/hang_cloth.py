@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Tools
 from diffcloth_torch.envs.env import EnvState, lengths
 from diffcloth_torch.envs.hands import HandTask, twist_to
@@ -15,7 +16,7 @@ from diffcloth_torch.sim.state import State
 
 __all__ = ["HangCloth"]
 
-_PEG = torch.tensor([0.3, 0.0, 0.2], dtype=torch.float64, device="cpu")  # between the pegs [m]
+_PEG = cpu.tensor([0.3, 0.0, 0.2])  # between the pegs [m]
 _TIP = 0.075  # from the frame of the hand to between its fingers [m]
 _CLOSE = 0.06  # distance of a cloth that hangs [m]
 
@@ -45,7 +46,7 @@ class HangCloth(HandTask):
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
         """Also the orientation of a hand that points down."""
         state, tools = super().place(drawn)
-        quarter = torch.tensor([0.5**0.5, 0.0, 0.5**0.5, 0.0], dtype=torch.float64)
+        quarter = cpu.tensor([0.5**0.5, 0.0, 0.5**0.5, 0.0])
         base = drawn["base"]
         drawn["down"] = quaternion_multiply(quarter.expand(len(base), -1), base[:, 3:])
         return state, tools
@@ -68,14 +69,14 @@ class HangCloth(HandTask):
     def scripted(self, env: EnvState) -> Tensor:
         """Close, lift and turn down, pass between the pegs, sink behind them, let go, rise."""
         steps, tips = zip(*_PATH, strict=True)
-        pegs = _PEG + torch.tensor([0.0, 0.0, _TIP], dtype=torch.float64)
-        points = [(pegs + torch.tensor(tip, dtype=torch.float64)) for tip in tips]
+        pegs = _PEG + cpu.tensor([0.0, 0.0, _TIP])
+        points = [(pegs + cpu.tensor(tip)) for tip in tips]
         path = [p.expand(len(env), 1, 3) for p in points]
         grasps = [1.0 if step <= _RELEASE else _AJAR for step in steps]
         wanted, grasp = follow(env, steps, path, grasps)
         target = torch.cat([wanted[:, 0], env.drawn["down"]], dim=-1)
         base = env.state.base_poses[:, 0]
-        rise = torch.zeros(len(env), 6, dtype=torch.float64)
+        rise = cpu.zeros(len(env), 6)
         rise[:, 2] = 0.02
         risen = (env.elapsed >= _RISEN)[:, None]
         moves = self.towards(env, torch.where(risen, 0.5 * twist_to(base, target), rise))

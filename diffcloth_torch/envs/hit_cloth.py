@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Tools, Twist
 from diffcloth_torch.envs.env import EnvState, Task, lengths
@@ -14,6 +15,7 @@ from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import SolverOptions
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State
 
@@ -47,7 +49,7 @@ class HitCloth(Task):
             horizon: Transitions of an episode.
             substeps: Time steps of a transition, of .02 s each.
         """
-        check_count(f"{self.name}: `size`", size, 4)
+        check_count(f"{operation(self.name)}: `size`", size, 4)
         sheet = Cloth.grid(
             size,
             size,
@@ -64,9 +66,9 @@ class HitCloth(Task):
         simulator = Simulator(Scene([sheet], [cuboid]), _DT, solver=SolverOptions(throw=False))
         actuator = Twist("cuboid", 0, dt=_DT, speed=1.5, spin=4.0)
         super().__init__(simulator, actuator, horizon=horizon, substeps=substeps)
-        some = torch.linspace(0, size - 1, 4).round().long()
+        some = cpu.linspace(0, size - 1, 4).round().long()
         self._rows = (some[:, None] * size + some).flatten()
-        rest = torch.tensor(sheet.rest_positions, dtype=torch.float64)
+        rest = cpu.tensor(sheet.rest_positions)
         # Turned up by half a turn about the pins.
         self.target = torch.stack(
             [rest[:, 0], 0.5 - rest[:, 1], torch.full_like(rest[:, 2], 1.5)], dim=-1
@@ -92,7 +94,7 @@ class HitCloth(Task):
             "velocities": env.state.velocities[:, self._rows].flatten(1),
             "to_target": (self.target[self._rows] - positions).flatten(1),
             "cuboid": env.state.body_poses[:, 0],
-            "time": (env.elapsed / self.horizon).to(torch.float64)[:, None],
+            "time": env.elapsed.double()[:, None] / self.horizon,
         }
 
     def distance(self, env: EnvState) -> Tensor:
@@ -111,7 +113,7 @@ class HitCloth(Task):
     def scripted(self, env: EnvState) -> Tensor:
         """Swing the cuboid along a path made by hand."""
         duration = self.substeps * _DT
-        path = torch.tensor(_PATH, dtype=torch.float64).expand(len(env), -1, -1)
+        path = cpu.tensor(_PATH).expand(len(env), -1, -1)
         times = [0.1 * (k + 1) / duration for k in range(len(_PATH))]
         wanted, _ = follow(env, times, path[:, :, None].unbind(dim=1), [0.0] * len(_PATH))
         pose = env.state.body_poses[:, 0]

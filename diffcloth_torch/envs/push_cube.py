@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Tools, Velocities
 from diffcloth_torch.envs.env import EnvState, Task, lengths
@@ -14,6 +15,7 @@ from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import SolverOptions
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State
 
@@ -43,7 +45,7 @@ class PushCube(Task):
             horizon: Transitions of an episode.
             substeps: Time steps of a transition, of .02 s each.
         """
-        check_count(f"{self.name}: `size`", size, 4)
+        check_count(f"{operation(self.name)}: `size`", size, 4)
         sheet = Cloth.grid(
             size,
             size,
@@ -69,13 +71,13 @@ class PushCube(Task):
         actuator = Velocities(pins, dt=_DT, speed=_SPEED)
         super().__init__(simulator, actuator, horizon=horizon, substeps=substeps)
         self._pins = [row for rows in pins.values() for row in rows]
-        self._rows = torch.linspace(0, size * size - 1, 16).round().long()
+        self._rows = cpu.linspace(0, size * size - 1, 16).round().long()
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Where the cube stands, within 2 cm, and its target, within 5 cm."""
         return {
             "cube": uniform(generator, 2, -0.02, 0.02),
-            "target": torch.tensor([0.0, 0.22]) + uniform(generator, 2, -0.05, 0.05),
+            "target": cpu.tensor([0.0, 0.22]) + uniform(generator, 2, -0.05, 0.05),
         }
 
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
@@ -95,7 +97,7 @@ class PushCube(Task):
             "cube": state.body_poses[:, 0],
             "cube_velocities": state.body_velocities[:, 0],
             "to_target": self._away(env),
-            "time": (env.elapsed / self.horizon).to(torch.float64)[:, None],
+            "time": env.elapsed.double()[:, None] / self.horizon,
         }
 
     def reward(self, env: EnvState) -> Tensor:
@@ -114,7 +116,7 @@ class PushCube(Task):
         to_target = away / distance.clamp(min=1e-3)
         ahead = away - _BRAKING * velocity
         pushes = ((ahead * away).sum(dim=-1, keepdim=True) > 0) & (distance > 0.3 * _CLOSE)
-        middle = cube + torch.where(pushes, 0.04, -_CUBE) * to_target
+        middle = cube + torch.where(pushes, 0.04 * to_target, -_CUBE * to_target)
         across = 0.5 * _SIDE * torch.stack([to_target[:, 1], -to_target[:, 0]], dim=-1)
         goals = torch.stack([middle - across, middle + across], dim=1)
         pins = env.state.positions[:, self._pins, :2]

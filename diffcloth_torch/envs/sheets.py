@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import check_choice, check_count
 from diffcloth_torch.envs.actuators import Pickers, Tools
 from diffcloth_torch.envs.env import EnvState, Task
@@ -17,6 +18,7 @@ from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State
 
@@ -32,7 +34,7 @@ _MATERIAL = Material(bending=1e-5, damping=1e-3, friction=0.5)
 
 def uniform(generator: torch.Generator, size: int, low: float, high: float) -> Tensor:
     """Numbers [size] between two bounds, float64."""
-    return low + (high - low) * torch.rand(size, generator=generator, dtype=torch.float64)
+    return low + (high - low) * cpu.rand(size, generator=generator)
 
 
 class SheetTask(Task):
@@ -69,8 +71,8 @@ class SheetTask(Task):
                 is nowhere zero; see `Pickers`.
             reach: Within which a picker closes on a vertex [m]; at .06 all begin within reach.
         """
-        self.side = check_count(f"{self.name}: `size`", size, 4)
-        check_choice(f"{self.name}: `observation`", observation, OBSERVATIONS)
+        self.side = check_count(f"{operation(self.name)}: `size`", size, 4)
+        check_choice(f"{operation(self.name)}: `observation`", observation, OBSERVATIONS)
         sheet = Cloth.grid(
             size, size, SIDE, name="sheet", pose=[0, 0, HEIGHT, 1, 0, 0, 0], material=material
         )
@@ -84,9 +86,9 @@ class SheetTask(Task):
         )
         super().__init__(simulator, pickers, horizon=horizon, substeps=substeps)
         self.pickers = pickers
-        self.rest = torch.tensor(np.asarray(sheet.rest_positions), dtype=torch.float64)
-        some = torch.linspace(0, size - 1, _KEY_POINTS).round().long()
-        rows = some if observation == "keypoints" else torch.arange(size)
+        self.rest = cpu.tensor(np.asarray(sheet.rest_positions))
+        some = cpu.linspace(0, size - 1, _KEY_POINTS).round().long()
+        rows = some if observation == "keypoints" else cpu.arange(size)
         self.key_points = (rows[:, None] * size + rows).flatten()
         self._share = float(np.mean(material.density)) * SIDE**2 * 9.81 / size**2
 
@@ -104,7 +106,7 @@ class SheetTask(Task):
 
     def shape(self, drawn: dict[str, Tensor]) -> Tensor:
         """Positions [B, N, 3] of the sheet before it is turned and moved: flat on the table."""
-        flat = self.rest + torch.tensor([0.0, 0.0, HEIGHT], dtype=torch.float64)
+        flat = self.rest + cpu.tensor([0.0, 0.0, HEIGHT])
         return flat.expand(len(drawn["turn"]), -1, -1)
 
     def posed(self, points: Tensor, drawn: Mapping[str, Tensor]) -> Tensor:
@@ -125,8 +127,8 @@ class SheetTask(Task):
 
     def tools(self, positions: Tensor, drawn: Mapping[str, Tensor]) -> Tools:
         """Open pickers up to 1.5 cm beside, and 1 to 3 cm above, the vertices of `beginnings`."""
-        off = drawn["pickers"] * torch.tensor([0.015, 0.015, 0.01], dtype=torch.float64)
-        off = off + torch.tensor([0.0, 0.0, 0.02], dtype=torch.float64)
+        off = drawn["pickers"] * cpu.tensor([0.015, 0.015, 0.01])
+        off = off + cpu.tensor([0.0, 0.0, 0.02])
         return self.pickers.start(positions[:, self.beginnings()] + off)
 
     def beginnings(self) -> list[int]:
@@ -142,7 +144,7 @@ class SheetTask(Task):
             "contact_forces": (state.contact_forces[:, rows] / self._share).flatten(1),
             "pickers": (env.tools["points"] / SIDE).flatten(1),
             "grasp": env.tools["grasp"],
-            "time": (env.elapsed / self.horizon).to(torch.float64)[:, None],
+            "time": env.elapsed.double()[:, None] / self.horizon,
         }
 
     def moves_to(self, env: EnvState, points: Tensor, grasp: Tensor) -> Tensor:
@@ -166,20 +168,20 @@ def follow(
         Points [B, P, 3], and grasps [B, P].
     """
     after = (env.elapsed + 1).to(torch.float64)
-    knots = torch.tensor(list(times), dtype=torch.float64)
+    knots = cpu.tensor(list(times))
     last = torch.searchsorted(knots, after).clamp(max=len(knots) - 1)
     first = (last - 1).clamp(min=0)
     length = (knots[last] - knots[first]).clamp(min=1e-9)
     t = ((after - knots[first]) / length).clamp(0, 1)[:, None, None]
     path = torch.stack(list(points))  # [K, B, P, 3]
-    rows = torch.arange(len(env))
+    rows = cpu.arange(len(env))
     there = path[first, rows] + t * (path[last, rows] - path[first, rows])
-    grasp = torch.tensor(list(grasps), dtype=torch.float64)[last]
+    grasp = cpu.tensor(list(grasps))[last]
     return there, grasp[:, None].expand(-1, there.shape[1])
 
 
 def arc(a: Tensor, b: Tensor, height: float, count: int) -> list[Tensor]:
     """Points on half an ellipse from a to b above the line between them, without a itself."""
-    up = torch.tensor([0.0, 0.0, height], dtype=torch.float64)
+    up = cpu.tensor([0.0, 0.0, height])
     turns = [math.pi * k / count for k in range(1, count + 1)]
     return [a + 0.5 * (1 - math.cos(turn)) * (b - a) + math.sin(turn) * up for turn in turns]

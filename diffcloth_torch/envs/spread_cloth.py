@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Tools
 from diffcloth_torch.envs.env import EnvState, failures
 from diffcloth_torch.envs.sheets import HEIGHT, SIDE, SheetTask, follow, uniform
@@ -34,7 +35,7 @@ def covered_area(positions: Tensor, spacing: float) -> Tensor:
         positions: Of the vertices [B, N, 3].
         spacing: Their distances in the flat sheet [m].
     """
-    centers = torch.arange(-_EXTENT, _EXTENT, _CELL, dtype=torch.float64)
+    centers = cpu.arange(-_EXTENT, _EXTENT, _CELL, dtype=torch.float64)
     width = _WIDTH * spacing
     x, y = (
         torch.exp(-0.5 * ((centers[:, None] - positions[:, None, :, axis]) / width) ** 2)
@@ -70,7 +71,7 @@ class SpreadCloth(SheetTask):
     def shape(self, drawn: dict[str, Tensor]) -> Tensor:
         """Pleats across x that keep all lengths: the slope is a sine of the arc length."""
         n = self.side
-        s = torch.linspace(0.0, 1.0, 16 * (n - 1) + 1, dtype=torch.float64)
+        s = cpu.linspace(0.0, 1.0, 16 * (n - 1) + 1)
         middle = 0.5 * (s[1:] + s[:-1])
         slope = drawn["steepness"][:, None] * torch.sin(
             2 * math.pi * _PLEATS * middle + drawn["phase"][:, None]
@@ -127,10 +128,10 @@ class SpreadCloth(SheetTask):
     def scripted(self, env: EnvState) -> Tensor:
         """Close on the edges, pull them apart, let go."""
         here = env.drawn["start"][:, self.beginnings()]
-        along = self.along(env) * torch.tensor([[-0.5], [0.5]], dtype=torch.float64)
+        along = self.along(env) * cpu.tensor([[-0.5], [0.5]])
         apart = here.mean(dim=1, keepdim=True) + SIDE * along
         apart = torch.cat([apart[..., :2], torch.full_like(apart[..., 2:], 0.01)], dim=-1)
-        up = torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64)
+        up = cpu.tensor([0.0, 0.0, 0.03])
         return self.moves_to(
             env,
             *follow(
@@ -168,7 +169,7 @@ class FlingCloth(SpreadCloth):
         here = env.drawn["start"][:, self.beginnings()]
         along = SIDE * self.along(env)
         foot = torch.cat([here[..., :2], torch.zeros_like(here[..., 2:])], dim=-1) - 0.9 * along
-        up = torch.tensor([0.0, 0.0, SIDE], dtype=torch.float64)
+        up = cpu.tensor([0.0, 0.0, SIDE])
         # What has been laid down and what still hangs are together as long as the sheet.
         laid = [foot + k / 6 * along + (1.02 - k / 6) * up for k in range(7)]
         points = [here, here, *[foot + 1.15 * up] * 2, *laid, laid[-1], laid[-1] + 0.1 * up]

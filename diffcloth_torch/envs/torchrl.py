@@ -10,6 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from diffcloth_torch import cpu
 from diffcloth_torch.envs.gym import ClothVectorEnv
 from diffcloth_torch.errors import InvalidInput
 
@@ -54,7 +55,9 @@ class TorchRLEnv(EnvBase):  # type: ignore[misc]  # which has no types
             options = {"reset_mask": tensordict["_reset"].reshape(-1)}
         observation, info = self.env.reset(seed=self._next_seed, options=options)
         self._next_seed = None
-        ends = dict.fromkeys(("terminated", "truncated"), torch.zeros(self.batch_size).bool())
+        ends = dict.fromkeys(
+            ("terminated", "truncated"), cpu.zeros(self.batch_size, dtype=torch.bool)
+        )
         return self._dict(observation, info, ends)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:

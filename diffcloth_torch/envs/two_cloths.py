@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Forces, Tools
 from diffcloth_torch.envs.env import EnvState, Task, lengths
@@ -15,6 +16,7 @@ from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import SolverOptions
 from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.sim.state import State
 
@@ -47,13 +49,13 @@ class TwoCloths(Task):
             horizon: Transitions of an episode.
             substeps: Time steps of a transition, of .02 s each.
         """
-        check_count(f"{self.name}: `size`", size, 4)
+        check_count(f"{operation(self.name)}: `size`", size, 4)
         columns = 2 * size + 7
         flat, bent, faces = strip(_LENGTH, _WIDTH, _ROWS, columns, 180.0, 0.05, 0.5)
         material = Material(stretch=300, bending=1e-5, density=0.2, damping=0.01, friction=0.3)
         cloths = [
             Cloth(
-                transform(bent, torch.tensor(pose, dtype=torch.float64).numpy()),
+                transform(bent, cpu.tensor(pose).numpy()),
                 faces,
                 rest_positions=flat,
                 material=material,
@@ -64,19 +66,19 @@ class TwoCloths(Task):
         count = len(flat)
         ends = [row * columns + end for row in range(_ROWS) for end in (0, columns - 1)]
         weight = 0.2 * _LENGTH * _WIDTH * 9.81
-        steady = torch.zeros(2 * count, 3, dtype=torch.float64)
+        steady = cpu.zeros(2 * count, 3)
         steady[ends, 2] = weight / len(ends)
         pulled = [count + i for i in ends]
-        steady[pulled] = torch.tensor([_PULL, 0.0, weight], dtype=torch.float64) / len(ends)
+        steady[pulled] = cpu.tensor([_PULL, 0.0, weight]) / len(ends)
         simulator = Simulator(Scene(cloths), _DT, solver=SolverOptions(throw=False))
         actuator = Forces([ends], steady, largest=_LARGEST)
         super().__init__(simulator, actuator, horizon=horizon, substeps=substeps)
         self._count, self._weight = count, weight
-        self._rows = torch.linspace(0, 2 * count - 1, 20).round().long()
+        self._rows = cpu.linspace(0, 2 * count - 1, 20).round().long()
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """The target, within 3 cm."""
-        target = torch.tensor([-0.2, 0.05, 0.05], dtype=torch.float64)
+        target = cpu.tensor([-0.2, 0.05, 0.05])
         return {"target": target + uniform(generator, 3, -0.03, 0.03)}
 
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
@@ -91,7 +93,7 @@ class TwoCloths(Task):
             "velocities": state.velocities[:, self._rows].flatten(1),
             "to_target": self._away(env),
             "center_velocity": state.velocities[:, : self._count].mean(dim=1),
-            "time": (env.elapsed / self.horizon).to(torch.float64)[:, None],
+            "time": env.elapsed.double()[:, None] / self.horizon,
         }
 
     def distance(self, env: EnvState) -> Tensor:
@@ -116,7 +118,7 @@ class TwoCloths(Task):
     def scripted(self, env: EnvState) -> Tensor:
         """Bear the pull, and be a damped spring to the target."""
         velocity = env.state.velocities[:, : self._count].mean(dim=1)
-        bear = torch.tensor([-_PULL, 0.0, 0.0], dtype=torch.float64)
+        bear = cpu.tensor([-_PULL, 0.0, 0.0])
         force = bear + 0.7 * self._away(env) - 0.12 * velocity
         return (force / _LARGEST).clamp(-1, 1)
 

@@ -30,8 +30,12 @@ MeshPart = tuple[str, FloatArray, NDArray[np.integer]]
 """Name, vertices [n, 3] in meters and faces [f, 3] of one object of a file."""
 
 
-def read_mesh(path: str | Path) -> tuple[FloatArray, Indices]:
+def read_mesh(path: str | Path, name: str = "read_mesh: `path`") -> tuple[FloatArray, Indices]:
     """Read vertices [n, 3] and triangles [f, 3] of an .obj, .ply or .stl file.
+
+    Args:
+        path: The file.
+        name: Opens messages about the path; those about the content of the file open with it.
 
     Raises:
         InvalidInput: If the file is empty, malformed, of another format, larger than 1 GiB or not a
@@ -40,11 +44,11 @@ def read_mesh(path: str | Path) -> tuple[FloatArray, Indices]:
         TypeError: If `path` is not a path.
         OSError: If the file cannot be read.
     """
-    path = as_path("mesh file: `path`", path)
+    path = as_path(name, path)
     readers = {".obj": _read_obj, ".ply": read_ply, ".stl": _read_stl}
     reader = readers.get(path.suffix.lower())
     if reader is None:
-        raise InvalidInput(f"{path}: mesh files end in {', '.join(readers)}; got {path.suffix!r}")
+        raise InvalidInput(f"{name} must end in {', '.join(readers)}, got {str(path)!r}")
     vertices, faces = reader(path, read_regular_file(path, _LARGEST_FILE))
     if len(vertices) == 0 or len(faces) == 0:
         raise InvalidInput(

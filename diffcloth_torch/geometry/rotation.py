@@ -11,6 +11,8 @@ import math
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
+
 __all__ = [
     "integrate_poses",
     "interpolate_poses",
@@ -29,10 +31,8 @@ __all__ = [
 _SERIES_ANGLE = 0.1
 
 # Of (a/2)^2 to the powers of 1 to 4: in cos(a/2) - 1, and in sin(a/2) / (a/2) - 1.
-_SERIES = torch.tensor(
+_SERIES = cpu.tensor(
     [[(-1) ** k / math.factorial(2 * k + i) for k in range(1, 5)] for i in range(2)],
-    dtype=torch.float64,
-    device="cpu",
 )
 
 # sin(a / 2) below which a logarithm takes a / sin(a / 2) = 2, right to rounding.
@@ -41,10 +41,10 @@ _SMALLEST_SINE = 1e-9
 
 # The entries of a rotation matrix are twice a product of two entries of its quaternion plus or
 # minus another, less one on the diagonal; products of (w, x, y, z) are numbered row after row.
-_FIRST = torch.tensor([0, 6, 7, 6, 0, 11, 7, 11, 0], device="cpu")
-_SECOND = torch.tensor([5, 3, 2, 3, 10, 1, 2, 1, 15], device="cpu")
-_SIGN = torch.tensor([1, -1, 1, 1, 1, -1, -1, 1, 1], dtype=torch.float64, device="cpu")
-_IDENTITY = torch.eye(3, dtype=torch.float64, device="cpu").flatten()
+_FIRST = cpu.tensor([0, 6, 7, 6, 0, 11, 7, 11, 0], dtype=torch.int64)
+_SECOND = cpu.tensor([5, 3, 2, 3, 10, 1, 2, 1, 15], dtype=torch.int64)
+_SIGN = cpu.tensor([1, -1, 1, 1, 1, -1, -1, 1, 1])
+_IDENTITY = cpu.eye(3).flatten()
 
 
 def quaternion_exp(rotation_vector: Tensor) -> Tensor:
@@ -150,7 +150,7 @@ def pose_velocities(start: Tensor, end: Tensor, dt: float) -> Tensor:
         pose[..., 3:] / torch.linalg.vector_norm(pose[..., 3:], dim=-1, keepdim=True)
         for pose in (start, end)
     )
-    conjugate = before * torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=before.dtype)
+    conjugate = before * cpu.tensor([1.0, -1.0, -1.0, -1.0], dtype=before.dtype)
     turn = quaternion_log(quaternion_multiply(after, conjugate))
     return torch.cat([end[..., :3] - start[..., :3], turn], dim=-1) / dt
 
@@ -168,7 +168,7 @@ def row_velocities(start: Tensor, end: Tensor, rows: Tensor, dt: float) -> Tenso
         Shape [B, K, 6].
     """
     shape = (max(len(start), len(end)), start.shape[1], 6)
-    velocities = torch.zeros(shape, dtype=start.dtype)
+    velocities = cpu.zeros(shape, dtype=start.dtype)
     if not len(rows):
         return velocities
     return velocities.index_copy(1, rows, pose_velocities(start[:, rows], end[:, rows], dt))
@@ -191,7 +191,7 @@ def interpolate_poses(times: Tensor, poses: Tensor, at: Tensor) -> Tensor:
     a, b = poses[after - 1], poses[after]
     span = times[after] - times[after - 1]
     part = ((at - times[after - 1]) / span).clamp(0, 1)[:, None]
-    conjugate = a[:, 3:] * torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=a.dtype)
+    conjugate = a[:, 3:] * cpu.tensor([1.0, -1.0, -1.0, -1.0], dtype=a.dtype)
     turn = quaternion_log(quaternion_multiply(b[:, 3:], conjugate))
     quaternions = quaternion_multiply(quaternion_exp(part * turn), a[:, 3:])
     return torch.cat([torch.lerp(a[:, :3], b[:, :3], part), quaternions], dim=-1)

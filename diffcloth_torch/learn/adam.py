@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
+
 __all__ = ["TensorAdam"]
 
 _LEAST = 1e-8  # added to what gradients are divided by, as in Adam
@@ -40,7 +42,7 @@ class TensorAdam(torch.optim.Optimizer):
         gradient, kept = parameter.grad, self.state[parameter]
         assert gradient is not None
         if not kept:
-            kept["step"] = torch.zeros(())
+            kept["step"] = cpu.zeros((), dtype=torch.float32)
             kept["mean"] = torch.zeros_like(parameter)
             kept["square"] = parameter.new_zeros(())
         kept["step"] += 1

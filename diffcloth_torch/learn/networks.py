@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
+
+from diffcloth_torch import cpu
 
 __all__ = ["Actor", "Critics", "Plan", "Scale"]
 
@@ -16,14 +19,16 @@ _LIMIT = 5.0  # of a scaled observation
 _QUIET = 0.01  # share of the weights of a last layer that is left at first
 _WIDEST = 2.0  # of the logarithm of a width: how far what is seen changes it
 _LEAST = 1e-2  # standard deviation that observations are divided by
+# As observations, whatever torch's defaults are.
+_KIND: dict[str, Any] = {"device": cpu.DEVICE, "dtype": torch.float32}
 
 
 def _layers(sizes: Sequence[int], outputs: int) -> nn.Sequential:
     """Linear layers with ELU and LayerNorm between them."""
     layers: list[nn.Module] = []
     for before, after in pairwise(sizes):
-        layers += [nn.Linear(before, after), nn.ELU(), nn.LayerNorm(after)]
-    return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
+        layers += [nn.Linear(before, after, **_KIND), nn.ELU(), nn.LayerNorm(after, **_KIND)]
+    return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs, **_KIND))
 
 
 def _quieten(layers: nn.Module) -> Tensor:
@@ -48,12 +53,12 @@ class Plan(nn.Module):
         """Make a plan that is `first` [A] at all times, whatever is seen."""
         super().__init__()
         self.knots = nn.Parameter(first.repeat(knots, 1))
-        self.gains = nn.Parameter(torch.zeros(len(first), observations))
+        self.gains = nn.Parameter(cpu.zeros(len(first), observations, dtype=torch.float32))
 
     def forward(self, scaled: Tensor, time: Tensor) -> Tensor:
         """Actions before their tanh [B, A] for observations [B, O] at times in [0, 1], [B]."""
         count = len(self.knots)
-        away = time[:, None] * (count - 1) - torch.arange(count)
+        away = time[:, None] * (count - 1) - cpu.arange(count)
         shares = (1 - away.abs()).clamp(min=0)
         result: Tensor = shares @ self.knots + scaled @ self.gains.T
         return result
@@ -133,9 +138,9 @@ class Scale(nn.Module):
 
     def __init__(self, observations: int) -> None:
         super().__init__()
-        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("mean", torch.zeros(observations))
-        self.register_buffer("square", torch.ones(observations))
+        self.register_buffer("count", cpu.zeros(()))
+        self.register_buffer("mean", cpu.zeros(observations, dtype=torch.float32))
+        self.register_buffer("square", cpu.ones(observations, dtype=torch.float32))
         self.count: Tensor
         self.mean: Tensor
         self.square: Tensor

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.envs.env import EnvState
 from diffcloth_torch.envs.gym import ClothVectorEnv
 from diffcloth_torch.errors import InvalidInput
@@ -46,10 +47,11 @@ class Policy(torch.nn.Module):
         """Make networks for the observations and actions of environments."""
         super().__init__()
         observations = env.task.observation(env.task.example()).shape[-1]
+        self.observations = int(observations)
         first = options.first_action or [0.0] * env.task.action_size
         self.actor = Actor(
             observations,
-            torch.tensor(first),
+            cpu.tensor(first, dtype=torch.float32),
             options.hidden,
             options.deviation,
             sees_width=options.has_entropy,
@@ -61,7 +63,9 @@ class Policy(torch.nn.Module):
         self.targets = Critics(observations, options.hidden, critics)
         self.targets.load_state_dict(self.critics.state_dict())
         self.scale = Scale(observations)
-        self.log_temperature = torch.nn.Parameter(torch.tensor(options.temperature).log())
+        self.log_temperature = torch.nn.Parameter(
+            cpu.tensor(options.temperature, dtype=torch.float32).log()
+        )
         self._has_entropy = options.has_entropy
 
     @property
@@ -72,7 +76,7 @@ class Policy(torch.nn.Module):
     def forward(self, observation: Tensor, noise: Tensor | None = None) -> Tensor:
         """Actions [B, A] for observations [B, O], with standard normal noise [B, A] or without."""
         if noise is None:
-            noise = torch.zeros(1)
+            noise = cpu.zeros(1, dtype=torch.float32)
         return self.act(observation, noise)[0]
 
     def act(self, observation: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
@@ -158,7 +162,7 @@ def roll_out(env: ClothVectorEnv, piece: Piece) -> Rollout:
     count, horizon = env.num_envs, len(piece.noise)
     temperature = policy.temperature
     rows: list[dict[str, Tensor]] = []
-    discount, total = torch.ones(count), torch.zeros(count)
+    discount, total = cpu.ones(count, dtype=torch.float32), cpu.zeros(count, dtype=torch.float32)
     for t, noise in enumerate(piece.noise):
         seen = observation.detach()
         actions, entropy = policy.act(observation if o.feedback else seen, noise)

@@ -20,7 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch.checks import check_count, refuse_threads
+from diffcloth_torch import cpu
+from diffcloth_torch.checks import check_count, check_shape, refuse_threads
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.envs.gym import begins_anew
 from diffcloth_torch.errors import InvalidInput, SimulationError
@@ -113,7 +114,7 @@ class Trainer:
                 f"TrainerOptions: `first_action` must have {actions} numbers, got {len(first)}"
             )
         o = self.options
-        self._noise = torch.Generator().manual_seed(o.seed)
+        self._noise = cpu.generator().manual_seed(o.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(o.seed)
             self.policy = Policy(self._env, o)
@@ -132,7 +133,7 @@ class Trainer:
             [self.policy.log_temperature], lr=o.temperature_rate, betas=o.betas
         )
         self.steps = self.updates = 0
-        self._return = torch.zeros(num_envs)
+        self._return = cpu.zeros(num_envs, dtype=torch.float32)
 
     @property
     def task(self) -> Task:
@@ -141,6 +142,13 @@ class Trainer:
 
     def act(self, observation: Tensor) -> Tensor:
         """Actions [B, A] without noise."""
+        given: object = observation
+        if not isinstance(given, Tensor) or given.dtype != torch.float32 or not given.is_cpu:
+            kind = given.dtype if isinstance(given, Tensor) else type(given).__name__
+            raise TypeError(
+                f"Trainer.act: `observation` must be a float32 tensor on the CPU, got {kind}"
+            )
+        check_shape("Trainer.act: `observation`", given.shape, [("B", self.policy.observations)])
         with torch.no_grad(), threads_of_torch(self._threads):
             actions: Tensor = self.policy(observation)
         return actions
@@ -196,10 +204,15 @@ class Trainer:
             Mean return, share of successes at the end, and the states of all episodes until the
             first of them ends.
         """
+        check_count("Trainer.evaluate: `episodes`", episodes, 1)
+        check_count("Trainer.evaluate: `seed`", seed, 0)
         env = self._make_env(num_envs=episodes)
         observation, _ = env.reset(seed=seed)
-        total, running = torch.zeros(episodes), torch.ones(episodes, dtype=torch.bool)
-        success = torch.zeros(episodes, dtype=torch.bool)
+        total, running = (
+            cpu.zeros(episodes, dtype=torch.float32),
+            cpu.ones(episodes, dtype=torch.bool),
+        )
+        success = cpu.zeros(episodes, dtype=torch.bool)
         states = [env.env_state.state]
         while bool(running.any()):
             observation, reward, terminated, truncated, info = env.step(self.act(observation))
@@ -247,7 +260,7 @@ class Trainer:
         if not path.is_file():
             raise InvalidInput(f"Trainer.load: `path` must be a file, got {str(path)!r}")
         try:
-            kept: Any = torch.load(path, weights_only=True)
+            kept: Any = torch.load(path, map_location=cpu.DEVICE, weights_only=True)
         except (OSError, MemoryError):
             raise
         except Exception as error:  # whatever unpickling makes of bytes that are not its own
@@ -320,7 +333,7 @@ class Trainer:
     def _pieces(self) -> list[Piece]:
         o = self.options
         sizes = (o.horizon, self._count, self.task.action_size)
-        noise = torch.randn(sizes, generator=self._noise)
+        noise = cpu.randn(*sizes, generator=self._noise, dtype=torch.float32)
         # The workers' copies must not change with ours.
         weights = {name: t.clone() for name, t in self.policy.state_dict().items()}
         return [
@@ -351,7 +364,8 @@ class Trainer:
                 "root or a norm in a reward has no derivative at 0"
             )
         if learns:
-            self._actor_steps.step()
+            with cpu.DEVICE:  # where Adam keeps its counts
+                self._actor_steps.step()
         return float(norm)
 
     def _fit_critics(self, rows: _Rows) -> float:
@@ -364,12 +378,13 @@ class Trainer:
             seen = policy.scale(rows.seen).flatten(0, 1)
         losses = []
         for _ in range(o.critic_epochs):
-            order = torch.randperm(len(goals), generator=self._noise)
+            order = cpu.randperm(len(goals), generator=self._noise)
             for chosen in order.chunk(o.critic_batches):
                 self._critic_steps.zero_grad()
                 errors = (policy.critics(seen[chosen]) - goals[chosen]).square().mean(dim=-1)
                 errors.sum().backward()
-                self._critic_steps.step()
+                with cpu.DEVICE:
+                    self._critic_steps.step()
                 losses.append(float(errors.detach().mean()))
         with torch.no_grad():
             pairs = zip(policy.targets.parameters(), policy.critics.parameters(), strict=True)
@@ -380,8 +395,11 @@ class Trainer:
     def _step_temperature(self, entropy: float) -> None:
         """Make entropy worth more where there is too little of it, and less where too much."""
         too_much = entropy - self.options.target_entropy
-        self.policy.log_temperature.grad = torch.tensor(too_much * self.policy.temperature)
-        self._temperature_steps.step()
+        self.policy.log_temperature.grad = cpu.tensor(
+            too_much * self.policy.temperature, dtype=torch.float32
+        )
+        with cpu.DEVICE:
+            self._temperature_steps.step()
 
     def _ended(self, rows: _Rows) -> dict[str, float]:
         """Mean return and share of success of the episodes that have ended, if any has."""

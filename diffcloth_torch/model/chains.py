@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import FloatArray, check_finite, check_shape, float_array, texts
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.mesh_checks import Surface, surface_arrays
@@ -59,9 +60,9 @@ def _joint_of_chain(mechanism: Mechanism, i: int, name: str) -> Any:
             limits = tuple(moved.tolist())
     return ChainJoint(
         name=name,
-        offset=Transform3d(matrix=torch.tensor(mechanism.offset[i])),
+        offset=Transform3d(matrix=cpu.tensor(mechanism.offset[i])),
         joint_type=mechanism.kind[i],
-        axis=torch.tensor(mechanism.axis[i]) if j >= 0 else None,
+        axis=cpu.tensor(mechanism.axis[i]) if j >= 0 else None,
         dtype=torch.float64,
         limits=limits,
     )
@@ -106,6 +107,8 @@ def describe_chain(chain: Any, inertials: Inertials, limits: Limits) -> RobotDes
         raise TypeError(
             f"{_OWNER}: `chain` must be a pytorch_kinematics.Chain, got {type(chain).__name__}"
         )
+    _check_mapping("inertials", inertials)
+    _check_mapping("limits", limits)
     frames = list(_frames(chain._root, None))
     links = [frame.name for frame, _ in frames]
     joints = [_joint(frame, parent, limits) for frame, parent in frames[1:]]
@@ -131,6 +134,7 @@ def describe_chain(chain: Any, inertials: Inertials, limits: Limits) -> RobotDes
 
 def link_surfaces(links: Sequence[str], given: Surfaces) -> list[Surface | None]:
     """Surface of each link from name -> (vertices, faces); None for links without one."""
+    _check_mapping("surfaces", given)
     for name in given:
         if name not in links:
             raise InvalidInput(f"{_OWNER}: `surfaces` has the names {texts(links)}; got {name!r}")
@@ -143,6 +147,11 @@ def link_surfaces(links: Sequence[str], given: Surfaces) -> list[Surface | None]
         _check_length(owner, given[name], "(vertices, faces)", 2)
         surfaces.append(Surface(*surface_arrays(owner, *given[name], instead=_DETACHED)))
     return surfaces
+
+
+def _check_mapping(field: str, given: object) -> None:
+    if not isinstance(given, Mapping):
+        raise TypeError(f"{_OWNER}: `{field}` must be by name, got {type(given).__name__}")
 
 
 def _frames(frame: Any, parent: Any) -> Iterator[tuple[Any, Any]]:

@@ -142,7 +142,7 @@ class Cloth:
             **keywords: As for `Cloth`; `rest_positions` is in meters, `scale` and `pose` do not
                 apply to it.
         """
-        vertices, faces = read_mesh(path)
+        vertices, faces = read_mesh(path, "Cloth.load: `path`")
         factor = check_number("Cloth.load: `scale`", scale, POSITIVE, instead=_POSITIONS)
         return cls._posed("Cloth.load", factor * vertices, faces, pose, keywords)
 

@@ -184,8 +184,8 @@ def _placed(
 ) -> Surface:
     if shape.kind == "mesh":
         path = find_mesh(owner, shape.filename, file, mesh_root)
+        vertices, faces = read_mesh(path, f"{owner}: the mesh")
         owner = str(path)
-        vertices, faces = read_mesh(path)
         check_finite(f"{owner}: `vertices`", vertices)
         scale = np.array(shape.size)
         if not scale.all():

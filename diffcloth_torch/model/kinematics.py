@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.geometry.products import product
 from diffcloth_torch.geometry.rotation import quaternion_matrix
@@ -91,4 +92,4 @@ def constant(array: FloatArray) -> Tensor:
     return torch.from_numpy(np.array(array, dtype=np.float64))
 
 
-_LAST_ROW = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64, device="cpu")
+_LAST_ROW = cpu.tensor([[0.0, 0.0, 0.0, 1.0]])

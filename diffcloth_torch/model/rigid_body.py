@@ -268,7 +268,7 @@ class RigidBody:
             scale: Meters per unit of the file, > 0.
             **keywords: As for `RigidBody`.
         """
-        vertices, faces = read_mesh(path)
+        vertices, faces = read_mesh(path, "RigidBody.load: `path`")
         factor = check_number("RigidBody.load: `scale`", scale, POSITIVE, instead=_POSES)
         return cls(factor * vertices, faces, **keywords)
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import (
     ANY_NUMBER,
     NON_NEGATIVE,
@@ -327,7 +328,8 @@ class Robot:
         >>> serial = pk.SerialChain(robot.chain, "hand", dtype=torch.float64)
         >>> jacobian = serial.jacobian(q)
         """
-        return make_chain(self.mechanism)
+        with cpu.DEVICE:  # as pytorch-kinematics takes torch's default
+            return make_chain(self.mechanism)
 
     def chain_positions(self, joint_positions: Tensor) -> dict[str, Tensor]:
         """Positions of all joints of `chain`, those that mimic included.

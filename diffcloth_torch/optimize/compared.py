@@ -21,11 +21,12 @@ from diffcloth_torch.checks import (
     float_array,
 )
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.state import State, check_state
 from diffcloth_torch.transforms import numbers_of
 
 __all__ = [
     "Comparison",
+    "check_count_of",
     "checked_noise",
     "checked_points",
     "note",
@@ -89,14 +90,28 @@ def positions_of(owner: str, states: Sequence[State]) -> Tensor:
     if not len(given):
         raise InvalidInput(f"{owner}: `states` must be one or more, got none")
     for k, state in enumerate(given):
-        if not isinstance(state, State):
-            raise TypeError(f"{owner}: `states`[{k}] must be a State, got {type(state).__name__}")
+        check_state(f"{owner}: `states`[{k}]", state)
         if state.batch_size is not None:
             raise InvalidInput(
                 f"{owner}: `states`[{k}] must have no batch axis, got {state.batch_size} "
                 "environments; state[i] is one of them"
             )
-    return torch.stack([state.positions for state in states])
+        check_shape(
+            f"{owner}: `states`[{k}].positions", state.positions.shape, [given[0].positions.shape]
+        )
+    positions = torch.stack([state.positions for state in states])
+    check_finite(f"{owner}: `states`", numbers_of(positions))
+    return positions
+
+
+def check_count_of(owner: str, name: str, value: object, count: int) -> None:
+    """Require a sequence with an entry for each state."""
+    if not isinstance(value, Sequence | np.ndarray | Tensor) or isinstance(value, str):
+        raise TypeError(f"{owner}: `{name}` must be a list, got {type(value).__name__}")
+    if len(value) != count:
+        raise InvalidInput(
+            f"{owner}: `{name}` must be one for each of {count} states, got {len(value)}"
+        )
 
 
 def times_of(states: Sequence[State]) -> FloatArray:

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import POSITIVE, check_count, check_number
 from diffcloth_torch.errors import (
     InfeasibleMotion,
@@ -180,6 +181,9 @@ def descend(
         O'Donoghue and Candès, "Adaptive restart for accelerated gradient schemes", Foundations of
         Computational Mathematics 15 (2015), the function scheme.
     """
+    for name, function in (("simulate", simulate), ("loss", loss), ("report", report)):
+        if not callable(function):
+            raise TypeError(f"descend: `{name}` must be a function, got {type(function).__name__}")
     check_count("descend: `iterations`", iterations, 1)
     check_count("descend: `failures`", failures, 0)
     for name, value in (("clip", clip), ("stop_below", stop_below)):
@@ -267,7 +271,8 @@ class _Loop:
         if self._restart:
             self._forget(risen)
         self._clip_gradients()
-        self._optimizer.step()
+        with cpu.DEVICE:  # where optimizers keep their counts
+            self._optimizer.step()
         self._rows.go_back(evaluation, self._optimizer)
         found = self.found
         self.found = Descent(
@@ -328,9 +333,13 @@ def _detached(value: Any) -> Any:
 
 
 def _check_variables(variables: Variables, per_environment: Collection[str]) -> None:
-    if not variables:
+    given: Any = variables
+    if not isinstance(given, Mapping):
+        raise TypeError(
+            f"descend: `variables` must map names to tensors, got {type(given).__name__}"
+        )
+    if not given:
         raise InvalidInput("descend: `variables` must have at least one entry")
-    given: Mapping[str, Any] = variables
     for name, tensor in given.items():
         label = f"descend: `variables[{name!r}]`"
         if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
@@ -353,6 +362,11 @@ def _check_variables(variables: Variables, per_environment: Collection[str]) -> 
 
 def _optimizer(given: Optimizers, variables: Variables) -> torch.optim.Optimizer:
     tensors = list(variables.values())
+    if not callable(given) and not isinstance(given, torch.optim.Optimizer):
+        raise TypeError(
+            "descend: `optimizer` must be an optimizer of torch or make one, "
+            f"got {type(given).__name__}"
+        )
     made: Any = given if isinstance(given, torch.optim.Optimizer) else given(tensors)
     if not isinstance(made, torch.optim.Optimizer):
         raise TypeError(

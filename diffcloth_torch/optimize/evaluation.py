@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from diffcloth_torch.errors import (
@@ -209,4 +208,4 @@ def _error(failures: Mapping[int, tuple[int, str]]) -> SimulationError:
 def _gradient(name: str, tensor: Tensor) -> float:
     if tensor.grad is None:
         raise InvalidInput(f"the loss does not depend on the variable {name!r}")
-    return float(torch.as_tensor(tensor.grad).norm())
+    return float(tensor.grad.norm())

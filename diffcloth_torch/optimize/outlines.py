@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import (
     FloatArray,
     check_bool,
@@ -21,6 +22,7 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.optimize.compared import (
     Comparison,
+    check_count_of,
     checked_noise,
     note,
     positions_of,
@@ -84,10 +86,7 @@ def outline(
     check_shape(f"{owner}: `center`", origin.shape, [(2,)])
     check_finite(f"{owner}: `center`", origin)
     flat, edges = _flattened(owner, states, faces, origin)
-    if len(outlines) != len(states):
-        raise InvalidInput(
-            f"{owner}: `outlines` must be one for each of {len(states)} states, got {len(outlines)}"
-        )
+    check_count_of(owner, "outlines", outlines, len(states))
     rays = _rays(directions)
     radii, seen, turns = [], [], []
     for k, (points, given) in enumerate(zip(flat, outlines, strict=True)):
@@ -147,7 +146,7 @@ def _flattened(
 
 
 def _rays(directions: int, turn: Tensor | float = 0.0) -> Tensor:
-    angles = 2 * np.pi / directions * torch.arange(directions, dtype=torch.float64) + turn
+    angles = 2 * np.pi / directions * cpu.arange(directions, dtype=torch.float64) + turn
     return torch.stack([angles.cos(), angles.sin()], dim=1)
 
 
@@ -194,8 +193,8 @@ def _turned(
 def _waves(radii: Tensor) -> Tensor:
     """Real and imaginary parts of the harmonics of radii below the highest, shape [D / 2, 2]."""
     count = len(radii)
-    k = torch.arange((count + 1) // 2, dtype=torch.float64)
-    angles = 2 * np.pi / count * k[:, None] * torch.arange(count, dtype=torch.float64)
+    k = cpu.arange((count + 1) // 2, dtype=torch.float64)
+    angles = 2 * np.pi / count * k[:, None] * cpu.arange(count, dtype=torch.float64)
     return torch.stack([angles.cos() @ radii, -(angles.sin() @ radii)], dim=1)
 
 

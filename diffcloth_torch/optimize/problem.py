@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InadmissibleMaterial, InvalidInput, SimulationError
 from diffcloth_torch.model.quantities import PARAMETERS
@@ -86,7 +87,7 @@ class Memory:
         if file is None or not file.exists():
             return
         try:
-            saved = torch.load(file, weights_only=True)
+            saved = torch.load(file, map_location=cpu.DEVICE, weights_only=True)
             problem, records = saved["problem"], saved["records"]
             keys = [(r["kind"], r["stage"], _key(r["theta"])) for r in records]
         except (OSError, MemoryError):
@@ -238,7 +239,7 @@ class Problem:
         failure: Failure | None = None
         if record is None:
             begin = time.perf_counter()
-            found = torch.zeros(0, dtype=torch.float64)
+            found = cpu.zeros(0)
             try:
                 with torch.no_grad():
                     found = self._call(numbers)

@@ -20,6 +20,7 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.optimize.compared import (
     Comparison,
+    check_count_of,
     checked_noise,
     checked_points,
     note,
@@ -118,10 +119,7 @@ def point_cloud(states: Sequence[State], clouds: Sequence[object], *, noise: flo
     owner = "residuals.point_cloud"
     positions = positions_of(owner, states)
     scale = checked_noise(owner, noise)
-    if len(clouds) != len(states):
-        raise InvalidInput(
-            f"{owner}: `clouds` must be one for each of {len(states)} states, got {len(clouds)}"
-        )
+    check_count_of(owner, "clouds", clouds, len(states))
     parts, nearest_points, seen = [], [], []
     for k, cloud in enumerate(clouds):
         points = checked_points(f"{owner}: `clouds`[{k}]", cloud)

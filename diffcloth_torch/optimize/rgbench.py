@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from diffcloth_torch.checks import (
+    ANY_NUMBER,
     NON_NEGATIVE,
     POSITIVE,
     FloatArray,
@@ -41,7 +42,7 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path, read_regular_file
 from diffcloth_torch.geometry.pcd import read_pcd
-from diffcloth_torch.optimize.compared import checked_points
+from diffcloth_torch.optimize.compared import check_count_of, checked_points, positions_of
 from diffcloth_torch.sim.state import State
 from diffcloth_torch.transforms import numbers_of
 
@@ -75,6 +76,7 @@ class Capture:
 
     def grippers(self, time: float) -> dict[str, FloatArray]:
         """Position of each gripper at a time [m], between its rows straight; at rest beyond."""
+        time = check_number("Capture.grippers: `time`", time, ANY_NUMBER)
         return {
             name: np.stack([np.interp(time, times, column) for column in positions.T])
             for name, (times, positions) in self.arms.items()
@@ -91,6 +93,8 @@ class Capture:
         Raises:
             InvalidInput: If there are none.
         """
+        first = check_number("Capture.between: `first`", first, ANY_NUMBER)
+        last = check_number("Capture.between: `last`", last, ANY_NUMBER)
         kept = [k for k, time in enumerate(self.times) if first <= time <= last]
         if not kept:
             raise InvalidInput(
@@ -161,6 +165,9 @@ def nearest_vertices(positions: object, grippers: Mapping[str, object]) -> dict[
     if not len(vertices):
         raise InvalidInput(f"{owner}: `positions` must have one or more vertices, got none")
     found = {}
+    given: object = grippers
+    if not isinstance(given, Mapping):
+        raise TypeError(f"{owner}: `grippers` must be by name, got {type(given).__name__}")
     for name, gripper in grippers.items():
         place = float_array(f"{owner}: `grippers[{name!r}]`", gripper)
         check_shape(f"{owner}: `grippers[{name!r}]`", place.shape, [(3,)])
@@ -188,16 +195,14 @@ def chamfer(states: Sequence[State], clouds: Sequence[object], *, norm: int = 1)
     owner = "rgbench.chamfer"
     if norm not in (1, 2):
         raise InvalidInput(f"{owner}: `norm` must be 1 or 2, got {norm!r}")
-    if len(clouds) != len(states):
-        raise InvalidInput(
-            f"{owner}: `clouds` must be one for each of {len(states)} states, got {len(clouds)}"
-        )
+    positions = positions_of(owner, states)
+    check_count_of(owner, "clouds", clouds, len(states))
     found = []
-    for k, (state, cloud) in enumerate(zip(states, clouds, strict=True)):
+    for k, cloud in enumerate(clouds):
         points = checked_points(f"{owner}: `clouds`[{k}]", cloud)
         if not len(points):
             raise InvalidInput(f"{owner}: `clouds`[{k}] must have one or more points, got none")
-        tree: Any = cKDTree(numbers_of(state.positions))
+        tree: Any = cKDTree(numbers_of(positions[k]))
         found.append(float(np.mean(tree.query(points, p=norm)[0])))
     return found
 

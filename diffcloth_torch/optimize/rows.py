@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.optimize.evaluation import Evaluation, Variables, copies
 
@@ -32,7 +33,7 @@ class Rows:
         self._variables, self._allowed = variables, allowed
         rows = next(iter(variables.values())).shape[0] if variables else 0
         self.best = copies(variables)
-        self.losses = torch.full((rows,), math.inf, dtype=torch.float64)
+        self.losses = cpu.full((rows,), math.inf)
         self.risen: list[int] = []
 
     def restore(self, best: Variables, losses: Tensor) -> None:

@@ -7,10 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.dynamics.dynamics import Dynamics
 from diffcloth_torch.dynamics.staggering import StaggeredStep, added_mass_numbers
 from diffcloth_torch.errors import AddedMassWarning, warn_caller
 from diffcloth_torch.model.quantities import Fields
+from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.border import Given
 from diffcloth_torch.sim.cores import Core, arrays_of, rigid_inputs
 from diffcloth_torch.sim.layout import Layout
@@ -159,8 +161,8 @@ class AddedMassWatch:
                     f"above {_LARGEST_ADDED_MASS:g}"
                 )
             warn_caller(
-                f"step: the coupling {self._coupling!r} gets inaccurate, and then unstable, where "
-                f"what a body touches is heavy or stiff against it: {sign}; "
+                f"{operation()}: the coupling {self._coupling!r} gets inaccurate, and then "
+                f"unstable, where what a body touches is heavy or stiff against it: {sign}; "
                 'use coupling="monolithic", or a smaller dt',
                 AddedMassWarning,
             )
@@ -169,7 +171,7 @@ class AddedMassWatch:
         """Masses of the surfaces of bodies and links, zero if not dynamic, [B or 1, K + Lc]."""
         layout = self._layout
         sizes = layout.assembly.sizes
-        bodies, links = (torch.zeros(1, sizes[n], dtype=torch.float64) for n in "KL")
+        bodies, links = (cpu.zeros(1, sizes[n]) for n in "KL")
         bodies = parameters.get("body_mass", bodies)
         links = parameters.get("link_mass", links)[:, layout.shaped_links]
         environments = max(len(bodies), len(links))

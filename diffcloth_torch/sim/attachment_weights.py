@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.operations import label
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.transforms import numbers_of
 
@@ -38,7 +39,8 @@ def refuse_untargeted(layout: Layout, weights: Tensor, targets: Targets | None) 
         springs = layout.assembly.springs.groups[name]
         if not whole[springs].all() and numbers_of(weights)[:, springs].any():
             raise InvalidInput(
-                f"control: `attachments` must set the target of {name!r}, whose weight is not zero"
+                f"{label('control', 'attachments')} must set the target of {name!r}, whose "
+                "weight is not zero"
             )
 
 

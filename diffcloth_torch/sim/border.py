@@ -13,6 +13,7 @@ import torch
 from diffcloth_torch.core_functions import as_array
 from diffcloth_torch.model.defaults import check_barrier
 from diffcloth_torch.model.quantities import Fields
+from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.control_fields import control_fields
 from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.layout import Layout
@@ -83,7 +84,7 @@ class Border:
         if parameters is None:
             return self.defaults
         physical = parameter_fields(self._layout, parameters, self.defaults, batch)
-        self.check_barrier("parameters", physical)
+        self.check_barrier(operation(), physical)
         return physical
 
     def check_barrier(self, owner: str, inputs: Fields) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.checks import texts
 from diffcloth_torch.errors import InvalidInput
@@ -57,8 +58,8 @@ class ContactPoints:
     def of(rows: Sequence[Tensor], surfaces: tuple[str, ...], *, batched: bool) -> ContactPoints:
         """Pad the rows of each environment, [M, COLUMNS], and name their columns."""
         largest = max((len(own) for own in rows), default=0)
-        padded = torch.zeros(len(rows), largest, COLUMNS, dtype=torch.float64)
-        mask = torch.zeros(len(rows), largest, dtype=torch.bool)
+        padded = cpu.zeros(len(rows), largest, COLUMNS)
+        mask = cpu.zeros(len(rows), largest, dtype=torch.bool)
         padded[..., :2] = -1.0
         for i, own in enumerate(rows):
             padded[i, : len(own)] = own
@@ -91,7 +92,8 @@ class ContactPoints:
         """
         if surface not in self.surfaces:
             raise InvalidInput(
-                f"contacts: the surfaces are {texts(self.surfaces)}; got {surface!r}"
+                f"ContactPoints.on: `surface` must be one of {texts(self.surfaces)}, "
+                f"got {surface!r}"
             )
         is_own = self.pairs == self.surfaces.index(surface)
         mask = self.mask & (is_own[..., 0] ^ is_own[..., 1])

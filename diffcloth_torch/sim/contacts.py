@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.checks import FloatArray, texts
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.sim.guards import on_cpu
 
 __all__ = ["Contacts", "PairContact"]
 
@@ -93,7 +93,6 @@ class Contacts:
         size = len(found) if batched else None
         return Contacts(tuple(surfaces), size, tensors(counts), tensors(forces), rows_kept)
 
-    @on_cpu
     def __getitem__(self, pair: Pair) -> PairContact:
         """Contacts of two surfaces.
 
@@ -112,8 +111,8 @@ class Contacts:
         key = turned if turned in self.counts and pair not in self.counts else pair
         shape = () if self.batch_size is None else (self.batch_size,)
         if key not in self.counts:
-            none = torch.zeros(shape, dtype=torch.int64)
-            return PairContact(_plain(none), torch.zeros(*shape, 3, dtype=torch.float64))
+            none = cpu.zeros(shape, dtype=torch.int64)
+            return PairContact(_plain(none), cpu.zeros(*shape, 3))
         force = self.forces[key]
         return PairContact(_plain(self.counts[key]), force.clone() if key == pair else -force)
 
@@ -147,7 +146,7 @@ class Contacts:
         """Contacts of one environment, or of several."""
         if self.batch_size is None:  # nothing is known of the environments
             return self
-        chosen = torch.arange(self.batch_size)[index].reshape(-1).tolist()
+        chosen = cpu.arange(self.batch_size)[index].reshape(-1).tolist()
         size = None if isinstance(index, int) else len(chosen)
         rows = tuple(self.rows[i] for i in chosen) if self.rows else ()
         return self._map(lambda tensor: tensor[index], size, rows)
@@ -207,7 +206,7 @@ def _combined(
     def all_of(table: str, pair: Pair, row: tuple[int, ...], dtype: torch.dtype) -> list[Tensor]:
         shapes = ((() if p.batch_size is None else (p.batch_size,)) + row for p in parts)
         return [
-            getattr(part, table).get(pair, torch.zeros(shape, dtype=dtype))
+            getattr(part, table).get(pair, cpu.zeros(shape, dtype=dtype))
             for part, shape in zip(parts, shapes, strict=True)
         ]
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import (
     ANY_NUMBER,
     LARGEST,
@@ -23,6 +24,7 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.quantities import CONTROL, Fields, Shape
+from diffcloth_torch.operations import label, operation
 from diffcloth_torch.sim.attachment_weights import Targets, default_weights, refuse_untargeted
 from diffcloth_torch.sim.axes import refuse_short_quaternions, with_axis
 from diffcloth_torch.sim.controls import Control
@@ -45,7 +47,7 @@ def check_control(layout: Layout, control: Control) -> Control:
 def _targets(layout: Layout, control: Control) -> dict[str, Tensor | dict[str, Tensor]]:
     """The fields that a control sets, checked."""
     if not isinstance(control, Control):
-        raise TypeError(f"step: `control` must be a Control, got {type(control).__name__}")
+        raise TypeError(f"{operation()}: `control` must be a Control, got {type(control).__name__}")
     checked: dict[str, Tensor | dict[str, Tensor]] = {}
     for field, shape in layout.control_shapes.items():
         given = getattr(control, field)
@@ -61,8 +63,8 @@ def _targets(layout: Layout, control: Control) -> dict[str, Tensor | dict[str, T
     return checked
 
 
-def _target(field: str, label: str, value: object, shape: Shape) -> Tensor:
-    name = f"control: `{label}`"
+def _target(field: str, entry: str, value: object, shape: Shape) -> Tensor:
+    name = label("control", entry)
     tensor = float_tensor(name, value)
     check_shape(name, tensor.shape, [shape, ("B", *shape)])
     numbers = numbers_of(tensor)
@@ -81,10 +83,11 @@ def _named_targets(layout: Layout, field: str, given: Mapping[str, object]) -> d
     for key, value in given.items():
         name = layout.full_name(field, key)
         if name in named:
-            raise InvalidInput(f"control: `{field}` must name {name!r} once, got it twice")
+            raise InvalidInput(f"{label('control', field)} must name {name!r} once, got it twice")
         if value is None:
             raise InvalidInput(
-                f"control: `{field}[{key!r}]` must hold numbers; leave the name out to hold it"
+                f"{label('control', f'{field}[{key!r}]')} must hold numbers; leave the name out to "
+                "hold it"
             )
         shape = layout.entry_shape(field, name)
         tensor = _target(field, f"{field}[{key!r}]", value, shape)
@@ -99,14 +102,16 @@ def _named_targets(layout: Layout, field: str, given: Mapping[str, object]) -> d
 def _check_rows(layout: Layout, field: str, values: FloatArray, first: int = 0) -> None:
     """Refuse what nothing feels, as wrenches on prescribed bodies; joints beyond a limit."""
     if field == "wind" and not layout.cloth_names:
-        raise InvalidInput("control: `wind` must be None: the scene has no cloth that feels it")
+        raise InvalidInput(
+            f"{label('control', field)} must be None: the scene has no cloth that feels it"
+        )
     if field in layout.permissions.unforced:
         rows = slice(first, first + values.shape[-2])
         for k, why in enumerate(layout.permissions.unforced[field][rows]):
             if why and values[..., k, :].any():
                 raise InvalidInput(
-                    f"control: `{field}` must be zero in the row [{first + k}]: {why}, and no "
-                    "force moves it"
+                    f"{label('control', field)} must be zero in the row [{first + k}]: {why}, and "
+                    "no force moves it"
                 )
     if field == "joint_positions":
         rows = slice(first, first + values.shape[-1])
@@ -120,7 +125,7 @@ def _check_rows(layout: Layout, field: str, values: FloatArray, first: int = 0) 
             at = tuple(int(i) for i in np.argwhere(beyond)[0])
             joint = at[-1]
             raise InvalidInput(
-                f"control: `{field}` must be between the limits {lower[joint]:g} and "
+                f"{label('control', field)} must be between the limits {lower[joint]:g} and "
                 f"{upper[joint]:g} of {layout.joint_names[first + joint]!r}, "
                 f"got {values[at]:g} in the row [{first + joint}]"
             )
@@ -171,7 +176,7 @@ def _complete(
         return unset
     if isinstance(given, Tensor):
         dimensions = len(layout.control_shapes[field])
-        values = with_axis(f"control: `{field}`", given, dimensions, batch)
+        values = with_axis(label("control", field), given, dimensions, batch)
         if field in layout.permissions.settable:
             sets = torch.from_numpy(layout.permissions.settable[field])
             values = torch.where(sets, values, unset)
@@ -189,7 +194,9 @@ def _complete_by_name(
         part = unset[:, rows]
         if name in given:
             dimensions = len(layout.entry_shape(field, name))
-            values = with_axis(f"control: `{field}[{name!r}]`", given[name], dimensions, batch)
+            values = with_axis(
+                label("control", f"{field}[{name!r}]"), given[name], dimensions, batch
+            )
             part = values.reshape(len(values), *part.shape[1:])
         parts.append(part)
     environments = max(len(part) for part in parts)
@@ -209,11 +216,11 @@ def _keep(layout: Layout, field: str, targets: Tensor, poses: Tensor) -> Tensor:
         row = still[int(np.argwhere(moved)[0][1])]
         remedy = 'motion="kinematic"' if field == "body_poses" else 'base="kinematic"'
         raise InvalidInput(
-            f"control: `{field}` must keep the row [{row}] of the state: {reasons[row]}; "
+            f"{label('control', field)} must keep the row [{row}] of the state: {reasons[row]}; "
             f"make it {remedy} to move it"
         )
     if (given == kept).all():
         return targets
-    mask = torch.zeros(targets.shape[-2], 1, dtype=torch.bool)
+    mask = cpu.zeros(targets.shape[-2], 1, dtype=torch.bool)
     mask[still] = True
     return torch.where(mask, poses, targets)

@@ -7,9 +7,8 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
-from diffcloth_torch import _core
+from diffcloth_torch import _core, cpu
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.core_functions import as_array
 from diffcloth_torch.dynamics.limits import LimitStiffness
@@ -143,7 +142,7 @@ def rigid_inputs(layout: Layout, inputs: Fields) -> Fields:
     """Select the inputs of bodies and links from those of a scene."""
     assembly = layout.assembly
     cloths, surfaces = assembly.cloth_count, assembly.surface_count
-    none = torch.zeros(len(inputs["positions"]), 0, 3, dtype=torch.float64)
+    none = cpu.zeros(len(inputs["positions"]), 0, 3)
     names = ("positions", "velocities", "pin_targets", "soft_pin_targets", "forces")
     kept = ("gravity", "barrier_distance", "slip_velocity")
     rigid = dict.fromkeys(names, none) | {k: inputs[k] for k in kept if k in inputs}

@@ -19,6 +19,7 @@ from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.options import SCHEMES, ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.border import Given
 from diffcloth_torch.sim.cores import CoreOptions, arrays_of, core_inputs, make_core
 from diffcloth_torch.sim.failures import failures_of, mark, refuse_gradients
@@ -208,13 +209,13 @@ class Engine:
 
     def path(self, given: Given, check: Check) -> FloatArray:
         """Polyline that the surfaces of one environment follow in a step, [M, N + V, 3]."""
-        with failing_as("path"):
+        with failing_as(operation()):
             if self._staggered is not None:
                 return self._staggered.path(given, self.core_inputs(given, None), check)
             prediction = self.predict(given)
             if self.dynamics is not None and prediction is not None:
                 for environment, sentence in self.dynamics.too_fast(prediction).items():
-                    raise TurnedTooFar(f"path: {sentence}", environments=[environment])
+                    raise TurnedTooFar(f"{operation()}: {sentence}", environments=[environment])
             return self.core.path(arrays_of(self.core_inputs(given, prediction)))
 
     def predict(self, given: Given, joint_origins: Tensor | None = None) -> Prediction | None:

@@ -28,6 +28,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import LARGEST
 from diffcloth_torch.errors import InvalidInput, SimulationError, TurnedTooFar
 from diffcloth_torch.model.mechanism import Mechanism
@@ -121,7 +122,7 @@ class Equilibria:
         self._size = max([size, *(_reach(robot) for robot in assembly.robots)])
         turns = [kind == "revolute" for robot in assembly.robots for kind in _kinds(robot)]
         # A radian counts like the size of the scene.
-        self._lever = torch.where(torch.tensor(turns, dtype=torch.bool), self._size, 1.0).double()
+        self._lever = cpu.tensor([self._size if turn else 1.0 for turn in turns])
 
     def find(self, given: Given, check: Check) -> tuple[Fields, Diagnostics]:
         """Find an equilibrium in each environment.
@@ -144,7 +145,7 @@ class Equilibria:
         given = _resting(given)
         origins = self._engine(_LAST).surfaces.vertices(given.state)
         joints = given.state.get("joint_positions")
-        iterations = torch.zeros(len(given.state["positions"]), dtype=torch.long)
+        iterations = cpu.zeros(len(given.state["positions"]), dtype=torch.long)
 
         def step(
             length: float,
@@ -163,7 +164,7 @@ class Equilibria:
                     report=error.report,
                     environments=error.environments,
                 ) from error
-            spent = torch.tensor(found.diagnostics["iterations"])
+            spent = cpu.tensor(found.diagnostics["iterations"], dtype=torch.int64)
             iterations.add_(spent if counted is None else torch.where(counted, spent, 0))
             return found
 
@@ -311,7 +312,7 @@ class Equilibria:
 
     def _descend(self, here: Given, step: Callable[[Given, Tensor], _Found]) -> Given:
         """Repeat a step until robots are near an equilibrium, in each environment by itself."""
-        far = torch.ones(len(here.state["positions"]), dtype=torch.bool)
+        far = cpu.ones(len(here.state["positions"]), dtype=torch.bool)
         for _ in range(_DESCENTS):
             after = _only(far, self._from(here, step(here, far)), here)
             moved = self._moved(here.state, after.state)
@@ -351,20 +352,20 @@ class Equilibria:
         In each environment by itself: what others are like, and whether they fail, is no matter.
         """
         slip = here.parameters.get("slip_velocity")
-        enough = torch.tensor([self._dt * self._solver.tolerance], dtype=torch.float64)
+        enough = cpu.tensor([self._dt * self._solver.tolerance])
         if slip is not None:
             enough = torch.maximum(enough, _SETTLED * self._dt * slip.flatten())
-        moves = torch.ones(len(here.state["positions"]), dtype=torch.bool)
+        moves = cpu.ones(len(here.state["positions"]), dtype=torch.bool)
         for _ in range(_REPEATS):
             found = step(here, moves)
             after = _only(moves, self._from(here, found), here)
             moves = (self._moved(here.state, after.state) > enough[:, None]).any(dim=-1)
-            moves &= torch.tensor(found.diagnostics["status"]) == CONVERGED
+            moves &= cpu.tensor(found.diagnostics["status"], dtype=torch.int64) == CONVERGED
             here = after
             if not moves.any():
                 break
-        failed = torch.tensor(found.diagnostics["status"]) != CONVERGED
-        touching = torch.tensor(found.diagnostics["contact_count"]) > 0
+        failed = cpu.tensor(found.diagnostics["status"], dtype=torch.int64) != CONVERGED
+        touching = cpu.tensor(found.diagnostics["contact_count"], dtype=torch.int64) > 0
         return _Settled(here, moves.nonzero()[:, 0].tolist(), touching & ~failed)
 
     def _probe(self, here: Given, step: Callable[[Given], _Found]) -> Given:

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 
+from diffcloth_torch import cpu
 from diffcloth_torch.core_functions import Arrays, CoreFunction, evaluate
 from diffcloth_torch.errors import SimulationError
 from diffcloth_torch.transforms import in_backward_transform, outside_transforms
@@ -83,7 +84,7 @@ class Linearization:
             torch.from_numpy(generator.standard_normal(x.shape[1:])).expand(1, *x.shape)
             for x in self._x.values()
         ]
-        counts = torch.zeros(len(self.acts), dtype=torch.long)
+        counts = cpu.zeros(len(self.acts), dtype=torch.long)
         first = _size(vectors)[0]
         for _ in range(_TERMS):
             vectors = self.transposed(vectors)
@@ -124,7 +125,7 @@ class _FixedPoint(CoreFunction):
 
     def tangents(self, inputs: Arrays, tape: Arrays, given: Arrays, count: int) -> list[Tensor]:
         assert self._linearization is None  # it has no products with dS/dx
-        zeros = {n: torch.zeros(count, *t.shape, dtype=torch.float64) for n, t in self._at.items()}
+        zeros = {n: cpu.zeros(count, *t.shape) for n, t in self._at.items()}
         return [torch.from_numpy(given[n]) if n in given else zeros[n] for n in self.names]
 
     def gradients(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.errors import SimulationError
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.sim.layout import Layout
@@ -41,10 +42,10 @@ def refuse_free_modes(
     outputs = [fields[n] for n in _OUTPUTS if n in fields and fields[n].requires_grad]
     if not outputs:
         return
-    generator = torch.Generator().manual_seed(0)
+    generator = cpu.generator().manual_seed(0)
     # The same in all environments, so that what is refused alone is refused in a batch.
     signs = [
-        (2.0 * torch.randint(2, (_PROBES, 1, *t.shape[1:]), generator=generator).double() - 1.0)
+        (2.0 * cpu.randint(2, (_PROBES, 1, *t.shape[1:]), generator=generator).double() - 1.0)
         .expand(-1, len(t), *t.shape[1:])
         .contiguous()
         for t in outputs
@@ -58,7 +59,7 @@ def refuse_free_modes(
         allow_unused=True,
     )
     responses = {
-        n: torch.zeros(_PROBES, *t.shape, dtype=torch.float64) if r is None else r
+        n: cpu.zeros(_PROBES, *t.shape) if r is None else r
         for (n, t), r in zip(inputs.items(), found, strict=True)
     }
     for field in pushes:

@@ -1,4 +1,4 @@
-"""A wrapper of a simulator's methods: for lack of memory, `torch.compile`, and default devices."""
+"""A wrapper of a simulator's methods: for their name, for lack of memory, and `torch.compile`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
 import torch
-from torch.utils import _device
 
-__all__ = ["guarded", "on_cpu"]
+from diffcloth_torch.operations import called
+
+__all__ = ["guarded"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -29,33 +30,24 @@ def _uncompiled(method: Callable[P, T]) -> Callable[P, T]:
     return _UNCOMPILED[method]
 
 
-def on_cpu(function: Callable[P, T]) -> Callable[P, T]:
-    """Make tensors on the CPU, also where a user's default device is another one."""
+def guarded(method: Callable[P, T], name: str = "") -> Callable[P, T]:
+    """Name the operation in messages; raise torch's lack of memory as MemoryError, like NumPy.
 
-    @wraps(function)
-    def call(*args: P.args, **keywords: P.kwargs) -> T:
-        # None unless a default has been set; torch's public question takes some microseconds.
-        if _device.CURRENT_DEVICE is None:
-            return function(*args, **keywords)
-        with torch.device("cpu"):
-            return function(*args, **keywords)
+    Args:
+        method: What is called.
+        name: Name of the operation; by default that of the method.
+    """
+    operation = name or method.__name__
 
-    return call
-
-
-def guarded(method: Callable[P, T]) -> Callable[P, T]:
-    """Compute on the CPU; raise torch's lack of memory as MemoryError, like NumPy and the core."""
+    named = called(operation)(method)
 
     @wraps(method)
     def call(*args: P.args, **keywords: P.kwargs) -> T:
         try:
-            if _device.CURRENT_DEVICE is None:
-                return _uncompiled(method)(*args, **keywords)
-            with torch.device("cpu"):
-                return _uncompiled(method)(*args, **keywords)
+            return _uncompiled(named)(*args, **keywords)
         except RuntimeError as error:
             if "can't allocate memory" in str(error):
-                raise MemoryError(f"{method.__name__}: {error}") from error
+                raise MemoryError(f"{operation}: {error}") from error
             raise
 
     return call

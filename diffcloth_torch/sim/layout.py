@@ -8,10 +8,12 @@ from itertools import pairwise
 import numpy as np
 import torch
 
+from diffcloth_torch import cpu
 from diffcloth_torch.dynamics.jacobians import DifferentialKinematics
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Shape, shape_of
+from diffcloth_torch.operations import label
 from diffcloth_torch.sim.permissions import Permissions
 
 __all__ = ["SEVERAL", "Layout"]
@@ -79,7 +81,7 @@ class Layout:
             name for name, q in CONTROL.items() if self.has_coordinates or q.core is not None
         )
         self.zeros = {
-            name: torch.zeros(1, *shape, dtype=torch.float64)
+            name: cpu.zeros(1, *shape)
             for name, shape in self.control_shapes.items()
             if CONTROL[name].source in ("zero", "released") or (name == "pins" and 0 in shape)
         }
@@ -102,7 +104,7 @@ class Layout:
             )
         }
         kinematic = [k for k, body in enumerate(assembly.bodies) if body.base == "kinematic"]
-        self.kinematic_bodies = torch.tensor(kinematic, dtype=torch.int64)
+        self.kinematic_bodies = cpu.tensor(kinematic, dtype=torch.int64)
         rows = {
             "K": _single_rows([body.name for body in assembly.bodies]),
             "R": _single_rows([robot.name for robot in assembly.robots]),
@@ -164,7 +166,7 @@ class Layout:
             accepted = ", ".join(map(repr, groups)) or "none, the scene has nothing of the kind"
             shorter = " (or the part behind '/' where it is unique)" if "/" in accepted else ""
             raise InvalidInput(
-                f"control: `{field}` has the names {accepted}{shorter}; {key!r} {problem}"
+                f"{label('control', field)} has the names {accepted}{shorter}; {key!r} {problem}"
             )
         self.permissions.check_settable(field, groups[full[0]].start, full[0])
         return full[0]

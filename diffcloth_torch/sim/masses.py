@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.quantities import Fields
@@ -16,7 +17,7 @@ __all__ = ["cloth_totals", "vertex_masses"]
 def vertex_masses(assembly: Assembly, parameters: Fields) -> Tensor:
     """Mass of each vertex, a third of that of each face around it, [B or 1, N] kg."""
     if not assembly.cloth_count:
-        return torch.zeros(1, 0, dtype=torch.float64)
+        return cpu.zeros(1, 0)
     density, rest = parameters["density"], parameters["rest_positions"]
     corners = torch.from_numpy(assembly.faces).long()
     a, b, c = rest[:, corners].unbind(-2)
@@ -25,7 +26,7 @@ def vertex_masses(assembly: Assembly, parameters: Fields) -> Tensor:
         counts = torch.from_numpy(np.diff(assembly.cloth_face_start)).long()
         density = density.repeat_interleave(counts, dim=1)
     parts = (density * area / 3).repeat_interleave(3, dim=1)
-    zeros = torch.zeros(len(parts), len(assembly.vertices), dtype=torch.float64)
+    zeros = cpu.zeros(len(parts), len(assembly.vertices))
     return zeros.scatter_add(1, corners.flatten().expand(len(parts), -1), parts)
 
 

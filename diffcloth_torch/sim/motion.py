@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.geometry.rotation import row_velocities
 from diffcloth_torch.model.quantities import Fields
@@ -37,7 +38,7 @@ def with_rows(fields: Fields, others: Fields, environments: Iterable[int]) -> Fi
     """
     mixed = {}
     for name, other in others.items():
-        mask = torch.zeros(len(other), *[1] * (other.ndim - 1), dtype=torch.bool)
+        mask = cpu.zeros(len(other), *[1] * (other.ndim - 1), dtype=torch.bool)
         mask[list(environments)] = True
         mixed[name] = torch.where(mask, other, fields.get(name, torch.zeros_like(other)))
     return fields | mixed

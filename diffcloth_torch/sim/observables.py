@@ -7,11 +7,13 @@ from typing import Any, Literal, overload
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import check_bool, check_count, check_shape
 from diffcloth_torch.dynamics.totals import Totals
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.options import SolverOptions
 from diffcloth_torch.model.quantities import Fields
+from diffcloth_torch.operations import label
 from diffcloth_torch.sim.axes import with_axis, without_axes, without_axis
 from diffcloth_torch.sim.border import Border, Given
 from diffcloth_torch.sim.contact_points import ContactPoints, refuse_gradient
@@ -22,6 +24,7 @@ from diffcloth_torch.sim.links import contact_wrenches, link_velocities
 from diffcloth_torch.sim.masses import vertex_masses
 from diffcloth_torch.sim.outcome import make_report, raise_on_failure
 from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.state_fields import check_state_tensor
 from diffcloth_torch.sim.stored_energy import stored_energy
 
 __all__ = ["Observables"]
@@ -92,8 +95,9 @@ class Observables:
         """
         fields, batch = self._border.state(state)
         engine = self._engine
+        check_state_tensor("body_forces", state.body_forces)
         shape = (*(() if batch is None else (batch,)), *engine.assembly.body_vertices.shape)
-        check_shape("contact_wrenches: `state.body_forces`", state.body_forces.shape, [shape])
+        check_shape(label("state", "body_forces"), state.body_forces.shape, [shape])
         forces = with_axis("body_forces", state.body_forces, 2, batch)
         centers = [self._centers(owner, parameters, batch) for owner in ("body", "link")]
         frames = engine.surfaces.frames(fields)
@@ -316,4 +320,4 @@ class Observables:
         """Centers of mass of bodies or links, zero where nothing is dynamic; [B or 1, rows, 3]."""
         fields = self._border.parameters(parameters, batch)
         rows = self._engine.assembly.sizes["K" if owner == "body" else "L"]
-        return fields.get(f"{owner}_center", torch.zeros(1, rows, 3, dtype=torch.float64))
+        return fields.get(f"{owner}_center", cpu.zeros(1, rows, 3))

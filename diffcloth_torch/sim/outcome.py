@@ -15,6 +15,7 @@ from diffcloth_torch.errors import (
     SimulationError,
     TurnedTooFar,
 )
+from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.contacts import Contacts
 from diffcloth_torch.sim.report import Report
 from diffcloth_torch.sim.step import (
@@ -109,7 +110,7 @@ def raise_on_failure(
                 f"{diagnostics['residual'][first]:.3g} m/s, motion fraction "
                 f"{_share(diagnostics['motion_fraction'][first])}"
             )
-            text = f"step: {place}{sentence} ({detail + '; ' if detail else ''}{numbers})"
+            text = f"{operation()}: {place}{sentence} ({detail + '; ' if detail else ''}{numbers})"
             raise error(text, report=report, environments=environments)
 
 

@@ -19,6 +19,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.mesh_checks import check_areas
 from diffcloth_torch.model.orthotropy import check_bending
 from diffcloth_torch.model.quantities import PARAMETERS, Fields, Shape
+from diffcloth_torch.operations import label, operation
 from diffcloth_torch.sim.controls import Parameters
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.named_parameters import has_names, named_rows
@@ -33,7 +34,9 @@ _BENDING = ("bending", "bending_weft", "bending_twill", "poisson")
 def check_parameters(parameters: Parameters) -> Parameters:
     """Promote parameters to tensors; their values are checked in each step."""
     if not isinstance(parameters, Parameters):
-        raise TypeError(f"step: `parameters` must be Parameters, got {type(parameters).__name__}")
+        raise TypeError(
+            f"{operation()}: `parameters` must be Parameters, got {type(parameters).__name__}"
+        )
     given = {name: getattr(parameters, name) for name in PARAMETERS}
     checked = {name: _promoted(name, value) for name, value in given.items() if value is not None}
     return Parameters(**checked, _unbatched=parameters._unbatched)  # type: ignore[arg-type]
@@ -42,8 +45,8 @@ def check_parameters(parameters: Parameters) -> Parameters:
 def _promoted(name: str, value: object) -> Tensor | dict[object, Tensor]:
     """Promote a parameter to a tensor, or to one tensor for each name."""
     if isinstance(value, Mapping) and has_names(name):
-        return {k: float_tensor(f"parameters: `{name}[{k!r}]`", v) for k, v in value.items()}
-    return float_tensor(f"parameters: `{name}`", value)
+        return {k: float_tensor(label("parameters", f"{name}[{k!r}]"), v) for k, v in value.items()}
+    return float_tensor(label("parameters", name), value)
 
 
 def parameter_fields(
@@ -59,22 +62,22 @@ def parameter_fields(
         given = getattr(checked, name)
         if given is None:
             continue
-        label = f"parameters: `{name}`"
+        opening = label("parameters", name)
         if name not in defaults:
-            raise InvalidInput(f"{label} must be None: it has no meaning in this scene")
+            raise InvalidInput(f"{opening} must be None: it has no meaning in this scene")
         if isinstance(given, Mapping):
             fields[name] = named_rows(layout, name, given, defaults[name], batch)
             _check_values(layout, name, numbers_of(fields[name]), numbers_of(defaults[name]))
             continue
-        check_range(label, numbers_of(given), quantity.accepted)
+        check_range(opening, numbers_of(given), quantity.accepted)
         shared = layout.parameter_shapes[name]
         unbatched = name in parameters._unbatched
-        environments = _environments(label, tuple(given.shape), shared, batch, unbatched)
+        environments = _environments(opening, tuple(given.shape), shared, batch, unbatched)
         fields[name] = _rows(given, environments, quantity.row_shape)
         _check_values(layout, name, numbers_of(fields[name]), numbers_of(defaults[name]))
     if "bending_weft" in fields and any(getattr(checked, name) is not None for name in _BENDING):
         values = (_per_face(layout, numbers_of(fields[name])) for name in _BENDING)
-        check_bending("parameters", *values)
+        check_bending(operation(), *values)
     return fields
 
 
@@ -101,7 +104,7 @@ def _check_values(layout: Layout, name: str, values: FloatArray, default: FloatA
     if name == "rest_positions":
         if not (values == default).all():
             for shape in values:
-                check_areas("parameters", name, shape, layout.assembly.faces)
+                check_areas(operation(), name, shape, layout.assembly.faces)
         return
     if name in ("body_mass", "link_mass"):
         _refuse_rows(layout, name, values == 0.0, "> 0", layout.permissions.massive)
@@ -133,20 +136,20 @@ def _refuse_rows(
     row = int(np.argwhere(wrong)[0][-1])
     moved = layout.link_names[row] if owner == "link" else layout.assembly.bodies[row].name
     raise InvalidInput(
-        f"parameters: `{name}` must be {accepted} in the row [{row}], that of {moved!r}, which "
-        "is dynamic"
+        f"{label('parameters', name)} must be {accepted} in the row [{row}], that of {moved!r}, "
+        "which is dynamic"
     )
 
 
 def _environments(
-    label: str, shape: Shape, shared: Sequence[Shape], batch: int | None, unbatched: bool
+    opening: str, shape: Shape, shared: Sequence[Shape], batch: int | None, unbatched: bool
 ) -> int:
     """Number of environments of a parameter with the given shape: 1, or the batch size."""
     is_shared = shape in shared
     is_batched = batch is not None and shape[:1] == (batch,) and shape[1:] in shared
     if is_shared and is_batched and shape != (1,) and not unbatched:
         raise InvalidInput(
-            f"{label} of shape {list(shape)} could mean one value per environment or per "
+            f"{opening} of shape {list(shape)} could mean one value per environment or per "
             f"{'cloth' if shape == shared[1] else 'face'}; write it as "
             f"{[batch, *shared[1]]} to say which"
         )
@@ -156,11 +159,11 @@ def _environments(
         return batch
     if batch is None and shape[1:] in shared:
         raise InvalidInput(
-            f"{label} has shape {list(shape)}; accepted are {_texts(shared)}. A batch axis needs "
+            f"{opening} has shape {list(shape)}; accepted are {_texts(shared)}. A batch axis needs "
             "a state with one: make it with initial_state(batch_size=...)"
         )
     accepted = list(shared) if batch is None else [*shared, *((batch, *s) for s in shared)]
-    check_shape(label, shape, accepted)
+    check_shape(opening, shape, accepted)
     raise AssertionError("a shape that is accepted is shared or batched")
 
 

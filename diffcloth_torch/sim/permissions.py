@@ -9,11 +9,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import FloatArray, refuse_gradient
 from diffcloth_torch.dynamics.limits import ZONE
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.mechanism import Mechanism
+from diffcloth_torch.operations import label
 
 __all__ = ["Permissions"]
 
@@ -60,12 +62,10 @@ class Permissions:
             "base_wrenches": _unless("floating", robots, base_motions),
         }
         self.actuation = tuple(mode for robot in robots for mode in robot.actuation)
-        self.driven = torch.tensor([mode == "pd" for mode in self.actuation], dtype=torch.bool)
-        self.at_rates = torch.tensor([m == "velocity" for m in self.actuation], dtype=torch.bool)
-        self.at_positions = torch.tensor(
-            [m == "position" for m in self.actuation], dtype=torch.bool
-        )
-        self.floating = torch.tensor([r.base == "floating" for r in robots], dtype=torch.bool)
+        self.driven = cpu.tensor([mode == "pd" for mode in self.actuation], dtype=torch.bool)
+        self.at_rates = cpu.tensor([m == "velocity" for m in self.actuation], dtype=torch.bool)
+        self.at_positions = cpu.tensor([m == "position" for m in self.actuation], dtype=torch.bool)
+        self.floating = cpu.tensor([r.base == "floating" for r in robots], dtype=torch.bool)
         self.settable = {
             field: np.array([mode in modes for mode in self.actuation], dtype=bool)
             for field, modes in _MODES.items()
@@ -83,7 +83,7 @@ class Permissions:
         """Refuse a joint that a field of a control cannot set."""
         if field in _MODES and self.actuation[joint] not in _MODES[field]:
             raise InvalidInput(
-                f"control: `{field}` sets joints whose actuation is "
+                f"{label('control', field)} sets joints whose actuation is "
                 f"{' or '.join(map(repr, _MODES[field]))}; that of {name!r} is "
                 f"{self.actuation[joint]!r}"
             )
@@ -93,7 +93,7 @@ class Permissions:
         if field in _MODES and len(self.actuation) and not self.settable[field].any():
             modes = " or ".join(map(repr, _MODES[field]))
             remedy = f"have a joint of the actuation {modes}, or pass a detached tensor"
-            refuse_gradient(f"control: `{field}`", values, remedy)
+            refuse_gradient(label("control", field), values, remedy)
 
 
 def _joined(arrays: Sequence[FloatArray]) -> FloatArray:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.reprs import record_text, value_text
@@ -127,7 +128,7 @@ class Report:
             return _combine(
                 lambda values: values[index].item(), [self], self.status[index], contacts
             )
-        rows = torch.arange(len(self.status))[index].tolist()
+        rows = cpu.arange(len(self.status))[index].tolist()
         status = tuple(self.status[i] for i in rows)
         return _combine(lambda values: values[index], [self], status, contacts)
 
@@ -140,7 +141,10 @@ class Report:
         status = tuple(str(report.status) for report in present)
         contacts = Contacts.stack([report.contacts for report in present])
         return _combine(
-            lambda *values: torch.stack([_tensor(v) for v in values]), present, status, contacts
+            lambda *values: torch.stack([cpu.as_tensor(v) for v in values]),
+            present,
+            status,
+            contacts,
         )
 
     @staticmethod
@@ -152,15 +156,11 @@ class Report:
         status = tuple(x if m else y for m, x, y in zip(mask.tolist(), *names, strict=True))
         contacts = Contacts.where(mask, a.contacts, b.contacts)
         return _combine(
-            lambda x, y: torch.where(mask, _tensor(x), _tensor(y)), [a, b], status, contacts
+            lambda x, y: torch.where(mask, cpu.as_tensor(x), cpu.as_tensor(y)),
+            [a, b],
+            status,
+            contacts,
         )
-
-
-def _tensor(value: Any) -> Tensor:
-    # A Python float would become a float32 tensor.
-    return (
-        torch.tensor(value, dtype=torch.float64) if type(value) is float else torch.as_tensor(value)
-    )
 
 
 def outcome_text(report: Report | None) -> str:

@@ -112,7 +112,8 @@ def _digests(record: Control | Parameters | None) -> Digests:
         entries = value if isinstance(value, Mapping) else {None: value}
         for key, entry in entries.items():
             if entry is not None:
-                numbers = np.asarray(numbers_of(torch.as_tensor(entry)), dtype=np.float64)
+                values = numbers_of(entry) if isinstance(entry, Tensor) else entry
+                numbers = np.asarray(values, dtype=np.float64)
                 content = hashlib.blake2b(numbers.tobytes(), digest_size=16).digest()
                 name = field if key is None else f"{field}[{key!r}]"
                 digests[name] = repr(numbers.shape).encode() + content

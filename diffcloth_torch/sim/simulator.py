@@ -20,6 +20,7 @@ from diffcloth_torch.model.options import (
 )
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.operations import called
 from diffcloth_torch.sim.axes import without_axes
 from diffcloth_torch.sim.border import Border
 from diffcloth_torch.sim.control_fields import check_control
@@ -27,7 +28,7 @@ from diffcloth_torch.sim.controls import Control, Parameters
 from diffcloth_torch.sim.cores import constants
 from diffcloth_torch.sim.engine import Engine
 from diffcloth_torch.sim.equilibrium import Equilibria
-from diffcloth_torch.sim.guards import guarded, on_cpu
+from diffcloth_torch.sim.guards import guarded
 from diffcloth_torch.sim.layout import Layout
 from diffcloth_torch.sim.observables import Observables
 from diffcloth_torch.sim.outcome import make_report
@@ -79,7 +80,7 @@ class Simulator(Observables):
     slices: dict[str, slice]
     joint_slices: dict[str, slice]
 
-    @on_cpu
+    @called("Simulator")
     def __init__(
         self,
         scene: Scene,
@@ -295,15 +296,7 @@ class Simulator(Observables):
             InvalidInput: If a shape or value is not accepted.
             TypeError: If a tensor of the state is not float64 on the CPU.
         """
-        given, batch = self._border.enter(state, control, parameters)
-        self._start_watch.look_at(state, given, batch)
-        fields, diagnostics = self._engine.step(given, self._check(batched=batch is not None))
-        return State(
-            **without_axes(fields, batch),
-            time=state.time + self.dt,
-            report=make_report(diagnostics, self.surfaces, batched=batch is not None),
-            _surfaces=self._engine.surfaces,
-        )
+        return self._step(state, control, parameters)
 
     @guarded
     def equilibrium(
@@ -373,12 +366,32 @@ class Simulator(Observables):
         Returns:
             The states after each step, as a list that also has each of their fields over time.
         """
-        # Copies of NumPy arrays and lists: edits before backward must not change repeated steps.
+        controls, parameters = self._kept(controls, parameters)
+        return roll_out(self._next, state, controls, parameters, steps, checkpoint_every)
+
+    def _step(self, state: State, control: Control | None, parameters: Parameters | None) -> State:
+        given, batch = self._border.enter(state, control, parameters)
+        self._start_watch.look_at(state, given, batch)
+        fields, diagnostics = self._engine.step(given, self._check(batched=batch is not None))
+        return State(
+            **without_axes(fields, batch),
+            time=state.time + self.dt,
+            report=make_report(diagnostics, self.surfaces, batched=batch is not None),
+            _surfaces=self._engine.surfaces,
+        )
+
+    def _copies(
+        self, controls: Controls, parameters: StepParameters
+    ) -> tuple[Controls, StepParameters]:
+        """Copies of arrays and lists: edits before backward must not change repeated steps."""
         if isinstance(controls, Sequence):
             controls = [c if c is None else check_control(self._layout, c) for c in controls]
         if parameters is not None and not callable(parameters):
             parameters = check_parameters(parameters)
-        return roll_out(self.step, state, controls, parameters, steps, checkpoint_every)
+        return controls, parameters
+
+    # What a rollout does between the functions of its caller.
+    _next, _kept = guarded(_step, "rollout"), guarded(_copies, "rollout")
 
     def _inputs(
         self, state: State, control: Control | None, parameters: Parameters | None

@@ -16,6 +16,7 @@ from diffcloth_torch.dynamics.limits import LimitStiffness
 from diffcloth_torch.dynamics.staggering import cloth_to_rigid, rigid_to_cloth
 from diffcloth_torch.errors import InfeasibleMotion
 from diffcloth_torch.model.quantities import Fields
+from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.added_mass import AddedMassWatch
 from diffcloth_torch.sim.border import Given
 from diffcloth_torch.sim.contact_points import COLUMNS
@@ -196,7 +197,8 @@ class Staggered:
         remedy = 'passing through a cloth; lower dt, or use coupling="monolithic"'
         if blocked and self._throw:
             raise InfeasibleMotion(
-                f"step: dynamic bodies in the environments {blocked} cannot go on without {remedy}",
+                f"{operation()}: dynamic bodies in the environments {blocked} cannot go on without "
+                f"{remedy}",
                 environments=blocked,
             )
         return dict.fromkeys(blocked, f"dynamic bodies cannot go on without {remedy}")

@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import POSITIVE, check_number
 from diffcloth_torch.core_functions import failing_as
 from diffcloth_torch.dynamics.limits import slip_rates
@@ -21,6 +22,7 @@ from diffcloth_torch.model.defaults import choose_barrier_distance
 from diffcloth_torch.model.options import ContactOptions
 from diffcloth_torch.model.quantities import STATE, Fields, shape_of
 from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.border import Border, Given
 from diffcloth_torch.sim.cores import arrays_of
 from diffcloth_torch.sim.engine import Engine
@@ -61,7 +63,7 @@ def initial_tensors(assembly: Assembly) -> Fields:
     }
     for name, quantity in STATE.items():  # everything else is zero
         shape = shape_of(quantity.axes[0], assembly.sizes)
-        tensors.setdefault(name, torch.zeros(shape, dtype=torch.float64))
+        tensors.setdefault(name, cpu.zeros(shape))
     return tensors
 
 
@@ -195,7 +197,7 @@ class StartWatch:
             numbers = Given(*({n: plain(t) for n, t in fields.items()} for fields in given))
             at_rest = numbers.at_rest()
             inputs = self._engine.core_inputs(at_rest, self._engine.predict(at_rest))
-            with failing_as("step"):
+            with failing_as(operation()):
                 throws = self._engine.core.find_throws(arrays_of(inputs), torch.get_num_threads())
         fast = {
             i: throw for i, throw in enumerate(throws) if throw is not None and throw[3] > _SLOW
@@ -206,7 +208,7 @@ class StartWatch:
         elements, gap, distance, speed = fast[worst]
         place = "" if batch is None else f"in environment {worst} of {list(fast)}, "
         warn_caller(
-            f"step: the barrier throws apart what starts inside of it: {place}{elements} are "
+            f"{operation()}: the barrier throws apart what starts inside of it: {place}{elements} are "
             f"{gap:.3g} m apart, {gap / distance:.2g} of the barrier distance {distance:.3g} m, "
             f"and the energy stored there gives about {speed:.2g} m/s; start them "
             f"{distance - gap:.2g} m further apart, or give a `contact.barrier_distance` of at "
@@ -216,4 +218,4 @@ class StartWatch:
 
 
 def _number(value: float | NDArray[np.float64]) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
+    return cpu.tensor(value)

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.checks import is_dense
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import write_mesh
 from diffcloth_torch.model.quantities import STATE, shape_of
 from diffcloth_torch.reprs import field_text, record_text
-from diffcloth_torch.sim.guards import on_cpu
 from diffcloth_torch.sim.report import Report, outcome_text
 
 # Saved states name them here, where they once were.
@@ -95,7 +95,7 @@ class State:
             sizes = {"K": _row_count(self.body_poses), "N": _row_count(self.positions)}
             for name in missing:
                 rows = shape_of(STATE[name].axes[0], {"J": 0, "R": 0, "P": 0, **sizes})
-                zeros = torch.zeros(*environments, *rows, dtype=torch.float64)
+                zeros = cpu.zeros(*environments, *rows)
                 object.__setattr__(self, name, zeros)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -132,7 +132,6 @@ class State:
         """Copy that shares no memory; gradients flow to the original."""
         return self._map(lambda tensor: tensor.clone(), self.report)
 
-    @on_cpu
     def meshes(self) -> dict[str, tuple[Tensor, Tensor]]:
         """Place all surfaces in the world: cloths, bodies, and links that have collision shapes.
 
@@ -154,7 +153,6 @@ class State:
             )
         return self._surfaces
 
-    @on_cpu
     def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> State:
         """Select one environment of a batch, without the batch axis, or several as a batch.
 
@@ -217,7 +215,6 @@ _TENSORS = tuple(STATE)
 _ADDED = _TENSORS[_TENSORS.index("body_velocities") :]
 
 
-@on_cpu
 def stack(states: Sequence[State]) -> State:
     """Combine states without a batch axis into a batch; gradients flow to each of them.
 
@@ -249,7 +246,6 @@ def stack(states: Sequence[State]) -> State:
     return State(**tensors, report=report, _surfaces=states[0]._surfaces)
 
 
-@on_cpu
 def where(mask: Tensor, a: State, b: State) -> State:
     """Take environment `i` from `a` if `mask[i]` is true, else from `b`.
 
@@ -293,6 +289,11 @@ def check_state(name: str, state: Any) -> None:
         if not isinstance(value, Tensor) or not is_dense(value):
             kind = "another layout" if isinstance(value, Tensor) else type(value).__name__
             raise TypeError(f"{name}: `{entry}` must be a dense torch tensor, got {kind}")
+        if not value.is_cpu or not value.is_floating_point():
+            raise TypeError(
+                f"{name}: `{entry}` must be a tensor of real numbers on the CPU, got "
+                f"{value.dtype} on {value.device}"
+            )
     batch = state.batch_size
     for entry in _TENSORS:
         shape = getattr(state, entry).shape
@@ -324,13 +325,13 @@ def _environments(index: Any, size: int) -> int | slice | Tensor:
         )
     try:
         is_empty = isinstance(index, Sequence) and not len(index)
-        rows = torch.zeros(0, dtype=torch.int64) if is_empty else torch.as_tensor(index)
+        rows = cpu.zeros(0, dtype=torch.int64) if is_empty else cpu.as_tensor(index)
     except (TypeError, ValueError) as error:
         raise TypeError(f"state[i]: `i` must be integers or a mask, got {index!r}") from error
-    if rows.is_floating_point() or rows.is_complex() or rows.ndim != 1:
+    if rows.is_floating_point() or rows.is_complex() or rows.ndim != 1 or not rows.is_cpu:
         raise TypeError(
-            "state[i]: `i` must be integers or a mask, of one axis, got "
-            f"{rows.dtype} of shape {list(rows.shape)}"
+            "state[i]: `i` must be integers or a mask, of one axis, on the CPU, got "
+            f"{rows.dtype} of shape {list(rows.shape)} on {rows.device}"
         )
     if rows.dtype == torch.bool:
         if len(rows) != size:
@@ -352,8 +353,8 @@ def _row_count(tensor: Any) -> int:
 
 
 def _check_mask(mask: object) -> None:
-    if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
-        raise TypeError("where: `mask` must be a boolean tensor")
+    if not isinstance(mask, Tensor) or mask.dtype != torch.bool or not mask.is_cpu:
+        raise TypeError("where: `mask` must be a boolean tensor on the CPU")
     if mask.dim() != 1:
         raise InvalidInput(f"where: `mask` must have shape [B], got {list(mask.shape)}")
 

@@ -42,6 +42,7 @@ from diffcloth_torch.core_functions import (
     failing_as,
 )
 from diffcloth_torch.errors import SimulationError
+from diffcloth_torch.operations import operation
 from diffcloth_torch.transforms import is_differentiated
 
 __all__ = [
@@ -160,7 +161,7 @@ def have_quaternions(poses: NDArray[np.float64], shortest: float) -> bool:
 
 def _forward(core: _core.Simulator, arrays: dict[str, Any], *, tape: bool) -> dict[str, Any]:
     note_caller()
-    with failing_as("step"):
+    with failing_as(operation()):
         return core.forward(arrays, tape, torch.get_num_threads())
 
 

@@ -10,6 +10,7 @@ from typing import Any, SupportsIndex, overload
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path
 from diffcloth_torch.model.quantities import STATE
@@ -82,7 +83,7 @@ class Trajectory(list[State]):
         """
         file = as_path("Trajectory.load: `path`", path)
         try:
-            states: Any = torch.load(file, weights_only=True)
+            states: Any = torch.load(file, map_location=cpu.DEVICE, weights_only=True)
         except OSError:
             raise
         except Exception as error:  # whatever the reader makes of bytes that are not its own

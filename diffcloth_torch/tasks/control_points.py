@@ -15,6 +15,7 @@ import torch
 from pydantic import model_validator
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.config.schema import RunConfig
 from diffcloth_torch.config.section import Positive
 from diffcloth_torch.sim.state import State
@@ -54,8 +55,8 @@ class ControlPoints(Drape):
             first = self.simulator.slices[name].start
             for pins, vertices in cloth.soft_pins.items():
                 moved = self._motions["soft_pins"].get(f"{name}/{pins}")
-                held = torch.tensor(cloth.vertices[vertices])
-                self._points.append(first + torch.tensor(vertices))
+                held = cpu.tensor(cloth.vertices[vertices])
+                self._points.append(first + cpu.tensor(vertices, dtype=torch.int64))
                 self._targets.append((held if moved is None else moved[-1]).mean(dim=0))
 
     def distances(self, state: State) -> Tensor:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.config.documents import resolve_path, set_values
 from diffcloth_torch.config.fit_schema import FitConfig, SyntheticSection, TrajectorySection
@@ -232,9 +233,7 @@ def _synthesize(
             raise InvalidInput(f"{where}.changes must divide the time step, got {ratio:g} parts")
         later = [round(ratio) * k for k in section.steps]
         other = _motion(config, section, changes, source, later)
-    values = {
-        name: torch.tensor(value, dtype=torch.float64) for name, value in synthetic.values.items()
-    }
+    values = {name: cpu.tensor(value) for name, value in synthetic.values.items()}
     with torch.no_grad():
         states = other.simulate(values)
     generator = np.random.default_rng(synthetic.seed)

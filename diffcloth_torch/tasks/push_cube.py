@@ -20,6 +20,7 @@ from annotated_types import Len
 from pydantic import model_validator
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.config.scenes import Motions, PerStep
 from diffcloth_torch.config.section import Section, Vector3
 from diffcloth_torch.geometry.poses import transform
@@ -94,7 +95,7 @@ class PushCube(Reach):
         super().__init__(config, source)
         self._actions = config.actions
         self._body = self.scene.body_names.index(config.target.body)
-        self._target = torch.tensor(config.target.position, dtype=torch.float64)
+        self._target = cpu.tensor(config.target.position)
 
     def initial_rows(self) -> dict[str, list[list[float]]]:
         """Velocities of each group of pins."""

@@ -12,6 +12,7 @@ from annotated_types import Ge, Len
 from pydantic import model_validator
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.config.scene_schema import BodySection, ClothSection, RobotSection
 from diffcloth_torch.config.scenes import (
     Motions,
@@ -162,7 +163,7 @@ def _tensor(name: str, rows: list[list[float]], count: int) -> Tensor:
             f"`actions.{name}` must have 1 row or one for each of the {count} control intervals, "
             f"got {len(rows)}"
         )
-    return torch.tensor(rows, dtype=torch.float64).expand(count, -1).clone()
+    return cpu.tensor(rows).expand(count, -1).clone()
 
 
 # --- rigid motion -------------------------------------------------------------------------------

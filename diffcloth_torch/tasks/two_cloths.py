@@ -17,6 +17,7 @@ import torch
 from pydantic import model_validator
 from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.config.scene_schema import Selection
 from diffcloth_torch.config.scenes import Motions, select_vertices
 from diffcloth_torch.config.section import Positive, Section, Vector3
@@ -85,10 +86,10 @@ class TwoCloths(Reach):
         super().__init__(config, source)
         self._force = config.actions.force
         self._acting = self._shares("actions", config.actions)
-        pull = torch.tensor(config.pull.force, dtype=torch.float64)
+        pull = cpu.tensor(config.pull.force)
         self._constant = self._shares("pull", config.pull)[:, None] * pull
         self._rows = self.simulator.slices[config.target.cloth]
-        self._target = torch.tensor(config.target.position, dtype=torch.float64)
+        self._target = cpu.tensor(config.target.position)
         self._radius = config.target.marker_radius
 
     def _shares(self, key: str, section: PullSection | ForceActionSection) -> Tensor:
@@ -100,7 +101,7 @@ class TwoCloths(Reach):
                 f"`{key}.at.vertices` must be between 0 and {len(cloth.vertices) - 1}, vertices of "
                 f"{section.cloth!r}, got {chosen.max()}"
             )
-        shares = torch.zeros(len(self.simulator.initial_state().positions), dtype=torch.float64)
+        shares = cpu.zeros(len(self.simulator.initial_state().positions))
         first = self.simulator.slices[section.cloth].start
         shares[first + torch.from_numpy(chosen)] = 1 / len(chosen)
         return shares

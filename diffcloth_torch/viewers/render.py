@@ -12,7 +12,7 @@ from diffcloth_torch.checks import POSITIVE, check_count, check_number
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.state import State, check_state
 from diffcloth_torch.viewers.look import Camera, Pictures, checked_camera
 from diffcloth_torch.viewers.record import Record
 
@@ -120,11 +120,15 @@ def checked_states(
         raise TypeError(f"{owner}: `scene` must be a Scene, got {type(shown).__name__}")
     vertices = sum(len(cloth.vertices) for cloth in scene.cloths)
     joints = sum(len(robot.joint_names) for robot in scene.robots)
+    links = [link for robot in scene.robots for link in robot.contact_surfaces if link is not None]
+    rigid = [*(body.contact_surface for body in scene.bodies), *links]
+    touching = sum(len(surface.vertices) for surface in rigid)
     for i, state in enumerate(states):
         if not isinstance(state, State):
             raise TypeError(
                 f"{owner}: `states` must be states, got {type(state).__name__} at [{i}]"
             )
+        check_state(f"{owner}: `states`[{i}]", state)
         size = state.batch_size
         if size is not None and not batches:
             raise InvalidInput(f"{owner}: states[{i}] is a batch; take one of it by its index")
@@ -139,6 +143,7 @@ def checked_states(
             "body_poses": (*lead, len(scene.bodies), 7),
             "joint_positions": (*lead, joints),
             "base_poses": (*lead, len(scene.robots), 7),
+            "body_forces": (*lead, touching, 3),
         }
         for name, shape in shapes.items():
             got = tuple(getattr(state, name).shape)

@@ -128,7 +128,9 @@ def test_a_batch_takes_shared_and_own_values(layout, scene):
     assert torch.equal(control["joint_positions"][:, SLIDE], own)
     assert control["joint_positions"][:, TURN].tolist() == [0.5] * 3
     assert torch.equal(control["joint_efforts"][:, SPIN], rows(3, 5)[:, SPIN])
-    with pytest.raises(dc.InvalidInput, match=r"`joint_positions\['arm/slide'\]` has a batch axis"):
+    with pytest.raises(
+        dc.InvalidInput, match=r"`control.joint_positions\['arm/slide'\]` has a batch axis"
+    ):
         complete(layout, scene, dc.Control(joint_positions={"slide": own}))
     with pytest.raises(dc.InvalidInput, match="must have 3 environments"):
         complete(layout, scene, dc.Control(joint_efforts=rows(2, 5)), batch=(3,))
@@ -147,7 +149,9 @@ def test_a_gradient_by_what_moves_no_joint_is_refused(actuation):
         if field == own[actuation]:
             check_control(layout, control)
         else:
-            with pytest.raises(dc.InvalidInput, match=f"`{field}` must not require a gradient"):
+            with pytest.raises(
+                dc.InvalidInput, match=f"`control.{field}` must not require a gradient"
+            ):
                 check_control(layout, control)
 
 
@@ -170,11 +174,17 @@ MOVED = [[0, 0, 0.1, 1, 0, 0, 0], [0, 1, 1, 1, 0, 0, 0], [0, -1, 1, 1, 0, 0, 0]]
 @pytest.mark.parametrize(
     ("control", "message"),
     [
-        ({"joint_positions": [0.0] * 4}, r"`joint_positions` must have shape \[5\] or \[B, 5\]"),
+        (
+            {"joint_positions": [0.0] * 4},
+            r"`control.joint_positions` must have shape \[5\] or \[B, 5\]",
+        ),
         ({"joint_positions": {"elbow": 0.0}}, r"'arm/slide', .* 'elbow' is none of them"),
         ({"joint_positions": {"slide": [0.0, 0.0, 0.0]}}, None),
-        ({"joint_positions": {"slide": [[0.0]]}}, r"`joint_positions\['slide'\]` must have shape"),
-        ({"joint_positions": {"slide": np.nan}}, r"`joint_positions\['slide'\]` .*got nan"),
+        (
+            {"joint_positions": {"slide": [[0.0]]}},
+            r"`control.joint_positions\['slide'\]` must have shape",
+        ),
+        ({"joint_positions": {"slide": np.nan}}, r"`control.joint_positions\['slide'\]` .*got nan"),
         ({"joint_positions": {"slide": None}}, "leave the name out"),
         ({"joint_positions": {"slide": 0.0, "arm/slide": 0.0}}, "once, got it twice"),
         ({"joint_positions": {"spin": 0.0}}, "'position' or 'pd'; that of 'arm/spin' is 'torque'"),
@@ -313,19 +323,29 @@ def with_row(tensor, row, value):
 @pytest.mark.parametrize(
     ("name", "row", "value", "message"),
     [
-        ("body_mass", 2, 0.0, r"`body_mass` must be > 0 in the row \[2\], that of 'brick', "),
-        ("body_mass", 0, -1.0, r"`body_mass` must be finite and >= 0, got -1 at \[0\]"),
-        ("link_mass", 1, 0.0, r"`link_mass` must be > 0 in the row \[1\]"),
-        ("body_inertia", 2, -1.0, r"`body_inertia` must be positive definite in the row \[2\]"),
+        (
+            "body_mass",
+            2,
+            0.0,
+            r"`parameters.body_mass` must be > 0 in the row \[2\], that of 'brick', ",
+        ),
+        ("body_mass", 0, -1.0, r"`parameters.body_mass` must be finite and >= 0, got -1 at \[0\]"),
+        ("link_mass", 1, 0.0, r"`parameters.link_mass` must be > 0 in the row \[1\]"),
+        (
+            "body_inertia",
+            2,
+            -1.0,
+            r"`parameters.body_inertia` must be positive definite in the row \[2\]",
+        ),
         (
             "link_inertia",
             3,
             0.0,
-            r"`link_inertia` must be positive definite in the row \[3\], that of 'arm/",
+            r"`parameters.link_inertia` must be positive definite in the row \[3\], that of 'arm/",
         ),
-        ("link_center", 0, np.inf, r"`link_center` must be finite, got inf at \[0, 0\]"),
-        ("joint_stiffness", 1, -1.0, r"`joint_stiffness` .*got -1 at \[1\]"),
-        ("joint_armature", 4, np.nan, r"`joint_armature` .*got nan at \[4\]"),
+        ("link_center", 0, np.inf, r"`parameters.link_center` must be finite, got inf at \[0, 0\]"),
+        ("joint_stiffness", 1, -1.0, r"`parameters.joint_stiffness` .*got -1 at \[1\]"),
+        ("joint_armature", 4, np.nan, r"`parameters.joint_armature` .*got nan at \[4\]"),
     ],
 )
 def test_a_bad_parameter_is_refused(layout, defaults, name, row, value, message):

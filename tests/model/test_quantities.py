@@ -171,7 +171,7 @@ BOUNDED = [(name, value) for name, q in PARAMETERS.items() for value in outside(
 def test_a_value_beyond_the_range_is_refused_wherever_it_enters(sim, name, value):
     accepted = re.escape(str(PARAMETERS[name].accepted))
     wrong = torch.full_like(getattr(sim.parameters(), name), value)
-    with pytest.raises(dc.InvalidInput, match=rf"parameters: `{name}` must be {accepted}"):
+    with pytest.raises(dc.InvalidInput, match=rf"^step: `parameters\.{name}` must be {accepted}"):
         sim.step(sim.initial_state(), None, sim.parameters().replace(**{name: wrong}))
     for owner, field in sources(name):
         if (owner, field) in (("Robot", "mechanism"), ("Robot", "viscosity")):

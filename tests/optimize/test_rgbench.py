@@ -193,7 +193,10 @@ def test_bad_captures_are_refused(recorded, tmp_path, file, content, message):
         ),
         (lambda root: rgbench.read_capture(root).between(7, 8), "must be a frame between 7 and 8"),
         (lambda root: rgbench.chamfer([], [], norm=3), "`norm` must be 1 or 2, got 3"),
-        (lambda root: rgbench.chamfer([], [np.zeros((1, 3))]), "one for each of 0 states"),
+        (
+            lambda root: rgbench.chamfer([], [np.zeros((1, 3))]),
+            "`states` must be one or more, got none",
+        ),
         (lambda root: rgbench.nearest_vertices(np.zeros((0, 3)), {}), "one or more vertices"),
         (
             lambda root: rgbench.nearest_vertices(np.zeros((2, 3)), {"left": [0, 0, np.nan]}),

@@ -226,9 +226,9 @@ def test_parameters_that_the_scene_lacks_are_none_and_refused():
     assert parameters.poisson is None
     for name in ("stretch_weft", "stretch_shear", "bending_weft", "bending_twill"):
         assert getattr(parameters, name) is None
-        with pytest.raises(dc.InvalidInput, match=f"`{name}` must be None"):
+        with pytest.raises(dc.InvalidInput, match=f"^step: `parameters.{name}` must be None"):
             sim.step(sim.initial_state(), None, parameters.replace(**{name: 0.1}))
-    with pytest.raises(dc.InvalidInput, match="`friction` must be None"):
+    with pytest.raises(dc.InvalidInput, match=r"^step: `parameters.friction` must be None"):
         sim.step(sim.initial_state(), None, parameters.replace(friction=0.1))
 
 
@@ -303,14 +303,29 @@ POSE = [0, 1, 1, 1, 0, 0, 0]
 @pytest.mark.parametrize(
     ("field", "value", "error", "message"),
     [
-        ("forces", torch.zeros(3, 3), dc.InvalidInput, r"`forces` must have shape \[25, 3\]"),
+        (
+            "forces",
+            torch.zeros(3, 3),
+            dc.InvalidInput,
+            r"^(step: `control\.|control: `)forces` must have shape \[25, 3\]",
+        ),
         ("forces", torch.zeros(25, 3, device="meta"), TypeError, r"on the CPU, got meta"),
         ("forces", np.zeros((25, 3), complex), TypeError, "real numbers"),
         ("forces", [[np.nan] * 3] * 25, dc.InvalidInput, r"nan at \[0, 0\]"),
-        ("pins", torch.zeros(3, 3), dc.InvalidInput, r"`pins` must have shape \[4, 3\]"),
+        (
+            "pins",
+            torch.zeros(3, 3),
+            dc.InvalidInput,
+            r"^(step: `control\.|control: `)pins` must have shape \[4, 3\]",
+        ),
         ("pins", {"hem": [[0, 0, 0]]}, dc.InvalidInput, "'sheet/edge', .*'hem' is none of them"),
         ("pins", {"edge": [[0, 0, 0]]}, dc.InvalidInput, "'edge' is the name of several"),
-        ("pins", {"corner": [0, 0, 0]}, dc.InvalidInput, r"`pins\['corner'\]` .*\[1, 3\]"),
+        (
+            "pins",
+            {"corner": [0, 0, 0]},
+            dc.InvalidInput,
+            r"^(step: `control\.|control: `)pins\['corner'\]` .*\[1, 3\]",
+        ),
         ("pins", {"corner": None}, dc.InvalidInput, "leave the name out"),
         (
             "pins",
@@ -514,7 +529,9 @@ def test_batched_inputs_of_a_single_state_are_refused(sim):
 
 def test_one_value_per_environment_or_per_cloth_must_be_told_apart(sim):
     state, parameters = sim.initial_state(2), sim.parameters()
-    with pytest.raises(dc.InvalidInput, match=r"`stretch` of shape \[2\] could .*\[2, 2\]"):
+    with pytest.raises(
+        dc.InvalidInput, match=r"^step: `parameters\.stretch` of shape \[2\] could .*\[2, 2\]"
+    ):
         sim.step(state, None, parameters.replace(stretch=[500.0, 600.0]))
     per_cloth = torch.tensor([500.0, 600.0], dtype=F64)
     sim.step(state, None, parameters.replace(stretch=per_cloth.expand(2, 2)))

@@ -254,14 +254,32 @@ def test_gradients_reach_named_values_and_batches_have_their_own(sim):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"thickness": {"shirt": 0.1}}, r"`thickness` has the names 'sheet'.*'shirt' is none"),
-        ({"thickness": {"box": -0.1}}, r"`thickness\['box'\]` must be finite and >= 0"),
-        ({"thickness": {"box": [0.1, 0.1, 0.1]}}, r"`thickness\['box'\]` has a batch axis"),
-        ({"body_mass": {"sheet": 1.0}}, r"`body_mass` has the names 'box', 'floor'"),
+        (
+            {"thickness": {"shirt": 0.1}},
+            r"^step: `parameters.thickness` has the names 'sheet'.*'shirt' is none",
+        ),
+        (
+            {"thickness": {"box": -0.1}},
+            r"^step: `parameters.thickness\['box'\]` must be finite and >= 0",
+        ),
+        (
+            {"thickness": {"box": [0.1, 0.1, 0.1]}},
+            r"^step: `parameters.thickness\['box'\]` has a batch axis",
+        ),
+        (
+            {"body_mass": {"sheet": 1.0}},
+            r"^step: `parameters.body_mass` has the names 'box', 'floor'",
+        ),
         ({"joint_damping": {"hand": 1.0, "left_finger_joint": 2.0}}, "name each row once"),
-        ({"stretch": {"sheet": torch.ones(5)}}, r"`stretch\['sheet'\]` has a batch axis"),
+        (
+            {"stretch": {"sheet": torch.ones(5)}},
+            r"^step: `parameters.stretch\['sheet'\]` has a batch axis",
+        ),
         ({"friction": {("sheet", "shirt"): 0.1}}, "must name pairs"),
-        ({"body_mass": {"box": 0.0}}, r"`body_mass` must be > 0 in the row \[0\]"),
+        (
+            {"body_mass": {"box": 0.0}},
+            r"^step: `parameters.body_mass` must be > 0 in the row \[0\]",
+        ),
     ],
 )
 def test_wrong_names_and_values_are_refused(sim, changes, message):

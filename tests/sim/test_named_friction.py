@@ -133,7 +133,7 @@ ACCEPTED = r"must name pairs \(a, b\) of the surfaces 'mat', 'floor', 'far'; got
         pytest.param(
             {("mat", "floor"): -0.1},
             dc.InvalidInput,
-            r"`friction\[\('mat', 'floor'\)\]` must be finite and >= 0, got -0.1",
+            r"`parameters.friction\[\('mat', 'floor'\)\]` must be finite and >= 0, got -0.1",
             id="negative",
         ),
         pytest.param({("mat", "floor"): [0.1]}, dc.InvalidInput, "has a batch axis", id="batch"),
@@ -143,6 +143,6 @@ ACCEPTED = r"must name pairs \(a, b\) of the surfaces 'mat', 'floor', 'far'; got
     ],
 )
 def test_what_is_no_friction_is_refused(sim, friction, error, message):
-    with pytest.raises(error, match="parameters: `friction") as caught:
+    with pytest.raises(error, match=r"^rollout: `parameters\.friction") as caught:
         slide(sim, friction)
     assert re.search(message, str(caught.value))

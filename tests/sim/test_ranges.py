@@ -81,7 +81,7 @@ def test_a_control_of_absurd_size_is_refused(sim, field, value):
         "forces": torch.zeros_like(state.positions),
     }
     control = dc.Control(**{field: with_last(valid[field], value)})
-    with refused(field, value, r" at \["):
+    with refused(f"control.{field}", value, r" at \["):
         sim.step(state, control)
 
 
@@ -93,7 +93,9 @@ def test_a_parameter_of_absurd_size_is_refused(moved_sim, field):
     sim = moved_sim
     parameters = sim.parameters()
     bad = parameters.replace(**{field: with_last(getattr(parameters, field), 1e300)})
-    with pytest.raises(dc.InvalidInput, match=rf"`{field}` must be at most 1e\+30 in size"):
+    with pytest.raises(
+        dc.InvalidInput, match=rf"^step: `parameters\.{field}` must be at most 1e\+30 in size"
+    ):
         sim.step(sim.initial_state(), None, bad)
 
 
@@ -103,7 +105,9 @@ def test_a_parameter_of_absurd_size_is_refused(moved_sim, field):
 )
 def test_a_parameter_that_vanishes_is_refused(sim, field):
     bad = sim.parameters().replace(**{field: torch.tensor(1e-200, dtype=F64)})
-    with pytest.raises(dc.InvalidInput, match=rf"`{field}` must be at least 1e-30"):
+    with pytest.raises(
+        dc.InvalidInput, match=rf"^step: `parameters\.{field}` must be at least 1e-30"
+    ):
         sim.step(sim.initial_state(), None, bad)
 
 
@@ -118,14 +122,14 @@ def test_a_parameter_that_vanishes_is_refused(sim, field):
         ([0, 0, 0, 0], "non-zero length"),
     ],
 )
-@pytest.mark.parametrize("where", ["state.body_poses", "body_poses", "pose"])
+@pytest.mark.parametrize("where", ["state.body_poses", "control.body_poses", "pose"])
 def test_a_quaternion_that_cannot_be_normalized_is_refused(sim, where, quaternion, text):
     state = sim.initial_state()
     poses = state.body_poses.clone()
     poses[0, 3:] = torch.tensor(quaternion, dtype=F64)
     use = {
         "state.body_poses": lambda: sim.step(state.replace(body_poses=poses)),
-        "body_poses": lambda: sim.step(state, dc.Control(body_poses=poses)),
+        "control.body_poses": lambda: sim.step(state, dc.Control(body_poses=poses)),
         "pose": lambda: dc.RigidBody.box(1.0, pose=poses[0]),
     }[where]
     with pytest.raises(dc.InvalidInput, match=rf"`{where}` .*{text}"):
