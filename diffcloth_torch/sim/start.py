@@ -208,9 +208,9 @@ class StartWatch:
         elements, gap, distance, speed = fast[worst]
         place = "" if batch is None else f"in environment {worst} of {list(fast)}, "
         warn_caller(
-            f"{operation()}: the barrier throws apart what starts inside of it: {place}{elements} are "
-            f"{gap:.3g} m apart, {gap / distance:.2g} of the barrier distance {distance:.3g} m, "
-            f"and the energy stored there gives about {speed:.2g} m/s; start them "
+            f"{operation()}: the barrier throws apart what starts inside of it: {place}{elements} "
+            f"are {gap:.3g} m apart, {gap / distance:.2g} of the barrier distance {distance:.3g} "
+            f"m, and the energy stored there gives about {speed:.2g} m/s; start them "
             f"{distance - gap:.2g} m further apart, or give a `contact.barrier_distance` of at "
             f"most {gap:.3g} m",
             BarrierStartWarning,
