@@ -51,7 +51,7 @@ class IntersectingState(SimulationError):  # noqa: N818
 
 
 class InfeasibleMotion(SimulationError):  # noqa: N818
-    """The prescribed motion of bodies, joints and pins cannot be completed without an intersection.
+    """The prescribed motion of bodies, joints and pins was not completed.
 
     Raised by a step, or by backward through a step whose failure was returned as a value.
     """

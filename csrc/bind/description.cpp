@@ -174,6 +174,7 @@ void take_options(NamedFields& fields, step::Description& d) {
   d.elastic = choose<step::ElasticSolver>("elastic", step::kElasticSolvers,
                                           fields.take<std::string>("elastic"));
   d.friction_iterations = fields.take<int>("friction_iterations");
+  if (fields.has("begins_at_state")) d.begins_at_state = fields.take<bool>("begins_at_state");
   d.options.tolerance = fields.take<double>("tolerance");
   d.options.max_iterations = fields.take<int>("max_iterations");
   if (fields.has("large_factor")) {  // only tests say it

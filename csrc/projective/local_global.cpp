@@ -165,7 +165,7 @@ LocalGlobalOutcome minimize(const LocalGlobalObjective& objective,
     if (iteration.residual() < options.tolerance) return end(LocalGlobalStatus::kConverged);
     if (outcome.iterations == options.max_iterations)
       return end(LocalGlobalStatus::kIterationLimit);
-    if (!iteration.advance()) return end(LocalGlobalStatus::kRoundingFloor);
+    if (!iteration.advance()) return end(LocalGlobalStatus::kNoProgress);
     ++outcome.iterations;
   }
 }

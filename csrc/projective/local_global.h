@@ -35,9 +35,9 @@ struct LocalGlobalOptions {
 enum class LocalGlobalStatus : std::uint8_t {
   kConverged,
   kIterationLimit,
-  kRoundingFloor,  ///< steps are lost in the rounding of positions, or raise the energy
-  kStalled,        ///< contact at nodes: the residual no longer shrinks
-  kOverflow,       ///< forces are not finite
+  kNoProgress,  ///< steps are lost in the rounding of positions, raise the energy, or do not shrink
+  kStalled,     ///< contact at nodes: the residual no longer shrinks
+  kOverflow,    ///< forces are not finite
 };
 
 struct LocalGlobalOutcome {

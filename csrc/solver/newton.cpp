@@ -60,7 +60,7 @@ class Descent {
   enum class Next : std::uint8_t { kGoOn, kStop };
 
   Next proceed();
-  Status too_stiff();
+  Status without_step();
   Next settle();
   Status look();
   Next take(const Directions::Direction& direction);
@@ -72,6 +72,7 @@ class Descent {
   Next no_way(const Directions::Direction& direction, double step, SearchResult result);
   bool is_settled(double step, double share) const;
   bool may_end(const Directions::Direction& direction, double step) const;
+  bool is_lost(double step) const;
   bool idles(double step, const Search& search);
   Next go(const Directions::Direction& direction);
   Search walk_along(const Directions::Direction& direction);
@@ -141,6 +142,11 @@ bool Descent::may_end(const Directions::Direction& direction, double step) const
   return !(doubtful && directions_.is_dear());
 }
 
+/// Whether rounding of the coordinates hides a step.
+bool Descent::is_lost(double step) const {
+  return !(step > kResolution * walk_.f.coordinates->extent(walk_.x()));
+}
+
 /// Whether steps have stopped to shrink while their gain drowns in rounding.
 bool Descent::idles(double step, const Search& search) {
   if (step < kProgress * best_ || search.measured) {
@@ -157,9 +163,10 @@ Descent::Next Descent::no_way(const Directions::Direction& direction,
                               double step,
                               SearchResult result) {
   const bool exact = direction.kind != Kind::kDamped;
+  const Status without_gain = is_lost(step) ? Status::kRoundingFloor : Status::kNoDescent;
   if (exact && result == SearchResult::kNoGain) {
     if (direction.kind == Kind::kFactored && (step >= goal_ || directions_.is_certified())) {
-      return stop(step < goal_ ? Status::kConverged : Status::kRoundingFloor);
+      return stop(step < goal_ ? Status::kConverged : without_gain);
     }
     if (step < goal_) {
       settling_ = true;
@@ -167,7 +174,7 @@ Descent::Next Descent::no_way(const Directions::Direction& direction,
     }
   }
   if (directions_.retry(direction.kind)) return Next::kGoOn;
-  return stop(result == SearchResult::kBlocked ? Status::kBlocked : Status::kRoundingFloor);
+  return stop(result == SearchResult::kBlocked ? Status::kBlocked : without_gain);
 }
 
 /// Whether an excursion may go so far.
@@ -240,9 +247,9 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
     if (!directions_.confirm()) return escape();
     step = walk_.displacement(directions_.p());  // of doubles, perhaps
   }
-  const bool is_lost = !(step > kResolution * walk_.f.coordinates->extent(walk_.x()));
+  const bool lost = is_lost(step);
   // A minimum above the start of an excursion is none to end in.
-  if (away_ && (step < goal_ || is_lost)) return come_back();
+  if (away_ && (step < goal_ || lost)) return come_back();
   residual_ = step / walk_.f.h;
   if (direction.kind == Kind::kDamped) {
     if (step < kSettled * goal_) {
@@ -259,7 +266,7 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
       settled_step_ = step;
     }
   }
-  if (is_lost) return no_way(direction, step, SearchResult::kNoGain);
+  if (lost) return no_way(direction, step, SearchResult::kNoGain);
   return go(direction);
 }
 
@@ -282,16 +289,17 @@ Descent::Next Descent::go(const Directions::Direction& direction) {
 }
 
 /// There is no Newton step to measure.
-Status Descent::too_stiff() {
+Status Descent::without_step() {
   residual_ = std::numeric_limits<double>::infinity();
-  return Status::kTooStiff;
+  const bool finite = std::ranges::all_of(walk_.g(), [](double g) { return std::isfinite(g); });
+  return finite ? Status::kIndefinite : Status::kNotFinite;
 }
 
 /// What is here when the iterations are used up: the residual of this very point.
 Status Descent::look() {
   if (away_) walk_.back(excursion_.start);
   const bool minimum = directions_.certify();
-  if (!minimum && !directions_.next()) return too_stiff();
+  if (!minimum && !directions_.next()) return without_step();
   const double step = walk_.displacement(directions_.p());
   residual_ = step / walk_.f.h;
   if (step >= goal_) return Status::kIterationLimit;
@@ -302,7 +310,7 @@ Descent::Next Descent::proceed() {
   const std::optional<Directions::Direction> direction =
       away_ ? directions_.next_extrapolated() : directions_.next();
   if (direction) return take(*direction);
-  return away_ ? come_back() : stop(too_stiff());
+  return away_ ? come_back() : stop(without_step());
 }
 
 Status Descent::run() {
@@ -389,7 +397,8 @@ bool start_from(Walk& walk, const std::vector<double>& guess) {
   }
   coordinates.place(held);
   const auto is_better_and_free = [&] {
-    if (walk.f.energy_change_without_contact(held.data(), guess.data()) > 0.0) return false;
+    // Written so that a change that is not a number, of strains beyond all numbers, is no gain.
+    if (!(walk.f.energy_change_without_contact(held.data(), guess.data()) <= 0.0)) return false;
     if (walk.f.friction != nullptr && is_resisted(walk, guess)) return false;
     std::vector<double> change(guess.size());
     for (std::size_t a = 0; a < guess.size(); ++a) change[a] = guess[a] - walk.x()[a];
@@ -413,8 +422,8 @@ Outcome minimize(const Objective& objective,
                  Context& context) {
   Walk walk(objective, x, context);
   Outcome outcome;
-  const bool guessed = departure != nullptr && departure->motion.portions() == 1 &&
-                       start_from(walk, departure->guess);
+  const bool guessed = departure != nullptr && departure->guess != nullptr &&
+                       departure->motion.portions() == 1 && start_from(walk, *departure->guess);
   if (!guessed) walk.watch(x);
   walk.refresh();
   if (departure != nullptr && !guessed) {

@@ -10,10 +10,12 @@ namespace diffcloth::solver {
 enum class Status : std::uint8_t {
   kConverged,
   kIterationLimit,  ///< the step's iterations are used up
-  kRoundingFloor,   ///< rounding hides any further decrease
-  kBlocked,         ///< every direction is blocked by collisions
-  kTooStiff,        ///< rounding leaves no positive definite Hessian, not even of the projected one
-  kSaddle,          ///< the gradient vanishes where the Hessian is indefinite, and nothing is lower
+  kRoundingFloor,   ///< rounding hides steps: no gain is measured, or no coordinate changes
+  kNoDescent,       ///< no step along the last direction lowers the objective, however short
+  kBlocked,         ///< collision detection leaves no part of the last direction
+  kIndefinite,      ///< the projected Hessian has no factor
+  kNotFinite,       ///< the gradient is not finite
+  kSaddle,          ///< the gradient vanishes where the Hessian is indefinite
   kUnsolved,        ///< friction at nodes: no way leads on, and no solution was found
   kInfeasibleMotion,
 };
@@ -28,9 +30,9 @@ struct Outcome {
 /// How the first solve of a step leaves the start of the step.
 struct Departure {
   const PrescribedMotion& motion;
-  /// Point to begin at if the straight way there is certified free of contact; prescribed points at their
-  /// ends.
-  const std::vector<double>& guess;
+  /// Point to begin at if the straight way there is certified free of contact, prescribed points at their
+  /// ends; null where there is none.
+  const std::vector<double>* guess;
 };
 
 /// Find a local minimum of the objective near x.

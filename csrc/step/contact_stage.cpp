@@ -19,6 +19,8 @@ namespace {
 using contact::Contact;
 using Array = std::vector<double>;
 
+constexpr std::string_view kUsedUp = "the iterations of the step (`max_iterations`) are used up";
+
 void report_contacts(const contact::CollisionMesh& mesh,
                      const std::vector<Contact>& contacts,
                      Report& report) {
@@ -31,11 +33,12 @@ void report_contacts(const contact::CollisionMesh& mesh,
   }
 }
 
-/// Name what is near each other where a step could not go on. Contacts do not tell: two surfaces that
-/// are both prescribed have none, and block each other all the same.
+/// Explain where a prescribed motion has ended, and name what is near each other where a step could not go
+/// on. Contacts do not tell: two surfaces that are both prescribed have none, and block each other all the same.
 void report_blockers(const Problem& problem,
                      const Array& x,
                      solver::Status status,
+                     const solver::Context& context,
                      Report& report) {
   const bool is_infeasible = status == solver::Status::kInfeasibleMotion;
   if (!is_infeasible && status != solver::Status::kBlocked) return;
@@ -44,13 +47,11 @@ void report_blockers(const Problem& problem,
     const contact::Parameters& parameters = problem.contact->parameters();
     names = describe_near(problem.scene, x.data(), parameters.thickness, parameters.d_hat);
   }
-  if (!is_infeasible) {
-    report.message += ": " + names;
-  } else if (names.empty()) {
-    report.message = "nothing is in the way yet, but the iterations of the step are used up";
-  } else {
-    report.message = "in contact: " + names;
+  if (is_infeasible) {
+    const bool is_used_up = context.iterations >= context.options.max_iterations;
+    report.message = is_used_up ? kUsedUp : "the motion no longer advances";
   }
+  if (!names.empty()) report.message += (is_infeasible ? "; in contact: " : ": ") + names;
 }
 
 /// Forces of contact on all vertices, minus the partial derivative of its energy, with those of
@@ -75,16 +76,20 @@ std::string_view words(solver::Status status) {
     case solver::Status::kInfeasibleMotion:
       return {};
     case solver::Status::kIterationLimit:
-      return "the iterations of the step are used up";
+      return kUsedUp;
     case solver::Status::kRoundingFloor:
-      return "rounding hides any further decrease: the floor of float64 for this scene";
+      return "rounding hides the last steps: their gain, or their change of the coordinates";
+    case solver::Status::kNoDescent:
+      return "no step along the last direction lowers the energy, however short";
     case solver::Status::kBlocked:
-      return "surfaces are so close that rounding lets none of them move";
-    case solver::Status::kTooStiff:
-      return "not even the projected Hessian is positive definite: stiffnesses differ by more than "
-             "float64 can hold";
+      return "collision detection leaves no way along the last direction";
+    case solver::Status::kIndefinite:
+      return "not even the projected Hessian has a factor";
+    case solver::Status::kNotFinite:
+      return "forces are not finite";
     case solver::Status::kSaddle:
-      return "at a saddle, and no lower point was found from there";
+      return "at a saddle: forces balance to the tolerance, and the Hessian is not positive "
+             "definite";
     case solver::Status::kUnsolved:
       return "no solution of the law of friction at vertices was found";
   }
@@ -136,7 +141,8 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
   }
   // Everything at its end, unknowns where inertia alone (or x^D) would put them.
   const Array first_guess = problem.predicted(guess);
-  const solver::Departure departure{.motion = motion, .guess = first_guess};
+  const solver::Departure departure{
+      .motion = motion, .guess = problem.scene.given.begins_at_state ? nullptr : &first_guess};
   solver::Factor factor;
   int solves = 0;
   solver::Status status = solver::Status::kConverged;
@@ -161,7 +167,7 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
     if (solves < friction_iterations) sum.lag(x, contacts);
   }
   report_contacts(problem.scene.collision_mesh, sum.contacts(), step.report);
-  report_blockers(problem, x, status, step.report);
+  report_blockers(problem, x, status, step.context, step.report);
   const double reached = step.report.motion_fraction;
   if (reached < 1.0) step.report.root_poses = motion.root_poses(reached);
   if (!step.tape.empty()) *step.tape["solves"] = solves;

@@ -1,7 +1,6 @@
 #include "step/elastic_stage.h"
 
 #include <algorithm>
-#include <string_view>
 #include <utility>
 
 #include "projective/local_global.h"
@@ -10,22 +9,6 @@
 
 namespace diffcloth::step {
 namespace {
-
-std::string_view words(projective::LocalGlobalStatus status) {
-  switch (status) {
-    case projective::LocalGlobalStatus::kConverged:
-      return {};
-    case projective::LocalGlobalStatus::kIterationLimit:
-      return "the local/global iterations of the step are used up";
-    case projective::LocalGlobalStatus::kRoundingFloor:
-      return "rounding hides any further decrease of the elastic stage";
-    case projective::LocalGlobalStatus::kStalled:
-      return "the local/global iterations of the step have stalled";
-    case projective::LocalGlobalStatus::kOverflow:
-      return "the forces of the elastic stage are not finite";
-  }
-  __builtin_unreachable();
-}
 
 /// Of a step that has been taken; none where it is gone.
 solver::Certificate certificate_of(const Taken& step) {
@@ -77,17 +60,13 @@ void solve_by_projective_dynamics(Problem& problem,
                                    : projective::minimize(f, x, options, checkpoint);
   }
   step.report.counts.local_global += outcome.iterations;
-  if (outcome.status == projective::LocalGlobalStatus::kStalled) {
+  if (outcome.status != projective::LocalGlobalStatus::kConverged) {
     ++step.report.counts.left_to_newton;
     x = start;
     solve_by_newton(problem, step, nodes, x);
     return;
   }
   step.report.residual = std::max(step.report.residual, outcome.residual);
-  if (outcome.status != projective::LocalGlobalStatus::kConverged) {
-    step.report.result = Result::kNotConverged;
-    step.report.message = words(outcome.status);
-  }
   step.kept.add({});
 }
 

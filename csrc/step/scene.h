@@ -91,6 +91,7 @@ struct Description {
   Metric metric = Metric::kEnergy;
   ElasticSolver elastic = ElasticSolver::kNewton;
   int friction_iterations = 2;
+  bool begins_at_state = false;  ///< solves begin where the step does, not where inertia leads
   solver::Options options{};
 };
 

@@ -49,6 +49,7 @@ class CoreOptions(NamedTuple):
         scheme: "coupled", "split" or "projective".
         contact: Contact options.
         solver: Solver options.
+        begins_at_state: Whether solves begin where the step does, not where inertia leads.
     """
 
     bending_models: Sequence[str]
@@ -56,6 +57,7 @@ class CoreOptions(NamedTuple):
     scheme: str
     contact: ContactOptions
     solver: SolverOptions
+    begins_at_state: bool = False
 
 
 def make_core(
@@ -104,6 +106,7 @@ def make_core(
         friction_iterations=options.contact.friction_iterations,
         tolerance=options.solver.tolerance,
         max_iterations=options.solver.max_iterations,
+        begins_at_state=options.begins_at_state,
         ignored_pairs=assembly.ignored_pairs,
         primitive_kinds=[p.kind if p is not None else "none" for p in assembly.primitives],
         primitive_sizes=np.array(

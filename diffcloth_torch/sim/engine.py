@@ -61,6 +61,7 @@ class Engine:
         solver: SolverOptions,
         weight: str | None = None,
         limits_dt: float | None = None,
+        begins_at_state: bool = False,
     ) -> None:
         """Make the cores; the arguments are those of `Simulator`, checked.
 
@@ -74,6 +75,7 @@ class Engine:
             solver: Options of the solver.
             weight: As for `Dynamics`.
             limits_dt: Time step that sets the stiffness of joint limits; None takes `dt`.
+            begins_at_state: As for `CoreOptions`.
         """
         assembly = layout.assembly
         self.layout, self._dt = layout, dt
@@ -87,6 +89,7 @@ class Engine:
             scheme=scheme if scene.cloths else SCHEMES[0],
             contact=contact,
             solver=solver,
+            begins_at_state=begins_at_state,
         )
         stiffness = None
         if self.dynamics is not None:

@@ -89,12 +89,12 @@ class _Settled(NamedTuple):
 
     Attributes:
         here: The state.
-        alternating: Environments in which friction does not settle.
+        unsettled: Environments in which friction has not settled.
         touching: In which environments something is in contact, [B].
     """
 
     here: Given
-    alternating: list[int]
+    unsettled: list[int]
     touching: Tensor
 
 
@@ -191,9 +191,9 @@ class Equilibria:
         fields, diagnostics = step(_LAST, begun, origins, joints)
         if self._settles:
             fields = fields | {"joint_efforts": self._efforts(begun, fields)}
-        if settled.alternating:
-            alternate = dict.fromkeys(settled.alternating, "friction and normal forces alternate")
-            mark(diagnostics, alternate, UNCONVERGED)
+        if settled.unsettled:
+            message = f"friction and normal forces have not settled in {_REPEATS} repetitions"
+            mark(diagnostics, dict.fromkeys(settled.unsettled, message), UNCONVERGED)
             check(diagnostics)
             fields = refuse_gradients(fields, failures_of(diagnostics))
         diagnostics["iterations"] = iterations.tolist()
@@ -220,6 +220,7 @@ class Equilibria:
                 solver=replace(solver, tolerance=solver.tolerance / length, metric=None),
                 weight="bounded" if length in _GROWTH else "exact",
                 limits_dt=self._dt,
+                begins_at_state=True,  # inertia alone leads millions of meters away
             )
         return self._engines[length]
 

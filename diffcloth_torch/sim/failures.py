@@ -27,7 +27,7 @@ _ERRORS = {UNCONVERGED: NotConverged, INFEASIBLE: InfeasibleMotion, TURNED: Turn
 _REMEDIES: dict[type[SimulationError], str] = {
     InfeasibleMotion: "a step that did not complete the prescribed motion has no gradient; move "
     "bodies and pins less far in it",
-    NotConverged: "a step that did not converge has no gradient; raise max_iterations",
+    NotConverged: "a step that did not converge has no gradient; lower dt",
     TurnedTooFar: "a step in which a body turns further than contact resolves has no gradient; "
     "lower dt",
 }

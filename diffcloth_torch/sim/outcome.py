@@ -62,6 +62,7 @@ def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched
         contact_count=value(diagnostics["contact_count"]),
         motion_fraction=value(diagnostics["motion_fraction"]),
         seconds={phase: value(diagnostics[name]) for phase, name in _SECONDS.items()},
+        cpu_seconds=value(diagnostics["cpu_seconds"]),
         counts={what: value(diagnostics[name]) for what, name in _COUNTS.items()},
         status=names if batched else names[0],
         contacts=Contacts.of(
@@ -84,14 +85,13 @@ def raise_on_failure(
         (
             InfeasibleMotion,
             (status == INFEASIBLE) & throw,
-            "the prescribed motion cannot be completed without an intersection; move bodies and "
-            "pins less far in a step, or make room for the cloth",
+            "the prescribed motion was not completed; move bodies and pins less far in a step, or "
+            "make room for the cloth",
         ),
         (
             NotConverged,
             (status == UNCONVERGED) & throw,
-            "the solver stopped before its tolerance was reached; raise "
-            "SolverOptions.max_iterations or tolerance, or lower dt",
+            "the solver stopped before its tolerance was reached",
         ),
         (
             TurnedTooFar,

@@ -192,16 +192,21 @@ class Staggered:
             Environments with such a motion, except the known ones, and what to do about it.
         """
         result = self.judge.forward(inputs, False, torch.get_num_threads())
-        status = diagnostics_of(result)["status"]
-        blocked = [i for i, s in enumerate(status) if s != CONVERGED and i not in known]
-        remedy = 'passing through a cloth; lower dt, or use coupling="monolithic"'
+        diagnostics = diagnostics_of(result)
+        outcomes = zip(diagnostics["status"], diagnostics["message"], strict=True)
+        remedy = 'lower dt, or use coupling="monolithic"'
+        blocked = {
+            i: f"dynamic bodies cannot go on past cloths at rest ({message}); {remedy}"
+            for i, (status, message) in enumerate(outcomes)
+            if status != CONVERGED and i not in known
+        }
         if blocked and self._throw:
+            environments = list(blocked)
             raise InfeasibleMotion(
-                f"{operation()}: dynamic bodies in the environments {blocked} cannot go on without "
-                f"{remedy}",
-                environments=blocked,
+                f"{operation()}: environments {environments}: {blocked[environments[0]]}",
+                environments=environments,
             )
-        return dict.fromkeys(blocked, f"dynamic bodies cannot go on without {remedy}")
+        return blocked
 
 
 class _Solves:

@@ -435,7 +435,8 @@ def _summarize(tally: Tally, seconds: float) -> None:
     print(f"{c['scenes']} scenes, {c['steps']} steps in {seconds:.0f} s")
     print(f"converged {c['converged']}, {c['iterations'] / converged:.1f} iterations each")
     print(
-        f"NotConverged {c['NotConverged']}: {share:.1%} of scenes, {c['NotConverged'] / steps:.1%}"
+        f"NotConverged {c['NotConverged']}: {share:.2%} of scenes, "
+        f"{c['NotConverged'] / steps:.3%} of steps"
     )
     for kind in sorted(kind for kind in c if kind.startswith("NotConverged: ")):
         print(f"  {kind.removeprefix('NotConverged: ')} {c[kind]}")

@@ -571,3 +571,36 @@ def test_a_scene_of_bodies_has_the_scale_of_its_bodies():
         ) as error:
             sim.equilibrium(sim.initial_state())
         assert moved < float(str(error.value).split("moves by ")[1].split(" m")[0]) < 1e3 * moved
+
+
+WOVEN = {"stretch": 1000.0, "stretch_weft": 200.0, "stretch_shear": 50.0}
+SOFT = {"stretch": 100.0, "stretch_weft": 100.0, "stretch_shear": 10.0, "bending": 1e-6}
+
+
+@pytest.mark.parametrize(
+    ("count", "size", "material", "pins", "force"),
+    [
+        pytest.param(9, 0.3, WOVEN, [0, 8], [0.0, -0.1, 0.0], id="woven"),
+        pytest.param(7, 0.2, WOVEN, [42, 48], [0.1, 0.0, 0.0], id="woven, drawn aside"),
+        pytest.param(9, 0.3, SOFT, [72, 80], [0.0, 0.0, -0.1], id="soft, woven"),
+        pytest.param(6, 0.25, {}, [0, 5], [0.05, -0.1, 0.02], id="isotropic"),
+    ],
+)
+def test_a_search_begins_at_its_state(count, size, material, pins, force):
+    """Where inertia alone leads in its last step is 4e14 m away, and the energy there no number."""
+    cloth = dc.Cloth.grid(
+        count, count, size, pins={"corners": pins}, material=dc.Material(**material)
+    )
+    contact = dc.ContactOptions(self_contact=False)
+    sim = dc.Simulator(dc.Scene([cloth]), 0.01, contact=contact)
+    state = sim.initial_state()
+    forces = torch.zeros_like(state.positions)
+    forces[count // 2 if 0 not in pins else count * count - count // 2 - 1] = torch.tensor(
+        force, dtype=F64
+    )
+    end = sim.equilibrium(state, sim.control(forces=forces))
+    assert (end.positions - state.positions).abs().max() < 4 * size
+    weight = sim.vertex_masses().sum() * torch.tensor([0.0, 0.0, -9.81], dtype=F64)
+    # Forces balance to the solver's tolerance, which leaves 1e-9 of the weight.
+    balance = weight + forces.sum(dim=0) + end.pin_forces.sum(dim=0)
+    assert balance.abs().max() < 1e-7 * float(weight.norm())
