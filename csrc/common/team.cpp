@@ -3,6 +3,8 @@
 #include <cstddef>
 #include <system_error>
 
+#include "common/processor_time.h"
+
 namespace diffcloth {
 
 Team::~Team() {
@@ -62,8 +64,11 @@ void Team::work(std::unique_lock<std::mutex>& lock, int member) {
     }
     taken_[i] = 1;
     lock.unlock();
+    const double before = member == 0 ? 0.0 : processor_seconds();
     (*body_)(i, member);
+    const double spent = member == 0 ? 0.0 : processor_seconds() - before;
     lock.lock();
+    helpers_seconds_ += spent;
     done_[i] = 1;
     --left_;
     changed_.notify_all();

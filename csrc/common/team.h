@@ -26,6 +26,9 @@ class Team {
   /// Most threads of a loop, the caller's included.
   int size() const { return size_; }
 
+  /// Processor time that the helpers have spent on all loops so far [s].
+  double helpers_seconds() const { return helpers_seconds_; }
+
   /// What is done of a loop, by index.
   using Done = std::vector<char>;
 
@@ -58,6 +61,7 @@ class Team {
   Index first_ = 0;  // all below are taken
   Index left_ = 0;   // not yet done
   bool ends_ = false;
+  double helpers_seconds_ = 0.0;
 };
 
 }  // namespace diffcloth

@@ -51,6 +51,7 @@ struct Report {
   Index slipping = 0;
   solver::Counts counts;
   Seconds seconds{};
+  double cpu_seconds = 0.0;  ///< processor time of the threads of the environment [s]
   std::string message;
   std::vector<PairContacts> pairs;   ///< in ascending order
   std::vector<ContactPoint> points;  ///< of barrier and friction, not of nodes
@@ -64,6 +65,7 @@ struct Report {
     visit("minimum_distance", minimum_distance);
     visit("contact_count", static_cast<std::int64_t>(contact_count));
     visit("motion_fraction", motion_fraction);
+    visit("cpu_seconds", cpu_seconds);
     visit("count_exact", static_cast<std::int64_t>(counts.exact));
     visit("count_chord", static_cast<std::int64_t>(counts.chord));
     visit("count_projected", static_cast<std::int64_t>(counts.projected));

@@ -4,6 +4,7 @@
 #include <array>
 #include <utility>
 
+#include "common/processor_time.h"
 #include "step/scheme.h"
 
 namespace diffcloth::step {
@@ -106,6 +107,7 @@ Report forward(const Scene& scene,
                int threads,
                std::vector<std::vector<double>>* path) {
   Stopwatch watch;
+  const double before = processor_seconds();
   Report report;
   contact::Detection detection(scene.broad_phase);
   Problem problem(scene, inputs);
@@ -154,6 +156,7 @@ Report forward(const Scene& scene,
   }
   report.iterations = context.iterations;
   report.seconds = watch.read();
+  report.cpu_seconds = processor_seconds() - before + workspace.team().helpers_seconds();
   return report;
 }
 

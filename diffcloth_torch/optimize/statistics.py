@@ -19,9 +19,9 @@ def reports_of(states: Sequence[State]) -> list[Report]:
     return [state.report for state in states if state.report is not None]
 
 
-def finite_or_none(distance: float) -> float | None:
-    """Replace an infinite distance, of surfaces far apart, by None: JSON has no infinity."""
-    return distance if math.isfinite(distance) else None
+def finite_or_none(value: float) -> float | None:
+    """Replace by None what JSON cannot write: the distance of what is far apart, no known time."""
+    return value if math.isfinite(value) else None
 
 
 def rollout_statistics(states: Sequence[State]) -> dict[str, Any]:
@@ -49,6 +49,7 @@ def rollout_statistics(states: Sequence[State]) -> dict[str, Any]:
         "largest_contact_count": max(contacts, default=0),
         "steps_with_contact": sum(count > 0 for count in contacts),
         "phase_seconds": seconds,
+        "cpu_seconds": finite_or_none(sum(map(float, all_of("cpu_seconds")))),
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
@@ -39,7 +40,8 @@ class Report:
             between a cloth and a body, features that are not hidden behind nearer ones; in
             "projective", vertices that stick or slip.
         motion_fraction: Fraction of the prescribed motion that was completed, 1 for all of it.
-        seconds: Phase of the step -> time [s]; the phases add up to the time in the core.
+        seconds: Phase of the step -> time [s]; the phases add up to the time in the core, by the
+            clock of the wall, which also counts while other work has the processor.
         counts: Event -> number of times: steps with the `exact` Hessian, `chord` steps with an
             older factor, steps with a `projected` Hessian, Hessians of `negative_curvature`,
             `local_global` iterations of Projective Dynamics, solves that they `left_to_newton`,
@@ -49,6 +51,8 @@ class Report:
         status: "converged", "not_converged", "infeasible_motion" or "turned_too_far"; in a batch a
             tuple of B of them. In the report of an `IntersectingState`, environments that intersect
             have "intersecting_state".
+        cpu_seconds: Processor time of the step in the core [s], of all threads that work on the
+            environment; NaN where it is not known.
         contacts: Contacts by pairs of names of surfaces: `contacts["gripper/left", "shirt"]` has
             `count` and `force`.
     """
@@ -63,8 +67,11 @@ class Report:
     counts: dict[str, int | Tensor] = field(default_factory=dict)
     status: str | tuple[str, ...] = ()  # if left out, derived from `converged`
     contacts: Contacts = field(default_factory=Contacts)
+    cpu_seconds: float | Tensor | None = None  # if left out, not known
 
     def __post_init__(self) -> None:
+        if self.cpu_seconds is None:
+            object.__setattr__(self, "cpu_seconds", _unknown_like(self.residual))
         # Reports may come from files: errors are raised here, not where the report is used.
         for entry in _NUMERIC:
             value = self.__dict__.get(entry)
@@ -89,8 +96,8 @@ class Report:
             raise TypeError(f"Report: `status` must be a str or a tuple of them, got {names!r}")
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Reports that the first version saved count nothing, and have no status.
-        defaults = {"counts": {}, "status": (), "contacts": Contacts()}
+        # Reports that earlier versions saved count nothing, have no status, or no processor time.
+        defaults = {"counts": {}, "status": (), "contacts": Contacts(), "cpu_seconds": None}
         self.__dict__.update(defaults | state)
         self.__post_init__()
 
@@ -161,6 +168,13 @@ class Report:
             status,
             contacts,
         )
+
+
+def _unknown_like(residual: Any) -> Any:
+    """NaN for each environment."""
+    if isinstance(residual, Tensor):
+        return cpu.full(tuple(residual.shape), math.nan)
+    return math.nan
 
 
 def outcome_text(report: Report | None) -> str:
