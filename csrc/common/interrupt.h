@@ -33,19 +33,57 @@ class Interrupt {
   std::atomic<bool> stopped_{false};
 };
 
-/// What one worker sees of an Interrupt.
+/// Thrown to unwind a step whose time is up, to where it can end.
+struct TimeIsUp {};
+
+/// What one worker sees of an Interrupt, and of the time that a step may take.
 class Checkpoint {
  public:
-  Checkpoint(Interrupt& interrupt, bool is_caller) : interrupt_(interrupt), is_caller_(is_caller) {}
+  Checkpoint(Interrupt& interrupt, bool is_caller)
+      : interrupt_(&interrupt), is_caller_(is_caller) {}
 
-  void check() const {
-    if (is_caller_) interrupt_.poll();
-    if (interrupt_.stopped()) throw Interrupted{};
+  /// The same with some time from now on; all the time there is where that is infinite [s].
+  Checkpoint with_seconds(double seconds) const {
+    constexpr double kForever = 1e9;  // beyond what the clock counts
+    Checkpoint other = *this;
+    if (seconds < kForever) {
+      const std::chrono::duration<double> left(seconds);
+      other.deadline_ = Clock::now() + std::chrono::duration_cast<Clock::duration>(left);
+    }
+    return other;
   }
 
+  /// @throws Interrupted, TimeIsUp
+  void check() const {
+    check_interrupt();
+    if (is_late()) throw TimeIsUp{};
+  }
+
+  /// @throws Interrupted
+  void check_interrupt() const {
+    if (is_caller_) interrupt_->poll();
+    if (interrupt_->stopped()) throw Interrupted{};
+  }
+
+  bool is_late() const { return deadline_ < kNever && Clock::now() > deadline_; }
+
+  /// Be late no more, so that a step whose time is up can end; no solve goes on then.
+  void stop_clock() {
+    deadline_ = kNever;
+    is_up_ = true;
+  }
+
+  /// Whether the time was up.
+  bool is_up() const { return is_up_; }
+
  private:
-  Interrupt& interrupt_;
+  using Clock = std::chrono::steady_clock;
+  static constexpr Clock::time_point kNever = Clock::time_point::max();
+
+  Interrupt* interrupt_;
   bool is_caller_;
+  Clock::time_point deadline_ = kNever;
+  bool is_up_ = false;
 };
 
 }  // namespace diffcloth

@@ -22,8 +22,9 @@ namespace diffcloth::contact {
 /// collision-free steps are those of BroadPhase::find, to the bit.
 class CandidateList {
  public:
-  explicit CandidateList(const BroadPhase& broad_phase)
-      : broad_phase_(&broad_phase), relative_search_(broad_phase) {}
+  /// @param checkpoint  see RelativeSearch
+  explicit CandidateList(const BroadPhase& broad_phase, const Checkpoint* checkpoint = nullptr)
+      : broad_phase_(&broad_phase), relative_search_(broad_phase, checkpoint) {}
 
   /// Make the list at the start of a motion that will follow.
   void prepare(const double* x_t0,

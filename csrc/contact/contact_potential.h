@@ -4,6 +4,7 @@
 #include <utility>
 #include <vector>
 
+#include "common/interrupt.h"
 #include "contact/broad_phase.h"
 #include "contact/candidate_list.h"
 #include "contact/contact_set.h"
@@ -14,10 +15,14 @@ namespace diffcloth::contact {
 
 /// What one thread searches with: lists that are kept over the solves of a step.
 struct Detection {
-  explicit Detection(const BroadPhase& broad_phase_in)
-      : broad_phase(broad_phase_in), candidates(broad_phase_in) {}
+  /// @param checkpoint_in  passed now and then in long searches, which it may end by an exception; may be null
+  explicit Detection(const BroadPhase& broad_phase_in, const Checkpoint* checkpoint_in = nullptr)
+      : broad_phase(broad_phase_in),
+        checkpoint(checkpoint_in),
+        candidates(broad_phase_in, checkpoint_in) {}
 
   const BroadPhase& broad_phase;
+  const Checkpoint* checkpoint;
   CandidateList candidates;
   BroadPhase::Scratch scratch;
 };

@@ -9,6 +9,9 @@
 namespace diffcloth::contact {
 namespace {
 
+/// Pairs of leaves between two looks at the time.
+constexpr std::size_t kLeavesAtOnce = 256;
+
 void include(Box& box, const double* p) {
   for (int k = 0; k < 3; ++k) {
     box.lo[k] = std::min(box.lo[k], p[k]);
@@ -205,7 +208,7 @@ std::size_t RelativeSearch::find(const Wanted& wanted, BroadPhase::Scratch& scra
             tree_a, tree_b, scratch.stack,
             [&](Index i, Index j) { return may_meet(a[i], b[j], range, wanted.least); },
             [&](const BoxTree::Node& p, const BoxTree::Node& q) {
-              ++looked_at;
+              if (++looked_at % kLeavesAtOnce == 0 && checkpoint_) checkpoint_->check();
               visit_items(tree_a.items_of(p), corners_a, tree_b.items_of(q), corners_b, wanted,
                           range, visit_pair);
             });

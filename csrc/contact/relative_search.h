@@ -3,6 +3,7 @@
 #include <span>
 #include <vector>
 
+#include "common/interrupt.h"
 #include "common/types.h"
 #include "contact/broad_phase.h"
 
@@ -38,7 +39,9 @@ double approach_sq(const Candidate& pair, const double* u_t0, const double* u_t1
 /// it, by the boxes of positions at the reference and those of displacements since then.
 class RelativeSearch {
  public:
-  explicit RelativeSearch(const BroadPhase& broad_phase) : broad_phase_(&broad_phase) {}
+  /// @param checkpoint  passed now and then by find(), which it may end by an exception; may be null
+  explicit RelativeSearch(const BroadPhase& broad_phase, const Checkpoint* checkpoint)
+      : broad_phase_(&broad_phase), checkpoint_(checkpoint) {}
 
   /// Begin at a configuration.
   void start(const double* reference);
@@ -80,6 +83,7 @@ class RelativeSearch {
   void fit_displacements(const Wanted& wanted, Index surface);
 
   const BroadPhase* broad_phase_;
+  const Checkpoint* checkpoint_;
   std::vector<Surface> surfaces_;
 };
 

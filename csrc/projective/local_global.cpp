@@ -157,7 +157,8 @@ LocalGlobalOutcome minimize(const LocalGlobalObjective& objective,
     return outcome;
   };
   for (;;) {
-    checkpoint.check();
+    checkpoint.check_interrupt();
+    if (checkpoint.is_late()) return end(LocalGlobalStatus::kTimeLimit);
     if (!std::isfinite(iteration.residual())) {
       if (outcome.iterations > 0) iteration.go_back();
       return end(LocalGlobalStatus::kOverflow);

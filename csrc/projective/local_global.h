@@ -35,6 +35,7 @@ struct LocalGlobalOptions {
 enum class LocalGlobalStatus : std::uint8_t {
   kConverged,
   kIterationLimit,
+  kTimeLimit,
   kNoProgress,  ///< steps are lost in the rounding of positions, raise the energy, or do not shrink
   kStalled,     ///< contact at nodes: the residual no longer shrinks
   kOverflow,    ///< forces are not finite

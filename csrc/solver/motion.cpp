@@ -109,16 +109,15 @@ double halt(Walk& walk, const PrescribedMotion& motion, const std::vector<Stop>&
   return way.front().fraction;
 }
 
-}  // namespace
-
-double arrive(Walk& walk, const PrescribedMotion& motion) {
+/// Walk all portions; what was passed in the last one is written to `way`.
+double go_to_the_end(Walk& walk, const PrescribedMotion& motion, std::vector<Stop>& way) {
   const int portions = motion.portions();
   std::vector<double> ends(walk.x());
   for (int k = 0; k < portions; ++k) {
     motion.at((k + 1.0) / portions, ends.data());
     double remaining = 1.0;
     double checked = 1.0;
-    std::vector<Stop> way;  // in this portion
+    way.clear();
     for (int iteration = 1; remaining > 0.0; ++iteration) {
       // What is left may drown in rounding, where things approach one another without end.
       const double fraction = std::min((k + 1.0 - remaining) / portions, std::nextafter(1.0, 0.0));
@@ -133,6 +132,18 @@ double arrive(Walk& walk, const PrescribedMotion& motion) {
     }
   }
   return 1.0;
+}
+
+}  // namespace
+
+double arrive(Walk& walk, const PrescribedMotion& motion) {
+  std::vector<Stop> way;
+  try {
+    return go_to_the_end(walk, motion, way);
+  } catch (const TimeIsUp&) {  // in a portion, whose start is on the way
+    walk.context.checkpoint->stop_clock();
+    return halt(walk, motion, way);
+  }
 }
 
 }  // namespace diffcloth::solver

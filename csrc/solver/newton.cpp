@@ -59,6 +59,7 @@ class Descent {
  private:
   enum class Next : std::uint8_t { kGoOn, kStop };
 
+  Status descend();
   Next proceed();
   Status without_step();
   Next settle();
@@ -295,14 +296,16 @@ Status Descent::without_step() {
   return finite ? Status::kIndefinite : Status::kNotFinite;
 }
 
-/// What is here when the iterations are used up: the residual of this very point.
+/// What is here when the iterations or the time are used up: the residual of this very point.
 Status Descent::look() {
   if (away_) walk_.back(excursion_.start);
   const bool minimum = directions_.certify();
   if (!minimum && !directions_.next()) return without_step();
   const double step = walk_.displacement(directions_.p());
   residual_ = step / walk_.f.h;
-  if (step >= goal_) return Status::kIterationLimit;
+  if (step >= goal_) {
+    return walk_.context.checkpoint->is_up() ? Status::kTimeLimit : Status::kIterationLimit;
+  }
   return minimum ? Status::kConverged : Status::kSaddle;
 }
 
@@ -314,6 +317,17 @@ Descent::Next Descent::proceed() {
 }
 
 Status Descent::run() {
+  try {
+    return descend();
+  } catch (const TimeIsUp&) {
+    walk_.context.checkpoint->stop_clock();
+    walk_.back(walk_.place());
+    directions_.restart();
+    return look();
+  }
+}
+
+Status Descent::descend() {
   for (;;) {
     if (settling_) {
       walk_.context.checkpoint->check();
@@ -422,8 +436,13 @@ Outcome minimize(const Objective& objective,
                  Context& context) {
   Walk walk(objective, x, context);
   Outcome outcome;
-  const bool guessed = departure != nullptr && departure->guess != nullptr &&
-                       departure->motion.portions() == 1 && start_from(walk, *departure->guess);
+  bool guessed = false;
+  try {
+    guessed = departure != nullptr && departure->guess != nullptr &&
+              departure->motion.portions() == 1 && start_from(walk, *departure->guess);
+  } catch (const TimeIsUp&) {
+    context.checkpoint->stop_clock();
+  }
   if (!guessed) walk.watch(x);
   walk.refresh();
   if (departure != nullptr && !guessed) {

@@ -10,6 +10,7 @@ namespace diffcloth::solver {
 enum class Status : std::uint8_t {
   kConverged,
   kIterationLimit,  ///< the step's iterations are used up
+  kTimeLimit,       ///< the step's time is
   kRoundingFloor,   ///< rounding hides steps: no gain is measured, or no coordinate changes
   kNoDescent,       ///< no step along the last direction lowers the objective, however short
   kBlocked,         ///< collision detection leaves no part of the last direction

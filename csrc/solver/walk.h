@@ -18,6 +18,7 @@ using linalg::dot;
 struct Options {
   double tolerance;    ///< on |p|_inf / h, p the full Newton step [m/s]
   int max_iterations;  ///< of a step, over all its solves
+  double max_seconds = std::numeric_limits<double>::infinity();  ///< of a step [s]
   /// A factor of more than this is dropped before the next one is made [bytes].
   std::size_t large_factor = std::size_t{64} << 20;
   /// A factor of more operations per entry, of a sheet of 150 x 150 vertices or more, is dear beside the
@@ -33,7 +34,7 @@ struct SinglePrecision {
 
 /// What the solves of one step share.
 struct Context {
-  const Checkpoint* checkpoint;
+  Checkpoint* checkpoint;
   Options options;
   linalg::CholeskyWorkspace* workspace;
   Stopwatch* watch;
@@ -193,9 +194,10 @@ class Walk {
     return false;
   }
 
-  /// Take one iteration from the budget of the step. False when it is used up.
+  /// Take one iteration from the budget of the step. False when it is used up, or the time.
   bool spend() {
     context.checkpoint->check();
+    if (context.checkpoint->is_up()) return false;
     if (context.iterations >= context.options.max_iterations) return false;
     ++context.iterations;
     return true;

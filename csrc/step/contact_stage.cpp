@@ -20,6 +20,7 @@ using contact::Contact;
 using Array = std::vector<double>;
 
 constexpr std::string_view kUsedUp = "the iterations of the step (`max_iterations`) are used up";
+constexpr std::string_view kTimeIsUp = "the time of the step (`max_seconds`) is used up";
 
 void report_contacts(const contact::CollisionMesh& mesh,
                      const std::vector<Contact>& contacts,
@@ -49,7 +50,9 @@ void report_blockers(const Problem& problem,
   }
   if (is_infeasible) {
     const bool is_used_up = context.iterations >= context.options.max_iterations;
-    report.message = is_used_up ? kUsedUp : "the motion no longer advances";
+    report.message = context.checkpoint->is_up() ? kTimeIsUp
+                     : is_used_up                ? kUsedUp
+                                                 : "the motion no longer advances";
   }
   if (!names.empty()) report.message += (is_infeasible ? "; in contact: " : ": ") + names;
 }
@@ -77,6 +80,8 @@ std::string_view words(solver::Status status) {
       return {};
     case solver::Status::kIterationLimit:
       return kUsedUp;
+    case solver::Status::kTimeLimit:
+      return kTimeIsUp;
     case solver::Status::kRoundingFloor:
       return "rounding hides the last steps: their gain, or their change of the coordinates";
     case solver::Status::kNoDescent:

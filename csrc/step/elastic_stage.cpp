@@ -45,7 +45,7 @@ void solve_by_projective_dynamics(Problem& problem,
   const projective::LocalGlobalOptions options{
       .tolerance = given.tolerance,
       .max_iterations = projective::kIterationsPerNewton * given.max_iterations};
-  const Checkpoint& checkpoint = *step.context.checkpoint;
+  Checkpoint& checkpoint = *step.context.checkpoint;
   const std::vector<double> start = x;
   projective::LocalGlobalOutcome outcome;
   {
@@ -60,6 +60,7 @@ void solve_by_projective_dynamics(Problem& problem,
                                    : projective::minimize(f, x, options, checkpoint);
   }
   step.report.counts.local_global += outcome.iterations;
+  if (outcome.status == projective::LocalGlobalStatus::kTimeLimit) checkpoint.stop_clock();
   if (outcome.status != projective::LocalGlobalStatus::kConverged) {
     ++step.report.counts.left_to_newton;
     x = start;

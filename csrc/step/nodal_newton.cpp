@@ -87,6 +87,19 @@ class NodalSolve {
   }
 
   solver::Outcome run() {
+    try {
+      return descend();
+    } catch (const TimeIsUp&) {
+      context_.checkpoint->stop_clock();
+      return finish(solver::Status::kTimeLimit);
+    }
+  }
+
+ private:
+  enum class Newton : std::uint8_t { kNoStep, kContracts, kArrived };
+
+  solver::Outcome descend() {
+    outcome_.residual = kInfinity;  // until a step of Newton's method is there to measure
     for (;; ++context_.iterations) {
       context_.checkpoint->check();
       assemble();
@@ -96,6 +109,7 @@ class NodalSolve {
       constraint_step_ = system_.constraint_step(here_);
       const Newton newton = factor_ ? try_newton() : Newton::kNoStep;
       if (newton == Newton::kArrived) return finish(solver::Status::kConverged);
+      if (context_.checkpoint->is_up()) return finish(solver::Status::kTimeLimit);
       if (context_.iterations >= context_.options.max_iterations) {
         return finish(solver::Status::kIterationLimit);
       }
@@ -110,9 +124,6 @@ class NodalSolve {
       std::swap(here_, there_);
     }
   }
-
- private:
-  enum class Newton : std::uint8_t { kNoStep, kContracts, kArrived };
 
   solver::Outcome finish(solver::Status status) {
     outcome_.status = status;

@@ -94,7 +94,7 @@ projective::LocalGlobalOutcome NodalStage::iterate(const projective::LocalGlobal
   Progress progress;
   bool accelerated = false;
   for (;; ++outcome.iterations) {
-    checkpoint.check();
+    checkpoint.check_interrupt();
     smooth.gradient(x, g);
     force = g;
     subtract_impulses(problem_, contacts_, system, x, g, force);
@@ -108,6 +108,10 @@ projective::LocalGlobalOutcome NodalStage::iterate(const projective::LocalGlobal
       return outcome;
     }
     if (outcome.iterations == options.max_iterations) return outcome;
+    if (checkpoint.is_late()) {
+      outcome.status = projective::LocalGlobalStatus::kTimeLimit;
+      return outcome;
+    }
     if (progress.has_ended(outcome.residual)) {
       outcome.status = projective::LocalGlobalStatus::kStalled;
       return outcome;

@@ -108,8 +108,9 @@ Report forward(const Scene& scene,
                std::vector<std::vector<double>>* path) {
   Stopwatch watch;
   const double before = processor_seconds();
+  Checkpoint limited = checkpoint.with_seconds(scene.given.options.max_seconds);
   Report report;
-  contact::Detection detection(scene.broad_phase);
+  contact::Detection detection(scene.broad_phase, &limited);
   Problem problem(scene, inputs);
   double* const positions = outputs["positions"];
   std::copy_n(problem.start.begin(), problem.cloth_size, positions);
@@ -132,7 +133,7 @@ Report forward(const Scene& scene,
   }
 
   linalg::CholeskyWorkspace workspace(threads);
-  solver::Context context{.checkpoint = &checkpoint,
+  solver::Context context{.checkpoint = &limited,
                           .options = scene.given.options,
                           .workspace = &workspace,
                           .watch = &watch,
@@ -179,7 +180,8 @@ void backward(const Scene& scene,
   }
 
   linalg::CholeskyWorkspace workspace(threads);
-  solver::Context context{.checkpoint = &checkpoint,
+  Checkpoint unlimited = checkpoint;
+  solver::Context context{.checkpoint = &unlimited,
                           .options = scene.given.options,
                           .workspace = &workspace,
                           .watch = &watch,
@@ -217,7 +219,8 @@ void tangent(const Scene& scene,
   }
 
   linalg::CholeskyWorkspace workspace(threads);
-  solver::Context context{.checkpoint = &checkpoint,
+  Checkpoint unlimited = checkpoint;
+  solver::Context context{.checkpoint = &unlimited,
                           .options = scene.given.options,
                           .workspace = &workspace,
                           .watch = &watch,

@@ -52,6 +52,7 @@ class SolverSection(Section):
 
     tolerance: Positive | None = None
     max_iterations: Annotated[int, Ge(1)] | None = None
+    max_seconds: Positive | None = None
     throw: bool | None = None
     metric: Metric | None = None
     elastic: ElasticSolver | None = None

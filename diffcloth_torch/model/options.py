@@ -74,6 +74,12 @@ class SolverOptions:
             Between 5 and 40 is common; single steps of a sheet that whips take some hundreds.
             Projective Dynamics may take 50 times as many iterations, which are cheaper by about the
             same factor.
+        max_seconds: Longest time of a step of one environment [s], > 0, on the clock of the wall;
+            None sets no limit. A step that takes longer ends like one whose iterations are used up,
+            after at most one more factorization. Which steps do depends on the machine and its
+            load: with a limit, the same input gives the same bits only where every step ends in
+            time. Each solve of a staggered coupling, and each step in the search for an
+            equilibrium, has that time. Backward has no limit.
         throw: Whether a step that fails in any environment raises `NotConverged`,
             `InfeasibleMotion` or `TurnedTooFar`. Otherwise `report.status` says which environments
             failed. Their state is the last feasible iterate: bodies, joints and pins are where the
@@ -90,6 +96,7 @@ class SolverOptions:
 
     tolerance: float = 1e-6
     max_iterations: int = 1000
+    max_seconds: float | None = None
     throw: bool = True
     metric: str | None = None
     elastic: str = "newton"
@@ -99,6 +106,9 @@ class SolverOptions:
         object.__setattr__(self, "tolerance", tolerance)
         iterations = check_count("SolverOptions: `max_iterations`", self.max_iterations, 1)
         object.__setattr__(self, "max_iterations", iterations)
+        if self.max_seconds is not None:
+            seconds = check_number("SolverOptions: `max_seconds`", self.max_seconds, POSITIVE)
+            object.__setattr__(self, "max_seconds", seconds)
         object.__setattr__(self, "throw", check_bool("SolverOptions: `throw`", self.throw))
         check_choice("SolverOptions: `elastic`", self.elastic, ELASTIC_SOLVERS)
         if self.metric is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -79,6 +80,7 @@ def make_core(
     trees: dict[str, Any] = {}
     if limit_stiffness is not None:
         trees = tree_arguments(assembly, limit_stiffness, all_prescribed=all_prescribed)
+    seconds = options.solver.max_seconds
     return _core.Simulator(
         vertices=assembly.vertices,
         rest_positions=assembly.rest_positions,
@@ -106,6 +108,7 @@ def make_core(
         friction_iterations=options.contact.friction_iterations,
         tolerance=options.solver.tolerance,
         max_iterations=options.solver.max_iterations,
+        max_seconds=math.inf if seconds is None else seconds,
         begins_at_state=options.begins_at_state,
         ignored_pairs=assembly.ignored_pairs,
         primitive_kinds=[p.kind if p is not None else "none" for p in assembly.primitives],

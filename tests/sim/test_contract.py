@@ -60,7 +60,7 @@ PUBLIC = {
         "initial_state control parameters step rollout equilibrium energy kinetic_energy momentum "
         "vertex_masses link_poses link_velocities contact_wrenches contacts"
     ),
-    "SolverOptions": "tolerance max_iterations throw metric elastic",
+    "SolverOptions": "tolerance max_iterations max_seconds throw metric elastic",
     "State": "batch_size replace detach clone export meshes contact_forces pin_forces",
     "Trajectory": "save load detach",
     "build_info": "",
