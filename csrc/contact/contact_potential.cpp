@@ -1,6 +1,7 @@
 #include "contact/contact_potential.h"
 
 #include <algorithm>
+#include <cmath>
 #include <span>
 #include <utility>
 
@@ -13,10 +14,40 @@ namespace {
 /// What is nearer than the sum of its reaches and this share of d_hat may be in contact soon.
 constexpr double kSoon = 0.4;
 
+/// A motion that changes the shape of a surface by more than so many times its size is watched in parts.
+constexpr double kTorn = 1.0;
+/// The first part changes a shape by this share of its size, and each next one by so many times more.
+constexpr double kFirstPart = 1.0 / 16.0;
+constexpr double kNextPart = 4.0;
 /// Pairs between two looks at the time, which take about as long as a tenth of a microsecond each.
 constexpr int kPairsAtOnce = 64;
 
 using Stencil = std::array<Index, 4>;
+
+/// How much the vertices of a surface move against their mean, at most, in sizes of the surface: the largest
+/// over all surfaces. NaN counts as zero.
+double distortion(const CollisionMesh& mesh, const double* x, const double* to) {
+  double result = 0.0;
+  for (Index first = 0, last = 0; first < mesh.vertex_count; first = last) {
+    const Index surface = mesh.vertex_surface[first];
+    Vec3 mean = Vec3::Zero();
+    Vec3 lo = row(x, first);
+    Vec3 hi = lo;
+    for (; last < mesh.vertex_count && mesh.vertex_surface[last] == surface; ++last) {
+      mean += row(to, last) - row(x, last);
+      lo = lo.cwiseMin(row(x, last));
+      hi = hi.cwiseMax(row(x, last));
+    }
+    mean /= last - first;
+    double deviation = 0.0;
+    for (Index v = first; v < last; ++v) {
+      deviation = std::max(deviation, (row(to, v) - row(x, v) - mean).squaredNorm());
+    }
+    const double size = (hi - lo).squaredNorm();
+    if (size > 0.0) result = std::max(result, std::sqrt(deviation / size));
+  }
+  return result;
+}
 
 void add_stencil_couplings(std::span<const Index> v, linalg::Couplings& pairs) {
   for (const Index i : v) {
@@ -74,6 +105,23 @@ void ContactPotential::visit_approaching(const double* x, const double* to, Visi
     const double xi = model_.xi(pair);
     if (found_.apart[k] > harmless_distance(xi, d_hat, largest)) continue;
     if (!visit(pair, xi)) return;
+  }
+}
+
+double ContactPotential::watch_free(const double* x, const double* to) {
+  const double by = distortion(model_.mesh(), x, to);
+  std::vector<double> part;
+  double fraction = by > kTorn ? kFirstPart / by : 1.0;
+  for (;; fraction = std::min(1.0, kNextPart * fraction)) {
+    const double* end = to;
+    if (fraction < 1.0) {
+      part.resize(3 * static_cast<std::size_t>(model_.mesh().vertex_count));
+      for (std::size_t a = 0; a < part.size(); ++a) part[a] = x[a] + fraction * (to[a] - x[a]);
+      end = part.data();
+    }
+    watch(x, end);
+    const double safe = safe_fraction(x, end);
+    if (safe < 1.0 || fraction == 1.0) return fraction * safe;
   }
 }
 

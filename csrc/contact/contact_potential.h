@@ -76,6 +76,13 @@ class ContactPotential final : public TouchingPotential {
     here_.x.clear();
   }
 
+  /// Watch the straight motion x -> to as far as it is free of collisions, and perhaps further; returns the
+  /// fraction that is certified so.
+  ///
+  /// A motion that tears a surface to pieces takes everything past everything, and is blocked long before: of
+  /// such a one a short part is watched, and a longer one only if that is free.
+  double watch_free(const double* x, const double* to);
+
   /// Fraction of the watched motion x -> to that is certified free of collisions.
   double safe_fraction(const double* x, const double* to) const;
 

@@ -74,12 +74,12 @@ class Walk {
   /// Size of a change of all points [m].
   double displacement(const std::vector<double>& p) const { return f.coordinates->displacement(p); }
 
-  /// Watch the straight motion to a point; returns its fraction that is free of collisions.
+  /// Watch the straight motion to a point, at least as far as it is free of collisions; returns the fraction
+  /// that is.
   double watch(const std::vector<double>& to) {
     if (f.contact == nullptr) return 1.0;
     const Stopwatch::Scope scope(*context.watch, Phase::kDetection);
-    f.contact->watch(x_.data(), to.data());
-    return f.contact->safe_fraction(x_.data(), to.data());
+    return f.contact->watch_free(x_.data(), to.data());
   }
 
   /// The surfaces that meet something on the straight motion to a point; what is watched is that motion.
