@@ -19,7 +19,7 @@ constexpr double kTorn = 1.0;
 /// The first part changes a shape by this share of its size, and each next one by so many times more.
 constexpr double kFirstPart = 1.0 / 16.0;
 constexpr double kNextPart = 4.0;
-/// Pairs between two looks at the time, which take about as long as a tenth of a microsecond each.
+/// Pairs between two looks at the clock, which cost a tenth of a microsecond each.
 constexpr int kPairsAtOnce = 64;
 
 using Stencil = std::array<Index, 4>;
@@ -137,7 +137,9 @@ double ContactPotential::safe_fraction(const double* x, const double* to) const 
   return alpha;
 }
 
-std::vector<char> ContactPotential::meeting(const double* x, const double* to) const {
+std::vector<char> ContactPotential::meeting(const double* x, const double* to) {
+  if (distortion(model_.mesh(), x, to) > kTorn) return std::vector<char>(model_.reach().size(), 1);
+  watch(x, to);
   const std::vector<Index>& surface = model_.mesh().vertex_surface;
   std::vector<char> meets(model_.reach().size(), 0);
   int count = 0;

@@ -86,8 +86,9 @@ class ContactPotential final : public TouchingPotential {
   /// Fraction of the watched motion x -> to that is certified free of collisions.
   double safe_fraction(const double* x, const double* to) const;
 
-  /// The surfaces that collide on the watched motion x -> to, or are in contact at its end.  [surfaces]
-  std::vector<char> meeting(const double* x, const double* to) const;
+  /// Watch the straight motion x -> to, and find the surfaces that collide on it, or are in contact at its
+  /// end; all of them where it tears one to pieces.  [surfaces]
+  std::vector<char> meeting(const double* x, const double* to);
 
   const ContactModel& model() const { return model_; }
   const std::vector<Contact>& contacts() const {

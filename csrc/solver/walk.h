@@ -82,10 +82,9 @@ class Walk {
     return f.contact->watch_free(x_.data(), to.data());
   }
 
-  /// The surfaces that meet something on the straight motion to a point; what is watched is that motion.
+  /// The surfaces that may meet something on the straight motion to a point.
   std::vector<char> meeting(const std::vector<double>& to) {
     const Stopwatch::Scope scope(*context.watch, Phase::kDetection);
-    f.contact->watch(x_.data(), to.data());
     return f.contact->meeting(x_.data(), to.data());
   }
 
