@@ -47,6 +47,13 @@ def test_directions_that_single_precision_turns_are_computed_again():
     assert "NotConverged 0" in result.stdout
 
 
+def test_exact_directions_that_single_precision_turns_are_computed_again():
+    """A fold of a 5 mm sheet: a step of the exact Hessian pointed uphill, which ended the solve."""
+    result = fuzz("--seed", "24", "--only", "21")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "NotConverged 0" in result.stdout
+
+
 def test_every_second_scene_is_a_tower():
     """The others are what they were when cloths alone moved."""
     drawings = fuzz_main.DRAWINGS

@@ -64,13 +64,31 @@ bool Directions::refactor(linalg::BlockMatrix& H) {
     ++walk_.context.counts->negative_curvature;
     return false;
   }
+  factor = solve_downhill(std::move(factor), H);
+  if (!factor) {
+    ++walk_.context.counts->negative_curvature;
+    return false;
+  }
   ++walk_.context.counts->exact;
-  solve(*factor, H);
   confirmed_ = factor->precision() == linalg::Precision::kDouble;
   last_ = {
       .factor = std::move(factor),
       .hessian = confirmed_ ? nullptr : std::make_shared<const linalg::BlockValues>(std::move(H))};
   return true;
+}
+
+Factor Directions::solve_downhill(Factor factor, const linalg::BlockMatrix& A) {
+  solve(*factor, A);
+  slope_ = dot(walk_.g(), p_);
+  if (slope_ <= 0.0 || factor->precision() == linalg::Precision::kDouble) return factor;
+  // Single precision has turned it: what a positive matrix makes of a gradient descends.
+  walk_.context.single.was_wrong = true;
+  factor = nullptr;  // never two at once
+  factor = walk_.system.factor_in_doubles(A);
+  if (!factor) return nullptr;
+  solve(*factor, A);
+  slope_ = dot(walk_.g(), p_);
+  return factor;
 }
 
 void Directions::solve(const linalg::CholeskyFactor& factor, const linalg::BlockValues& A) {
@@ -189,18 +207,7 @@ std::optional<Directions::Direction> Directions::next_extrapolated() {
 
 bool Directions::descend(const linalg::BlockMatrix& A, bool doubts) {
   Factor factor = this->factor(A, doubts);
-  if (!factor) return false;
-  solve(*factor, A);
-  slope_ = dot(walk_.g(), p_);
-  if (slope_ < 0.0 || factor->precision() == linalg::Precision::kDouble) return true;
-  // Single precision has turned it: what a positive matrix makes of a gradient descends.
-  walk_.context.single.was_wrong = true;
-  factor = nullptr;  // never two at once
-  factor = walk_.system.factor_in_doubles(A);
-  if (!factor) return false;
-  solve(*factor, A);
-  slope_ = dot(walk_.g(), p_);
-  return true;
+  return factor && solve_downhill(std::move(factor), A);
 }
 
 std::optional<Directions::Direction> Directions::damp(const linalg::BlockMatrix& H,

@@ -111,6 +111,10 @@ class Directions {
   /// @param A  what it is the factor of
   void solve(const linalg::CholeskyFactor& factor, const linalg::BlockValues& A);
 
+  /// The same, and its slope; where single precision has turned it uphill, by a factor in doubles. Returns the
+  /// factor that the step is of; null where that matrix is not positive definite.
+  Factor solve_downhill(Factor factor, const linalg::BlockMatrix& A);
+
   /// Compute the step of the last factor, and whether it does.
   bool chord();
 
