@@ -71,13 +71,13 @@ double follow(Walk& walk, const std::vector<double>& ends, const std::vector<dou
 /// Their sum is the joint Newton step. Separately, q and d vanish together, so that the end is a continuous
 /// function of d, at d = 0 as well.
 double descend_and_follow(Walk& walk, const std::vector<double>& ends) {
+  const std::vector<double> d = prescribed_change(walk, ends);
   const linalg::BlockMatrix matrix =
       walk.system.assemble(walk.x().data(), Curvature::kPositive, walk.g());
   // Positive by construction, M/h^2 plus positive semi-definite parts, but for rounding.
   const Factor factor = walk.system.factor(matrix);
-  if (!factor) return 0.0;
+  if (!factor) return follow(walk, ends, d);
   ++walk.context.counts->projected;
-  const std::vector<double> d = prescribed_change(walk, ends);
   std::vector<double> b(d.size(), 0.0);
   add_coupling(walk.f, matrix, walk.x(), d, b);
   std::vector<double> p;
@@ -95,7 +95,19 @@ struct Stop {
   double fraction;
 };
 
+bool has_arrived(const Walk& walk, const PrescribedMotion& motion) {
+  std::vector<double> ends(walk.x());
+  motion.at(1.0, ends.data());
+  for (Index i = 0; i < walk.f.coordinates->point_count(); ++i) {
+    if (walk.f.coordinates->prescribed()[i] == 0) continue;
+    if (row(walk.x().data(), i) != row(ends.data(), i)) return false;
+  }
+  return true;
+}
+
 /// Go back to the last of these at which what is prescribed can have the place that its motion gives it.
+///
+/// @return the fraction there; 1 where the motion has no length, of which nothing can be missing
 double halt(Walk& walk, const PrescribedMotion& motion, const std::vector<Stop>& way) {
   for (const Stop& stop : std::views::reverse(way)) {
     walk.back(stop.place);
@@ -104,7 +116,7 @@ double halt(Walk& walk, const PrescribedMotion& motion, const std::vector<Stop>&
     if (walk.watch(to) < 1.0) continue;
     walk.go(to);
     walk.refresh();
-    return stop.fraction;
+    return has_arrived(walk, motion) ? 1.0 : stop.fraction;
   }
   return way.front().fraction;
 }
