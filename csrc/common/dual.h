@@ -1,5 +1,6 @@
 #pragma once
 
+#include <array>
 #include <cmath>
 
 #include <Eigen/Core>
@@ -40,5 +41,13 @@ struct Dual {
   friend bool operator<(const Dual& a, const Dual& b) { return a.value < b.value; }
   friend bool operator>(const Dual& a, const Dual& b) { return a.value > b.value; }
 };
+
+/// The values as independent variables.
+template <int n>
+std::array<Dual<n>, n> variables(const std::array<double, n>& values) {
+  std::array<Dual<n>, n> result;
+  for (int i = 0; i < n; ++i) result[i] = Dual<n>::variable(values[i], i);
+  return result;
+}
 
 }  // namespace diffcloth

@@ -46,32 +46,37 @@ Svd decompose(const FitMatrix& M) {
   return svd;
 }
 
-constexpr double kFloor2 = kRankFloor * kRankFloor;
-constexpr double kFloor8 = kFloor2 * kFloor2 * kFloor2 * kFloor2;
-
 double power7(double s) { return s * s * s * s * s * s * s; }
-double denominator(double s) { return s * power7(s) + kFloor8; }
-double filtered_inverse(double s) { return power7(s) / denominator(s); }
-double filtered_inverse_over_s(double s) { return s * s * s * s * s * s / denominator(s); }
 
-/// (f(s) - f(t)) / (s - t), without cancellation; t -> -t gives (f(s) + f(t)) / (s + t).
-double divided_difference(double s, double t) {
-  double power_sum = 0.0;  // (s^7 - t^7) / (s - t)
-  for (int i = 0; i < 7; ++i) {
-    double term = 1.0;
-    for (int j = 0; j < 6; ++j) term *= j < i ? s : t;
-    power_sum += term;
+/// f(s) = s^7 / (s^8 + floor^8).
+struct Filter {
+  double floor8;
+
+  explicit Filter(double floor) : floor8(floor * power7(floor)) {}
+
+  double denominator(double s) const { return s * power7(s) + floor8; }
+  double operator()(double s) const { return power7(s) / denominator(s); }
+  double over_s(double s) const { return s * s * s * s * s * s / denominator(s); }
+
+  /// (f(s) - f(t)) / (s - t), without cancellation; t -> -t gives (f(s) + f(t)) / (s + t).
+  double divided_difference(double s, double t) const {
+    double power_sum = 0.0;  // (s^7 - t^7) / (s - t)
+    for (int i = 0; i < 7; ++i) {
+      double term = 1.0;
+      for (int j = 0; j < 6; ++j) term *= j < i ? s : t;
+      power_sum += term;
+    }
+    return (floor8 * power_sum - power7(s) * power7(t)) / (denominator(s) * denominator(t));
   }
-  return (kFloor8 * power_sum - power7(s) * power7(t)) / (denominator(s) * denominator(t));
-}
+};
 
 }  // namespace
 
-double smallest_singular_value(const FitMatrix& M) { return decompose(M).S.minCoeff(); }
+Vec3 singular_values(const FitMatrix& M) { return decompose(M).S; }
 
-FitInverse fit_inverse(const FitMatrix& M) {
+FitInverse fit_inverse(const FitMatrix& M, double floor) {
   const Svd svd = decompose(M);
-  const Vec3 f = svd.S.unaryExpr(&filtered_inverse);
+  const Vec3 f = svd.S.unaryExpr(Filter(floor));
   return svd.V * f.asDiagonal() * svd.U.transpose();
 }
 
@@ -81,7 +86,8 @@ FitInverse fit_inverse(const FitMatrix& M) {
 //   G_kl = (f_k - f_l) / (s_k - s_l),   L_kl = (f_k + f_l) / (s_k + s_l),
 //
 // a linear map of dM that is its own adjoint.
-FitMatrix fit_inverse_vjp(const FitMatrix& M, const FitInverse& inverse_bar) {
+FitMatrix fit_inverse_vjp(const FitMatrix& M, const FitInverse& inverse_bar, double floor) {
+  const Filter filter(floor);
   const auto [U, s, V] = decompose(M);
 
   const FitMatrix bar_V = inverse_bar.transpose() * V;
@@ -89,11 +95,11 @@ FitMatrix fit_inverse_vjp(const FitMatrix& M, const FitInverse& inverse_bar) {
   Mat3 inner;
   for (int k = 0; k < 3; ++k) {
     for (int l = 0; l < 3; ++l) {
-      inner(k, l) = 0.5 * (divided_difference(s(k), s(l)) * (D(k, l) + D(l, k)) +
-                           divided_difference(s(k), -s(l)) * (D(k, l) - D(l, k)));
+      inner(k, l) = 0.5 * (filter.divided_difference(s(k), s(l)) * (D(k, l) + D(l, k)) +
+                           filter.divided_difference(s(k), -s(l)) * (D(k, l) - D(l, k)));
     }
   }
-  const Vec3 f_over_s = s.unaryExpr(&filtered_inverse_over_s);
+  const Vec3 f_over_s = s.unaryExpr([&](double value) { return filter.over_s(value); });
   return (U * inner + (bar_V - U * D) * f_over_s.asDiagonal()) * V.transpose();
 }
 

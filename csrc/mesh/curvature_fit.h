@@ -9,9 +9,11 @@
 
 namespace diffcloth::mesh {
 
-/// Most vertices that a patch can have: its triangle, three neighbors, and two more for each.
-inline constexpr int kMaxPatch = 12;
-inline constexpr int kMaxExtra = kMaxPatch - 3;
+/// Most points of a quadratic: a triangle and the vertices across its sides.
+inline constexpr int kMaxQuadratic = 6;
+/// Most points that are unfolded together. A side's two triangles and two layers around them have 16;
+/// further layers are only added to five points or fewer, which have ten edges.
+inline constexpr int kMaxPoints = 16;
 
 /// The equation of one extra point in the fit of a patch.
 ///
@@ -36,26 +38,21 @@ FitRow<Scalar> fit_row(const std::array<Scalar, 5>& p) {
                 scale * (sqrt2 * (u * v - lambda2 * a * b)), scale * (v * v - lambda2 * b * b)}};
 }
 
-/// Rows of the fit, one an extra point; at least three (rows of zeros change nothing).
-using FitMatrix = Eigen::Matrix<double, Eigen::Dynamic, 3, 0, kMaxExtra, 3>;
-using FitInverse = Eigen::Matrix<double, 3, Eigen::Dynamic, 0, 3, kMaxExtra>;
+/// Rows of a fit, one a point; at least three (rows of zeros change nothing).
+using FitMatrix = Eigen::Matrix<double, Eigen::Dynamic, 3, 0, kMaxPoints, 3>;
+using FitInverse = Eigen::Matrix<double, 3, Eigen::Dynamic, 0, 3, kMaxPoints>;
 
-/// Smallest singular value of the fit below which a patch takes the second ring, and the size
-/// below which a singular value counts as zero.
-inline constexpr double kWellPosed = 0.15;
-inline constexpr double kRankFloor = 0.08;
+Vec3 singular_values(const FitMatrix& M);
 
-double smallest_singular_value(const FitMatrix& M);
-
-/// Smooth pseudo-inverse: V f(S) U^T of M = U S V^T with f(s) = s^7 / (s^8 + kRankFloor^8).
+/// Smooth pseudo-inverse: V f(S) U^T of M = U S V^T with f(s) = s^7 / (s^8 + floor^8).
 ///
 /// f is odd and analytic, so the inverse is smooth in M also where the rank changes, and a
 /// direction that the points do not determine (a strip one triangle wide) stays undetermined to
-/// first order. Where the fit is well posed, f differs from 1/s by less than 0.7 %, and by less
-/// than 3e-5 from s = 0.3 on.
-FitInverse fit_inverse(const FitMatrix& M);
+/// first order. f differs from 1/s by less than 0.7 % where s is twice the floor, and by less than
+/// 2e-4 where it is three times.
+FitInverse fit_inverse(const FitMatrix& M, double floor);
 
 /// Cotangent of M from the cotangent of fit_inverse(M).
-FitMatrix fit_inverse_vjp(const FitMatrix& M, const FitInverse& inverse_bar);
+FitMatrix fit_inverse_vjp(const FitMatrix& M, const FitInverse& inverse_bar, double floor);
 
 }  // namespace diffcloth::mesh

@@ -8,29 +8,20 @@ namespace {
 using Dual5 = Dual<5>;
 using Dual8 = Dual<8>;
 
+/// Size below which a singular value of a patch counts as zero.
+constexpr double kRankFloor = 0.08;
+
 /// The unknown of the fit is (x,uu ; sqrt2 x,uv ; x,vv), whose norm does not depend on the frame.
 const Vec3 kUnknownScale(1.0, std::sqrt(0.5), 1.0);
 
 // ---- the curvature operator of a patch ----
 
-Operator patch_operator(const Chart& chart) {
-  const FitInverse inverse = fit_inverse(fit_matrix(chart)) / chart.area();
-  Operator c = Operator::Zero(3, chart.size);
-  for (int j = 3; j < chart.size; ++j) {
-    const Vec3 weight = kUnknownScale.cwiseProduct(inverse.col(j - 3));
-    const FitRow<double> row = fit_row(fit_parameters(chart, j));
-    c.col(j) = weight;
-    for (int i = 0; i < 3; ++i) c.col(i) -= row.lambda[i] * weight;
-  }
-  return c;
-}
-
 void patch_operator_vjp(const Chart& chart, const Operator& c_bar, ChartBar& bar) {
   const FitMatrix M = fit_matrix(chart);
   const double area = chart.area();
-  const FitInverse inverse = fit_inverse(M) / area;
+  const FitInverse inverse = fit_inverse(M, kRankFloor) / area;
   FitInverse inverse_bar = FitInverse::Zero(3, M.rows());
-  std::array<Vec3, kMaxPatch> lambda_bar;
+  std::array<Vec3, kMaxQuadratic> lambda_bar;
   for (int j = 3; j < chart.size; ++j) {
     const FitRow<double> row = fit_row(fit_parameters(chart, j));
     const Vec3 weight = kUnknownScale.cwiseProduct(inverse.col(j - 3));
@@ -42,7 +33,7 @@ void patch_operator_vjp(const Chart& chart, const Operator& c_bar, ChartBar& bar
     inverse_bar.col(j - 3) = kUnknownScale.cwiseProduct(weight_bar);
   }
   add_area_bar(chart, -inverse.cwiseProduct(inverse_bar).sum() / area, bar);
-  const FitMatrix M_bar = fit_inverse_vjp(M, inverse_bar / area);
+  const FitMatrix M_bar = fit_inverse_vjp(M, inverse_bar / area, kRankFloor);
 
   for (int j = 3; j < chart.size; ++j) {
     const FitRow<Dual5> row = fit_row(variables<5>(fit_parameters(chart, j)));
@@ -61,7 +52,7 @@ Operator patch_operator_jvp(const Chart& chart, const ChartBar& dot) {
   const FitMatrix M = fit_matrix(chart);
   const double area = chart.area();
   const double area_dot = 0.5 * (dot.length * chart.base.b + chart.base.length * dot.b);
-  std::array<FitRow<Dual<1>>, kMaxPatch> rows;
+  std::array<FitRow<Dual<1>>, kMaxQuadratic> rows;
   FitMatrix M_dot = FitMatrix::Zero(M.rows(), 3);
   for (int j = 3; j < chart.size; ++j) {
     const std::array<double, 5> values = fit_parameters(chart, j);
@@ -73,9 +64,9 @@ Operator patch_operator_jvp(const Chart& chart, const ChartBar& dot) {
     rows[j] = fit_row(p);
     for (int k = 0; k < 3; ++k) M_dot(j - 3, k) = rows[j].m[k].derivative(0);
   }
-  const FitInverse inverse = fit_inverse(M) / area;
+  const FitInverse inverse = fit_inverse(M, kRankFloor) / area;
   // The derivative of fit_inverse() is its own adjoint.
-  FitInverse inverse_dot = fit_inverse_vjp(M, M_dot.transpose()).transpose() / area;
+  FitInverse inverse_dot = fit_inverse_vjp(M, M_dot.transpose(), kRankFloor).transpose() / area;
   inverse_dot -= (area_dot / area) * inverse;
 
   Operator c_dot = Operator::Zero(3, chart.size);
@@ -168,9 +159,16 @@ Operator hinge_operator_jvp(const Chart& chart,
 
 }  // namespace
 
-Chart element_chart(const BendingStencils& stencils, Index e, const double* X) {
-  const std::span<const Index> points = stencils.fit(e);
-  return chart(points, stencils.unfolding(e), X);
+Operator patch_operator(const Chart& chart) {
+  const FitInverse inverse = fit_inverse(fit_matrix(chart), kRankFloor) / chart.area();
+  Operator c = Operator::Zero(3, chart.size);
+  for (int j = 3; j < chart.size; ++j) {
+    const Vec3 weight = kUnknownScale.cwiseProduct(inverse.col(j - 3));
+    const FitRow<double> row = fit_row(fit_parameters(chart, j));
+    c.col(j) = weight;
+    for (int i = 0; i < 3; ++i) c.col(i) -= row.lambda[i] * weight;
+  }
+  return c;
 }
 
 Operator fit_operator(const BendingStencils& stencils, Index e, const Chart& chart) {

@@ -7,17 +7,18 @@
 #include "mesh/curvature_fit.h"
 #include "mesh/local_chart.h"
 #include "mesh/rest_shape.h"
+#include "mesh/side_derivative.h"
 
 namespace diffcloth::mesh {
 
 /// Weights (c_uu, c_uv, c_vv) of each vertex of the quadratic of an element, one vertex a column.
-using Operator = Eigen::Matrix<double, 3, Eigen::Dynamic, 0, 3, kMaxPatch>;
+using Operator = Eigen::Matrix<double, 3, Eigen::Dynamic, 0, 3, kMaxQuadratic>;
 
 /// Cotangents of the chart, or tangents: base triangle and local coordinates.
 struct ChartBar {
   double length = 0.0, a = 0.0, b = 0.0;
   std::array<double, 9> frame{};
-  std::array<Vec2, kMaxPatch> u;
+  std::array<Vec2, kMaxPoints> u;
 
   ChartBar() { u.fill(Vec2::Zero()); }
 };
@@ -25,14 +26,6 @@ struct ChartBar {
 inline void add_area_bar(const Chart& chart, double area_bar, ChartBar& bar) {
   bar.length += 0.5 * chart.base.b * area_bar;
   bar.b += 0.5 * chart.base.length * area_bar;
-}
-
-/// The values as independent variables.
-template <int n>
-std::array<Dual<n>, n> variables(const std::array<double, n>& values) {
-  std::array<Dual<n>, n> result;
-  for (int i = 0; i < n; ++i) result[i] = Dual<n>::variable(values[i], i);
-  return result;
 }
 
 /// Shape gradients of the triangle (0, 0), (length, 0), (a, b).
@@ -44,8 +37,8 @@ std::array<Scalar, 6> shape_gradient(const Scalar& length, const Scalar& a, cons
   return {-g1u, -(g1v + g2v), g1u, g1v, Scalar(0.0), g2v};
 }
 
-/// The points of an element's quadratic, unfolded.
-Chart element_chart(const BendingStencils& stencils, Index e, const double* X);
+/// Second derivatives of the quadratic of a triangle and the points across its sides; zero without these.
+Operator patch_operator(const Chart& chart);
 
 /// Second derivatives of an element's quadratic: a patch's, or a hinge's in the row uu.
 Operator fit_operator(const BendingStencils& stencils, Index e, const Chart& chart);
@@ -106,8 +99,7 @@ inline std::array<double, 3> base_parameters(const Chart& chart) {
   return {chart.base.length, chart.base.a, chart.base.b};
 }
 
-/// Weights of the outward derivative at the middle of a side, one for each point of the fit.
-using SideWeights = Eigen::Matrix<double, Eigen::Dynamic, 1, 0, kMaxPatch, 1>;
+/// Weights of the outward derivative at the middle of a side, one for each point of the quadratic.
 SideWeights side_weights(const Side<double>& side, const Operator& c);
 
 }  // namespace diffcloth::mesh

@@ -10,12 +10,12 @@
 
 namespace diffcloth::mesh {
 
-/// An element unfolded into the plane of its base triangle.
+/// Points of the mesh, unfolded into the plane of a base triangle.
 struct Chart {
   BaseTriangle<double> base;
   int size = 0;
-  std::array<Vec2, kMaxPatch> u;             ///< of each stencil vertex
-  std::array<Foot<double>, kMaxPatch> foot;  ///< of each extra vertex, on its edge
+  std::array<Vec2, kMaxPoints> u;             ///< of each point
+  std::array<Foot<double>, kMaxPoints> foot;  ///< of each extra point, on its edge
 
   Mat3 frame() const { return Eigen::Map<const Mat3>(base.frame.data()); }
   double area() const { return 0.5 * base.length * base.b; }

@@ -15,13 +15,15 @@ namespace {
 
 using Dual3 = Dual<3>;
 using Dual9 = Dual<9>;
-/// Cotangents of the quadratics of all elements.
+/// Cotangents of the quadratics of all elements and of the derivatives of all sides.
 struct FitsBar {
   std::vector<Operator> c;
   std::vector<Vec3> base;  ///< length, a, b of the base triangles
+  std::vector<SideWeights> w;
 
   explicit FitsBar(const Fits& fits) : base(fits.c.size(), Vec3::Zero()) {
     for (const Operator& operator_e : fits.c) c.emplace_back(Operator::Zero(3, operator_e.cols()));
+    for (const SideWeights& weights : fits.w) w.emplace_back(SideWeights::Zero(weights.size()));
   }
 };
 
@@ -30,34 +32,36 @@ void add_base_bar(const std::array<Dual3, 3>& values, const Vec3& bars, Vec3& ba
   for (int j = 0; j < 3; ++j) base_bar += bars(j) * values[j].derivative;
 }
 
-void kink_vjp(const BendingStencils& stencils,
-              const Fits& fits,
-              const Kink& kink,
-              const ConstOperatorMap& c_bar,
-              FitsBar& bar) {
-  const Side<Dual3> own =
-      side(variables<3>(base_parameters(fits.chart[kink.element])), kink.corner);
-  const Vec3 N(own.N[0].value, own.N[1].value, own.N[2].value);
+void element_side_vjp(const BendingStencils& stencils,
+                      const Fits& fits,
+                      const ElementSide& part,
+                      const ConstOperatorMap& c_bar,
+                      FitsBar& bar) {
+  const Index e = part.element;
+  const std::array<double, 3> base = base_parameters(fits.chart[e]);
+  const Side<double> own = side(base, part.corner);
+  const Eigen::Map<const Vec3> N(own.N.data());
+  const SideWeights d = side_weights(own, fits.c[e]);
   Vec3 N_bar = Vec3::Zero();
-  for (const auto& [e, corner] : sides(kink)) {
-    const std::array<double, 3> base = base_parameters(fits.chart[e]);
-    const Side<double> value = side(base, corner);
-    const SideWeights d = side_weights(value, fits.c[e]);
-    const std::vector<Index> place = places(stencils, kink.element, e);
-    Vec3 k_bar = Vec3::Zero();
-    Vec3 g_bar = Vec3::Zero();
-    for (std::size_t i = 0; i < place.size(); ++i) {
-      N_bar -= 0.5 * d(i) * c_bar.col(place[i]);
-      const double d_bar = -0.5 * N.dot(c_bar.col(place[i]));
-      bar.c[e].col(i) += d_bar * Eigen::Map<const Vec3>(value.k.data());
-      k_bar += d_bar * fits.c[e].col(i);
-      if (i < 3) g_bar(i) = d_bar;
-    }
-    const Side<Dual3> dual = side(variables<3>(base), corner);
-    add_base_bar(dual.k, k_bar, bar.base[e]);
-    add_base_bar(dual.g, g_bar, bar.base[e]);
+  Vec3 k_bar = Vec3::Zero();
+  Vec3 g_bar = Vec3::Zero();
+  for (Index i = 0; i < d.size(); ++i) {
+    N_bar -= d(i) * c_bar.col(i);
+    const double d_bar = -N.dot(c_bar.col(i));
+    bar.c[e].col(i) += d_bar * Eigen::Map<const Vec3>(own.k.data());
+    k_bar += d_bar * fits.c[e].col(i);
+    if (i < 3) g_bar(i) = d_bar;
   }
-  add_base_bar(own.N, N_bar, bar.base[kink.element]);
+  const std::vector<Index> place = places(stencils, e, stencils.side_chart(part.side));
+  for (std::size_t i = 0; i < place.size(); ++i) {
+    const auto k = static_cast<Index>(i);
+    N_bar += part.sign * fits.w[part.side](k) * c_bar.col(place[i]);
+    bar.w[part.side](k) += part.sign * N.dot(c_bar.col(place[i]));
+  }
+  const Side<Dual3> dual = side(variables<3>(base), part.corner);
+  add_base_bar(dual.N, N_bar, bar.base[e]);
+  add_base_bar(dual.k, k_bar, bar.base[e]);
+  add_base_bar(dual.g, g_bar, bar.base[e]);
 }
 
 /// Curvature times element size below which a rest shape is flat: rounding of the curvature
@@ -155,20 +159,18 @@ void bending_vjp(const BendingStencils& stencils,
     const std::span<const Index> vertices = stencils.element(e);
     const auto size = static_cast<Index>(vertices.size());
     const std::ptrdiff_t offset = 3 * static_cast<std::ptrdiff_t>(stencils.start[e]);
-    OperatorMap element_bar(c_bar.data() + offset, 3, size);
+    OperatorMap element_bar = element_columns(stencils, e, c_bar);
     Mat3 frame_bar;
     curvature_vjp(vertices, ConstOperatorMap(c.data() + offset, 3, size), X, bar.curvature[e],
                   fits.chart[e].frame(), frame_bar, element_bar, X_bar);
     Eigen::Map<Mat3>(chart_bar[e].frame.data()) = frame_bar;
     fits_bar.c[e] += element_bar.leftCols(fits.c[e].cols());
   }
-  for (const Kink& kink : stencils.kinks) {
-    const Index e = kink.element;
-    kink_vjp(stencils, fits, kink,
-             ConstOperatorMap(c_bar.data() + 3 * static_cast<std::ptrdiff_t>(stencils.start[e]), 3,
-                              stencils.start[e + 1] - stencils.start[e]),
-             fits_bar);
-  }
+  for_each_element_side(stencils, [&](const ElementSide& part) {
+    const OperatorMap columns = element_columns(stencils, part.element, c_bar);
+    element_side_vjp(stencils, fits, part, ConstOperatorMap(columns.data(), 3, columns.cols()),
+                     fits_bar);
+  });
   for (Index e = 0; e < stencils.size(); ++e) {
     const Chart& local = fits.chart[e];
     if (stencils.model[e] == BendingModel::kPatch) {
@@ -178,7 +180,15 @@ void bending_vjp(const BendingStencils& stencils,
     chart_bar[e].a += fits_bar.base[e](1);
     chart_bar[e].b += fits_bar.base[e](2);
     fit_operator_vjp(stencils, e, local, fits_bar.c[e], chart_bar[e]);
-    chart_vjp(stencils.fit(e), stencils.unfolding(e), local, X, chart_bar[e], X_bar);
+  }
+  for (std::size_t s = 0; s < stencils.sides.size(); ++s) {
+    const auto side = static_cast<Index>(s);
+    const SidePoints u_bar = side_derivative_vjp(fits.stencil(stencils, side), fits_bar.w[side]);
+    ChartBar& local_bar = chart_bar[stencils.side_chart(side)];
+    for (Index i = 0; i < u_bar.rows(); ++i) local_bar.u[i] = u_bar.row(i).transpose();
+  }
+  for (Index k = 0; k < stencils.chart_count(); ++k) {
+    chart_vjp(stencils.points(k), stencils.unfolding(k), fits.chart[k], X, chart_bar[k], X_bar);
   }
 }
 

@@ -15,36 +15,37 @@ using ShapeGradient = Eigen::Matrix<double, 3, 2>;
 
 /// How a face resists bending.
 ///
-/// A patch is the quadratic through its triangle and the three opposite vertices, made consistent
-/// with its neighbors (see Kink). It gives every quadratic map its exact energy on every mesh,
+/// A patch has the second derivatives whose mean over its triangle follows from the derivatives across
+/// its sides (see FittedSide). It gives every quadratic map its exact energy on every mesh,
 /// boundaries included, and a bent plate its stiffness.
 ///
 /// A hinge is that of Bergou and DiffCloth: three to nine times too stiff, for comparisons.
 enum class BendingModel : std::uint8_t { kPatch, kHinge };
 
-/// A side across which the quadratics of two patches disagree. The element takes the mean of both
-/// derivatives there, so that it also couples the points of its neighbor's quadratic. On grids with
-/// one diagonal and on equilateral meshes there are none away from the boundary.
-struct Kink {
-  Index element, corner;      ///< the side opposite the corner of the base triangle
-  Index other, other_corner;  ///< the same side, as its neighbor sees it
+/// A side whose derivative is fitted by itself (side_derivative.h) and taken by the patches at both
+/// sides. At the other sides the quadratics of both patches have the same derivative, which is taken.
+/// On grids with one diagonal and on equilateral meshes there are no fitted sides away from the boundary.
+struct FittedSide {
+  std::array<Index, 2> element;  ///< the second is -1 where there is none
+  std::array<Index, 2> corner;   ///< the side is opposite that corner of the base triangle
 };
 
 /// Which vertices each bending element couples.
 ///
 /// The first three vertices of an element are the corners of its base face; then come the other
-/// points of its quadratic, which are laid into the plane of the base face by unfolding the mesh,
-/// then those of its neighbors' quadratics. The choice is made once, from the scene's rest mesh,
-/// and then kept, so that everything is smooth in the rest positions.
+/// points of its quadratic, if one of its sides is not fitted, then those of its fitted sides. The points of
+/// a quadratic, or of a side, are laid into the plane of a base face by unfolding the mesh.
+/// The choice is made once, from the scene's rest mesh, and then kept, so that everything is smooth
+/// in the rest positions.
 struct BendingStencils {
   std::vector<Index> start{0};              ///< [B + 1] into `vertices`
   std::vector<Index> vertices;              ///< [start.back()]
   std::vector<std::array<Index, 2>> faces;  ///< [B] base face; other face of a hinge or -1
   std::vector<BendingModel> model;          ///< [B]
-  std::vector<Kink> kinks;
-  std::vector<Index> fit_start{0};  ///< [B + 1] into `fit_points`
-  std::vector<Index> fit_points;    ///< the points of each element's own quadratic
-  /// [fit_start.back()] Local edge a -> b that an extra point is unfolded about; it lies to the
+  std::vector<FittedSide> sides;            ///< [S]
+  std::vector<Index> chart_start{0};        ///< [B + S + 1] into `chart_points`
+  std::vector<Index> chart_points;          ///< of each element's quadratic, then of each side
+  /// [chart_start.back()] Local edge a -> b that an extra point is unfolded about; it lies to the
   /// right of it. Corners of the base face hold {-1, -1}.
   std::vector<std::array<Index, 2>> unfold_edge;
 
@@ -52,12 +53,14 @@ struct BendingStencils {
   std::span<const Index> element(Index e) const {
     return {vertices.data() + start[e], static_cast<std::size_t>(start[e + 1] - start[e])};
   }
-  std::span<const Index> fit(Index e) const {
-    return {fit_points.data() + fit_start[e],
-            static_cast<std::size_t>(fit_start[e + 1] - fit_start[e])};
+  Index chart_count() const { return static_cast<Index>(chart_start.size()) - 1; }
+  Index side_chart(Index s) const { return size() + s; }
+  std::span<const Index> points(Index chart) const {
+    return {chart_points.data() + chart_start[chart],
+            static_cast<std::size_t>(chart_start[chart + 1] - chart_start[chart])};
   }
-  std::span<const std::array<Index, 2>> unfolding(Index e) const {
-    return {unfold_edge.data() + fit_start[e], fit(e).size()};
+  std::span<const std::array<Index, 2>> unfolding(Index chart) const {
+    return {unfold_edge.data() + chart_start[chart], points(chart).size()};
   }
 };
 

@@ -1,4 +1,4 @@
-// Forward: the chart of each element, the operator of its quadratic, the kinks between them, the curvature.
+// Forward: the charts, the operators of the quadratics, the derivatives of the fitted sides, the curvature.
 
 #include <array>
 #include <span>
@@ -66,10 +66,11 @@ Vec3 changes(const std::array<Dual1, 3>& numbers) {
   return {change_of(numbers[0]), change_of(numbers[1]), change_of(numbers[2])};
 }
 
-/// Changes of the charts and operators of all elements.
+/// Changes of Fits.
 struct FitsChange {
   std::vector<ChartBar> chart;
   std::vector<Operator> c;
+  std::vector<SideWeights> w;
 };
 
 FitsChange fits_jvp(const BendingStencils& stencils,
@@ -77,44 +78,50 @@ FitsChange fits_jvp(const BendingStencils& stencils,
                     const double* X,
                     const double* X_dot) {
   FitsChange dot;
+  for (Index k = 0; k < stencils.chart_count(); ++k) {
+    dot.chart.push_back(
+        chart_jvp(stencils.points(k), stencils.unfolding(k), fits.chart[k], X, X_dot));
+  }
   for (Index e = 0; e < stencils.size(); ++e) {
-    dot.chart.push_back(chart_jvp(stencils.fit(e), stencils.unfolding(e), fits.chart[e], X, X_dot));
-    dot.c.push_back(fit_operator_jvp(stencils, e, fits.chart[e], dot.chart.back()));
+    dot.c.push_back(fit_operator_jvp(stencils, e, fits.chart[e], dot.chart[e]));
+  }
+  for (std::size_t s = 0; s < stencils.sides.size(); ++s) {
+    const auto side = static_cast<Index>(s);
+    const SideStencil stencil = fits.stencil(stencils, side);
+    const ChartBar& chart_dot = dot.chart[stencils.side_chart(side)];
+    SidePoints u_dot(stencil.u.rows(), 2);
+    for (Index i = 0; i < u_dot.rows(); ++i) u_dot.row(i) = chart_dot.u[i].transpose();
+    dot.w.push_back(side_derivative_jvp(stencil, u_dot));
   }
   return dot;
 }
 
-/// Change of what curvature_operator() returns.
+/// Change of curvature_operator().
 std::vector<double> curvature_operator_jvp(const BendingStencils& stencils,
                                            const Fits& fits,
                                            const FitsChange& dot) {
   std::vector<double> result(3 * stencils.vertices.size(), 0.0);
-  const auto columns = [&](Index e) {
-    return OperatorMap(result.data() + 3 * static_cast<std::ptrdiff_t>(stencils.start[e]), 3,
-                       stencils.start[e + 1] - stencils.start[e]);
-  };
-  for (Index e = 0; e < stencils.size(); ++e) columns(e).leftCols(dot.c[e].cols()) = dot.c[e];
-  for (const Kink& kink : stencils.kinks) {
-    OperatorMap c_dot = columns(kink.element);
-    const Side<Dual1> own =
-        side(dual_base(fits.chart[kink.element], dot.chart[kink.element]), kink.corner);
-    const Vec3 N(own.N[0].value, own.N[1].value, own.N[2].value);
-    const Vec3 N_dot = changes(own.N);
-    for (const auto& [e, corner] : sides(kink)) {
-      const Side<Dual1> of_e = side(dual_base(fits.chart[e], dot.chart[e]), corner);
-      const Side<double> value = side(base_parameters(fits.chart[e]), corner);
-      const SideWeights d = side_weights(value, fits.c[e]);
-      SideWeights d_dot = dot.c[e].transpose() * Eigen::Map<const Vec3>(value.k.data()) +
-                          fits.c[e].transpose() * changes(of_e.k);
-      const Vec3 g_dot = changes(of_e.g);
-      for (int i = 0; i < 3; ++i) d_dot(i) += g_dot(i);
-      const std::vector<Index> place = places(stencils, kink.element, e);
-      for (std::size_t i = 0; i < place.size(); ++i) {
-        const auto k = static_cast<Index>(i);
-        c_dot.col(place[i]) -= 0.5 * (d_dot(k) * N + d(k) * N_dot);
-      }
-    }
+  for (Index e = 0; e < stencils.size(); ++e) {
+    element_columns(stencils, e, result).leftCols(dot.c[e].cols()) = dot.c[e];
   }
+  for_each_element_side(stencils, [&](const ElementSide& part) {
+    const Index e = part.element;
+    OperatorMap c_dot = element_columns(stencils, e, result);
+    const Side<Dual1> own = side(dual_base(fits.chart[e], dot.chart[e]), part.corner);
+    const Side<double> value = side(base_parameters(fits.chart[e]), part.corner);
+    const Eigen::Map<const Vec3> N(value.N.data());
+    const Vec3 N_dot = changes(own.N);
+    const SideWeights d = side_weights(value, fits.c[e]);
+    SideWeights d_dot = dot.c[e].transpose() * Eigen::Map<const Vec3>(value.k.data()) +
+                        fits.c[e].transpose() * changes(own.k);
+    d_dot.head<3>() += changes(own.g);
+    for (Index i = 0; i < d.size(); ++i) c_dot.col(i) -= d_dot(i) * N + d(i) * N_dot;
+    const std::vector<Index> place = places(stencils, e, stencils.side_chart(part.side));
+    for (std::size_t i = 0; i < place.size(); ++i) {
+      const auto k = static_cast<Index>(i);
+      c_dot.col(place[i]) += part.sign * (dot.w[part.side](k) * N + fits.w[part.side](k) * N_dot);
+    }
+  });
   return result;
 }
 

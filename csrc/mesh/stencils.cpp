@@ -1,130 +1,29 @@
 #include <algorithm>
 #include <cmath>
+#include <optional>
 #include <stdexcept>
+#include <utility>
 
 #include "mesh/curvature_fit.h"
 #include "mesh/fit_operator.h"
 #include "mesh/local_chart.h"
+#include "mesh/quadratics.h"
 #include "mesh/rest_shape.h"
+#include "mesh/side_derivative.h"
 
 namespace diffcloth::mesh {
 namespace {
 
-/// A patch while it grows: vertices and the local edges that the extra ones are unfolded about.
-struct Patch {
-  Index face = -1;
-  std::vector<Index> vertices;
-  std::vector<std::array<Index, 2>> unfold_edge;
-  std::vector<Index> reached_face;  ///< the face that brought each vertex
+/// Smallest singular value from which on six points determine a quadratic by themselves.
+constexpr double kWellPosed = 0.15;
 
-  explicit Patch(const Topology& topology, Index f)
-      : face(f),
-        vertices(topology.faces[f].begin(), topology.faces[f].end()),
-        unfold_edge(3, {-1, -1}),
-        reached_face(3, f) {}
-
-  bool contains(Index v) const { return std::ranges::find(vertices, v) != vertices.end(); }
-};
+/// Largest weight of the sum of two outward derivatives, relative to the largest in either of them, below
+/// which two quadratics agree across their side.
+constexpr double kAgreement = 1e-3;
 
 Index other_face(const Topology& topology, Index edge, Index face) {
   const auto [f0, f1] = topology.edge_faces[edge];
   return f0 == face ? f1 : f0;
-}
-
-/// The edge of `face` between two of its vertices, and the place of the third.
-struct Across {
-  Index edge;
-  Index opposite;
-};
-Across across(const Topology& topology, Index face, Index v0, Index v1) {
-  for (Index p = 0; p < 3; ++p) {
-    const Index v = topology.faces[face][p];
-    if (v != v0 && v != v1) return {.edge = topology.face_edges[face][p], .opposite = v};
-  }
-  throw std::logic_error("stencils: an edge is not on its face");
-}
-
-/// Add the vertex beyond local edge a -> b of `face`, if there is one and it is new.
-void extend(const Topology& topology, Index face, Index a, Index b, Patch& patch) {
-  const Index v0 = patch.vertices[a];
-  const Index v1 = patch.vertices[b];
-  const Index beyond = other_face(topology, across(topology, face, v0, v1).edge, face);
-  if (beyond < 0) return;
-  const Index v = across(topology, beyond, v0, v1).opposite;
-  if (patch.contains(v)) return;
-  patch.vertices.push_back(v);
-  patch.unfold_edge.push_back({a, b});
-  patch.reached_face.push_back(beyond);
-}
-
-void add_first_ring(const Topology& topology, Patch& patch) {
-  for (Index p = 0; p < 3; ++p) extend(topology, patch.face, (p + 1) % 3, (p + 2) % 3, patch);
-}
-
-/// The vertices beyond the two other edges of each neighbor that brought a vertex.
-void add_second_ring(const Topology& topology, Patch& patch) {
-  const auto first_end = static_cast<Index>(patch.vertices.size());
-  for (Index j = 3; j < first_end; ++j) {
-    const auto [a, b] = patch.unfold_edge[j];  // the neighbor is (b, a, j), counterclockwise
-    extend(topology, patch.reached_face[j], a, j, patch);
-    extend(topology, patch.reached_face[j], j, b, patch);
-  }
-}
-
-bool well_posed(const Patch& patch, const double* X) {
-  if (patch.vertices.size() < 6) return false;
-  return smallest_singular_value(fit_matrix(chart(patch.vertices, patch.unfold_edge, X))) >=
-         kWellPosed;
-}
-
-void append(const Patch& patch,
-            std::array<Index, 2> faces,
-            BendingModel model,
-            BendingStencils& stencils) {
-  stencils.fit_points.insert(stencils.fit_points.end(), patch.vertices.begin(),
-                             patch.vertices.end());
-  stencils.unfold_edge.insert(stencils.unfold_edge.end(), patch.unfold_edge.begin(),
-                              patch.unfold_edge.end());
-  stencils.fit_start.push_back(static_cast<Index>(stencils.fit_points.size()));
-  stencils.faces.push_back(faces);
-  stencils.model.push_back(model);
-}
-
-/// Largest weight of the sum of two outward derivatives, relative to that in either of them, below
-/// which two quadratics agree across their side. Lower values change no mode of a plate in the
-/// fourth digit.
-constexpr double kAgreement = 0.1;
-
-/// The derivative across a side as one of its patches sees it.
-struct Outward {
-  std::span<const Index> points;
-  SideWeights weights;
-};
-
-Outward outward(const BendingStencils& stencils, Index e, Index corner, const double* X) {
-  const Chart local = element_chart(stencils, e, X);
-  return {.points = stencils.fit(e),
-          .weights =
-              side_weights(side(base_parameters(local), corner), fit_operator(stencils, e, local))};
-}
-
-bool agree(const Outward& s0, const Outward& s1) {
-  double largest = 0.0;
-  for (std::size_t i = 0; i < s0.points.size(); ++i) {
-    double sum = s0.weights(i);
-    for (std::size_t j = 0; j < s1.points.size(); ++j) {
-      if (s1.points[j] == s0.points[i]) sum += s1.weights(j);
-    }
-    largest = std::max(largest, std::abs(sum));
-  }
-  for (std::size_t j = 0; j < s1.points.size(); ++j) {
-    if (std::ranges::find(s0.points, s1.points[j]) == s0.points.end()) {
-      largest = std::max(largest, std::abs(s1.weights(j)));
-    }
-  }
-  // Of both, so that the order of the faces does not matter.
-  const double scale = std::max(s0.weights.cwiseAbs().maxCoeff(), s1.weights.cwiseAbs().maxCoeff());
-  return largest < kAgreement * scale;
 }
 
 Index corner_opposite(const Topology& topology, Index face, Index edge) {
@@ -132,40 +31,207 @@ Index corner_opposite(const Topology& topology, Index face, Index edge) {
   return static_cast<Index>(std::ranges::find(edges, edge) - edges.begin());
 }
 
-void find_kinks(const Topology& topology, const double* X, BendingStencils& stencils) {
-  std::vector<Index> patch_of_face(topology.faces.size(), -1);
-  for (Index e = 0; e < stencils.size(); ++e) {
-    if (stencils.model[e] == BendingModel::kPatch) patch_of_face[stencils.faces[e][0]] = e;
+/// Faces while they are unfolded, one after the other, and their vertices.
+class Patch {
+ public:
+  Patch(const Topology& topology, Index face)
+      : topology_(&topology),
+        vertices_(topology.faces[face].begin(), topology.faces[face].end()),
+        unfold_edge_(3, {-1, -1}),
+        faces_{{.face = face, .corner = {0, 1, 2}}} {}
+
+  const std::vector<Index>& vertices() const { return vertices_; }
+  const std::vector<std::array<Index, 2>>& unfold_edge() const { return unfold_edge_; }
+
+  Chart chart(const double* X) const { return mesh::chart(vertices_, unfold_edge_, X); }
+
+  /// Add the face beyond the side opposite corner p of the base face, if there is one.
+  void add_across(Index p) { add_beyond(0, topology_->face_edges[faces_[0].face][p]); }
+
+  /// Add the faces across all sides.
+  ///
+  /// @returns  whether this brought a vertex
+  bool add_layer() {
+    const std::size_t face_count = faces_.size(), vertex_count = vertices_.size();
+    for (std::size_t i = 0; i < face_count; ++i) {
+      const Index face = faces_[i].face;
+      for (Index p = 0; p < 3; ++p) add_beyond(i, topology_->face_edges[face][p]);
+    }
+    return vertices_.size() > vertex_count;
   }
-  for (Index edge = 0; edge < static_cast<Index>(topology.edges.size()); ++edge) {
-    const auto [f0, f1] = topology.edge_faces[edge];
-    if (f1 < 0 || patch_of_face[f0] < 0 || patch_of_face[f1] < 0) continue;
-    const Index e0 = patch_of_face[f0], e1 = patch_of_face[f1];
-    const Index p0 = corner_opposite(topology, f0, edge);
-    const Index p1 = corner_opposite(topology, f1, edge);
-    if (agree(outward(stencils, e0, p0, X), outward(stencils, e1, p1, X))) continue;
-    stencils.kinks.push_back({.element = e0, .corner = p0, .other = e1, .other_corner = p1});
-    stencils.kinks.push_back({.element = e1, .corner = p1, .other = e0, .other_corner = p0});
+
+ private:
+  struct Unfolded {
+    Index face;
+    std::array<Index, 3> corner;  ///< places of its corners, counterclockwise in the plane
+  };
+
+  Index place(Index v) const {
+    return static_cast<Index>(std::ranges::find(vertices_, v) - vertices_.begin());
   }
+
+  void add_beyond(std::size_t i, Index edge) {
+    const Index beyond = other_face(*topology_, edge, faces_[i].face);
+    const auto is_beyond = [&](const Unfolded& other) { return other.face == beyond; };
+    if (beyond < 0 || std::ranges::any_of(faces_, is_beyond)) return;
+    const auto [v0, v1] = topology_->edges[edge];
+    Index a = place(v0), b = place(v1);
+    const std::array<Index, 3>& corner = faces_[i].corner;
+    const auto at_a = std::ranges::find(corner, a) - corner.begin();
+    if (corner[(at_a + 1) % 3] != b) std::swap(a, b);  // the face is to the left of a -> b
+    const Index v = topology_->faces[beyond][corner_opposite(*topology_, beyond, edge)];
+    const Index j = place(v);
+    if (j == static_cast<Index>(vertices_.size())) {
+      vertices_.push_back(v);
+      unfold_edge_.push_back({a, b});
+    }
+    faces_.push_back({.face = beyond, .corner = {b, a, j}});
+  }
+
+  const Topology* topology_;
+  std::vector<Index> vertices_;
+  std::vector<std::array<Index, 2>> unfold_edge_;
+  std::vector<Unfolded> faces_;
+};
+
+void append_chart(const Patch& patch, BendingStencils& stencils) {
+  stencils.chart_points.insert(stencils.chart_points.end(), patch.vertices().begin(),
+                               patch.vertices().end());
+  stencils.unfold_edge.insert(stencils.unfold_edge.end(), patch.unfold_edge().begin(),
+                              patch.unfold_edge().end());
+  stencils.chart_start.push_back(static_cast<Index>(stencils.chart_points.size()));
 }
 
-/// Each element couples the points of its own quadratic and of those across its kinks.
+void append_element(const Patch& patch,
+                    std::array<Index, 2> faces,
+                    BendingModel model,
+                    BendingStencils& stencils) {
+  append_chart(patch, stencils);
+  stencils.faces.push_back(faces);
+  stencils.model.push_back(model);
+}
+
+/// A face that bends as a patch, and the quadratic of its six points if these determine it.
+struct PatchFace {
+  Index face;
+  Patch patch;
+  std::optional<Operator> quadratic;
+  std::array<double, 3> base;
+
+  PatchFace(const Topology& topology, Index f, const double* X) : face(f), patch(topology, f) {
+    patch.add_layer();
+    const Chart local = patch.chart(X);
+    base = base_parameters(local);
+    if (local.size == kMaxQuadratic &&
+        singular_values(fit_matrix(local)).minCoeff() >= kWellPosed) {
+      quadratic = patch_operator(local);
+    }
+  }
+};
+
+/// Whether the quadratics of two faces have the same derivative across their side.
+bool agree(const PatchFace& f0, Index corner0, const PatchFace& f1, Index corner1) {
+  if (!f0.quadratic || !f1.quadratic) return false;
+  const SideWeights w0 = side_weights(side(f0.base, corner0), *f0.quadratic);
+  const SideWeights w1 = side_weights(side(f1.base, corner1), *f1.quadratic);
+  const std::vector<Index>&points0 = f0.patch.vertices(), &points1 = f1.patch.vertices();
+  double largest = 0.0;
+  for (std::size_t i = 0; i < points0.size(); ++i) {
+    double sum = w0(static_cast<Index>(i));
+    for (std::size_t j = 0; j < points1.size(); ++j) {
+      if (points1[j] == points0[i]) sum += w1(static_cast<Index>(j));
+    }
+    largest = std::max(largest, std::abs(sum));
+  }
+  for (std::size_t j = 0; j < points1.size(); ++j) {
+    if (std::ranges::find(points0, points1[j]) == points0.end()) {
+      largest = std::max(largest, std::abs(w1(static_cast<Index>(j))));
+    }
+  }
+  // Of both, so that the order of the faces does not matter.
+  return largest < kAgreement * std::max(w0.cwiseAbs().maxCoeff(), w1.cwiseAbs().maxCoeff());
+}
+
+/// The two faces of a side, and layers around them: one, or as many as bring six points. A second one where the
+/// points do not determine the derivative well, if they do then.
+Patch side_patch(const Topology& topology, Index face, Index corner, const double* X) {
+  Patch first(topology, face);
+  first.add_across(corner);
+  int layers = 0;
+  do {
+    ++layers;
+    if (!first.add_layer()) return first;
+  } while (first.vertices().size() < 6);
+  if (layers > 1) return first;
+  const SideQuality quality = side_quality(side_stencil(first.chart(X), corner));
+  if (quality.good()) return first;
+  Patch second = first;
+  if (!second.add_layer()) return first;
+  const bool better = side_quality(side_stencil(second.chart(X), corner)).better_than(quality);
+  return better ? second : first;
+}
+
+/// Each element couples the points of its own quadratic and of its fitted sides.
 void gather_vertices(BendingStencils& stencils) {
   std::vector<std::vector<Index>> elements(stencils.size());
   for (Index e = 0; e < stencils.size(); ++e) {
-    const std::span<const Index> points = stencils.fit(e);
+    const std::span<const Index> points = stencils.points(e);
     elements[e].assign(points.begin(), points.end());
   }
-  for (const Kink& kink : stencils.kinks) {
-    std::vector<Index>& element = elements[kink.element];
-    for (const Index v : stencils.fit(kink.other)) {
+  for_each_element_side(stencils, [&](const ElementSide& part) {
+    std::vector<Index>& element = elements[part.element];
+    for (const Index v : stencils.points(stencils.side_chart(part.side))) {
       if (std::ranges::find(element, v) == element.end()) element.push_back(v);
     }
-  }
+  });
   for (const std::vector<Index>& element : elements) {
     stencils.vertices.insert(stencils.vertices.end(), element.begin(), element.end());
     stencils.start.push_back(static_cast<Index>(stencils.vertices.size()));
   }
+}
+
+/// Whether a patch face is by itself, without a neighbor to bend about.
+bool alone(const Patch& patch) { return patch.vertices().size() == 3; }
+
+/// The patches, and the charts of their fitted sides.
+std::vector<Patch> choose_patches(const Topology& topology,
+                                  const double* X,
+                                  std::span<const BendingModel> face_model,
+                                  BendingStencils& stencils) {
+  std::vector<PatchFace> patches;
+  std::vector<Index> element(topology.faces.size(), -1);
+  for (Index f = 0; f < static_cast<Index>(topology.faces.size()); ++f) {
+    if (face_model[f] != BendingModel::kPatch) continue;
+    PatchFace patch(topology, f, X);
+    if (alone(patch.patch)) continue;
+    element[f] = static_cast<Index>(patches.size());
+    patches.push_back(std::move(patch));
+  }
+  std::vector<bool> takes_quadratic(patches.size(), false);
+  std::vector<Patch> sides;
+  for (Index edge = 0; edge < static_cast<Index>(topology.edges.size()); ++edge) {
+    FittedSide side{.element = {-1, -1}, .corner = {-1, -1}};
+    int count = 0;
+    for (const Index f : topology.edge_faces[edge]) {
+      if (f < 0 || element[f] < 0) continue;
+      side.element[count] = element[f];
+      side.corner[count++] = corner_opposite(topology, f, edge);
+    }
+    if (count == 0) continue;
+    const PatchFace& f0 = patches[side.element[0]];
+    if (count == 2 && agree(f0, side.corner[0], patches[side.element[1]], side.corner[1])) {
+      for (const Index e : side.element) takes_quadratic[e] = true;
+      continue;
+    }
+    stencils.sides.push_back(side);
+    sides.push_back(side_patch(topology, f0.face, side.corner[0], X));
+  }
+  for (std::size_t e = 0; e < patches.size(); ++e) {
+    const Index f = patches[e].face;
+    append_element(takes_quadratic[e] ? patches[e].patch : Patch(topology, f), {f, -1},
+                   BendingModel::kPatch, stencils);
+  }
+  return sides;
 }
 
 }  // namespace
@@ -174,28 +240,17 @@ BendingStencils choose_stencils(const Topology& topology,
                                 const double* X,
                                 std::span<const BendingModel> face_model) {
   BendingStencils stencils;
-  for (Index f = 0; f < static_cast<Index>(topology.faces.size()); ++f) {
-    if (face_model[f] != BendingModel::kPatch) continue;
-    Patch patch(topology, f);
-    add_first_ring(topology, patch);
-    if (patch.vertices.size() == 3) continue;
-    if (!well_posed(patch, X)) add_second_ring(topology, patch);
-    append(patch, {f, -1}, BendingModel::kPatch, stencils);
-  }
+  const std::vector<Patch> sides = choose_patches(topology, X, face_model, stencils);
   for (std::size_t e = 0; e < topology.edges.size(); ++e) {
     const auto [f0, f1] = topology.edge_faces[e];
     if (f1 < 0) continue;
     if (face_model[f0] != BendingModel::kHinge || face_model[f1] != BendingModel::kHinge) continue;
     Patch patch(topology, f0);
-    for (Index p = 0; p < 3; ++p) {
-      if (topology.face_edges[f0][p] == static_cast<Index>(e)) {
-        extend(topology, f0, (p + 1) % 3, (p + 2) % 3, patch);
-      }
-    }
+    patch.add_across(corner_opposite(topology, f0, static_cast<Index>(e)));
     // Two faces on the same three vertices have no hinge.
-    if (patch.vertices.size() == 4) append(patch, {f0, f1}, BendingModel::kHinge, stencils);
+    if (!alone(patch)) append_element(patch, {f0, f1}, BendingModel::kHinge, stencils);
   }
-  find_kinks(topology, X, stencils);
+  for (const Patch& side : sides) append_chart(side, stencils);
   gather_vertices(stencils);
   return stencils;
 }

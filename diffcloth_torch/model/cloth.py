@@ -54,7 +54,7 @@ class Cloth:
         soft_pins: Name -> indices of vertices that springs pull to targets.
         pin_stiffness: Stiffness of each of these springs [N/m].
         rest_positions: Where the cloth is free of stress [m], shape [n, 3].
-        bending_model: "patch" (six-point patches, isotropic on any mesh) or "hinge".
+        bending_model: "patch" (isotropic on any mesh) or "hinge".
         name: Name in the scene; None lets the scene choose one.
         directions: Direction of the warp at rest, shape [3], or one per face, shape [f, 3].
     """

@@ -75,6 +75,60 @@ MESHES: dict[str, Callable[[int, int], tuple[np.ndarray, np.ndarray]]] = {
 }
 
 
+def oriented(X: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A flat mesh with counterclockwise faces."""
+    side = X[faces[:, 1:], :2] - X[faces[:, :1], :2]
+    clockwise = side[:, 0, 0] * side[:, 1, 1] < side[:, 0, 1] * side[:, 1, 0]
+    faces = np.where(clockwise[:, None], faces[:, ::-1], faces)
+    return np.ascontiguousarray(X), np.ascontiguousarray(faces, np.int32)
+
+
+def squeezed(name: str, nu: int, nv: int, aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Cells that are `aspect` times as long along x as along y."""
+    X, faces = MESHES[name](nu, nv)
+    return X / [1, aspect, 1], faces
+
+
+def annulus() -> tuple[np.ndarray, np.ndarray]:
+    """Rings of slivers and of wide triangles in turns."""
+    n, radii = 20, (1, 1.03, 1.5, 1.55)
+    angle = [2 * np.pi * np.arange(n) / n + 0.08 * i for i in range(len(radii))]
+    X = [
+        np.stack([r * np.cos(t), r * np.sin(t), 0 * t], 1)
+        for r, t in zip(radii, angle, strict=True)
+    ]
+    i, j = np.divmod(np.arange(n * (len(radii) - 1)), n)
+    a, b = i * n + j, i * n + (j + 1) % n
+    return oriented(
+        np.concatenate(X),
+        np.concatenate([np.stack([a, b, a + n], 1), np.stack([b, b + n, a + n], 1)]),
+    )
+
+
+def l_shape() -> tuple[np.ndarray, np.ndarray]:
+    X, faces = grid(9, 9, "alternating")
+    faces = faces[~(X[faces, :2].mean(1) > 4).all(1)]
+    used, faces = np.unique(faces, return_inverse=True)
+    return X[used], faces.reshape(-1, 3).astype(np.int32)
+
+
+def fan() -> tuple[np.ndarray, np.ndarray]:
+    t = np.arange(8) * np.pi / 4
+    X = np.stack([np.cos(t), 0.5 * np.sin(t), 0 * t], 1)
+    return np.concatenate([np.zeros((1, 3)), X]), np.array(
+        [[0, i + 1, (i + 1) % 8 + 1] for i in range(8)], np.int32
+    )
+
+
+def slivers(aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Random points of a rectangle, triangulated."""
+    X = np.random.default_rng(3).uniform(size=(60, 2)) / [1, aspect]
+    faces = scipy.spatial.Delaunay(X).simplices
+    side = X[faces[:, 1:]] - X[faces[:, :1]]
+    area = side[:, 0, 0] * side[:, 1, 1] - side[:, 0, 1] * side[:, 1, 0]
+    return oriented(np.c_[X, 0 * X[:, 0]], faces[np.abs(area) > 2e-6])
+
+
 def on_cylinder(X: np.ndarray, curvature: float, angle: float) -> np.ndarray:
     """Roll a flat sheet onto a cylinder; `angle` is that of the bent direction."""
     along = np.array([np.cos(angle), np.sin(angle)])

@@ -16,10 +16,10 @@ def tensor(values):
     return torch.as_tensor(np.asarray(values), dtype=F64)
 
 
-def strip(cells, rows, length, width):
+def strip(cells, rows, length, width, *, alternating=False):
     """Flat strip along x from 0 to `length`, centered in y; vertex [i, j] is i * rows + j.
 
-    All diagonals run one way: where they alternate, the six-point patches are too soft.
+    All diagonals run one way, or in turns.
     """
     x, y = np.linspace(0, length, cells + 1), np.linspace(-width / 2, width / 2, rows)
     vertices = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((cells + 1, rows))], axis=-1)
@@ -27,7 +27,12 @@ def strip(cells, rows, length, width):
     for i in range(cells):
         for j in range(rows - 1):
             a, b = i * rows + j, (i + 1) * rows + j
-            faces += [[a, b, b + 1], [a, b + 1, a + 1]]
+            other_way = alternating and (i + j) % 2 == 1
+            faces += (
+                [[a, b, a + 1], [b, b + 1, a + 1]]
+                if other_way
+                else [[a, b, b + 1], [a, b + 1, a + 1]]
+            )
     return vertices.reshape(-1, 3), np.array(faces)
 
 

@@ -218,7 +218,8 @@ def test_a_flag_streams_and_flutters_in_wind_and_hangs_without():
     free = np.isclose(x, x.max())
     tail = blown[-100:, free]
     assert tail[..., 0].mean() > 0.95 * x.max()  # streams
-    assert hanging[-100:, free, 0].mean() < 0.6 * x.max()
+    # Which folds form changes it: 0.58 to 0.61 for bending stiffnesses from 1.9e-5 to 3e-5.
+    assert hanging[-100:, free, 0].mean() < 0.65 * x.max()
     aside = tail[..., 1].mean(axis=1)
     assert np.ptp(aside) > 0.1  # flutters,
     assert (np.diff(np.sign(aside)) != 0).sum() >= 4  # to both sides

@@ -6,6 +6,7 @@ the catenary, free fall, and the recursions of implicit Euler.
 
 import numpy as np
 import pytest
+import scipy.integrate
 import torch
 from physics_scenes import (
     F64,
@@ -194,6 +195,47 @@ def test_a_cantilever_under_end_shear_bends_like_the_elastica(alpha, deflection)
     coarse, fine = tip(20), tip(40)
     assert fine == pytest.approx(deflection, rel=0.02)
     assert 2 * fine - coarse == pytest.approx(deflection, rel=0.005)
+
+
+def droop_of_the_elastica(gamma):
+    """Drop of the tip over the length of a heavy elastica: theta'' = -gamma (1 - s) cos theta."""
+
+    def slope(s, y):
+        return np.stack([y[1], -gamma * (1 - s) * np.cos(y[0])])
+
+    s = np.linspace(0, 1, 50)
+
+    def ends(at_clamp, at_tip):
+        return np.array([at_clamp[0], at_tip[1]])
+
+    solution = scipy.integrate.solve_bvp(
+        slope, ends, s, np.stack([-0.5 * s, -0.5 + 0 * s]), tol=1e-8
+    )
+    t = np.linspace(0, 1, 2001)
+    return np.trapezoid(np.sin(solution.sol(t)[0]), t)
+
+
+@pytest.mark.parametrize("alternating", [False, True])
+@pytest.mark.parametrize(
+    ("cells", "rows", "width"),
+    [
+        pytest.param(30, 4, 0.01, id="31 x 4"),
+        pytest.param(40, 3, 0.01, id="41 x 3"),
+        pytest.param(24, 5, 0.008, id="25 x 5"),
+        pytest.param(30, 2, 0.01, id="31 x 2"),
+    ],
+)
+def test_a_narrow_strip_droops_like_the_elastica(cells, rows, width, alternating):
+    # Held at its middle column, which symmetry keeps level. Most triangles are at the boundary.
+    D, density, length, g = 1e-3, 0.2, 0.3, 9.81
+    material = dc.Material(stretch=3e3, bending=D, poisson=0.0, density=density)
+    vertices, faces = strip(cells, rows, length, width, alternating=alternating)
+    middle = range(cells // 2 * rows, (cells // 2 + 1) * rows)
+    cloth = dc.Cloth(vertices, faces, material=material, pins={"middle": middle})
+    sim = make_sim(cloth, 0.5, gravity=(0, 0, -g), tolerance=1e-8)
+    z = settle(sim, sim.initial_state(), speed=1e-5).positions[:, 2].reshape(-1, rows)
+    expected = droop_of_the_elastica(density * g * (length / 2) ** 3 / D)
+    assert -z[[0, -1]].mean().item() / (length / 2) == pytest.approx(expected, rel=0.01)
 
 
 # Sag of the catenary of span 1 by its length.
