@@ -377,7 +377,8 @@ def distance(x, faces, ends):
 @pytest.mark.parametrize("kind", ["sphere", "capsule"])
 def test_no_point_of_a_cloth_enters_a_smooth_body(kind, scheme):
     body, ends = below(kind, smooth=True)
-    sim, states = drape(body, scheme=scheme)
+    # The report is of all pairs: folds of the sheet may be nearer to each other than to the body.
+    sim, states = drape(body, scheme=scheme, contact=dc.ContactOptions(self_contact=False))
     faces = np.array(sim.scene.cloths[0].faces)
     gaps = [distance(state.positions.numpy(), faces, ends) - 0.12 for state in states]
     assert min(gaps) > 0

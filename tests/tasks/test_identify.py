@@ -32,7 +32,7 @@ SHORT = {
             "fit.trajectories.fall.synthetic.changes=[simulation.dt=0.005, simulation.steps=40, "
             "scene.cloths.strip.shape.rows=21, scene.cloths.strip.shape.columns=5]",
         ],
-        {"bending": 0.05, "damping": 0.15},
+        {"bending": 0.07, "damping": 0.15},
     ),
     "fit_throw": (
         [
