@@ -130,7 +130,7 @@ def test_parameters_by_name_and_in_batches_act():
 
 
 BAD_MATERIALS = [
-    ({"stretch_weft": 0.0}, "`parameters.stretch_weft` must be finite and > 0"),
+    ({"stretch_weft": 0.0}, "`stretch_weft` must be finite and > 0"),
     ({"stretch_shear": [1.0, -1.0]}, r"`stretch_shear` .* got -1 at \[1\]"),
     ({"bending_weft": -1.0}, "`bending_weft` must be finite and >= 0"),
     ({"bending_weft": 0.0}, "`bending_weft` must be > 0 like `bending`, got 0"),

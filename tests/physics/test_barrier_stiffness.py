@@ -308,10 +308,11 @@ def test_a_start_is_deep_by_the_stiffness_of_its_own_pair():
     def warns(height, *bodies):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            simulator([soft(height)], [FLOOR, *bodies], dt=0.03, barrier_distance=4e-3)
-        return ["m apart, while at rest" in str(warning.message) for warning in caught] == [True]
+            sim = simulator([soft(height)], [FLOOR, *bodies], dt=0.03, barrier_distance=4e-3)
+            sim.step(sim.initial_state())
+        return [warning.category for warning in caught] == [dc.BarrierStartWarning]
 
-    heights = np.linspace(6e-4, 1e-3, 15)
+    heights = np.linspace(6e-4, 4.2e-3, 15)
     alone = [warns(height) for height in heights]
     assert any(alone)
     assert not all(alone)
@@ -392,7 +393,7 @@ def test_a_batch_has_a_number_or_numbers_for_each_environment():
         sim.step(state, None, wrong)
     wrong = default.clone()
     wrong[1, 2] = 0.0
-    with pytest.raises(dc.InvalidInput, match=r"`barrier_stiffness` must be .*> 0, got 0 at"):
+    with pytest.raises(dc.InvalidInput, match=r"`parameters.barrier_stiffness` must be .*> 0, got 0 at"):
         sim.step(state, None, sim.parameters().replace(barrier_stiffness=wrong))
 
 

@@ -43,4 +43,5 @@ def test_a_box_creeps_by_the_law_at_the_default_tolerance():
     down = torch.tensor([math.cos(slope), 0.0, -math.sin(slope)], dtype=torch.float64)
     speed = float(end.body_velocities[1, :3] @ down)
     law = dc.ContactOptions().slip_velocity * (1 - math.sqrt(1 - math.tan(slope) / mu))
-    assert speed == pytest.approx(law, rel=1e-4)
+    # A solve may end where a step changes friction by 1e-3 of the largest: 2.4e-3 of this speed.
+    assert speed == pytest.approx(law, rel=1e-3)
