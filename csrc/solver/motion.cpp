@@ -70,7 +70,9 @@ double follow(Walk& walk, const std::vector<double>& ends, const std::vector<dou
 ///
 /// Their sum is the joint Newton step. Separately, q and d vanish together, so that the end is a continuous
 /// function of d, at d = 0 as well.
-double descend_and_follow(Walk& walk, const std::vector<double>& ends) {
+///
+/// @param descends  false: p is left out
+double descend_and_follow(Walk& walk, const std::vector<double>& ends, bool descends) {
   const std::vector<double> d = prescribed_change(walk, ends);
   const linalg::BlockMatrix matrix =
       walk.system.assemble(walk.x().data(), Curvature::kPositive, walk.g());
@@ -80,12 +82,14 @@ double descend_and_follow(Walk& walk, const std::vector<double>& ends) {
   ++walk.context.counts->projected;
   std::vector<double> b(d.size(), 0.0);
   add_coupling(walk.f, matrix, walk.x(), d, b);
-  std::vector<double> p;
   std::vector<double> q;
-  walk.system.solve(*factor, walk.g(), p);
   walk.system.solve(*factor, b, q);
   for (std::size_t a = 0; a < q.size(); ++a) q[a] += d[a];
-  search(walk, p, farthest(walk, p, 1.0));
+  if (descends) {
+    std::vector<double> p;
+    walk.system.solve(*factor, walk.g(), p);
+    search(walk, p, farthest(walk, p, 1.0));
+  }
   return follow(walk, ends, q);
 }
 
@@ -122,7 +126,10 @@ double halt(Walk& walk, const PrescribedMotion& motion, const std::vector<Stop>&
 }
 
 /// Walk all portions; what was passed in the last one is written to `way`.
-double go_to_the_end(Walk& walk, const PrescribedMotion& motion, std::vector<Stop>& way) {
+double go_to_the_end(Walk& walk,
+                     const PrescribedMotion& motion,
+                     bool descends,
+                     std::vector<Stop>& way) {
   const int portions = motion.portions();
   std::vector<double> ends(walk.x());
   for (int k = 0; k < portions; ++k) {
@@ -135,7 +142,8 @@ double go_to_the_end(Walk& walk, const PrescribedMotion& motion, std::vector<Sto
       const double fraction = std::min((k + 1.0 - remaining) / portions, std::nextafter(1.0, 0.0));
       way.push_back({.place = walk.place(), .fraction = fraction});
       if (!walk.spend()) return halt(walk, motion, way);
-      const double alpha = descend_and_follow(walk, ends);
+      // Where a motion is blocked, a descent reopens the gaps.
+      const double alpha = descend_and_follow(walk, ends, descends || iteration > 1);
       remaining *= 1.0 - alpha;
       if (iteration % kStuckIterations == 0) {
         if (checked - remaining < kStuckProgress) return halt(walk, motion, way);
@@ -148,10 +156,10 @@ double go_to_the_end(Walk& walk, const PrescribedMotion& motion, std::vector<Sto
 
 }  // namespace
 
-double arrive(Walk& walk, const PrescribedMotion& motion) {
+double arrive(Walk& walk, const PrescribedMotion& motion, bool descends) {
   std::vector<Stop> way;
   try {
-    return go_to_the_end(walk, motion, way);
+    return go_to_the_end(walk, motion, descends, way);
   } catch (const TimeIsUp&) {  // in a portion, whose start is on the way
     walk.context.checkpoint->stop_clock();
     return halt(walk, motion, way);

@@ -27,7 +27,9 @@ class PrescribedMotion {
 /// Where there is no way on, the walk goes back to the last point at which all that is prescribed can have
 /// the place that its motion gives it: between the ends of a portion, bodies that turn are distorted.
 ///
+/// @param descends  false: nothing descends unless the motion is blocked, so that a point that is a solution
+///                  remains one where the motion has no length
 /// @return the fraction of the motion that was reached: 1 for all of it
-double arrive(Walk& walk, const PrescribedMotion& motion);
+double arrive(Walk& walk, const PrescribedMotion& motion, bool descends);
 
 }  // namespace diffcloth::solver

@@ -446,7 +446,7 @@ Outcome minimize(const Objective& objective,
   if (!guessed) walk.watch(x);
   walk.refresh();
   if (departure != nullptr && !guessed) {
-    outcome.motion_fraction = arrive(walk, departure->motion);
+    outcome.motion_fraction = arrive(walk, departure->motion, departure->guess != nullptr);
     if (outcome.motion_fraction < 1.0) {
       outcome.status = Status::kInfeasibleMotion;
       return outcome;

@@ -32,7 +32,7 @@ struct Outcome {
 struct Departure {
   const PrescribedMotion& motion;
   /// Point to begin at if the straight way there is certified free of contact, prescribed points at their
-  /// ends; null where there is none.
+  /// ends. Null: the start of the step is near a solution, and a solve begins there.
   const std::vector<double>* guess;
 };
 
