@@ -19,7 +19,11 @@ def make(seed=0, *, report=True, batch=()):
         return torch.rand((*batch, *shape), dtype=torch.float64, generator=g)
 
     diagnostics = (
-        dc.Report(True, seed, 0.5, float("inf"), 2, 1.0, {"solve": 0.1 * seed}) if report else None
+        dc.Report(
+            True, seed, 0.5, float("inf"), 2, 1.0, {"solve": 0.1 * seed}, cpu_seconds=0.2 * seed
+        )
+        if report
+        else None
     )
     return dc.State(
         positions=random(4, 3),
