@@ -165,7 +165,7 @@ def test_a_light_body_warns_once(coupling):
     words = r"the added-mass number of 'box' is about [\d.]+, above 0\.5"
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
-        warnings.simplefilter("ignore", dc.BarrierStartWarning)  # the box starts just above the cloth
+        warnings.simplefilter("ignore", dc.BarrierStartWarning)  # the box starts close
         for _ in range(10):
             state = sim.step(state)
     assert [w.category for w in warned] == [dc.AddedMassWarning]

@@ -277,7 +277,7 @@ def test_the_energy_refuses_a_bad_control():
         dc.Scene([sheet()], attachments=[dc.Attachment(("sheet", 5), stiffness=40.0)]), DT
     )
     state = sim.initial_state()
-    with pytest.raises(dc.InvalidInput, match="`control.attachments` must have"):
+    with pytest.raises(dc.InvalidInput, match=r"`control\.attachments` must have"):
         sim.energy(state, control=dc.Control(attachments=torch.zeros(2, 3, dtype=F64)))
     with pytest.raises(dc.InvalidInput, match="must set the target"):
         sim.energy(state, control=dc.Control(attachment_weights=torch.ones(1, dtype=F64)))
