@@ -393,7 +393,7 @@ def test_a_batch_has_a_number_or_numbers_for_each_environment():
         sim.step(state, None, wrong)
     wrong = default.clone()
     wrong[1, 2] = 0.0
-    with pytest.raises(dc.InvalidInput, match=r"`parameters\.barrier_stiffness` must be .*> 0, got 0"):
+    with pytest.raises(dc.InvalidInput, match=r"`parameters\.barrier_stiffness` must .*> 0, got 0"):
         sim.step(state, None, sim.parameters().replace(barrier_stiffness=wrong))
 
 

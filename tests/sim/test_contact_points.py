@@ -218,7 +218,7 @@ def test_what_has_no_contacts_of_a_step_is_refused():
     with pytest.raises(dc.InvalidInput, match="`state` must be the result of a step"):
         sim.contacts(sim.initial_state())
     contacts = sim.contacts(scenes.regime("sliding").step())
-    with pytest.raises(dc.InvalidInput, match="`surface` must be one of .*, got 'moon'"):
+    with pytest.raises(dc.InvalidInput, match=r"`surface` must be one of .*, got 'moon'"):
         contacts.on("moon")
 
 
