@@ -247,19 +247,19 @@ def test_metrics_hold_defaults_as_they_were_used(call, tmp_path):
 
 
 class Interrupt:
-    """Ctrl-C before some step of a process."""
+    """Ctrl-C before some step of a rollout."""
 
     def __init__(self, monkeypatch, before):
-        real, taken = Simulator.step, []
+        real, taken = Simulator._next, []
 
         def step(simulator, *args, **kwargs):
             if len(taken) == before:
-                monkeypatch.setattr(Simulator, "step", real)
+                monkeypatch.setattr(Simulator, "_next", real)
                 raise KeyboardInterrupt
             taken.append(1)
             return real(simulator, *args, **kwargs)
 
-        monkeypatch.setattr(Simulator, "step", step)
+        monkeypatch.setattr(Simulator, "_next", step)
 
 
 def results(folder):
@@ -450,6 +450,7 @@ def no_work(monkeypatch):
         pytest.fail("a step was taken before the refusal")
 
     monkeypatch.setattr(Simulator, "step", fail)
+    monkeypatch.setattr(Simulator, "_next", fail)  # of rollouts
 
 
 @pytest.mark.parametrize("name", ["metrics.json", "actions.npz", "loss.png", "resume.part"])
@@ -480,7 +481,7 @@ def test_a_folder_in_what_is_resumed_is_refused_before_the_work(call, tmp_path, 
     assert call("optimize", *arguments, "--out", "out").exit_code == 0
     (tmp_path / "out" / name).unlink()
     (tmp_path / "out" / name).mkdir()
-    monkeypatch.setattr(Simulator, "step", lambda *_: pytest.fail("it went on"))
+    monkeypatch.setattr(Simulator, "_next", lambda *_: pytest.fail("it went on"))
     result = call("optimize", "--resume", "out", "--set", "optimizer.iterations=2")
     assert result.exit_code == 2
     assert f"out/{name} is a folder" in one_sentence(result)

@@ -184,9 +184,10 @@ std::map<Index, double> lengths_of(const Scene& scene, const Owners& owners, con
 std::optional<Throw> find_throw(const Scene& scene, const Inputs& inputs) {
   Problem p(scene, inputs);
   if (!p.contact) return {};
+  contact::ContactModel& model = *p.contact;
   const double* const x = p.start.data();
   contact::Detection detection(scene.broad_phase);
-  contact::ContactPotential barrier(*p.contact, detection, nullptr);
+  contact::ContactPotential barrier(model, detection, nullptr);
   barrier.look_at(x);
   const auto is_apart = [](const Contact& c) { return std::isfinite(c.barrier.b); };
   if (barrier.contacts().empty() || !std::ranges::all_of(barrier.contacts(), is_apart)) return {};
@@ -206,15 +207,15 @@ std::optional<Throw> find_throw(const Scene& scene, const Inputs& inputs) {
   Array all;
   p.coordinates.pull_back(gradient, all);
   const Owners owners(scene);
-  const double d_hat = p.contact->parameters().d_hat;
+  const double d_hat = model.parameters().d_hat;
   std::optional<Throw> fastest;
-  for_each_pair(*p.contact, barrier.contacts(), [&](const auto&, const std::vector<Contact>& own) {
+  for_each_pair(model, barrier.contacts(), [&](const auto&, const std::vector<Contact>& own) {
     // Forces with the signs of gradients, as solve() takes them: it returns the motion.
     Array push;
     Array dx;
     Array motion;
     gradient.assign(gradient.size(), 0.0);
-    p.contact->add_gradient(own, x, gradient.data());
+    model.add_gradient(own, x, gradient.data());
     p.coordinates.pull_back(gradient, push);
     Array load = all;
     for (std::size_t k = 0; k < load.size(); ++k) load[k] -= push[k];
