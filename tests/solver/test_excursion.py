@@ -37,9 +37,14 @@ def test_a_stiff_sheet_that_turns_far_does_not_creep():
 
 
 def test_the_path_leaves_out_what_was_undone():
-    simulator, start = falling_sheet((0.3, 0.3, 0.3))
-    with torch.no_grad():
-        path = simulator.path(start, dc.Control())
-        after = simulator.step(start)
-    assert torch.equal(path[-1][: len(after.positions)], after.positions)
-    assert len(path) < after.report.iterations
+    """In some of the throws excursions are undone; which ones depends on rounding."""
+    random = np.random.default_rng(1)
+    shorter = []
+    for _ in range(8):
+        simulator, start = falling_sheet(tuple(random.uniform(-0.4, 0.4, 3)))
+        with torch.no_grad():
+            path = simulator.path(start, dc.Control())
+            after = simulator.step(start)
+        assert torch.equal(path[-1][: len(after.positions)], after.positions)
+        shorter.append(len(path) < after.report.iterations)
+    assert any(shorter)
