@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.rounding
 
 
-# Four starts within 1e-9 m, with AVX-512 and with portable instructions, take 29 or 30, and 32 or 33.
+# Four starts within 1e-9 m, with AVX-512 and portable instructions, take 29 or 30, and 32 or 33.
 @pytest.mark.parametrize(("name", "most"), [("crumple", 35), ("twist", 45)])
 def test_slips_that_turn_round_do_not_zigzag(monkeypatch, name, most):
     """Newton's method has no curvature along a slip on either side: up to 52 and 66 iterations."""
