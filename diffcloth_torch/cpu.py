@@ -46,6 +46,7 @@ def as_tensor(values: Any) -> Tensor:
     Raises:
         TypeError: If NumPy reads no numbers.
         ValueError: If it reads no rectangular array.
+        RuntimeError: If it is a list with tensors that require gradients.
     """
     return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values).copy())
 

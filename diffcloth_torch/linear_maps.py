@@ -121,8 +121,8 @@ class _Apply(torch.autograd.Function):
 
 def _no_second(linear):
     return (
-        f"{linear.owner}: second derivatives are not available; its {linear.kind} cannot be "
-        "differentiated again, detach it where it enters another loss"
+        f"backward: second derivatives of {linear.owner} are not available; its {linear.kind} "
+        "cannot be differentiated again, detach it where it enters another loss"
     )
 
 

@@ -141,12 +141,13 @@ void CandidateList::build(const double* x_t0,
 
 /// Make the near list at the start of a motion with this approach.
 void CandidateList::build_near(const double* x_t0, double approach, BroadPhase::Scratch& scratch) {
-  near_.reference.assign(x_t0, x_t0 + static_cast<std::ptrdiff_t>(wide_.reference.size()));
+  near_.reference.clear();  // no list stands anywhere if an exception ends the search
   near_.skin = std::clamp(kAhead * 0.5 * approach,
                           reach_.empty() ? 0.0 : kThinnest * std::ranges::min(reach_), wide_.skin);
   with_skin_.clear();
   for (const double value : reach_) with_skin_.push_back(value + near_.skin);
   find_wide(x_t0, x_t0, with_skin_, near_.skin, scratch, found_);
+  near_.reference.assign(x_t0, x_t0 + static_cast<std::ptrdiff_t>(wide_.reference.size()));
   near_.pairs = found_.pairs;
   keep_near_ones(near_);
 }

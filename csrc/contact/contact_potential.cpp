@@ -110,6 +110,10 @@ void ContactPotential::visit_approaching(const double* x, const double* to, Visi
 
 double ContactPotential::watch_free(const double* x, const double* to) {
   const double by = distortion(model_.mesh(), x, to);
+  if (!std::isfinite(by)) {  // an overflow: no part of the motion can be certified
+    watch(x, x);
+    return 0.0;
+  }
   std::vector<double> part;
   double fraction = by > kTorn ? kFirstPart / by : 1.0;
   for (;; fraction = std::min(1.0, kNextPart * fraction)) {

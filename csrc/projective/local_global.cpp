@@ -158,12 +158,12 @@ LocalGlobalOutcome minimize(const LocalGlobalObjective& objective,
   };
   for (;;) {
     checkpoint.check_interrupt();
-    if (checkpoint.is_late()) return end(LocalGlobalStatus::kTimeLimit);
     if (!std::isfinite(iteration.residual())) {
       if (outcome.iterations > 0) iteration.go_back();
       return end(LocalGlobalStatus::kOverflow);
     }
     if (iteration.residual() < options.tolerance) return end(LocalGlobalStatus::kConverged);
+    if (checkpoint.is_late()) return end(LocalGlobalStatus::kTimeLimit);
     if (outcome.iterations == options.max_iterations)
       return end(LocalGlobalStatus::kIterationLimit);
     if (!iteration.advance()) return end(LocalGlobalStatus::kNoProgress);

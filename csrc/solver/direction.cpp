@@ -148,6 +148,18 @@ bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
   return true;
 }
 
+bool Directions::project() {
+  last_ = {};
+  confirmed_ = false;
+  const linalg::BlockMatrix P =
+      walk_.system.assemble(walk_.x().data(), Curvature::kPositive, walk_.g());
+  const Factor factor = walk_.system.factor(P);
+  if (!factor) return false;
+  ++walk_.context.counts->projected;
+  walk_.system.solve(*factor, walk_.g(), p_);
+  return true;
+}
+
 bool Directions::certify() {
   // Whatever was near is of no use where this is indefinite: it is a saddle.
   last_ = {};

@@ -51,6 +51,9 @@ class Directions {
   /// The same, of Hessians with extrapolated stresses; factored, as excursions need exact directions.
   std::optional<Direction> next_extrapolated();
 
+  /// Compute the direction of the projected Hessian. False where rounding leaves it indefinite.
+  bool project();
+
   /// Compute the direction of the exact Hessian, factored here. False where it is indefinite.
   bool certify();
 

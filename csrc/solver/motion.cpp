@@ -88,7 +88,8 @@ double descend_and_follow(Walk& walk, const std::vector<double>& ends, bool desc
   if (descends) {
     std::vector<double> p;
     walk.system.solve(*factor, walk.g(), p);
-    search(walk, p, farthest(walk, p, 1.0));
+    // Single precision may turn the direction of an ill-conditioned Hessian uphill.
+    if (dot(walk.g(), p) < 0.0) search(walk, p, farthest(walk, p, 1.0));
   }
   return follow(walk, ends, q);
 }
@@ -122,7 +123,7 @@ double halt(Walk& walk, const PrescribedMotion& motion, const std::vector<Stop>&
     walk.refresh();
     return has_arrived(walk, motion) ? 1.0 : stop.fraction;
   }
-  return way.front().fraction;
+  return has_arrived(walk, motion) ? 1.0 : way.front().fraction;
 }
 
 /// Walk all portions; what was passed in the last one is written to `way`.

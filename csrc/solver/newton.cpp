@@ -299,13 +299,16 @@ Status Descent::without_step() {
 /// What is here when the iterations or the time are used up: the residual of this very point.
 Status Descent::look() {
   if (away_) walk_.back(excursion_.start);
+  const bool is_late = walk_.context.checkpoint->is_up();
   const bool minimum = directions_.certify();
-  if (!minimum && !directions_.next()) return without_step();
+  // Shifts of an indefinite Hessian take many factorizations, for which no time is left.
+  const bool has_step =
+      minimum || (is_late ? directions_.project() : directions_.next().has_value());
+  if (!has_step) return without_step();
   const double step = walk_.displacement(directions_.p());
   residual_ = step / walk_.f.h;
-  if (step >= goal_) {
-    return walk_.context.checkpoint->is_up() ? Status::kTimeLimit : Status::kIterationLimit;
-  }
+  if (is_late && !minimum) return Status::kTimeLimit;
+  if (step >= goal_) return is_late ? Status::kTimeLimit : Status::kIterationLimit;
   return minimum ? Status::kConverged : Status::kSaddle;
 }
 
@@ -427,6 +430,16 @@ bool start_from(Walk& walk, const std::vector<double>& guess) {
   return taken;
 }
 
+/// Find the contacts of the current iterate, also when the time of the step is up.
+void watch_here(Walk& walk) {
+  try {
+    walk.watch(walk.x());
+  } catch (const TimeIsUp&) {
+    walk.context.checkpoint->stop_clock();
+    walk.watch(walk.x());
+  }
+}
+
 }  // namespace
 
 Outcome minimize(const Objective& objective,
@@ -443,7 +456,7 @@ Outcome minimize(const Objective& objective,
   } catch (const TimeIsUp&) {
     context.checkpoint->stop_clock();
   }
-  if (!guessed) walk.watch(x);
+  if (!guessed) watch_here(walk);
   walk.refresh();
   if (departure != nullptr && !guessed) {
     outcome.motion_fraction = arrive(walk, departure->motion, departure->guess != nullptr);

@@ -60,10 +60,11 @@ void solve_by_projective_dynamics(Problem& problem,
                                    : projective::minimize(f, x, options, checkpoint);
   }
   step.report.counts.local_global += outcome.iterations;
-  if (outcome.status == projective::LocalGlobalStatus::kTimeLimit) checkpoint.stop_clock();
+  const bool is_late = outcome.status == projective::LocalGlobalStatus::kTimeLimit;
+  if (is_late) checkpoint.stop_clock();
   if (outcome.status != projective::LocalGlobalStatus::kConverged) {
     ++step.report.counts.left_to_newton;
-    x = start;
+    if (!is_late) x = start;  // else only the residual of the last iterate is left to compute
     solve_by_newton(problem, step, nodes, x);
     return;
   }

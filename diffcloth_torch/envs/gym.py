@@ -264,7 +264,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
             return None
         try:
             mask = cpu.as_tensor(options["reset_mask"])
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, RuntimeError) as error:
             raise TypeError(f"reset: `reset_mask` must be booleans: {error}") from error
         if mask.dtype != torch.bool or mask.shape != (self.num_envs,) or not mask.is_cpu:
             raise InvalidInput(

@@ -74,12 +74,6 @@ class SolverOptions:
             Between 5 and 40 is common; single steps of a sheet that whips take some hundreds.
             Projective Dynamics may take 50 times as many iterations, which are cheaper by about the
             same factor.
-        max_seconds: Longest time of a step of one environment [s], > 0, on the clock of the wall;
-            None sets no limit. A step that takes longer ends like one whose iterations are used up,
-            after at most one more factorization. Which steps do depends on the machine and its
-            load: with a limit, the same input gives the same bits only where every step ends in
-            time. Each solve of a staggered coupling, and each step in the search for an
-            equilibrium, has that time. Backward has no limit.
         throw: Whether a step that fails in any environment raises `NotConverged`,
             `InfeasibleMotion` or `TurnedTooFar`. Otherwise `report.status` says which environments
             failed. Their state is the last feasible iterate: bodies, joints and pins are where the
@@ -92,14 +86,20 @@ class SolverOptions:
         elastic: Method for the elastic stage of the schemes "split" and "projective": "newton", or
             "projective", the local/global iterations of Projective Dynamics. Both find the same
             positions.
+        max_seconds: Longest time of a step of one environment [s], > 0, on the clock of the wall;
+            None sets no limit. A step that takes longer ends like one whose iterations are used up,
+            after a few more factorizations. Which steps do depends on the machine and its
+            load: with a limit, the same input gives the same bits only where every step ends in
+            time. Each solve of a staggered coupling, and each step in the search for an
+            equilibrium, has that time. Backward has no limit.
     """
 
     tolerance: float = 1e-6
     max_iterations: int = 1000
-    max_seconds: float | None = None
     throw: bool = True
     metric: str | None = None
     elastic: str = "newton"
+    max_seconds: float | None = None
 
     def __post_init__(self) -> None:
         tolerance = check_number("SolverOptions: `tolerance`", self.tolerance, POSITIVE)

@@ -367,7 +367,8 @@ def _optimizer(given: Optimizers, variables: Variables) -> torch.optim.Optimizer
             "descend: `optimizer` must be an optimizer of torch or make one, "
             f"got {type(given).__name__}"
         )
-    made: Any = given if isinstance(given, torch.optim.Optimizer) else given(tensors)
+    with cpu.DEVICE:  # some optimizers keep numbers from the beginning
+        made: Any = given if isinstance(given, torch.optim.Optimizer) else given(tensors)
     if not isinstance(made, torch.optim.Optimizer):
         raise TypeError(
             "descend: `optimizer` must be an optimizer of torch or make one, "

@@ -17,6 +17,7 @@ from diffcloth_torch.errors import (
     SimulationError,
     TurnedTooFar,
 )
+from diffcloth_torch.operations import operation
 from diffcloth_torch.optimize.statistics import rollout_statistics
 from diffcloth_torch.sim.state import State
 
@@ -186,7 +187,10 @@ def _total(
     for number, i in zip(numbers, left or [0], strict=True):
         if not math.isfinite(number):
             where = f" in the environment [{i}]" if values.dim() else ""
-            raise SimulationError(f"the loss is {number}{where}: a gradient has no direction there")
+            raise SimulationError(
+                f"{operation('descend')}: the loss is {number}{where}: a gradient has no direction "
+                "there"
+            )
     if not values.dim():
         return kept, []
     by_environment = dict(zip(left, numbers, strict=True))

@@ -373,6 +373,7 @@ class Simulator(Observables):
         given, batch = self._border.enter(state, control, parameters)
         self._start_watch.look_at(state, given, batch)
         fields, diagnostics = self._engine.step(given, self._check(batched=batch is not None))
+        self._start_watch.close(state)
         return State(
             **without_axes(fields, batch),
             time=state.time + self.dt,
@@ -385,6 +386,12 @@ class Simulator(Observables):
     ) -> tuple[Controls, StepParameters]:
         """Copies of arrays and lists: edits before backward must not change repeated steps."""
         if isinstance(controls, Sequence):
+            for k, control in enumerate(controls):
+                if control is not None and not isinstance(control, Control):
+                    raise TypeError(
+                        f"rollout: `controls[{k}]` must be a Control or None, "
+                        f"got {type(control).__name__}"
+                    )
             controls = [c if c is None else check_control(self._layout, c) for c in controls]
         if parameters is not None and not callable(parameters):
             parameters = check_parameters(parameters)

@@ -45,6 +45,8 @@ __all__ = [
 # Slower throws are no fault of a start: a cloth that falls gets as fast in a millisecond. [m/s]
 _SLOW = 0.01
 
+_NAMED = 8  # environments that a warning lists; of more it states the number
+
 # Largest error of a step when its solver stops: in a scene of micrometers the default tolerance
 # would be as long as the barrier.
 _LARGEST_PART_OF_BARRIER = 0.1
@@ -182,6 +184,10 @@ class StartWatch:
         self._engine = engine
         self._looked = False
 
+    def close(self, state: State) -> None:
+        """Look at no other state once a step from a start has been taken."""
+        self._looked = self._looked or state.report is None
+
     def look_at(self, state: State, given: Given, batch: int | None) -> None:
         """Warn if the barrier throws something apart.
 
@@ -192,7 +198,6 @@ class StartWatch:
         """
         if self._looked or state.report is not None:
             return
-        self._looked = True
         with torch.no_grad(), outside_transforms():
             numbers = Given(*({n: plain(t) for n, t in fields.items()} for fields in given))
             at_rest = numbers.at_rest()
@@ -206,7 +211,8 @@ class StartWatch:
             return
         worst = max(fast, key=lambda i: fast[i][3])
         elements, gap, distance, speed = fast[worst]
-        place = "" if batch is None else f"in environment {worst} of {list(fast)}, "
+        affected = str(list(fast)) if len(fast) <= _NAMED else f"{len(fast)} environments"
+        place = "" if batch is None else f"in environment {worst} of {affected}, "
         warn_caller(
             f"{operation()}: the barrier throws apart what starts inside of it: {place}{elements} "
             f"are {gap:.3g} m apart, {gap / distance:.2g} of the barrier distance {distance:.3g} "

@@ -204,8 +204,8 @@ class _Step(CoreFunction):
         changed = [i for i in failed if any(_depends(d, i) for d in given.values())]
         if changed:
             raise SimulationError(
-                f"tangent: the step of environments {changed} failed and has no tangent; give "
-                "their inputs none",
+                f"{operation()}: the step of environments {changed} failed and has no tangent; "
+                "give their inputs none",
                 environments=changed,
             )
         threads = torch.get_num_threads()

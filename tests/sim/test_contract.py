@@ -756,7 +756,7 @@ def test_second_derivatives_are_refused(sim, function):
     total = function(sim.step(state.replace(positions=x)).positions)
     (gradient,) = torch.autograd.grad(total, x, create_graph=True)
     assert gradient.requires_grad
-    with pytest.raises(RuntimeError, match="second derivatives are not available"):
+    with pytest.raises(RuntimeError, match=r"second derivatives of \w+ are not available"):
         torch.autograd.grad((gradient**2).sum(), x)
 
 

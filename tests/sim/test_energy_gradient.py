@@ -361,7 +361,7 @@ def test_second_derivatives_are_refused(part):
     parts = sim.energy(state.replace(positions=x), parts=True)
     energy = sum(parts.values()) if part == "total" else parts[part]
     (gradient,) = torch.autograd.grad(energy, x, create_graph=True)
-    with pytest.raises(RuntimeError, match="energy: second derivatives are not available"):
+    with pytest.raises(RuntimeError, match=r"second derivatives of energy are not available"):
         gradient.sum().backward()
 
 
