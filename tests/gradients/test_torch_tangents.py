@@ -312,7 +312,7 @@ class TestFailures:
             return forward_ad.unpack_dual(after.positions).tangent
 
     def test_they_raise(self):
-        with pytest.raises(dc.SimulationError, match=r"tangent: .*environments \[1\]"):
+        with pytest.raises(dc.SimulationError, match=r"step: .*environments \[1\]"):
             self.run(torch.ones_like)
 
     def test_the_others_have_theirs(self):
