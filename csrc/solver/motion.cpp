@@ -158,6 +158,8 @@ double go_to_the_end(Walk& walk,
 }  // namespace
 
 double arrive(Walk& walk, const PrescribedMotion& motion, bool descends) {
+  // Without a descent and a motion nothing is left to do: a solution stays where it is, to the bit.
+  if (!descends && has_arrived(walk, motion)) return 1.0;
   std::vector<Stop> way;
   try {
     return go_to_the_end(walk, motion, descends, way);

@@ -459,7 +459,10 @@ Outcome minimize(const Objective& objective,
   if (!guessed) watch_here(walk);
   walk.refresh();
   if (departure != nullptr && !guessed) {
-    outcome.motion_fraction = arrive(walk, departure->motion, departure->guess != nullptr);
+    // Exact steps alternate around the kinks of joints, a descent does not.
+    const bool descends = departure->guess != nullptr ||
+                          (objective.chart != nullptr && objective.chart->has_joint_terms());
+    outcome.motion_fraction = arrive(walk, departure->motion, descends);
     if (outcome.motion_fraction < 1.0) {
       outcome.status = Status::kInfeasibleMotion;
       return outcome;

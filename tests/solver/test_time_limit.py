@@ -140,14 +140,15 @@ def swarm(count, speed, **solver):
 
 
 def test_time_is_looked_at_within_detection():
-    """One search and one look at all pairs take seconds."""
-    sim, state = swarm(9, 1e4, max_seconds=0.1, max_iterations=3)
-    begin = time.process_time()
-    report = sim.step(state).report
-    spent = time.process_time() - begin
-    assert report.status == "not_converged"
-    # 1.8 s without a limit; the end takes a factorization and a look at what is near.
-    assert spent < 0.6
+    """One search and one look at all pairs take seconds; the end takes a look at what is near."""
+    spent = []
+    for limit in (None, 0.1):
+        sim, state = swarm(9, 1e4, max_seconds=limit, max_iterations=3)
+        begin = time.process_time()
+        report = sim.step(state).report
+        spent.append(time.process_time() - begin)
+        assert report.status == "not_converged"
+    assert spent[1] < 0.5 * spent[0]
 
 
 def test_a_free_body_does_not_look_through_torn_sheets():
