@@ -36,13 +36,13 @@ class Interrupt {
 /// Thrown to unwind a step whose time is up, to where it can end.
 struct TimeIsUp {};
 
-/// What one worker sees of an Interrupt, and of the time that a step may take.
+/// View of an Interrupt for one worker, with the deadline of a step.
 class Checkpoint {
  public:
   Checkpoint(Interrupt& interrupt, bool is_caller)
       : interrupt_(&interrupt), is_caller_(is_caller) {}
 
-  /// The same with some time from now on; all the time there is where that is infinite [s].
+  /// Copy with a deadline that many seconds from now; none where the number is infinite.
   Checkpoint with_seconds(double seconds) const {
     constexpr double kForever = 1e9;  // beyond what the clock counts
     Checkpoint other = *this;
@@ -67,13 +67,13 @@ class Checkpoint {
 
   bool is_late() const { return deadline_ < kNever && Clock::now() > deadline_; }
 
-  /// Be late no more, so that a step whose time is up can end; no solve goes on then.
+  /// Remove the deadline that has passed, so that the step can end in order; solves do not go on.
   void stop_clock() {
     deadline_ = kNever;
     is_up_ = true;
   }
 
-  /// Whether the time was up.
+  /// Whether stop_clock() was called.
   bool is_up() const { return is_up_; }
 
  private:

@@ -99,11 +99,13 @@ void ContactPotential::visit_approaching(const double* x, const double* to, Visi
   const double d_hat = model_.parameters().d_hat;
   const double most = 2.0 * std::ranges::max(model_.reach()) - d_hat;  // of any xi
   const double harmless_to_all = harmless_distance(most, d_hat, largest);
+  int visited = 0;
   for (std::size_t k = 0; k < found_.pairs.size(); ++k) {
     if (found_.apart[k] > harmless_to_all) continue;
     const Candidate& pair = found_.pairs[k];
     const double xi = model_.xi(pair);
     if (found_.apart[k] > harmless_distance(xi, d_hat, largest)) continue;
+    if (++visited % kPairsAtOnce == 0 && detection_.checkpoint) detection_.checkpoint->check();
     if (!visit(pair, xi)) return;
   }
 }
@@ -131,9 +133,7 @@ double ContactPotential::watch_free(const double* x, const double* to) {
 
 double ContactPotential::safe_fraction(const double* x, const double* to) const {
   double alpha = 1.0;
-  int count = 0;
   visit_approaching(x, to, [&](const Candidate& pair, double xi) {
-    if (++count % kPairsAtOnce == 0 && detection_.checkpoint) detection_.checkpoint->check();
     alpha = safe_step(pair.kind, corners(pair.vertices, x), corners(pair.vertices, to), xi,
                       model_.parameters().d_hat, alpha);
     return alpha != 0.0;
@@ -146,12 +146,10 @@ std::vector<char> ContactPotential::meeting(const double* x, const double* to) {
   watch(x, to);
   const std::vector<Index>& surface = model_.mesh().vertex_surface;
   std::vector<char> meets(model_.reach().size(), 0);
-  int count = 0;
   const auto mark = [&](const Candidate& pair) {
     meets[surface[pair.vertices[0]]] = meets[surface[pair.vertices[3]]] = 1;
   };
   visit_approaching(x, to, [&](const Candidate& pair, double xi) {
-    if (++count % kPairsAtOnce == 0 && detection_.checkpoint) detection_.checkpoint->check();
     const double safe = safe_step(pair.kind, corners(pair.vertices, x), corners(pair.vertices, to),
                                   xi, model_.parameters().d_hat, 1.0);
     if (safe < 1.0) mark(pair);

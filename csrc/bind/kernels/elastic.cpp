@@ -356,7 +356,7 @@ class Elastic {
     return rows_array(X_bar);
   }
 
-  /// The same cotangents times the change of every field with X.
+  /// Sum over all fields of the cotangents of rest_vjp() times the change of the field along X_dot.
   double rest_jvp(const Positions& X_dot) const {
     const mesh::RestShapeBar dot =
         mesh::rest_shape_jvp(topology_, stencils_, X_.data(), positions("X_dot", X_dot).data());
