@@ -80,7 +80,7 @@ struct StretchKernels {
   //
   //   dE = k_w (a0 + a1 - 2) / 2 da + k_f (b0 + b1 - 2) / 2 db + k_wf (da + db - dt),   a = |w|, b = |f|,
   //
-  // with the changes of lengths and of t from those of their squares.
+  // where the changes of |w|, |f| and t are computed from the changes of their squares.
 
   double (*woven_energy_change)(const WovenBatch* batches,
                                 std::size_t count,

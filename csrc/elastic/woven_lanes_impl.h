@@ -116,7 +116,7 @@ void add_woven_gradient(const WovenBatch* batches, std::size_t count, const doub
   }
 }
 
-// In the frame of R, w = (w_1, w_2) |w| and f = (f_1, f_2) |f| with unit vectors. A change of F in plane is that of
+// In the frame of R, w = (w_1, w_2) |w| and f = (f_1, f_2) |f| with unit vectors. An in-plane change of F moves
 // each yarn along itself, with the stiffness k_y, and across, with
 //
 //   m_y = k_wf + (k_y - k_wf) (1 - 1 / |y|),
@@ -182,7 +182,8 @@ DIFFCLOTH_INLINE void forms_of(const WovenBatch& batch, const double* x, WovenFo
   }
 }
 
-/// What raises the negative eigenvalue of each form to zero: value v v^T, v by columns of F along r1 and r2.
+/// Rank-one term value v v^T that raises the negative eigenvalue of a form to zero; v by columns of F along
+/// r1 and r2.
 struct NegativeParts {
   alignas(64) double value[kLanes];
   alignas(64) double warp[2][kLanes];

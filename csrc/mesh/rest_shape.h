@@ -33,7 +33,7 @@ struct FittedSide {
 /// Which vertices each bending element couples.
 ///
 /// The first three vertices of an element are the corners of its base face; then come the other
-/// points of its quadratic, if one of its sides is not fitted, then those of its fitted sides. The points of
+/// points of its quadratic, unless all its sides are fitted, and then the points of the fitted sides. The points of
 /// a quadratic, or of a side, are laid into the plane of a base face by unfolding the mesh.
 /// The choice is made once, from the scene's rest mesh, and then kept, so that everything is smooth
 /// in the rest positions.

@@ -129,7 +129,7 @@ struct PatchFace {
   }
 };
 
-/// Whether the quadratics of two faces have the same derivative across their side.
+/// True if the quadratics of two faces have equal derivatives across the shared side.
 bool agree(const PatchFace& f0, Index corner0, const PatchFace& f1, Index corner1) {
   if (!f0.quadratic || !f1.quadratic) return false;
   const SideWeights w0 = side_weights(side(f0.base, corner0), *f0.quadratic);
@@ -190,7 +190,7 @@ void gather_vertices(BendingStencils& stencils) {
   }
 }
 
-/// Whether a patch face is by itself, without a neighbor to bend about.
+/// True if a patch has a single face, which has no side to bend about.
 bool alone(const Patch& patch) { return patch.vertices().size() == 3; }
 
 /// The patches, and the charts of their fitted sides.
