@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from short_tasks import SHEET, write_config
 
 import diffcloth_torch as dc
 from diffcloth_torch.optimize import residuals, rgbench
@@ -302,24 +303,6 @@ class World:
         return f64([0.01] * len(robot.joint_names))
 
 
-CONFIG = """
-task: drape
-simulation: {dt: 0.01, steps: 2}
-scene:
-  cloths:
-    - name: sheet
-      shape: {kind: grid, rows: 3, columns: 4, size: [3, 2]}
-      pose: {position: [0, 0, 1], axis: [1, 0, 0], degrees: 90}
-      pins: {top: {box: {lower: [-9, -0.1, 1.9], upper: [9, 0.1, 2.1]}}}
-"""
-
-
-def config(w):
-    path = w.folder / "config.yaml"
-    path.write_text(CONFIG, encoding="utf-8")
-    return path
-
-
 def saving(w):
     path = w.folder / "trainer.pt"
     trainer = w.trainer
@@ -435,7 +418,9 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "build_info": lambda w: call(dc.build_info),
     "descend": lambda w: w.descent,
     "fit": lambda w: w.fitting,
-    "load_config": lambda w: call(dc.load_config, config(w), ["simulation.steps=3"]),
+    "load_config": lambda w: call(
+        dc.load_config, write_config(w.folder, SHEET), ["simulation.steps=3"]
+    ),
     "render": lambda w: call(
         dc.render,
         w.scene,
