@@ -39,15 +39,25 @@ _POSES = ("body_poses", "base_poses")
 _HELD = {"soft_pins": "soft_pin_targets", "body_poses": "body_poses", "base_poses": "base_poses"}
 
 
-def check_control(layout: Layout, control: Control) -> Control:
-    """Promote a control to tensors and make all checks that do not depend on a state."""
-    return Control(**_targets(layout, control))  # type: ignore[arg-type]
+def check_control(layout: Layout, control: Control, argument: str = "control") -> Control:
+    """Promote a control to tensors and make all checks that do not depend on a state.
+
+    Args:
+        layout: Layout of the scene.
+        control: The control.
+        argument: Name of the argument in the message of a TypeError.
+    """
+    return Control(**_targets(layout, control, argument))  # type: ignore[arg-type]
 
 
-def _targets(layout: Layout, control: Control) -> dict[str, Tensor | dict[str, Tensor]]:
+def _targets(
+    layout: Layout, control: Control, argument: str = "control"
+) -> dict[str, Tensor | dict[str, Tensor]]:
     """The fields that a control sets, checked."""
     if not isinstance(control, Control):
-        raise TypeError(f"{operation()}: `control` must be a Control, got {type(control).__name__}")
+        raise TypeError(
+            f"{operation()}: `{argument}` must be a Control, got {type(control).__name__}"
+        )
     checked: dict[str, Tensor | dict[str, Tensor]] = {}
     for field, shape in layout.control_shapes.items():
         given = getattr(control, field)

@@ -386,13 +386,10 @@ class Simulator(Observables):
     ) -> tuple[Controls, StepParameters]:
         """Copies of arrays and lists: edits before backward must not change repeated steps."""
         if isinstance(controls, Sequence):
-            for k, control in enumerate(controls):
-                if control is not None and not isinstance(control, Control):
-                    raise TypeError(
-                        f"rollout: `controls[{k}]` must be a Control or None, "
-                        f"got {type(control).__name__}"
-                    )
-            controls = [c if c is None else check_control(self._layout, c) for c in controls]
+            controls = [
+                c if c is None else check_control(self._layout, c, f"controls[{k}]")
+                for k, c in enumerate(controls)
+            ]
         if parameters is not None and not callable(parameters):
             parameters = check_parameters(parameters)
         return controls, parameters
