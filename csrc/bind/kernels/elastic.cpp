@@ -351,32 +351,19 @@ class Elastic {
   /// Pull cotangents of every field of the rest shape back to X. The cotangent of entry k of a field is
   /// cos(k + 1): a test repeats it.
   Array rest_vjp() const {
+    mesh::RestShapeBar bar(topology_, stencils_);
+    for_each_entry(bar, [](double& entry, std::size_t k) { entry = std::cos(k + 1.0); });
     std::vector<double> X_bar(X_.size(), 0.0);
-    mesh::rest_shape_vjp(topology_, stencils_, X_.data(), rest_cotangents(), X_bar.data());
+    mesh::rest_shape_vjp(topology_, stencils_, X_.data(), bar, X_bar.data());
     return rows_array(X_bar);
   }
 
-  /// Sum over all fields of the cotangents of rest_vjp() times the change of the field along X_dot.
+  /// Sum of the cotangents of rest_vjp() times the changes of the fields along X_dot.
   double rest_jvp(const Positions& X_dot) const {
-    const mesh::RestShapeBar dot =
+    mesh::RestShapeBar dot =
         mesh::rest_shape_jvp(topology_, stencils_, X_.data(), positions("X_dot", X_dot).data());
-    const mesh::RestShapeBar bar = rest_cotangents();
     double total = 0.0;
-    const auto add = [&](const std::vector<double>& u, const std::vector<double>& v) {
-      total += std::inner_product(u.begin(), u.end(), v.begin(), 0.0);
-    };
-    add(bar.area, dot.area);
-    add(bar.curvature_operator, dot.curvature_operator);
-    add(bar.bending_area, dot.bending_area);
-    add(bar.vertex_area, dot.vertex_area);
-    add(bar.edge_area, dot.edge_area);
-    add(bar.edge_length_sq, dot.edge_length_sq);
-    for (std::size_t f = 0; f < bar.shape_gradient.size(); ++f) {
-      total += bar.shape_gradient[f].cwiseProduct(dot.shape_gradient[f]).sum();
-    }
-    for (std::size_t e = 0; e < bar.curvature.size(); ++e) {
-      total += bar.curvature[e].cwiseProduct(dot.curvature[e]).sum();
-    }
+    for_each_entry(dot, [&](double entry, std::size_t k) { total += std::cos(k + 1.0) * entry; });
     return total;
   }
 
@@ -408,24 +395,20 @@ class Elastic {
     return {x.data(), x.data() + x.size()};
   }
 
-  mesh::RestShapeBar rest_cotangents() const {
-    mesh::RestShapeBar bar(topology_, stencils_);
-    const auto fill = [](std::vector<double>& field) {
-      for (std::size_t k = 0; k < field.size(); ++k) field[k] = std::cos(k + 1.0);
-    };
-    fill(bar.area);
-    fill(bar.curvature_operator);
-    fill(bar.bending_area);
-    fill(bar.vertex_area);
-    fill(bar.edge_area);
-    fill(bar.edge_length_sq);
-    for (std::size_t k = 0; k < 6 * bar.shape_gradient.size(); ++k) {
-      bar.shape_gradient[k / 6](k % 6 / 2, k % 2) = std::cos(k + 1.0);
+  /// Call visit(entry, k) for all entries of all fields; k counts within a field.
+  template <class Visit>
+  static void for_each_entry(mesh::RestShapeBar& fields, Visit&& visit) {
+    for (std::vector<double>* field :
+         {&fields.area, &fields.curvature_operator, &fields.bending_area, &fields.vertex_area,
+          &fields.edge_area, &fields.edge_length_sq}) {
+      for (std::size_t k = 0; k < field->size(); ++k) visit((*field)[k], k);
     }
-    for (std::size_t k = 0; k < 9 * bar.curvature.size(); ++k) {
-      bar.curvature[k / 9].data()[k % 9] = std::cos(k + 1.0);
+    for (std::size_t k = 0; k < 6 * fields.shape_gradient.size(); ++k) {
+      visit(fields.shape_gradient[k / 6](k % 6 / 2, k % 2), k);
     }
-    return bar;
+    for (std::size_t k = 0; k < 9 * fields.curvature.size(); ++k) {
+      visit(fields.curvature[k / 9].data()[k % 9], k);
+    }
   }
 
   std::vector<double> X_;
