@@ -459,7 +459,8 @@ Outcome minimize(const Objective& objective,
   if (!guessed) watch_here(walk);
   walk.refresh();
   if (departure != nullptr && !guessed) {
-    // Exact steps alternate around the kinks of joints, a descent does not.
+    // A stiff drive at its limit balances within rounding: exact steps alternate there between two points
+    // without end. The projection has more curvature, and its step ends between them.
     const bool descends = departure->guess != nullptr ||
                           (objective.chart != nullptr && objective.chart->has_joint_terms());
     outcome.motion_fraction = arrive(walk, departure->motion, descends);
