@@ -131,7 +131,8 @@ def test_constant_curvature_leaves_no_force_inside(name, aspect):
     assert inside.any()
     g = elastic.gradient(x)
     # Quadratics have the error of the filter of a fit, 2e-4 at most, and that only in slivers.
-    assert np.abs(g[inside]).max() < 1e-6 * np.abs(g).max()
+    is_regular = aspect == 1 and name in ("right", "left", "alternating", "equilateral")
+    assert np.abs(g[inside]).max() < (1e-10 if is_regular else 1e-6) * np.abs(g).max()
 
 
 ODD_MESHES = {
