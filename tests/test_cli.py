@@ -247,19 +247,23 @@ def test_metrics_hold_defaults_as_they_were_used(call, tmp_path):
 
 
 class Interrupt:
-    """Ctrl-C before some step of a rollout."""
+    """Ctrl-C before a step, taken by itself or in a rollout."""
 
     def __init__(self, monkeypatch, before):
-        real, taken = Simulator._next, []
+        taken = []
 
-        def step(simulator, *args, **kwargs):
-            if len(taken) == before:
-                monkeypatch.setattr(Simulator, "_next", real)
-                raise KeyboardInterrupt
-            taken.append(1)
-            return real(simulator, *args, **kwargs)
+        def interrupted(real):
+            def step(*args, **kwargs):
+                if len(taken) == before:
+                    taken.append(1)  # the run that resumes takes all its steps
+                    raise KeyboardInterrupt
+                taken.append(1)
+                return real(*args, **kwargs)
 
-        monkeypatch.setattr(Simulator, "_next", step)
+            return step
+
+        for name in ("step", "_next"):
+            monkeypatch.setattr(Simulator, name, interrupted(getattr(Simulator, name)))
 
 
 def results(folder):
