@@ -254,10 +254,9 @@ class Interrupt:
 
         def interrupted(real):
             def step(*args, **kwargs):
-                if len(taken) == before:
-                    taken.append(1)  # the run that resumes takes all its steps
-                    raise KeyboardInterrupt
                 taken.append(1)
+                if len(taken) == before + 1:  # once: the run that resumes takes all its steps
+                    raise KeyboardInterrupt
                 return real(*args, **kwargs)
 
             return step

@@ -45,7 +45,7 @@ class CoordinatePotential final : public Potential {
   void update_duals(const double* x, const double* p, double alpha, const double* to) override;
   double force_change(const double* x, const double* p) const override;
   bool has_duals(const double* x) const override;
-  /// Whether a joint has a drive, friction or a limit of its own. Their forces have kinks.
+  /// True if a joint has a drive, friction or a limit. The forces of these terms have kinks.
   bool has_joint_terms() const { return joints_ != nullptr; }
   void swap_cotangents(CotangentStore& store) override {
     store.exchange(target_bar);

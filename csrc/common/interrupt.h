@@ -73,7 +73,7 @@ class Checkpoint {
     is_up_ = true;
   }
 
-  /// Whether stop_clock() was called.
+  /// True once stop_clock() has been called.
   bool is_up() const { return is_up_; }
 
  private:
