@@ -14,7 +14,7 @@ import click
 import torch
 
 from diffcloth_torch import envs
-from diffcloth_torch.sim import step as core_step
+from diffcloth_torch.sim.solve import step as core_step
 
 SIZES, BATCHES = (8, 12, 24), (1, 4, 8, 32)
 POLICIES = ("zero", "random", "scripted")

@@ -17,7 +17,7 @@ from benchmarks.extra import require
 from benchmarks.scenes import DT, Scene, in_regime
 
 try:
-    from diffcloth_torch.core_functions import as_array
+    from diffcloth_torch.autograd.core_function import as_array
     from diffcloth_torch.geometry.poses import transform
 except ModuleNotFoundError:  # in the first version, which we compare with
     from diffcloth_torch.poses import transform

@@ -18,7 +18,7 @@ import click
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.core_functions import as_array
+from diffcloth_torch.autograd.core_function import as_array
 
 DT = 1 / 180  # [s]
 ROWS = [(elastic, tolerance) for tolerance in (1e-3, 1e-6) for elastic in ("newton", "projective")]

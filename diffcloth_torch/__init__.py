@@ -53,12 +53,12 @@ if TYPE_CHECKING:
     from diffcloth_torch.optimize.evaluation import Evaluation
     from diffcloth_torch.optimize.fit import Fit, Stage, fit
     from diffcloth_torch.optimize.variables import Variable
-    from diffcloth_torch.sim.contact_points import ContactPoints
-    from diffcloth_torch.sim.controls import Control, Parameters
-    from diffcloth_torch.sim.report import Report
+    from diffcloth_torch.sim.records.contact_points import ContactPoints
+    from diffcloth_torch.sim.records.controls import Control, Parameters
+    from diffcloth_torch.sim.records.report import Report
+    from diffcloth_torch.sim.records.state import State, stack, where
+    from diffcloth_torch.sim.records.trajectory import Trajectory
     from diffcloth_torch.sim.simulator import Simulator
-    from diffcloth_torch.sim.state import State, stack, where
-    from diffcloth_torch.sim.trajectory import Trajectory
     from diffcloth_torch.tasks.task import LoadedConfig
     from diffcloth_torch.viewers.look import Camera
     from diffcloth_torch.viewers.render import render
@@ -138,12 +138,12 @@ _HOMES = {
     "optimize.evaluation": ("Evaluation",),
     "optimize.fit": ("Fit", "Stage", "fit"),
     "optimize.variables": ("Variable",),
-    "sim.contact_points": ("ContactPoints",),
-    "sim.controls": ("Control", "Parameters"),
-    "sim.report": ("Report",),
+    "sim.records.contact_points": ("ContactPoints",),
+    "sim.records.controls": ("Control", "Parameters"),
+    "sim.records.report": ("Report",),
     "sim.simulator": ("Simulator",),
-    "sim.state": ("State", "stack", "where"),
-    "sim.trajectory": ("Trajectory",),
+    "sim.records.state": ("State", "stack", "where"),
+    "sim.records.trajectory": ("Trajectory",),
     "viewers.look": ("Camera",),
     "viewers.render": ("render",),
     "viewers.show": ("show",),

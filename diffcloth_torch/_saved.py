@@ -88,8 +88,8 @@ def _is_being_imported(module: ModuleType) -> bool:
 
 def register_classes() -> None:
     """Import the modules that register what they have."""
-    import_module("diffcloth_torch.sim.state")
-    import_module("diffcloth_torch.sim.controls")
+    import_module("diffcloth_torch.sim.records.state")
+    import_module("diffcloth_torch.sim.records.controls")
 
 
 def allow_loading(*classes: type, once_in: str | None = None) -> None:

@@ -15,8 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from diffcloth_torch import _core
+from diffcloth_torch.autograd.transforms import has_derivative, is_dense, numbers_of
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.transforms import has_derivative, numbers_of
 
 __all__ = [
     "ANY_NUMBER",
@@ -29,6 +30,7 @@ __all__ = [
     "FloatArray",
     "IndexArray",
     "Range",
+    "are_within",
     "check_bool",
     "check_choice",
     "check_count",
@@ -42,7 +44,6 @@ __all__ = [
     "float_tensor",
     "frozen",
     "index_array",
-    "is_dense",
     "refuse_gradient",
     "refuse_threads",
     "texts",
@@ -141,9 +142,9 @@ def float_tensor(name: str, value: object) -> Tensor:
     return value if value.dtype == torch.float64 else value.to(torch.float64)
 
 
-def is_dense(value: Tensor) -> bool:
-    """Tell whether a tensor is one plain block of memory; nested and sparse ones are not."""
-    return not value.is_nested and value.layout == torch.strided
+def are_within(arrays: list[FloatArray], largest: float) -> bool:
+    """Whether all numbers are at most `largest` in magnitude; false for NaN."""
+    return _core.are_within(arrays, largest)
 
 
 def _require_dense(name: str, value: Tensor) -> None:

@@ -17,7 +17,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloth_torch import build_info, cpu
+from diffcloth_torch import _core, cpu
 from diffcloth_torch.config.documents import set_values
 from diffcloth_torch.config.viewers import open_viewers
 from diffcloth_torch.errors import InvalidInput, SimulationError
@@ -25,7 +25,7 @@ from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.descent import Descent
 from diffcloth_torch.optimize.statistics import rollout_statistics
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.tasks.optimization import Actions, position_gradients
 from diffcloth_torch.tasks.optimization import optimize as run_optimization
 from diffcloth_torch.tasks.registry import TASKS, check_document, load_task, make_task
@@ -368,7 +368,7 @@ def info() -> str:
         "torch threads": torch.get_num_threads(),
         "tasks": ", ".join(TASKS),
     }
-    rows |= {f"core: {name}": value for name, value in build_info().items()}
+    rows |= {f"core: {name}": value for name, value in _core.build_info().items()}
     width = max(map(len, rows))
     return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from diffcloth_torch.checks import is_dense
+from diffcloth_torch.autograd.transforms import is_dense
 
 __all__ = ["field_text", "record_text", "value_text"]
 

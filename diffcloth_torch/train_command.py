@@ -24,7 +24,7 @@ from diffcloth_torch.learn.options import TrainerOptions
 from diffcloth_torch.learn.trainer import Trainer
 from diffcloth_torch.learn.workers import Processes, Ranks, RayActors
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.tasks.statistics import replace_file, write_metrics
 from diffcloth_torch.viewers.look import Camera, Pictures
 from diffcloth_torch.viewers.record import Record

@@ -57,6 +57,34 @@ def test_only_bind_knows_python():
     assert users == {"bind"}
 
 
+def names_of_the_package(text: str) -> list[str]:
+    """Names that a module imports from the package itself and that are no modules of it."""
+    wanted = re.findall(r"^\s*from diffcloth_torch import (\([^)]*\)|.*)$", text, re.MULTILINE)
+    names = [
+        name.split()[0] for line in wanted for name in line.strip("()").split(",") if name.strip()
+    ]
+    modules = {p.stem for p in (ROOT / "diffcloth_torch").iterdir()}
+    return [name for name in names if name not in modules]
+
+
+def test_modules_import_only_the_core_from_the_package_itself():
+    """Import contracts ignore imports of the package itself, which stand for the core."""
+    for path in (ROOT / "diffcloth_torch").rglob("*.py"):
+        text = path.read_text()
+        assert set(names_of_the_package(text)) <= {"_core"}, path
+        assert not re.search(r"^import diffcloth_torch\b", text, re.MULTILINE), path
+    assert names_of_the_package("from diffcloth_torch import State, cpu") == ["State"]
+
+
+PRIVATE = re.compile(r"(?<!diffcloth_)\b(torch|forward_ad)(\.\w+)*\._[a-zA-Z]")
+
+
+def test_one_module_uses_undocumented_torch():
+    package = ROOT / "diffcloth_torch"
+    users = {p.relative_to(package) for p in package.rglob("*.py") if PRIVATE.search(p.read_text())}
+    assert users == {Path("autograd/torch_private.py")}
+
+
 def test_python_imports_point_down():
     pytest.importorskip("importlinter", reason="import-linter is in the extra `dev`")
     lint = Path(sys.executable).with_name("lint-imports")

@@ -36,7 +36,7 @@ from diffcloth_torch.model.options import ContactOptions, SolverOptions
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.robot import Robot
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.sim.controls import Control
+from diffcloth_torch.sim.records.controls import Control
 from diffcloth_torch.sim.simulator import Simulator
 
 __all__ = [

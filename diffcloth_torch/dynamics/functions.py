@@ -15,10 +15,10 @@ from torch import Tensor
 
 from diffcloth_torch import _core
 from diffcloth_torch._exit import note_caller
-from diffcloth_torch.core_functions import Arrays, CoreFunction, as_array, evaluate
+from diffcloth_torch.autograd.core_function import Arrays, CoreFunction, as_array, evaluate
+from diffcloth_torch.autograd.transforms import is_differentiated
 from diffcloth_torch.model.mechanism import JOINT_KINDS, Mechanism
 from diffcloth_torch.model.robot import ACTUATIONS, BASES
-from diffcloth_torch.transforms import is_differentiated
 
 __all__ = ["body_functions", "outputs_of", "robot_functions"]
 

@@ -24,13 +24,14 @@ from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 
 from diffcloth_torch import cpu
+from diffcloth_torch.autograd.torch_private import saved_tensor_hooks_are_allowed
+from diffcloth_torch.autograd.transforms import outside_transforms, plain
 from diffcloth_torch.dynamics.inertia import Inertia, Motion, generalized_force
 from diffcloth_torch.dynamics.jacobians import ROOT, DifferentialKinematics, Frames, root_frame
 from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.geometry.products import product
 from diffcloth_torch.geometry.rotation import quaternion_matrix, rotation_exp
 from diffcloth_torch.model.kinematics import constant
-from diffcloth_torch.transforms import outside_transforms, plain
 
 __all__ = ["Configuration", "WeightSpring"]
 
@@ -185,8 +186,7 @@ def _without_hooks() -> AbstractContextManager[None]:
 
     Reverse-mode transforms of `torch.func` forbid hooks, and so there are none inside them.
     """
-    # Not among the stubs of torch.
-    if torch._C._autograd._saved_tensors_hooks_is_enabled():  # type: ignore[attr-defined]
+    if saved_tensor_hooks_are_allowed():
         return saved_tensors_hooks(_same, _same)
     return nullcontext()
 

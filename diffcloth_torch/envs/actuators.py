@@ -23,8 +23,8 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.rotation import quaternion_exp, quaternion_multiply
 from diffcloth_torch.model.attachment import Attachment
 from diffcloth_torch.model.cloth import Cloth
-from diffcloth_torch.sim.controls import Control
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.controls import Control
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["Actuator", "Forces", "Hand", "Pickers", "Tools", "Twist", "Velocities", "moved"]
 

@@ -19,9 +19,9 @@ from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Actuator, Tools
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.operations import operation
-from diffcloth_torch.sim.controls import Parameters
+from diffcloth_torch.sim.records.controls import Parameters
+from diffcloth_torch.sim.records.state import State, where
 from diffcloth_torch.sim.simulator import Simulator
-from diffcloth_torch.sim.state import State, where
 
 __all__ = ["EnvState", "Task", "lengths"]
 

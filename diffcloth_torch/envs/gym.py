@@ -18,7 +18,7 @@ from diffcloth_torch.checks import check_choice, check_count, check_shape, float
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.operations import operation
-from diffcloth_torch.sim.controls import Parameters
+from diffcloth_torch.sim.records.controls import Parameters
 
 __all__ = ["ClothVectorEnv"]
 

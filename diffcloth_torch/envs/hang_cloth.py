@@ -12,7 +12,7 @@ from diffcloth_torch.envs.hands import HandTask, twist_to
 from diffcloth_torch.envs.sheets import follow
 from diffcloth_torch.geometry.rotation import quaternion_multiply
 from diffcloth_torch.model.rigid_body import RigidBody
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["HangCloth"]
 

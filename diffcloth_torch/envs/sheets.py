@@ -19,8 +19,8 @@ from diffcloth_torch.model.options import ContactOptions, SolverOptions
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.operations import operation
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.simulator import Simulator
-from diffcloth_torch.sim.state import State
 
 __all__ = ["SheetTask", "arc", "follow", "uniform"]
 

@@ -12,7 +12,7 @@ from diffcloth_torch.envs.actuators import Tools
 from diffcloth_torch.envs.env import EnvState, failures
 from diffcloth_torch.envs.sheets import HEIGHT, SIDE, SheetTask, follow, uniform
 from diffcloth_torch.errors import SimulationError
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["FlingCloth", "SpreadCloth", "covered_area"]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from diffcloth_torch import _core
 from diffcloth_torch.checks import FloatArray, check_finite, check_shape, float_array
 from diffcloth_torch.errors import InvalidInput
 
@@ -12,6 +13,7 @@ __all__ = [
     "SHORTEST_QUATERNION",
     "check_quaternions",
     "pose_array",
+    "refuse_short_quaternions",
     "rotation_matrix",
     "transform",
 ]
@@ -33,6 +35,13 @@ def check_quaternions(name: str, poses: FloatArray) -> None:
             f"{name} must hold a quaternion (w, x, y, z) of non-zero length in its last four "
             f"entries, got length {norms[tuple(at)]:g}{where}"
         )
+
+
+def refuse_short_quaternions(name: str, poses: FloatArray) -> None:
+    """Refuse poses [..., 7] whose quaternion is too short to have a direction."""
+    # A fast check with a margin; near the shortest length the other function decides.
+    if not _core.have_quaternions(poses, 2 * SHORTEST_QUATERNION):
+        check_quaternions(name, poses)
 
 
 def pose_array(name: str, pose: object, *, instead: str) -> FloatArray:

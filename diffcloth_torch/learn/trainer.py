@@ -38,7 +38,7 @@ from diffcloth_torch.learn.rollouts import (
     threads_of_torch,
 )
 from diffcloth_torch.learn.workers import Ranks, Workers
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["Trainer"]
 

@@ -11,6 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from diffcloth_torch import cpu
+from diffcloth_torch.autograd.transforms import numbers_of
 from diffcloth_torch.checks import (
     ANY_NUMBER,
     NON_NEGATIVE,
@@ -45,7 +46,6 @@ from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.robot_tree import JointBounds, joint_bounds, make_mechanism
 from diffcloth_torch.model.round_bodies import ContactSurface
 from diffcloth_torch.model.urdf import read_urdf
-from diffcloth_torch.transforms import numbers_of
 
 __all__ = ["ACTUATIONS", "BASES", "Robot"]
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch.autograd.transforms import numbers_of
 from diffcloth_torch.checks import (
     POSITIVE,
     FloatArray,
@@ -21,8 +22,7 @@ from diffcloth_torch.checks import (
     float_array,
 )
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.sim.state import State, check_state
-from diffcloth_torch.transforms import numbers_of
+from diffcloth_torch.sim.records.state import State, check_state
 
 __all__ = [
     "Comparison",

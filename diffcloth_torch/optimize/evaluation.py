@@ -19,7 +19,7 @@ from diffcloth_torch.errors import (
 )
 from diffcloth_torch.operations import operation
 from diffcloth_torch.optimize.statistics import rollout_statistics
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["Evaluation", "Loss", "Simulate", "Variables", "copies", "evaluate"]
 

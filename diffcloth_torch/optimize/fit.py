@@ -36,7 +36,7 @@ from diffcloth_torch.optimize.problem import FAILURES, Residuals, Trial, paramet
 from diffcloth_torch.optimize.starts import Job, Stage, Start, judge, run_all
 from diffcloth_torch.optimize.uncertainty import Direction, noise_of, uncertainty_of
 from diffcloth_torch.optimize.variables import Space, Variable
-from diffcloth_torch.sim.controls import Parameters
+from diffcloth_torch.sim.records.controls import Parameters
 
 __all__ = ["Direction", "Fit", "Stage", "Start", "Trial", "fit"]
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
+from diffcloth_torch.autograd.transforms import numbers_of
 from diffcloth_torch.checks import (
     FloatArray,
     check_bool,
@@ -28,8 +29,7 @@ from diffcloth_torch.optimize.compared import (
     positions_of,
     times_of,
 )
-from diffcloth_torch.sim.state import State
-from diffcloth_torch.transforms import numbers_of
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["outline", "silhouettes"]
 

@@ -20,7 +20,7 @@ from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InadmissibleMaterial, InvalidInput, SimulationError
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.variables import Space
-from diffcloth_torch.sim.controls import Parameters
+from diffcloth_torch.sim.records.controls import Parameters
 
 __all__ = [
     "FAILURES",

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from diffcloth_torch.autograd.transforms import numbers_of
 from diffcloth_torch.checks import (
     NON_NEGATIVE,
     check_finite,
@@ -28,8 +29,7 @@ from diffcloth_torch.optimize.compared import (
     times_of,
 )
 from diffcloth_torch.optimize.outlines import outline
-from diffcloth_torch.sim.state import State
-from diffcloth_torch.transforms import numbers_of
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["markers", "outline", "point_cloud"]
 

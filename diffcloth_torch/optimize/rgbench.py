@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 
+from diffcloth_torch.autograd.transforms import numbers_of
 from diffcloth_torch.checks import (
     ANY_NUMBER,
     NON_NEGATIVE,
@@ -43,8 +44,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path, read_regular_file
 from diffcloth_torch.geometry.pcd import read_pcd
 from diffcloth_torch.optimize.compared import check_count_of, checked_points, positions_of
-from diffcloth_torch.sim.state import State
-from diffcloth_torch.transforms import numbers_of
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["BASES", "Capture", "chamfer", "nearest_vertices", "read_capture"]
 

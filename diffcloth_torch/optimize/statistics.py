@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
-from diffcloth_torch.sim.report import Report
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.report import Report
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["finite_or_none", "reports_of", "rollout_statistics"]
 

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from diffcloth_torch.autograd.transforms import in_backward_transform, numbers_of
 from diffcloth_torch.checks import check_count
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.sim.controls import Control, Parameters, tensors_of
-from diffcloth_torch.sim.state import State
-from diffcloth_torch.sim.trajectory import Trajectory
-from diffcloth_torch.transforms import in_backward_transform, numbers_of
+from diffcloth_torch.sim.records.controls import Control, Parameters, tensors_of
+from diffcloth_torch.sim.records.state import State
+from diffcloth_torch.sim.records.trajectory import Trajectory
 
 __all__ = ["Controls", "StepParameters", "roll_out"]
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from diffcloth_torch.autograd.guards import guarded
 from diffcloth_torch.checks import check_choice, check_count
 from diffcloth_torch.model.assembly import assemble
 from diffcloth_torch.model.defaults import has_barrier, has_contact, scene_parameters
@@ -21,20 +22,20 @@ from diffcloth_torch.model.options import (
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.operations import called
-from diffcloth_torch.sim.axes import without_axes
-from diffcloth_torch.sim.border import Border
-from diffcloth_torch.sim.control_fields import check_control
-from diffcloth_torch.sim.controls import Control, Parameters
-from diffcloth_torch.sim.cores import constants
-from diffcloth_torch.sim.engine import Engine
-from diffcloth_torch.sim.equilibrium import Equilibria
-from diffcloth_torch.sim.guards import guarded
-from diffcloth_torch.sim.layout import Layout
-from diffcloth_torch.sim.observables import Observables
-from diffcloth_torch.sim.outcome import make_report
-from diffcloth_torch.sim.parameter_fields import check_parameters, default_fields
+from diffcloth_torch.sim.inputs.axes import without_axes
+from diffcloth_torch.sim.inputs.border import Border
+from diffcloth_torch.sim.inputs.control_fields import check_control
+from diffcloth_torch.sim.inputs.layout import Layout
+from diffcloth_torch.sim.inputs.parameter_fields import check_parameters, default_fields
+from diffcloth_torch.sim.inputs.schemes import check_scheme
+from diffcloth_torch.sim.observables.observables import Observables
+from diffcloth_torch.sim.records.controls import Control, Parameters
+from diffcloth_torch.sim.records.state import State
+from diffcloth_torch.sim.records.trajectory import Trajectory
 from diffcloth_torch.sim.rollout import Controls, StepParameters, roll_out
-from diffcloth_torch.sim.schemes import check_scheme
+from diffcloth_torch.sim.solve.cores import constants
+from diffcloth_torch.sim.solve.engine import Engine
+from diffcloth_torch.sim.solve.outcome import make_report
 from diffcloth_torch.sim.start import (
     StartWatch,
     check_gains,
@@ -45,8 +46,7 @@ from diffcloth_torch.sim.start import (
     choose_slip_rates,
     initial_tensors,
 )
-from diffcloth_torch.sim.state import State
-from diffcloth_torch.sim.trajectory import Trajectory
+from diffcloth_torch.sim.statics.equilibrium import Equilibria
 
 __all__ = ["Simulator"]
 

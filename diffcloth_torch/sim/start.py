@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch import cpu
+from diffcloth_torch.autograd.core_function import failing_as
+from diffcloth_torch.autograd.transforms import outside_transforms, plain
 from diffcloth_torch.checks import POSITIVE, check_number
-from diffcloth_torch.core_functions import failing_as
 from diffcloth_torch.dynamics.limits import slip_rates
 from diffcloth_torch.errors import (
     BarrierStartWarning,
@@ -23,13 +24,12 @@ from diffcloth_torch.model.options import ContactOptions
 from diffcloth_torch.model.quantities import STATE, Fields, shape_of
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.operations import operation
-from diffcloth_torch.sim.border import Border, Given
-from diffcloth_torch.sim.cores import arrays_of
-from diffcloth_torch.sim.engine import Engine
-from diffcloth_torch.sim.layout import Layout
-from diffcloth_torch.sim.parameter_fields import default_fields
-from diffcloth_torch.sim.state import State
-from diffcloth_torch.transforms import outside_transforms, plain
+from diffcloth_torch.sim.inputs.border import Border, Given
+from diffcloth_torch.sim.inputs.layout import Layout
+from diffcloth_torch.sim.inputs.parameter_fields import default_fields
+from diffcloth_torch.sim.records.state import State
+from diffcloth_torch.sim.solve.cores import arrays_of
+from diffcloth_torch.sim.solve.engine import Engine
 
 __all__ = [
     "StartWatch",

@@ -18,7 +18,7 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.config.schema import RunConfig
 from diffcloth_torch.config.section import Positive
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.tasks.drape import Drape
 from diffcloth_torch.viewers.look import Goal, marker
 

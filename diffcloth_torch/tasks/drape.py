@@ -15,7 +15,7 @@ from diffcloth_torch.config.scenes import (
     step_control,
 )
 from diffcloth_torch.config.schema import RunConfig
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.tasks.optimization import Controller
 from diffcloth_torch.viewers.look import Goal
 

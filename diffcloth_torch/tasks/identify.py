@@ -28,8 +28,8 @@ from diffcloth_torch.optimize import residuals
 from diffcloth_torch.optimize.compared import noting
 from diffcloth_torch.optimize.outlines import silhouettes
 from diffcloth_torch.optimize.variables import Variable
-from diffcloth_torch.sim.controls import Parameters
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.controls import Parameters
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.tasks.drape import Drape
 from diffcloth_torch.viewers.fitted import Track
 

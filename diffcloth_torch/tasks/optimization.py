@@ -16,9 +16,9 @@ from diffcloth_torch.optimize.descent import Descent, descend
 from diffcloth_torch.optimize.evaluation import Evaluation, Simulate, Variables
 from diffcloth_torch.optimize.evaluation import evaluate as evaluate_variables
 from diffcloth_torch.optimize.progress import Progress
-from diffcloth_torch.sim.controls import Control
+from diffcloth_torch.sim.records.controls import Control
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.simulator import Simulator
-from diffcloth_torch.sim.state import State
 
 __all__ = [
     "Actions",

@@ -24,7 +24,7 @@ from diffcloth_torch import cpu
 from diffcloth_torch.config.scenes import Motions, PerStep
 from diffcloth_torch.config.section import Section, Vector3
 from diffcloth_torch.geometry.poses import transform
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.tasks.reach import (
     ActionSection,
     Reach,

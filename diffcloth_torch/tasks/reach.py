@@ -29,7 +29,7 @@ from diffcloth_torch.config.shape_schema import PoseSection
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.geometry.rotation import integrate_poses
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.tasks.optimization import Controller, OptimizerSection
 from diffcloth_torch.viewers.look import Goal
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from tqdm import tqdm
 
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.tasks.optimization import Actions
 from diffcloth_torch.tasks.task import Task
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from diffcloth_torch.optimize.statistics import finite_or_none, reports_of
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["replace_file", "step_records", "write_metrics"]
 

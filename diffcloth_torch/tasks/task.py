@@ -9,8 +9,8 @@ from torch import Tensor
 
 from diffcloth_torch.config.schema import RunConfig
 from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.simulator import Simulator
-from diffcloth_torch.sim.state import State
 from diffcloth_torch.tasks.optimization import Controller, OptimizerSection
 from diffcloth_torch.viewers.look import Goal
 

@@ -22,8 +22,8 @@ from diffcloth_torch.config.scene_schema import Selection
 from diffcloth_torch.config.scenes import Motions, select_vertices
 from diffcloth_torch.config.section import Positive, Section, Vector3
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.sim.controls import Control
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.controls import Control
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.tasks.optimization import Controller
 from diffcloth_torch.tasks.reach import (
     ActionSection,

@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.viewers.drawing import Drawing
 from diffcloth_torch.viewers.look import Camera, Goal, Paint
 from diffcloth_torch.viewers.motion import Motion

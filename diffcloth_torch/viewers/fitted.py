@@ -13,7 +13,7 @@ import numpy as np
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.viewers.drawing import Drawing
 from diffcloth_torch.viewers.look import Camera, Paint
 from diffcloth_torch.viewers.motion import Motion

@@ -7,7 +7,7 @@ from types import TracebackType
 
 from torch import Tensor
 
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["MeshSequence"]
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.viewers.layers import strain
 from diffcloth_torch.viewers.look import Goal
 from diffcloth_torch.viewers.shown import Bounds, Shown

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.viewers.labels import Entry, legend_strip, overview, write_time
 from diffcloth_torch.viewers.look import FORCE_COLOR, GOAL_COLOR, Goal, Paint, Pictures
 from diffcloth_torch.viewers.shown import Bounds, Shown

@@ -12,7 +12,7 @@ from diffcloth_torch.checks import POSITIVE, check_count, check_number
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.sim.state import State, check_state
+from diffcloth_torch.sim.records.state import State, check_state
 from diffcloth_torch.viewers.look import Camera, Pictures, checked_camera
 from diffcloth_torch.viewers.record import Record
 

@@ -8,7 +8,7 @@ from types import TracebackType
 
 from torch import Tensor
 
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.viewers.viewer import Viewer
 
 __all__ = ["Viewers"]

@@ -11,7 +11,7 @@ from torch import Tensor
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.viewers.browser import Browser
 from diffcloth_torch.viewers.look import Camera, Goal, checked_camera
 from diffcloth_torch.viewers.render import checked_states

@@ -17,8 +17,8 @@ from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.model.assembly import assemble
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.sim.state import State
-from diffcloth_torch.sim.surfaces import Surfaces, place
+from diffcloth_torch.sim.records.state import State
+from diffcloth_torch.sim.records.surfaces import Surfaces, place
 from diffcloth_torch.viewers.look import Goal, Paint
 
 __all__ = ["Bounds", "Rigid", "Shown"]

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from diffcloth_torch.sim.state import State
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["NullViewer", "Viewer"]
 

@@ -6,7 +6,7 @@ import torch
 import diffcloth_torch as dc
 from diffcloth_torch.model.assembly import assemble
 from diffcloth_torch.robots import GRIPPER
-from diffcloth_torch.sim.layout import Layout
+from diffcloth_torch.sim.inputs.layout import Layout
 
 F64 = torch.float64
 

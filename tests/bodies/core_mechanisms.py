@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import diffcloth_torch as dc
 from diffcloth_torch import _core
-from diffcloth_torch.sim.step import diagnostics_of
+from diffcloth_torch.sim.solve.step import diagnostics_of
 
 DT = 0.01
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2

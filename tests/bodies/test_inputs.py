@@ -8,10 +8,10 @@ from body_scenes import F64, make_scene
 import diffcloth_torch as dc
 from diffcloth_torch.model.assembly import assemble
 from diffcloth_torch.model.defaults import scene_parameters
-from diffcloth_torch.sim.control_fields import check_control, control_fields
-from diffcloth_torch.sim.layout import Layout
-from diffcloth_torch.sim.parameter_fields import default_fields, parameter_fields
-from diffcloth_torch.sim.state_fields import state_fields
+from diffcloth_torch.sim.inputs.control_fields import check_control, control_fields
+from diffcloth_torch.sim.inputs.layout import Layout
+from diffcloth_torch.sim.inputs.parameter_fields import default_fields, parameter_fields
+from diffcloth_torch.sim.inputs.state_fields import state_fields
 
 JOINTS = ("arm/slide", "arm/turn", "arm/spin", "hold/left_finger_joint", "hold/right_finger_joint")
 SLIDE, TURN, SPIN, LEFT, RIGHT = range(5)

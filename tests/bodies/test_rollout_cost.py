@@ -7,7 +7,7 @@ import torch
 
 import diffcloth_torch as dc
 from diffcloth_torch.robots import GRIPPER
-from diffcloth_torch.sim import engine
+from diffcloth_torch.sim.solve import engine
 
 STEPS = 200
 WINDOW = 20

@@ -9,7 +9,7 @@ from parallel_scenes import batch, simulator
 
 import diffcloth_torch as dc
 from diffcloth_torch import _core
-from diffcloth_torch.core_functions import as_array
+from diffcloth_torch.autograd.core_function import as_array
 
 
 def test_factors_are_kept_up_to_a_number_of_bytes():

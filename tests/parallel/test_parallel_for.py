@@ -55,7 +55,7 @@ WITHOUT_THREADS = """
     import torch
     import diffcloth_torch as dc
     from diffcloth_torch import _kernels
-    from diffcloth_torch.sim import step
+    from diffcloth_torch.sim.solve import step
 
     try:
         threading.Thread(target=int).start()

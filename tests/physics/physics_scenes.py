@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from diffcloth_torch.core_functions import as_array
+from diffcloth_torch.autograd.core_function import as_array
 
 F64 = torch.float64
 WEIGHTLESS = (0.0, 0.0, 0.0)

@@ -6,9 +6,9 @@ import torch
 
 import diffcloth_torch as dc
 from diffcloth_torch import _core
-from diffcloth_torch.core_functions import as_array
-from diffcloth_torch.sim import cores
-from diffcloth_torch.sim.step import _OUTPUTS, diagnostics_of
+from diffcloth_torch.autograd.core_function import as_array
+from diffcloth_torch.sim.solve import cores
+from diffcloth_torch.sim.solve.step import _OUTPUTS, diagnostics_of
 
 F64 = torch.float64
 REFUSED = (ValueError, TypeError, RuntimeError, KeyError)

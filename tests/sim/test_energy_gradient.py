@@ -11,7 +11,7 @@ from differences import directions
 import diffcloth_torch as dc
 from diffcloth_torch import _core
 from diffcloth_torch.robots import GRIPPER
-from diffcloth_torch.sim.stored_energy import _STORES_NOTHING
+from diffcloth_torch.sim.observables.stored_energy import _STORES_NOTHING
 
 F64 = torch.float64
 STORED = ("stretch", "bending", "soft_pins", "contact")

@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from torch.utils.checkpoint import checkpoint
 
 import diffcloth_torch as dc
-from diffcloth_torch.sim import equilibrium
+from diffcloth_torch.sim.statics import equilibrium
 
 F64 = torch.float64
 TIGHT = dc.SolverOptions(tolerance=1e-9)

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import diffcloth_torch as dc
 from diffcloth_torch.robots import GRIPPER
-from diffcloth_torch.sim.surfaces import place
+from diffcloth_torch.sim.records.surfaces import place
 
 F64 = torch.float64
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.sim import cores
+from diffcloth_torch.sim.solve import cores
 
 
 def states(scheme):

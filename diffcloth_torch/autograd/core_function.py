@@ -1,0 +1,158 @@
+"""Functions of the core as operations of torch: values, tangents, and gradients."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from inspect import signature
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloth_torch import _core
+from diffcloth_torch._exit import note_caller
+from diffcloth_torch.autograd.linear_map import LinearMap, apply_map
+from diffcloth_torch.autograd.transforms import numbers_of, same_rows
+from diffcloth_torch.errors import InvalidInput, SimulationError
+
+__all__ = ["Arrays", "CoreFunction", "as_array", "evaluate", "failing_as"]
+
+Arrays = dict[str, NDArray[np.float64]]
+
+
+def as_array(tensor: Tensor) -> NDArray[np.float64]:
+    """Contiguous array of a tensor's numbers; shares its memory if possible."""
+    return np.ascontiguousarray(numbers_of(tensor))
+
+
+@contextmanager
+def failing_as(operation: str) -> Iterator[None]:
+    """Let failures of the core name the operation."""
+    try:
+        yield
+    except _core.SimulationError as error:
+        raise SimulationError(f"{operation}: {error}") from error
+
+
+class CoreFunction(ABC):
+    """A function of the core that is evaluated once, by `evaluate`.
+
+    Attributes:
+        owner: What messages say that it is.
+        names: Of its differentiable inputs.
+        tape: What its derivatives need beside these; the graph keeps it.
+    """
+
+    owner: str
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self.names = names
+        self.tape: dict[str, Tensor] = {}
+
+    @abstractmethod
+    def values(self, inputs: Arrays) -> tuple[Tensor, ...]:
+        """All outputs; fills the tape."""
+
+    @abstractmethod
+    def tangents(self, inputs: Arrays, tape: Arrays, given: Arrays, count: int) -> list[Tensor]:
+        """Those of all outputs, [count, ...], from those of some inputs, [count, ...]."""
+
+    @abstractmethod
+    def gradients(
+        self, inputs: Arrays, tape: Arrays, cotangents: list[Tensor], needs: list[str]
+    ) -> list[Tensor]:
+        """Those of some inputs, [losses, ...], from cotangents of all outputs, [losses, ...]."""
+
+
+def evaluate(function: CoreFunction, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    """Outputs of a function at its inputs, with a graph."""
+    outputs: tuple[Tensor, ...] = _Evaluate.apply(function, *inputs)
+    # From here on only the graph holds the tape: torch frees it after backward.
+    function.tape = {}
+    return outputs
+
+
+class _Evaluate(torch.autograd.Function):
+    @staticmethod
+    def forward(function, *tensors):
+        return function.values(dict(zip(function.names, map(as_array, tensors), strict=True)))
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        function, *tensors = inputs
+        # Saves the inputs, not their arrays, because their version counters notice edits in place.
+        saved = (*tensors, *function.tape.values())
+        ctx.save_for_backward(*saved)
+        ctx.save_for_forward(*saved)
+        ctx.function = function
+        ctx.saved_names = (*function.names, *function.tape)
+        ctx.saved_shapes = [t.shape for t in saved]
+        ctx.axes = output[0].ndim
+
+    @staticmethod
+    def vmap(info, in_dims, function, *tensors):
+        """All directions of `jacfwd` have copies of the same inputs: one evaluation serves them."""
+        outputs = _Evaluate.apply(function, *same_rows(tensors, in_dims[1:]))
+        return outputs, (None,) * len(outputs)
+
+    @staticmethod
+    def jvp(ctx, _, *tangents):
+        given = {n: t for n, t in zip(ctx.function.names, tangents, strict=True) if t is not None}
+        first = ctx.saved_shapes[ctx.saved_names.index(next(iter(given)))]
+        linear = LinearMap(
+            owner=ctx.function.owner,
+            kind="tangent",
+            saved_names=ctx.saved_names,
+            saved_shapes=ctx.saved_shapes,
+            axes=len(first),
+            rows=partial(_tangents, ctx, tuple(given)),
+        )
+        return apply_map(linear, ctx.saved_tensors, tuple(given.values()))
+
+    @staticmethod
+    def backward(ctx, *cotangents):
+        saved = ctx.saved_tensors  # first: raises torch's own error if the tape was freed
+        names = ctx.function.names
+        needs = [n for n, used in zip(names, ctx.needs_input_grad[1:], strict=True) if used]
+        linear = LinearMap(
+            owner=ctx.function.owner,
+            kind="gradient",
+            saved_names=ctx.saved_names,
+            saved_shapes=ctx.saved_shapes,
+            axes=ctx.axes,
+            rows=partial(_gradients, ctx, needs),
+        )
+        found = dict(zip(needs, apply_map(linear, saved, cotangents), strict=True))
+        return None, *(found.get(name) for name in names)
+
+
+# torch asks for it in every call, and inspect reads a function anew each time unless it is there.
+_Evaluate.forward.__signature__ = signature(_Evaluate.forward)  # type: ignore[attr-defined]
+
+
+def _tangents(ctx, given, saved, directions):
+    inputs, tape = _arrays(ctx, saved)
+    rows = dict(zip(given, map(as_array, directions), strict=True))
+    note_caller()
+    with failing_as("tangent"):
+        return ctx.function.tangents(inputs, tape, rows, len(directions[0]))
+
+
+def _gradients(ctx, needs, saved, losses):
+    inputs, tape = _arrays(ctx, saved)
+    note_caller()
+    try:
+        with failing_as("backward"):
+            return ctx.function.gradients(inputs, tape, losses, needs)
+    except ValueError as error:  # hooks on saved tensors have changed numbers
+        raise InvalidInput(f"backward: {error}") from error
+
+
+def _arrays(ctx, saved):
+    arrays = dict(zip(ctx.saved_names, map(as_array, saved), strict=True))
+    inputs = {name: arrays.pop(name) for name in ctx.function.names}
+    return inputs, arrays

@@ -1,0 +1,53 @@
+"""A wrapper of a simulator's methods: for their name, for lack of memory, and `torch.compile`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+
+from diffcloth_torch.autograd.torch_private import has_compiler
+from diffcloth_torch.operations import called
+
+__all__ = ["guarded"]
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+_UNCOMPILED: dict[Callable[..., Any], Callable[..., Any]] = {}
+
+
+def _uncompiled(method: Callable[P, T]) -> Callable[P, T]:
+    """The method, excluded from `torch.compile`: there is nothing to fuse in a step."""
+    # Code that compiles has imported the compiler already.
+    if not has_compiler():
+        return method
+    if method not in _UNCOMPILED:
+        _UNCOMPILED[method] = torch.compiler.disable(method)  # type: ignore[no-untyped-call]
+    return _UNCOMPILED[method]
+
+
+def guarded(method: Callable[P, T], name: str = "") -> Callable[P, T]:
+    """Name the operation in messages; raise torch's lack of memory as MemoryError, like NumPy.
+
+    Args:
+        method: What is called.
+        name: Name of the operation; by default that of the method.
+    """
+    operation = name or method.__name__
+
+    named = called(operation)(method)
+
+    @wraps(method)
+    def call(*args: P.args, **keywords: P.kwargs) -> T:
+        try:
+            return _uncompiled(named)(*args, **keywords)
+        except RuntimeError as error:
+            if "can't allocate memory" in str(error):
+                raise MemoryError(f"{operation}: {error}") from error
+            raise
+
+    return call

@@ -1,0 +1,95 @@
+"""All uses of names that torch does not document; no other module has any.
+
+Public torch reports neither the transforms of `torch.func` around a call, nor the numbers inside
+their wrappers, nor the older vmap of `is_grads_batched`. `tests/autograd/test_torch_private.py`
+checks each function against the public behavior that it depends on; run it with a new torch first.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import torch
+from torch import Tensor
+from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack as outside_transforms
+from torch.autograd import forward_ad
+
+__all__ = [
+    "has_compiler",
+    "in_forward_mode",
+    "in_transform",
+    "is_batched_by_older_vmap",
+    "is_wrapped",
+    "outside_transforms",
+    "saved_tensor_hooks_are_allowed",
+    "transforms",
+    "unwrap",
+    "with_older_axis",
+    "without_older_axis",
+]
+
+_functorch = torch._C._functorch
+
+
+def in_transform() -> bool:
+    """Whether a transform of `torch.func` or `torch.vmap` is active."""
+    active: bool = torch._C._are_functorch_transforms_active()
+    return active
+
+
+def transforms() -> list[bool]:
+    """Active transforms from the outermost inwards: true for `grad`, `vjp` and `jacrev`."""
+    stack = _functorch.get_interpreter_stack() or []
+    return [level.key() == _functorch.TransformType.Grad for level in stack]
+
+
+def in_forward_mode() -> bool:
+    """Whether a level of forward-mode differentiation is open."""
+    return forward_ad._current_level >= 0
+
+
+def is_wrapped(tensor: Tensor) -> bool:
+    """Whether a tensor is a transform's wrapper, without memory of its own."""
+    wrapped: bool = _functorch.is_functorch_wrapped_tensor(tensor)
+    return wrapped
+
+
+def unwrap(tensor: Tensor) -> tuple[Tensor, int | None]:
+    """The tensor inside of a wrapper, and its axis of `torch.vmap`, None for other transforms."""
+    axis: int = _functorch.maybe_get_bdim(tensor)
+    return _functorch.get_unwrapped(tensor), None if axis < 0 else axis
+
+
+def is_batched_by_older_vmap(tensor: Tensor) -> bool:
+    """Whether a tensor is batched by the vmap of `is_grads_batched` and vectorized Jacobians."""
+    batched: bool = _functorch.is_legacy_batchedtensor(tensor)
+    return batched
+
+
+def _older_level() -> int:
+    """Level of the older vmap that is active."""
+    level: int = torch._C._vmapmode_increment_nesting() - 1
+    torch._C._vmapmode_decrement_nesting()
+    return level
+
+
+def without_older_axis(tensor: Tensor, count: int = 1) -> Tensor:
+    """Rows [count, ...] of a tensor of the older vmap; equal rows of a tensor without its axis."""
+    return torch._remove_batch_dim(tensor, _older_level(), count, 0)
+
+
+def with_older_axis(rows: Tensor) -> Tensor:
+    """Inverse of `without_older_axis`."""
+    return torch._add_batch_dim(rows, 0, _older_level())
+
+
+def saved_tensor_hooks_are_allowed() -> bool:
+    """Whether hooks on saved tensors may be set; reverse-mode transforms forbid them."""
+    # Absent from torch's stubs.
+    allowed: bool = torch._C._autograd._saved_tensors_hooks_is_enabled()  # type: ignore[attr-defined]
+    return allowed
+
+
+def has_compiler() -> bool:
+    """Whether the compiler has been imported; its import takes longer than the rest of torch."""
+    return hasattr(sys.modules.get("torch._dynamo"), "disable")

@@ -1,0 +1,132 @@
+"""The numbers of tensors that are being differentiated, also inside transforms of `torch.func`.
+
+What is computed outside torch reads numbers, and gives them their derivative again by a function of
+its own. Inside `torch.func.jvp` and the like a tensor is a wrapper without memory, and in
+`torch.func.jacfwd` it has one equal copy for each direction besides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from diffcloth_torch.autograd import torch_private
+from diffcloth_torch.autograd.torch_private import outside_transforms
+
+__all__ = [
+    "has_derivative",
+    "in_backward_transform",
+    "is_dense",
+    "is_differentiated",
+    "is_plain",
+    "numbers_of",
+    "outside_transforms",
+    "plain",
+    "same_rows",
+]
+
+_CLOSE = 1e-13  # relative; batched products round by their batch
+_ONE_TRANSFORM = 2  # most interpreters of one: `jacfwd` is a vmap of a jvp
+
+
+def is_dense(value: Tensor) -> bool:
+    """Whether a tensor is one plain block of memory; nested and sparse ones are not."""
+    return not value.is_nested and value.layout == torch.strided
+
+
+def is_plain(tensor: Tensor) -> bool:
+    """Whether a tensor has memory of its own: no transform is at work."""
+    return not torch_private.is_wrapped(tensor)
+
+
+def plain(tensor: Tensor) -> Tensor:
+    """The numbers of a tensor as a tensor outside of all transforms, without graph or tangent.
+
+    Raises:
+        NotImplementedError: If `torch.vmap` gives it different numbers in one call.
+    """
+    value = tensor
+    with outside_transforms():
+        while not is_plain(value):
+            inner, axis = torch_private.unwrap(value)
+            value = inner if axis is None else _same_row(inner, axis)
+        return value.detach()
+
+
+def same_rows(tensors: Sequence[Tensor], axes: Sequence[int | None]) -> list[Tensor]:
+    """Tensors without the axes of a vmap, along which all are equal but for rounding.
+
+    Raises:
+        NotImplementedError: If they are not.
+    """
+    pairs = zip(tensors, axes, strict=True)
+    return [t if axis is None else _same_row(t, axis) for t, axis in pairs]
+
+
+def _same_row(tensor: Tensor, axis: int) -> Tensor:
+    rows = tensor.movedim(axis, 0)
+    first = rows[0]
+    if is_plain(rows) and rows.stride(0):
+        values = rows.detach()
+        largest = values.abs().max() if values.numel() else 0.0
+        if not bool(((values - values[0]).abs() <= _CLOSE * largest).all()):
+            raise NotImplementedError(
+                "torch.vmap over states, controls or parameters is not supported: give them a "
+                "batch axis, initial_state(batch_size=...), as one call then has all environments"
+            )
+    return first
+
+
+def numbers_of(tensor: Tensor) -> NDArray[np.float64]:
+    """Array of a tensor's numbers; shares its memory, without its graph."""
+    if is_plain(tensor) and not torch_private.in_transform():
+        return tensor.detach().numpy()
+    value = plain(tensor)
+    with outside_transforms():
+        return value.numpy()
+
+
+def in_backward_transform() -> bool:
+    """Whether `torch.func.grad`, `vjp` or `jacrev` is at work."""
+    return any(torch_private.transforms())
+
+
+def has_derivative(tensor: Tensor) -> bool:
+    """Whether a tensor is being differentiated; one that is made inside a transform need not be.
+
+    Inside transforms of transforms it is not known, and taken as true.
+    """
+    if tensor.requires_grad or _has_tangent(tensor):
+        return True
+    if is_plain(tensor):
+        return False
+    if len(torch_private.transforms()) > _ONE_TRANSFORM:
+        return True
+    value = tensor
+    with outside_transforms():
+        while not is_plain(value):
+            value, _ = torch_private.unwrap(value)
+            if value.requires_grad:
+                return True
+    return False
+
+
+def is_differentiated(tensors: Iterable[Tensor]) -> bool:
+    """Whether a derivative of one of these is wanted: backward, or forward."""
+    tensors = list(tensors)
+    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
+        return True
+    if not all(map(is_plain, tensors)):
+        return True
+    return any(map(_has_tangent, tensors))
+
+
+def _has_tangent(tensor: Tensor) -> bool:
+    unpack: Any = forward_ad.unpack_dual
+    return torch_private.in_forward_mode() and unpack(tensor).tangent is not None

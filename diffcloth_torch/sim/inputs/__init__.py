@@ -1,0 +1,1 @@
+"""Inputs of a step: checked, complete, and with a leading axis of environments."""

@@ -1,0 +1,54 @@
+"""Weights of attachments where a control says nothing, and what it may not leave out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from diffcloth_torch.autograd.transforms import numbers_of
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.operations import label
+from diffcloth_torch.sim.inputs.layout import Layout
+
+__all__ = ["Targets", "default_weights", "refuse_untargeted"]
+
+Targets = Tensor | Mapping[str, Tensor]
+"""A field of a control that is set: all rows, or some by name."""
+
+
+def default_weights(layout: Layout, targets: Targets | None) -> Tensor:
+    """One of every spring that has both ends, zero of those whose target is not set; [1, A]."""
+    unset = layout.zeros["attachment_weights"]
+    if targets is None:
+        return unset
+    return torch.from_numpy(_are_whole(layout, targets)).to(unset)[None]
+
+
+def refuse_untargeted(layout: Layout, weights: Tensor, targets: Targets | None) -> None:
+    """Refuse weights [B, A] that pull to targets that are not set.
+
+    Raises:
+        InvalidInput: If one is not zero.
+    """
+    whole = _are_whole(layout, targets)
+    for name in layout.assembly.springs.target_groups:
+        springs = layout.assembly.springs.groups[name]
+        if not whole[springs].all() and numbers_of(weights)[:, springs].any():
+            raise InvalidInput(
+                f"{label('control', 'attachments')} must set the target of {name!r}, whose "
+                "weight is not zero"
+            )
+
+
+def _are_whole(layout: Layout, targets: Targets | None) -> NDArray[np.bool_]:
+    """Which springs have both ends; numbers, which no transform of torch wraps."""
+    springs = layout.assembly.springs
+    whole = np.asarray(springs.targets < 0)
+    names = springs.target_groups if isinstance(targets, Tensor) else targets or ()
+    for name in names:
+        whole[springs.groups[name]] = True
+    return whole

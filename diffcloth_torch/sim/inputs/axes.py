@@ -1,0 +1,52 @@
+"""The leading axis of environments: added to what a caller passes, removed from what it gets.
+
+Inside `sim/` every value of a state, a control, parameters or an outcome has it. It has as many
+rows as the state has environments (one for a state without a batch axis), or one row for a value
+that all environments share.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from diffcloth_torch.errors import InvalidInput
+
+__all__ = ["with_axis", "without_axes", "without_axis"]
+
+
+def with_axis(name: str, tensor: Tensor, dimensions: int, batch: int | None) -> Tensor:
+    """Give a tensor of checked shape its leading axis.
+
+    Args:
+        name: Opens a message.
+        tensor: Tensor of `dimensions` axes, or one more for the environments.
+        dimensions: Number of axes of the value of one environment.
+        batch: Number of environments of the state, None if it has no batch axis.
+    """
+    if tensor.dim() == dimensions:
+        return tensor.unsqueeze(0)
+    if batch is None:
+        raise InvalidInput(
+            f"{name} has a batch axis, {list(tensor.shape)}, but the state has none; "
+            "make the state with initial_state(batch_size=...)"
+        )
+    if len(tensor) != batch:
+        raise InvalidInput(
+            f"{name} must have {batch} environments, as the state, got {list(tensor.shape)}"
+        )
+    return tensor
+
+
+def without_axis(tensor: Tensor, batch: int | None) -> Tensor:
+    """Copy rows [B or 1, ...] for a caller; without the leading axis if `batch` is None.
+
+    The copy shares no storage with what the caller passed or with what is kept here.
+    """
+    rows = tensor[0] if batch is None else tensor.expand(batch, *tensor.shape[1:])
+    return rows.clone(memory_format=torch.contiguous_format)
+
+
+def without_axes(named: dict[str, Tensor], batch: int | None) -> dict[str, Tensor]:
+    """Apply `without_axis` to values by name."""
+    return {name: without_axis(tensor, batch) for name, tensor in named.items()}

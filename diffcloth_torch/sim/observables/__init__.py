@@ -1,0 +1,1 @@
+"""Quantities of a state: energy, momentum, poses and velocities of links, wrenches."""

@@ -1,0 +1,1 @@
+"""Records that callers hold: states, controls, parameters, reports and trajectories."""

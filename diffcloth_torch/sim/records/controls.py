@@ -1,0 +1,213 @@
+"""What a caller sets in a step: targets for its end, forces, and physical parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, is_dataclass, replace
+from typing import Any
+
+from torch import Tensor
+
+from diffcloth_torch._saved import allow_loading
+from diffcloth_torch.model.quantities import CONTROL, PARAMETERS
+from diffcloth_torch.reprs import field_text, record_text
+from diffcloth_torch.sim.records.state import check_field_names
+
+__all__ = ["Control", "Parameters", "tensors_of"]
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """Targets for the end of a step, and forces during it. A target that is None holds.
+
+    Every tensor may have a leading batch axis; without one it applies to all environments.
+
+    Attributes:
+        pins: Positions of the pinned vertices [m], shape [P, 3], or "cloth/pin" (or "pin" if that
+            is unique) -> positions; pins that are not named stay in place.
+        soft_pins: Positions to which the soft pins pull [m], shape [Q, 3], or likewise by name.
+        body_poses: [px, py, pz, qw, qx, qy, qz] of each body, shape [K, 7], or body -> pose [7];
+            the row of a body that is not kinematic must equal that of the state.
+        forces: Forces on the cloth vertices [N], shape [N, 3]; none by default.
+        body_wrenches: Force at the center of mass of each dynamic body, then torque, in world axes
+            [N, N m], shape [K, 6], or body -> wrench [6]; must be zero for a body that is not
+            dynamic.
+        joint_positions: Targets of position and pd joints [rad or m], shape [J], or "robot/joint"
+            (or "joint" if that is unique) -> number; rows of other joints are ignored, here and in
+            the next two, and pd joints that are not named keep their last target.
+        joint_velocities: Targets of velocity and pd joints [rad/s or m/s], shape [J], or likewise
+            by name; zero by default.
+        joint_efforts: Efforts of torque joints, and efforts added to those of pd drives [N m or N],
+            shape [J], or likewise by name; zero by default. What is beyond the limits of a joint
+            does not act.
+        base_poses: Frames of the robots' root links, shape [R, 7], or robot -> pose [7]; the row of
+            a robot whose base is not kinematic must equal that of the state.
+        base_wrenches: Force at the center of mass of each floating root link, then torque, in world
+            axes [N, N m], shape [R, 6], or robot -> wrench [6]; must be zero for a base that is not
+            floating.
+        attachments: Targets of the attachments that have some [m], shape [U, 3], or attachment ->
+            targets [n, 3]. Those that are not set are released.
+        attachment_weights: Share of the stiffness with which the springs of attachments pull [-],
+            between 0 (released) and 1, shape [A], or attachment -> weights [n]; 1 by default, and
+            0 where a target is not set.
+        wind: Velocity of the air around the cloths [m/s], shape [3]; none by default. Faces whose
+            material has drag feel it.
+    """
+
+    pins: Tensor | Mapping[str, Tensor] | None = None
+    soft_pins: Tensor | Mapping[str, Tensor] | None = None
+    body_poses: Tensor | Mapping[str, Tensor] | None = None
+    forces: Tensor | None = None
+    body_wrenches: Tensor | Mapping[str, Tensor] | None = None
+    joint_positions: Tensor | Mapping[str, Tensor] | None = None
+    joint_velocities: Tensor | Mapping[str, Tensor] | None = None
+    joint_efforts: Tensor | Mapping[str, Tensor] | None = None
+    base_poses: Tensor | Mapping[str, Tensor] | None = None
+    base_wrenches: Tensor | Mapping[str, Tensor] | None = None
+    attachments: Tensor | Mapping[str, Tensor] | None = None
+    attachment_weights: Tensor | Mapping[str, Tensor] | None = None
+    wind: Tensor | None = None
+
+    def __repr__(self) -> str:
+        return _text(self, CONTROL)
+
+    def replace(self, **changes: Any) -> Control:
+        """Copy with some fields replaced."""
+        check_field_names("Control.replace", self, changes)
+        return replace(self, **changes)
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """Physical parameters. A field that is None takes what the scene has, if anything.
+
+    Each may have a leading batch axis [B]. The friction and the barrier stiffness of a pair of
+    surfaces are the mean of its two entries.
+
+    What has rows may be given by names, as {"shirt": 300.0}: what is per cloth or face by cloths,
+    `thickness` by surfaces, `attachment_stiffness` by attachments, the rest by bodies, by
+    "robot/link" or by "robot/joint" (or the part behind the slash where it is unique, or a robot
+    for all of its rows). What is not named keeps
+    what the scene has.
+
+    Attributes:
+        stretch: Membrane stiffness [N/m], > 0; shape [], [C] or [F].
+        bending: Bending stiffness [N m], >= 0; shape [], [C] or [F].
+        poisson: Poisson ratio of bending [-], between -1 and 0.5; shape [], [C] or [F].
+        density: Mass per rest area [kg/m^2], > 0; shape [], [C] or [F].
+        damping: Time over which strain rates are damped [s], >= 0; shape [], [C] or [F].
+        friction: Friction coefficient [-], >= 0; shape [] or [S, S], or pair of names of surfaces,
+            in either order, -> number, as {("cloth", "table"): 0.4}; pairs that are not named keep
+            the values of the scene.
+        thickness: Full thickness of each surface [m], >= 0; shape [S].
+        barrier_stiffness: Stiffness of the barrier [Pa], > 0; shape [] or [S, S].
+        barrier_distance: Distance at which the barrier begins [m], > 0; shape [].
+        slip_velocity: Velocity at which sticking turns into sliding [m/s], > 0; shape [].
+        pin_stiffness: Stiffness of the soft pins [N/m], > 0; shape [] or [C].
+        gravity: Acceleration of gravity [m/s^2], shape [3].
+        rest_positions: Stress-free positions of the cloth vertices [m], shape [N, 3].
+        attachment_stiffness: Of the springs of attachments [N/m], > 0, shape [A].
+        normal_drag: Coefficient of the pressure of air across faces [-], >= 0; shape [], [C] or
+            [F].
+        tangential_drag: Coefficient of the friction of air along faces [-], >= 0; shape [], [C] or
+            [F].
+        air_density: Density of the air [kg/m^3], >= 0; shape [].
+        body_mass: Mass of each body [kg], >= 0, > 0 where it is dynamic; shape [K]. This and the
+            next two are ignored where the body is not dynamic.
+        body_center: Its center of mass, in its frame [m], shape [K, 3].
+        body_inertia: Its inertia about that center, in the axes of its frame [kg m^2]; the
+            symmetric part is meant and must be positive definite; shape [K, 3, 3].
+        link_mass: Mass of each link [kg], >= 0, shape [L].
+        link_center: Center of mass of each link, in its frame [m], shape [L, 3].
+        link_inertia: Inertia of each link about that center, in the axes of its frame [kg m^2];
+            only the symmetric part counts; shape [L, 3, 3].
+        joint_stiffness: Stiffness of pd drives [N m/rad or N/m], >= 0, shape [J].
+        joint_damping: Damping of pd drives [N m s/rad or N s/m], >= 0, shape [J].
+        joint_viscosity: Damping of the joints themselves [N m s/rad or N s/m], >= 0, shape [J].
+        joint_armature: Inertia of the drives, seen at the joints [kg m^2 or kg], >= 0, shape [J].
+        stretch_weft: Membrane stiffness of woven cloth along its weft [N/m], > 0; shape [], [C] or
+            [F]. This and the next three exist where a material sets one of the kind; then
+            `stretch` and `bending` are those along the warp, also of cloths that are isotropic,
+            which keep their own numbers here.
+        stretch_shear: Membrane stiffness of woven cloth in shear [N/m], > 0; shape [], [C] or [F].
+        bending_weft: Bending stiffness of woven cloth along its weft [N m], >= 0; shape [], [C] or
+            [F]; > 0 where `bending` is.
+        bending_twill: Bending stiffness of woven cloth at 45 degrees [N m], >= 0; shape [], [C] or
+            [F]; at least (bending + bending_weft + 2 poisson sqrt(bending bending_weft)) / 4.
+        joint_effort_limits: Largest efforts of pd drives, and of what is applied to torque joints
+            [N m or N], > 0, shape [J]; 1e30 where there is no limit.
+        joint_velocity_limits: Largest speeds of pd and torque joints [rad/s or m/s], > 0, shape
+            [J], likewise.
+        joint_friction: Coulomb friction of these joints [N m or N], >= 0, shape [J].
+        joint_slip_rates: Speeds at which sticking joints turn into sliding ones [rad/s or m/s],
+            > 0, shape [J]; by default those at which the joint moves what it carries by
+            `ContactOptions.slip_velocity`, at the radius of gyration about its axis.
+    """
+
+    stretch: Tensor | None = None
+    bending: Tensor | None = None
+    poisson: Tensor | None = None
+    density: Tensor | None = None
+    damping: Tensor | None = None
+    friction: Tensor | Mapping[tuple[str, str], Tensor] | None = None
+    thickness: Tensor | None = None
+    barrier_stiffness: Tensor | None = None
+    barrier_distance: Tensor | None = None
+    slip_velocity: Tensor | None = None
+    pin_stiffness: Tensor | None = None
+    gravity: Tensor | None = None
+    rest_positions: Tensor | None = None
+    attachment_stiffness: Tensor | None = None
+    normal_drag: Tensor | None = None
+    tangential_drag: Tensor | None = None
+    air_density: Tensor | None = None
+    body_mass: Tensor | None = None
+    body_center: Tensor | None = None
+    body_inertia: Tensor | None = None
+    link_mass: Tensor | None = None
+    link_center: Tensor | None = None
+    link_inertia: Tensor | None = None
+    joint_stiffness: Tensor | None = None
+    joint_damping: Tensor | None = None
+    joint_viscosity: Tensor | None = None
+    joint_armature: Tensor | None = None
+    stretch_weft: Tensor | None = None
+    stretch_shear: Tensor | None = None
+    bending_weft: Tensor | None = None
+    bending_twill: Tensor | None = None
+    joint_effort_limits: Tensor | None = None
+    joint_velocity_limits: Tensor | None = None
+    joint_friction: Tensor | None = None
+    joint_slip_rates: Tensor | None = None
+    # Fields that a simulator made without a batch axis: their [C] or [F] is never read as [B].
+    _unbatched: tuple[str, ...] = field(default=(), repr=False)
+
+    def __repr__(self) -> str:
+        return _text(self, PARAMETERS)
+
+    def replace(self, **changes: Any) -> Parameters:
+        """Copy with some fields replaced."""
+        check_field_names("Parameters.replace", self, changes)
+        unbatched = tuple(name for name in self._unbatched if name not in changes)
+        return replace(self, **changes, _unbatched=unbatched)
+
+
+def _text(record: Control | Parameters, names: Iterable[str]) -> str:
+    """Describe the fields that a record sets."""
+    values = ((name, getattr(record, name)) for name in names)
+    parts = (field_text(name, value) for name, value in values if value is not None)
+    return record_text(type(record).__name__, parts)
+
+
+def tensors_of(record: Any) -> Iterator[Tensor]:
+    """Iterate over the tensors of a State, Control or Parameters; anything else has none."""
+    if not is_dataclass(record):
+        return
+    for value in vars(record).values():
+        if isinstance(value, Tensor):
+            yield value
+        elif isinstance(value, Mapping):
+            yield from (entry for entry in value.values() if isinstance(entry, Tensor))
+
+
+allow_loading(Control, Parameters)

@@ -1,0 +1,246 @@
+"""The report of a step: convergence, distances, contacts, time and counts."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffcloth_torch import cpu
+from diffcloth_torch._saved import allow_loading
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.reprs import record_text, value_text
+from diffcloth_torch.sim.records.contacts import Contacts
+
+__all__ = ["Report", "outcome_text"]
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """How a step went, in Python numbers, or in tensors of shape [B] in a batch.
+
+    Attributes:
+        converged: Whether every solve of the step ended in a local minimum: the exact Hessian is
+            positive definite there, and the Newton step is below the tolerance. For Projective
+            Dynamics, whether the residual is below the tolerance.
+        iterations: Newton iterations of all solves of the step, including its prescribed motion.
+        residual: Largest displacement of the last Newton step, as a velocity [m/s]; for Projective
+            Dynamics, the largest change of velocity by the residual force. The largest of them if
+            there are several solves.
+        minimum_distance: Smallest distance between mid-surfaces in contact [m], of smooth bodies
+            and links between the round surfaces, always above half the sum of their thicknesses;
+            infinite if nothing is within the barrier's reach.
+        contact_count: Contacts within the barrier distance: pairs of primitives between cloths;
+            between a cloth and a body, features that are not hidden behind nearer ones; in
+            "projective", vertices that stick or slip.
+        motion_fraction: Fraction of the prescribed motion that was completed, 1 for all of it.
+        seconds: Phase of the step -> time [s]; the phases add up to the time in the core, by the
+            clock of the wall, which also counts while other work has the processor.
+        counts: Event -> number of times: steps with the `exact` Hessian, `chord` steps with an
+            older factor, steps with a `projected` Hessian, Hessians of `negative_curvature`,
+            `local_global` iterations of Projective Dynamics, solves that they `left_to_newton`,
+            numeric `factorizations` including failed ones, those of them `in_doubles`, and symbolic
+            `analyses`; vertices in dry frictional contact that are `taking_off`, `sticking` and
+            `slipping`.
+        status: "converged", "not_converged", "infeasible_motion" or "turned_too_far"; in a batch a
+            tuple of B of them. In the report of an `IntersectingState`, environments that intersect
+            have "intersecting_state".
+        cpu_seconds: Processor time of the step in the core [s], of all threads that work on the
+            environment; NaN where it is not known.
+        contacts: Contacts by pairs of names of surfaces: `contacts["gripper/left", "shirt"]` has
+            `count` and `force`.
+    """
+
+    converged: bool | Tensor
+    iterations: int | Tensor
+    residual: float | Tensor
+    minimum_distance: float | Tensor
+    contact_count: int | Tensor
+    motion_fraction: float | Tensor
+    seconds: dict[str, float | Tensor]
+    counts: dict[str, int | Tensor] = field(default_factory=dict)
+    status: str | tuple[str, ...] = ()  # if left out, derived from `converged`
+    contacts: Contacts = field(default_factory=Contacts)
+    cpu_seconds: float | Tensor | None = None  # if left out, not known
+
+    def __post_init__(self) -> None:
+        if self.cpu_seconds is None:
+            object.__setattr__(self, "cpu_seconds", _unknown_like(self.residual))
+        # Reports may come from files: errors are raised here, not where the report is used.
+        for entry in _NUMERIC:
+            value = self.__dict__.get(entry)
+            table = value if entry in _TABLES else {None: value}
+            if not isinstance(table, dict):
+                kind = type(table).__name__
+                raise TypeError(f"Report: `{entry}` must be a dict of numbers, got {kind}")
+            for name, number in table.items():
+                if not isinstance(number, _NUMBERS):
+                    label = entry if name is None else f"{entry}[{name!r}]"
+                    kind = type(number).__name__
+                    raise TypeError(f"Report: `{label}` must be a number or a tensor, got {kind}")
+        if self.status == ():
+            object.__setattr__(self, "status", _status_by(self.converged))
+        status: Any = self.status
+        names = (status,) if isinstance(status, str) else status
+        contacts: Any = self.contacts
+        if not isinstance(contacts, Contacts):
+            kind = type(contacts).__name__
+            raise TypeError(f"Report: `contacts` must be Contacts, got {kind}")
+        if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
+            raise TypeError(f"Report: `status` must be a str or a tuple of them, got {names!r}")
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # Reports that earlier versions saved count nothing, have no status, or no processor time.
+        defaults = {"counts": {}, "status": (), "contacts": Contacts(), "cpu_seconds": None}
+        self.__dict__.update(defaults | state)
+        self.__post_init__()
+
+    def __repr__(self) -> str:
+        parts = [
+            f"{name}={_range_text(getattr(self, name))}" for name in _NUMERIC if name not in _TABLES
+        ]
+        if self.status != _status_by(self.converged):
+            parts.append(f"status={_status_text(self.status)}")
+        for table in _TABLES:
+            # Events that never happened are left out.
+            texts = {name: _range_text(number) for name, number in getattr(self, table).items()}
+            entries = [f"{name}: {text}" for name, text in texts.items() if text != "0"] or [""]
+            entries[0] = f"{table}={{{entries[0]}"
+            entries[-1] += "}"
+            parts += entries
+        return record_text("Report", parts)
+
+    def check_environments(self, owner: str, count: int | None) -> None:
+        """Require tensors of shape [count], or numbers where there is no batch axis."""
+        shape = [] if count is None else [count]
+        for name in (*_NUMERIC, "status"):
+            value = getattr(self, name)
+            for number in value.values() if name in _TABLES else [value]:
+                if list(np.shape(number)) != shape:
+                    raise InvalidInput(
+                        f"{owner}: `report.{name}` must have shape {shape}, as the state "
+                        f"has environments, got {list(np.shape(number))}"
+                    )
+
+    def select(self, index: int | slice | Tensor) -> Report:
+        """Report of one environment, or of several."""
+        contacts = self.contacts.select(index)
+        if isinstance(index, int):
+            return _combine(
+                lambda values: values[index].item(), [self], self.status[index], contacts
+            )
+        rows = cpu.arange(len(self.status))[index].tolist()
+        status = tuple(self.status[i] for i in rows)
+        return _combine(lambda values: values[index], [self], status, contacts)
+
+    @staticmethod
+    def stack(reports: Sequence[Report | None]) -> Report | None:
+        """Report of a batch from those of its environments; None if one of them is missing."""
+        present = [report for report in reports if report is not None]
+        if len(present) < len(reports) or len({_names(r) for r in present}) > 1:
+            return None
+        status = tuple(str(report.status) for report in present)
+        contacts = Contacts.stack([report.contacts for report in present])
+        return _combine(
+            lambda *values: torch.stack([cpu.as_tensor(v) for v in values]),
+            present,
+            status,
+            contacts,
+        )
+
+    @staticmethod
+    def where(mask: Tensor, a: Report | None, b: Report | None) -> Report | None:
+        """Take environments of `a` where `mask` is true, else of `b`; None if one is missing."""
+        if a is None or b is None or _names(a) != _names(b):
+            return None
+        names = [(r.status,) * len(mask) if isinstance(r.status, str) else r.status for r in (a, b)]
+        status = tuple(x if m else y for m, x, y in zip(mask.tolist(), *names, strict=True))
+        contacts = Contacts.where(mask, a.contacts, b.contacts)
+        return _combine(
+            lambda x, y: torch.where(mask, cpu.as_tensor(x), cpu.as_tensor(y)),
+            [a, b],
+            status,
+            contacts,
+        )
+
+
+def _unknown_like(residual: Any) -> Any:
+    """NaN for each environment."""
+    if isinstance(residual, Tensor):
+        return cpu.full(tuple(residual.shape), math.nan)
+    return math.nan
+
+
+def outcome_text(report: Report | None) -> str:
+    """Short text of a report, for use within another text."""
+    if report is None:
+        return "None"
+    names = ("converged", "iterations")
+    return f"Report({', '.join(f'{n}={_range_text(getattr(report, n))}' for n in names)}, ...)"
+
+
+def _range_text(values: Any) -> str:
+    """Text of a number, or of the range of the numbers of a batch."""
+    if not isinstance(values, Tensor) or values.dim() == 0 or values.numel() == 0:
+        return value_text(values)
+    if values.dtype == torch.bool and values.any() and not values.all():
+        return f"{int(values.sum())} of {values.numel()}"
+    low, high = (value_text(values.aminmax()[i].item()) for i in range(2))
+    return low if low == high else f"{low} .. {high}"
+
+
+def _status_text(status: str | tuple[str, ...]) -> str:
+    """Text of a status, or of how many environments have each status."""
+    if isinstance(status, str):
+        return repr(status)
+    return f"{{{', '.join(f'{name}: {n}' for name, n in Counter(status).items())}}}"
+
+
+def _status_by(converged: bool | Tensor) -> str | tuple[str, ...]:
+    """Status of steps of which only `converged` is known."""
+    names = ("not_converged", "converged")
+    if isinstance(converged, Tensor) and converged.dim() > 0:
+        return tuple(names[is_true] for is_true in converged.bool().flatten().tolist())
+    return names[bool(converged)]
+
+
+_FIELDS = tuple(entry.name for entry in fields(Report))
+_NUMERIC = tuple(name for name in _FIELDS if name not in ("status", "contacts"))
+_NUMBERS = (bool, int, float, Tensor)
+# Fields that hold several numbers by name.
+_TABLES = ("seconds", "counts")
+
+
+def _names(report: Report) -> tuple[tuple[str, ...], ...]:
+    return tuple(tuple(getattr(report, table)) for table in _TABLES)
+
+
+def _combine(
+    function: Callable[..., Any],
+    reports: Sequence[Report],
+    status: str | tuple[str, ...],
+    contacts: Contacts,
+) -> Report:
+    """Apply a function to each number of the given reports."""
+    plain = {
+        name: function(*(getattr(report, name) for report in reports))
+        for name in _NUMERIC
+        if name not in _TABLES
+    }
+    tables: dict[str, Any] = {
+        table: {
+            name: function(*(getattr(report, table)[name] for report in reports))
+            for name in getattr(reports[0], table)
+        }
+        for table in _TABLES
+    }
+    return Report(**plain, **tables, status=status, contacts=contacts)
+
+
+allow_loading(Report)

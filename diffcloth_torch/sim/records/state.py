@@ -1,0 +1,370 @@
+"""The state of a simulation: the tensors that a step takes and returns, with or without batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from diffcloth_torch import cpu
+from diffcloth_torch._saved import allow_loading
+from diffcloth_torch.autograd.transforms import is_dense
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.geometry.meshes import write_mesh
+from diffcloth_torch.model.quantities import STATE, shape_of
+from diffcloth_torch.reprs import field_text, record_text
+from diffcloth_torch.sim.records.report import Report, outcome_text
+
+# Saved states name them here, where they once were.
+from diffcloth_torch.sim.records.surfaces import LinkSurfaces, Surfaces
+
+__all__ = [
+    "LinkSurfaces",
+    "State",
+    "Surfaces",
+    "check_field_names",
+    "check_state",
+    "stack",
+    "where",
+]
+
+_BATCHED_DIMENSIONS = 3  # positions [B, N, 3]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Positions, velocities and forces at one time. All tensors may share a leading batch axis.
+
+    Attributes:
+        positions: Positions of the cloth vertices [m], shape [N, 3].
+        velocities: Velocities of the cloth vertices [m/s], shape [N, 3].
+        body_poses: [px, py, pz, qw, qx, qy, qz] of each body, shape [K, 7].
+        soft_pin_targets: Where the soft pins pull [m], shape [Q, 3].
+        body_forces: Forces of contact and attachments on the body vertices, of smooth ones on
+            four points that move with them, during the step that led here [N], shape [V, 3].
+        time: Time since the initial state [s], shape [].
+        report: Report of the step that led here; None in an initial state.
+        body_velocities: Velocity of each body's center of mass, then its angular velocity, in world
+            axes [m/s, rad/s], shape [K, 6]; zero if the body is static; a step ignores it unless
+            the body is dynamic.
+        joint_positions: Positions of the joints [rad or m], shape [J].
+        joint_velocities: Velocities of the joints [rad/s or m/s], shape [J].
+        joint_targets: Positions to which pd drives pull until a control changes them [rad or m],
+            shape [J].
+        joint_efforts: Efforts of the drives during the step that led here [N m or N], within their
+            limits and without the friction of the joints, shape [J]. For a prescribed joint, the
+            effort that its motion required against inertia, weights and contact, without the
+            joint's viscosity and the armature of its drive.
+        base_poses: Frame of each robot's root link, as in `body_poses`, shape [R, 7].
+        base_velocities: Velocity of the root link's center of mass, then its angular velocity, in
+            world axes [m/s, rad/s], shape [R, 6].
+        contact_forces: Contact forces on the cloth vertices during the step that led here, barrier
+            and friction [N], shape [N, 3].
+        pin_forces: Forces that held the pinned vertices during that step [N], shape [P, 3].
+    """
+
+    positions: Tensor
+    velocities: Tensor
+    body_poses: Tensor
+    soft_pin_targets: Tensor
+    body_forces: Tensor
+    time: Tensor
+    report: Report | None = None
+    # Never None: a field that is left out becomes rows of zeros.
+    body_velocities: Tensor = None  # type: ignore[assignment]
+    joint_positions: Tensor = None  # type: ignore[assignment]
+    joint_velocities: Tensor = None  # type: ignore[assignment]
+    joint_targets: Tensor = None  # type: ignore[assignment]
+    joint_efforts: Tensor = None  # type: ignore[assignment]
+    base_poses: Tensor = None  # type: ignore[assignment]
+    base_velocities: Tensor = None  # type: ignore[assignment]
+    contact_forces: Tensor = None  # type: ignore[assignment]
+    pin_forces: Tensor = None  # type: ignore[assignment]
+    _surfaces: Surfaces | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        missing = [name for name in _ADDED if getattr(self, name) is None]
+        if missing:
+            shape: tuple[int, ...] = getattr(self.body_poses, "shape", ())
+            environments = shape[:-2]
+            sizes = {"K": _row_count(self.body_poses), "N": _row_count(self.positions)}
+            for name in missing:
+                rows = shape_of(STATE[name].axes[0], {"J": 0, "R": 0, "P": 0, **sizes})
+                zeros = cpu.zeros(*environments, *rows)
+                object.__setattr__(self, name, zeros)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # States that the first version saved have no robots, and bodies without velocities.
+        self.__dict__.update(state)
+        self.__post_init__()
+
+    def __repr__(self) -> str:
+        # Tensors without rows, of things that the scene lacks, are left out.
+        tensors = {name: getattr(self, name) for name in ("time", *_TENSORS)}
+        there = {n: t for n, t in tensors.items() if not isinstance(t, Tensor) or t.numel()}
+        parts = [field_text(name, value) for name, value in there.items()]
+        parts.append(f"report={outcome_text(self.report)}")
+        if self.batch_size is not None:
+            parts.insert(0, f"batch_size={self.batch_size}")
+        return record_text("State", parts)
+
+    @property
+    def batch_size(self) -> int | None:
+        """Number of environments, None without a batch axis."""
+        batched = self.positions.dim() == _BATCHED_DIMENSIONS
+        return self.positions.shape[0] if batched else None
+
+    def replace(self, **changes: Any) -> State:
+        """Copy with some fields replaced; the other tensors are shared."""
+        check_field_names("State.replace", self, changes)
+        return replace(self, **changes)
+
+    def detach(self) -> State:
+        """Copy whose tensors carry no graph."""
+        return self._map(lambda tensor: tensor.detach(), self.report)
+
+    def clone(self) -> State:
+        """Copy that shares no memory; gradients flow to the original."""
+        return self._map(lambda tensor: tensor.clone(), self.report)
+
+    def meshes(self) -> dict[str, tuple[Tensor, Tensor]]:
+        """Place all surfaces in the world: cloths, bodies, and links that have collision shapes.
+
+        Returns:
+            For each surface, in the order of `Simulator.surfaces`, its name -> its vertices in the
+            world [m], shape [v, 3], or [B, v, 3] in a batch, differentiable in the state, and its
+            faces, shape [f, 3].
+
+        Raises:
+            InvalidInput: If the state was not made by a simulator.
+        """
+        check_state("meshes: the state", self)
+        return self._known_surfaces("meshes").meshes(vars(self))
+
+    def _known_surfaces(self, owner: str) -> Surfaces:
+        if self._surfaces is None:
+            raise InvalidInput(
+                f"{owner}: the state must come from a Simulator, which knows its faces"
+            )
+        return self._surfaces
+
+    def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> State:
+        """Select one environment of a batch, without the batch axis, or several as a batch.
+
+        Args:
+            index: An integer; or, for several, a slice, a list or tensor of integers, or a mask of
+                shape [B].
+
+        Raises:
+            InvalidInput: If the state has no batch axis, an integer is out of range, or a mask has
+                another length.
+            TypeError: If `index` is anything else.
+        """
+        check_state("state[i]", self)
+        chosen = _environments(index, self._require_batch("state[i]"))
+        report = None if self.report is None else self.report.select(chosen)
+        return self._map(lambda tensor: tensor[chosen], report)
+
+    def __len__(self) -> int:
+        """Number of environments."""
+        return self._require_batch("len(state)")
+
+    def __iter__(self) -> Iterator[State]:
+        """Iterate over the environments."""
+        return (self[i] for i in range(len(self)))
+
+    def __bool__(self) -> bool:
+        """Return True: `len` counts environments."""
+        return True
+
+    def export(self, path: str | Path, *, bodies: bool = False) -> None:
+        """Write the cloths as a mesh, with the vertices in the order of `positions`.
+
+        Args:
+            path: File ending in .obj (one object per surface) or .ply (all surfaces in one mesh).
+            bodies: Whether to write the bodies and links, at their poses, after the cloths.
+
+        Raises:
+            InvalidInput: If the state is a batch, was not made by a simulator, or `path` has
+                another ending.
+        """
+        check_state("export: the state", self)
+        if self.batch_size is not None:
+            raise InvalidInput("export: the state must be a single one; use state[i].export(...)")
+        plain, surfaces = vars(self.detach()), self._known_surfaces("export")
+        meshes = surfaces.meshes(plain) if bodies else surfaces.cloth_meshes(plain["positions"])
+        write_mesh(path, [(n, v.numpy(), f.numpy()) for n, (v, f) in meshes.items()])
+
+    def _require_batch(self, what: str) -> int:
+        if self.batch_size is None:
+            raise InvalidInput(f"{what}: the state must have a batch axis")
+        return self.batch_size
+
+    def _map(self, function: Callable[[Tensor], Tensor], report: Report | None) -> State:
+        tensors = {name: function(getattr(self, name)) for name in _TENSORS}
+        return State(**tensors, report=report, _surfaces=self._surfaces)
+
+
+_TENSORS = tuple(STATE)
+# Fields that states of the first version lack.
+_ADDED = _TENSORS[_TENSORS.index("body_velocities") :]
+
+
+def stack(states: Sequence[State]) -> State:
+    """Combine states without a batch axis into a batch; gradients flow to each of them.
+
+    Raises:
+        InvalidInput: If `states` is empty, one of them is already a batch, or their shapes differ.
+        TypeError: If an item is not a State, or has a field of a wrong type.
+    """
+    given: Any = states
+    if not isinstance(given, Sequence):
+        kind = type(given).__name__
+        raise TypeError(f"stack: `states` must be a sequence of states, got {kind}")
+    if len(states) == 0:
+        raise InvalidInput("stack: `states` must hold at least one state")
+    for i, state in enumerate(states):
+        check_state(f"stack: `states[{i}]`", state)
+        if state.batch_size is not None:
+            raise InvalidInput(f"stack: `states` must have no batch axis, got one at [{i}]")
+    tensors = {}
+    for name in _TENSORS:
+        parts = [getattr(state, name) for state in states]
+        for i, part in enumerate(parts):
+            if part.shape != parts[0].shape:
+                raise InvalidInput(
+                    f"stack: `{name}` must have the same shape in all states, "
+                    f"got {list(parts[0].shape)} at [0] and {list(part.shape)} at [{i}]"
+                )
+        tensors[name] = torch.stack(parts)
+    report = Report.stack([state.report for state in states])
+    return State(**tensors, report=report, _surfaces=states[0]._surfaces)
+
+
+def where(mask: Tensor, a: State, b: State) -> State:
+    """Take environment `i` from `a` if `mask[i]` is true, else from `b`.
+
+    Args:
+        mask: Booleans, shape [B].
+        a: A batch, or one state for all environments.
+        b: A batch, or one state for all environments.
+
+    Raises:
+        InvalidInput: If the batch sizes or other shapes differ.
+        TypeError: If `mask` is not a boolean tensor, or `a` or `b` is not a State.
+    """
+    _check_mask(mask)
+    for name, state in (("a", a), ("b", b)):
+        check_state(f"where: `{name}`", state)
+        if state.batch_size not in (None, len(mask)):
+            raise InvalidInput(
+                f"where: `{name}` must have {len(mask)} environments, as `mask`, "
+                f"got {state.batch_size}"
+            )
+    tensors = {}
+    for name in _TENSORS:
+        x, y = getattr(a, name), getattr(b, name)
+        shapes = [list(z.shape[state.batch_size is not None :]) for z, state in ((x, a), (y, b))]
+        if shapes[0] != shapes[1]:
+            raise InvalidInput(
+                f"where: `{name}` must have the same shape in both states, got {shapes[0]} in `a` "
+                f"and {shapes[1]} in `b`"
+            )
+        tensors[name] = torch.where(mask.reshape(-1, *[1] * len(shapes[0])), x, y)
+    report = Report.where(mask, a.report, b.report)
+    return State(**tensors, report=report, _surfaces=a._surfaces)
+
+
+def check_state(name: str, state: Any) -> None:
+    """Require a State whose fields have the right types and batch size: it may come from a file."""
+    if not isinstance(state, State):
+        raise TypeError(f"{name} must be a State, got {type(state).__name__}")
+    for entry in _TENSORS:
+        value = getattr(state, entry)
+        if not isinstance(value, Tensor) or not is_dense(value):
+            kind = "another layout" if isinstance(value, Tensor) else type(value).__name__
+            raise TypeError(f"{name}: `{entry}` must be a dense torch tensor, got {kind}")
+        if not value.is_cpu or not value.is_floating_point():
+            raise TypeError(
+                f"{name}: `{entry}` must be a tensor of real numbers on the CPU, got "
+                f"{value.dtype} on {value.device}"
+            )
+    batch = state.batch_size
+    for entry in _TENSORS:
+        shape = getattr(state, entry).shape
+        if batch is not None and shape[:1] != (batch,):
+            raise InvalidInput(
+                f"{name}: `{entry}` must have {batch} environments, as `positions`, "
+                f"got {list(shape)}"
+            )
+    report: Any = state.report
+    if report is not None:
+        if not isinstance(report, Report):
+            kind = type(report).__name__
+            raise TypeError(f"{name}: `report` must be a Report or None, got {kind}")
+        report.check_environments(name, batch)
+
+
+def _environments(index: Any, size: int) -> int | slice | Tensor:
+    """Check an index into a batch of `size` environments; lists and arrays become tensors."""
+    if isinstance(index, slice):
+        return index
+    if isinstance(index, int | np.integer) and not isinstance(index, bool):
+        if not -size <= index < size:
+            raise InvalidInput(f"state[i]: `i` must be in 0 .. {size - 1}, got {index}")
+        return int(index)
+    if not isinstance(index, Sequence | np.ndarray | Tensor) or isinstance(index, str | tuple):
+        raise TypeError(
+            "state[i]: `i` must be an integer, a slice, a list or a tensor, got "
+            f"{type(index).__name__}"
+        )
+    try:
+        is_empty = isinstance(index, Sequence) and not len(index)
+        rows = cpu.zeros(0, dtype=torch.int64) if is_empty else cpu.as_tensor(index)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"state[i]: `i` must be integers or a mask, got {index!r}") from error
+    if rows.is_floating_point() or rows.is_complex() or rows.ndim != 1 or not rows.is_cpu:
+        raise TypeError(
+            "state[i]: `i` must be integers or a mask, of one axis, on the CPU, got "
+            f"{rows.dtype} of shape {list(rows.shape)} on {rows.device}"
+        )
+    if rows.dtype == torch.bool:
+        if len(rows) != size:
+            raise InvalidInput(f"state[i]: a mask must have shape [{size}], got [{len(rows)}]")
+        return rows.nonzero()[:, 0]
+    wrong = (rows < -size) | (rows >= size)
+    if wrong.any():
+        at = int(wrong.nonzero()[0])
+        raise InvalidInput(
+            f"state[i]: `i` must be in 0 .. {size - 1}, got {int(rows[at])} at [{at}]"
+        )
+    return rows.to(torch.int64)
+
+
+def _row_count(tensor: Any) -> int:
+    """Number of rows of a tensor [.., rows, k]; 0 for anything else."""
+    shape: tuple[int, ...] = getattr(tensor, "shape", ())
+    return shape[-2] if len(shape) > 1 else 0
+
+
+def _check_mask(mask: object) -> None:
+    if not isinstance(mask, Tensor) or mask.dtype != torch.bool or not mask.is_cpu:
+        raise TypeError("where: `mask` must be a boolean tensor on the CPU")
+    if mask.dim() != 1:
+        raise InvalidInput(f"where: `mask` must have shape [B], got {list(mask.shape)}")
+
+
+def check_field_names(owner: str, instance: Any, changes: dict[str, Any]) -> None:
+    """Require that changes name public fields of a dataclass."""
+    accepted = [f.name for f in fields(instance) if not f.name.startswith("_")]
+    for name in changes:
+        if name not in accepted:
+            raise InvalidInput(f"{owner}: the fields are {', '.join(accepted)}; got {name!r}")
+
+
+allow_loading(State)

@@ -1,0 +1,1 @@
+"""One step of a scene on checked fields: cores, couplings and failures."""

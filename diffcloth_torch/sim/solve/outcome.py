@@ -1,0 +1,120 @@
+"""From the core's diagnostics to a report, or to the exception that a failed step raises."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from diffcloth_torch.errors import (
+    InfeasibleMotion,
+    IntersectingState,
+    NotConverged,
+    SimulationError,
+    TurnedTooFar,
+)
+from diffcloth_torch.operations import operation
+from diffcloth_torch.sim.records.contacts import Contacts
+from diffcloth_torch.sim.records.report import Report
+from diffcloth_torch.sim.solve.step import (
+    CONVERGED,
+    DIAGNOSTICS,
+    INFEASIBLE,
+    INTERSECTING,
+    TURNED,
+    UNCONVERGED,
+)
+
+__all__ = ["make_report", "raise_on_failure"]
+
+
+def _named(prefix: str) -> dict[str, str]:
+    """Name in a report -> full name, of the core's numbers with a prefix."""
+    return {n.removeprefix(prefix): n for n in DIAGNOSTICS if n.startswith(prefix)}
+
+
+# Texts of a report for the core's `status`.
+_NAMES = {
+    CONVERGED: "converged",
+    UNCONVERGED: "not_converged",
+    INFEASIBLE: "infeasible_motion",
+    INTERSECTING: "intersecting_state",
+    TURNED: "turned_too_far",
+}
+_SECONDS = _named("seconds_")
+_COUNTS = _named("count_")
+
+
+def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched: bool) -> Report:
+    """Put the core's numbers into a report, with the names of the surfaces."""
+
+    def value(numbers: list[Any]) -> Any:
+        return torch.from_numpy(np.array(numbers)) if batched else numbers[0]
+
+    names = tuple(_NAMES[status] for status in diagnostics["status"])
+    return Report(
+        converged=value([status == CONVERGED for status in diagnostics["status"]]),
+        iterations=value(diagnostics["iterations"]),
+        residual=value(diagnostics["residual"]),
+        minimum_distance=value(diagnostics["minimum_distance"]),
+        contact_count=value(diagnostics["contact_count"]),
+        motion_fraction=value(diagnostics["motion_fraction"]),
+        seconds={phase: value(diagnostics[name]) for phase, name in _SECONDS.items()},
+        cpu_seconds=value(diagnostics["cpu_seconds"]),
+        counts={what: value(diagnostics[name]) for what, name in _COUNTS.items()},
+        status=names if batched else names[0],
+        contacts=Contacts.of(
+            diagnostics["pairs"], diagnostics["points"], surfaces, batched=batched
+        ),
+    )
+
+
+def raise_on_failure(
+    diagnostics: dict[str, Any], report: Report, *, throw: bool, batched: bool
+) -> None:
+    """Raise the worst failure of any environment; without `throw` only one that leaves no state."""
+    status = np.array(diagnostics["status"])
+    failures: list[tuple[type[SimulationError], np.ndarray[Any, Any], str]] = [
+        (
+            IntersectingState,
+            status == INTERSECTING,
+            "surfaces overlap in the given state",
+        ),
+        (
+            InfeasibleMotion,
+            (status == INFEASIBLE) & throw,
+            "the prescribed motion was not completed; move bodies and pins less far in a step, or "
+            "make room for the cloth",
+        ),
+        (
+            NotConverged,
+            (status == UNCONVERGED) & throw,
+            "the solver stopped before its tolerance was reached",
+        ),
+        (
+            TurnedTooFar,
+            (status == TURNED) & throw,
+            "a body turns further than a step resolves",
+        ),
+    ]
+    for error, failed, sentence in failures:
+        environments = np.flatnonzero(failed).tolist()
+        if environments:
+            first = environments[0]
+            place = f"environments {environments}: " if batched else ""
+            detail = diagnostics["message"][first]
+            numbers = (
+                f"iterations {diagnostics['iterations'][first]}, residual "
+                f"{diagnostics['residual'][first]:.3g} m/s, motion fraction "
+                f"{_share(diagnostics['motion_fraction'][first])}"
+            )
+            text = f"{operation()}: {place}{sentence} ({detail + '; ' if detail else ''}{numbers})"
+            raise error(text, report=report, environments=environments)
+
+
+def _share(fraction: float) -> str:
+    """Three digits; what is less than one does not read as one."""
+    left = 1.0 - fraction
+    return f"1 - {left:.1g}" if 0.0 < left < 1e-3 else f"{fraction:.3g}"

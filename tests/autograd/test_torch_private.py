@@ -1,0 +1,119 @@
+"""Undocumented functions of torch against the public behavior that they stand for."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch.autograd import forward_ad
+from torch.autograd.graph import saved_tensors_hooks
+
+from diffcloth_torch.autograd import torch_private
+
+X = torch.arange(6.0, dtype=torch.float64).reshape(3, 2)
+
+
+def inside(transform):
+    """Observations inside a transform: its activity, the stack, and the wrapper of an argument."""
+    seen = []
+
+    def function(x):
+        inner, axis = torch_private.unwrap(x)
+        seen.append((torch_private.transforms(), axis, inner.shape))
+        assert torch_private.in_transform()
+        assert torch_private.is_wrapped(x)
+        with torch_private.outside_transforms():
+            assert not torch_private.in_transform()
+        assert torch_private.in_transform()
+        return (x * x).sum()
+
+    transform(function)(X)
+    return seen[0]
+
+
+@pytest.mark.parametrize(
+    ("transform", "stack", "axis", "shape"),
+    [
+        pytest.param(torch.func.grad, [True], None, (3, 2), id="grad"),
+        pytest.param(torch.func.jacrev, [True], None, (3, 2), id="jacrev"),
+        pytest.param(torch.vmap, [False], 0, (3, 2), id="vmap"),
+        pytest.param(lambda f: torch.vmap(f, in_dims=1), [False], 1, (3, 2), id="vmap-axis-1"),
+        pytest.param(
+            lambda f: torch.vmap(torch.func.grad(f)), [False, True], None, (2,), id="both"
+        ),
+    ],
+)
+def test_transforms_and_their_wrappers(transform, stack, axis, shape):
+    assert inside(transform) == (stack, axis, shape)
+
+
+def test_a_tensor_outside_of_transforms_is_not_wrapped():
+    assert not torch_private.in_transform()
+    assert torch_private.transforms() == []
+    assert not torch_private.is_wrapped(X)
+
+
+def test_forward_mode():
+    assert not torch_private.in_forward_mode()
+    with forward_ad.dual_level():
+        assert torch_private.in_forward_mode()
+    assert not torch_private.in_forward_mode()
+    seen = []
+    torch.func.jvp(lambda x: seen.append(torch_private.in_forward_mode()) or x, (X,), (X,))
+    assert seen == [True]
+
+
+class Watched(torch.autograd.Function):
+    """The identity; backward records the cotangent's rows and returns twice the cotangent."""
+
+    rows = None
+
+    @staticmethod
+    def forward(ctx, x):
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx, cotangent):
+        assert torch_private.is_batched_by_older_vmap(cotangent)
+        rows = torch_private.without_older_axis(cotangent)
+        fixed = torch_private.without_older_axis(X[0], len(rows))
+        assert torch.equal(fixed, X[:1].expand(len(rows), 2))
+        Watched.rows = rows.clone()
+        return torch_private.with_older_axis(2 * rows)
+
+
+def test_axis_of_the_older_vmap():
+    x = X[0].clone().requires_grad_()
+    (gradients,) = torch.autograd.grad(
+        Watched.apply(x), x, grad_outputs=X.clone(), is_grads_batched=True
+    )
+    assert torch.equal(Watched.rows, X)
+    assert torch.equal(gradients, 2 * X)
+    assert not torch_private.is_batched_by_older_vmap(X)
+
+
+def test_hooks_on_saved_tensors():
+    def function(x):
+        allowed = torch_private.saved_tensor_hooks_are_allowed()
+        if allowed:
+            with saved_tensors_hooks(lambda t: t, lambda t: t):
+                return (x * x).sum()
+        with pytest.raises(RuntimeError), saved_tensors_hooks(lambda t: t, lambda t: t):
+            (x * x).sum()
+        return (x * x).sum()
+
+    assert torch_private.saved_tensor_hooks_are_allowed()
+    function(X)
+    torch.func.grad(function)(X)
+    assert torch_private.saved_tensor_hooks_are_allowed()
+
+
+def test_the_compiler_is_seen_once_it_is_imported():
+    code = (
+        "from diffcloth_torch.autograd.torch_private import has_compiler\n"
+        "before = has_compiler()\n"
+        "import torch._dynamo\n"
+        "print(before, has_compiler())"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.split()[-1] == "True"
