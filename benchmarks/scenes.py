@@ -80,7 +80,7 @@ def _gap(n: int) -> float:
 def _upright(n: int, **keywords: object) -> dc.Cloth:
     vertices, faces = sheet(n)
     placed = np.stack([vertices[:, 0], np.zeros(n * n), 1.0 + vertices[:, 1]], axis=-1)
-    return dc.Cloth(placed, faces, rest_vertices=vertices, **keywords)
+    return dc.Cloth(placed, faces, rest_positions=vertices, **keywords)
 
 
 def hanging(n: int, **material: float) -> Scene:
@@ -182,7 +182,7 @@ def self_contact(n: int) -> Scene:
     folded = np.stack([vertices[:, 0], np.where(lower, s, -s), np.where(lower, 0.0, gap)], axis=-1)
     last = int(lower.reshape(n, n)[:, 0].sum()) - 1
     pins = {"edge": range(n), "fold": range(last * n, (last + 1) * n)}
-    cloth = dc.Cloth(folded, faces, rest_vertices=vertices, pins=pins)
+    cloth = dc.Cloth(folded, faces, rest_positions=vertices, pins=pins)
     return Scene(dc.Scene([cloth]), approach=14)
 
 

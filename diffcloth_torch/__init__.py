@@ -11,6 +11,7 @@ Units are SI, z is up, quaternions are (w, x, y, z), and everything is float64 o
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 from importlib import import_module
 from importlib.util import find_spec
@@ -26,7 +27,6 @@ if find_spec("diffcloth_torch._core") is None:
         "or run  pip install -e .  where the sources are"
     )
 
-from diffcloth_torch._saved import let_saved_states_load, register_classes
 from diffcloth_torch.operations import called
 
 if TYPE_CHECKING:
@@ -207,10 +207,11 @@ def __getattr__(name: str) -> Any:
         return import_module("diffcloth_torch.optimize.residuals")
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    register_classes()
+    import_module("diffcloth_torch.sim")  # reads saved objects
     value = getattr(import_module(f"diffcloth_torch.{_HOME_OF[name]}"), name)
     globals()[name] = value  # later uses bypass this function
     return value
 
 
-let_saved_states_load()
+if "torch" in sys.modules:
+    import_module("diffcloth_torch.sim")  # reads saved objects

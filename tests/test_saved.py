@@ -1,7 +1,8 @@
-"""Saved states load, those of the first version too; names are imported when asked for."""
+"""Objects in files load, those of 0.1 too; names are imported when they are first used."""
 
 import importlib
 import pickle
+import pickletools
 import re
 from pathlib import Path
 
@@ -10,68 +11,91 @@ import torch
 from processes import run_python
 
 import diffcloth_torch as dc
-from diffcloth_torch._saved import _NOW
+from diffcloth_torch import saved
 
-SAVED = Path(__file__).parent / "data" / "first_version"  # by save.py there
+SAVED = Path(__file__).parent / "data" / "saved_0_1"  # by save_records.py there
+KINDS = "['ContactPoints', 'Control', 'Parameters', 'State']\n"
+SHOW = "print(sorted({type(value).__name__ for value in saved.values()}))"
 
 
 def load_pickle():
     return pickle.loads(SAVED.with_suffix(".pkl").read_bytes())
 
 
+def records(load):
+    """Records of a file without its simulator."""
+    return {name: value for name, value in load().items() if name != "simulator"}
+
+
 def test_importing_the_package_imports_no_torch():
     assert run_python("import sys, diffcloth_torch; print('torch' in sys.modules)") == "False\n"
-
-
-LOADED = "print(sorted({type(value).__name__ for value in saved.values()}))"
-KINDS = "['Control', 'Parameters', 'State']\n"
 
 
 @pytest.mark.parametrize(
     "imports",
     [
         "import torch, diffcloth_torch",
-        "import diffcloth_torch, torch",
-        # One of our modules imports torch, before those of states are there.
-        "import diffcloth_torch as dc; dc.Material(); import torch",
-        "from diffcloth_torch.tasks.registry import load_task; import torch",
-        # Whoever asks whether torch is there does not import it yet.
-        "import diffcloth_torch, importlib.util; importlib.util.find_spec('torch'); import torch",
+        "import diffcloth_torch as dc, torch; dc.Material()",
+        "from diffcloth_torch import State; import torch",
+        "from diffcloth_torch.sim.records.state import State; import torch",
     ],
 )
-def test_states_load_as_soon_as_torch_and_the_package_are_imported(imports):
-    """With nothing else asked of the package, in either order of the imports."""
+def test_torch_loads_records_of_0_1(imports):
     load = f"saved = torch.load({str(SAVED.with_suffix('.pt'))!r}, weights_only=True)"
-    assert run_python(f"{imports}\n{load}\n{LOADED}") == KINDS
-
-
-def test_torch_is_found_by_its_own_finder_afterwards():
-    code = (
-        "import diffcloth_torch, sys\n"
-        "before = len(sys.meta_path)\n"
-        "import torch, importlib.util, inspect\n"
-        "print(before - len(sys.meta_path), torch.__spec__.origin == torch.__file__,\n"
-        "      'import' in inspect.getsource(torch),\n"
-        "      importlib.util.find_spec('torch') is torch.__spec__)"
-    )
-    assert run_python(code) == "1 True True True\n"
+    assert run_python(f"{imports}\n{load}\n{SHOW}") == KINDS
 
 
 @pytest.mark.parametrize("imports", ["", "import diffcloth_torch\n"])
-def test_a_pickle_loads_where_nothing_else_is_imported(imports):
+def test_a_pickle_of_0_1_loads_where_nothing_else_is_imported(imports):
     load = f"saved = pickle.load(open({str(SAVED.with_suffix('.pkl'))!r}, 'rb'))\n"
     drop = "saved.pop('simulator').step(saved['state'])\n"
-    assert run_python(f"{imports}import pickle\n{load}{drop}{LOADED}") == KINDS
+    assert run_python(f"{imports}import pickle\n{load}{drop}{SHOW}") == KINDS
 
 
-def test_old_paths_have_the_classes_of_today():
-    for old, new in _NOW.items():
-        there = importlib.import_module(f"diffcloth_torch.{old}")
-        module = importlib.import_module(f"diffcloth_torch.{new}")
-        for name in module.__all__:
-            assert getattr(there, name) is getattr(module, name)
-        with pytest.raises(AttributeError):
-            _ = there.nothing
+def test_the_table_has_the_module_of_each_saved_class():
+    for name, module in saved._MODULES.items():
+        cls = getattr(importlib.import_module(f"diffcloth_torch.{module}"), name)
+        assert (cls.__module__, cls.__name__) == (f"diffcloth_torch.{module}", name)
+    for module, names in saved._MODULES_0_1.items():
+        there = importlib.import_module(f"diffcloth_torch.{module}")
+        assert all(getattr(there, name) is saved._class(name) for name in names)
+
+
+def globals_of(data: bytes) -> set[str]:
+    """Names of the package that a pickle of protocol 2 refers to."""
+    names = (arg for op, arg, _ in pickletools.genops(data) if op.name == "GLOBAL")
+    return {name for name in names if name.startswith("diffcloth_torch")}
+
+
+def test_files_name_no_module_of_a_class():
+    """All that a simulator and its records hold: a class without `saved` would add its module."""
+    whole = load_pickle()
+    whole["trajectory"] = list(dc.Trajectory([whole["state"]]))
+    assert globals_of(pickle.dumps(whole, protocol=2)) == {"diffcloth_torch.saved restore"}
+
+
+def test_a_file_of_a_later_format_is_refused():
+    data = pickle.dumps(dc.Material(), protocol=2)
+    restore, arguments = saved._reduce(dc.Material())
+    with pytest.raises(dc.InvalidInput, match=r"format 1 at most .* got 'Material' of format 2"):
+        restore(arguments[0], saved.FORMAT + 1, arguments[2])
+    with pytest.raises(dc.InvalidInput, match="got 'Velvet' of format 1"):
+        restore("Velvet", 1, {})
+    assert pickle.loads(data).stretch == dc.Material().stretch
+
+
+def test_a_class_outside_of_the_table_is_refused():
+    with pytest.raises(TypeError, match="State needs its module in the table"):
+        saved.saved(type("State", (), {}))
+
+
+@pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
+def test_each_protocol_loads(protocol):
+    whole = load_pickle()
+    again = pickle.loads(pickle.dumps(whole, protocol=protocol))
+    assert {name: type(value) for name, value in again.items()} == {
+        name: type(value) for name, value in whole.items()
+    }
 
 
 _IMPORT = r"from diffcloth_torch\.([\w.]+) import ([^()]+?|\([^)]*\))\n"
@@ -104,52 +128,71 @@ def test_a_name_that_never_was_is_refused():
         importlib.import_module("diffcloth_torch.meshs")
 
 
-@pytest.mark.parametrize("load", [load_pickle, lambda: torch.load(SAVED.with_suffix(".pt"))])
-def test_states_controls_and_parameters_load(load):
-    saved = load()
-    assert type(saved["state"]) is dc.State
-    assert type(saved["state"].report) is dc.Report
-    assert type(saved["control"]) is dc.Control
-    assert type(saved["parameters"]) is dc.Parameters
-    assert saved["state"].report.converged is True
-    assert saved["state"].report.counts == {}
-    assert saved["batch"][1].report.counts == {}
-    assert saved["parameters"].replace(stretch=2.0).stretch == 2.0
-    for state, batch in ((saved["state"], ()), (saved["batch"], (2,))):
-        assert torch.equal(state.body_velocities, torch.zeros(*batch, 1, 6, dtype=torch.float64))
-        assert state.joint_positions.shape == (*batch, 0)
-        assert state.base_poses.shape == (*batch, 0, 7)
-    assert saved["control"].joint_positions is None
-    assert saved["parameters"].body_mass is None
+def same(a, b):
+    """Whether two records hold the same numbers."""
+    if isinstance(a, torch.Tensor):
+        return torch.equal(a.nan_to_num(), b.nan_to_num())
+    if isinstance(a, tuple | list):
+        return len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same(a[k], b[k]) for k in a)
+    if hasattr(a, "__dict__"):
+        return type(a) is type(b) and same(vars(a), vars(b))
+    return a == b or a != a
 
 
-def test_a_simulator_loads_and_goes_on_from_saved_states(tmp_path):
-    saved = load_pickle()
-    simulator = saved["simulator"]
-    assert type(simulator) is dc.Simulator
-    assert type(simulator.scene) is dc.Scene
-    assert (simulator.scheme, simulator.dt) == ("split", 0.01)
-    assert simulator.coupling == "monolithic"
-    assert simulator.solver.metric == "identity"
+@pytest.mark.parametrize(
+    "load", [load_pickle, lambda: torch.load(SAVED.with_suffix(".pt"), weights_only=True)]
+)
+def test_records_of_0_1_are_complete(load):
+    loaded = records(load)
+    state, batch = loaded["state"], loaded["batch"]
+    assert type(state.report) is dc.Report
+    assert state.report.converged is True
+    assert state.report.cpu_seconds != state.report.cpu_seconds  # not a number: not known
+    assert batch.report.cpu_seconds.isnan().all()
+    assert state.report.contacts["sheet", "box"].count > 0
+    assert batch.batch_size == 2
+    assert loaded["parameters"].replace(stretch=2.0).stretch == 2.0
+    assert loaded["contacts"].mask.any()
+    assert list(state.meshes()) == [
+        "sheet",
+        "box",
+        "ball",
+        "hand/palm",
+        "hand/left_finger",
+        "hand/right_finger",
+    ]
+
+
+def test_a_simulator_of_0_1_goes_on_from_saved_states(tmp_path):
+    loaded = load_pickle()
+    simulator = loaded["simulator"]
+    assert (simulator.scheme, simulator.coupling, simulator.dt) == ("coupled", "monolithic", 0.01)
+    assert simulator.solver.tolerance == 1e-7
     assert simulator.contact.friction_iterations == 1
-    (cloth,) = simulator.scene.cloths
-    assert type(cloth) is dc.Cloth
-    assert (cloth.material.stretch, cloth.material.friction) == (300.0, 0.3)
+    cloth, (box, ball) = simulator.scene.cloths[0], simulator.scene.bodies
+    assert cloth.material.friction == 0.3
     assert cloth.pins["left"].tolist() == [0, 4]
-    assert simulator.scene.bodies[0].motion == "kinematic"
-
-    after = simulator.step(saved["state"], saved["control"], saved["parameters"])
+    assert (box.motion, ball.motion, ball.smooth) == ("kinematic", "dynamic", True)
+    after = simulator.step(loaded["state"], loaded["control"], loaded["parameters"])
     assert after.report.converged
     assert float(after.time) == pytest.approx(0.02)
-    both = simulator.step(saved["batch"])
-    assert both.report.converged.all()
+    assert simulator.step(loaded["batch"]).report.converged.all()
     after.export(tmp_path / "after.obj", bodies=True)
     assert (tmp_path / "after.obj").is_file()
 
 
-def test_what_is_saved_now_loads_again(tmp_path):
-    saved = load_pickle()
-    torch.save({name: saved[name] for name in ("state", "control")}, tmp_path / "again.pt")
-    again = torch.load(tmp_path / "again.pt")
-    assert torch.equal(again["state"].positions, saved["state"].positions)
-    assert b"sim.state" in (tmp_path / "again.pt").read_bytes()
+def test_saved_objects_load_again(tmp_path):
+    before = records(load_pickle)
+    torch.save(before, tmp_path / "again.pt")
+    after = torch.load(tmp_path / "again.pt", weights_only=True)
+    assert all(same(before[name], after[name]) for name in before)
+
+
+def test_a_simulator_loads_again_and_steps_with_the_same_bits(tmp_path):
+    loaded = load_pickle()
+    torch.save(loaded["simulator"], tmp_path / "simulator.pt")
+    again = torch.load(tmp_path / "simulator.pt", weights_only=False)
+    ends = [sim.step(loaded["state"]).positions for sim in (loaded["simulator"], again)]
+    assert torch.equal(*ends)

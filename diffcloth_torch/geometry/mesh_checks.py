@@ -17,6 +17,7 @@ from diffcloth_torch.checks import (
     index_array,
 )
 from diffcloth_torch.errors import InvalidInput, warn_caller
+from diffcloth_torch.saved import saved
 
 __all__ = [
     "Surface",
@@ -28,6 +29,7 @@ __all__ = [
 ]
 
 
+@saved
 class Surface(NamedTuple):
     """Vertices [n, 3] in meters and triangles [f, 3]."""
 

@@ -22,6 +22,7 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.quantities import PARAMETERS
+from diffcloth_torch.saved import saved
 
 __all__ = ["Attachment", "Points"]
 
@@ -30,6 +31,7 @@ _STIFFNESS = "differentiate with respect to Parameters.attachment_stiffness"
 _SUM = 1e-6  # how far the weights of corners may be from adding to one
 
 
+@saved
 class Points(NamedTuple):
     """Points of one surface, as they were given; the scene knows what kind of surface it is.
 
@@ -44,6 +46,7 @@ class Points(NamedTuple):
     weights: FloatArray | None
 
 
+@saved
 class Attachment:
     """Springs between points of a scene, or between points and targets; immutable.
 

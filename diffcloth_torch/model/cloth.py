@@ -32,6 +32,7 @@ from diffcloth_torch.geometry.poses import pose_array, transform
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.orthotropy import material_axes
 from diffcloth_torch.model.quantities import FACE_QUANTITIES, check_parameter
+from diffcloth_torch.saved import saved
 
 __all__ = ["BENDING_MODELS", "Cloth", "plane_size"]
 
@@ -43,6 +44,7 @@ _POSITIONS = "differentiate with respect to State.positions"
 _REST = "differentiate with respect to Parameters.rest_positions"
 
 
+@saved
 class Cloth:
     """A triangulated sheet; immutable.
 
@@ -82,7 +84,6 @@ class Cloth:
         rest_positions: object = None,
         bending_model: str = "patch",
         name: str | None = None,
-        rest_vertices: object = None,
         directions: object = None,
     ) -> None:
         """Check and copy the arguments.
@@ -97,7 +98,6 @@ class Cloth:
             rest_positions: Stress-free positions [m], shape [n, 3]; `vertices` by default.
             bending_model: "patch" or "hinge".
             name: Name in the scene.
-            rest_vertices: Earlier name of `rest_positions`; give one of them.
             directions: Direction of the warp in the rest shape, shape [3] or [f, 3]; along x by
                 default. It is projected onto each face and fixed to the material, also where
                 `Parameters.rest_positions` are others. Isotropic cloth has no use for it.
@@ -109,7 +109,7 @@ class Cloth:
         points, triangles = surface_arrays("Cloth", vertices, faces, instead=_POSITIONS)
         check_manifold("Cloth", len(points), triangles)
         self.vertices, self.faces = points, triangles
-        self.rest_positions = _rest(rest_positions, rest_vertices, points, triangles)
+        self.rest_positions = _rest(rest_positions, points, triangles)
         self.material = _material(material, len(triangles))
         self.pins, self.soft_pins = _pin_groups(pins, soft_pins, len(points))
         self.pin_stiffness = check_parameter("Cloth", "pin_stiffness", pin_stiffness)
@@ -191,14 +191,9 @@ class Cloth:
             return cls(vertices, faces, **keywords)
         placed = transform(vertices, pose_array(f"{owner}: `pose`", pose, instead=_POSITIONS))
         # The rest shape does not depend on the pose, and unrotated coordinates are exact.
-        if keywords.get("rest_positions") is None and keywords.get("rest_vertices") is None:
+        if keywords.get("rest_positions") is None:
             keywords = {**keywords, "rest_positions": vertices}
         return cls(placed, faces, **keywords)
-
-    @property
-    def rest_vertices(self) -> FloatArray:
-        """Earlier name of `rest_positions`."""
-        return self.rest_positions
 
     def __repr__(self) -> str:
         name = "" if self.name is None else f"{self.name!r}, "
@@ -209,10 +204,7 @@ class Cloth:
         return {**vars(self), **plain}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.directions = _ALONG_X  # pickles of earlier versions have none
-        for name, value in state.items():
-            # Pickles of earlier versions have that name.
-            setattr(self, "rest_positions" if name == "rest_vertices" else name, value)
+        self.__dict__.update(state)
         self.pins, self.soft_pins = MappingProxyType(self.pins), MappingProxyType(self.soft_pins)
 
 
@@ -224,21 +216,14 @@ def plane_size(name: str, size: object) -> FloatArray:
     return np.broadcast_to(lengths, 2)
 
 
-def _rest(given: object, earlier: object, vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """Check the rest shape, under the name by which it was given."""
-    if given is not None and earlier is not None:
-        raise InvalidInput(
-            "Cloth: `rest_vertices` must be None beside `rest_positions`, of which it is the "
-            "earlier name"
-        )
-    name = "rest_positions" if earlier is None else "rest_vertices"
-    positions = given if earlier is None else earlier
-    if positions is None:
+def _rest(given: object, vertices: FloatArray, faces: IndexArray) -> FloatArray:
+    """Check the rest shape."""
+    if given is None:
         return vertices
-    rest = float_array(f"Cloth: `{name}`", positions, instead=_REST)
-    check_shape(f"Cloth: `{name}`", rest.shape, [vertices.shape])
-    check_finite(f"Cloth: `{name}`", rest)
-    check_areas("Cloth", name, rest, faces)
+    rest = float_array("Cloth: `rest_positions`", given, instead=_REST)
+    check_shape("Cloth: `rest_positions`", rest.shape, [vertices.shape])
+    check_finite("Cloth: `rest_positions`", rest)
+    check_areas("Cloth", "rest_positions", rest, faces)
     frozen(rest)
     return rest
 

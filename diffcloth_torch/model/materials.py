@@ -18,10 +18,12 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.orthotropy import STAND_INS, check_bending
 from diffcloth_torch.model.quantities import FACE_QUANTITIES, PARAMETERS, check_parameter
 from diffcloth_torch.reprs import field_text, record_text
+from diffcloth_torch.saved import saved
 
 __all__ = ["Material"]
 
 
+@saved
 @dataclass(frozen=True, eq=False)
 class Material:
     """Properties of a cloth; numbers, or one value per face for all but friction and thickness.

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray, IndexArray
+from diffcloth_torch.saved import saved
 
 __all__ = ["FORCED", "JOINT_KINDS", "Mechanism"]
 
@@ -19,6 +20,7 @@ JOINT_KINDS = ("fixed", "revolute", "prismatic")
 """Joints of links to their parents, in the order of their numbers in the core."""
 
 
+@saved
 @dataclass(frozen=True, eq=False)
 class Mechanism:
     """Links and joints, in float64. A rigid body is a mechanism of one link.

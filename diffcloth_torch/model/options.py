@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from diffcloth_torch import _core
 from diffcloth_torch.checks import POSITIVE, check_bool, check_choice, check_count, check_number
 from diffcloth_torch.model.quantities import check_parameter
+from diffcloth_torch.saved import saved
 
 __all__ = [
     "ABILITIES",
@@ -27,6 +28,7 @@ COUPLINGS = ("monolithic", "rigid_to_cloth", "cloth_to_rigid")
 """How cloths and dynamic bodies act on each other: together, or in turn."""
 
 
+@saved
 @dataclass(frozen=True, eq=False)
 class ContactOptions:
     """Options of contact and friction.
@@ -62,6 +64,7 @@ class ContactOptions:
         object.__setattr__(self, "self_contact", self_contact)
 
 
+@saved
 @dataclass(frozen=True, eq=False)
 class SolverOptions:
     """Tolerance, limits and methods of the solver.

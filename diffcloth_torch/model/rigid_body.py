@@ -38,6 +38,7 @@ from diffcloth_torch.model.round_bodies import (
     round_solid,
     round_surface,
 )
+from diffcloth_torch.saved import saved
 
 __all__ = ["MOTIONS", "Primitive", "RigidBody"]
 
@@ -62,6 +63,7 @@ _CENTER = "differentiate with respect to Parameters.body_center"
 _INERTIA = "differentiate with respect to Parameters.body_inertia"
 
 
+@saved
 class RigidBody:
     """A rigid triangle mesh; immutable.
 
@@ -89,7 +91,7 @@ class RigidBody:
     pose: FloatArray
     friction: float
     thickness: float
-    # Values of their own, for pickles that were made before bodies had a mass.
+    # Zero unless the body is dynamic.
     mass: float = 0.0
     center: FloatArray = frozen(np.zeros(3))
     inertia: FloatArray = frozen(np.zeros((3, 3)))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -46,6 +45,7 @@ from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.robot_tree import JointBounds, joint_bounds, make_mechanism
 from diffcloth_torch.model.round_bodies import ContactSurface
 from diffcloth_torch.model.urdf import read_urdf
+from diffcloth_torch.saved import saved
 
 __all__ = ["ACTUATIONS", "BASES", "Robot"]
 
@@ -65,6 +65,7 @@ _DIFFERENTIABLE = {
 _POSE = "differentiate with respect to State.base_poses or Control.base_poses"
 
 
+@saved
 class Robot:
     """Links connected by joints; immutable. `Robot.load` or `Robot.from_chain` makes it.
 
@@ -91,8 +92,7 @@ class Robot:
 
     mechanism: Mechanism
     surfaces: tuple[Surface | None, ...]
-    # A value of its own, for pickles that were made before links could be smooth.
-    skeletons: Mapping[str, ContactSurface] = MappingProxyType({})
+    skeletons: Mapping[str, ContactSurface]
     pose: FloatArray
     joint_positions: FloatArray
     stiffness: FloatArray

@@ -12,10 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from diffcloth_torch.checks import FloatArray, IndexArray, frozen
+from diffcloth_torch.saved import saved
 
 __all__ = ["ContactSurface", "Primitive", "round_solid", "round_surface"]
 
 
+@saved
 class Primitive(NamedTuple):
     """An analytic surface around the origin of a body's frame.
 
@@ -29,6 +31,7 @@ class Primitive(NamedTuple):
     size: tuple[float, float, float]
 
 
+@saved
 class ContactSurface(NamedTuple):
     """What a body touches with.
 

@@ -20,6 +20,7 @@ from diffcloth_torch.model.quantities import check_parameter
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.robot import Robot
 from diffcloth_torch.model.springs import AttachedSurface, Springs, make_springs, surfaces_of
+from diffcloth_torch.saved import saved
 
 __all__ = ["Scene"]
 
@@ -28,6 +29,7 @@ _AIR_DENSITY = 1.2  # [kg/m^3], dry, at 20 degrees Celsius and sea level
 S = TypeVar("S")
 
 
+@saved
 class Scene:
     """The cloths, bodies and robots to simulate, and gravity. Immutable.
 
@@ -48,17 +50,16 @@ class Scene:
 
     cloths: tuple[Cloth, ...]
     bodies: tuple[RigidBody, ...]
-    # Without robots, for pickles that were made before scenes had them.
-    robots: tuple[Robot, ...] = ()
+    robots: tuple[Robot, ...]
     gravity: FloatArray
-    air_density: float = _AIR_DENSITY
-    ignore_contact: tuple[tuple[str, str], ...] = ()
+    air_density: float
+    ignore_contact: tuple[tuple[str, str], ...]
     cloth_names: tuple[str, ...]
     body_names: tuple[str, ...]
-    robot_names: tuple[str, ...] = ()
-    attachments: tuple[Attachment, ...] = ()
-    attachment_names: tuple[str, ...] = ()
-    springs: Springs = Springs()
+    robot_names: tuple[str, ...]
+    attachments: tuple[Attachment, ...]
+    attachment_names: tuple[str, ...]
+    springs: Springs
 
     def __init__(
         self,

@@ -11,6 +11,7 @@ import numpy as np
 from diffcloth_torch.checks import FloatArray, IndexArray, check_shape, index_array, texts
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.attachment import Attachment, Points
+from diffcloth_torch.saved import saved
 
 __all__ = ["AttachedSurface", "Springs", "make_springs", "surfaces_of"]
 
@@ -38,6 +39,7 @@ def _empty(dtype: type = np.int32) -> IndexArray:
     return np.zeros(0, dtype=dtype)
 
 
+@saved
 @dataclass(frozen=True, eq=False)
 class Springs:
     """All A springs of a scene, attachment after attachment, U of them to targets.

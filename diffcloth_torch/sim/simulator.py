@@ -22,6 +22,7 @@ from diffcloth_torch.model.options import (
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.operations import called
+from diffcloth_torch.saved import saved
 from diffcloth_torch.sim.inputs.axes import without_axes
 from diffcloth_torch.sim.inputs.border import Border
 from diffcloth_torch.sim.inputs.control_fields import check_control
@@ -54,6 +55,7 @@ _DEFAULT_CONTACT = ContactOptions()
 _DEFAULT_SOLVER = SolverOptions()
 
 
+@saved
 class Simulator(Observables):
     """Steps a scene through time. Immutable, and safe to use from several threads.
 
@@ -174,9 +176,12 @@ class Simulator(Observables):
         if abilities["barrier"]:
             check_start(self._engine, start._replace(parameters=self._border.defaults))
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        arguments = (self.scene, self.dt, self.scheme, self.contact, self.solver, self.coupling)
-        return _restore, arguments
+    def __getstate__(self) -> dict[str, Any]:
+        arguments = ("scene", "dt", "scheme", "coupling", "contact", "solver")
+        return {name: getattr(self, name) for name in arguments}
+
+    def __setstate__(self, arguments: dict[str, Any]) -> None:
+        self.__init__(**arguments)  # type: ignore[misc]
 
     def __repr__(self) -> str:
         coupling = "" if self.coupling == "monolithic" else f", coupling={self.coupling!r}"
@@ -411,6 +416,7 @@ def _restore(
     scheme: str,
     contact: ContactOptions,
     solver: SolverOptions,
-    coupling: str = "monolithic",  # pickles of the first version end before it
+    coupling: str,
 ) -> Simulator:
+    """Make a simulator from a file of 0.1, which names this function."""
     return Simulator(scene, dt, scheme=scheme, coupling=coupling, contact=contact, solver=solver)

@@ -349,28 +349,11 @@ def test_the_flattest_face_that_is_accepted(scale):
 REST = 1.5 * VERTICES[:4]
 
 
-def test_the_earlier_name_of_rest_positions_means_the_same():
-    cloth = dc.Cloth(VERTICES[:4], FACES, rest_vertices=REST)
-    assert cloth.rest_vertices is cloth.rest_positions
-    np.testing.assert_array_equal(cloth.rest_positions, REST)
+def test_a_rest_shape_has_the_vertices_of_the_cloth():
     np.testing.assert_array_equal(
-        dc.Cloth(VERTICES[:4], FACES, rest_positions=REST).rest_vertices, REST
+        dc.Cloth(VERTICES[:4], FACES, rest_positions=REST).rest_positions, REST
     )
-    posed = dc.Cloth.grid(2, 2, pose=[0, 0, 1, 1, 0, 0, 0], rest_vertices=REST)
+    posed = dc.Cloth.grid(2, 2, pose=[0, 0, 1, 1, 0, 0, 0], rest_positions=REST)
     np.testing.assert_array_equal(posed.rest_positions, REST)
-
-
-def test_a_rest_shape_is_given_once_and_named_as_it_was_given():
-    with pytest.raises(dc.InvalidInput, match="`rest_vertices` must be None beside `rest_pos"):
-        dc.Cloth(VERTICES[:4], FACES, rest_positions=REST, rest_vertices=REST)
-    for name in ("rest_positions", "rest_vertices"):
-        with pytest.raises(dc.InvalidInput, match=f"`{name}` must have shape"):
-            dc.Cloth(VERTICES[:4], FACES, **{name: REST[:3]})
-
-
-def test_a_pickle_with_the_earlier_name_loads():
-    state = dc.Cloth(VERTICES[:4], FACES, rest_positions=REST).__getstate__()
-    state["rest_vertices"] = state.pop("rest_positions")
-    cloth = dc.Cloth.__new__(dc.Cloth)
-    cloth.__setstate__(state)
-    np.testing.assert_array_equal(cloth.rest_positions, REST)
+    with pytest.raises(dc.InvalidInput, match="`rest_positions` must have shape"):
+        dc.Cloth(VERTICES[:4], FACES, rest_positions=REST[:3])

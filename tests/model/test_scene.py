@@ -105,16 +105,3 @@ def test_a_scene_pickles():
 def test_scenes_compare_by_identity():
     assert two_cloths() != two_cloths()
     assert dc.Material() != dc.Material()
-
-
-def test_a_scene_of_the_first_version_has_no_robots_and_bodies_have_no_mass():
-    scene = two_cloths()
-    for name in ("robots", "robot_names", "ignore_contact"):
-        vars(scene).pop(name)
-    for body in scene.bodies:
-        assert not {"mass", "center", "inertia"} & set(vars(body))
-    again = pickle.loads(pickle.dumps(scene))
-    assembly = assemble(again)
-    assert assembly.surface_names == ("shirt", "cloth1", "body0", "body1")
-    assert [m.is_dynamic for m in assembly.mechanisms] == [False, False]
-    assert len(assembly.ignored_pairs) == 0

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
-from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.autograd.transforms import is_differentiated
 from diffcloth_torch.checks import texts
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.reprs import field_text, record_text
+from diffcloth_torch.saved import saved
 
 __all__ = ["COLUMNS", "ContactPoints", "refuse_gradient"]
 
@@ -22,6 +22,7 @@ COLUMNS = 16
 """Numbers of a contact in the core: surfaces, points, normal, gap, normal and tangential force."""
 
 
+@saved
 @dataclass(frozen=True, eq=False)
 class ContactPoints:
     """Contacts between surfaces at the end of a step, M of them.
@@ -158,5 +159,3 @@ _NO_GRADIENT = (
     "contacts: single contacts have no gradient, as they come and go; take that of "
     "state.contact_forces, state.body_forces or simulator.contact_wrenches(state)"
 )
-
-allow_loading(ContactPoints)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch import cpu
-from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.checks import FloatArray, texts
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.saved import saved
 
 __all__ = ["Contacts", "PairContact"]
 
@@ -35,6 +35,7 @@ class PairContact:
     force: Tensor
 
 
+@saved
 @dataclass(frozen=True, eq=False)
 class Contacts:
     """Contacts of a step by pairs of names: `contacts["gripper/left", "shirt"]`.
@@ -213,6 +214,3 @@ def _combined(
     counts = {p: function(*all_of("counts", p, (), torch.int64)) for p in pairs}
     forces = {p: function(*all_of("forces", p, (3,), torch.float64)) for p in pairs}
     return Contacts(surfaces, size, counts, forces, rows)
-
-
-allow_loading(Contacts)

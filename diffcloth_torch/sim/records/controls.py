@@ -8,14 +8,15 @@ from typing import Any
 
 from torch import Tensor
 
-from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.model.quantities import CONTROL, PARAMETERS
 from diffcloth_torch.reprs import field_text, record_text
+from diffcloth_torch.saved import saved
 from diffcloth_torch.sim.records.state import check_field_names
 
 __all__ = ["Control", "Parameters", "tensors_of"]
 
 
+@saved
 @dataclass(frozen=True, eq=False)
 class Control:
     """Targets for the end of a step, and forces during it. A target that is None holds.
@@ -77,6 +78,7 @@ class Control:
         return replace(self, **changes)
 
 
+@saved
 @dataclass(frozen=True, eq=False)
 class Parameters:
     """Physical parameters. A field that is None takes what the scene has, if anything.
@@ -208,6 +210,3 @@ def tensors_of(record: Any) -> Iterator[Tensor]:
             yield value
         elif isinstance(value, Mapping):
             yield from (entry for entry in value.values() if isinstance(entry, Tensor))
-
-
-allow_loading(Control, Parameters)

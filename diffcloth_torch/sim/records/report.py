@@ -13,14 +13,15 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
-from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.reprs import record_text, value_text
+from diffcloth_torch.saved import saved
 from diffcloth_torch.sim.records.contacts import Contacts
 
 __all__ = ["Report", "outcome_text"]
 
 
+@saved
 @dataclass(frozen=True, eq=False)
 class Report:
     """How a step went, in Python numbers, or in tensors of shape [B] in a batch.
@@ -96,10 +97,8 @@ class Report:
             raise TypeError(f"Report: `status` must be a str or a tuple of them, got {names!r}")
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Reports that earlier versions saved count nothing, have no status, or no processor time.
-        defaults = {"counts": {}, "status": (), "contacts": Contacts(), "cpu_seconds": None}
-        self.__dict__.update(defaults | state)
-        self.__post_init__()
+        # Checks the fields, and completes a report of 0.1, which has no processor time.
+        self.__init__(**state)  # type: ignore[misc]
 
     def __repr__(self) -> str:
         parts = [
@@ -241,6 +240,3 @@ def _combine(
         for table in _TABLES
     }
     return Report(**plain, **tables, status=status, contacts=contacts)
-
-
-allow_loading(Report)

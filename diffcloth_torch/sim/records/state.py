@@ -12,21 +12,17 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
-from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.autograd.transforms import is_dense
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import write_mesh
 from diffcloth_torch.model.quantities import STATE, shape_of
 from diffcloth_torch.reprs import field_text, record_text
+from diffcloth_torch.saved import saved
 from diffcloth_torch.sim.records.report import Report, outcome_text
-
-# Saved states name them here, where they once were.
-from diffcloth_torch.sim.records.surfaces import LinkSurfaces, Surfaces
+from diffcloth_torch.sim.records.surfaces import Surfaces
 
 __all__ = [
-    "LinkSurfaces",
     "State",
-    "Surfaces",
     "check_field_names",
     "check_state",
     "stack",
@@ -36,6 +32,7 @@ __all__ = [
 _BATCHED_DIMENSIONS = 3  # positions [B, N, 3]
 
 
+@saved
 @dataclass(frozen=True, eq=False)
 class State:
     """Positions, velocities and forces at one time. All tensors may share a leading batch axis.
@@ -97,11 +94,6 @@ class State:
                 rows = shape_of(STATE[name].axes[0], {"J": 0, "R": 0, "P": 0, **sizes})
                 zeros = cpu.zeros(*environments, *rows)
                 object.__setattr__(self, name, zeros)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        # States that the first version saved have no robots, and bodies without velocities.
-        self.__dict__.update(state)
-        self.__post_init__()
 
     def __repr__(self) -> str:
         # Tensors without rows, of things that the scene lacks, are left out.
@@ -211,7 +203,7 @@ class State:
 
 
 _TENSORS = tuple(STATE)
-# Fields that states of the first version lack.
+# Fields that a caller may leave out.
 _ADDED = _TENSORS[_TENSORS.index("body_velocities") :]
 
 
@@ -365,6 +357,3 @@ def check_field_names(owner: str, instance: Any, changes: dict[str, Any]) -> Non
     for name in changes:
         if name not in accepted:
             raise InvalidInput(f"{owner}: the fields are {', '.join(accepted)}; got {name!r}")
-
-
-allow_loading(State)

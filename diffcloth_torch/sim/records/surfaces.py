@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from diffcloth_torch._saved import allow_loading
 from diffcloth_torch.autograd.transforms import numbers_of
 from diffcloth_torch.geometry.products import product
 from diffcloth_torch.model.assembly import Assembly
@@ -24,6 +23,7 @@ from diffcloth_torch.model.kinematics import link_frames, pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.robot import Robot
 from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.saved import saved
 
 __all__ = ["LinkSurfaces", "Surfaces", "place"]
 
@@ -37,6 +37,7 @@ def place(vertices: Tensor, frames: Tensor) -> Tensor:
     return product(points, frames[..., :3, :3].mT) + frames[..., None, :3, 3]
 
 
+@saved
 @dataclass(frozen=True, eq=False)
 class LinkSurfaces:
     """The meshes of a robot's links, and the mechanism that places them.
@@ -87,6 +88,7 @@ class LinkSurfaces:
         return dict(zip(self.link_names, frames.unbind(-3), strict=True))
 
 
+@saved
 @dataclass(frozen=True, eq=False)
 class Surfaces:
     """The meshes that a state moves, as plain tensors.
@@ -98,9 +100,8 @@ class Surfaces:
         body_vertices: Vertices of each body in its frame [m], shape [v, 3].
         body_faces: Faces of each body, as indices into its own vertices, shape [g, 3].
         robots: The surfaces of each robot.
-        body_points: What forces act on, of bodies, then of links with a shape: their vertices, but
-            of smooth ones those of their skeletons. Those of earlier versions have None, or only
-            those of bodies, as nothing else was smooth.
+        body_points: Points of bodies, then of links with a shape, on which forces act: vertices of
+            the mesh, or of the skeleton where a surface is smooth; shape [v, 3] each.
     """
 
     cloth_names: list[str]
@@ -108,8 +109,8 @@ class Surfaces:
     body_names: list[str]
     body_vertices: list[Tensor]
     body_faces: list[Tensor]
-    robots: tuple[LinkSurfaces, ...] = ()
-    body_points: list[Tensor] | None = None
+    robots: tuple[LinkSurfaces, ...]
+    body_points: list[Tensor]
 
     @staticmethod
     def of(scene: Scene, assembly: Assembly) -> Surfaces:
@@ -161,11 +162,8 @@ class Surfaces:
         return meshes
 
     def rigid_points(self) -> dict[str, Tensor]:
-        """What forces act on of each body, then of each link with a shape, in their frames."""
-        points = {name: vertices for name, (vertices, _) in self.rigid_meshes().items()}
-        if self.body_points is not None:
-            points |= dict(zip(points, self.body_points, strict=False))
-        return points
+        """Points of bodies, then of links with a shape, on which forces act, in their frames."""
+        return dict(zip(self.rigid_meshes(), self.body_points, strict=True))
 
     def surface_frames(self, state: Mapping[str, Tensor]) -> Tensor:
         """Frames of bodies, then of links with a shape, [..., K + Lc, 4, 4]."""
@@ -203,7 +201,3 @@ class Surfaces:
         cloths = (vertices for vertices, _ in self.cloth_meshes(positions).values())
         rigid = (place(points, frames[name]) for name, points in self.rigid_points().items())
         return torch.cat([positions[..., :0, :], *cloths, *rigid], dim=-2)
-
-
-# Earlier versions had these classes there, and saved states name that module.
-allow_loading(Surfaces, LinkSurfaces, once_in="diffcloth_torch.sim.records.state")

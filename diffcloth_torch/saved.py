@@ -1,0 +1,126 @@
+"""Objects in files, under names that stay when modules move.
+
+A pickle of an object whose class is `saved` holds the function `restore`, the name of the class,
+the number of the format and the fields of the object. `torch.load` with `weights_only` reads these
+files as soon as `diffcloth_torch.sim` has been imported, which any public name does. Files of 0.1
+name modules instead; `_MODULES_0_1` has their paths.
+"""
+
+from __future__ import annotations
+
+import copyreg
+import sys
+from importlib import import_module
+from typing import Any, TypeVar
+
+from diffcloth_torch.errors import InvalidInput
+
+__all__ = ["FORMAT", "read_saved_objects", "restore", "saved"]
+
+FORMAT = 1
+"""Number of the format of files; raised where an older reader would misread a file."""
+
+_PACKAGE = "diffcloth_torch"
+
+_MODULES = {
+    "Attachment": "model.attachment",
+    "Cloth": "model.cloth",
+    "ContactOptions": "model.options",
+    "ContactPoints": "sim.records.contact_points",
+    "ContactSurface": "model.round_bodies",
+    "Contacts": "sim.records.contacts",
+    "Control": "sim.records.controls",
+    "LinkSurfaces": "sim.records.surfaces",
+    "Material": "model.materials",
+    "Mechanism": "model.mechanism",
+    "Parameters": "sim.records.controls",
+    "Points": "model.attachment",
+    "Primitive": "model.round_bodies",
+    "Report": "sim.records.report",
+    "RigidBody": "model.rigid_body",
+    "Robot": "model.robot",
+    "Scene": "model.scene",
+    "Simulator": "sim.simulator",
+    "SolverOptions": "model.options",
+    "Springs": "model.springs",
+    "State": "sim.records.state",
+    "Surface": "geometry.mesh_checks",
+    "Surfaces": "sim.records.surfaces",
+}
+"""Class that files name -> its module."""
+
+_MODULES_0_1 = {
+    "sim.contact_points": ("ContactPoints",),
+    "sim.contacts": ("Contacts",),
+    "sim.controls": ("Control", "Parameters"),
+    "sim.report": ("Report",),
+    "sim.state": ("State",),
+    "sim.surfaces": ("LinkSurfaces", "Surfaces"),
+}
+"""Module that files of 0.1 name, where there is none now -> its classes."""
+
+# Reads classes at a path other than their own since this version of torch.
+_OTHER_PATHS = (2, 6)
+
+C = TypeVar("C", bound=type)
+
+
+def saved(cls: C) -> C:
+    """Save objects of a class by its name and their fields."""
+    if _MODULES.get(cls.__name__) != cls.__module__.removeprefix(f"{_PACKAGE}."):
+        raise TypeError(f"saved: {cls.__name__} needs its module in the table of saved classes")
+    copyreg.pickle(cls, _reduce)
+    return cls
+
+
+def _reduce(value: Any) -> tuple[Any, ...]:
+    if isinstance(value, tuple):
+        fields = value._asdict()  # type: ignore[attr-defined]
+    else:
+        own = getattr(value, "__getstate__", None)  # Python 3.10 has it only where a class does
+        fields = dict(own() if own else vars(value))
+    return restore, (type(value).__name__, FORMAT, fields)
+
+
+def restore(name: str, version: int, fields: dict[str, Any]) -> Any:
+    """Make an object from a file.
+
+    Args:
+        name: Name of its class.
+        version: Format of the file.
+        fields: Names and values of its fields.
+
+    Raises:
+        InvalidInput: If the format is newer than this version of the package, or holds a class
+            that it does not have.
+    """
+    if version > FORMAT or name not in _MODULES:
+        raise InvalidInput(
+            f"load: the file must have format {FORMAT} at most and classes of this version, got "
+            f"{name!r} of format {version}; install a later diffcloth_torch"
+        )
+    cls = _class(name)
+    if issubclass(cls, tuple):
+        return cls(**fields)
+    value = cls.__new__(cls)
+    getattr(value, "__setstate__", value.__dict__.update)(fields)
+    return value
+
+
+def _class(name: str) -> Any:
+    return getattr(import_module(f"{_PACKAGE}.{_MODULES[name]}"), name)
+
+
+def read_saved_objects() -> None:
+    """Allow `torch.load` to read saved objects, and pickles to name the modules of 0.1."""
+    import torch
+
+    torch.serialization.add_safe_globals([restore])
+    release = tuple(int(part) for part in torch.__version__.split(".")[:2])
+    for module, names in _MODULES_0_1.items():
+        classes = [_class(name) for name in names]
+        sys.modules[f"{_PACKAGE}.{module}"] = sys.modules[classes[0].__module__]
+        if release >= _OTHER_PATHS:
+            torch.serialization.add_safe_globals(
+                [(cls, f"{_PACKAGE}.{module}.{cls.__name__}") for cls in classes]
+            )
