@@ -21,6 +21,7 @@ from torch import Tensor
 
 from diffcloth_torch.checks import (
     ANY_NUMBER,
+    LARGEST,
     NON_NEGATIVE,
     POISSON,
     POSITIVE,
@@ -35,6 +36,7 @@ __all__ = [
     "FACE_QUANTITIES",
     "PARAMETERS",
     "STATE",
+    "STORING",
     "Axes",
     "Fields",
     "Quantity",
@@ -62,6 +64,8 @@ class Quantity(NamedTuple):
         accepted: Accepted values.
         core: Name of the core's input that it becomes; None if it has no input of its own.
         ignored: Whether a step ignores it.
+        stores: Whether a stored energy may depend on it: false of motion, loads and dissipation.
+        at_rest: Value in a static equilibrium, where resistance to motion vanishes; None keeps it.
     """
 
     name: str
@@ -71,6 +75,8 @@ class Quantity(NamedTuple):
     accepted: Range = ANY_NUMBER
     core: str | None = None
     ignored: bool = False
+    stores: bool = True
+    at_rest: float | None = None
 
     @property
     def row_shape(self) -> Shape:
@@ -91,7 +97,7 @@ _POSES, _TWIST, _WRENCH = "m, -", "m/s, rad/s", "N, N m"
 
 STATE = _table(
     Quantity("positions", "m", (("N", 3),), "result", core="positions"),
-    Quantity("velocities", "m/s", (("N", 3),), "result", core="velocities"),
+    Quantity("velocities", "m/s", (("N", 3),), "result", core="velocities", stores=False),
     Quantity("body_poses", _POSES, (("K", 7),), "result", core="body_poses"),
     Quantity("soft_pin_targets", "m", (("Q", 3),), "result", core="soft_pin_targets"),
     Quantity("body_forces", "N", (("V", 3),), "result", ignored=True),
@@ -107,40 +113,58 @@ STATE = _table(
     Quantity("pin_forces", "N", (("P", 3),), "result", ignored=True),
 )
 CONTROL = _table(
-    Quantity("pins", "m", (("P", 3),), "hold", core="pin_targets"),
+    Quantity("pins", "m", (("P", 3),), "hold", core="pin_targets", stores=False),
     Quantity("soft_pins", "m", (("Q", 3),), "hold", core="soft_pin_targets"),
-    Quantity("body_poses", _POSES, (("K", 7),), "hold", core="body_targets"),
-    Quantity("forces", "N", (("N", 3),), "zero", core="forces"),
-    Quantity("body_wrenches", _WRENCH, (("K", 6),), "zero"),
-    Quantity("joint_positions", "rad or m", _JOINTS, "hold"),
-    Quantity("joint_velocities", "rad/s or m/s", _JOINTS, "zero"),
-    Quantity("joint_efforts", "N m or N", _JOINTS, "zero"),
-    Quantity("base_poses", _POSES, (("R", 7),), "hold"),
-    Quantity("base_wrenches", _WRENCH, (("R", 6),), "zero"),
+    Quantity("body_poses", _POSES, (("K", 7),), "hold", core="body_targets", stores=False),
+    Quantity("forces", "N", (("N", 3),), "zero", core="forces", stores=False),
+    Quantity("body_wrenches", _WRENCH, (("K", 6),), "zero", stores=False),
+    Quantity("joint_positions", "rad or m", _JOINTS, "hold", stores=False),
+    Quantity("joint_velocities", "rad/s or m/s", _JOINTS, "zero", stores=False),
+    Quantity("joint_efforts", "N m or N", _JOINTS, "zero", stores=False),
+    Quantity("base_poses", _POSES, (("R", 7),), "hold", stores=False),
+    Quantity("base_wrenches", _WRENCH, (("R", 6),), "zero", stores=False),
     Quantity("attachments", "m", (("U", 3),), "released", core="attachment_targets"),
     Quantity(
         "attachment_weights", "-", (("A",),), "released", UNIT_INTERVAL, core="attachment_weights"
     ),
-    Quantity("wind", "m/s", ((3,),), "zero", core="wind"),
+    Quantity("wind", "m/s", ((3,),), "zero", core="wind", stores=False),
 )
 _TAKEN_BY_THE_CORE = (
     Quantity("stretch", "N/m", _PER_FACE, "Material.stretch", POSITIVE),
     Quantity("bending", "N m", _PER_FACE, "Material.bending", NON_NEGATIVE),
     Quantity("poisson", "-", _PER_FACE, "Material.poisson", POISSON),
-    Quantity("density", "kg/m^2", _PER_FACE, "Material.density", POSITIVE),
-    Quantity("damping", "s", _PER_FACE, "Material.damping", NON_NEGATIVE),
-    Quantity("friction", "-", _PAIRS, _OF_SURFACES.format("friction"), NON_NEGATIVE),
+    Quantity("density", "kg/m^2", _PER_FACE, "Material.density", POSITIVE, stores=False),
+    Quantity(
+        "damping", "s", _PER_FACE, "Material.damping", NON_NEGATIVE, stores=False, at_rest=0.0
+    ),
+    Quantity("friction", "-", _PAIRS, _OF_SURFACES.format("friction"), NON_NEGATIVE, stores=False),
     Quantity("thickness", "m", (("S",),), _OF_SURFACES.format("thickness"), NON_NEGATIVE),
     Quantity("barrier_stiffness", "Pa", _PAIRS, "ContactOptions.barrier_stiffness", POSITIVE),
     Quantity("barrier_distance", "m", _ONE, "ContactOptions.barrier_distance", POSITIVE),
-    Quantity("slip_velocity", "m/s", _ONE, "ContactOptions.slip_velocity", POSITIVE),
+    Quantity("slip_velocity", "m/s", _ONE, "ContactOptions.slip_velocity", POSITIVE, stores=False),
     Quantity("pin_stiffness", "N/m", ((), ("C",)), "Cloth.pin_stiffness", POSITIVE),
-    Quantity("gravity", "m/s^2", ((3,),), "Scene.gravity"),
+    Quantity("gravity", "m/s^2", ((3,),), "Scene.gravity", stores=False),
     Quantity("rest_positions", "m", (("N", 3),), "Cloth.rest_positions"),
     Quantity("attachment_stiffness", "N/m", (("A",),), "Attachment.stiffness", POSITIVE),
-    Quantity("normal_drag", "-", _PER_FACE, "Material.normal_drag", NON_NEGATIVE),
-    Quantity("tangential_drag", "-", _PER_FACE, "Material.tangential_drag", NON_NEGATIVE),
-    Quantity("air_density", "kg/m^3", _ONE, "Scene.air_density", NON_NEGATIVE),
+    Quantity(
+        "normal_drag",
+        "-",
+        _PER_FACE,
+        "Material.normal_drag",
+        NON_NEGATIVE,
+        stores=False,
+        at_rest=0.0,
+    ),
+    Quantity(
+        "tangential_drag",
+        "-",
+        _PER_FACE,
+        "Material.tangential_drag",
+        NON_NEGATIVE,
+        stores=False,
+        at_rest=0.0,
+    ),
+    Quantity("air_density", "kg/m^3", _ONE, "Scene.air_density", NON_NEGATIVE, stores=False),
 )
 _OF_WOVEN_CLOTH = (
     Quantity("stretch_weft", "N/m", _PER_FACE, "Material.stretch_weft", POSITIVE),
@@ -157,12 +181,36 @@ PARAMETERS = _table(
     Quantity("link_center", "m", (("L", 3),), "Robot.mechanism"),
     Quantity("link_inertia", "kg m^2", (("L", 3, 3),), "Robot.mechanism"),
     Quantity("joint_stiffness", "N m/rad or N/m", _JOINTS, "Robot.stiffness", NON_NEGATIVE),
-    Quantity("joint_damping", "N m s/rad or N s/m", _JOINTS, "Robot.damping", NON_NEGATIVE),
-    Quantity("joint_viscosity", "N m s/rad or N s/m", _JOINTS, "Robot.viscosity", NON_NEGATIVE),
+    Quantity(
+        "joint_damping",
+        "N m s/rad or N s/m",
+        _JOINTS,
+        "Robot.damping",
+        NON_NEGATIVE,
+        stores=False,
+        at_rest=0.0,
+    ),
+    Quantity(
+        "joint_viscosity",
+        "N m s/rad or N s/m",
+        _JOINTS,
+        "Robot.viscosity",
+        NON_NEGATIVE,
+        stores=False,
+        at_rest=0.0,
+    ),
     Quantity("joint_armature", "kg m^2 or kg", _JOINTS, "zero", NON_NEGATIVE),
     *(quantity._replace(core=quantity.name) for quantity in _OF_WOVEN_CLOTH),
     Quantity("joint_effort_limits", "N m or N", _JOINTS, "Robot.effort_limits", POSITIVE),
-    Quantity("joint_velocity_limits", "rad/s or m/s", _JOINTS, "Robot.velocity_limits", POSITIVE),
+    Quantity(
+        "joint_velocity_limits",
+        "rad/s or m/s",
+        _JOINTS,
+        "Robot.velocity_limits",
+        POSITIVE,
+        stores=False,
+        at_rest=LARGEST,
+    ),
     Quantity("joint_friction", "N m or N", _JOINTS, "Robot.joint_friction", NON_NEGATIVE),
     Quantity("joint_slip_rates", "rad/s or m/s", _JOINTS, "ContactOptions.slip_velocity", POSITIVE),
 )
@@ -174,7 +222,11 @@ DERIVED = (
     "joint_terms",
     "friction_origins",
 )
-"""Inputs of the core that follow from several fields: what drives the coordinates of bodies."""
+"""Inputs of the core that follow from several fields and drive the coordinates of bodies."""
+STORING = frozenset(
+    ("coordinates", *(q.core for t in (STATE, CONTROL, PARAMETERS) for q in t.values() if q.stores))
+) - {None}
+"""Inputs of the core on which a stored energy may depend."""
 FACE_QUANTITIES = tuple(name for name, quantity in PARAMETERS.items() if quantity.axes == _PER_FACE)
 """Names of the parameters that may differ from face to face."""
 

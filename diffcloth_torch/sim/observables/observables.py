@@ -13,7 +13,7 @@ from diffcloth_torch.checks import check_bool, check_count, check_shape
 from diffcloth_torch.dynamics.totals import Totals
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.options import SolverOptions
-from diffcloth_torch.model.quantities import Fields
+from diffcloth_torch.model.quantities import CONTROL, Fields
 from diffcloth_torch.operations import label
 from diffcloth_torch.sim.inputs.axes import with_axis, without_axes, without_axis
 from diffcloth_torch.sim.inputs.border import Border, Given
@@ -29,8 +29,8 @@ from diffcloth_torch.sim.solve.outcome import make_report, raise_on_failure
 
 __all__ = ["Observables"]
 
-# Fields of a control that store energy: where springs pull to, and how much.
-_STORING = ("attachments", "attachment_weights", "soft_pins")
+# Targets and weights of springs.
+_STORING = [name for name, quantity in CONTROL.items() if quantity.stores]
 
 
 class Observables:

@@ -8,33 +8,9 @@ from torch import Tensor
 from diffcloth_torch import _core
 from diffcloth_torch.autograd.core_function import Arrays, CoreFunction, as_array, evaluate
 from diffcloth_torch.autograd.transforms import is_differentiated
-from diffcloth_torch.model.quantities import Fields
+from diffcloth_torch.model.quantities import STORING, Fields
 
 __all__ = ["stored_energy"]
-
-# Motion, what acts on it and what dissipates it store nothing: no cotangent need go back there.
-_STORES_NOTHING = frozenset(
-    {
-        "velocities",
-        "body_targets",
-        "pin_targets",
-        "forces",
-        "gravity",
-        "density",
-        "damping",
-        "friction",
-        "slip_velocity",
-        "coordinate_ends",
-        "coordinate_targets",
-        "coordinate_metric",
-        "joint_terms",
-        "friction_origins",
-        "normal_drag",
-        "tangential_drag",
-        "air_density",
-        "wind",
-    }
-)
 
 
 def stored_energy(core: _core.Simulator, inputs: Fields) -> Fields:
@@ -47,7 +23,7 @@ def stored_energy(core: _core.Simulator, inputs: Fields) -> Fields:
     Returns:
         Part -> energy [B] J.
     """
-    storing = {n: t for n, t in inputs.items() if n not in _STORES_NOTHING}
+    storing = {n: t for n, t in inputs.items() if n in STORING}
     others = {n: as_array(t) for n, t in inputs.items() if n not in storing}
     # Inside Function.forward gradients are always off, so this is decided here.
     if not is_differentiated(storing.values()):

@@ -27,7 +27,12 @@ from diffcloth_torch.sim.records.surfaces import Surfaces
 from diffcloth_torch.sim.solve.cores import CoreOptions, arrays_of, core_inputs, make_core
 from diffcloth_torch.sim.solve.failures import failures_of, mark, refuse_gradients
 from diffcloth_torch.sim.solve.masses import cloth_totals
-from diffcloth_torch.sim.solve.motion import ended_poses, held_targets, prescribed_motion, with_rows
+from diffcloth_torch.sim.solve.motion import (
+    held_targets,
+    prescribed_motion,
+    reached_poses,
+    with_rows,
+)
 from diffcloth_torch.sim.solve.staggered import Staggered
 from diffcloth_torch.sim.solve.step import INTERSECTING, TURNED, Constant, Outcome, take_step
 
@@ -174,16 +179,12 @@ class Engine:
         return outcome, {**after, "joint_targets": self._held_targets(given)}
 
     def _moved(self, given: Given, ended: Mapping[int, FloatArray]) -> Fields:
-        """Fields of bodies that all move on prescribed poses."""
-        state, control = given.state, given.control
-        after = prescribed_motion(self.layout, state, control, self._dt)
+        """Fields of bodies that all move on prescribed poses, for some as far as these."""
+        control = given.control
         if ended:
-            poses = ended_poses(control["body_poses"], ended, len(state["positions"]))
-            with torch.no_grad():
-                reached = control | {"body_poses": poses}
-                there = prescribed_motion(self.layout, state, reached, self._dt)
-            after = with_rows(after, there, ended)
-        return after
+            poses = reached_poses(control["body_poses"], ended, len(given.state["positions"]))
+            control = control | {"body_poses": poses}
+        return prescribed_motion(self.layout, given.state, control, self._dt)
 
     def _advanced(self, dynamics: Dynamics, prediction: Prediction, outcome: Outcome) -> Fields:
         """Fields of bodies and robots after a step that has moved them."""
@@ -193,7 +194,7 @@ class Engine:
         after = dynamics.advance(prediction, coordinates, forces)
         ended = outcome.diagnostics["ended"]
         if ended:
-            poses = ended_poses(prediction.body_targets, ended, len(forces))
+            poses = reached_poses(prediction.body_targets, ended, len(forces))
             with torch.no_grad():
                 stopped = dynamics.end_at(prediction, poses)
                 there = dynamics.advance(stopped, coordinates, forces)

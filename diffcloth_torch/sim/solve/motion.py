@@ -13,21 +13,21 @@ from diffcloth_torch.geometry.rotation import row_velocities
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.sim.inputs.layout import Layout
 
-__all__ = ["ended_poses", "held_targets", "prescribed_motion", "with_rows"]
+__all__ = ["held_targets", "prescribed_motion", "reached_poses", "with_rows"]
 
 
-def ended_poses(targets: Tensor, ended: Mapping[int, FloatArray], environments: int) -> Tensor:
-    """Poses at the end of a step in which the motion of some environments stopped early.
+def reached_poses(targets: Tensor, ended: Mapping[int, FloatArray], environments: int) -> Tensor:
+    """Poses at the end of a step, [B, T, 7], without a graph where the motion stopped early.
 
     Args:
         targets: Poses at the end of the complete motion, [B or 1, T, 7].
         ended: Environment that stopped early -> its poses there, [T, 7].
         environments: Number of environments, B.
     """
-    poses = targets.detach().expand(environments, *targets.shape[1:]).clone()
-    for i, there in ended.items():
-        poses[i] = torch.from_numpy(there)
-    return poses
+    there = cpu.zeros(environments, *targets.shape[1:])
+    for i, poses in ended.items():
+        there[i] = torch.from_numpy(poses)
+    return with_rows({"": targets}, {"": there}, ended)[""]
 
 
 def with_rows(fields: Fields, others: Fields, environments: Iterable[int]) -> Fields:

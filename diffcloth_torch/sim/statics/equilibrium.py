@@ -35,11 +35,10 @@ from diffcloth_torch.autograd.transforms import (
     outside_transforms,
     plain,
 )
-from diffcloth_torch.checks import LARGEST
 from diffcloth_torch.errors import InvalidInput, SimulationError, TurnedTooFar
 from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.options import ContactOptions, SolverOptions
-from diffcloth_torch.model.quantities import Fields
+from diffcloth_torch.model.quantities import PARAMETERS, Fields
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.inputs.border import Given
 from diffcloth_torch.sim.inputs.layout import Layout
@@ -424,21 +423,11 @@ def _kinds(robot: Mechanism) -> list[str]:
 
 
 def _resting(given: Given) -> Given:
-    """The same inputs at rest, without damping, drag and limits of speeds: none acts there."""
+    """The same inputs at rest, where nothing resists motion."""
     parameters = given.parameters
-    resisting = (
-        "damping",
-        "normal_drag",
-        "tangential_drag",
-        "joint_damping",
-        "joint_viscosity",
-    )
-    none = {n: 0.0 * t for n, t in parameters.items() if n in resisting}
-    if "joint_velocity_limits" in parameters:
-        none["joint_velocity_limits"] = torch.full_like(
-            parameters["joint_velocity_limits"], LARGEST
-        )
-    return given.at_rest()._replace(parameters=parameters | none)
+    at_rest = {n: PARAMETERS[n].at_rest for n in parameters}
+    values = {n: 0.0 * parameters[n] + v for n, v in at_rest.items() if v is not None}
+    return given.at_rest()._replace(parameters=parameters | values)
 
 
 def _slower(given: Given, length: float) -> Given:
