@@ -13,6 +13,11 @@ PAGE = ROOT / "docs" / "extending.md"
 _INCLUDE = re.compile(r'^\s*#\s*include\s+"([^"]+)"', re.MULTILINE)
 
 
+def section(text: str, title: str) -> str:
+    """Text of the section of a page below a title, as far as the next section."""
+    return text[text.index(f"\n## {title}\n") :].split("\n## ", 2)[1]
+
+
 def class_of_page(text: str) -> tuple[str, str]:
     """Path and text of the class in the section of a potential."""
     path = re.search(r"^\*\*The class\*\*, `([^`]+)`", text, re.MULTILINE)[1]
