@@ -42,7 +42,7 @@ def test_cpp_includes_point_down(source):
 @pytest.mark.parametrize(
     ("folder", "path"),
     [
-        pytest.param("linalg", "step/coupled.h", id="upward"),
+        pytest.param("linalg", "step/schemes/coupled.h", id="upward"),
         pytest.param("contact", "elastic/stretch.h", id="sideways"),
         pytest.param("mesh", "topology.h", id="not relative to csrc"),
     ],

@@ -9,7 +9,7 @@ namespace diffcloth::elastic {
 
 /// Nearness to a target in the constant form of the elastic energy,  P = 1/2 (x - y)^T L (x - y).
 ///
-/// With nearness in the masses it is that in G = M + h^2 L: see step/split.cpp. What L is made of is
+/// With nearness in the masses it is that in G = M + h^2 L: see step/schemes/split.cpp. What L is made of is
 /// what the elastic potentials are made of: they keep the cotangents for both.
 class ElasticNearness final : public Potential {
  public:

@@ -4,10 +4,10 @@
 #include <utility>
 
 #include "solver/linear_system.h"
-#include "step/attachments.h"
-#include "step/elasticity.h"
-#include "step/potentials.h"
-#include "step/soft_pins.h"
+#include "step/potentials/attachments.h"
+#include "step/potentials/elasticity.h"
+#include "step/potentials/potentials.h"
+#include "step/potentials/soft_pins.h"
 
 namespace diffcloth::step {
 

@@ -49,7 +49,7 @@ class Problem {
   std::vector<double> origins;  ///< like start, vertices at friction_origins; empty: at the start
 
   Proximity inertia;  ///< metric M, target xhat = x_n + h v_n + h^2 (gravity + M^-1 f)
-  std::vector<std::unique_ptr<StepPotential>> potentials;  ///< see potentials.cpp
+  std::vector<std::unique_ptr<StepPotential>> potentials;  ///< see potentials/potentials.cpp
   std::optional<bodies::CoordinatePotential> chart;        ///< absent without free coordinates
   std::optional<contact::ContactModel> contact;            ///< absent where nothing can touch
 

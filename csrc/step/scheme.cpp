@@ -4,9 +4,9 @@
 #include <stdexcept>
 #include <string>
 
-#include "step/coupled.h"
-#include "step/projective.h"
-#include "step/split.h"
+#include "step/schemes/coupled.h"
+#include "step/schemes/projective.h"
+#include "step/schemes/split.h"
 
 namespace diffcloth::step {
 

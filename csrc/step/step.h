@@ -51,7 +51,7 @@ struct Loss {
 inline constexpr std::size_t kAtOnce = linalg::kMaxVectors;
 
 /// Gradients of a step that forward() took, of several losses, each with the bits that it has alone: see
-/// contact_stage.cpp for the derivation.
+/// schemes/contact_stage.cpp for the derivation.
 ///
 /// @param kept  what forward kept, or nothing
 /// @throws std::domain_error when the solution is not a local minimum.

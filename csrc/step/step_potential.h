@@ -14,7 +14,7 @@ class Problem;
 class Tangents;
 
 /// A potential of the cloths that every step minimizes, and how it hangs together with the step's
-/// inputs. It is made from a Problem; step/potentials.cpp lists all.
+/// inputs. It is made from a Problem; step/potentials/potentials.cpp lists all.
 class StepPotential {
  public:
   StepPotential() = default;

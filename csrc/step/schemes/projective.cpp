@@ -1,9 +1,9 @@
-#include "step/projective.h"
+#include "step/schemes/projective.h"
 
 #include <algorithm>
 #include <limits>
 
-#include "step/elastic_stage.h"
+#include "step/schemes/elastic_stage.h"
 
 namespace diffcloth::step {
 

@@ -1,4 +1,4 @@
-#include "step/air.h"
+#include "step/potentials/air.h"
 
 #include <algorithm>
 #include <cstddef>

@@ -1,4 +1,4 @@
-#include "step/taken_solves.h"
+#include "step/schemes/taken_solves.h"
 
 #include <algorithm>
 #include <stdexcept>

@@ -4,7 +4,7 @@
 
 #include "projective/local_global.h"
 #include "solver/newton.h"
-#include "step/nodal_contacts.h"
+#include "step/nodal/contacts.h"
 #include "step/scheme.h"
 
 namespace diffcloth::step {
@@ -13,7 +13,7 @@ namespace diffcloth::step {
 /// with the law of Signorini and Coulomb at each node in contact (the paper's Eqs. 3-5). Contacts are
 /// found once, on the straight way from x_n to the inertial prediction.
 ///
-/// See nodal_system.cpp for the equations, nodal_adjoint.cpp for their adjoint.
+/// See nodal/system.cpp for the equations, nodal/adjoint.cpp for their adjoint.
 class NodalStage {
  public:
   explicit NodalStage(Problem& problem) : problem_(problem), contacts_(problem) {}

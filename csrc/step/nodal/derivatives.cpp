@@ -2,7 +2,7 @@
 
 #include <stdexcept>
 
-#include "step/nodal_system.h"
+#include "step/nodal/system.h"
 
 namespace diffcloth::step {
 

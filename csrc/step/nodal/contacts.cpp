@@ -1,4 +1,4 @@
-#include "step/nodal_contacts.h"
+#include "step/nodal/contacts.h"
 
 #include <algorithm>
 #include <array>

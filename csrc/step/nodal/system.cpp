@@ -1,4 +1,4 @@
-// Dry frictional contact at nodes. Its adjoint is in nodal_adjoint.cpp.
+// Dry frictional contact at nodes. Its adjoint is in nodal/adjoint.cpp.
 //
 // Let g(x) be the gradient of inertia + elasticity + anchors. Contact c acts through a map E with
 // orthonormal rows: on a body's obstacle E x = x_i; between vertices E x = (x_i - x_j) / sqrt(2) = s
@@ -28,7 +28,7 @@
 // the solution is a minimum where the friction is frozen. Off the solution the same operators, with t and k
 // of s = r - rho u, are those of a semismooth Newton method.
 
-#include "step/nodal_system.h"
+#include "step/nodal/system.h"
 
 #include <algorithm>
 #include <array>

@@ -1,11 +1,11 @@
-#include "step/elastic_stage.h"
+#include "step/schemes/elastic_stage.h"
 
 #include <algorithm>
 #include <utility>
 
 #include "projective/local_global.h"
 #include "solver/newton.h"
-#include "step/contact_stage.h"
+#include "step/schemes/contact_stage.h"
 
 namespace diffcloth::step {
 namespace {

@@ -1,4 +1,4 @@
-#include "step/elasticity.h"
+#include "step/potentials/elasticity.h"
 
 #include <algorithm>
 #include <array>

@@ -2,7 +2,7 @@
 
 #include <vector>
 
-#include "step/nodal_stage.h"
+#include "step/nodal/stage.h"
 #include "step/scheme.h"
 
 namespace diffcloth::step {

@@ -17,7 +17,7 @@ struct NodalContacts {
   std::vector<projective::Obstacle> obstacles;
   std::vector<projective::NodalContact> list;
   std::vector<Index> partner;            ///< [N] vertex in contact with each, or -1
-  std::vector<double> inertia;           ///< [N] rho, see nodal_system.cpp [kg]
+  std::vector<double> inertia;           ///< [N] rho, see nodal/system.cpp [kg]
   std::unique_ptr<Potential> couplings;  ///< of pairs, without energy; null without pairs
 };
 

@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "solver/linear_system.h"
-#include "step/contact_sum.h"
+#include "step/schemes/contact_sum.h"
 
 namespace diffcloth::step {
 

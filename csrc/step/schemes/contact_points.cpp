@@ -1,4 +1,4 @@
-#include "step/contact_points.h"
+#include "step/schemes/contact_points.h"
 
 #include <array>
 #include <cmath>

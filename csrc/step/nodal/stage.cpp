@@ -1,4 +1,4 @@
-#include "step/nodal_stage.h"
+#include "step/nodal/stage.h"
 
 #include <algorithm>
 #include <cmath>
@@ -6,7 +6,7 @@
 #include <utility>
 
 #include "projective/anderson.h"
-#include "step/nodal_system.h"
+#include "step/nodal/system.h"
 
 namespace diffcloth::step {
 namespace {

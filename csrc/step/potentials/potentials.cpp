@@ -1,10 +1,10 @@
-#include "step/potentials.h"
+#include "step/potentials/potentials.h"
 
-#include "step/air.h"
-#include "step/attachments.h"
-#include "step/elasticity.h"
+#include "step/potentials/air.h"
+#include "step/potentials/attachments.h"
+#include "step/potentials/elasticity.h"
+#include "step/potentials/soft_pins.h"
 #include "step/problem.h"
-#include "step/soft_pins.h"
 
 namespace diffcloth::step {
 

@@ -18,9 +18,9 @@
 #include <algorithm>
 #include <utility>
 
-#include "step/contact_stage.h"
-#include "step/contact_sum.h"
-#include "step/taken_solves.h"
+#include "step/schemes/contact_stage.h"
+#include "step/schemes/contact_sum.h"
+#include "step/schemes/taken_solves.h"
 
 namespace diffcloth::step {
 namespace {

@@ -1,4 +1,4 @@
-#include "step/attachments.h"
+#include "step/potentials/attachments.h"
 
 #include <algorithm>
 

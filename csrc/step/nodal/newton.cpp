@@ -1,6 +1,6 @@
 // How a stage with dry friction at nodes is solved.
 //
-// Newton's method on the equations of nodal_system.cpp is quick where it knows the case of each contact,
+// Newton's method on the equations of nodal/system.cpp is quick where it knows the case of each contact,
 // but between cases its residual is no measure of the way to go: steps that reduce it, and steps that
 // do not, may go round in circles. So it is taken at its word only where it contracts the residual below
 // all that was seen before. Else an energy leads. With friction as large as some impulses allow the step
@@ -29,8 +29,8 @@
 
 #include "solver/linear_system.h"
 #include "solver/saddle.h"
-#include "step/nodal_stage.h"
-#include "step/nodal_system.h"
+#include "step/nodal/stage.h"
+#include "step/nodal/system.h"
 
 namespace diffcloth::step {
 
@@ -287,7 +287,7 @@ class NodalSolve {
   NodalSystem::Point here_;
   NodalSystem::Point there_;
   std::unique_ptr<const linalg::BlockMatrix> H_;  // exact, at `here`
-  std::unique_ptr<const linalg::BlockMatrix> S_;  // see nodal_system.cpp
+  std::unique_ptr<const linalg::BlockMatrix> S_;  // see nodal/system.cpp
   solver::Factor factor_;                         // of S; null where it is indefinite
   Array constraint_step_;
 

@@ -1,4 +1,4 @@
-#include "step/motion.h"
+#include "step/schemes/motion.h"
 
 #include <algorithm>
 #include <cmath>

@@ -6,7 +6,7 @@
 #include <vector>
 
 #include "contact/contact_potential.h"
-#include "step/contact_stage.h"
+#include "step/schemes/contact_stage.h"
 
 namespace diffcloth::step {
 

@@ -3,7 +3,7 @@
 // paper's Eqs. 8 and 29 with all explicit terms. In the metric `energy` it is zero, unless nodes touch. Tangents
 // go the other way: that of x^D is one of the contact stage's inputs.
 
-#include "step/split.h"
+#include "step/schemes/split.h"
 
 #include <algorithm>
 #include <optional>
@@ -11,9 +11,9 @@
 
 #include "elastic/elastic_nearness.h"
 #include "potential/tilt.h"
-#include "step/contact_stage.h"
-#include "step/elastic_stage.h"
-#include "step/elasticity.h"
+#include "step/potentials/elasticity.h"
+#include "step/schemes/contact_stage.h"
+#include "step/schemes/elastic_stage.h"
 
 namespace diffcloth::step {
 namespace {

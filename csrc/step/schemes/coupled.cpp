@@ -1,9 +1,9 @@
-#include "step/coupled.h"
+#include "step/schemes/coupled.h"
 
 #include <cstddef>
 #include <utility>
 
-#include "step/contact_stage.h"
+#include "step/schemes/contact_stage.h"
 
 namespace diffcloth::step {
 namespace {

@@ -1,4 +1,4 @@
-// The tangent of dry frictional contact at nodes, in the terms of nodal_system.cpp.
+// The tangent of dry frictional contact at nodes, in the terms of nodal/system.cpp.
 //
 // The held part of the change of x follows from  E (x - x_n) = h s v_out  there: with the tangents of all that
 // the frame depends on,
@@ -15,8 +15,8 @@
 #include <utility>
 
 #include "solver/linear_system.h"
-#include "step/nodal_stage.h"
-#include "step/nodal_system.h"
+#include "step/nodal/stage.h"
+#include "step/nodal/system.h"
 
 namespace diffcloth::step {
 

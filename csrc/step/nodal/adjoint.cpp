@@ -1,8 +1,8 @@
-// The adjoint of dry frictional contact at nodes, in the terms of nodal_system.cpp.
+// The adjoint of dry frictional contact at nodes, in the terms of nodal/system.cpp.
 //
 // For the cotangent g_x of x, let lambda = Z lambda solve  K^T lambda = Z (g_x + H eta), with eta
 // those of the forces g at nodes, which cloths, bodies and pins feel. Then z = L^T lambda - eta goes through the
-// potentials as in contact_stage.cpp. The cotangent of E (x - x_n) - h s v_out at fixed g is minus
+// potentials as in schemes/contact_stage.cpp. The cotangent of E (x - x_n) - h s v_out at fixed g is minus
 //
 //   q = (I - P) E (g_x - H z)  +  F lambda            (the first term without P where it sticks)
 //
@@ -16,8 +16,8 @@
 #include <utility>
 
 #include "solver/linear_system.h"
-#include "step/nodal_stage.h"
-#include "step/nodal_system.h"
+#include "step/nodal/stage.h"
+#include "step/nodal/system.h"
 
 namespace diffcloth::step {
 

@@ -1,4 +1,4 @@
-#include "step/contact_stage.h"
+#include "step/schemes/contact_stage.h"
 
 #include <algorithm>
 #include <cmath>
@@ -8,10 +8,10 @@
 #include <utility>
 
 #include "solver/newton.h"
-#include "step/attachments.h"
-#include "step/contact_points.h"
-#include "step/contact_sum.h"
-#include "step/motion.h"
+#include "step/potentials/attachments.h"
+#include "step/schemes/contact_points.h"
+#include "step/schemes/contact_sum.h"
+#include "step/schemes/motion.h"
 
 namespace diffcloth::step {
 namespace {

@@ -1,4 +1,4 @@
-#include "step/soft_pins.h"
+#include "step/potentials/soft_pins.h"
 
 #include <algorithm>
 #include <numeric>

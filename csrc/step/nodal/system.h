@@ -10,12 +10,12 @@
 #include "projective/nodal_contact.h"
 #include "solver/linear_system.h"
 #include "solver/objective.h"
-#include "step/nodal_contacts.h"
+#include "step/nodal/contacts.h"
 #include "step/problem.h"
 
 namespace diffcloth::step {
 
-/// s of a contact: see nodal_system.cpp.
+/// s of a contact: see nodal/system.cpp.
 double scale(const projective::NodalContact& contact);
 
 /// E v.
