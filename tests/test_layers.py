@@ -16,21 +16,54 @@ CPP_LAYERS = [
     {"mesh"},
     {"potential"},
     {"elastic", "air", "contact", "bodies"},
-    {"solver", "projective"},
+    {"solver"},
+    {"projective"},
     {"step"},
     {"bind"},
 ]
-RANK = {folder: rank for rank, row in enumerate(CPP_LAYERS) for folder in row}
+# Inside csrc/step: its folders, and the files of its root without their endings.
+STEP_LAYERS = [
+    {"inputs", "report"},
+    {"scene", "step_potential"},
+    {"problem"},
+    {"cotangents", "tangents"},
+    {"potentials", "scheme"},
+    {"nodal"},
+    {"schemes"},
+    {"step"},
+    {"energy", "default_barrier", "throw"},
+]
 SOURCES = sorted(p for p in (ROOT / "csrc").rglob("*") if p.suffix in {".h", ".cpp"})
 
 
-def forbidden_includes(folder: str, text: str) -> list[str]:
-    included = re.findall(r'^\s*#\s*include\s+"([^"]+)"', text, re.MULTILINE)
+def includes(text: str) -> list[str]:
+    return re.findall(r'^\s*#\s*include\s+"([^"]+)"', text, re.MULTILINE)
+
+
+def not_below(unit: str, targets: dict[str, str], layers: list[set[str]]) -> list[str]:
+    """Those of the includes, path -> unit, that are neither of a unit itself nor of a lower row."""
+    rank = {name: row for row, names in enumerate(layers) for name in names}
     return [
         path
-        for path in included
-        if (target := path.split("/")[0]) != folder and RANK.get(target, 99) >= RANK[folder]
+        for path, target in targets.items()
+        if target != unit and rank.get(target, 99) >= rank[unit]
     ]
+
+
+def forbidden_includes(folder: str, text: str) -> list[str]:
+    targets = {path: path.split("/")[0] for path in includes(text)}
+    return not_below(folder, targets, CPP_LAYERS)
+
+
+def forbidden_in_step(unit: str, text: str) -> list[str]:
+    inside = [path for path in includes(text) if path.startswith("step/")]
+    targets = {path: step_unit(Path(path)) for path in inside}
+    return not_below(unit, targets, STEP_LAYERS)
+
+
+def step_unit(path: Path) -> str:
+    """Of a path in csrc: the folder in csrc/step, or the file in its root."""
+    return path.with_suffix("").parts[1]
 
 
 @pytest.mark.parametrize("source", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
@@ -49,6 +82,29 @@ def test_cpp_includes_point_down(source):
 )
 def test_an_include_against_the_order_is_found(folder, path):
     assert forbidden_includes(folder, f'#pragma once\n#include "{path}"\n') == [path]
+
+
+@pytest.mark.parametrize(
+    "source",
+    [p for p in SOURCES if p.is_relative_to(ROOT / "csrc/step")],
+    ids=lambda p: str(p.relative_to(ROOT)),
+)
+def test_includes_inside_the_step_point_down(source):
+    unit = step_unit(source.relative_to(ROOT / "csrc"))
+    assert forbidden_in_step(unit, source.read_text()) == []
+
+
+@pytest.mark.parametrize(
+    ("unit", "path"),
+    [
+        pytest.param("problem", "step/potentials/air.h", id="upward"),
+        pytest.param("nodal", "step/schemes/split.h", id="from one wing to the next"),
+        pytest.param("energy", "step/throw.h", id="sideways"),
+        pytest.param("scene", "step/new.h", id="to a unit without a place"),
+    ],
+)
+def test_an_include_against_the_order_inside_the_step_is_found(unit, path):
+    assert forbidden_in_step(unit, f'#pragma once\n#include "{path}"\n') == [path]
 
 
 def test_only_bind_knows_python():

@@ -24,10 +24,8 @@ constexpr std::array kBendingModels{
 };
 
 /// The value of a name.
-template <class Value>
-Value choose(const char* field,
-             std::span<const step::Named<Value>> choices,
-             const std::string& name) {
+template <class Value, class Table>
+Value choose(const char* field, const Table& choices, const std::string& name) {
   std::string names;
   for (const auto& choice : choices) {
     if (name == choice.name) return choice.value;
@@ -169,7 +167,7 @@ void take_surfaces(NamedFields& fields, step::Description& d) {
 void take_options(NamedFields& fields, step::Description& d) {
   d.self_contact = fields.take<bool>("self_contact");
   d.dt = fields.take<double>("dt");
-  d.scheme = fields.take<std::string>("scheme");
+  d.scheme = choose<step::SchemeKind>("scheme", step::kSchemes, fields.take<std::string>("scheme"));
   d.metric = choose<step::Metric>("metric", step::kMetrics, fields.take<std::string>("metric"));
   d.elastic = choose<step::ElasticSolver>("elastic", step::kElasticSolvers,
                                           fields.take<std::string>("elastic"));

@@ -5,7 +5,7 @@
 #include <vector>
 
 #include "bind/arrays.h"
-#include "step/fields.h"
+#include "step/inputs.h"
 
 namespace diffcloth::bind {
 

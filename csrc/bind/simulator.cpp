@@ -25,7 +25,7 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   const std::vector<double> expected = step_seconds_;  // another call may write while this one runs
   last_turns_ = for_environments(b, threads, expected, [&](Index i, const Checkpoint& checkpoint) {
     const auto e = static_cast<std::size_t>(i);
-    step::Kept found;
+    solver::KeptSolves found;
     reports[e] = step::forward(scene_, arrays.environment(e), checkpoint, outputs.environment(e),
                                tapes.environment(e), found, threads_each(b, threads), nullptr);
     if (tape) kept.tickets[e] = factors_.insert(std::move(found));
@@ -50,7 +50,7 @@ nb::object Simulator::path(const nb::dict& inputs) {
   const Outputs outputs(outputs_, {1}, "", unused);
   std::vector<std::vector<double>> path;
   for_environments(1, 1, {}, [&](Index, const Checkpoint& checkpoint) {
-    step::Kept kept;
+    solver::KeptSolves kept;
     step::forward(scene_, arrays.environment(0), checkpoint, outputs.environment(0), {}, kept, 1,
                   &path);
   });

@@ -9,8 +9,8 @@
 #include "bind/arrays.h"
 #include "bind/environments.h"
 #include "bind/field_arrays.h"
-#include "step/factor_cache.h"
-#include "step/fields.h"
+#include "solver/factor_cache.h"
+#include "step/inputs.h"
 #include "step/scene.h"
 #include "step/step.h"
 
@@ -18,7 +18,7 @@ namespace diffcloth::bind {
 
 /// What a step with a tape keeps for its backward, environment by environment: given up with the tape.
 struct KeptSteps {
-  std::vector<std::shared_ptr<step::FactorCache::Ticket>> tickets;
+  std::vector<std::shared_ptr<solver::FactorCache::Ticket>> tickets;
   std::vector<double> costs;  ///< of a derivative, in any unit
 };
 
@@ -73,7 +73,7 @@ class Simulator {
   step::Scene scene_;
   std::vector<step::Field> outputs_;
   std::vector<step::Field> tape_;
-  step::FactorCache factors_;
+  solver::FactorCache factors_;
 
   // Read and written with the GIL. What a step took is the best guess of what the next one will take,
   // and decides nothing but the order in which threads take environments.

@@ -15,7 +15,7 @@
 #include "bind/numbers.h"
 #include "bind/reports.h"
 #include "bind/simulator.h"
-#include "step/scheme.h"
+#include "step/scene.h"
 
 namespace diffcloth::bind {
 
@@ -31,16 +31,16 @@ std::vector<std::string> names_of(const Table& table) {
   return names;
 }
 
-/// What each scheme is able to, by their names.
+/// Capabilities of each scheme, by its name.
 nb::dict abilities_of_schemes() {
   nb::dict result;
-  for (const step::Scheme* scheme : step::schemes()) {
+  for (const step::SchemeRow& scheme : step::kSchemes) {
     nb::dict abilities;
-    abilities["barrier"] = scheme->has_barrier();
-    abilities["moves_bodies"] = scheme->moves_bodies();
-    abilities["elastic_stage"] = scheme->has_elastic_stage();
-    abilities["metrics"] = scheme->has_metrics();
-    result[std::string(scheme->name()).c_str()] = abilities;
+    abilities["barrier"] = scheme.has_barrier;
+    abilities["moves_bodies"] = scheme.moves_bodies;
+    abilities["elastic_stage"] = scheme.has_elastic_stage;
+    abilities["metrics"] = scheme.has_metrics;
+    result[scheme.name] = abilities;
   }
   return result;
 }
@@ -103,7 +103,7 @@ void simulator(nb::module_& m) {
                    "For each environment of the last step, or portion of the last derivative, how "
                    "many began before it, and the seconds that it took.")
       .def_prop_ro_static("largest_factor_bytes",
-                          [](nb::handle) { return step::FactorCache::kBytes; });
+                          [](nb::handle) { return solver::FactorCache::kBytes; });
   m.attr("input_names") = names_of(step::kInputTable);
   m.attr("schemes") = abilities_of_schemes();
   m.attr("metrics") = names_of(step::kMetrics);

@@ -3,6 +3,11 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <stdexcept>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <vector>
 
 #include "common/types.h"
 
@@ -156,10 +161,40 @@ struct Inputs {
   const double* data(Input input) const { return (*this)[input].data; }
 };
 
-/// Where one environment's gradients go: arrays like the inputs, zeroed; null where not wanted.
+/// Gradients of one environment: arrays like the inputs, zeroed; null where not requested.
 struct Gradients {
   std::array<double*, kInputCount> data{};
   double* operator[](Input input) const { return data[static_cast<std::size_t>(input)]; }
+};
+
+/// Name and shape of an array of doubles of each environment: an output, or a part of the tape.
+struct Field {
+  std::string name;
+  std::vector<std::size_t> shape;
+
+  std::size_t size() const {
+    std::size_t result = 1;
+    for (const std::size_t extent : shape) result *= extent;
+    return result;
+  }
+};
+
+/// One environment's arrays by name. T is double or const double.
+template <class T>
+class Arrays {
+ public:
+  void set(std::string_view name, T* data) { entries_.emplace_back(name, data); }
+  bool empty() const { return entries_.empty(); }
+
+  T* operator[](std::string_view name) const {
+    for (const auto& [own, data] : entries_) {
+      if (own == name) return data;
+    }
+    throw std::out_of_range("step: no array '" + std::string(name) + "'");
+  }
+
+ private:
+  std::vector<std::pair<std::string, T*>> entries_;
 };
 
 }  // namespace diffcloth::step

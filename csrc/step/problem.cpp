@@ -4,10 +4,6 @@
 #include <utility>
 
 #include "solver/linear_system.h"
-#include "step/potentials/attachments.h"
-#include "step/potentials/elasticity.h"
-#include "step/potentials/potentials.h"
-#include "step/potentials/soft_pins.h"
 
 namespace diffcloth::step {
 
@@ -171,25 +167,6 @@ std::vector<Potential*> Problem::cloth_potentials() const {
   result.reserve(potentials.size());
   for (const auto& potential : potentials) result.push_back(&potential->potential());
   return result;
-}
-
-std::vector<elastic::SpringPotential*> Problem::springs() const {
-  return {&find<SoftPins>().potential(), &find<Attachments>().potential()};
-}
-
-elastic::ConstantForm Problem::constant_form() const {
-  std::vector<elastic::Springs> kinds;
-  for (const elastic::SpringPotential* const kind : springs()) kinds.push_back(kind->springs());
-  return {find<Elasticity>().model(), scene.slots, kinds, scene.elastic_patterns.base()};
-}
-
-std::shared_ptr<const projective::ConstantMatrix> Problem::constant_matrix() const {
-  const elastic::ConstantForm form = constant_form();
-  std::vector<double> values(form.values().begin(), form.values().end());
-  for (std::size_t i = 0; i < masses.size(); ++i) {
-    values[form.pattern().column_start()[i]] += masses[i] / (h * h);
-  }
-  return scene.constant_matrices.find(values);
 }
 
 solver::Objective Problem::objective(Proximity& inertia_or_nearness,

@@ -7,10 +7,7 @@
 
 #include "bodies/coordinate_potential.h"
 #include "contact/contact_set.h"
-#include "elastic/constant_form.h"
-#include "elastic/elastic_potential.h"
 #include "potential/proximity.h"
-#include "projective/constant_matrix.h"
 #include "solver/coordinates.h"
 #include "solver/objective.h"
 #include "solver/pattern_cache.h"
@@ -49,7 +46,7 @@ class Problem {
   std::vector<double> origins;  ///< like start, vertices at friction_origins; empty: at the start
 
   Proximity inertia;  ///< metric M, target xhat = x_n + h v_n + h^2 (gravity + M^-1 f)
-  std::vector<std::unique_ptr<StepPotential>> potentials;  ///< see potentials/potentials.cpp
+  std::vector<std::unique_ptr<StepPotential>> potentials;  ///< see make_potentials()
   std::optional<bodies::CoordinatePotential> chart;        ///< absent without free coordinates
   std::optional<contact::ContactModel> contact;            ///< absent where nothing can touch
 
@@ -67,15 +64,6 @@ class Problem {
     }
     throw std::logic_error("step: no such potential");
   }
-
-  /// Those of them that are springs: soft pins and attachments.
-  std::vector<elastic::SpringPotential*> springs() const;
-
-  /// L of elasticity and springs.
-  elastic::ConstantForm constant_form() const;
-
-  /// A = M/h^2 + L over the cloths' free vertices, factored.
-  std::shared_ptr<const projective::ConstantMatrix> constant_matrix() const;
 
   /// A sum of potentials over the cloths' vertices, without contact.
   solver::Objective objective(Proximity& inertia,

@@ -7,6 +7,7 @@
 
 #include "common/stopwatch.h"
 #include "common/types.h"
+#include "contact/friction_set.h"
 #include "solver/linear_system.h"
 
 namespace diffcloth::step {
@@ -79,6 +80,31 @@ struct Report {
     visit("count_sticking", static_cast<std::int64_t>(sticking));
     visit("count_slipping", static_cast<std::int64_t>(slipping));
   }
+};
+
+/// Contacts of each pair of surfaces and the force of the first on the second, added up in a report.
+class PairTally {
+ public:
+  explicit PairTally(Report& report) : pairs_(report.pairs) {}
+
+  /// Count the contacts of a solution, and add the forces of barrier and friction there.
+  ///
+  /// @param contacts  at the solution
+  /// @param friction  of the contacts that it was taken from; null where there are none
+  void add(const contact::ContactModel& model,
+           const std::vector<contact::Contact>& contacts,
+           const contact::FrictionSet* friction,
+           const std::vector<double>& x);
+
+  /// Count one contact of two surfaces, the smaller first.
+  ///
+  /// @param force  of the first on the second [N]
+  void add(Index first, Index second, const Vec3& force);
+
+ private:
+  PairContacts& of(Index first, Index second);
+
+  std::vector<PairContacts>& pairs_;
 };
 
 }  // namespace diffcloth::step

@@ -7,8 +7,6 @@
 #include <sstream>
 #include <utility>
 
-#include "step/scheme.h"
-
 namespace diffcloth::step {
 namespace {
 
@@ -108,7 +106,7 @@ double mean_length(const mesh::RestShape& rest,
   return sum / static_cast<double>(count);
 }
 
-/// Where nothing is said of trees: every body is one, of one link without coordinates.
+/// The mechanisms as given; without any, each body is a tree of one link without coordinates.
 bodies::MechanismsDescription complete(const Description& d) {
   bodies::MechanismsDescription m = d.mechanisms;
   if (!m.tree_free.empty()) return m;
@@ -248,7 +246,6 @@ std::vector<bodies::Mechanisms::FreeBody> find_free_bodies(const Description& d,
 
 Scene::Scene(Description description)
     : given(std::move(description)),
-      scheme(&find_scheme(given.scheme)),
       topology(static_cast<Index>(given.vertices.size() / 3), given.faces),
       face_cloth(owners(given.cloth_face_start)),
       material_axes(vectors(given.material_axes)),
@@ -264,8 +261,8 @@ Scene::Scene(Description description)
       feature_weights(collision_mesh, all_rest_positions(given).data(), prescribed),
       broad_phase(collision_mesh, reference_positions(given).data()),
       face_search(face_searches(given)),
-      vertex_spheres(scheme->has_barrier() ? projective::VertexSpheres()
-                                           : make_vertex_spheres(given, collision_mesh)),
+      vertex_spheres(scheme().has_barrier ? projective::VertexSpheres()
+                                          : make_vertex_spheres(given, collision_mesh)),
       elastic_patterns(
           with_nodes(topology.vertex_count, cloth_cliques(given, topology, stencils), mechanisms),
           fixed_rows(prescribed, topology.vertex_count, mechanisms)),

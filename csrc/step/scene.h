@@ -23,9 +23,10 @@
 
 namespace diffcloth::step {
 
-class Scheme;
+/// The ways to take a step.
+enum class SchemeKind : std::uint8_t { kCoupled, kSplit, kProjective };
 
-/// What the contact stage of `split` measures nearness in.
+/// Metric of the contact stage of `split`.
 enum class Metric : std::uint8_t { kEnergy, kElastic, kMass, kIdentity };
 
 /// How the elastic stage of `split` and `projective` is solved.
@@ -40,7 +41,30 @@ struct Named {
   Value value;
 };
 
-/// All of them, the default first.
+/// A scheme: its name in Python and its capabilities.
+struct SchemeRow {
+  const char* name;
+  SchemeKind value;
+  bool has_barrier = true;         ///< else cloths touch bodies and each other at their nodes
+  bool moves_bodies = false;       ///< cloths and dynamic bodies are solved together
+  bool has_elastic_stage = false;  ///< elasticity is solved alone first, by one of kElasticSolvers
+  bool has_metrics = false;        ///< nearness may be measured in each of kMetrics
+};
+
+/// All schemes in the order of SchemeKind, the default first.
+inline constexpr std::array kSchemes{
+    SchemeRow{.name = "coupled", .value = SchemeKind::kCoupled, .moves_bodies = true},
+    SchemeRow{.name = "split",
+              .value = SchemeKind::kSplit,
+              .has_elastic_stage = true,
+              .has_metrics = true},
+    SchemeRow{.name = "projective",
+              .value = SchemeKind::kProjective,
+              .has_barrier = false,
+              .has_elastic_stage = true},
+};
+
+/// All metrics and solvers, the defaults first.
 inline constexpr std::array kMetrics{
     Named<Metric>{"energy", Metric::kEnergy},
     Named<Metric>{"elastic", Metric::kElastic},
@@ -87,7 +111,7 @@ struct Description {
   std::vector<std::string> pin_names;      ///< [P] that of the group of each pin; empty: none
   bool self_contact = true;
   double dt = 0.01;
-  std::string scheme = "coupled";
+  SchemeKind scheme = SchemeKind::kCoupled;
   Metric metric = Metric::kEnergy;
   ElasticSolver elastic = ElasticSolver::kNewton;
   int friction_iterations = 2;
@@ -108,8 +132,9 @@ struct Scene {
   /// Whether something is attached to a body.
   bool has_attached_bodies() const;
 
+  const SchemeRow& scheme() const { return kSchemes[static_cast<std::size_t>(given.scheme)]; }
+
   Description given;
-  const Scheme* scheme;
   mesh::Topology topology;
   std::vector<Index> face_cloth;    ///< [F]
   std::vector<Vec2> material_axes;  ///< [F] the warp in the rest frames; empty: no weft

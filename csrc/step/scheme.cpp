@@ -1,31 +1,18 @@
 #include "step/scheme.h"
 
-#include <array>
-#include <stdexcept>
-#include <string>
-
-#include "step/schemes/coupled.h"
-#include "step/schemes/projective.h"
-#include "step/schemes/split.h"
-
 namespace diffcloth::step {
 
-std::span<const Scheme* const> schemes() {
-  static const Coupled coupled;
-  static const Split split;
-  static const Projective projective;
-  static const std::array<const Scheme*, 3> all{&coupled, &split, &projective};
-  return all;
-}
-
-const Scheme& find_scheme(std::string_view name) {
-  std::string names;
-  for (const Scheme* scheme : schemes()) {
-    if (scheme->name() == name) return *scheme;
-    names += (names.empty() ? "'" : ", '") + std::string(scheme->name()) + "'";
+void add_pin_forces(const Problem& problem,
+                    const solver::Objective& objective,
+                    const std::vector<double>& x,
+                    double* pins) {
+  const std::vector<Index>& pinned = problem.scene.given.pins;
+  if (pinned.empty()) return;
+  std::vector<double> g;
+  objective.gradient(x.data(), g);
+  for (std::size_t p = 0; p < pinned.size(); ++p) {
+    for (std::size_t k = 0; k < 3; ++k) pins[3 * p + k] += g[3 * pinned[p] + k];
   }
-  throw std::invalid_argument("scheme must be one of " + names + ", got '" + std::string(name) +
-                              "'");
 }
 
 }  // namespace diffcloth::step

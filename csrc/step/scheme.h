@@ -1,28 +1,37 @@
 #pragma once
 
 #include <span>
-#include <string_view>
 #include <vector>
 
+#include "solver/factor_cache.h"
 #include "step/cotangents.h"
-#include "step/factor_cache.h"
-#include "step/fields.h"
-#include "step/forces.h"
+#include "step/inputs.h"
 #include "step/problem.h"
 #include "step/report.h"
 #include "step/tangents.h"
 
 namespace diffcloth::step {
 
-struct Scene;
+/// Arrays to which the stages of a step add the forces at its end [N].
+struct Forces {
+  double* bodies;   ///< of contact, on the bodies' vertices [V, 3]
+  double* contact;  ///< of contact, on the cloths' vertices [N, 3]
+  double* pins;     ///< that hold the pinned vertices where they are [P, 3]
+};
 
-/// What a scheme works with going forward.
+/// Forces that hold pins: the gradient of all that acts on them.
+void add_pin_forces(const Problem& problem,
+                    const solver::Objective& objective,
+                    const std::vector<double>& x,
+                    double* pins);
+
+/// Context of a step that is to be taken.
 struct Forward {
   Problem& problem;
   contact::Detection& detection;
   solver::Context& context;
   const Arrays<double>& tape;  ///< empty where no tape is wanted
-  Kept& kept;                  ///< for backward
+  solver::KeptSolves& kept;    ///< for backward
   Report& report;
 };
 
@@ -32,20 +41,20 @@ struct Taken {
   contact::Detection& detection;
   solver::Context& context;
   const Arrays<const double>& tape;
-  const Kept& kept;  ///< empty where it is gone
+  const solver::KeptSolves& kept;  ///< empty if evicted
 };
 
-/// What a scheme works with going back, for several losses side by side.
+/// A reverse pass over several losses side by side.
 struct Backward : Taken {
   std::span<Cotangents> losses;
-  bool barrier;   ///< whether someone asks for the cotangents of what the barrier is made of
-  bool friction;  ///< the same of friction, which depends on the barrier
+  bool barrier;   ///< whether gradients of the barrier's inputs are requested
+  bool friction;  ///< likewise of friction, which depends on the barrier
 };
 
-/// What it works with for tangents, along several directions of the inputs side by side.
+/// A forward pass of tangents along several directions of the inputs side by side.
 struct Pushforward : Taken {
   std::span<const Tangents> directions;
-  std::span<const Forces> forces;  ///< of each direction, where the changes of the forces are added
+  std::span<const Forces> forces;  ///< of each direction: the changes of the forces are added here
 };
 
 /// A way to take a step: what is minimized, in which order, and the derivatives of that.
@@ -56,21 +65,7 @@ class Scheme {
   Scheme(const Scheme&) = delete;
   Scheme& operator=(const Scheme&) = delete;
 
-  virtual std::string_view name() const = 0;
-
-  /// Whether a barrier keeps surfaces apart; else cloths touch all bodies and each other at their nodes.
-  virtual bool has_barrier() const { return true; }
-
-  /// Whether cloths and dynamic bodies are solved for together.
-  virtual bool moves_bodies() const { return false; }
-
-  /// Whether elasticity is solved for on its own first, by one of kElasticSolvers.
-  virtual bool has_elastic_stage() const { return false; }
-
-  /// Whether it can measure nearness in each of kMetrics.
-  virtual bool has_metrics() const { return false; }
-
-  /// What backward needs of forward beyond the inputs: positions, no contacts and no matrices.
+  /// Fields that backward needs beyond the inputs: positions, no contacts and no matrices.
   virtual std::vector<Field> tape(const Scene& scene) const = 0;
 
   /// Find all points at the end of the step, and the forces there.
@@ -85,12 +80,5 @@ class Scheme {
   /// How all points at the end change along each direction, as if it were alone.
   virtual std::vector<std::vector<double>> tangent(const Pushforward& step) const = 0;
 };
-
-/// The scheme of a name.
-/// @throws std::invalid_argument with the names that there are
-const Scheme& find_scheme(std::string_view name);
-
-/// All schemes, the default first.
-std::span<const Scheme* const> schemes();
 
 }  // namespace diffcloth::step

@@ -5,7 +5,9 @@
 #include <utility>
 
 #include "common/processor_time.h"
+#include "linalg/reference_factorization.h"
 #include "step/scheme.h"
+#include "step/schemes/schemes.h"
 
 namespace diffcloth::step {
 namespace {
@@ -84,7 +86,9 @@ std::vector<Field> output_fields(const Scene& scene) {
   return fields;
 }
 
-std::vector<Field> tape_fields(const Scene& scene) { return scene.scheme->tape(scene); }
+std::vector<Field> tape_fields(const Scene& scene) {
+  return find_scheme(scene.given.scheme).tape(scene);
+}
 
 std::string find_overlap(const Scene& scene, const Inputs& inputs) {
   std::vector<double> thickness(static_cast<std::size_t>(scene.surface_count()), 0.0);
@@ -103,7 +107,7 @@ Report forward(const Scene& scene,
                const Checkpoint& checkpoint,
                const Arrays<double>& outputs,
                const Arrays<double>& tape,
-               Kept& kept,
+               solver::KeptSolves& kept,
                int threads,
                std::vector<std::vector<double>>* path) {
   Stopwatch watch;
@@ -140,13 +144,14 @@ Report forward(const Scene& scene,
                           .counts = &report.counts,
                           .path = path};
   std::vector<double> x = problem.start;
-  scene.scheme->forward({.problem = problem,
-                         .detection = detection,
-                         .context = context,
-                         .tape = tape,
-                         .kept = kept,
-                         .report = report},
-                        x, forces_of(outputs));
+  find_scheme(scene.given.scheme)
+      .forward({.problem = problem,
+                .detection = detection,
+                .context = context,
+                .tape = tape,
+                .kept = kept,
+                .report = report},
+               x, forces_of(outputs));
   std::copy_n(x.begin(), problem.cloth_size, positions);
   for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
     outputs["coordinates"][c] = problem.coordinates.nodes(x)[scene.mechanisms.slot(c)];
@@ -164,7 +169,7 @@ Report forward(const Scene& scene,
 void backward(const Scene& scene,
               const Inputs& inputs,
               const Arrays<const double>& tape,
-              const Kept& kept,
+              const solver::KeptSolves& kept,
               std::span<const Loss> losses,
               int threads,
               const Checkpoint& checkpoint) {
@@ -186,11 +191,15 @@ void backward(const Scene& scene,
                           .workspace = &workspace,
                           .watch = &watch,
                           .counts = &counts};
-  scene.scheme->backward(
-      {{.problem = problem, .detection = detection, .context = context, .tape = tape, .kept = kept},
-       bars,
-       wants_barrier(wanted),
-       wants_friction(wanted)});
+  find_scheme(scene.given.scheme)
+      .backward({{.problem = problem,
+                  .detection = detection,
+                  .context = context,
+                  .tape = tape,
+                  .kept = kept},
+                 bars,
+                 wants_barrier(wanted),
+                 wants_friction(wanted)});
   const Turn::Exchange exchange = [&](std::size_t l) { bars[l].exchange(problem); };
   for (std::size_t l = 0; l < losses.size(); ++l) {
     const Turn turn(exchange, l);
@@ -202,7 +211,7 @@ void backward(const Scene& scene,
 void tangent(const Scene& scene,
              const Inputs& inputs,
              const Arrays<const double>& tape,
-             const Kept& kept,
+             const solver::KeptSolves& kept,
              std::span<const Direction> directions,
              int threads,
              const Checkpoint& checkpoint) {
@@ -225,13 +234,23 @@ void tangent(const Scene& scene,
                           .workspace = &workspace,
                           .watch = &watch,
                           .counts = &counts};
-  const auto dx = scene.scheme->tangent(
-      {{.problem = problem, .detection = detection, .context = context, .tape = tape, .kept = kept},
-       tangents,
-       forces});
+  const auto dx = find_scheme(scene.given.scheme)
+                      .tangent({{.problem = problem,
+                                 .detection = detection,
+                                 .context = context,
+                                 .tape = tape,
+                                 .kept = kept},
+                                tangents,
+                                forces});
   for (std::size_t l = 0; l < directions.size(); ++l) {
     write_outputs(problem, tangents[l], dx[l], directions[l].outputs);
   }
+}
+
+double reference_factorization_seconds(const Scene& scene, const Inputs& inputs, int repeats) {
+  Problem p(scene, inputs);
+  return linalg::reference_factorization_seconds(
+      contact_free_hessian(p, p.start.data(), Curvature::kPositive), repeats);
 }
 
 }  // namespace diffcloth::step

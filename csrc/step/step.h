@@ -9,19 +9,18 @@
 
 #include "common/interrupt.h"
 #include "linalg/dense_kernels.h"
-#include "step/factor_cache.h"
-#include "step/fields.h"
+#include "solver/factor_cache.h"
 #include "step/inputs.h"
 #include "step/report.h"
 #include "step/scene.h"
 
 namespace diffcloth::step {
 
-/// What a step gives back: "positions" and "velocities" [N, 3], "body_forces" [V, 3], "contact_forces"
+/// Outputs of a step: "positions" and "velocities" [N, 3], "body_forces" [V, 3], "contact_forces"
 /// [N, 3], "pin_forces" [P, 3], and, where there are any, "coordinates" [n].
 std::vector<Field> output_fields(const Scene& scene);
 
-/// What backward needs of forward beyond the inputs: the fields of the scheme.
+/// Fields that backward needs beyond the inputs: those that the scheme keeps.
 std::vector<Field> tape_fields(const Scene& scene);
 
 /// One step of the scene's scheme.
@@ -36,11 +35,11 @@ Report forward(const Scene& scene,
                const Checkpoint& checkpoint,
                const Arrays<double>& outputs,
                const Arrays<double>& tape,
-               Kept& kept,
+               solver::KeptSolves& kept,
                int threads,
                std::vector<std::vector<double>>* path);
 
-/// What a loss gives and gets.
+/// Output cotangents and input gradients of one loss.
 struct Loss {
   Arrays<const double> cotangents;  ///< of the outputs, by their names
   Gradients gradients;              ///< the same inputs for all losses
@@ -58,7 +57,7 @@ inline constexpr std::size_t kAtOnce = linalg::kMaxVectors;
 void backward(const Scene& scene,
               const Inputs& inputs,
               const Arrays<const double>& tape,
-              const Kept& kept,
+              const solver::KeptSolves& kept,
               std::span<const Loss> losses,
               int threads,
               const Checkpoint& checkpoint);
@@ -77,7 +76,7 @@ struct Direction {
 void tangent(const Scene& scene,
              const Inputs& inputs,
              const Arrays<const double>& tape,
-             const Kept& kept,
+             const solver::KeptSolves& kept,
              std::span<const Direction> directions,
              int threads,
              const Checkpoint& checkpoint);

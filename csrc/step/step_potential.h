@@ -1,8 +1,10 @@
 #pragma once
 
 #include <functional>
+#include <memory>
 #include <stdexcept>
 #include <string>
+#include <vector>
 
 #include "potential/potential.h"
 #include "step/inputs.h"
@@ -13,8 +15,8 @@ class Cotangents;
 class Problem;
 class Tangents;
 
-/// A potential of the cloths that every step minimizes, and how it hangs together with the step's
-/// inputs. It is made from a Problem; step/potentials/potentials.cpp lists all.
+/// A potential of the cloths that every step minimizes, and its dependence on the step's inputs. It is
+/// made from a Problem; step/potentials/make_potentials.cpp lists all.
 class StepPotential {
  public:
   StepPotential() = default;
@@ -45,5 +47,12 @@ class StepPotential {
     });
   }
 };
+
+/// Every potential of the cloths but inertia and contact, in the order of all sums.
+///
+/// @param problem  whose inputs, masses, rest shape, start and model are there
+/// @param wanted   whose cotangents are wanted; null: nobody's
+std::vector<std::unique_ptr<StepPotential>> make_potentials(const Problem& problem,
+                                                            const Gradients* wanted);
 
 }  // namespace diffcloth::step

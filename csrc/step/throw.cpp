@@ -4,8 +4,8 @@
 #include <map>
 #include <span>
 
+#include "contact/pair_groups.h"
 #include "solver/linear_system.h"
-#include "step/forces.h"
 #include "step/problem.h"
 #include "step/step.h"
 
@@ -209,48 +209,49 @@ std::optional<Throw> find_throw(const Scene& scene, const Inputs& inputs) {
   const Owners owners(scene);
   const double d_hat = model.parameters().d_hat;
   std::optional<Throw> fastest;
-  for_each_pair(model, barrier.contacts(), [&](const auto&, const std::vector<Contact>& own) {
-    // Forces with the signs of gradients, as solve() takes them: it returns the motion.
-    Array push;
-    Array dx;
-    Array motion;
-    gradient.assign(gradient.size(), 0.0);
-    model.add_gradient(own, x, gradient.data());
-    p.coordinates.pull_back(gradient, push);
-    Array load = all;
-    for (std::size_t k = 0; k < load.size(); ++k) load[k] -= push[k];
-    system.solve(*factor, gradient, dx);
-    p.coordinates.take_rows(dx, motion);
-    auto pushed = owners.products(motion, push);
-    auto loaded = owners.products(motion, load);
-    const auto held = [&](Index which) {
-      return pushed[which] < 0.0 ? std::clamp(-loaded[which] / pushed[which], 0.0, 1.0) : 1.0;
-    };
-    Array left = push;
-    for (Index i = 0; i < owners.row_count(); ++i) {
-      for (int k = 0; k < 3; ++k) left[3 * i + k] *= 1.0 - held(owners.of_row(i));
-    }
-    gradient.assign(gradient.size(), 0.0);
-    p.coordinates.put_rows(left.data(), gradient);
-    system.solve(*factor, gradient, dx);
-    p.coordinates.take_rows(dx, motion);
-    auto lengths = lengths_of(scene, owners, dx);
-    auto works = owners.products(motion, push);
-    double speed = 0.0;
-    for (const auto& [which, course] : courses_of(own, owners, dx, d_hat)) {
-      const double work = -works[which];
-      const double mu = (1.0 - held(which)) * work;
-      if (mu <= 0.0) continue;
-      speed = std::max(speed, course.final_rate(mu, -held(which) * work, p.h) * lengths[which]);
-    }
-    if (speed == 0.0 || (fastest && speed <= fastest->speed)) return;
-    const auto gap = [](const Contact& c) { return std::sqrt(c.closest.d_sq) - c.xi; };
-    const Contact& nearest = *std::ranges::min_element(own, {}, gap);
-    fastest = {.elements = describe_pair(scene, nearest.pair),
-               .gap = gap(nearest),
-               .barrier_distance = d_hat,
-               .speed = speed};
-  });
+  contact::for_each_pair(
+      model, barrier.contacts(), [&](const auto&, const std::vector<Contact>& own) {
+        // Forces with the signs of gradients, as solve() takes them: it returns the motion.
+        Array push;
+        Array dx;
+        Array motion;
+        gradient.assign(gradient.size(), 0.0);
+        model.add_gradient(own, x, gradient.data());
+        p.coordinates.pull_back(gradient, push);
+        Array load = all;
+        for (std::size_t k = 0; k < load.size(); ++k) load[k] -= push[k];
+        system.solve(*factor, gradient, dx);
+        p.coordinates.take_rows(dx, motion);
+        auto pushed = owners.products(motion, push);
+        auto loaded = owners.products(motion, load);
+        const auto held = [&](Index which) {
+          return pushed[which] < 0.0 ? std::clamp(-loaded[which] / pushed[which], 0.0, 1.0) : 1.0;
+        };
+        Array left = push;
+        for (Index i = 0; i < owners.row_count(); ++i) {
+          for (int k = 0; k < 3; ++k) left[3 * i + k] *= 1.0 - held(owners.of_row(i));
+        }
+        gradient.assign(gradient.size(), 0.0);
+        p.coordinates.put_rows(left.data(), gradient);
+        system.solve(*factor, gradient, dx);
+        p.coordinates.take_rows(dx, motion);
+        auto lengths = lengths_of(scene, owners, dx);
+        auto works = owners.products(motion, push);
+        double speed = 0.0;
+        for (const auto& [which, course] : courses_of(own, owners, dx, d_hat)) {
+          const double work = -works[which];
+          const double mu = (1.0 - held(which)) * work;
+          if (mu <= 0.0) continue;
+          speed = std::max(speed, course.final_rate(mu, -held(which) * work, p.h) * lengths[which]);
+        }
+        if (speed == 0.0 || (fastest && speed <= fastest->speed)) return;
+        const auto gap = [](const Contact& c) { return std::sqrt(c.closest.d_sq) - c.xi; };
+        const Contact& nearest = *std::ranges::min_element(own, {}, gap);
+        fastest = {.elements = describe_pair(scene, nearest.pair),
+                   .gap = gap(nearest),
+                   .barrier_distance = d_hat,
+                   .speed = speed};
+      });
   return fastest;
 }
 

@@ -7,7 +7,7 @@
 #include <optional>
 #include <utility>
 
-#include "step/scheme.h"
+#include "step/potentials/constant_form.h"
 
 namespace diffcloth::step {
 
@@ -96,7 +96,7 @@ std::vector<Obstacle> make_obstacles(const Problem& p) {
 /// How the vertices of cloths touch each other; absent where none may.
 std::optional<projective::Touching> make_touching(const Problem& p) {
   const Scene& scene = p.scene;
-  if (scene.scheme->has_barrier()) return {};
+  if (scene.scheme().has_barrier) return {};
   projective::Touching touching{.spheres = &scene.vertex_spheres, .friction = {}, .may_touch = {}};
   for (Index a = 0; a < scene.cloth_count(); ++a) {
     for (Index b = 0; b < scene.cloth_count(); ++b) {
@@ -125,7 +125,7 @@ NodalContacts::NodalContacts(Problem& problem) : obstacles(make_obstacles(proble
   const std::optional<projective::Touching> touching = make_touching(problem);
   list = projective::find_contacts(swept(problem), obstacles, touching ? &*touching : nullptr);
   if (list.empty()) return;
-  const elastic::ConstantForm form = problem.constant_form();
+  const elastic::ConstantForm form = constant_form(problem);
   for (std::size_t i = 0; i < problem.masses.size(); ++i) {
     const double stiffness = form.values()[form.pattern().column_start()[i]];
     inertia.push_back(problem.masses[i] + problem.h * problem.h * stiffness);

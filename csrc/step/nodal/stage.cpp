@@ -145,7 +145,7 @@ void NodalStage::finish(const Array& x, Report& report, const Forces& forces) co
   at.x = x;
   system.look(at);
   add_pin_forces(problem_, f, x, forces.pins);
-  PairTally tally(problem_, report);
+  PairTally tally(report);
   for (std::size_t k = 0; k < contacts_.list.size(); ++k) {
     const NodalContact& c = contacts_.list[k];
     switch (at.laws[k].kind) {

@@ -164,7 +164,7 @@ void ContactStage::backward(const Backward& step, std::vector<Array> g) {
   Problem& problem = step.problem;
   // What contact and friction accumulate, of the loss whose turn it is.
   contact::ContactModel::Bar contact_bar(problem.scene.collision_mesh);
-  ContactSum sum(*this, problem, step.detection, step.friction ? &contact_bar : nullptr,
+  ContactSum sum(potentials(), problem, step.detection, step.friction ? &contact_bar : nullptr,
                  step.barrier ? &contact_bar : nullptr);
   std::vector<Array> start_bars(g.size());
   std::vector<Array> lag_bars(g.size());

@@ -128,7 +128,7 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
   Problem& problem = step.problem;
   const std::size_t size = problem.coordinates.size();
   const int friction_iterations = problem.scene.given.friction_iterations;
-  ContactSum sum(*this, problem, step.detection, nullptr, nullptr);
+  ContactSum sum(potentials(), problem, step.detection, nullptr, nullptr);
   const GeodesicMotion motion(problem);
   const auto keep = [&](int k, const std::vector<Contact>& contacts) {
     if (step.tape.empty()) return;
@@ -178,7 +178,9 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
   if (!step.tape.empty()) *step.tape["solves"] = solves;
   add_forces(problem, sum, x, forces);
   const contact::FrictionSet* const friction = sum.friction ? &sum.friction->set() : nullptr;
-  PairTally(problem, step.report).add(sum.contacts(), friction, x);
+  if (problem.contact) {
+    PairTally(step.report).add(*problem.contact, sum.contacts(), friction, x);
+  }
   step.report.points = contact_points(problem, sum.contacts(), friction, x);
 }
 

@@ -6,6 +6,7 @@
 
 #include "solver/newton.h"
 #include "step/scheme.h"
+#include "step/schemes/contact_sum.h"
 
 namespace diffcloth::step {
 
@@ -35,6 +36,11 @@ struct ContactStage {
 
   /// Change of all points at the end, along each direction.
   std::vector<std::vector<double>> tangent(const Pushforward& step);
+
+ private:
+  StagePotentials potentials() {
+    return {.inertia = inertia, .others = others, .patterns = patterns};
+  }
 };
 
 /// zhat of one solve, and everything it pulls back but the lag: see contact_stage.cpp. All losses are

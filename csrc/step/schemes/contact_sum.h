@@ -6,21 +6,28 @@
 #include <vector>
 
 #include "contact/contact_potential.h"
-#include "step/schemes/contact_stage.h"
+#include "step/scheme.h"
 
 namespace diffcloth::step {
+
+/// Potentials of a contact stage but barrier and friction, and the pattern of their Hessian.
+struct StagePotentials {
+  Proximity& inertia;
+  std::vector<Potential*> others;
+  solver::PatternCache& patterns;
+};
 
 /// The potentials of one friction iteration of a stage.
 class ContactSum {
  public:
   /// @param bar          where friction accumulates; null where it never does
   /// @param barrier_bar  likewise, the barrier
-  ContactSum(ContactStage& stage,
+  ContactSum(const StagePotentials& stage,
              Problem& problem,
              contact::Detection& detection,
              contact::ContactModel::Bar* bar,
              contact::ContactModel::Bar* barrier_bar)
-      : stage_(stage), problem_(problem), bar_(bar) {
+      : problem_(problem), bar_(bar) {
     if (problem.contact) contact_.emplace(*problem.contact, detection, barrier_bar);
     objective = problem.objective(stage.inertia, stage.others, stage.patterns);
     objective.contact = contact_ ? &*contact_ : nullptr;
@@ -105,7 +112,6 @@ class ContactSum {
   std::optional<contact::FrictionPotential> friction;
 
  private:
-  ContactStage& stage_;
   Problem& problem_;
   contact::ContactModel::Bar* bar_;
   std::optional<contact::ContactPotential> contact_;

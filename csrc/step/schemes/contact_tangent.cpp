@@ -171,7 +171,7 @@ std::vector<Array> push_forward_solve(const Pushforward& step,
 }
 
 std::vector<Array> ContactStage::tangent(const Pushforward& step) {
-  ContactSum sum(*this, step.problem, step.detection, nullptr, nullptr);
+  ContactSum sum(potentials(), step.problem, step.detection, nullptr, nullptr);
   std::vector<Array> dx;  // of the lag configuration
   for (const Tangents& tangents : step.directions) dx.push_back(tangents.start);
   TakenSolves solves(step, sum, first_factor);

@@ -8,8 +8,6 @@ namespace diffcloth::step {
 /// step in contact.
 class Coupled final : public Scheme {
  public:
-  std::string_view name() const override { return "coupled"; }
-  bool moves_bodies() const override { return true; }
   std::vector<Field> tape(const Scene& scene) const override;
   void forward(const Forward& step, std::vector<double>& x, const Forces& forces) const override;
   void backward(const Backward& step) const override;

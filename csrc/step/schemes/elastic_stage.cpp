@@ -5,6 +5,7 @@
 
 #include "projective/local_global.h"
 #include "solver/newton.h"
+#include "step/potentials/constant_form.h"
 #include "step/schemes/contact_stage.h"
 
 namespace diffcloth::step {
@@ -50,7 +51,7 @@ void solve_by_projective_dynamics(Problem& problem,
   projective::LocalGlobalOutcome outcome;
   {
     const Stopwatch::Scope scope(*step.context.watch, Phase::kSolve);
-    const auto matrix = problem.constant_matrix();
+    const auto matrix = constant_matrix(problem);
     projective::LocalGlobalObjective f{.potentials = {&problem.inertia},
                                        .matrix = matrix.get(),
                                        .masses = &problem.masses,

@@ -8,9 +8,6 @@ namespace diffcloth::step {
 /// nodes, and no barrier. Surfaces may cross between nodes.
 class Projective final : public Scheme {
  public:
-  std::string_view name() const override { return "projective"; }
-  bool has_barrier() const override { return false; }
-  bool has_elastic_stage() const override { return true; }
   std::vector<Field> tape(const Scene& scene) const override;
   void forward(const Forward& step, std::vector<double>& x, const Forces& forces) const override;
   void backward(const Backward& step) const override;

@@ -11,6 +11,7 @@
 
 #include "elastic/elastic_nearness.h"
 #include "potential/tilt.h"
+#include "step/potentials/constant_form.h"
 #include "step/potentials/elasticity.h"
 #include "step/schemes/contact_stage.h"
 #include "step/schemes/elastic_stage.h"
@@ -40,8 +41,8 @@ class Nearness {
         if (tilted) tilt_.emplace(gradient_at_target());
         return;
       case Metric::kElastic:
-        elastic_.emplace(problem.constant_form(), problem.find<Elasticity>().potential(),
-                         problem.springs(), x_d_);
+        elastic_.emplace(constant_form(problem), problem.find<Elasticity>().potential(),
+                         springs(problem), x_d_);
         inertial_.emplace(problem.masses, x_d_, problem.h);
         return;
       case Metric::kMass:

@@ -8,9 +8,6 @@ namespace diffcloth::step {
 /// x^D; then 1/(2h^2) (x - x^D)^T G (x - x^D) + barrier + friction.
 class Split final : public Scheme {
  public:
-  std::string_view name() const override { return "split"; }
-  bool has_elastic_stage() const override { return true; }
-  bool has_metrics() const override { return true; }
   std::vector<Field> tape(const Scene& scene) const override;
   void forward(const Forward& step, std::vector<double>& x, const Forces& forces) const override;
   void backward(const Backward& step) const override;

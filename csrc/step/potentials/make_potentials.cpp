@@ -1,5 +1,3 @@
-#include "step/potentials/potentials.h"
-
 #include "step/potentials/air.h"
 #include "step/potentials/attachments.h"
 #include "step/potentials/elasticity.h"

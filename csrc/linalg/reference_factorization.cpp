@@ -1,23 +1,21 @@
+#include "linalg/reference_factorization.h"
+
 #include <algorithm>
 #include <chrono>
+#include <vector>
 
 #include <Eigen/SparseCholesky>
 
-#include "step/problem.h"
-#include "step/step.h"
+namespace diffcloth::linalg {
 
-namespace diffcloth::step {
-
-double reference_factorization_seconds(const Scene& scene, const Inputs& inputs, int repeats) {
-  Problem p(scene, inputs);
-  const linalg::BlockMatrix hessian = contact_free_hessian(p, p.start.data(), Curvature::kPositive);
-  const linalg::BlockPattern& pattern = hessian.pattern();
+double reference_factorization_seconds(const BlockMatrix& A, int repeats) {
+  const BlockPattern& pattern = A.pattern();
 
   std::vector<Eigen::Triplet<double>> entries;
   for (Index j = 0; j < pattern.size(); ++j) {
     for (Index k = pattern.column_start()[j]; k < pattern.column_start()[j + 1]; ++k) {
       const Index i = pattern.row()[k];
-      const Eigen::Map<const Mat3> block(hessian.blocks() + 9 * static_cast<std::ptrdiff_t>(k));
+      const Eigen::Map<const Mat3> block(A.blocks() + 9 * static_cast<std::ptrdiff_t>(k));
       for (Index a = 0; a < 3; ++a) {
         for (Index b = 0; b < 3; ++b) {
           if (3 * i + a >= 3 * j + b) entries.emplace_back(3 * i + a, 3 * j + b, block(a, b));
@@ -41,4 +39,4 @@ double reference_factorization_seconds(const Scene& scene, const Inputs& inputs,
   return seconds[seconds.size() / 2];
 }
 
-}  // namespace diffcloth::step
+}  // namespace diffcloth::linalg

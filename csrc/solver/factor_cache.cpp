@@ -1,19 +1,19 @@
-#include "step/factor_cache.h"
+#include "solver/factor_cache.h"
 
 #include <iterator>
 #include <utility>
 
-namespace diffcloth::step {
+namespace diffcloth::solver {
 
-std::size_t Kept::bytes() const {
+std::size_t KeptSolves::bytes() const {
   std::size_t sum = 0;
   for (const auto& certificate : certificates) sum += certificate.bytes();
   for (const auto& list : contacts) sum += list.size() * sizeof(contact::Contact);
   return sum;
 }
 
-void Kept::add(solver::Certificate certificate) {
-  // One that is too large anyway is not held while the step goes on.
+void KeptSolves::add(Certificate certificate) {
+  // A certificate above the limit would be evicted at once, and holds memory meanwhile.
   if (certificate.bytes() > FactorCache::kBytes) certificate = {};
   certificates.push_back(std::move(certificate));
 }
@@ -27,7 +27,7 @@ void FactorCache::Room::shrink(std::size_t largest) {
   }
 }
 
-std::unique_ptr<FactorCache::Ticket> FactorCache::insert(Kept kept) {
+std::unique_ptr<FactorCache::Ticket> FactorCache::insert(KeptSolves kept) {
   std::unique_ptr<Ticket> ticket(new Ticket(room_, std::move(kept)));
   room_->shrink(kBytes);
   return ticket;
@@ -38,9 +38,9 @@ std::size_t FactorCache::bytes() const {
   return room_->bytes;
 }
 
-FactorCache::Ticket::Ticket(std::shared_ptr<Room> room, Kept kept) : room_(std::move(room)) {
+FactorCache::Ticket::Ticket(std::shared_ptr<Room> room, KeptSolves kept) : room_(std::move(room)) {
   const std::size_t bytes = kept.bytes();
-  auto shared = std::make_shared<const Kept>(std::move(kept));
+  auto shared = std::make_shared<const KeptSolves>(std::move(kept));
   const std::lock_guard lock(room_->mutex);
   room_->entries.push_back({.bytes = bytes, .kept = std::move(shared), .ticket = this});
   room_->bytes += bytes;
@@ -54,9 +54,9 @@ FactorCache::Ticket::~Ticket() {
   room_->entries.erase(entry_);
 }
 
-std::shared_ptr<const Kept> FactorCache::Ticket::find() const {
+std::shared_ptr<const KeptSolves> FactorCache::Ticket::find() const {
   const std::lock_guard lock(room_->mutex);
-  return entry_ != room_->entries.end() ? entry_->kept : std::make_shared<const Kept>();
+  return entry_ != room_->entries.end() ? entry_->kept : std::make_shared<const KeptSolves>();
 }
 
-}  // namespace diffcloth::step
+}  // namespace diffcloth::solver

@@ -9,35 +9,35 @@
 #include "contact/contact_set.h"
 #include "solver/linear_system.h"
 
-namespace diffcloth::step {
+namespace diffcloth::solver {
 
-/// What forward leaves for backward to use again. All of it is a function of the inputs and the tape:
-/// backward finds what is gone again, with the same bits.
-struct Kept {
-  /// Of one step, each in its scheme's own order.
-  std::vector<solver::Certificate> certificates;
+/// Certificates and contacts of the solves of one step, kept for backward. They are functions of the
+/// inputs and the tape: recomputed if evicted, with the same bits.
+struct KeptSolves {
+  // Both in the order that the scheme chooses.
+  std::vector<Certificate> certificates;
   std::vector<std::vector<contact::Contact>> contacts;
 
   std::size_t bytes() const;
 
   /// Add a certificate, or none where the cache has no room for it.
-  void add(solver::Certificate certificate);
+  void add(Certificate certificate);
 };
 
-/// What is kept of steps whose backward can still be asked for, up to a number of bytes; the oldest go
-/// first.
+/// Kept solves of the steps that may still be differentiated, up to a number of bytes; the oldest are
+/// evicted first.
 class FactorCache {
  public:
   class Ticket;
 
   FactorCache() : room_(std::make_shared<Room>()) {}
 
-  /// Keep something for as long as its ticket lives, and there is room.
-  std::unique_ptr<Ticket> insert(Kept kept);
+  /// Keep solves while their ticket lives, and there is room.
+  std::unique_ptr<Ticket> insert(KeptSolves kept);
 
   void clear() { room_->shrink(0); }
 
-  /// What everything that is kept takes up; at most kBytes.
+  /// Size of all that is kept; at most kBytes.
   std::size_t bytes() const;
 
   static constexpr std::size_t kBytes = std::size_t{256} << 20;
@@ -45,7 +45,7 @@ class FactorCache {
  private:
   struct Entry {
     std::size_t bytes;
-    std::shared_ptr<const Kept> kept;
+    std::shared_ptr<const KeptSolves> kept;
     Ticket* ticket;
   };
 
@@ -62,23 +62,23 @@ class FactorCache {
   std::shared_ptr<Room> room_;
 };
 
-/// The right to what is kept of one step.
+/// The right to the kept solves of one step.
 class FactorCache::Ticket {
  public:
   ~Ticket();
   Ticket(const Ticket&) = delete;
   Ticket& operator=(const Ticket&) = delete;
 
-  /// What is kept; nothing where it had to go.
-  std::shared_ptr<const Kept> find() const;
+  /// The kept solves; empty if evicted.
+  std::shared_ptr<const KeptSolves> find() const;
 
  private:
   friend class FactorCache;
 
-  Ticket(std::shared_ptr<Room> room, Kept kept);
+  Ticket(std::shared_ptr<Room> room, KeptSolves kept);
 
   std::shared_ptr<Room> room_;
-  std::list<Entry>::iterator entry_;  // the end where it had to go
+  std::list<Entry>::iterator entry_;  // the end if evicted
 };
 
-}  // namespace diffcloth::step
+}  // namespace diffcloth::solver
