@@ -1,6 +1,5 @@
-// The comparison of two groups of boxes, written once over packs of `kPack` doubles, which the file
-// that includes this one defines. Everything here is in an anonymous namespace, for the reason given in
-// linalg/dense_kernels_impl.h.
+// The comparison of two groups of boxes, written once over packs of `kPack` doubles. Everything here is in an
+// anonymous namespace, for the reason given in linalg/dense_kernels_impl.h.
 
 #pragma once
 
@@ -37,6 +36,8 @@ std::uint32_t find_near_boxes(const BoxGroup& a, const BoxGroup& b, double range
   for (int l = 0; l < kPack; ++l) result |= static_cast<std::uint32_t>(found[l]);
   return result;
 }
+
+constexpr NearBoxes kKernels = find_near_boxes;
 
 }  // namespace
 }  // namespace diffcloth::contact

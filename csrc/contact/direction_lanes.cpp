@@ -2,19 +2,19 @@
 
 namespace diffcloth::contact {
 
-extern const DirectionLevel kPortableDirections;
+extern const DirectionLevel kPortableDirectionLanes;
 #ifdef DIFFCLOTH_X86_KERNELS
-extern const DirectionLevel kAvx2Directions;
-extern const DirectionLevel kAvx512Directions;
+extern const DirectionLevel kAvx2DirectionLanes;
+extern const DirectionLevel kAvx512DirectionLanes;
 #endif
 
 const DirectionLevel& direction_kernels(linalg::KernelLevel level) {
   linalg::check_supported(level);
 #ifdef DIFFCLOTH_X86_KERNELS
-  if (level == linalg::KernelLevel::kAvx512) return kAvx512Directions;
-  if (level == linalg::KernelLevel::kAvx2) return kAvx2Directions;
+  if (level == linalg::KernelLevel::kAvx512) return kAvx512DirectionLanes;
+  if (level == linalg::KernelLevel::kAvx2) return kAvx2DirectionLanes;
 #endif
-  return kPortableDirections;
+  return kPortableDirectionLanes;
 }
 
 void DirectionRows::read(std::span<const double* const> vectors) {

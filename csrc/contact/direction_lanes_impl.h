@@ -1,6 +1,6 @@
 // The arithmetic of DirectionKernels, written once over vectors of `kPack` doubles, a divisor of
-// kDirectionLanes which the file that includes this one defines. Everything here is in an anonymous namespace,
-// for the reason given in linalg/dense_kernels_impl.h.
+// kDirectionLanes. Everything here is in an anonymous namespace, for the reason given in
+// linalg/dense_kernels_impl.h.
 
 #pragma once
 

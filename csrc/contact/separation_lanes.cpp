@@ -2,19 +2,19 @@
 
 namespace diffcloth::contact {
 
-extern const SquaredDistances kPortableDistances;
+extern const SquaredDistances kPortableSeparationLanes;
 #ifdef DIFFCLOTH_X86_KERNELS
-extern const SquaredDistances kAvx2Distances;
-extern const SquaredDistances kAvx512Distances;
+extern const SquaredDistances kAvx2SeparationLanes;
+extern const SquaredDistances kAvx512SeparationLanes;
 #endif
 
 SquaredDistances squared_distances(linalg::KernelLevel level) {
   linalg::check_supported(level);
 #ifdef DIFFCLOTH_X86_KERNELS
-  if (level == linalg::KernelLevel::kAvx512) return kAvx512Distances;
-  if (level == linalg::KernelLevel::kAvx2) return kAvx2Distances;
+  if (level == linalg::KernelLevel::kAvx512) return kAvx512SeparationLanes;
+  if (level == linalg::KernelLevel::kAvx2) return kAvx2SeparationLanes;
 #endif
-  return kPortableDistances;
+  return kPortableSeparationLanes;
 }
 
 }  // namespace diffcloth::contact

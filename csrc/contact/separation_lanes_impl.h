@@ -1,7 +1,6 @@
-// The distances of SquaredDistances, written once over packs of `kPack` doubles, which the file that includes this
-// one defines. Each pack is one number of as many pairs. What distance/separation.cpp decides by branches is
-// chosen here from results that are all computed. Everything is in an anonymous namespace, for the reason given in
-// linalg/dense_kernels_impl.h.
+// The distances of SquaredDistances, written once over packs of `kPack` doubles. Each pack is one number of as many
+// pairs. Where distance/separation.cpp branches, all results are computed here and one is selected. Everything is in
+// an anonymous namespace, for the reason given in linalg/dense_kernels_impl.h.
 
 #pragma once
 
@@ -128,6 +127,8 @@ void find_squared_distances(bool edges,
     for (int l = 0; l < kPack && l < left; ++l) d_sq[first + l] = found[l];
   }
 }
+
+constexpr SquaredDistances kKernels = find_squared_distances;
 
 }  // namespace
 }  // namespace diffcloth::contact

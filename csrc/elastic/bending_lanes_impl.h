@@ -528,7 +528,7 @@ void add_hessian(const BendingBatch* batches,
   }
 }
 
-constexpr BendingKernels kBendingKernels{
+constexpr BendingKernels kKernels{
     .energy_change = energy_change, .add_gradient = add_gradient, .add_hessian = add_hessian};
 
 }  // namespace

@@ -2,19 +2,19 @@
 
 namespace diffcloth::elastic {
 
-extern const StretchKernels kPortableStretch;
+extern const StretchKernels kPortableStretchLanes;
 #ifdef DIFFCLOTH_X86_KERNELS
-extern const StretchKernels kAvx2Stretch;
-extern const StretchKernels kAvx512Stretch;
+extern const StretchKernels kAvx2StretchLanes;
+extern const StretchKernels kAvx512StretchLanes;
 #endif
 
 const StretchKernels& stretch_kernels(linalg::KernelLevel level) {
   linalg::check_supported(level);
 #ifdef DIFFCLOTH_X86_KERNELS
-  if (level == linalg::KernelLevel::kAvx512) return kAvx512Stretch;
-  if (level == linalg::KernelLevel::kAvx2) return kAvx2Stretch;
+  if (level == linalg::KernelLevel::kAvx512) return kAvx512StretchLanes;
+  if (level == linalg::KernelLevel::kAvx2) return kAvx2StretchLanes;
 #endif
-  return kPortableStretch;
+  return kPortableStretchLanes;
 }
 
 }  // namespace diffcloth::elastic

@@ -2,19 +2,19 @@
 
 namespace diffcloth::linalg {
 
-extern const DenseKernels kPortableKernels;
+extern const DenseKernels kPortableDenseKernels;
 #ifdef DIFFCLOTH_X86_KERNELS
-extern const DenseKernels kAvx2Kernels;
-extern const DenseKernels kAvx512Kernels;
+extern const DenseKernels kAvx2DenseKernels;
+extern const DenseKernels kAvx512DenseKernels;
 #endif
 
 const DenseKernels& dense_kernels(KernelLevel level) {
   check_supported(level);
 #ifdef DIFFCLOTH_X86_KERNELS
-  if (level == KernelLevel::kAvx512) return kAvx512Kernels;
-  if (level == KernelLevel::kAvx2) return kAvx2Kernels;
+  if (level == KernelLevel::kAvx512) return kAvx512DenseKernels;
+  if (level == KernelLevel::kAvx2) return kAvx2DenseKernels;
 #endif
-  return kPortableKernels;
+  return kPortableDenseKernels;
 }
 
 }  // namespace diffcloth::linalg

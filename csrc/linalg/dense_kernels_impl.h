@@ -1,14 +1,13 @@
 // The dense kernels, written once over packs of numbers that fill a cache line: eight doubles or sixteen
-// floats. A file that compiles them for some instructions defines, in its anonymous namespace and
-// before it includes this one, the types Doubles and Floats of such packs, ManyFloats of kMaxVectors floats,
-// with the operations on them, and
+// floats. dense_kernels_LEVEL.h, included before this file, defines the types Doubles and Floats of such packs,
+// ManyFloats of kMaxVectors floats, the operations on them, and
 //
 //   kPacks   packs of rows in a block of registers,   kWidth  columns of it, a divisor of eight
 //   kAcross  vectors that a product with a block takes in registers, a divisor of kMaxVectors
 //
-// Such a file must hold nothing that another file could define, too: the linker would keep one copy,
-// perhaps of instructions that the machine lacks. So this one includes no Eigen and no standard
-// templates, and everything in it is in an anonymous namespace.
+// A file that is compiled for a level of instructions must define nothing that another file may define too: the
+// linker would keep one copy, perhaps of instructions that the machine lacks. Headers for such files include
+// neither Eigen nor standard templates, and all their definitions are in anonymous namespaces.
 
 #pragma once
 

@@ -1,14 +1,11 @@
-// The arithmetic of AddStencil, written once over vectors of `kPack` doubles, for a file that defines in its
-// anonymous namespace, before it includes this one, kPack and
-//
-//   slot_of(start, rows, i, j)  see BlockPattern::slot()
-//
-// Everything here is in an anonymous namespace, for the reason given in linalg/dense_kernels_impl.h.
+// The arithmetic of AddStencil, written once over vectors of `kRows` doubles. Everything here is in an anonymous
+// namespace, for the reason given in linalg/dense_kernels_impl.h.
 
 #pragma once
 
 #include <cstddef>
 
+#include "linalg/slot_search.h"
 #include "linalg/stencil_kernels.h"
 
 // NOLINTBEGIN(modernize-avoid-c-arrays)
@@ -19,8 +16,11 @@ namespace diffcloth::linalg {
 
 namespace {
 
-using Pack = double __attribute__((vector_size(8 * kPack)));
-using Stored = double __attribute__((vector_size(8 * kPack), aligned(8), may_alias));
+/// Twelve and sixteen rows are three and four vectors of four; vectors of eight are no faster.
+constexpr int kRows = kPack < 4 ? kPack : 4;
+
+using Pack = double __attribute__((vector_size(8 * kRows)));
+using Stored = double __attribute__((vector_size(8 * kRows), aligned(8), may_alias));
 
 DIFFCLOTH_INLINE Pack load(const double* from) { return *reinterpret_cast<const Stored*>(from); }
 DIFFCLOTH_INLINE void store(double* to, const Pack& from) { *reinterpret_cast<Stored*>(to) = from; }
@@ -74,10 +74,10 @@ DIFFCLOTH_INLINE void add(const StencilTerms& of,
   const double* right[3] = {of.right[0], of.right[1], of.right[2]};
   if (of.core != nullptr) {
     for (int k = 0; k < 3; ++k) {
-      for (int l = 0; l < kSize / kPack; ++l) {
-        Pack sum = of.core[k] * load(of.left[0] + kPack * l);
-        for (int m = 1; m < 3; ++m) sum += of.core[3 * m + k] * load(of.left[m] + kPack * l);
-        store(made[k] + kPack * l, sum);
+      for (int l = 0; l < kSize / kRows; ++l) {
+        Pack sum = of.core[k] * load(of.left[0] + kRows * l);
+        for (int m = 1; m < 3; ++m) sum += of.core[3 * m + k] * load(of.left[m] + kRows * l);
+        store(made[k] + kRows * l, sum);
       }
       right[k] = made[k];
     }
@@ -151,6 +151,8 @@ void add_stencil(const StencilTerms& of,
     add<5, 16>(of, row, start, rows, blocks);
   }
 }
+
+constexpr AddStencil kKernels = add_stencil;
 
 }  // namespace
 }  // namespace diffcloth::linalg

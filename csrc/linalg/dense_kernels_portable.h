@@ -1,5 +1,7 @@
-// The dense kernels in what GCC and Clang make of vectors of two doubles, which every 64-bit
-// processor has.
+// Packs of the dense kernels as vectors of two doubles, which GCC and Clang compile for every 64-bit
+// processor.
+
+#pragma once
 
 namespace diffcloth::linalg {
 namespace {
@@ -132,11 +134,4 @@ constexpr int kWidth = 2;
 constexpr int kAcross = 4;
 
 }  // namespace
-}  // namespace diffcloth::linalg
-
-#include "linalg/dense_kernels_impl.h"
-
-namespace diffcloth::linalg {
-extern const DenseKernels kPortableKernels;
-const DenseKernels kPortableKernels = kKernels;
 }  // namespace diffcloth::linalg

@@ -1,7 +1,6 @@
-// The dense kernels with AVX-512. Only CMakeLists.txt's flags for this file allow the instructions.
-#ifdef __AVX512F__
+// Packs of the dense kernels with AVX-512.
 
-#include <immintrin.h>
+#pragma once
 
 #include "linalg/many_floats_avx.h"
 
@@ -82,12 +81,3 @@ constexpr int kAcross = 8;
 
 }  // namespace
 }  // namespace diffcloth::linalg
-
-#include "linalg/dense_kernels_impl.h"
-
-namespace diffcloth::linalg {
-extern const DenseKernels kAvx512Kernels;
-const DenseKernels kAvx512Kernels = kKernels;
-}  // namespace diffcloth::linalg
-
-#endif

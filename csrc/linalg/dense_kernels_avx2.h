@@ -1,7 +1,6 @@
-// The dense kernels with AVX2 and FMA. Only CMakeLists.txt's flags for this file allow them.
-#ifdef __AVX2__
+// Packs of the dense kernels with AVX2 and FMA.
 
-#include <immintrin.h>
+#pragma once
 
 #include "linalg/many_floats_avx.h"
 
@@ -113,12 +112,3 @@ constexpr int kAcross = 4;
 
 }  // namespace
 }  // namespace diffcloth::linalg
-
-#include "linalg/dense_kernels_impl.h"
-
-namespace diffcloth::linalg {
-extern const DenseKernels kAvx2Kernels;
-const DenseKernels kAvx2Kernels = kKernels;
-}  // namespace diffcloth::linalg
-
-#endif
