@@ -27,13 +27,11 @@ void write_surfaces(const Problem& p, const Cotangents& bars, const Gradients& g
   if (double* out = gradients[Input::kBodyPoses]) {
     const double* poses = p.inputs.data(Input::kBodyPoses);
     bodies.place_vjp(poses, start.data() + p.cloth_size, out);
-    add_to(out, bars.body_poses);
     mechanisms.set_frames_vjp(poses, p.coordinates.nodes(start), out);
   }
   if (double* out = gradients[Input::kBodyTargets]) {
     const double* poses = p.inputs.data(Input::kBodyTargets);
     bodies.place_vjp(poses, bars.ends.data() + p.cloth_size, out);
-    add_to(out, bars.body_targets);
     mechanisms.set_frames_vjp(poses, p.coordinates.nodes(bars.ends), out);
   }
   for (Index c = 0; c < mechanisms.coordinate_count(); ++c) {
@@ -113,8 +111,6 @@ Cotangents::Cotangents(const Problem& p, const Gradients& gradients)
       ends(p.start.size(), 0.0),
       velocities(p.cloth_size, 0.0),
       masses(p.masses.size(), 0.0),
-      body_poses(p.inputs[Input::kBodyPoses].count, 0.0),
-      body_targets(p.inputs[Input::kBodyTargets].count, 0.0),
       contact(p.scene.collision_mesh) {
   if (gradients[Input::kRestPositions] != nullptr) {
     rest = mesh::RestShapeBar(p.scene.topology, p.scene.stencils);
@@ -158,6 +154,7 @@ void Cotangents::write(Problem& p, const Gradients& gradients) {
     }
   }
   write_surfaces(p, *this, gradients);
+  for (const PullBack& pull_back : of_stages) pull_back(gradients);
   write_rest(p, *this, gradients);
 }
 

@@ -8,9 +8,10 @@
 
 namespace diffcloth::step {
 
-/// Cotangents of what the potentials of a step depend on, before they are pulled back to the inputs.
+/// Cotangents of the quantities that the potentials of a step share, before they are pulled back to the inputs.
 ///
-/// The potentials of a problem keep those of their own parameters, of one loss at a time: see Turn.
+/// The potentials of a problem keep the cotangents of their own parameters, of one loss at a time: see Turn. A
+/// stage of a scheme adds a PullBack for its own.
 class Cotangents {
  public:
   /// All zero.
@@ -33,11 +34,13 @@ class Cotangents {
   std::vector<double> body_forces;  ///< of the output [3 V]
   std::vector<double> contact_forces;  ///< likewise [3 N]
   std::vector<double> pin_forces;      ///< likewise [3 P]
-  std::vector<double> body_poses;    ///< of the poses at the start, beyond what `start` pulls back
-  std::vector<double> body_targets;  ///< likewise, at the end
   contact::ContactModel::Bar contact;
 
   mesh::RestShapeBar rest;  ///< of the cloths' rest shape; empty where nobody asks for it
+
+  /// Adds the cotangents that a stage keeps to the gradients of the inputs; write() calls it.
+  using PullBack = std::function<void(const Gradients& gradients)>;
+  std::vector<PullBack> of_stages;
 
   /// Swap what the problem's potentials have accumulated with what they have for this loss.
   void exchange(Problem& problem);

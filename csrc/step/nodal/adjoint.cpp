@@ -92,7 +92,18 @@ Vec3 pull_back_slipping(const Problem& problem,
          c.normal.dot(q_held) * (problem.h * scale(c)) * at.u[k];
 }
 
-/// The cotangents of the contacts' frames, and of what moves against them.
+/// Cotangents of the poses of obstacles: a contact depends on them beyond the vertices of its body.
+struct PoseCotangents {
+  Array start;  ///< [7 T]
+  Array end;    ///< [7 T]
+
+  void pull_back(const Gradients& gradients) const {
+    add_to(gradients[Input::kBodyPoses], start);
+    add_to(gradients[Input::kBodyTargets], end);
+  }
+};
+
+/// Pull back to the contacts' frames, and to the positions and poses that these depend on.
 void pull_back_frames(Problem& problem,
                       const NodalContacts& contacts,
                       const NodalSystem& system,
@@ -102,6 +113,8 @@ void pull_back_frames(Problem& problem,
                       const std::vector<Vec3>& surface_point_bar,
                       Cotangents& bars) {
   const projective::Swept cloths = swept(problem);
+  PoseCotangents poses{.start = Array(problem.inputs[Input::kBodyPoses].count, 0.0),
+                       .end = Array(problem.inputs[Input::kBodyTargets].count, 0.0)};
   for (std::size_t k = 0; k < contacts.list.size(); ++k) {
     const NodalContact& c = contacts.list[k];
     const Coulomb& law = at.laws[k];
@@ -126,10 +139,12 @@ void pull_back_frames(Problem& problem,
       add_vertex(c.partner, frame.partner);
     } else {
       const Index pose = problem.scene.given.bodies.pose[contacts.obstacles[c.obstacle].body];
-      Eigen::Map<bodies::Pose>(bars.body_poses.data() + 7 * pose) += frame.start;
-      Eigen::Map<bodies::Pose>(bars.body_targets.data() + 7 * pose) += frame.end;
+      Eigen::Map<bodies::Pose>(poses.start.data() + 7 * pose) += frame.start;
+      Eigen::Map<bodies::Pose>(poses.end.data() + 7 * pose) += frame.end;
     }
   }
+  bars.of_stages.emplace_back(
+      [poses = std::move(poses)](const Gradients& gradients) { poses.pull_back(gradients); });
 }
 
 }  // namespace
