@@ -10,14 +10,6 @@
 namespace diffcloth::linalg {
 namespace {
 
-/// Residuals seldom shrink more in an iteration: solves in which they would have to are given up.
-constexpr double kFastest = 2.5;
-
-/// See agrees().
-constexpr double kFirstContraction = 0.1;
-constexpr double kAgreement = 1e-4;
-constexpr int kFewIterations = 6;
-
 /// The largest magnitude. Several maxima at once: each would wait for the one before.
 double largest_magnitude(const std::vector<double>& values) {
   std::array<double, 4> largest{};
@@ -111,6 +103,7 @@ Convergence conjugate_gradient(const BlockValues& A,
                                const std::vector<double>& b,
                                double tolerance,
                                int max_iterations,
+                               double fastest,
                                CholeskyWorkspace& workspace,
                                std::vector<double>& x) {
   Descent descent(b, x);
@@ -125,7 +118,7 @@ Convergence conjugate_gradient(const BlockValues& A,
     preconditioner.solve(descent.r.data(), descent.z.data(), workspace);
     descent.turn();
     if (descent.rz <= goal) result = Convergence::kConverged;
-    if (descent.rz > goal * std::pow(kFastest * kFastest, left - 1)) break;
+    if (descent.rz > goal * std::pow(fastest * fastest, left - 1)) break;
   }
   x = std::move(descent.x);
   return result;
@@ -148,11 +141,12 @@ bool agrees(const BlockValues& A,
             const CholeskyFactor& factor,
             const std::vector<double>& b,
             const std::vector<double>& x,
+            const Agreement& agreement,
             CholeskyWorkspace& workspace) {
   Descent descent(b, x);
-  const double first = kFirstContraction * kFirstContraction * descent.rz;
-  const double goal = kAgreement * kAgreement * descent.rz;
-  for (int iteration = 0; iteration < kFewIterations; ++iteration) {
+  const double first = agreement.first_contraction * agreement.first_contraction * descent.rz;
+  const double goal = agreement.residual * agreement.residual * descent.rz;
+  for (int iteration = 0; iteration < agreement.iterations; ++iteration) {
     if (!descent.advance(A)) return false;
     factor.solve(descent.r.data(), descent.z.data(), workspace);
     descent.turn();

@@ -21,7 +21,8 @@ enum class Convergence : std::uint8_t { kConverged, kIterationLimit, kNegativeCu
 /// it.
 ///
 /// @param tolerance  on the residual in the preconditioner's norm, relative to b's
-/// @param max_iterations  given up before, where it can hardly be enough
+/// @param fastest    contraction of the residual in an iteration that is seldom exceeded: the solve is given
+///                   up early if the remaining iterations would have to contract more
 /// @param x          in: what the preconditioner makes of b, zero at vertices left out; out: the best
 ///                   iterate, however it ended
 [[nodiscard]] Convergence conjugate_gradient(const BlockValues& A,
@@ -29,6 +30,7 @@ enum class Convergence : std::uint8_t { kConverged, kIterationLimit, kNegativeCu
                                              const std::vector<double>& b,
                                              double tolerance,
                                              int max_iterations,
+                                             double fastest,
                                              CholeskyWorkspace& workspace,
                                              std::vector<double>& x);
 
@@ -40,15 +42,23 @@ void solve(const CholeskyFactor& factor,
            CholeskyWorkspace& workspace,
            std::vector<std::vector<double>>& x);
 
-/// Whether the factor of a matrix in single precision does for it along a right side: x is the solution to a
-/// tenth, and conjugate gradients from there converge in a few iterations, to 1e-4 of the residual. A
-/// direction in which A is negative would keep its share of the residual.
+/// Test by which a factor in single precision agrees with its matrix.
+struct Agreement {
+  double first_contraction;  ///< of the residual, by the first iteration
+  double residual;           ///< at the end, relative to the first
+  int iterations;            ///< to get there
+};
+
+/// Test whether the factor of a matrix in single precision stands for it along a right side: conjugate gradients
+/// from x contract the residual as agreed. A direction in which A is negative would keep its share of the
+/// residual.
 ///
-/// @param x  what the factor makes of b
+/// @param x  solution by the factor alone
 [[nodiscard]] bool agrees(const BlockValues& A,
                           const CholeskyFactor& factor,
                           const std::vector<double>& b,
                           const std::vector<double>& x,
+                          const Agreement& agreement,
                           CholeskyWorkspace& workspace);
 
 /// Solve A x = b for several right sides, each with the bits that it has alone, with a factor of A itself in

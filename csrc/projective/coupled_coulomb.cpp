@@ -8,23 +8,13 @@
 #include <Eigen/LU>
 
 #include "projective/coulomb.h"
+#include "solver/stopping.h"
 
 namespace diffcloth::projective {
-namespace {
 
-/// Directions among which those of a slip are bracketed, and refinements of a bracket.
-constexpr int kDirections = 32;
-constexpr int kRefinements = 60;
-constexpr double kAngle = 1e-15;
-/// Sweeps after which Newton's method may take over, and its steps.
-constexpr int kSweepsPerPolish = 20;
-constexpr int kNewtonSteps = 10;
-constexpr double kNewtonContraction = 0.5;
-/// Sweeps after which contacts take a smaller share of their step: full ones may go round in circles.
-constexpr int kSweepsPerShare = 100;
-constexpr double kLeastShare = 0.125;
-/// Changes of impulses that are none, relative to the largest.
-constexpr double kRounding = 1e-14;
+using solver::stopping::kCoupledCoulomb;
+
+namespace {
 
 /// The velocities of a contact that slips, by the direction of friction. With t = cos(a) t_1 + sin(a)
 /// t_2 and r = r_n (n + mu t), where r_n keeps n . u at zero.
@@ -62,7 +52,9 @@ class Slip {
     double weight_b = 1.0;
     int side = 0;
     At best = std::abs(at_a.across) < std::abs(at_b.across) ? at_a : at_b;
-    for (int k = 0; k < kRefinements && std::abs(b - a) > kAngle && best.across != 0.0; ++k) {
+    for (int k = 0; k < kCoupledCoulomb.refinements && std::abs(b - a) > kCoupledCoulomb.angle &&
+                    best.across != 0.0;
+         ++k) {
       const double f_a = weight_a * at_a.across;
       const double f_b = weight_b * at_b.across;
       const double c = (a * f_b - b * f_a) / (f_b - f_a);
@@ -90,11 +82,11 @@ class Slip {
 
   Vec3 solve() const {
     // From the last direction to both sides.
-    constexpr double kStep = 2.0 * std::numbers::pi / kDirections;
+    constexpr double kStep = 2.0 * std::numbers::pi / kCoupledCoulomb.directions;
     At best{.r = Vec3::Zero(), .across = INFINITY, .along = INFINITY};
     At left = at(0.0);
     At right = left;
-    for (int k = 1; k <= kDirections / 2; ++k) {
+    for (int k = 1; k <= kCoupledCoulomb.directions / 2; ++k) {
       for (const double side : {1.0, -1.0}) {
         At& last = side > 0.0 ? right : left;
         const At next = at(side * kStep * k);
@@ -128,10 +120,10 @@ class Equations {
   /// Newton's steps while they contract what is left of the equations.
   void polish(Eigen::VectorXd& r) const {
     Eigen::VectorXd left = residual(r);
-    for (int k = 0; k < kNewtonSteps; ++k) {
+    for (int k = 0; k < kCoupledCoulomb.newton_steps; ++k) {
       const Eigen::VectorXd next = r - jacobian(r).partialPivLu().solve(left);
       const Eigen::VectorXd left_next = residual(next);
-      if (!(left_next.norm() < kNewtonContraction * left.norm())) return;
+      if (!(left_next.norm() < kCoupledCoulomb.newton_contraction * left.norm())) return;
       r = next;
       left = left_next;
     }
@@ -219,7 +211,8 @@ bool solve_coulomb(const Eigen::MatrixXd& W,
   const Eigen::VectorXd guess = r;
   double share = 1.0;
   for (int sweep = 0; sweep < max_sweeps; ++sweep) {
-    if (sweep > 0 && sweep % kSweepsPerShare == 0) share = std::max(kLeastShare, 0.5 * share);
+    if (sweep > 0 && sweep % kCoupledCoulomb.sweeps_per_share == 0)
+      share = std::max(kCoupledCoulomb.least_share, 0.5 * share);
     double change = 0.0;  // of this sweep, and of all
     double moved = 0.0;
     double size = 0.0;
@@ -235,8 +228,9 @@ bool solve_coulomb(const Eigen::MatrixXd& W,
       size = std::max(size, next.norm());
       r.segment<3>(3 * k) = next;
     }
-    if (change <= std::max(tolerance * moved, kRounding * size)) return true;
-    if (sweep % kSweepsPerPolish == kSweepsPerPolish - 1) equations.polish(r);
+    if (change <= std::max(tolerance * moved, kCoupledCoulomb.rounding * size)) return true;
+    if (sweep % kCoupledCoulomb.sweeps_per_polish == kCoupledCoulomb.sweeps_per_polish - 1)
+      equations.polish(r);
   }
   return false;
 }

@@ -5,23 +5,13 @@
 #include <limits>
 
 #include "projective/anderson.h"
+#include "solver/stopping.h"
 
 namespace diffcloth::projective {
-namespace {
 
-/// A step below this share of the largest coordinate is lost in rounding.
-constexpr double kResolution = 1e-15;
-/// Relative size of a change of energy that rounding can fake. Below, the slope decides.
-constexpr double kEnergyNoise = 1e-11;
-constexpr double kWolfeSlope = 0.8;
-/// Iterations after which the scale of the energy is looked up again.
-constexpr int kEnergyAge = 50;
-/// Iterations that neither shrink the residual by this much nor gain more than noise, after which
-/// the floor of rounding is reached.
-constexpr int kIdle = 1000;
-constexpr double kProgress = 0.9;
-/// Halvings after which a step that raises the energy gives up.
-constexpr int kHalvings = 40;
+using solver::stopping::kLocalGlobal;
+
+namespace {
 
 /// The iterate, the gradient there and the next step. What is allocated is so once.
 class Iteration {
@@ -53,7 +43,7 @@ class Iteration {
       step = std::max(step, std::abs(p_[a]));
       extent = std::max(extent, std::abs(x_[a]));
     }
-    if (!(step > kResolution * extent) || idles()) return false;
+    if (!(step > kLocalGlobal.resolution * extent) || idles()) return false;
     anderson_.next(x_.data(), p_.data(), q_.data(), to_.data());
     if (!gains() && !halve()) return false;
     x_.swap(to_);
@@ -84,25 +74,25 @@ class Iteration {
       slope += step.dot(row(g_.data(), i));
       slope_to += step.dot(row(g_to_.data(), i));
     }
-    return slope < 0.0 && slope_to <= -kWolfeSlope * slope;
+    return slope < 0.0 && slope_to <= -kLocalGlobal.wolfe_slope * slope;
   }
 
   bool idles() {
-    if (age_++ % kEnergyAge == 0) {
+    if (age_++ % kLocalGlobal.energy_age == 0) {
       double energy = 0.0;
       for (const Potential* p : f_.potentials) energy += p->energy(x_.data());
-      noise_ = kEnergyNoise * std::abs(energy);
+      noise_ = kLocalGlobal.energy_noise * std::abs(energy);
     }
-    const bool progress = residual_ < kProgress * best_ || change_ < -noise_;
+    const bool progress = residual_ < kLocalGlobal.progress * best_ || change_ < -noise_;
     idle_ = progress ? 0 : idle_ + 1;
     best_ = std::min(best_, residual_);
-    return idle_ > kIdle;
+    return idle_ > kLocalGlobal.idle_iterations;
   }
 
   /// Take the plain step, or a part of it.
   bool halve() {
     double share = 1.0;
-    for (int k = 0; k < kHalvings; ++k, share *= 0.5) {
+    for (int k = 0; k < kLocalGlobal.halvings; ++k, share *= 0.5) {
       for (std::size_t a = 0; a < size_; ++a) to_[a] = x_[a] + share * p_[a];
       if (gains()) return true;
     }

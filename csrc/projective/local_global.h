@@ -23,10 +23,6 @@ struct LocalGlobalObjective {
   double largest_rate(const std::vector<double>& force) const;
 };
 
-/// Iterations that are allowed for each of Newton's: one takes about as much less time, and they
-/// converge linearly.
-inline constexpr std::int64_t kIterationsPerNewton = 50;
-
 struct LocalGlobalOptions {
   double tolerance;             ///< on max_i h |g_i| / m_i over the free vertices [m/s]
   std::int64_t max_iterations;  ///< of this solve

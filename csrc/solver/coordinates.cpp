@@ -3,13 +3,11 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <numbers>
+
+#include "solver/stopping.h"
 
 namespace diffcloth::solver {
 namespace {
-
-/// No link turns farther in one step: beyond, the quadratic model of where its points go is void.
-constexpr double kLargestTurn = std::numbers::pi / 4.0;
 
 /// Largest size among some numbers; NaN counts as infinite.
 double largest(const double* first, const double* last) {
@@ -202,7 +200,7 @@ void Coordinates::retract(const std::vector<double>& x,
 double Coordinates::largest_fraction(const std::vector<double>& x,
                                      const std::vector<double>& dx) const {
   if (!is_curved()) return std::numeric_limits<double>::infinity();
-  double fraction = kLargestTurn / mechanisms_->turn(nodes(dx));
+  double fraction = stopping::kJointSteps.largest_turn / mechanisms_->turn(nodes(dx));
   const bodies::MechanismsDescription& given = mechanisms_->given();
   for (Index c = 0; c < mechanisms_->coordinate_count(); ++c) {
     const double zone = given.limit_zone * (given.upper[c] - given.lower[c]);
@@ -211,7 +209,7 @@ double Coordinates::largest_fraction(const std::vector<double>& x,
     const double change = nodes(dx)[mechanisms_->slot(c)];
     const double left = change > 0.0 ? given.upper[c] + zone - q : q - given.lower[c] + zone;
     if (std::abs(change) > 0.0) {
-      fraction = std::min(fraction, kShareOfLimit * left / std::abs(change));
+      fraction = std::min(fraction, stopping::kJointSteps.share_of_limit * left / std::abs(change));
     }
   }
   return fraction;

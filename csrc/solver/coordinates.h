@@ -113,9 +113,6 @@ class Coordinates {
   /// to the end of its limits.
   double largest_fraction(const std::vector<double>& x, const std::vector<double>& dx) const;
 
-  /// Of what is left to the end of a limit, the share that a step may use.
-  static constexpr double kShareOfLimit = 0.9;
-
   /// Largest displacement in a change of all points [m]; NaN counts as infinite.
   double displacement(const std::vector<double>& dx) const;
 

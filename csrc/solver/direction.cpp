@@ -3,42 +3,11 @@
 #include <algorithm>
 #include <cmath>
 
+#include "solver/stopping.h"
+
 namespace diffcloth::solver {
-namespace {
 
-/// A chord step is taken while it shrinks the step by this much.
-constexpr double kChordContraction = 0.1;
-/// An old factor is not asked for more conjugate gradient iterations, to this relative residual: a
-/// new factor would be cheaper.
-constexpr int kIterations = 8;
-constexpr double kForcing = 0.03;
-/// The same of a dear factor: an iteration takes as long as so many operations per entry.
-constexpr double kOperationsPerIteration = 80.0;
-constexpr double kForcingOfDear = 0.01;
-/// Near a solution full steps with the exact Hessian move nothing by more than this share of an edge.
-constexpr double kNear = 0.03;
-/// Share s of the projection after an indefinite Hessian; its growth while the blend is indefinite;
-/// its fall and growth with what steps gain; below which it counts as none; to which poor steps let
-/// it grow, as little else is left then; beyond which nothing more is to be had from it.
-constexpr double kFirstShare = 1.0;
-constexpr double kFailureGrowth = 4.0;
-constexpr double kDecay = 0.25;
-constexpr double kGrowth = 2.0;
-constexpr double kNoShare = 0.05;
-constexpr double kFullShare = 64.0;
-constexpr double kLargestShare = 1e8;
-/// A step is good that gains this share of what its quadratic model promises, at once; the model is poor
-/// where it gains less than the second, as when it has crossed a valley, or after this many backtracks.
-constexpr double kGoodGain = 0.25;
-constexpr double kPoorGain = 0.1;
-constexpr int kManyBacktracks = 3;
-/// A blend holds a direction along which it has this share of the projection's curvature.
-constexpr double kHeld = 0.5;
-/// Damped steps are lengthened to where the exact curvature along them puts the minimum.
-constexpr double kWorthGrowing = 1.5;
-constexpr double kLargestGrowth = 4.0;
-
-}  // namespace
+using stopping::kDirections;
 
 void Directions::make_room() {
   // It would seldom be of use: where the next one fails, damped steps follow, which lead away.
@@ -100,14 +69,15 @@ void Directions::solve(const linalg::CholeskyFactor& factor, const linalg::Block
 
 bool Directions::chord() {
   walk_.system.solve(*last_.factor, walk_.g(), p_);
-  if (!chord_allowed_ || !(walk_.displacement(p_) <= kChordContraction * last_step_)) return false;
+  if (!chord_allowed_ || !(walk_.displacement(p_) <= kDirections.chord_contraction * last_step_))
+    return false;
   ++walk_.context.counts->chord;
   return true;
 }
 
 bool Directions::is_near() const {
   if (std::isinf(last_step_)) return true;
-  return chord_allowed_ && last_step_ <= kNear * walk_.f.length;
+  return chord_allowed_ && last_step_ <= kDirections.near * walk_.f.length;
 }
 
 double Directions::operations_per_entry() const {
@@ -119,7 +89,9 @@ bool Directions::is_dear() const {
   return last_.factor != nullptr && operations_per_entry() > walk_.context.options.dear_factor;
 }
 
-bool Directions::is_far() const { return walk_.displacement(p_) > kNear * walk_.f.length; }
+bool Directions::is_far() const {
+  return walk_.displacement(p_) > kDirections.near * walk_.f.length;
+}
 
 double Directions::curvature_along(const linalg::BlockMatrix& H) const {
   std::vector<double> z;
@@ -131,14 +103,15 @@ double Directions::curvature_along(const linalg::BlockMatrix& H) const {
 
 bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
   if (!is_near() && !(chord_allowed_ && is_dear())) return false;
-  double forcing = kForcing;
-  int iterations = kIterations;
+  double forcing = kDirections.forcing;
+  int iterations = kDirections.iterations;
   if (is_dear()) {
     // Far from the solution what is left of the direction is to be no longer than it may be near there.
-    const double far = walk_.displacement(p_) / (kNear * walk_.f.length);
-    forcing = kForcingOfDear / std::max(far, 1.0);
-    const auto worth = static_cast<int>(operations_per_entry() / kOperationsPerIteration);
-    iterations = std::max(kIterations, worth);
+    const double far = walk_.displacement(p_) / (kDirections.near * walk_.f.length);
+    forcing = kDirections.forcing_of_expensive / std::max(far, 1.0);
+    const auto worth =
+        static_cast<int>(operations_per_entry() / kDirections.operations_per_iteration);
+    iterations = std::max(kDirections.iterations, worth);
   }
   const linalg::Convergence result =
       walk_.system.solve(H, *last_.factor, walk_.g(), forcing, iterations, p_);
@@ -203,7 +176,7 @@ std::optional<Directions::Direction> Directions::next() {
       leave();  // it says nothing of the exact one
       return Direction{.kind = Kind::kPrimalDual, .first = 1.0};
     }
-    s_ = kFirstShare;
+    s_ = kDirections.first_share;
   }
   return damp(H, walk_.system.assemble(x, Curvature::kPositive, walk_.g()));
 }
@@ -213,7 +186,7 @@ std::optional<Directions::Direction> Directions::next_extrapolated() {
   const double* x = walk_.x().data();
   linalg::BlockMatrix H = walk_.system.assemble_extrapolated(x, Curvature::kExact, walk_.g());
   if (refactor(H)) return Direction{.kind = Kind::kExtrapolated, .first = 1.0};
-  if (s_ == 0.0) s_ = kFirstShare;
+  if (s_ == 0.0) s_ = kDirections.first_share;
   return damp(H, walk_.system.assemble_extrapolated(x, Curvature::kPositive, walk_.g()));
 }
 
@@ -230,21 +203,22 @@ std::optional<Directions::Direction> Directions::damp(const linalg::BlockMatrix&
     walk_.context.checkpoint->check();
     linalg::BlockMatrix A = H;
     A.blend(P, s_);
-    if (descend(A, s_ > kFirstShare)) {
+    if (descend(A, s_ > kDirections.first_share)) {
       curvature = curvature_along(H);
       const double positive = (-(1.0 + s_) * slope_ - curvature) / s_;
-      if (-slope_ >= kHeld * positive || !is_far()) break;
-      s_ *= kFailureGrowth;
+      if (-slope_ >= kDirections.held * positive || !is_far()) break;
+      s_ *= kDirections.failure_growth;
     } else {
-      if (s_ > kLargestShare) return std::nullopt;
-      s_ = std::max(kFirstShare, kFailureGrowth * s_);
+      if (s_ > kDirections.largest_share) return std::nullopt;
+      s_ = std::max(kDirections.first_share, kDirections.failure_growth * s_);
     }
   }
   ++walk_.context.counts->projected;
   // The minimum of that quadratic; beyond any bound where its curvature is negative.
-  const double best = curvature > 0.0 ? -slope_ / curvature : kLargestGrowth;
-  return Direction{.kind = Kind::kDamped,
-                   .first = best > kWorthGrowing ? std::min(best, kLargestGrowth) : 1.0};
+  const double best = curvature > 0.0 ? -slope_ / curvature : kDirections.largest_growth;
+  return Direction{
+      .kind = Kind::kDamped,
+      .first = best > kDirections.worth_growing ? std::min(best, kDirections.largest_growth) : 1.0};
 }
 
 void Directions::learn(const Direction& direction, const Search& search) {
@@ -252,12 +226,12 @@ void Directions::learn(const Direction& direction, const Search& search) {
   chord_allowed_ = direction.kind != Kind::kDamped && search.alpha == 1.0;
   if (direction.kind != Kind::kDamped) return;
   const double promised = slope_ * search.alpha * (1.0 - 0.5 * std::min(search.alpha, 1.0));
-  if (search.backtracks == 0 && search.gain <= kGoodGain * promised) {
-    s_ *= kDecay;
-    if (s_ < kNoShare) s_ = 0.0;
-  } else if (search.backtracks >= kManyBacktracks ||
-             (search.measured && search.gain > kPoorGain * promised)) {
-    s_ = std::min(kGrowth * s_, kFullShare);
+  if (search.backtracks == 0 && search.gain <= kDirections.good_gain * promised) {
+    s_ *= kDirections.decay;
+    if (s_ < kDirections.no_share) s_ = 0.0;
+  } else if (search.backtracks >= kDirections.many_backtracks ||
+             (search.measured && search.gain > kDirections.poor_gain * promised)) {
+    s_ = std::min(kDirections.growth * s_, kDirections.full_share);
   }
 }
 
@@ -272,11 +246,11 @@ bool Directions::retry(Kind kind) {
       return true;
     case Kind::kFactored:
     case Kind::kPrimalDual:
-      s_ = kFirstShare;
+      s_ = kDirections.first_share;
       return true;
     case Kind::kDamped:
-      s_ *= kFailureGrowth;
-      return s_ <= kLargestShare;
+      s_ *= kDirections.failure_growth;
+      return s_ <= kDirections.largest_share;
   }
   __builtin_unreachable();
 }

@@ -3,22 +3,13 @@
 #include <algorithm>
 #include <cmath>
 
+#include "solver/stopping.h"
+
 namespace diffcloth::solver {
-namespace {
 
-/// Sufficient decrease, and the slope that replaces it where the change drowns in rounding.
-constexpr double kArmijo = 1e-4;
-constexpr double kWolfeSlope = 0.8;
-/// Relative size of a change of energy that rounding can fake.
-constexpr double kEnergyNoise = 1e-11;
-/// A change of so many times that, by what is known of the energy, is larger whatever friction has done.
-constexpr double kClearly = 1e3;
-/// Halvings of the step: beyond, it is lost in the rounding of the coordinates.
-constexpr int kBacktracks = 40;
+using stopping::kLineSearch;
 
-}  // namespace
-
-double Trial::enough(double slope) const { return kArmijo * alpha * slope; }
+double Trial::enough(double slope) const { return kLineSearch.armijo * alpha * slope; }
 
 Trial farthest(Walk& walk, const std::vector<double>& p, double first) {
   Trial trial;
@@ -28,8 +19,9 @@ Trial farthest(Walk& walk, const std::vector<double>& p, double first) {
 }
 
 bool drowns(Walk& walk, double change) {
-  if (std::abs(change) > kEnergyNoise * kClearly * walk.extent()) return false;
-  return std::abs(change) <= kEnergyNoise * std::abs(walk.energy());
+  if (std::abs(change) > kLineSearch.energy_noise * kLineSearch.clearly * walk.extent())
+    return false;
+  return std::abs(change) <= kLineSearch.energy_noise * std::abs(walk.energy());
 }
 
 Search search(Walk& walk, const std::vector<double>& p, Trial trial) {
@@ -41,7 +33,7 @@ Search search(Walk& walk, const std::vector<double>& p, Trial trial) {
   const double slope = dot(walk.g(), p);
   const std::vector<double> start = walk.x();
 
-  for (; result.backtracks < kBacktracks; ++result.backtracks, trial.alpha *= 0.5) {
+  for (; result.backtracks < kLineSearch.backtracks; ++result.backtracks, trial.alpha *= 0.5) {
     walk.context.checkpoint->check();
     if (result.backtracks > 0) {
       if (walk.f.coordinates->is_curved(p)) {
@@ -58,7 +50,7 @@ Search search(Walk& walk, const std::vector<double>& p, Trial trial) {
       walk.f.update_duals(start.data(), p.data(), trial.alpha, trial.to.data());
       walk.go(trial.to, trial.gain);
       walk.refresh();
-    } else if (!walk.go_if_flat(trial.to, p, kWolfeSlope * std::abs(slope))) {
+    } else if (!walk.go_if_flat(trial.to, p, kLineSearch.wolfe_slope * std::abs(slope))) {
       continue;
     }
     result.result = SearchResult::kMoved;

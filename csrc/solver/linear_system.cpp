@@ -6,14 +6,10 @@
 #include <utility>
 
 #include "common/fixed_noise.h"
+#include "solver/stopping.h"
 
 namespace diffcloth::solver {
 namespace {
-
-/// Relative residual of a solve to rounding, and in how many iterations a factor in single precision must
-/// reach it. A good one takes three.
-constexpr double kRounding = 1e-12;
-constexpr int kManyIterations = 30;
 
 /// A fixed right side without symmetry, with numbers of the size of the diagonal's root.
 std::vector<double> probe(const linalg::BlockValues& matrix) {
@@ -116,7 +112,8 @@ bool LinearSystem::agrees(const Certificate& certificate,
     b[a] += weight * b_[a];
     z[a] -= weight * z_[a];
   }
-  return linalg::agrees(*certificate.hessian, *certificate.factor, b, z, workspace_);
+  return linalg::agrees(*certificate.hessian, *certificate.factor, b, z, stopping::kAgreement,
+                        workspace_);
 }
 
 void LinearSystem::solve(const linalg::CholeskyFactor& factor,
@@ -159,7 +156,8 @@ void LinearSystem::solve(const Certificate& certificate,
     linalg::solve(factor, right, workspace_, z);
   } else {
     const std::vector<char> converged = linalg::conjugate_gradients(
-        *certificate.hessian, factor, right, kRounding, kManyIterations, workspace_, z);
+        *certificate.hessian, factor, right, stopping::kRefinement.residual,
+        stopping::kRefinement.iterations, workspace_, z);
     if (std::ranges::count(converged, 0) > 0) {
       linalg::CholeskyFactor exact(factor.analysis());
       if (exact.compute(certificate.hessian->blocks(), workspace_) != linalg::Verdict::kPositive) {
@@ -190,7 +188,8 @@ linalg::Convergence LinearSystem::solve(const linalg::BlockValues& matrix,
   f_.coordinates->take_rows(p, z_);
   for (double& value : z_) value = -value;
   const linalg::Convergence result =
-      linalg::conjugate_gradient(matrix, nearby, b_, tolerance, max_iterations, workspace_, z_);
+      linalg::conjugate_gradient(matrix, nearby, b_, tolerance, max_iterations,
+                                 stopping::kConjugateGradients.fastest, workspace_, z_);
   for (double& value : z_) value = -value;
   f_.coordinates->push_forward(z_, p);
   return result;

@@ -5,13 +5,13 @@
 #include <ranges>
 
 #include "solver/line_search.h"
+#include "solver/stopping.h"
 
 namespace diffcloth::solver {
-namespace {
 
-/// A motion is stuck when this many iterations move it by less than this fraction.
-constexpr int kStuckIterations = 20;
-constexpr double kStuckProgress = 1e-3;
+using stopping::kPrescribedMotion;
+
+namespace {
 
 /// Change of what is prescribed to its ends, and of what follows it; zero elsewhere.
 std::vector<double> prescribed_change(const Walk& walk, const std::vector<double>& ends) {
@@ -146,8 +146,8 @@ double go_to_the_end(Walk& walk,
       // Where a motion is blocked, a descent reopens the gaps.
       const double alpha = descend_and_follow(walk, ends, descends || iteration > 1);
       remaining *= 1.0 - alpha;
-      if (iteration % kStuckIterations == 0) {
-        if (checked - remaining < kStuckProgress) return halt(walk, motion, way);
+      if (iteration % kPrescribedMotion.stuck_iterations == 0) {
+        if (checked - remaining < kPrescribedMotion.stuck_progress) return halt(walk, motion, way);
         checked = remaining;
       }
     }

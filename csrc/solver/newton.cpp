@@ -8,41 +8,14 @@
 
 #include "solver/direction.h"
 #include "solver/saddle.h"
+#include "solver/stopping.h"
 
 namespace diffcloth::solver {
-namespace {
 
-/// A Newton step at this share of the tolerance is not worth taking; a larger one makes the solution,
-/// and so its gradient, more exact than the tolerance asks for at the price of a solve.
-constexpr double kSettled = 0.1;
-/// The same of a certified step, whose end would have to be certified again: that is another factorization.
-constexpr double kSettledFactored = 0.25;
-/// A step that changes friction by more than this share of the largest is taken, however short it is: from
-/// no force to the largest, what sticks slips by a few times the tolerance.
-constexpr double kForceChange = 1e-3;
-/// Unless it would not shrink by this much: then rounding is all that is left of it.
-constexpr double kShrinks = 0.5;
-/// A step below this share of the coordinates is lost in their rounding.
-constexpr double kResolution = 1e-15;
-/// Steps with the exact Hessian whose gain drowns in rounding, and that do not shrink, after which
-/// the floor of rounding is reached.
-constexpr int kIdle = 5;
-constexpr double kProgress = 0.9;
-/// Steps that an excursion may take to end below its start; the share that collisions must leave of
-/// each.
-constexpr int kExcursion = 6;
-constexpr double kFree = 0.3;
-/// In contact an excursion begins with a step of more than this share of an edge.
-constexpr double kFar = 0.03;
-/// Bodies and links go less than so many edges of the cloths in each of its steps, and without cloths there
-/// is none. A body that friction alone holds would be led around what it rests on, to where it falls
-/// without end.
-constexpr double kFarthest = 10.0;
-/// Steps of a solve before the first excursion: most solves end sooner.
-constexpr int kPatience = 8;
-/// After an excursion in vain the next steps are ordinary ones, twice as many as the last time, at most
-/// so many.
-constexpr int kLongestWait = 64;
+using stopping::kExcursions;
+using stopping::kNewton;
+
+namespace {
 
 class Descent {
  public:
@@ -109,8 +82,8 @@ class Descent {
   };
   bool away_ = false;  ///< on an excursion
   Excursion excursion_;
-  int wait_ = kPatience;  ///< ordinary steps before the next one
-  int next_wait_ = 1;     ///< after the next one in vain
+  int wait_ = kExcursions.patience;  ///< ordinary steps before the next one
+  int next_wait_ = 1;                ///< after the next one in vain
 };
 
 /// Leave a saddle, or stop there.
@@ -133,30 +106,30 @@ Descent::Next Descent::settle() {
 /// Whether a step below the goal is not worth taking.
 bool Descent::is_settled(double step, double share) const {
   return step <= share * goal_ &&
-         walk_.f.force_change(walk_.x().data(), directions_.p().data()) <= kForceChange;
+         walk_.f.force_change(walk_.x().data(), directions_.p().data()) <= kNewton.force_change;
 }
 
 /// Whether the end of a step below the goal is to be certified. A chord is often shorter than the step
 /// that it stands for: where that leaves more than may be left, a dear factor would be made twice.
 bool Descent::may_end(const Directions::Direction& direction, double step) const {
-  const bool doubtful = direction.kind == Kind::kChord && step > kSettledFactored * goal_;
+  const bool doubtful = direction.kind == Kind::kChord && step > kNewton.settled_factored * goal_;
   return !(doubtful && directions_.is_dear());
 }
 
 /// Whether rounding of the coordinates hides a step.
 bool Descent::is_lost(double step) const {
-  return !(step > kResolution * walk_.f.coordinates->extent(walk_.x()));
+  return !(step > kNewton.resolution * walk_.f.coordinates->extent(walk_.x()));
 }
 
 /// Whether steps have stopped to shrink while their gain drowns in rounding.
 bool Descent::idles(double step, const Search& search) {
-  if (step < kProgress * best_ || search.measured) {
+  if (step < kNewton.progress * best_ || search.measured) {
     idle_ = 0;
   } else {
     ++idle_;
   }
   best_ = std::min(best_, step);
-  return idle_ >= kIdle;
+  return idle_ >= kNewton.idle_steps;
 }
 
 /// The direction cannot be walked.
@@ -181,7 +154,7 @@ Descent::Next Descent::no_way(const Directions::Direction& direction,
 /// Whether an excursion may go so far.
 bool Descent::is_near(const std::vector<double>& p) const {
   const Coordinates& coordinates = *walk_.f.coordinates;
-  const double farthest = kFarthest * walk_.f.length;
+  const double farthest = kExcursions.farthest * walk_.f.length;
   for (Index i = coordinates.cloth_vertex_count(); i < coordinates.vertex_count(); ++i) {
     if (!(row(p.data(), i).squaredNorm() < farthest * farthest)) return false;
   }
@@ -194,11 +167,11 @@ Search Descent::walk_along(const Directions::Direction& direction) {
   Trial trial = farthest(walk_, p, direction.first);
   const double slope = dot(walk_.g(), p);
   const double enough = trial.enough(slope);
-  const bool rises =
-      slope < 0.0 && trial.alpha > kFree && std::isfinite(trial.gain) && trial.gain > enough;
+  const bool rises = slope < 0.0 && trial.alpha > kExcursions.free && std::isfinite(trial.gain) &&
+                     trial.gain > enough;
   // The next step relaxes what this one stretches, but not what it drives into barriers.
   const bool touches = walk_.f.contact != nullptr && !walk_.f.contact->contacts().empty();
-  const bool far = !touches || walk_.displacement(p) > kFar * walk_.f.length;
+  const bool far = !touches || walk_.displacement(p) > kExcursions.far * walk_.f.length;
   if (wait_ == 0 && direction.kind != Kind::kDamped && far && is_near(p) && rises &&
       trial.gain > 0.0 && !drowns(walk_, trial.gain)) {
     excursion_ = {.start = walk_.place(),
@@ -218,7 +191,8 @@ Search Descent::wander(const Trial& trial) {
   const double balance = excursion_.balance + trial.gain;
   const bool ends = trial.alpha > 0.0 && balance <= excursion_.enough;
   if (!is_near(directions_.p())) return {.result = SearchResult::kNoGain};
-  if (!ends && !(trial.alpha > kFree && std::isfinite(balance) && excursion_.steps < kExcursion)) {
+  if (!ends && !(trial.alpha > kExcursions.free && std::isfinite(balance) &&
+                 excursion_.steps < kExcursions.steps)) {
     return {.result = SearchResult::kNoGain};
   }
   walk_.go_extrapolating(trial.to);
@@ -235,7 +209,7 @@ Search Descent::wander(const Trial& trial) {
 Descent::Next Descent::come_back() {
   away_ = false;
   wait_ = next_wait_;
-  next_wait_ = std::min(2 * next_wait_, kLongestWait);
+  next_wait_ = std::min(2 * next_wait_, kExcursions.longest_wait);
   walk_.back(excursion_.start);
   directions_.resume(excursion_.p, excursion_.share);
   return go(excursion_.direction);
@@ -253,15 +227,16 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
   if (away_ && (step < goal_ || lost)) return come_back();
   residual_ = step / walk_.f.h;
   if (direction.kind == Kind::kDamped) {
-    if (step < kSettled * goal_) {
+    if (step < kNewton.settled * goal_) {
       settling_ = true;
       return Next::kGoOn;
     }
   } else if (step < goal_) {
     if (direction.kind != Kind::kFactored) {
       settling_ = may_end(direction, step);
-      if (is_settled(step, kSettled)) return Next::kGoOn;
-    } else if (is_settled(step, kSettledFactored) || step > kShrinks * settled_step_) {
+      if (is_settled(step, kNewton.settled)) return Next::kGoOn;
+    } else if (is_settled(step, kNewton.settled_factored) ||
+               step > kNewton.contraction * settled_step_) {
       return stop(Status::kConverged);
     } else {
       settled_step_ = step;

@@ -5,6 +5,8 @@
 #include <tuple>
 #include <utility>
 
+#include "solver/stopping.h"
+
 namespace diffcloth::solver {
 namespace {
 
@@ -39,8 +41,8 @@ double Objective::largest_fraction(const std::vector<double>& x,
                                    const std::vector<double>& dx) const {
   const double fraction = coordinates->largest_fraction(x, dx);
   if (chart == nullptr) return fraction;
-  return std::min(fraction,
-                  chart->largest_fraction(x.data(), dx.data(), Coordinates::kShareOfLimit));
+  return std::min(
+      fraction, chart->largest_fraction(x.data(), dx.data(), stopping::kJointSteps.share_of_limit));
 }
 
 linalg::Couplings Objective::couplings() const {

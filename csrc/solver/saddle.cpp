@@ -4,19 +4,13 @@
 #include <cmath>
 
 #include "common/fixed_noise.h"
+#include "solver/stopping.h"
 
 namespace diffcloth::solver {
-namespace {
 
-/// The first shift that is tried to make the Hessian definite, as a share of M/h^2, its growth, and
-/// how many are tried: up to 4e11.
-constexpr double kFirstShift = 0.1;
-constexpr double kShiftGrowth = 4.0;
-constexpr int kShifts = 22;
-constexpr int kInverseIterations = 30;
-/// Share of the mean edge that the first trial moves a vertex by, and its halvings.
-constexpr double kFirstMove = 0.25;
-constexpr int kEscapeBacktracks = 40;
+using stopping::kSaddle;
+
+namespace {
 
 /// A fixed start without symmetry.
 std::vector<double> start_vector(const Coordinates& coordinates) {
@@ -35,8 +29,8 @@ Factor shifted_factor(const std::vector<double>& metric,
                       const linalg::BlockMatrix& exact) {
   linalg::BlockMatrix H = exact;
   double added = 0.0;
-  double shift = kFirstShift;
-  for (int k = 0; k < kShifts; ++k, shift *= kShiftGrowth) {
+  double shift = kSaddle.first_shift;
+  for (int k = 0; k < kSaddle.shifts; ++k, shift *= kSaddle.shift_growth) {
     checkpoint.check();
     for (Index i = 0; i < H.pattern().size(); ++i) {
       H.add_to_diagonal(i, (shift - added) * row(metric.data(), i));
@@ -49,12 +43,12 @@ Factor shifted_factor(const std::vector<double>& metric,
 
 /// Go to the first lower point along p, from far to near, and on while the next is lower still.
 bool go_down(Walk& walk, const std::vector<double>& p) {
-  const double length = kFirstMove * walk.f.length;
+  const double length = kSaddle.first_move * walk.f.length;
   std::vector<double> to;
   double alpha = walk.watch(p, std::min(length, walk.f.largest_fraction(walk.x(), p)), to);
   double best = 0.0;
   double best_alpha = 0.0;
-  for (int k = 0; k < kEscapeBacktracks; ++k, alpha *= 0.5) {
+  for (int k = 0; k < kSaddle.backtracks; ++k, alpha *= 0.5) {
     if (k > 0) alpha = walk.watch(p, alpha, to);
     if (!(alpha > 0.0)) break;
     const double change = walk.change(to);
@@ -83,7 +77,7 @@ std::vector<double> most_negative(const Objective& f,
   std::vector<double> d = start_vector(*f.coordinates);
   std::vector<double> b(d.size(), 0.0);
   std::vector<double> p;
-  for (int k = 0; k < kInverseIterations; ++k) {
+  for (int k = 0; k < kSaddle.inverse_iterations; ++k) {
     checkpoint.check();
     for (std::size_t a = 0; a < d.size(); ++a) b[a] = metric[a] * d[a];
     shifted->solve(b.data(), d.data());

@@ -10,6 +10,7 @@
 #include "common/stopwatch.h"
 #include "solver/linear_system.h"
 #include "solver/objective.h"
+#include "solver/stopping.h"
 
 namespace diffcloth::solver {
 
@@ -94,12 +95,6 @@ class Walk {
   /// @param to  out: the end
   /// @return the fraction, 0 where there is no way
   double watch(const std::vector<double>& p, double alpha, std::vector<double>& to) {
-    // On a curve each fraction has a chord of its own: the safe part of one says little more about the
-    // next than where to try.
-    constexpr double kShorter = 0.9;
-    // But what bends far from there makes no difference.
-    constexpr double kBarelyShorter = 1.0 - 1e-9;
-    constexpr int kTrials = 60;
     f.coordinates->retract(x_, p, alpha, to);
     double safe = watch(to);
     if (!f.coordinates->is_curved(p)) {
@@ -110,8 +105,9 @@ class Walk {
       return alpha;
     }
     for (int k = 0; safe < 1.0; ++k) {
-      if (!(safe > 0.0) || k == kTrials) return 0.0;
-      alpha *= (k == 0 ? kBarelyShorter : kShorter) * safe;
+      if (!(safe > 0.0) || k == stopping::kCurvedStep.trials) return 0.0;
+      alpha *=
+          (k == 0 ? stopping::kCurvedStep.barely_shorter : stopping::kCurvedStep.shorter) * safe;
       f.coordinates->retract(x_, p, alpha, to);
       safe = watch(to);
     }

@@ -17,6 +17,7 @@
 #include "linalg/cholesky.h"
 #include "linalg/conjugate_gradient.h"
 #include "linalg/stencil_kernels.h"
+#include "solver/stopping.h"
 
 namespace diffcloth::bind {
 namespace {
@@ -165,7 +166,8 @@ class Factor {
     const std::vector<double> right(b.data(), b.data() + 3 * vertices_);
     std::vector<double> x(right.size(), 0.0);
     factor_.solve(right.data(), x.data(), workspace);
-    return linalg::agrees(matrix(analysis, blocks), factor_, right, x, workspace);
+    return linalg::agrees(matrix(analysis, blocks), factor_, right, x, solver::stopping::kAgreement,
+                          workspace);
   }
 
   std::size_t bytes() const { return factor_.bytes(); }

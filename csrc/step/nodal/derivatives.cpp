@@ -2,20 +2,14 @@
 
 #include <stdexcept>
 
+#include "solver/stopping.h"
 #include "step/nodal/system.h"
 
 namespace diffcloth::step {
 
+using solver::stopping::kNodal;
+
 using Array = std::vector<double>;
-
-namespace {
-
-/// Of a derivative, relative.
-constexpr double kTolerance = 1e-12;
-/// What rounding may leave of it on a badly conditioned mesh.
-constexpr double kLargestError = 1e-8;
-
-}  // namespace
 
 Array solve_derivative(const NodalSystem& system,
                        const NodalSystem::Point& at,
@@ -24,10 +18,10 @@ Array solve_derivative(const NodalSystem& system,
                        bool transposed,
                        const Array& b) {
   Array w;
-  if (!system.solve(at, H, S, transposed, b, kTolerance, w).converged) {
+  if (!system.solve(at, H, S, transposed, b, kNodal.derivative_tolerance, w).converged) {
     // The floor of rounding may lie above the tolerance: then what has been found must do.
     Array again;
-    if (!system.solve(at, H, S, transposed, b, kLargestError, again).converged) {
+    if (!system.solve(at, H, S, transposed, b, kNodal.largest_derivative_error, again).converged) {
       throw std::domain_error("a derivative of nodal friction did not converge");
     }
   }

@@ -29,34 +29,19 @@
 
 #include "solver/linear_system.h"
 #include "solver/saddle.h"
+#include "solver/stopping.h"
 #include "step/nodal/stage.h"
 #include "step/nodal/system.h"
 
 namespace diffcloth::step {
+
+using solver::stopping::kNodal;
 
 using Array = std::vector<double>;
 
 namespace {
 
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
-
-/// Of a direction of Newton's method: less would not shorten the way.
-constexpr double kDirectionTolerance = 1e-4;
-/// A Newton step must reduce the squared residual by this much; else the energy leads.
-constexpr double kContraction = 0.25;
-/// As in solver/newton.cpp: a step below this share of the tolerance is not worth taking.
-constexpr double kSettled = 0.1;
-/// Steps down with the cases at hand before the law is solved as a whole, and the halvings of each.
-constexpr int kMostDescents = 8;
-constexpr int kFewHalvings = 6;
-constexpr int kHalvings = 20;
-/// Steps that have shrunk by this much while the Hessian is indefinite lead to a saddle.
-constexpr double kShrunk = 1e-2;
-/// Share of the mean edge that the first trial away from a saddle moves a vertex by.
-constexpr double kFirstMove = 0.25;
-/// Of the exact Hessian's projection, where that is indefinite: see solver/direction.h.
-constexpr double kLeastBlend = 0.1;
-constexpr double kMostBlend = 1e12;
 
 double largest(const Array& change) {
   double size = 0.0;
@@ -158,16 +143,16 @@ class NodalSolve {
     Array b = system_.right_side(here_, *H_, constraint_step_, false);
     system_.project(here_, b);
     Array p;
-    if (!system_.solve(here_, *H_, *factor_, false, b, kDirectionTolerance, p).converged) {
+    if (!system_.solve(here_, *H_, *factor_, false, b, kNodal.direction_tolerance, p).converged) {
       return Newton::kNoStep;
     }
     for (std::size_t a = 0; a < p.size(); ++a) p[a] += constraint_step_[a];
     const double step = largest(p);
     outcome_.residual = step / h_;
-    if (step <= kSettled * goal_) return Newton::kArrived;
+    if (step <= kNodal.settled * goal_) return Newton::kArrived;
     go(p, 1.0);
     system_.look(there_);
-    if (there_.merit <= kContraction * least_) {
+    if (there_.merit <= kNodal.contraction * least_) {
       measure(step);
       descents_ = 0;
       return Newton::kContracts;
@@ -182,7 +167,8 @@ class NodalSolve {
   solver::Factor damped(Form&& form) {
     const linalg::BlockMatrix positive =
         linear_.assemble(here_.x.data(), Curvature::kPositive, here_.g);
-    for (blend_ = std::max(kLeastBlend, blend_ / 4.0); blend_ < kMostBlend; blend_ *= 4.0) {
+    for (blend_ = std::max(kNodal.least_blend, blend_ / 4.0); blend_ < kNodal.most_blend;
+         blend_ *= 4.0) {
       linalg::BlockMatrix matrix = *H_;
       matrix.blend(positive, blend_);
       if (solver::Factor factor = linear_.factor_in_doubles(form(matrix))) return factor;
@@ -215,7 +201,7 @@ class NodalSolve {
   }
 
   bool descend_by_cases() {
-    if (descents_ == kMostDescents) return false;
+    if (descents_ == kNodal.most_descents) return false;
     ++descents_;
     solver::Factor factor = factor_;
     if (!factor) {
@@ -229,8 +215,8 @@ class NodalSolve {
     Array p(b.size(), 0.0);
     factor->solve(b.data(), p.data());
     for (std::size_t a = 0; a < p.size(); ++a) p[a] += constraint_step_[a];
-    if (descend(p, impulses(), kFewHalvings)) return true;
-    descents_ = kMostDescents;
+    if (descend(p, impulses(), kNodal.few_halvings)) return true;
+    descents_ = kNodal.most_descents;
     return false;
   }
 
@@ -243,10 +229,10 @@ class NodalSolve {
     if (!factor) factor = damped([](const linalg::BlockMatrix& matrix) { return matrix; });
     if (!factor) return false;
     const NodalSystem::Linearized solution = system_.solve_linearized(here_, *factor);
-    return descend(solution.p, solution.impulses, kHalvings);
+    return descend(solution.p, solution.impulses, kNodal.halvings);
   }
 
-  bool is_near_saddle() const { return !factor_ && last_ <= kShrunk * longest_; }
+  bool is_near_saddle() const { return !factor_ && last_ <= kNodal.shrunk * longest_; }
 
   /// Along the most negative direction, to either side, from far to near: the first point that is
   /// lower, and on while the next is lower still.
@@ -256,8 +242,8 @@ class NodalSolve {
     const std::vector<Vec3> frozen = impulses();
     double best = 0.0;
     double best_alpha = 0.0;
-    double alpha = kFirstMove * f_.length;
-    for (int k = 0; k < 2 * kHalvings; ++k, alpha *= k % 2 == 0 ? -0.5 : -1.0) {
+    double alpha = kNodal.first_move * f_.length;
+    for (int k = 0; k < 2 * kNodal.halvings; ++k, alpha *= k % 2 == 0 ? -0.5 : -1.0) {
       const double gained = change(p, alpha, frozen);
       if (gained < best) {
         best = gained;

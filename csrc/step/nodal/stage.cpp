@@ -6,14 +6,11 @@
 #include <utility>
 
 #include "projective/anderson.h"
+#include "solver/stopping.h"
 #include "step/nodal/system.h"
 
 namespace diffcloth::step {
 namespace {
-
-/// Local/global iterations that do not halve the residual, after which they are given up: near a saddle
-/// it must grow on the way down, which they do not follow.
-constexpr int kIdle = 100;
 
 using Array = std::vector<double>;
 using projective::ContactCase;
@@ -28,7 +25,7 @@ class Progress {
       best_ = residual;
       idle_ = 0;
     }
-    return idle_ == kIdle;
+    return idle_ == solver::stopping::kLocalGlobal.stalled_iterations;
   }
 
  private:

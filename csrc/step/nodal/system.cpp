@@ -39,8 +39,11 @@
 #include <Eigen/Core>
 
 #include "projective/coupled_coulomb.h"
+#include "solver/stopping.h"
 
 namespace diffcloth::step {
+
+using solver::stopping::kNodal;
 
 using Array = std::vector<double>;
 using projective::ContactCase;
@@ -49,11 +52,7 @@ using projective::NodalContact;
 
 namespace {
 
-constexpr int kMostProducts = 300;
-/// Of the law at linearized forces, relative: it shows a direction.
-constexpr double kLawTolerance = 1e-4;
-constexpr int kMostSweeps = 500;
-/// Columns of its matrix that are solved for at a time.
+/// Columns of the matrix of the linearized law that are solved for at a time.
 constexpr Eigen::Index kColumns = 48;
 
 Vec3 tangential(const Vec3& e, const Vec3& n) { return e - n * n.dot(e); }
@@ -198,7 +197,7 @@ linalg::GmresOutcome NodalSystem::solve(const Point& at,
     y.assign(v.size(), 0.0);
     S.solve(v.data(), y.data());
   };
-  return linalg::gmres(apply, precondition, b, tolerance, kMostProducts, w);
+  return linalg::gmres(apply, precondition, b, tolerance, kNodal.most_products, w);
 }
 
 Array NodalSystem::constraint_step(const Point& at) const {
@@ -306,7 +305,7 @@ NodalSystem::Linearized NodalSystem::solve_linearized(const Point& at,
     r.segment<3>(3 * k) = at.laws[static_cast<std::size_t>(k)].impulse;
     planes.push_back({.normal = c.normal, .friction = c.friction});
   }
-  projective::solve_coulomb(W, q, planes, kLawTolerance, kMostSweeps, r);
+  projective::solve_coulomb(W, q, planes, kNodal.law_tolerance, kNodal.most_sweeps, r);
   for (Eigen::Index k = 0; k < m; ++k) {
     result.impulses.emplace_back(r.segment<3>(3 * k));
     to_rows(contact(k), r.segment<3>(3 * k), force);

@@ -5,6 +5,7 @@
 
 #include "projective/local_global.h"
 #include "solver/newton.h"
+#include "solver/stopping.h"
 #include "step/potentials/constant_form.h"
 #include "step/schemes/contact_stage.h"
 
@@ -45,7 +46,8 @@ void solve_by_projective_dynamics(Problem& problem,
   const solver::Options& given = step.context.options;
   const projective::LocalGlobalOptions options{
       .tolerance = given.tolerance,
-      .max_iterations = projective::kIterationsPerNewton * given.max_iterations};
+      .max_iterations =
+          solver::stopping::kLocalGlobal.iterations_per_newton * given.max_iterations};
   Checkpoint& checkpoint = *step.context.checkpoint;
   const std::vector<double> start = x;
   projective::LocalGlobalOutcome outcome;

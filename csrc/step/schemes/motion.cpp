@@ -4,12 +4,10 @@
 #include <cmath>
 #include <numbers>
 
+#include "solver/stopping.h"
+
 namespace diffcloth::step {
 namespace {
-
-/// A body turns along its geodesic in portions of at most this angle [rad]; straight motion of its
-/// vertices through a larger one would collapse it.
-constexpr double kLargestTurn = 10.0 * std::numbers::pi / 180.0;
 
 Index tree_count(const Scene& scene) {
   return static_cast<Index>(scene.mechanisms.given().tree_free.size());
@@ -27,7 +25,8 @@ GeodesicMotion::GeodesicMotion(const Problem& problem) : problem_(problem) {
     turn = std::max(turn, bodies::angle(Eigen::Map<const bodies::Pose>(from + 7 * k),
                                         Eigen::Map<const bodies::Pose>(to + 7 * k)));
   }
-  portions_ = std::max(1, static_cast<int>(std::ceil(turn / kLargestTurn)));
+  portions_ = std::max(
+      1, static_cast<int>(std::ceil(turn / solver::stopping::kPrescribedMotion.largest_turn)));
 }
 
 std::vector<double> GeodesicMotion::root_poses(double fraction) const {
