@@ -21,6 +21,8 @@ schemes: dict[str, dict[str, bool]] = {
 """What each is able to: "barrier", "moves_bodies", "elastic_stage", "metrics"; default first."""
 metrics: list[str] = ["energy", "elastic", "mass", "identity"]
 elastic_solvers: list[str] = ["newton", "projective"]
+criteria: list[str]
+"""Of the number "criterion" of a step: names of the criteria that end a solve."""
 input_names: list[str]
 number_names: list[str]
 """Of the lists "numbers" that a step returns."""

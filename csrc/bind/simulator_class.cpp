@@ -15,6 +15,7 @@
 #include "bind/numbers.h"
 #include "bind/reports.h"
 #include "bind/simulator.h"
+#include "solver/stopping.h"
 #include "step/scene.h"
 
 namespace diffcloth::bind {
@@ -105,6 +106,8 @@ void simulator(nb::module_& m) {
       .def_prop_ro_static("largest_factor_bytes",
                           [](nb::handle) { return solver::FactorCache::kBytes; });
   m.attr("input_names") = names_of(step::kInputTable);
+  m.attr("criteria") =
+      std::vector<std::string>(solver::kCriterionNames.begin(), solver::kCriterionNames.end());
   m.attr("schemes") = abilities_of_schemes();
   m.attr("metrics") = names_of(step::kMetrics);
   m.attr("elastic_solvers") = names_of(step::kElasticSolvers);

@@ -24,7 +24,7 @@ class Descent {
         directions_(walk, std::move(nearby)),
         goal_(walk.f.h * walk.context.options.tolerance) {}
 
-  Status run();
+  Criterion run();
 
   double residual() const { return residual_; }
   const Certificate& certificate() const { return directions_.certificate(); }
@@ -32,14 +32,14 @@ class Descent {
  private:
   enum class Next : std::uint8_t { kGoOn, kStop };
 
-  Status descend();
+  Criterion descend();
   Next proceed();
-  Status without_step();
+  Criterion without_step();
   Next settle();
-  Status look();
+  Criterion look();
   Next take(const Directions::Direction& direction);
-  Next stop(Status status) {
-    status_ = status;
+  Next stop(Criterion criterion) {
+    criterion_ = criterion;
     return Next::kStop;
   }
   Next escape();
@@ -57,7 +57,7 @@ class Descent {
   Walk& walk_;
   Directions directions_;
   double goal_;  ///< largest step that counts as converged [m]
-  Status status_ = Status::kIterationLimit;
+  Criterion criterion_ = Criterion::kIterationLimit;
   double residual_ = 0.0;
   bool settling_ = false;  ///< the last step was below the goal
   double settled_step_ = std::numeric_limits<double>::infinity();
@@ -88,7 +88,7 @@ class Descent {
 
 /// Leave a saddle, or stop there.
 Descent::Next Descent::escape() {
-  if (!leave_saddle(walk_)) return stop(Status::kSaddle);
+  if (!leave_saddle(walk_)) return stop(Criterion::kSaddle);
   directions_.restart();
   best_ = settled_step_ = std::numeric_limits<double>::infinity();
   idle_ = 0;
@@ -137,10 +137,10 @@ Descent::Next Descent::no_way(const Directions::Direction& direction,
                               double step,
                               SearchResult result) {
   const bool exact = direction.kind != Kind::kDamped;
-  const Status without_gain = is_lost(step) ? Status::kRoundingFloor : Status::kNoDescent;
+  const Criterion without_gain = is_lost(step) ? Criterion::kPrecisionLimit : Criterion::kNoDescent;
   if (exact && result == SearchResult::kNoGain) {
     if (direction.kind == Kind::kFactored && (step >= goal_ || directions_.is_certified())) {
-      return stop(step < goal_ ? Status::kConverged : without_gain);
+      return stop(step < goal_ ? Criterion::kRounding : without_gain);
     }
     if (step < goal_) {
       settling_ = true;
@@ -148,7 +148,7 @@ Descent::Next Descent::no_way(const Directions::Direction& direction,
     }
   }
   if (directions_.retry(direction.kind)) return Next::kGoOn;
-  return stop(result == SearchResult::kBlocked ? Status::kBlocked : without_gain);
+  return stop(result == SearchResult::kBlocked ? Criterion::kBlocked : without_gain);
 }
 
 /// Whether an excursion may go so far.
@@ -235,9 +235,10 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
     if (direction.kind != Kind::kFactored) {
       settling_ = may_end(direction, step);
       if (is_settled(step, kNewton.settled)) return Next::kGoOn;
-    } else if (is_settled(step, kNewton.settled_factored) ||
-               step > kNewton.contraction * settled_step_) {
-      return stop(Status::kConverged);
+    } else if (is_settled(step, kNewton.settled_factored)) {
+      return stop(Criterion::kTolerance);
+    } else if (step > kNewton.contraction * settled_step_) {
+      return stop(Criterion::kRounding);
     } else {
       settled_step_ = step;
     }
@@ -258,21 +259,21 @@ Descent::Next Descent::go(const Directions::Direction& direction) {
   }
   directions_.learn(direction, search);
   if (direction.kind != Kind::kDamped && idles(step, search)) {
-    if (step >= goal_) return stop(Status::kRoundingFloor);
+    if (step >= goal_) return stop(Criterion::kPrecisionLimit);
     settling_ = true;
   }
   return Next::kGoOn;
 }
 
 /// There is no Newton step to measure.
-Status Descent::without_step() {
+Criterion Descent::without_step() {
   residual_ = std::numeric_limits<double>::infinity();
   const bool finite = std::ranges::all_of(walk_.g(), [](double g) { return std::isfinite(g); });
-  return finite ? Status::kIndefinite : Status::kNotFinite;
+  return finite ? Criterion::kIndefinite : Criterion::kNotFinite;
 }
 
 /// What is here when the iterations or the time are used up: the residual of this very point.
-Status Descent::look() {
+Criterion Descent::look() {
   if (away_) walk_.back(excursion_.start);
   const bool is_late = walk_.context.checkpoint->is_up();
   const bool minimum = directions_.certify();
@@ -282,9 +283,9 @@ Status Descent::look() {
   if (!has_step) return without_step();
   const double step = walk_.displacement(directions_.p());
   residual_ = step / walk_.f.h;
-  if (is_late && !minimum) return Status::kTimeLimit;
-  if (step >= goal_) return is_late ? Status::kTimeLimit : Status::kIterationLimit;
-  return minimum ? Status::kConverged : Status::kSaddle;
+  if (is_late && !minimum) return Criterion::kTimeLimit;
+  if (step >= goal_) return is_late ? Criterion::kTimeLimit : Criterion::kIterationLimit;
+  return minimum ? Criterion::kTolerance : Criterion::kSaddle;
 }
 
 Descent::Next Descent::proceed() {
@@ -294,7 +295,7 @@ Descent::Next Descent::proceed() {
   return away_ ? come_back() : stop(without_step());
 }
 
-Status Descent::run() {
+Criterion Descent::run() {
   try {
     return descend();
   } catch (const TimeIsUp&) {
@@ -305,15 +306,15 @@ Status Descent::run() {
   }
 }
 
-Status Descent::descend() {
+Criterion Descent::descend() {
   for (;;) {
     if (settling_) {
       walk_.context.checkpoint->check();
-      if (settle() == Next::kStop) return status_;
+      if (settle() == Next::kStop) return criterion_;
       continue;
     }
     if (!walk_.spend()) return look();
-    if (proceed() == Next::kStop) return status_;
+    if (proceed() == Next::kStop) return criterion_;
   }
 }
 
@@ -405,6 +406,13 @@ bool start_from(Walk& walk, const std::vector<double>& guess) {
   return taken;
 }
 
+/// The criterion that ended a prescribed motion early.
+Criterion end_of_motion(const Context& context) {
+  if (context.checkpoint->is_up()) return Criterion::kTimeLimit;
+  const bool is_used_up = context.iterations >= context.options.max_iterations;
+  return is_used_up ? Criterion::kIterationLimit : Criterion::kStuckMotion;
+}
+
 /// Find the contacts of the current iterate, also when the time of the step is up.
 void watch_here(Walk& walk) {
   try {
@@ -440,14 +448,14 @@ Outcome minimize(const Objective& objective,
                           (objective.chart != nullptr && objective.chart->has_joint_terms());
     outcome.motion_fraction = arrive(walk, departure->motion, descends);
     if (outcome.motion_fraction < 1.0) {
-      outcome.status = Status::kInfeasibleMotion;
+      outcome.criterion = end_of_motion(context);
       return outcome;
     }
   }
   Descent descent(walk, std::move(nearby));
-  outcome.status = descent.run();
+  outcome.criterion = descent.run();
   outcome.residual = descent.residual();
-  if (outcome.status == Status::kConverged) outcome.certificate = descent.certificate();
+  if (has_converged(outcome.criterion)) outcome.certificate = descent.certificate();
   return outcome;
 }
 

@@ -3,26 +3,13 @@
 #include <vector>
 
 #include "solver/motion.h"
+#include "solver/stopping.h"
 #include "solver/walk.h"
 
 namespace diffcloth::solver {
 
-enum class Status : std::uint8_t {
-  kConverged,
-  kIterationLimit,  ///< the step's iterations are used up
-  kTimeLimit,       ///< the step's time is
-  kRoundingFloor,   ///< rounding hides steps: no gain is measured, or no coordinate changes
-  kNoDescent,       ///< no step along the last direction lowers the objective, however short
-  kBlocked,         ///< collision detection leaves no part of the last direction
-  kIndefinite,      ///< the projected Hessian has no factor
-  kNotFinite,       ///< the gradient is not finite
-  kSaddle,          ///< the gradient vanishes where the Hessian is indefinite
-  kUnsolved,        ///< friction at nodes: no way leads on, and no solution was found
-  kInfeasibleMotion,
-};
-
 struct Outcome {
-  Status status = Status::kIterationLimit;
+  Criterion criterion = Criterion::kIterationLimit;
   double residual = 0.0;         ///< |p|_inf / h of the last Newton step [m/s]
   double motion_fraction = 1.0;  ///< of the prescribed motion that was reached
   Certificate certificate;       ///< at the solution, where converged
@@ -42,8 +29,8 @@ struct Departure {
 /// prescribed motion (arrive()), by one rule for all motions: the result is a continuous function of the
 /// motion where the motion vanishes.
 ///
-/// @param x          in: a feasible start; out: the last feasible iterate, whatever the status. The
-///                   potentials stand there.
+/// @param x          in: a feasible start; out: the last feasible iterate, whatever the criterion.
+///                   The potentials stand there.
 /// @param departure  null where the prescribed points of x are at their ends
 /// @param nearby     factor of an exact Hessian of a similar objective near x; may be null
 ///

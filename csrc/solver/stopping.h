@@ -1,5 +1,7 @@
 #pragma once
 
+#include <array>
+#include <cstddef>
 #include <cstdint>
 #include <numbers>
 
@@ -8,6 +10,35 @@
 /// Stopping criteria and step-size constants of all solvers. Constants without a unit are counts, shares or
 /// ratios.
 namespace diffcloth::solver {
+
+/// The criterion that ended a solve; the first two mean that it converged.
+enum class Criterion : std::uint8_t {
+  kTolerance,       ///< the Newton step (local/global: the residual) is below the tolerance
+  kRounding,        ///< likewise, and rounding hides any further progress
+  kIterationLimit,  ///< the iterations of the step are used up
+  kTimeLimit,       ///< the time of the step is used up
+  kPrecisionLimit,  ///< rounding hides steps above the tolerance: no gain or no change of a coordinate
+  kNoDescent,       ///< no step along the last direction lowers the objective, however short
+  kBlocked,         ///< collision detection leaves no part of the last direction
+  kIndefinite,      ///< the projected Hessian has no factor
+  kNotFinite,       ///< the gradient is not finite
+  kSaddle,          ///< the gradient vanishes where the Hessian is indefinite
+  kNoSolution,      ///< friction at nodes: no descent is left, and the law is not satisfied
+  kStuckMotion,     ///< the prescribed motion no longer advances
+  kNoSolve,         ///< nothing was solved, as surfaces intersect at the start
+};
+
+/// Names of the criteria in Python, in the order of Criterion.
+inline constexpr std::array kCriterionNames{
+    "tolerance",   "rounding",     "iteration_limit", "time_limit", "precision_limit",
+    "no_descent",  "blocked",      "indefinite",      "not_finite", "saddle",
+    "no_solution", "stuck_motion", "no_solve",
+};
+static_assert(kCriterionNames.size() == static_cast<std::size_t>(Criterion::kNoSolve) + 1);
+
+constexpr bool has_converged(Criterion criterion) {
+  return criterion == Criterion::kTolerance || criterion == Criterion::kRounding;
+}
 
 namespace stopping {
 

@@ -9,6 +9,7 @@
 #include "common/types.h"
 #include "contact/friction_set.h"
 #include "solver/linear_system.h"
+#include "solver/stopping.h"
 
 namespace diffcloth::step {
 
@@ -41,6 +42,7 @@ struct ContactPoint {
 
 struct Report {
   Result result = Result::kConverged;
+  solver::Criterion criterion = solver::Criterion::kNoSolve;  ///< that ended the deciding solve
   Index iterations = 0;
   double residual = 0.0;          ///< |p|_inf / h [m/s]
   double minimum_distance = 0.0;  ///< of the pairs in contact; infinite without contact [m]
@@ -61,6 +63,7 @@ struct Report {
   template <class Visit>
   void for_each(Visit&& visit) const {
     visit("status", static_cast<std::int64_t>(result));
+    visit("criterion", static_cast<std::int64_t>(criterion));
     visit("iterations", static_cast<std::int64_t>(iterations));
     visit("residual", residual);
     visit("minimum_distance", minimum_distance);

@@ -76,7 +76,7 @@ class NodalSolve {
       return descend();
     } catch (const TimeIsUp&) {
       context_.checkpoint->stop_clock();
-      return finish(solver::Status::kTimeLimit);
+      return finish(solver::Criterion::kTimeLimit);
     }
   }
 
@@ -93,16 +93,16 @@ class NodalSolve {
       if (!factor_) ++context_.counts->negative_curvature;
       constraint_step_ = system_.constraint_step(here_);
       const Newton newton = factor_ ? try_newton() : Newton::kNoStep;
-      if (newton == Newton::kArrived) return finish(solver::Status::kConverged);
-      if (context_.checkpoint->is_up()) return finish(solver::Status::kTimeLimit);
+      if (newton == Newton::kArrived) return finish(outcome_.criterion);
+      if (context_.checkpoint->is_up()) return finish(solver::Criterion::kTimeLimit);
       if (context_.iterations >= context_.options.max_iterations) {
-        return finish(solver::Status::kIterationLimit);
+        return finish(solver::Criterion::kIterationLimit);
       }
       if (newton != Newton::kContracts) {
         const Stopwatch::Scope scope(*context_.watch, Phase::kLineSearch);
         const bool moved =
             (is_near_saddle() && leave_saddle()) || descend_by_cases() || descend_by_law();
-        if (!moved) return finish(solver::Status::kUnsolved);
+        if (!moved) return finish(solver::Criterion::kNoSolution);
         system_.look(there_);
       }
       ++(factor_ ? context_.counts->exact : context_.counts->projected);
@@ -110,9 +110,9 @@ class NodalSolve {
     }
   }
 
-  solver::Outcome finish(solver::Status status) {
-    outcome_.status = status;
-    if (status == solver::Status::kConverged) outcome_.certificate.factor = factor_;
+  solver::Outcome finish(solver::Criterion criterion) {
+    outcome_.criterion = criterion;
+    if (solver::has_converged(criterion)) outcome_.certificate.factor = factor_;
     x_ = std::move(here_.x);
     return outcome_;
   }
@@ -135,6 +135,11 @@ class NodalSolve {
     longest_ = std::max(longest_, step);
   }
 
+  Newton arrive(solver::Criterion criterion) {
+    outcome_.criterion = criterion;
+    return Newton::kArrived;
+  }
+
   /// Newton's step from here to there.
   Newton try_newton() {
     const Stopwatch::Scope scope(*context_.watch, Phase::kSolve);
@@ -149,7 +154,9 @@ class NodalSolve {
     for (std::size_t a = 0; a < p.size(); ++a) p[a] += constraint_step_[a];
     const double step = largest(p);
     outcome_.residual = step / h_;
-    if (step <= kNodal.settled * goal_) return Newton::kArrived;
+    if (step <= kNodal.settled * goal_) {
+      return arrive(solver::Criterion::kTolerance);
+    }
     go(p, 1.0);
     system_.look(there_);
     if (there_.merit <= kNodal.contraction * least_) {
@@ -158,7 +165,7 @@ class NodalSolve {
       return Newton::kContracts;
     }
     // Below the tolerance, what is left of the residual is rounding.
-    return step < goal_ ? Newton::kArrived : Newton::kNoStep;
+    return step < goal_ ? arrive(solver::Criterion::kRounding) : Newton::kNoStep;
   }
 
   /// A factor of the form that a Hessian takes, of H blended with as little of its projection as it

@@ -34,26 +34,51 @@ void report_contacts(const contact::CollisionMesh& mesh,
   }
 }
 
-/// Explain where a prescribed motion has ended, and name what is near each other where a step could not go
-/// on. Contacts do not tell: two surfaces that are both prescribed have none, and block each other all the same.
+std::string_view words(solver::Criterion criterion) {
+  switch (criterion) {
+    case solver::Criterion::kTolerance:
+    case solver::Criterion::kRounding:
+    case solver::Criterion::kNoSolve:
+      return {};
+    case solver::Criterion::kIterationLimit:
+      return kUsedUp;
+    case solver::Criterion::kTimeLimit:
+      return kTimeIsUp;
+    case solver::Criterion::kPrecisionLimit:
+      return "rounding hides the last steps: their gain, or their change of the coordinates";
+    case solver::Criterion::kNoDescent:
+      return "no step along the last direction lowers the energy, however short";
+    case solver::Criterion::kBlocked:
+      return "collision detection leaves no way along the last direction";
+    case solver::Criterion::kIndefinite:
+      return "not even the projected Hessian has a factor";
+    case solver::Criterion::kNotFinite:
+      return "forces are not finite";
+    case solver::Criterion::kSaddle:
+      return "at a saddle: forces balance to the tolerance, and the Hessian is not positive "
+             "definite";
+    case solver::Criterion::kStuckMotion:
+      return "the motion no longer advances";
+    case solver::Criterion::kNoSolution:
+      return "no solution of the law of friction at vertices was found";
+  }
+  __builtin_unreachable();
+}
+
+/// Explain why a prescribed motion has ended, and name the surfaces near each other that stopped a step.
+/// Contacts do not show them: two prescribed surfaces have none, but block each other.
 void report_blockers(const Problem& problem,
                      const Array& x,
-                     solver::Status status,
-                     const solver::Context& context,
+                     const solver::Outcome& outcome,
                      Report& report) {
-  const bool is_infeasible = status == solver::Status::kInfeasibleMotion;
-  if (!is_infeasible && status != solver::Status::kBlocked) return;
+  const bool is_infeasible = outcome.motion_fraction < 1.0;
+  if (!is_infeasible && outcome.criterion != solver::Criterion::kBlocked) return;
   std::string names;
   if (problem.contact) {
     const contact::Parameters& parameters = problem.contact->parameters();
     names = describe_near(problem.scene, x.data(), parameters.thickness, parameters.d_hat);
   }
-  if (is_infeasible) {
-    const bool is_used_up = context.iterations >= context.options.max_iterations;
-    report.message = context.checkpoint->is_up() ? kTimeIsUp
-                     : is_used_up                ? kUsedUp
-                                                 : "the motion no longer advances";
-  }
+  if (is_infeasible) report.message = words(outcome.criterion);
   if (!names.empty()) report.message += (is_infeasible ? "; in contact: " : ": ") + names;
 }
 
@@ -73,44 +98,18 @@ void add_forces(const Problem& problem, ContactSum& sum, const Array& x, const F
   add_pin_forces(problem, sum.objective, x, forces.pins);
 }
 
-std::string_view words(solver::Status status) {
-  switch (status) {
-    case solver::Status::kConverged:
-    case solver::Status::kInfeasibleMotion:
-      return {};
-    case solver::Status::kIterationLimit:
-      return kUsedUp;
-    case solver::Status::kTimeLimit:
-      return kTimeIsUp;
-    case solver::Status::kRoundingFloor:
-      return "rounding hides the last steps: their gain, or their change of the coordinates";
-    case solver::Status::kNoDescent:
-      return "no step along the last direction lowers the energy, however short";
-    case solver::Status::kBlocked:
-      return "collision detection leaves no way along the last direction";
-    case solver::Status::kIndefinite:
-      return "not even the projected Hessian has a factor";
-    case solver::Status::kNotFinite:
-      return "forces are not finite";
-    case solver::Status::kSaddle:
-      return "at a saddle: forces balance to the tolerance, and the Hessian is not positive "
-             "definite";
-    case solver::Status::kUnsolved:
-      return "no solution of the law of friction at vertices was found";
-  }
-  __builtin_unreachable();
-}
-
 }  // namespace
 
 void merge(const solver::Outcome& outcome, Report& report) {
+  const bool converged = solver::has_converged(outcome.criterion);
+  if (report.result == Result::kConverged || !converged) report.criterion = outcome.criterion;
   report.residual = std::max(report.residual, outcome.residual);
   report.motion_fraction = std::min(report.motion_fraction, outcome.motion_fraction);
-  if (outcome.status == solver::Status::kInfeasibleMotion) {
+  if (outcome.motion_fraction < 1.0) {
     report.result = Result::kInfeasibleMotion;
-  } else if (outcome.status != solver::Status::kConverged) {
+  } else if (!converged) {
     report.result = Result::kNotConverged;
-    report.message = words(outcome.status);
+    report.message = words(outcome.criterion);
   }
 }
 
@@ -150,14 +149,13 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
       .motion = motion, .guess = problem.scene.given.begins_at_state ? nullptr : &first_guess};
   solver::Factor factor;
   int solves = 0;
-  solver::Status status = solver::Status::kConverged;
+  solver::Outcome outcome;
   while (solves < friction_iterations) {
-    const solver::Outcome outcome = solver::minimize(
-        sum.objective, x, solves == 0 ? &departure : nullptr, std::move(factor), step.context);
-    status = outcome.status;
+    outcome = solver::minimize(sum.objective, x, solves == 0 ? &departure : nullptr,
+                               std::move(factor), step.context);
     merge(outcome, step.report);
-    step.kept.add(outcome.certificate);
     factor = outcome.certificate.factor;
+    step.kept.add(std::move(outcome.certificate));
     if (!step.tape.empty()) {
       Array rows;
       problem.coordinates.take_rows(x, rows);
@@ -172,7 +170,7 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
     if (solves < friction_iterations) sum.lag(x, contacts);
   }
   report_contacts(problem.scene.collision_mesh, sum.contacts(), step.report);
-  report_blockers(problem, x, status, step.context, step.report);
+  report_blockers(problem, x, outcome, step.report);
   const double reached = step.report.motion_fraction;
   if (reached < 1.0) step.report.root_poses = motion.root_poses(reached);
   if (!step.tape.empty()) *step.tape["solves"] = solves;

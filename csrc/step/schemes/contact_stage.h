@@ -78,7 +78,7 @@ std::vector<std::vector<double>> push_forward_solve(
     const std::vector<contact::TouchingPotential*>& touching,
     const SetTangents& set_tangents);
 
-/// Fold the outcome of one minimization into the report.
+/// Fold the outcome of one solve into the report: the criterion of the first that failed, else of the last.
 void merge(const solver::Outcome& outcome, Report& report);
 
 }  // namespace diffcloth::step

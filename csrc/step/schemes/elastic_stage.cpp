@@ -71,7 +71,10 @@ void solve_by_projective_dynamics(Problem& problem,
     solve_by_newton(problem, step, nodes, x);
     return;
   }
-  step.report.residual = std::max(step.report.residual, outcome.residual);
+  solver::Outcome solved;
+  solved.criterion = solver::Criterion::kTolerance;
+  solved.residual = outcome.residual;
+  merge(solved, step.report);
   step.kept.add({});
 }
 

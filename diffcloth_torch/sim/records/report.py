@@ -56,6 +56,17 @@ class Report:
             environment; NaN where it is not known.
         contacts: Contacts by pairs of names of surfaces: `contacts["gripper/left", "shirt"]` has
             `count` and `force`.
+        criterion: Criterion that ended the solve of the core that decided the step, its last one or
+            the first that failed; in a batch a tuple of B of them. Converged: "tolerance", the
+            Newton step or the residual of Projective Dynamics is below the tolerance; "rounding",
+            likewise, and rounding hides further progress. Not converged: "iteration_limit";
+            "time_limit"; "precision_limit", rounding hides steps above the tolerance; "no_descent",
+            no step along the last direction lowers the energy; "blocked", collisions leave no part
+            of the last direction; "indefinite", not even the projected Hessian has a factor;
+            "not_finite", forces are not finite; "saddle", forces balance at an indefinite Hessian;
+            "no_solution", the law of friction at vertices is not satisfied; "stuck_motion", the
+            prescribed motion no longer advances. "no_solve" if surfaces intersect at the start,
+            "unknown" in reports of earlier versions.
     """
 
     converged: bool | Tensor
@@ -69,6 +80,7 @@ class Report:
     status: str | tuple[str, ...] = ()  # if left out, derived from `converged`
     contacts: Contacts = field(default_factory=Contacts)
     cpu_seconds: float | Tensor | None = None  # if left out, not known
+    criterion: str | tuple[str, ...] = ()  # if left out, not known
 
     def __post_init__(self) -> None:
         if self.cpu_seconds is None:
@@ -87,17 +99,24 @@ class Report:
                     raise TypeError(f"Report: `{label}` must be a number or a tensor, got {kind}")
         if self.status == ():
             object.__setattr__(self, "status", _status_by(self.converged))
-        status: Any = self.status
-        names = (status,) if isinstance(status, str) else status
+        if self.criterion == ():
+            is_single = isinstance(self.status, str)
+            unknown: Any = "unknown" if is_single else ("unknown",) * len(self.status)
+            object.__setattr__(self, "criterion", unknown)
         contacts: Any = self.contacts
         if not isinstance(contacts, Contacts):
             kind = type(contacts).__name__
             raise TypeError(f"Report: `contacts` must be Contacts, got {kind}")
-        if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
-            raise TypeError(f"Report: `status` must be a str or a tuple of them, got {names!r}")
+        for entry in _TEXTS:
+            text = getattr(self, entry)
+            names = (text,) if isinstance(text, str) else text
+            if not isinstance(names, tuple) or not all(isinstance(name, str) for name in names):
+                raise TypeError(
+                    f"Report: `{entry}` must be a str or a tuple of them, got {names!r}"
+                )
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Checks the fields, and completes a report of 0.1, which has no processor time.
+        # Checks the fields, and completes a report of 0.1: no processor time, no criterion.
         self.__init__(**state)  # type: ignore[misc]
 
     def __repr__(self) -> str:
@@ -106,6 +125,7 @@ class Report:
         ]
         if self.status != _status_by(self.converged):
             parts.append(f"status={_status_text(self.status)}")
+            parts.append(f"criterion={_status_text(self.criterion)}")
         for table in _TABLES:
             # Events that never happened are left out.
             texts = {name: _range_text(number) for name, number in getattr(self, table).items()}
@@ -118,7 +138,7 @@ class Report:
     def check_environments(self, owner: str, count: int | None) -> None:
         """Require tensors of shape [count], or numbers where there is no batch axis."""
         shape = [] if count is None else [count]
-        for name in (*_NUMERIC, "status"):
+        for name in (*_NUMERIC, *_TEXTS):
             value = getattr(self, name)
             for number in value.values() if name in _TABLES else [value]:
                 if list(np.shape(number)) != shape:
@@ -131,12 +151,11 @@ class Report:
         """Report of one environment, or of several."""
         contacts = self.contacts.select(index)
         if isinstance(index, int):
-            return _combine(
-                lambda values: values[index].item(), [self], self.status[index], contacts
-            )
+            texts = {name: getattr(self, name)[index] for name in _TEXTS}
+            return _combine(lambda values: values[index].item(), [self], texts, contacts)
         rows = cpu.arange(len(self.status))[index].tolist()
-        status = tuple(self.status[i] for i in rows)
-        return _combine(lambda values: values[index], [self], status, contacts)
+        texts = {name: tuple(getattr(self, name)[i] for i in rows) for name in _TEXTS}
+        return _combine(lambda values: values[index], [self], texts, contacts)
 
     @staticmethod
     def stack(reports: Sequence[Report | None]) -> Report | None:
@@ -144,12 +163,12 @@ class Report:
         present = [report for report in reports if report is not None]
         if len(present) < len(reports) or len({_names(r) for r in present}) > 1:
             return None
-        status = tuple(str(report.status) for report in present)
+        texts = {name: tuple(str(getattr(r, name)) for r in present) for name in _TEXTS}
         contacts = Contacts.stack([report.contacts for report in present])
         return _combine(
             lambda *values: torch.stack([cpu.as_tensor(v) for v in values]),
             present,
-            status,
+            texts,
             contacts,
         )
 
@@ -158,13 +177,19 @@ class Report:
         """Take environments of `a` where `mask` is true, else of `b`; None if one is missing."""
         if a is None or b is None or _names(a) != _names(b):
             return None
-        names = [(r.status,) * len(mask) if isinstance(r.status, str) else r.status for r in (a, b)]
-        status = tuple(x if m else y for m, x, y in zip(mask.tolist(), *names, strict=True))
+        chosen = mask.tolist()
+        texts = {}
+        for name in _TEXTS:
+            rows = [
+                (text,) * len(chosen) if isinstance(text, str) else text
+                for text in (getattr(a, name), getattr(b, name))
+            ]
+            texts[name] = tuple(x if m else y for m, x, y in zip(chosen, *rows, strict=True))
         contacts = Contacts.where(mask, a.contacts, b.contacts)
         return _combine(
             lambda x, y: torch.where(mask, cpu.as_tensor(x), cpu.as_tensor(y)),
             [a, b],
-            status,
+            texts,
             contacts,
         )
 
@@ -195,7 +220,7 @@ def _range_text(values: Any) -> str:
 
 
 def _status_text(status: str | tuple[str, ...]) -> str:
-    """Text of a status, or of how many environments have each status."""
+    """Text of a status or criterion, or of how many environments have each."""
     if isinstance(status, str):
         return repr(status)
     return f"{{{', '.join(f'{name}: {n}' for name, n in Counter(status).items())}}}"
@@ -210,7 +235,9 @@ def _status_by(converged: bool | Tensor) -> str | tuple[str, ...]:
 
 
 _FIELDS = tuple(entry.name for entry in fields(Report))
-_NUMERIC = tuple(name for name in _FIELDS if name not in ("status", "contacts"))
+# Fields that hold a text, or one for each environment.
+_TEXTS = ("status", "criterion")
+_NUMERIC = tuple(name for name in _FIELDS if name not in (*_TEXTS, "contacts"))
 _NUMBERS = (bool, int, float, Tensor)
 # Fields that hold several numbers by name.
 _TABLES = ("seconds", "counts")
@@ -223,7 +250,7 @@ def _names(report: Report) -> tuple[tuple[str, ...], ...]:
 def _combine(
     function: Callable[..., Any],
     reports: Sequence[Report],
-    status: str | tuple[str, ...],
+    texts: dict[str, Any],
     contacts: Contacts,
 ) -> Report:
     """Apply a function to each number of the given reports."""
@@ -239,4 +266,4 @@ def _combine(
         }
         for table in _TABLES
     }
-    return Report(**plain, **tables, status=status, contacts=contacts)
+    return Report(**plain, **tables, **texts, contacts=contacts)

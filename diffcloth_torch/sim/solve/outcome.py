@@ -20,6 +20,7 @@ from diffcloth_torch.sim.records.contacts import Contacts
 from diffcloth_torch.sim.records.report import Report
 from diffcloth_torch.sim.solve.step import (
     CONVERGED,
+    CRITERIA,
     DIAGNOSTICS,
     INFEASIBLE,
     INTERSECTING,
@@ -54,6 +55,7 @@ def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched
         return torch.from_numpy(np.array(numbers)) if batched else numbers[0]
 
     names = tuple(_NAMES[status] for status in diagnostics["status"])
+    criteria = tuple(CRITERIA[criterion] for criterion in diagnostics["criterion"])
     return Report(
         converged=value([status == CONVERGED for status in diagnostics["status"]]),
         iterations=value(diagnostics["iterations"]),
@@ -65,6 +67,7 @@ def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched
         cpu_seconds=value(diagnostics["cpu_seconds"]),
         counts={what: value(diagnostics[name]) for what, name in _COUNTS.items()},
         status=names if batched else names[0],
+        criterion=criteria if batched else criteria[0],
         contacts=Contacts.of(
             diagnostics["pairs"], diagnostics["points"], surfaces, batched=batched
         ),

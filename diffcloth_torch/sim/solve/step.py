@@ -47,6 +47,7 @@ from diffcloth_torch.operations import operation
 
 __all__ = [
     "CONVERGED",
+    "CRITERIA",
     "DIAGNOSTICS",
     "INFEASIBLE",
     "INTERSECTING",
@@ -64,6 +65,9 @@ TURNED = 4  # not from the core: bodies turn further than a step resolves
 
 DIAGNOSTICS = tuple(_core.number_names)
 """Names of the numbers that the core has for each environment; some open with what they are."""
+
+CRITERIA = tuple(_core.criteria)
+"""Texts of a report for the core's number "criterion"."""
 
 # The last one exists only in scenes that have coordinates.
 _OUTPUTS = (
