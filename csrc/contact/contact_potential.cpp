@@ -325,7 +325,9 @@ void FrictionPotential::accumulate(const double* x, const double* z) {
   const std::size_t size = 3 * static_cast<std::size_t>(set_.model().mesh().vertex_count);
   start_bar.resize(size, 0.0);
   lag_bar.resize(size, 0.0);
-  set_.add_mixed(x, z, -1.0, bar_, start_bar.data(), lag_bar.data());
+  using enum FrictionSet::DiffWrt;
+  set_.add_mixed(x, z, -1.0, bar_ != nullptr ? kPointsAndParameters : kPoints,
+                 {.start = start_bar.data(), .lag = lag_bar.data(), .parameters = bar_});
 }
 
 void FrictionPotential::add_tangents(const double* x, std::span<double* const> y) const {

@@ -150,7 +150,7 @@ class FrictionPotential final : public TouchingPotential {
   /// @param contacts  of the lag configuration; they outlive the potential
   /// @param x_start   positions at the start of the step; likewise
   /// @param x_lag     those of the lag configuration, which accumulate() and add_tangents() read again
-  /// @param bar       where accumulate() adds what parameters get; null where nobody asks for it
+  /// @param bar       cotangents of the parameters, for accumulate(); null if it differentiates by points alone
   FrictionPotential(const ContactModel& model,
                     const std::vector<Contact>& contacts,
                     const double* x_start,

@@ -521,8 +521,8 @@ void FrictionSet::add_product(const Entry& k,
 
 namespace {
 
-/// Pull the cotangent of a normal force back, times scale into `bar` where there is one; returns those of the
-/// corners.
+/// Pull the cotangent of a normal force back: returns the cotangents of the corners, and adds those of the
+/// parameters, times scale, to `bar` if they are chosen.
 ///
 ///   d(lambda) = -kappa w (2 d b' dm + m (2 d b'' + b'/d) dD)
 Vec12 pull_back_lambda(const ContactModel& model,
@@ -530,6 +530,7 @@ Vec12 pull_back_lambda(const ContactModel& model,
                        const double* x_lag,
                        double lambda_bar,
                        double scale,
+                       FrictionSet::DiffWrt inputs,
                        ContactModel::Bar* bar) {
   const double kappa = lag.kappa;
   const double d = std::sqrt(lag.closest.d_sq);
@@ -545,7 +546,7 @@ Vec12 pull_back_lambda(const ContactModel& model,
     threshold_bar = per_lambda * kappa * area * mol.m_eps * b1;
     x_bar += (per_lambda * kappa * area * b1) * mol.gradient;
   }
-  if (bar == nullptr) return x_bar;
+  if (inputs == FrictionSet::DiffWrt::kPoints) return x_bar;
   model.pull_back_kappa(lag.pair, scale * per_lambda * area * m * b1, *bar);
   bar->d_hat += scale * per_lambda * kappa * area * m * lag.barrier.b1_d_hat;
   const double xi_bar = per_lambda * kappa * area * m * lag.barrier.b1_xi;
@@ -613,12 +614,8 @@ FrictionSet::ExtensionDerivative FrictionSet::extension_derivative(const Entry& 
 // change with it (see extension_derivative()),
 // and the lag configuration moves c through d(beta) = J dx, n through dn = P dt / d with
 // dt = sum c_i dx_i + s d(beta), and lambda as pull_back_lambda() says.
-void FrictionSet::add_mixed(const double* x,
-                            const double* z,
-                            double scale,
-                            ContactModel::Bar* bar,
-                            double* start_bar,
-                            double* lag_bar) const {
+void FrictionSet::add_mixed(
+    const double* x, const double* z, double scale, DiffWrt inputs, const Cotangents& out) const {
   const Slips& here = slips(x);
   for (std::size_t e = 0; e < entries_.size(); ++e) {
     const Entry& k = entries_[e];
@@ -641,13 +638,13 @@ void FrictionSet::add_mixed(const double* x,
     const double w_zeta = at.w.dot(zeta);
 
     const double lambda_bar = k.mu * law.f1_over_y * w_zeta;
-    if (bar != nullptr) {
+    if (inputs == DiffWrt::kPointsAndParameters) {
       const double mu_bar = k.lambda * law.f1_over_y * w_zeta;
-      bar->slip += scale * k.mu * k.lambda * law.f1_over_y_e * w_zeta;
-      model_->pull_back_mu(lag.pair, scale * mu_bar, *bar);
+      out.parameters->slip += scale * k.mu * k.lambda * law.f1_over_y_e * w_zeta;
+      model_->pull_back_mu(lag.pair, scale * mu_bar, *out.parameters);
     }
 
-    Vec12 x_bar = pull_back_lambda(*model_, lag, x_lag_, lambda_bar, scale, bar);
+    Vec12 x_bar = pull_back_lambda(*model_, lag, x_lag_, lambda_bar, scale, inputs, out.parameters);
 
     // The frame at the start, c and n.
     const double strength = k.mu * k.lambda;
@@ -679,8 +676,8 @@ void FrictionSet::add_mixed(const double* x,
         lag_edges = sum(lag_edges, lag_frame.pull_back(b, k.n));
         start_edges = sum(start_edges, start.pull_back(-b, part.turn.transpose() * k.n));
       }
-      k.add_edges(part, lag_edges, lag_bar);
-      k.add_edges(part, start_edges, start_bar);
+      k.add_edges(part, lag_edges, out.lag);
+      k.add_edges(part, start_edges, out.start);
     }
     if (along < kLeastAlong) n_bar += (k.extension * beta) * (n_turned + k.turned_back(k.n));
     t_bar += tangential(n_bar, k.n) / d;
@@ -690,11 +687,11 @@ void FrictionSet::add_mixed(const double* x,
         return row(rows, v[i]) - row(rows, v[0]);
       };
       c_bar[i] = s_bar.dot(from_first(x)) + eta.dot(from_first(z)) + h.dot(from_first(x_start_));
-      Eigen::Map<Vec3>(start_bar + 3 * v[i]) += scale * geometry.c[i] * h;
+      Eigen::Map<Vec3>(out.start + 3 * v[i]) += scale * geometry.c[i] * h;
     }
     pull_back_gap(geometry, t_bar, c_bar, x_bar);
     for (int i = 0; i < 4; ++i) {
-      Eigen::Map<Vec3>(lag_bar + 3 * v[i]) += scale * x_bar.segment<3>(3 * i);
+      Eigen::Map<Vec3>(out.lag + 3 * v[i]) += scale * x_bar.segment<3>(3 * i);
     }
   }
 }

@@ -1,6 +1,7 @@
 #pragma once
 
 #include <array>
+#include <cstdint>
 #include <span>
 #include <vector>
 
@@ -215,15 +216,22 @@ class FrictionSet {
   /// what sticks the change of its slip over half of eps_v h.
   double force_change(const double* x, const double* p) const;
 
-  /// d/d(theta) of phi = z . grad D, times scale: into `bar` for the parameters (friction, slip,
-  /// and, through lambda, kappa, d_hat, thickness, rest shape) unless it is null, into `start_bar` for
-  /// x_start, and into `lag_bar` for x_lag.
-  void add_mixed(const double* x,
-                 const double* z,
-                 double scale,
-                 ContactModel::Bar* bar,
-                 double* start_bar,
-                 double* lag_bar) const;
+  /// The inputs of friction besides x by which add_mixed() differentiates.
+  enum class DiffWrt : std::uint8_t {
+    kPoints,               ///< x_start and x_lag
+    kPointsAndParameters,  ///< and friction, slip and, through lambda, kappa, d_hat, thickness, rest shape
+  };
+
+  /// Cotangents of these inputs.
+  struct Cotangents {
+    double* start;                  ///< of x_start, all vertices
+    double* lag;                    ///< of x_lag, likewise
+    ContactModel::Bar* parameters;  ///< not read if only points are asked for
+  };
+
+  /// out += scale * d/d(theta) of z . grad D, for the inputs theta that are chosen.
+  void add_mixed(
+      const double* x, const double* z, double scale, DiffWrt inputs, const Cotangents& out) const;
 
   /// Tangents of what friction depends on besides x, along a direction.
   struct Tangents {

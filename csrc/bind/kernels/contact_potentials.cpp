@@ -165,7 +165,8 @@ class ContactPotential {
     contact::ContactModel::Bar bar(mesh_);
     Values start_bar = Values::Zero(x.size());
     Values lag_bar = Values::Zero(x.size());
-    set.add_mixed(x.data(), z.data(), scale, &bar, start_bar.data(), lag_bar.data());
+    set.add_mixed(x.data(), z.data(), scale, contact::FrictionSet::DiffWrt::kPointsAndParameters,
+                  {.start = start_bar.data(), .lag = lag_bar.data(), .parameters = &bar});
     nb::dict result = to_dict(bar);
     result["x_start"] = start_bar;
     result["x_lag"] = lag_bar;
