@@ -27,8 +27,8 @@ class Cotangents {
 
   std::vector<double> rows;         ///< of the outputs x_{n+1}, v_{n+1} / h included, and q_{n+1}
   std::vector<double> start;        ///< x_n and o_n: all points
-  std::vector<double> origins;      ///< what friction counts motion from, where it is not the start
-  std::vector<double> ends;         ///< what is prescribed, at its end: all points
+  std::vector<double> origins;      ///< origins of friction's displacements, if not the start
+  std::vector<double> ends;         ///< prescribed points at their ends: all points
   std::vector<double> velocities;   ///< v_n
   std::vector<double> masses;       ///< [N]
   std::vector<double> body_forces;  ///< of the output [3 V]
@@ -42,14 +42,14 @@ class Cotangents {
   using PullBack = std::function<void(const Gradients& gradients)>;
   std::vector<PullBack> of_stages;
 
-  /// Swap what the problem's potentials have accumulated with what they have for this loss.
+  /// Swap the cotangents in the problem's potentials with the stored ones of this loss.
   void exchange(Problem& problem);
 
  private:
   CotangentStore store_;
 };
 
-/// What potentials accumulate, and what is read from them, belongs to this loss while it lasts.
+/// Scope in which the cotangents in the potentials belong to one loss.
 class Turn {
  public:
   using Exchange = std::function<void(std::size_t loss)>;
@@ -71,7 +71,7 @@ void add_to(double* out, const std::vector<double>& bar);
 
 /// Adjoint of lumped(): into the gradient of the input that is given per face, and into the rest shape.
 ///
-/// @param bar       of what is lumped [N]
+/// @param bar       of the lumped quantity [N]
 /// @param per_face  the values of the input
 void pull_back_lumped(const Problem& problem,
                       Input input,

@@ -19,8 +19,8 @@ HalfGap at_half_gap(double xi, double barrier_distance) {
   return {.slope = -2.0 * d * b.b1, .stiffness = 4.0 * d * d * b.b2 + 2.0 * b.b1};
 }
 
-/// Takes springs with a length at rest out of the weights, and returns what they add to the trace of the
-/// Hessian of each vertex as if they had none. Their Hessian depends on where their ends are, which the rest
+/// Remove springs with a length at rest from the weights; return the traces that they would add to the Hessian
+/// of each vertex without that length. Their Hessian depends on where their ends are, which the rest
 /// positions of several cloths do not say; shorter than at rest it is not even positive.
 std::vector<double> take_out_long_springs(const Scene& scene,
                                           const Inputs& inputs,
@@ -109,7 +109,7 @@ double felt_mass(const Scene& scene, const double* metric, Index first, Index co
   return result;
 }
 
-/// kappa at which each tree, resting on one of six sides, stays d_hat / 2 away; zero of what no force
+/// kappa at which each tree, resting on one of six sides, stays d_hat / 2 away; zero for trees that no force
 /// moves. Without gravity, where it crosses the gap from rest in a time step.
 std::vector<double> stiffness_of_trees(const Scene& scene,
                                        const Inputs& inputs,
@@ -143,7 +143,7 @@ std::vector<double> stiffness_of_trees(const Scene& scene,
   return result;
 }
 
-/// At half the gap the barrier is softer, in numbers, the larger xi is: what makes up for it where one
+/// At half the gap the barrier is softer, in numbers, the larger xi is: the factor that compensates it if one
 /// surface that kappa was chosen for, or the other one, is round.
 double for_radii(const Scene& scene, Index own, double xi, double radii, double barrier_distance) {
   if (radii == 0.0) return 1.0;
@@ -159,7 +159,7 @@ std::vector<double> default_barrier_stiffness(const Scene& scene,
                                               const Inputs& inputs,
                                               double barrier_distance) {
   const Index surfaces = scene.surface_count();
-  // What cloths and free bodies need; and joints, which count where neither is there.
+  // Stiffness that cloths and free bodies need, and joints, which count only without either.
   std::vector<double> own = stiffness_of_cloths(scene, inputs, barrier_distance);
   std::vector<double> of_joints(own.size(), 0.0);
   const std::vector<double> of_trees = stiffness_of_trees(scene, inputs, barrier_distance);
@@ -185,8 +185,7 @@ std::vector<double> default_barrier_stiffness(const Scene& scene,
       result.push_back(kappa);
     }
   }
-  // What never touches has no number of its own, and any that is positive will do: also where nothing
-  // touches at all.
+  // Pairs that never touch have no stiffness of their own: any positive number serves, also if nothing touches.
   const auto first = std::ranges::find_if(result, [](double kappa) { return kappa > 0.0; });
   std::ranges::replace(result, 0.0, first != result.end() ? double{*first} : 1.0);
   return result;

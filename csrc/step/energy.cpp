@@ -11,7 +11,7 @@ namespace diffcloth::step {
 
 namespace {
 
-/// What the barrier, that of the problem, has within reach at the start.
+/// Pairs within the reach of the problem's barrier at the start.
 contact::Near near_at_start(const Problem& p, const contact::ContactModel& barrier) {
   const double* const x = p.start.data();
   contact::BroadPhase::Scratch scratch;
@@ -92,7 +92,7 @@ namespace {
 struct OwnGradients {
   std::array<std::vector<double>, kInputCount> numbers;
 
-  /// Of the inputs that change along one of some directions.
+  /// Gradients of the inputs that change along any of the directions.
   OwnGradients(const Inputs& inputs, std::span<const Direction> directions) {
     for (std::size_t k = 0; k < kInputCount; ++k) {
       const auto changes = [&](const Direction& d) { return d.tangents.views[k].data != nullptr; };

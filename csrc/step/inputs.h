@@ -54,13 +54,13 @@ enum class Input : std::uint8_t {
   kFrictionOrigins,    ///< where friction counts motion from [m]; absent: at the start
 };
 
-/// What an input has a value for. N vertices, F faces and C cloths; T trees and n coordinates of
+/// Extent of an input: the things that each have a value. N vertices, F faces and C cloths; T trees and n coordinates of
 /// mechanisms; S surfaces.
 enum class Extent : std::uint8_t {
   kOne,          ///< []
   kVector,       ///< [3]
   kVertices,     ///< [N, 3]
-  kAllVertices,  ///< [N + V, 3], those of bodies and links too
+  kAllVertices,  ///< [N + V, 3], with the vertices of bodies and links
   kPins,         ///< [P, 3]
   kSoftPins,     ///< [Q, 3]
   kAttachments,  ///< [A]
@@ -78,7 +78,7 @@ enum class Extent : std::uint8_t {
 /// Where a step needs an input; elsewhere it may be absent.
 enum class Need : std::uint8_t {
   kExtent,           ///< where the scene has anything of its extent
-  kNowhere,          ///< what stands in for it is known
+  kNowhere,          ///< it has a default
   kCloths,           ///< where there are cloths
   kBarrier,          ///< where there is a barrier
   kSoftPins,         ///< where there are soft pins

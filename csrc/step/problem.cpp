@@ -28,7 +28,7 @@ contact::Parameters contact_parameters(const Scene& scene, const Inputs& in) {
   return p;
 }
 
-/// Of the rest_positions input; empty where the scene's own holds.
+/// Rest shape of the rest_positions input; empty if absent, as the scene's own holds then.
 mesh::RestShape own_rest_shape(const Scene& scene, const Inputs& in) {
   const double* X = in.data(Input::kRestPositions);
   return X == nullptr ? mesh::RestShape() : mesh::rest_shape(scene.topology, scene.stencils, X);

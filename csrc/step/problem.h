@@ -37,12 +37,12 @@ class Problem {
   mesh::RestShape own_rest_;
 
  public:
-  const mesh::RestShape* rest;  ///< the scene's, or that of the rest_positions input
+  const mesh::RestShape* rest;  ///< the scene's, or of the rest_positions input
   contact::RestMeasures measures;
   std::vector<double> density;  ///< [F]
   std::vector<double> masses;   ///< [N] lumped [kg]
   std::vector<double> start;    ///< x_n and o_n: all points at the start of the step
-  std::vector<double> ends;     ///< like start, what is prescribed at its targets
+  std::vector<double> ends;     ///< like start, with prescribed points at their targets
   std::vector<double> origins;  ///< like start, vertices at friction_origins; empty: at the start
 
   Proximity inertia;  ///< metric M, target xhat = x_n + h v_n + h^2 (gravity + M^-1 f)
@@ -93,7 +93,7 @@ void add_per_face(const Problem& problem,
                   const std::vector<double>& bar,
                   const Gradients& gradients);
 
-/// What faces have per area, lumped at vertices: a third of each face goes to each corner [N].
+/// Quantity per area of faces, lumped at vertices: a third of each face goes to each corner [N].
 std::vector<double> lumped(const Problem& problem, const std::vector<double>& per_face);
 
 }  // namespace diffcloth::step

@@ -97,7 +97,7 @@ double mean_length(const mesh::RestShape& rest,
   for (const auto& [i, j] : mesh.edges) {
     sum += (row(bodies.vertices.data(), j) - row(bodies.vertices.data(), i)).norm();
   }
-  // Of a round body, the radius.
+  // A round body counts with its radius.
   std::size_t count = mesh.edges.size();
   for (const double radius : mesh.radius) {
     sum += radius;
@@ -152,7 +152,7 @@ std::vector<char> make_prescribed(const Description& d, const bodies::Mechanisms
   return prescribed;
 }
 
-/// Of the bodies that nodes touch.
+/// Face searches of the bodies that nodes touch.
 std::vector<projective::FaceSearch> face_searches(const Description& d) {
   std::vector<projective::FaceSearch> searches(d.primitives.size());
   for (std::size_t k = 0; k < d.primitives.size(); ++k) {
@@ -168,7 +168,7 @@ std::vector<projective::FaceSearch> face_searches(const Description& d) {
   return searches;
 }
 
-/// Spheres half as large as the shortest edge at their vertex at rest; those of an edge never touch.
+/// Spheres half as large as the shortest edge at their vertex at rest; the two spheres of an edge never touch.
 projective::VertexSpheres make_vertex_spheres(const Description& d,
                                               const contact::CollisionMesh& mesh) {
   const double* const X = d.rest_positions.data();
@@ -188,7 +188,7 @@ projective::VertexSpheres make_vertex_spheres(const Description& d,
   return spheres;
 }
 
-/// Those of rows: of the cloth's vertices and the nodes of coordinates.
+/// Prescribed rows: the cloth's vertices and the nodes of coordinates.
 std::vector<char> fixed_rows(const std::vector<char>& prescribed,
                              Index cloth_vertex_count,
                              const bodies::Mechanisms& mechanisms) {
@@ -198,7 +198,7 @@ std::vector<char> fixed_rows(const std::vector<char>& prescribed,
   return fixed;
 }
 
-/// Those of elements, and of the cloths' vertices that one spring is attached to.
+/// Cliques of elements, and of the cloths' vertices that one spring is attached to.
 std::vector<std::vector<Index>> cloth_cliques(const Description& d,
                                               const mesh::Topology& topology,
                                               const mesh::BendingStencils& stencils) {

@@ -86,7 +86,7 @@ struct AttachmentDescription {
   Index target_count = 0;
 };
 
-/// What a simulator is made from.
+/// Description of a scene and its options: the arguments of a simulator.
 struct Description {
   std::vector<double> vertices;        ///< [3 N] initial positions [m]
   std::vector<double> rest_positions;  ///< [3 N] rest positions [m]
@@ -108,7 +108,7 @@ struct Description {
   /// empty: none
   std::vector<projective::Primitive> primitives;
   std::vector<std::string> surface_names;  ///< in messages; empty: surfaces have numbers
-  std::vector<std::string> pin_names;      ///< [P] that of the group of each pin; empty: none
+  std::vector<std::string> pin_names;      ///< [P] group of each pin; empty: none
   bool self_contact = true;
   double dt = 0.01;
   SchemeKind scheme = SchemeKind::kCoupled;
@@ -129,7 +129,7 @@ struct Scene {
   Index surface_count() const { return cloth_count() + given.bodies.count(); }
   Index point_count() const { return static_cast<Index>(prescribed.size()); }
 
-  /// Whether something is attached to a body.
+  /// Report whether a spring is attached to a body.
   bool has_attached_bodies() const;
 
   const SchemeRow& scheme() const { return kSchemes[static_cast<std::size_t>(given.scheme)]; }
@@ -167,7 +167,7 @@ contact::RestMeasures rest_measures(const Scene& scene, const mesh::RestShape& r
 /// Two primitives near each other, and how far they must be apart at least [m].
 struct ClosePair {
   double distance;
-  double thickness;  ///< mean of that of their surfaces, and the radii of round ones
+  double thickness;  ///< mean of their surfaces, and the radii of round ones
   contact::Candidate pair;
 };
 

@@ -57,7 +57,7 @@ struct Pushforward : Taken {
   std::span<const Forces> forces;  ///< of each direction: the changes of the forces are added here
 };
 
-/// A way to take a step: what is minimized, in which order, and the derivatives of that.
+/// A way to take a step: its minimizations, their order, and their derivatives.
 class Scheme {
  public:
   Scheme() = default;
@@ -73,7 +73,7 @@ class Scheme {
   /// @param x  in: at the start of the step
   virtual void forward(const Forward& step, std::vector<double>& x, const Forces& forces) const = 0;
 
-  /// From the cotangents of the end to those of all that the potentials depend on, for each loss as if
+  /// Pull the cotangents of the end back to all quantities that the potentials depend on, for each loss as if
   /// it were alone.
   virtual void backward(const Backward& step) const = 0;
 

@@ -24,7 +24,7 @@ bool wants_friction(const Gradients& gradients) {
          gradients[Input::kSlipVelocity] != nullptr;
 }
 
-/// From the cotangents of the outputs to those of the points at the end.
+/// Cotangents of the points at the end, from the cotangents of the outputs.
 void read_outputs(const Problem& problem,
                   const Arrays<const double>& cotangents,
                   Cotangents& bars) {
@@ -48,7 +48,7 @@ void read_outputs(const Problem& problem,
   bars.pin_forces.assign(pin_bar, pin_bar + 3 * scene.given.pins.size());
 }
 
-/// From the change of all points at the end to that of the outputs but the forces.
+/// Change of the outputs but the forces, from the change of all points at the end.
 void write_outputs(const Problem& problem,
                    const Tangents& tangents,
                    std::vector<double> x,

@@ -62,7 +62,7 @@ void backward(const Scene& scene,
               int threads,
               const Checkpoint& checkpoint);
 
-/// Tangents of the inputs, and where those of the outputs go.
+/// Tangents of the inputs, and arrays for the tangents of the outputs.
 struct Direction {
   Inputs tangents;         ///< of the counts of the inputs; zero where null
   Arrays<double> outputs;  ///< named like output_fields(), zeroed
@@ -99,13 +99,13 @@ std::optional<Throw> find_throw(const Scene& scene, const Inputs& inputs);
 /// Parts of an energy by their names [J].
 using Energies = std::vector<std::pair<const char*, double>>;
 
-/// What the potentials of the cloths and the barrier store at the positions of the inputs. Of weights,
-/// Python knows.
+/// Energy of the potentials of the cloths and of the barrier at the positions of the inputs. Gravity is
+/// computed in Python.
 Energies stored_energy(const Scene& scene, const Inputs& inputs);
 
 /// Gradients of these parts, of several losses, whose cotangents are numbers by the names of the parts.
 ///
-/// Inputs that only motion and what dissipates depend on get zero.
+/// The gradient is zero for inputs of motion and dissipation.
 ///
 /// @throws std::domain_error where surfaces overlap, if the barrier's part has a cotangent
 void pull_back_energy(const Scene& scene, const Inputs& inputs, std::span<const Loss> losses);
@@ -123,9 +123,9 @@ void push_forward_energy(const Scene& scene,
 /// median of several.
 double reference_factorization_seconds(const Scene& scene, const Inputs& inputs, int repeats);
 
-/// kappa of each pair of surfaces, from these two alone [surfaces^2], [Pa]: the larger of what balances
-/// a cloth's contact-free Hessian at rest and what carries a free body; of joints where a pair has
-/// neither. Pairs that never touch have the number of the first that may; zero where none may.
+/// kappa of each pair of surfaces, from these two alone [surfaces^2], [Pa]: the larger of the stiffness that
+/// balances a cloth's contact-free Hessian at rest and the stiffness that carries a free body; of joints if a
+/// pair has neither. Pairs that never touch have the number of the first that may; zero where none may.
 std::vector<double> default_barrier_stiffness(const Scene& scene,
                                               const Inputs& inputs,
                                               double barrier_distance);

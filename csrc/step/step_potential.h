@@ -27,11 +27,10 @@ class StepPotential {
   virtual Potential& potential() = 0;
 
   /// Pull what the potential has accumulated back: to the gradients of its own inputs, and to the
-  /// cotangents of what it shares with others, as positions at the start, masses and the rest shape.
+  /// cotangents of shared quantities: positions at the start, masses and the rest shape.
   virtual void pull_back(const Problem& problem, Cotangents& bars, const Gradients& gradients) = 0;
 
-  /// Put the tangents of the potential's inputs into it, for add_tangent(): what pull_back() does,
-  /// transposed.
+  /// Put the tangents of the potential's inputs into it, for add_tangent(): pull_back(), transposed.
   virtual void push_forward(const Problem& problem, const Tangents& tangents) = 0;
 
   /// Call visit(name, value) for every part of the energy that it stores at x [J].

@@ -89,11 +89,11 @@ Array predicted(const Problem& p, const Tangents& tangents) {
   return result;
 }
 
-/// What barrier and friction depend on besides points and the rest shape.
+/// Inputs of barrier and friction besides points and the rest shape.
 constexpr std::array kOfContact = {Input::kBarrierDistance, Input::kSlipVelocity, Input::kThickness,
                                    Input::kBarrierStiffness, Input::kFriction};
 
-/// Of an input that has one value for all pairs of surfaces, or one for each.
+/// Copy the tangent of an input that has one value for all pairs of surfaces, or one for each.
 void copy_pairs(const Problem& p, const Inputs& directions, Input input, Array& out) {
   const double* const change = directions.data(input);
   if (change == nullptr) return;
@@ -101,7 +101,7 @@ void copy_pairs(const Problem& p, const Inputs& directions, Input input, Array& 
   for (std::size_t k = 0; k < out.size(); ++k) out[k] = change[one ? 0 : k];
 }
 
-/// What the barrier and friction are made of, the rest shape of the cloths included.
+/// Tangents of the parameters of barrier and friction, the rest shape of the cloths included.
 void fill_contact(const Problem& p, const Tangents& tangents, contact::ContactModel::Bar& out) {
   const Inputs& directions = tangents.directions;
   if (const double* d_hat = directions.data(Input::kBarrierDistance)) out.d_hat = *d_hat;

@@ -7,8 +7,8 @@
 
 namespace diffcloth::step {
 
-/// Tangents of what the potentials of a step depend on, along one direction of the inputs: Cotangents,
-/// transposed. Fields whose names there are the same mean the tangents of the same quantities.
+/// Tangents of the quantities that the potentials of a step share, along one direction of the inputs:
+/// Cotangents, transposed. Fields whose names there are the same mean the tangents of the same quantities.
 class Tangents {
  public:
   /// @param directions  a tangent for each input, of the count of that input; zero where null
@@ -22,20 +22,20 @@ class Tangents {
 
   Inputs directions;
 
-  std::vector<double> start;    ///< x_n and o_n: all points
-  std::vector<double> origins;  ///< what friction counts motion from, where it is not the start
-  std::vector<double> ends;     ///< what is prescribed, at its end: all points but those of links
-  std::vector<double> masses;   ///< [N]
+  std::vector<double> start;       ///< x_n and o_n: all points
+  std::vector<double> origins;     ///< origins of friction's displacements, if not the start
+  std::vector<double> ends;        ///< prescribed points at their ends: all but the points of links
+  std::vector<double> masses;      ///< [N]
   std::vector<double> prediction;  ///< y, the target of inertia [3 N]
   contact::ContactModel::Bar contact;
   bool changes_contact = false;  ///< whether that is not zero
 
   mesh::RestShapeBar rest;  ///< empty where the rest shape does not change
 
-  /// Those of an input that is given per face [F].
+  /// Tangent of an input that is given per face [F].
   std::vector<double> per_face(const Problem& problem, Input input) const;
 
-  /// Those of lumped(): of an input per face, and of the areas.
+  /// Tangent of lumped(): by an input per face, and by the areas.
   ///
   /// @param values  of the input [F]
   std::vector<double> lumped(const Problem& problem,

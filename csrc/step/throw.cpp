@@ -23,7 +23,7 @@
 //   E(s) = sum over its contacts of (d'_i / d') kappa w m b((d + s d')^2),
 //
 // its first step ends where  mu s^2 / 2 + E(s) - l s  is least. What is stored there, down to where push and
-// load balance, becomes kinetic energy at most. So the speed is that of implicit Euler, which dissipates most
+// load balance, becomes kinetic energy at most. So the speed holds for implicit Euler, which dissipates most
 // of the energy where a step is longer than the barrier takes: 99 % at 10 ms with a default barrier stiffness.
 
 namespace diffcloth::step {
@@ -44,7 +44,7 @@ double first_point(double low, double high, Condition&& holds) {
   return high;
 }
 
-/// What moves as one, by rows of the unknowns and by vertices: vertices of cloths, then trees.
+/// Owners: bodies that move as one, by rows of the unknowns and by vertices: vertices of cloths, then trees.
 class Owners {
  public:
   explicit Owners(const Scene& scene)
@@ -82,7 +82,7 @@ class Owners {
   std::vector<Index> of_vertex_;
 };
 
-/// The contacts of what moves as one, as their distances change at the rates that they have at the start.
+/// The contacts of one owner, as their distances change at the rates that they have at the start.
 class Course {
  public:
   /// @param rate  of the distance
@@ -145,7 +145,7 @@ class Course {
   double end_ = 0.0;  // where all that come apart are out of reach
 };
 
-/// The courses of what the contacts of two surfaces move along a change of all points.
+/// The courses of the owners that the contacts of two surfaces move along a change of all points.
 std::map<Index, Course> courses_of(std::span<const Contact> contacts,
                                    const Owners& owners,
                                    const Array& dx,
@@ -167,7 +167,7 @@ std::map<Index, Course> courses_of(std::span<const Contact> contacts,
   return courses;
 }
 
-/// Of each, the largest motion of a vertex in a change of all points.
+/// The largest motion of a vertex of each owner in a change of all points.
 std::map<Index, double> lengths_of(const Scene& scene, const Owners& owners, const Array& dx) {
   std::map<Index, double> lengths;
   for (Index v = 0; v < scene.vertex_count(); ++v) {

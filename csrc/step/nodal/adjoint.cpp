@@ -1,12 +1,12 @@
 // The adjoint of dry frictional contact at nodes, in the terms of nodal/system.cpp.
 //
 // For the cotangent g_x of x, let lambda = Z lambda solve  K^T lambda = Z (g_x + H eta), with eta
-// those of the forces g at nodes, which cloths, bodies and pins feel. Then z = L^T lambda - eta goes through the
+// the cotangents of the forces g at nodes, which act on cloths, bodies and pins. Then z = L^T lambda - eta goes through the
 // potentials as in schemes/contact_stage.cpp. The cotangent of E (x - x_n) - h s v_out at fixed g is minus
 //
 //   q = (I - P) E (g_x - H z)  +  F lambda            (the first term without P where it sticks)
 //
-// and those of the frame are
+// and the cotangents of the frame are
 //
 //   n_bar  = (n . E g) lambda_E + mu (t . lambda_E) E g - (n . q) h s u,     v_bar = h s q,
 //   mu_bar = (n . E g) (t . lambda_E).
@@ -28,12 +28,12 @@ using projective::NodalContact;
 
 namespace {
 
-/// What the forces pull back to: on nodes E^T E g, on the bodies minus E g, shared by the corners of the
+/// Cotangents that the forces pull back: on nodes E^T E g, on the bodies minus E g, shared by the corners of the
 /// nearest faces, on pins g.
 struct ForcesBar {
   Array eta;                            ///< of the rows
   std::vector<Vec3> surface_point_bar;  ///< of each contact
-  bool any;                             ///< whether someone asks for it
+  bool any;                             ///< whether any of them is not zero
 };
 
 ForcesBar pull_back_forces(const Problem& problem,
@@ -72,7 +72,7 @@ ForcesBar pull_back_forces(const Problem& problem,
   return result;
 }
 
-/// The cotangent of the normal of a slipping contact; that of its friction goes into `bars`.
+/// The cotangent of the normal of a slipping contact; the cotangent of its friction is added to `bars`.
 Vec3 pull_back_slipping(const Problem& problem,
                         const NodalContacts& contacts,
                         const NodalSystem::Point& at,

@@ -64,7 +64,7 @@ double pair_friction(const Problem& p, Index a, Index b) {
   return 0.5 * (mu.data[a * surfaces + b] + mu.data[b * surfaces + a]);
 }
 
-/// Whether two surfaces may touch: the pairs that the user leaves out are left out here too.
+/// Report whether two surfaces may touch: pairs that the user ignores do not.
 bool may_touch(const Problem& p, Index a, Index b) {
   const std::array<Index, 2> pair{std::min(a, b), std::max(a, b)};
   return std::ranges::find(p.scene.given.ignored_pairs, pair) == p.scene.given.ignored_pairs.end();

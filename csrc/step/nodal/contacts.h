@@ -9,7 +9,7 @@
 
 namespace diffcloth::step {
 
-/// What touches in a stage with contact at nodes: found once, on the straight way from x_n to the
+/// Contacts of a stage with contact at nodes: found once, on the straight way from x_n to the
 /// inertial prediction.
 struct NodalContacts {
   explicit NodalContacts(Problem& problem);

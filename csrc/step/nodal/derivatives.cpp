@@ -1,4 +1,4 @@
-// What the adjoint and the tangent of nodal contact share.
+// Shared by the adjoint and the tangent of nodal contact.
 
 #include <stdexcept>
 
@@ -19,7 +19,7 @@ Array solve_derivative(const NodalSystem& system,
                        const Array& b) {
   Array w;
   if (!system.solve(at, H, S, transposed, b, kNodal.derivative_tolerance, w).converged) {
-    // The floor of rounding may lie above the tolerance: then what has been found must do.
+    // Rounding may lie above the tolerance: then a larger residual is accepted.
     Array again;
     if (!system.solve(at, H, S, transposed, b, kNodal.largest_derivative_error, again).converged) {
       throw std::domain_error("a derivative of nodal friction did not converge");

@@ -164,7 +164,7 @@ class NodalSolve {
       descents_ = 0;
       return Newton::kContracts;
     }
-    // Below the tolerance, what is left of the residual is rounding.
+    // Below the tolerance, the remaining residual is rounding.
     return step < goal_ ? arrive(solver::Criterion::kRounding) : Newton::kNoStep;
   }
 

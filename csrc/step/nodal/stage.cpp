@@ -16,7 +16,7 @@ using Array = std::vector<double>;
 using projective::ContactCase;
 using projective::NodalContact;
 
-/// Whether residuals still halve now and then.
+/// Detects that residuals no longer halve now and then.
 class Progress {
  public:
   bool has_ended(double residual) {

@@ -35,7 +35,7 @@ class NodalStage {
   /// Solve by local/global iterations with impulses (Ly et al. 2020), accelerated. They are given up
   /// where they stall.
   ///
-  /// @param smooth  what is minimized where nothing touches
+  /// @param smooth  the objective without contact
   /// @param x  in: a start; out: the solution
   projective::LocalGlobalOutcome iterate(const projective::LocalGlobalObjective& smooth,
                                          const projective::LocalGlobalOptions& options,
@@ -48,7 +48,7 @@ class NodalStage {
 
   /// The adjoint, for a solution x.
   ///
-  /// @param factor  as solve() gave it, or null to make it again
+  /// @param factor  as solve() gave it, or null to recompute it
   /// @param g       cotangent of the rows at the end
   /// @param bars    of the loss whose turn it is
   void backward(const Backward& step,
@@ -60,7 +60,7 @@ class NodalStage {
   /// Change of all points along a direction, for a solution x, and of the forces there, which is added. The
   /// potentials have the tangents of the direction.
   ///
-  /// @param factor  as solve() gave it, or null to make it again
+  /// @param factor  as solve() returned it, or null to recompute it
   std::vector<double> tangent(const Pushforward& step,
                               const std::vector<double>& x,
                               solver::Factor factor,

@@ -8,15 +8,15 @@
 //   relative velocity  u = E (x - x_n) / (h s) - v_out,
 //
 // and (r, u) obey the law of Signorini and Coulomb: r = Phi(r - rho u), see projective/coulomb.h; which
-// masses rho > 0 has no influence on the solution, and those of h^2 times the diagonal of the constant
-// matrix M / h^2 + L predict its cases well. So the impulses are no unknowns. Elsewhere g = 0. Let P =
+// masses rho > 0 has no influence on the solution, and h^2 times the diagonal of the constant
+// matrix M / h^2 + L predicts its cases well. So the impulses are no unknowns. Elsewhere g = 0. Let P =
 // I - n n^T. The equations along E of each case are
 //
 //   taking off   E g = 0
 //   sticking     u = 0
 //   slipping     n . u = 0,   P E g - mu (n . E g) t = 0,   t = -u_T / |u_T|.
 //
-// Let Z project onto what no constraint holds (E^T P E of slipping nodes, nothing of sticking ones),
+// Let Z project onto the subspace that no constraint holds (E^T P E of slipping nodes, nothing of sticking ones),
 // L = Z - sum mu E^T t n^T E, and F = sum k E^T (P - t t^T) E with k = mu r_n / (h^2 s^2 |u_T|): friction
 // turns with the slip. With the Hessian H of the energy, a change w = Z w of the free part changes the
 // equations by
@@ -26,7 +26,7 @@
 // K is not symmetric, but S = Z H Z + F + (I - Z) rho / h^2 is: the system without the coupling of friction
 // and normal force. It has the pattern of H, its Cholesky factor preconditions GMRES, and shows that
 // the solution is a minimum where the friction is frozen. Off the solution the same operators, with t and k
-// of s = r - rho u, are those of a semismooth Newton method.
+// of s = r - rho u, define a semismooth Newton method.
 
 #include "step/nodal/system.h"
 
@@ -267,7 +267,7 @@ NodalSystem::Linearized NodalSystem::solve_linearized(const Point& at,
   const auto to_velocity = [&](const NodalContact& c, const Array& p) -> Vec3 {
     return relative(c, p.data()) / (p_.h * scale(c));
   };
-  // What each impulse does to each velocity, some columns at a time.
+  // The change of each velocity by each impulse, some columns at a time.
   Eigen::MatrixXd W(3 * m, 3 * m);
   std::vector<Array> columns(static_cast<std::size_t>(std::min(kColumns, 3 * m)), Array(size));
   for (Eigen::Index first = 0; first < 3 * m; first += kColumns) {
@@ -382,7 +382,7 @@ struct Moved {
   Mat3 block;
 };
 
-/// Project the blocks of vertices against obstacles in place; those of pairs leave.
+/// Project the blocks of vertices against obstacles in place; return the blocks of pairs.
 std::vector<Moved> project_in_place(const Projections& Z,
                                     const std::vector<Index>& partner,
                                     linalg::BlockMatrix& S) {

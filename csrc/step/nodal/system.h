@@ -24,7 +24,7 @@ Vec3 relative(const projective::NodalContact& contact, const double* v);
 /// v += E^T e.
 void spread(const projective::NodalContact& contact, const Vec3& e, double* v);
 
-/// Of masses of vertices: that of the vertex, or what two of them have against each other.
+/// The mass of the vertex of a contact, or the reduced mass of its two vertices.
 double reduced(const std::vector<double>& masses, const projective::NodalContact& contact);
 
 /// The equations of a stage at one point.
@@ -39,7 +39,7 @@ class NodalSystem {
         inertia_(contacts.inertia),
         inv_h_sq_(1.0 / (p_.h * p_.h)) {}
 
-  /// What the equations are at a point.
+  /// The equations at a point.
   struct Point {
     std::vector<double> x;
     std::vector<double> g;  ///< of all points
@@ -54,7 +54,7 @@ class NodalSystem {
 
   Vec3 velocity(const projective::NodalContact& c, const std::vector<double>& x) const;
 
-  /// What holds along E at this case of the law: I - P, or all, or nothing.
+  /// The held part of e at this case of the law: I - P, or all, or nothing.
   static Vec3 held(const projective::NodalContact& c,
                    const projective::Coulomb& law,
                    const Vec3& e);
@@ -93,10 +93,10 @@ class NodalSystem {
                              double tolerance,
                              std::vector<double>& w) const;
 
-  /// What brings the held parts to where they must be.
+  /// The step that brings the held parts to their values.
   std::vector<double> constraint_step(const Point& at) const;
 
-  /// Minus the equations at the free parts, and minus what the constraints' step d does to them.
+  /// Minus the equations at the free parts, and minus their change by the constraints' step d.
   ///
   /// @param frozen  with friction as large as it is now, whatever becomes of the normal forces
   std::vector<double> right_side(const Point& at,
@@ -104,7 +104,7 @@ class NodalSystem {
                                  const std::vector<double>& d,
                                  bool frozen) const;
 
-  /// Move the points that approach what they touch back to where they do not; whether there were any.
+  /// Move points that approach their obstacle back until they do not; return whether there were any.
   bool clear_approach(std::vector<double>& x) const;
 
   /// A change of the rows, and the impulses along the way [N s].
@@ -141,7 +141,7 @@ std::vector<double> solve_derivative(const NodalSystem& system,
                                      bool transposed,
                                      const std::vector<double>& b);
 
-/// The factor of S at a solution, made again where it is gone.
+/// The factor of S at a solution, recomputed if evicted.
 ///
 /// @throws std::domain_error where the solution is no minimum
 solver::Factor certified(const NodalSystem& system,

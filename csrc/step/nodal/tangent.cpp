@@ -28,7 +28,7 @@ using projective::NodalContact;
 
 namespace {
 
-/// Of the frames of all contacts.
+/// Tangents of the frames of all contacts.
 std::vector<FrameTangent> push_forward_frames(const Problem& problem,
                                               const NodalContacts& contacts,
                                               const Tangents& tangents) {
@@ -80,7 +80,7 @@ double friction_tangent(const Problem& problem,
   return sum;
 }
 
-/// Add the change of the forces with that of the gradient, of the rows.
+/// Add the change of the forces, from the change of the gradient of the rows.
 void add_force_tangents(const Problem& problem,
                         const NodalContacts& contacts,
                         const NodalSystem::Point& at,
@@ -126,7 +126,7 @@ Array NodalStage::tangent(const Pushforward& step,
   factor = certified(system, linear, at, H, std::move(factor));
   const std::vector<FrameTangent> frames = push_forward_frames(problem_, contacts_, tangents);
 
-  // What is prescribed, and what contacts hold.
+  // Prescribed points, and the parts that contacts hold.
   Array d;
   f.coordinates->take_rows(tangents.ends, d);
   Array law_change(d.size(), 0.0);

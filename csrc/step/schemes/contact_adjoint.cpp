@@ -17,7 +17,7 @@
 //
 // which each potential adds up for its own inputs; in particular prescribed positions (pins c, bodies
 // o) get  -(H zhat) at their rows, and pins also the direct g_k. Friction's displacement from x_start gives
-// x_start_bar, or that of the origins where these are given. Contact forces with cotangent c_bar on
+// x_start_bar, or the cotangent of the origins if these are given. Contact forces with cotangent c_bar on
 // the cloths' vertices are like another f_bar of the objective C = barrier + friction: g_K loses H_C c_bar,
 // and C is pulled back at zhat + c_bar. The lag configuration of k is x_{k-1}
 // (x_n for k = 1): its cotangent becomes g_{k-1}, and the sweep goes on from K to 1.
@@ -153,7 +153,7 @@ void add_lag(const Problem& problem,
   lag_bar.resize(x_lag.size(), 0.0);
   problem.coordinates.gather(x_lag, lag_bar);
   problem.coordinates.take_rows(lag_bar, g);
-  // What is prescribed and no row: bodies and frames.
+  // The rest is prescribed and no row: bodies and frames.
   problem.coordinates.clear_rows(lag_bar);
   for (std::size_t a = 0; a < lag_bar.size(); ++a) bars.ends[a] += lag_bar[a];
 }
@@ -162,7 +162,7 @@ void add_lag(const Problem& problem,
 
 void ContactStage::backward(const Backward& step, std::vector<Array> g) {
   Problem& problem = step.problem;
-  // What contact and friction accumulate, of the loss whose turn it is.
+  // Cotangents of barrier and friction, of the loss whose turn it is.
   contact::ContactModel::Bar contact_bar(problem.scene.collision_mesh);
   ContactSum sum(potentials(), problem, step.detection, step.friction ? &contact_bar : nullptr,
                  step.barrier ? &contact_bar : nullptr);

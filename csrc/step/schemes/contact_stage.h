@@ -22,10 +22,10 @@ struct ContactStage {
   std::vector<Potential*> others;
   solver::PatternCache& patterns;
   std::size_t first_factor;  ///< place of its factors among the scheme's
-  Turn::Exchange exchange;   ///< of what its potentials accumulate; only backward needs it
+  Turn::Exchange exchange;   ///< of the cotangents of its potentials; only backward needs it
   SetTangents set_tangents;  ///< of its potentials; only tangent needs it
 
-  /// What it keeps on the tape.
+  /// Fields of the tape.
   static std::vector<Field> tape(const Scene& scene);
 
   /// @param x  in: all points at the start of the step; out: at its end
@@ -49,9 +49,9 @@ struct ContactStage {
 /// @param x            all points where the objective has been minimized; its potentials stand there
 /// @param factor       of the exact Hessian there, or null to make it
 /// @param g            of each loss, cotangent of the rows
-/// @param with_forces  whether the forces that the step gives back are those of this solve
+/// @param with_forces  whether this solve yields the forces of the step
 /// @param touching     the potentials of the objective that contact forces are of
-/// @param exchange     of what the potentials of the objective accumulate
+/// @param exchange     of the cotangents of the objective's potentials
 void pull_back_solve(const Backward& step,
                      const solver::Objective& objective,
                      const std::vector<double>& x,
@@ -65,7 +65,7 @@ void pull_back_solve(const Backward& step,
 ///
 /// @param x             all points where the objective has been minimized; its potentials stand there
 /// @param certificate   of the exact Hessian there, or none to make it
-/// @param with_forces   whether the forces that the step gives back are those of this solve
+/// @param with_forces   whether this solve yields the forces of the step
 /// @param touching      the potentials of the objective that contact forces are of; the tangents along all
 ///                      directions are in them
 /// @param set_tangents  of the other potentials

@@ -90,9 +90,9 @@ class ContactSum {
     objective.take_friction(&*friction);
   }
 
-  /// Put the tangents of what barrier and friction depend on into them, along each direction.
+  /// Put the tangents of their inputs into barrier and friction, along each direction.
   ///
-  /// @param lag  those of the lag configuration: all points; they outlive the next add_tangents()
+  /// @param lag  tangents of the lag configuration: all points; they outlive the next add_tangents()
   void set_tangents(std::span<const Tangents> directions,
                     const std::vector<std::vector<double>>& lag) {
     if (!contact_) return;

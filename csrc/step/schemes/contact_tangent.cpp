@@ -1,14 +1,14 @@
 // The tangent of a step, in the terms of contact_adjoint.cpp.
 //
 // At the minimizer x_k the gradient vanishes at the rows, J^T grad E_k = 0, and stays zero along a direction of
-// the inputs. Let d be the change of all points with what is prescribed alone: pins, bodies, and vertices
+// the inputs. Let d be the change of all points with the prescribed ones alone: pins, bodies, and vertices
 // of links with prescribed joints and frames, at fixed free coordinates. Then
 //
 //   dx_k = d - J H_k^-1 (J^T b + C d),   b = H d + d/d(theta) (grad E_k) theta_dot,
 //
-// with H over all points, H_k that of the rows, and C d the change of J^T grad E_k with J along d. Every potential
-// adds what its own inputs do to b; friction of k = 1..K also what the lag configuration does, whose change
-// is dx_{k-1} (that of the start for k = 1). The outputs change by
+// with H over all points, H_k the Hessian over the rows, and C d the change of J^T grad E_k with J along d. Every potential
+// adds the contribution of its own inputs to b; friction of k = 1..K also the contribution of the lag
+// configuration, whose change is dx_{k-1} (the change of the start for k = 1). The outputs change by
 //
 //   dx = dx_K,   dv = (dx - dx_n) / h,   dg = H dx_K + d/d(theta) (grad E_K) theta_dot   at pins,
 //
@@ -57,7 +57,7 @@ std::vector<GradientTangent> gradient_tangents(
   return result;
 }
 
-/// d: of all points with what is prescribed, at fixed rows.
+/// d: the change of all points with the prescribed ones, at fixed rows.
 Array prescribed_tangent(const Pushforward& step, std::size_t l, const Array& x) {
   Array d = step.directions[l].ends;
   step.problem.coordinates.carry(x, d);
@@ -76,7 +76,7 @@ struct ProductList {
   Products products() const { return {.z = z, .y = y}; }
 };
 
-/// y = H d at the free rows, direction by direction; what others get means nothing.
+/// y = H d at the free rows, direction by direction; other rows are left undefined.
 void products_with_prescribed(const solver::Objective& f,
                               const Array& x,
                               const std::vector<Array>& d,
@@ -96,7 +96,7 @@ void products_with_prescribed(const solver::Objective& f,
   });
 }
 
-/// Add H dx to the changes of the gradient: at all points for what touches, else at those that are held.
+/// Add H dx to the changes of the gradient: at all points for barrier and friction, else at held points.
 void add_products_with_motion(const solver::Objective& f,
                               const Array& x,
                               const std::vector<Array>& dx,
@@ -113,7 +113,7 @@ void add_products_with_motion(const solver::Objective& f,
   });
 }
 
-/// The change of the forces with that of the gradient.
+/// Add the change of the forces, from the change of the gradient.
 void add_force_tangents(const Pushforward& step,
                         const GradientTangent& change,
                         const Forces& forces) {
@@ -121,7 +121,7 @@ void add_force_tangents(const Pushforward& step,
   const std::size_t end = 3 * static_cast<std::size_t>(step.problem.scene.vertex_count());
   for (std::size_t a = 0; a < cloth; ++a) forces.contact[a] -= change.touching[a];
   for (std::size_t a = cloth; a < end; ++a) {
-    // Of the others, attachments alone act on bodies.
+    // Attachments are the only other potential that acts on bodies.
     forces.bodies[a - cloth] -= change.touching[a] + change.others[a];
   }
   double* out = forces.pins;

@@ -12,7 +12,7 @@
 namespace diffcloth::step {
 namespace {
 
-/// Of a step that has been taken; none where it is gone.
+/// The certificate of a step that has been taken; none if evicted.
 solver::Certificate certificate_of(const Taken& step) {
   return step.kept.certificates.empty() ? solver::Certificate{} : step.kept.certificates.front();
 }

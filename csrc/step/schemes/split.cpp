@@ -1,7 +1,7 @@
-// The adjoint of `split` is that of its contact stage (contact_stage.cpp), whose target is x^D; the
-// cotangent of x^D is the g of one more adjoint of the same form, that of the elastic stage: the
-// paper's Eqs. 8 and 29 with all explicit terms. In the metric `energy` it is zero, unless nodes touch. Tangents
-// go the other way: that of x^D is one of the contact stage's inputs.
+// The adjoint of `split` begins with its contact stage (contact_stage.cpp), whose target is x^D. The cotangent
+// of x^D is the g of the adjoint of the elastic stage, which has the same form: the paper's Eqs. 8 and 29 with
+// all explicit terms. In the metric `energy` it is zero, unless nodes touch. Tangents go the other way: the
+// tangent of x^D is an input of the contact stage.
 
 #include "step/schemes/split.h"
 
@@ -21,10 +21,10 @@ namespace {
 
 using Array = std::vector<double>;
 
-/// Nearness to x^D: what the contact stage minimizes beside barrier and friction.
+/// Nearness to x^D: the objective of the contact stage without barrier and friction.
 ///
 /// `energy` is  P(x) - P(x^D) - grad P(x^D) (x - x^D),  P inertia and elasticity, soft pins and damping
-/// included: what the state lacks of being the elastic stage's minimum, in joules. The others are
+/// included: its excess over the elastic stage's minimum, in joules. The others are
 /// 1/2 |x - x^D|^2 in a matrix G / h^2: the masses, the identity, or, in `elastic`, h^2 A with
 /// A = M/h^2 + L the constant matrix of the whole elastic stage. L annihilates constants, so that a free
 /// cloth keeps its momentum as it does in the masses alone; but it resists turns by k_s |R - R^D|^2 / 2.
@@ -34,7 +34,7 @@ using Array = std::vector<double>;
 class Nearness {
  public:
   /// @param tilted  whether x^D leaves forces that P does not have, those at nodes in contact; else
-  ///                grad P(x^D) is zero but for what the elastic stage's tolerance leaves
+  ///                grad P(x^D) is zero up to the elastic stage's tolerance
   Nearness(Problem& problem, Array x_d, bool tilted) : problem_(problem), x_d_(std::move(x_d)) {
     switch (problem.scene.given.metric) {
       case Metric::kEnergy:
@@ -55,7 +55,7 @@ class Nearness {
     __builtin_unreachable();
   }
 
-  /// Whether it changes with x^D.
+  /// Report whether it changes with x^D.
   static bool follows_target(const Problem& problem, bool tilted) {
     return tilted || problem.scene.given.metric != Metric::kEnergy;
   }
@@ -76,7 +76,7 @@ class Nearness {
             .set_tangents = {}};
   }
 
-  /// Swap what its own potentials have accumulated.
+  /// Swap the cotangents of its own potentials.
   void swap_cotangents(CotangentStore& store) {
     store.begin();
     if (inertial_) inertial_->swap_cotangents(store);
@@ -84,7 +84,7 @@ class Nearness {
     if (tilt_) tilt_->swap_cotangents(store);
   }
 
-  /// Put the tangents of its own potentials into them; those of P are there.
+  /// Put the tangents of its own potentials into them; P has its tangents already.
   ///
   /// @param x_d_dot  of x^D, of all points
   void set_tangents(const Tangents& tangents, const Array& x_d_dot) {
@@ -99,7 +99,7 @@ class Nearness {
     if (tilt_) tilt_->force_dot = gradient_tangent(target);
   }
 
-  /// Cotangent of x^D; those of what else the nearness is made of go where they belong.
+  /// Cotangent of x^D; the cotangents of masses and of P are added where they belong.
   Array pull_back(Cotangents& bars) {
     Array bar(problem_.cloth_size, 0.0);
     if (inertial_) {
@@ -141,7 +141,7 @@ class Nearness {
     return change;
   }
 
-  // f = grad P(x^D):  x^D gets H f_bar, and what P is made of  d/d theta (f_bar . grad P).
+  // f = grad P(x^D):  x^D gets H f_bar, and the inputs of P  d/d theta (f_bar . grad P).
   void pull_back_tilt(const Array& force_bar, Array& target_bar) {
     Array minus = force_bar;
     for (double& value : minus) value = -value;
@@ -178,7 +178,7 @@ std::vector<Field> Split::tape(const Scene& scene) const {
 void Split::forward(const Forward& step, Array& x, const Forces& forces) const {
   Problem& problem = step.problem;
   const ElasticStage elastic(problem);
-  // What is near x^D in energy holds its pins against all that the elastic stage has.
+  // Nearness in energy holds the pins against all potentials of the elastic stage, too.
   Array unused(3 * problem.scene.given.pins.size());
   Forces elastic_forces = forces;
   if (!Nearness::follows_target(problem, elastic.has_contacts()))

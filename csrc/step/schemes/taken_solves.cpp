@@ -45,7 +45,7 @@ void TakenSolves::stand(std::size_t k) {
   const std::size_t place = first_factor_ + k;
   const auto& kept = step_.kept.certificates;
   certificate_ = place < kept.size() ? kept[place] : solver::Certificate{};
-  // Of all solves the same.
+  // The expected contacts are the same for all solves.
   if (!certificate_.factor && sum_.objective.expected.empty()) {
     sum_.expect_contacts_near(step_.problem.start);
   }

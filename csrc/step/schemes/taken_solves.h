@@ -11,7 +11,7 @@ namespace diffcloth::step {
 
 /// The solves of a contact stage that have been taken, to be differentiated one by one in any order.
 ///
-/// What forward has not kept is found again from the tape.
+/// Contacts and certificates that forward has not kept are recomputed from the tape.
 class TakenSolves {
  public:
   /// @param sum           stands where the last stand() says
@@ -26,7 +26,7 @@ class TakenSolves {
   const std::vector<double>& x() const { return x_; }
   const std::vector<double>& x_lag() const { return x_lag_; }
 
-  /// Of the solve; nothing where it is gone.
+  /// Certificate of the solve; empty if evicted.
   const solver::Certificate& certificate() const { return certificate_; }
 
  private:
@@ -43,7 +43,7 @@ class TakenSolves {
   solver::Certificate certificate_;
 };
 
-/// The certificate of a solve, made again where it is gone.
+/// The certificate of a solve, recomputed if evicted.
 ///
 /// @param gradient  out: that at x, where the certificate is gone or the coordinates are curved
 /// @throws std::domain_error where x is no local minimum
