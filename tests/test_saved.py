@@ -149,6 +149,7 @@ def test_records_of_0_1_are_complete(load):
     state, batch = loaded["state"], loaded["batch"]
     assert type(state.report) is dc.Report
     assert state.report.converged is True
+    assert state.report.criterion == "unknown"
     assert state.report.cpu_seconds != state.report.cpu_seconds  # not a number: not known
     assert batch.report.cpu_seconds.isnan().all()
     assert state.report.contacts["sheet", "box"].count > 0

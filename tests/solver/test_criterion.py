@@ -7,7 +7,7 @@ import torch
 
 import diffcloth_torch as dc
 from diffcloth_torch import _core
-from diffcloth_torch.sim.report import Report
+from diffcloth_torch.sim.records.report import Report
 
 CONVERGED = ("tolerance", "rounding")
 
@@ -85,14 +85,13 @@ def test_it_is_selected_stacked_chosen_and_saved(tmp_path):
     sim, start, control = pushed_batch()
     state = sim.step(start, control)
     report = state.report
-    assert report.select(1).criterion == "stuck_motion"
-    assert report.select(slice(1, 3)).criterion == report.criterion[1:]
-    assert report.select(torch.tensor([2, 0])).criterion == report.criterion[2::-2]
-    assert Report.stack([report.select(i) for i in range(3)]).criterion == report.criterion
+    assert state[1].report.criterion == "stuck_motion"
+    assert state[1:3].report.criterion == report.criterion[1:]
+    assert state[[2, 0]].report.criterion == report.criterion[2::-2]
+    assert dc.stack(list(state)).report.criterion == report.criterion
     mask = torch.tensor([True, False, True])
-    other = report.select(0)
-    chosen = Report.where(mask, report, other)
-    assert chosen.criterion == (report.criterion[0], other.criterion, report.criterion[2])
+    chosen = dc.where(mask, state, state[0]).report
+    assert chosen.criterion == (report.criterion[0], report.criterion[0], report.criterion[2])
     torch.save(state, tmp_path / "state.pt")
     loaded = torch.load(tmp_path / "state.pt", weights_only=True)
     assert loaded.report.criterion == report.criterion

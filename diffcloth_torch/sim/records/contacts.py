@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +15,7 @@ from diffcloth_torch import cpu
 from diffcloth_torch.checks import FloatArray, texts
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.saved import saved
+from diffcloth_torch.sim.records.environments import Combination
 
 __all__ = ["Contacts", "PairContact"]
 
@@ -143,74 +144,28 @@ class Contacts:
         pairs = (f"{pair}: {_plain(count)}" for pair, count in self.counts.items())
         return f"Contacts({', '.join(pairs)})"
 
-    def select(self, index: Any) -> Contacts:
-        """Contacts of one environment, or of several."""
-        if self.batch_size is None:  # nothing is known of the environments
-            return self
-        chosen = cpu.arange(self.batch_size)[index].reshape(-1).tolist()
-        size = None if isinstance(index, int) else len(chosen)
-        rows = tuple(self.rows[i] for i in chosen) if self.rows else ()
-        return self._map(lambda tensor: tensor[index], size, rows)
-
     @staticmethod
-    def stack(all_contacts: Sequence[Contacts]) -> Contacts:
-        """Contacts of a batch, from those of its environments."""
-        known = all(contacts.rows for contacts in all_contacts)
-        rows = tuple(contacts.rows[0] for contacts in all_contacts) if known else ()
-        return _combined(
-            lambda *tensors: torch.stack(tensors), all_contacts, len(all_contacts), rows
-        )
+    def combined(how: Combination, parts: Sequence[Contacts]) -> Contacts:
+        """Combine environments; a pair without contact in one of the parts has zeros there."""
+        surfaces = max((part.surfaces for part in parts), key=len)
+        order = {name: i for i, name in enumerate(surfaces)}
+        pairs = sorted({p for part in parts for p in part}, key=lambda p: [order[n] for n in p])
 
-    @staticmethod
-    def where(mask: Tensor, a: Contacts, b: Contacts) -> Contacts:
-        """Contacts of `a` where `mask` is true, else of `b`."""
+        def entries(table: str, pair: Pair, row: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+            shapes = ((() if p.batch_size is None else (p.batch_size,)) + row for p in parts)
+            return how.tensors(
+                [
+                    getattr(part, table).get(pair, cpu.zeros(shape, dtype=dtype))
+                    for part, shape in zip(parts, shapes, strict=True)
+                ]
+            )
 
-        def mix(x: Tensor, y: Tensor) -> Tensor:
-            return torch.where(mask.reshape(-1, *[1] * (x.ndim - 1)), x, y)
-
-        rows: tuple[Tensor, ...] = ()
-        if a.rows and b.rows:
-            chosen = [(a if is_a else b).rows for is_a in mask.tolist()]
-            rows = tuple(own[i if len(own) > 1 else 0] for i, own in enumerate(chosen))
-        parts = [part._expanded(len(mask)) for part in (a, b)]
-        return _combined(mix, parts, len(mask), rows)
-
-    def _expanded(self, size: int) -> Contacts:
-        """Contacts of a batch; of a single state, its own in each environment."""
-        if self.batch_size is not None:
-            return self
-        return self._map(lambda tensor: tensor.expand(size, *tensor.shape), size, self.rows)
-
-    def _map(
-        self, function: Callable[[Tensor], Tensor], size: int | None, rows: tuple[Tensor, ...]
-    ) -> Contacts:
-        counts = {pair: function(count) for pair, count in self.counts.items()}
-        forces = {pair: function(force) for pair, force in self.forces.items()}
-        return Contacts(self.surfaces, size, counts, forces, rows)
+        counts = {p: entries("counts", p, (), torch.int64) for p in pairs}
+        forces = {p: entries("forces", p, (3,), torch.float64) for p in pairs}
+        known = all(part.rows for part in parts)
+        rows = how.items([part.rows for part in parts]) if known else ()
+        return Contacts(surfaces, how.size, counts, forces, rows)
 
 
 def _plain(count: Tensor) -> int | Tensor:
     return int(count) if count.ndim == 0 else count.clone()
-
-
-def _combined(
-    function: Callable[..., Tensor],
-    parts: Sequence[Contacts],
-    size: int | None,
-    rows: tuple[Tensor, ...],
-) -> Contacts:
-    """Apply a function to the tensors of each pair in contact in any of the parts."""
-    surfaces = max((part.surfaces for part in parts), key=len)
-    order = {name: i for i, name in enumerate(surfaces)}
-    pairs = sorted({p for part in parts for p in part}, key=lambda p: (order[p[0]], order[p[1]]))
-
-    def all_of(table: str, pair: Pair, row: tuple[int, ...], dtype: torch.dtype) -> list[Tensor]:
-        shapes = ((() if p.batch_size is None else (p.batch_size,)) + row for p in parts)
-        return [
-            getattr(part, table).get(pair, cpu.zeros(shape, dtype=dtype))
-            for part, shape in zip(parts, shapes, strict=True)
-        ]
-
-    counts = {p: function(*all_of("counts", p, (), torch.int64)) for p in pairs}
-    forces = {p: function(*all_of("forces", p, (3,), torch.float64)) for p in pairs}
-    return Contacts(surfaces, size, counts, forces, rows)

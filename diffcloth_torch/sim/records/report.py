@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -17,6 +17,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.reprs import record_text, value_text
 from diffcloth_torch.saved import saved
 from diffcloth_torch.sim.records.contacts import Contacts
+from diffcloth_torch.sim.records.environments import Combination
 
 __all__ = ["Report", "outcome_text"]
 
@@ -147,51 +148,29 @@ class Report:
                         f"has environments, got {list(np.shape(number))}"
                     )
 
-    def select(self, index: int | slice | Tensor) -> Report:
-        """Report of one environment, or of several."""
-        contacts = self.contacts.select(index)
-        if isinstance(index, int):
-            texts = {name: getattr(self, name)[index] for name in _TEXTS}
-            return _combine(lambda values: values[index].item(), [self], texts, contacts)
-        rows = cpu.arange(len(self.status))[index].tolist()
-        texts = {name: tuple(getattr(self, name)[i] for i in rows) for name in _TEXTS}
-        return _combine(lambda values: values[index], [self], texts, contacts)
-
     @staticmethod
-    def stack(reports: Sequence[Report | None]) -> Report | None:
-        """Report of a batch from those of its environments; None if one of them is missing."""
+    def combined(how: Combination, reports: Sequence[Report | None]) -> Report | None:
+        """Combine environments; None if a report is missing, or they hold different numbers."""
         present = [report for report in reports if report is not None]
-        if len(present) < len(reports) or len({_names(r) for r in present}) > 1:
+        if len(present) < len(reports) or len({_names(report) for report in present}) > 1:
             return None
-        texts = {name: tuple(str(getattr(r, name)) for r in present) for name in _TEXTS}
-        contacts = Contacts.stack([report.contacts for report in present])
-        return _combine(
-            lambda *values: torch.stack([cpu.as_tensor(v) for v in values]),
-            present,
-            texts,
-            contacts,
-        )
 
-    @staticmethod
-    def where(mask: Tensor, a: Report | None, b: Report | None) -> Report | None:
-        """Take environments of `a` where `mask` is true, else of `b`; None if one is missing."""
-        if a is None or b is None or _names(a) != _names(b):
-            return None
-        chosen = mask.tolist()
-        texts = {}
+        def entries(name: str) -> list[Any]:
+            return [getattr(report, name) for report in present]
+
+        tables: dict[str, Any] = {
+            name: {key: how.numbers([own[key] for own in entries(name)]) for key in first}
+            for name in _TABLES
+            for first in entries(name)[:1]
+        }
+        texts: dict[str, Any] = {}
         for name in _TEXTS:
-            rows = [
-                (text,) * len(chosen) if isinstance(text, str) else text
-                for text in (getattr(a, name), getattr(b, name))
-            ]
-            texts[name] = tuple(x if m else y for m, x, y in zip(chosen, *rows, strict=True))
-        contacts = Contacts.where(mask, a.contacts, b.contacts)
-        return _combine(
-            lambda x, y: torch.where(mask, cpu.as_tensor(x), cpu.as_tensor(y)),
-            [a, b],
-            texts,
-            contacts,
-        )
+            each = [(text,) if isinstance(text, str) else text for text in entries(name)]
+            items = how.items(each)
+            texts[name] = items[0] if how.size is None else items
+        numbers = {n: how.numbers(entries(n)) for n in _NUMERIC if n not in _TABLES}
+        contacts = Contacts.combined(how, entries("contacts"))
+        return Report(**numbers, **tables, **texts, contacts=contacts)
 
 
 def _unknown_like(residual: Any) -> Any:
@@ -245,25 +224,3 @@ _TABLES = ("seconds", "counts")
 
 def _names(report: Report) -> tuple[tuple[str, ...], ...]:
     return tuple(tuple(getattr(report, table)) for table in _TABLES)
-
-
-def _combine(
-    function: Callable[..., Any],
-    reports: Sequence[Report],
-    texts: dict[str, Any],
-    contacts: Contacts,
-) -> Report:
-    """Apply a function to each number of the given reports."""
-    plain = {
-        name: function(*(getattr(report, name) for report in reports))
-        for name in _NUMERIC
-        if name not in _TABLES
-    }
-    tables: dict[str, Any] = {
-        table: {
-            name: function(*(getattr(report, table)[name] for report in reports))
-            for name in getattr(reports[0], table)
-        }
-        for table in _TABLES
-    }
-    return Report(**plain, **tables, **texts, contacts=contacts)

@@ -18,6 +18,7 @@ from diffcloth_torch.geometry.meshes import write_mesh
 from diffcloth_torch.model.quantities import STATE, shape_of
 from diffcloth_torch.reprs import field_text, record_text
 from diffcloth_torch.saved import saved
+from diffcloth_torch.sim.records.environments import Choice, Combination, Selection, Stack
 from diffcloth_torch.sim.records.report import Report, outcome_text
 from diffcloth_torch.sim.records.surfaces import Surfaces
 
@@ -159,8 +160,7 @@ class State:
         """
         check_state("state[i]", self)
         chosen = _environments(index, self._require_batch("state[i]"))
-        report = None if self.report is None else self.report.select(chosen)
-        return self._map(lambda tensor: tensor[chosen], report)
+        return _combined(Selection(chosen, len(self)), [self])
 
     def __len__(self) -> int:
         """Number of environments."""
@@ -224,18 +224,8 @@ def stack(states: Sequence[State]) -> State:
         check_state(f"stack: `states[{i}]`", state)
         if state.batch_size is not None:
             raise InvalidInput(f"stack: `states` must have no batch axis, got one at [{i}]")
-    tensors = {}
-    for name in _TENSORS:
-        parts = [getattr(state, name) for state in states]
-        for i, part in enumerate(parts):
-            if part.shape != parts[0].shape:
-                raise InvalidInput(
-                    f"stack: `{name}` must have the same shape in all states, "
-                    f"got {list(parts[0].shape)} at [0] and {list(part.shape)} at [{i}]"
-                )
-        tensors[name] = torch.stack(parts)
-    report = Report.stack([state.report for state in states])
-    return State(**tensors, report=report, _surfaces=states[0]._surfaces)
+    _check_shapes("stack", "all states", [(f"at [{i}]", state) for i, state in enumerate(states)])
+    return _combined(Stack(len(states)), states)
 
 
 def where(mask: Tensor, a: State, b: State) -> State:
@@ -258,18 +248,28 @@ def where(mask: Tensor, a: State, b: State) -> State:
                 f"where: `{name}` must have {len(mask)} environments, as `mask`, "
                 f"got {state.batch_size}"
             )
-    tensors = {}
+    _check_shapes("where", "both states", [("in `a`", a), ("in `b`", b)])
+    return _combined(Choice(mask, [state.batch_size is not None for state in (a, b)]), [a, b])
+
+
+def _combined(how: Combination, states: Sequence[State]) -> State:
+    tensors = {n: how.tensors([getattr(state, n) for state in states]) for n in _TENSORS}
+    report = Report.combined(how, [state.report for state in states])
+    return State(**tensors, report=report, _surfaces=states[0]._surfaces)
+
+
+def _check_shapes(owner: str, which: str, states: Sequence[tuple[str, State]]) -> None:
+    """Require fields of the same shapes, but for the axis of environments."""
     for name in _TENSORS:
-        x, y = getattr(a, name), getattr(b, name)
-        shapes = [list(z.shape[state.batch_size is not None :]) for z, state in ((x, a), (y, b))]
-        if shapes[0] != shapes[1]:
-            raise InvalidInput(
-                f"where: `{name}` must have the same shape in both states, got {shapes[0]} in `a` "
-                f"and {shapes[1]} in `b`"
-            )
-        tensors[name] = torch.where(mask.reshape(-1, *[1] * len(shapes[0])), x, y)
-    report = Report.where(mask, a.report, b.report)
-    return State(**tensors, report=report, _surfaces=a._surfaces)
+        shapes = [
+            list(getattr(state, name).shape[state.batch_size is not None :]) for _, state in states
+        ]
+        for (place, _), shape in zip(states, shapes, strict=True):
+            if shape != shapes[0]:
+                raise InvalidInput(
+                    f"{owner}: `{name}` must have the same shape in {which}, got {shapes[0]} "
+                    f"{states[0][0]} and {shape} {place}"
+                )
 
 
 def check_state(name: str, state: Any) -> None:
