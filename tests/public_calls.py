@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, fields
@@ -19,7 +18,7 @@ import torch
 from short_tasks import SHEET, write_config
 
 import diffcloth_torch as dc
-from diffcloth_torch.optimize import residuals, rgbench
+from diffcloth_torch.optimize import residuals
 
 F64 = torch.float64
 HOMES = {
@@ -29,7 +28,6 @@ HOMES = {
     "learn.": dc.learn,
     "robots.": dc.robots,
     "residuals.": residuals,
-    "rgbench.": rgbench,
 }
 # What is left out, and why.
 WITHOUT_CALL = {
@@ -253,28 +251,6 @@ class World:
     @cached_property
     def fit(self):
         return self.fitting()
-
-    @cached_property
-    def recording(self):
-        """A capture of one frame of two points, of arms that stand still."""
-        root = self.folder / "recording"
-        for name in ("calibration", "joints", "segment_pcds"):
-            (root / name).mkdir(parents=True, exist_ok=True)
-        camera = np.eye(4).tolist()
-        (root / "calibration/world_to_camera_transform.json").write_text(json.dumps(camera))
-        for arm in rgbench.BASES:
-            rows = [f"{time},0.1,0.2,0.3" for time in (0.0, 0.5, 1.0)]
-            file = root / f"joints/{arm}_arm_joint_states_and_end_pose.csv"
-            file.write_text("\n".join(["time,pos_x,pos_y,pos_z", *rows]) + "\n")
-        (root / "segment_pcds/pointcloud_0.500000_segmented.pcd").write_text(
-            "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\n"
-            "WIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n0.1 0.2 0.3\n0.2 0.2 0.3\n"
-        )
-        return root
-
-    @cached_property
-    def capture(self):
-        return rgbench.read_capture(self.recording)
 
     @cached_property
     def mesh(self):
@@ -515,15 +491,6 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "residuals.point_cloud": lambda w: call(
         residuals.point_cloud, w.states, [np.zeros((2, 3))] * 3, noise=0.1
     ),
-    "rgbench.Capture": lambda w: record(rgbench.Capture, w.capture),
-    "rgbench.Capture.between": lambda w: call(w.capture.between, -1.0, 1.0),
-    "rgbench.Capture.grippers": lambda w: call(w.capture.grippers, 0.1),
-    "rgbench.Capture.steps": lambda w: call(w.capture.steps, 0.01),
-    "rgbench.chamfer": lambda w: call(rgbench.chamfer, w.states, [np.zeros((2, 3))] * 3),
-    "rgbench.nearest_vertices": lambda w: call(
-        rgbench.nearest_vertices, w.start.positions, {"left": [0.0, 0.0, 0.6]}
-    ),
-    "rgbench.read_capture": lambda w: call(rgbench.read_capture, w.recording),
 }
 CORNERS = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
 FACES = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]

@@ -152,7 +152,6 @@ WITHOUT_REFUSAL = {
     "fabrics.Measurement",
     "learn.Jobs",
     "learn.Trainer.update",
-    "rgbench.Capture",
     "robots.panda",
 }
 # Where neither the name nor that of the class opens a message.

@@ -6,11 +6,12 @@ import json
 
 import numpy as np
 import pytest
+import rgbench
 import torch
+from click.testing import CliRunner
 
 import diffcloth_torch as dc
 from diffcloth_torch.geometry.rotation import quaternion_matrix
-from diffcloth_torch.optimize import rgbench
 
 BEGIN = 1.7e9 + 0.25  # [s], as stamps of a recording have
 DT, DELAY = 0.02, 0.06
@@ -116,6 +117,13 @@ def test_a_capture_is_in_world_axes_and_on_the_clock_of_the_arms(recorded):
     assert rgbench.nearest_vertices(start, capture.grippers(0.0)) == {"left": 48, "right": 42}
     window = capture.between(0.15, 0.35)
     assert [len(window.clouds), *window.steps(DT)] == [2, 10, 15]
+
+
+def test_the_program_prints_a_line_for_each_frame(recorded):
+    result = CliRunner().invoke(rgbench.main, [str(recorded), "--delay", str(DELAY)])
+    lines = result.output.splitlines()
+    assert len(lines) == 4, result.output
+    assert lines[0].startswith("0.100 s: 28 points, grippers left [")
 
 
 def test_chamfer_is_that_of_all_pairs_from_real_to_simulated(recorded):

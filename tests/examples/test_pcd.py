@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pcd import read_pcd
 
 import diffcloth_torch as dc
-from diffcloth_torch.geometry.pcd import read_pcd
 
 POINTS = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
 

@@ -1,5 +1,7 @@
 """Captures of real garments in the format of RGBench, to fit to them or to be measured by them.
 
+    python examples/rgbench.py green_tshirt/green_tshirt_grasp_2025-07-19-19-14-58
+
 RGBench records garments that two robot arms fling, fold or grasp, as point clouds of a camera. A
 folder of its data set `RGBench-Cloth-Sim2Real-v1` holds, for each capture,
 
@@ -8,8 +10,8 @@ folder of its data set `RGBench-Cloth-Sim2Real-v1` holds, for each capture,
     segment_pcds/pointcloud_<time>_segmented.pcd            points of the garment, in camera axes
 
 In its protocol "fixed point" a vertex of the garment follows each gripper; the error of a frame is
-the mean distance of what was seen to the nearest simulated vertex. Times count from the first row
-of the arms; a camera is late by a delay of about one frame.
+the mean distance of the observed points to the nearest simulated vertex. Times count from the first
+row of the arms; a camera is late by a delay of about one frame.
 
 References:
     Hu et al., "Real Garment Benchmark (RGBench): a comprehensive benchmark for robotic garment
@@ -27,7 +29,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
+from pcd import read_pcd
 
 from diffcloth_torch.autograd.transforms import numbers_of
 from diffcloth_torch.checks import (
@@ -42,7 +46,6 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path, read_regular_file
-from diffcloth_torch.geometry.pcd import read_pcd
 from diffcloth_torch.optimize.compared import check_count_of, checked_points, positions_of
 from diffcloth_torch.sim.records.state import State
 
@@ -61,7 +64,7 @@ _NEARLY = 1e-3  # by which a rotation may be off: matrices are written with a fe
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """What was seen of a garment, in world axes, and how it was moved.
+    """Point clouds of a garment, in world axes, and the motion of the grippers.
 
     Attributes:
         times: Of the frames [s], from the first row of the arms, with the camera's delay: the times
@@ -177,7 +180,7 @@ def nearest_vertices(positions: object, grippers: Mapping[str, object]) -> dict[
 
 
 def chamfer(states: Sequence[State], clouds: Sequence[object], *, norm: int = 1) -> list[float]:
-    """Mean distance [m] of what was seen in each frame to the nearest simulated vertex.
+    """Mean distance [m] of the observed points of each frame to the nearest simulated vertex.
 
     One-sided, from real to simulated. The benchmark reports it with the norm 1, the sum of the
     absolute differences of the coordinates. For a fit, `dc.residuals.point_cloud` has residuals.
@@ -270,3 +273,18 @@ def _read_clouds(
             times.append(time)
             clouds.append(points @ world_from_camera[:3, :3].T + world_from_camera[:3, 3])
     return times, clouds
+
+
+@click.command()
+@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option("--delay", default=0.0, help="By how much the camera is late [s].")
+def main(folder: Path, delay: float) -> None:
+    """Read a capture and print its frames, with the positions of the grippers."""
+    capture = read_capture(folder, delay=delay)
+    for time, cloud in zip(capture.times, capture.clouds, strict=True):
+        places = [f"{n} {np.round(p, 3).tolist()}" for n, p in capture.grippers(time).items()]
+        print(f"{time:.3f} s: {len(cloud)} points, grippers {', '.join(places)}")
+
+
+if __name__ == "__main__":
+    main()
