@@ -15,7 +15,8 @@ from short_tasks import CONFIGS, DYNAMIC, controls_of
 
 import diffcloth_torch as dc
 from diffcloth_torch.cli import main
-from diffcloth_torch.commands import optimize, run
+from diffcloth_torch.cli.optimize import optimize
+from diffcloth_torch.cli.run import run
 from diffcloth_torch.viewers.browser import Browser
 from diffcloth_torch.viewers.fitted import FittedPage, Track
 from diffcloth_torch.viewers.layers import colors, strain

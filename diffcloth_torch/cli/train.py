@@ -14,18 +14,23 @@ from typing import Any
 from tqdm import tqdm
 
 from diffcloth_torch import envs
-from diffcloth_torch.commands import check_folder
+from diffcloth_torch.cli.results import (
+    check_folder,
+    read_resume,
+    replace_file,
+    resumed_from,
+    write_metrics,
+    write_resume,
+)
 from diffcloth_torch.config.documents import read_document, set_values
 from diffcloth_torch.config.train_schema import TrainConfig, TryoutSection, WorkersSection
 from diffcloth_torch.config.validation import validate
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.learn.options import TrainerOptions
 from diffcloth_torch.learn.trainer import Trainer
 from diffcloth_torch.learn.workers import Processes, Ranks, RayActors
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.records.state import State
-from diffcloth_torch.tasks.statistics import replace_file, write_metrics
 from diffcloth_torch.viewers.look import Camera, Pictures
 from diffcloth_torch.viewers.record import Record
 from diffcloth_torch.viewers.show import show
@@ -33,9 +38,8 @@ from diffcloth_torch.viewers.show import show
 __all__ = ["resume_training", "train"]
 
 # Files in a folder of results; TensorBoard reads those of a folder.
-_RESULT, _RESUME, _POLICY, _EVENTS = "train.json", "resume.json", "policy.pt", "events"
+_RESULT, _POLICY, _EVENTS = "train.json", "policy.pt", "events"
 _VIDEO = "evaluation"
-_LARGEST = 1 << 20  # bytes of a configuration
 _NOT_THERE = ("num_envs", "seed", "autoreset_mode")  # what a trainer decides
 
 
@@ -48,16 +52,7 @@ def train(
 ) -> str:
     """Train the policy of a configuration.
 
-    Args:
-        config: YAML file.
-        assignments: "key=value" each, see `set_values`.
-        out: Folder for the results; by default results/ and the name of `config`.
-        overwrite: Whether to replace existing results.
-
-    Raises:
-        InvalidInput: If an argument or the configuration is not accepted.
-        SimulationError: If a gradient is not finite.
-        KeyboardInterrupt: If the user ends the training; the message says how to go on.
+    Arguments and errors are those of `run`.
     """
     section = _check(set_values(read_document(config), assignments), config)
     job = _Job(section, config)
@@ -65,11 +60,11 @@ def train(
     if job.writes:
         check_folder(config, out, overwrite)
         out.mkdir(parents=True, exist_ok=True)
-        for file in (out / _RESULT, out / _RESUME, out / _POLICY, *out.glob(f"{_VIDEO}.*")):
+        for file in (out / _RESULT, out / _POLICY, *out.glob(f"{_VIDEO}.*")):
             file.unlink(missing_ok=True)
         if (out / _EVENTS).is_dir():
             shutil.rmtree(out / _EVENTS)
-        job.write_resume(out)
+        job.keep_configuration(out)
     return job.run(out, [])
 
 
@@ -82,19 +77,13 @@ def resume_training(folder: Path) -> str:
     Raises:
         InvalidInput: If the folder has no such results.
     """
-    file = folder / _RESUME
-    if not file.is_file():
-        raise InvalidInput(f"--resume: {folder} must hold what `diffcloth train` wrote: no {file}")
-    try:
-        saved = json.loads(read_regular_file(file, _LARGEST))
-        document, source = saved["config"], Path(saved["source"])
-        history: list[dict[str, Any]] = []
-        tried: list[dict[str, Any]] = []
-        if (folder / _RESULT).is_file():
-            result = json.loads((folder / _RESULT).read_text())
+    document, source = read_resume(folder, "train")
+    history: list[dict[str, Any]] = []
+    tried: list[dict[str, Any]] = []
+    if (folder / _RESULT).is_file():
+        with resumed_from(folder, _RESULT, "train") as file:
+            result = json.loads(file.read_text())
             history, tried = result["evaluations"], result.get("tried", [])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InvalidInput(f"--resume: {file} is not what `diffcloth train` wrote") from error
     job = _Job(_check(document, source), source, tried)
     if (folder / _POLICY).is_file():
         job.trainer.load(folder / _POLICY)
@@ -139,10 +128,9 @@ class _Job:
             threads=section.workers.threads,
         )
 
-    def write_resume(self, out: Path) -> None:
-        """Write what `--resume` begins with."""
-        document = self.section.model_dump(mode="json", exclude_unset=True)
-        write_metrics(out / _RESUME, {"config": document, "source": str(self._source)})
+    def keep_configuration(self, out: Path) -> None:
+        """Write the configuration that `--resume` begins with."""
+        write_resume(out, self.section.model_dump(mode="json", exclude_unset=True), self._source)
 
     def run(self, out: Path, evaluations: list[dict[str, Any]]) -> str:
         """Learn until the end, and write what was found."""
@@ -199,7 +187,7 @@ class _Job:
         self.section = self.section.model_copy(update={"trainer": trained, "tryout": None})
         if self.writes:
             # What is resumed must be a training with this seed before there is its policy.
-            self.write_resume(out)
+            self.keep_configuration(out)
             self._write(out, evaluations)
         return states, evaluations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from contextlib import nullcontext
 from pathlib import Path
@@ -11,23 +10,24 @@ from typing import Any
 from torch import Tensor
 from tqdm import tqdm
 
-from diffcloth_torch.commands import check_folder
-from diffcloth_torch.config.documents import Document, set_values
+from diffcloth_torch.cli.results import (
+    check_folder,
+    read_resume,
+    write_metrics,
+    write_resume,
+)
 from diffcloth_torch.config.viewers import ANIMATION, open_fitted
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.optimize.fit import Fit, Trial, fit
 from diffcloth_torch.optimize.statistics import finite_or_none
 from diffcloth_torch.tasks.identify import Identify
 from diffcloth_torch.tasks.registry import check_document, load_task, make_task
-from diffcloth_torch.tasks.statistics import write_metrics
 from diffcloth_torch.viewers.fitted import FittedPage
 
 __all__ = ["fit_configuration", "resume_fit"]
 
 # Files in a folder of results. Evaluations lie in a folder, one file for each start.
-_RESULT, _PAGE, _RESUME, _EVALUATIONS = "fit.json", "fit.html", "resume.json", "evaluations"
-_LARGEST = 1 << 20  # bytes of a configuration
+_RESULT, _PAGE, _EVALUATIONS = "fit.json", "fit.html", "evaluations"
 
 
 def fit_configuration(
@@ -39,16 +39,7 @@ def fit_configuration(
 ) -> str:
     """Fit the variables of a configuration to its observations.
 
-    Args:
-        config: YAML file.
-        assignments: "key=value" each, see `set_values`.
-        out: Folder for the results; by default results/ and the name of `config`.
-        overwrite: Whether to replace existing results.
-
-    Raises:
-        InvalidInput: If an argument or the configuration is not accepted.
-        SimulationError: If the simulation fails at the first values of every start.
-        KeyboardInterrupt: If the user ends the fit; the message says how to go on.
+    Arguments and errors are those of `run`.
     """
     task = load_task(config, assignments)
     if not isinstance(task, Identify):
@@ -57,12 +48,11 @@ def fit_configuration(
         )
     out = check_folder(config, out, overwrite)
     out.mkdir(parents=True, exist_ok=True)
-    for name in (_RESULT, _PAGE, _RESUME, ANIMATION):
+    for name in (_RESULT, _PAGE, ANIMATION):
         (out / name).unlink(missing_ok=True)
     for file in (out / _EVALUATIONS).glob("start_*.pt"):
         file.unlink()
-    document = task.config.model_dump(mode="json", exclude_unset=True)
-    write_metrics(out / _RESUME, {"config": document, "source": str(config.resolve())})
+    write_resume(out, task.config.model_dump(mode="json", exclude_unset=True), config)
     return _run(task, out)
 
 
@@ -75,16 +65,8 @@ def resume_fit(folder: Path) -> str:
     Raises:
         InvalidInput: If the folder has no such results.
     """
-    file = folder / _RESUME
-    if not file.is_file():
-        raise InvalidInput(f"--resume: {folder} must hold what `diffcloth fit` wrote: no {file}")
-    try:
-        saved = json.loads(read_regular_file(file, _LARGEST))
-        document: Document = saved["config"]
-        source = Path(saved["source"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InvalidInput(f"--resume: {file} is not what `diffcloth fit` wrote") from error
-    task = make_task(check_document(set_values(document, ()), source), source)
+    document, source = read_resume(folder, "fit")
+    task = make_task(check_document(document, source), source)
     assert isinstance(task, Identify)
     return _run(task, folder)
 

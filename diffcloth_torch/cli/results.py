@@ -1,0 +1,222 @@
+"""Folders of results: checks before the work, files of actions, files to resume from, metrics."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.files import read_regular_file
+from diffcloth_torch.model.quantities import PARAMETERS
+from diffcloth_torch.optimize.statistics import finite_or_none, reports_of
+from diffcloth_torch.sim.records.state import State
+from diffcloth_torch.tasks.optimization import Actions
+from diffcloth_torch.tasks.task import Task
+
+__all__ = [
+    "METRICS",
+    "RESUME",
+    "check_folder",
+    "check_places",
+    "clear",
+    "read_actions",
+    "read_resume",
+    "replace_file",
+    "resumed_from",
+    "step_records",
+    "values_used",
+    "write_metrics",
+    "write_resume",
+]
+
+# Files in a folder of results, and folders, which are cleared by the viewers that write into them.
+METRICS, RESUME = "metrics.json", "resume.pt"
+_FILES = (
+    *(METRICS, RESUME, "actions.pt", "actions.npz", "loss.png"),
+    *("animation.mp4", "animation.gif", "animation.png", "animation.html"),
+    *("metrics.part", "resume.part"),
+)
+_FOLDERS = ("meshes", "animation_frames")
+
+_RESUME_JSON = "resume.json"  # of fits and trainings
+_LARGEST_JSON = 1 << 20  # bytes of a configuration
+_LARGEST_ACTIONS = 256 << 20  # bytes of a file: no run of this code writes a tenth
+
+
+def check_folder(config: Path, out: Path | None, overwrite: bool) -> Path:
+    """Name the folder for results, and refuse one that holds others unless `overwrite`."""
+    folder = Path("results") / config.stem if out is None else out
+    if folder.is_dir() and any(folder.iterdir()) and not overwrite:
+        going_on = f", `optimize --resume {folder}` goes on" if (folder / RESUME).exists() else ""
+        raise InvalidInput(
+            f"--out: {folder} holds results already: --overwrite replaces them{going_on}, and "
+            "--out names another folder"
+        )
+    check_places(folder)
+    return folder
+
+
+def check_places(folder: Path) -> None:
+    """Refuse, before the work, anything in the way of its results."""
+    for name in _FILES:
+        if (folder / name).is_dir():
+            raise InvalidInput(
+                f"{folder / name} is a folder, in the place of a file of results: move it away"
+            )
+    for name in _FOLDERS:
+        if (folder / name).exists() and not (folder / name).is_dir():
+            raise InvalidInput(
+                f"{folder / name} must be a folder, as results are written into it: move it away"
+            )
+
+
+def clear(folder: Path) -> None:
+    """Make the folder for results, without the files of an earlier run or optimization."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in _FILES:
+        (folder / name).unlink(missing_ok=True)
+
+
+def read_actions(task: Task, file: Path | None) -> Actions:
+    """The initial actions of a task, or those in a file."""
+    actions = task.actions()
+    if file is None:
+        return actions
+    if not actions:
+        raise InvalidInput(f"--actions: the task {task.config.task!r} has no actions")
+    content = BytesIO(read_regular_file(file, _LARGEST_ACTIONS))
+    wanted = {name: list(tensor.shape) for name, tensor in actions.items()}
+    given: dict[str, NDArray[Any]] = {}
+    try:
+        claims = _claims(content)
+        got = {name: shape for name, (shape, _) in claims.items()}
+        exact = all(dtype == np.float64 for _, dtype in claims.values())
+        if got == wanted and exact:
+            content.seek(0)
+            with np.load(content, allow_pickle=False) as arrays:
+                given = {name: arrays[name] for name in wanted}
+    except MemoryError:
+        raise
+    except Exception as error:  # whatever zipfile and NumPy raise for other bytes
+        raise InvalidInput(f"--actions: {file} is not an `actions.npz` of a run") from error
+    if got != wanted:
+        raise InvalidInput(f"--actions: {file} must hold {_shapes(wanted)}, got {_shapes(got)}")
+    if not exact or not all(np.isfinite(array).all() for array in given.values()):
+        raise InvalidInput(f"--actions: the arrays of {file} must be finite and float64")
+    return {name: torch.from_numpy(given[name]).requires_grad_() for name in actions}
+
+
+def _claims(file: BytesIO) -> dict[str, tuple[list[int], np.dtype[Any]]]:
+    """Shapes and types that the headers of an .npz claim, without reading its numbers."""
+    claims = {}
+    with zipfile.ZipFile(file) as entries:
+        for entry in entries.namelist():
+            with entries.open(entry) as array:
+                major, _ = npy.read_magic(array)
+                read = npy.read_array_header_1_0 if major == 1 else npy.read_array_header_2_0
+                shape, _, dtype = read(array)
+                claims[entry.removesuffix(".npy")] = (list(shape), dtype)
+    return claims
+
+
+def _shapes(shapes: dict[str, list[int]]) -> str:
+    return ", ".join(f"{name} {shape}" for name, shape in shapes.items()) or "nothing"
+
+
+@contextmanager
+def resumed_from(folder: Path, name: str, command: str) -> Iterator[Path]:
+    """Yield the file that `diffcloth command --resume` reads, and name it in what goes wrong.
+
+    Raises:
+        InvalidInput: If there is no such file, or the block fails to read its content.
+    """
+    file = folder / name
+    if not file.is_file():
+        raise InvalidInput(
+            f"--resume: {folder} must hold what `diffcloth {command}` wrote: no {file}"
+        )
+    try:
+        yield file
+    except (OSError, MemoryError):
+        raise
+    except Exception as error:  # any that parsers and unpicklers raise for other bytes
+        raise InvalidInput(f"--resume: {file} is not what `diffcloth {command}` wrote") from error
+
+
+def write_resume(folder: Path, document: dict[str, Any], source: Path) -> None:
+    """Write the configuration, and the file that it was read from, for `read_resume`."""
+    write_metrics(folder / _RESUME_JSON, {"config": document, "source": str(source.resolve())})
+
+
+def read_resume(folder: Path, command: str) -> tuple[dict[str, Any], Path]:
+    """Read the configuration of a fit or a training, and the file that it was read from."""
+    with resumed_from(folder, _RESUME_JSON, command) as file:
+        saved = json.loads(read_regular_file(file, _LARGEST_JSON))
+        return dict(saved["config"]), Path(saved["source"])
+
+
+def write_metrics(path: Path, metrics: dict[str, Any]) -> None:
+    """Write numbers as JSON; the file is replaced completely or not at all."""
+    text = json.dumps(metrics, indent=2, allow_nan=False) + "\n"
+    with replace_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def replace_file(path: Path) -> Iterator[Path]:
+    """Yield a path to write to, which replaces `path` when all is written."""
+    part = path.with_suffix(".part")
+    yield part
+    part.replace(path)
+
+
+def step_records(states: Sequence[State]) -> list[dict[str, Any]]:
+    """One record for each step that led to the given states."""
+    return [
+        {
+            "time": float(state.time),
+            "converged": bool(report.converged),
+            "iterations": int(report.iterations),
+            "residual": float(report.residual),
+            "minimum_distance": finite_or_none(float(report.minimum_distance)),
+            "contact_count": int(report.contact_count),
+            "motion_fraction": float(report.motion_fraction),
+            "seconds": sum(float(value) for value in report.seconds.values()),
+        }
+        for state, report in zip(states, reports_of(states), strict=True)
+    ]
+
+
+def values_used(task: Task) -> dict[str, Any]:
+    """The configuration, and the values that it leaves at their defaults.
+
+    `used` has the options of contact and solver, the bending model of each cloth, and all
+    parameters except the rest positions, which are those of the mesh.
+    """
+    simulator = task.simulator
+    parameters = simulator.parameters()
+    values = {name: getattr(parameters, name) for name in PARAMETERS if name != "rest_positions"}
+    given = {name: value.tolist() for name, value in values.items() if value is not None}
+    chosen = {name: given.get(name) for name in ("barrier_distance", "barrier_stiffness")}
+    return {
+        "config": task.config.model_dump(mode="json"),
+        "used": {
+            "contact": vars(simulator.contact) | chosen,
+            "solver": dict(vars(simulator.solver)),
+            "bending_models": {
+                name: cloth.bending_model
+                for name, cloth in zip(task.scene.cloth_names, task.scene.cloths, strict=True)
+            },
+            "parameters": given,
+        },
+    }

@@ -1,0 +1,93 @@
+"""The command `diffcloth run`: simulate a configuration without optimizing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from diffcloth_torch.cli.results import (
+    METRICS,
+    check_folder,
+    clear,
+    read_actions,
+    step_records,
+    values_used,
+    write_metrics,
+)
+from diffcloth_torch.config.viewers import open_viewers
+from diffcloth_torch.errors import SimulationError
+from diffcloth_torch.optimize.statistics import rollout_statistics
+from diffcloth_torch.sim.records.state import State
+from diffcloth_torch.tasks.registry import load_task
+from diffcloth_torch.tasks.simulation import simulate
+from diffcloth_torch.tasks.task import Task
+
+__all__ = ["run"]
+
+
+def run(
+    config: Path,
+    assignments: Iterable[str] = (),
+    out: Path | None = None,
+    *,
+    overwrite: bool = False,
+    actions: Path | None = None,
+) -> str:
+    """Simulate a configuration without optimizing.
+
+    Args:
+        config: YAML file.
+        assignments: "key=value" each, see `set_values`.
+        out: Folder for the results; by default results/ and the name of `config`.
+        overwrite: Whether to replace existing results.
+        actions: File `actions.npz` of a run whose actions are used instead of the initial ones.
+
+    Raises:
+        InvalidInput: If an argument or the configuration is not accepted.
+        SimulationError: If a step fails; earlier results are kept.
+        KeyboardInterrupt: If the user ends the run; the message says what is kept.
+    """
+    out = check_folder(config, out, overwrite)
+    task = load_task(config, assignments)
+    start_actions = read_actions(task, actions)
+    states: list[State] = []
+    start = time.perf_counter()
+    try:
+        clear(out)
+        with open_viewers(task.config, task.scene, out, task.goals()) as viewers:
+            for state in simulate(task, start_actions):
+                viewers.show(state)
+                states.append(state)
+            seconds = time.perf_counter() - start
+    except SimulationError as error:
+        after = _after(states)
+        _write_run(task, states[1:], out, time.perf_counter() - start, str(error))
+        raise type(error)(f"{config}: {error} ({after})", report=error.report) from error
+    except KeyboardInterrupt as error:
+        after = _after(states)
+        _write_run(task, states[1:], out, time.perf_counter() - start, f"interrupted {after}")
+        raise KeyboardInterrupt(
+            f"{after} of {task.steps}: {out / METRICS} has the steps so far; the same command "
+            "with --overwrite starts again"
+        ) from error
+    _write_run(task, states[1:], out, seconds)
+    return f"{len(states) - 1} steps in {seconds:.1f} s; results are in {out}"
+
+
+def _after(states: Sequence[State]) -> str:
+    return f"after step {len(states) - 1}" if states else "after the start"
+
+
+def _write_run(
+    task: Task, states: Sequence[State], out: Path, seconds: float, error: str | None = None
+) -> None:
+    metrics = {
+        "task": task.config.task,
+        "seconds": seconds,
+        "error": error,
+        **rollout_statistics(states),
+        "per_step": step_records(states),
+        **values_used(task),
+    }
+    write_metrics(out / METRICS, metrics)
