@@ -18,6 +18,7 @@ from diffcloth_torch.cli.results import (
 )
 from diffcloth_torch.config.viewers import ANIMATION, open_fitted
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.extras import from_extra
 from diffcloth_torch.optimize.fit import Fit, Trial, fit
 from diffcloth_torch.optimize.statistics import finite_or_none
 from diffcloth_torch.tasks.identify import Identify
@@ -72,6 +73,8 @@ def resume_fit(folder: Path) -> str:
 
 
 def _run(task: Identify, out: Path) -> str:
+    # Before the long computation, because a package may be missing.
+    from_extra("matplotlib", "fit", "the page of a fit needs Matplotlib")
     page = open_fitted(task.config, task.observed.scenes(), out)
     with page or nullcontext(), _Progress(task, page) as bar:
         try:

@@ -215,7 +215,7 @@ def info() -> str:
 
     import torch
 
-    from diffcloth_torch import build_info
+    from diffcloth_torch import _core
     from diffcloth_torch.tasks.registry import TASKS
 
     def installed(package: str) -> str:
@@ -232,6 +232,6 @@ def info() -> str:
         "torch threads": torch.get_num_threads(),
         "tasks": ", ".join(TASKS),
     }
-    rows |= {f"core: {name}": value for name, value in build_info().items()}
+    rows |= {f"core: {name}": value for name, value in _core.build_info().items()}
     width = max(map(len, rows))
     return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())

@@ -32,7 +32,7 @@ from diffcloth_torch.tasks.optimization import Actions, position_gradients
 from diffcloth_torch.tasks.optimization import optimize as run_optimization
 from diffcloth_torch.tasks.registry import TASKS, check_document, load_task, make_task
 from diffcloth_torch.tasks.task import Optimizable, Task
-from diffcloth_torch.viewers.curves import draw_loss_curve
+from diffcloth_torch.viewers.curves import draw_loss_curve, require_matplotlib
 
 __all__ = ["optimize", "resume"]
 
@@ -100,6 +100,7 @@ def _optimize(
     task: Optimizable, source: Path, out: Path, start: Actions, found: Descent | None
 ) -> str:
     # Before the long computation, because a package may be missing.
+    require_matplotlib()
     viewers = open_viewers(task.config, task.scene, out, task.goals())
 
     # After every iteration, so that an interruption loses only the current one.

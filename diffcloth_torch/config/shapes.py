@@ -7,6 +7,8 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from diffcloth_torch.extras import from_extra
+
 __all__ = ["chair", "disk"]
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
@@ -80,9 +82,8 @@ def _disturbed_lattice(radius: float, edge_length: float) -> NDArray[np.float64]
 
 def _triangulate(points: NDArray[np.float64]) -> NDArray[np.int64]:
     """Delaunay triangulation, counterclockwise."""
-    from matplotlib.tri import Triangulation
-
-    faces = np.array(Triangulation(points[:, 0], points[:, 1]).triangles, dtype=np.int64)
+    tri = from_extra("matplotlib.tri", "viewer", "disk: its triangulation needs Matplotlib")
+    faces = np.array(tri.Triangulation(points[:, 0], points[:, 1]).triangles, dtype=np.int64)
     a, b, c = (points[faces[:, k]] for k in range(3))
     area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     faces[area < 0] = faces[area < 0][:, ::-1]

@@ -17,6 +17,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from diffcloth_torch.checks import NON_NEGATIVE, check_count, check_number
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.extras import from_extra
 
 __all__ = ["Jobs", "Processes", "Ranks", "RayActors", "Workers"]
 
@@ -129,12 +130,7 @@ class RayActors:
         """
         check_count("RayActors: `count`", count, 1)
         check_number("RayActors: `cores`", cores, NON_NEGATIVE)
-        try:
-            import ray
-        except ModuleNotFoundError as error:
-            raise InvalidInput(
-                "RayActors needs ray: run  pip install 'diffcloth-torch[ray]'"
-            ) from error
+        ray = from_extra("ray", "ray", "RayActors needs ray")
         if not ray.is_initialized():
             # As many as they occupy, or they would wait for cores for ever.
             cpus = max(math.ceil(count * cores), 1)

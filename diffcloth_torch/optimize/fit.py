@@ -28,6 +28,7 @@ from diffcloth_torch.checks import (
     refuse_threads,
 )
 from diffcloth_torch.errors import InvalidInput, warn_caller
+from diffcloth_torch.extras import from_extra
 from diffcloth_torch.files import as_path
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.fit_page import Page, write_page
@@ -189,7 +190,7 @@ def fit(
         SimulationError: If the simulation fails at the first values of every start.
         TypeError: If `residuals` returns something else than tensors.
     """
-    _require_scipy()
+    from_extra("scipy", "fit", "fit: it needs SciPy")
     check_count("fit: `starts`", starts, 1)
     check_count("fit: `seed`", seed, 0)
     refuse_threads("fit: `workers`", workers)
@@ -356,12 +357,3 @@ def _warn_of_bounds(
                 f"fit: {', '.join(here)} ended a factor of 1000 from where it began, and goes no "
                 "further without `bounds`; give them, or a better first value",
             )
-
-
-def _require_scipy() -> None:
-    try:
-        import scipy  # noqa: F401
-    except ImportError as error:
-        raise InvalidInput(
-            f"fit: it needs SciPy: run  pip install 'diffcloth-torch[fit]'  ({error})"
-        ) from error

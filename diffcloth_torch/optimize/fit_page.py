@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.extras import from_extra
 from diffcloth_torch.optimize.compared import Comparison, noting
 from diffcloth_torch.optimize.problem import Residuals, Trial, trajectories
 from diffcloth_torch.optimize.starts import Start
@@ -207,6 +208,7 @@ def _costs(figure: Any, page: Page) -> None:
 
 
 def _image(draw: Callable[[Any], None], size: tuple[float, float], name: str) -> str:
+    from_extra("matplotlib", "fit", "the page of a fit needs Matplotlib")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -7,9 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["draw_loss_curve"]
+from diffcloth_torch.extras import from_extra
+
+__all__ = ["draw_loss_curve", "require_matplotlib"]
 
 _COLOR, _BEST_COLOR = "#2a6f97", "#c8553d"
+
+
+def require_matplotlib() -> None:
+    """Test whether curves can be drawn.
+
+    Raises:
+        InvalidInput: If Matplotlib is not installed; the message names the extra.
+    """
+    from_extra("matplotlib", "viewer", "curves need Matplotlib")
 
 
 def draw_loss_curve(path: Path, losses: Sequence[float], *, label: str = "loss") -> None:
@@ -20,6 +31,7 @@ def draw_loss_curve(path: Path, losses: Sequence[float], *, label: str = "loss")
         losses: Loss of each iteration.
         label: Text at the vertical axis.
     """
+    require_matplotlib()
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from diffcloth_torch.extras import from_extra
 from diffcloth_torch.viewers.floor import BACKGROUND
 
 if TYPE_CHECKING:
@@ -198,7 +199,7 @@ def _font(size: float) -> Any:
 
 @lru_cache(maxsize=16)
 def _font_of_size(size: int) -> Any:
-    import matplotlib
+    matplotlib = from_extra("matplotlib", "viewer", "labels of pictures need Matplotlib's font")
     from PIL import ImageFont
 
     file = Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf"

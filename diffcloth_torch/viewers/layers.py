@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloth_torch.checks import FloatArray
+from diffcloth_torch.extras import from_extra
 from diffcloth_torch.model.cloth import Cloth
 
 __all__ = ["colors", "strain"]
@@ -50,9 +51,9 @@ def colors(values: FloatArray, largest: float) -> NDArray[np.uint8]:
 
     Colors of vertices in glTF files are linear, those of a color map are for the screen (sRGB).
     """
-    import matplotlib
-
+    matplotlib = from_extra("matplotlib", "viewer", "colors of a page need Matplotlib")
     scaled = values / largest if largest > 0 else np.zeros_like(values)
     on_screen = matplotlib.colormaps[_COLOR_MAP](scaled)
     linear = np.where(on_screen <= 0.04045, on_screen / 12.92, ((on_screen + 0.055) / 1.055) ** 2.4)
-    return np.round(255 * linear).astype(np.uint8)
+    bytes_of: NDArray[np.uint8] = np.round(255 * linear).astype(np.uint8)
+    return bytes_of

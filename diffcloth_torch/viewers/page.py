@@ -17,10 +17,11 @@ import numpy as np
 
 from diffcloth_torch.checks import check_count
 from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.extras import from_extra
 from diffcloth_torch.viewers.look import Camera
 from diffcloth_torch.viewers.motion import LAYERS, Motion
 
-__all__ = ["DEFAULT_CAMERA", "VECTORS", "Drawn", "Page", "require_viser"]
+__all__ = ["DEFAULT_CAMERA", "VECTORS", "Drawn", "Page"]
 
 P = TypeVar("P", bound="Page")
 
@@ -29,23 +30,9 @@ DEFAULT_CAMERA = Camera()
 VECTORS = ("forces", "gradient")
 """Arrows: contact forces on everything, and the gradient of a loss by the cloths' vertices."""
 
-_INSTALL = "pages of the browser need viser: run  pip install 'diffcloth-torch[viewer]'"
 _HEIGHT = 480  # pixels of a page inside a notebook
 _SHORTEST_WAIT = 0.01  # seconds between two moments of the page
 _SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
-
-
-def require_viser() -> Any:
-    """Import viser.
-
-    Raises:
-        InvalidInput: If it is not installed; the message says how to install it.
-    """
-    try:
-        import viser
-    except ImportError as error:
-        raise InvalidInput(f"{_INSTALL} ({error})") from error
-    return viser
 
 
 class Drawn(Protocol):
@@ -98,7 +85,7 @@ class Page(ABC):
         Raises:
             InvalidInput: If a package is missing, or an argument is not accepted.
         """
-        self._viser = require_viser()
+        self._viser = from_extra("viser", "viewer", "pages of the browser need viser")
         check_count("show: `port`", port, 0, 65535)
         if color not in LAYERS:
             raise InvalidInput(f"show: `color` must be one of {', '.join(LAYERS)}, got {color!r}")

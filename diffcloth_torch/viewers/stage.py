@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.extras import from_extra
 from diffcloth_torch.viewers.floor import BACKGROUND, Floor, Shadow
 from diffcloth_torch.viewers.look import FORCE_COLOR, GOAL_COLOR, Camera, Goal, Paint
 from diffcloth_torch.viewers.shown import Bounds
@@ -36,11 +36,6 @@ _BODY_SHINE = {"ambient": 0.4, "diffuse": 0.7, "specular": 0.25, "specular_power
 
 _SHORTEST_ARROW = 0.002  # fraction of the scene's size; shorter arrows are left out
 _CREASE_ANGLE = 35.0  # angle [degrees] between faces of a body above which an edge is drawn sharp
-
-_INSTALL = (
-    "pictures need pyvista: run  pip install 'diffcloth-torch[viewer]'  or leave them out with  "
-    "--set 'output.viewers=[meshes]'"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +60,12 @@ def require_pyvista() -> Any:
     if not os.environ.get("DISPLAY"):
         # Otherwise VTK tries an X server first, and prints a warning about it.
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
-    try:
-        import pyvista
-    except ImportError as error:
-        raise InvalidInput(f"{_INSTALL} ({error})") from error
-    return pyvista
+    return from_extra(
+        "pyvista",
+        "viewer",
+        "pictures need pyvista",
+        "  or leave them out with  --set 'output.viewers=[meshes]'",
+    )
 
 
 class _Surface:

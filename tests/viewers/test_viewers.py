@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import builtins
 import itertools
+import sys
 import typing
 
 import numpy as np
@@ -400,14 +400,7 @@ class TestRender:
 
 
 def test_a_missing_package_is_named_before_anything_runs(make_task, tmp_path, monkeypatch):
-    real = builtins.__import__
-
-    def without_pyvista(name, *args, **kwargs):
-        if name.partition(".")[0] == "pyvista":
-            raise ImportError("No module named 'pyvista'")
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without_pyvista)
+    monkeypatch.setitem(sys.modules, "pyvista", None)  # as if it were not installed
     with pytest.raises(dc.InvalidInput, match=r"pip install 'diffcloth-torch\[viewer\]'"):
         open_task(make_task(), tmp_path)
     open_task(make_task("output.viewers=[meshes]"), tmp_path)
