@@ -28,10 +28,10 @@ from diffcloth_torch.config.documents import set_values
 from diffcloth_torch.config.viewers import open_viewers
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.optimize.descent import Descent
-from diffcloth_torch.tasks.optimization import Actions, position_gradients
 from diffcloth_torch.tasks.optimization import optimize as run_optimization
+from diffcloth_torch.tasks.optimization import position_gradients
 from diffcloth_torch.tasks.registry import TASKS, check_document, load_task, make_task
-from diffcloth_torch.tasks.task import Optimizable, Task
+from diffcloth_torch.tasks.task import Actions, OptimizableTask
 from diffcloth_torch.viewers.curves import draw_loss_curve, require_matplotlib
 
 __all__ = ["optimize", "resume"]
@@ -54,8 +54,8 @@ def optimize(
     """
     out = check_folder(config, out, overwrite)
     task = load_task(config, assignments)
-    if not isinstance(task, Optimizable):
-        able = ", ".join(name for name, kind in TASKS.items() if hasattr(kind, "loss"))
+    if not isinstance(task, OptimizableTask):
+        able = ", ".join(name for name, kind in TASKS.items() if issubclass(kind, OptimizableTask))
         raise InvalidInput(
             f"{config}: the task {task.config.task!r} has nothing to optimize: use "
             f"`diffcloth run`; tasks that have are {able}"
@@ -92,12 +92,12 @@ def resume(folder: Path, assignments: Iterable[str] = ()) -> str:
                 f"got {assignment!r}"
             )
     task = make_task(check_document(set_values(document, assignments), source), source)
-    assert isinstance(task, Optimizable)
+    assert isinstance(task, OptimizableTask)
     return _optimize(task, source, folder, start, found)
 
 
 def _optimize(
-    task: Optimizable, source: Path, out: Path, start: Actions, found: Descent | None
+    task: OptimizableTask, source: Path, out: Path, start: Actions, found: Descent | None
 ) -> str:
     # Before the long computation, because a package may be missing.
     require_matplotlib()
@@ -135,7 +135,7 @@ def _optimize(
     )
 
 
-def _write_optimization(task: Task, found: Descent, out: Path) -> None:
+def _write_optimization(task: OptimizableTask, found: Descent, out: Path) -> None:
     metrics = {
         "task": task.config.task,
         **found.metrics(),
@@ -149,7 +149,7 @@ def _write_optimization(task: Task, found: Descent, out: Path) -> None:
 
 
 def _write_resume(
-    task: Task, source: Path, start: Actions, found: Descent | None, out: Path
+    task: OptimizableTask, source: Path, start: Actions, found: Descent | None, out: Path
 ) -> None:
     saved = {
         "config": task.config.model_dump(mode="json"),

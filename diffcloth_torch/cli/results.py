@@ -20,8 +20,7 @@ from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.statistics import finite_or_none, reports_of
 from diffcloth_torch.sim.records.state import State
-from diffcloth_torch.tasks.optimization import Actions
-from diffcloth_torch.tasks.task import Task
+from diffcloth_torch.tasks.task import Actions, ConfiguredTask
 
 __all__ = [
     "METRICS",
@@ -87,7 +86,7 @@ def clear(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def read_actions(task: Task, file: Path | None) -> Actions:
+def read_actions(task: ConfiguredTask, file: Path | None) -> Actions:
     """The initial actions of a task, or those in a file."""
     actions = task.actions()
     if file is None:
@@ -197,7 +196,7 @@ def step_records(states: Sequence[State]) -> list[dict[str, Any]]:
     ]
 
 
-def values_used(task: Task) -> dict[str, Any]:
+def values_used(task: ConfiguredTask) -> dict[str, Any]:
     """The configuration, and the values that it leaves at their defaults.
 
     `used` has the options of contact and solver, the bending model of each cloth, and all

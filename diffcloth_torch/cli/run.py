@@ -21,7 +21,7 @@ from diffcloth_torch.optimize.statistics import rollout_statistics
 from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.tasks.registry import load_task
 from diffcloth_torch.tasks.simulation import simulate
-from diffcloth_torch.tasks.task import Task
+from diffcloth_torch.tasks.task import ConfiguredTask
 
 __all__ = ["run"]
 
@@ -80,7 +80,11 @@ def _after(states: Sequence[State]) -> str:
 
 
 def _write_run(
-    task: Task, states: Sequence[State], out: Path, seconds: float, error: str | None = None
+    task: ConfiguredTask,
+    states: Sequence[State],
+    out: Path,
+    seconds: float,
+    error: str | None = None,
 ) -> None:
     metrics = {
         "task": task.config.task,

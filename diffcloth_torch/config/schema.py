@@ -20,6 +20,7 @@ from diffcloth_torch.viewers.look import Camera, Pictures
 __all__ = [
     "CameraSection",
     "ContactSection",
+    "OptimizerSection",
     "OutputSection",
     "PictureSection",
     "RunConfig",
@@ -108,6 +109,27 @@ class OutputSection(Section):
     viewers: list[Literal["record", "meshes", "web"]] = ["record", "meshes"]
     every: Annotated[int, Ge(1)] = 1
     pictures: PictureSection = PictureSection()
+
+
+class OptimizerSection(Section):
+    """Stochastic gradient descent.
+
+    `learning_rates` has one entry for each tensor of actions. `clip` limits the norm of the
+    gradient of each of them; by default nothing is clipped. With `restart`, momentum is reset to
+    zero whenever the loss has risen, so that it does not swing across a narrow valley. `failures`
+    is the number of successive attempts that may fail. `stop_below` ends the loop when the loss is
+    smaller.
+    """
+
+    iterations: Annotated[int, Ge(1)]
+    learning_rates: dict[str, Annotated[float, Gt(0)]]
+    momentum: Annotated[float, Ge(0), Lt(1)] = 0.0
+    nesterov: bool = False
+    restart: bool = False
+    clip: Positive | None = None
+    failures: Annotated[int, Ge(0)] = 6
+    checkpoint_every: Annotated[int, Ge(1)] | None = None
+    stop_below: Positive | None = None
 
 
 class RunConfig(Section):

@@ -29,7 +29,9 @@ from diffcloth_torch.sim.inputs.control_fields import check_control
 from diffcloth_torch.sim.inputs.layout import Layout
 from diffcloth_torch.sim.inputs.parameter_fields import check_parameters, default_fields
 from diffcloth_torch.sim.inputs.schemes import check_scheme
-from diffcloth_torch.sim.observables.observables import Observables
+from diffcloth_torch.sim.observables.observables import (
+    Observables,
+)
 from diffcloth_torch.sim.records.controls import Control, Parameters
 from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.records.trajectory import Trajectory

@@ -19,7 +19,7 @@ from diffcloth_torch import cpu
 from diffcloth_torch.config.schema import RunConfig
 from diffcloth_torch.config.section import Positive
 from diffcloth_torch.sim.records.state import State
-from diffcloth_torch.tasks.drape import Drape
+from diffcloth_torch.tasks.task import ConfiguredTask
 from diffcloth_torch.viewers.look import Goal, marker
 
 __all__ = ["ControlPoints", "ControlPointsConfig"]
@@ -40,7 +40,7 @@ class ControlPointsConfig(RunConfig):
         return self
 
 
-class ControlPoints(Drape):
+class ControlPoints(ConfiguredTask):
     """A scene, bodies and pins that follow keyframes, and the targets of its soft pins."""
 
     Config = ControlPointsConfig

@@ -31,7 +31,7 @@ from diffcloth_torch.tasks.reach import (
     rigid_motion,
 )
 
-__all__ = ["GraspCloth", "GraspClothConfig"]
+__all__ = ["GraspClothConfig", "GraspClothProblem"]
 
 _JOINTS = {"velocities": ("velocity",), "efforts": FORCED}
 """Key of the actions -> how its joints must be actuated."""
@@ -70,7 +70,7 @@ class GraspClothConfig(ShapeConfig):
         return self
 
 
-class GraspCloth(ReachShape):
+class GraspClothProblem(ReachShape):
     """A robot grasps a cloth and brings it into a target shape."""
 
     Config = GraspClothConfig

@@ -27,7 +27,7 @@ from diffcloth_torch.tasks.reach import (
     rigid_motion,
 )
 
-__all__ = ["HitCloth", "HitClothConfig"]
+__all__ = ["HitClothConfig", "HitClothProblem"]
 
 
 class BodyActionSection(RigidActionSection):
@@ -48,7 +48,7 @@ class HitClothConfig(ShapeConfig):
         return self
 
 
-class HitCloth(ReachShape):
+class HitClothProblem(ReachShape):
     """A body strikes a cloth into a target shape."""
 
     Config = HitClothConfig

@@ -30,7 +30,7 @@ from diffcloth_torch.optimize.outlines import silhouettes
 from diffcloth_torch.optimize.variables import Variable
 from diffcloth_torch.sim.records.controls import Parameters
 from diffcloth_torch.sim.records.state import State
-from diffcloth_torch.tasks.drape import Drape
+from diffcloth_torch.tasks.task import ConfiguredTask
 from diffcloth_torch.viewers.fitted import Track
 
 __all__ = ["Identify", "Observations"]
@@ -40,7 +40,7 @@ _LARGEST_OBSERVATION = 256 << 20  # bytes of a file: an hour of a camera with a 
 _SAME_POINT = 1e-6  # of the size of a mesh: vertices of two meshes are one material point
 
 
-class Identify(Drape):
+class Identify(ConfiguredTask):
     """A scene that moves as its configuration says, and observations to fit it to."""
 
     Config = FitConfig
@@ -84,7 +84,7 @@ class _Motion:
     A `velocity` is that of the real start: in free fall x(t) = v t + g t^2 / 2 at all steps.
     """
 
-    task: Drape
+    task: ConfiguredTask
     velocity: FloatArray | None
     steps: list[int] | None  # None: at equilibrium
 
@@ -199,7 +199,7 @@ def _motion(
     document = config.model_dump(mode="json", exclude_unset=True)
     del document["fit"]
     changed = validate(RunConfig, set_values(document, changes), source)
-    task = Drape(changed, source)
+    task = ConfiguredTask(changed, source)
     if len(task.scene.cloths) != 1:
         raise InvalidInput(
             f"{source}: `scene.cloths` must have one cloth to fit, got {len(task.scene.cloths)}"
@@ -250,7 +250,9 @@ def _synthesize(
     return outlines
 
 
-def _same_points(where: str, task: Drape, other: Drape, vertices: list[int]) -> list[int]:
+def _same_points(
+    where: str, task: ConfiguredTask, other: ConfiguredTask, vertices: list[int]
+) -> list[int]:
     """Vertices of another mesh at the material points of these, which are those at rest."""
     from scipy.spatial import cKDTree
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Annotated, Protocol
 
 import torch
-from annotated_types import Ge, Gt, Lt
 from torch import Tensor
 
-from diffcloth_torch.config.section import Positive, Section
+from diffcloth_torch.config.schema import OptimizerSection
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.optimize.descent import Descent, descend
 from diffcloth_torch.optimize.evaluation import Evaluation, Simulate, Variables
@@ -18,59 +16,13 @@ from diffcloth_torch.optimize.evaluation import evaluate as evaluate_variables
 from diffcloth_torch.optimize.progress import Progress
 from diffcloth_torch.sim.records.controls import Control
 from diffcloth_torch.sim.records.state import State
-from diffcloth_torch.sim.simulator import Simulator
+from diffcloth_torch.tasks.task import Actions, OptimizableTask
 
-__all__ = [
-    "Actions",
-    "Controller",
-    "OptimizerSection",
-    "evaluate",
-    "optimize",
-    "position_gradients",
-]
-
-Actions = dict[str, Tensor]
-Controller = Callable[[int, State], Control]
-"""From the index of a step and the state before it to its control."""
-
-
-class OptimizerSection(Section):
-    """Stochastic gradient descent.
-
-    `learning_rates` has one entry for each tensor of actions. `clip` limits the norm of the
-    gradient of each of them; by default nothing is clipped. With `restart`, momentum is reset to
-    zero whenever the loss has risen, so that it does not swing across a narrow valley. `failures`
-    is the number of successive attempts that may fail. `stop_below` ends the loop when the loss is
-    smaller.
-    """
-
-    iterations: Annotated[int, Ge(1)]
-    learning_rates: dict[str, Annotated[float, Gt(0)]]
-    momentum: Annotated[float, Ge(0), Lt(1)] = 0.0
-    nesterov: bool = False
-    restart: bool = False
-    clip: Positive | None = None
-    failures: Annotated[int, Ge(0)] = 6
-    checkpoint_every: Annotated[int, Ge(1)] | None = None
-    stop_below: Positive | None = None
-
-
-class _Optimizable(Protocol):
-    # Structural, so that the protocol of tasks can name the options above.
-    @property
-    def simulator(self) -> Simulator: ...
-    @property
-    def optimizer(self) -> OptimizerSection: ...
-    @property
-    def steps(self) -> int: ...
-    def initial_state(self) -> State: ...
-    def actions(self) -> Actions: ...
-    def controller(self, actions: Mapping[str, Tensor]) -> Controller: ...
-    def loss(self, states: Sequence[State]) -> Tensor: ...
+__all__ = ["evaluate", "optimize", "position_gradients"]
 
 
 def optimize(
-    task: _Optimizable,
+    task: OptimizableTask,
     report: Callable[[Descent], None] = lambda _: None,
     *,
     start: Actions | None = None,
@@ -79,7 +31,7 @@ def optimize(
     """Minimize the loss of a task by gradient descent; see `descend`.
 
     Args:
-        task: What to optimize.
+        task: The task.
         report: Called after each iteration with the results so far.
         start: Actions to start from, leaf tensors; by default those of the task.
         found: Results that an earlier loop over the same task reported, to continue it.
@@ -112,12 +64,12 @@ def optimize(
         )
 
 
-def evaluate(task: _Optimizable, actions: Actions) -> Evaluation:
+def evaluate(task: OptimizableTask, actions: Actions) -> Evaluation:
     """Roll a task out and store the gradient of its loss in the `.grad` of the actions."""
     return evaluate_variables(_simulation(task, lambda _: None), task.loss, actions)
 
 
-def position_gradients(task: _Optimizable, actions: Mapping[str, Tensor]) -> list[Tensor]:
+def position_gradients(task: OptimizableTask, actions: Mapping[str, Tensor]) -> list[Tensor]:
     """Gradients of the loss of a task by the positions after each step, [N, 3] each.
 
     Each is the whole derivative: what moves at a step also moves all that follows.
@@ -128,7 +80,7 @@ def position_gradients(task: _Optimizable, actions: Mapping[str, Tensor]) -> lis
     return list(torch.autograd.grad(task.loss(states), positions, materialize_grads=True))
 
 
-def _simulation(task: _Optimizable, on_step: Callable[[int], None]) -> Simulate:
+def _simulation(task: OptimizableTask, on_step: Callable[[int], None]) -> Simulate:
     def simulate(actions: Variables) -> list[State]:
         controller = task.controller(actions)
         forward = True

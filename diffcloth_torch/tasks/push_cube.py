@@ -35,7 +35,7 @@ from diffcloth_torch.tasks.reach import (
 )
 from diffcloth_torch.viewers.look import Goal
 
-__all__ = ["PushCube", "PushCubeConfig"]
+__all__ = ["PushCubeConfig", "PushCubeProblem"]
 
 
 class PinActionSection(ActionSection):
@@ -85,7 +85,7 @@ class _Moved:
         return self.start + self.displacements[k]
 
 
-class PushCube(Reach):
+class PushCubeProblem(Reach):
     """A cloth pushes a body to a target position."""
 
     Config = PushCubeConfig

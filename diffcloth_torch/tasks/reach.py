@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
@@ -16,21 +16,17 @@ from diffcloth_torch import cpu
 from diffcloth_torch.config.scene_schema import BodySection, ClothSection, RobotSection
 from diffcloth_torch.config.scenes import (
     Motions,
-    build_scene,
-    build_simulator,
     pose_array,
-    prescribed_motions,
-    steady_wind,
     step_control,
 )
-from diffcloth_torch.config.schema import RunConfig
+from diffcloth_torch.config.schema import OptimizerSection, RunConfig
 from diffcloth_torch.config.section import Section, Vector3
 from diffcloth_torch.config.shape_schema import PoseSection
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.geometry.rotation import integrate_poses
 from diffcloth_torch.sim.records.state import State
-from diffcloth_torch.tasks.optimization import Controller, OptimizerSection
+from diffcloth_torch.tasks.task import Controller, OptimizableTask
 from diffcloth_torch.viewers.look import Goal
 
 __all__ = [
@@ -88,24 +84,19 @@ class ReachConfig(RunConfig):
         return self
 
 
-class Reach(ABC):
+class Reach(OptimizableTask):
     """A task in which actions bring something to a target.
 
     The start must make contact: without contact there is no gradient. Subclasses have a `Config`
-    and say what the actions are, what they do, and how far the target is.
+    and define the actions, their motions, and the distance to the target.
     """
 
     def __init__(self, config: ReachConfig, source: Path) -> None:
         """Build the scene of a configuration that was read from the file `source`."""
-        self.config = config
-        self.scene = build_scene(config, source)
-        self.simulator = build_simulator(self.scene, config.simulation)
-        self.steps = config.simulation.steps
+        super().__init__(config, source)
         self.optimizer = config.optimizer
         self._loss = config.loss
         self._interval = config.actions.interval
-        self._prescribed = prescribed_motions(config, self.scene, self.steps)
-        self._wind = steady_wind(config)
 
     @abstractmethod
     def initial_rows(self) -> dict[str, list[list[float]]]:
@@ -123,10 +114,6 @@ class Reach(ABC):
     def goals(self) -> list[Goal]:
         """Show the target."""
 
-    def initial_state(self) -> State:
-        """Make the state that the scene describes."""
-        return self.simulator.initial_state()
-
     def actions(self) -> dict[str, Tensor]:
         """Initial actions, each of shape [T, n] for T control intervals."""
         intervals = -(-self.steps // self._interval)
@@ -138,9 +125,9 @@ class Reach(ABC):
     def controller(self, actions: Mapping[str, Tensor]) -> Controller:
         """Apply the actions; the rest of the scene follows keyframes."""
         acted = self.motions(self.each_step(actions))
-        fields = [*self._prescribed, *(name for name in acted if name not in self._prescribed)]
+        fields = [*self._motions, *(name for name in acted if name not in self._motions)]
         merged: Motions = {
-            field: {**self._prescribed.get(field, {}), **acted.get(field, {})} for field in fields
+            field: {**self._motions.get(field, {}), **acted.get(field, {})} for field in fields
         }
         return lambda k, _state: step_control(merged, k, self._wind)
 

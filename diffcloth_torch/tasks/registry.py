@@ -11,22 +11,21 @@ from diffcloth_torch.config.schema import RunConfig
 from diffcloth_torch.config.validation import validate
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.tasks.control_points import ControlPoints
-from diffcloth_torch.tasks.drape import Drape
-from diffcloth_torch.tasks.grasp_cloth import GraspCloth
-from diffcloth_torch.tasks.hit_cloth import HitCloth
+from diffcloth_torch.tasks.grasp_cloth import GraspClothProblem
+from diffcloth_torch.tasks.hit_cloth import HitClothProblem
 from diffcloth_torch.tasks.identify import Identify
-from diffcloth_torch.tasks.push_cube import PushCube
-from diffcloth_torch.tasks.task import Task
-from diffcloth_torch.tasks.two_cloths import TwoCloths
+from diffcloth_torch.tasks.push_cube import PushCubeProblem
+from diffcloth_torch.tasks.task import ConfiguredTask
+from diffcloth_torch.tasks.two_cloths import TwoClothsProblem
 
 __all__ = ["TASKS", "check_document", "load_task", "make_task", "read_config"]
 
 TASKS: dict[str, Any] = {
-    "drape": Drape,
-    "hit_cloth": HitCloth,
-    "push_cube": PushCube,
-    "grasp_cloth": GraspCloth,
-    "two_cloths": TwoCloths,
+    "drape": ConfiguredTask,
+    "hit_cloth": HitClothProblem,
+    "push_cube": PushCubeProblem,
+    "grasp_cloth": GraspClothProblem,
+    "two_cloths": TwoClothsProblem,
     "control_points": ControlPoints,
     "identify": Identify,
 }
@@ -65,12 +64,12 @@ def check_document(document: Mapping[str, Any], path: str | Path) -> RunConfig:
     return config
 
 
-def make_task(config: RunConfig, path: str | Path) -> Task:
+def make_task(config: RunConfig, path: str | Path) -> ConfiguredTask:
     """Build the scene, simulator and task of a configuration that was read from `path`."""
-    constructor: Callable[[RunConfig, Path], Task] = TASKS[config.task]
+    constructor: Callable[[RunConfig, Path], ConfiguredTask] = TASKS[config.task]
     return constructor(config, Path(path))
 
 
-def load_task(path: str | Path, assignments: Iterable[str] = ()) -> Task:
+def load_task(path: str | Path, assignments: Iterable[str] = ()) -> ConfiguredTask:
     """Read a configuration, and build its scene, simulator and task."""
     return make_task(read_config(path, assignments), path)

@@ -8,13 +8,12 @@ import torch
 from tqdm import tqdm
 
 from diffcloth_torch.sim.records.state import State
-from diffcloth_torch.tasks.optimization import Actions
-from diffcloth_torch.tasks.task import Task
+from diffcloth_torch.tasks.task import Actions, ConfiguredTask
 
 __all__ = ["simulate"]
 
 
-def simulate(task: Task, actions: Actions | None = None) -> Iterator[State]:
+def simulate(task: ConfiguredTask, actions: Actions | None = None) -> Iterator[State]:
     """Yield the initial state and the state after each step.
 
     Args:

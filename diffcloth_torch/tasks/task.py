@@ -1,63 +1,89 @@
-"""The protocol of tasks, which can be simulated, and may be optimized."""
+"""Tasks of configurations: a scene with prescribed motion, and actions that may be optimized."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 from torch import Tensor
 
-from diffcloth_torch.config.schema import RunConfig
+from diffcloth_torch.config.scenes import (
+    build_scene,
+    build_simulator,
+    prescribed_motions,
+    steady_wind,
+    step_control,
+)
+from diffcloth_torch.config.schema import OptimizerSection, RunConfig
 from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.sim.records.controls import Control
 from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.simulator import Simulator
-from diffcloth_torch.tasks.optimization import Controller, OptimizerSection
 from diffcloth_torch.viewers.look import Goal
 
-__all__ = ["Controller", "LoadedConfig", "Optimizable", "Task"]
+__all__ = ["Actions", "ConfiguredTask", "Controller", "LoadedConfig", "OptimizableTask"]
+
+Actions = dict[str, Tensor]
+Controller = Callable[[int, State], Control]
+"""From the index of a step and the state before it to its control."""
 
 
-class Task(Protocol):
-    """A scene, and how it is controlled."""
+class ConfiguredTask:
+    """A scene whose bodies and pins follow keyframes. Nothing is optimized.
 
-    config: RunConfig
-    scene: Scene
-    simulator: Simulator
-    steps: int
+    Attributes:
+        config: The configuration.
+        scene: Cloths, bodies and robots.
+        simulator: Simulator of the scene.
+        steps: Number of time steps.
+    """
+
+    Config: type[RunConfig] = RunConfig
+
+    def __init__(self, config: RunConfig, source: Path) -> None:
+        """Build the scene of a configuration that was read from the file `source`."""
+        self.config = config
+        self.scene: Scene = build_scene(config, source)
+        self.simulator: Simulator = build_simulator(self.scene, config.simulation)
+        self.steps = config.simulation.steps
+        self._motions = prescribed_motions(config, self.scene, self.steps)
+        self._wind = steady_wind(config)
 
     def initial_state(self) -> State:
         """Make the state before the first step."""
-        ...
+        return self.simulator.initial_state()
 
-    def actions(self) -> dict[str, Tensor]:
+    def actions(self) -> Actions:
         """Make new leaf tensors of the initial actions; none if nothing is optimized."""
-        ...
+        return {}
 
     def controller(self, actions: Mapping[str, Tensor]) -> Controller:
         """Make a function that returns the control of a step under the given actions.
 
-        It takes the index of a step and the state before it. For the same arguments it returns the
-        same control, because checkpointed rollouts repeat steps.
+        For the same arguments it returns the same control, because checkpointed rollouts repeat
+        steps.
         """
-        ...
+        return lambda k, _state: step_control(self._motions, k, self._wind)
 
     def goals(self) -> Sequence[Goal]:
         """Shapes to show as targets of the task; may be none."""
-        ...
+        return []
 
 
-@runtime_checkable
-class Optimizable(Task, Protocol):
-    """A task with a loss."""
+class OptimizableTask(ConfiguredTask, ABC):
+    """A task with a loss.
 
-    @property
-    def optimizer(self) -> OptimizerSection:
-        """Options of the optimization."""
-        ...
+    Attributes:
+        optimizer: Options of the optimization.
+    """
 
+    optimizer: OptimizerSection
+
+    @abstractmethod
     def loss(self, states: Sequence[State]) -> Tensor:
         """Loss of the states after each step, shape [], or [B] of a batch."""
-        ...
 
 
 class LoadedConfig(NamedTuple):
@@ -71,7 +97,7 @@ class LoadedConfig(NamedTuple):
 
     scene: Scene
     simulator: Simulator
-    task: Task
+    task: ConfiguredTask
 
     def __repr__(self) -> str:
         return (

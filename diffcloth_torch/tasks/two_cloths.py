@@ -24,7 +24,6 @@ from diffcloth_torch.config.section import Positive, Section, Vector3
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.sim.records.controls import Control
 from diffcloth_torch.sim.records.state import State
-from diffcloth_torch.tasks.optimization import Controller
 from diffcloth_torch.tasks.reach import (
     ActionSection,
     Reach,
@@ -33,9 +32,10 @@ from diffcloth_torch.tasks.reach import (
     find_named,
     measured,
 )
+from diffcloth_torch.tasks.task import Controller
 from diffcloth_torch.viewers.look import Goal, marker
 
-__all__ = ["TwoCloths", "TwoClothsConfig"]
+__all__ = ["TwoClothsConfig", "TwoClothsProblem"]
 
 
 class PullSection(Section):
@@ -76,7 +76,7 @@ class TwoClothsConfig(ReachConfig):
         return self
 
 
-class TwoCloths(Reach):
+class TwoClothsProblem(Reach):
     """Two cloths pull at each other until one is at a target."""
 
     Config = TwoClothsConfig

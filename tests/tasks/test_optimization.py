@@ -11,7 +11,8 @@ import pytest
 import torch
 
 import diffcloth_torch as dc
-from diffcloth_torch.tasks.optimization import OptimizerSection, optimize
+from diffcloth_torch.config.schema import OptimizerSection
+from diffcloth_torch.tasks.optimization import optimize
 
 
 @dataclass

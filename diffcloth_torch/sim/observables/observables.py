@@ -18,8 +18,13 @@ from diffcloth_torch.operations import label
 from diffcloth_torch.sim.inputs.axes import with_axis, without_axes, without_axis
 from diffcloth_torch.sim.inputs.border import Border, Given
 from diffcloth_torch.sim.inputs.state_fields import check_state_tensor
-from diffcloth_torch.sim.observables.links import contact_wrenches, link_velocities
-from diffcloth_torch.sim.observables.stored_energy import stored_energy
+from diffcloth_torch.sim.observables.links import (
+    contact_wrenches,
+    link_velocities,
+)
+from diffcloth_torch.sim.observables.stored_energy import (
+    stored_energy,
+)
 from diffcloth_torch.sim.records.contact_points import ContactPoints, refuse_gradient
 from diffcloth_torch.sim.records.controls import Control, Parameters
 from diffcloth_torch.sim.records.state import State
