@@ -172,5 +172,11 @@ def test_the_gripper_comes_with_the_package():
     assert importlib.resources.files("diffcloth_torch.robots").joinpath("gripper.urdf").is_file()
 
 
+def test_the_scenes_of_tasks_come_with_the_package():
+    folder = importlib.resources.files("diffcloth_torch.tasks")
+    for task in ("hit_cloth", "push_cube", "grasp_cloth", "two_cloths"):
+        assert folder.joinpath(f"{task}.yaml").is_file()
+
+
 def test_the_package_is_typed():
     assert importlib.resources.files("diffcloth_torch").joinpath("py.typed").is_file()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from diffcloth_torch import cpu, robots
+from diffcloth_torch import cpu
 from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Hand, Tools
 from diffcloth_torch.envs.env import EnvState, Task, lengths
@@ -15,20 +15,17 @@ from diffcloth_torch.geometry.rotation import (
     quaternion_multiply,
     rotate,
 )
-from diffcloth_torch.model.cloth import Cloth
-from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import SolverOptions
 from diffcloth_torch.model.rigid_body import RigidBody
-from diffcloth_torch.model.robot import Robot
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.simulator import Simulator
+from diffcloth_torch.tasks.scenes import grid_changes, pose_of, scene_of
 
 __all__ = ["GraspCloth", "HandTask", "LiftCloth", "twist_to"]
 
 _DT = 0.02  # [s]
-_SIDE, _TOP = 0.12, 0.105  # of the cloth, and at which it lies [m]
 _JOINTS = ("gripper/left_finger_joint", "gripper/right_finger_joint")
 _CLOSING = 5  # transitions in which a scripted hand closes
 
@@ -38,6 +35,10 @@ class HandTask(Task):
 
     Actions are the linear and angular velocity of the gripper's base and the effort of its fingers.
     The start is drawn: where the gripper is, within 4 mm.
+
+    Attributes:
+        center: Position of the cloth's center at the start [m], [3].
+        target: Pose of the target of the task grasp_cloth, [7].
     """
 
     obstacles: tuple[RigidBody, ...] = ()
@@ -51,34 +52,17 @@ class HandTask(Task):
             substeps: Time steps of a transition, of .02 s each.
         """
         check_count(f"{operation(self.name)}: `size`", size, 4)
-        material = Material(
-            stretch=200, bending=1e-4, density=0.2, damping=0.01, thickness=8e-4, friction=0.8
-        )
-        cloth = Cloth.grid(
-            size, size, _SIDE, name="cloth", pose=[0.02, 0, _TOP, 1, 0, 0, 0], material=material
-        )
-        table = RigidBody.box(
-            [0.14, 0.2, 0.1], pose=[0.07, 0, 0.05, 1, 0, 0, 0], friction=0.3, name="table"
-        )
-        ground = RigidBody.plane(2.0, name="ground")
-        gripper = Robot.load(
-            robots.GRIPPER,
-            base="kinematic",
-            pose=[-0.096, 0, _TOP, 0.5, 0.5, 0.5, 0.5],
-            actuation="pd",
-            stiffness=400.0,
-            damping=15.0,
-            friction=0.8,
-            name="gripper",
-        )
+        scene, sections = scene_of("grasp_cloth", grid_changes("cloth", size))
         simulator = Simulator(
-            Scene([cloth], [table, ground, *self.obstacles], [gripper]),
+            Scene(scene.cloths, [*scene.bodies, *self.obstacles], scene.robots),
             _DT,
             solver=SolverOptions(throw=False),
         )
         hand = Hand("gripper", _JOINTS, dt=_DT)
         super().__init__(simulator, hand, horizon=horizon, substeps=substeps)
         self.hand = hand
+        self.center = cpu.tensor(sections["scene"]["cloths"][0]["pose"]["position"])  # of the cloth
+        self.target = cpu.tensor(pose_of(sections["target"]["pose"]))
         some = cpu.linspace(0, size - 1, 4).round().long()
         self._rows = (some[:, None] * size + some).flatten()
 
@@ -128,7 +112,7 @@ class LiftCloth(HandTask):
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Also the goal, 6 to 12 cm above the table."""
-        goal = cpu.tensor([-0.03, 0.0, _TOP + 0.09])
+        goal = cpu.tensor([-0.03, 0.0, float(self.center[2]) + 0.09])
         return super().draw(generator) | {"goal": goal + uniform(generator, 3, -0.03, 0.03)}
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
@@ -137,7 +121,7 @@ class LiftCloth(HandTask):
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        height = env.state.positions[..., 2].mean(dim=-1) - _TOP
+        height = env.state.positions[..., 2].mean(dim=-1) - self.center[2]
         return torch.sigmoid((height - 0.03) / 0.005) * (1 - torch.tanh(self._distance(env) / 0.1))
 
     def success(self, env: EnvState) -> Tensor:
@@ -168,15 +152,13 @@ class GraspCloth(HandTask):
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
         """Also the target: the cloth hanging from the edge that is held."""
         state, tools = super().place(drawn)
-        quarter = cpu.tensor([0.5**0.5, 0.0, 0.5**0.5, 0.0])
-        center = cpu.tensor([0.02, 0.0, _TOP])
-        at = cpu.tensor([-0.03, 0.05, 0.25])
-        drawn["target"] = rotate(quarter, state.positions - center) + at
+        at, turn = self.target[:3], self.target[3:]
+        drawn["target"] = rotate(turn, state.positions - self.center) + at
         base = drawn["base"]
         drawn["target_base"] = torch.cat(
             [
-                rotate(quarter, base[:, :3] - center) + at,
-                quaternion_multiply(quarter.expand(len(base), -1), base[:, 3:]),
+                rotate(turn, base[:, :3] - self.center) + at,
+                quaternion_multiply(turn.expand(len(base), -1), base[:, 3:]),
             ],
             dim=-1,
         )

@@ -10,14 +10,12 @@ from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Tools, Twist
 from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import follow, uniform
-from diffcloth_torch.model.cloth import Cloth
-from diffcloth_torch.model.materials import Material
+from diffcloth_torch.geometry.poses import transform
 from diffcloth_torch.model.options import SolverOptions
-from diffcloth_torch.model.rigid_body import RigidBody
-from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.simulator import Simulator
+from diffcloth_torch.tasks.scenes import grid_changes, pose_of, scene_of
 
 __all__ = ["HitCloth"]
 
@@ -45,34 +43,19 @@ class HitCloth(Task):
         """Build the scene.
 
         Args:
-            size: Vertices along a side of the sheet, of 1 m, >= 4.
+            size: Vertices along a side of the sheet, >= 4.
             horizon: Transitions of an episode.
             substeps: Time steps of a transition, of .02 s each.
         """
         check_count(f"{operation(self.name)}: `size`", size, 4)
-        sheet = Cloth.grid(
-            size,
-            size,
-            1.0,
-            name="sheet",
-            pose=[0, 0, 1.0, 0.5**0.5, 0.5**0.5, 0, 0],
-            material=Material(stretch=550, bending=1e-4, density=0.124, damping=2e-3, friction=0.4),
-            pins={"top": list(range(size * (size - 1), size * size))},
-        )
-        cuboid = RigidBody.box(
-            [1.1, 0.04, 0.86], motion="kinematic", friction=0.4, name="cuboid",
-            pose=[0, -0.06, 0.9, 1, 0, 0, 0],
-        )  # fmt: skip
-        simulator = Simulator(Scene([sheet], [cuboid]), _DT, solver=SolverOptions(throw=False))
+        scene, sections = scene_of("hit_cloth", grid_changes("sheet", size))
+        simulator = Simulator(scene, _DT, solver=SolverOptions(throw=False))
         actuator = Twist("cuboid", 0, dt=_DT, speed=1.5, spin=4.0)
         super().__init__(simulator, actuator, horizon=horizon, substeps=substeps)
         some = cpu.linspace(0, size - 1, 4).round().long()
         self._rows = (some[:, None] * size + some).flatten()
-        rest = cpu.tensor(sheet.rest_positions)
-        # Turned up by half a turn about the pins.
-        self.target = torch.stack(
-            [rest[:, 0], 0.5 - rest[:, 1], torch.full_like(rest[:, 2], 1.5)], dim=-1
-        )
+        target = transform(scene.cloths[0].rest_positions, pose_of(sections["target"]["pose"]))
+        self.target = cpu.tensor(target)
         self._speeds = actuator.speeds
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:

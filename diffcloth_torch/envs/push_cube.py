@@ -10,18 +10,14 @@ from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Tools, Velocities
 from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import uniform
-from diffcloth_torch.model.cloth import Cloth
-from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import SolverOptions
-from diffcloth_torch.model.rigid_body import RigidBody
-from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.simulator import Simulator
+from diffcloth_torch.tasks.scenes import grid_changes, scene_of, sections_of
 
 __all__ = ["PushCube"]
 
-_SIDE, _CUBE = 0.3, 0.1  # [m]
 _GAP = 0.004  # below the cube, at least [m]
 _DT, _SPEED = 0.02, 0.4  # [s], [m/s] of the pins
 _BRAKING = 0.1  # time in which a scripted cube comes to rest [s]
@@ -46,27 +42,19 @@ class PushCube(Task):
             substeps: Time steps of a transition, of .02 s each.
         """
         check_count(f"{operation(self.name)}: `size`", size, 4)
-        sheet = Cloth.grid(
-            size,
-            size,
-            _SIDE,
-            name="sheet",
-            pose=[0, -0.1, 0.17, 0.5**0.5, 0.5**0.5, 0, 0],
-            material=Material(stretch=200, bending=1e-4, density=0.5, damping=5e-3, friction=0.3),
-            pins={"left": [size * (size - 1)], "right": [size * size - 1]},
-        )
+        section = sections_of("push_cube")["scene"]
+        self._side, self._cube = (section[k][0]["shape"]["size"] for k in ("cloths", "bodies"))
         # Outside of the barrier, whose default is a tenth of an edge.
-        gap = max(_GAP, 0.1 * _SIDE / (size - 1))
-        cube = RigidBody.box(
-            _CUBE,
-            motion="dynamic",
-            mass=0.03,
-            friction=0.15,
-            name="cube",
-            pose=[0, 0, 0.5 * _CUBE + gap, 1, 0, 0, 0],
+        gap = max(_GAP, 0.1 * self._side / (size - 1))
+        scene, _ = scene_of(
+            "push_cube",
+            [
+                *grid_changes("sheet", size),
+                f"scene.bodies.cube.pose.position=[0, 0, {0.5 * self._cube + gap}]",
+            ],
         )
-        floor = RigidBody.plane(4.0, friction=0.15, name="floor")
-        simulator = Simulator(Scene([sheet], [cube, floor]), _DT, solver=SolverOptions(throw=False))
+        sheet = scene.cloths[0]
+        simulator = Simulator(scene, _DT, solver=SolverOptions(throw=False))
         pins = {f"sheet/{name}": list(rows) for name, rows in sheet.pins.items()}
         actuator = Velocities(pins, dt=_DT, speed=_SPEED)
         super().__init__(simulator, actuator, horizon=horizon, substeps=substeps)
@@ -116,8 +104,8 @@ class PushCube(Task):
         to_target = away / distance.clamp(min=1e-3)
         ahead = away - _BRAKING * velocity
         pushes = ((ahead * away).sum(dim=-1, keepdim=True) > 0) & (distance > 0.3 * _CLOSE)
-        middle = cube + torch.where(pushes, 0.04 * to_target, -_CUBE * to_target)
-        across = 0.5 * _SIDE * torch.stack([to_target[:, 1], -to_target[:, 0]], dim=-1)
+        middle = cube + torch.where(pushes, 0.04 * to_target, -self._cube * to_target)
+        across = 0.5 * self._side * torch.stack([to_target[:, 1], -to_target[:, 0]], dim=-1)
         goals = torch.stack([middle - across, middle + across], dim=1)
         pins = env.state.positions[:, self._pins, :2]
         moves = ((goals - pins) / (self.substeps * _DT * _SPEED)).clamp(-0.5, 0.5)

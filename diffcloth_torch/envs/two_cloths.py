@@ -10,22 +10,16 @@ from diffcloth_torch.checks import check_count
 from diffcloth_torch.envs.actuators import Forces, Tools
 from diffcloth_torch.envs.env import EnvState, Task, lengths
 from diffcloth_torch.envs.sheets import uniform
-from diffcloth_torch.geometry.poses import transform
-from diffcloth_torch.geometry.shapes import strip
-from diffcloth_torch.model.cloth import Cloth
-from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import SolverOptions
-from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.simulator import Simulator
+from diffcloth_torch.tasks.scenes import scene_of
 
 __all__ = ["TwoCloths"]
 
 _DT = 0.02  # [s]
-_LENGTH, _WIDTH, _ROWS = 0.4, 0.06, 5  # of a strip [m]
 _PULL, _LARGEST = 0.3, 0.8  # on the ends of the other strip, and at an action of 1 [N]
-_POSES = {"blue": [0, 0, 0, 0.5**0.5, 0, 0.5**0.5, 0], "red": [0.07, 0, 0, 0.5, 0.5, -0.5, -0.5]}
 _FAR = 1.0  # distance at which an episode ends [m]
 _CLOSE = 0.02  # distance to the target that succeeds [m]
 
@@ -51,35 +45,27 @@ class TwoCloths(Task):
         """
         check_count(f"{operation(self.name)}: `size`", size, 4)
         columns = 2 * size + 7
-        flat, bent, faces = strip(_LENGTH, _WIDTH, _ROWS, columns, 180.0, 0.05, 0.5)
-        material = Material(stretch=300, bending=1e-5, density=0.2, damping=0.01, friction=0.3)
-        cloths = [
-            Cloth(
-                transform(bent, cpu.tensor(pose).numpy()),
-                faces,
-                rest_positions=flat,
-                material=material,
-                name=name,
-            )
-            for name, pose in _POSES.items()
-        ]
-        count = len(flat)
-        ends = [row * columns + end for row in range(_ROWS) for end in (0, columns - 1)]
-        weight = 0.2 * _LENGTH * _WIDTH * 9.81
+        names = ("blue", "red")
+        changes = [f"scene.cloths.{name}.shape.columns={columns}" for name in names]
+        scene, sections = scene_of("two_cloths", changes)
+        blue = sections["scene"]["cloths"][0]
+        count = len(scene.cloths[0].vertices)
+        ends = [row * columns + end for row in range(count // columns) for end in (0, columns - 1)]
+        shape = blue["shape"]
+        weight = blue["material"]["density"] * shape["length"] * shape["width"] * 9.81
         steady = cpu.zeros(2 * count, 3)
         steady[ends, 2] = weight / len(ends)
         pulled = [count + i for i in ends]
         steady[pulled] = cpu.tensor([_PULL, 0.0, weight]) / len(ends)
-        simulator = Simulator(Scene(cloths), _DT, solver=SolverOptions(throw=False))
+        simulator = Simulator(scene, _DT, solver=SolverOptions(throw=False))
         actuator = Forces([ends], steady, largest=_LARGEST)
         super().__init__(simulator, actuator, horizon=horizon, substeps=substeps)
-        self._count, self._weight = count, weight
+        self._count, self._center = count, cpu.tensor(sections["target"]["position"])
         self._rows = cpu.linspace(0, 2 * count - 1, 20).round().long()
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """The target, within 3 cm."""
-        target = cpu.tensor([-0.2, 0.05, 0.05])
-        return {"target": target + uniform(generator, 3, -0.03, 0.03)}
+        return {"target": self._center + uniform(generator, 3, -0.03, 0.03)}
 
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
         """See `Task`."""

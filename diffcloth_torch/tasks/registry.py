@@ -15,6 +15,7 @@ from diffcloth_torch.tasks.grasp_cloth import GraspClothProblem
 from diffcloth_torch.tasks.hit_cloth import HitClothProblem
 from diffcloth_torch.tasks.identify import Identify
 from diffcloth_torch.tasks.push_cube import PushCubeProblem
+from diffcloth_torch.tasks.scenes import sections_of
 from diffcloth_torch.tasks.task import ConfiguredTask
 from diffcloth_torch.tasks.two_cloths import TwoClothsProblem
 
@@ -35,6 +36,8 @@ TASKS: dict[str, Any] = {
 def read_config(path: str | Path, assignments: Iterable[str] = ()) -> RunConfig:
     """Read a configuration, change values, and check it against the schema of its task.
 
+    A configuration without a `scene` has the scene and the target of its task.
+
     Args:
         path: YAML file.
         assignments: "key=value" each, see `set_values`.
@@ -42,7 +45,10 @@ def read_config(path: str | Path, assignments: Iterable[str] = ()) -> RunConfig:
     Raises:
         InvalidInput: If the file, a key or a value is not accepted.
     """
-    return check_document(set_values(read_document(path), assignments), path)
+    document = read_document(path)
+    if "scene" not in document:
+        document = {**sections_of(str(document.get("task"))), **document}
+    return check_document(set_values(document, assignments), path)
 
 
 def check_document(document: Mapping[str, Any], path: str | Path) -> RunConfig:
