@@ -1,7 +1,9 @@
 #include "bind/links.h"
 
 #include <cstddef>
+#include <span>
 #include <stdexcept>
+#include <utility>
 
 namespace diffcloth::bind {
 
@@ -14,19 +16,20 @@ std::vector<bodies::Link> to_links(const LinkArrays& arrays, Index coordinates) 
   if (arrays.offset.size() != 16 * count || arrays.axis.size() != 3 * count) {
     throw std::invalid_argument("trees: arrays must have one entry a link");
   }
+  const std::span<const bodies::JointKind> kinds = bodies::joint_kinds();
   std::vector<bodies::Link> links;
   for (std::size_t l = 0; l < count; ++l) {
     const Index kind = arrays.kind[l];
     const Index coordinate = arrays.coordinate[l];
-    const bool known = kind >= 0 && kind <= static_cast<Index>(bodies::JointKind::kPrismatic);
-    // What moves reads its coordinate without asking.
-    if (!known || coordinate >= coordinates || (kind != 0 && coordinate < 0)) {
+    const bool known = kind >= 0 && std::cmp_less(kind, kinds.size());
+    // A joint that moves reads its coordinate without a check.
+    if (!known || coordinate >= coordinates || (kinds[kind].moves() && coordinate < 0)) {
       throw std::invalid_argument("trees: kinds and coordinates must be in range");
     }
     const Eigen::Matrix<double, 4, 4, Eigen::RowMajor> frame(arrays.offset.data() + 16 * l);
     links.push_back({.tree = arrays.tree[l],
                      .parent = arrays.parent[l],
-                     .kind = static_cast<bodies::JointKind>(kind),
+                     .kind = kinds[kind],
                      .offset = frame.topRows<3>(),
                      .axis = row(arrays.axis.data(), static_cast<Index>(l)),
                      .coordinate = coordinate,

@@ -10,7 +10,7 @@ namespace diffcloth::bind {
 struct LinkArrays {
   std::vector<Index> tree;
   std::vector<Index> parent;
-  std::vector<Index> kind;        ///< a JointKind
+  std::vector<Index> kind;        ///< a place in joint_kinds()
   std::vector<double> offset;     ///< [L, 4, 4]
   std::vector<double> axis;       ///< [L, 3]
   std::vector<Index> coordinate;  ///< -1 where a joint is fixed

@@ -21,7 +21,7 @@ double largest(const VectorXd& x) { return x.size() == 0 ? 0.0 : x.cwiseAbs().ma
 
 bool solve(const FreeMotion<double>& motion, VectorXd& x) {
   const Configuration<double>& start = motion.start;
-  const std::vector<Placed<double>> here =
+  const std::vector<PlacedBody<double>> here =
       place(motion.tree, motion.inertia, start.rotation, start.joints);
   // Without velocity products, but for those of what is prescribed.
   const VectorXd carried = rates(motion.tree, motion.inertia, here, motion.known).momentum;

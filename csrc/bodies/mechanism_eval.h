@@ -15,8 +15,8 @@ struct Mechanisms::Eval {
   Exponential turn{Vec3::Zero()};  // of a free root
   Vec3 center = Vec3::Zero();
   Mat34 frame;                               // S
-  std::vector<Mat34> to_root;                // C_l
-  std::vector<Vec3> axis;                    // of the joint of a link
+  std::vector<Placed<double>> links;         // in the root's frame
+  std::vector<Mat34> to_root;                // C_l, the same as matrices
   std::vector<std::vector<Mat34>> by_joint;  // [link][k]: dC_l by the k-th joint of its path
 };
 

@@ -73,7 +73,7 @@ void Mechanisms::make_paths() {
   for (std::size_t l = 0; l < given_.links.size(); ++l) {
     const Link& own = given_.links[l];
     if (own.parent >= 0) path_[l] = path_[own.parent];
-    if (own.kind != JointKind::kFixed) path_[l].push_back(static_cast<Index>(l));
+    if (own.moves()) path_[l].push_back(static_cast<Index>(l));
   }
 }
 
@@ -148,13 +148,12 @@ void Mechanisms::find_levers() {
       for (const Index joint : path_[l]) {
         const Link& link = given_.links[joint];
         double& lever = lever_[slot_[link.coordinate]];
-        if (link.kind == JointKind::kPrismatic) {
-          lever = std::max(lever, std::abs(link.multiplier));
-          continue;
-        }
-        const Vec3 origin = e.to_root[joint - tree.first_link].col(3);
+        lever = std::max(lever, std::abs(link.slide()));
+        if (link.kind.turn == 0.0) continue;
+        const Vec3 origin = e.links[joint - tree.first_link].origin;
         for (const Vec3& p : points) {
-          lever = std::max(lever, std::abs(link.multiplier) * (p - origin).norm());
+          const double way = std::abs(link.turn()) * (p - origin).norm();
+          lever = std::max(lever, way + std::abs(link.slide()));
         }
         largest = std::max(largest, lever);
       }

@@ -20,18 +20,6 @@ Mat34 compose(const Mat34& a, const Mat34& b) {
 double inner(const Mat34& a, const Mat34& b) { return a.cwiseProduct(b).sum(); }
 double inner(const Mat3& a, const Mat3& b) { return a.cwiseProduct(b).sum(); }
 
-Mat34 motion(const Link& link, double value) {
-  Mat34 m;
-  m.leftCols<3>() = Mat3::Identity();
-  m.col(3).setZero();
-  if (link.kind == JointKind::kRevolute) {
-    m.leftCols<3>() = Eigen::AngleAxisd(value, link.axis).toRotationMatrix();
-  } else if (link.kind == JointKind::kPrismatic) {
-    m.col(3) = value * link.axis;
-  }
-  return m;
-}
-
 }  // namespace
 
 // With moments M_l = sum over its vertices of ybar [v; 1]^T, whatever is linear in the vertices is an
@@ -44,33 +32,23 @@ Mechanisms::Eval Mechanisms::evaluate(const Tree& tree, const double* points) co
     e.center = row(points, tree.first_node);
     e.turn = Exponential(row(points, tree.first_node + 1));
   }
-  const Index count = tree.last_link - tree.first_link;
-  e.to_root.resize(static_cast<std::size_t>(count));
-  e.axis.resize(static_cast<std::size_t>(count));
-  std::vector<Vec3> origin(static_cast<std::size_t>(count));
-  e.by_joint.resize(static_cast<std::size_t>(count));
+  const auto count = static_cast<std::size_t>(tree.last_link - tree.first_link);
+  e.to_root.resize(count);
+  e.by_joint.resize(count);
+  e.links.reserve(count);
+  const Placed<double> root{.rotation = Mat3::Identity(), .origin = Vec3::Zero(), .joint = {}};
   for (Index l = tree.first_link; l < tree.last_link; ++l) {
     const Link& link = given_.links[l];
     const Index k = l - tree.first_link;
-    Mat34 joint = link.offset;
-    if (link.parent >= 0) joint = compose(e.to_root[link.parent - tree.first_link], link.offset);
-    e.axis[k] = joint.leftCols<3>() * link.axis;
-    origin[k] = joint.col(3);
-    double value = 0.0;
-    if (link.kind != JointKind::kFixed) {
-      value = link.multiplier * points[slot_[link.coordinate]] + link.constant;
-    }
-    e.to_root[k] = compose(joint, motion(link, value));
+    const Placed<double>& parent = link.parent < 0 ? root : e.links[link.parent - tree.first_link];
+    const double coordinate = link.moves() ? points[slot_[link.coordinate]] : 0.0;
+    const Placed<double>& own = e.links.emplace_back(place_on<double>(parent, link, coordinate));
+    e.to_root[k] << own.rotation, own.origin;
     for (const Index m : path_[l]) {
-      const Index j = m - tree.first_link;
-      Mat34 d = Mat34::Zero();
-      if (given_.links[m].kind == JointKind::kRevolute) {
-        d = cross_matrix(e.axis[j]) * e.to_root[k];
-        d.col(3) -= e.axis[j].cross(origin[j]);
-      } else {
-        d.col(3) = e.axis[j];
-      }
-      e.by_joint[k].emplace_back(given_.links[m].multiplier * d);
+      const Twist<double>& joint = e.links[m - tree.first_link].joint;
+      Mat34 d = cross_matrix(joint.angular) * e.to_root[k];
+      d.col(3) += joint.linear;
+      e.by_joint[k].push_back(d);
     }
   }
   return e;
@@ -256,9 +234,8 @@ Eigen::MatrixXd Mechanisms::curvature(const Tree& tree,
     }
     const Mat34 in_frame = frame.transpose() * (e.turn.value.transpose() * m);
     for (std::size_t i = 0; i < path.size(); ++i) {
-      const Link& outer = given_.links[path[i]];
-      if (outer.kind != JointKind::kRevolute) continue;
-      const Mat3 turn = outer.multiplier * cross_matrix(e.axis[path[i] - tree.first_link]);
+      if (given_.links[path[i]].kind.turn == 0.0) continue;
+      const Mat3 turn = cross_matrix(e.links[path[i] - tree.first_link].joint.angular);
       for (std::size_t j = i; j < path.size(); ++j) {
         const double value = inner(Mat34(turn * e.by_joint[at][j]), in_frame);
         add(local(i), local(j), value);
@@ -405,8 +382,7 @@ double Mechanisms::turn(const double* change) const {
       double sum = root;
       for (const Index joint : path_[l]) {
         const Link& link = given_.links[joint];
-        if (link.kind != JointKind::kRevolute) continue;
-        sum += std::abs(link.multiplier * change[slot_[link.coordinate]]);
+        sum += std::abs(link.turn() * change[slot_[link.coordinate]]);
       }
       largest = std::max(largest, sum);
     }
@@ -430,9 +406,9 @@ double Mechanisms::turn_between(const double* from, const double* to) const {
       double sum = root;
       for (const Index joint : path_[l]) {
         const Link& link = given_.links[joint];
-        if (link.kind != JointKind::kRevolute || given_.prescribed[link.coordinate] == 0) continue;
+        if (given_.prescribed[link.coordinate] == 0) continue;
         const Index slot = slot_[link.coordinate];
-        sum += std::abs(link.multiplier * (to[slot] - from[slot]));
+        sum += std::abs(link.turn() * (to[slot] - from[slot]));
       }
       largest = std::max(largest, sum);
     }

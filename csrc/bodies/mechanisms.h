@@ -6,32 +6,17 @@
 #include <vector>
 
 #include "bodies/exponential.h"
+#include "bodies/link.h"
 #include "bodies/pose.h"
 #include "common/types.h"
 #include "linalg/attachments.h"
 
 namespace diffcloth::bodies {
 
-using Mat34 = Eigen::Matrix<double, 3, 4>;
-
-enum class JointKind : std::uint8_t { kFixed, kRevolute, kPrismatic };
-
-/// A link and the joint that carries it: T_l = T_parent offset motion(axis, multiplier q + constant).
-struct Link {
-  Index tree;
-  Index parent;  ///< -1 for a root; parents come before their children
-  JointKind kind;
-  Mat34 offset;  ///< of the joint's frame in the parent's
-  Vec3 axis;     ///< of unit length, in the joint's frame
-  Index coordinate;
-  double multiplier;
-  double constant;
-};
-
 /// What mechanisms are made from. Trees are the bodies of a scene, then its robots.
 struct MechanismsDescription {
   std::vector<char> tree_free;  ///< [T] roots that move by dynamics: six coordinates, c and w
-  std::vector<Link> links;      ///< tree after tree
+  std::vector<Link> links;      ///< tree after tree, parents before their children
   std::vector<Index> coordinate_tree;  ///< [n] those of a free root first, tree after tree
   std::vector<char> prescribed;        ///< [n] coordinates whose values at the end are given
   std::vector<char> held;              ///< [n] those that forces move, prescribed in this solve

@@ -158,7 +158,8 @@ class Robot {
   }
 
   template <class T>
-  std::vector<Placed<T>> place_at(const TreeInertia<T>& inertia, const Configuration<T>& at) const {
+  std::vector<PlacedBody<T>> place_at(const TreeInertia<T>& inertia,
+                                      const Configuration<T>& at) const {
     return place<T>(model_.tree, inertia, at.rotation, at.joints);
   }
 
@@ -172,7 +173,7 @@ class Robot {
 
   /// Generalized forces of forces on the vertices, [V, 3].
   template <class T>
-  VectorX<T> of_vertices(const std::vector<Placed<T>>& placed, const T* forces) const {
+  VectorX<T> of_vertices(const std::vector<PlacedBody<T>>& placed, const T* forces) const {
     std::vector<Wrench<T>> wrenches(placed.size());
     // Of each link, sum of f v^T over the places v in its frame.
     std::vector<Matrix3<T>> moments(placed.size(), Matrix3<T>::Zero());

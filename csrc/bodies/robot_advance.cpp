@@ -111,7 +111,7 @@ class RobotAdvance final : public TemplatedFunction<RobotAdvance>, private Robot
                            const VectorX<T>& over,
                            T* efforts) const {
     const double h = model_.dt;
-    const std::vector<Placed<T>> placed = place_at(inertia, end);
+    const std::vector<PlacedBody<T>> placed = place_at(inertia, end);
     const TreeRates<T> middle = this->middle(inertia, start, over);
     VectorX<T> impulse = VectorX<T>::Zero(size());
     if (in[kKick] != nullptr) impulse = T(h) * of_vertices(placed, in[kKick]);

@@ -212,7 +212,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
   }
 
   bool turns(const Link& link) const {
-    return link.kind == JointKind::kRevolute && is_forced_[link.coordinate] != 0;
+    return link.kind.turn != 0.0 && is_forced_[link.coordinate] != 0;
   }
 
   /// Coordinates at the start, those that are prescribed at the end, and frames of the root.
@@ -290,7 +290,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
                    const TreeInertia<T>& inertia,
                    const Start<T>& start,
                    const std::vector<Drive<T>>& drives) const {
-    const std::vector<Placed<T>> here = place_at(inertia, start.configuration);
+    const std::vector<PlacedBody<T>> here = place_at(inertia, start.configuration);
     VectorX<T> acting(size());
     acting.template head<6>() = vector(in[kWrench], kRoot);
     for (Index j = 0; j < joint_count(); ++j) acting[kRoot + j] = drives[j].applied;
@@ -298,7 +298,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
     std::vector<Wrench<T>> weights(here.size());
     for (Index l = 0; l < link_count(); ++l) {
       weights[l].force = inertia.mass[l] * gravity;
-      weights[l].moment = Vector3<T>(here[l].origin + here[l].arm).cross(weights[l].force);
+      weights[l].moment = here[l].center.cross(weights[l].force);
     }
     acting += generalized_force<T>(model_.tree, here, weights);
     if (in[kContact] != nullptr) acting += of_vertices(here, in[kContact]);
@@ -344,7 +344,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
     const double most = kMostTurn / model_.dt;
     if (floats_ && !(nu.segment<3>(3).norm() <= most)) return false;
     return std::ranges::all_of(model_.tree.links, [&](const Link& link) {
-      return !turns(link) || std::abs(link.multiplier * nu[kRoot + link.coordinate]) <= most;
+      return !turns(link) || std::abs(link.turn() * nu[kRoot + link.coordinate]) <= most;
     });
   }
 

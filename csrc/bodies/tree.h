@@ -8,20 +8,17 @@
 //
 //   M = sum_l J_l^T W_l J_l,   p = M nu.
 //
-// Let joint j turn about the axis z through the point o, and let F and N be the momentum and the
-// angular momentum about o of all links that it carries. Then p_j = z . N (z . F if it slides). A turn
-// of the joint moves all links that it carries and no others, so the kinetic energy T = p . nu / 2
-// grows with its value, at constant rates, by
+// All twists, momenta and forces are about the root's center of mass c: motion far from the origin of
+// the world has the same rounding. Let h be the momentum of all links that joint j carries, S_j the
+// twist of the joint and V_j the velocity of its link. Then p_j = S_j . h. A change of the coordinate
+// moves all links that the joint carries and no others, so the kinetic energy T = p . nu / 2 grows
+// with it, at constant rates, by
 //
-//   dT/dq_j = dz/dt . N + z . (F x do/dt),   dz/dt = omega x z      (dz/dt . F where it slides).
+//   dT/dq_j = (rate of S_j as it moves with V_j) . h.
 //
-// Lagrange's equations are dp/dt = dT/dq + forces. Those of the root's rotation, in world axes, have
-// the same form if its slope is P x dc/dt, with the momentum P of all.
-//
-// Points are relative to the root's center of mass c: what moves far from the origin of the world has
-// the same rounding.
+// Lagrange's equations are dp/dt = dT/dq + forces. The equations of the root's rotation, in world axes,
+// have the same form if their slope is P x dc/dt, with the momentum P of all links.
 
-#include <cmath>
 #include <ranges>
 #include <span>
 #include <vector>
@@ -29,7 +26,7 @@
 #include <Eigen/Core>
 #include <Eigen/Geometry>  // cross()
 
-#include "bodies/mechanisms.h"
+#include "bodies/link.h"
 #include "bodies/rotations.h"
 
 namespace diffcloth::bodies {
@@ -67,74 +64,31 @@ struct TreeInertia {
   }
 };
 
-/// A link in the world.
+/// A link with a center of mass.
 template <class T>
-struct Placed {
-  Matrix3<T> rotation;
-  Vector3<T> origin;  ///< of its frame; the axis of its joint goes through it
-  Vector3<T> axis;    ///< of its joint to the parent
-  Vector3<T> arm;     ///< from the origin to the center of mass
+struct PlacedBody : Placed<T> {
+  Vector3<T> center;
 };
-
-/// Force and moment about c, or momentum and angular momentum about it.
-template <class T>
-struct Wrench {
-  Vector3<T> force = Vector3<T>::Zero();
-  Vector3<T> moment = Vector3<T>::Zero();
-
-  Wrench& operator+=(const Wrench& other) {
-    force += other.force;
-    moment += other.moment;
-    return *this;
-  }
-};
-
-/// Turn by an angle about a constant axis of unit length.
-template <class T>
-Matrix3<T> axis_rotation(const Vec3& axis, const T& angle) {
-  using std::cos;
-  using std::sin;
-  const Mat3 K = cross_matrix(axis);
-  const Mat3 K_sq = K * K;
-  const T s = sin(angle);
-  const T c = 1.0 - cos(angle);
-  Matrix3<T> R;
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) R(i, j) = (i == j ? 1.0 : 0.0) + s * K(i, j) + c * K_sq(i, j);
-  }
-  return R;
-}
 
 /// Place all links, from the orientation of the root and the values of the joints.
 template <class T>
-std::vector<Placed<T>> place(const Tree& tree,
-                             const TreeInertia<T>& inertia,
-                             const Matrix3<T>& root_rotation,
-                             const VectorX<T>& joints) {
-  std::vector<Placed<T>> placed(tree.links.size());
+std::vector<PlacedBody<T>> place(const Tree& tree,
+                                 const TreeInertia<T>& inertia,
+                                 const Matrix3<T>& root_rotation,
+                                 const VectorX<T>& joints) {
+  std::vector<PlacedBody<T>> placed(tree.links.size());
   for (const Index l : tree.order) {
     const Link& link = tree.links[l];
-    Placed<T>& p = placed[l];
-    p.axis.setZero();
+    PlacedBody<T>& p = placed[l];
     if (link.parent < 0) {
       p.rotation = root_rotation;
-      p.arm = p.rotation * inertia.center_of(l);
-      p.origin = -p.arm;
+      p.origin = -(p.rotation * inertia.center_of(l));
+      p.center.setZero();
       continue;
     }
-    const Placed<T>& parent = placed[link.parent];
-    p.rotation = parent.rotation * link.offset.leftCols<3>().template cast<T>();
-    p.origin = parent.origin + parent.rotation * Vector3<T>(link.offset.col(3).template cast<T>());
-    if (link.kind != JointKind::kFixed) {
-      const T value = link.multiplier * joints[link.coordinate] + link.constant;
-      p.axis = p.rotation * link.axis.cast<T>();
-      if (link.kind == JointKind::kRevolute) {
-        p.rotation = Matrix3<T>(p.rotation * axis_rotation<T>(link.axis, value));
-      } else {
-        p.origin += value * p.axis;
-      }
-    }
-    p.arm = p.rotation * inertia.center_of(l);
+    const T coordinate = link.moves() ? joints[link.coordinate] : T(0.0);
+    static_cast<Placed<T>&>(p) = place_on<T>(placed[link.parent], link, coordinate);
+    p.center = p.origin + p.rotation * inertia.center_of(l);
   }
   return placed;
 }
@@ -149,61 +103,46 @@ struct TreeRates {
 template <class T>
 TreeRates<T> rates(const Tree& tree,
                    const TreeInertia<T>& inertia,
-                   const std::vector<Placed<T>>& placed,
+                   const std::vector<PlacedBody<T>>& placed,
                    const VectorX<T>& nu) {
-  struct Moving {
-    Vector3<T> omega;
-    Vector3<T> velocity;  // of the origin
-    Wrench<T> momentum;   // of all that hangs on the link
-  };
-  std::vector<Moving> moving(placed.size());
+  std::vector<Twist<T>> velocity(placed.size());
+  std::vector<Wrench<T>> momentum(placed.size());  // of all that a link carries, itself included
   for (const Index l : tree.order) {
     const Link& link = tree.links[l];
-    const Placed<T>& p = placed[l];
-    Moving& m = moving[l];
+    const PlacedBody<T>& p = placed[l];
+    Twist<T>& v = velocity[l];
     if (link.parent < 0) {
-      m.omega = nu.template segment<3>(3);
-      m.velocity = nu.template head<3>() + m.omega.cross(p.origin);
+      v = {.angular = nu.template segment<3>(3), .linear = nu.template head<3>()};
     } else {
-      const Moving& parent = moving[link.parent];
-      m.omega = parent.omega;
-      m.velocity = parent.velocity + parent.omega.cross(p.origin - placed[link.parent].origin);
-      if (link.kind != JointKind::kFixed) {
-        const T rate = link.multiplier * nu[kRoot + link.coordinate];
-        (link.kind == JointKind::kRevolute ? m.omega : m.velocity) += rate * p.axis;
+      v = velocity[link.parent];
+      if (link.moves()) {
+        const T& rate = nu[kRoot + link.coordinate];
+        v.angular += rate * p.joint.angular;
+        v.linear += rate * p.joint.linear;
       }
     }
-    m.momentum.force = inertia.mass[l] * (m.velocity + m.omega.cross(p.arm));
-    const Vector3<T> local = p.rotation.transpose() * m.omega;
+    momentum[l].force = inertia.mass[l] * v.at(p.center);
+    const Vector3<T> local = p.rotation.transpose() * v.angular;
     const Vector3<T> spin = p.rotation * Vector3<T>(inertia.inertia_of(l) * local);
-    m.momentum.moment = spin + (p.origin + p.arm).cross(m.momentum.force);
+    momentum[l].moment = spin + p.center.cross(momentum[l].force);
   }
 
   TreeRates<T> out{.momentum = VectorX<T>::Zero(tree.size()),
                    .slope = VectorX<T>::Zero(tree.size())};
   for (const Index l : std::views::reverse(tree.order)) {
     const Link& link = tree.links[l];
-    const Placed<T>& p = placed[l];
-    const Moving& m = moving[l];
-    const Vector3<T>& force = m.momentum.force;
+    const Wrench<T>& h = momentum[l];
     if (link.parent < 0) {
-      out.momentum.template head<3>() = force;
-      out.momentum.template segment<3>(3) = m.momentum.moment;
-      out.slope.template segment<3>(3) = force.cross(Vector3<T>(nu.template head<3>()));
+      out.momentum.template head<3>() = h.force;
+      out.momentum.template segment<3>(3) = h.moment;
+      out.slope.template segment<3>(3) = h.force.cross(Vector3<T>(nu.template head<3>()));
       continue;
     }
-    moving[link.parent].momentum += m.momentum;
-    if (link.kind == JointKind::kFixed) continue;
-    const Vector3<T> axis_rate = m.omega.cross(p.axis);
-    T along = p.axis.dot(force);
-    T change = axis_rate.dot(force);
-    if (link.kind == JointKind::kRevolute) {
-      const Vector3<T> moment = m.momentum.moment - p.origin.cross(force);  // about the axis
-      along = p.axis.dot(moment);
-      change = axis_rate.dot(moment) + p.axis.dot(force.cross(m.velocity));
-    }
-    out.momentum[kRoot + link.coordinate] += link.multiplier * along;
-    out.slope[kRoot + link.coordinate] += link.multiplier * change;
+    momentum[link.parent] += h;
+    if (!link.moves()) continue;
+    const Twist<T>& joint = placed[l].joint;
+    out.momentum[kRoot + link.coordinate] += joint.power(h);
+    out.slope[kRoot + link.coordinate] += velocity[l].rate_of(joint).power(h);
   }
   for (Index j = 0; j < tree.joint_count; ++j) {
     out.momentum[kRoot + j] += inertia.armature[j] * nu[kRoot + j];
@@ -211,15 +150,14 @@ TreeRates<T> rates(const Tree& tree,
   return out;
 }
 
-/// sum_l J_l^T f_l of wrenches on the links; `wrenches` then have those of all that a link carries.
+/// sum_l J_l^T f_l of wrenches on the links. `wrenches` then hold the sums over all that a link carries.
 template <class T>
 VectorX<T> generalized_force(const Tree& tree,
-                             const std::vector<Placed<T>>& placed,
+                             const std::vector<PlacedBody<T>>& placed,
                              std::vector<Wrench<T>>& wrenches) {
   VectorX<T> out = VectorX<T>::Zero(tree.size());
   for (const Index l : std::views::reverse(tree.order)) {
     const Link& link = tree.links[l];
-    const Placed<T>& p = placed[l];
     const Wrench<T>& w = wrenches[l];
     if (link.parent < 0) {
       out.template head<3>() = w.force;
@@ -227,11 +165,7 @@ VectorX<T> generalized_force(const Tree& tree,
       continue;
     }
     wrenches[link.parent] += w;
-    if (link.kind == JointKind::kFixed) continue;
-    const T along = link.kind == JointKind::kRevolute
-                        ? p.axis.dot(Vector3<T>(w.moment - p.origin.cross(w.force)))
-                        : p.axis.dot(w.force);
-    out[kRoot + link.coordinate] += link.multiplier * along;
+    if (link.moves()) out[kRoot + link.coordinate] += placed[l].joint.power(w);
   }
   return out;
 }
@@ -240,7 +174,7 @@ VectorX<T> generalized_force(const Tree& tree,
 template <class T>
 MatrixX<T> mass_matrix(const Tree& tree,
                        const TreeInertia<T>& inertia,
-                       const std::vector<Placed<T>>& placed) {
+                       const std::vector<PlacedBody<T>>& placed) {
   struct Carried {
     T mass = 0.0;
     Vector3<T> first = Vector3<T>::Zero();   // sum of mass times place
@@ -250,10 +184,10 @@ MatrixX<T> mass_matrix(const Tree& tree,
   MatrixX<T> M = MatrixX<T>::Zero(tree.size(), tree.size());
   for (const Index l : std::views::reverse(tree.order)) {
     const Link& link = tree.links[l];
-    const Placed<T>& p = placed[l];
+    const PlacedBody<T>& p = placed[l];
     Carried& own = carried[l];
     const T& m = inertia.mass[l];
-    const Vector3<T> at = p.origin + p.arm;
+    const Vector3<T>& at = p.center;
     own.mass += m;
     own.first += m * at;
     own.second += p.rotation * Matrix3<T>(inertia.inertia_of(l) * p.rotation.transpose());
@@ -277,37 +211,23 @@ MatrixX<T> mass_matrix(const Tree& tree,
     above.mass += own.mass;
     above.first += own.first;
     above.second += own.second;
-    if (link.kind == JointKind::kFixed) continue;
+    if (!link.moves()) continue;
     // Momentum of all that the joint carries when it alone moves, at unit speed.
+    const Twist<T>& joint = p.joint;
     Wrench<T> momentum;
-    const auto moves = [&](const Placed<T>& by, JointKind kind) {
-      const bool turns = kind == JointKind::kRevolute;
-      return turns ? Vector3<T>(by.origin.cross(by.axis)) : by.axis;  // of a point that is at c
-    };
-    const Vector3<T> velocity = moves(p, link.kind);
-    if (link.kind == JointKind::kRevolute) {
-      momentum.force = own.mass * velocity + p.axis.cross(own.first);
-      momentum.moment = own.second * p.axis + own.first.cross(velocity);
-    } else {
-      momentum.force = own.mass * velocity;
-      momentum.moment = own.first.cross(velocity);
-    }
+    momentum.force = own.mass * joint.linear + joint.angular.cross(own.first);
+    momentum.moment = own.second * joint.angular + own.first.cross(joint.linear);
     const Index row = kRoot + link.coordinate;
     for (int i = 0; i < 3; ++i) {
-      const T linear = link.multiplier * momentum.force[i];
-      const T angular = link.multiplier * momentum.moment[i];
-      M(i, row) += linear;
-      M(row, i) += linear;
-      M(3 + i, row) += angular;
-      M(row, 3 + i) += angular;
+      M(i, row) += momentum.force[i];
+      M(row, i) += momentum.force[i];
+      M(3 + i, row) += momentum.moment[i];
+      M(row, 3 + i) += momentum.moment[i];
     }
     for (Index a = l; a >= 0; a = tree.links[a].parent) {
       const Link& other = tree.links[a];
-      if (other.parent < 0 || other.kind == JointKind::kFixed) continue;
-      const Placed<T>& q = placed[a];
-      T along = moves(q, other.kind).dot(momentum.force);
-      if (other.kind == JointKind::kRevolute) along += q.axis.dot(momentum.moment);
-      const T entry = link.multiplier * other.multiplier * along;
+      if (other.parent < 0 || !other.moves()) continue;
+      const T entry = placed[a].joint.power(momentum);
       const Index column = kRoot + other.coordinate;
       M(row, column) += entry;
       if (a != l) M(column, row) += entry;

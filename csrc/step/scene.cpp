@@ -115,7 +115,7 @@ bodies::MechanismsDescription complete(const Description& d) {
     m.surface_link.push_back(k);
     bodies::Link link{.tree = k,
                       .parent = -1,
-                      .kind = bodies::JointKind::kFixed,
+                      .kind = bodies::kFixedJoint,
                       .offset = bodies::Mat34::Identity(),
                       .axis = Vec3::Zero(),
                       .coordinate = -1,
