@@ -42,7 +42,11 @@ class SmoothFunction:
     ) -> Arrays: ...
     def tangents(self, inputs: Arrays, directions: Arrays, count: int, threads: int) -> Arrays: ...
 
-def robot_functions(
+class Tree: ...
+
+joint_kinds: dict[str, tuple[float, float]]
+
+def tree(
     *,
     parent: list[int],
     order: list[int],
@@ -52,6 +56,12 @@ def robot_functions(
     dof: list[int],
     multiplier: NDArray[np.float64],
     constant: NDArray[np.float64],
+    joint_count: int,
+) -> Tree: ...
+def link_frames(tree: Tree) -> SmoothFunction: ...
+def robot_functions(
+    *,
+    tree: Tree,
     base: int,
     actuation: list[int],
     vertex_link: list[int],
@@ -59,6 +69,7 @@ def robot_functions(
     dt: float,
     largest: float,
     is_at_rest: bool,
+    bounds_weight: bool,
 ) -> tuple[SmoothFunction, SmoothFunction]: ...
 def body_functions(count: int, dt: float) -> tuple[SmoothFunction, SmoothFunction]: ...
 

@@ -15,6 +15,7 @@
 #include "bind/environments.h"
 #include "bind/links.h"
 #include "bodies/body_functions.h"
+#include "bodies/link_frames.h"
 #include "bodies/robot_functions.h"
 
 namespace diffcloth::bind {
@@ -216,9 +217,24 @@ auto at(const Table& table, Index i, const char* what) {
   return table[i];
 }
 
-bodies::Tree to_tree(const LinkArrays& arrays, const std::vector<Index>& order, Index joint_count) {
-  const std::vector<Index>& parent = arrays.parent;
+bodies::Tree make_tree(const std::vector<Index>& parent,
+                       const std::vector<Index>& order,
+                       const std::vector<Index>& kind,
+                       const Doubles& offset,
+                       const Doubles& axis,
+                       const std::vector<Index>& dof,
+                       const Doubles& multiplier,
+                       const Doubles& constant,
+                       Index joint_count) {
   const std::size_t count = parent.size();
+  const LinkArrays arrays{.tree = std::vector<Index>(count, 0),
+                          .parent = parent,
+                          .kind = kind,
+                          .offset = to_vector(offset),
+                          .axis = to_vector(axis),
+                          .coordinate = dof,
+                          .multiplier = to_vector(multiplier),
+                          .constant = to_vector(constant)};
   bodies::Tree tree{
       .links = to_links(arrays, joint_count), .order = order, .joint_count = joint_count};
   constexpr const char* kOrder =
@@ -235,42 +251,33 @@ bodies::Tree to_tree(const LinkArrays& arrays, const std::vector<Index>& order, 
 
 using Functions = std::pair<std::unique_ptr<SmoothFunction>, std::unique_ptr<SmoothFunction>>;
 
-nb::object robot_functions(const std::vector<Index>& parent,
-                           const std::vector<Index>& order,
-                           const std::vector<Index>& kind,
-                           const Doubles& offset,
-                           const Doubles& axis,
-                           const std::vector<Index>& dof,
-                           const Doubles& multiplier,
-                           const Doubles& constant,
+nb::object robot_functions(const bodies::Tree& tree,
                            Index base,
                            const std::vector<Index>& actuation,
                            const std::vector<Index>& vertex_link,
                            const Doubles& points,
                            double dt,
                            double largest,
-                           bool is_at_rest) {
-  const LinkArrays links{.tree = std::vector<Index>(parent.size(), 0),
-                         .parent = parent,
-                         .kind = kind,
-                         .offset = to_vector(offset),
-                         .axis = to_vector(axis),
-                         .coordinate = dof,
-                         .multiplier = to_vector(multiplier),
-                         .constant = to_vector(constant)};
-  bodies::RobotModel model{.tree = to_tree(links, order, static_cast<Index>(actuation.size())),
+                           bool is_at_rest,
+                           bool bounds_weight) {
+  bodies::RobotModel model{.tree = tree,
                            .base = at(kBases, base, "dynamics: `base` is out of range"),
+                           .actuation = {},
                            .vertex_link = vertex_link,
                            .points = to_vector(points),
                            .dt = dt,
                            .largest = largest,
-                           .is_at_rest = is_at_rest};
+                           .is_at_rest = is_at_rest,
+                           .bounds_weight = bounds_weight};
+  require(std::cmp_equal(actuation.size(), tree.joint_count),
+          "dynamics: `actuation` must have one entry a joint");
   for (const Index mode : actuation) {
     model.actuation.push_back(at(kActuations, mode, "dynamics: `actuation` is out of range"));
   }
   require(model.points.size() == 3 * vertex_link.size(), "dynamics: `points` must be [V, 3]");
   for (const Index l : vertex_link) {
-    require(l >= 0 && std::cmp_less(l, parent.size()), "dynamics: `vertex_link` is out of range");
+    require(l >= 0 && std::cmp_less(l, tree.links.size()),
+            "dynamics: `vertex_link` is out of range");
   }
   return nb::make_tuple(bodies::robot_prediction(model), bodies::robot_advance(model));
 }
@@ -289,9 +296,18 @@ void dynamics(nb::module_& m) {
            "Gradients [losses, B or 1, size] by some inputs, from cotangents [losses, B, ...].")
       .def("tangents", &tangents, "inputs"_a, "directions"_a, "count"_a, "threads"_a,
            "Tangents [count, B, ...] of all outputs, from those of some inputs.");
-  m.def("robot_functions", &robot_functions, nb::kw_only(), "parent"_a, "order"_a, "kind"_a,
-        "offset"_a, "axis"_a, "dof"_a, "multiplier"_a, "constant"_a, "base"_a, "actuation"_a,
-        "vertex_link"_a, "points"_a, "dt"_a, "largest"_a, "is_at_rest"_a,
+  nb::dict kinds;
+  for (const bodies::JointKind& kind : bodies::joint_kinds()) {
+    kinds[std::string(kind.name).c_str()] = nb::make_tuple(kind.turn, kind.slide);
+  }
+  m.attr("joint_kinds") = kinds;
+  nb::class_<bodies::Tree>(m, "Tree");
+  m.def("tree", &make_tree, nb::kw_only(), "parent"_a, "order"_a, "kind"_a, "offset"_a, "axis"_a,
+        "dof"_a, "multiplier"_a, "constant"_a, "joint_count"_a, "Links and joints of a mechanism.");
+  m.def("link_frames", &bodies::link_frames, "tree"_a,
+        "Frames [L, 4, 4] of links in their root's frame, and twists [L, 4, 4] of their joints.");
+  m.def("robot_functions", &robot_functions, nb::kw_only(), "tree"_a, "base"_a, "actuation"_a,
+        "vertex_link"_a, "points"_a, "dt"_a, "largest"_a, "is_at_rest"_a, "bounds_weight"_a,
         "A robot over a step: its prediction, and its state once the step is solved.");
   m.def("body_functions", &body_functions, "count"_a, "dt"_a, "The same of free bodies.");
 }

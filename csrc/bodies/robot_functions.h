@@ -22,8 +22,9 @@ struct RobotModel {
   std::vector<Index> vertex_link;    ///< [V] of the vertices that may be in contact
   std::vector<double> points;        ///< [V, 3] these, in the frames of their links
   double dt = 0.0;
-  double largest = 0.0;     ///< a limit that is none
-  bool is_at_rest = false;  ///< steps that look for an equilibrium
+  double largest = 0.0;        ///< a limit that is none
+  bool is_at_rest = false;     ///< steps that look for an equilibrium
+  bool bounds_weight = false;  ///< in these: the stiffness of the weight is a bound
 
   Index coordinate_count() const {
     return tree.joint_count + (base == Base::kFloating ? kRoot : 0);

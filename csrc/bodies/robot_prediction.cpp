@@ -7,6 +7,7 @@
 #include <type_traits>
 
 #include "bodies/robot.h"
+#include "bodies/weight_stiffness.h"
 
 namespace diffcloth::bodies {
 namespace {
@@ -133,7 +134,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
       }
       metric = mass.bottomRightCorner(n, n) / T(h * h);
       if (model_.is_at_rest) {
-        add_weight_stiffness(in, metric);
+        add_weight_stiffness(in, place_at(inertia, start.configuration), metric);
         force = given.tail(n) / T(h);
       }
     }
@@ -158,8 +159,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
     kVelocityLimits,
     kFriction,
     kSlipRates,
-    kOrigins,
-    kWeightStiffness
+    kOrigins
   };
   enum Output : std::uint8_t {
     kRootStart,
@@ -177,7 +177,6 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
 
   static std::vector<Array> inputs_of(const RobotModel& model) {
     const std::size_t J = model.tree.joint_count;
-    const std::size_t all = model.tree.size();
     const std::size_t V = model.vertex_link.size();
     std::vector<Array> inputs = shared_inputs(model);
     const std::vector<Array> own = {{"velocity", {6}},
@@ -189,8 +188,7 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
                                     {"velocity_limits", {J}, true},
                                     {"friction", {J}, true},
                                     {"slip_rates", {J}, true},
-                                    {"origins", {J}, true},
-                                    {"weight_stiffness", {all, all}, true}};
+                                    {"origins", {J}, true}};
     inputs.insert(inputs.end(), own.begin(), own.end());
     return inputs;
   }
@@ -244,15 +242,27 @@ class RobotPrediction final : public TemplatedFunction<RobotPrediction>, private
     put(ends, last);
   }
 
+  /// The stiffness is a constant: derivatives of an equilibrium do not depend on it.
   template <class T>
-  void add_weight_stiffness(Inputs<T> in, MatrixX<T>& metric) const {
-    const Index n = coordinate_count();
-    const Index first = size() - n;
-    for (Index i = 0; i < n; ++i) {
-      for (Index j = 0; j < n; ++j) {
-        metric(i, j) += in[kWeightStiffness][(first + i) * size() + first + j];
-      }
+  void add_weight_stiffness(Inputs<T> in,
+                            const std::vector<PlacedBody<T>>& placed,
+                            MatrixX<T>& metric) const {
+    constexpr auto kNumber = [](const T& x) { return value_of(x); };
+    std::vector<double> mass(placed.size());
+    std::transform(in[kMass], in[kMass] + mass.size(), mass.begin(), kNumber);
+    std::vector<PlacedBody<double>> numbers(placed.size());
+    for (std::size_t l = 0; l < placed.size(); ++l) {
+      const PlacedBody<T>& p = placed[l];
+      numbers[l].rotation = p.rotation.unaryExpr(kNumber);
+      numbers[l].origin = p.origin.unaryExpr(kNumber);
+      numbers[l].center = p.center.unaryExpr(kNumber);
+      numbers[l].joint = {.angular = p.joint.angular.unaryExpr(kNumber),
+                          .linear = p.joint.linear.unaryExpr(kNumber)};
     }
+    const Vec3 gravity = vector3(in[kGravity]).unaryExpr(kNumber);
+    const auto stiffness = model_.bounds_weight ? weight_stiffness_bound : weight_stiffness;
+    const Index n = coordinate_count();
+    metric += stiffness(model_.tree, mass, numbers, gravity).bottomRightCorner(n, n).cast<T>();
   }
 
   /// nu where it is prescribed, zero elsewhere.

@@ -21,7 +21,6 @@ __all__ = [
     "is_batched_by_older_vmap",
     "is_wrapped",
     "outside_transforms",
-    "saved_tensor_hooks_are_allowed",
     "transforms",
     "unwrap",
     "with_older_axis",
@@ -81,13 +80,6 @@ def without_older_axis(tensor: Tensor, count: int = 1) -> Tensor:
 def with_older_axis(rows: Tensor) -> Tensor:
     """Inverse of `without_older_axis`."""
     return torch._add_batch_dim(rows, 0, _older_level())
-
-
-def saved_tensor_hooks_are_allowed() -> bool:
-    """Whether hooks on saved tensors may be set; reverse-mode transforms forbid them."""
-    # Absent from torch's stubs.
-    allowed: bool = torch._C._autograd._saved_tensors_hooks_is_enabled()  # type: ignore[attr-defined]
-    return allowed
 
 
 def has_compiler() -> bool:

@@ -13,12 +13,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from diffcloth_torch.dynamics.functions import body_functions, outputs_of
-from diffcloth_torch.dynamics.linear import times
-from diffcloth_torch.dynamics.totals import Totals, ordered_sum
+from diffcloth_torch.dynamics.inertia import rigid_totals
+from diffcloth_torch.dynamics.totals import Totals
 from diffcloth_torch.errors import TurnedTooFar
 from diffcloth_torch.model.kinematics import pose_frame
 from diffcloth_torch.operations import operation
@@ -141,14 +140,7 @@ def body_totals(poses: Tensor, velocities: Tensor, inertia: BodyInertia, gravity
         inertia: Masses, centers and inertias of the bodies.
         gravity: [B or 1, 3] m/s^2.
     """
-    frames = pose_frame(poses)
-    rotation = frames[..., :3, :3]
-    center = frames[..., :3, 3] + times(rotation, inertia.center)
-    spin = times(rotation.transpose(-1, -2), velocities[..., 3:])
-    angular = times(rotation, times(inertia.inertia, spin))
-    momenta = torch.cat([inertia.mass[..., None] * velocities[..., :3], angular], dim=-1)
-    kinetic = ordered_sum((momenta * velocities).flatten(-2)) / 2
-    return Totals.of(center, momenta, kinetic, inertia.mass, gravity)
+    return rigid_totals(pose_frame(poses), velocities, *inertia, gravity)
 
 
 def advance_bodies(

@@ -17,7 +17,8 @@ from diffcloth_torch import _core
 from diffcloth_torch._exit import note_caller
 from diffcloth_torch.autograd.core_function import Arrays, CoreFunction, as_array, evaluate
 from diffcloth_torch.autograd.transforms import is_differentiated
-from diffcloth_torch.model.mechanism import JOINT_KINDS, Mechanism
+from diffcloth_torch.model.kinematics import core_tree
+from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.robot import ACTUATIONS, BASES
 
 __all__ = ["body_functions", "outputs_of", "robot_functions"]
@@ -45,6 +46,7 @@ def robot_functions(
     largest: float,
     *,
     is_at_rest: bool,
+    bounds_weight: bool = False,
 ) -> tuple[_core.SmoothFunction, _core.SmoothFunction]:
     """Prediction of a robot, and its state once the step is solved.
 
@@ -55,16 +57,11 @@ def robot_functions(
         points: These vertices, in the frames of their links [m], shape [V, 3].
         largest: Limits that are none.
         is_at_rest: Whether steps lead to an equilibrium.
+        bounds_weight: Whether the stiffness of the weight in these is an upper bound, for steps
+            from afar, or exact.
     """
     return _core.robot_functions(
-        parent=mechanism.parent.tolist(),
-        order=list(mechanism.order),
-        kind=[JOINT_KINDS.index(kind) for kind in mechanism.kind],
-        offset=np.array(mechanism.offset),
-        axis=np.array(mechanism.axis),
-        dof=mechanism.dof.tolist(),
-        multiplier=np.array(mechanism.multiplier),
-        constant=np.array(mechanism.constant),
+        tree=core_tree(mechanism),
         base=BASES.index(mechanism.base),
         actuation=[ACTUATIONS.index(mode) for mode in mechanism.actuation],
         vertex_link=links.tolist(),
@@ -72,6 +69,7 @@ def robot_functions(
         dt=dt,
         largest=largest,
         is_at_rest=is_at_rest,
+        bounds_weight=bounds_weight,
     )
 
 

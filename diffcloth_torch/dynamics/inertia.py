@@ -1,13 +1,4 @@
-"""Mass matrix, momentum and forces of a mechanism in its velocities nu = (dc/dt, omega, dq/dt).
-
-With the 6 velocities V_l = J_l nu of each link, those of its center and of rotation, and its mass
-and inertia in world axes W_l = diag(m 1, R I R^T):
-
-    M = sum_l J_l^T W_l J_l,   p = M nu = sum_l J_l^T h_l,   h_l = W_l V_l.
-
-This serves energies, momenta and constants. Steps take the same from recursions along the tree in
-the core (`csrc/bodies/tree.h`).
-"""
+"""Masses and inertias of links, and the momentum and energy of rigid bodies and links."""
 
 from __future__ import annotations
 
@@ -16,18 +7,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from diffcloth_torch.dynamics.jacobians import DifferentialKinematics, Frames
 from diffcloth_torch.dynamics.linear import times
-from diffcloth_torch.geometry.products import product
+from diffcloth_torch.dynamics.totals import Totals, ordered_sum
 
-__all__ = [
-    "Inertia",
-    "Motion",
-    "generalized_force",
-    "link_momenta",
-    "mass_matrix",
-    "momentum",
-]
+__all__ = ["ROOT", "Inertia", "rigid_totals"]
+
+ROOT = 6
+"""Velocities of a root, which stand before those of the joints: of its center, then angular."""
 
 
 class Inertia(NamedTuple):
@@ -46,56 +32,28 @@ class Inertia(NamedTuple):
     armature: Tensor
 
 
-class Motion(NamedTuple):
-    """Links in a configuration, ready for any velocity.
+def rigid_totals(
+    frames: Tensor,
+    velocities: Tensor,
+    mass: Tensor,
+    center: Tensor,
+    inertia: Tensor,
+    gravity: Tensor,
+) -> Totals:
+    """Momentum and energy of rigid bodies, or of links without their drives.
 
-    Attributes:
-        frames: Frames of the links.
-        jacobian: J_l, shape [B, L, 6, 6 + J].
-        weighted: W_l J_l, likewise.
+    Args:
+        frames: Their frames, [B, n, 4, 4].
+        velocities: Velocities of the centers, then angular ones, in world axes; [B, n, 6].
+        mass: [B or 1, n] kg.
+        center: Centers of mass in the frames, [B or 1, n, 3] m.
+        inertia: Inertias about the centers, in the axes of the frames, [B or 1, n, 3, 3] kg m^2.
+        gravity: [B or 1, 3] m/s^2.
     """
-
-    frames: Frames
-    jacobian: Tensor
-    weighted: Tensor
-
-    @staticmethod
-    def at(
-        kinematics: DifferentialKinematics, inertia: Inertia, root: Tensor, joints: Tensor
-    ) -> Motion:
-        """Place the links; `root` is the frame [B, 4, 4] of the root link, `joints` [B, J]."""
-        frames = kinematics.frames(root, joints, inertia.center)
-        jacobian = kinematics.jacobian(frames)
-        rotation = frames.poses[..., :3, :3]
-        linear = inertia.mass[..., None, None] * jacobian[..., :3, :]
-        local = product(inertia.inertia, product(rotation.transpose(-1, -2), jacobian[..., 3:, :]))
-        return Motion(frames, jacobian, torch.cat([linear, product(rotation, local)], dim=-2))
-
-
-def mass_matrix(motion: Motion, inertia: Inertia) -> Tensor:
-    """M with the armature on its diagonal, shape [B, 6 + J, 6 + J]."""
-    columns = motion.jacobian.flatten(-3, -2)
-    matrix = product(columns.transpose(-1, -2), motion.weighted.flatten(-3, -2))
-    return matrix + torch.diag_embed(_at_joints(inertia.armature))
-
-
-def link_momenta(motion: Motion, velocity: Tensor) -> Tensor:
-    """h_l of velocities nu [B, 6 + J]: linear, then angular about the centers; [B, L, 6]."""
-    return times(motion.weighted, velocity[..., None, :])
-
-
-def momentum(motion: Motion, inertia: Inertia, velocity: Tensor) -> Tensor:
-    """M nu of velocities nu [B, 6 + J], likewise."""
-    of_links = link_momenta(motion, velocity)
-    return generalized_force(motion, of_links) + _at_joints(inertia.armature) * velocity
-
-
-def generalized_force(motion: Motion, wrenches: Tensor) -> Tensor:
-    """sum_l J_l^T f_l of forces at the links' centers and torques, [B, L, 6] -> [B, 6 + J]."""
-    columns = motion.jacobian.flatten(-3, -2)
-    return product(wrenches.flatten(-2).unsqueeze(-2), columns).squeeze(-2)
-
-
-def _at_joints(values: Tensor) -> Tensor:
-    """Put zeros for the root before values [B, J] of the joints."""
-    return torch.nn.functional.pad(values, (6, 0))
+    rotation = frames[..., :3, :3]
+    centers = frames[..., :3, 3] + times(rotation, center)
+    spin = times(rotation.transpose(-1, -2), velocities[..., 3:])
+    angular = times(rotation, times(inertia, spin))
+    momenta = torch.cat([mass[..., None] * velocities[..., :3], angular], dim=-1)
+    kinetic = ordered_sum((momenta * velocities).flatten(-2)) / 2
+    return Totals.of(centers, momenta, kinetic, mass, gravity)

@@ -6,13 +6,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from diffcloth_torch import cpu
 from diffcloth_torch.checks import FloatArray
-from diffcloth_torch.dynamics.inertia import Inertia, Motion, mass_matrix
-from diffcloth_torch.dynamics.jacobians import ROOT, DifferentialKinematics
+from diffcloth_torch.dynamics.inertia import ROOT, rigid_totals
 from diffcloth_torch.model.assembly import Assembly
+from diffcloth_torch.model.kinematics import Links, constant
 from diffcloth_torch.model.mechanism import Mechanism
 
 __all__ = ["ZONE", "LimitStiffness", "limit_stiffness", "slip_rates"]
@@ -113,13 +112,17 @@ def _inertias(assembly: Assembly) -> Iterator[tuple[Mechanism, _Inertia]]:
 
 
 def _of_joints(mechanism: Mechanism, start: FloatArray, armature: FloatArray) -> _Inertia:
-    kinematics = DifferentialKinematics(mechanism)
-    arrays = (mechanism.mass, mechanism.center, mechanism.inertia, armature)
-    inertia = Inertia(*(torch.from_numpy(np.array(a))[None] for a in arrays))
-    joints = torch.from_numpy(np.array(start))[None]
-    motion = Motion.at(kinematics, inertia, cpu.eye(4)[None], joints)
-    moments = mass_matrix(motion, inertia)[0].diagonal()[ROOT:].numpy()
-    pulls = motion.weighted[0, :, :3, ROOT:].norm(dim=1).sum(0).numpy()
+    arrays = (mechanism.mass, mechanism.center, mechanism.inertia)
+    mass, center, inertia = (constant(array)[None] for array in arrays)
+    # One joint after the other moves alone, at unit speed.
+    count = mechanism.joint_count
+    links, joints = Links(mechanism), constant(start).expand(count, -1)
+    root, still = cpu.eye(4).expand(count, 4, 4), cpu.zeros(1, ROOT)
+    velocities = links.velocities(root, joints, center, still, cpu.eye(count))
+    frames = links.frames(root, joints)
+    totals = rigid_totals(frames, velocities, mass, center, inertia, cpu.zeros(1, 3))
+    moments = 2 * totals.kinetic_energy.numpy() + armature
+    pulls = (mass * velocities[..., :3].norm(dim=-1)).sum(-1).numpy()
     return _Inertia(moments, pulls, _carried(mechanism))
 
 

@@ -45,7 +45,7 @@ evaluates (see csrc/bodies/joint_term.h), as are a limit of the speed and Coulom
 
 **At rest.** A step that looks for an equilibrium is long, and tau(q_n) would lead far away in it.
 Such a step predicts no motion; it counts tau(q_n) as a force and adds a stiffness of the weight to
-M/h^2: see `weights.py`.
+M/h^2: see csrc/bodies/weight_stiffness.h.
 """
 
 from __future__ import annotations
@@ -59,19 +59,11 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.checks import LARGEST
 from diffcloth_torch.dynamics.functions import outputs_of, robot_functions
-from diffcloth_torch.dynamics.inertia import (
-    Inertia,
-    Motion,
-    generalized_force,
-    link_momenta,
-    momentum,
-)
-from diffcloth_torch.dynamics.jacobians import ROOT, DifferentialKinematics
+from diffcloth_torch.dynamics.inertia import ROOT, Inertia, rigid_totals
 from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.dynamics.totals import Totals, ordered_sum
-from diffcloth_torch.dynamics.weights import Configuration, WeightSpring
 from diffcloth_torch.geometry.rotation import pose_velocities, quaternion_matrix
-from diffcloth_torch.model.kinematics import constant, pose_frame
+from diffcloth_torch.model.kinematics import Links, constant, pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
 
 __all__ = ["Bounds", "Gains", "RobotControl", "RobotDynamics", "RobotPrediction", "RobotState"]
@@ -203,18 +195,21 @@ class RobotDynamics:
             weight: As for `Dynamics`.
         """
         self.mechanism, self._dt = mechanism, dt
-        self._kinematics = DifferentialKinematics(mechanism)
-        self.root = self._kinematics.root
+        self._links = Links(mechanism)
+        self.root = mechanism.root
         self._prescribed = torch.from_numpy(~mechanism.forced)
         base = cpu.zeros(ROOT * (mechanism.base == "floating"), dtype=torch.bool)
         self.prescribed = torch.cat([base, self._prescribed])
         self.coordinate_count = len(self.prescribed)
         self._prediction, self._advance = robot_functions(
-            mechanism, dt, links, points, LARGEST, is_at_rest=weight is not None
+            mechanism,
+            dt,
+            links,
+            points,
+            LARGEST,
+            is_at_rest=weight is not None,
+            bounds_weight=weight == "bounded",
         )
-        self._weight = None
-        if weight is not None and mechanism.is_dynamic:
-            self._weight = WeightSpring(self._kinematics, is_bound=weight == "bounded")
         self._own_inertia = None if mechanism.is_dynamic else _inertia_of_prescribed(mechanism)
 
     def predict(
@@ -265,9 +260,6 @@ class RobotDynamics:
         }
         if contact is not None:
             own["contact"] = contact
-        if self._weight is not None:
-            at = Configuration.of(state.pose, inertia.center[..., self.root, :], state.joints)
-            own["weight_stiffness"] = self._weight.stiffness(at, inertia, gravity)
         if bounds is not None:
             shared["effort_limits"] = bounds.efforts
             own["velocity_limits"] = bounds.velocities
@@ -336,9 +328,9 @@ class RobotDynamics:
         """
         if not self.mechanism.is_dynamic:
             return torch.zeros_like(state.joints)
-        motion = Motion.at(self._kinematics, inertia, pose_frame(state.pose), state.joints)
-        weights = torch.nn.functional.pad(gravity, (0, 3))[..., None, :]
-        return generalized_force(motion, inertia.mass[..., None] * weights)[..., ROOT:]
+        weights = inertia.mass[..., None] * gravity[..., None, :]
+        root = pose_frame(state.pose)
+        return self._links.efforts(root, state.joints, inertia.center, weights)
 
     def totals(self, state: RobotState, inertia: Inertia, gravity: Tensor) -> Totals:
         """Momentum and energy of a state; zero if the robot is not dynamic.
@@ -351,12 +343,18 @@ class RobotDynamics:
         if not self.mechanism.is_dynamic:
             return Totals.zero(len(state.pose))
         inertia = self._acting(inertia)
-        motion = Motion.at(self._kinematics, inertia, pose_frame(state.pose), state.joints)
-        velocity = self._velocity(state)
-        # T = p . nu / 2
-        kinetic = ordered_sum(momentum(motion, inertia, velocity) * velocity) / 2
-        momenta = link_momenta(motion, velocity)
-        return Totals.of(motion.frames.centers, momenta, kinetic, inertia.mass, gravity)
+        root, at = pose_frame(state.pose), (state.joints, inertia.center)
+        velocity = state.velocity
+        if self.mechanism.base == "fixed":
+            velocity = torch.zeros_like(velocity)
+        velocities = self._links.velocities(root, *at, velocity, state.rates)
+        frames = self._links.frames(root, state.joints)
+        mass, center, moments, armature = inertia
+        totals = rigid_totals(frames, velocities, mass, center, moments, gravity)
+        if not self.mechanism.joint_count:
+            return totals
+        drives = ordered_sum(armature * state.rates**2) / 2
+        return totals._replace(kinetic_energy=totals.kinetic_energy + drives)
 
     # Constituents
 
@@ -368,13 +366,6 @@ class RobotDynamics:
         if self._own_inertia is not None:
             return self._own_inertia
         return inertia._replace(armature=~self._prescribed * inertia.armature)
-
-    def _velocity(self, state: RobotState) -> Tensor:
-        """Velocities nu, [B, 6 + J]."""
-        root = state.velocity
-        if self.mechanism.base == "fixed":
-            root = torch.zeros_like(root)
-        return torch.cat([root, state.rates], dim=-1)
 
     def too_fast(self, prediction: RobotPrediction) -> dict[int, str]:
         """Environment without a motion by itself -> a sentence."""

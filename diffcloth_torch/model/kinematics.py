@@ -1,51 +1,76 @@
-"""Forward kinematics of a mechanism: frames of links from joint positions, in torch and float64."""
+"""Frames and velocities of the links of a mechanism, which the core places.
+
+The core returns the frames F_l of all links in the root's frame, and the twists S_l of their
+joints as matrices. A change dq of the coordinate of joint l moves link l and all links that it
+carries, and the twists of their joints, by
+
+    dF = dq S_l F,   dS = dq (S_l S - S S_l).
+
+This is closed in F and S. So all derivatives, of any order, are products of these matrices, for
+every kind of joint.
+"""
 
 from __future__ import annotations
 
 import math
+from inspect import signature
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
-from diffcloth_torch import cpu
+from diffcloth_torch import _core, cpu
+from diffcloth_torch._exit import note_caller
+from diffcloth_torch.autograd.core_function import as_array
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.geometry.products import product
 from diffcloth_torch.geometry.rotation import quaternion_matrix
-from diffcloth_torch.model.mechanism import Mechanism
+from diffcloth_torch.model.mechanism import JOINT_KINDS, Mechanism
 
-__all__ = ["Kinematics", "constant", "joined_frame", "link_frames", "pose_frame"]
+__all__ = ["Links", "constant", "core_tree", "link_frames", "pose_frame"]
 
 
-class Kinematics:
-    """The constants of a mechanism that its links' frames depend on, as tensors.
+def core_tree(mechanism: Mechanism) -> _core.Tree:
+    """Links and joints of a mechanism for functions of the core."""
+    return _core.tree(
+        parent=mechanism.parent.tolist(),
+        order=list(mechanism.order),
+        kind=[JOINT_KINDS.index(kind) for kind in mechanism.kind],
+        offset=np.array(mechanism.offset),
+        axis=np.array(mechanism.axis),
+        dof=mechanism.dof.tolist(),
+        multiplier=np.array(mechanism.multiplier),
+        constant=np.array(mechanism.constant),
+        joint_count=mechanism.joint_count,
+    )
 
-    A joint turns about a constant axis of unit length. With K the matrix of its cross product,
 
-        R = 1 + sin(a) K + (1 - cos(a)) K^2
+class Links:
+    """How the links of a mechanism follow its root and its joints. Immutable.
 
-    is smooth in a everywhere, unlike the exponential of a rotation vector at zero.
+    Everything is differentiable any number of times.
+
+    Attributes:
+        mechanism: The mechanism.
     """
 
     def __init__(self, mechanism: Mechanism) -> None:
+        self.mechanism = mechanism
+        self._place = _core.link_frames(core_tree(mechanism))
+        carried = np.eye(mechanism.link_count)
+        for link in mechanism.order[1:]:
+            carried[link] += carried[mechanism.parent[link]]
         moving = np.flatnonzero(mechanism.dof >= 0)
+        rates = np.zeros((mechanism.link_count, mechanism.joint_count))
+        rates[moving, mechanism.dof[moving]] = 1.0
         # A first axis for the environments: rounding in one product of all of them would depend on
         # their number.
-        leaders = np.zeros((1, mechanism.joint_count, mechanism.link_count))
-        leaders[0, mechanism.dof[moving], moving] = mechanism.multiplier[moving]
-        turns = np.array([kind == "revolute" for kind in mechanism.kind])[:, None]
-        cross, shift = (np.zeros((mechanism.link_count, 4, 4)) for _ in range(2))
-        cross[:, :3, :3] = np.cross(np.eye(3), mechanism.axis[:, None, :]) * turns[..., None]
-        shift[:, :3, 3] = mechanism.axis * ~turns
-        self._leaders = constant(leaders)
-        self._constants = constant(mechanism.constant * (mechanism.dof >= 0))
-        self._offsets = constant(mechanism.offset)
-        self._cross, self._cross_sq, self._shift = map(constant, (cross, cross @ cross, shift))
-        self._root = mechanism.root
-        self._parents = [(link, int(mechanism.parent[link])) for link in mechanism.order[1:]]
+        self._carried, self._rates = constant(carried)[None], constant(rates)[None]
 
     def frames(self, root: Tensor, joints: Tensor) -> Tensor:
-        """Frames of all links; differentiable any number of times.
+        """Frames of all links.
 
         Args:
             root: Frames of the root link, shape [..., 4, 4].
@@ -57,39 +82,139 @@ class Kinematics:
         """
         shape = np.broadcast_shapes(root.shape[:-2], joints.shape[:-1])
         count = math.prod(shape)
-        rows = joints.expand(*shape, joints.shape[-1]).reshape(count, 1, joints.shape[-1])
-        values = product(rows, self._leaders)[:, 0]
-        values = (values + self._constants)[..., None, None]
-        motions = torch.sin(values) * self._cross + (1 - torch.cos(values)) * self._cross_sq
-        steps = self._offsets + product(self._offsets, motions + values * self._shift)
-        local = steps.unbind(-3)
-        placed = {self._root: root.expand(*shape, 4, 4).reshape(count, 4, 4)}
-        for link, parent in self._parents:
-            placed[link] = product(placed[parent], local[link])
-        frames = torch.stack([placed[link] for link in range(len(placed))], dim=1)
-        return frames.reshape(*shape, len(placed), 4, 4)
+        rows = joints.expand(*shape, joints.shape[-1]).reshape(count, joints.shape[-1])
+        local, _ = self.local(rows)
+        root = root.expand(*shape, 4, 4).reshape(count, 1, 4, 4)
+        return product(root, local).reshape(*shape, *local.shape[1:])
+
+    def local(self, joints: Tensor) -> tuple[Tensor, Tensor]:
+        """F and S in the root's frame, both [N, L, 4, 4], at joints [N, J]."""
+        found: tuple[Tensor, Tensor] = _Local.apply(self, joints)  # type: ignore[no-untyped-call]
+        return found
+
+    def velocities(
+        self, root: Tensor, joints: Tensor, centers: Tensor, velocity: Tensor, rates: Tensor
+    ) -> Tensor:
+        """Velocities of the links' centers of mass, then angular ones, in world axes; [N, L, 6].
+
+        Args:
+            root: Frames of the root link, shape [N, 4, 4].
+            joints: Values of the joints [rad or m], shape [N, J].
+            centers: Centers of mass in the links' frames [m], shape [N or 1, L, 3].
+            velocity: Velocity of the root's center of mass, then angular velocity, [N or 1, 6].
+            rates: Velocities of the joints, [N or 1, J].
+        """
+        frames, twists = self.local(joints)
+        of_links = self.push_forward(twists, rates)
+        points = product(frames, _homogeneous(centers))[..., :3, :]
+        own = centers[..., self.mechanism.root, None, :, None]
+        slid = product(of_links[..., :3, :3], points)[..., 0] + of_links[..., :3, 3]
+        parts = torch.stack([(points - own)[..., 0], slid, _axial(of_links)], dim=-1)
+        arms, slid, turned = product(root[..., None, :3, :3], parts).unbind(-1)
+        linear, angular = velocity[..., None, :3], velocity[..., None, 3:].expand_as(arms)
+        moved = linear + torch.linalg.cross(angular, arms) + slid
+        return torch.cat([moved, angular + turned], dim=-1)
+
+    def efforts(self, root: Tensor, joints: Tensor, centers: Tensor, forces: Tensor) -> Tensor:
+        """Efforts [N, J] that do at the joints the work of forces at the links' centers of mass.
+
+        Args:
+            root: Frames of the root link, shape [N, 4, 4].
+            joints: Values of the joints [rad or m], shape [N, J].
+            centers: Centers of mass in the links' frames [m], shape [N or 1, L, 3].
+            forces: [N or 1, L, 3] N.
+        """
+        frames, twists = self.local(joints)
+        local = product(root[..., None, :3, :3].mT, forces[..., None])
+        points = product(frames, _homogeneous(centers))
+        work = torch.nn.functional.pad(product(local, points.mT), (0, 0, 0, 1))
+        return self.pull_back(twists, work)
+
+    def push_forward(self, twists: Tensor, rates: Tensor) -> Tensor:
+        """Twists of the links [N, L, 4, 4], from twists S of the joints and rates [N or 1, J]."""
+        own = product(self._rates, rates[..., None])[..., None] * twists
+        return product(self._carried, _rows(own)).reshape(own.shape)
+
+    def pull_back(self, twists: Tensor, moments: Tensor) -> Tensor:
+        """push_forward transposed: [N, J] from cotangents of the links' twists, [N, L, 4, 4]."""
+        carried = product(self._carried.mT, _rows(moments)).reshape(moments.shape)
+        along = (carried * twists).sum((-2, -1))
+        return product(self._rates.mT, along[..., None])[..., 0]
+
+
+class _Local(torch.autograd.Function):
+    @staticmethod
+    def forward(links: Links, joints: Tensor) -> Any:
+        count = links.mechanism.link_count
+        if not len(joints):
+            return cpu.zeros(0, count, 4, 4), cpu.zeros(0, count, 4, 4)
+        note_caller()
+        found = links._place.values({"joints": as_array(joints)}, 1)
+        return torch.from_numpy(found["frames"]), torch.from_numpy(found["twists"])
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        ctx.links, joints = inputs
+        # The outputs are computed again where they are needed: so they know their derivative.
+        ctx.save_for_backward(joints)
+        ctx.save_for_forward(joints)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, links: Links, joints: Tensor) -> Any:
+        rows = joints.movedim(in_dims[1], 0)
+        found = links.local(rows.flatten(0, 1))
+        return tuple(t.reshape(*rows.shape[:2], *t.shape[1:]) for t in found), (0, 0)
+
+    @staticmethod
+    def jvp(ctx: Any, _: Any, change: Tensor) -> Any:
+        # torch computes no tangents in here; one of a tangent needs them.
+        with forward_ad._set_fwd_grad_enabled(True):
+            unpack: Any = forward_ad.unpack_dual
+            F, S = ctx.links.local(unpack(*ctx.saved_tensors).primal)
+            moved = ctx.links.push_forward(S, change)
+            return product(moved, F), product(moved, S) - product(S, moved)
+
+    @staticmethod
+    def backward(ctx: Any, F_bar: Tensor, S_bar: Tensor) -> Any:
+        F, S = ctx.links.local(*ctx.saved_tensors)
+        moments = product(F_bar, F.mT) + product(S_bar, S.mT) - product(S.mT, S_bar)
+        return None, ctx.links.pull_back(S, moments)
+
+
+# torch reads it in every call, and inspect computes it each time unless it is there.
+_Local.forward.__signature__ = signature(_Local.forward)  # type: ignore[attr-defined]
 
 
 def link_frames(mechanism: Mechanism, root_frame: Tensor, joint_positions: Tensor) -> Tensor:
-    """Frames of all links, [..., L, 4, 4]: see `Kinematics.frames`."""
-    return Kinematics(mechanism).frames(root_frame, joint_positions)
+    """Frames of all links, [..., L, 4, 4]: see `Links.frames`."""
+    return Links(mechanism).frames(root_frame, joint_positions)
 
 
 def pose_frame(pose: Tensor) -> Tensor:
     """Frames [..., 4, 4] of poses [..., 7], whose quaternions are normalized."""
     quaternion = pose[..., 3:] / torch.linalg.vector_norm(pose[..., 3:], dim=-1, keepdim=True)
-    return joined_frame(quaternion_matrix(quaternion), pose[..., :3])
-
-
-def joined_frame(rotation: Tensor, translation: Tensor) -> Tensor:
-    """Frames [..., 4, 4] of rotations [..., 3, 3] and translations [..., 3]."""
-    top = torch.cat([rotation.expand(*translation.shape, 3), translation[..., None]], dim=-1)
+    top = torch.cat([quaternion_matrix(quaternion), pose[..., :3, None]], dim=-1)
     return torch.cat([top, _LAST_ROW.expand(*top.shape[:-2], 1, 4)], dim=-2)
 
 
 def constant(array: FloatArray) -> Tensor:
     """Copy an array of any real numbers into a float64 tensor."""
     return torch.from_numpy(np.array(array, dtype=np.float64))
+
+
+def _rows(matrices: Tensor) -> Tensor:
+    """Rows [..., 16] of matrices [..., 4, 4]; the older vmap of torch knows no `flatten`."""
+    return matrices.reshape(*matrices.shape[:-2], 16)
+
+
+def _homogeneous(points: Tensor) -> Tensor:
+    """Columns [..., 4, 1] of points [..., 3]."""
+    return torch.nn.functional.pad(points, (0, 1), value=1.0)[..., None]
+
+
+def _axial(matrices: Tensor) -> Tensor:
+    """Angular velocities [..., 3] of twists [..., 4, 4]."""
+    return torch.stack([matrices[..., 2, 1], matrices[..., 0, 2], matrices[..., 1, 0]], dim=-1)
 
 
 _LAST_ROW = cpu.tensor([[0.0, 0.0, 0.0, 1.0]])

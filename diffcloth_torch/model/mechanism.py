@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from diffcloth_torch import _core
 from diffcloth_torch.checks import FloatArray, IndexArray
 from diffcloth_torch.saved import saved
 
@@ -16,8 +17,8 @@ __all__ = ["FORCED", "JOINT_KINDS", "Mechanism"]
 FORCED = ("torque", "pd")
 """Actuations that leave a joint's motion to forces."""
 
-JOINT_KINDS = ("fixed", "revolute", "prismatic")
-"""Joints of links to their parents, in the order of their numbers in the core."""
+JOINT_KINDS = tuple(_core.joint_kinds)
+"""Kinds of joints, in the order of their numbers in the core: see csrc/bodies/joint_kind.cpp."""
 
 
 @saved
@@ -29,17 +30,17 @@ class Mechanism:
 
         T_l = T_p offset_l motion(axis_l, multiplier_l q[dof_l] + constant_l),
 
-    where motion turns about the axis or shifts along it. Links are in the order of the file, in
-    which a parent may follow its children. Arrays are not marked read-only, because torch takes no
-    views of read-only arrays.
+    where motion turns about the axis, shifts along it, or does both. Links are in the order of the
+    file, in which a parent may follow its children. Arrays are not marked read-only, because torch
+    takes no views of read-only arrays.
 
     Attributes:
         name: Name of the robot or body.
         base: "fixed", "kinematic" (the root link moves on prescribed poses), or "floating".
         link_names: Names of the L links.
         parent: Index of each link's parent, -1 for the root; shape [L].
-        kind: Kind of each link's joint to its parent: "fixed" (also for the root), "revolute" or
-            "prismatic"; length L.
+        kind: Kind of each link's joint to its parent, of `JOINT_KINDS`; "fixed" for the root;
+            length L.
         offset: Frame of that joint in the parent's frame, shape [L, 4, 4].
         axis: Unit axis in the joint's frame, zero for a fixed joint; shape [L, 3].
         dof: Index of the one of the J joints that moves each link, -1 for a fixed joint; shape [L].
@@ -120,6 +121,11 @@ class Mechanism:
             for a, b in combinations(range(self.link_count), 2)
             if group[a] == group[b] or above[a] == group[b] or above[b] == group[a]
         )
+
+    @property
+    def turning(self) -> NDArray[np.bool_]:
+        """Which links a joint turns when its value changes, shape [L]."""
+        return np.array([_core.joint_kinds[kind][0] != 0.0 for kind in self.kind], dtype=bool)
 
     @property
     def is_dynamic(self) -> bool:

@@ -6,7 +6,6 @@ import sys
 import pytest
 import torch
 from torch.autograd import forward_ad
-from torch.autograd.graph import saved_tensors_hooks
 
 from diffcloth_torch.autograd import torch_private
 
@@ -90,22 +89,6 @@ def test_axis_of_the_older_vmap():
     assert torch.equal(Watched.rows, X)
     assert torch.equal(gradients, 2 * X)
     assert not torch_private.is_batched_by_older_vmap(X)
-
-
-def test_hooks_on_saved_tensors():
-    def function(x):
-        allowed = torch_private.saved_tensor_hooks_are_allowed()
-        if allowed:
-            with saved_tensors_hooks(lambda t: t, lambda t: t):
-                return (x * x).sum()
-        with pytest.raises(RuntimeError), saved_tensors_hooks(lambda t: t, lambda t: t):
-            (x * x).sum()
-        return (x * x).sum()
-
-    assert torch_private.saved_tensor_hooks_are_allowed()
-    function(X)
-    torch.func.grad(function)(X)
-    assert torch_private.saved_tensor_hooks_are_allowed()
 
 
 def test_the_compiler_is_seen_once_it_is_imported():

@@ -2,9 +2,9 @@
 
 import numpy as np
 import torch
+from tree_in_torch import DifferentialKinematics, root_frame
 
 from diffcloth_torch.dynamics.inertia import Inertia
-from diffcloth_torch.dynamics.jacobians import DifferentialKinematics, root_frame
 from diffcloth_torch.geometry.rotation import quaternion_matrix
 from diffcloth_torch.model.mechanism import Mechanism
 

@@ -9,8 +9,8 @@ by
 """
 
 import torch
+from tree_in_torch import link_momenta
 
-from diffcloth_torch.dynamics.inertia import link_momenta
 from diffcloth_torch.dynamics.linear import times
 from diffcloth_torch.dynamics.totals import about_origin
 from diffcloth_torch.geometry.products import product

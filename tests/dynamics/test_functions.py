@@ -8,11 +8,17 @@ import pytest
 import torch
 from mechanisms import F64, TREES, frame_of, inertia_of, make, random_configuration, tensor
 from reference import slope, wrenches_of_forces
+from tree_in_torch import (
+    DifferentialKinematics,
+    Motion,
+    generalized_force,
+    mass_matrix,
+    momentum,
+    root_frame,
+)
 
 from diffcloth_torch import _core, _kernels
 from diffcloth_torch.dynamics.bodies import BodyInertia, predict_bodies
-from diffcloth_torch.dynamics.inertia import Motion, generalized_force, mass_matrix, momentum
-from diffcloth_torch.dynamics.jacobians import DifferentialKinematics, root_frame
 from diffcloth_torch.dynamics.robots import Gains, RobotControl, RobotDynamics, RobotState
 from diffcloth_torch.geometry.rotation import (
     quaternion_exp,
@@ -199,6 +205,7 @@ def robot_functions(**changes):
         "dof": [-1, 0],
         "multiplier": np.ones(2),
         "constant": np.zeros(2),
+        "joint_count": 1,
         "base": 2,
         "actuation": [3],
         "vertex_link": [1, 0],
@@ -206,8 +213,11 @@ def robot_functions(**changes):
         "dt": H,
         "largest": 1e30,
         "is_at_rest": False,
+        "bounds_weight": False,
     }
-    return _core.robot_functions(**{**options, **changes})
+    options |= changes
+    tree = {name: options.pop(name) for name in list(options)[:9]}
+    return _core.robot_functions(tree=_core.tree(**tree), **options)
 
 
 SIZES = {
@@ -315,6 +325,7 @@ def test_rotations(angle):
         ({"dof": [-1, -1]}, "in range"),
         ({"base": 3}, "`base` is out of range"),
         ({"actuation": [4]}, "`actuation` is out of range"),
+        ({"actuation": [3, 3]}, "`actuation` must have one entry a joint"),
         ({"vertex_link": [0, 2]}, "`vertex_link` is out of range"),
         ({"points": np.ones((3, 3))}, "`points` must be [V, 3]"),
     ],

@@ -13,14 +13,15 @@ from mechanisms import (
     tensor,
 )
 from reference import slope, wrenches_of_forces
-
-from diffcloth_torch.dynamics.inertia import (
+from tree_in_torch import (
+    DifferentialKinematics,
     Motion,
     generalized_force,
     mass_matrix,
     momentum,
+    root_frame,
 )
-from diffcloth_torch.dynamics.jacobians import DifferentialKinematics, root_frame
+
 from diffcloth_torch.geometry.rotation import quaternion_matrix, rotation_exp
 
 pin = pytest.importorskip("pinocchio", reason="Pinocchio is in the extra `test`")

@@ -16,10 +16,9 @@ from mechanisms import (
     random_configuration,
     tensor,
 )
+from tree_in_torch import DifferentialKinematics, Motion, mass_matrix, momentum
 
 from diffcloth_torch.dynamics.bodies import BodyInertia, advance_bodies, predict_bodies
-from diffcloth_torch.dynamics.inertia import Motion, mass_matrix, momentum
-from diffcloth_torch.dynamics.jacobians import DifferentialKinematics
 from diffcloth_torch.dynamics.robots import Gains, RobotControl, RobotDynamics, RobotState
 from diffcloth_torch.errors import SimulationError
 from diffcloth_torch.geometry.rotation import quaternion_exp, quaternion_log, quaternion_multiply

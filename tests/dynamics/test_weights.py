@@ -1,14 +1,18 @@
 """The stiffness of weight: a second derivative, and its bound in other configurations."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from mechanisms import F64, inertia_of, make, random_configuration
+from tree_in_torch import DifferentialKinematics, root_frame
 
-from diffcloth_torch.dynamics.jacobians import DifferentialKinematics
-from diffcloth_torch.dynamics.weights import Configuration, WeightSpring, _moved
+from diffcloth_torch.dynamics.linear import times
+from diffcloth_torch.dynamics.robots import Gains, RobotControl, RobotDynamics, RobotState
+from diffcloth_torch.geometry.products import product
+from diffcloth_torch.geometry.rotation import quaternion_matrix, rotation_exp
 
 TREES = {
     "chain": (["fixed", *["revolute"] * 4], [-1, 0, 1, 2, 3], None),
@@ -19,23 +23,46 @@ TREES = {
 GRAVITY = torch.tensor([[1.0, -2.0, -9.0]], dtype=F64)
 
 
+# So long a step [s] that the metric M / h^2 + K of a step at rest is K, to rounding.
+LONG = 1e8
+
+
+class Configuration(NamedTuple):
+    """Pose of the root [1, 7] and values of the joints [1, J]."""
+
+    pose: torch.Tensor
+    joints: torch.Tensor
+
+
 def stiffness(mechanism, weight, at):
-    spring = WeightSpring(DifferentialKinematics(mechanism), is_bound=weight == "bounded")
-    return spring.stiffness(at, inertia_of(mechanism), GRAVITY)[0].numpy()
+    none, joints = torch.zeros(1, 6, dtype=F64), torch.zeros_like(at.joints)
+    points = torch.zeros(0, 3, dtype=F64)
+    robot = RobotDynamics(mechanism, LONG, torch.zeros(0, dtype=torch.int64), points, weight)
+    prediction = robot.predict(
+        RobotState(at.pose, none, at.joints, joints),
+        RobotControl(at.pose, none, joints, joints, joints),
+        inertia_of(mechanism),
+        Gains(joints, joints, joints),
+        GRAVITY,
+    )
+    return prediction.metric[0].numpy()
 
 
 def energy(mechanism, at, x):
     """Of the weight, after a motion x of the root and the joints."""
-    kinematics, inertia = DifferentialKinematics(mechanism), inertia_of(mechanism)
-    spring = WeightSpring(kinematics, is_bound=False)
-    centers = spring.motion(_moved(kinematics, at, x), inertia).frames.centers
+    inertia = inertia_of(mechanism)
+    local = inertia.center[:, mechanism.root]
+    rotation = quaternion_matrix(at.pose[:, 3:])
+    center = at.pose[:, :3] + times(rotation, local) + x[:, :3]
+    root = root_frame(center, product(rotation_exp(x[:, 3:6]), rotation), local)
+    tree = DifferentialKinematics(mechanism)
+    centers = tree.frames(root, at.joints + x[:, 6:], inertia.center).centers
     return -(inertia.mass[..., None] * centers * GRAVITY[:, None]).sum()
 
 
 def configuration(mechanism, rng):
     pose, joints, _ = random_configuration(mechanism, rng)
-    center = inertia_of(mechanism).center[:, mechanism.root]
-    return Configuration.of(pose, center, joints)
+    return Configuration(pose, joints)
 
 
 @pytest.mark.parametrize("name", TREES)

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from diffcloth_torch import cpu
-from diffcloth_torch.dynamics.jacobians import DifferentialKinematics
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.assembly import Assembly
+from diffcloth_torch.model.kinematics import Links
 from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Shape, shape_of
 from diffcloth_torch.operations import label
 from diffcloth_torch.sim.inputs.permissions import Permissions
@@ -36,7 +36,7 @@ class Layout:
         zeros: Field of a control -> its constant default, one environment for all. Never edited.
         parameter_shapes: Accepted shapes of each parameter.
         pins: Indices of the pinned vertices, shape [P].
-        robots: Kinematics of each of the R robots.
+        robots: Links of each of the R robots.
         shaped_links: Which of the L links have a shape, in the order of the surfaces.
         rigid_vertices: Name of a body or "robot/link" -> its rows among the V vertices.
         kinematic_bodies: Indices of the bodies on prescribed poses.
@@ -54,7 +54,7 @@ class Layout:
         self.assembly = assembly
         self.permissions = Permissions(assembly)
         self.is_dynamic = any(mechanism.is_dynamic for mechanism in assembly.mechanisms)
-        self.robots = tuple(DifferentialKinematics(robot) for robot in assembly.robots)
+        self.robots = tuple(Links(robot) for robot in assembly.robots)
         self.joint_names = tuple(
             f"{r.name}/{joint}" for r in assembly.robots for joint in r.joint_names
         )

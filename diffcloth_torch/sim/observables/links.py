@@ -34,12 +34,13 @@ def link_velocities(layout: Layout, state: Fields, link_centers: Tensor) -> ByNa
     slices = layout.assembly.joint_slices.values()
     for r, (robot, joints) in enumerate(zip(layout.robots, slices, strict=True)):
         links = slice(first, first := first + robot.mechanism.link_count)
-        positions = state["joint_positions"][:, joints]
-        frames = robot.frames(bases[:, r], positions, link_centers[:, links])
-        rates = torch.cat(
-            [state["base_velocities"][:, r], state["joint_velocities"][:, joints]], -1
+        twists = robot.velocities(
+            bases[:, r],
+            state["joint_positions"][:, joints],
+            link_centers[:, links],
+            state["base_velocities"][:, r],
+            state["joint_velocities"][:, joints],
         )
-        twists = times(robot.jacobian(frames), rates[:, None])
         named |= dict(zip(layout.link_names[links], twists.unbind(1), strict=True))
     return named
 

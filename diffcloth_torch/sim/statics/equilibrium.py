@@ -124,7 +124,7 @@ class Equilibria:
         points = assembly.vertices if len(assembly.vertices) else assembly.body_vertices
         size = float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
         self._size = max([size, *(_reach(robot) for robot in assembly.robots)])
-        turns = [kind == "revolute" for robot in assembly.robots for kind in _kinds(robot)]
+        turns = [turn for robot in assembly.robots for turn in _turns(robot)]
         # A radian counts like the size of the scene.
         self._lever = cpu.tensor([self._size if turn else 1.0 for turn in turns])
 
@@ -416,10 +416,10 @@ def _reach(robot: Mechanism) -> float:
     return float(np.linalg.norm(robot.offset[:, :3, 3], axis=-1).sum())
 
 
-def _kinds(robot: Mechanism) -> list[str]:
-    """Kind of each of the J joints."""
-    leads = [int(np.flatnonzero(robot.dof == j)[0]) for j in range(robot.joint_count)]
-    return [robot.kind[link] for link in leads]
+def _turns(robot: Mechanism) -> list[bool]:
+    """Whether each of the J joints turns what it carries."""
+    leads = (int(np.flatnonzero(robot.dof == j)[0]) for j in range(robot.joint_count))
+    return [bool(robot.turning[link]) for link in leads]
 
 
 def _resting(given: Given) -> Given:

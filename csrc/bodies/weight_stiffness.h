@@ -1,0 +1,40 @@
+#pragma once
+
+#include <span>
+
+#include "bodies/tree.h"
+
+namespace diffcloth::bodies {
+
+/// The weight of a robot as a spring, for steps that lead to an equilibrium.
+///
+/// The potential energy of the weight, V(x) = -sum_l m_l g . c_l(x), is not quadratic in the
+/// coordinates x of a robot. Near x_n it is V(x_n) - Q . d + 1/2 d^T K d, with d = x - x_n and the
+/// generalized weight Q. A step that ends where it began, d = 0, ends in an equilibrium for any K, and
+/// its derivatives by all inputs are those of the equilibrium if K is the second derivative of V.
+///
+/// Far from an equilibrium the second derivative may be too small: Q then leads across it. With a K
+/// that is at least as large everywhere, each step lowers the energy (majorization and minimization;
+/// Lange, "MM Optimization Algorithms", SIAM 2016).
+///
+/// Both return [6 + J, 6 + J], for a shift of the root's center, its rotation vector and the joints.
+///
+/// @param mass     [L] kg
+/// @param gravity  [m/s^2]
+MatrixX<double> weight_stiffness(const Tree& tree,
+                                 std::span<const double> mass,
+                                 const std::vector<PlacedBody<double>>& placed,
+                                 const Vec3& gravity);
+
+/// A diagonal that is at least K, however the joints turn. Joints that slide count with their present
+/// values.
+///
+/// A turn moves the center of a link by at most its way from the axis along the links between, r. The
+/// second derivative by two turns is at most the smaller r of both; by a turn and a shift it is at
+/// most one, and by two shifts it is zero.
+MatrixX<double> weight_stiffness_bound(const Tree& tree,
+                                       std::span<const double> mass,
+                                       const std::vector<PlacedBody<double>>& placed,
+                                       const Vec3& gravity);
+
+}  // namespace diffcloth::bodies
