@@ -50,7 +50,7 @@ def make_mechanism(
         base=base,
         link_names=tuple(link.name for link in links),
         parent=_indices(parent),
-        kind=tuple("fixed" if joint is None else _KINDS[joint.type] for joint in above),
+        kind=tuple("fixed" if joint is None else _kind(joint.type) for joint in above),
         offset=_stack([np.eye(4) if joint is None else joint.frame for joint in above]),
         axis=_stack([np.zeros(3) if joint is None else joint.axis for joint in above]),
         dof=_indices([j for j, _, _ in followed]),
@@ -68,12 +68,8 @@ def make_mechanism(
     return mechanism
 
 
-_KINDS = {
-    "fixed": "fixed",
-    "revolute": "revolute",
-    "continuous": "revolute",
-    "prismatic": "prismatic",
-}
+def _kind(joint_type: str) -> str:
+    return "revolute" if joint_type == "continuous" else joint_type
 
 
 def _stack(values: Sequence[object]) -> FloatArray:

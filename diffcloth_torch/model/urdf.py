@@ -153,7 +153,14 @@ def read_urdf(path: Path) -> RobotDescription:
     # Bytes, because its parser refuses text with an XML declaration. Written anew, so that both
     # parsers see the same document whatever the encoding of the file.
     parse: Callable[[bytes], Any] = URDF.from_xml_string
-    return _description(str(path), parse(tostring(checked)))
+    # That parser refuses types of joints that it does not know.
+    types = [joint.attrib["type"] for joint in checked.findall("joint")]
+    for joint in checked.findall("joint"):
+        joint.set("type", "unknown")
+    robot = parse(tostring(checked))
+    for joint, kind in zip(robot.joints, types, strict=True):
+        joint.type = kind
+    return _description(str(path), robot)
 
 
 def _description(file: str, robot: Any) -> RobotDescription:
@@ -246,7 +253,7 @@ def _joint(file: str, joint: Any) -> Joint:
             f"got {length:g}"
         )
     lower, upper = -math.inf, math.inf
-    if joint.type in ("revolute", "prismatic"):
+    if joint.type not in ("fixed", "continuous"):
         if joint.limit is None:
             raise InvalidInput(
                 f"{where} of type {joint.type!r} must have a <limit>; a joint that turns without "

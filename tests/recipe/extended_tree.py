@@ -1,4 +1,4 @@
-"""A copy of the sources with the example of docs/extending.md in it, and what changed compiled."""
+"""Copies of the sources with an example of docs/extending.md applied, compiled where it changed."""
 
 import os
 import re
@@ -8,24 +8,28 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "extending.md"
 _INCLUDE = re.compile(r'^\s*#\s*include\s+"([^"]+)"', re.MULTILINE)
 
 
-def section(text: str, title: str) -> str:
-    """Text of the section of a page below a title, as far as the next section."""
-    return text[text.index(f"\n## {title}\n") :].split("\n## ", 2)[1]
+def section_of_page(title: str) -> str:
+    """Text of a section of the page."""
+    _, *parts = PAGE.read_text().split(f"\n## {title}\n")
+    assert len(parts) == 1, title
+    return parts[0].split("\n## ")[0]
 
 
-def class_of_page(text: str) -> tuple[str, str]:
-    """Path and text of the class in the section of a potential."""
-    path = re.search(r"^\*\*The class\*\*, `([^`]+)`", text, re.MULTILINE)[1]
-    return path, re.search(r"```cpp\n(.*?)```", text, re.DOTALL)[1]
+def classes_of_page(text: str) -> dict[str, str]:
+    """Path of each class that a section adds -> its text."""
+    paths = re.findall(r"^\*\*The class\*\*, `([^`]+)`", text, re.MULTILINE)
+    return dict(zip(paths, re.findall(r"```cpp\n(.*?)```", text, re.DOTALL), strict=True))
 
 
 def changes_of_page(text: str) -> dict[str, list[str]]:
-    """Path of each file that the diff of that section changes -> its lines."""
+    """Path of each file that the diff of a section changes -> its lines."""
     diff = re.search(r"```diff\n(.*?)```", text, re.DOTALL)[1]
     parts = re.split(r"^--- (.+)\n", diff, flags=re.MULTILINE)
     assert not parts[0]
@@ -66,8 +70,12 @@ def _with_hunk(path: str, text: str, place: int, hunk: list[str]) -> tuple[str, 
     return result, at + len(new) - 1
 
 
-def make_tree(folder: Path) -> set[str]:
-    """Copy what git tracks to a folder, with the example; the paths of what the example changes."""
+def make_tree(folder: Path, title: str) -> set[str]:
+    """Copy all tracked files to a folder and apply the example of a section.
+
+    Returns:
+        Paths of the files that the example adds or changes.
+    """
     names = subprocess.run(
         ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.split("\0")
@@ -75,15 +83,16 @@ def make_tree(folder: Path) -> set[str]:
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name)
-    text = PAGE.read_text()
-    path, code = class_of_page(text)
-    assert not (folder / path).exists()
-    (folder / path).write_text(code)
+    text = section_of_page(title)
+    classes = classes_of_page(text)
+    for path, code in classes.items():
+        assert not (folder / path).exists()
+        (folder / path).write_text(code)
     changes = changes_of_page(text)
     for changed, lines in changes.items():
         file = folder / changed
         file.write_text(patched(changed, file.read_text(), lines))
-    return {path, *changes}
+    return {*classes, *changes}
 
 
 def find_build() -> Path | None:
@@ -165,6 +174,35 @@ def _dependents(csrc: Path, changed: set[str]) -> set[str]:
         if not more:
             return dirty
         dirty |= more
+
+
+def check_example(folder: Path, title: str, checks: str, most: int) -> None:
+    """Apply the example of a section to a copy of the sources, compile it, and run its checks.
+
+    Args:
+        folder: Place for the copy.
+        title: Title of the section.
+        checks: File of tests in this folder.
+        most: Limit of the number of files that are compiled.
+    """
+    if not (ROOT / ".git").exists():
+        pytest.skip("needs a clone")
+    build = find_build()
+    assert build is not None, "no build of this clone in build/: pip install -e ."
+    assert compile_core(folder, make_tree(folder, title), build) < most
+    result = subprocess.run(
+        [
+            *(sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider"),
+            Path("tests", "recipe", checks),
+        ],
+        cwd=folder,
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(folder)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    print(result.stdout[-3000:])
+    assert result.returncode == 0, result.stdout + result.stderr
 
 
 def _run(*command, cwd=None) -> str:

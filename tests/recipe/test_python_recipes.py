@@ -96,7 +96,7 @@ def test_an_example_that_changes_python(title, tmp_path):
     if not (ROOT / ".git").exists():
         pytest.skip("needs a clone")
     copy_of_the_package(tmp_path)
-    text = extended_tree.section(extended_tree.PAGE.read_text(), title)
+    text = extended_tree.section_of_page(title)
     for name, lines in extended_tree.changes_of_page(text).items():
         file = tmp_path / name
         file.write_text(extended_tree.patched(name, file.read_text(), lines))
