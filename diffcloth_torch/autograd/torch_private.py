@@ -8,6 +8,7 @@ checks each function against the public behavior that it depends on; run it with
 from __future__ import annotations
 
 import sys
+from contextlib import AbstractContextManager
 
 import torch
 from torch import Tensor
@@ -24,6 +25,7 @@ __all__ = [
     "transforms",
     "unwrap",
     "with_older_axis",
+    "with_tangents",
     "without_older_axis",
 ]
 
@@ -45,6 +47,12 @@ def transforms() -> list[bool]:
 def in_forward_mode() -> bool:
     """Whether a level of forward-mode differentiation is open."""
     return forward_ad._current_level >= 0
+
+
+def with_tangents() -> AbstractContextManager[None]:
+    """Allow tangents inside of the `jvp` of a Function, where torch computes none by itself."""
+    enabled: AbstractContextManager[None] = forward_ad._set_fwd_grad_enabled(True)
+    return enabled
 
 
 def is_wrapped(tensor: Tensor) -> bool:

@@ -24,6 +24,7 @@ from torch.autograd import forward_ad
 from diffcloth_torch import _core, cpu
 from diffcloth_torch._exit import note_caller
 from diffcloth_torch.autograd.core_function import as_array
+from diffcloth_torch.autograd.torch_private import with_tangents
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.geometry.products import product
 from diffcloth_torch.geometry.rotation import quaternion_matrix
@@ -168,7 +169,7 @@ class _Local(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, _: Any, change: Tensor) -> Any:
         # torch computes no tangents in here; one of a tangent needs them.
-        with forward_ad._set_fwd_grad_enabled(True):
+        with with_tangents():
             unpack: Any = forward_ad.unpack_dual
             F, S = ctx.links.local(unpack(*ctx.saved_tensors).primal)
             moved = ctx.links.push_forward(S, change)

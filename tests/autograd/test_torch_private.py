@@ -62,6 +62,43 @@ def test_forward_mode():
     assert seen == [True]
 
 
+class Cube(torch.autograd.Function):
+    """x^3, whose tangent is computed from dual numbers."""
+
+    allows = True
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(x):
+        return x**3
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.save_for_forward(*inputs)
+
+    @staticmethod
+    def jvp(ctx, change):
+        (x,) = ctx.saved_tensors
+        if not Cube.allows:
+            return 3 * x**2 * change
+        with torch_private.with_tangents():
+            return 3 * forward_ad.unpack_dual(x).primal ** 2 * change
+
+
+@pytest.mark.parametrize("allows", [True, False])
+def test_tangents_of_tangents(allows, monkeypatch):
+    """Without the function, torch loses the tangent of a tangent."""
+    monkeypatch.setattr(Cube, "allows", allows)
+    x = torch.tensor(2.0, dtype=torch.float64)
+    one = torch.ones_like(x)
+
+    def first(at):
+        return torch.func.jvp(Cube.apply, (at,), (one,))[1]
+
+    _, second = torch.func.jvp(first, (x,), (one,))
+    assert (second.item() == 12.0) is allows
+
+
 class Watched(torch.autograd.Function):
     """The identity; backward records the cotangent's rows and returns twice the cotangent."""
 

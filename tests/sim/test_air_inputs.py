@@ -1,7 +1,5 @@
 """Drag, the density of the air and wind, where they enter."""
 
-import pickle
-
 import numpy as np
 import pytest
 import torch
@@ -71,16 +69,6 @@ def test_winds_that_are_none_are_refused(wind, message):
 def test_densities_that_are_none_are_refused(density):
     with pytest.raises((dc.InvalidInput, TypeError), match="Scene: `air_density` must "):
         dc.Scene([sheet()], air_density=density)
-
-
-def test_what_was_pickled_before_there_was_air_has_none():
-    scene = dc.Scene([sheet()])
-    for name in ("normal_drag", "tangential_drag"):
-        del scene.cloths[0].material.__dict__[name]
-    del scene.__dict__["air_density"]
-    again = pickle.loads(pickle.dumps(scene))
-    parameters = dc.Simulator(again, 0.01).parameters()
-    assert (parameters.normal_drag, parameters.air_density) == (0.0, 1.2)
 
 
 def test_equilibria_refuse_wind_and_feel_no_air_at_rest():

@@ -17,9 +17,9 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.reprs import record_text, value_text
 from diffcloth_torch.saved import saved
 from diffcloth_torch.sim.records.contacts import Contacts
-from diffcloth_torch.sim.records.environments import Combination
+from diffcloth_torch.sim.records.environments import Choice, Combination, Selection, Stack
 
-__all__ = ["Report", "outcome_text"]
+__all__ = ["Report", "combine_reports", "outcome_text"]
 
 
 @saved
@@ -148,29 +148,46 @@ class Report:
                         f"has environments, got {list(np.shape(number))}"
                     )
 
+    def select(self, index: int | slice | Tensor) -> Report:
+        """Report of one environment of a batch, or of several."""
+        selected = combine_reports(Selection(index, len(self.status)), [self])
+        assert selected is not None  # one report agrees with itself
+        return selected
+
     @staticmethod
-    def combined(how: Combination, reports: Sequence[Report | None]) -> Report | None:
-        """Combine environments; None if a report is missing, or they hold different numbers."""
-        present = [report for report in reports if report is not None]
-        if len(present) < len(reports) or len({_names(report) for report in present}) > 1:
-            return None
+    def stack(reports: Sequence[Report | None]) -> Report | None:
+        """Report of a batch from those of its environments; None if one of them is missing."""
+        return combine_reports(Stack(len(reports)), reports)
 
-        def entries(name: str) -> list[Any]:
-            return [getattr(report, name) for report in present]
+    @staticmethod
+    def where(mask: Tensor, a: Report | None, b: Report | None) -> Report | None:
+        """Take environments of `a` where `mask` is true, else of `b`; None if one is missing."""
+        batched = [report is not None and not isinstance(report.status, str) for report in (a, b)]
+        return combine_reports(Choice(mask, batched), [a, b])
 
-        tables: dict[str, Any] = {
-            name: {key: how.numbers([own[key] for own in entries(name)]) for key in first}
-            for name in _TABLES
-            for first in entries(name)[:1]
-        }
-        texts: dict[str, Any] = {}
-        for name in _TEXTS:
-            each = [(text,) if isinstance(text, str) else text for text in entries(name)]
-            items = how.items(each)
-            texts[name] = items[0] if how.size is None else items
-        numbers = {n: how.numbers(entries(n)) for n in _NUMERIC if n not in _TABLES}
-        contacts = Contacts.combined(how, entries("contacts"))
-        return Report(**numbers, **tables, **texts, contacts=contacts)
+
+def combine_reports(how: Combination, reports: Sequence[Report | None]) -> Report | None:
+    """Combine environments; None if a report is missing, or they hold different numbers."""
+    present = [report for report in reports if report is not None]
+    if len(present) < len(reports) or len({_names(report) for report in present}) > 1:
+        return None
+
+    def entries(name: str) -> list[Any]:
+        return [getattr(report, name) for report in present]
+
+    tables: dict[str, Any] = {
+        name: {key: how.numbers([own[key] for own in entries(name)]) for key in first}
+        for name in _TABLES
+        for first in entries(name)[:1]
+    }
+    texts: dict[str, Any] = {}
+    for name in _TEXTS:
+        each = [(text,) if isinstance(text, str) else text for text in entries(name)]
+        items = how.items(each)
+        texts[name] = items[0] if how.size is None else items
+    numbers = {n: how.numbers(entries(n)) for n in _NUMERIC if n not in _TABLES}
+    contacts = Contacts.combined(how, entries("contacts"))
+    return Report(**numbers, **tables, **texts, contacts=contacts)
 
 
 def _unknown_like(residual: Any) -> Any:

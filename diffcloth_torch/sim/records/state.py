@@ -19,7 +19,7 @@ from diffcloth_torch.model.quantities import STATE, shape_of
 from diffcloth_torch.reprs import field_text, record_text
 from diffcloth_torch.saved import saved
 from diffcloth_torch.sim.records.environments import Choice, Combination, Selection, Stack
-from diffcloth_torch.sim.records.report import Report, outcome_text
+from diffcloth_torch.sim.records.report import Report, combine_reports, outcome_text
 from diffcloth_torch.sim.records.surfaces import Surfaces
 
 __all__ = [
@@ -254,7 +254,7 @@ def where(mask: Tensor, a: State, b: State) -> State:
 
 def _combined(how: Combination, states: Sequence[State]) -> State:
     tensors = {n: how.tensors([getattr(state, n) for state in states]) for n in _TENSORS}
-    report = Report.combined(how, [state.report for state in states])
+    report = combine_reports(how, [state.report for state in states])
     return State(**tensors, report=report, _surfaces=states[0]._surfaces)
 
 
