@@ -37,6 +37,7 @@ def quick(tmp_path_factory):
     return result.stdout, json.loads(out.read_text())
 
 
+@pytest.mark.slow
 def test_every_scene_is_timed_alone_and_in_batches(quick):
     text, records = quick
     assert len(records["timings"]) == SCENES * (2 + 2)
@@ -83,6 +84,7 @@ def test_summaries(quick):
             assert all(math.isfinite(number) for number in row.values())
 
 
+@pytest.mark.slow
 def test_two_packages_are_compared_on_the_same_steps(tmp_path):
     out = tmp_path / "compare.json"
     command = [
@@ -157,6 +159,7 @@ def run_figures(*arguments):
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.slow
 def test_the_page_of_figures_has_what_was_measured(figures):
     records = json.loads((figures / "performance.json").read_text())
     page = (figures / "performance.md").read_text()
@@ -184,6 +187,7 @@ def test_the_page_of_figures_has_what_was_measured(figures):
     assert all(f"](images/{name})" in page for name in shown)
 
 
+@pytest.mark.quick("hanging", "plane")
 @pytest.mark.parametrize("name", ["hanging", "plane", "sphere"])
 def test_our_side_of_a_peer(name):
     """Gradients of rollouts at 60 Hz are those of their differences, and nothing sinks in."""
@@ -223,6 +227,7 @@ def test_our_side_of_a_peer_without_gradients(name):
     assert told["mass"] == pytest.approx(told["density"], rel=1e-9)  # of one square meter
 
 
+@pytest.mark.slow
 def test_the_page_of_figures_is_that_of_its_records(tmp_path):
     """Nobody has edited the page, nor forgotten to draw it again."""
     for name in ("performance.json", "performance.md"):
@@ -251,6 +256,7 @@ def read_tables(*command):
     return tables
 
 
+@pytest.mark.slow
 def test_experiments_are_compared_by_scheme():
     tables = read_tables("benchmarks.experiments", "--quick")
     assert list(tables) == ["tie", "cloth_on_cube"]

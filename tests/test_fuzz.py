@@ -40,6 +40,7 @@ def test_nothing_is_wrong_with_a_few_random_scenes():
     assert "intersection 0, path 0, report 0, momentum 0, not finite 0, error 0" in result.stdout
 
 
+@pytest.mark.slow
 def test_directions_that_single_precision_turns_are_computed_again():
     """Two soft sheets of 1.6 cm between a box and a plane: damped directions pointed uphill."""
     result = fuzz("--seed", "3", "--only", "19")

@@ -78,6 +78,7 @@ def tumbling_boxes(speed, dt=DT):
 
 
 # What hits the floor so fast is spun beyond what a step of DT resolves.
+@pytest.mark.quick("1.0-*", "10.0-*")
 @pytest.mark.parametrize(("speed", "dt"), [(1.0, DT), (10.0, DT / 5), (30.0, DT / 20)])
 def test_tumbling_boxes_never_meet(speed, dt):
     sim, state = tumbling_boxes(speed, dt)

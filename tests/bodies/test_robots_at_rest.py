@@ -61,6 +61,7 @@ def rest(sim, control, seconds):
         )[-1]
 
 
+@pytest.mark.quick("*-0.02", "revolute-prismatic-0.005")
 @pytest.mark.parametrize("dt", [0.02, 0.005])
 @pytest.mark.parametrize(
     "kinds",

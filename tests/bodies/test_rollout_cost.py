@@ -38,6 +38,7 @@ def solves(monkeypatch):
     return times
 
 
+@pytest.mark.quick("30-*")
 @pytest.mark.parametrize("base", ["fixed", "floating"])
 @pytest.mark.parametrize("checkpoint_every", [None, STEPS, 30])
 def test_the_last_step_of_a_rollout_takes_the_time_of_the_first(base, checkpoint_every, solves):

@@ -115,6 +115,7 @@ CASES = [
 IDS = [f"{make.__name__}-{scheme}" for make, scheme in CASES]
 
 
+@pytest.mark.quick("picked-coupled", "picked-projective", "sewn-split_mass", "held-*")
 @pytest.mark.parametrize(("make", "scheme"), CASES, ids=IDS)
 def test_every_input_matches_differences(make, scheme):
     case = make(**SCHEMES[scheme])

@@ -118,6 +118,9 @@ def without_slip(case):
     return () if slip.any() else ("parameters.slip_velocity",)
 
 
+@pytest.mark.quick(
+    "triangle-moving", "slivers-still", "smooth_ball-moving", "smooth_capsule-still", "dented-still"
+)
 @pytest.mark.parametrize("moving", [False, True], ids=["still", "moving"])
 @pytest.mark.parametrize("name", [*BODIES, *SMOOTH])
 def test_every_gradient_is_that_of_the_step(name, moving):
@@ -129,6 +132,7 @@ def test_every_gradient_is_that_of_the_step(name, moving):
     check(case, CONTACT, zero=without_slip(case))
 
 
+@pytest.mark.quick("triangle")
 @pytest.mark.parametrize("name", ["triangle", "dented", "smooth_capsule"])
 def test_split_steps_too(name):
     case = resting(name, moving=True, scheme="split")

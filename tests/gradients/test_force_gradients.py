@@ -70,6 +70,13 @@ HOLDING = ("hanging", "curved", "pinned", "held")
 TOUCHING = ("sticking", "sliding", "pinned", "folded", "dragged", "sphere")
 
 
+@pytest.mark.quick(
+    "coupled-*-held",
+    "coupled-*-sliding",
+    "split-energy-*-sphere",
+    "split-mass-*-hanging",
+    "split-energy-*-curved",
+)
 @pytest.mark.parametrize(
     ("output", "name"),
     [

@@ -104,6 +104,7 @@ def rolled(case, steps):
     return loss, leaves
 
 
+@pytest.mark.quick("sliding-coupled-1-*")
 @pytest.mark.parametrize(
     ("name", "scheme", "steps", "rtol"),
     [

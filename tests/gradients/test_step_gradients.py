@@ -295,6 +295,21 @@ def identify(value):
     return "-".join(filter(None, value)) if isinstance(value, tuple) else str(value)
 
 
+@pytest.mark.quick(
+    "hanging-*",
+    "curved-*",
+    "hinge-*",
+    "sliding-coupled-*",
+    "sliding-split-energy-*",
+    "separating-*",
+    "pinned-split-elastic-*",
+    "held-*",
+    "folded-*",
+    "stacked-*",
+    "poking-*",
+    "woven-*",
+    "woven_pinned-split-mass-*",
+)
 @pytest.mark.parametrize(
     ("name", "scheme", "iterations"),
     [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],

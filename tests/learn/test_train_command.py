@@ -108,6 +108,7 @@ def same_policies(a, b):
     )
 
 
+@pytest.mark.slow
 def test_the_best_of_several_seeds_goes_on_as_if_it_had_been_alone(config, tmp_path):
     out = tmp_path / "out"
     result = call(config, "--out", out, *TRYOUT)

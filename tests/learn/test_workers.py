@@ -94,6 +94,7 @@ def die(_):
     os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_what_a_process_that_dies_did_not_finish_is_made_again(tmp_path):
     workers = Processes(2)
     try:
@@ -141,6 +142,7 @@ class TestRay:
             yield ray
             ray.shutdown()
 
+    @pytest.mark.slow
     def test_same_bits_also_where_an_actor_dies_in_an_update(self, ray, here, tmp_path):
         workers = RayActors(2)
         try:
@@ -160,6 +162,7 @@ class TestRay:
         finally:
             workers.close()
 
+    @pytest.mark.slow
     def test_who_dies_again_and_again_ends_it(self, ray):
         workers = RayActors(1)
         try:
@@ -168,6 +171,7 @@ class TestRay:
         finally:
             workers.close()
 
+    @pytest.mark.slow
     def test_ray_has_the_cores_that_actors_occupy(self, ray):
         ray.shutdown()
         workers = RayActors(2, cores=1.5)
@@ -214,6 +218,7 @@ workers.close()
 """
 
 
+@pytest.mark.slow
 def test_ranks_of_torchrun(tmp_path, here):
     import hashlib
 

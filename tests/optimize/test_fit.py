@@ -60,6 +60,7 @@ TRUTH = {"stretch": 60.0, "bending": 4e-4}
 START = {"stretch": dc.Variable(30.0), "bending": dc.Variable(2e-4)}
 
 
+@pytest.mark.slow
 @pytest.mark.rounding
 def test_the_true_values_are_in_their_intervals(strip):
     """In nearly all of ten seeds; the fit is that of SciPy with differences."""

@@ -72,6 +72,7 @@ def test_no_point_is_evaluated_twice_in_a_row():
     assert len(set(calls)) == len(calls)
 
 
+@pytest.mark.slow
 def test_any_number_of_workers_finds_the_same_bits():
     alone = dc.fit(VARIABLES, residuals, starts=4, seed=3)
     assert bits(dc.fit(VARIABLES, residuals, starts=4, seed=3, workers=2)) == bits(alone)

@@ -49,6 +49,7 @@ def serial():
     return of
 
 
+@pytest.mark.quick("12-*", "16-4-*")
 @pytest.mark.parametrize("often", [1, SLOW])
 @pytest.mark.parametrize("count", [2, 4])
 @pytest.mark.parametrize("n", SIZES)
@@ -108,6 +109,7 @@ def test_threads_that_share_one_environment_change_no_bit(scheme):
         assert differing(values, expected) == []
 
 
+@pytest.mark.quick("12-*", "16-*")
 @pytest.mark.parametrize("often", [1, SLOW])
 @pytest.mark.parametrize("n", SIZES)
 def test_eight_python_threads_on_one_simulator(n, often):

@@ -68,6 +68,7 @@ def attempt(sim, judge, state, control):
 SLOW = pytest.mark.slow
 
 
+@pytest.mark.quick("*-10.0", "*-plate-*-100.0", "*-rod-*-100.0")
 @pytest.mark.parametrize(
     ("pins", "speed"),
     [("top", 10.0), ("all", 10.0), ("top", 100.0), pytest.param("all", 100.0, marks=SLOW)],

@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 MINUTE = 60.0
 
 
+@pytest.mark.quick("box")
 @pytest.mark.parametrize("what", ["box", "cloth"])
 def test_it_moves_by_less_than_a_tenth_of_a_millimeter_in_a_minute(what, monkeypatch):
     monkeypatch.syspath_prepend(ROOT)

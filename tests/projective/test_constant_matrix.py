@@ -88,6 +88,7 @@ def test_matrices_that_differ_in_one_entry_are_told_apart(entry):
     assert matrices.find(other) is not matrices.find(values)
 
 
+@pytest.mark.slow
 def test_what_is_forgotten_is_made_again_with_the_same_bits():
     """More matrices than the cache keeps: 32 MiB, and each takes up its values alone 1 MB."""
     pairs = grid_graph(100, 100)

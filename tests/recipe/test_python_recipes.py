@@ -91,6 +91,8 @@ def run_in(folder: Path, *arguments: str) -> None:
     assert result.returncode == 0, result.stdout + result.stderr
 
 
+@pytest.mark.recipe
+@pytest.mark.slow
 @pytest.mark.parametrize("title", CHECKS)
 def test_an_example_that_changes_python(title, tmp_path):
     if not (ROOT / ".git").exists():

@@ -407,6 +407,7 @@ def test_what_a_hand_holds_by_friction_stays_in_it(table):
         assert hold == pytest.approx(-0.048 * 9.81, rel=1e-4)
 
 
+@pytest.mark.quick("actuation0")
 @pytest.mark.parametrize(
     "actuation", [("pd", "position"), ("position", "pd"), ("position", "position")]
 )

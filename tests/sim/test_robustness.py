@@ -232,6 +232,7 @@ INTERRUPTED = """
 """
 
 
+@pytest.mark.quick("2")
 @pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
 @pytest.mark.parametrize("threads", [1, 2])
 def test_ctrl_c_ends_a_long_step_within_a_second(threads):

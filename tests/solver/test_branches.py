@@ -21,6 +21,7 @@ def branches(monkeypatch):
     return importlib.import_module("benchmarks.branches")
 
 
+@pytest.mark.quick("thrown-16-3")
 @pytest.mark.parametrize(
     ("scene", "size", "states"), [("thrown", 15, 8), ("thrown-1e-9", 16, 3), ("thrown", 16, 3)]
 )

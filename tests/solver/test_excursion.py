@@ -36,6 +36,7 @@ def test_a_stiff_sheet_that_turns_far_does_not_creep():
     assert np.median(iterations) < 120
 
 
+@pytest.mark.slow
 def test_the_path_leaves_out_what_was_undone():
     """In some of the throws excursions are undone; which ones depends on rounding."""
     random = np.random.default_rng(1)

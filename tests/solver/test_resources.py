@@ -58,6 +58,7 @@ def _lends_huge_pages() -> bool:
     return path.exists() and "[never]" not in path.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not _lends_huge_pages(), reason="asks the system for huge pages")
 def test_large_arrays_are_asked_of_the_system_in_huge_pages():
     # 1,000; with pages of 4 KiB 28,000, of which each matrix takes 2,600.

@@ -164,6 +164,13 @@ CASES = [
 ]
 
 
+@pytest.mark.quick(
+    "coupled-monolithic-*",
+    "split-rigid_to_cloth-joint_positions",
+    "coupled-cloth_to_rigid-soft_pins",
+    "split-monolithic-body_poses",
+    "projective-*",
+)
 @pytest.mark.parametrize(("scheme", "coupling", "quantity"), CASES)
 def test_a_quantity_at_zero_is_the_limit_of_small_ones(scheme, coupling, quantity):
     sim = simulator(scheme, coupling)

@@ -80,6 +80,7 @@ SHORT = {
 }
 
 
+@pytest.mark.quick("fit_cantilever", "fit_hang")
 @pytest.mark.rounding
 @pytest.mark.parametrize("name", SHORT)
 def test_what_is_known_is_found_on_a_coarser_mesh(name):
@@ -272,6 +273,7 @@ def test_the_command_refuses_what_is_no_fit(config, tmp_path):
     assert "Missing argument 'CONFIG'" in result.output
 
 
+@pytest.mark.quick("option1-*")
 @pytest.mark.parametrize(
     ("option", "expected"),
     [

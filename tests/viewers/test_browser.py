@@ -174,6 +174,7 @@ class TestPages:
         state.positions.zero_()
         np.testing.assert_array_equal(browser.motion[0].positions, before)
 
+    @pytest.mark.slow
     def test_a_page_of_its_own_plays(self, falling, chromium, tmp_path):
         scene, states = falling
         page = tmp_path / "falling.html"
@@ -196,6 +197,7 @@ class TestPages:
         assert purple.sum() > 2000
         assert np.diff(columns).max() > 5  # two sheets, with a gap between them
 
+    @pytest.mark.slow
     def test_a_server_shows_states_while_they_come(self, falling, chromium, tmp_path):
         scene, states = falling
         browser = Browser(scene, port=8471)
@@ -295,6 +297,7 @@ fit:
 
 
 class TestFits:
+    @pytest.mark.slow
     def test_a_fit_writes_the_page_of_its_best_values(self, chromium, tmp_path, monkeypatch):
         config, out = tmp_path / "hang.yaml", tmp_path / "out"
         config.write_text(FIT)
@@ -326,6 +329,7 @@ class TestFits:
         assert is_blue(image).sum() + is_sand(image).sum() > 3000  # two sheets, of either side
         assert is_orange(image[FREE]).sum() > 50  # nine points on each
 
+    @pytest.mark.slow
     def test_a_page_follows_a_fit(self, falling, chromium, tmp_path):
         """Its points are those that were observed, and go where they are observed next."""
         scene, states = falling
