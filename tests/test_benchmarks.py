@@ -108,6 +108,7 @@ def test_two_packages_are_compared_on_the_same_steps(tmp_path):
             assert row[side]["unconverged"] == 0
 
 
+@pytest.mark.slow
 def test_a_folder_without_a_package_is_refused(tmp_path):
     command = [sys.executable, "-m", "benchmarks.compare", "--against", str(tmp_path)]
     command += ["--scene", "hanging", "--size", "6", "--no-batch"]
@@ -116,6 +117,7 @@ def test_a_folder_without_a_package_is_refused(tmp_path):
     assert f"{tmp_path} has no diffcloth_torch" in result.stderr
 
 
+@pytest.mark.slow
 def test_every_factorization_is_timed():
     command = [sys.executable, "-m", "benchmarks.factorization", "--quick"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -126,6 +128,7 @@ def test_every_factorization_is_timed():
         assert result.stdout.count(method) >= 4
 
 
+@pytest.mark.slow
 def test_what_moves_by_forces_is_timed_beside_what_is_given():
     command = [sys.executable, "-m", "benchmarks.coupling", "--quick"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -281,6 +284,7 @@ def test_turns_are_those_of_links():
     assert linking(ring, other + np.array([3, 0, 0])) == pytest.approx(0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_schemes_are_compared_on_the_same_scenes():
     tables = read_tables("benchmarks.schemes", "--quick")
     assert list(tables) == ["sphere", "floor", "box"]
@@ -351,6 +355,7 @@ def test_the_baseline_is_timed_with_both_elastic_solvers():
     assert all(int(row[2]) > 0 for row in rows[1:])  # vertices in contact
 
 
+@pytest.mark.quick("step-ipctk-*")
 @pytest.mark.parametrize(
     ("benchmark", "module", "sentence"),
     [
@@ -441,6 +446,7 @@ def test_uneven_batches_are_shared_as_evenly_as_costs_tell():
     assert found["batch"] <= found["best"]
 
 
+@pytest.mark.slow
 def test_energy_of_fast_turns_is_counted():
     command = [sys.executable, "-m", "benchmarks.turns", "--throws", "1", "--seconds", "0.05"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

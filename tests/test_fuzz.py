@@ -48,6 +48,7 @@ def test_directions_that_single_precision_turns_are_computed_again():
     assert "NotConverged 0" in result.stdout
 
 
+@pytest.mark.slow
 def test_exact_directions_that_single_precision_turns_are_computed_again():
     """A fold of a 5 mm sheet: a step of the exact Hessian pointed uphill, which ended the solve."""
     result = fuzz("--seed", "24", "--only", "21")
@@ -64,6 +65,7 @@ def test_every_second_scene_is_a_tower():
         assert ("coupling" in drawn) == (name == "towers")
 
 
+@pytest.mark.slow
 def test_towers_are_of_every_kind():
     scenes = [draw_tower(1, index) for index in range(60)]
     simulators = [scene.simulator for scene in scenes]
@@ -145,6 +147,7 @@ def test_the_fuzz_sees_air_that_pushes_wrongly():
         assert tally.counts["momentum"] == wrong
 
 
+@pytest.mark.slow
 def test_a_scene_is_a_function_of_its_seed_and_index():
     first, again = (fuzz("--only", "2", "--seed", "1") for _ in range(2))
     assert numbers(first.stdout) == numbers(again.stdout)
@@ -184,6 +187,7 @@ def test_slopes_that_are_no_numbers_are_not_right():
     assert np.isnan(slope_error(points))
 
 
+@pytest.mark.slow
 @pytest.mark.rounding
 def test_a_gradient_where_a_step_has_several_minima_is_not_suspect():
     """A stiff sheet, thrown without gravity: changes of 1e-9 make it buckle in other ways."""

@@ -156,6 +156,7 @@ except ImportError as error:
     assert last == "environments need gymnasium: run  pip install 'diffcloth-torch[envs]'"
 
 
+@pytest.mark.quick("matplotlib", "pyvista")
 @pytest.mark.parametrize("module", ["matplotlib", "pytorch_kinematics", "pyvista", "trimesh"])
 def test_importing_the_package_leaves_out(module):
     code = f"import sys; from diffcloth_torch import *; print({module!r} in sys.modules)"

@@ -128,6 +128,7 @@ def test_axis_of_the_older_vmap():
     assert not torch_private.is_batched_by_older_vmap(X)
 
 
+@pytest.mark.slow
 def test_the_compiler_is_seen_once_it_is_imported():
     code = (
         "from diffcloth_torch.autograd.torch_private import has_compiler\n"

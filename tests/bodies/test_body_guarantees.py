@@ -120,6 +120,12 @@ def test_a_box_thrown_at_a_curtain_never_passes_through(coupling, pins, mass, sp
         assert not came or states[-1].body_velocities[0, 0] < 0.5 * speed
 
 
+@pytest.mark.quick(
+    "monolithic-fixed-2.0",
+    "monolithic-floating-50.0",
+    "rigid_to_cloth-floating-2.0",
+    "cloth_to_rigid-fixed-50.0",
+)
 @pytest.mark.parametrize("effort", [2.0, 50.0])
 @pytest.mark.parametrize("base", ["fixed", "floating"])
 @pytest.mark.parametrize("coupling", COUPLINGS)

@@ -505,6 +505,7 @@ def test_what_is_prescribed_passes_through_what_is_prescribed(coupling):
     assert not after.body_forces.any()
 
 
+@pytest.mark.quick("coupled-rigid_to_cloth", "split-rigid_to_cloth")
 @STAGGERED
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
 def test_gradients_through_contact_are_those_of_differences(coupling, scheme):

@@ -52,6 +52,7 @@ def pull(sim, state, steps=2):
     return states, torch.autograd.grad(loss, list(leaves.values()))
 
 
+@pytest.mark.quick("monolithic-fixed", "rigid_to_cloth-fixed", "cloth_to_rigid-fixed")
 @CASES
 def test_a_batch_has_the_bits_of_its_environments_on_any_threads(coupling, base, threads):
     sim, singles = starts(coupling, base)
@@ -98,6 +99,7 @@ def test_environments_that_are_reset_go_on_as_if_alone(coupling, base):
     assert gradient[2].any()
 
 
+@pytest.mark.quick("monolithic-fixed", "rigid_to_cloth-fixed", "cloth_to_rigid-fixed")
 @CASES
 def test_a_checkpointed_rollout_has_the_same_gradients(coupling, base):
     sim, (start, *_) = starts(coupling, base)

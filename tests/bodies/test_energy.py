@@ -56,6 +56,18 @@ def rigid_energy(frame, velocity, mass, center, inertia, gravity):
 # --- Contact -------------------------------------------------------------------------------------
 
 
+@pytest.mark.quick(
+    "0.001-free-0.0",
+    "0.001-pinned-0.4",
+    "0.01-pinned-0.0",
+    "0.1-free-0.4",
+    "1.0-free-0.0",
+    "1.0-pinned-0.4",
+    "10.0-pinned-0.0",
+    "100.0-free-0.4",
+    "1000.0-free-0.0",
+    "1000.0-pinned-0.4",
+)
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 @pytest.mark.parametrize("pinned", [False, True], ids=["free", "pinned"])
 @pytest.mark.parametrize("ratio", [1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0, 1e3])
@@ -250,6 +262,7 @@ PENDULUM = """<robot name="pendulum"><link name="base"/>
 </robot>"""
 
 
+@pytest.mark.quick("10.0-1.0-0.0")
 @pytest.mark.parametrize("gravity", [0.0, -9.81])
 @pytest.mark.parametrize(
     ("rate", "seconds"),

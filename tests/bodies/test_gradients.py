@@ -159,6 +159,17 @@ def owner(kind):
     return "cloth" if kind == "bodies" else kind
 
 
+@pytest.mark.quick(
+    "monolithic-fixed-5-state",
+    "monolithic-floating-5-state",
+    "monolithic-kinematic-5-state",
+    "rigid_to_cloth-fixed-5-state",
+    "rigid_to_cloth-floating-5-state",
+    "rigid_to_cloth-kinematic-5-state",
+    "cloth_to_rigid-fixed-5-state",
+    "cloth_to_rigid-floating-5-state",
+    "cloth_to_rigid-kinematic-5-state",
+)
 @pytest.mark.parametrize("kind", list(SCALES))
 @pytest.mark.parametrize(
     ("coupling", "base", "steps"),

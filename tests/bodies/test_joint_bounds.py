@@ -131,6 +131,7 @@ def test_an_applied_effort_stays_within_its_limit(tmp_path, asked):
     assert float(end.joint_velocities) == pytest.approx(speed, rel=1e-9)
 
 
+@pytest.mark.quick("0.0-3.0", "-40.0-3.0")
 @pytest.mark.parametrize("stiffness", [3.0, 2e4])
 @pytest.mark.parametrize("feed", [0.0, -40.0])
 def test_a_drive_that_cannot_lift_rests_where_its_limit_holds_the_weight(tmp_path, stiffness, feed):
@@ -436,6 +437,7 @@ def test_friction_holds_an_arm_where_the_search_begins(tmp_path):
     assert WEIGHT * np.cos(float(found.joint_positions)) == pytest.approx(0.5 * WEIGHT, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_of_an_equilibrium_by_limits_friction_and_start(tmp_path):
     robot = dc.Robot.load(arm_file(tmp_path, 2), stiffness=3.0, damping=0.1)
     sim = simulator(robot)

@@ -8,6 +8,7 @@ from bodies.coupled_scenes import COUPLINGS, control, in_contact, parameters
 STEPS = [1e-5] * 4 + [1e-3]
 
 
+@pytest.mark.quick("monolithic-fixed", "rigid_to_cloth-fixed", "cloth_to_rigid-fixed")
 @pytest.mark.parametrize("base", ["fixed", "floating"])
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_both_modes_find_the_jacobian(coupling, base):

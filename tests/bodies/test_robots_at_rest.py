@@ -112,6 +112,7 @@ def test_a_floor_carries_a_limp_arm(tmp_path, dt):
     assert found == pytest.approx(G * arm / (elbow + 0.2 * fore), rel=1e-6)
 
 
+@pytest.mark.quick("0.02")
 @pytest.mark.parametrize("dt", [0.02, 0.005])
 def test_drives_on_a_base_that_stands_carry_the_weight(tmp_path, dt):
     """It floats, and falls as a whole; its floor holds it."""

@@ -406,6 +406,23 @@ def weights_of(state):
     return {name: torch.randn(getattr(state, name).shape, dtype=F64, generator=g) for name in names}
 
 
+@pytest.mark.quick(
+    "state-positions",
+    "state-body_poses",
+    "state-joint_positions",
+    "state-joint_targets",
+    "state-base_velocities",
+    "control-body_wrenches",
+    "control-joint_velocities",
+    "control-base_wrenches",
+    "parameters-body_mass",
+    "parameters-body_inertia",
+    "parameters-link_center",
+    "parameters-joint_stiffness",
+    "parameters-joint_viscosity",
+    "parameters-joint_effort_limits",
+    "parameters-joint_friction",
+)
 @pytest.mark.parametrize(("record", "name"), EVERY)
 def test_gradients_of_two_steps_are_those_of_differences(sim, record, name):
     """Every differentiable field, with a loss on every output field."""

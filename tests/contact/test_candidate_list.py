@@ -30,6 +30,7 @@ def search():
     return x, mesh, surface, mesh.find(x, x, 100.0)
 
 
+@pytest.mark.quick("1e-05-still", "0.001-still", "0.01-still", "0.1-still")
 @pytest.mark.parametrize("common", [0.0, 5.0], ids=["still", "flying"])
 @pytest.mark.parametrize("scale", [1e-5, 1e-3, 1e-2, 1e-1])
 def test_no_pair_that_comes_within_reach_is_missed(search, scale, common):

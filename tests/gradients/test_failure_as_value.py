@@ -54,6 +54,23 @@ def loss_of(state):
     return sum(w * (getattr(state, name) ** 2).sum() for name, w in WEIGHTS.items())
 
 
+@pytest.mark.quick(
+    "pins-split-monolithic",
+    "pins-split-rigid_to_cloth",
+    "pins-coupled-cloth_to_rigid",
+    "body-coupled-monolithic",
+    "body-coupled-rigid_to_cloth",
+    "turning body-split-monolithic",
+    "turning body-split-rigid_to_cloth",
+    "turning body-coupled-cloth_to_rigid",
+    "joint-coupled-monolithic",
+    "joint-coupled-rigid_to_cloth",
+    "base-split-monolithic",
+    "base-split-rigid_to_cloth",
+    "base-coupled-cloth_to_rigid",
+    "forces-coupled-monolithic",
+    "forces-coupled-rigid_to_cloth",
+)
 @by_solve
 @by_kind
 def test_the_others_keep_the_bits_and_gradients_that_they_have_alone(kind, scheme, coupling):
@@ -81,6 +98,21 @@ def test_the_others_keep_the_bits_and_gradients_that_they_have_alone(kind, schem
     assert not wanted_bar[FAILED].any()
 
 
+@pytest.mark.quick(
+    "pins-split-monolithic",
+    "pins-split-rigid_to_cloth",
+    "pins-coupled-cloth_to_rigid",
+    "body-coupled-monolithic",
+    "body-coupled-rigid_to_cloth",
+    "turning body-split-monolithic",
+    "turning body-split-rigid_to_cloth",
+    "turning body-coupled-cloth_to_rigid",
+    "joint-coupled-monolithic",
+    "joint-coupled-rigid_to_cloth",
+    "base-split-monolithic",
+    "base-split-rigid_to_cloth",
+    "base-coupled-cloth_to_rigid",
+)
 @by_solve
 @by_block
 def test_the_state_is_where_the_motion_has_ended_and_can_be_gone_on_from(kind, scheme, coupling):
@@ -186,6 +218,15 @@ def test_a_loss_that_depends_on_it_raises_its_error(kind):
     assert looked >= 3
 
 
+@pytest.mark.quick(
+    "pins-split-monolithic",
+    "pins-coupled-rigid_to_cloth",
+    "body-coupled-monolithic",
+    "body-coupled-cloth_to_rigid",
+    "joint-split-rigid_to_cloth",
+    "forces-split-monolithic",
+    "forces-coupled-rigid_to_cloth",
+)
 @by_solve
 @pytest.mark.parametrize("kind", ["pins", "body", "joint", "forces"])
 def test_rollouts_with_and_without_checkpoints_agree(kind, scheme, coupling):

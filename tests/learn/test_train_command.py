@@ -56,6 +56,7 @@ def test_results(config, tmp_path):
     assert len(events.Scalars("evaluation/return")) == 3
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_goes_on_with_the_same_bits(config, tmp_path, monkeypatch):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert call(config, "--out", whole).exit_code == 0
@@ -133,6 +134,7 @@ def test_the_best_of_several_seeds_goes_on_as_if_it_had_been_alone(config, tmp_p
     assert not [f for f in (out / "events").iterdir() if f.is_dir()]
 
 
+@pytest.mark.quick("while seeds are tried")
 @pytest.mark.parametrize("at", [3, 8], ids=["while seeds are tried", "after that"])
 def test_an_interrupted_tryout_goes_on_with_the_same_bits(config, tmp_path, monkeypatch, at):
     whole, cut = tmp_path / "whole", tmp_path / "cut"

@@ -360,6 +360,7 @@ def rollouts_rows(h, count, generator):
     return Rows
 
 
+@pytest.mark.quick("apg-3-number", "shac-0-tensor")
 @pytest.mark.parametrize(
     ("algorithm", "knots", "scale"),
     [("apg", 3, "number"), ("apg", 3, "tensor"), ("shac", 0, "tensor"), ("sapo", 0, "number")],
@@ -567,6 +568,7 @@ def test_it_improves(algorithm, seed):
 
 # Of four seeds: where one scale serves a tensor the return is .32 to .34 of the first one, and .49
 # to .61 of the return where each number has its own.
+@pytest.mark.quick("0")
 @pytest.mark.rounding
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_plan_with_one_scale_improves_faster(seed):

@@ -48,6 +48,7 @@ def test_processes(here):
         workers.close()
 
 
+@pytest.mark.slow
 def test_jobs_of_whatever_submits(here):
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         assert_same(train(Jobs(pool)), here)
@@ -151,6 +152,7 @@ class TestRay:
         finally:
             workers.close()
 
+    @pytest.mark.slow
     def test_same_bits_also_where_an_actor_is_killed_between_updates(self, ray, here):
         workers = RayActors(2)
         try:

@@ -21,6 +21,7 @@ GRAPHS = {
 }
 
 
+@pytest.mark.quick("sheet", "chain", "star", "two sheets")
 @pytest.mark.parametrize("name", GRAPHS)
 def test_large_graphs_of_any_kind_are_solved(name):
     size, pairs = GRAPHS[name]()

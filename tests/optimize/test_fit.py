@@ -180,6 +180,7 @@ def test_values_of_starts_and_several_trajectories(strip):
     assert float(found.parameters.bending) == 3e-4
 
 
+@pytest.mark.slow
 @pytest.mark.rounding
 def test_starts_end_at_one_place_and_repeat(strip):
     residuals = residuals_of(strip, observe(strip, 1, **TRUTH))

@@ -40,6 +40,7 @@ def test_the_process_ends_in_order(robot, backward, delay):
     assert run_python(script, timeout=120) == "ended\n"
 
 
+@pytest.mark.slow
 def test_an_idle_thread_does_not_hold_up_the_end():
     out = run_python(
         """

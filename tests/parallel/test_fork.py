@@ -53,6 +53,7 @@ def in_child(function, patience):
     return os.waitstatus_to_exitcode(status)
 
 
+@pytest.mark.quick("6-1", "12-2")
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_forked_child_steps_batches(after_a_parallel_region, count):
     n, state, expected, patience = after_a_parallel_region

@@ -62,6 +62,7 @@ def test_a_batch_has_the_same_bits_on_any_number_of_threads(serial, n, count, of
         assert differing(values, expected) == []
 
 
+@pytest.mark.quick("2")
 @pytest.mark.parametrize("count", [2, 4])
 def test_split_has_the_same_bits_on_any_number_of_threads(serial, count):
     state, expected = serial(16, "split")
@@ -71,6 +72,7 @@ def test_split_has_the_same_bits_on_any_number_of_threads(serial, count):
         assert differing(values, expected) == []
 
 
+@pytest.mark.quick("12")
 @pytest.mark.parametrize("n", SIZES[:2])
 def test_woven_cloth_has_the_same_bits_alone_and_on_any_number_of_threads(n):
     sim, state = simulator(n, woven=True), batch(n, ENVIRONMENTS, woven=True)
@@ -96,6 +98,7 @@ def test_an_environment_has_the_same_bits_alone_and_in_a_batch(serial, n):
         assert torch.equal(after.body_forces, expected[2][i])
 
 
+@pytest.mark.quick("coupled")
 @pytest.mark.parametrize("scheme", ["coupled", "split"])
 def test_threads_that_share_one_environment_change_no_bit(scheme):
     # As large as it takes: see tests/linalg/test_shared_work.py.

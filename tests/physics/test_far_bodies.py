@@ -96,6 +96,14 @@ def run(given, far, steps, speeds=SPEEDS):
     return states[1:]
 
 
+@pytest.mark.quick(
+    "stiff-sheets-one",
+    "hanging-one",
+    "self-contact-one",
+    "crumple-one",
+    "air-one",
+    "limited-gripper-one",
+)
 @pytest.mark.parametrize(
     ("name", "far"),
     [*((name, far) for name in OWN for far in FAR), *((name, "one") for name in TIMED)],

@@ -40,6 +40,7 @@ def test_every_step_of_a_drape_converges(name, drape):
     assert indefinite > 0
 
 
+@pytest.mark.quick("sphere")
 @pytest.mark.parametrize("name", ["sphere", "box"])
 def test_what_local_global_iterations_give_up_is_solved_by_newton(name, drape):
     steps, local_global = drape(name, "projective")

@@ -47,6 +47,7 @@ def sizes_of(step):
     return sizes
 
 
+@pytest.mark.quick("plane-sticking", "sphere-sticking", "capsule-sticking", "box-sticking")
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("kind", BODIES)
 def test_gradients_of_a_step_are_those_of_differences(kind, case):

@@ -188,6 +188,9 @@ def slopes(sim, state, name, tensor, d, step, stencil):
     return {p: sum(w * float(at[p]) for w, at in points) / step for p in points[0][1]}
 
 
+@pytest.mark.quick(
+    "hanging", "hinge", "thick", "sphere", "folded_thick", "woven", "handled", "handled_kinematic"
+)
 @pytest.mark.parametrize("name", REGIMES)
 def test_every_part_has_its_gradient_by_every_input(name):
     sim, state = case(name)

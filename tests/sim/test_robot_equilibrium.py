@@ -311,6 +311,20 @@ def test_a_base_that_a_control_turns_is_where_the_weight_counts(arm, angle):
 MIXED = {"shoulder": "pd", "elbow": "position"}, {"shoulder": "position", "elbow": "pd"}
 
 
+@pytest.mark.quick(
+    "actuation0-targets",
+    "actuation0-stiffness",
+    "actuation0-link_mass",
+    "actuation1-targets",
+    "actuation1-stiffness",
+    "actuation1-link_mass",
+    "position-targets",
+    "position-stiffness",
+    "position-link_mass",
+    "actuation3-targets",
+    "actuation3-stiffness",
+    "actuation3-link_mass",
+)
 @pytest.mark.parametrize("name", ["targets", "base", "stiffness", "gravity", "link_mass", "held"])
 @pytest.mark.parametrize("actuation", [*MIXED, "position", {**MIXED[0], "elbow": "velocity"}])
 def test_derivatives_by_what_is_prescribed_and_of_its_efforts(arm, actuation, name):

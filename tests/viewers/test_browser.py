@@ -186,6 +186,7 @@ class TestPages:
         # Without the bar of the page below, which moves in any case.
         assert (np.abs(early - late)[: HEIGHT // 2] > 60).any(axis=-1).sum() > 1000
 
+    @pytest.mark.slow
     def test_colors_and_several_environments(self, falling, chromium, tmp_path):
         scene, states = falling
         page = tmp_path / "strain.html"

@@ -430,6 +430,9 @@ def scenes_without_cloth():
     }
 
 
+@pytest.mark.quick(
+    "one.png-1-body", "one.png-1-both", "few.png-3-robot", "film.gif-1-body and floor"
+)
 @pytest.mark.parametrize("name", scenes_without_cloth())
 @pytest.mark.parametrize(("file", "moments"), [("one.png", 1), ("few.png", 3), ("film.gif", 1)])
 @pytest.mark.usefixtures("pictures")
