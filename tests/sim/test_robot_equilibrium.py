@@ -243,6 +243,36 @@ def test_a_pendulum_without_a_shape_hangs(tmp_path):
     assert hanging.joint_positions.item() == pytest.approx(np.pi / 2, abs=1e-8)
 
 
+def test_a_drive_at_its_effort_limit_balances_the_weight(tmp_path):
+    """The links have no shape and their joint is at their origin: nothing but centers has extent.
+
+    The arm sinks from its target until m g l cos(q) is the limit, with dq/dL = -1 / (m g l sin(q)).
+    """
+    link = LINK.format(name="bob", center=CENTERS[0], mass=MASSES[0], length=0.2)
+    start, end = link.index("<collision>"), link.index("</link>")
+    hinge = JOINT.format(name="hinge", parent="base", child="bob", at=0)
+    path = tmp_path / "arm.urdf"
+    path.write_text(f'<robot name="arm">{BASE}{link[:start]}{link[end:]}{hinge}</robot>')
+    moment = MASSES[0] * 9.81 * CENTERS[0]
+    limit = torch.tensor([0.6 * moment], dtype=F64, requires_grad=True)
+    robot = dc.Robot.load(
+        path,
+        actuation="pd",
+        stiffness=400.0,
+        damping=0.1,
+        effort_limits=[0.6 * moment],
+        joint_positions=0.2,
+    )
+    contact = dc.ContactOptions(barrier_distance=2e-3)
+    sim = dc.Simulator(dc.Scene([], [], [robot]), 0.01, contact=contact, solver=TIGHT)
+    parameters = dc.Parameters(joint_effort_limits=limit)
+    angle = sim.equilibrium(sim.initial_state(), parameters=parameters).joint_positions[0]
+    expected = np.arccos(0.6)
+    assert angle.item() == pytest.approx(expected, abs=1e-7)
+    (by_limit,) = torch.autograd.grad(angle, limit)
+    assert by_limit.item() == pytest.approx(-1 / (moment * np.sin(expected)), rel=1e-6)
+
+
 @pytest.mark.parametrize("viscosity", [0.0, 0.1])
 def test_a_joint_that_nothing_holds_is_named(arm, viscosity):
     """A joint that resists its motion yields to a force without end, too."""

@@ -123,7 +123,8 @@ class Equilibria:
         self._settles = any(robot.is_dynamic for robot in assembly.robots)
         points = assembly.vertices if len(assembly.vertices) else assembly.body_vertices
         size = float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0
-        self._size = max([size, *(_reach(robot) for robot in assembly.robots)])
+        # Without any extent, as for a wheel alone, a radian counts like a meter.
+        self._size = max([size, *(_reach(robot) for robot in assembly.robots)]) or 1.0
         turns = [turn for robot in assembly.robots for turn in _turns(robot)]
         # A radian counts like the size of the scene.
         self._lever = cpu.tensor([self._size if turn else 1.0 for turn in turns])
@@ -412,8 +413,12 @@ def _leaf(values: Tensor) -> Tensor:
 
 
 def _reach(robot: Mechanism) -> float:
-    """How far the links of a robot reach at most, without shifts of joints [m]."""
-    return float(np.linalg.norm(robot.offset[:, :3, 3], axis=-1).sum())
+    """Upper bound on the distance of links and their centers of mass, without shifts of joints [m].
+
+    A robot whose joints all meet in one point may have its weight beside it.
+    """
+    offsets = np.linalg.norm(robot.offset[:, :3, 3], axis=-1).sum()
+    return float(offsets + np.linalg.norm(robot.center, axis=-1).max(initial=0.0))
 
 
 def _turns(robot: Mechanism) -> list[bool]:
