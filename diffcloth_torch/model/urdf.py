@@ -1,19 +1,16 @@
-"""URDF files: read safely and checked entirely before pytorch-kinematics parses them.
+"""URDF files, read safely.
 
-pytorch-kinematics responds to bad files with NaN poses, endless recursion or nothing at all, and
-its chains drop inertias and mimicking joints. So a file is first reduced to the elements and
-attributes of `urdf_document`, all checked; its parser then reads only these; and what it returns is
-checked to be a tree of links.
+A file is first reduced to the elements and attributes of `urdf_document`, all checked and with
+their defaults. The description is made from these alone, and must be a tree of links.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from xml.etree.ElementTree import ParseError, tostring
+from xml.etree.ElementTree import Element, ParseError
 
 import defusedxml.ElementTree
 import numpy as np
@@ -30,6 +27,8 @@ __all__ = ["Joint", "Link", "RobotDescription", "Shape", "read_urdf"]
 
 # Robots with a thousand links have files of a few MB.
 _LARGEST_FILE = 16 * 2**20  # bytes
+
+_NAMED = ("link", "joint")
 
 # An axis shorter than this is taken for zero.
 _SHORTEST_AXIS = 1e-9
@@ -146,34 +145,18 @@ def read_urdf(path: Path) -> RobotDescription:
         raise InvalidInput(f"{path}: not well-formed XML: {error}") from error
     if document.tag != "robot":
         raise InvalidInput(f"{path}: the root element must be <robot>, got <{document.tag}>")
-    checked = reduced(f"{path}: ", document)
-    # Imported here: it imports matplotlib.
-    from pytorch_kinematics.urdf_parser_py.urdf import URDF
-
-    # Bytes, because its parser refuses text with an XML declaration. Written anew, so that both
-    # parsers see the same document whatever the encoding of the file.
-    parse: Callable[[bytes], Any] = URDF.from_xml_string
-    # That parser refuses types of joints that it does not know.
-    types = [joint.attrib["type"] for joint in checked.findall("joint")]
-    for joint in checked.findall("joint"):
-        joint.set("type", "unknown")
-    robot = parse(tostring(checked))
-    for joint, kind in zip(robot.joints, types, strict=True):
-        joint.type = kind
-    return _description(str(path), robot)
-
-
-def _description(file: str, robot: Any) -> RobotDescription:
-    """Describe a robot that the parser of pytorch-kinematics has read."""
-    if not robot.links:
+    robot = reduced(f"{path}: ", document)
+    file = str(path)
+    names = {kind: [found.attrib["name"] for found in robot.iter(kind)] for kind in _NAMED}
+    if not names["link"]:
         raise InvalidInput(f"{file}: a robot must have a <link>, got none")
-    _check_names(file, "link", [link.name for link in robot.links])
-    _check_names(file, "joint", [joint.name for joint in robot.joints])
-    links = tuple(_link(link) for link in robot.links)
-    joints = tuple(_joint(file, joint) for joint in robot.joints)
-    _check_tree(file, [link.name for link in links], joints)
+    for kind in _NAMED:
+        _check_names(file, kind, names[kind])
+    links = tuple(_link(link) for link in robot.iter("link"))
+    joints = tuple(_joint(file, joint) for joint in robot.iter("joint"))
+    _check_tree(file, names["link"], joints)
     _check_mimics(file, joints)
-    return RobotDescription(robot.name, links, joints)
+    return RobotDescription(robot.attrib["name"], links, joints)
 
 
 def _check_names(file: str, kind: str, names: Sequence[str]) -> None:
@@ -189,12 +172,22 @@ def _check_names(file: str, kind: str, names: Sequence[str]) -> None:
         seen.add(name)
 
 
-def _frame(origin: Any) -> FloatArray:
-    """Frame [4, 4] of an <origin>: turned about the fixed axes x, then y, then z."""
+def _numbers(element: Element, attribute: str) -> FloatArray:
+    return np.array([float(word) for word in element.attrib[attribute].split()])
+
+
+def _number(element: Element | None, attribute: str) -> float:
+    """A number of an element, zero if the element is missing."""
+    return 0.0 if element is None else float(element.attrib[attribute])
+
+
+def _frame(owner: Element | None) -> FloatArray:
+    """Frame [4, 4] of the <origin>: turned about the fixed axes x, then y, then z."""
     frame = np.eye(4)
+    origin = None if owner is None else owner.find("origin")
     if origin is None:
         return frame
-    roll, pitch, yaw = origin.rpy
+    roll, pitch, yaw = _numbers(origin, "rpy")
     turn = np.eye(3)
     for (i, j), angle in (((1, 2), roll), ((2, 0), pitch), ((0, 1), yaw)):
         about = np.eye(3)
@@ -202,86 +195,84 @@ def _frame(origin: Any) -> FloatArray:
         about[j, i] = math.sin(angle)
         about[i, j] = -about[j, i]
         turn = about @ turn
-    frame[:3, :3], frame[:3, 3] = turn, origin.xyz
+    frame[:3, :3], frame[:3, 3] = turn, _numbers(origin, "xyz")
     return frame
 
 
-def _link(link: Any) -> Link:
-    inertial = link.inertial
-    frame = _frame(inertial and inertial.origin)
-    inertia = np.zeros((3, 3))
-    if inertial and inertial.inertia:
-        inertia = np.array(inertial.inertia.to_matrix())
+def _link(link: Element) -> Link:
+    inertial = link.find("inertial")
+    frame = _frame(inertial)
+    moments = None if inertial is None else inertial.find("inertia")
+    rows = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))
+    inertia = np.array([[_number(moments, name) for name in row] for row in rows])
     rotation = frame[:3, :3]
     return Link(
-        name=link.name,
-        mass=inertial.mass if inertial else 0.0,
+        name=link.attrib["name"],
+        mass=0.0 if inertial is None else _number(inertial.find("mass"), "value"),
         center=frame[:3, 3],
         inertia=rotation @ inertia @ rotation.T,
-        shapes=tuple(_shape(collision) for collision in link.collisions),
+        shapes=tuple(_shape(collision) for collision in link.iter("collision")),
     )
 
 
-_SIZES = {
-    "box": ("size",),
-    "cylinder": ("radius", "length"),
-    "sphere": ("radius",),
-    "capsule": ("radius", "length"),
-    "mesh": ("scale",),
-}
-
-
-def _shape(collision: Any) -> Shape:
-    geometry = collision.geometry
-    kind = type(geometry).__name__.lower()
-    size = np.hstack([getattr(geometry, field) for field in _SIZES[kind]])
+def _shape(collision: Element) -> Shape:
+    (shape,) = collision.iterfind("geometry/*")
+    fields = [field for field in shape.attrib if field != "filename"]
     return Shape(
-        kind=kind,
-        frame=_frame(collision.origin),
-        size=tuple(size.tolist()),
-        filename=geometry.filename if kind == "mesh" else "",
+        kind=shape.tag,
+        frame=_frame(collision),
+        size=tuple(float(x) for field in fields for x in _numbers(shape, field)),
+        filename=shape.get("filename", ""),
     )
 
 
-def _joint(file: str, joint: Any) -> Joint:
-    where = f"{file}: <joint name={joint.name!r}>"
-    axis = np.array([1.0, 0.0, 0.0] if joint.axis is None else joint.axis)
-    length = float(np.linalg.norm(axis))
-    if joint.type != "fixed" and length < _SHORTEST_AXIS:
+def _joint(file: str, joint: Element) -> Joint:
+    name, kind = joint.attrib["name"], joint.attrib["type"]
+    where = f"{file}: <joint name={name!r}>"
+    given = {tag: joint.find(tag) for tag in ("axis", "limit", "dynamics", "mimic")}
+    axis, limit, mimic = given["axis"], given["limit"], given["mimic"]
+    direction = np.array([1.0, 0.0, 0.0]) if axis is None else _numbers(axis, "xyz")
+    length = float(np.linalg.norm(direction))
+    if kind != "fixed" and length < _SHORTEST_AXIS:
         raise InvalidInput(
             f"{where} <axis>: `xyz` must have a length of at least {_SHORTEST_AXIS:g}, "
             f"got {length:g}"
         )
     lower, upper = -math.inf, math.inf
-    if joint.type not in ("fixed", "continuous"):
-        if joint.limit is None:
+    if kind not in ("fixed", "continuous"):
+        if limit is None:
             raise InvalidInput(
-                f"{where} of type {joint.type!r} must have a <limit>; a joint that turns without "
+                f"{where} of type {kind!r} must have a <limit>; a joint that turns without "
                 "limits has type 'continuous'"
             )
-        lower, upper = joint.limit.lower, joint.limit.upper
+        lower, upper = _number(limit, "lower"), _number(limit, "upper")
         if lower > upper:
             raise InvalidInput(
                 f"{where} <limit>: `lower` must not be above `upper`, got {lower:g} and {upper:g}"
             )
-    mimic = joint.mimic
-    if mimic is not None and joint.type == "fixed":
+    if mimic is not None and kind == "fixed":
         raise InvalidInput(f"{where} of type 'fixed' must have no <mimic>: it does not move")
+    follows = None
+    if mimic is not None:
+        follows = mimic.attrib["joint"], _number(mimic, "multiplier"), _number(mimic, "offset")
+    parent, child = (joint.find(tag) for tag in ("parent", "child"))
+    assert parent is not None  # the document has both
+    assert child is not None
     return Joint(
-        name=joint.name,
-        type=joint.type,
-        parent=joint.parent,
-        child=joint.child,
-        frame=_frame(joint.origin),
-        axis=np.zeros(3) if joint.type == "fixed" else axis / length,
+        name=name,
+        type=kind,
+        parent=parent.attrib["link"],
+        child=child.attrib["link"],
+        frame=_frame(joint),
+        axis=np.zeros(3) if kind == "fixed" else direction / length,
         lower=lower,
         upper=upper,
-        viscosity=joint.dynamics.damping if joint.dynamics else 0.0,
+        viscosity=_number(given["dynamics"], "damping"),
         # Files write 0 where they have no limit.
-        effort=(joint.limit and joint.limit.effort) or math.inf,
-        velocity=(joint.limit and joint.limit.velocity) or math.inf,
-        friction=joint.dynamics.friction if joint.dynamics else 0.0,
-        mimic=mimic and (mimic.joint, mimic.multiplier, mimic.offset),
+        effort=_number(limit, "effort") or math.inf,
+        velocity=_number(limit, "velocity") or math.inf,
+        friction=_number(given["dynamics"], "friction"),
+        mimic=follows,
     )
 
 
