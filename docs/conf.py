@@ -35,7 +35,7 @@ extensions = [
     "sphinx_design",
 ]
 root_doc = "README"
-include_patterns = ["*.md", "docs/**"]
+include_patterns = ["*.md", "docs/**", "csrc/*/README.md", "diffcloth_torch/*/README.md"]
 exclude_patterns = [".*", "build", "results"]
 
 html_theme = "furo"

@@ -16,7 +16,8 @@ import diffcloth_torch as dc
 from diffcloth_torch import _core
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
+READMES = sorted([*ROOT.glob("csrc/*/README.md"), *ROOT.glob("diffcloth_torch/*/README.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *READMES])
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -33,6 +34,27 @@ def test_files_that_are_named_exist(page):
     ):
         if path != "tests/oracles":  # where such references go
             assert (ROOT / path).exists(), path
+
+
+def files_of(readme):
+    """Headers and modules of a folder, without the levels of a kernel."""
+    files = [*readme.parent.glob("*.h"), *readme.parent.glob("*.py")]
+    return [f.name for f in files if not re.search(r"^__|_(impl|avx\w*|portable)\.h$", f.name)]
+
+
+def test_every_folder_of_code_has_a_readme():
+    folders = [f.parent for f in ROOT.glob("csrc/*/*.h")]
+    folders += [f.parent for f in ROOT.glob("diffcloth_torch/*/*.py")]
+    assert {readme.parent for readme in READMES} == set(folders)
+
+
+@pytest.mark.parametrize("readme", READMES, ids=lambda readme: readme.parent.name)
+def test_the_readme_of_a_folder_names_its_files(readme):
+    text = readme.read_text()
+    assert [name for name in files_of(readme) if name not in text] == []
+    tops = ("csrc", "diffcloth_torch", "scripts", "tests")
+    known = {f.name for top in tops for f in ROOT.glob(f"{top}/**/*")}
+    assert [n for n in re.findall(r"\b\w+\.(?:h|cpp|py)\b", text) if n not in known] == []
 
 
 def test_the_reference_has_every_public_name():
