@@ -54,6 +54,7 @@ def test_every_scene_is_timed_alone_and_in_batches(quick):
         assert 0 <= timing["residual"] < 1e-6  # the default tolerance [m/s]
 
 
+@pytest.mark.slow
 def test_scenes_are_in_their_regimes(quick):
     _, records = quick
     for timing in records["timings"]:
@@ -138,6 +139,7 @@ def test_what_moves_by_forces_is_timed_beside_what_is_given():
     assert all(float(row[-1]) >= 1 for row in rows[1:])  # steps in contact
 
 
+@pytest.mark.slow
 def test_a_jacobian_is_timed_beside_its_rollout():
     command = [sys.executable, "-m", "benchmarks.tangents", "--size", "6", "--steps", "4"]
     command += ["--repeats", "1"]
@@ -346,6 +348,7 @@ def pierces(a, b):
     return False
 
 
+@pytest.mark.slow
 def test_the_baseline_is_timed_with_both_elastic_solvers():
     command = [sys.executable, "-m", "benchmarks.projective", "--quick"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -379,6 +382,7 @@ def test_a_missing_extra_is_named_in_a_sentence(benchmark, module, sentence):
     assert len(result.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_jumps_are_counted():
     command = [sys.executable, "-m", "benchmarks.branches", "--quick"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -402,6 +406,7 @@ def test_an_end_that_is_elsewhere_is_a_jump(monkeypatch):
     assert (count.jumps, count.starts, count.failed) == (4, 4, 0)
 
 
+@pytest.mark.slow
 def test_creep_is_measured():
     command = [sys.executable, "-m", "benchmarks.sticking", "--quick"]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -413,6 +418,7 @@ def test_creep_is_measured():
         assert way == pytest.approx(law, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_bits_are_the_same_twice_and_others_in_another_scheme():
     command = [sys.executable, "-m", "benchmarks.bits", "--size", "6", "--only", "sphere"]
     runs = [
@@ -429,6 +435,7 @@ def test_bits_are_the_same_twice_and_others_in_another_scheme():
     assert len({line[-1] for line in lines}) >= 3
 
 
+@pytest.mark.slow
 def test_uneven_batches_are_shared_as_evenly_as_costs_tell():
     uneven = importlib.import_module("benchmarks.uneven")
     assert uneven.makespan([1.0, 1.0, 2.0]) == 3.0

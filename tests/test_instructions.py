@@ -75,6 +75,7 @@ print(*(number.hex() for number in found.flatten().tolist()))
 """
 
 
+@pytest.mark.slow
 def test_levels_differ_in_bits_only_where_one_has_no_fused_multiply_add(supported):
     """A step with contact, friction, woven cloth and a body, and its gradient."""
     found = {level: run_python(STEPS, env=os.environ | {VARIABLE: level}) for level in supported}

@@ -40,12 +40,17 @@ def test_importing_the_package_imports_no_torch():
         "from diffcloth_torch.sim.records.state import State; import torch",
     ],
 )
+@pytest.mark.quick("import torch*", "from diffcloth_torch import*")
 def test_torch_loads_records_of_0_1(imports):
     load = f"saved = torch.load({str(SAVED.with_suffix('.pt'))!r}, weights_only=True)"
     assert run_python(f"{imports}\n{load}\n{SHOW}") == KINDS
 
 
-@pytest.mark.parametrize("imports", ["", "import diffcloth_torch\n"])
+@pytest.mark.parametrize(
+    "imports",
+    [pytest.param("", id="nothing"), pytest.param("import diffcloth_torch\n", id="package")],
+)
+@pytest.mark.quick("nothing")
 def test_a_pickle_of_0_1_loads_where_nothing_else_is_imported(imports):
     load = f"saved = pickle.load(open({str(SAVED.with_suffix('.pkl'))!r}, 'rb'))\n"
     drop = "saved.pop('simulator').step(saved['state'])\n"

@@ -240,6 +240,7 @@ def stroke(time):
 
 
 @pytest.mark.parametrize("actuation", ["pd", ("pd", "position"), ("torque", "velocity")])
+@pytest.mark.quick("pd")
 def test_a_robot_in_empty_space_keeps_its_momentum(tmp_path, actuation):
     """All six numbers; its center of mass goes astray by what the metric of a solve is off."""
     astray = []
@@ -255,6 +256,7 @@ def test_a_robot_in_empty_space_keeps_its_momentum(tmp_path, actuation):
     assert astray[1] < 0.25 * astray[0]
 
 
+@pytest.mark.quick("0.5")
 @pytest.mark.parametrize("friction", [0.0, 0.5])
 def test_a_robot_that_strikes_a_box_keeps_their_momentum(tmp_path, friction):
     box = dc.RigidBody.box(

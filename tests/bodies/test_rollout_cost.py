@@ -41,6 +41,7 @@ def solves(monkeypatch):
 @pytest.mark.quick("30-*")
 @pytest.mark.parametrize("base", ["fixed", "floating"])
 @pytest.mark.parametrize("checkpoint_every", [None, STEPS, 30])
+@pytest.mark.slow
 def test_the_last_step_of_a_rollout_takes_the_time_of_the_first(base, checkpoint_every, solves):
     rollout(base, WINDOW, checkpoint_every=checkpoint_every)  # what torch does once
     rollouts = []

@@ -136,6 +136,7 @@ def test_the_best_of_several_seeds_goes_on_as_if_it_had_been_alone(config, tmp_p
 
 @pytest.mark.quick("while seeds are tried")
 @pytest.mark.parametrize("at", [3, 8], ids=["while seeds are tried", "after that"])
+@pytest.mark.slow
 def test_an_interrupted_tryout_goes_on_with_the_same_bits(config, tmp_path, monkeypatch, at):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert call(config, "--out", whole, *TRYOUT).exit_code == 0

@@ -553,6 +553,7 @@ def carry_strip(num_envs):
 @pytest.mark.rounding
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
+@pytest.mark.quick("*-0", "apg-*")
 def test_it_improves(algorithm, seed):
     options = TrainerOptions(
         algorithm=algorithm, horizon=10, actor_rate=4e-3, deviation=0.05, seed=seed

@@ -73,6 +73,7 @@ def dying(folder):
     return functools.partial(dies_in_its_first_worker, folder / "died", os.getpid())
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_in_an_update_changes_no_bit(here, tmp_path):
     workers = Processes(2)
     try:

@@ -30,7 +30,7 @@ _SCRIPT = """
 """
 
 
-@pytest.mark.quick("False-False-0.0", "False-True-0.013", "True-True-0.031")
+@pytest.mark.quick("False-True-0.013", "True-True-0.031")
 @pytest.mark.parametrize("delay", [0.0, 0.013, 0.031])
 @pytest.mark.parametrize("backward", [False, True])
 @pytest.mark.parametrize("robot", [False, True])

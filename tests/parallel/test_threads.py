@@ -112,7 +112,7 @@ def test_threads_that_share_one_environment_change_no_bit(scheme):
         assert differing(values, expected) == []
 
 
-@pytest.mark.quick("12-*", "16-*")
+@pytest.mark.quick("12-*")
 @pytest.mark.parametrize("often", [1, SLOW])
 @pytest.mark.parametrize("n", SIZES)
 def test_eight_python_threads_on_one_simulator(n, often):

@@ -93,7 +93,7 @@ CASES = [
 ]
 
 
-@pytest.mark.quick("push_cube", "hit_cloth_dynamic", "grasp_cloth", "two_cloths", "cloth_on_cube")
+@pytest.mark.quick("push_cube", "hit_cloth_dynamic", "grasp_cloth")
 @pytest.mark.parametrize(("config", "assignments"), CASES)
 def test_no_attempt_intersects(config, assignments):
     if "panda" in config:

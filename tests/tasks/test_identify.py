@@ -282,6 +282,7 @@ def test_the_command_refuses_what_is_no_fit(config, tmp_path):
         (["--compare"], r"tangents +\d+(.*\n)differences +\d+(.*\n)Adam +100(.*\n)CMA-ES +\d+"),
     ],
 )
+@pytest.mark.slow
 def test_the_benchmark_runs(option, expected):
     if "--compare" in option:
         pytest.importorskip("cma")
