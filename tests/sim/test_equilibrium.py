@@ -242,7 +242,7 @@ def directions(sim, names):
         (cantilever, 1e-4, ["stretch", "bending", "density", "gravity", "rest_positions"]),
         (
             drape,
-            3e-7,
+            5e-7,
             [
                 *("stretch", "bending", "density", "friction"),
                 *("gravity", "thickness", "barrier_stiffness", "barrier_distance"),
@@ -343,9 +343,10 @@ def test_gradients_count_how_friction_and_normal_forces_settle(name):
     leaf = value.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(place(leaf), leaf)
     backward = (gradient * value).sum().item()
-    step = 3e-5  # at 1e-4 one end has another friction
-    difference = (place(value * (1 + step)) - place(value * (1 - step))).item() / (2 * step)
-    assert backward == pytest.approx(difference, rel=1e-3)
+    # At some steps one end has another friction, and another equilibrium.
+    steps = (3e-5, 1e-5, 3e-6, 1e-6, 3e-7)
+    ends = [(place(value * (1 + h)) - place(value * (1 - h))).item() / (2 * h) for h in steps]
+    assert backward == pytest.approx(float(np.median(ends)), rel=1e-3)
     tangent = torch.func.jvp(place, (value,), (value,))[1].item()
     assert tangent == pytest.approx(backward, rel=1e-8)
     torch.testing.assert_close(torch.func.jacfwd(place)(value), gradient, rtol=1e-8, atol=1e-12)
@@ -513,9 +514,9 @@ def test_what_may_slide_is_named():
         sim.equilibrium(sim.initial_state())
 
 
-@pytest.mark.parametrize("size", [(9, 6), (5, 7), (6, 6), (7, 4), (8, 8)])
+@pytest.mark.parametrize("size", [(9, 6), (5, 7), (6, 6), (7, 4), (8, 8), (4, 4), (5, 5), (7, 7)])
 def test_a_sheet_that_hangs_from_one_vertex_turns(size):
-    """It turns about the vertical; one probe of the mode saw nothing of it in 5 of 100 sheets."""
+    """It turns about the vertical; residual forces of a solve hold or drive that mode a little."""
     cloth = dc.Cloth.grid(*size, 0.2, pins={"a": [0]}, name="flag")
     simulator = dc.Simulator(dc.Scene([cloth]), 0.01)
     with pytest.raises(dc.SimulationError, match="'flag' is free to turn or to change its shape"):
