@@ -54,7 +54,8 @@ def loss_of(state):
     return sum(w * (getattr(state, name) ** 2).sum() for name, w in WEIGHTS.items())
 
 
-@pytest.mark.quick(
+# Each kind of failure in some schemes and couplings.
+MOTIONS = (
     "pins-split-monolithic",
     "pins-split-rigid_to_cloth",
     "pins-coupled-cloth_to_rigid",
@@ -68,9 +69,10 @@ def loss_of(state):
     "base-split-monolithic",
     "base-split-rigid_to_cloth",
     "base-coupled-cloth_to_rigid",
-    "forces-coupled-monolithic",
-    "forces-coupled-rigid_to_cloth",
 )
+
+
+@pytest.mark.quick(*MOTIONS, "forces-coupled-monolithic", "forces-coupled-rigid_to_cloth")
 @by_solve
 @by_kind
 def test_the_others_keep_the_bits_and_gradients_that_they_have_alone(kind, scheme, coupling):
@@ -98,21 +100,7 @@ def test_the_others_keep_the_bits_and_gradients_that_they_have_alone(kind, schem
     assert not wanted_bar[FAILED].any()
 
 
-@pytest.mark.quick(
-    "pins-split-monolithic",
-    "pins-split-rigid_to_cloth",
-    "pins-coupled-cloth_to_rigid",
-    "body-coupled-monolithic",
-    "body-coupled-rigid_to_cloth",
-    "turning body-split-monolithic",
-    "turning body-split-rigid_to_cloth",
-    "turning body-coupled-cloth_to_rigid",
-    "joint-coupled-monolithic",
-    "joint-coupled-rigid_to_cloth",
-    "base-split-monolithic",
-    "base-split-rigid_to_cloth",
-    "base-coupled-cloth_to_rigid",
-)
+@pytest.mark.quick(*MOTIONS)
 @by_solve
 @by_block
 def test_the_state_is_where_the_motion_has_ended_and_can_be_gone_on_from(kind, scheme, coupling):
