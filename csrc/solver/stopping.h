@@ -47,7 +47,7 @@ struct Newton {
   /// Share of the tolerance below which a step is not taken: it would cost a solve, and the gradient needs
   /// no more accuracy.
   double settled = 0.1;
-  /// The same share of a certified step: its end needs another factorization.
+  /// Share of the tolerance below which a certified step is not taken: its end needs another factorization.
   double settled_factored = 0.25;
   /// Change of friction, as a share of the largest force, above which a step is taken however short it is:
   /// a few times the tolerance turn sticking into slipping.
@@ -100,7 +100,7 @@ inline constexpr LineSearch kLineSearch;
 struct CurvedStep {
   /// Share of the last free fraction that is tried next: the chord of each fraction is another one.
   double shorter = 0.9;
-  /// The same share at first: bends far away make no difference.
+  /// Share of the first free fraction that is tried first: bends far away make no difference.
   double barely_shorter = 1.0 - 1e-9;
   /// Fractions that are tried before the direction counts as blocked.
   int trials = 60;
@@ -124,7 +124,7 @@ struct Directions {
   int iterations = 8;
   /// Relative residual at which these iterations end: Newton's method needs no more.
   double forcing = 0.03;
-  /// The same residual if a factor is expensive, as more iterations pay then.
+  /// Relative residual at which they end if a factor is expensive, as more iterations pay then.
   double forcing_of_expensive = 0.01;
   /// Operations per entry of a factor that one iteration is worth, by its time.
   double operations_per_iteration = 80.0;
@@ -214,11 +214,11 @@ struct LocalGlobal {
   /// Iterations that are allowed for each of Newton's: one takes about as much less time.
   std::int64_t iterations_per_newton = 50;
   /// Share of the largest coordinate below which a step is lost in rounding.
-  double resolution = 1e-15;
+  double resolution = kNewton.resolution;
   /// Change of the energy, relative to it, that rounding can fake; below, the slope decides.
-  double energy_noise = 1e-11;
+  double energy_noise = kLineSearch.energy_noise;
   /// Share of the slope that must vanish then.
-  double wolfe_slope = 0.8;
+  double wolfe_slope = kLineSearch.wolfe_slope;
   /// Iterations after which the scale of the energy is computed again.
   int energy_age = 50;
   /// Iterations that neither shrink the residual nor gain more than noise, after which rounding is reached.
