@@ -143,7 +143,7 @@ def float_tensor(name: str, value: object) -> Tensor:
 
 
 def are_within(arrays: list[FloatArray], largest: float) -> bool:
-    """Whether all numbers are at most `largest` in magnitude; false for NaN."""
+    """Return true if all numbers are at most `largest` in magnitude, false for NaN."""
     return _core.are_within(arrays, largest)
 
 

@@ -10,8 +10,8 @@ namespace diffcloth::bodies {
 ///
 /// The potential energy of the weight, V(x) = -sum_l m_l g . c_l(x), is not quadratic in the
 /// coordinates x of a robot. Near x_n it is V(x_n) - Q . d + 1/2 d^T K d, with d = x - x_n and the
-/// generalized weight Q. A step that ends where it began, d = 0, ends in an equilibrium for any K, and
-/// its derivatives by all inputs are those of the equilibrium if K is the second derivative of V.
+/// generalized weight Q. A step that ends where it began, d = 0, ends in an equilibrium for any K. If K
+/// is the second derivative of V, the step and the equilibrium have the same derivatives by all inputs.
 ///
 /// Far from an equilibrium the second derivative may be too small: Q then leads across it. With a K
 /// that is at least as large everywhere, each step lowers the energy (majorization and minimization;

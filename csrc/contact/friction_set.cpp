@@ -521,8 +521,8 @@ void FrictionSet::add_product(const Entry& k,
 
 namespace {
 
-/// Pull the cotangent of a normal force back: returns the cotangents of the corners, and adds those of the
-/// parameters, times scale, to `bar` if they are chosen.
+/// Pull the cotangent of a normal force back. Returns the cotangents of the corners; adds the cotangents of the
+/// parameters, times scale, to `bar` if parameters are chosen.
 ///
 ///   d(lambda) = -kappa w (2 d b' dm + m (2 d b'' + b'/d) dD)
 Vec12 pull_back_lambda(const ContactModel& model,

@@ -33,7 +33,7 @@ _functorch = torch._C._functorch
 
 
 def in_transform() -> bool:
-    """Whether a transform of `torch.func` or `torch.vmap` is active."""
+    """Return true inside a transform of `torch.func` or `torch.vmap`."""
     active: bool = torch._C._are_functorch_transforms_active()
     return active
 
@@ -45,7 +45,7 @@ def transforms() -> list[bool]:
 
 
 def in_forward_mode() -> bool:
-    """Whether a level of forward-mode differentiation is open."""
+    """Return true inside a level of forward-mode differentiation."""
     return forward_ad._current_level >= 0
 
 
@@ -56,7 +56,7 @@ def with_tangents() -> AbstractContextManager[None]:
 
 
 def is_wrapped(tensor: Tensor) -> bool:
-    """Whether a tensor is a transform's wrapper, without memory of its own."""
+    """Return true for the wrapper of a transform, which has no memory of its own."""
     wrapped: bool = _functorch.is_functorch_wrapped_tensor(tensor)
     return wrapped
 
@@ -68,7 +68,7 @@ def unwrap(tensor: Tensor) -> tuple[Tensor, int | None]:
 
 
 def is_batched_by_older_vmap(tensor: Tensor) -> bool:
-    """Whether a tensor is batched by the vmap of `is_grads_batched` and vectorized Jacobians."""
+    """Return true if the vmap of `is_grads_batched` or vectorized Jacobians batches a tensor."""
     batched: bool = _functorch.is_legacy_batchedtensor(tensor)
     return batched
 
@@ -91,5 +91,5 @@ def with_older_axis(rows: Tensor) -> Tensor:
 
 
 def has_compiler() -> bool:
-    """Whether the compiler has been imported; its import takes longer than the rest of torch."""
+    """Return true if the compiler is imported; its import takes longer than the rest of torch."""
     return hasattr(sys.modules.get("torch._dynamo"), "disable")

@@ -36,7 +36,7 @@ _ONE_TRANSFORM = 2  # most interpreters of one: `jacfwd` is a vmap of a jvp
 
 
 def is_dense(value: Tensor) -> bool:
-    """Whether a tensor is one plain block of memory; nested and sparse ones are not."""
+    """Return true for one plain block of memory, false for nested and sparse tensors."""
     return not value.is_nested and value.layout == torch.strided
 
 

@@ -15,10 +15,7 @@ from xml.etree.ElementTree import Element, ParseError
 import defusedxml.ElementTree
 import numpy as np
 
-from diffcloth_torch.checks import (
-    FloatArray,
-    texts,
-)
+from diffcloth_torch.checks import FloatArray, texts
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.model.urdf_document import reduced
@@ -217,6 +214,7 @@ def _link(link: Element) -> Link:
 
 def _shape(collision: Element) -> Shape:
     (shape,) = collision.iterfind("geometry/*")
+    # The document has attributes in the order of its grammar.
     fields = [field for field in shape.attrib if field != "filename"]
     return Shape(
         kind=shape.tag,

@@ -331,8 +331,8 @@ class Simulator(Observables):
 
         Raises:
             IntersectingState: If surfaces intersect in `state`.
-            SimulationError: If something is free to move, so that the Hessian is singular; the
-                message names it.
+            SimulationError: If something is free to move, so that the Hessian is singular, or takes
+                more than some 2e4 time steps to swing; the message names it.
             NotConverged: If a solve stops before it reaches its tolerance, or friction does not
                 settle.
             InfeasibleMotion: As for `step`.
