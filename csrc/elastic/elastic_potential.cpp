@@ -83,18 +83,18 @@ void SpringPotential::add_hessian(const double* x,
                                   Curvature curvature,
                                   linalg::BlockMatrix& A) const {
   std::vector<Mat3> changes;
-  for (Index a = 0; a < springs_.size(); ++a) {
+  springs_.for_each_pulling([&](Index a) {
     changes.clear();
     for (const double b : springs_.coefficients(a)) changes.emplace_back(b * Mat3::Identity());
     A.add_congruence(springs_.points(a), changes,
                      hessian(springs_, a, x, curvature == Curvature::kPositive));
-  }
+  });
 }
 
 void SpringPotential::add_left_out_products(const double* x,
                                             Curvature curvature,
                                             const Products& products) const {
-  for (Index a = 0; a < springs_.size(); ++a) {
+  springs_.for_each_pulling([&](Index a) {
     const Mat3 core = hessian(springs_, a, x, curvature == Curvature::kPositive);
     const auto points = springs_.points(a);
     for (std::size_t l = 0; l < products.size(); ++l) {
@@ -105,7 +105,7 @@ void SpringPotential::add_left_out_products(const double* x,
         Eigen::Map<Vec3>(products.y[l] + 3 * points[p]) += springs_.coefficients(a)[p] * force;
       }
     }
-  }
+  });
 }
 
 void SpringPotential::accumulate(const double* x, const double* z) {

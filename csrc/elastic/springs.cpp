@@ -74,16 +74,16 @@ Mat3 hessian(const Springs& springs, Index a, const double* x, bool positive) {
 
 double energy(const Springs& springs, const double* x) {
   double total = 0.0;
-  for (Index a = 0; a < springs.size(); ++a) {
+  springs.for_each_pulling([&](Index a) {
     const double squared = squared_stretch(extension(springs, a, x), rest_length(springs, a));
     total += 0.5 * springs.stiffness[a] * squared;
-  }
+  });
   return total;
 }
 
 double energy_change(const Springs& springs, const double* x0, const double* x1) {
   double total = 0.0;
-  for (Index a = 0; a < springs.size(); ++a) {
+  springs.for_each_pulling([&](Index a) {
     const Vec3 step = difference(springs, a, x1) - difference(springs, a, x0);
     const Vec3 d0 = extension(springs, a, x0);
     const Vec3 d1 = extension(springs, a, x1);
@@ -93,24 +93,24 @@ double energy_change(const Springs& springs, const double* x0, const double* x1)
     const double lengths = rest == 0.0 ? 0.0 : d0.norm() + d1.norm();
     const double share = lengths > 0.0 ? 1.0 - 2.0 * rest / lengths : 1.0;
     total += 0.5 * springs.stiffness[a] * squares * share;
-  }
+  });
   return total;
 }
 
 void add_gradient(const Springs& springs, const double* x, double* g) {
-  for (Index a = 0; a < springs.size(); ++a) {
+  springs.for_each_pulling([&](Index a) {
     const Vec3 d = extension(springs, a, x);
     add_to_points(springs, a, springs.stiffness[a] * unit_force(d, rest_length(springs, a)), g);
-  }
+  });
 }
 
 void add_hessian_product(const Springs& springs, const double* x, const double* z, double* y) {
-  for (Index a = 0; a < springs.size(); ++a) {
+  springs.for_each_pulling([&](Index a) {
     const Vec3 d = extension(springs, a, x);
     const Vec3 change = difference(springs, a, z);
     add_to_points(springs, a,
                   times_hessian(d, springs.stiffness[a], rest_length(springs, a), change), y);
-  }
+  });
 }
 
 void add_energy_bars(const Springs& springs,

@@ -35,6 +35,13 @@ struct Springs {
   const double* target;                 ///< [rows, 3] c [m]
 
   Index size() const { return static_cast<Index>(start.size()) - 1; }
+  /// Visit the springs that pull: pickers have one for each vertex, of which all but a few are released.
+  template <class Visit>
+  void for_each_pulling(Visit&& visit) const {
+    for (Index a = 0; a < size(); ++a) {
+      if (stiffness[a] != 0.0) visit(a);
+    }
+  }
   std::span<const Index> points(Index a) const {
     return point.subspan(start[a], start[a + 1] - start[a]);
   }
