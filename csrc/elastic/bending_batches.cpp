@@ -33,7 +33,7 @@ void put_points(const Model& model, const Slots& slots, Index e, int l, BendingP
     for (int a = 0; a < 3; ++a) point.c[a][l] = element.c[3 * i + a];
     for (Index j = 0; j < 3; ++j) {
       point.slot[j][l] = own[linalg::lower(std::max(i, j), std::min(i, j))];
-      point.above[j][l] = element.vertices[i] < element.vertices[j];
+      point.above[j][l] = element.vertices[i] < element.vertices[j] ? -1 : 0;
     }
   }
 }

@@ -17,8 +17,9 @@ inline constexpr int kBendingLanes = 8;
 struct BendingPoint {
   std::int32_t vertex[kBendingLanes];
   std::int32_t slot[3][kBendingLanes];  ///< of its blocks with base corners up to itself
-  bool above[3][kBendingLanes];         ///< whether these lie transposed in the lower triangle
-  double c[3][kBendingLanes];           ///< c_uu, c_uv, c_vv [1/m^2]
+  std::int64_t
+      above[3][kBendingLanes];  ///< -1 where these lie transposed in the lower triangle, else 0
+  double c[3][kBendingLanes];   ///< c_uu, c_uv, c_vv [1/m^2]
 };
 
 /// Eight elements of as many vertices each, or fewer: the lanes behind the last one repeat it, without

@@ -5,6 +5,7 @@
 #include <cstddef>
 
 #include "elastic/bending_lanes.h"
+#include "elastic/block_lanes_impl.h"
 #include "elastic/polar_lanes_impl.h"
 
 // NOLINTBEGIN(modernize-avoid-c-arrays)
@@ -125,29 +126,18 @@ struct Shape {
   Lanes<6> sides;
 };
 
-/// Of offsets from the first vertices: offset(v, v0, k) for two vertices and a coordinate.
-template <class Offset>
-DIFFCLOTH_INLINE void gather(const BendingBatch& batch,
-                             const BendingPoint* points,
-                             Offset&& offset,
-                             Shape& shape) {
-  shape.Y = {};
-  const BendingPoint* const first = points + batch.first;
-  for (int i = 1; i < batch.points; ++i) {
-    const BendingPoint& point = first[i];
-    Lanes<3> side;
-    for (int l = 0; l < kLanes; ++l) {
-      for (int k = 0; k < 3; ++k) side.at[k][l] = offset(point.vertex[l], first->vertex[l], k);
-    }
-    for (int a = 0; a < 3; ++a) {
-      for (int k = 0; k < 3; ++k) {
-        for (int l = 0; l < kLanes; ++l) shape.Y.at[3 * a + k][l] += side.at[k][l] * point.c[a][l];
-      }
-    }
-    if (i > 2) continue;
+/// Y += side c^T of a point.
+DIFFCLOTH_INLINE void add_to_shape(const BendingPoint& point, const Lanes<3>& side, Lanes<9>& Y) {
+  for (int a = 0; a < 3; ++a) {
     for (int k = 0; k < 3; ++k) {
-      for (int l = 0; l < kLanes; ++l) shape.sides.at[3 * (i - 1) + k][l] = side.at[k][l];
+      for (int l = 0; l < kLanes; ++l) Y.at[3 * a + k][l] += side.at[k][l] * point.c[a][l];
     }
+  }
+}
+
+DIFFCLOTH_INLINE void put_side(int i, const Lanes<3>& side, Lanes<6>& sides) {
+  for (int k = 0; k < 3; ++k) {
+    for (int l = 0; l < kLanes; ++l) sides.at[3 * (i - 1) + k][l] = side.at[k][l];
   }
 }
 
@@ -155,10 +145,54 @@ DIFFCLOTH_INLINE void gather_at(const BendingBatch& batch,
                                 const BendingPoint* points,
                                 const double* x,
                                 Shape& shape) {
-  const auto offset = [x](std::ptrdiff_t v, std::ptrdiff_t v0, int k) {
-    return x[3 * v + k] - x[3 * v0 + k];
-  };
-  gather(batch, points, offset, shape);
+  shape.Y = {};
+  const BendingPoint* const first = points + batch.first;
+  for (int i = 1; i < batch.points; ++i) {
+    Lanes<3> side;
+    for (int l = 0; l < kLanes; ++l) {
+      const double* const at = x + 3 * static_cast<std::ptrdiff_t>(first[i].vertex[l]);
+      const double* const at_0 = x + 3 * static_cast<std::ptrdiff_t>(first->vertex[l]);
+      for (int k = 0; k < 3; ++k) side.at[k][l] = at[k] - at_0[k];
+    }
+    add_to_shape(first[i], side, shape.Y);
+    if (i <= 2) put_side(i, side, shape.sides);
+  }
+}
+
+/// The shapes at both ends of a motion, whose change is that of differences.
+struct BendingMotion {
+  Shape start;
+  Lanes<6> end;     ///< sides
+  Lanes<9> change;  ///< of Y
+};
+
+DIFFCLOTH_INLINE void gather_motion(const BendingBatch& batch,
+                                    const BendingPoint* points,
+                                    const double* x0,
+                                    const double* x1,
+                                    BendingMotion& motion) {
+  motion.start.Y = {};
+  motion.change = {};
+  const BendingPoint* const first = points + batch.first;
+  for (int i = 1; i < batch.points; ++i) {
+    Lanes<3> start;
+    Lanes<3> end;
+    Lanes<3> change;
+    for (int l = 0; l < kLanes; ++l) {
+      const std::ptrdiff_t at = 3 * static_cast<std::ptrdiff_t>(first[i].vertex[l]);
+      const std::ptrdiff_t at_0 = 3 * static_cast<std::ptrdiff_t>(first->vertex[l]);
+      for (int k = 0; k < 3; ++k) {
+        start.at[k][l] = x0[at + k] - x0[at_0 + k];
+        end.at[k][l] = x1[at + k] - x1[at_0 + k];
+        change.at[k][l] = (x1[at + k] - x0[at + k]) - (x1[at_0 + k] - x0[at_0 + k]);
+      }
+    }
+    add_to_shape(first[i], start, motion.start.Y);
+    add_to_shape(first[i], change, motion.change);
+    if (i > 2) continue;
+    put_side(i, start, motion.start.sides);
+    put_side(i, end, motion.end);
+  }
 }
 
 DIFFCLOTH_INLINE Polar polar_at(const BendingBatch& batch, const Lanes<6>& sides, int l) {
@@ -199,22 +233,15 @@ double energy_change(const BendingBatch* batches,
                      const double* x1) {
   double total = 0.0;
   for (const BendingBatch* batch = batches; batch != batches + count; ++batch) {
-    Shape start;
-    Shape end;
-    Shape change;
-    gather_at(*batch, points, x0, start);
-    gather_at(*batch, points, x1, end);
-    const auto moved = [x0, x1](std::ptrdiff_t v, std::ptrdiff_t v0, int k) {
-      return (x1[3 * v + k] - x0[3 * v + k]) - (x1[3 * v0 + k] - x0[3 * v0 + k]);
-    };
-    gather(*batch, points, moved, change);
+    BendingMotion motion;
+    gather_motion(*batch, points, x0, x1, motion);
     alignas(64) double energy[kLanes];
     for (int l = 0; l < kLanes; ++l) {
-      const Matrix R0 = rotation_of(polar_at(*batch, start.sides, l));
-      const Matrix R1 = rotation_of(polar_at(*batch, end.sides, l));
+      const Matrix R0 = rotation_of(polar_at(*batch, motion.start.sides, l));
+      const Matrix R1 = rotation_of(polar_at(*batch, motion.end, l));
       const Matrix dR = difference(R1, R0);
-      const Matrix Y0 = matrix_at(start.Y.at, l);
-      const Matrix dY = matrix_at(change.Y.at, l);
+      const Matrix Y0 = matrix_at(motion.start.Y.at, l);
+      const Matrix dY = matrix_at(motion.change.at, l);
       const Form Q = form_of(*batch, l);
       const double rest = change_of_term(Y0, dY, R0, dR, matrix_at(batch->b, l), Q);
       const double damped = change_of_term(Y0, dY, R0, dR, matrix_at(batch->b_n, l), Q);
@@ -463,7 +490,7 @@ DIFFCLOTH_INLINE void base_block(
   }
 }
 
-/// Of a vertex beyond the base triangle and each corner j of that: [m]x A_j in world axes.
+/// Of a vertex beyond the base triangle and each corner j of that: [m]x A_j in world axes. They add to zero.
 DIFFCLOTH_INLINE void outer_blocks(const Parts& parts,
                                    const BendingPoint& point,
                                    Block (&blocks)[3]) {
@@ -471,7 +498,7 @@ DIFFCLOTH_INLINE void outer_blocks(const Parts& parts,
     const Vector n = vector_at(parts.R.at, 2, l);
     const Vector m = moment(parts.bQ_world, point, l);
     const Vector across = cross(m, n);
-    for (int j = 0; j < 3; ++j) {
+    for (int j = 1; j < 3; ++j) {
       const Vector along = cross(m, vector_at(parts.alpha.at, j, l));
       const Vector epsilon = vector_at(parts.epsilon.at, j, l);
       for (int b = 0; b < 3; ++b) {
@@ -480,25 +507,41 @@ DIFFCLOTH_INLINE void outer_blocks(const Parts& parts,
         }
       }
     }
+    for (int k = 0; k < 9; ++k) blocks[0][k][l] = -(blocks[1][k][l] + blocks[2][k][l]);
+  }
+}
+
+/// The blocks of the base triangle with its first corner, as all that are in one row of the Hessian add to zero.
+///
+/// @param rows   lower triangle of the base triangle, of which the blocks of corners 1 and 2 are known
+/// @param outer  sum of the blocks of all vertices beyond it with each corner
+DIFFCLOTH_INLINE void complete_rows(const Block (&outer)[3], Block (&rows)[6]) {
+  for (int l = 0; l < kLanes; ++l) {
+    for (int b = 0; b < 3; ++b) {
+      for (int a = 0; a < 3; ++a) {
+        const int k = 3 * b + a;
+        const int across = 3 * a + b;
+        rows[1][k][l] = -((rows[2][k][l] + rows[4][across][l]) + outer[1][across][l]);
+        rows[3][k][l] = -((rows[4][k][l] + rows[5][k][l]) + outer[2][across][l]);
+      }
+    }
+    for (int b = 0; b < 3; ++b) {
+      for (int a = 0; a < 3; ++a) {
+        const int across = 3 * a + b;
+        rows[0][3 * b + a][l] = -((rows[1][across][l] + rows[3][across][l]) + outer[0][across][l]);
+      }
+    }
   }
 }
 
 DIFFCLOTH_INLINE void scatter(const BendingPoint& point,
                               int j,
                               int size,
-                              const Block& block,
+                              Block& block,
                               const std::int32_t* place,
                               double* blocks) {
-  for (int l = 0; l < size; ++l) {
-    double* const to = blocks + 9 * static_cast<std::ptrdiff_t>(place[point.slot[j][l]]);
-    if (point.above[j][l]) {
-      for (int b = 0; b < 3; ++b) {
-        for (int a = 0; a < 3; ++a) to[3 * a + b] += block[3 * b + a][l];
-      }
-    } else {
-      for (int k = 0; k < 9; ++k) to[k] += block[k][l];
-    }
-  }
+  transpose_blocks(point.above[j], block);
+  add_blocks(block, point.slot[j], size, place, blocks);
 }
 
 void add_hessian(const BendingBatch* batches,
@@ -514,15 +557,25 @@ void add_hessian(const BendingBatch* batches,
     gather_at(*batch, points, x, shape);
     find_parts(*batch, shape, positive, parts);
     const BendingPoint* const first = points + batch->first;
-    alignas(64) Block row[3];
-    for (int i = 0; i < batch->points; ++i) {
-      if (i < 3) {
-        for (int j = 0; j <= i; ++j) base_block(parts, first, i, j, positive, row[j]);
-      } else {
-        outer_blocks(parts, first[i], row);
-      }
-      for (int j = 0; j < 3 && j <= i; ++j) {
+    alignas(64) Block outer[3] = {};
+    for (int i = 3; i < batch->points; ++i) {
+      alignas(64) Block row[3];
+      outer_blocks(parts, first[i], row);
+      for (int j = 0; j < 3; ++j) {
+        for (int k = 0; k < 9; ++k) {
+          for (int l = 0; l < kLanes; ++l) outer[j][k][l] += row[j][k][l];
+        }
         scatter(first[i], j, batch->size, row[j], place, blocks);
+      }
+    }
+    alignas(64) Block base[6];  // (0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)
+    base_block(parts, first, 1, 1, positive, base[2]);
+    base_block(parts, first, 2, 1, positive, base[4]);
+    base_block(parts, first, 2, 2, positive, base[5]);
+    complete_rows(outer, base);
+    for (int i = 0, k = 0; i < 3; ++i) {
+      for (int j = 0; j <= i; ++j, ++k) {
+        scatter(first[i], j, batch->size, base[k], place, blocks);
       }
     }
   }

@@ -5,6 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "elastic/block_lanes_impl.h"
 #include "elastic/polar_lanes_impl.h"
 #include "elastic/stretch_lanes.h"
 
@@ -94,12 +95,7 @@ DIFFCLOTH_INLINE void scatter_blocks(const FaceBatch& batch,
                                      const double (&h)[54][kLanes],
                                      const std::int32_t* place,
                                      double* blocks) {
-  for (int l = 0; l < batch.size; ++l) {
-    for (int k = 0; k < 6; ++k) {
-      double* const block = blocks + 9 * static_cast<std::ptrdiff_t>(place[batch.slot[k][l]]);
-      for (int a = 0; a < 9; ++a) block[a] += h[9 * k + a][l];
-    }
-  }
+  for (int k = 0; k < 6; ++k) add_blocks(h + 9 * k, batch.slot[k], batch.size, place, blocks);
 }
 
 /// blocks += the Hessians of batches, exact or projected.
