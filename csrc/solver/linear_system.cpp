@@ -35,7 +35,7 @@ linalg::BlockMatrix LinearSystem::assemble(const double* x,
   const Stopwatch::Scope scope(watch_, Phase::kAssembly);
   const std::size_t size = 3 * static_cast<std::size_t>(f_.coordinates->point_count());
   if (pattern_ == nullptr || !std::equal(x_.begin(), x_.end(), x)) {
-    pattern_ = f_.patterns->find(f_.couplings());
+    pattern_ = f_.pattern();
     x_.assign(x, x + size);
   }
   linalg::BlockMatrix matrix({pattern_, &pattern_->merged}, f_.patterns->fixed(),

@@ -45,23 +45,30 @@ double Objective::largest_fraction(const std::vector<double>& x,
       fraction, chart->largest_fraction(x.data(), dx.data(), stopping::kJointSteps.share_of_limit));
 }
 
-linalg::Couplings Objective::couplings() const {
+std::shared_ptr<const AnalyzedPattern> Objective::pattern() const {
   linalg::Couplings points;
   for_each([&](const Potential& p) {
     if (&p != friction) p.add_couplings(points);
   });
-  linalg::Couplings here = united(expected, beyond_base(*this, std::move(points)));
-  if (friction == nullptr) return here;
-  if (!of_friction) {
-    linalg::Couplings of_its_points;
-    friction->add_couplings(of_its_points);
-    of_friction = beyond_base(*this, std::move(of_its_points));
+  if (known_pattern.pattern != nullptr && known_pattern.points == points) {
+    return known_pattern.pattern;
   }
-  return united(here, *of_friction);
+  linalg::Couplings all = united(expected, beyond_base(*this, points));
+  if (friction != nullptr) {
+    if (!of_friction) {
+      linalg::Couplings of_its_points;
+      friction->add_couplings(of_its_points);
+      of_friction = beyond_base(*this, std::move(of_its_points));
+    }
+    all = united(all, *of_friction);
+  }
+  known_pattern = {.points = std::move(points), .pattern = patterns->find(all)};
+  return known_pattern.pattern;
 }
 
 void Objective::expect(linalg::Couplings points) {
   expected = beyond_base(*this, std::move(points));
+  known_pattern.pattern = nullptr;
 }
 
 }  // namespace diffcloth::solver

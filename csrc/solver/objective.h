@@ -1,6 +1,7 @@
 #pragma once
 
 #include <algorithm>
+#include <memory>
 #include <optional>
 #include <span>
 #include <vector>
@@ -30,14 +31,22 @@ struct Objective {
   /// Bodies of which nothing but contact and `chart`, a quadratic form for them, knows.
   std::span<const bodies::Mechanisms::FreeBody> free_bodies;
   PatternCache* patterns;
-  linalg::Couplings expected;  ///< of rows beyond the base pattern, sorted: always in couplings()
+  linalg::Couplings expected;  ///< of rows beyond the base pattern, sorted: always in pattern()
 
   /// Those of friction alone, which last as long as it does; empty until they are asked for.
   mutable std::optional<linalg::Couplings> of_friction;
 
+  /// The last result of pattern(), and the couplings of points that it was found for.
+  struct KnownPattern {
+    linalg::Couplings points;
+    std::shared_ptr<const AnalyzedPattern> pattern;  ///< null where none is known
+  };
+  mutable KnownPattern known_pattern;
+
   void take_friction(Potential* potential) {
     friction = potential;
     of_friction.reset();
+    known_pattern.pattern = nullptr;
   }
 
   /// Every potential in a fixed order.
@@ -118,8 +127,9 @@ struct Objective {
   /// diagonal of the metric of coordinates.
   std::vector<double> metric() const;
 
-  /// Couplings of rows beyond the base pattern, sorted.
-  linalg::Couplings couplings() const;
+  /// Pattern of the Hessian at the point where the objective stands. Most iterates have the couplings of the
+  /// one before, and its pattern.
+  std::shared_ptr<const AnalyzedPattern> pattern() const;
 
   /// Expect couplings of points, in place of those expected so far.
   void expect(linalg::Couplings points);

@@ -181,7 +181,8 @@ solver::Objective Problem::objective(Proximity& inertia_or_nearness,
           .free_bodies = scene.free_bodies,
           .patterns = &patterns,
           .expected = {},
-          .of_friction = {}};
+          .of_friction = {},
+          .known_pattern = {}};
 }
 
 linalg::BlockMatrix contact_free_hessian(Problem& p, const double* x, Curvature curvature) {
