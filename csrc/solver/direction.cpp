@@ -102,6 +102,7 @@ double Directions::curvature_along(const linalg::BlockMatrix& H) const {
 }
 
 bool Directions::iterate(const linalg::BlockMatrix& H, bool& indefinite) {
+  if (last_.factor->analysis()->flops() < kDirections.cheap_factor) return false;
   if (!is_near() && !(chord_allowed_ && is_dear())) return false;
   double forcing = kDirections.forcing;
   int iterations = kDirections.iterations;

@@ -120,6 +120,9 @@ inline constexpr JointSteps kJointSteps;
 struct Directions {
   /// Ratio to the last step below which a chord step is taken: slower chords cost more than a factor.
   double chord_contraction = 0.1;
+  /// Operations of a factorization, up to some 18 x 18 vertices, below which a new factor costs less than
+  /// iterations with an old one.
+  double cheap_factor = 3e7;
   /// Most conjugate gradient iterations with an old factor: a new factor would be cheaper.
   int iterations = 8;
   /// Relative residual at which these iterations end: Newton's method needs no more.

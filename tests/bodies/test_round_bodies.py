@@ -405,7 +405,7 @@ def test_no_point_of_a_cloth_enters_a_smooth_body(kind, scheme):
 def test_it_carries_the_weight_of_the_cloth(kind):
     """At rest; the sheet is held in place by friction."""
     body, _ = below(kind, smooth=True, friction=2.0)
-    sim, states = drape(body, n=10)
+    sim, states = drape(body, n=10, solver=dc.SolverOptions(tolerance=1e-7))
     state = sim.equilibrium(states[-1])
     weight = float(sim.parameters().density * 0.25 * G)
     assert float(sim.contact_wrenches(state)["body0"][2]) == pytest.approx(-weight, rel=1e-6)

@@ -430,7 +430,7 @@ def test_the_length_and_sign_of_a_quaternion_do_not_matter():
 
 @pytest.mark.parametrize(("name", "largest"), [("curved", 1e-2), ("sticking", 3e-2)])
 def test_taylor_remainder_is_of_second_order(name, largest):
-    """Over four decades, along a direction in all inputs at once."""
+    """Over three decades and more, along a direction in all inputs at once."""
     case = scenes.regime(name)
     loss = make_loss(case)
     inputs = case.inputs()
@@ -450,7 +450,9 @@ def test_taylor_remainder_is_of_second_order(name, largest):
         with torch.no_grad():
             change = loss(case.step({k: t + size * d[k] for k, t in inputs.items()})).item()
         remainders.append(abs(change - size * slope))
-    order = np.polyfit(np.log(sizes), np.log(remainders), 1)[0]
+    above = np.array(remainders) > 1e-15  # rounding of the loss
+    assert above[:7].all()
+    order = np.polyfit(np.log(sizes[above]), np.log(np.array(remainders)[above]), 1)[0]
     assert order == pytest.approx(2.0, abs=0.1), remainders
 
 
