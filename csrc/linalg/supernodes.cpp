@@ -24,6 +24,27 @@ bool few_zeros(Index columns, double share) {
   return (scalars <= 16 && share < 0.8) || (scalars <= 48 && share < 0.1) || share < 0.05;
 }
 
+/// Operations that eliminate a front of so many vertices.
+double operations(Index columns, Index rows) {
+  const auto c = static_cast<double>(columns);
+  const auto r = static_cast<double>(rows);
+  return 27.0 * c * (c * c / 3.0 + c * r + r * r);
+}
+
+/// Operations that take as long as the kernels of a front need to begin, and as one entry needs that is added to a
+/// parent.
+constexpr double kFront = 2e4;
+constexpr double kMoved = 20.0;
+
+/// Whether a child costs less as a part of its parent than as a front of its own.
+bool is_cheaper_together(const Node& child, const Node& parent) {
+  const double apart =
+      operations(child.columns, child.rows) + operations(parent.columns, parent.rows);
+  const double together = operations(child.columns + parent.columns, parent.rows);
+  const double moved = 4.5 * static_cast<double>(child.rows) * (child.rows + 1.0);
+  return together - apart < kFront + kMoved * moved;
+}
+
 /// Supernodes of columns that have the same structure below them; owner[k] is that of column k.
 std::vector<Node> fundamental(const EliminationTree& tree, std::vector<Index>& owner) {
   const auto n = static_cast<Index>(tree.order.size());
@@ -65,7 +86,9 @@ void merge_children(std::vector<Node>& nodes) {
       const Node& child = nodes[*best];
       const Index columns = child.columns + node.columns;
       const double zeros = zeros_together(child, node);
-      if (!few_zeros(columns, zeros / panel_blocks(columns, node.rows))) break;
+      if (!few_zeros(columns, zeros / panel_blocks(columns, node.rows)) &&
+          !is_cheaper_together(child, node))
+        break;
       nodes[*best].merged_into = s;
       node.columns = columns;
       node.zeros = zeros;
