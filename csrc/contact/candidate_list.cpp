@@ -66,10 +66,10 @@ std::vector<Travel> motions(const CollisionMesh& mesh, const double* from, const
   std::vector<Travel> result(mesh.surface_count());
   for (Index first = 0, last = 0; first < mesh.vertex_count; first = last) {
     const Index surface = mesh.vertex_surface[first];
+    while (last < mesh.vertex_count && mesh.vertex_surface[last] == surface) ++last;
+    if (std::equal(from + 3 * first, from + 3 * last, to + 3 * first)) continue;  // at rest
     Travel motion;
-    for (; last < mesh.vertex_count && mesh.vertex_surface[last] == surface; ++last) {
-      motion.mean += row(to, last) - row(from, last);
-    }
+    for (Index v = first; v < last; ++v) motion.mean += row(to, v) - row(from, v);
     motion.mean /= last - first;
     for (Index v = first; v < last; ++v) {
       const Vec3 u = row(to, v) - row(from, v);
