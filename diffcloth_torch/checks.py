@@ -188,10 +188,11 @@ def check_shape(
     name: str, got: Sequence[int], accepted: Iterable[Sequence[int | str]], hint: str = ""
 ) -> None:
     """Require one of the accepted shapes; a letter in a shape stands for any length."""
-    shapes = [list(shape) for shape in accepted]
+    shapes = tuple(accepted)
     for shape in shapes:
-        pairs = zip(shape, got, strict=False)
-        if len(shape) == len(got) and all(isinstance(n, str) or n == m for n, m in pairs):
+        if len(shape) == len(got) and all(
+            n == m or isinstance(n, str) for n, m in zip(shape, got, strict=True)
+        ):
             return
     texts = ["[" + ", ".join(str(n) for n in shape) + "]" for shape in shapes]
     raise InvalidInput(f"{name} must have shape {' or '.join(texts)}, got {list(got)}{hint}")

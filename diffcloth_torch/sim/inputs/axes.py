@@ -31,7 +31,7 @@ def with_axis(name: str, tensor: Tensor, dimensions: int, batch: int | None) -> 
             f"{name} has a batch axis, {list(tensor.shape)}, but the state has none; "
             "make the state with initial_state(batch_size=...)"
         )
-    if len(tensor) != batch:
+    if tensor.shape[0] != batch:
         raise InvalidInput(
             f"{name} must have {batch} environments, as the state, got {list(tensor.shape)}"
         )
@@ -43,7 +43,12 @@ def without_axis(tensor: Tensor, batch: int | None) -> Tensor:
 
     The copy shares no storage with what the caller passed or with what is kept here.
     """
-    rows = tensor[0] if batch is None else tensor.expand(batch, *tensor.shape[1:])
+    if batch is None:
+        rows = tensor.select(0, 0)
+    elif tensor.shape[0] == batch:
+        rows = tensor
+    else:
+        rows = tensor.expand(batch, *tensor.shape[1:])
     return rows.clone(memory_format=torch.contiguous_format)
 
 

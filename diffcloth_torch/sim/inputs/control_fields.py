@@ -6,7 +6,8 @@ in its own dtype.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 import torch
@@ -154,7 +155,7 @@ def control_fields(
     targets = given.get("attachments")
     fields = {}
     for field in layout.control_fields:
-        unset = _unset(layout, field, state, targets)
+        unset = partial(_unset, layout, field, state, targets)
         values = _complete(layout, field, given.get(field), unset, batch)
         if field in given and field in layout.permissions.kept:
             values = _keep(layout, field, values, state[field])
@@ -183,39 +184,49 @@ def _complete(
     layout: Layout,
     field: str,
     given: Targets | None,
-    unset: Tensor,
+    unset: Callable[[], Tensor],
     batch: int | None,
 ) -> Tensor:
-    """Complete a field of which a control may set only some rows."""
+    """Complete a field of which a control may set only some rows; `unset` computes the others."""
     if given is None:
-        return unset
+        return unset()
     if isinstance(given, Tensor):
         dimensions = len(layout.control_shapes[field])
         values = with_axis(label("control", field), given, dimensions, batch)
         if field in layout.permissions.settable:
             sets = torch.from_numpy(layout.permissions.settable[field])
-            values = torch.where(sets, values, unset)
+            values = torch.where(sets, values, unset())
         return values
     return _complete_by_name(layout, field, given, unset, batch)
 
 
 def _complete_by_name(
-    layout: Layout, field: str, given: Mapping[str, Tensor], unset: Tensor, batch: int | None
+    layout: Layout,
+    field: str,
+    given: Mapping[str, Tensor],
+    unset: Callable[[], Tensor],
+    batch: int | None,
 ) -> Tensor:
+    groups = layout.groups[field]
+    others = unset() if len(given) < len(groups) else None
     if not given:
-        return unset
+        assert others is not None  # a group has a name
+        return others
+    axes = len(layout.control_shapes[field]) - (field not in SEVERAL)
     parts = []
-    for name, rows in layout.groups[field].items():
-        part = unset[:, rows]
-        if name in given:
-            dimensions = len(layout.entry_shape(field, name))
-            values = with_axis(
-                label("control", f"{field}[{name!r}]"), given[name], dimensions, batch
-            )
-            part = values.reshape(len(values), *part.shape[1:])
-        parts.append(part)
-    environments = max(len(part) for part in parts)
-    return torch.cat([part.expand(environments, *part.shape[1:]) for part in parts], dim=1)
+    for name, rows in groups.items():
+        if name not in given:
+            assert others is not None
+            parts.append(others[:, rows])
+            continue
+        values = with_axis(label("control", f"{field}[{name!r}]"), given[name], axes, batch)
+        parts.append(values if field in SEVERAL else values.unsqueeze(1))
+    environments = max(part.shape[0] for part in parts)
+    wide = [
+        part if part.shape[0] == environments else part.expand(environments, *part.shape[1:])
+        for part in parts
+    ]
+    return torch.cat(wide, dim=1)
 
 
 def _keep(layout: Layout, field: str, targets: Tensor, poses: Tensor) -> Tensor:

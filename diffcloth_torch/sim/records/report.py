@@ -88,16 +88,7 @@ class Report:
             object.__setattr__(self, "cpu_seconds", _unknown_like(self.residual))
         # Reports may come from files: errors are raised here, not where the report is used.
         for entry in _NUMERIC:
-            value = self.__dict__.get(entry)
-            table = value if entry in _TABLES else {None: value}
-            if not isinstance(table, dict):
-                kind = type(table).__name__
-                raise TypeError(f"Report: `{entry}` must be a dict of numbers, got {kind}")
-            for name, number in table.items():
-                if not isinstance(number, _NUMBERS):
-                    label = entry if name is None else f"{entry}[{name!r}]"
-                    kind = type(number).__name__
-                    raise TypeError(f"Report: `{label}` must be a number or a tensor, got {kind}")
+            _check_numbers(entry, self.__dict__.get(entry))
         if self.status == ():
             object.__setattr__(self, "status", _status_by(self.converged))
         if self.criterion == ():
@@ -188,6 +179,19 @@ def combine_reports(how: Combination, reports: Sequence[Report | None]) -> Repor
     numbers = {n: how.numbers(entries(n)) for n in _NUMERIC if n not in _TABLES}
     contacts = Contacts.combined(how, entries("contacts"))
     return Report(**numbers, **tables, **texts, contacts=contacts)
+
+
+def _check_numbers(entry: str, value: Any) -> None:
+    """Require a number, or in a table a dict of numbers."""
+    table = value if entry in _TABLES else {None: value}
+    if not isinstance(table, dict):
+        kind = type(table).__name__
+        raise TypeError(f"Report: `{entry}` must be a dict of numbers, got {kind}")
+    for name, number in table.items():
+        if type(number) not in _NUMBERS and not isinstance(number, _NUMBERS):
+            label = entry if name is None else f"{entry}[{name!r}]"
+            kind = type(number).__name__
+            raise TypeError(f"Report: `{label}` must be a number or a tensor, got {kind}")
 
 
 def _unknown_like(residual: Any) -> Any:

@@ -15,7 +15,7 @@ from diffcloth_torch import cpu
 from diffcloth_torch.autograd.transforms import is_dense
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import write_mesh
-from diffcloth_torch.model.quantities import STATE, shape_of
+from diffcloth_torch.model.quantities import STATE
 from diffcloth_torch.reprs import field_text, record_text
 from diffcloth_torch.saved import saved
 from diffcloth_torch.sim.records.environments import Choice, Combination, Selection, Stack
@@ -92,8 +92,8 @@ class State:
             environments = shape[:-2]
             sizes = {"K": _row_count(self.body_poses), "N": _row_count(self.positions)}
             for name in missing:
-                rows = shape_of(STATE[name].axes[0], {"J": 0, "R": 0, "P": 0, **sizes})
-                zeros = cpu.zeros(*environments, *rows)
+                letter, *rest = STATE[name].axes[0]
+                zeros = cpu.zeros(*environments, sizes.get(str(letter), 0), *rest)
                 object.__setattr__(self, name, zeros)
 
     def __repr__(self) -> str:

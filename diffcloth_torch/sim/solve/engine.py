@@ -146,9 +146,9 @@ class Engine:
             **after,
             "soft_pin_targets": given.control["soft_pins"],
         }
-        environments = len(outcome.positions)
+        environments = outcome.positions.shape[0]
         fields = {
-            n: t if len(t) == environments else t.expand(environments, *t.shape[1:])
+            n: t if t.shape[0] == environments else t.expand(environments, *t.shape[1:])
             for n, t in fields.items()
         }
         return refuse_gradients(fields, failures_of(outcome.diagnostics)), outcome.diagnostics

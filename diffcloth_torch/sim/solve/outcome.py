@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from diffcloth_torch import cpu
 from diffcloth_torch.errors import (
     InfeasibleMotion,
     IntersectingState,
@@ -46,32 +48,42 @@ _NAMES = {
 }
 _SECONDS = _named("seconds_")
 _COUNTS = _named("count_")
+# Fields of a report that are numbers of the core, of each type with the entries of its tables.
+_INTEGERS = ("iterations", "contact_count")
+_REALS = ("residual", "minimum_distance", "motion_fraction", "cpu_seconds")
+_ROWS: dict[type, tuple[str, ...]] = {
+    np.int64: (*_INTEGERS, *_COUNTS.values()),
+    np.float64: (*_REALS, *_SECONDS.values()),
+}
+_REPORTED = tuple(name for names in _ROWS.values() for name in names)
 
 
 def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched: bool) -> Report:
     """Put the core's numbers into a report, with the names of the surfaces."""
-
-    def value(numbers: list[Any]) -> Any:
-        return torch.from_numpy(np.array(numbers)) if batched else numbers[0]
-
     names = tuple(_NAMES[status] for status in diagnostics["status"])
     criteria = tuple(CRITERIA[criterion] for criterion in diagnostics["criterion"])
+    converged: list[bool] = [status == CONVERGED for status in diagnostics["status"]]
+    numbers = _tensors(diagnostics) if batched else {n: diagnostics[n][0] for n in _REPORTED}
     return Report(
-        converged=value([status == CONVERGED for status in diagnostics["status"]]),
-        iterations=value(diagnostics["iterations"]),
-        residual=value(diagnostics["residual"]),
-        minimum_distance=value(diagnostics["minimum_distance"]),
-        contact_count=value(diagnostics["contact_count"]),
-        motion_fraction=value(diagnostics["motion_fraction"]),
-        seconds={phase: value(diagnostics[name]) for phase, name in _SECONDS.items()},
-        cpu_seconds=value(diagnostics["cpu_seconds"]),
-        counts={what: value(diagnostics[name]) for what, name in _COUNTS.items()},
+        **{name: numbers[name] for name in (*_INTEGERS, *_REALS)},
+        converged=cpu.tensor(converged, dtype=torch.bool) if batched else converged[0],
+        seconds={phase: numbers[name] for phase, name in _SECONDS.items()},
+        counts={what: numbers[name] for what, name in _COUNTS.items()},
         status=names if batched else names[0],
         criterion=criteria if batched else criteria[0],
         contacts=Contacts.of(
             diagnostics["pairs"], diagnostics["points"], surfaces, batched=batched
         ),
     )
+
+
+def _tensors(diagnostics: dict[str, Any]) -> dict[str, Tensor]:
+    """The reported numbers of a batch, [B] each: those of one type are rows of one array."""
+    rows: dict[str, Tensor] = {}
+    for kind, names in _ROWS.items():
+        table = torch.from_numpy(np.array([diagnostics[n] for n in names], dtype=kind))
+        rows |= zip(names, table.unbind(), strict=True)
+    return rows
 
 
 def raise_on_failure(
