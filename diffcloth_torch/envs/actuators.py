@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
-from torch.nn.functional import one_hot
 
 from diffcloth_torch import cpu
 from diffcloth_torch.checks import (
@@ -114,14 +114,13 @@ class Pickers(Actuator):
             raise TypeError(f"Pickers: `cloth` must be a Cloth, got {type(given).__name__}")
         stiffness = check_number("Pickers: `stiffness`", stiffness, POSITIVE)
         self._vertices = len(cloth.vertices)
+        self._indices = cpu.arange(self._vertices)
+        self._lowest = cpu.tensor([-math.inf, -math.inf, self.floor])
+        self._names = [f"picker_{p}" for p in range(self.count)]
         self.attachments = tuple(
             Attachment((str(cloth.name), range(self._vertices)), stiffness=stiffness, name=name)
             for name in self._names
         )
-
-    @property
-    def _names(self) -> list[str]:
-        return [f"picker_{p}" for p in range(self.count)]
 
     def start(self, points: Tensor, held: Tensor | None = None) -> Tools:
         """Pickers at points [B, P, 3], open, or closed on vertices [B, P] that are there."""
@@ -144,19 +143,15 @@ class Pickers(Actuator):
         before = tools["points"]
         held, offsets = self._close(tools, state.positions, grasp)
         after = before + self.stride * moves
-        after = torch.cat([after[..., :2], after[..., 2:].clamp(min=self.floor)], dim=-1)
-        chosen = one_hot(held.clamp(min=0), self._vertices) * (held != _NOTHING)[..., None]
-        weights = grasp[..., None] * chosen
+        after = torch.where(after < self._lowest, self._lowest, after)
+        chosen = held[..., None] == self._indices  # nothing where a picker is open
+        weights = dict(zip(self._names, (grasp[..., None] * chosen).unbind(dim=1), strict=True))
         controls = []
         for k in range(1, substeps + 1):
             points = before + (k / substeps) * (after - before) + offsets
-            targets = points[..., None, :].expand(-1, -1, self._vertices, -1)
-            controls.append(
-                Control(
-                    attachments={n: targets[:, p] for p, n in enumerate(self._names)},
-                    attachment_weights={n: weights[:, p] for p, n in enumerate(self._names)},
-                )
-            )
+            targets = points[..., None, :].expand(-1, -1, self._vertices, -1).unbind(dim=1)
+            attachments = dict(zip(self._names, targets, strict=True))
+            controls.append(Control(attachments=attachments, attachment_weights=weights))
         return controls, {"points": after, "held": held, "offsets": offsets, "grasp": grasp}
 
     def _close(self, tools: Tools, positions: Tensor, grasp: Tensor) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import torch
 from torch import Tensor
 
@@ -27,6 +29,10 @@ class FoldCloth(SheetTask):
     pace = 3  # transitions for an eighth of the way
     close = 0.1  # in sides: see success()
 
+    @cached_property
+    def _pairs(self) -> tuple[Tensor, Tensor]:
+        return self.pairs()
+
     def pairs(self) -> tuple[Tensor, Tensor]:
         """Vertices that move, and the ones on which they are to lie."""
         rows = cpu.arange(self.side)[:, None]
@@ -37,7 +43,7 @@ class FoldCloth(SheetTask):
 
     def distances(self, env: EnvState) -> tuple[Tensor, Tensor]:
         """Mean distance of the pairs, and mean drift of the kept half [m], [B] each."""
-        moved, kept = self.pairs()
+        moved, kept = self._pairs
         x = env.state.positions
         drift = x[:, kept] - env.drawn["start"][:, kept]
         return _mean_length(x[:, moved] - x[:, kept]), _mean_length(drift)
