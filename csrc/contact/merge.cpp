@@ -108,6 +108,24 @@ Projection project(const CollisionMesh& mesh,
   return result;
 }
 
+/// Whether a point is above the inside of a triangle, farther than a range from all of its edges: nothing but the
+/// inside is then within that range.
+bool is_far_inside(const Vec3& p, const Vec3& a, const Vec3& b, const Vec3& c, double range) {
+  const Vec3 e0 = b - a;
+  const Vec3 e1 = c - a;
+  const Vec3 w = p - a;
+  const Vec3 n = e0.cross(e1);
+  const double n_sq = n.squaredNorm();
+  const double b0 = w.cross(e1).dot(n);
+  const double b1 = e0.cross(w).dot(n);
+  // The way along the plane to a side is from_side / (|n| |side|).
+  const double least = 2.0 * range * std::sqrt(n_sq);
+  const auto is_clear = [&](double from_side, const Vec3& side) {
+    return from_side > 0.0 && from_side * from_side > least * least * side.squaredNorm();
+  };
+  return is_clear(b1, e0) && is_clear(b0, e1) && is_clear(n_sq - b0 - b1, e1 - e0);
+}
+
 bool is_beyond(const Vec3& p, const Vec3& a, const Vec3& b, const Vec3& c, double range) {
   for (int k = 0; k < 3; ++k) {
     if (p[k] < std::min({a[k], b[k], c[k]}) - range) return true;
@@ -422,6 +440,16 @@ void add_point_terms(const CollisionMesh& mesh,
                      std::vector<Term>& out) {
   const Index point = group.front().a;
   const Vec3 p = row(x, point);
+  if (group.size() == 1 && features.counts[group.front().b] != 0) {
+    const Candidate& pair = group.front();
+    const auto& [self, i, j, k] = pair.vertices;
+    if (is_far_inside(p, row(x, i), row(x, j), row(x, k), range)) {
+      const double d_sq =
+          closest_points(PairKind::kPointTriangle, {p, row(x, i), row(x, j), row(x, k)}).d_sq;
+      if (d_sq < range * range) out.push_back({.pair = pair, .coefficient = scale, .d_sq = d_sq});
+      return;
+    }
+  }
   find_faces_and_edges(mesh, features, group, x, range, scratch);
   if (scratch.faces.empty()) return;
   // What no edge is near to, no vertex is, and inside of a face it has nothing else.
