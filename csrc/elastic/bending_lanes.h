@@ -41,11 +41,14 @@ struct BendingBatch {
 /// same bits at every level.
 struct BendingKernels {
   /// E(x1) - E(x0) from differences of positions, summed in the order of the elements.
+  ///
+  /// @param g1  += grad E(x1), with the bits of add_gradient(); null for none
   double (*energy_change)(const BendingBatch* batches,
                           std::size_t count,
                           const BendingPoint* points,
                           const double* x0,
-                          const double* x1);
+                          const double* x1,
+                          double* g1);
 
   /// g += grad E.
   void (*add_gradient)(const BendingBatch* batches,

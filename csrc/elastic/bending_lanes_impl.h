@@ -162,7 +162,7 @@ DIFFCLOTH_INLINE void gather_at(const BendingBatch& batch,
 /// The shapes at both ends of a motion, whose change is that of differences.
 struct BendingMotion {
   Shape start;
-  Lanes<6> end;     ///< sides
+  Shape end;
   Lanes<9> change;  ///< of Y
 };
 
@@ -172,6 +172,7 @@ DIFFCLOTH_INLINE void gather_motion(const BendingBatch& batch,
                                     const double* x1,
                                     BendingMotion& motion) {
   motion.start.Y = {};
+  motion.end.Y = {};
   motion.change = {};
   const BendingPoint* const first = points + batch.first;
   for (int i = 1; i < batch.points; ++i) {
@@ -188,10 +189,11 @@ DIFFCLOTH_INLINE void gather_motion(const BendingBatch& batch,
       }
     }
     add_to_shape(first[i], start, motion.start.Y);
+    add_to_shape(first[i], end, motion.end.Y);
     add_to_shape(first[i], change, motion.change);
     if (i > 2) continue;
     put_side(i, start, motion.start.sides);
-    put_side(i, end, motion.end);
+    put_side(i, end, motion.end.sides);
   }
 }
 
@@ -226,32 +228,6 @@ DIFFCLOTH_INLINE double change_of_term(const Matrix& Y0,
   return 0.5 * inner(times_form(1.0, sum(sum(s0, s0), ds), Q), ds);
 }
 
-double energy_change(const BendingBatch* batches,
-                     std::size_t count,
-                     const BendingPoint* points,
-                     const double* x0,
-                     const double* x1) {
-  double total = 0.0;
-  for (const BendingBatch* batch = batches; batch != batches + count; ++batch) {
-    BendingMotion motion;
-    gather_motion(*batch, points, x0, x1, motion);
-    alignas(64) double energy[kLanes];
-    for (int l = 0; l < kLanes; ++l) {
-      const Matrix R0 = rotation_of(polar_at(*batch, motion.start.sides, l));
-      const Matrix R1 = rotation_of(polar_at(*batch, motion.end, l));
-      const Matrix dR = difference(R1, R0);
-      const Matrix Y0 = matrix_at(motion.start.Y.at, l);
-      const Matrix dY = matrix_at(motion.change.at, l);
-      const Form Q = form_of(*batch, l);
-      const double rest = change_of_term(Y0, dY, R0, dR, matrix_at(batch->b, l), Q);
-      const double damped = change_of_term(Y0, dY, R0, dR, matrix_at(batch->b_n, l), Q);
-      energy[l] = rest + batch->damping[l] * damped;
-    }
-    for (int l = 0; l < batch->size; ++l) total += energy[l];
-  }
-  return total;
-}
-
 /// Work conjugates of the curvature in the body frame, of both terms, and the torque on the frame.
 struct Stress {
   Matrix q, q_n;
@@ -275,6 +251,61 @@ stress_of(const BendingBatch& batch, const Matrix& R, const Matrix& Y, const For
   return result;
 }
 
+/// Cotangents of Y and of the shape gradients F of eight elements.
+struct Stresses {
+  Lanes<9> Y;
+  Lanes<6> F;
+};
+
+DIFFCLOTH_INLINE void put_stresses(const BendingBatch& batch,
+                                   const Polar& polar,
+                                   const Matrix& R,
+                                   const Matrix& Y,
+                                   int l,
+                                   Stresses& stresses) {
+  const Stress stress = stress_of(batch, R, Y, form_of(batch, l), l);
+  const Matrix q = turned(R, sum(stress.q, stress.q_n));
+  for (int a = 0; a < 3; ++a) put(q.column[a], a, l, stresses.Y.at);
+  const double in_plane = stress.tau.at[2] / polar.t;
+  const double out_1 = polar.s11 * stress.tau.at[1] - polar.s12 * stress.tau.at[0];
+  const double out_2 = polar.s12 * stress.tau.at[1] - polar.s22 * stress.tau.at[0];
+  for (int k = 0; k < 3; ++k) {
+    stresses.F.at[k][l] = out_1 * polar.n[k] - in_plane * polar.r2[k];
+    stresses.F.at[3 + k][l] = out_2 * polar.n[k] + in_plane * polar.r1[k];
+  }
+}
+
+/// g += the forces of eight elements.
+DIFFCLOTH_INLINE void add_forces(const BendingBatch& batch,
+                                 const BendingPoint* points,
+                                 const Stresses& stresses,
+                                 double* g) {
+  for (int i = 0; i < batch.points; ++i) {
+    const BendingPoint& point = points[batch.first + i];
+    Lanes<3> force;
+    for (int k = 0; k < 3; ++k) {
+      for (int l = 0; l < kLanes; ++l) {
+        force.at[k][l] = stresses.Y.at[k][l] * point.c[0][l] +
+                         stresses.Y.at[3 + k][l] * point.c[1][l] +
+                         stresses.Y.at[6 + k][l] * point.c[2][l];
+      }
+    }
+    if (i < 3) {
+      for (int k = 0; k < 3; ++k) {
+        for (int l = 0; l < kLanes; ++l) {
+          const double g_u = i == 0 ? -(batch.g[0][l] + batch.g[2][l]) : batch.g[2 * i - 2][l];
+          const double g_v = i == 0 ? -(batch.g[1][l] + batch.g[3][l]) : batch.g[2 * i - 1][l];
+          force.at[k][l] += stresses.F.at[k][l] * g_u + stresses.F.at[3 + k][l] * g_v;
+        }
+      }
+    }
+    for (int l = 0; l < batch.size; ++l) {
+      double* const to = g + 3 * static_cast<std::ptrdiff_t>(point.vertex[l]);
+      for (int k = 0; k < 3; ++k) to[k] += force.at[k][l];
+    }
+  }
+}
+
 void add_gradient(const BendingBatch* batches,
                   std::size_t count,
                   const BendingPoint* points,
@@ -283,46 +314,44 @@ void add_gradient(const BendingBatch* batches,
   for (const BendingBatch* batch = batches; batch != batches + count; ++batch) {
     Shape shape;
     gather_at(*batch, points, x, shape);
-    Lanes<9> Y_bar;
-    Lanes<6> F_bar;
+    Stresses stresses;
     for (int l = 0; l < kLanes; ++l) {
       const Polar polar = polar_at(*batch, shape.sides, l);
-      const Matrix R = rotation_of(polar);
-      const Stress stress = stress_of(*batch, R, matrix_at(shape.Y.at, l), form_of(*batch, l), l);
-      const Matrix q = turned(R, sum(stress.q, stress.q_n));
-      for (int a = 0; a < 3; ++a) put(q.column[a], a, l, Y_bar.at);
-      const double in_plane = stress.tau.at[2] / polar.t;
-      const double out_1 = polar.s11 * stress.tau.at[1] - polar.s12 * stress.tau.at[0];
-      const double out_2 = polar.s12 * stress.tau.at[1] - polar.s22 * stress.tau.at[0];
-      for (int k = 0; k < 3; ++k) {
-        F_bar.at[k][l] = out_1 * polar.n[k] - in_plane * polar.r2[k];
-        F_bar.at[3 + k][l] = out_2 * polar.n[k] + in_plane * polar.r1[k];
-      }
+      put_stresses(*batch, polar, rotation_of(polar), matrix_at(shape.Y.at, l), l, stresses);
     }
-    for (int i = 0; i < batch->points; ++i) {
-      const BendingPoint& point = points[batch->first + i];
-      Lanes<3> force;
-      for (int k = 0; k < 3; ++k) {
-        for (int l = 0; l < kLanes; ++l) {
-          force.at[k][l] = Y_bar.at[k][l] * point.c[0][l] + Y_bar.at[3 + k][l] * point.c[1][l] +
-                           Y_bar.at[6 + k][l] * point.c[2][l];
-        }
-      }
-      if (i < 3) {
-        for (int k = 0; k < 3; ++k) {
-          for (int l = 0; l < kLanes; ++l) {
-            const double g_u = i == 0 ? -(batch->g[0][l] + batch->g[2][l]) : batch->g[2 * i - 2][l];
-            const double g_v = i == 0 ? -(batch->g[1][l] + batch->g[3][l]) : batch->g[2 * i - 1][l];
-            force.at[k][l] += F_bar.at[k][l] * g_u + F_bar.at[3 + k][l] * g_v;
-          }
-        }
-      }
-      for (int l = 0; l < batch->size; ++l) {
-        double* const to = g + 3 * static_cast<std::ptrdiff_t>(point.vertex[l]);
-        for (int k = 0; k < 3; ++k) to[k] += force.at[k][l];
-      }
-    }
+    add_forces(*batch, points, stresses, g);
   }
+}
+
+double energy_change(const BendingBatch* batches,
+                     std::size_t count,
+                     const BendingPoint* points,
+                     const double* x0,
+                     const double* x1,
+                     double* g1) {
+  double total = 0.0;
+  for (const BendingBatch* batch = batches; batch != batches + count; ++batch) {
+    BendingMotion motion;
+    gather_motion(*batch, points, x0, x1, motion);
+    alignas(64) double energy[kLanes];
+    Stresses stresses;
+    for (int l = 0; l < kLanes; ++l) {
+      const Matrix R0 = rotation_of(polar_at(*batch, motion.start.sides, l));
+      const Polar polar = polar_at(*batch, motion.end.sides, l);
+      const Matrix R1 = rotation_of(polar);
+      const Matrix dR = difference(R1, R0);
+      const Matrix Y0 = matrix_at(motion.start.Y.at, l);
+      const Matrix dY = matrix_at(motion.change.at, l);
+      const Form Q = form_of(*batch, l);
+      const double rest = change_of_term(Y0, dY, R0, dR, matrix_at(batch->b, l), Q);
+      const double damped = change_of_term(Y0, dY, R0, dR, matrix_at(batch->b_n, l), Q);
+      energy[l] = rest + batch->damping[l] * damped;
+      put_stresses(*batch, polar, R1, matrix_at(motion.end.Y.at, l), l, stresses);
+    }
+    if (g1 != nullptr) add_forces(*batch, points, stresses, g1);
+    for (int l = 0; l < batch->size; ++l) total += energy[l];
+  }
+  return total;
 }
 
 /// What the Hessians of eight elements are made of; vectors are in the body frame unless they say otherwise.

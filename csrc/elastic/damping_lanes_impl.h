@@ -35,23 +35,44 @@ DIFFCLOTH_INLINE Symmetric strain_of(const DampingBatch& batch, const Gradient& 
   return change_of_square(dF, F, F_n);
 }
 
+/// Forces of a triangle on its corners 1 and 2, by its strain since the start of the step.
+DIFFCLOTH_INLINE void put_damping_force(const DampingBatch& batch,
+                                        const Gradient& F,
+                                        const Symmetric& strain,
+                                        int l,
+                                        double (&force)[6][kLanes]) {
+  const FaceBatch& faces = batch.woven.faces;
+  const Symmetric T = times(stiffness_of(batch.woven, l), strain);
+  for (int k = 0; k < 3; ++k) {
+    const double a = 0.5 * (F.a[k] * T.uu + F.b[k] * T.uv);
+    const double b = 0.5 * (F.a[k] * T.uv + F.b[k] * T.vv);
+    force[k][l] = a * faces.g[0][l] + b * faces.g[1][l];
+    force[3 + k][l] = a * faces.g[2][l] + b * faces.g[3][l];
+  }
+}
+
 double damping_energy_change(const DampingBatch* batches,
                              std::size_t count,
                              const double* x0,
-                             const double* x1) {
+                             const double* x1,
+                             double* g1) {
   double total = 0.0;
   for (const DampingBatch* batch = batches; batch != batches + count; ++batch) {
     const FaceBatch& faces = batch->woven.faces;
     Motion motion;
     gather_motion(faces, x0, x1, motion);
     alignas(64) double energy[kLanes];
+    alignas(64) double force[6][kLanes];
     for (int l = 0; l < kLanes; ++l) {
       const Gradient F0 = gradient(faces, motion.start, l);
       const Gradient F1 = gradient(faces, motion.end, l);
       const Symmetric dC = change_of_square(gradient(faces, motion.change, l), F1, F0);
-      const Symmetric twice_mean = sum(strain_of(*batch, F0, l), strain_of(*batch, F1, l));
+      const Symmetric strain = strain_of(*batch, F1, l);
+      const Symmetric twice_mean = sum(strain_of(*batch, F0, l), strain);
       energy[l] = 0.125 * product(times(stiffness_of(batch->woven, l), twice_mean), dC);
+      put_damping_force(*batch, F1, strain, l, force);
     }
+    if (g1 != nullptr) scatter_forces(faces, force, g1);
     for (int l = 0; l < faces.size; ++l) total += energy[l];
   }
   return total;
@@ -68,13 +89,7 @@ void add_damping_gradient(const DampingBatch* batches,
     alignas(64) double force[6][kLanes];
     for (int l = 0; l < kLanes; ++l) {
       const Gradient F = gradient(faces, sides, l);
-      const Symmetric T = times(stiffness_of(batch->woven, l), strain_of(*batch, F, l));
-      for (int k = 0; k < 3; ++k) {
-        const double a = 0.5 * (F.a[k] * T.uu + F.b[k] * T.uv);
-        const double b = 0.5 * (F.a[k] * T.uv + F.b[k] * T.vv);
-        force[k][l] = a * faces.g[0][l] + b * faces.g[1][l];
-        force[3 + k][l] = a * faces.g[2][l] + b * faces.g[3][l];
-      }
+      put_damping_force(*batch, F, strain_of(*batch, F, l), l, force);
     }
     scatter_forces(faces, force, g);
   }

@@ -286,17 +286,21 @@ double bending_energy(const Model& model, const double* x) {
   return total;
 }
 
-double energy_change(const Model& model, const double* x0, const double* x1) {
+double energy_change(const Model& model, const double* x0, const double* x1, double* g1) {
   const Prepared& prepared = *model.prepared;
   double total =
-      stretch_here().energy_change(prepared.stretch.data(), prepared.stretch.size(), x0, x1);
+      stretch_here().energy_change(prepared.stretch.data(), prepared.stretch.size(), x0, x1, g1);
   total += stretch_here().woven_energy_change(prepared.woven.data(), prepared.woven.size(), x0, x1);
+  if (g1 != nullptr) {
+    stretch_here().add_woven_gradient(prepared.woven.data(), prepared.woven.size(), x1, g1);
+  }
   total += stretch_here().damping_energy_change(prepared.damping_of_stretch.data(),
-                                                prepared.damping_of_stretch.size(), x0, x1);
+                                                prepared.damping_of_stretch.size(), x0, x1, g1);
   total += bending_here().energy_change(prepared.bent.batches.data(), prepared.bent.batches.size(),
-                                        prepared.bent.points.data(), x0, x1);
+                                        prepared.bent.points.data(), x0, x1, g1);
   for_stiff_elements(model, [&](const bending::Element& element) {
     total += bending::flat_energy_change(element, x0, x1);
+    if (g1 != nullptr) bending::add_flat_gradient(element, x1, g1);
   });
   return total;
 }

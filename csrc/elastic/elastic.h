@@ -136,7 +136,9 @@ inline double energy(const Model& model, const double* x) {
 
 /// Energy at x1 minus energy at x0, damping included, as a sum of differences of the elements that
 /// do not cancel [J].
-double energy_change(const Model& model, const double* x0, const double* x1);
+///
+/// @param g1  += grad E(x1), with the bits of add_gradient(); null for none
+double energy_change(const Model& model, const double* x0, const double* x1, double* g1 = nullptr);
 
 /// g += grad E(x), damping included, [N, 3] [N].
 void add_gradient(const Model& model, const double* x, double* g);

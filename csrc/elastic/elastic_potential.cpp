@@ -1,5 +1,7 @@
 #include "elastic/elastic_potential.h"
 
+#include <algorithm>
+
 namespace diffcloth::elastic {
 namespace {
 
@@ -23,14 +25,24 @@ ElasticPotential::ElasticPotential(const Model& model,
 
 double ElasticPotential::energy_change(const double* x, const double* to) const {
   for (std::size_t a = 0; a < change_.size(); ++a) change_[a] = to[a] - x[a];
-  double change = elastic::energy_change(model_, x, to);
-  if (model_.prepared->by_matrix) change += flat_bending_.energy_change(x, change_.data());
+  trial_.x.assign(to, to + change_.size());
+  trial_.gradient.assign(change_.size(), 0.0);
+  double change = elastic::energy_change(model_, x, to, trial_.gradient.data());
+  if (model_.prepared->by_matrix) {
+    change += flat_bending_.energy_change(x, change_.data());
+    flat_bending_.add_product(to, trial_.gradient.data());
+  }
   return change;
 }
 
 void ElasticPotential::add_gradient(const double* x, double* g) const {
-  elastic::add_gradient(model_, x, g);
-  if (model_.prepared->by_matrix) flat_bending_.add_product(x, g);
+  if (trial_.x.empty() || !std::equal(trial_.x.begin(), trial_.x.end(), x)) {
+    trial_.x.assign(x, x + change_.size());
+    trial_.gradient.assign(change_.size(), 0.0);
+    elastic::add_gradient(model_, x, trial_.gradient.data());
+    if (model_.prepared->by_matrix) flat_bending_.add_product(x, trial_.gradient.data());
+  }
+  for (std::size_t a = 0; a < change_.size(); ++a) g[a] += trial_.gradient[a];
 }
 
 void ElasticPotential::add_hessian(const double* x,

@@ -71,8 +71,15 @@ class ElasticPotential final : public Potential {
   Wanted wanted_;
   ConstantForm flat_bending_;
   mutable std::vector<double> change_;  ///< scratch
-  Bar bar_;                             ///< empty where it is zero
-  std::vector<Mat2> extrapolated_;      ///< [F] second stresses
+
+  /// The point where the energy or the gradient was last evaluated: mostly the next iterate.
+  struct Trial {
+    std::vector<double> x;  ///< of the vertices; empty where nothing is known
+    std::vector<double> gradient;
+  };
+  mutable Trial trial_;
+  Bar bar_;                         ///< empty where it is zero
+  std::vector<Mat2> extrapolated_;  ///< [F] second stresses
   Bar dot_;
   Changing changing_;
 };

@@ -53,10 +53,13 @@ struct StretchKernels {
   ///   dE = k_s A / 2 ( <F0 - R0 + F1 - R1, dF> - 1/2 <S1 - S0, dR^T dR> ),
   ///
   /// with dF from differences of positions.
+  ///
+  /// @param g1  += grad E(x1), with the bits of add_gradient(); null for none
   double (*energy_change)(const StretchBatch* batches,
                           std::size_t count,
                           const double* x0,
-                          const double* x1);
+                          const double* x1,
+                          double* g1);
 
   /// g += grad E.
   void (*add_gradient)(const StretchBatch* batches, std::size_t count, const double* x, double* g);
@@ -109,7 +112,8 @@ struct StretchKernels {
   double (*damping_energy_change)(const DampingBatch* batches,
                                   std::size_t count,
                                   const double* x0,
-                                  const double* x1);
+                                  const double* x1,
+                                  double* g1);
 
   void (*add_damping_gradient)(const DampingBatch* batches,
                                std::size_t count,

@@ -30,15 +30,31 @@ DIFFCLOTH_INLINE double strain_sq(const Gradient& F, const Polar& p) {
   return p.d >= kNearlyDegenerate ? regular : degenerate;
 }
 
+/// Forces of a triangle on its corners 1 and 2.
+DIFFCLOTH_INLINE void put_force(const StretchBatch& batch,
+                                const Gradient& F,
+                                const Polar& p,
+                                int l,
+                                double (&force)[6][kLanes]) {
+  for (int k = 0; k < 3; ++k) {
+    const double a = batch.weight[l] * (F.a[k] - p.r1[k]);
+    const double b = batch.weight[l] * (F.b[k] - p.r2[k]);
+    force[k][l] = a * batch.faces.g[0][l] + b * batch.faces.g[1][l];
+    force[3 + k][l] = a * batch.faces.g[2][l] + b * batch.faces.g[3][l];
+  }
+}
+
 double energy_change(const StretchBatch* batches,
                      std::size_t count,
                      const double* x0,
-                     const double* x1) {
+                     const double* x1,
+                     double* g1) {
   double total = 0.0;
   for (const StretchBatch* batch = batches; batch != batches + count; ++batch) {
     Motion motion;
     gather_motion(batch->faces, x0, x1, motion);
     alignas(64) double energy[kLanes];
+    alignas(64) double force[6][kLanes];
     for (int l = 0; l < kLanes; ++l) {
       const Gradient F0 = gradient(batch->faces, motion.start, l);
       const Gradient F1 = gradient(batch->faces, motion.end, l);
@@ -65,7 +81,9 @@ double energy_change(const StretchBatch* batches,
       const double difference = strain_sq(F1, p1) - strain_sq(F0, p0);
       const bool is_regular = smaller(p0.d, p1.d) >= kNearlyDegenerate;
       energy[l] = (0.5 * batch->weight[l]) * (is_regular ? regular : difference);
+      put_force(*batch, F1, p1, l, force);
     }
+    if (g1 != nullptr) scatter_forces(batch->faces, force, g1);
     for (int l = 0; l < batch->faces.size; ++l) total += energy[l];
   }
   return total;
@@ -75,16 +93,10 @@ void add_gradient(const StretchBatch* batches, std::size_t count, const double* 
   for (const StretchBatch* batch = batches; batch != batches + count; ++batch) {
     Sides sides;
     gather_sides(batch->faces, x, sides);
-    alignas(64) double force[6][kLanes];  // on corners 1 and 2
+    alignas(64) double force[6][kLanes];
     for (int l = 0; l < kLanes; ++l) {
       const Gradient F = gradient(batch->faces, sides, l);
-      const Polar p = polar_of(F);
-      for (int k = 0; k < 3; ++k) {
-        const double a = batch->weight[l] * (F.a[k] - p.r1[k]);
-        const double b = batch->weight[l] * (F.b[k] - p.r2[k]);
-        force[k][l] = a * batch->faces.g[0][l] + b * batch->faces.g[1][l];
-        force[3 + k][l] = a * batch->faces.g[2][l] + b * batch->faces.g[3][l];
-      }
+      put_force(*batch, F, polar_of(F), l, force);
     }
     scatter_forces(batch->faces, force, g);
   }

@@ -189,7 +189,8 @@ class Elastic {
     kernels.add_gradient(batches.data(), batches.size(), from.data(), g.data());
     kernels.add_hessian(batches.data(), batches.size(), from.data(), positive, own_places().data(),
                         blocks.data());
-    double change = kernels.energy_change(batches.data(), batches.size(), from.data(), to.data());
+    double change =
+        kernels.energy_change(batches.data(), batches.size(), from.data(), to.data(), nullptr);
     const std::vector<elastic::WovenBatch>& woven = model_.prepared->woven;
     kernels.add_woven_gradient(woven.data(), woven.size(), from.data(), g.data());
     kernels.add_woven_hessian(woven.data(), woven.size(), from.data(), positive,
@@ -199,7 +200,8 @@ class Elastic {
     kernels.add_damping_gradient(damped.data(), damped.size(), from.data(), g.data());
     kernels.add_damping_hessian(damped.data(), damped.size(), from.data(), positive,
                                 own_places().data(), blocks.data());
-    change += kernels.damping_energy_change(damped.data(), damped.size(), from.data(), to.data());
+    change += kernels.damping_energy_change(damped.data(), damped.size(), from.data(), to.data(),
+                                            nullptr);
     return nb::make_tuple(change, rows_array(g), owned(blocks.data(), {blocks.size() / 9, 9}));
   }
 
@@ -219,7 +221,7 @@ class Elastic {
     kernels.add_hessian(batches.data(), batches.size(), points.data(), from.data(), positive,
                         own_places().data(), blocks.data());
     return nb::make_tuple(kernels.energy_change(batches.data(), batches.size(), points.data(),
-                                                from.data(), to.data()),
+                                                from.data(), to.data(), nullptr),
                           rows_array(g), owned(blocks.data(), {blocks.size() / 9, 9}));
   }
 
