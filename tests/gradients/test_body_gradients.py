@@ -124,7 +124,8 @@ def without_slip(case):
 @pytest.mark.parametrize("moving", [False, True], ids=["still", "moving"])
 @pytest.mark.parametrize("name", [*BODIES, *SMOOTH])
 def test_every_gradient_is_that_of_the_step(name, moving):
-    case = resting(name, moving=moving)
+    # Few contacts stick: differences by slip_velocity (5e-7 N s / m) need forces to 1e-16 N.
+    case = resting(name, moving=moving, tolerance=1e-12)
     after = case.step()
     assert after.report.converged
     assert after.report.contact_count >= 5
