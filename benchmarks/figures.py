@@ -3,6 +3,7 @@
     python -m benchmarks.figures --against "the first version=../first"
     python -m benchmarks.figures --newton ../peer/bin/python ...    # see benchmarks.peers
     python -m benchmarks.figures --forward-peers NEWTON MUJOCO    # these peers alone, again
+    python -m benchmarks.figures --environments "the first version=../first"    # these alone, again
     python -m benchmarks.figures --draw    # the page alone, again
 
 `--against` names another checkout with a built package, and may be repeated: all scenes are timed
@@ -10,8 +11,8 @@ with it and this checkout side by side, as by `benchmarks.compare`. Then this ch
 timed by phases, as by `benchmarks.step`, and with several losses in one backward. `--newton` is the
 Python of an environment with Newton, which is timed beside us as by `benchmarks.peers`. What was
 measured is in docs/performance.json, of which page and plots are made. `--forward-peers` times
-what `benchmarks.forward_peers` does, with the Pythons of its two environments, and leaves the rest
-of the records as it is.
+what `benchmarks.forward_peers` does, with the Pythons of its two environments, and `--environments`
+what `benchmarks.scripted` does; both leave the rest of the records as it is.
 
 `--cpu` counts processor time, on a machine that others use too; then threads are left out, as
 processor time says nothing of them.
@@ -36,7 +37,7 @@ import torch
 from tqdm import tqdm
 
 import diffcloth_torch as dc
-from benchmarks import forward_peers
+from benchmarks import forward_peers, scripted
 from benchmarks.compare import BATCH, POOLS, ROOT, Row, time_row
 from benchmarks.measure import time_steps
 from benchmarks.peers import time_all
@@ -79,6 +80,9 @@ Records = dict[str, Any]
     metavar="NEWTON MUJOCO",
     help="Measure these alone: Pythons of environments that have Newton and MuJoCo.",
 )
+@click.option(
+    "--environments", "environments", help="NAME=FOLDER with a built package; measure these alone."
+)
 @click.option("--cpu", is_flag=True, help="Processor time instead of wall-clock time.")
 @click.option("--quick", is_flag=True, help="Tiny sheets: shows that it runs.")
 @click.option("--draw", is_flag=True, help="Measure nothing: draw what was measured before.")
@@ -87,26 +91,33 @@ def main(
     others: tuple[str, ...],
     newton: Path | None,
     forward: tuple[Path, Path] | None,
+    environments: str | None,
     cpu: bool,
     quick: bool,
     draw: bool,
     docs: Path,
 ) -> None:
     file = docs / RECORDS
-    if draw or forward:
+    if draw or forward or environments:
         if not file.exists():
-            option = "--draw" if draw else "--forward-peers"
+            option = "--draw" if draw else "--forward-peers" if forward else "--environments"
             raise click.UsageError(f"{option} needs {file}, which a run without it writes")
         if forward and not draw:
             records = json.loads(file.read_text())
             records["forward_peers"] = measure_forward_peers(*forward)
             file.write_text(json.dumps(records, indent=1) + "\n")
+        if environments and not draw:
+            records = json.loads(file.read_text())
+            ((release, folder),) = _folders([environments]).items()
+            records["environments"] = measure_environments(release, folder, quick)
+            file.write_text(json.dumps(records, indent=1) + "\n")
     else:
-        kept_peers = json.loads(file.read_text()).get("forward_peers") if file.exists() else None
+        earlier = json.loads(file.read_text()) if file.exists() else {}
         file.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory() as kept:
             measured = measure(_folders(others), newton, cpu, quick, Path(kept))
-        measured["forward_peers"] = kept_peers
+        for part in ("forward_peers", "environments"):
+            measured[part] = earlier.get(part)
         file.write_text(json.dumps(measured, indent=1) + "\n")
     records = json.loads(file.read_text())
     (docs / "images").mkdir(exist_ok=True)
@@ -193,6 +204,20 @@ def measure_forward_peers(newton: Path, mujoco: Path) -> Records:
         "date": date.today().isoformat(),
         "processor": _processor(),
         "rows": list(forward_peers.time_all(newton, mujoco, PHASE_SIZES[0])),
+    }
+
+
+def measure_environments(release: str, folder: Path, quick: bool) -> Records:
+    """What `benchmarks.scripted` prints, and when."""
+    rows, steps, turns = ((("FoldCloth", 7, 1),), 2, 1) if quick else (scripted.ROWS, 40, 3)
+    return {
+        "date": date.today().isoformat(),
+        "processor": _processor(),
+        "release": release,
+        "rows": [
+            scripted.time_row(row, folder, steps, turns)
+            for row in tqdm(rows, desc="environments", disable=None, leave=False)
+        ],
     }
 
 
@@ -366,6 +391,10 @@ def page(records: Records, plots: list[tuple[str, str]]) -> str:
     """The Markdown of the page."""
     parts = ["# Performance", _preface(records)]
     parts += [f"![{text}](images/{file})" for file, text in plots]
+    if records.get("environments"):
+        found = records["environments"]
+        parts += ["## Environments", _environment_text(found), _environment_table(found["rows"])]
+        parts += [_environment_phases(found["rows"])]
     for release, rows in records["releases"].items():
         parts += [f"## Compared with {release}", _release_text(rows, release), _release_table(rows)]
     parts += ["## By phase", _PHASE_TEXT, _phase_table(records["phases"])]
@@ -434,6 +463,46 @@ def _release_table(rows: list[Records]) -> str:
         line += [r[side]["unconverged"] for side in ("this", "other")]
         lines.append(line)
     return _table(head, lines)
+
+
+def _environment_text(found: Records) -> str:
+    return f"""\
+Small, damped, frictional sheets that tools move by the scripts of their tasks, the default solver
+options. {found["release"].capitalize()} and this release take the same recorded steps in turn:
+`python -m benchmarks.scripted` describes how. Measured on {found["date"]} ({found["processor"]}).
+Times are processor times of a time step, per environment, with the step's backward in
+`with gradients`; `python` is the part of `env.step` outside of the core. A ratio is the time of
+{found["release"]} over that of this release."""
+
+
+def _environment_table(rows: list[Records]) -> str:
+    head = ["task", "size", "batch"]
+    for part in ("forward [ms]", "with gradients [ms]", "python [ms]"):
+        head += [part, "other", "ratio"]
+    lines = []
+    for r in rows:
+        line = [r["task"], r["size"], r["batch"]]
+        for part in ("forward", "with_gradients", "python"):
+            line += [_number(r[side][part]) for side in ("this", "other")]
+            line.append(_number(_ratio(r, part)))
+        lines.append([*line, *(f"{r[side]['iterations']:.1f}" for side in ("this", "other"))])
+    return _table([*head, "iterations", "other"], lines)
+
+
+def _environment_phases(rows: list[Records]) -> str:
+    """Phases of forward [ms] and counts a step, of this release."""
+    phases = list(rows[0]["this"]["phases"])
+    counts = ["exact", "chord", "projected", "factorizations"]
+    return _table(
+        ["task", "size", "batch", *phases, "contacts", *counts],
+        [
+            [r["task"], r["size"], r["batch"]]
+            + [_number(r["this"]["phases"][phase]) for phase in phases]
+            + [_number(r["this"]["contacts"])]
+            + [_number(r["this"]["counts"][name]) for name in counts]
+            for r in rows
+        ],
+    )
 
 
 _PHASE_TEXT = """\
