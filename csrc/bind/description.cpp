@@ -176,6 +176,7 @@ void take_options(NamedFields& fields, step::Description& d) {
   d.options.tolerance = fields.take<double>("tolerance");
   d.options.max_iterations = fields.take<int>("max_iterations");
   if (fields.has("max_seconds")) d.options.max_seconds = fields.take<double>("max_seconds");
+  if (fields.has("certify")) d.options.certify = fields.take<bool>("certify");
   if (fields.has("large_factor")) {  // only tests say it
     d.options.large_factor = fields.take<std::size_t>("large_factor");
   }

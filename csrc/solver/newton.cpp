@@ -28,6 +28,7 @@ class Descent {
 
   double residual() const { return residual_; }
   const Certificate& certificate() const { return directions_.certificate(); }
+  bool is_certified() const { return !ends_uncertified_; }
 
  private:
   enum class Next : std::uint8_t { kGoOn, kStop };
@@ -46,9 +47,10 @@ class Descent {
   Next no_way(const Directions::Direction& direction, double step, SearchResult result);
   bool is_settled(double step, double share) const;
   bool may_end(const Directions::Direction& direction, double step) const;
+  bool may_end_uncertified(const Directions::Direction& direction) const;
   bool is_lost(double step) const;
   bool idles(double step, const Search& search);
-  Next go(const Directions::Direction& direction);
+  Next go(const Directions::Direction& direction, bool is_last = false);
   Search walk_along(const Directions::Direction& direction);
   Search wander(const Trial& trial);
   bool is_near(const std::vector<double>& p) const;
@@ -60,6 +62,7 @@ class Descent {
   Criterion criterion_ = Criterion::kIterationLimit;
   double residual_ = 0.0;
   bool settling_ = false;  ///< the last step was below the goal
+  bool ends_uncertified_ = false;
   double settled_step_ = std::numeric_limits<double>::infinity();
   double best_ = std::numeric_limits<double>::infinity();
   int idle_ = 0;
@@ -114,6 +117,16 @@ bool Descent::is_settled(double step, double share) const {
 bool Descent::may_end(const Directions::Direction& direction, double step) const {
   const bool doubtful = direction.kind == Kind::kChord && step > kNewton.settled_factored * goal_;
   return !(doubtful && directions_.is_dear());
+}
+
+/// Whether a step below the goal may end the solve without a certificate: it is a Newton or chord step of a
+/// definite exact Hessian, and turns no contact from sticking to slipping.
+bool Descent::may_end_uncertified(const Directions::Direction& direction) const {
+  if (walk_.context.options.certify || away_ || directions_.is_certified()) return false;
+  const bool exact = direction.kind == Kind::kFactored || direction.kind == Kind::kIterated ||
+                     direction.kind == Kind::kChord;
+  return exact &&
+         walk_.f.force_change(walk_.x().data(), directions_.p().data()) <= kNewton.force_change;
 }
 
 /// Whether rounding of the coordinates hides a step.
@@ -217,6 +230,12 @@ Descent::Next Descent::come_back() {
 
 Descent::Next Descent::take(const Directions::Direction& direction) {
   double step = walk_.displacement(directions_.p());
+  if (step < goal_ && may_end_uncertified(direction)) {
+    residual_ = step / walk_.f.h;
+    if (step > kNewton.settled * goal_ && !is_lost(step)) return go(direction, true);
+    ends_uncertified_ = true;
+    return stop(Criterion::kTolerance);
+  }
   if (direction.kind == Kind::kFactored && step < goal_ && !directions_.is_certified()) {
     residual_ = step / walk_.f.h;
     if (!directions_.confirm()) return escape();
@@ -248,7 +267,9 @@ Descent::Next Descent::take(const Directions::Direction& direction) {
 }
 
 /// Walk along the direction, and learn from it.
-Descent::Next Descent::go(const Directions::Direction& direction) {
+///
+/// @param is_last  whether the solve ends, uncertified, once the step is taken
+Descent::Next Descent::go(const Directions::Direction& direction, bool is_last) {
   const double step = walk_.displacement(directions_.p());
   const Search search =
       away_ ? wander(farthest(walk_, directions_.p(), 1.0)) : walk_along(direction);
@@ -258,6 +279,10 @@ Descent::Next Descent::go(const Directions::Direction& direction) {
     return no_way(direction, step, search.result);
   }
   directions_.learn(direction, search);
+  if (is_last) {
+    ends_uncertified_ = true;
+    return stop(Criterion::kTolerance);
+  }
   if (direction.kind != Kind::kDamped && idles(step, search)) {
     if (step >= goal_) return stop(Criterion::kPrecisionLimit);
     settling_ = true;
@@ -455,7 +480,9 @@ Outcome minimize(const Objective& objective,
   Descent descent(walk, std::move(nearby));
   outcome.criterion = descent.run();
   outcome.residual = descent.residual();
-  if (has_converged(outcome.criterion)) outcome.certificate = descent.certificate();
+  outcome.nearby = descent.certificate().factor;
+  outcome.certified = has_converged(outcome.criterion) && descent.is_certified();
+  if (outcome.certified) outcome.certificate = descent.certificate();
   return outcome;
 }
 

@@ -12,7 +12,9 @@ struct Outcome {
   Criterion criterion = Criterion::kIterationLimit;
   double residual = 0.0;         ///< |p|_inf / h of the last Newton step [m/s]
   double motion_fraction = 1.0;  ///< of the prescribed motion that was reached
-  Certificate certificate;       ///< at the solution, where converged
+  bool certified = false;        ///< converged, at a Hessian that is positive definite
+  Certificate certificate;       ///< at the solution, where certified
+  Factor nearby;                 ///< of the last exact Hessian, for the next solve; may be null
 };
 
 /// How the first solve of a step leaves the start of the step.

@@ -20,6 +20,9 @@ struct Options {
   double tolerance;    ///< on |p|_inf / h, p the full Newton step [m/s]
   int max_iterations;  ///< of a step, over all its solves
   double max_seconds = std::numeric_limits<double>::infinity();  ///< of a step [s]
+  /// Whether every solve ends with a factor of the Hessian at its end. Otherwise a Newton or chord step below
+  /// the tolerance ends it, too.
+  bool certify = true;
   /// A factor of more than this is dropped before the next one is made [bytes].
   std::size_t large_factor = std::size_t{64} << 20;
   /// A factor of more operations per entry, of a sheet of 150 x 150 vertices or more, is dear beside the

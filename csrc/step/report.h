@@ -43,6 +43,7 @@ struct ContactPoint {
 struct Report {
   Result result = Result::kConverged;
   solver::Criterion criterion = solver::Criterion::kNoSolve;  ///< that ended the deciding solve
+  bool certified = true;  ///< every solve has ended with a factor of its Hessian
   Index iterations = 0;
   double residual = 0.0;          ///< |p|_inf / h [m/s]
   double minimum_distance = 0.0;  ///< of the pairs in contact; infinite without contact [m]
@@ -64,6 +65,7 @@ struct Report {
   void for_each(Visit&& visit) const {
     visit("status", static_cast<std::int64_t>(result));
     visit("criterion", static_cast<std::int64_t>(criterion));
+    visit("certified", static_cast<std::int64_t>(certified));
     visit("iterations", static_cast<std::int64_t>(iterations));
     visit("residual", residual);
     visit("minimum_distance", minimum_distance);

@@ -102,6 +102,16 @@ std::string find_overlap(const Scene& scene, const Inputs& inputs) {
   return find_overlap(scene, x, thickness, candidates, scratch);
 }
 
+namespace {
+
+/// Options of the solves that derivatives begin with.
+solver::Options certifying(solver::Options options) {
+  options.certify = true;
+  return options;
+}
+
+}  // namespace
+
 Report forward(const Scene& scene,
                const Inputs& inputs,
                const Checkpoint& checkpoint,
@@ -187,7 +197,7 @@ void backward(const Scene& scene,
   linalg::CholeskyWorkspace workspace(threads);
   Checkpoint unlimited = checkpoint;
   solver::Context context{.checkpoint = &unlimited,
-                          .options = scene.given.options,
+                          .options = certifying(scene.given.options),
                           .workspace = &workspace,
                           .watch = &watch,
                           .counts = &counts};
@@ -230,7 +240,7 @@ void tangent(const Scene& scene,
   linalg::CholeskyWorkspace workspace(threads);
   Checkpoint unlimited = checkpoint;
   solver::Context context{.checkpoint = &unlimited,
-                          .options = scene.given.options,
+                          .options = certifying(scene.given.options),
                           .workspace = &workspace,
                           .watch = &watch,
                           .counts = &counts};

@@ -14,7 +14,7 @@ from diffcloth_torch.config.section import (
     Vector3,
     limits,
 )
-from diffcloth_torch.model.options import COUPLINGS, ELASTIC_SOLVERS, METRICS, SCHEMES
+from diffcloth_torch.model.options import CERTIFY, COUPLINGS, ELASTIC_SOLVERS, METRICS, SCHEMES
 from diffcloth_torch.viewers.look import Camera, Pictures
 
 __all__ = [
@@ -32,10 +32,12 @@ if TYPE_CHECKING:
     Scheme: TypeAlias = str
     Metric: TypeAlias = str
     ElasticSolver: TypeAlias = str
+    Certify: TypeAlias = str
     Coupling: TypeAlias = str
 else:
     Scheme, Metric = Literal[SCHEMES], Literal[METRICS]
     ElasticSolver, Coupling = Literal[ELASTIC_SOLVERS], Literal[COUPLINGS]
+    Certify = Literal[CERTIFY]
 
 
 class ContactSection(Section):
@@ -57,6 +59,7 @@ class SolverSection(Section):
     throw: bool | None = None
     metric: Metric | None = None
     elastic: ElasticSolver | None = None
+    certify: Certify | None = None
 
 
 class SimulationSection(Section):

@@ -11,6 +11,7 @@ from diffcloth_torch.saved import saved
 
 __all__ = [
     "ABILITIES",
+    "CERTIFY",
     "COUPLINGS",
     "ELASTIC_SOLVERS",
     "METRICS",
@@ -24,6 +25,8 @@ ABILITIES = _core.schemes
 SCHEMES = tuple(ABILITIES)
 METRICS = tuple(_core.metrics)
 ELASTIC_SOLVERS = tuple(_core.elastic_solvers)
+CERTIFY = ("always", "gradients")
+"""Which solves end with a factor of the exact Hessian: all, or those that are differentiated."""
 COUPLINGS = ("monolithic", "rigid_to_cloth", "cloth_to_rigid")
 """How cloths and dynamic bodies act on each other: together, or in turn."""
 
@@ -95,6 +98,12 @@ class SolverOptions:
             load: with a limit, the same input gives the same bits only where every step ends in
             time. Each solve of a staggered coupling, and each step in the search for an
             equilibrium, has that time. Backward has no limit.
+        certify: Whether each solve ends with a factor of the exact Hessian, which shows that forces
+            balance at a minimum. "always" makes it for every solve. "gradients" lets a Newton or
+            chord step below the tolerance end a solve of the scheme "coupled"; `report.certified`
+            is then False. The result is the same with and without gradients. Backward and tangents
+            of such a step certify its end first, with further Newton steps where the end is not
+            accurate enough, or raise `SimulationError`. `equilibrium` always certifies.
     """
 
     tolerance: float = 1e-6
@@ -103,6 +112,7 @@ class SolverOptions:
     metric: str | None = None
     elastic: str = "newton"
     max_seconds: float | None = None
+    certify: str = "always"
 
     def __post_init__(self) -> None:
         tolerance = check_number("SolverOptions: `tolerance`", self.tolerance, POSITIVE)
@@ -116,3 +126,4 @@ class SolverOptions:
         check_choice("SolverOptions: `elastic`", self.elastic, ELASTIC_SOLVERS)
         if self.metric is not None:
             check_choice("SolverOptions: `metric`", self.metric, METRICS)
+        check_choice("SolverOptions: `certify`", self.certify, CERTIFY)

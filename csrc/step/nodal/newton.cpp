@@ -113,6 +113,7 @@ class NodalSolve {
   solver::Outcome finish(solver::Criterion criterion) {
     outcome_.criterion = criterion;
     if (solver::has_converged(criterion)) outcome_.certificate.factor = factor_;
+    outcome_.certified = outcome_.certificate.factor != nullptr;
     x_ = std::move(here_.x);
     return outcome_;
   }

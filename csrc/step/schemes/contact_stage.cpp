@@ -103,6 +103,7 @@ void add_forces(const Problem& problem, ContactSum& sum, const Array& x, const F
 void merge(const solver::Outcome& outcome, Report& report) {
   const bool converged = solver::has_converged(outcome.criterion);
   if (report.result == Result::kConverged || !converged) report.criterion = outcome.criterion;
+  report.certified = report.certified && outcome.certified;
   report.residual = std::max(report.residual, outcome.residual);
   report.motion_fraction = std::min(report.motion_fraction, outcome.motion_fraction);
   if (outcome.motion_fraction < 1.0) {
@@ -154,7 +155,7 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
     outcome = solver::minimize(sum.objective, x, solves == 0 ? &departure : nullptr,
                                std::move(factor), step.context);
     merge(outcome, step.report);
-    factor = outcome.certificate.factor;
+    factor = outcome.nearby;
     step.kept.add(std::move(outcome.certificate));
     if (!step.tape.empty()) {
       Array rows;

@@ -2,6 +2,9 @@
 
 #include <algorithm>
 #include <stdexcept>
+#include <utility>
+
+#include "solver/newton.h"
 
 namespace diffcloth::step {
 
@@ -49,6 +52,17 @@ void TakenSolves::stand(std::size_t k) {
   if (!certificate_.factor && sum_.objective.expected.empty()) {
     sum_.expect_contacts_near(step_.problem.start);
   }
+  if (!certificate_.factor && !step_.problem.scene.given.options.certify) refine();
+}
+
+void TakenSolves::refine() {
+  solver::Outcome outcome = solver::minimize(sum_.objective, x_, nullptr, nullptr, step_.context);
+  if (!outcome.certified) {
+    throw std::domain_error(
+        "the end of an uncertified solve is near no solution at which the Hessian is positive "
+        "definite: solve with certify = 'always' or a smaller tolerance");
+  }
+  certificate_ = std::move(outcome.certificate);
 }
 
 solver::Certificate certified(solver::LinearSystem& system,

@@ -26,10 +26,15 @@ class TakenSolves {
   const std::vector<double>& x() const { return x_; }
   const std::vector<double>& x_lag() const { return x_lag_; }
 
-  /// Certificate of the solve; empty if evicted.
+  /// Certificate of the solve; empty if evicted. A solve that had none gets it, and its solution is refined.
   const solver::Certificate& certificate() const { return certificate_; }
 
  private:
+  /// Minimize from where an uncertified solve has ended, which its derivative takes for a solution.
+  ///
+  /// @throws std::domain_error if that does not converge
+  void refine();
+
   /// All points at the start, k = 0, or where solve k has ended; and the contacts there.
   std::vector<double> at(std::size_t k) const;
   const std::vector<contact::Contact>& contacts_at(std::size_t k, const std::vector<double>& x);

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.model.options import ABILITIES, COUPLINGS, SCHEMES, SolverOptions
+from diffcloth_torch.model.options import ABILITIES, CERTIFY, COUPLINGS, SCHEMES, SolverOptions
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.inputs.layout import Layout
 
@@ -31,6 +31,11 @@ def check_scheme(
     if not abilities["metrics"] and solver.metric not in (None, "mass"):
         raise InvalidInput(
             f"Simulator: `solver.metric` {solver.metric!r} needs scheme {_able('metrics')}, "
+            f"got {scheme!r}"
+        )
+    if solver.certify != CERTIFY[0] and scheme != SCHEMES[0]:
+        raise InvalidInput(
+            f"Simulator: `solver.certify` {solver.certify!r} needs scheme {SCHEMES[0]!r}, "
             f"got {scheme!r}"
         )
     if not abilities["elastic_stage"]:

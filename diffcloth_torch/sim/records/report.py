@@ -68,6 +68,9 @@ class Report:
             "no_solution", the law of friction at vertices is not satisfied; "stuck_motion", the
             prescribed motion no longer advances. "no_solve" if surfaces intersect at the start,
             "unknown" in reports of earlier versions.
+        certified: Whether each solve of the step ended with a positive definite Hessian, see
+            `SolverOptions.certify`; False for the iterations of Projective Dynamics, which form
+            none, and for steps that have not converged.
     """
 
     converged: bool | Tensor
@@ -82,10 +85,13 @@ class Report:
     contacts: Contacts = field(default_factory=Contacts)
     cpu_seconds: float | Tensor | None = None  # if left out, not known
     criterion: str | tuple[str, ...] = ()  # if left out, not known
+    certified: bool | Tensor | None = None  # if left out, that of `converged`
 
     def __post_init__(self) -> None:
         if self.cpu_seconds is None:
             object.__setattr__(self, "cpu_seconds", _unknown_like(self.residual))
+        if self.certified is None:
+            object.__setattr__(self, "certified", self.converged)
         # Reports may come from files: errors are raised here, not where the report is used.
         for entry in _NUMERIC:
             _check_numbers(entry, self.__dict__.get(entry))
@@ -108,7 +114,7 @@ class Report:
                 )
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Checks the fields, and completes a report of 0.1: no processor time, no criterion.
+        # Checks the fields, and completes a report of 0.1, which lacks the last three.
         self.__init__(**state)  # type: ignore[misc]
 
     def __repr__(self) -> str:

@@ -109,6 +109,7 @@ def make_core(
         tolerance=options.solver.tolerance,
         max_iterations=options.solver.max_iterations,
         max_seconds=math.inf if seconds is None else seconds,
+        certify=options.solver.certify == "always",
         begins_at_state=options.begins_at_state,
         ignored_pairs=assembly.ignored_pairs,
         primitive_kinds=[p.kind if p is not None else "none" for p in assembly.primitives],

@@ -63,6 +63,9 @@ def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched
     names = tuple(_NAMES[status] for status in diagnostics["status"])
     criteria = tuple(CRITERIA[criterion] for criterion in diagnostics["criterion"])
     converged: list[bool] = [status == CONVERGED for status in diagnostics["status"]]
+    certified = [
+        done and bool(flag) for done, flag in zip(converged, diagnostics["certified"], strict=True)
+    ]
     numbers = _tensors(diagnostics) if batched else {n: diagnostics[n][0] for n in _REPORTED}
     return Report(
         **{name: numbers[name] for name in (*_INTEGERS, *_REALS)},
@@ -71,6 +74,7 @@ def make_report(diagnostics: dict[str, Any], surfaces: Sequence[str], *, batched
         counts={what: numbers[name] for what, name in _COUNTS.items()},
         status=names if batched else names[0],
         criterion=criteria if batched else criteria[0],
+        certified=cpu.tensor(certified, dtype=torch.bool) if batched else certified[0],
         contacts=Contacts.of(
             diagnostics["pairs"], diagnostics["points"], surfaces, batched=batched
         ),

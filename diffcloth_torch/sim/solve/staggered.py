@@ -288,6 +288,7 @@ def _merged(cloth: dict[str, Any], rigid: dict[str, Any], cloth_count: int) -> d
     combine = {
         "status": np.maximum,
         "criterion": np.maximum,  # in which failures follow convergence
+        "certified": np.minimum,
         "residual": np.maximum,
         "minimum_distance": np.minimum,
         "motion_fraction": np.minimum,

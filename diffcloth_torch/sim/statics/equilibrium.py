@@ -226,7 +226,9 @@ class Equilibria:
                 coupling="monolithic",
                 contact=contact,
                 # Steps of all lengths must be solved to the same length, not to the same velocity.
-                solver=replace(solver, tolerance=solver.tolerance / length, metric=None),
+                solver=replace(
+                    solver, tolerance=solver.tolerance / length, metric=None, certify="always"
+                ),
                 weight="bounded" if length in _GROWTH else "exact",
                 limits_dt=self._dt,
                 begins_at_state=True,  # inertia alone leads millions of meters away
