@@ -142,6 +142,7 @@ def simulator(
     metric=None,
     gravity=(0.4, -0.3, -9.81),
     tolerance=TOLERANCE,
+    integrator="implicit_euler",
     **contact,
 ):
     options = {
@@ -156,6 +157,7 @@ def simulator(
         scheme=scheme,
         contact=dc.ContactOptions(**options),
         solver=dc.SolverOptions(tolerance=tolerance, metric=metric),
+        integrator=integrator,
     )
 
 
@@ -450,6 +452,13 @@ REGIMES = {
 
 
 @cache
-def regime(name, scheme="coupled", metric=None, friction_iterations=2):
+def regime(
+    name, scheme="coupled", metric=None, friction_iterations=2, integrator="implicit_euler"
+):
     """A scene by name; made once."""
-    return REGIMES[name](scheme=scheme, metric=metric, friction_iterations=friction_iterations)
+    return REGIMES[name](
+        scheme=scheme,
+        metric=metric,
+        friction_iterations=friction_iterations,
+        integrator=integrator,
+    )

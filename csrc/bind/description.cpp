@@ -168,6 +168,10 @@ void take_options(NamedFields& fields, step::Description& d) {
   d.self_contact = fields.take<bool>("self_contact");
   d.dt = fields.take<double>("dt");
   d.scheme = choose<step::SchemeKind>("scheme", step::kSchemes, fields.take<std::string>("scheme"));
+  if (fields.has("integrator")) {
+    d.integrator = choose<step::Integrator>("integrator", step::kIntegrators,
+                                            fields.take<std::string>("integrator"));
+  }
   d.metric = choose<step::Metric>("metric", step::kMetrics, fields.take<std::string>("metric"));
   d.elastic = choose<step::ElasticSolver>("elastic", step::kElasticSolvers,
                                           fields.take<std::string>("elastic"));

@@ -109,6 +109,7 @@ void simulator(nb::module_& m) {
   m.attr("criteria") =
       std::vector<std::string>(solver::kCriterionNames.begin(), solver::kCriterionNames.end());
   m.attr("schemes") = abilities_of_schemes();
+  m.attr("integrators") = names_of(step::kIntegrators);
   m.attr("metrics") = names_of(step::kMetrics);
   m.attr("elastic_solvers") = names_of(step::kElasticSolvers);
   m.def("are_within", &are_within, "arrays"_a, "largest"_a,

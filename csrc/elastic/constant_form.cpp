@@ -59,16 +59,22 @@ void add_constant_mixed(
   scatter_gradient_bar(model, f, k_s * area * factor * F_u, z, g_bar);
 }
 
-void add_element_mixed(
-    const Model& model, Index e, const double* u, const double* z, bool with_rest, Bar& bar) {
-  const double factor = element_factor(model, e);
+/// @param damped  whether damping counts
+void add_element_mixed(const Model& model,
+                       Index e,
+                       bool damped,
+                       const double* u,
+                       const double* z,
+                       bool with_rest,
+                       Bar& bar) {
+  const double factor = damped ? element_factor(model, e) : 1.0;
   bending::Element element = differentiable_element(model, e);
   element.weight *= factor;
   double* const c_bar =
       with_rest ? bar.rest.curvature_operator.data() + 3 * model.stencils->start[e] : nullptr;
   const FormNumbers numbers(model, e);
   bending::ScalarBars scalar = bending::constant_mixed(element, numbers.derivatives(), u, z, c_bar);
-  if (model.h > 0.0) {
+  if (damped && model.h > 0.0) {
     const double stiffness = element_stiffness(model, e) * model.rest->bending_area[e];
     add_to_faces(model, e, scalar.weight * stiffness / model.h, bar.damping);
   }
@@ -133,11 +139,12 @@ void add_constant_tangent(const Model& model,
 
 void add_element_tangent(const Model& model,
                          Index e,
+                         bool damped,
                          const double* u,
                          const Bar& dot,
                          const Changing& changing,
                          double* y) {
-  const double factor = element_factor(model, e);
+  const double factor = damped ? element_factor(model, e) : 1.0;
   bending::Element element = differentiable_element(model, e);
   const double stiffness = element.weight;
   element.weight *= factor;
@@ -147,7 +154,7 @@ void add_element_tangent(const Model& model,
       tangents.weight = element_mean(model, e, dot.bending) * factor * model.rest->bending_area[e];
     }
     tangents.form = FormNumbers(model, e).change(dot);
-    if (model.h > 0.0) {
+    if (damped && model.h > 0.0) {
       tangents.weight += element_mean(model, e, dot.damping) * stiffness / model.h;
     }
   }
@@ -163,6 +170,21 @@ void add_element_tangent(const Model& model,
 ConstantForm ConstantForm::of_flat_bending(const Model& model,
                                            const linalg::BlockPattern& pattern) {
   return {pattern, model.topology->vertex_count, model.prepared->constant};
+}
+
+ConstantForm ConstantForm::of_bending(const Model& model,
+                                      const Slots& slots,
+                                      const linalg::BlockPattern& pattern) {
+  ConstantForm form(pattern, model.topology->vertex_count, {});
+  form.own_values_ = model.prepared->constant;
+  form.values_ = form.own_values_;
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    const bending::Element element = bending_element(model, e);
+    if (!element.flat) {
+      bending::add_constant(element, bending_slots(slots, e), form.own_values_.data());
+    }
+  }
+  return form;
 }
 
 ConstantForm::ConstantForm(const Model& model,
@@ -271,7 +293,7 @@ void add_constant_form_tangent(
   const auto add = is_woven(model) ? add_woven_constant_tangent : add_constant_tangent;
   for (Index f = 0; f < face_count(model); ++f) add(model, f, u, dot, changing, y);
   for (Index e = 0; e < model.stencils->size(); ++e) {
-    add_element_tangent(model, e, u, dot, changing, y);
+    add_element_tangent(model, e, true, u, dot, changing, y);
   }
 }
 
@@ -280,7 +302,22 @@ void add_constant_form_mixed(
   const auto add = is_woven(model) ? add_woven_constant_mixed : add_constant_mixed;
   for (Index f = 0; f < face_count(model); ++f) add(model, f, u, z, with_rest, bar);
   for (Index e = 0; e < model.stencils->size(); ++e) {
-    add_element_mixed(model, e, u, z, with_rest, bar);
+    add_element_mixed(model, e, true, u, z, with_rest, bar);
+  }
+}
+
+void add_bending_form_mixed(
+    const Model& model, const double* u, const double* z, bool with_rest, Bar& bar) {
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    add_element_mixed(model, e, false, u, z, with_rest, bar);
+  }
+}
+
+void add_bending_form_tangent(
+    const Model& model, const double* u, const Bar& dot, const Changing& changing, double* y) {
+  if (!changing.materials && !changing.rest) return;
+  for (Index e = 0; e < model.stencils->size(); ++e) {
+    add_element_tangent(model, e, false, u, dot, changing, y);
   }
 }
 

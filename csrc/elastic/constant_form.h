@@ -37,6 +37,11 @@ class ConstantForm {
   /// That of flat bending alone, which is its energy; the values stay the model's.
   static ConstantForm of_flat_bending(const Model& model, const linalg::BlockPattern& pattern);
 
+  /// That of all bending without its damping, as if every element were flat.
+  static ConstantForm of_bending(const Model& model,
+                                 const Slots& slots,
+                                 const linalg::BlockPattern& pattern);
+
   ConstantForm(const ConstantForm&) = delete;
   ConstantForm& operator=(const ConstantForm&) = delete;
   ConstantForm(ConstantForm&&) = default;
@@ -74,6 +79,12 @@ void add_constant_form_mixed(
 
 /// y += d/d theta (L u) theta_dot, springs not included: add_constant_form_mixed(), transposed.
 void add_constant_form_tangent(
+    const Model& model, const double* u, const Bar& dot, const Changing& changing, double* y);
+
+/// The same two of ConstantForm::of_bending().
+void add_bending_form_mixed(
+    const Model& model, const double* u, const double* z, bool with_rest, Bar& bar);
+void add_bending_form_tangent(
     const Model& model, const double* u, const Bar& dot, const Changing& changing, double* y);
 
 }  // namespace diffcloth::elastic

@@ -23,6 +23,11 @@ ElasticPotential::ElasticPotential(const Model& model,
       flat_bending_(ConstantForm::of_flat_bending(model, pattern)),
       change_(3 * static_cast<std::size_t>(model.topology->vertex_count)) {}
 
+void ElasticPotential::renew() {
+  flat_bending_ = ConstantForm::of_flat_bending(model_, flat_bending_.pattern());
+  trial_ = {};
+}
+
 double ElasticPotential::energy_change(const double* x, const double* to) const {
   for (std::size_t a = 0; a < change_.size(); ++a) change_[a] = to[a] - x[a];
   trial_.x.assign(to, to + change_.size());
@@ -66,6 +71,11 @@ void ElasticPotential::accumulate(const double* x, const double* z) {
 
 void ElasticPotential::add_tangent(const double* x, double* y) const {
   elastic::add_tangent(model_, x, dot_, changing_, y);
+}
+
+void ElasticPotential::subtract_from_start_tangent(const std::vector<double>& change) {
+  for (std::size_t a = 0; a < dot_.x_n.size(); ++a) dot_.x_n[a] -= change[a];
+  changing_.start = true;
 }
 
 Bar& ElasticPotential::bar() {

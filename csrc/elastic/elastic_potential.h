@@ -26,6 +26,9 @@ class ElasticPotential final : public Potential {
                    const linalg::BlockPattern& pattern,
                    Wanted wanted);
 
+  /// Take the numbers of the model anew, which has been prepared again.
+  void renew();
+
   double energy(const double* x) const override { return elastic::energy(model_, x); }
   double energy_change(const double* x, const double* to) const override;
   void add_gradient(const double* x, double* g) const override;
@@ -64,6 +67,11 @@ class ElasticPotential final : public Potential {
     dot_ = std::move(dot);
     changing_ = changing;
   }
+  const Bar& tangent() const { return dot_; }
+  const Changing& changing() const { return changing_; }
+
+  /// Subtract a change from the tangent of x_n.
+  void subtract_from_start_tangent(const std::vector<double>& change);
 
  private:
   const Model& model_;

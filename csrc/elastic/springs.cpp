@@ -10,13 +10,6 @@ double rest_length(const Springs& springs, Index a) {
   return springs.rest_length.empty() ? 0.0 : springs.rest_length[a];
 }
 
-/// d.
-Vec3 extension(const Springs& springs, Index a, const double* x) {
-  const Vec3 d = difference(springs, a, x);
-  const Index target = springs.target_row[a];
-  return target < 0 ? d : Vec3(d - row(springs.target, target));
-}
-
 /// (|d| - L)^2.
 double squared_stretch(const Vec3& d, double rest) {
   const double stretch = rest == 0.0 ? 0.0 : d.norm() - rest;
@@ -59,6 +52,14 @@ Vec3 difference(const Springs& springs, Index a, const double* v) {
   for (std::size_t p = 1; p < points.size(); ++p) sum += b[p] * row(v, points[p]);
   return sum;
 }
+
+Vec3 extension(const Springs& springs, Index a, const double* x) {
+  const Vec3 d = difference(springs, a, x);
+  const Index target = springs.target_row[a];
+  return target < 0 ? d : Vec3(d - row(springs.target, target));
+}
+
+bool has_length(const Springs& springs, Index a) { return rest_length(springs, a) != 0.0; }
 
 Mat3 hessian(const Springs& springs, Index a, const double* x, bool positive) {
   const double k = springs.stiffness[a];

@@ -53,6 +53,12 @@ struct Springs {
 /// Sum of b_p v_p over the points of a spring, for rows v.
 Vec3 difference(const Springs& springs, Index a, const double* v);
 
+/// d of a spring.
+Vec3 extension(const Springs& springs, Index a, const double* x);
+
+/// Whether a spring has a rest length, so that it resists rates along d alone.
+bool has_length(const Springs& springs, Index a);
+
 /// The second derivative of one spring along d; with `positive` the semi-definite one.
 Mat3 hessian(const Springs& springs, Index a, const double* x, bool positive);
 

@@ -8,14 +8,6 @@
 namespace diffcloth::elastic {
 namespace {
 
-/// Calls visit with the weave of each stiffness alone, equal to one, and its cotangent.
-template <class Visit>
-void for_each_stiffness(const Weave& k, Index f, Bar& bar, const Visit& visit) {
-  visit(Weave{.warp = 1.0, .weft = 0.0, .shear = 0.0, .axis = k.axis}, bar.stretch[f]);
-  visit(Weave{.warp = 0.0, .weft = 1.0, .shear = 0.0, .axis = k.axis}, bar.stretch_weft[f]);
-  visit(Weave{.warp = 0.0, .weft = 0.0, .shear = 1.0, .axis = k.axis}, bar.stretch_shear[f]);
-}
-
 double along(const Mat32& P, const Mat32& G) { return P.cwiseProduct(G).sum(); }
 
 }  // namespace

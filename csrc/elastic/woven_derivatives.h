@@ -1,8 +1,17 @@
 #pragma once
 
 #include "elastic/elastic.h"
+#include "elastic/weave.h"
 
 namespace diffcloth::elastic {
+
+/// Call visit with the weave of each stiffness alone, equal to one, and its cotangent.
+template <class Visit>
+void for_each_stiffness(const Weave& k, Index f, Bar& bar, const Visit& visit) {
+  visit(Weave{.warp = 1.0, .weft = 0.0, .shear = 0.0, .axis = k.axis}, bar.stretch[f]);
+  visit(Weave{.warp = 0.0, .weft = 1.0, .shear = 0.0, .axis = k.axis}, bar.stretch_weft[f]);
+  visit(Weave{.warp = 0.0, .weft = 0.0, .shear = 1.0, .axis = k.axis}, bar.stretch_shear[f]);
+}
 
 // The parts of add_mixed(), add_tangent() and add_energy_bars() of one face whose stretch has three
 // stiffnesses, also where their values are equal.

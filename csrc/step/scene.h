@@ -26,6 +26,9 @@ namespace diffcloth::step {
 /// The ways to take a step.
 enum class SchemeKind : std::uint8_t { kCoupled, kSplit, kProjective };
 
+/// The integrators of `coupled`: see schemes/coupled.h and schemes/second_order.h.
+enum class Integrator : std::uint8_t { kImplicitEuler, kSecondOrder };
+
 /// Metric of the contact stage of `split`.
 enum class Metric : std::uint8_t { kEnergy, kElastic, kMass, kIdentity };
 
@@ -64,7 +67,11 @@ inline constexpr std::array kSchemes{
               .has_elastic_stage = true},
 };
 
-/// All metrics and solvers, the defaults first.
+/// All integrators, metrics and solvers, the defaults first.
+inline constexpr std::array kIntegrators{
+    Named<Integrator>{"implicit_euler", Integrator::kImplicitEuler},
+    Named<Integrator>{"second_order", Integrator::kSecondOrder},
+};
 inline constexpr std::array kMetrics{
     Named<Metric>{"energy", Metric::kEnergy},
     Named<Metric>{"elastic", Metric::kElastic},
@@ -112,6 +119,7 @@ struct Description {
   bool self_contact = true;
   double dt = 0.01;
   SchemeKind scheme = SchemeKind::kCoupled;
+  Integrator integrator = Integrator::kImplicitEuler;  ///< kSecondOrder: of kCoupled alone
   Metric metric = Metric::kEnergy;
   ElasticSolver elastic = ElasticSolver::kNewton;
   int friction_iterations = 2;

@@ -12,6 +12,10 @@
 namespace diffcloth::step {
 namespace {
 
+const Scheme& scheme_of(const Scene& scene) {
+  return find_scheme(scene.given.scheme, scene.given.integrator);
+}
+
 bool wants_barrier(const Gradients& gradients) {
   using enum Input;
   return std::ranges::any_of(
@@ -86,9 +90,7 @@ std::vector<Field> output_fields(const Scene& scene) {
   return fields;
 }
 
-std::vector<Field> tape_fields(const Scene& scene) {
-  return find_scheme(scene.given.scheme).tape(scene);
-}
+std::vector<Field> tape_fields(const Scene& scene) { return scheme_of(scene).tape(scene); }
 
 std::string find_overlap(const Scene& scene, const Inputs& inputs) {
   std::vector<double> thickness(static_cast<std::size_t>(scene.surface_count()), 0.0);
@@ -154,7 +156,7 @@ Report forward(const Scene& scene,
                           .counts = &report.counts,
                           .path = path};
   std::vector<double> x = problem.start;
-  find_scheme(scene.given.scheme)
+  scheme_of(scene)
       .forward({.problem = problem,
                 .detection = detection,
                 .context = context,
@@ -201,7 +203,7 @@ void backward(const Scene& scene,
                           .workspace = &workspace,
                           .watch = &watch,
                           .counts = &counts};
-  find_scheme(scene.given.scheme)
+  scheme_of(scene)
       .backward({{.problem = problem,
                   .detection = detection,
                   .context = context,
@@ -244,7 +246,7 @@ void tangent(const Scene& scene,
                           .workspace = &workspace,
                           .watch = &watch,
                           .counts = &counts};
-  const auto dx = find_scheme(scene.given.scheme)
+  const auto dx = scheme_of(scene)
                       .tangent({{.problem = problem,
                                  .detection = detection,
                                  .context = context,

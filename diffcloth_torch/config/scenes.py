@@ -75,6 +75,7 @@ def build_simulator(scene: Scene, section: SimulationSection) -> Simulator:
         section.dt,
         scheme=section.scheme,
         coupling=section.coupling,
+        integrator=section.integrator,
         contact=ContactOptions(**_given(section.contact)),
         solver=SolverOptions(**_given(section.solver)),
     )

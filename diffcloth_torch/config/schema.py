@@ -14,7 +14,14 @@ from diffcloth_torch.config.section import (
     Vector3,
     limits,
 )
-from diffcloth_torch.model.options import CERTIFY, COUPLINGS, ELASTIC_SOLVERS, METRICS, SCHEMES
+from diffcloth_torch.model.options import (
+    CERTIFY,
+    COUPLINGS,
+    ELASTIC_SOLVERS,
+    INTEGRATORS,
+    METRICS,
+    SCHEMES,
+)
 from diffcloth_torch.viewers.look import Camera, Pictures
 
 __all__ = [
@@ -33,11 +40,12 @@ if TYPE_CHECKING:
     Metric: TypeAlias = str
     ElasticSolver: TypeAlias = str
     Certify: TypeAlias = str
+    Integrator: TypeAlias = str
     Coupling: TypeAlias = str
 else:
     Scheme, Metric = Literal[SCHEMES], Literal[METRICS]
     ElasticSolver, Coupling = Literal[ELASTIC_SOLVERS], Literal[COUPLINGS]
-    Certify = Literal[CERTIFY]
+    Certify, Integrator = Literal[CERTIFY], Literal[INTEGRATORS]
 
 
 class ContactSection(Section):
@@ -69,6 +77,7 @@ class SimulationSection(Section):
     steps: Annotated[int, Ge(1)]
     scheme: Scheme = SCHEMES[0]
     coupling: Coupling = COUPLINGS[0]
+    integrator: Integrator = INTEGRATORS[0]
     contact: ContactSection = ContactSection()
     solver: SolverSection = SolverSection()
 

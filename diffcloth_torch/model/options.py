@@ -14,6 +14,7 @@ __all__ = [
     "CERTIFY",
     "COUPLINGS",
     "ELASTIC_SOLVERS",
+    "INTEGRATORS",
     "METRICS",
     "SCHEMES",
     "ContactOptions",
@@ -23,6 +24,7 @@ __all__ = [
 ABILITIES = _core.schemes
 """What each scheme is able to; the default is first."""
 SCHEMES = tuple(ABILITIES)
+INTEGRATORS = tuple(_core.integrators)
 METRICS = tuple(_core.metrics)
 ELASTIC_SOLVERS = tuple(_core.elastic_solvers)
 CERTIFY = ("always", "gradients")

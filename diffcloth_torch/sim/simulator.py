@@ -15,6 +15,7 @@ from diffcloth_torch.model.defaults import has_barrier, has_contact, scene_param
 from diffcloth_torch.model.options import (
     ABILITIES,
     COUPLINGS,
+    INTEGRATORS,
     SCHEMES,
     ContactOptions,
     SolverOptions,
@@ -65,6 +66,7 @@ class Simulator(Observables):
         scene: The scene.
         dt: Time step [s].
         scheme: "coupled", "split" or "projective".
+        integrator: "implicit_euler" or "second_order".
         coupling: "monolithic", "rigid_to_cloth" or "cloth_to_rigid".
         contact: Contact options, as given.
         solver: Solver options.
@@ -77,6 +79,7 @@ class Simulator(Observables):
     scene: Scene
     dt: float
     scheme: str
+    integrator: str
     coupling: str
     contact: ContactOptions
     solver: SolverOptions
@@ -94,6 +97,7 @@ class Simulator(Observables):
         coupling: str = "monolithic",
         contact: ContactOptions = _DEFAULT_CONTACT,
         solver: SolverOptions = _DEFAULT_SOLVER,
+        integrator: str = "implicit_euler",
     ) -> None:
         """Prepare the solver, and choose the barrier parameters that are not given.
 
@@ -115,6 +119,9 @@ class Simulator(Observables):
                 the bodies.
             contact: Options of contact and friction.
             solver: Tolerance and limits of the solver.
+            integrator: "implicit_euler", or "second_order" for the scheme "coupled": second order
+                where motion is smooth, implicit Euler's behavior in contact. Velocities of its
+                states are those half a step earlier: see `at_half_step`.
 
         Raises:
             IntersectingState: If surfaces of the scene intersect, touch, or are closer than their
@@ -136,11 +143,12 @@ class Simulator(Observables):
         self.dt = check_time_step(dt)
         self.scheme = check_choice("Simulator: `scheme`", scheme, SCHEMES)
         self.coupling = check_choice("Simulator: `coupling`", coupling, COUPLINGS)
+        self.integrator = check_choice("Simulator: `integrator`", integrator, INTEGRATORS)
         abilities = ABILITIES[scheme]
         self._assembly = assemble(scene, all_nodal=not abilities["barrier"])
         self._layout = Layout(self._assembly)
         check_gains(self._layout)
-        check_scheme(self.scheme, self.coupling, scene, self._layout, solver)
+        check_scheme(self.scheme, self.coupling, self.integrator, scene, self._layout, solver)
         self.surfaces = self._assembly.surface_names
         starts = self._assembly.cloth_vertex_start.tolist()
         rows = [slice(a, b) for a, b in pairwise(starts)]
@@ -155,6 +163,7 @@ class Simulator(Observables):
             coupling=coupling,
             contact=contact,
             solver=solver,
+            integrator=integrator,
         )
         self._core = self._engine.core
         self._start_watch = StartWatch(self._engine)
@@ -179,15 +188,17 @@ class Simulator(Observables):
             check_start(self._engine, start._replace(parameters=self._border.defaults))
 
     def __getstate__(self) -> dict[str, Any]:
-        arguments = ("scene", "dt", "scheme", "coupling", "contact", "solver")
+        arguments = ("scene", "dt", "scheme", "coupling", "contact", "solver", "integrator")
         return {name: getattr(self, name) for name in arguments}
 
     def __setstate__(self, arguments: dict[str, Any]) -> None:
         self.__init__(**arguments)  # type: ignore[misc]
 
     def __repr__(self) -> str:
-        coupling = "" if self.coupling == "monolithic" else f", coupling={self.coupling!r}"
-        return f"Simulator({self.scene!r}, dt={self.dt:g}, scheme={self.scheme!r}{coupling})"
+        others = "" if self.coupling == "monolithic" else f", coupling={self.coupling!r}"
+        if self.integrator != "implicit_euler":
+            others += f", integrator={self.integrator!r}"
+        return f"Simulator({self.scene!r}, dt={self.dt:g}, scheme={self.scheme!r}{others})"
 
     @guarded
     def initial_state(self, batch_size: int | None = None) -> State:

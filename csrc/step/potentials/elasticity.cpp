@@ -43,6 +43,14 @@ elastic::Wanted of_model(const Gradients* wanted) {
   return std::ranges::any_of(kFaceValues, is_wanted) ? kMaterials : kNone;
 }
 
+void prepare(const Problem& p, elastic::Model& model) {
+  if (p.rest == &p.scene.rest) {
+    p.scene.prepared.prepare(model, p.scene.slots);
+  } else {
+    elastic::prepare(model, p.scene.slots);
+  }
+}
+
 elastic::Model make_model(const Problem& p) {
   elastic::Model model;
   model.topology = &p.scene.topology;
@@ -57,11 +65,7 @@ elastic::Model make_model(const Problem& p) {
   model.x_n = p.inputs.data(Input::kPositions);
   model.held = &p.scene.held_elements;
   if (!p.masses.empty()) model.least_inertia = std::ranges::min(p.masses) / (p.h * p.h);
-  if (p.rest == &p.scene.rest) {
-    p.scene.prepared.prepare(model, p.scene.slots);
-  } else {
-    elastic::prepare(model, p.scene.slots);
-  }
+  prepare(p, model);
   return model;
 }
 
@@ -71,6 +75,13 @@ Elasticity::Elasticity(const Problem& problem, const Gradients* wanted)
     : model_(make_model(problem)),
       potential_(
           model_, problem.scene.slots, problem.scene.elastic_patterns.base(), of_model(wanted)) {}
+
+void Elasticity::begin_at(const Problem& problem, const double* start) {
+  model_.x_n = start;
+  if (!model_.prepared->has_damping) return;
+  prepare(problem, model_);
+  potential_.renew();
+}
 
 void Elasticity::pull_back(const Problem& problem, Cotangents& bars, const Gradients& gradients) {
   const elastic::Bar& bar = potential_.bar();

@@ -20,6 +20,11 @@ class Elasticity final : public StepPotential {
 
   const elastic::Model& model() const { return model_; }
 
+  /// Take the start of damping from other positions, which outlive this.
+  ///
+  /// @param start  [N, 3] [m]
+  void begin_at(const Problem& problem, const double* start);
+
  private:
   elastic::Model model_;
   elastic::ElasticPotential potential_;

@@ -8,7 +8,6 @@
 #include <utility>
 
 #include "solver/newton.h"
-#include "step/potentials/attachments.h"
 #include "step/schemes/contact_points.h"
 #include "step/schemes/contact_sum.h"
 #include "step/schemes/motion.h"
@@ -84,13 +83,17 @@ void report_blockers(const Problem& problem,
 
 /// Forces of contact on all vertices, minus the partial derivative of its energy, with those of
 /// attachments on bodies, and forces on pins.
-void add_forces(const Problem& problem, ContactSum& sum, const Array& x, const Forces& forces) {
+void add_forces(const Problem& problem,
+                ContactSum& sum,
+                const Potential& attachments,
+                const Array& x,
+                const Forces& forces) {
   Array g(x.size(), 0.0);
   for (const Potential* p : sum.touching()) p->add_gradient(x.data(), g.data());
   const std::size_t end = 3 * static_cast<std::size_t>(problem.scene.vertex_count());
   for (std::size_t a = 0; a < problem.cloth_size; ++a) forces.contact[a] -= g[a];
   if (problem.scene.has_attached_bodies()) {
-    problem.find<Attachments>().potential().add_gradient(x.data(), g.data());
+    attachments.add_gradient(x.data(), g.data());
   }
   for (std::size_t a = problem.cloth_size; a < end; ++a) {
     forces.bodies[a - problem.cloth_size] -= g[a];
@@ -175,7 +178,7 @@ void ContactStage::forward(const Forward& step, Array& x, const Forces& forces) 
   const double reached = step.report.motion_fraction;
   if (reached < 1.0) step.report.root_poses = motion.root_poses(reached);
   if (!step.tape.empty()) *step.tape["solves"] = solves;
-  add_forces(problem, sum, x, forces);
+  add_forces(problem, sum, *attachments, x, forces);
   const contact::FrictionSet* const friction = sum.friction ? &sum.friction->set() : nullptr;
   if (problem.contact) {
     PairTally(step.report).add(*problem.contact, sum.contacts(), friction, x);

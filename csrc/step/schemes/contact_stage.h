@@ -22,6 +22,7 @@ struct ContactStage {
   std::vector<Potential*> others;
   solver::PatternCache& patterns;
   std::size_t first_factor;  ///< place of its factors among the scheme's
+  const Potential* attachments;  ///< of cloths to bodies, as they count here
   Turn::Exchange exchange;   ///< of the cotangents of its potentials; only backward needs it
   SetTangents set_tangents;  ///< of its potentials; only tangent needs it
 

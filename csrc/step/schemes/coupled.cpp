@@ -3,6 +3,7 @@
 #include <cstddef>
 #include <utility>
 
+#include "step/potentials/attachments.h"
 #include "step/schemes/contact_stage.h"
 
 namespace diffcloth::step {
@@ -14,6 +15,7 @@ ContactStage stage(Problem& problem) {
           .others = problem.cloth_potentials(),
           .patterns = problem.scene.elastic_patterns,
           .first_factor = 0,
+          .attachments = &problem.find<Attachments>().potential(),
           .exchange = {},
           .set_tangents = {}};
 }

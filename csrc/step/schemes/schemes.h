@@ -4,7 +4,7 @@
 
 namespace diffcloth::step {
 
-/// The implementation of a scheme.
-const Scheme& find_scheme(SchemeKind kind);
+/// The implementation of a scheme with an integrator.
+const Scheme& find_scheme(SchemeKind kind, Integrator integrator);
 
 }  // namespace diffcloth::step

@@ -11,6 +11,7 @@
 
 #include "elastic/elastic_nearness.h"
 #include "potential/tilt.h"
+#include "step/potentials/attachments.h"
 #include "step/potentials/constant_form.h"
 #include "step/potentials/elasticity.h"
 #include "step/schemes/contact_stage.h"
@@ -72,6 +73,7 @@ class Nearness {
             .others = std::move(others),
             .patterns = is_diagonal ? scene.diagonal_patterns : scene.elastic_patterns,
             .first_factor = 1,
+            .attachments = &problem_.find<Attachments>().potential(),
             .exchange = {},
             .set_tangents = {}};
   }

@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.model.options import ABILITIES, CERTIFY, COUPLINGS, SCHEMES, SolverOptions
+from diffcloth_torch.model.options import (
+    ABILITIES,
+    CERTIFY,
+    COUPLINGS,
+    INTEGRATORS,
+    SCHEMES,
+    SolverOptions,
+)
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.inputs.layout import Layout
 
@@ -11,13 +18,19 @@ __all__ = ["check_scheme"]
 
 
 def check_scheme(
-    scheme: str, coupling: str, scene: Scene, layout: Layout, solver: SolverOptions
+    scheme: str,
+    coupling: str,
+    integrator: str,
+    scene: Scene,
+    layout: Layout,
+    solver: SolverOptions,
 ) -> None:
     """Refuse options, motion and contact that a scheme does not support.
 
     Args:
         scheme: One of `SCHEMES`.
         coupling: One of `COUPLINGS`.
+        integrator: One of `INTEGRATORS`.
         scene: The scene.
         layout: Layout of its rows.
         solver: Solver options.
@@ -27,6 +40,8 @@ def check_scheme(
     """
     abilities = ABILITIES[scheme]
     _check_attachments(scheme, coupling, layout)
+    if integrator != INTEGRATORS[0]:
+        _check_second_order(scheme, coupling, integrator, layout)
     # The other schemes measure inertia in the masses; "mass", once the default, says just that.
     if not abilities["metrics"] and solver.metric not in (None, "mass"):
         raise InvalidInput(
@@ -67,6 +82,23 @@ def _check_attachments(scheme: str, coupling: str, layout: Layout) -> None:
             raise InvalidInput(
                 f"Simulator: an attachment to {name!r}, which is dynamic, needs coupling "
                 f"{COUPLINGS[0]!r}, got {coupling!r}"
+            )
+
+
+def _check_second_order(scheme: str, coupling: str, integrator: str, layout: Layout) -> None:
+    """The second-order step is one solve for everything, with springs to given motions alone."""
+    start = f"Simulator: `integrator` {integrator!r} needs"
+    if scheme != SCHEMES[0]:
+        raise InvalidInput(f"{start} scheme {SCHEMES[0]!r}, got {scheme!r}")
+    if coupling != COUPLINGS[0]:
+        raise InvalidInput(f"{start} coupling {COUPLINGS[0]!r}, got {coupling!r}")
+    assembly = layout.assembly
+    for name in assembly.springs.surfaces if assembly.cloth_count else ():
+        row = assembly.surface_names.index(name) - assembly.cloth_count
+        if assembly.mechanisms[assembly.surface_mechanism[row]].is_dynamic:
+            raise InvalidInput(
+                f"{start} attachments of cloths to cloths, targets, and bodies or links whose "
+                f"motion is given, got one to {name!r}, which is dynamic"
             )
 
 

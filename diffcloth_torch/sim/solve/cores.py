@@ -14,7 +14,7 @@ from diffcloth_torch.autograd.core_function import as_array
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.dynamics.limits import LimitStiffness
 from diffcloth_torch.model.assembly import Assembly
-from diffcloth_torch.model.options import ContactOptions, SolverOptions
+from diffcloth_torch.model.options import INTEGRATORS, ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Fields
 from diffcloth_torch.model.springs import Springs
 from diffcloth_torch.sim.inputs.layout import Layout
@@ -51,6 +51,7 @@ class CoreOptions(NamedTuple):
         contact: Contact options.
         solver: Solver options.
         begins_at_state: Whether solves begin where the step does, not where inertia leads.
+        integrator: "implicit_euler" or "second_order", of the scheme "coupled".
     """
 
     bending_models: Sequence[str]
@@ -59,6 +60,7 @@ class CoreOptions(NamedTuple):
     contact: ContactOptions
     solver: SolverOptions
     begins_at_state: bool = False
+    integrator: str = INTEGRATORS[0]
 
 
 def make_core(
@@ -103,6 +105,7 @@ def make_core(
         self_contact=options.contact.self_contact,
         dt=options.dt,
         scheme=options.scheme,
+        integrator=options.integrator,
         metric=options.solver.metric or "energy",
         elastic=options.solver.elastic,
         friction_iterations=options.contact.friction_iterations,

@@ -17,7 +17,7 @@ from diffcloth_torch.dynamics.limits import limit_stiffness
 from diffcloth_torch.dynamics.totals import Totals
 from diffcloth_torch.errors import TurnedTooFar
 from diffcloth_torch.model.assembly import Assembly
-from diffcloth_torch.model.options import SCHEMES, ContactOptions, SolverOptions
+from diffcloth_torch.model.options import INTEGRATORS, SCHEMES, ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.operations import operation
@@ -67,6 +67,7 @@ class Engine:
         weight: str | None = None,
         limits_dt: float | None = None,
         begins_at_state: bool = False,
+        integrator: str = INTEGRATORS[0],
     ) -> None:
         """Make the cores; the arguments are those of `Simulator`, checked.
 
@@ -81,6 +82,7 @@ class Engine:
             weight: As for `Dynamics`.
             limits_dt: Time step that sets the stiffness of joint limits; None takes `dt`.
             begins_at_state: As for `CoreOptions`.
+            integrator: Name of the integrator.
         """
         assembly = layout.assembly
         self.layout, self._dt = layout, dt
@@ -95,6 +97,7 @@ class Engine:
             contact=contact,
             solver=solver,
             begins_at_state=begins_at_state,
+            integrator=integrator if scene.cloths else INTEGRATORS[0],
         )
         stiffness = None
         if self.dynamics is not None:

@@ -1,0 +1,340 @@
+// The adjoint of a step of second order begins with the contact stage (contact_adjoint.cpp), whose shifted
+// potentials yield the cotangent of the shift d,  d_bar = W''(x' - d) zhat. With d = y - x_n and y the minimizer of
+//
+//   1/(2 h^2) |y - x_n - h v_n|^2_M + 1/2 (y - x_n)^T S(u) (y - x_n),
+//
+// d_bar is the g of the adjoint of this minimization, which has the same form. Its inputs are x_n, v_n, u, the
+// ends of prescribed points, masses and stiffnesses. Tangents go the other way.
+
+#include "step/schemes/second_order.h"
+
+#include <algorithm>
+#include <optional>
+#include <utility>
+
+#include "elastic/spring_rate.h"
+#include "elastic/strain_rate.h"
+#include "potential/shifted.h"
+#include "solver/newton.h"
+#include "step/potentials/air.h"
+#include "step/potentials/attachments.h"
+#include "step/potentials/elasticity.h"
+#include "step/potentials/soft_pins.h"
+#include "step/schemes/contact_stage.h"
+
+namespace diffcloth::step {
+namespace {
+
+using Array = std::vector<double>;
+
+/// Whether a point is a vertex whose end is given: a pin, or of a body whose motion is prescribed.
+bool follows_ends(const Problem& p, std::size_t point) {
+  const auto vertices = static_cast<std::size_t>(p.scene.vertex_count());
+  return point < vertices && p.scene.prescribed[point] != 0;
+}
+
+/// u: x_n + h v_n / 2 of free vertices of cloths, of prescribed points the mean of both ends.
+Array middle(const Problem& p) {
+  Array u = p.coasting();
+  for (std::size_t a = 0; a < u.size(); ++a) u[a] = 0.5 * (u[a] + p.start[a]);
+  return u;
+}
+
+/// The first stage: the displacement that the cloths would have by their velocities, without the fast modes of strain.
+class Filter {
+ public:
+  explicit Filter(Problem& p)
+      : p_(p),
+        middle_(middle(p)),
+        inertia_(p.masses, coasting(p), p.h),
+        stretch_(p.find<Elasticity>().potential(),
+                 p.scene.elastic_patterns.base(),
+                 middle_.data(),
+                 p.start.data()),
+        attachments_(p.find<Attachments>().potential(), middle_, p.start),
+        soft_pins_(p.find<SoftPins>().potential(), middle_, p.start),
+        objective_(p.objective(inertia_,
+                               {&stretch_, &attachments_, &soft_pins_},
+                               p.scene.elastic_patterns)) {}
+
+  const solver::Objective& objective() const { return objective_; }
+
+  /// All points where it ends; none where rounding leaves no definite matrix.
+  std::optional<Array> solve(const Forward& step) const {
+    Array y = p_.coasting();
+    objective_.stand_at(y.data());
+    Array g;
+    objective_.gradient(y.data(), g);
+    solver::LinearSystem system(objective_, *step.context.workspace, *step.context.watch,
+                                *step.context.counts);
+    Array p;
+    const solver::Certificate certificate = system.certify(y.data(), g, p);
+    if (!certificate.factor) return std::nullopt;
+    std::vector<Array> exact;
+    system.solve(certificate, {g}, exact);
+    for (std::size_t a = 0; a < p_.cloth_size; ++a) y[a] += exact.front()[a];
+    step.kept.add(certificate);
+    return y;
+  }
+
+  void swap_cotangents(CotangentStore& store) {
+    inertia_.swap_cotangents(store);
+    stretch_.swap_cotangents(store);
+    attachments_.swap_cotangents(store);
+    soft_pins_.swap_cotangents(store);
+  }
+
+  /// Pull the cotangents of its own inputs back; those of materials are with the potentials of the step.
+  void pull_back(Cotangents& bars) const {
+    for (std::size_t a = 0; a < p_.cloth_size; ++a) {
+      bars.start[a] += inertia_.target_bar[a] + stretch_.start_bar[a];
+      bars.velocities[a] += p_.h * inertia_.target_bar[a];
+    }
+    for (std::size_t i = 0; i < bars.masses.size(); ++i) bars.masses[i] += inertia_.metric_bar[i];
+    Array middle_bar = attachments_.middle_bar;
+    for (std::size_t a = 0; a < middle_bar.size(); ++a) {
+      bars.start[a] += attachments_.start_bar[a] + soft_pins_.start_bar[a];
+      middle_bar[a] += soft_pins_.middle_bar[a];
+      if (a < p_.cloth_size) middle_bar[a] += stretch_.middle_bar[a];
+    }
+    Array ends_bar(middle_bar.size(), 0.0);
+    for (std::size_t a = 0; a < middle_bar.size(); ++a) {
+      const bool prescribed = follows_ends(p_, a / 3);
+      bars.start[a] += prescribed ? 0.5 * middle_bar[a] : middle_bar[a];
+      if (prescribed) ends_bar[a] = 0.5 * middle_bar[a];
+      if (!prescribed && a < p_.cloth_size) bars.velocities[a] += 0.5 * p_.h * middle_bar[a];
+    }
+    add_to_ends(p_, std::move(ends_bar), bars);
+  }
+
+  /// Put the tangents of its own inputs into its potentials.
+  ///
+  /// @param ends_dot  of all points
+  void set_tangents(const Tangents& tangents, const Array& ends_dot) {
+    const double* const v_dot = tangents.directions.data(Input::kVelocities);
+    const auto velocity = [&](std::size_t a) { return v_dot != nullptr ? v_dot[a] : 0.0; };
+    inertia_.metric_dot = tangents.masses;
+    inertia_.target_dot.resize(p_.cloth_size);
+    for (std::size_t a = 0; a < p_.cloth_size; ++a) {
+      inertia_.target_dot[a] = tangents.start[a] + p_.h * velocity(a);
+    }
+    Array middle_dot = tangents.start;
+    for (std::size_t a = 0; a < middle_dot.size(); ++a) {
+      if (follows_ends(p_, a / 3)) {
+        middle_dot[a] = 0.5 * (middle_dot[a] + ends_dot[a]);
+      } else if (a < p_.cloth_size) {
+        middle_dot[a] += 0.5 * p_.h * velocity(a);
+      }
+    }
+    stretch_.start_dot.assign(tangents.start.begin(),
+                              tangents.start.begin() + static_cast<std::ptrdiff_t>(p_.cloth_size));
+    stretch_.middle_dot = attachments_.middle_dot = soft_pins_.middle_dot = middle_dot;
+    attachments_.start_dot = soft_pins_.start_dot = tangents.start;
+  }
+
+  /// Add the cotangents of vertices at the ends of prescribed points to those of the latter.
+  static void add_to_ends(const Problem& p, Array bar, Cotangents& bars) {
+    p.coordinates.gather(p.ends, bar);
+    for (std::size_t a = 0; a < bar.size(); ++a) {
+      if (p.scene.prescribed[a / 3] != 0) bars.ends[a] += bar[a];
+    }
+  }
+
+ private:
+  static Array coasting(const Problem& p) {
+    Array target = p.coasting();
+    target.resize(p.cloth_size);
+    return target;
+  }
+
+  Problem& p_;
+  Array middle_;
+  Proximity inertia_;
+  elastic::StrainRate stretch_;
+  elastic::SpringRate attachments_;
+  elastic::SpringRate soft_pins_;
+  solver::Objective objective_;
+};
+
+/// The second stage: the contact stage with elasticity and springs evaluated at points less the displacement.
+class ShiftedStage {
+ public:
+  /// @param y  all points where the filter has ended
+  ShiftedStage(Problem& p, const Array& y)
+      : p_(p),
+        shift_(p.start.size(), 0.0),
+        start_(p.cloth_size),
+        guess_(p.inertia.target()),
+        elastic_(p.find<Elasticity>().potential(), shift_),
+        attachments_(p.find<Attachments>().potential(), shift_),
+        soft_pins_(p.find<SoftPins>().potential(), shift_) {
+    for (std::size_t a = 0; a < shift_.size(); ++a) {
+      if (a < p.cloth_size || follows_ends(p, a / 3)) shift_[a] = y[a] - p.start[a];
+    }
+    // Inertia leads to x_n + h v_n; strain takes the difference to y from it.
+    const Array coasting = p.coasting();
+    for (std::size_t a = 0; a < p.cloth_size; ++a) {
+      start_[a] = p.start[a] - shift_[a];
+      guess_[a] += y[a] - coasting[a];
+    }
+    p.find<Elasticity>().begin_at(p, start_.data());
+  }
+
+  ContactStage stage() {
+    return {.inertia = p_.inertia,
+            .guess = guess_.data(),
+            .others = {&elastic_, &p_.find<Air>().potential(), &attachments_, &soft_pins_},
+            .patterns = p_.scene.elastic_patterns,
+            .first_factor = 1,
+            .attachments = &attachments_,
+            .exchange = {},
+            .set_tangents = {}};
+  }
+
+  void swap_cotangents(CotangentStore& store) {
+    elastic_.swap_cotangents(store);
+    attachments_.swap_cotangents(store);
+    soft_pins_.swap_cotangents(store);
+  }
+
+  /// Pull the cotangent of the shift back to the start and to prescribed ends; returns that of y, of the rows.
+  Array pull_back(Cotangents& bars) const {
+    Array bar(shift_.size(), 0.0);
+    for (const Shifted* potential : {&elastic_, &attachments_, &soft_pins_}) {
+      for (std::size_t a = 0; a < potential->shift_bar.size(); ++a) bar[a] += potential->shift_bar[a];
+    }
+    // Damping begins at x_n - d.
+    const elastic::Bar& model = p_.find<Elasticity>().potential().bar();
+    for (std::size_t a = 0; a < p_.cloth_size; ++a) bar[a] -= model.x_n[a];
+    Array rows(p_.coordinates.size(), 0.0);
+    Array ends_bar(bar.size(), 0.0);
+    for (std::size_t a = 0; a < bar.size(); ++a) {
+      if (a < p_.cloth_size) {
+        rows[a] = bar[a];
+      } else if (follows_ends(p_, a / 3)) {
+        ends_bar[a] = bar[a];
+      } else {
+        continue;
+      }
+      bars.start[a] -= bar[a];
+    }
+    Filter::add_to_ends(p_, std::move(ends_bar), bars);
+    return rows;
+  }
+
+  /// Put a tangent of the shift into the potentials, whose other tangents are there.
+  ///
+  /// @param y_dot     of all points
+  /// @param ends_dot  likewise
+  void set_tangents(const Tangents& tangents, const Array& y_dot, const Array& ends_dot) {
+    Array dot(shift_.size(), 0.0);
+    for (std::size_t a = 0; a < dot.size(); ++a) {
+      if (a < p_.cloth_size) {
+        dot[a] = y_dot[a] - tangents.start[a];
+      } else if (follows_ends(p_, a / 3)) {
+        dot[a] = ends_dot[a] - tangents.start[a];
+      }
+    }
+    p_.find<Elasticity>().potential().subtract_from_start_tangent(dot);
+    elastic_.shift_dot = attachments_.shift_dot = soft_pins_.shift_dot = std::move(dot);
+  }
+
+ private:
+  Problem& p_;
+  Array shift_;  ///< d
+  Array start_;  ///< x_n - d of the cloths
+  Array guess_;
+  Shifted elastic_;
+  Shifted attachments_;
+  Shifted soft_pins_;
+};
+
+/// All points where the filter of a step has ended, from the tape.
+Array filtered(const Taken& step) {
+  Array y = step.problem.coasting();
+  std::copy_n(step.tape["filter"], step.problem.cloth_size, y.begin());
+  return y;
+}
+
+solver::Certificate certificate_of(const Taken& step) {
+  return step.kept.certificates.empty() ? solver::Certificate{} : step.kept.certificates.front();
+}
+
+}  // namespace
+
+std::vector<Field> SecondOrder::tape(const Scene& scene) const {
+  std::vector<Field> fields = ContactStage::tape(scene);
+  fields.push_back(
+      {.name = "filter", .shape = {static_cast<std::size_t>(scene.cloth_vertex_count()), 3}});
+  return fields;
+}
+
+void SecondOrder::forward(const Forward& step, Array& x, const Forces& forces) const {
+  Problem& problem = step.problem;
+  const std::optional<Array> y = Filter(problem).solve(step);
+  if (!y) {
+    solver::Outcome failed;
+    failed.criterion = solver::Criterion::kIndefinite;
+    failed.motion_fraction = 0.0;
+    merge(failed, step.report);
+    return;
+  }
+  if (!step.tape.empty()) std::copy_n(y->begin(), problem.cloth_size, step.tape["filter"]);
+  ShiftedStage(problem, *y).stage().forward(step, x, forces);
+}
+
+void SecondOrder::backward(const Backward& step) const {
+  Problem& problem = step.problem;
+  const Array y = filtered(step);
+  Filter filter(problem);
+  ShiftedStage shifted(problem, y);
+  std::vector<CotangentStore> own(step.losses.size());
+  ContactStage contact = shifted.stage();
+  contact.exchange = [&](std::size_t l) {
+    step.losses[l].exchange(problem);
+    own[l].begin();
+    shifted.swap_cotangents(own[l]);
+    filter.swap_cotangents(own[l]);
+  };
+  std::vector<Array> g;
+  for (const Cotangents& bars : step.losses) g.push_back(bars.rows);
+  contact.backward(step, g);
+  for (std::size_t l = 0; l < g.size(); ++l) {
+    const Turn turn(contact.exchange, l);
+    g[l] = shifted.pull_back(step.losses[l]);
+  }
+  const solver::Objective& f = filter.objective();
+  f.stand_at(y.data());
+  pull_back_solve(step, f, y, certificate_of(step), g, false, {}, contact.exchange);
+  for (std::size_t l = 0; l < g.size(); ++l) {
+    const Turn turn(contact.exchange, l);
+    filter.pull_back(step.losses[l]);
+  }
+}
+
+std::vector<Array> SecondOrder::tangent(const Pushforward& step) const {
+  Problem& problem = step.problem;
+  const Array y = filtered(step);
+  Filter filter(problem);
+  ShiftedStage shifted(problem, y);
+  std::vector<Array> ends_dot;
+  for (const Tangents& tangents : step.directions) {
+    ends_dot.push_back(tangents.ends);
+    problem.coordinates.carry(problem.ends, ends_dot.back());
+  }
+  const solver::Objective& f = filter.objective();
+  f.stand_at(y.data());
+  const std::vector<Array> y_dot =
+      push_forward_solve(step, f, y, certificate_of(step), false, {}, [&](std::size_t l) {
+        step.directions[l].push_forward(problem);
+        filter.set_tangents(step.directions[l], ends_dot[l]);
+      });
+  ContactStage contact = shifted.stage();
+  contact.set_tangents = [&](std::size_t l) {
+    step.directions[l].push_forward(problem);
+    shifted.set_tangents(step.directions[l], y_dot[l], ends_dot[l]);
+  };
+  return contact.tangent(step);
+}
+
+}  // namespace diffcloth::step

@@ -1,0 +1,27 @@
+#pragma once
+
+#include "step/scheme.h"
+
+namespace diffcloth::step {
+
+/// The coupled scheme with a step of second order where motion is smooth, and of implicit Euler's behavior in
+/// contact. From x_n and v_n:
+///
+///   1. Filter:  (M + h^2 S(u)) d = M h v_n,   u = x_n + h v_n / 2,  S the stiffness against strain rates;
+///      prescribed points have d = their motion.
+///   2. x' = argmin  1/(2 h^2) |x - xhat|^2_M + W(x - d) + barrier + friction + drag,   v' = (x' - x_n) / h,
+///
+/// W the energy of elasticity, damping and springs. With d = h v_n it is leapfrog on the Moreau envelope of W, with
+/// velocities at the middle of steps: unconditionally stable, of second order. The filter takes modes that are
+/// fast beside the step to implicit Euler. Contact, friction, gravity and drag are those of implicit Euler, so
+/// that rest is exact, and nothing is averaged that the barrier has changed. The balance of linear momentum
+/// holds for every S.
+class SecondOrder final : public Scheme {
+ public:
+  std::vector<Field> tape(const Scene& scene) const override;
+  void forward(const Forward& step, std::vector<double>& x, const Forces& forces) const override;
+  void backward(const Backward& step) const override;
+  std::vector<std::vector<double>> tangent(const Pushforward& step) const override;
+};
+
+}  // namespace diffcloth::step
