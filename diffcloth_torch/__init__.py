@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from diffcloth_torch.optimize.evaluation import Evaluation
     from diffcloth_torch.optimize.fit import Fit, Stage, fit
     from diffcloth_torch.optimize.variables import Variable
+    from diffcloth_torch.sim.half_step import at_half_step
     from diffcloth_torch.sim.records.contact_points import ContactPoints
     from diffcloth_torch.sim.records.controls import Control, Parameters
     from diffcloth_torch.sim.records.report import Report
@@ -94,6 +95,7 @@ __all__ = [
     "Trajectory",
     "TurnedTooFar",
     "Variable",
+    "at_half_step",
     "build_info",
     "descend",
     "envs",
@@ -138,6 +140,7 @@ _HOMES = {
     "optimize.evaluation": ("Evaluation",),
     "optimize.fit": ("Fit", "Stage", "fit"),
     "optimize.variables": ("Variable",),
+    "sim.half_step": ("at_half_step",),
     "sim.records.contact_points": ("ContactPoints",),
     "sim.records.controls": ("Control", "Parameters"),
     "sim.records.report": ("Report",),

@@ -19,6 +19,7 @@ schemes: dict[str, dict[str, bool]] = {
     },
 }
 """What each is able to: "barrier", "moves_bodies", "elastic_stage", "metrics"; default first."""
+integrators: list[str] = ["implicit_euler", "second_order"]
 metrics: list[str] = ["energy", "elastic", "mass", "identity"]
 elastic_solvers: list[str] = ["newton", "projective"]
 criteria: list[str]
@@ -103,6 +104,8 @@ class Simulator:
         self_contact: bool,
         dt: float,
         scheme: str,
+        integrator: str = ...,
+        certify: bool = ...,
         metric: str,
         elastic: str,
         friction_iterations: int,

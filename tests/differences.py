@@ -80,6 +80,31 @@ def mismatch(
     return best
 
 
+def directional(
+    f: Callable[[dict[str, torch.Tensor]], torch.Tensor],
+    inputs: dict[str, torch.Tensor],
+    names: Sequence[str],
+    seed: int = 0,
+) -> float:
+    """Relative error of a gradient by named inputs along one random direction of all of them."""
+    leaves = {n: x.clone().requires_grad_() for n, x in inputs.items() if n in names}
+    found = torch.autograd.grad(f({**inputs, **leaves}), list(leaves.values()))
+    g = torch.Generator().manual_seed(seed)
+    d = {n: torch.randn(inputs[n].shape, generator=g, dtype=F64) for n in leaves}
+    terms = [(gradient * d[n]).sum() for n, gradient in zip(leaves, found, strict=True)]
+    scale = torch.stack(terms).norm().item()
+
+    def at(t):
+        with torch.no_grad():
+            return f({**inputs, **{n: inputs[n] + t * d[n] for n in leaves}}).item()
+
+    errors = []
+    for h in (1e-4, 1e-5, 1e-6, 1e-7):
+        difference = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
+        errors.append(abs(difference - sum(terms).item()) / scale)
+    return min(errors)
+
+
 def slope_error(points: Sequence[tuple[float, float, float]]) -> float:
     """Smallest relative error of the slopes of a function with branches, over every two points.
 

@@ -452,9 +452,7 @@ REGIMES = {
 
 
 @cache
-def regime(
-    name, scheme="coupled", metric=None, friction_iterations=2, integrator="implicit_euler"
-):
+def regime(name, scheme="coupled", metric=None, friction_iterations=2, integrator="implicit_euler"):
     """A scene by name; made once."""
     return REGIMES[name](
         scheme=scheme,

@@ -26,8 +26,10 @@ DragPotential::DragPotential(Flow flow, Index vertex_count, bool of_coefficients
     : across_bar(flow.faces.size(), 0.0),
       along_bar(flow.faces.size(), 0.0),
       start_bar(3 * static_cast<std::size_t>(vertex_count), 0.0),
+      velocity_bar(flow.velocities != nullptr ? start_bar.size() : 0, 0.0),
       wind_bar(3, 0.0),
       flow_(std::move(flow)),
+      span_(flow_.velocities != nullptr ? 2.0 * flow_.h : flow_.h),
       size_(3 * static_cast<std::size_t>(vertex_count)),
       of_coefficients_(of_coefficients) {
   for (std::size_t f = 0; f < flow_.faces.size(); ++f) {
@@ -50,14 +52,17 @@ const std::vector<FaceDrag>& DragPotential::drags() const {
 /// u.
 Vec3 DragPotential::velocity(Index f, const double* x) const {
   Vec3 moved = Vec3::Zero();
-  for (const Index i : flow_.faces[f]) moved += row(x, i) - row(flow_.start, i);
-  return moved / (3.0 * flow_.h) - flow_.wind;
+  for (const Index i : flow_.faces[f]) {
+    moved += row(x, i) - row(flow_.start, i);
+    if (flow_.velocities != nullptr) moved += flow_.h * row(flow_.velocities, i);
+  }
+  return moved / (3.0 * span_) - flow_.wind;
 }
 
 double DragPotential::energy(const double* x) const {
   double sum = 0.0;
   for (const Index f : with_drag_) sum += drags()[f].power(velocity(f, x));
-  return flow_.h * sum;
+  return span_ * sum;
 }
 
 double DragPotential::energy_change(const double* x, const double* to) const {
@@ -65,9 +70,9 @@ double DragPotential::energy_change(const double* x, const double* to) const {
   for (const Index f : with_drag_) {
     Vec3 moved = Vec3::Zero();
     for (const Index i : flow_.faces[f]) moved += row(to, i) - row(x, i);
-    sum += drags()[f].power_change(velocity(f, x), velocity(f, to), moved / (3.0 * flow_.h));
+    sum += drags()[f].power_change(velocity(f, x), velocity(f, to), moved / (3.0 * span_));
   }
-  return flow_.h * sum;
+  return span_ * sum;
 }
 
 void DragPotential::add_gradient(const double* x, double* g) const {
@@ -80,7 +85,7 @@ void DragPotential::add_hessian(const double* x,
                                 Curvature /*curvature*/,
                                 linalg::BlockMatrix& A) const {
   for (const Index f : with_drag_) {
-    const Mat3 block = drags()[f].slope(velocity(f, x)) / (9.0 * flow_.h);
+    const Mat3 block = drags()[f].slope(velocity(f, x)) / (9.0 * span_);
     A.add_rows(flow_.faces[f], [&](int /*p*/, int /*q*/) -> const Mat3& { return block; });
   }
 }
@@ -88,7 +93,7 @@ void DragPotential::add_hessian(const double* x,
 void DragPotential::add_product(Index f, const Mat3& slope, const double* z, double* y) const {
   const Vec3 sum = sum_of_corners(flow_.faces[f], z);
   if (sum.isZero(0.0)) return;
-  add_to_corners(flow_.faces[f], slope * sum / (9.0 * flow_.h), y);
+  add_to_corners(flow_.faces[f], slope * sum / (9.0 * span_), y);
 }
 
 void DragPotential::add_hessian_product(const double* x, const double* z, double* y) const {
@@ -117,7 +122,10 @@ void DragPotential::accumulate(const double* x, const double* z) {
     if (face.across == 0.0 && face.along == 0.0) return;
     const Vec3 minus_u_bar = face.slope(u) * z_f;
     Eigen::Map<Vec3>(wind_bar.data()) += minus_u_bar;
-    add_to_corners(flow_.faces[f], minus_u_bar / (3.0 * flow_.h), start_bar.data());
+    add_to_corners(flow_.faces[f], minus_u_bar / (3.0 * span_), start_bar.data());
+    if (!velocity_bar.empty()) {
+      add_to_corners(flow_.faces[f], -flow_.h / (3.0 * span_) * minus_u_bar, velocity_bar.data());
+    }
     add_frame_bar(f, -face.frame_bar(u, z_f));
   };
   if (of_coefficients_) {
@@ -163,8 +171,11 @@ void DragPotential::add_tangent(const double* x, double* y) const {
     if (drags) {
       const Derivative& of = here[next - with_drag_.begin()];
       ++next;
-      const Vec3 u_dot =
-          -sum_of_corners(flow_.faces[k], start_dot.data()) / (3.0 * flow_.h) - wind_dot;
+      Vec3 moved = -sum_of_corners(flow_.faces[k], start_dot.data());
+      if (flow_.velocities != nullptr) {
+        moved += flow_.h * sum_of_corners(flow_.faces[k], velocity_dot.data());
+      }
+      const Vec3 u_dot = moved / (3.0 * span_) - wind_dot;
       change = of.by_velocity * u_dot + of.by_frame * frame_dot(f);
       if (changes) change += by_coefficients(f, of.u);
     } else {
@@ -178,6 +189,7 @@ void DragPotential::swap_cotangents(CotangentStore& store) {
   store.exchange(across_bar);
   store.exchange(along_bar);
   store.exchange(start_bar);
+  store.exchange(velocity_bar);
   store.exchange(wind_bar);
 }
 

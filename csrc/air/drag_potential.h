@@ -14,11 +14,12 @@ namespace diffcloth::air {
 /// Faces that move through air during a step.
 struct Flow {
   std::span<const std::array<Index, 3>> faces;
-  std::vector<double> across;     ///< [F] a [kg/m^3]
-  std::vector<double> along;      ///< [F] b [kg/m^3]
-  const double* start = nullptr;  ///< [N, 3] x_n [m]
-  Vec3 wind = Vec3::Zero();       ///< w [m/s]
-  double h = 0.0;                 ///< time step [s]
+  std::vector<double> across;          ///< [F] a [kg/m^3]
+  std::vector<double> along;           ///< [F] b [kg/m^3]
+  const double* start = nullptr;       ///< [N, 3] x_n [m]
+  Vec3 wind = Vec3::Zero();            ///< w [m/s]
+  double h = 0.0;                      ///< time step [s]
+  const double* velocities = nullptr;  ///< [N, 3] v_n, for the mean with them; null: without [m/s]
   /// Faces with a corner that is no free vertex, if known: add_held_product() takes these alone.
   const std::vector<Index>* held = nullptr;
 };
@@ -27,7 +28,11 @@ struct Flow {
 ///
 ///   P(x) = h sum_f D_f(u_f),    u_f = 1/3 sum_p (x_p - x_n,p) / h - w,
 ///
-/// the sum over the corners p of a face. D, see FaceDrag, takes the normal and the area of the face from x_n,
+/// the sum over the corners p of a face. With given velocities v_n it is that of the mean velocity, of second order,
+///
+///   P(x) = 2 h sum_f D_f(u_f),    u_f = 1/3 sum_p ((x_p - x_n,p) / h + v_n,p) / 2 - w.
+///
+/// D, see FaceDrag, takes the normal and the area of the face from x_n,
 /// so that P is convex in x. Each corner bears a third of the face's force: together they have the force and
 /// the moment of one at the centroid.
 class DragPotential final : public Potential {
@@ -50,9 +55,11 @@ class DragPotential final : public Potential {
   // Cotangents, zero until accumulate(), and tangents, for add_tangent().
   std::vector<double> across_bar, along_bar;  ///< [F]
   std::vector<double> start_bar;              ///< [3 N]
+  std::vector<double> velocity_bar;           ///< [3 N], of v_n; empty without these
   std::vector<double> wind_bar;               ///< [3]
   std::vector<double> across_dot, along_dot;  ///< [F]
   std::vector<double> start_dot;              ///< [3 N]
+  std::vector<double> velocity_dot;           ///< [3 N], likewise
   Vec3 wind_dot = Vec3::Zero();
 
  private:
@@ -73,6 +80,7 @@ class DragPotential final : public Potential {
   Vec3 frame_dot(Index f) const;
 
   Flow flow_;
+  double span_;                   ///< h, or 2 h with given velocities [s]
   std::size_t size_;              ///< 3 N
   std::vector<Index> with_drag_;  ///< faces that have some
   bool of_coefficients_;

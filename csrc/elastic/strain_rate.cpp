@@ -93,8 +93,7 @@ void add_face_tangent(const Model& model,
     D_dot = face_gradient(model, f, g_dot, d);
     scatter(model, f, form.stress(), g_dot, y);
   }
-  const Mat2 rate_dot =
-      strain_rate(F_u_dot, form.D) + strain_rate(form.F_u, D_dot);
+  const Mat2 rate_dot = strain_rate(F_u_dot, form.D) + strain_rate(form.F_u, D_dot);
   const Mat2 change = weave_dot.times_in_rest_frame(strain_rate(form.F_u, form.D)) +
                       form.weave.times_in_rest_frame(rate_dot);
   scatter(model, f, F_u_dot * form.of_d + form.F_u * change, y);

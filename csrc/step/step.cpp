@@ -156,14 +156,13 @@ Report forward(const Scene& scene,
                           .counts = &report.counts,
                           .path = path};
   std::vector<double> x = problem.start;
-  scheme_of(scene)
-      .forward({.problem = problem,
-                .detection = detection,
-                .context = context,
-                .tape = tape,
-                .kept = kept,
-                .report = report},
-               x, forces_of(outputs));
+  scheme_of(scene).forward({.problem = problem,
+                            .detection = detection,
+                            .context = context,
+                            .tape = tape,
+                            .kept = kept,
+                            .report = report},
+                           x, forces_of(outputs));
   std::copy_n(x.begin(), problem.cloth_size, positions);
   for (Index c = 0; c < scene.mechanisms.coordinate_count(); ++c) {
     outputs["coordinates"][c] = problem.coordinates.nodes(x)[scene.mechanisms.slot(c)];
@@ -203,15 +202,11 @@ void backward(const Scene& scene,
                           .workspace = &workspace,
                           .watch = &watch,
                           .counts = &counts};
-  scheme_of(scene)
-      .backward({{.problem = problem,
-                  .detection = detection,
-                  .context = context,
-                  .tape = tape,
-                  .kept = kept},
-                 bars,
-                 wants_barrier(wanted),
-                 wants_friction(wanted)});
+  scheme_of(scene).backward(
+      {{.problem = problem, .detection = detection, .context = context, .tape = tape, .kept = kept},
+       bars,
+       wants_barrier(wanted),
+       wants_friction(wanted)});
   const Turn::Exchange exchange = [&](std::size_t l) { bars[l].exchange(problem); };
   for (std::size_t l = 0; l < losses.size(); ++l) {
     const Turn turn(exchange, l);
@@ -246,14 +241,10 @@ void tangent(const Scene& scene,
                           .workspace = &workspace,
                           .watch = &watch,
                           .counts = &counts};
-  const auto dx = scheme_of(scene)
-                      .tangent({{.problem = problem,
-                                 .detection = detection,
-                                 .context = context,
-                                 .tape = tape,
-                                 .kept = kept},
-                                tangents,
-                                forces});
+  const auto dx = scheme_of(scene).tangent(
+      {{.problem = problem, .detection = detection, .context = context, .tape = tape, .kept = kept},
+       tangents,
+       forces});
   for (std::size_t l = 0; l < directions.size(); ++l) {
     write_outputs(problem, tangents[l], dx[l], directions[l].outputs);
   }

@@ -24,8 +24,9 @@ from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.operations import called
 from diffcloth_torch.saved import saved
+from diffcloth_torch.sim.half_step import remember, with_half_step_velocities
 from diffcloth_torch.sim.inputs.axes import without_axes
-from diffcloth_torch.sim.inputs.border import Border
+from diffcloth_torch.sim.inputs.border import Border, Given
 from diffcloth_torch.sim.inputs.control_fields import check_control
 from diffcloth_torch.sim.inputs.layout import Layout
 from diffcloth_torch.sim.inputs.parameter_fields import check_parameters, default_fields
@@ -175,7 +176,7 @@ class Simulator(Observables):
         self._defaults |= choose_slip_rates(self._assembly, contact)
         fields = default_fields(self._defaults)
         self._border = Border(self._layout, fields, nonadjacent, self_contact=contact.self_contact)
-        start, _ = self._border.enter(self.initial_state(), None, None)
+        start, _ = self._border.enter(self._state_at_rest(None), None, None)
         if has_barrier(scene, contact, scheme):
             self._defaults |= choose_barrier(
                 self._engine, self._border, scene, contact, start, nonadjacent
@@ -186,6 +187,8 @@ class Simulator(Observables):
             check_tolerance(solver.tolerance, distance, self.dt)
         if abilities["barrier"]:
             check_start(self._engine, start._replace(parameters=self._border.defaults))
+        if self.integrator == "second_order":
+            remember(self, self._engine.surfaces)
 
     def __getstate__(self) -> dict[str, Any]:
         arguments = ("scene", "dt", "scheme", "coupling", "contact", "solver", "integrator")
@@ -204,12 +207,22 @@ class Simulator(Observables):
     def initial_state(self, batch_size: int | None = None) -> State:
         """Make the state that the scene describes, at rest.
 
+        With `integrator="second_order"` its velocities are those half a step earlier: see
+        `at_half_step`, which takes one step.
+
         Args:
             batch_size: Number of identical environments, >= 1; None makes a state without a batch
                 axis.
         """
         if batch_size is not None:
             check_count("initial_state: `batch_size`", batch_size, 1)
+        state = self._state_at_rest(batch_size)
+        if self.integrator != "second_order":
+            return state
+        with torch.no_grad():
+            return with_half_step_velocities(state, self._advance(state, None, None)).detach()
+
+    def _state_at_rest(self, batch_size: int | None) -> State:
         environments = () if batch_size is None else (batch_size,)
         copies = {
             name: tensor.expand((*environments, *tensor.shape)).clone(
@@ -390,8 +403,18 @@ class Simulator(Observables):
     def _step(self, state: State, control: Control | None, parameters: Parameters | None) -> State:
         given, batch = self._border.enter(state, control, parameters)
         self._start_watch.look_at(state, given, batch)
-        fields, diagnostics = self._engine.step(given, self._check(batched=batch is not None))
+        after = self._advance_given(state, given, batch)
         self._start_watch.close(state)
+        return after
+
+    def _advance(
+        self, state: State, control: Control | None, parameters: Parameters | None
+    ) -> State:
+        """Take a step without a look at where it starts."""
+        return self._advance_given(state, *self._border.enter(state, control, parameters))
+
+    def _advance_given(self, state: State, given: Given, batch: int | None) -> State:
+        fields, diagnostics = self._engine.step(given, self._check(batched=batch is not None))
         return State(
             **without_axes(fields, batch),
             time=state.time + self.dt,

@@ -31,7 +31,7 @@ _FASTEST = {
 _HEAVIER = {"monolithic": 1.0, "rigid_to_cloth": 10.0, "cloth_to_rigid": 10.0}
 
 
-def simulator(coupling, base, **options):
+def simulator(coupling, base, integrator="implicit_euler", **options):
     vertices, faces = scenes.grid(5, 5, edge=0.06, seed=3)
     vertices = scenes.turned(vertices - vertices.mean(axis=0), (0.3, 1, 0), 0.04)
     cloth = dc.Cloth(
@@ -66,6 +66,7 @@ def simulator(coupling, base, **options):
         dc.Scene([cloth], [box], [hand], gravity=GRAVITY / heavier),
         DT,
         coupling=coupling,
+        integrator=integrator,
         contact=dc.ContactOptions(**{**given, **options}),
         solver=dc.SolverOptions(tolerance=1e-12, max_iterations=2000),
     )

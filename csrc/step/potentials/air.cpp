@@ -23,6 +23,9 @@ double half_density(const Problem& p) {
   return density != nullptr ? 0.5 * *density : 0.0;
 }
 
+/// Whether drag takes the mean velocity: those of second-order steps are half a step before the positions.
+bool takes_mean(const Problem& p) { return p.scene.given.integrator == Integrator::kSecondOrder; }
+
 bool wants_coefficients(const Gradients* wanted) {
   return wanted != nullptr &&
          ((*wanted)[Input::kNormalDrag] != nullptr || (*wanted)[Input::kTangentialDrag] != nullptr);
@@ -36,6 +39,7 @@ air::Flow flow(const Problem& p, const Array& normal, const Array& tangential) {
           .start = p.start.data(),
           .wind = wind != nullptr ? row(wind, 0) : Vec3(Vec3::Zero()),
           .h = p.h,
+          .velocities = takes_mean(p) ? p.inputs.data(Input::kVelocities) : nullptr,
           .held = &p.scene.held_elements.faces};
 }
 
@@ -61,6 +65,7 @@ void Air::pull_back(const Problem& p, Cotangents& bars, const Gradients& gradien
   }
   add_to(gradients[Input::kWind], potential_.wind_bar);
   add_to(bars.start.data(), potential_.start_bar);
+  add_to(bars.velocities.data(), potential_.velocity_bar);
 }
 
 void Air::push_forward(const Problem& p, const Tangents& tangents) {
@@ -74,6 +79,11 @@ void Air::push_forward(const Problem& p, const Tangents& tangents) {
   }
   potential_.start_dot.assign(tangents.start.begin(),
                               tangents.start.begin() + static_cast<std::ptrdiff_t>(p.cloth_size));
+  if (takes_mean(p)) {
+    const double* const v = tangents.directions.data(Input::kVelocities);
+    potential_.velocity_dot.assign(p.cloth_size, 0.0);
+    if (v != nullptr) std::copy_n(v, p.cloth_size, potential_.velocity_dot.begin());
+  }
   const double* const wind = tangents.directions.data(Input::kWind);
   potential_.wind_dot = wind != nullptr ? row(wind, 0) : Vec3(Vec3::Zero());
 }

@@ -21,10 +21,10 @@ struct ContactStage {
   const double* guess;  ///< where the cloths begin if the way there is free: all [N, 3] of them
   std::vector<Potential*> others;
   solver::PatternCache& patterns;
-  std::size_t first_factor;  ///< place of its factors among the scheme's
+  std::size_t first_factor;      ///< place of its factors among the scheme's
   const Potential* attachments;  ///< of cloths to bodies, as they count here
-  Turn::Exchange exchange;   ///< of the cotangents of its potentials; only backward needs it
-  SetTangents set_tangents;  ///< of its potentials; only tangent needs it
+  Turn::Exchange exchange;       ///< of the cotangents of its potentials; only backward needs it
+  SetTangents set_tangents;      ///< of its potentials; only tangent needs it
 
   /// Fields of the tape.
   static std::vector<Field> tape(const Scene& scene);

@@ -9,6 +9,7 @@
 #include "step/schemes/second_order.h"
 
 #include <algorithm>
+#include <memory>
 #include <optional>
 #include <utility>
 
@@ -53,9 +54,8 @@ class Filter {
                  p.start.data()),
         attachments_(p.find<Attachments>().potential(), middle_, p.start),
         soft_pins_(p.find<SoftPins>().potential(), middle_, p.start),
-        objective_(p.objective(inertia_,
-                               {&stretch_, &attachments_, &soft_pins_},
-                               p.scene.elastic_patterns)) {}
+        objective_(p.objective(
+            inertia_, {&stretch_, &attachments_, &soft_pins_}, p.scene.elastic_patterns)) {}
 
   const solver::Objective& objective() const { return objective_; }
 
@@ -67,9 +67,13 @@ class Filter {
     objective_.gradient(y.data(), g);
     solver::LinearSystem system(objective_, *step.context.workspace, *step.context.watch,
                                 *step.context.counts);
-    Array p;
-    const solver::Certificate certificate = system.certify(y.data(), g, p);
+    linalg::BlockMatrix matrix = system.assemble(y.data(), Curvature::kExact, g);
+    // It is definite by construction: no certificate is needed.
+    solver::Certificate certificate{.factor = system.factor(matrix), .hessian = nullptr};
     if (!certificate.factor) return std::nullopt;
+    if (certificate.factor->precision() == linalg::Precision::kSingle) {
+      certificate.hessian = std::make_shared<const linalg::BlockValues>(std::move(matrix));
+    }
     std::vector<Array> exact;
     system.solve(certificate, {g}, exact);
     for (std::size_t a = 0; a < p_.cloth_size; ++a) y[a] += exact.front()[a];
@@ -201,7 +205,8 @@ class ShiftedStage {
   Array pull_back(Cotangents& bars) const {
     Array bar(shift_.size(), 0.0);
     for (const Shifted* potential : {&elastic_, &attachments_, &soft_pins_}) {
-      for (std::size_t a = 0; a < potential->shift_bar.size(); ++a) bar[a] += potential->shift_bar[a];
+      for (std::size_t a = 0; a < potential->shift_bar.size(); ++a)
+        bar[a] += potential->shift_bar[a];
     }
     // Damping begins at x_n - d.
     const elastic::Bar& model = p_.find<Elasticity>().potential().bar();

@@ -11,9 +11,9 @@ namespace diffcloth::step {
 ///      prescribed points have d = their motion.
 ///   2. x' = argmin  1/(2 h^2) |x - xhat|^2_M + W(x - d) + barrier + friction + drag,   v' = (x' - x_n) / h,
 ///
-/// W the energy of elasticity, damping and springs. With d = h v_n it is leapfrog on the Moreau envelope of W, with
+/// W the energy of elasticity, damping and springs, drag that of the mean of v_n and v'. With d = h v_n it is leapfrog on the Moreau envelope of W, with
 /// velocities at the middle of steps: unconditionally stable, of second order. The filter takes modes that are
-/// fast beside the step to implicit Euler. Contact, friction, gravity and drag are those of implicit Euler, so
+/// fast beside the step to implicit Euler. Contact, friction and gravity are those of implicit Euler, so
 /// that rest is exact, and nothing is averaged that the barrier has changed. The balance of linear momentum
 /// holds for every S.
 class SecondOrder final : public Scheme {

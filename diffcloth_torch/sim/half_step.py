@@ -1,0 +1,79 @@
+"""Velocities of the second-order step, which are those half a step before the positions."""
+
+from __future__ import annotations
+
+import weakref
+from typing import TYPE_CHECKING
+
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.sim.records.controls import Control, Parameters
+from diffcloth_torch.sim.records.state import State
+from diffcloth_torch.sim.records.surfaces import Surfaces
+
+if TYPE_CHECKING:
+    from diffcloth_torch.sim.simulator import Simulator
+
+__all__ = ["at_half_step", "remember", "with_half_step_velocities"]
+
+# The simulator that states with these surfaces come from, while it lives.
+_SIMULATORS: weakref.WeakKeyDictionary[Surfaces, weakref.ref[Simulator]] = (
+    weakref.WeakKeyDictionary()
+)
+
+
+def remember(simulator: Simulator, surfaces: Surfaces) -> None:
+    """Associate a simulator with the surfaces that its states hold."""
+    _SIMULATORS[surfaces] = weakref.ref(simulator)
+
+
+def at_half_step(
+    state: State,
+    control: Control | None = None,
+    parameters: Parameters | None = None,
+    *,
+    simulator: Simulator | None = None,
+) -> State:
+    """Convert velocities at the time of a state to those that a second-order step starts from.
+
+    Simulators with `integrator="second_order"` take the velocities of cloths half a time step
+    before the positions. Velocities that are given at the same time as the positions change to
+
+        v - (h / 2) a,    a = (v' - v) / h,
+
+    v' those after one step. States that `initial_state`, `step` and `rollout` return need no
+    conversion. In contact a is that of the whole step: do not start in the step of an impact.
+    Velocities of bodies and joints stay as they are.
+
+    Args:
+        state: The state, of a simulator with `integrator="second_order"`, without or with a batch
+            axis. Differentiable, like the two others.
+        control: Control of the first step; None holds pins and bodies.
+        parameters: Physical parameters; None takes those of the scene.
+        simulator: The simulator; None takes that of which `state` has been made.
+
+    Returns:
+        The state with `velocities` at the half step.
+
+    Raises:
+        InvalidInput: If the simulator is not known, or integrates by implicit Euler.
+        SimulationError: As for `Simulator.step`.
+    """
+    if simulator is None and state._surfaces is not None:
+        known = _SIMULATORS.get(state._surfaces)
+        simulator = None if known is None else known()
+    if simulator is None:
+        raise InvalidInput(
+            "at_half_step: the simulator of `state` is not known, as for states from files; give "
+            "it as `simulator`"
+        )
+    if simulator.integrator != "second_order":
+        raise InvalidInput(
+            "at_half_step: needs a simulator with integrator 'second_order', got "
+            f"{simulator.integrator!r}, whose velocities have the time of the positions"
+        )
+    return with_half_step_velocities(state, simulator.step(state, control, parameters))
+
+
+def with_half_step_velocities(state: State, after: State) -> State:
+    """Replace velocities v at the time of a state by v - (v' - v) / 2, v' those after one step."""
+    return state.replace(velocities=1.5 * state.velocities - 0.5 * after.velocities)
