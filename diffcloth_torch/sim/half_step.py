@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import weakref
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.sim.records.controls import Control, Parameters
 from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.records.surfaces import Surfaces
 
-if TYPE_CHECKING:
-    from diffcloth_torch.sim.simulator import Simulator
-
 __all__ = ["at_half_step", "remember", "with_half_step_velocities"]
+
+
+class Simulator(Protocol):
+    """The part of a simulator that takes a step."""
+
+    integrator: str
+
+    def step(
+        self, state: State, control: Control | None, parameters: Parameters | None
+    ) -> State: ...
+
 
 # The simulator that states with these surfaces come from, while it lives.
 _SIMULATORS: weakref.WeakKeyDictionary[Surfaces, weakref.ref[Simulator]] = (
