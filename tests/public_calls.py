@@ -122,6 +122,12 @@ class World:
         )
 
     @cached_property
+    def of_second_order(self):
+        scene = dc.Scene([dc.Cloth.grid(3, 3)])
+        self.second = dc.Simulator(scene, 0.01, integrator="second_order")  # kept alive
+        return self.second.initial_state()
+
+    @cached_property
     def robot(self):
         return dc.Robot.load(
             dc.robots.GRIPPER,
@@ -391,6 +397,7 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "Trajectory.load": lambda w: call(dc.Trajectory.load, w.saved),
     "Trajectory.save": lambda w: call(w.states.save, w.folder / "states.pt"),
     "Variable": lambda w: call(dc.Variable, 3.0, (1.0, 5.0), "log"),
+    "at_half_step": lambda w: call(dc.at_half_step, w.of_second_order),
     "build_info": lambda w: call(dc.build_info),
     "descend": lambda w: w.descent,
     "fit": lambda w: w.fitting,
