@@ -5,6 +5,7 @@
 #include "elastic/elements.h"
 #include "elastic/face_batches.h"
 #include "elastic/face_terms.h"
+#include "elastic/stretch_lanes.h"
 #include "elastic/symmetric2.h"
 #include "elastic/woven_derivatives.h"
 
@@ -99,8 +100,11 @@ void add_face_tangent(const Model& model,
   scatter(model, f, F_u_dot * form.of_d + form.F_u * change, y);
 }
 
-/// Batches of all faces, damped over the time step about u.
-std::vector<DampingBatch> rate_batches(const Model& model, const Slots& slots, const double* u) {
+/// S of stretch: the Hessian of damping over a time step at its start.
+void add_stretch_blocks(const Model& model,
+                        const Slots& slots,
+                        const double* u,
+                        std::vector<double>& blocks) {
   Model damped = model;
   damped.h = 1.0;
   damped.damping.assign(model.damping.size(), 1.0);
@@ -109,7 +113,11 @@ std::vector<DampingBatch> rate_batches(const Model& model, const Slots& slots, c
   std::iota(faces.begin(), faces.end(), 0);
   std::vector<DampingBatch> batches = damping_batches(damped, slots, faces);
   put_start_gradients(damped, faces, batches);
-  return batches;
+  std::vector<Index> place(blocks.size() / 9);
+  std::iota(place.begin(), place.end(), 0);
+  static const StretchKernels& kernels = stretch_kernels(linalg::chosen_level());
+  kernels.add_damping_hessian(batches.data(), batches.size(), u, false, place.data(),
+                              blocks.data());
 }
 
 }  // namespace
@@ -124,33 +132,44 @@ StrainRate::StrainRate(ElasticPotential& elastic,
       model_(elastic.model()),
       middle_(middle),
       start_(start),
-      bending_(ConstantForm::of_bending(model_, elastic.slots(), pattern)) {}
+      pattern_(pattern) {}
 
 std::vector<double> StrainRate::displacement(const double* x) const {
-  std::vector<double> d(size());
-  for (std::size_t a = 0; a < d.size(); ++a) d[a] = x[a] - start_[a];
+  std::vector<double> d(3 * static_cast<std::size_t>(pattern_.size()), 0.0);
+  for (std::size_t a = 0; a < size(); ++a) d[a] = x[a] - start_[a];
   return d;
 }
 
-double StrainRate::product(const double* z, const double* d) const {
-  std::vector<double> y(size(), 0.0);
-  add_hessian_product(nullptr, d, y.data());
-  return std::inner_product(y.begin(), y.end(), z, 0.0);
+const std::vector<double>& StrainRate::blocks() const {
+  if (!blocks_.empty()) return blocks_;
+  blocks_.assign(9 * static_cast<std::size_t>(pattern_.block_count()), 0.0);
+  add_stretch_blocks(model_, elastic_.slots(), middle_, blocks_);
+  const ConstantForm bending = ConstantForm::of_bending(model_, elastic_.slots(), pattern_);
+  for (std::size_t slot = 0; slot < bending.values().size(); ++slot) {
+    for (std::size_t k = 0; k < 9; k += 4) blocks_[9 * slot + k] += bending.values()[slot];
+  }
+  return blocks_;
+}
+
+double StrainRate::product(const std::vector<double>& z, const std::vector<double>& d) const {
+  std::vector<double> y(d.size(), 0.0);
+  add_hessian_product(nullptr, d.data(), y.data());
+  return std::inner_product(y.begin(), y.end(), z.begin(), 0.0);
 }
 
 double StrainRate::energy(const double* x) const {
   const std::vector<double> d = displacement(x);
-  return 0.5 * product(d.data(), d.data());
+  return 0.5 * product(d, d);
 }
 
 double StrainRate::energy_change(const double* x, const double* to) const {
   std::vector<double> sum = displacement(x);
-  std::vector<double> step(size());
-  for (std::size_t a = 0; a < step.size(); ++a) {
+  std::vector<double> step(sum.size(), 0.0);
+  for (std::size_t a = 0; a < size(); ++a) {
     step[a] = to[a] - x[a];
     sum[a] += 0.5 * step[a];
   }
-  return product(sum.data(), step.data());
+  return product(sum, step);
 }
 
 void StrainRate::add_gradient(const double* x, double* g) const {
@@ -160,22 +179,16 @@ void StrainRate::add_gradient(const double* x, double* g) const {
 void StrainRate::add_hessian(const double* /*x*/,
                              Curvature /*curvature*/,
                              linalg::BlockMatrix& A) const {
-  if (batches_.empty()) batches_ = rate_batches(model_, elastic_.slots(), middle_);
+  const std::vector<double>& own = blocks();
   const std::vector<Index>& place = A.slot_of_base();
-  for (std::size_t slot = 0; slot < bending_.values().size(); ++slot) {
+  for (std::size_t slot = 0; slot < place.size(); ++slot) {
     double* const block = A.blocks() + 9 * static_cast<std::ptrdiff_t>(place[slot]);
-    for (int k = 0; k < 9; k += 4) block[k] += bending_.values()[slot];
+    for (std::size_t k = 0; k < 9; ++k) block[k] += own[9 * slot + k];
   }
-  static const StretchKernels& kernels = stretch_kernels(linalg::chosen_level());
-  kernels.add_damping_hessian(batches_.data(), batches_.size(), middle_, false, place.data(),
-                              A.blocks());
 }
 
 void StrainRate::add_hessian_product(const double* /*x*/, const double* z, double* y) const {
-  for (Index f = 0; f < face_count(model_); ++f) {
-    scatter(model_, f, FaceForm(model_, f, middle_, z).stress(), y);
-  }
-  bending_.add_product(z, y);
+  linalg::add_products(pattern_, blocks().data(), {&z, 1}, {&y, 1});
 }
 
 void StrainRate::accumulate(const double* x, const double* z) {
@@ -191,7 +204,9 @@ void StrainRate::accumulate(const double* x, const double* z) {
     add_bending_form_mixed(model_, d.data(), minus.data(), wanted == Wanted::kMaterialsAndRest,
                            bar);
   }
-  add_hessian_product(x, z, start_bar.data());
+  std::vector<double> product(d.size(), 0.0);
+  add_hessian_product(x, z, product.data());
+  for (std::size_t a = 0; a < size(); ++a) start_bar[a] += product[a];
 }
 
 void StrainRate::add_tangent(const double* x, double* y) const {
@@ -201,8 +216,8 @@ void StrainRate::add_tangent(const double* x, double* y) const {
                      middle_dot.data(), y);
   }
   add_bending_form_tangent(model_, d.data(), elastic_.tangent(), elastic_.changing(), y);
-  std::vector<double> minus(start_dot.begin(), start_dot.end());
-  for (double& value : minus) value = -value;
+  std::vector<double> minus(d.size(), 0.0);
+  for (std::size_t a = 0; a < size(); ++a) minus[a] = -start_dot[a];
   add_hessian_product(x, minus.data(), y);
 }
 

@@ -5,7 +5,6 @@
 #include "elastic/constant_form.h"
 #include "elastic/elastic.h"
 #include "elastic/elastic_potential.h"
-#include "elastic/stretch_lanes.h"
 #include "potential/potential.h"
 
 namespace diffcloth::elastic {
@@ -47,16 +46,18 @@ class StrainRate final : public Potential {
 
  private:
   std::size_t size() const { return middle_bar.size(); }
+  /// d, with zeros behind up to the rows of the pattern.
   std::vector<double> displacement(const double* x) const;
-  double product(const double* z, const double* d) const;
+  double product(const std::vector<double>& z, const std::vector<double>& d) const;
+  /// S by the slots of the pattern, 9 numbers each.
+  const std::vector<double>& blocks() const;
 
   ElasticPotential& elastic_;
   const Model& model_;
   const double* middle_;
   const double* start_;
-  ConstantForm bending_;
-  /// Damping over the time step of all faces, whose Hessian at its start is the form.
-  mutable std::vector<DampingBatch> batches_;
+  const linalg::BlockPattern& pattern_;
+  mutable std::vector<double> blocks_;  ///< empty until asked for
 };
 
 }  // namespace diffcloth::elastic

@@ -13,6 +13,7 @@
 #include <optional>
 #include <utility>
 
+#include "elastic/chord_strain.h"
 #include "elastic/spring_rate.h"
 #include "elastic/strain_rate.h"
 #include "potential/shifted.h"
@@ -39,6 +40,44 @@ Array middle(const Problem& p) {
   Array u = p.coasting();
   for (std::size_t a = 0; a < u.size(); ++a) u[a] = 0.5 * (u[a] + p.start[a]);
   return u;
+}
+
+/// Add the cotangents of vertices at the ends of prescribed points to those of the latter.
+void add_to_ends(const Problem& p, Array bar, Cotangents& bars) {
+  p.coordinates.gather(p.ends, bar);
+  for (std::size_t a = 0; a < bar.size(); ++a) {
+    if (p.scene.prescribed[a / 3] != 0) bars.ends[a] += bar[a];
+  }
+}
+
+/// Pull a cotangent of u back.
+///
+/// @param bar  of the first points, or of all
+void pull_back_middle(const Problem& p, const Array& bar, Cotangents& bars) {
+  Array ends_bar(p.start.size(), 0.0);
+  for (std::size_t a = 0; a < bar.size(); ++a) {
+    const bool prescribed = follows_ends(p, a / 3);
+    bars.start[a] += prescribed ? 0.5 * bar[a] : bar[a];
+    if (prescribed) ends_bar[a] = 0.5 * bar[a];
+    if (!prescribed && a < p.cloth_size) bars.velocities[a] += 0.5 * p.h * bar[a];
+  }
+  add_to_ends(p, std::move(ends_bar), bars);
+}
+
+/// The tangent of u.
+///
+/// @param ends_dot  of all points
+Array middle_tangent(const Problem& p, const Tangents& tangents, const Array& ends_dot) {
+  const double* const v_dot = tangents.directions.data(Input::kVelocities);
+  Array dot = tangents.start;
+  for (std::size_t a = 0; a < dot.size(); ++a) {
+    if (follows_ends(p, a / 3)) {
+      dot[a] = 0.5 * (dot[a] + ends_dot[a]);
+    } else if (a < p.cloth_size && v_dot != nullptr) {
+      dot[a] += 0.5 * p.h * v_dot[a];
+    }
+  }
+  return dot;
 }
 
 /// The first stage: the displacement that the cloths would have by their velocities, without the fast modes of strain.
@@ -101,14 +140,7 @@ class Filter {
       middle_bar[a] += soft_pins_.middle_bar[a];
       if (a < p_.cloth_size) middle_bar[a] += stretch_.middle_bar[a];
     }
-    Array ends_bar(middle_bar.size(), 0.0);
-    for (std::size_t a = 0; a < middle_bar.size(); ++a) {
-      const bool prescribed = follows_ends(p_, a / 3);
-      bars.start[a] += prescribed ? 0.5 * middle_bar[a] : middle_bar[a];
-      if (prescribed) ends_bar[a] = 0.5 * middle_bar[a];
-      if (!prescribed && a < p_.cloth_size) bars.velocities[a] += 0.5 * p_.h * middle_bar[a];
-    }
-    add_to_ends(p_, std::move(ends_bar), bars);
+    pull_back_middle(p_, middle_bar, bars);
   }
 
   /// Put the tangents of its own inputs into its potentials.
@@ -122,26 +154,11 @@ class Filter {
     for (std::size_t a = 0; a < p_.cloth_size; ++a) {
       inertia_.target_dot[a] = tangents.start[a] + p_.h * velocity(a);
     }
-    Array middle_dot = tangents.start;
-    for (std::size_t a = 0; a < middle_dot.size(); ++a) {
-      if (follows_ends(p_, a / 3)) {
-        middle_dot[a] = 0.5 * (middle_dot[a] + ends_dot[a]);
-      } else if (a < p_.cloth_size) {
-        middle_dot[a] += 0.5 * p_.h * velocity(a);
-      }
-    }
+    const Array middle_dot = middle_tangent(p_, tangents, ends_dot);
     stretch_.start_dot.assign(tangents.start.begin(),
                               tangents.start.begin() + static_cast<std::ptrdiff_t>(p_.cloth_size));
     stretch_.middle_dot = attachments_.middle_dot = soft_pins_.middle_dot = middle_dot;
     attachments_.start_dot = soft_pins_.start_dot = tangents.start;
-  }
-
-  /// Add the cotangents of vertices at the ends of prescribed points to those of the latter.
-  static void add_to_ends(const Problem& p, Array bar, Cotangents& bars) {
-    p.coordinates.gather(p.ends, bar);
-    for (std::size_t a = 0; a < bar.size(); ++a) {
-      if (p.scene.prescribed[a / 3] != 0) bars.ends[a] += bar[a];
-    }
   }
 
  private:
@@ -161,6 +178,11 @@ class Filter {
 };
 
 /// The second stage: the contact stage with elasticity and springs evaluated at points less the displacement.
+///
+/// The strain of a face at x' is that at y = x' - d and  sym(F(x' - d/2)^T F(d)),  of which the filter has left
+/// sym(F(u)^T F(d)). Contact may lead x' - d/2 far from u in one step, so that the positions x' are strained: the stage
+/// resists the difference e = sym(F(x' - d/2 - u)^T F(d)), by elastic::ChordStrain. In smooth motion e is of third
+/// order in h.
 class ShiftedStage {
  public:
   /// @param y  all points where the filter has ended
@@ -169,9 +191,11 @@ class ShiftedStage {
         shift_(p.start.size(), 0.0),
         start_(p.cloth_size),
         guess_(p.inertia.target()),
+        middle_(middle(p)),
         elastic_(p.find<Elasticity>().potential(), shift_),
         attachments_(p.find<Attachments>().potential(), shift_),
-        soft_pins_(p.find<SoftPins>().potential(), shift_) {
+        soft_pins_(p.find<SoftPins>().potential(), shift_),
+        chords_(p.find<Elasticity>().potential(), shift_.data(), middle_.data()) {
     for (std::size_t a = 0; a < shift_.size(); ++a) {
       if (a < p.cloth_size || follows_ends(p, a / 3)) shift_[a] = y[a] - p.start[a];
     }
@@ -180,25 +204,28 @@ class ShiftedStage {
     for (std::size_t a = 0; a < p.cloth_size; ++a) {
       start_[a] = p.start[a] - shift_[a];
       guess_[a] += y[a] - coasting[a];
+      middle_[a] += 0.5 * shift_[a];
     }
     p.find<Elasticity>().begin_at(p, start_.data());
   }
 
   ContactStage stage() {
-    return {.inertia = p_.inertia,
-            .guess = guess_.data(),
-            .others = {&elastic_, &p_.find<Air>().potential(), &attachments_, &soft_pins_},
-            .patterns = p_.scene.elastic_patterns,
-            .first_factor = 1,
-            .attachments = &attachments_,
-            .exchange = {},
-            .set_tangents = {}};
+    return {
+        .inertia = p_.inertia,
+        .guess = guess_.data(),
+        .others = {&elastic_, &p_.find<Air>().potential(), &attachments_, &soft_pins_, &chords_},
+        .patterns = p_.scene.elastic_patterns,
+        .first_factor = 1,
+        .attachments = &attachments_,
+        .exchange = {},
+        .set_tangents = {}};
   }
 
   void swap_cotangents(CotangentStore& store) {
     elastic_.swap_cotangents(store);
     attachments_.swap_cotangents(store);
     soft_pins_.swap_cotangents(store);
+    chords_.swap_cotangents(store);
   }
 
   /// Pull the cotangent of the shift back to the start and to prescribed ends; returns that of y, of the rows.
@@ -210,7 +237,10 @@ class ShiftedStage {
     }
     // Damping begins at x_n - d.
     const elastic::Bar& model = p_.find<Elasticity>().potential().bar();
-    for (std::size_t a = 0; a < p_.cloth_size; ++a) bar[a] -= model.x_n[a];
+    for (std::size_t a = 0; a < p_.cloth_size; ++a) {
+      bar[a] += chords_.shift_bar[a] + 0.5 * chords_.center_bar[a] - model.x_n[a];
+    }
+    pull_back_middle(p_, chords_.center_bar, bars);
     Array rows(p_.coordinates.size(), 0.0);
     Array ends_bar(bar.size(), 0.0);
     for (std::size_t a = 0; a < bar.size(); ++a) {
@@ -223,7 +253,7 @@ class ShiftedStage {
       }
       bars.start[a] -= bar[a];
     }
-    Filter::add_to_ends(p_, std::move(ends_bar), bars);
+    add_to_ends(p_, std::move(ends_bar), bars);
     return rows;
   }
 
@@ -241,6 +271,9 @@ class ShiftedStage {
       }
     }
     p_.find<Elasticity>().potential().subtract_from_start_tangent(dot);
+    chords_.center_dot = middle_tangent(p_, tangents, ends_dot);
+    for (std::size_t a = 0; a < dot.size(); ++a) chords_.center_dot[a] += 0.5 * dot[a];
+    chords_.shift_dot = dot;
     elastic_.shift_dot = attachments_.shift_dot = soft_pins_.shift_dot = std::move(dot);
   }
 
@@ -249,9 +282,11 @@ class ShiftedStage {
   Array shift_;  ///< d
   Array start_;  ///< x_n - d of the cloths
   Array guess_;
+  Array middle_;  ///< u + d / 2 of the cloths
   Shifted elastic_;
   Shifted attachments_;
   Shifted soft_pins_;
+  elastic::ChordStrain chords_;
 };
 
 /// All points where the filter of a step has ended, from the tape.

@@ -1,0 +1,59 @@
+#pragma once
+
+#include <vector>
+
+#include "elastic/elastic_potential.h"
+#include "elastic/frame.h"
+#include "potential/potential.h"
+
+namespace diffcloth::elastic {
+
+/// Resistance to strain that a displacement d adds to faces which a step turns:
+///
+///   E(x) = sum_faces k A phi(|e|^2),   e = sym(F(x - c)^T F(d)),   phi(q) = 1/2 q^2 / (q + q_0),
+///
+/// k the mean stiffness of a face, A its area. The faces at x have the strain of those at x - d and e, if the strain
+/// rate of d is zero at c - d / 2. E is convex; below strains of sqrt(q_0) it is of fourth order, so that smooth motion
+/// does not feel it.
+class ChordStrain final : public Potential {
+ public:
+  /// @param elastic  of the model, whose cotangents and tangents count here, too; outlives this
+  /// @param shift    d, the cloths' vertices at least, from the first use on; outlives this
+  /// @param center   c, likewise
+  ChordStrain(ElasticPotential& elastic, const double* shift, const double* center);
+
+  double energy(const double* x) const override;
+  double energy_change(const double* x, const double* to) const override;
+  void add_gradient(const double* x, double* g) const override;
+  void add_hessian(const double* x, Curvature curvature, linalg::BlockMatrix& A) const override;
+  void add_hessian_product(const double* x, const double* z, double* y) const override;
+  void accumulate(const double* x, const double* z) override;
+  void add_tangent(const double* x, double* y) const override;
+  void swap_cotangents(CotangentStore& store) override {
+    store.exchange(shift_bar);
+    store.exchange(center_bar);
+  }
+
+  std::vector<double> shift_bar, center_bar;  ///< [3 N]
+  std::vector<double> shift_dot, center_dot;  ///< [3 N at least] tangents, for add_tangent()
+
+ private:
+  struct Face;
+  /// Numbers of a face that do not depend on x.
+  struct Constants {
+    Mat32 D;        ///< F(d)
+    Mat32 center;   ///< F(c)
+    double weight;  ///< k A
+  };
+  const Constants& constants(Index f) const;
+  Face face(Index f, const double* x) const;
+  double stiffness(Index f) const;
+
+  ElasticPotential& elastic_;
+  const Model& model_;
+  const double* shift_;
+  const double* center_;
+  mutable std::vector<Constants> constants_;  ///< of all faces; empty until asked for
+};
+
+}  // namespace diffcloth::elastic
