@@ -1,15 +1,18 @@
-"""Files from outside: only regular ones, of a bounded size, are read."""
+"""Files: only regular ones of a bounded size are read; new ones replace old ones as a whole."""
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from diffcloth_torch.errors import InvalidInput
 
-__all__ = ["INTEGER", "NUMBER", "as_path", "read_regular_file"]
+__all__ = ["INTEGER", "NUMBER", "as_path", "read_regular_file", "replacing"]
 
 INTEGER = re.compile(rb"[+-]?[0-9]+")
 """An integer in a text file. Python alone would also read 1_0 and digits of other scripts."""
@@ -56,3 +59,20 @@ def read_regular_file(path: Path, largest: int) -> bytes:
     if not regular:
         raise InvalidInput(f"{path}: must be a regular file, no folder, pipe or device")
     raise InvalidInput(f"{path}: must be at most {largest >> 20} MiB")
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a path to write to, of the same ending, which replaces `path` when all is written.
+
+    Raises:
+        FileNotFoundError: If there is no folder for the file.
+    """
+    if not path.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
+    part = path.with_name(f"{path.stem}.part{path.suffix}")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

@@ -81,6 +81,51 @@ def test_set_and_out_are_used(call, tmp_path):
     assert len(list((tmp_path / "x/meshes").glob("*.obj"))) == 2
 
 
+def test_saved_states_are_exported(call, tmp_path):
+    result = call("run", "sheet.yaml", "--save", "states.pt")
+    assert result.exit_code == 0, result.output
+    states = dc.Trajectory.load("states.pt")
+    result = call("export", "states.pt", "states.npz")
+    assert result.exit_code == 0, result.output
+    assert result.stdout == "4 states of states.pt are in states.npz\n"
+    with np.load("states.npz") as arrays:
+        np.testing.assert_array_equal(arrays["positions/sheet"], states.positions)
+    result = call("export", "states.pt", "states.npz")
+    assert result.exit_code == 2
+    assert "states.npz exists already: --overwrite replaces it" in one_sentence(result)
+    assert call("export", "states.pt", "states.npz", "--overwrite").exit_code == 0
+
+
+def test_one_environment_of_a_batch_is_exported(call):
+    simulator = Simulator(dc.Scene([dc.Cloth.grid(2, 2, name="sheet")]), 0.01)
+    states = simulator.rollout(simulator.initial_state(2), steps=2)
+    states.save("batch.pt")
+    assert "a batch of 2" in one_sentence(call("export", "batch.pt", "states.glb"))
+    result = call("export", "batch.pt", "states.glb", "--environment", "1")
+    assert result.exit_code == 0, result.output
+    assert Path("states.glb").read_bytes()[:4] == b"glTF"
+    assert "must be in 0 .. 1, got 2" in one_sentence(
+        call("export", "batch.pt", "other.glb", "--environment", "2")
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        pytest.param(["--save", "states.h5"], "--save must end in .pt, .npz, .pvd", id="ending"),
+        pytest.param(["--save", "none/states.pt"], "there is no folder none", id="folder"),
+        pytest.param(["--save", "old.pt"], "old.pt exists already", id="existing"),
+    ],
+)
+def test_a_file_for_states_is_checked_before_the_run(call, tmp_path, arguments, message):
+    (tmp_path / "old.pt").write_text("kept")
+    result = call("run", "sheet.yaml", *arguments)
+    assert result.exit_code == 2
+    assert message in one_sentence(result)
+    assert not (tmp_path / "results").exists()
+    assert (tmp_path / "old.pt").read_text() == "kept"
+
+
 def test_optimize_writes_metrics_actions_and_a_curve(call, tmp_path):
     result = call("optimize", CONFIGS / "hit_cloth.yaml", *SMALL_HIT, "--out", "out")
     assert result.exit_code == 0, result.output

@@ -1,4 +1,4 @@
-"""The command line: run, optimize, fit, train, info.
+"""The command line: run, optimize, fit, train, export, info.
 
 Commands import what they need when they run: torch takes seconds to import, and `diffcloth --help`
 or a misspelled option need not wait for it.
@@ -123,6 +123,11 @@ _MOTION_VIEWERS = _viewers(
 @_SET
 @_ACTIONS
 @_OUT
+@click.option(
+    "--save",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Also write all states to this file; its ending names the format, as for export.",
+)
 @_OVERWRITE
 @_ending_in_a_sentence
 def run(**arguments: Any) -> str:
@@ -204,6 +209,23 @@ def _begin_or_resume(
     if extra:
         raise click.UsageError(f"--resume takes these from its DIRECTORY: {', '.join(extra)}.")
     return resume(folder, **passed)
+
+
+@main.command()
+@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("target", type=click.Path(path_type=Path))
+@click.option("--environment", type=int, help="Write this environment of a batch alone.")
+@click.option("--overwrite", is_flag=True, help="Replace the file TARGET.")
+@_ending_in_a_sentence
+def export(**arguments: Any) -> str:
+    """Convert the states in SOURCE, a .pt file, to the format that the ending of TARGET names.
+
+    .npz for NumPy, .pvd for ParaView, .glb and .gltf for Blender and players of glTF, .usd, .usda
+    and .usdc for USD.
+    """
+    from diffcloth_torch.cli.export import export
+
+    return export(**arguments)
 
 
 @main.command()

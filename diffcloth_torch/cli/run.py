@@ -16,9 +16,10 @@ from diffcloth_torch.cli.results import (
     write_metrics,
 )
 from diffcloth_torch.config.viewers import open_viewers
-from diffcloth_torch.errors import SimulationError
+from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.optimize.statistics import rollout_statistics
 from diffcloth_torch.sim.records.state import State
+from diffcloth_torch.sim.records.trajectory import Trajectory, check_ending
 from diffcloth_torch.tasks.registry import load_task
 from diffcloth_torch.tasks.simulation import simulate
 from diffcloth_torch.tasks.task import ConfiguredTask
@@ -33,6 +34,7 @@ def run(
     *,
     overwrite: bool = False,
     actions: Path | None = None,
+    save: Path | None = None,
 ) -> str:
     """Simulate a configuration without optimizing.
 
@@ -42,6 +44,7 @@ def run(
         out: Folder for the results; by default results/ and the name of `config`.
         overwrite: Whether to replace existing results.
         actions: File `actions.npz` of a run whose actions are used instead of the initial ones.
+        save: File for all states, the first one included; see `Trajectory.save`.
 
     Raises:
         InvalidInput: If an argument or the configuration is not accepted.
@@ -49,6 +52,8 @@ def run(
         KeyboardInterrupt: If the user ends the run; the message says what is kept.
     """
     out = check_folder(config, out, overwrite)
+    if save is not None:
+        _check_target(save, overwrite)
     task = load_task(config, assignments)
     start_actions = read_actions(task, actions)
     states: list[State] = []
@@ -72,7 +77,18 @@ def run(
             "with --overwrite starts again"
         ) from error
     _write_run(task, states[1:], out, seconds)
+    if save is not None:
+        Trajectory(states).save(save)
     return f"{len(states) - 1} steps in {seconds:.1f} s; results are in {out}"
+
+
+def _check_target(save: Path, overwrite: bool) -> None:
+    """Refuse, before the work, a file that cannot be written."""
+    check_ending("--save", save)
+    if save.exists() and not overwrite:
+        raise InvalidInput(f"--save: {save} exists already: --overwrite replaces it")
+    if not save.parent.is_dir():
+        raise InvalidInput(f"--save: there is no folder {save.parent}")
 
 
 def _after(states: Sequence[State]) -> str:

@@ -13,6 +13,7 @@ __all__ = [
     "SHORTEST_QUATERNION",
     "check_quaternions",
     "pose_array",
+    "poses_of_frames",
     "refuse_short_quaternions",
     "rotation_matrix",
     "transform",
@@ -69,3 +70,13 @@ def transform(vertices: FloatArray, pose: FloatArray) -> FloatArray:
     """Map points [n, 3] of a body frame to the world."""
     moved: FloatArray = vertices @ rotation_matrix(pose[3:]).T + pose[:3]
     return moved
+
+
+def poses_of_frames(frames: FloatArray) -> FloatArray:
+    """Poses [..., 7] of frames [..., 4, 4], with quaternions of length one and w >= 0."""
+    from trimesh.transformations import quaternion_from_matrix
+
+    rows = frames.reshape(-1, 4, 4)
+    quaternions = [quaternion_from_matrix(frame) for frame in rows]  # type: ignore[no-untyped-call]
+    poses = np.concatenate([rows[:, :3, 3], np.reshape(quaternions, (-1, 4))], axis=1)
+    return poses.reshape(*frames.shape[:-2], 7)

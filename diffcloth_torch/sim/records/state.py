@@ -25,6 +25,7 @@ from diffcloth_torch.sim.records.surfaces import Surfaces
 __all__ = [
     "State",
     "check_field_names",
+    "check_shapes",
     "check_state",
     "stack",
     "where",
@@ -224,7 +225,7 @@ def stack(states: Sequence[State]) -> State:
         check_state(f"stack: `states[{i}]`", state)
         if state.batch_size is not None:
             raise InvalidInput(f"stack: `states` must have no batch axis, got one at [{i}]")
-    _check_shapes("stack", "all states", [(f"at [{i}]", state) for i, state in enumerate(states)])
+    check_shapes("stack", "all states", [(f"at [{i}]", state) for i, state in enumerate(states)])
     return _combined(Stack(len(states)), states)
 
 
@@ -248,7 +249,7 @@ def where(mask: Tensor, a: State, b: State) -> State:
                 f"where: `{name}` must have {len(mask)} environments, as `mask`, "
                 f"got {state.batch_size}"
             )
-    _check_shapes("where", "both states", [("in `a`", a), ("in `b`", b)])
+    check_shapes("where", "both states", [("in `a`", a), ("in `b`", b)])
     return _combined(Choice(mask, [state.batch_size is not None for state in (a, b)]), [a, b])
 
 
@@ -258,7 +259,7 @@ def _combined(how: Combination, states: Sequence[State]) -> State:
     return State(**tensors, report=report, _surfaces=states[0]._surfaces)
 
 
-def _check_shapes(owner: str, which: str, states: Sequence[tuple[str, State]]) -> None:
+def check_shapes(owner: str, which: str, states: Sequence[tuple[str, State]]) -> None:
     """Require fields of the same shapes, but for the axis of environments."""
     for name in _TENSORS:
         shapes = [

@@ -152,6 +152,12 @@ class Surfaces:
             named |= robot.frames(bases[..., r, :, :], state["joint_positions"][..., rows])
         return named
 
+    def joint_slices(self) -> dict[str, slice]:
+        """Name of a robot -> its rows among the joints."""
+        ends = np.cumsum([0, *(robot.joint_count for robot in self.robots)]).tolist()
+        names = (robot.mechanism["name"] for robot in self.robots)
+        return {name: slice(*rows) for name, rows in zip(names, pairwise(ends), strict=True)}
+
     def rigid_meshes(self) -> dict[str, tuple[Tensor, Tensor]]:
         """Vertices [v, 3] and faces [g, 3] of bodies, then links with a shape, in their frames."""
         bodies = zip(self.body_names, self.body_vertices, self.body_faces, strict=True)

@@ -7,16 +7,23 @@ import os
 from pathlib import Path
 from typing import Any, SupportsIndex, overload
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch import cpu
+from diffcloth_torch.animation.formats import ANIMATIONS
+from diffcloth_torch.animation.surfaces import Animation, MovingSurface
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.files import as_path
-from diffcloth_torch.model.quantities import STATE
-from diffcloth_torch.sim.records.state import State, check_state
+from diffcloth_torch.files import as_path, replacing
+from diffcloth_torch.geometry.poses import poses_of_frames
+from diffcloth_torch.model.quantities import STATE, Fields
+from diffcloth_torch.sim.records.state import State, check_shapes, check_state
 
-__all__ = ["Trajectory"]
+__all__ = ["Trajectory", "check_ending"]
+
+_FILES = (".pt", ".npz")  # of data; the others are animations
 
 
 class Trajectory(list[State]):
@@ -55,24 +62,107 @@ class Trajectory(list[State]):
         return Trajectory(state.detach() for state in self)
 
     def save(self, path: str | Path) -> None:
-        """Write the states with their reports and surfaces, but without their graph.
+        """Write the states without their graph, in the format that the ending names.
+
+        - .pt: the states with reports and surfaces; `load` reads it.
+        - .npz: arrays in float64, also of a batch: `times` [T]; `positions/cloth` and
+          `velocities/cloth` [T, v, 3]; `faces/surface` [f, 3]; `vertices/surface` [v, 3] and
+          `poses/surface` [T, 7] of bodies and links; `joint_positions/robot` [T, j].
+        - .pvd: for ParaView; it names .vtp files in a folder of the same name.
+        - .glb, .gltf: glTF with morph targets for cloths and moving nodes for bodies; y is up.
+        - .usd, .usda, .usdc: USD with points and transforms over time; needs the extra `usd`.
+
+        The last three hold the surfaces of one environment, in meters and seconds, z up unless
+        stated otherwise; the times of the states must increase. glTF and USD have float32.
 
         Args:
             path: The file; an existing one is replaced.
 
         Raises:
+            InvalidInput: If the ending is another one, or the format cannot hold the states.
+            TypeError: If an item is not a State.
             OSError: If it cannot be written.
         """
         for i, state in enumerate(self):
             check_state(f"Trajectory.save: the state [{i}]", state)
         file = as_path("Trajectory.save: `path`", path)
+        ending = check_ending("Trajectory.save: `path`", file)
+        if ending == ".pt":
+            with replacing(file) as part:
+                torch.save(list(self.detach()), part)
+            return
+        if not self:
+            raise InvalidInput(f"Trajectory.save: {ending} needs at least one state, got none")
+        places = [(f"at [{i}]", state) for i, state in enumerate(self)]
+        check_shapes("Trajectory.save", "all states", places)
+        if ending == ".npz":
+            arrays = self._arrays()
+            with replacing(file) as part:
+                np.savez(part, **arrays)  # type: ignore[arg-type]
+            return
+        animation = self._animation()
+        animation.check_times("Trajectory.save")
         if not file.parent.is_dir():
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(file.parent))
-        torch.save(list(self.detach()), file)
+        ANIMATIONS[ending](file, animation)
+
+    def _fields(self) -> Fields:
+        """Tensors of all states over time, without a graph."""
+        states = self.detach()
+        return {name: getattr(states, name) for name in STATE}
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays of an .npz file."""
+        surfaces, fields = self[0]._known_surfaces("Trajectory.save"), self._fields()
+        arrays = {"times": fields["time"]}
+        for field in ("positions", "velocities"):
+            for name, (values, _) in surfaces.cloth_meshes(fields[field]).items():
+                arrays[f"{field}/{name}"] = values
+        for name, (_, faces) in surfaces.cloth_meshes(fields["positions"]).items():
+            arrays[f"faces/{name}"] = faces
+        frames = surfaces.surface_frames(fields).unbind(-3)
+        for (name, (vertices, faces)), frame in zip(
+            surfaces.rigid_meshes().items(), frames, strict=True
+        ):
+            arrays[f"vertices/{name}"], arrays[f"faces/{name}"] = vertices, faces
+            arrays[f"poses/{name}"] = torch.from_numpy(poses_of_frames(frame.numpy()))
+        for name, rows in surfaces.joint_slices().items():
+            arrays[f"joint_positions/{name}"] = fields["joint_positions"][..., rows]
+        return {name: values.numpy() for name, values in arrays.items()}
+
+    def _animation(self) -> Animation:
+        """Surfaces over time, of one environment."""
+        surfaces = self[0]._known_surfaces("Trajectory.save")
+        if self[0].batch_size is not None:
+            raise InvalidInput(
+                "Trajectory.save: the states must be those of one environment in this format, got "
+                f"a batch of {self[0].batch_size}; save "
+                "dc.Trajectory(state[i] for state in trajectory), or .npz"
+            )
+        fields = self._fields()
+        vectors = {"velocity": fields["velocities"], "contact_force": fields["contact_forces"]}
+        of_cloths = {name: surfaces.cloth_meshes(values) for name, values in vectors.items()}
+        cloths = [
+            MovingSurface(
+                name,
+                faces.numpy(),
+                vertices.numpy(),
+                vectors={kind: meshes[name][0].numpy() for kind, meshes in of_cloths.items()},
+            )
+            for name, (vertices, faces) in surfaces.cloth_meshes(fields["positions"]).items()
+        ]
+        frames = surfaces.surface_frames(fields).unbind(-3)
+        rigid = [
+            MovingSurface(name, faces.numpy(), vertices.numpy(), frames=frame.numpy())
+            for (name, (vertices, faces)), frame in zip(
+                surfaces.rigid_meshes().items(), frames, strict=True
+            )
+        ]
+        return Animation(fields["time"].numpy(), [*cloths, *rigid])
 
     @staticmethod
     def load(path: str | Path) -> Trajectory:
-        """Read a trajectory that `save` has written.
+        """Read a trajectory that `save` has written to a .pt file.
 
         Args:
             path: The file.
@@ -97,3 +187,20 @@ class Trajectory(list[State]):
         except TypeError as error:
             raise InvalidInput(str(error)) from error
         return Trajectory(states)
+
+
+def check_ending(name: str, file: Path) -> str:
+    """Return the ending of a file for states, in lower case.
+
+    Args:
+        name: Opens the message.
+        file: The file.
+
+    Raises:
+        InvalidInput: If the ending names no format.
+    """
+    ending = file.suffix.lower()
+    accepted = (*_FILES, *ANIMATIONS)
+    if ending not in accepted:
+        raise InvalidInput(f"{name} must end in {', '.join(accepted)}, got {str(file)!r}")
+    return ending

@@ -1,0 +1,1 @@
+"""Surfaces over time, in files of other programs."""

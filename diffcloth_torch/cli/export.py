@@ -1,0 +1,34 @@
+"""The command `diffcloth export`: states of a file in the format of another program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.sim.records.trajectory import Trajectory
+
+__all__ = ["export"]
+
+
+def export(
+    source: Path, target: Path, environment: int | None = None, *, overwrite: bool = False
+) -> str:
+    """Convert a file of states.
+
+    Args:
+        source: File of `Trajectory.save` that ends in .pt.
+        target: The file to write; its ending names the format.
+        environment: The environment of a batch to write; None writes all of them.
+        overwrite: Whether to replace an existing file.
+
+    Raises:
+        InvalidInput: If a file or the environment is not accepted.
+        OSError: If a file cannot be read or written.
+    """
+    if target.exists() and not overwrite:
+        raise InvalidInput(f"export: {target} exists already: --overwrite replaces it")
+    states = Trajectory.load(source)
+    if environment is not None:
+        states = Trajectory(state[environment] for state in states)
+    states.save(target)
+    return f"{len(states)} states of {source} are in {target}"
