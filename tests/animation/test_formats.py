@@ -1,5 +1,7 @@
 """Trajectories in files of other programs, read back by readers that are not ours."""
 
+import base64
+import json
 import math
 import sys
 import zipfile
@@ -130,6 +132,19 @@ def test_gltf_begins_at_the_first_state(states, tmp_path):
         mesh = scene.geometry[name].copy().apply_transform(frame)
         np.testing.assert_array_equal(mesh.faces, faces)
         np.testing.assert_allclose(mesh.vertices, y_up(vertices.numpy()), rtol=0, atol=1e-7)
+
+
+def test_gltf_turns_the_shorter_way(states, tmp_path):
+    """Some players interpolate quaternions of opposite signs through zero."""
+    states.save(tmp_path / "t.gltf")
+    document = json.loads((tmp_path / "t.gltf").read_text())
+    data = base64.b64decode(document["buffers"][0]["uri"].partition(",")[2])
+    motion = document["animations"][0]
+    (channel,) = (c for c in motion["channels"] if c["target"]["path"] == "rotation")
+    accessor = document["accessors"][motion["samplers"][channel["sampler"]]["output"]]
+    start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    turns = np.frombuffer(data, "<f4", 4 * accessor["count"], start).reshape(-1, 4)
+    np.testing.assert_allclose((turns[1:] * turns[:-1]).sum(1), math.cos(0.6), atol=1e-6)
 
 
 @pytest.mark.parametrize("ending", ["usd", "usda", "usdc"])
