@@ -8,10 +8,10 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
-from diffcloth_torch.autograd.torch_private import has_compiler
+from diffcloth_torch.autograd.torch_private import compile_nothing_in, has_compiler
 from diffcloth_torch.operations import called
 
-__all__ = ["guarded"]
+__all__ = ["guarded", "uncompiled"]
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -26,8 +26,20 @@ def _uncompiled(method: Callable[P, T]) -> Callable[P, T]:
     if not has_compiler():
         return method
     if method not in _UNCOMPILED:
+        # Else the compiler would compile this function again for each new entry.
+        compile_nothing_in(_uncompiled)
         _UNCOMPILED[method] = torch.compiler.disable(method)  # type: ignore[no-untyped-call]
     return _UNCOMPILED[method]
+
+
+def uncompiled(method: Callable[P, T]) -> Callable[P, T]:
+    """Exclude a method, and all that it calls, from `torch.compile`."""
+
+    @wraps(method)
+    def call(*args: P.args, **keywords: P.kwargs) -> T:
+        return _uncompiled(method)(*args, **keywords)
+
+    return call
 
 
 def guarded(method: Callable[P, T], name: str = "") -> Callable[P, T]:

@@ -8,20 +8,27 @@ checks each function against the public behavior that it depends on; run it with
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch._functorch.pyfunctorch import temporarily_clear_interpreter_stack as outside_transforms
 from torch.autograd import forward_ad
+from torch.utils import _pytree
+from torch.utils.data._utils.collate import default_collate_fn_map
 
 __all__ = [
+    "compile_nothing_in",
     "has_compiler",
     "in_forward_mode",
     "in_transform",
     "is_batched_by_older_vmap",
     "is_wrapped",
     "outside_transforms",
+    "register_collate",
+    "register_tree",
     "transforms",
     "unwrap",
     "with_older_axis",
@@ -93,3 +100,53 @@ def with_older_axis(rows: Tensor) -> Tensor:
 def has_compiler() -> bool:
     """Return true if the compiler is imported; its import takes longer than the rest of torch."""
     return hasattr(sys.modules.get("torch._dynamo"), "disable")
+
+
+def compile_nothing_in(function: Callable[..., Any]) -> None:
+    """Run the lines of a function as they are in future, but not those of what it calls.
+
+    Requires `has_compiler()`.
+    """
+    sys.modules["torch._dynamo"].eval_frame.skip_code(function.__code__)
+
+
+def register_tree(
+    cls: type[Any],
+    flatten: Callable[[Any], tuple[list[Any], Any]],
+    unflatten: Callable[[Any, Any], Any],
+    names: Callable[[Any], Sequence[str] | None],
+) -> None:
+    """Make a class a pytree of torch.
+
+    Args:
+        cls: The class.
+        flatten: Returns the branches of an object, and its structure.
+        unflatten: Makes an object of branches and a structure.
+        names: Returns the names of the branches of a structure; None numbers them.
+    """
+
+    def flatten_with_keys(value: Any) -> tuple[list[tuple[Any, Any]], Any]:
+        branches, structure = flatten(value)
+        given = names(structure)
+        if given is None:
+            keys: list[Any] = [_pytree.SequenceKey(i) for i in range(len(branches))]
+        else:
+            keys = [_pytree.GetAttrKey(name) for name in given]
+        return list(zip(keys, branches, strict=True)), structure
+
+    _pytree.register_pytree_node(
+        cls,
+        flatten,
+        unflatten,
+        serialized_type_name=f"diffcloth_torch.{cls.__name__}",
+        flatten_with_keys_fn=flatten_with_keys,
+    )
+
+
+def register_collate(cls: type[Any], combine: Callable[[list[Any]], Any]) -> None:
+    """Let `torch.utils.data.default_collate` combine a list of objects of a class."""
+
+    def collate(batch: list[Any], *, collate_fn_map: Any = None) -> Any:
+        return combine(batch)
+
+    default_collate_fn_map[cls] = collate

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from diffcloth_torch.autograd.guards import guarded
+from diffcloth_torch.autograd.guards import guarded, uncompiled
 from diffcloth_torch.checks import check_choice, check_count
 from diffcloth_torch.model.assembly import assemble
 from diffcloth_torch.model.defaults import has_barrier, has_contact, scene_parameters
@@ -372,6 +372,7 @@ class Simulator(Observables):
             _surfaces=self._engine.surfaces,
         )
 
+    @uncompiled
     def rollout(
         self,
         state: State,

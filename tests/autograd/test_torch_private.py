@@ -128,6 +128,71 @@ def test_axis_of_the_older_vmap():
     assert not torch_private.is_batched_by_older_vmap(X)
 
 
+class Pair:
+    """Two branches with names, and a note that is none."""
+
+    def __init__(self, left, right, note):
+        self.left, self.right, self.note = left, right, note
+
+
+def test_a_class_becomes_a_tree():
+    torch_private.register_tree(
+        Pair,
+        lambda pair: ([pair.left, pair.right], pair.note),
+        lambda branches, note: Pair(*branches, note),
+        lambda _note: ("left", "right"),
+    )
+    doubled = torch.utils._pytree.tree_map(lambda x: 2 * x, {"pair": Pair(1, [2, 3], "kept")})
+    assert vars(doubled["pair"]) == {"left": 2, "right": [4, 6], "note": "kept"}
+    paths, _ = torch.utils._pytree.tree_flatten_with_path(Pair(1, [2, 3], ""))
+    assert [torch.utils._pytree.keystr(path) for path, _ in paths] == [
+        ".left",
+        ".right[0]",
+        ".right[1]",
+    ]
+    x = torch.ones(3)
+    total = torch.vmap(lambda pair: pair.left + pair.right)(Pair(x, x, ""))
+    assert torch.equal(total, 2 * x)
+
+
+def test_a_class_is_collated():
+    class Note(str):
+        """Text, which is collated as a list without this."""
+
+    torch_private.register_collate(Note, lambda notes: "".join(notes))
+    batch = torch.utils.data.default_collate([{"note": Note("a")}, {"note": Note("b")}])
+    assert batch == {"note": "ab"}
+
+
+@pytest.mark.slow
+def test_lines_that_are_not_compiled():
+    """Functions that are called from there still are."""
+    import torch._dynamo
+
+    sizes = []
+
+    def backend(graph, _inputs):
+        sizes.append(sum(node.op == "call_function" for node in graph.graph.nodes))
+        return graph
+
+    def double(x):
+        return 2 * x
+
+    def outer(x):
+        return double(x) + 1
+
+    def run():
+        assert torch.equal(torch.compile(outer, backend=backend)(X), 2 * X + 1)
+
+    torch._dynamo.reset()
+    run()
+    torch._dynamo.reset()
+    torch_private.compile_nothing_in(outer)
+    run()
+    torch._dynamo.reset()
+    assert sizes == [2, 1]
+
+
 @pytest.mark.slow
 def test_the_compiler_is_seen_once_it_is_imported():
     code = (

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torch.utils.checkpoint import checkpoint
 
 import diffcloth_torch as dc
 from diffcloth_torch.robots import GRIPPER
@@ -379,3 +380,53 @@ def test_wrong_trajectories_are_refused(hanging, tmp_path):
             dc.Trajectory.load(tmp_path / f"{name}.pt")
     with pytest.raises(FileNotFoundError):
         dc.Trajectory.load(tmp_path / "none.pt")
+
+
+def test_checkpoints_of_torch_differentiate_states(hanging):
+    """The reentrant form does not look into arguments: docs/failures.md."""
+    start = hanging.initial_state()
+    v = start.velocities.clone().requires_grad_()
+    thrown = start.replace(velocities=v)
+    (expected,) = torch.autograd.grad(hanging.step(thrown).positions.sum(), v)
+    after = checkpoint(hanging.step, thrown, use_reentrant=False)
+    (found,) = torch.autograd.grad(after.positions.sum(), v)
+    assert torch.equal(found, expected)
+    with pytest.warns(UserWarning, match="None of the inputs have requires_grad=True"):
+        lost = checkpoint(hanging.step, thrown, use_reentrant=True)
+    assert not lost.positions.requires_grad
+
+
+@pytest.mark.slow
+def test_compiled_rollouts_are_compiled_once(hanging):
+    """The compiler sees the lines around rollouts and steps; a policy may be compiled by itself."""
+    runs = []
+
+    def backend(graph, _inputs):
+        return lambda *inputs: runs.append("graph") or graph(*inputs)
+
+    torch._dynamo.reset()
+    policy = torch.compile(lambda positions, k: positions[:4] + 0.001 * k, backend=backend)
+
+    def run(offset):
+        start = hanging.initial_state()
+        start = start.replace(positions=start.positions + offset)
+        controls = [dc.Control(pins=start.positions[:4] + 0.001)] * 2
+        states = hanging.rollout(start, controls)
+        states += hanging.rollout(
+            states[-1],
+            lambda k, state: dc.Control(pins=policy(state.positions.detach(), 1.0)),
+            steps=3,
+            checkpoint_every=2,
+        )
+        return hanging.step(states[-1]).positions.square().sum()
+
+    offset = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    (expected,) = torch.autograd.grad(run(offset), offset)
+    compiled = torch.compile(run, backend="eager")
+    runs.clear()
+    with torch._dynamo.config.patch(error_on_recompile=True):
+        for _ in range(4):
+            (found,) = torch.autograd.grad(compiled(offset), offset)
+            assert torch.equal(found, expected)
+    assert len(runs) == 4 * (3 + 3)  # forward, and repeated in backward
+    torch._dynamo.reset()

@@ -12,6 +12,7 @@ from diffcloth_torch.model.quantities import CONTROL, PARAMETERS
 from diffcloth_torch.reprs import field_text, record_text
 from diffcloth_torch.saved import saved
 from diffcloth_torch.sim.records.state import check_field_names
+from diffcloth_torch.sim.records.trees import register_record
 
 __all__ = ["Control", "Parameters", "tensors_of"]
 
@@ -22,6 +23,7 @@ class Control:
     """Targets for the end of a step, and forces during it. A target that is None holds.
 
     Every tensor may have a leading batch axis; without one it applies to all environments.
+    A control is a pytree of torch: its leaves are the tensors that are set.
 
     Attributes:
         pins: Positions of the pinned vertices [m], shape [P, 3], or "cloth/pin" (or "pin" if that
@@ -91,6 +93,8 @@ class Parameters:
     "robot/link" or by "robot/joint" (or the part behind the slash where it is unique, or a robot
     for all of its rows). What is not named keeps
     what the scene has.
+
+    Parameters are a pytree of torch: their leaves are the tensors that are set.
 
     Attributes:
         stretch: Membrane stiffness [N/m], > 0; shape [], [C] or [F].
@@ -192,6 +196,35 @@ class Parameters:
         check_field_names("Parameters.replace", self, changes)
         unbatched = tuple(name for name in self._unbatched if name not in changes)
         return replace(self, **changes, _unbatched=unbatched)
+
+
+def _set_fields(record: Control | Parameters, names: Iterable[str]) -> dict[str, Any]:
+    """Fields that a record sets; mappings as dicts, which are pytrees."""
+    values = {name: getattr(record, name) for name in names}
+    return {
+        name: dict(value) if isinstance(value, Mapping) else value
+        for name, value in values.items()
+        if value is not None
+    }
+
+
+def _parameter_branches(record: Parameters) -> tuple[dict[str, Any], dict[str, Any]]:
+    fields = _set_fields(record, PARAMETERS)
+    return fields, {name: fields[name].shape for name in record._unbatched}
+
+
+def _restored_parameters(fields: dict[str, Any], shapes: dict[str, Any]) -> Parameters:
+    """Parameters whose fields of another shape than the simulator's may have a batch axis."""
+    unbatched = (n for n, shape in shapes.items() if getattr(fields[n], "shape", None) == shape)
+    return Parameters(**fields, _unbatched=tuple(unbatched))
+
+
+register_record(
+    Control,
+    lambda record: (_set_fields(record, CONTROL), None),
+    lambda fields, _: Control(**fields),
+)
+register_record(Parameters, _parameter_branches, _restored_parameters)
 
 
 def _text(record: Control | Parameters, names: Iterable[str]) -> str:

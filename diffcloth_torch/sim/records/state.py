@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
+from diffcloth_torch.autograd.torch_private import register_collate
 from diffcloth_torch.autograd.transforms import is_dense
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.meshes import write_mesh
@@ -21,6 +22,7 @@ from diffcloth_torch.saved import saved
 from diffcloth_torch.sim.records.environments import Choice, Combination, Selection, Stack
 from diffcloth_torch.sim.records.report import Report, combine_reports, outcome_text
 from diffcloth_torch.sim.records.surfaces import Surfaces
+from diffcloth_torch.sim.records.trees import register_record
 
 __all__ = [
     "State",
@@ -65,6 +67,10 @@ class State:
         contact_forces: Contact forces on the cloth vertices during the step that led here, barrier
             and friction [N], shape [N, 3].
         pin_forces: Forces that held the pinned vertices during that step [N], shape [P, 3].
+
+    A state is a pytree of torch with these tensors as leaves: `tree_map`, `torch.func` and
+    `torch.vmap` take it. `torch.utils.data.default_collate` stacks states without a batch axis.
+    Both drop the report: it describes a step that did not lead to the new state.
     """
 
     positions: Tensor
@@ -125,6 +131,31 @@ class State:
     def clone(self) -> State:
         """Copy that shares no memory; gradients flow to the original."""
         return self._map(lambda tensor: tensor.clone(), self.report)
+
+    def to(
+        self,
+        *targets: Any,
+        device: Any = None,
+        dtype: torch.dtype | None = None,
+        non_blocking: bool = False,
+        copy: bool = False,
+    ) -> State:
+        """Return the state, which stays in float64 on the CPU, as loops that move batches do.
+
+        Args:
+            *targets: Devices, dtypes or tensors, as for `torch.Tensor.to`.
+            device: A device.
+            dtype: A dtype.
+            non_blocking: Ignored: nothing is moved.
+            copy: Whether to copy the tensors.
+
+        Raises:
+            InvalidInput: If a device is not the CPU.
+            TypeError: If a dtype is not float64, or a target is none of these.
+        """
+        for target in (*targets, device, dtype):
+            _require_float64_on_cpu(target)
+        return self.clone() if copy else self
 
     def meshes(self) -> dict[str, tuple[Tensor, Tensor]]:
         """Place all surfaces in the world: cloths, bodies, and links that have collision shapes.
@@ -208,6 +239,48 @@ _TENSORS = tuple(STATE)
 _ADDED = _TENSORS[_TENSORS.index("body_velocities") :]
 
 
+def _require_float64_on_cpu(target: Any) -> None:
+    """Refuse a target of `State.to` that changes a state."""
+    where: Any = None if isinstance(target, torch.dtype) else target
+    dtype = target if isinstance(target, torch.dtype) else None
+    if isinstance(target, Tensor):
+        where, dtype = target.device, target.dtype
+    if isinstance(where, int) and not isinstance(where, bool):
+        where = f"index {where}"
+    elif isinstance(where, str):
+        where = where.partition(":")[0]
+    elif isinstance(where, torch.device):
+        where = where.type
+    elif where is not None:
+        raise TypeError(
+            f"State.to: a target must be a device, a dtype or a tensor, got {type(where).__name__}"
+        )
+    if where not in (None, "cpu"):
+        raise InvalidInput(
+            f"State.to: the device must be the CPU, where the simulator works, got {where}; move "
+            "single tensors instead, as state.positions.to(device)"
+        )
+    if dtype not in (None, torch.float64):
+        raise TypeError(
+            f"State.to: the dtype must be torch.float64, as positions in lower precision cannot "
+            f"keep surfaces apart, got {dtype}; convert single tensors instead, as "
+            "state.positions.to(dtype)"
+        )
+
+
+def _branches(state: State) -> tuple[dict[str, Any], Surfaces | None]:
+    return {name: getattr(state, name) for name in _TENSORS}, state._surfaces
+
+
+def _restored(fields: dict[str, Any], surfaces: Surfaces | None) -> State:
+    state = object.__new__(State)  # leaves may be of any type, None included
+    state.__dict__.update(fields, report=None, _surfaces=surfaces)
+    return state
+
+
+register_record(State, _branches, _restored)
+
+
 def stack(states: Sequence[State]) -> State:
     """Combine states without a batch axis into a batch; gradients flow to each of them.
 
@@ -227,6 +300,9 @@ def stack(states: Sequence[State]) -> State:
             raise InvalidInput(f"stack: `states` must have no batch axis, got one at [{i}]")
     check_shapes("stack", "all states", [(f"at [{i}]", state) for i, state in enumerate(states)])
     return _combined(Stack(len(states)), states)
+
+
+register_collate(State, lambda states: stack([s.replace(report=None) for s in states]))
 
 
 def where(mask: Tensor, a: State, b: State) -> State:

@@ -15,6 +15,7 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.animation.formats import ANIMATIONS
 from diffcloth_torch.animation.surfaces import Animation, MovingSurface
+from diffcloth_torch.autograd.torch_private import register_tree
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import as_path, replacing
 from diffcloth_torch.geometry.poses import poses_of_frames
@@ -30,7 +31,8 @@ class Trajectory(list[State]):
     """A list of successive states that also has each of their fields, stacked over time.
 
     `positions` has shape [T, N, 3], or [T, B, N, 3] in a batch, and likewise all other fields of
-    `State`; they carry gradients. A slice is a trajectory too.
+    `State`; they carry gradients. A slice is a trajectory too. A trajectory is a pytree of torch
+    whose branches are its states.
     """
 
     def __getattr__(self, name: str) -> Tensor:
@@ -187,6 +189,14 @@ class Trajectory(list[State]):
         except TypeError as error:
             raise InvalidInput(str(error)) from error
         return Trajectory(states)
+
+
+register_tree(
+    Trajectory,
+    lambda states: (list(states), None),
+    lambda states, _: Trajectory(states),
+    lambda _: None,
+)
 
 
 def check_ending(name: str, file: Path) -> str:

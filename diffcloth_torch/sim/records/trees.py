@@ -1,0 +1,50 @@
+"""Records as pytrees of torch: `tree_map`, `torch.func` and `torch.vmap` take them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from diffcloth_torch.autograd.torch_private import register_tree
+
+__all__ = ["register_record"]
+
+R = TypeVar("R")
+Branches = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class _Structure:
+    """Names of the fields of a record, and its parts that are no branches.
+
+    Two records with fields of the same names have one structure, whatever else they keep; a
+    function of several trees returns what the first one keeps.
+    """
+
+    names: tuple[str, ...]
+    kept: Any = field(compare=False)
+
+
+def register_record(
+    cls: type[R],
+    branches: Callable[[R], tuple[Branches, Any]],
+    restored: Callable[[dict[str, Any], Any], R],
+) -> None:
+    """Make a class a pytree whose branches are fields of its objects.
+
+    Args:
+        cls: The class.
+        branches: Returns the fields that are branches, and what a restored object keeps besides.
+        restored: Makes an object from both. The values may be of any type, as torch maps trees
+            to trees of axes or placeholders.
+    """
+
+    def flatten(record: R) -> tuple[list[Any], _Structure]:
+        fields, kept = branches(record)
+        return list(fields.values()), _Structure(tuple(fields), kept)
+
+    def unflatten(values: Any, structure: Any) -> R:
+        return restored(dict(zip(structure.names, values, strict=True)), structure.kept)
+
+    register_tree(cls, flatten, unflatten, lambda structure: structure.names)
