@@ -2,7 +2,7 @@
 
     import diffcloth_torch as dc
 
-    scene = dc.Scene(cloths=[dc.Cloth.grid(24, 24, pins={"edge": range(24)})])
+    scene = dc.Scene(cloths=[dc.Cloth.grid((24, 24), pins={"edge": range(24)})])
     sim = dc.Simulator(scene, dt=0.01)
     state = sim.step(sim.initial_state())
 
@@ -12,7 +12,7 @@ Units are SI, z is up, quaternions are (w, x, y, z), and everything is float64 o
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -162,7 +162,9 @@ def build_info() -> dict[str, Any]:
 
 
 @called("load_config")
-def load_config(path: str | Path, assignments: Iterable[str] = ()) -> LoadedConfig:
+def load_config(
+    path: str | Path | Mapping[str, Any], assignments: Iterable[str] = ()
+) -> LoadedConfig:
     """Read a configuration of the command line, and build its scene, simulator and task.
 
     >>> scene, simulator, task = dc.load_config("configs/drape.yaml", ["simulation.steps=50"])
@@ -170,7 +172,8 @@ def load_config(path: str | Path, assignments: Iterable[str] = ()) -> LoadedConf
     >>> states = simulator.rollout(task.initial_state(), controller, steps=task.steps)
 
     Args:
-        path: YAML file.
+        path: YAML file; or its content as a dict, where names of files are relative to the
+            current folder.
         assignments: "key=value" each, as after `--set`.
 
     Returns:
@@ -181,7 +184,7 @@ def load_config(path: str | Path, assignments: Iterable[str] = ()) -> LoadedConf
         IntersectingState: If surfaces of the scene intersect or touch.
     """
     from diffcloth_torch.files import as_path
-    from diffcloth_torch.tasks.registry import load_task
+    from diffcloth_torch.tasks.registry import load_document, load_task
     from diffcloth_torch.tasks.task import LoadedConfig
 
     given: Any = assignments
@@ -190,7 +193,10 @@ def load_config(path: str | Path, assignments: Iterable[str] = ()) -> LoadedConf
         raise TypeError(
             f'load_config: `assignments` must be a list of "key=value", got {assignments!r}'
         )
-    task = load_task(as_path("load_config: `path`", path), changes)
+    if isinstance(path, Mapping):
+        task = load_document(path, changes)
+    else:
+        task = load_task(as_path("load_config: `path`", path), changes)
     return LoadedConfig(task.scene, task.simulator, task)
 
 

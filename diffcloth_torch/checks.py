@@ -125,6 +125,11 @@ def float_array(name: str, value: object, *, instead: str = "pass a detached ten
     if isinstance(value, Tensor):
         return np.array(numbers_of(float_tensor(name, value)), dtype=np.float64, order="C")
     array = _array(name, value, "numbers")
+    if array.dtype.kind in "US" and array.size:
+        raise TypeError(
+            f"{name} must hold numbers, got the text {str(array.reshape(-1)[0])!r}; convert it with "
+            "float(..), as YAML 1.1 reads 1e-3 as text, and 1.0e-3 as a number"
+        )
     if array.dtype.kind not in "fiu" or array.dtype.itemsize > _FLOAT64_BYTES:
         raise TypeError(
             f"{name} must hold real numbers of at most 64 bits, got dtype {array.dtype}"

@@ -1,6 +1,6 @@
 """Starting points for real fabrics, from published measurements.
 
->>> sheet = dc.Cloth.grid(24, 24, material=dc.fabrics.material("denim", thickness=6e-4))
+>>> sheet = dc.Cloth.grid((24, 24), material=dc.fabrics.material("denim", thickness=6e-4))
 
 The numbers are those of the database of H. Wang, J. F. O'Brien and R. Ramamoorthi, Data-Driven
 Elastic Models for Cloth: Modeling and Measurement, ACM Trans. Graph. 30(4), 71, 2011

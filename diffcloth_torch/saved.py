@@ -1,21 +1,27 @@
 """Objects in files, under names that stay when modules move.
 
 A pickle of an object whose class is `saved` holds the function `restore`, the name of the class,
-the number of the format and the fields of the object. `torch.load` with `weights_only` reads these
-files as soon as `diffcloth_torch.sim` has been imported, which any public name does. Files of 0.1
+the number of the format and the fields of the object. Arrays and slices in the fields become calls
+of functions here, as `torch.load` does not trust those that their own pickles name. With
+`weights_only` it reads these files as soon as `diffcloth_torch.sim` has been imported, which any public name does. Files of 0.1
 name modules instead; `_MODULES_0_1` has their paths.
 """
 
 from __future__ import annotations
 
+import base64
 import copyreg
 import sys
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from diffcloth_torch.errors import InvalidInput
 
-__all__ = ["FORMAT", "read_saved_objects", "restore", "saved"]
+__all__ = ["FORMAT", "read_saved_objects", "restore", "restore_array", "restore_slice", "saved"]
 
 FORMAT = 1
 """Number of the format of files; raised where an older reader would misread a file."""
@@ -79,7 +85,61 @@ def _reduce(value: Any) -> tuple[Any, ...]:
     else:
         own = getattr(value, "__getstate__", None)  # Python 3.10 has it only where a class does
         fields = dict(own() if own else vars(value))
+    fields = {name: _plain(field) for name, field in fields.items()}
     return restore, (type(value).__name__, FORMAT, fields)
+
+
+class _Call:
+    """A value whose pickle calls a function of this module."""
+
+    def __init__(self, function: Callable[..., Any], *arguments: Any) -> None:
+        self._call = function, arguments
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self._call
+
+
+def _plain(value: Any) -> Any:
+    """A value without arrays and slices, also inside of plain containers."""
+    if isinstance(value, np.ndarray):
+        text = base64.b64encode(value.tobytes()).decode("ascii")
+        return _Call(restore_array, value.dtype.str, value.shape, text, value.flags.writeable)
+    if isinstance(value, slice):
+        return _Call(restore_slice, value.start, value.stop, value.step)
+    if type(value) in (list, tuple):
+        return type(value)(map(_plain, value))
+    if type(value) is dict:
+        return {key: _plain(entry) for key, entry in value.items()}
+    return value
+
+
+def restore_slice(start: int | None, stop: int | None, step: int | None) -> slice:
+    """Make a slice from a file."""
+    return slice(start, stop, step)
+
+
+def restore_array(
+    dtype: str, shape: tuple[int, ...], text: str, writable: bool
+) -> NDArray[Any]:
+    """Make an array of numbers from a file.
+
+    Args:
+        dtype: Type of its numbers, as "<f8".
+        shape: Its shape.
+        text: Its bytes in base64.
+        writable: Whether it may be edited.
+
+    Raises:
+        InvalidInput: If these do not belong together.
+    """
+    try:
+        kind = np.dtype(dtype)
+        if kind.kind not in "fiub":
+            raise ValueError(f"{dtype!r} is no type of numbers")
+        array = np.frombuffer(base64.b64decode(text, validate=True), dtype=kind).reshape(shape)
+    except (TypeError, ValueError) as error:
+        raise InvalidInput(f"load: the file must hold arrays of numbers: {error}") from error
+    return array.copy() if writable else array
 
 
 def restore(name: str, version: int, fields: dict[str, Any]) -> Any:
@@ -115,7 +175,7 @@ def read_saved_objects() -> None:
     """Allow `torch.load` to read saved objects, and pickles to name the modules of 0.1."""
     import torch
 
-    torch.serialization.add_safe_globals([restore])
+    torch.serialization.add_safe_globals([restore, restore_array, restore_slice])
     release = tuple(int(part) for part in torch.__version__.split(".")[:2])
     for module, names in _MODULES_0_1.items():
         classes = [_class(name) for name in names]

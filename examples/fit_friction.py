@@ -21,7 +21,7 @@ DURATION, FRICTION = 0.2, 0.3  # [s], and what is to be found
 
 def thrown(dt: float) -> tuple[dc.Simulator, dc.State]:
     """Make the sheet on the table, sliding at 1 m/s."""
-    cloth = dc.Cloth.grid(5, 5, 0.2, pose=[0, 0, 0.002, 1, 0, 0, 0])
+    cloth = dc.Cloth.grid((5, 5), 0.2, pose=[0, 0, 0.002, 1, 0, 0, 0])
     contact = dc.ContactOptions(barrier_distance=0.002)
     simulator = dc.Simulator(dc.Scene([cloth], [dc.RigidBody.plane(4.0)]), dt, contact=contact)
     start = simulator.initial_state()

@@ -36,8 +36,7 @@ with tempfile.TemporaryDirectory() as folder:
     path.write_text(ARM)
     arm = dc.Robot.load(path, stiffness=60.0, damping=1.0, name="arm")
 sheet = dc.Cloth.grid(
-    8,
-    8,
+    (8, 8),
     0.2,
     pose=[0.31, 0, -0.12, 0.7071, 0, 0.7071, 0],  # upright, below the tip
     material=dc.Material(stretch=200, bending=1e-4, density=0.4, damping=0.01),

@@ -19,7 +19,7 @@ import diffcloth_torch as dc
 F64 = torch.float64
 ENVIRONMENTS, STEPS, DT = 4, 15, 0.02
 
-cloth = dc.Cloth.grid(6, 6, 0.3, pose=[0, 0, 1, 0.5**0.5, 0.5**0.5, 0, 0], pins={"top": [30, 35]})
+cloth = dc.Cloth.grid((6, 6), 0.3, pose=[0, 0, 1, 0.5**0.5, 0.5**0.5, 0, 0], pins={"top": [30, 35]})
 simulator = dc.Simulator(dc.Scene([cloth]), DT, solver=dc.SolverOptions(throw=False))
 start = simulator.initial_state(ENVIRONMENTS)
 corners = [0, 5]

@@ -17,7 +17,7 @@ WANTED = 0.15  # [m]
 
 # A sheet in the xz-plane, held by its upper edge, and a cube just behind its middle.
 upright = [0, 0, 1, 0.5**0.5, 0.5**0.5, 0, 0]
-cloth = dc.Cloth.grid(12, 12, (0.6, 0.6), pose=upright, pins={"edge": range(132, 144)})
+cloth = dc.Cloth.grid((12, 12), (0.6, 0.6), pose=upright, pins={"edge": range(132, 144)})
 cube = dc.RigidBody.box(0.15, motion="kinematic", pose=[0, -0.1, 1, 1, 0, 0, 0])
 simulator = dc.Simulator(dc.Scene([cloth], [cube]), dt=DT)
 

@@ -20,8 +20,7 @@ SIZE = 9
 CORNER, OPPOSITE = 0, SIZE * SIZE - 1
 
 cloth = dc.Cloth.grid(
-    SIZE,
-    SIZE,
+    (SIZE, SIZE),
     0.3,
     name="sheet",
     pose=[0, 0, 0.004, 1, 0, 0, 0],

@@ -66,8 +66,7 @@ serial = pk.SerialChain(load(ROUGHLY).chain, "panda_hand", dtype=F64)
 grasp = reach(serial, GRASP)
 
 cloth = dc.Cloth.grid(
-    8,
-    8,
+    (8, 8),
     0.1,
     pose=[0.68, 0, 0.626, 1, 0, 0, 0],
     material=dc.Material(stretch=200, bending=1e-4, density=0.2, thickness=8e-4, friction=0.8),

@@ -24,8 +24,7 @@ PIXEL, BLUR = 5e-4, 1e-3  # of the image, and the depth of the pad's skin [m]
 
 top = range(21 * 24, 21 * 25)
 cloth = dc.Cloth.grid(
-    25,
-    21,
+    (21, 25),
     (0.06, 0.072),
     pose=[0, 0.008, 0.07, np.sqrt(0.5), np.sqrt(0.5), 0, 0],  # upright, between pen and finger
     pins={"top": top},

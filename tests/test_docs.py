@@ -215,7 +215,9 @@ def as_a_reader(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.mark.filterwarnings("error::diffcloth_torch.BarrierStartWarning")
+@pytest.mark.filterwarnings(
+    "error::diffcloth_torch.BarrierStartWarning", "error:Cloth.grid:FutureWarning"
+)
 @pytest.mark.parametrize(("page", "line", "code"), list(python_blocks()))
 @pytest.mark.usefixtures("as_a_reader")
 def test_every_block_of_python_runs_alone(page, line, code):

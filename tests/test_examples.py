@@ -21,7 +21,9 @@ import diffcloth_torch as dc
 ROOT = Path(__file__).resolve().parents[1]
 
 # What users start from is not thrown by the barrier.
-pytestmark = pytest.mark.filterwarnings("error::diffcloth_torch.BarrierStartWarning")
+pytestmark = pytest.mark.filterwarnings(
+    "error::diffcloth_torch.BarrierStartWarning", "error:Cloth.grid:FutureWarning"
+)
 
 
 @pytest.fixture

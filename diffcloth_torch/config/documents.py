@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.operations import operation
 
-__all__ = ["Document", "read_document", "resolve_path", "set_values"]
+__all__ = ["Document", "check_plain_document", "read_document", "resolve_path", "set_values"]
 
 Document = dict[str, Any]
 
@@ -46,6 +46,31 @@ def read_document(path: str | Path) -> Document:
     if not isinstance(document, dict):
         raise InvalidInput(f"{path}: a configuration must be a mapping of keys to values")
     return document
+
+
+def check_plain_document(document: Mapping[str, Any]) -> Document:
+    """Copy a configuration that is no file; it may hold what a file may hold.
+
+    Raises:
+        InvalidInput: If it is nested too deeply or holds other values than text and numbers.
+    """
+    try:
+        copy: Document = _plain_copy(document, _DEEPEST)
+        _check_plain(copy, "the configuration")
+    except ValueError as error:
+        raise InvalidInput(f"{operation()}: {error}") from error
+    return copy
+
+
+def _plain_copy(value: Any, levels: int) -> Any:
+    """Mappings as dicts, tuples as lists."""
+    if not isinstance(value, Mapping | list | tuple):
+        return value
+    if levels == 0:
+        raise ValueError(f"it must be at most {_DEEPEST} levels deep")
+    if isinstance(value, Mapping):
+        return {key: _plain_copy(entry, levels - 1) for key, entry in value.items()}
+    return [_plain_copy(entry, levels - 1) for entry in value]
 
 
 def _parse(text: str) -> Any:

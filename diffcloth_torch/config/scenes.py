@@ -104,7 +104,7 @@ def _cloth(section: ClothSection, root: str, source: Path) -> Cloth:
     rest: NDArray[np.float64]
     faces: NDArray[np.integer[Any]]
     if shape.kind == "grid":
-        sheet = Cloth.grid(shape.rows, shape.columns, shape.size)
+        sheet = Cloth.grid((shape.columns, shape.rows), shape.size)
         rest, faces = sheet.vertices, sheet.faces
         start = rest
     elif shape.kind == "disk":

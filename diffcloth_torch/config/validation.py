@@ -40,12 +40,18 @@ def _sentences(document: Document, problems: Iterable[Any]) -> list[str]:
         messages.setdefault(name, []).append(_message(problem))
         given = problem["input"]
         plain = problem["type"] not in ("missing", "value_error") and not isinstance(given, dict)
-        shown[name] = f", got {given!r}" if plain else ""
+        kind = "the text " if isinstance(given, str) and _is_number(problem) else ""
+        shown[name] = f", got {kind}{given!r}" if plain else ""
     # A value that may be of several types has a message for each type.
     return [
         f"`{name}` {' or '.join(dict.fromkeys(texts))}{shown[name]}".replace("``", "the file")
         for name, texts in messages.items()
     ]
+
+
+def _is_number(problem: Any) -> bool:
+    """Whether a number is wanted."""
+    return str(problem["type"]).partition("_")[0] in ("float", "int")
 
 
 def _message(problem: Any) -> str:

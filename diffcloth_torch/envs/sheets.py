@@ -74,7 +74,7 @@ class SheetTask(Task):
         self.side = check_count(f"{operation(self.name)}: `size`", size, 4)
         check_choice(f"{operation(self.name)}: `observation`", observation, OBSERVATIONS)
         sheet = Cloth.grid(
-            size, size, SIDE, name="sheet", pose=[0, 0, HEIGHT, 1, 0, 0, 0], material=material
+            (size, size), SIDE, name="sheet", pose=[0, 0, HEIGHT, 1, 0, 0, 0], material=material
         )
         pickers = Pickers(sheet, opens_at=opens_at, reach=reach)
         table = RigidBody.plane(4.0, friction=0.5, name="table")

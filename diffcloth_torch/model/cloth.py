@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from diffcloth_torch.checks import (
     frozen,
     index_array,
 )
-from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.errors import InvalidInput, warn_caller
 from diffcloth_torch.geometry import shapes
 from diffcloth_torch.geometry.mesh_checks import check_areas, check_manifold, surface_arrays
 from diffcloth_torch.geometry.meshes import read_mesh
@@ -85,6 +85,7 @@ class Cloth:
         bending_model: str = "patch",
         name: str | None = None,
         directions: object = None,
+        pose: object = None,
     ) -> None:
         """Check and copy the arguments.
 
@@ -101,6 +102,8 @@ class Cloth:
             directions: Direction of the warp in the rest shape, shape [3] or [f, 3]; along x by
                 default. It is projected onto each face and fixed to the material, also where
                 `Parameters.rest_positions` are others. Isotropic cloth has no use for it.
+            pose: Pose [px, py, pz, qw, qx, qy, qz] that places `vertices`, but not the rest shape;
+                the identity by default.
 
         Raises:
             InvalidInput: If a shape, an index or a value is not accepted.
@@ -108,8 +111,12 @@ class Cloth:
         """
         points, triangles = surface_arrays("Cloth", vertices, faces, instead=_POSITIONS)
         check_manifold("Cloth", len(points), triangles)
-        self.vertices, self.faces = points, triangles
+        # The rest shape does not depend on the pose, and unrotated coordinates are exact.
         self.rest_positions = _rest(rest_positions, points, triangles)
+        if pose is not None:
+            placement = pose_array("Cloth: `pose`", pose, instead=_POSITIONS)
+            points = frozen(transform(points, placement))
+        self.vertices, self.faces = points, triangles
         self.material = _material(material, len(triangles))
         self.pins, self.soft_pins = _pin_groups(pins, soft_pins, len(points))
         self.pin_stiffness = check_parameter("Cloth", "pin_stiffness", pin_stiffness)
@@ -130,70 +137,44 @@ class Cloth:
         return material_axes(owner, self.directions, self.rest_positions, self.faces)
 
     @classmethod
-    def load(
-        cls, path: str | Path, *, scale: float = 1.0, pose: object = None, **keywords: Any
-    ) -> Cloth:
+    def load(cls, path: str | Path, *, scale: float = 1.0, **keywords: Any) -> Cloth:
         """Read an .obj, .ply or .stl file; but for .stl, vertex `i` of it is that of the cloth.
 
         Args:
             path: Mesh file of triangles.
             scale: Meters per unit of the file, > 0.
-            pose: Pose [px, py, pz, qw, qx, qy, qz]; as in the file by default.
-            **keywords: As for `Cloth`; `rest_positions` is in meters, `scale` and `pose` do not
-                apply to it.
+            **keywords: As for `Cloth`; `rest_positions` is in meters, `scale` does not apply to it.
         """
         vertices, faces = read_mesh(path, "Cloth.load: `path`")
         factor = check_number("Cloth.load: `scale`", scale, POSITIVE, instead=_POSITIONS)
-        return cls._posed("Cloth.load", factor * vertices, faces, pose, keywords)
+        return cls(factor * vertices, faces, **keywords)
+
+    @overload
+    @classmethod
+    def grid(cls, counts: Sequence[int], size: object = 1.0, **keywords: Any) -> Cloth: ...
+
+    @overload
+    @classmethod
+    def grid(cls, rows: int, columns: int, size: object = 1.0, **keywords: Any) -> Cloth: ...
 
     @classmethod
-    def grid(
-        cls,
-        rows: int,
-        columns: int,
-        size: object = (1.0, 1.0),
-        *,
-        pose: object = None,
-        **keywords: Any,
-    ) -> Cloth:
+    def grid(cls, *arguments: Any, **keywords: Any) -> Cloth:
         """Make a rectangular sheet in the xy-plane, centered at the origin.
 
-        Vertex `row * columns + column` lies at x = (column / (columns - 1) - 1/2) * size[0] and
-        y = (row / (rows - 1) - 1/2) * size[1]. The faces point up.
+        >>> sheet = dc.Cloth.grid((4, 3), (0.3, 0.2))  # 4 vertices over 30 cm along x
+
+        Vertex `j * counts[0] + i` lies at x = (i / (counts[0] - 1) - 1/2) * size[0] and
+        y = (j / (counts[1] - 1) - 1/2) * size[1]. The faces point up.
 
         Args:
-            rows: Vertices along y, >= 2.
-            columns: Vertices along x, >= 2.
-            size: Lengths along x and y [m], or one length for both.
-            pose: Pose [px, py, pz, qw, qx, qy, qz]; the identity by default.
+            *arguments: `counts`, the numbers of vertices along x and y, each >= 2; then `size`, the
+                lengths along x and y [m], or one length for both, 1 by default. An earlier form
+                has `rows` (along y), `columns` (along x) and `size`; with two lengths it warns.
             **keywords: As for `Cloth`.
         """
-        rows = check_count("Cloth.grid: `rows`", rows, 2)
-        columns = check_count("Cloth.grid: `columns`", columns, 2)
-        if 2 * (rows - 1) * (columns - 1) > shapes.MOST_FACES:
-            raise InvalidInput(
-                "Cloth.grid: `rows` and `columns` must make at most "
-                f"{shapes.MOST_FACES} triangles, got {rows} x {columns} vertices"
-            )
+        columns, rows, size = _grid_shape(arguments, keywords)
         vertices, faces = shapes.grid(rows, columns, plane_size("Cloth.grid: `size`", size))
-        return cls._posed("Cloth.grid", vertices, faces, pose, keywords)
-
-    @classmethod
-    def _posed(
-        cls,
-        owner: str,
-        vertices: FloatArray,
-        faces: object,
-        pose: object,
-        keywords: dict[str, Any],
-    ) -> Cloth:
-        if pose is None:
-            return cls(vertices, faces, **keywords)
-        placed = transform(vertices, pose_array(f"{owner}: `pose`", pose, instead=_POSITIONS))
-        # The rest shape does not depend on the pose, and unrotated coordinates are exact.
-        if keywords.get("rest_positions") is None:
-            keywords = {**keywords, "rest_positions": vertices}
-        return cls(placed, faces, **keywords)
+        return cls(vertices, faces, **keywords)
 
     def __repr__(self) -> str:
         name = "" if self.name is None else f"{self.name!r}, "
@@ -206,6 +187,58 @@ class Cloth:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self.pins, self.soft_pins = MappingProxyType(self.pins), MappingProxyType(self.soft_pins)
+
+
+def _grid_shape(arguments: Sequence[Any], keywords: dict[str, Any]) -> tuple[int, int, object]:
+    """Numbers of vertices along x and y, and the size; they are taken out of the keywords."""
+    by_counts = "counts" in keywords or _has_an_axis(arguments[:1])
+    names = ("counts", "size") if by_counts else ("rows", "columns", "size")
+    if len(arguments) > len(names):
+        raise TypeError(
+            f"Cloth.grid: takes {', '.join(f'`{name}`' for name in names)}, got {len(arguments)} "
+            "arguments"
+        )
+    given = dict(zip(names, arguments, strict=False))
+    for name in names:
+        if name in keywords:
+            if name in given:
+                raise TypeError(f"Cloth.grid: `{name}` must be given once, got it twice")
+            given[name] = keywords.pop(name)
+        elif name not in given and name != "size":
+            raise TypeError(f"Cloth.grid: `{name}` must be given")
+    size = given.get("size", 1.0)
+    if not by_counts:
+        rows = check_count("Cloth.grid: `rows`", given["rows"], 2)
+        columns = check_count("Cloth.grid: `columns`", given["columns"], 2)
+        if _has_an_axis((size,)):
+            x, y = plane_size("Cloth.grid: `size`", size).tolist()
+            warn_caller(
+                "Cloth.grid: rows and columns are counted along y and x, lengths along x and y; "
+                f"write Cloth.grid(({columns}, {rows}), ({x:g}, {y:g})), with x first in both",
+                FutureWarning,
+            )
+        _check_face_count("`rows` and `columns`", rows, columns)
+        return columns, rows, size
+    counts = given["counts"]
+    check_shape("Cloth.grid: `counts`", np.shape(counts), [(2,)])
+    columns, rows = (
+        check_count(f"Cloth.grid: `counts[{i}]`", count, 2) for i, count in enumerate(counts)
+    )
+    _check_face_count("`counts`", columns, rows)
+    return columns, rows, size
+
+
+def _has_an_axis(values: Sequence[Any]) -> bool:
+    """Whether the only value, if there is one, is a list or an array of one axis."""
+    return any(isinstance(v, list | tuple) or getattr(v, "ndim", 0) == 1 for v in values)
+
+
+def _check_face_count(arguments: str, first: int, second: int) -> None:
+    if 2 * (first - 1) * (second - 1) > shapes.MOST_FACES:
+        raise InvalidInput(
+            f"Cloth.grid: {arguments} must make at most {shapes.MOST_FACES} triangles, got "
+            f"{first} x {second} vertices"
+        )
 
 
 def plane_size(name: str, size: object) -> FloatArray:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from diffcloth_torch.config.documents import read_document, set_values
+from diffcloth_torch.config.documents import check_plain_document, read_document, set_values
 from diffcloth_torch.config.schema import RunConfig
 from diffcloth_torch.config.validation import validate
 from diffcloth_torch.errors import InvalidInput
@@ -19,7 +19,18 @@ from diffcloth_torch.tasks.scenes import sections_of
 from diffcloth_torch.tasks.task import ConfiguredTask
 from diffcloth_torch.tasks.two_cloths import TwoClothsProblem
 
-__all__ = ["TASKS", "check_document", "load_task", "make_task", "read_config"]
+__all__ = [
+    "TASKS",
+    "check_document",
+    "complete_document",
+    "load_document",
+    "load_task",
+    "make_task",
+    "read_config",
+]
+
+DICT = "dict"
+"""Stands for the file of a configuration that is none, in messages and in the current folder."""
 
 TASKS: dict[str, Any] = {
     "drape": ConfiguredTask,
@@ -45,10 +56,26 @@ def read_config(path: str | Path, assignments: Iterable[str] = ()) -> RunConfig:
     Raises:
         InvalidInput: If the file, a key or a value is not accepted.
     """
-    document = read_document(path)
-    if "scene" not in document:
-        document = {**sections_of(str(document.get("task"))), **document}
-    return check_document(set_values(document, assignments), path)
+    return complete_document(read_document(path), path, assignments)
+
+
+def complete_document(
+    document: Mapping[str, Any], path: str | Path, assignments: Iterable[str] = ()
+) -> RunConfig:
+    """Add the scene and the target of its task to a document, change values, and check it.
+
+    Args:
+        document: Keys and values; it is not changed.
+        path: File that it was read from, for messages.
+        assignments: "key=value" each, see `set_values`.
+
+    Raises:
+        InvalidInput: If a key or a value is not accepted.
+    """
+    whole = dict(document)
+    if "scene" not in whole:
+        whole = {**sections_of(str(whole.get("task"))), **whole}
+    return check_document(set_values(whole, assignments), path)
 
 
 def check_document(document: Mapping[str, Any], path: str | Path) -> RunConfig:
@@ -79,3 +106,15 @@ def make_task(config: RunConfig, path: str | Path) -> ConfiguredTask:
 def load_task(path: str | Path, assignments: Iterable[str] = ()) -> ConfiguredTask:
     """Read a configuration, and build its scene, simulator and task."""
     return make_task(read_config(path, assignments), path)
+
+
+def load_document(document: Mapping[str, Any], assignments: Iterable[str] = ()) -> ConfiguredTask:
+    """Build the scene, simulator and task of a configuration that is no file.
+
+    Files that it names are relative to the current folder.
+
+    Raises:
+        InvalidInput: If a key or a value is not accepted.
+    """
+    plain = check_plain_document(document)
+    return make_task(complete_document(plain, DICT, assignments), Path(DICT))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import types
 from pathlib import Path
 
 import numpy as np
@@ -100,7 +101,7 @@ REFUSED = [
     pytest.param("simulation.dt=.nan", r"`simulation\.dt` must be a finite number", id="nan"),
     pytest.param(
         "simulation.dt=soon",
-        r"`simulation\.dt` must be a valid number, got 'soon'",
+        r"`simulation\.dt` must be a valid number, got the text 'soon'",
         id="text-for-number",
     ),
     pytest.param(
@@ -446,6 +447,50 @@ def test_a_configuration_gives_scene_simulator_and_task():
 
 def test_a_name_of_a_file_will_do():
     assert dc.load_config(str(CONFIGS / "drape.yaml")).task.steps == 150
+
+
+def test_a_configuration_may_be_a_dict():
+    document = read_document(CONFIGS / "drape.yaml")
+    loaded = dc.load_config(document, ["simulation.steps=2"])
+    expected = dc.load_config(CONFIGS / "drape.yaml", ["simulation.steps=2"])
+    assert loaded.task.config == expected.task.config
+    start, expected_start = loaded.task.initial_state(), expected.task.initial_state()
+    assert torch.equal(start.positions, expected_start.positions)
+    assert document == read_document(CONFIGS / "drape.yaml")
+    short = {key: v for key, v in read_document(CONFIGS / "hit_cloth.yaml").items() if key != "scene"}
+    assert dc.load_config(types.MappingProxyType(short)).scene.body_names  # the scene of the task
+
+
+def test_a_dict_names_files_from_the_current_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("sheet.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    cloths = [{"name": "sheet", "shape": {"kind": "load", "path": "sheet.obj", "scale": 0.1}}]
+    document = {"task": "drape", "simulation": {"dt": 0.01, "steps": 1}, "scene": {"cloths": cloths}}
+    (sheet,) = dc.load_config(document).scene.cloths
+    assert sheet.vertices.max() == 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        pytest.param({"task": "none"}, "dict: `task` must be one of", id="task"),
+        pytest.param({"steps": 3}, "dict: the file has no key `steps`", id="key"),
+        pytest.param({3: 4}, "load_config: a key must be text, got 3", id="number"),
+        pytest.param(
+            {"scene": np.eye(3)},
+            "load_config: `scene` must hold text or numbers, got a ndarray",
+            id="array",
+        ),
+        pytest.param(
+            {"simulation": {"dt": "1e-2", "steps": 3}},
+            "`simulation.dt` must be a valid number, got the text '1e-2'",
+            id="number as text",
+        ),
+    ],
+)
+def test_a_dict_that_is_not_accepted(change, message):
+    with pytest.raises(InvalidInput, match=message):
+        dc.load_config(read_document(CONFIGS / "drape.yaml") | change)
 
 
 @pytest.mark.parametrize(
