@@ -3,8 +3,8 @@
 A pickle of an object whose class is `saved` holds the function `restore`, the name of the class,
 the number of the format and the fields of the object. Arrays and slices in the fields become calls
 of functions here, as `torch.load` does not trust those that their own pickles name. With
-`weights_only` it reads these files as soon as `diffcloth_torch.sim` has been imported, which any public name does. Files of 0.1
-name modules instead; `_MODULES_0_1` has their paths.
+`weights_only` it reads these files as soon as `diffcloth_torch.sim` has been imported, which any
+public name does. Files of 0.1 name modules instead; `_MODULES_0_1` has their paths.
 """
 
 from __future__ import annotations
@@ -118,9 +118,7 @@ def restore_slice(start: int | None, stop: int | None, step: int | None) -> slic
     return slice(start, stop, step)
 
 
-def restore_array(
-    dtype: str, shape: tuple[int, ...], text: str, writable: bool
-) -> NDArray[Any]:
+def restore_array(dtype: str, shape: tuple[int, ...], text: str, writable: bool) -> NDArray[Any]:
     """Make an array of numbers from a file.
 
     Args:

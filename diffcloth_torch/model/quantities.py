@@ -88,7 +88,7 @@ def _table(*quantities: Quantity) -> Mapping[str, Quantity]:
     return MappingProxyType({quantity.name: quantity for quantity in quantities})
 
 
-_PER_FACE: tuple[Axes, ...] = ((), ("C",), ("F",))
+_PER_FACE: tuple[Axes, ...] = ((), ("C",), ("N",), ("F",))
 _PAIRS: tuple[Axes, ...] = ((), ("S", "S"))
 _ONE: tuple[Axes, ...] = ((),)
 _JOINTS: tuple[Axes, ...] = (("J",),)

@@ -457,7 +457,9 @@ def test_a_configuration_may_be_a_dict():
     start, expected_start = loaded.task.initial_state(), expected.task.initial_state()
     assert torch.equal(start.positions, expected_start.positions)
     assert document == read_document(CONFIGS / "drape.yaml")
-    short = {key: v for key, v in read_document(CONFIGS / "hit_cloth.yaml").items() if key != "scene"}
+    short = {
+        key: v for key, v in read_document(CONFIGS / "hit_cloth.yaml").items() if key != "scene"
+    }
     assert dc.load_config(types.MappingProxyType(short)).scene.body_names  # the scene of the task
 
 
@@ -465,7 +467,11 @@ def test_a_dict_names_files_from_the_current_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("sheet.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     cloths = [{"name": "sheet", "shape": {"kind": "load", "path": "sheet.obj", "scale": 0.1}}]
-    document = {"task": "drape", "simulation": {"dt": 0.01, "steps": 1}, "scene": {"cloths": cloths}}
+    document = {
+        "task": "drape",
+        "simulation": {"dt": 0.01, "steps": 1},
+        "scene": {"cloths": cloths},
+    }
     (sheet,) = dc.load_config(document).scene.cloths
     assert sheet.vertices.max() == 0.1
 

@@ -36,6 +36,7 @@ class Layout:
         zeros: Field of a control -> its constant default, one environment for all. Never edited.
         parameter_shapes: Accepted shapes of each parameter.
         pins: Indices of the pinned vertices, shape [P].
+        corners: Vertices of the faces of cloths, shape [F, 3].
         robots: Links of each of the R robots.
         shaped_links: Which of the L links have a shape, in the order of the surfaces.
         rigid_vertices: Name of a body or "robot/link" -> its rows among the V vertices.
@@ -92,6 +93,7 @@ class Layout:
     def _set_rows(self) -> None:
         assembly = self.assembly
         self.pins = torch.from_numpy(assembly.pins.astype(np.int64))
+        self.corners = torch.from_numpy(assembly.faces.astype(np.int64))
         first_links = np.cumsum([0, *(robot.link_count for robot in assembly.robots)])
         of_robots = assembly.surface_mechanism >= assembly.body_count
         owners = assembly.surface_mechanism[of_robots] - assembly.body_count

@@ -19,7 +19,7 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.mesh_checks import check_areas
 from diffcloth_torch.model.orthotropy import check_bending
-from diffcloth_torch.model.quantities import PARAMETERS, Fields, Shape
+from diffcloth_torch.model.quantities import FACE_QUANTITIES, PARAMETERS, Fields, Shape
 from diffcloth_torch.operations import label, operation
 from diffcloth_torch.sim.inputs.layout import Layout
 from diffcloth_torch.sim.inputs.named_parameters import has_names, named_rows
@@ -28,6 +28,7 @@ from diffcloth_torch.sim.records.controls import Parameters
 __all__ = ["check_parameters", "default_fields", "parameter_fields"]
 
 _ROUNDING = 1e-12  # of an eigenvalue, relative to the largest
+_ROWS = {"C": "cloth", "N": "vertex", "F": "face"}
 _BENDING = ("bending", "bending_weft", "bending_twill", "poisson")
 
 
@@ -70,15 +71,31 @@ def parameter_fields(
             _check_values(layout, name, numbers_of(fields[name]), numbers_of(defaults[name]))
             continue
         check_range(opening, numbers_of(given), quantity.accepted)
-        shared = layout.parameter_shapes[name]
         unbatched = name in parameters._unbatched
-        environments = _environments(opening, tuple(given.shape), shared, batch, unbatched)
+        environments = _environments(layout, name, tuple(given.shape), batch, unbatched)
         fields[name] = _rows(given, environments, quantity.row_shape)
+        if name in FACE_QUANTITIES and not unbatched:
+            fields[name] = _at_faces(layout, opening, fields[name])
         _check_values(layout, name, numbers_of(fields[name]), numbers_of(defaults[name]))
     if "bending_weft" in fields and any(getattr(checked, name) is not None for name in _BENDING):
         values = (_per_face(layout, numbers_of(fields[name])) for name in _BENDING)
         check_bending(operation(), *values)
     return fields
+
+
+def _at_faces(layout: Layout, opening: str, values: Tensor) -> Tensor:
+    """Means of the corners of each face, [nb, F], of values at vertices; others as they are."""
+    vertices, faces = len(layout.assembly.vertices), len(layout.assembly.faces)
+    if values.shape[1] != vertices:
+        return values
+    if vertices == faces:
+        raise InvalidInput(
+            f"{opening} of {faces} values could mean one per vertex or one per face, of which "
+            "there are as many; write values of faces by the names of cloths, and values of vertices as "
+            "means of corners, values[faces].mean(-1), likewise"
+        )
+    a, b, c = values[:, layout.corners].unbind(-1)
+    return (a + b + c) / 3
 
 
 def _per_face(layout: Layout, values: FloatArray) -> FloatArray:
@@ -142,16 +159,17 @@ def _refuse_rows(
 
 
 def _environments(
-    opening: str, shape: Shape, shared: Sequence[Shape], batch: int | None, unbatched: bool
+    layout: Layout, name: str, shape: Shape, batch: int | None, unbatched: bool
 ) -> int:
     """Number of environments of a parameter with the given shape: 1, or the batch size."""
+    opening, shared = label("parameters", name), layout.parameter_shapes[name]
     is_shared = shape in shared
     is_batched = batch is not None and shape[:1] == (batch,) and shape[1:] in shared
     if is_shared and is_batched and shape != (1,) and not unbatched:
+        letter = PARAMETERS[name].axes[shared.index(shape)][0]
         raise InvalidInput(
             f"{opening} of shape {list(shape)} could mean one value per environment or per "
-            f"{'cloth' if shape == shared[1] else 'face'}; write it as "
-            f"{[batch, *shared[1]]} to say which"
+            f"{_ROWS[str(letter)]}; write it as {[batch, *shared[1]]} to say which"
         )
     if is_shared:
         return 1

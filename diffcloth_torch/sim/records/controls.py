@@ -88,6 +88,9 @@ class Parameters:
     Each may have a leading batch axis [B]. The friction and the barrier stiffness of a pair of
     surfaces are the mean of its two entries.
 
+    A field at faces may have one value per cloth vertex, [N]: a face then has the mean of its
+    corners. Where there are as many vertices as faces, such a tensor is refused.
+
     What has rows may be given by names, as {"shirt": 300.0}: what is per cloth or face by cloths,
     `thickness` by surfaces, `attachment_stiffness` by attachments, the rest by bodies, by
     "robot/link" or by "robot/joint" (or the part behind the slash where it is unique, or a robot
@@ -97,11 +100,11 @@ class Parameters:
     Parameters are a pytree of torch: their leaves are the tensors that are set.
 
     Attributes:
-        stretch: Membrane stiffness [N/m], > 0; shape [], [C] or [F].
-        bending: Bending stiffness [N m], >= 0; shape [], [C] or [F].
-        poisson: Poisson ratio of bending [-], between -1 and 0.5; shape [], [C] or [F].
-        density: Mass per rest area [kg/m^2], > 0; shape [], [C] or [F].
-        damping: Time over which strain rates are damped [s], >= 0; shape [], [C] or [F].
+        stretch: Membrane stiffness [N/m], > 0; shape [], [C], [N] or [F].
+        bending: Bending stiffness [N m], >= 0; shape [], [C], [N] or [F].
+        poisson: Poisson ratio of bending [-], between -1 and 0.5; shape [], [C], [N] or [F].
+        density: Mass per rest area [kg/m^2], > 0; shape [], [C], [N] or [F].
+        damping: Time over which strain rates are damped [s], >= 0; shape [], [C], [N] or [F].
         friction: Friction coefficient [-], >= 0; shape [] or [S, S], or pair of names of surfaces,
             in either order, -> number, as {("cloth", "table"): 0.4}; pairs that are not named keep
             the values of the scene.
@@ -113,10 +116,10 @@ class Parameters:
         gravity: Acceleration of gravity [m/s^2], shape [3].
         rest_positions: Stress-free positions of the cloth vertices [m], shape [N, 3].
         attachment_stiffness: Of the springs of attachments [N/m], > 0, shape [A].
-        normal_drag: Coefficient of the pressure of air across faces [-], >= 0; shape [], [C] or
-            [F].
-        tangential_drag: Coefficient of the friction of air along faces [-], >= 0; shape [], [C] or
-            [F].
+        normal_drag: Coefficient of the pressure of air across faces [-], >= 0; shape [], [C], [N]
+            or [F].
+        tangential_drag: Coefficient of the friction of air along faces [-], >= 0; shape [], [C],
+            [N] or [F].
         air_density: Density of the air [kg/m^3], >= 0; shape [].
         body_mass: Mass of each body [kg], >= 0, > 0 where it is dynamic; shape [K]. This and the
             next two are ignored where the body is not dynamic.
@@ -131,15 +134,17 @@ class Parameters:
         joint_damping: Damping of pd drives [N m s/rad or N s/m], >= 0, shape [J].
         joint_viscosity: Damping of the joints themselves [N m s/rad or N s/m], >= 0, shape [J].
         joint_armature: Inertia of the drives, seen at the joints [kg m^2 or kg], >= 0, shape [J].
-        stretch_weft: Membrane stiffness of woven cloth along its weft [N/m], > 0; shape [], [C] or
-            [F]. This and the next three exist where a material sets one of the kind; then
+        stretch_weft: Membrane stiffness of woven cloth along its weft [N/m], > 0; shape [], [C],
+            [N] or [F]. This and the next three exist where a material sets one of the kind; then
             `stretch` and `bending` are those along the warp, also of cloths that are isotropic,
             which keep their own numbers here.
-        stretch_shear: Membrane stiffness of woven cloth in shear [N/m], > 0; shape [], [C] or [F].
-        bending_weft: Bending stiffness of woven cloth along its weft [N m], >= 0; shape [], [C] or
-            [F]; > 0 where `bending` is.
-        bending_twill: Bending stiffness of woven cloth at 45 degrees [N m], >= 0; shape [], [C] or
-            [F]; at least (bending + bending_weft + 2 poisson sqrt(bending bending_weft)) / 4.
+        stretch_shear: Membrane stiffness of woven cloth in shear [N/m], > 0; shape [], [C], [N] or
+            [F].
+        bending_weft: Bending stiffness of woven cloth along its weft [N m], >= 0; shape [], [C],
+            [N] or [F]; > 0 where `bending` is.
+        bending_twill: Bending stiffness of woven cloth at 45 degrees [N m], >= 0; shape [], [C],
+            [N] or [F]; at least (bending + bending_weft + 2 poisson sqrt(bending bending_weft)) /
+            4.
         joint_effort_limits: Largest efforts of pd drives, and of what is applied to torque joints
             [N m or N], > 0, shape [J]; 1e30 where there is no limit.
         joint_velocity_limits: Largest speeds of pd and torque joints [rad/s or m/s], > 0, shape
