@@ -209,7 +209,7 @@ def python_blocks():
 @pytest.fixture
 def as_a_reader(tmp_path, monkeypatch):
     """A folder with a mesh of the reader's own, and the configurations as they are in a clone."""
-    sheet = dc.Cloth.grid(6, 7, (0.3, 0.35), name="shirt")
+    sheet = dc.Cloth.grid((7, 6), (0.3, 0.35), name="shirt")
     dc.Simulator(dc.Scene([sheet]), 0.01).initial_state().export(tmp_path / "shirt.obj")
     (tmp_path / "configs").symlink_to(ROOT / "configs")
     monkeypatch.chdir(tmp_path)

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.filterwarnings(
 @pytest.fixture
 def own_mesh(tmp_path):
     """An unstructured sheet in a file of its own; tilted, so that it lands on one side first."""
-    grid = dc.Cloth.grid(7, 8, (0.3, 0.35))
+    grid = dc.Cloth.grid((8, 7), (0.3, 0.35))
     x, y = grid.vertices[:, 0], grid.vertices[:, 1]
     jitter = np.random.default_rng(0).uniform(-0.008, 0.008, grid.vertices.shape)
     vertices = np.stack([x, y, 0.02 * x + 0.01 * np.sin(9 * y)], axis=-1) + jitter

@@ -11,6 +11,7 @@ import io
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,9 @@ from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import INTEGER, NUMBER, as_path, read_regular_file
 from diffcloth_torch.geometry.ply import read_ply, write_ply
+from diffcloth_torch.geometry.polygons import triangulated
 
-__all__ = ["MeshPart", "read_mesh", "write_mesh"]
+__all__ = ["FileMesh", "MeshPart", "read_file_mesh", "read_mesh", "write_mesh"]
 
 # Far beyond what a step can take; a larger file is a mistake, refused before it fills the memory.
 _LARGEST_FILE = 1 << 30
@@ -28,6 +30,21 @@ _LARGEST_FILE = 1 << 30
 Indices = NDArray[np.int64]
 MeshPart = tuple[str, FloatArray, NDArray[np.integer]]
 """Name, vertices [n, 3] in meters and faces [f, 3] of one object of a file."""
+
+
+class FileMesh(NamedTuple):
+    """A mesh as its file has it.
+
+    Attributes:
+        vertices: Vertices in units of the file, [n, 3].
+        faces: Triangles, [f, 3].
+        texture: Texture coordinates (u, v) of the corners of the faces, [f, 3, 2]; NaN where a
+            corner has none, None where the format has none.
+    """
+
+    vertices: FloatArray
+    faces: Indices
+    texture: FloatArray | None = None
 
 
 def read_mesh(path: str | Path, name: str = "read_mesh: `path`") -> tuple[FloatArray, Indices]:
@@ -44,23 +61,36 @@ def read_mesh(path: str | Path, name: str = "read_mesh: `path`") -> tuple[FloatA
         TypeError: If `path` is not a path.
         OSError: If the file cannot be read.
     """
+    mesh = read_file_mesh(path, name)
+    return mesh.vertices, mesh.faces
+
+
+def read_file_mesh(path: str | Path, name: str, *, triangulate: bool = False) -> FileMesh:
+    """Read a mesh with its texture coordinates; see `read_mesh`.
+
+    Args:
+        path: The file.
+        name: Opens messages about the path.
+        triangulate: Whether to cut polygons into triangles instead of refusing them.
+    """
     path = as_path(name, path)
-    readers = {".obj": _read_obj, ".ply": read_ply, ".stl": _read_stl}
+    readers = {".obj": _read_obj, ".ply": _read_ply, ".stl": _read_stl}
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise InvalidInput(f"{name} must end in {', '.join(readers)}, got {str(path)!r}")
-    vertices, faces = reader(path, read_regular_file(path, _LARGEST_FILE))
-    if len(vertices) == 0 or len(faces) == 0:
+    mesh = reader(path, read_regular_file(path, _LARGEST_FILE), triangulate)
+    if len(mesh.vertices) == 0 or len(mesh.faces) == 0:
         raise InvalidInput(
-            f"{path}: the mesh is empty: {len(vertices)} vertices, {len(faces)} triangles"
+            f"{path}: the mesh is empty: {len(mesh.vertices)} vertices, {len(mesh.faces)} triangles"
         )
-    infinite = np.argwhere(~np.isfinite(vertices))
+    infinite = np.argwhere(~np.isfinite(mesh.vertices))
     if infinite.size:
         vertex, axis = (int(i) for i in infinite[0])
         raise InvalidInput(
-            f"{path}: coordinates must be finite, got {vertices[vertex, axis]} at vertex {vertex}"
+            f"{path}: coordinates must be finite, got {mesh.vertices[vertex, axis]} at vertex "
+            f"{vertex}"
         )
-    return vertices, faces
+    return mesh
 
 
 def write_mesh(path: str | Path, parts: Sequence[MeshPart]) -> None:
@@ -75,25 +105,48 @@ def write_mesh(path: str | Path, parts: Sequence[MeshPart]) -> None:
         raise InvalidInput(f"export: `path` must end in .obj or .ply, got {str(path)!r}")
 
 
-def _read_obj(path: Path, data: bytes) -> tuple[FloatArray, Indices]:
+def _read_obj(path: Path, data: bytes, triangulate: bool) -> FileMesh:
     vertices: list[list[float]] = []
-    faces: list[list[int]] = []
+    textures: list[list[float]] = []
+    polygons: list[list[int]] = []
+    corners: list[int] = []  # of texture, of all polygons; -1: none
     for number, line in _obj_lines(data.removeprefix(b"\xef\xbb\xbf")):
         keyword, *words = line.split() or [b""]
         try:
             if b"\0" in line:
                 raise ValueError("a text file must not hold the byte 0")
             if keyword == b"v":
-                vertices.append(_obj_vertex(words))
+                vertices.append(_obj_numbers(words, "a vertex", "coordinates", 3))
+            elif keyword == b"vt":
+                textures.append(_obj_texture(words))
             elif keyword == b"f":
-                faces.append(_obj_triangle(words, len(vertices)))
+                polygon, places = _obj_face(words, len(vertices), len(textures), triangulate)
+                polygons.append(polygon)
+                corners += places
         except ValueError as error:
             shown = line.strip()[:80].decode("utf-8", errors="replace")
             raise InvalidInput(f"{path}:{number}: {error}, in {shown!r}") from error
-    return (
-        np.array(vertices, dtype=np.float64).reshape(-1, 3),
-        np.array(faces, dtype=np.int64).reshape(-1, 3),
-    )
+    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
+    faces, at_corners = _cut(path, points, polygons)
+    coordinates = np.array([*textures, [np.nan, np.nan]], dtype=np.float64)
+    texture = coordinates[np.array(corners, dtype=np.int64)[at_corners]]
+    return FileMesh(points, faces, texture)
+
+
+def _read_ply(path: Path, data: bytes, triangulate: bool) -> FileMesh:
+    vertices, polygons = read_ply(path, data, triangulate=triangulate)
+    if isinstance(polygons, np.ndarray):
+        return FileMesh(vertices, polygons)
+    return FileMesh(vertices, _cut(path, vertices, polygons)[0])
+
+
+def _cut(
+    path: Path, vertices: FloatArray, polygons: Sequence[Sequence[int]]
+) -> tuple[Indices, Indices]:
+    """Triangles [f, 3] of polygons, and the place of their corners in all polygons, [f, 3]."""
+    at_corners = triangulated(str(path), vertices, polygons)
+    joined = np.array([corner for polygon in polygons for corner in polygon], dtype=np.int64)
+    return joined[at_corners], at_corners
 
 
 def _obj_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -113,26 +166,39 @@ def _obj_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
         yield first, b" ".join(parts)
 
 
-def _obj_vertex(words: Sequence[bytes]) -> list[float]:
-    # A fourth number is a weight; six or seven numbers carry a color.
-    if len(words) < 3:
-        raise ValueError(f"a vertex needs 3 coordinates, got {len(words)}")
-    for word in words[:3]:
+def _obj_numbers(words: Sequence[bytes], what: str, numbers: str, count: int) -> list[float]:
+    # A fourth number of a vertex is a weight; six or seven numbers carry a color.
+    if len(words) < count:
+        raise ValueError(f"{what} needs {count} {numbers}, got {len(words)}")
+    for word in words[:count]:
         if not NUMBER.fullmatch(word):
             raise ValueError(f"a coordinate must be a number, got {_shown(word)}")
-    return [float(word) for word in words[:3]]
+    return [float(word) for word in words[:count]]
 
 
-def _obj_triangle(words: Sequence[bytes], vertex_count: int) -> list[int]:
-    """Corners of `f a b c`, each `v`, `v/vt`, `v//vn` or `v/vt/vn`; negative: from the end."""
-    if len(words) != 3:
+def _obj_texture(words: Sequence[bytes]) -> list[float]:
+    """Coordinates u and v; v is 0 by default, and NaN where a file has no numbers."""
+    if not words or not all(NUMBER.fullmatch(word) for word in words[:2]):
+        return [float("nan"), float("nan")]  # only what wants texture coordinates refuses them
+    return [float(words[0]), float(words[1]) if len(words) > 1 else 0.0]
+
+
+def _obj_face(
+    words: Sequence[bytes], vertex_count: int, texture_count: int, triangulate: bool
+) -> tuple[list[int], list[int]]:
+    """Corners of `f a b c`, each `v`, `v/vt`, `v//vn` or `v/vt/vn`; negative: from the end.
+
+    Returns:
+        Indices of the vertices, and of the texture coordinates, -1 where there are none.
+    """
+    if len(words) < 3 or (len(words) > 3 and not triangulate):
         raise ValueError(
             f"a face must be a triangle, got {len(words)} corners; "
-            "triangulate the mesh before loading it"
+            "triangulate the mesh before loading it, or pass triangulate=True"
         )
-    corners = []
+    corners, texture = [], []
     for word in words:
-        text = word.partition(b"/")[0]
+        text, _, rest = word.partition(b"/")
         if not INTEGER.fullmatch(text):
             raise ValueError(f"a face index must be an integer, got {_shown(text)}")
         index = int(text)
@@ -143,14 +209,24 @@ def _obj_triangle(words: Sequence[bytes], vertex_count: int) -> list[int]:
                 f"or negative, got {text[:40].decode()}"
             )
         corners.append(corner)
-    return corners
+        texture.append(_obj_texture_index(rest.partition(b"/")[0], texture_count))
+    return corners, texture
+
+
+def _obj_texture_index(text: bytes, count: int) -> int:
+    """Index of texture coordinates; -1 where a corner has none that were read so far."""
+    if not INTEGER.fullmatch(text):
+        return -1
+    index = int(text)
+    place = index - 1 if index > 0 else count + index
+    return place if index != 0 and 0 <= place < count else -1
 
 
 def _shown(word: bytes) -> str:
     return repr(word[:40].decode("utf-8", errors="replace"))
 
 
-def _read_stl(path: Path, data: bytes) -> tuple[FloatArray, Indices]:
+def _read_stl(path: Path, data: bytes, triangulate: bool) -> FileMesh:
     from trimesh.exchange.stl import load_stl
 
     if not data:
@@ -170,7 +246,7 @@ def _read_stl(path: Path, data: bytes) -> tuple[FloatArray, Indices]:
     order = np.argsort(first)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    return points[first[order]], rank[inverse.reshape(-1)].reshape(-1, 3)
+    return FileMesh(points[first[order]], rank[inverse.reshape(-1)].reshape(-1, 3))
 
 
 def _write_obj(path: Path, parts: Sequence[MeshPart]) -> None:

@@ -1,4 +1,4 @@
-"""PLY files: a reader that keeps the order of vertices and refuses polygons, and a writer.
+"""PLY files: a reader that keeps the order of vertices, and a writer.
 
 Existing readers with a compatible license triangulate polygons, round indices that are not
 integers, or hang on a header without an end.
@@ -48,12 +48,15 @@ class _Element(NamedTuple):
     properties: list[_Property]
 
 
-def read_ply(path: Path, data: bytes) -> tuple[FloatArray, NDArray[np.int64]]:
+def read_ply(
+    path: Path, data: bytes, *, triangulate: bool = False
+) -> tuple[FloatArray, NDArray[np.int64] | list[list[int]]]:
     """Read vertices [n, 3] and triangles [f, 3] of an ASCII or binary PLY file.
 
     Args:
         path: File, for messages.
         data: Content of the file.
+        triangulate: Whether to return faces as lists of three or more corners instead.
 
     Raises:
         InvalidInput: If the file is malformed, or has polygons other than triangles or an index of
@@ -61,25 +64,43 @@ def read_ply(path: Path, data: bytes) -> tuple[FloatArray, NDArray[np.int64]]:
     """
     order, elements, body = _read_header(path, data)
     vertices = np.empty((0, 3))
-    faces = np.empty((0, 3), dtype=np.int64)
-    cursor = _Ascii(path, body) if order == "=" else _Binary(path, body, order)
+    faces: NDArray[np.int64] | list[list[int]] = np.empty((0, 3), dtype=np.int64)
+    cursor: _Ascii | _Binary
+    if order == "=":
+        cursor = _Ascii(path, body, triangulate)
+    else:
+        cursor = _Binary(path, body, order, triangulate)
     for element in elements:
         columns = cursor.read(element)
         if element.name == "vertex":
             vertices = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=-1)
         elif element.name == "face":
             corners = next(columns[name] for name in _CORNERS if name in columns)
-            faces = corners.astype(np.int64).reshape(-1, 3)
-        if vertices.size and faces.size:
+            if triangulate:
+                faces = [[int(corner) for corner in polygon] for polygon in corners]
+            else:
+                faces = corners.astype(np.int64).reshape(-1, 3)
+        if vertices.size and len(faces):
             break  # what follows (edges, materials) is of no interest and may hold any list
-    outside = np.argwhere((faces < 0) | (faces >= len(vertices)))
-    if outside.size:
-        face, corner = (int(i) for i in outside[0])
-        raise InvalidInput(
-            f"{path}: face {face} has vertex {faces[face, corner]}, "
-            f"but the vertices are 0 .. {len(vertices) - 1}"
-        )
+    _check_corners(path, faces, len(vertices))
     return vertices, faces
+
+
+def _check_corners(
+    path: Path, faces: NDArray[np.int64] | list[list[int]], vertex_count: int
+) -> None:
+    if isinstance(faces, np.ndarray):
+        lengths, corners = [3] * len(faces), faces.reshape(-1)
+    else:
+        lengths = [len(polygon) for polygon in faces]
+        corners = np.array([corner for polygon in faces for corner in polygon], dtype=np.int64)
+    outside = np.flatnonzero((corners < 0) | (corners >= vertex_count))
+    if outside.size:
+        face = int(np.searchsorted(np.cumsum(lengths), outside[0], side="right"))
+        raise InvalidInput(
+            f"{path}: face {face} has vertex {corners[outside[0]]}, "
+            f"but the vertices are 0 .. {vertex_count - 1}"
+        )
 
 
 def write_ply(path: Path, vertices: FloatArray, faces: NDArray[np.int32]) -> None:
@@ -179,19 +200,23 @@ def _check_elements(path: Path, elements: list[_Element], body: bytes) -> None:
 # --- The body -------------------------------------------------------------------------------------
 
 
-def _check_triangle(path: Path, element: _Element, column: _Property, row: int, count: int) -> None:
-    if element.name == "face" and column.name in _CORNERS and count != 3:
+def _check_polygon(
+    path: Path, element: _Element, column: _Property, row: int, count: int, triangulate: bool
+) -> None:
+    accepted = count >= 3 if triangulate else count == 3
+    if element.name == "face" and column.name in _CORNERS and not accepted:
         raise InvalidInput(
             f"{path}: face {row} must be a triangle, got {count} corners; "
-            "triangulate the mesh before loading it"
+            "triangulate the mesh before loading it, or pass triangulate=True"
         )
 
 
 class _Ascii:
     """The words of an ASCII body, element by element."""
 
-    def __init__(self, path: Path, body: bytes) -> None:
+    def __init__(self, path: Path, body: bytes, triangulate: bool) -> None:
         self._path = path
+        self._triangulate = triangulate
         self._words = body.split()
         self._at = 0
 
@@ -206,11 +231,15 @@ class _Ascii:
                     count = int(self._take(element, row, column.count_type, 1)[0])
                     if count < 0:
                         self._refuse(element, row, f"a length of {count}")
-                    _check_triangle(self._path, element, column, row, count)
+                    _check_polygon(self._path, element, column, row, count, self._triangulate)
                     entries = self._take(element, row, column.type, count)
                     if column.name in _CORNERS:  # other lists may be of any length
                         values.append(entries)
-        return {name: np.array(values) for name, values in columns.items()}
+        # Polygons may have different numbers of corners.
+        return {
+            name: np.array(values, dtype=object if _is_ragged(values) else None)
+            for name, values in columns.items()
+        }
 
     def _take(self, element: _Element, row: int, kind: str, count: int) -> list[float]:
         words = self._words[self._at : self._at + count]
@@ -233,6 +262,10 @@ class _Ascii:
         )
 
 
+def _is_ragged(values: list[Any]) -> bool:
+    return len({len(entry) for entry in values if isinstance(entry, list)}) > 1
+
+
 def _index(word: bytes) -> int:
     """An integer that fits the largest type that PLY has."""
     value = int(word)
@@ -244,8 +277,9 @@ def _index(word: bytes) -> int:
 class _Binary:
     """The bytes of a binary body, element by element."""
 
-    def __init__(self, path: Path, body: bytes, order: str) -> None:
+    def __init__(self, path: Path, body: bytes, order: str, triangulate: bool) -> None:
         self._path = path
+        self._triangulate = triangulate
         self._body = body
         self._order = order
         self._at = 0
@@ -266,7 +300,7 @@ class _Binary:
             count_kind = np.dtype(self._order + column.count_type)
             self._require(element, offset + count_kind.itemsize)
             count = int(np.frombuffer(self._body, count_kind, 1, offset)[0])
-            _check_triangle(self._path, element, column, 0, count)
+            _check_polygon(self._path, element, column, 0, count, self._triangulate)
             if count < 0:
                 raise InvalidInput(f"{self._path}: {element.name} 0 has a list of length {count}")
             offset += count_kind.itemsize + count * kind.itemsize
@@ -280,9 +314,11 @@ class _Binary:
             other = np.flatnonzero(counts != counts[:1])
             if other.size:
                 row = int(other[0])
-                _check_triangle(self._path, element, column, row, int(counts[row]))
+                found = int(counts[row])
+                _check_polygon(self._path, element, column, row, found, self._triangulate)
                 raise InvalidInput(
-                    f"{self._path}: lists {column.name!r} of different lengths cannot be read"
+                    f"{self._path}: lists {column.name!r} of different lengths cannot be read; "
+                    "an .obj or an ASCII .ply file may have them"
                 )
         self._at += rows.itemsize * element.rows
         return {p.name: table[f"{i}"] for i, p in enumerate(element.properties)}

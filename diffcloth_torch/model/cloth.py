@@ -26,8 +26,8 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.errors import InvalidInput, warn_caller
 from diffcloth_torch.geometry import shapes
+from diffcloth_torch.geometry.loaded import load_mesh
 from diffcloth_torch.geometry.mesh_checks import check_areas, check_manifold, surface_arrays
-from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import pose_array, transform
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.orthotropy import material_axes
@@ -59,6 +59,8 @@ class Cloth:
         bending_model: "patch" (isotropic on any mesh) or "hinge".
         name: Name in the scene; None lets the scene choose one.
         directions: Direction of the warp at rest, shape [3], or one per face, shape [f, 3].
+        file_vertices: Vertex that stands for each vertex of the file that `load` has read, shape
+            [m]; None for other cloths.
     """
 
     vertices: FloatArray
@@ -71,6 +73,7 @@ class Cloth:
     bending_model: str
     name: str | None
     directions: FloatArray
+    file_vertices: IndexArray | None = None
 
     def __init__(
         self,
@@ -137,17 +140,63 @@ class Cloth:
         return material_axes(owner, self.directions, self.rest_positions, self.faces)
 
     @classmethod
-    def load(cls, path: str | Path, *, scale: float = 1.0, **keywords: Any) -> Cloth:
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        scale: float = 1.0,
+        rest: str | None = None,
+        rest_scale: float | None = None,
+        triangulate: bool = False,
+        weld: float | None = None,
+        **keywords: Any,
+    ) -> Cloth:
         """Read an .obj, .ply or .stl file; but for .stl, vertex `i` of it is that of the cloth.
 
+        >>> flag = dc.Cloth.load("flag.obj", rest="uv", rest_scale=1.5)
+
+        A mesh of more than 10 m or less than 1 mm gets a warning about `scale`.
+
         Args:
-            path: Mesh file of triangles.
+            path: Mesh file.
             scale: Meters per unit of the file, > 0.
+            rest: "uv" takes the texture coordinates of an .obj file as rest shape, flat in the
+                xy-plane, with u along x. Each vertex must have one pair of them: no seam.
+            rest_scale: Meters per unit of the texture coordinates, > 0; required for `rest`.
+            triangulate: Whether to cut quads and other polygons into triangles, from their shorter
+                diagonals on, instead of refusing them.
+            weld: Distance [m] up to which vertices are merged; the first one stays. With 0, those
+                at one place. `file_vertices` has the vertex that stands for each one of the file.
             **keywords: As for `Cloth`; `rest_positions` is in meters, `scale` does not apply to it.
+
+        Raises:
+            InvalidInput: If the file or an argument is not accepted; the message names the line,
+                the vertex or the face.
         """
-        vertices, faces = read_mesh(path, "Cloth.load: `path`")
-        factor = check_number("Cloth.load: `scale`", scale, POSITIVE, instead=_POSITIONS)
-        return cls(factor * vertices, faces, **keywords)
+        mesh = load_mesh(
+            "Cloth.load",
+            path,
+            scale=scale,
+            triangulate=triangulate,
+            weld=weld,
+            instead=_POSITIONS,
+        )
+        if rest is not None:
+            check_choice("Cloth.load: `rest`", rest, ("uv",))
+            if keywords.get("rest_positions") is not None:
+                raise InvalidInput("Cloth.load: `rest` must be None beside `rest_positions`")
+            if rest_scale is None:
+                raise InvalidInput(
+                    "Cloth.load: `rest_scale` must be given with `rest`: the meters per unit of "
+                    "the texture coordinates"
+                )
+            size = check_number("Cloth.load: `rest_scale`", rest_scale, POSITIVE, instead=_REST)
+            keywords = {**keywords, "rest_positions": mesh.flat_rest_shape(f"{path}", size)}
+        elif rest_scale is not None:
+            raise InvalidInput("Cloth.load: `rest_scale` must be None without `rest`")
+        cloth = cls(mesh.vertices, mesh.faces, **keywords)
+        cloth.file_vertices = mesh.file_vertices
+        return cloth
 
     @overload
     @classmethod

@@ -26,9 +26,9 @@ from diffcloth_torch.checks import (
 )
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry import shapes
+from diffcloth_torch.geometry.loaded import load_mesh
 from diffcloth_torch.geometry.mass_properties import check_inertia, is_closed, mass_properties
 from diffcloth_torch.geometry.mesh_checks import surface_arrays, warn_of_cuts
-from diffcloth_torch.geometry.meshes import read_mesh
 from diffcloth_torch.geometry.poses import pose_array
 from diffcloth_torch.model.cloth import plane_size
 from diffcloth_torch.model.quantities import check_parameter
@@ -262,17 +262,30 @@ class RigidBody:
         return volume, center, inertia
 
     @classmethod
-    def load(cls, path: str | Path, *, scale: float = 1.0, **keywords: Any) -> RigidBody:
-        """Read an .obj, .ply or .stl file of triangles.
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        scale: float = 1.0,
+        triangulate: bool = False,
+        weld: float | None = None,
+        **keywords: Any,
+    ) -> RigidBody:
+        """Read an .obj, .ply or .stl file.
+
+        A mesh of more than 10 m or less than 1 mm gets a warning about `scale`.
 
         Args:
             path: Mesh file; its coordinates are the body frame.
             scale: Meters per unit of the file, > 0.
+            triangulate: Whether to cut polygons into triangles instead of refusing them.
+            weld: Distance [m] up to which vertices are merged; None merges none.
             **keywords: As for `RigidBody`.
         """
-        vertices, faces = read_mesh(path, "RigidBody.load: `path`")
-        factor = check_number("RigidBody.load: `scale`", scale, POSITIVE, instead=_POSES)
-        return cls(factor * vertices, faces, **keywords)
+        mesh = load_mesh(
+            "RigidBody.load", path, scale=scale, triangulate=triangulate, weld=weld, instead=_POSES
+        )
+        return cls(mesh.vertices, mesh.faces, **keywords)
 
     @classmethod
     def box(cls, size: object, **keywords: Any) -> RigidBody:

@@ -91,8 +91,8 @@ def _at_faces(layout: Layout, opening: str, values: Tensor) -> Tensor:
     if vertices == faces:
         raise InvalidInput(
             f"{opening} of {faces} values could mean one per vertex or one per face, of which "
-            "there are as many; write values of faces by the names of cloths, and values of vertices as "
-            "means of corners, values[faces].mean(-1), likewise"
+            "there are as many; write values of faces by the names of cloths, and values of "
+            "vertices as means of corners, values[faces].mean(-1), likewise"
         )
     a, b, c = values[:, layout.corners].unbind(-1)
     return (a + b + c) / 3

@@ -1,0 +1,120 @@
+"""Meshes of files in meters: polygons cut, vertices merged, and remarks on their size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from diffcloth_torch.checks import (
+    NON_NEGATIVE,
+    POSITIVE,
+    FloatArray,
+    IndexArray,
+    check_bool,
+    check_number,
+    frozen,
+)
+from diffcloth_torch.errors import InvalidInput, warn_caller
+from diffcloth_torch.geometry.meshes import Indices, read_file_mesh
+from diffcloth_torch.geometry.polygons import welded
+
+__all__ = ["LoadedMesh", "load_mesh"]
+
+# Sizes of cloths and bodies: what is beyond has most often another unit than the meter.
+_LONGEST, _SHORTEST = 10.0, 1e-3
+
+
+class LoadedMesh(NamedTuple):
+    """A mesh in meters.
+
+    Attributes:
+        vertices: Vertices [m], [n, 3].
+        faces: Triangles, [f, 3].
+        texture: Texture coordinates of the corners of the faces, [f, 3, 2], NaN where there are
+            none; None where the format has none.
+        file_vertices: Vertex that stands for each vertex of the file, [m].
+    """
+
+    vertices: FloatArray
+    faces: Indices
+    texture: FloatArray | None
+    file_vertices: IndexArray
+
+    def flat_rest_shape(self, owner: str, scale: float) -> FloatArray:
+        """Vertices [n, 3] in the plane of the texture coordinates.
+
+        Args:
+            owner: Opens messages.
+            scale: Meters per unit of the texture coordinates.
+
+        Raises:
+            InvalidInput: If a corner has no texture coordinates, a vertex has several, or faces
+                overlap because some are mirrored.
+        """
+        given = np.full((*self.faces.shape, 2), np.nan) if self.texture is None else self.texture
+        missing = np.isnan(given).any(axis=(1, 2))
+        if missing.any():
+            raise InvalidInput(
+                f"{owner}: `rest` 'uv' needs an .obj file with texture coordinates at all corners; "
+                f"face {int(np.argmax(missing))} has none ({int(missing.sum())} of {len(given)})"
+            )
+        corners, coordinates = self.faces.reshape(-1), given.reshape(-1, 2)
+        flat = np.zeros((len(self.vertices), 3))
+        flat[corners, :2] = coordinates
+        other = (flat[corners, :2] != coordinates).any(axis=1)
+        if other.any():
+            split = np.unique(corners[other])
+            raise InvalidInput(
+                f"{owner}: `rest` 'uv' must have one place for each vertex, but {len(split)} have "
+                f"several, as vertex {split[0]}: a seam cuts the texture there; cut the mesh at "
+                "its seams, load the pieces and sew them with attachments"
+            )
+        a, b, c = (flat[self.faces[:, k], :2] for k in range(3))
+        (u0, v0), (u1, v1) = (b - a).T, (c - a).T
+        mirrored = u0 * v1 - u1 * v0 < 0.0
+        if mirrored.any() and not mirrored.all():
+            rare = mirrored if 2 * mirrored.sum() <= len(mirrored) else ~mirrored
+            raise InvalidInput(
+                f"{owner}: `rest` 'uv' must have faces that all turn one way, but face "
+                f"{int(np.argmax(rare))} is mirrored ({int(rare.sum())} of {len(rare)}): the "
+                "texture is folded there"
+            )
+        return scale * flat
+
+
+def load_mesh(
+    owner: str,
+    path: str | Path,
+    *,
+    scale: object,
+    triangulate: object,
+    weld: object,
+    instead: str,
+) -> LoadedMesh:
+    """Read a mesh; warn if it is longer than 10 m or shorter than 1 mm.
+
+    Args:
+        owner: Opens messages.
+        path: Mesh file.
+        scale: Meters per unit of the file, > 0.
+        triangulate: Whether to cut polygons into triangles.
+        weld: Distance [m] up to which vertices are merged; None merges none.
+        instead: What to differentiate by instead of the scale.
+    """
+    factor = check_number(f"{owner}: `scale`", scale, POSITIVE, instead=instead)
+    cuts = check_bool(f"{owner}: `triangulate`", triangulate)
+    mesh = read_file_mesh(path, f"{owner}: `path`", triangulate=cuts)
+    vertices, faces = factor * mesh.vertices, mesh.faces
+    kept = np.arange(len(vertices))
+    if weld is not None:
+        vertices, kept = welded(vertices, check_number(f"{owner}: `weld`", weld, NON_NEGATIVE))
+        faces = kept[faces]
+    size = float(np.ptp(vertices, axis=0).max())
+    if not _SHORTEST <= size <= _LONGEST:
+        warn_caller(
+            f"{owner}: {path} is {size:.3g} m long with scale={factor:g}, which is meters per unit "
+            "of the file; for a file in millimeters pass scale=0.001"
+        )
+    return LoadedMesh(vertices, faces, mesh.texture, frozen(kept.astype(np.int32)))
