@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     )
     from diffcloth_torch.model.attachment import Attachment
     from diffcloth_torch.model.cloth import Cloth
+    from diffcloth_torch.model.deforming_body import DeformingBody
     from diffcloth_torch.model.materials import Material
     from diffcloth_torch.model.options import ContactOptions, SolverOptions
     from diffcloth_torch.model.rigid_body import RigidBody
@@ -74,6 +75,7 @@ __all__ = [
     "ContactOptions",
     "ContactPoints",
     "Control",
+    "DeformingBody",
     "Descent",
     "Evaluation",
     "Fit",
@@ -131,6 +133,7 @@ _HOMES = {
     ),
     "model.attachment": ("Attachment",),
     "model.cloth": ("Cloth",),
+    "model.deforming_body": ("DeformingBody",),
     "model.materials": ("Material",),
     "model.options": ("ContactOptions", "SolverOptions"),
     "model.rigid_body": ("RigidBody",),

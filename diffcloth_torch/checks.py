@@ -128,8 +128,8 @@ def float_array(name: str, value: object, *, instead: str = "pass a detached ten
     if array.dtype.kind in "US" and array.size:
         text = str(array.reshape(-1)[0])
         raise TypeError(
-            f"{name} must hold numbers, got the text {text!r}; convert it with float(..), as YAML "
-            "1.1 reads 1e-3 as text, and 1.0e-3 as a number"
+            f"{name} must hold real numbers, got the text {text!r}; convert it with float(..), as "
+            "YAML 1.1 reads 1e-3 as text, and 1.0e-3 as a number"
         )
     if array.dtype.kind not in "fiu" or array.dtype.itemsize > _FLOAT64_BYTES:
         raise TypeError(

@@ -36,6 +36,7 @@ _MODULES = {
     "ContactSurface": "model.round_bodies",
     "Contacts": "sim.records.contacts",
     "Control": "sim.records.controls",
+    "DeformingBody": "model.deforming_body",
     "LinkSurfaces": "sim.records.surfaces",
     "Material": "model.materials",
     "Mechanism": "model.mechanism",

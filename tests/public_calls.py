@@ -302,8 +302,15 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "Camera": lambda w: call(dc.Camera, 30.0, 20.0, zoom=1.5),
     "Camera.place": lambda w: call(dc.Camera().place, np.zeros(3), 1.0),
     "Cloth": lambda w: call(dc.Cloth, w.cloth.vertices, w.cloth.faces, name="cloth"),
-    "Cloth.grid": lambda w: call(dc.Cloth.grid, 3, 4, (1.0, 2.0), pose=[0, 0, 1, 1, 0, 0, 0]),
+    "Cloth.grid": lambda w: call(dc.Cloth.grid, (4, 3), (1.0, 2.0), pose=[0, 0, 1, 1, 0, 0, 0]),
     "Cloth.load": lambda w: call(dc.Cloth.load, w.mesh, scale=2.0, pose=[0, 0, 1, 1, 0, 0, 0]),
+    "DeformingBody": lambda w: call(dc.DeformingBody, w.cloth.vertices, w.cloth.faces),
+    "DeformingBody.load": lambda w: call(dc.DeformingBody.load, w.mesh, scale=2.0),
+    "DeformingBody.grid": lambda w: call(dc.DeformingBody.grid, (3, 4), (2.0, 1.0)),
+    "DeformingBody.material_axes": lambda w: call(
+        dc.DeformingBody(w.cloth.vertices, w.cloth.faces).material_axes, "test"
+    ),
+    "State.to": lambda w: call(w.state.to, "cpu"),
     "Cloth.material_axes": lambda w: call(w.cloth.material_axes, "test"),
     "ContactOptions": lambda w: call(dc.ContactOptions, 1e-3, 1e4, 2, slip_velocity=1e-3),
     "ContactPoints": lambda w: record(dc.ContactPoints, w.contacts),

@@ -94,6 +94,23 @@ def test_a_motor_lifts_what_its_limits_allow(capsys):
     assert "with friction" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+def test_a_figure_walks_under_a_sheet(capsys):
+    names = runpy.run_path(str(ROOT / "examples/walker.py"))
+    states, simulator = names["states"], names["simulator"]
+    figure = states[-1].positions[simulator.slices["walker"]]
+    # The sheet has come along, draped: it is as far as the figure, and reaches below its trunk.
+    assert names["mean"][0].item() == pytest.approx(figure[:, 0].mean().item(), abs=0.02)
+    assert names["mean"][0] > 0.4
+    assert names["cloth"][:, 2].min() < 0.43
+    assert all(state.report.converged for state in states)
+    weight = float(simulator.vertex_masses().sum()) * 9.81
+    forces = [state.report.contacts["walker", "sheet"].force[2] for state in states[40:]]
+    assert float(sum(forces)) / len(forces) == pytest.approx(weight, rel=0.1)
+    assert math.isfinite(names["stride"].grad.item())
+    assert "N upwards" in capsys.readouterr().out
+
+
 def test_own_mesh(own_mesh, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["own_mesh.py", str(own_mesh)])
     check_throw(runpy.run_path(str(ROOT / "examples/own_mesh.py")))

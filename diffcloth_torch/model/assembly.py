@@ -40,7 +40,8 @@ class Assembly:
             if no cloth is woven.
         cloth_vertex_start: First vertex of each cloth, then N; shape [C + 1].
         cloth_face_start: First face of each cloth, then F; shape [C + 1].
-        pins: Pinned vertices, shape [P].
+        deforming_count: Number of cloths, the last ones, that are deforming bodies.
+        pins: Pinned vertices, without those of deforming bodies; shape [P].
         soft_pins: Softly pinned vertices, shape [Q].
         pin_groups: "cloth/pin" -> rows of `pins`.
         soft_pin_groups: "cloth/pin" -> rows of `soft_pins`.
@@ -81,6 +82,7 @@ class Assembly:
     material_axes: FloatArray
     cloth_vertex_start: IndexArray
     cloth_face_start: IndexArray
+    deforming_count: int
     pins: IndexArray
     soft_pins: IndexArray
     pin_groups: Mapping[str, slice]
@@ -122,6 +124,7 @@ class Assembly:
             "V": len(self.body_vertices),
             "S": self.surface_count,
             "P": len(self.pins),
+            "D": len(self.body_vertex_rows),
             "Q": len(self.soft_pins),
             "A": len(self.springs),
             "U": self.springs.target_count,
@@ -149,6 +152,21 @@ class Assembly:
     def cloth_count(self) -> int:
         """Number of cloths, C."""
         return len(self.cloth_vertex_start) - 1
+
+    @property
+    def body_vertex_rows(self) -> IndexArray:
+        """Vertices of deforming bodies, shape [D]."""
+        first = self.cloth_vertex_start[self.cloth_count - self.deforming_count]
+        return np.arange(first, len(self.vertices), dtype=np.int32)
+
+    @property
+    def deforming_groups(self) -> dict[str, slice]:
+        """Name of a deforming body -> its rows among the D vertices."""
+        first = self.cloth_count - self.deforming_count
+        starts = self.cloth_vertex_start[first:] - self.cloth_vertex_start[first]
+        names = self.surface_names[first : self.cloth_count]
+        rows = pairwise(starts.tolist())
+        return {name: slice(*ends) for name, ends in zip(names, rows, strict=True)}
 
     @property
     def body_count(self) -> int:
@@ -196,6 +214,7 @@ def assemble(scene: Scene, *, all_nodal: bool = False) -> Assembly:
         material_axes=_material_axes(scene),
         cloth_vertex_start=vertex_start,
         cloth_face_start=face_start,
+        deforming_count=len(scene.deforming_bodies),
         pins=pins,
         soft_pins=soft_pins,
         pin_groups=pin_groups,
@@ -268,18 +287,33 @@ def _body_mechanism(name: str, body: RigidBody) -> Mechanism:
 
 
 def _ignored_pairs(scene: Scene) -> IndexArray:
-    """Pairs of links of one robot that touch by construction, and pairs that the scene names."""
+    """Pairs of links of one robot that touch by construction, and pairs that the scene names.
+
+    And those of deforming bodies and what is prescribed, itself included: nothing gives way.
+    """
     index = {name: i for i, name in enumerate(scene.surface_names)}
     named = list(scene.ignore_contact)
     for name, robot in zip(scene.robot_names, scene.robots, strict=True):
         pairs = [*robot.mechanism.adjacent_links, *robot.ignore_contact]
         named += [(f"{name}/{a}", f"{name}/{b}") for a, b in pairs]
+    deforming = scene.cloth_names[len(scene.cloths) - len(scene.deforming_bodies) :]
+    named += [(a, b) for a in deforming for b in (*deforming, *_prescribed_surfaces(scene))]
     found = {
         (min(index[a], index[b]), max(index[a], index[b]))
         for a, b in named
         if a in index and b in index  # links without collision shapes are not surfaces
     }
     return np.array(sorted(found), dtype=np.int32).reshape(-1, 2)
+
+
+def _prescribed_surfaces(scene: Scene) -> list[str]:
+    """Bodies that forces do not move, and links of such robots."""
+    bodies = zip(scene.body_names, scene.bodies, strict=True)
+    names = [name for name, body in bodies if body.motion != "dynamic"]
+    for name, robot in zip(scene.robot_names, scene.robots, strict=True):
+        if not robot.mechanism.is_dynamic:
+            names += [f"{name}/{link}" for link in robot.link_names]
+    return names
 
 
 def _joined(parts: Iterable[FloatArray]) -> FloatArray:

@@ -112,19 +112,20 @@ class Cloth:
             InvalidInput: If a shape, an index or a value is not accepted.
             TypeError: If an argument has a wrong type.
         """
-        points, triangles = surface_arrays("Cloth", vertices, faces, instead=_POSITIONS)
-        check_manifold("Cloth", len(points), triangles)
+        owner = type(self).__name__
+        points, triangles = surface_arrays(owner, vertices, faces, instead=_POSITIONS)
+        check_manifold(owner, len(points), triangles)
         # The rest shape does not depend on the pose, and unrotated coordinates are exact.
         self.rest_positions = _rest(rest_positions, points, triangles)
         if pose is not None:
-            placement = pose_array("Cloth: `pose`", pose, instead=_POSITIONS)
+            placement = pose_array(f"{owner}: `pose`", pose, instead=_POSITIONS)
             points = frozen(transform(points, placement))
         self.vertices, self.faces = points, triangles
         self.material = _material(material, len(triangles))
         self.pins, self.soft_pins = _pin_groups(pins, soft_pins, len(points))
         self.pin_stiffness = check_parameter("Cloth", "pin_stiffness", pin_stiffness)
         self.bending_model = check_choice("Cloth: `bending_model`", bending_model, BENDING_MODELS)
-        self.name = check_name("Cloth: `name`", name)
+        self.name = check_name(f"{owner}: `name`", name)
         self.directions = _directions(directions, len(triangles))
         if self.material.is_orthotropic or directions is not None:
             self.material_axes("Cloth")

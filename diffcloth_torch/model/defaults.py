@@ -10,6 +10,7 @@ from diffcloth_torch.checks import LARGEST, FloatArray
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.mesh_checks import unique_edges
 from diffcloth_torch.model.assembly import Assembly
+from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.options import ABILITIES, ContactOptions
 from diffcloth_torch.model.orthotropy import WOVEN_GROUPS
@@ -33,6 +34,11 @@ _PART_OF_NONADJACENT = 0.45
 _LARGEST_PART_OF_NONADJACENT = 0.5
 # Below this share of the distance that edges ask for, elements that are no neighbors touch.
 _TOUCHING = 1e-6
+
+
+def _elastic(scene: Scene) -> tuple[Cloth, ...]:
+    """The cloths without deforming bodies, which are the last ones."""
+    return scene.cloths[: len(scene.cloths) - len(scene.deforming_bodies)]
 
 
 def has_contact(scene: Scene, contact: ContactOptions) -> bool:
@@ -61,9 +67,9 @@ def scene_parameters(scene: Scene, assembly: Assembly, contact: bool) -> dict[st
     values: dict[str, FloatArray] = {}
     if scene.cloths:
         values = {field: _material_values(scene, field) for field in FACE_QUANTITIES}
-        if all(cloth.bending_model == "hinge" for cloth in scene.cloths):
+        if all(cloth.bending_model == "hinge" for cloth in _elastic(scene)):
             del values["poisson"]  # hinges have no Poisson effect
-        materials = [cloth.material for cloth in scene.cloths]
+        materials = [cloth.material for cloth in _elastic(scene)]
         for group in WOVEN_GROUPS:
             if all(getattr(m, field) is None for m in materials for field in group):
                 for field in group:
@@ -118,7 +124,9 @@ def _rigid_values(assembly: Assembly) -> dict[str, FloatArray]:
 
 def _material_values(scene: Scene, field: str) -> FloatArray:
     """One value if all cloths agree, one per cloth if each is uniform, else one per face."""
-    values = [cloth.material.per_face(field) for cloth in scene.cloths]
+    values = [cloth.material.per_face(field) for cloth in _elastic(scene)]
+    # A deforming body has an entry like the others, which nothing uses.
+    values += [float(np.mean(values[0]))] * len(scene.deforming_bodies)
     numbers = [value for value in values if isinstance(value, float)]
     if len(numbers) == len(values):
         return _shortest(numbers)
@@ -141,12 +149,12 @@ def choose_barrier_distance(
         )
     edges = [
         np.linalg.norm(np.diff(cloth.rest_positions[unique_edges(cloth.faces)[0]], axis=1), axis=-1)
-        for cloth in scene.cloths
+        for cloth in _elastic(scene)
     ]
     distance = _PART_OF_EDGE * float(np.median(np.concatenate(edges)))
     if not contact.self_contact:
         return distance
-    thickness = max(cloth.material.thickness for cloth in scene.cloths)
+    thickness = max(cloth.material.thickness for cloth in _elastic(scene))
     limit = _PART_OF_NONADJACENT * nonadjacent_distance - thickness
     if limit <= 0:
         _refuse_coincident(scene)
@@ -166,7 +174,7 @@ def choose_barrier_distance(
 
 def _refuse_coincident(scene: Scene) -> None:
     """Refuse cloths with two vertices at one place, which are no hem but two cut edges."""
-    for name, cloth in zip(scene.cloth_names, scene.cloths, strict=True):
+    for name, cloth in zip(scene.cloth_names, _elastic(scene), strict=False):
         _, first, inverse = np.unique(
             cloth.rest_positions, axis=0, return_index=True, return_inverse=True
         )

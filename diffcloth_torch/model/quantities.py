@@ -6,7 +6,8 @@ or letters for the sizes of a scene:
     N cloth vertices, F faces, C cloths, K bodies, R robots, L links of all robots, J joints that
     move and do not mimic, V vertices of bodies and links, S surfaces: cloths, bodies, links that
     have a shape; P pinned vertices, Q softly pinned ones; A springs of attachments, U of them to
-    targets.
+    targets; D vertices of deforming bodies. N, F, C and S count deforming bodies as cloths, the
+    last ones.
 
 The leading axis of environments is left out.
 """
@@ -128,6 +129,7 @@ CONTROL = _table(
         "attachment_weights", "-", (("A",),), "released", UNIT_INTERVAL, core="attachment_weights"
     ),
     Quantity("wind", "m/s", ((3,),), "zero", core="wind", stores=False),
+    Quantity("body_vertices", "m", (("D", 3),), "hold", stores=False),
 )
 _TAKEN_BY_THE_CORE = (
     Quantity("stretch", "N/m", _PER_FACE, "Material.stretch", POSITIVE),

@@ -16,6 +16,7 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.attachment import Attachment
 from diffcloth_torch.model.cloth import Cloth
+from diffcloth_torch.model.deforming_body import DeformingBody
 from diffcloth_torch.model.quantities import check_parameter
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.robot import Robot
@@ -34,13 +35,15 @@ class Scene:
     """The cloths, bodies and robots to simulate, and gravity. Immutable.
 
     Attributes:
-        cloths: Cloths; empty only if a body or a robot is dynamic.
+        cloths: Cloths, then deforming bodies; empty only if a body or a robot is dynamic.
         bodies: Rigid bodies.
+        deforming_bodies: Bodies that deform by prescription.
         robots: Robots.
         gravity: Acceleration [m/s^2], shape [3].
         air_density: Density of the air [kg/m^3], which cloths with drag feel.
         ignore_contact: Pairs of names of surfaces that do not collide with each other.
-        cloth_names: Names of the cloths; "cloth0", "cloth1" .. where none was given.
+        cloth_names: Names of the cloths; "cloth0", "cloth1" .. where none was given; and of the
+            deforming bodies, "deforming0" .. likewise.
         body_names: Names of the bodies; "body0", "body1" .. where none was given.
         robot_names: Names of the robots; "robot0", "robot1" .. where none was given.
         attachments: Springs between points of the scene, or to targets.
@@ -50,6 +53,7 @@ class Scene:
 
     cloths: tuple[Cloth, ...]
     bodies: tuple[RigidBody, ...]
+    deforming_bodies: tuple[DeformingBody, ...] = ()
     robots: tuple[Robot, ...]
     gravity: FloatArray
     air_density: float
@@ -64,7 +68,7 @@ class Scene:
     def __init__(
         self,
         cloths: Iterable[Cloth],
-        bodies: Iterable[RigidBody] = (),
+        bodies: Iterable[RigidBody | DeformingBody] = (),
         robots: Iterable[Robot] = (),
         *,
         gravity: object = (0.0, 0.0, -9.81),
@@ -76,7 +80,8 @@ class Scene:
 
         Args:
             cloths: At least one cloth; may be empty if a body or a robot is dynamic.
-            bodies: Bodies, in the order of `body_poses`.
+            bodies: Bodies, rigid ones in the order of `body_poses`, deforming ones in that of
+                `Control.body_vertices`.
             robots: Robots, in the order of `base_poses`; their joints are numbered in the same
                 order.
             gravity: Acceleration [m/s^2], shape [3].
@@ -89,15 +94,30 @@ class Scene:
                 names what is no surface, or an attachment names what the scene does not have.
             TypeError: If something is not a Cloth, a RigidBody, a Robot or an Attachment.
         """
-        self.cloths = _instances("cloths", cloths, Cloth)
-        self.bodies = _instances("bodies", bodies, RigidBody)
+        sheets = _instances("cloths", cloths, Cloth)
+        for i, sheet in enumerate(sheets):
+            if isinstance(sheet, DeformingBody):
+                raise TypeError(
+                    f"Scene: `bodies` must hold DeformingBody objects, not `cloths`[{i}]"
+                )
+        given: tuple[Any, ...] = _instances("bodies", bodies, RigidBody, DeformingBody)
+        self.bodies = tuple(body for body in given if isinstance(body, RigidBody))
+        self.deforming_bodies = tuple(body for body in given if isinstance(body, DeformingBody))
+        self.cloths = (*sheets, *self.deforming_bodies)
         self.robots = _instances("robots", robots, Robot)
-        if not self.cloths and not self.is_dynamic:
+        if not sheets and not self.is_dynamic:
             raise InvalidInput(
                 "Scene: `cloths` must hold at least one Cloth where no body is dynamic and no "
                 "robot has a floating base or a joint under torque or pd"
             )
-        self.cloth_names = tuple(c.name or f"cloth{i}" for i, c in enumerate(self.cloths))
+        if not sheets and self.deforming_bodies:
+            raise InvalidInput(
+                "Scene: `cloths` must hold at least one Cloth where a body deforms by prescription"
+            )
+        self.cloth_names = (
+            *(c.name or f"cloth{i}" for i, c in enumerate(sheets)),
+            *(b.name or f"deforming{i}" for i, b in enumerate(self.deforming_bodies)),
+        )
         self.body_names = tuple(b.name or f"body{i}" for i, b in enumerate(self.bodies))
         self.robot_names = tuple(r.name or f"robot{i}" for i, r in enumerate(self.robots))
         _check_unique([*self.cloth_names, *self.body_names, *self.robot_names])
@@ -149,15 +169,15 @@ class Scene:
         return f"Scene(cloths={list(self.cloths)}, bodies={list(self.bodies)}{robots}{attached})"
 
 
-def _instances(field: str, given: Any, kind: type[S]) -> tuple[S, ...]:
+def _instances(field: str, given: Any, kind: type[S], *others: type) -> tuple[S, ...]:
     if not isinstance(given, Iterable) or getattr(given, "ndim", 1) == 0:
         raise TypeError(f"Scene: `{field}` must be a list of {kind.__name__}")
-    items = []
+    items: list[Any] = []
     for i, item in enumerate(given):
-        if not isinstance(item, kind):
+        if not isinstance(item, (kind, *others)):
+            names = " or ".join(cls.__name__ for cls in (kind, *others))
             raise TypeError(
-                f"Scene: `{field}` must hold {kind.__name__} objects, "
-                f"got {type(item).__name__} at [{i}]"
+                f"Scene: `{field}` must hold {names} objects, got {type(item).__name__} at [{i}]"
             )
         items.append(item)
     return tuple(items)

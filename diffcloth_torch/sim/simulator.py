@@ -171,7 +171,7 @@ class Simulator(Observables):
         self._equilibria = Equilibria(
             scene, self._layout, dt=self.dt, scheme=scheme, contact=contact, solver=solver
         )
-        nonadjacent = self._core.smallest_nonadjacent_distance()
+        nonadjacent = self._engine.smallest_nonadjacent_distance()
         self._defaults = scene_parameters(scene, self._assembly, has_contact(scene, contact))
         self._defaults |= choose_slip_rates(self._assembly, contact)
         fields = default_fields(self._defaults)
@@ -249,6 +249,7 @@ class Simulator(Observables):
         attachments: Any = None,
         attachment_weights: Any = None,
         wind: Any = None,
+        body_vertices: Any = None,
     ) -> Control:
         """Make a control and check it against the scene.
 
@@ -269,6 +270,7 @@ class Simulator(Observables):
             attachments: Targets of attachments at the end of the step [m], shape [U, 3].
             attachment_weights: With which share of their stiffness they pull [-], shape [A].
             wind: Velocity of the air around the cloths [m/s], shape [3].
+            body_vertices: Vertices of deforming bodies at the end of the step [m], shape [D, 3].
 
         Raises:
             InvalidInput: If a name, shape or value is not accepted.
@@ -288,6 +290,7 @@ class Simulator(Observables):
             attachments=attachments,
             attachment_weights=attachment_weights,
             wind=wind,
+            body_vertices=body_vertices,
         )
         return check_control(self._layout, control)
 

@@ -79,8 +79,10 @@ def test_a_pose_places_vertices_and_not_the_rest_shape():
 
 def test_numbers_that_are_text_are_refused_with_their_value():
     """YAML 1.1 reads 1e-3 as text."""
-    sentence = r"^Material: `bending` must hold numbers, got the text '1e-3'; convert it with float"
+    sentence = (
+        r"^Material: `bending` must hold real numbers, got the text '1e-3'; convert it with float"
+    )
     with pytest.raises(TypeError, match=sentence):
         dc.Material(bending="1e-3")
-    with pytest.raises(TypeError, match=r"`size` must hold numbers, got the text '0\.1'"):
+    with pytest.raises(TypeError, match=r"`size` must hold real numbers, got the text '0\.1'"):
         dc.RigidBody.box(["0.1", "0.2", "0.3"])

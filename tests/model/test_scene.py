@@ -57,7 +57,12 @@ def test_duplicate_names_are_refused():
     [
         (([],), {}, dc.InvalidInput, "at least one Cloth"),
         (([dc.RigidBody.box(1.0)],), {}, TypeError, r"Cloth objects, got RigidBody at \[0\]"),
-        (([dc.Cloth.grid(2, 2)], [3]), {}, TypeError, r"RigidBody objects, got int at \[0\]"),
+        (
+            ([dc.Cloth.grid(2, 2)], [3]),
+            {},
+            TypeError,
+            r"RigidBody or DeformingBody objects, got int at \[0\]",
+        ),
         ((dc.Cloth.grid(2, 2),), {}, TypeError, "list of Cloth"),
         (([dc.Cloth.grid(2, 2)],), {"gravity": [0, 0]}, dc.InvalidInput, r"\[3\], got \[2\]"),
         (

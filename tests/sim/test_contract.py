@@ -29,8 +29,10 @@ PUBLIC = {
     "ContactPoints": "on forces",
     "Control": (
         "pins soft_pins body_poses forces body_wrenches joint_positions joint_velocities "
-        "joint_efforts base_poses base_wrenches attachments attachment_weights wind replace"
+        "joint_efforts base_poses base_wrenches attachments attachment_weights wind body_vertices "
+        "replace"
     ),
+    "DeformingBody": "load",
     "Descent": "record restore metrics",
     "Evaluation": "failed_environments is_better_than record",
     "InfeasibleMotion": "",
@@ -61,7 +63,7 @@ PUBLIC = {
         "vertex_masses link_poses link_velocities contact_wrenches contacts"
     ),
     "SolverOptions": "tolerance max_iterations max_seconds throw metric elastic",
-    "State": "batch_size replace detach clone export meshes contact_forces pin_forces",
+    "State": "batch_size replace detach clone to export meshes contact_forces pin_forces",
     "Trajectory": "save load detach",
     "build_info": "",
     "descend": "",

@@ -16,7 +16,7 @@ from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.inputs.control_fields import control_fields
 from diffcloth_torch.sim.inputs.layout import Layout
-from diffcloth_torch.sim.inputs.parameter_fields import parameter_fields
+from diffcloth_torch.sim.inputs.parameter_fields import parameter_fields, without_elasticity
 from diffcloth_torch.sim.inputs.state_fields import state_fields
 from diffcloth_torch.sim.records.controls import Control, Parameters
 from diffcloth_torch.sim.records.state import State
@@ -63,7 +63,7 @@ class Border:
                 [m].
             self_contact: Whether cloths collide with themselves.
         """
-        self.defaults = defaults
+        self.defaults = without_elasticity(layout, defaults)
         self._layout = layout
         self._nonadjacent_distance, self._self_contact = nonadjacent_distance, self_contact
 
@@ -85,7 +85,7 @@ class Border:
             return self.defaults
         physical = parameter_fields(self._layout, parameters, self.defaults, batch)
         self.check_barrier(operation(), physical)
-        return physical
+        return without_elasticity(self._layout, physical)
 
     def check_barrier(self, owner: str, inputs: Fields) -> None:
         """Refuse a barrier that reaches from one part of a cloth to the next.
@@ -94,7 +94,8 @@ class Border:
             owner: Opens the message.
             inputs: Fields of parameters.
         """
-        cloths = self._layout.assembly.cloth_count
+        assembly = self._layout.assembly
+        cloths = assembly.cloth_count - assembly.deforming_count
         if cloths and "barrier_distance" in inputs and self._self_contact:
             thickness = as_array(inputs["thickness"])[:, :cloths]
             distance = as_array(inputs["barrier_distance"])

@@ -173,6 +173,8 @@ def _unset(layout: Layout, field: str, state: Fields, targets: Targets | None) -
         return state[_HELD[field]]
     if field == "pins" and layout.pins.numel():
         return state["positions"][:, layout.pins]
+    if field == "body_vertices" and layout.body_vertex_rows.numel():
+        return state["positions"][:, layout.body_vertex_rows]
     if field == "joint_positions":
         return torch.where(
             layout.permissions.driven, state["joint_targets"], state["joint_positions"]

@@ -18,7 +18,7 @@ from diffcloth_torch.sim.inputs.permissions import Permissions
 
 __all__ = ["SEVERAL", "Layout"]
 
-SEVERAL = ("pins", "soft_pins", "attachments", "attachment_weights")
+SEVERAL = ("pins", "soft_pins", "attachments", "attachment_weights", "body_vertices")
 """Fields of a control whose names stand for several rows."""
 
 
@@ -36,6 +36,9 @@ class Layout:
         zeros: Field of a control -> its constant default, one environment for all. Never edited.
         parameter_shapes: Accepted shapes of each parameter.
         pins: Indices of the pinned vertices, shape [P].
+        elastic: Number of cloths or of faces -> which of them are not deforming bodies or theirs,
+            [1, C] or [1, F].
+        body_vertex_rows: Vertices of deforming bodies, shape [D].
         corners: Vertices of the faces of cloths, shape [F, 3].
         robots: Links of each of the R robots.
         shaped_links: Which of the L links have a shape, in the order of the surfaces.
@@ -78,13 +81,17 @@ class Layout:
         self.state_fields = tuple(
             name for name, q in looked_at.items() if self.has_coordinates or q.core is not None
         )
+        has_deforming = self.assembly.deforming_count > 0
         self.control_fields = tuple(
-            name for name, q in CONTROL.items() if self.has_coordinates or q.core is not None
+            name
+            for name, q in CONTROL.items()
+            if self.has_coordinates or q.core is not None or (q.axes[0][0] == "D" and has_deforming)
         )
         self.zeros = {
             name: cpu.zeros(1, *shape)
             for name, shape in self.control_shapes.items()
-            if CONTROL[name].source in ("zero", "released") or (name == "pins" and 0 in shape)
+            if CONTROL[name].source in ("zero", "released")
+            or (name in ("pins", "body_vertices") and 0 in shape)
         }
         # What is between points of the scene holds unless a control releases it.
         between = self.assembly.springs.targets < 0
@@ -93,6 +100,12 @@ class Layout:
     def _set_rows(self) -> None:
         assembly = self.assembly
         self.pins = torch.from_numpy(assembly.pins.astype(np.int64))
+        self.body_vertex_rows = torch.from_numpy(assembly.body_vertex_rows.astype(np.int64))
+        is_elastic = np.arange(assembly.cloth_count) < (
+            assembly.cloth_count - assembly.deforming_count
+        )
+        of_faces = np.repeat(is_elastic, np.diff(assembly.cloth_face_start))
+        self.elastic = {len(mask): torch.from_numpy(mask)[None] for mask in (is_elastic, of_faces)}
         self.corners = torch.from_numpy(assembly.faces.astype(np.int64))
         first_links = np.cumsum([0, *(robot.link_count for robot in assembly.robots)])
         of_robots = assembly.surface_mechanism >= assembly.body_count
@@ -111,6 +124,7 @@ class Layout:
             "K": _single_rows([body.name for body in assembly.bodies]),
             "R": _single_rows([robot.name for robot in assembly.robots]),
             "J": _single_rows(self.joint_names),
+            "D": assembly.deforming_groups,
         }
         self.groups: Mapping[str, Mapping[str, slice]] = {
             "pins": assembly.pin_groups,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -25,7 +26,7 @@ from diffcloth_torch.sim.inputs.layout import Layout
 from diffcloth_torch.sim.inputs.named_parameters import has_names, named_rows
 from diffcloth_torch.sim.records.controls import Parameters
 
-__all__ = ["check_parameters", "default_fields", "parameter_fields"]
+__all__ = ["check_parameters", "default_fields", "parameter_fields", "without_elasticity"]
 
 _ROUNDING = 1e-12  # of an eigenvalue, relative to the largest
 _ROWS = {"C": "cloth", "N": "vertex", "F": "face"}
@@ -81,6 +82,21 @@ def parameter_fields(
         values = (_per_face(layout, numbers_of(fields[name])) for name in _BENDING)
         check_bending(operation(), *values)
     return fields
+
+
+def without_elasticity(layout: Layout, fields: Fields) -> Fields:
+    """Set what deforming bodies resist with, their mass and their drag, to zero."""
+    if not layout.assembly.deforming_count:
+        return fields
+    cloths = layout.assembly.cloth_count
+    masked = {}
+    for name in FACE_QUANTITIES:
+        if name in fields and name != "poisson":
+            values = fields[name]
+            if values.shape[1] == 1:
+                values = values.expand(len(values), cloths)
+            masked[name] = torch.where(layout.elastic[values.shape[1]], values, 0.0)
+    return fields | masked
 
 
 def _at_faces(layout: Layout, opening: str, values: Tensor) -> Tensor:

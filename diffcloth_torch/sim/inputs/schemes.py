@@ -39,6 +39,11 @@ def check_scheme(
         InvalidInput: If something is not accepted.
     """
     abilities = ABILITIES[scheme]
+    if scene.deforming_bodies and (scheme != SCHEMES[0] or coupling != COUPLINGS[0]):
+        raise InvalidInput(
+            f"Simulator: bodies that deform by prescription need scheme {SCHEMES[0]!r} and "
+            f"coupling {COUPLINGS[0]!r}, got {scheme!r} and {coupling!r}"
+        )
     _check_attachments(scheme, coupling, layout)
     if integrator != INTEGRATORS[0]:
         _check_second_order(scheme, coupling, integrator, layout)

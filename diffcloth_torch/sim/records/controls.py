@@ -55,6 +55,8 @@ class Control:
             0 where a target is not set.
         wind: Velocity of the air around the cloths [m/s], shape [3]; none by default. Faces whose
             material has drag feel it.
+        body_vertices: Positions of the vertices of deforming bodies [m], shape [D, 3], or body ->
+            positions [n, 3]; bodies that are not named hold.
     """
 
     pins: Tensor | Mapping[str, Tensor] | None = None
@@ -70,6 +72,7 @@ class Control:
     attachments: Tensor | Mapping[str, Tensor] | None = None
     attachment_weights: Tensor | Mapping[str, Tensor] | None = None
     wind: Tensor | None = None
+    body_vertices: Tensor | Mapping[str, Tensor] | None = None
 
     def __repr__(self) -> str:
         return _text(self, CONTROL)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from diffcloth_torch import _core, cpu
 from diffcloth_torch.autograd.core_function import as_array
@@ -17,6 +18,7 @@ from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.options import INTEGRATORS, ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import CONTROL, PARAMETERS, STATE, Fields
 from diffcloth_torch.model.springs import Springs
+from diffcloth_torch.sim.inputs.border import Given
 from diffcloth_torch.sim.inputs.layout import Layout
 from diffcloth_torch.sim.solve.step import Constant
 from diffcloth_torch.sim.solve.trees import tree_arguments
@@ -30,6 +32,7 @@ __all__ = [
     "make_core",
     "rigid_inputs",
     "with_all_pinned",
+    "with_deforming_bodies",
     "without_cloths",
 ]
 
@@ -91,7 +94,7 @@ def make_core(
         cloth_vertex_start=assembly.cloth_vertex_start,
         cloth_face_start=assembly.cloth_face_start,
         bending_models=list(options.bending_models),
-        pins=assembly.pins,
+        pins=np.concatenate([assembly.pins, assembly.body_vertex_rows]),
         soft_pins=assembly.soft_pins,
         attachment_start=assembly.springs.start,
         attachment_points=assembly.springs.points,
@@ -121,7 +124,10 @@ def make_core(
         ).reshape(-1, 3),
         surface_names=list(assembly.surface_names),
         pin_names=[
-            name for name, rows in assembly.pin_groups.items() for _ in range(rows.start, rows.stop)
+            name
+            for groups in (assembly.pin_groups, assembly.deforming_groups)
+            for name, rows in groups.items()
+            for _ in range(rows.start, rows.stop)
         ],
         **trees,
     )
@@ -168,6 +174,22 @@ def rigid_inputs(layout: Layout, inputs: Fields) -> Fields:
     return rigid
 
 
+def with_deforming_bodies(layout: Layout, given: Given) -> Fields:
+    """Inputs of the core of which deforming bodies have rows of their own.
+
+    Their vertices are pins, the last ones. They have no stiffness (`Border`) and no mass, but the
+    core divides by masses, also by those that nothing feels: it gets the smallest of the cloths.
+    """
+    density = given.parameters["density"]
+    elastic = layout.elastic[density.shape[1]]
+    smallest = torch.where(elastic, density.detach(), torch.inf).amin(dim=1, keepdim=True)
+    held = torch.where(elastic, density, smallest)
+    targets = [given.control[name] for name in ("pins", "body_vertices")]
+    environments = max(len(rows) for rows in targets)
+    wide = [rows.expand(environments, *rows.shape[1:]) for rows in targets]
+    return {"density": held, "pin_targets": torch.cat(wide, dim=1)}
+
+
 def without_cloths(assembly: Assembly) -> Assembly:
     """The same scene without its cloths."""
     cloths = assembly.cloth_count
@@ -185,6 +207,7 @@ def without_cloths(assembly: Assembly) -> Assembly:
         pin_groups={},
         soft_pin_groups={},
         springs=Springs(),
+        deforming_count=0,
         surface_names=assembly.surface_names[cloths:],
         ignored_pairs=(pairs[(pairs >= cloths).all(axis=1)] - cloths).astype(np.int32),
     )
@@ -194,6 +217,7 @@ def with_all_pinned(assembly: Assembly) -> Assembly:
     """The same scene with all cloth vertices pinned, so that nothing moves by itself."""
     return replace(
         assembly,
+        deforming_count=0,
         pins=np.arange(len(assembly.vertices), dtype=np.int32),
         soft_pins=np.empty(0, dtype=np.int32),
         pin_groups={},

@@ -16,7 +16,7 @@ from diffcloth_torch.dynamics.dynamics import Dynamics, Prediction
 from diffcloth_torch.dynamics.limits import limit_stiffness
 from diffcloth_torch.dynamics.totals import Totals
 from diffcloth_torch.errors import TurnedTooFar
-from diffcloth_torch.model.assembly import Assembly
+from diffcloth_torch.model.assembly import Assembly, assemble
 from diffcloth_torch.model.options import INTEGRATORS, SCHEMES, ContactOptions, SolverOptions
 from diffcloth_torch.model.quantities import Fields
 from diffcloth_torch.model.scene import Scene
@@ -24,7 +24,13 @@ from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.inputs.border import Given
 from diffcloth_torch.sim.inputs.layout import Layout
 from diffcloth_torch.sim.records.surfaces import Surfaces
-from diffcloth_torch.sim.solve.cores import CoreOptions, arrays_of, core_inputs, make_core
+from diffcloth_torch.sim.solve.cores import (
+    CoreOptions,
+    arrays_of,
+    core_inputs,
+    make_core,
+    with_deforming_bodies,
+)
 from diffcloth_torch.sim.solve.failures import failures_of, mark, refuse_gradients
 from diffcloth_torch.sim.solve.masses import cloth_totals
 from diffcloth_torch.sim.solve.motion import (
@@ -103,6 +109,11 @@ class Engine:
         if self.dynamics is not None:
             stiffness = limit_stiffness(assembly, limits_dt or dt, scene.gravity)
         self.core = make_core(assembly, options, stiffness)
+        self._cloths_alone = self.core
+        if assembly.deforming_count:
+            cloths = scene.cloths[: -assembly.deforming_count]
+            alone = options._replace(bending_models=[cloth.bending_model for cloth in cloths])
+            self._cloths_alone = make_core(assemble(Scene(cloths)), alone)
         self._staggered = None
         in_turn = coupling != "monolithic" and scene.cloths and layout.is_dynamic
         if in_turn and self.dynamics is not None and stiffness is not None:
@@ -115,6 +126,10 @@ class Engine:
     def assembly(self) -> Assembly:
         """Arrays of the scene."""
         return self.layout.assembly
+
+    def smallest_nonadjacent_distance(self) -> float:
+        """Smallest distance between parts of one cloth at rest that share no vertex [m]."""
+        return self._cloths_alone.smallest_nonadjacent_distance()
 
     def step(
         self,
@@ -145,7 +160,7 @@ class Engine:
             "velocities": outcome.velocities,
             "body_forces": outcome.body_forces,
             "contact_forces": outcome.contact_forces,
-            "pin_forces": outcome.pin_forces,
+            "pin_forces": outcome.pin_forces[:, : len(self.assembly.pins)],
             **after,
             "soft_pin_targets": given.control["soft_pins"],
         }
@@ -234,6 +249,8 @@ class Engine:
     def core_inputs(self, given: Given, prediction: Prediction | None) -> Fields:
         """Inputs of the core, including the prediction of bodies and robots."""
         inputs = core_inputs(*given)
+        if self.assembly.deforming_count:
+            inputs |= with_deforming_bodies(self.layout, given)
         if prediction is not None:
             inputs |= prediction.core_inputs()
         rest = inputs.get("rest_positions")
