@@ -87,9 +87,10 @@ CONTENTS = {
         ["docs/getting-started", "docs/tutorials/index", "docs/gallery"],
     ),
     "How-to": (
-        "Your mesh, your robot, batches, failures, identification, learning, many machines.",
+        "Your mesh, files, your robot, batches, failures, identification, learning, many machines.",
         [
             "docs/meshes",
+            "docs/files",
             "docs/robots",
             "docs/batches",
             "docs/failures",

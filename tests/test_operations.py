@@ -85,6 +85,7 @@ def mistakes(call):
 # What the package or torch calls, with what was checked or made before, and what a list does.
 INNER = {
     "Cloth.material_axes",
+    "DeformingBody.material_axes",
     "ContactPoints.of",
     "Descent.restore",
     "Evaluation.is_better_than",

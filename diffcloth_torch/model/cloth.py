@@ -222,8 +222,9 @@ class Cloth:
                 has `rows` (along y), `columns` (along x) and `size`; with two lengths it warns.
             **keywords: As for `Cloth`.
         """
-        columns, rows, size = _grid_shape(arguments, keywords)
-        vertices, faces = shapes.grid(rows, columns, plane_size("Cloth.grid: `size`", size))
+        owner = f"{cls.__name__}.grid"
+        columns, rows, size = _grid_shape(owner, arguments, keywords)
+        vertices, faces = shapes.grid(rows, columns, plane_size(f"{owner}: `size`", size))
         return cls(vertices, faces, **keywords)
 
     def __repr__(self) -> str:
@@ -239,42 +240,44 @@ class Cloth:
         self.pins, self.soft_pins = MappingProxyType(self.pins), MappingProxyType(self.soft_pins)
 
 
-def _grid_shape(arguments: Sequence[Any], keywords: dict[str, Any]) -> tuple[int, int, object]:
+def _grid_shape(
+    owner: str, arguments: Sequence[Any], keywords: dict[str, Any]
+) -> tuple[int, int, object]:
     """Numbers of vertices along x and y, and the size; they are taken out of the keywords."""
     by_counts = "counts" in keywords or _has_an_axis(arguments[:1])
     names = ("counts", "size") if by_counts else ("rows", "columns", "size")
     if len(arguments) > len(names):
         raise TypeError(
-            f"Cloth.grid: takes {', '.join(f'`{name}`' for name in names)}, got {len(arguments)} "
+            f"{owner}: takes {', '.join(f'`{name}`' for name in names)}, got {len(arguments)} "
             "arguments"
         )
     given = dict(zip(names, arguments, strict=False))
     for name in names:
         if name in keywords:
             if name in given:
-                raise TypeError(f"Cloth.grid: `{name}` must be given once, got it twice")
+                raise TypeError(f"{owner}: `{name}` must be given once, got it twice")
             given[name] = keywords.pop(name)
         elif name not in given and name != "size":
-            raise TypeError(f"Cloth.grid: `{name}` must be given")
+            raise TypeError(f"{owner}: `{name}` must be given")
     size = given.get("size", 1.0)
     if not by_counts:
-        rows = check_count("Cloth.grid: `rows`", given["rows"], 2)
-        columns = check_count("Cloth.grid: `columns`", given["columns"], 2)
+        rows = check_count(f"{owner}: `rows`", given["rows"], 2)
+        columns = check_count(f"{owner}: `columns`", given["columns"], 2)
         if _has_an_axis((size,)):
-            x, y = plane_size("Cloth.grid: `size`", size).tolist()
+            x, y = plane_size(f"{owner}: `size`", size).tolist()
             warn_caller(
-                "Cloth.grid: rows and columns are counted along y and x, lengths along x and y; "
-                f"write Cloth.grid(({columns}, {rows}), ({x:g}, {y:g})), with x first in both",
+                f"{owner}: rows and columns are counted along y and x, lengths along x and y; "
+                f"write {owner}(({columns}, {rows}), ({x:g}, {y:g})), with x first in both",
                 FutureWarning,
             )
-        _check_face_count("`rows` and `columns`", rows, columns)
+        _check_face_count(owner, "`rows` and `columns`", rows, columns)
         return columns, rows, size
     counts = given["counts"]
-    check_shape("Cloth.grid: `counts`", np.shape(counts), [(2,)])
+    check_shape(f"{owner}: `counts`", np.shape(counts), [(2,)])
     columns, rows = (
-        check_count(f"Cloth.grid: `counts[{i}]`", count, 2) for i, count in enumerate(counts)
+        check_count(f"{owner}: `counts[{i}]`", count, 2) for i, count in enumerate(counts)
     )
-    _check_face_count("`counts`", columns, rows)
+    _check_face_count(owner, "`counts`", columns, rows)
     return columns, rows, size
 
 
@@ -283,10 +286,10 @@ def _has_an_axis(values: Sequence[Any]) -> bool:
     return any(isinstance(v, list | tuple) or getattr(v, "ndim", 0) == 1 for v in values)
 
 
-def _check_face_count(arguments: str, first: int, second: int) -> None:
+def _check_face_count(owner: str, arguments: str, first: int, second: int) -> None:
     if 2 * (first - 1) * (second - 1) > shapes.MOST_FACES:
         raise InvalidInput(
-            f"Cloth.grid: {arguments} must make at most {shapes.MOST_FACES} triangles, got "
+            f"{owner}: {arguments} must make at most {shapes.MOST_FACES} triangles, got "
             f"{first} x {second} vertices"
         )
 

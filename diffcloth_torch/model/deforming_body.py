@@ -63,7 +63,10 @@ class DeformingBody(Cloth):
             friction=check_parameter("DeformingBody", "friction", friction),
             thickness=check_parameter("DeformingBody", "thickness", thickness),
         )
-        super().__init__(vertices, faces, material=material, pose=pose, name=name)
+        # Hinges are the elements that take the least time.
+        super().__init__(
+            vertices, faces, material=material, pose=pose, name=name, bending_model="hinge"
+        )
 
     @classmethod
     def load(

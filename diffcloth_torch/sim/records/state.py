@@ -42,8 +42,9 @@ class State:
     """Positions, velocities and forces at one time. All tensors may share a leading batch axis.
 
     Attributes:
-        positions: Positions of the cloth vertices [m], shape [N, 3].
-        velocities: Velocities of the cloth vertices [m/s], shape [N, 3].
+        positions: Positions of the cloth vertices, then of those of deforming bodies [m], shape
+            [N, 3].
+        velocities: Velocities of these vertices [m/s], shape [N, 3].
         body_poses: [px, py, pz, qw, qx, qy, qz] of each body, shape [K, 7].
         soft_pin_targets: Where the soft pins pull [m], shape [Q, 3].
         body_forces: Forces of contact and attachments on the body vertices, of smooth ones on
