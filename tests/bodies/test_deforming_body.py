@@ -192,6 +192,30 @@ def test_its_moving_surface_drags_cloth_along(friction):
     assert state.velocities[:25, 1].abs().max() < 0.02
 
 
+def test_a_dynamic_body_rests_on_it_and_is_dragged_along():
+    belt = dc.DeformingBody.grid((13, 5), (1.2, 0.4), friction=0.5, name="belt")
+    box = dc.RigidBody.box(
+        [0.1, 0.1, 0.05],
+        motion="dynamic",
+        density=300,
+        friction=0.5,
+        pose=[-0.2, 0, 0.0295, 1, 0, 0, 0],
+        name="box",
+    )
+    sheet = dc.Cloth.grid((5, 5), 0.2, pose=[0, 1, 0, 1, 0, 0, 0], pins={"edge": range(5)})
+    simulator = dc.Simulator(dc.Scene([sheet], [belt, box]), 0.005)
+    state, rows = simulator.initial_state(), simulator.slices["belt"]
+    for _ in range(10):
+        state = simulator.step(state)
+    force = state.report.contacts["belt", "box"].force
+    torch.testing.assert_close(force, torch.tensor([0, 0, 0.15 * G], dtype=F64), rtol=0, atol=0.02)
+    for _ in range(20):
+        moved = state.positions[rows] + torch.tensor([0.01, 0, 0])
+        state = simulator.step(state, dc.Control(body_vertices={"belt": moved}))
+    # It rocks a little on its springs of contact.
+    assert state.body_velocities[0, 0].item() == pytest.approx(0.5 * G * 0.1, rel=0.03)
+
+
 def test_a_surface_that_widens_in_its_plane_drags_cloth_apart():
     """Nothing of it moves at its center, and more the farther outwards: the sheet is stretched."""
     belt = dc.DeformingBody.grid((9, 9), 0.5, name="belt", friction=1.0)

@@ -208,7 +208,7 @@ class State:
         return True
 
     def export(self, path: str | Path, *, bodies: bool = False) -> None:
-        """Write the cloths as a mesh, with the vertices in the order of `positions`.
+        """Write cloths and deforming bodies as a mesh, its vertices in the order of `positions`.
 
         Args:
             path: File ending in .obj (one object per surface) or .ply (all surfaces in one mesh).
