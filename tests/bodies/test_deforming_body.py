@@ -261,8 +261,8 @@ def test_gradients_by_its_motion(steps):
     stencil = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
     with torch.no_grad():
         expected = sum(w * loss(motion + k * h * direction).item() for k, w in stencil) / h
-    # A solve to 1e-10 m/s leaves 1e-12 m in each of the differences.
-    assert (gradient * direction).sum().item() == pytest.approx(expected, rel=1e-4)
+    # A solve to 1e-10 m/s leaves 1e-12 m in each difference: up to 9e-7 for three directions.
+    assert (gradient * direction).sum().item() == pytest.approx(expected, rel=1e-5)
     _, tangent = torch.func.jvp(loss, (motion,), (direction,))
     assert tangent.item() == pytest.approx((gradient * direction).sum().item(), rel=1e-8)
 
