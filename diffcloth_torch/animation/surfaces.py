@@ -35,7 +35,7 @@ class MovingSurface:
 
     @property
     def is_still(self) -> bool:
-        """Whether the surface is at one place throughout."""
+        """True if the surface is at one place throughout."""
         moving = self.vertices if self.frames is None else self.frames
         return bool((moving == moving[:1]).all())
 

@@ -103,7 +103,7 @@ def has_compiler() -> bool:
 
 
 def compile_nothing_in(function: Callable[..., Any]) -> None:
-    """Run the lines of a function as they are in future, but not those of what it calls.
+    """Exclude the lines of a function from the compiler, but not the functions that it calls.
 
     Requires `has_compiler()`.
     """
@@ -144,7 +144,7 @@ def register_tree(
 
 
 def register_collate(cls: type[Any], combine: Callable[[list[Any]], Any]) -> None:
-    """Let `torch.utils.data.default_collate` combine a list of objects of a class."""
+    """Make `torch.utils.data.default_collate` combine a list of objects of a class."""
 
     def collate(batch: list[Any], *, collate_fn_map: Any = None) -> Any:
         return combine(batch)

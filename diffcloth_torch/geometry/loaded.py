@@ -22,7 +22,7 @@ from diffcloth_torch.geometry.polygons import welded
 
 __all__ = ["LoadedMesh", "load_mesh"]
 
-# Sizes of cloths and bodies: what is beyond has most often another unit than the meter.
+# Usual sizes of cloths and bodies [m]: other ones are most often in another unit.
 _LONGEST, _SHORTEST = 10.0, 1e-3
 
 
@@ -101,7 +101,7 @@ def load_mesh(
         scale: Meters per unit of the file, > 0.
         triangulate: Whether to cut polygons into triangles.
         weld: Distance [m] up to which vertices are merged; None merges none.
-        instead: What to differentiate by instead of the scale.
+        instead: Remedy in the message about a scale that requires a gradient.
     """
     factor = check_number(f"{owner}: `scale`", scale, POSITIVE, instead=instead)
     cuts = check_bool(f"{owner}: `triangulate`", triangulate)

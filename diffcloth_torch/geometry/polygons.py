@@ -58,7 +58,7 @@ def _ears(points: FloatArray) -> list[tuple[int, int, int]]:
             if not _is_ear(flat, a, b, c, left):
                 continue
             length = float(np.linalg.norm(points[c] - points[a]))
-            # Of equally long diagonals, to rounding, the first one is cut.
+            # The first one of diagonals that are equally long, to rounding.
             if best is None or length < best[0] * (1 - 1e-9):
                 best = length, i
         if best is None:
@@ -87,7 +87,7 @@ def _in_plane(points: FloatArray) -> FloatArray:
 
 
 def _is_ear(flat: FloatArray, a: int, b: int, c: int, left: Sequence[int]) -> bool:
-    """Whether the corner b turns left and the triangle holds no other corner."""
+    """Report whether the corner b turns left and the triangle holds no other corner."""
     if _turn(flat[a], flat[b], flat[c]) <= 0.0:
         return False
     for other in left:

@@ -31,7 +31,7 @@ def breathing(vertices, t):
     return torch.stack([wide * x + 0.2 * t + 0.5 * t * z, y / wide, z + t * x * 0.3], dim=-1)
 
 
-# --- What it is -----------------------------------------------------------------------------------
+# --- Motion, mass, elasticity ---------------------------------------------------------------------
 
 
 def test_its_vertices_follow_the_control(tmp_path):
@@ -111,7 +111,7 @@ def test_it_may_cross_itself_and_what_is_prescribed():
 
 
 def free(state, simulator, ipctk):
-    """Whether the sheet crosses neither itself nor the body; the body may cross itself."""
+    """True if the sheet crosses neither itself nor the body; the body may cross itself."""
     first = simulator.slices["walker"].start
     faces = np.concatenate(
         [c.faces + s for c, s in zip(simulator.scene.cloths, (0, first), strict=True)]

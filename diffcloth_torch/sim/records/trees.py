@@ -18,8 +18,8 @@ Branches = Mapping[str, Any]
 class _Structure:
     """Names of the fields of a record, and its parts that are no branches.
 
-    Two records with fields of the same names have one structure, whatever else they keep; a
-    function of several trees returns what the first one keeps.
+    Two records with fields of the same names have one structure, and a function of several trees
+    returns the other parts of the first one.
     """
 
     names: tuple[str, ...]
@@ -35,7 +35,7 @@ def register_record(
 
     Args:
         cls: The class.
-        branches: Returns the fields that are branches, and what a restored object keeps besides.
+        branches: Returns the fields that are branches, and the other parts of a restored object.
         restored: Makes an object from both. The values may be of any type, as torch maps trees
             to trees of axes or placeholders.
     """
