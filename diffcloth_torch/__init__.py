@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         NotConverged,
         SimulationError,
         TurnedTooFar,
+        WorkerError,
     )
     from diffcloth_torch.model.attachment import Attachment
     from diffcloth_torch.model.cloth import Cloth
@@ -98,6 +99,7 @@ __all__ = [
     "TurnedTooFar",
     "Variable",
     "at_half_step",
+    "WorkerError",
     "build_info",
     "descend",
     "envs",
@@ -130,6 +132,7 @@ _HOMES = {
         "NotConverged",
         "SimulationError",
         "TurnedTooFar",
+        "WorkerError",
     ),
     "model.attachment": ("Attachment",),
     "model.cloth": ("Cloth",),

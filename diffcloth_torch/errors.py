@@ -18,6 +18,7 @@ __all__ = [
     "NotConverged",
     "SimulationError",
     "TurnedTooFar",
+    "WorkerError",
 ]
 
 
@@ -69,6 +70,10 @@ class TurnedTooFar(SimulationError):  # noqa: N818
 
     Raised by a step, or by backward through a step whose failure was returned as a value.
     """
+
+
+class WorkerError(RuntimeError):
+    """The workers that computed a piece of work died, or missed its deadline, again and again."""
 
 
 class AddedMassWarning(UserWarning):

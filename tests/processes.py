@@ -3,10 +3,14 @@
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import torch
+
+PATIENCE = 120.0  # seconds, for a machine under load
 
 
 @contextmanager
@@ -31,3 +35,29 @@ def run_python(code: str, **options) -> str:
     )
     assert result.returncode == 0, result.stderr
     return result.stdout
+
+
+def lives(pid: int) -> bool:
+    """Whether a process runs; one that ended may wait for its parent as a zombie."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state not in "ZX"
+
+
+def children(pid: int) -> list[int]:
+    """Processes that a process has started and that run."""
+    try:
+        text = "".join(f.read_text() for f in Path(f"/proc/{pid}/task").glob("*/children"))
+    except (FileNotFoundError, ProcessLookupError):
+        return []
+    return [child for child in map(int, text.split()) if lives(child)]
+
+
+def await_that(condition: Callable[[], bool], seconds: float = PATIENCE) -> None:
+    """Wait until a condition holds, and fail if it does not within a generous time."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)

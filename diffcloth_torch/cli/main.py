@@ -6,6 +6,8 @@ or a misspelled option need not wait for it.
 
 from __future__ import annotations
 
+import atexit
+import os
 import sys
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -24,7 +26,23 @@ _PACKAGES = ("torch", "numpy", "trimesh", "matplotlib", "pyvista", "imageio", "i
 C = TypeVar("C", bound=Callable[..., Any])
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+class _Program(click.Group):
+    """The commands; as a program, they end at once where the user interrupts them."""
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        try:
+            return self.main(*arguments, **options)
+        except SystemExit as end:
+            if end.code == _INTERRUPTED:
+                # The interpreter would take seconds to free the modules of torch one by one.
+                atexit._run_exitfuncs()
+                sys.stdout.flush()
+                sys.stderr.flush()
+                os._exit(_INTERRUPTED)
+            raise
+
+
+@click.group(cls=_Program, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="diffcloth-torch", prog_name="diffcloth")
 def main() -> None:
     """Differentiable cloth with intersection-free contact."""
@@ -36,13 +54,13 @@ def _ending_in_a_sentence(command: C) -> C:
     @wraps(command)
     def guarded(debug: bool, **arguments: Any) -> None:
         try:
-            from diffcloth_torch.errors import InvalidInput, SimulationError
+            from diffcloth_torch.errors import InvalidInput, SimulationError, WorkerError
 
             try:
                 click.echo(command(**arguments))
             except (InvalidInput, TypeError, OSError, ImportError) as error:
                 _end(error, _BAD_INPUT, debug)
-            except SimulationError as error:
+            except (SimulationError, WorkerError) as error:
                 _end(error, _SIMULATION_FAILED, debug)
         except KeyboardInterrupt as error:
             text = str(error) or "before there was anything to keep"

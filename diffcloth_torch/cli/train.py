@@ -280,11 +280,12 @@ class _Job:
 
 
 def _workers(section: WorkersSection) -> Processes | RayActors | Ranks | None:
+    deadline = section.deadline
     if section.kind == "processes":
-        return Processes(section.count)
+        return Processes(section.count, deadline=deadline)
     if section.kind == "ray":
-        return RayActors(section.count, cores=section.threads)
-    return Ranks() if section.kind == "ranks" else None
+        return RayActors(section.count, cores=section.threads, deadline=deadline)
+    return Ranks(deadline=deadline) if section.kind == "ranks" else None
 
 
 def _named(where: str, options: type[TrainerOptions], given: dict[str, Any]) -> TrainerOptions:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Gt, Len
+from annotated_types import Ge, Gt, Le, Len, Lt
 from pydantic import model_validator
 
 from diffcloth_torch.config.scene_schema import Selection
 from diffcloth_torch.config.schema import RunConfig
 from diffcloth_torch.config.section import Positive, Section, Vector3, require_one
+from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLINE
 
 __all__ = ["FitConfig", "FitSection", "SyntheticSection", "TrajectorySection", "VariableSection"]
 
@@ -83,7 +84,8 @@ class FitSection(Section):
     trajectories: Annotated[list[TrajectorySection], Len(1)]
     starts: Annotated[int, Ge(1)] = 1
     seed: Annotated[int, Ge(0)] = 0
-    workers: Annotated[int, Ge(0)] = 0
+    workers: Annotated[int, Ge(0), Le(LARGEST_WORKERS)] = 0
+    deadline: Annotated[float, Gt(0), Lt(LONGEST_DEADLINE)] = DEADLINE
     method: Literal["least_squares", "L-BFGS-B"] = "least_squares"
     loss: Literal["linear", "soft_l1", "huber", "cauchy", "arctan"] = "linear"
     loss_scale: Positive = 1.0

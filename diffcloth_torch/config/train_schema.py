@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from annotated_types import Ge, Le, MinLen
+from annotated_types import Ge, Gt, Le, Lt, MinLen
 
 from diffcloth_torch.config.schema import PictureSection
 from diffcloth_torch.config.section import Section
+from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLINE
 
 __all__ = ["EnvironmentSection", "TrainConfig", "TryoutSection", "WorkersSection"]
 
@@ -22,11 +23,15 @@ class EnvironmentSection(Section):
 
 
 class WorkersSection(Section):
-    """Who makes the rollouts: this process, others, actors of Ray, or the ranks of torchrun."""
+    """Who makes the rollouts: this process, others, actors of Ray, or the ranks of torchrun.
+
+    `deadline` is the longest time of a rollout of a chunk [s].
+    """
 
     kind: Literal["none", "processes", "ray", "ranks"] = "none"
-    count: Count = 1
+    count: Annotated[int, Ge(1), Le(LARGEST_WORKERS)] = 1
     threads: Count = 1
+    deadline: Annotated[float, Gt(0), Lt(LONGEST_DEADLINE)] = DEADLINE
 
 
 class TryoutSection(Section):

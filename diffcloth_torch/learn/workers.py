@@ -7,24 +7,25 @@ Each has `map(function, items)`, which gives the results in the order of the ite
 from __future__ import annotations
 
 import math
-import pickle
-import traceback
+import os
+import threading
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from datetime import timedelta
 from typing import Any, Generic, Protocol, TypeVar
 
-from diffcloth_torch.checks import NON_NEGATIVE, check_count, check_number
-from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.checks import NON_NEGATIVE, Range, check_count, check_number
+from diffcloth_torch.errors import InvalidInput, WorkerError
 from diffcloth_torch.extras import from_extra
+from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLINE, Pool
+from diffcloth_torch.worker import end_with_parent, portable
 
 __all__ = ["Jobs", "Processes", "Ranks", "RayActors", "Workers"]
 
 A = TypeVar("A")
 B = TypeVar("B")
 
-_REPEATS = 3  # of pieces whose process or actor died, before the error is passed on
+_DEADLINES = Range(0.0, LONGEST_DEADLINE)
+_REPEATS = 3  # of pieces whose actor died, before the error is passed on
 
 
 class Workers(Protocol):
@@ -45,54 +46,45 @@ class _Portable(Generic[A, B]):
         try:
             return self._function(item)
         except Exception as error:
-            portable = _portable(error)
-            if portable is error:
+            found = portable(error)
+            if found is error:
                 raise
-            raise portable from None
-
-
-def _portable(error: Exception) -> Exception:
-    try:
-        copy = pickle.loads(pickle.dumps(error))
-    except Exception:  # whatever its class does with arguments that are not its own
-        copy = None
-    if type(copy) is type(error):
-        return error
-    text = "".join(traceback.format_exception(error))
-    return RuntimeError(f"a worker raised {type(error).__qualname__}: {error}\n{text}")
+            raise found from None
 
 
 class Processes:
-    """Processes on this machine; what a process that dies did not finish is made again."""
+    """Processes on this machine, which end with this one however it ends.
 
-    def __init__(self, count: int) -> None:
-        """Prepare to start `count` processes."""
-        self._count = check_count("Processes: `count`", count, 1)
-        self._pool: ProcessPoolExecutor | None = None
+    A piece whose process dies, or misses the deadline, is computed again, up to three times.
+    """
+
+    def __init__(self, count: int, *, deadline: float = DEADLINE) -> None:
+        """Prepare to start processes.
+
+        Args:
+            count: Their number.
+            deadline: Longest time of a piece [s].
+
+        Raises:
+            InvalidInput: If an argument is not accepted.
+        """
+        check_count("Processes: `count`", count, 1, LARGEST_WORKERS)
+        check_number("Processes: `deadline`", deadline, _DEADLINES)
+        self._pool = Pool("Processes", count, deadline)
+        self._lock = threading.Lock()
 
     def map(self, function: Callable[[A], B], items: Sequence[A], /) -> list[B]:
         """Results in the order of the items.
 
         Raises:
-            BrokenProcessPool: If processes die again and again.
+            WorkerError: If processes die, or miss the deadline, again and again.
         """
-        for repeat in range(_REPEATS + 1):
-            if self._pool is None:
-                # Processes that are spawned inherit no thread or lock.
-                self._pool = ProcessPoolExecutor(self._count, mp_context=get_context("spawn"))
-            try:
-                return list(self._pool.map(_Portable(function), items))
-            except BrokenProcessPool:
-                self.close()
-                if repeat == _REPEATS:
-                    raise
-        raise AssertionError("unreachable")
+        with self._lock:
+            return list(self._pool.map(function, items))
 
     def close(self) -> None:
-        """End the processes."""
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-            self._pool = None
+        """End the processes; a later `map` starts new ones."""
+        self._pool.close()
 
 
 class Jobs:
@@ -118,18 +110,20 @@ class RayActors:
     times.
     """
 
-    def __init__(self, count: int, *, cores: float = 1.0) -> None:
+    def __init__(self, count: int, *, cores: float = 1.0, deadline: float = DEADLINE) -> None:
         """Start the actors, and Ray on this machine where it has not been started.
 
         Args:
             count: Number of actors.
             cores: That each occupies.
+            deadline: Longest time until the next result of a `map` arrives [s].
 
         Raises:
-            InvalidInput: If Ray is not there.
+            InvalidInput: If an argument is not accepted, or Ray is not installed.
         """
-        check_count("RayActors: `count`", count, 1)
+        check_count("RayActors: `count`", count, 1, LARGEST_WORKERS)
         check_number("RayActors: `cores`", cores, NON_NEGATIVE)
+        self._deadline = check_number("RayActors: `deadline`", deadline, _DEADLINES)
         ray = from_extra("ray", "ray", "RayActors needs ray")
         if not ray.is_initialized():
             # As many as they occupy, or they would wait for cores for ever.
@@ -144,16 +138,35 @@ class RayActors:
         """Results in the order of the items.
 
         Raises:
-            RayActorError: If actors die again and again.
+            WorkerError: If actors die again and again, or no result arrives within the deadline,
+                which ends the actors.
             InvalidInput: If they have been closed.
         """
+        from ray.exceptions import RayActorError
         from ray.util import ActorPool
 
         if not self.actors:
             raise InvalidInput("RayActors: they have been closed; make new ones")
         pool: Any = ActorPool(self.actors)
         call = _Portable(function)
-        return list(pool.map(lambda actor, item: actor.call.remote(call, item), items))
+        for item in items:
+            pool.submit(lambda actor, item: actor.call.remote(call, item), item)
+        results: list[B] = []
+        try:
+            while pool.has_next():
+                results.append(pool.get_next(timeout=self._deadline))
+        except TimeoutError as error:
+            self.close()
+            raise WorkerError(
+                f"RayActors: piece {len(results)} of {len(items)} did not end within the deadline "
+                f"of {self._deadline:g} s; the actors were ended"
+            ) from error
+        except RayActorError as error:
+            raise WorkerError(
+                f"RayActors: piece {len(results)} of {len(items)} was given up after "
+                f"{_REPEATS + 1} attempts: {error}"
+            ) from error
+        return results
 
     def close(self) -> None:
         """End the actors."""
@@ -173,20 +186,28 @@ class Ranks:
     """The processes of a `torchrun` job, each of which runs the same program.
 
     Each makes the pieces that fall to it and sends the results to all, so that all go on alike.
+    Under torchrun each ends with the agent that started it, however the agent ends.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, deadline: float = DEADLINE) -> None:
         """Join the job by gloo, where `torch.distributed` has not been initialized.
+
+        Args:
+            deadline: Longest time to wait for the results of the others [s]; a group that has been
+                initialized keeps its own.
 
         Raises:
             InvalidInput: If this is no process of a job.
         """
         import torch.distributed as dist
 
+        check_number("Ranks: `deadline`", deadline, _DEADLINES)
+
         if not dist.is_initialized():
             if not dist.is_torchelastic_launched():
                 raise InvalidInput("Ranks must run under torchrun")
-            dist.init_process_group("gloo")
+            end_with_parent(os.getppid())
+            dist.init_process_group("gloo", timeout=timedelta(seconds=deadline))
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
 
     def map(self, function: Callable[[A], B], items: Sequence[A], /) -> list[B]:
@@ -194,17 +215,15 @@ class Ranks:
 
         Raises:
             Exception: What a piece raised in any of the processes.
+            WorkerError: If a process has died, or missed the deadline.
         """
-        import torch.distributed as dist
-
         made: list[tuple[B | None, Exception | None]] = []
         for item in items[self.rank :: self.size]:
             try:
                 made.append((function(item), None))
             except Exception as error:  # all processes must learn of it, or they would wait
-                made.append((None, _portable(error)))
-        gathered: list[Any] = [None] * self.size
-        dist.all_gather_object(gathered, made)
+                made.append((None, portable(error)))
+        gathered = self._gather(made)
         results = []
         for k in range(len(items)):
             result, failure = gathered[k % self.size][k // self.size]
@@ -219,16 +238,27 @@ class Ranks:
         Raises:
             InvalidInput: If they do not, in every process.
         """
-        import torch.distributed as dist
-
-        digests: list[Any] = [None] * self.size
-        dist.all_gather_object(digests, digest)
+        digests = self._gather(digest)
         others = [rank for rank, other in enumerate(digests) if other != digests[0]]
         if others:
             raise InvalidInput(
                 f"Ranks: {what} must be the same in all processes, those of ranks {others} differ "
                 "from rank 0; seeds of each environment follow from the one of the options"
             )
+
+    def _gather(self, value: object) -> list[Any]:
+        """The values of all processes, in the order of their ranks."""
+        import torch.distributed as dist
+
+        gathered: list[Any] = [None] * self.size
+        try:
+            dist.all_gather_object(gathered, value)
+        except RuntimeError as error:  # of gloo: a connection that is closed, or a time out
+            raise WorkerError(
+                f"Ranks: another process died, or gave no result within the deadline, as rank "
+                f"{self.rank} of {self.size} reports: {error}"
+            ) from error
+        return gathered
 
     def close(self) -> None:
         """Leave the job."""

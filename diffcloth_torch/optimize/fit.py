@@ -22,6 +22,7 @@ from torch import Tensor
 from diffcloth_torch.checks import (
     POSITIVE,
     FloatArray,
+    Range,
     check_choice,
     check_count,
     check_number,
@@ -37,6 +38,7 @@ from diffcloth_torch.optimize.problem import FAILURES, Residuals, Trial, paramet
 from diffcloth_torch.optimize.starts import Job, Stage, Start, judge, run_all
 from diffcloth_torch.optimize.uncertainty import Direction, noise_of, uncertainty_of
 from diffcloth_torch.optimize.variables import Space, Variable
+from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLINE
 from diffcloth_torch.sim.records.controls import Parameters
 
 __all__ = ["Direction", "Fit", "Stage", "Start", "Trial", "fit"]
@@ -145,6 +147,7 @@ def fit(
     tolerance: float = 1e-8,
     hold_out: Residuals | None = None,
     workers: int | Executor = 0,
+    deadline: float = DEADLINE,
     resume: str | Path | None = None,
     progress: Callable[[Trial], None] = lambda _: None,
 ) -> Fit:
@@ -177,6 +180,9 @@ def fit(
             result has the same bits for any number. `residuals` must then be a function of a module
             or another object that can be pickled, and a script needs
             `if __name__ == "__main__":`.
+        deadline: Longest time of an evaluation and its Jacobian in a process of `workers` [s]. A
+            process that takes longer, or dies, is replaced, and its start computed again, up to
+            three times. An executor has no deadline.
         resume: Folder that keeps all evaluations. A fit that was interrupted takes them from there,
             and ends with the same bits. Residuals that differ where they began are refused.
         progress: Called after each evaluation; of starts in processes, when they have ended.
@@ -189,13 +195,15 @@ def fit(
         InvalidInput: If an argument is not accepted.
         SimulationError: If the simulation fails at the first values of every start.
         TypeError: If `residuals` returns something else than tensors.
+        WorkerError: If the processes of a start die, or miss the deadline, again and again.
     """
     from_extra("scipy", "fit", "fit: it needs SciPy")
     check_count("fit: `starts`", starts, 1)
     check_count("fit: `seed`", seed, 0)
     refuse_threads("fit: `workers`", workers)
     if not isinstance(workers, Executor):
-        check_count("fit: `workers`", workers, 0)
+        check_count("fit: `workers`", workers, 0, LARGEST_WORKERS)
+    check_number("fit: `deadline`", deadline, Range(0.0, LONGEST_DEADLINE))
     for name, function in (("hold_out", hold_out), ("progress", progress)):
         if not callable(function) and not (name == "hold_out" and function is None):
             raise TypeError(f"fit: `{name}` must be a function, got {type(function).__name__}")
@@ -212,7 +220,7 @@ def fit(
     )
     generator = np.random.default_rng(seed)
     firsts = [space.first] + [space.draw(generator) for _ in range(starts - 1)]
-    ends = run_all(job, firsts, workers, progress)
+    ends = run_all(job, firsts, workers, deadline, progress)
     best = min(ends, key=lambda end: end.cost)
     if best.failure is not None:
         raise next(end.failure for end in reversed(ends) if end.failure is not None)

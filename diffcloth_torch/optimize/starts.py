@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,8 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.optimize.methods import Options, solve
 from diffcloth_torch.optimize.problem import FAILURES, Failure, Memory, Problem, Residuals, Trial
 from diffcloth_torch.optimize.variables import Space
+from diffcloth_torch.processes import Pool
+from diffcloth_torch.worker import note_progress
 
 __all__ = ["End", "Job", "Stage", "Start", "judge", "run", "run_all"]
 
@@ -158,6 +162,7 @@ def run_all(
     job: Job,
     firsts: Sequence[FloatArray],
     workers: int | Executor,
+    deadline: float,
     report: Callable[[Trial], None],
 ) -> list[End]:
     """Run all starts, here or in processes: each is the same computation wherever it runs."""
@@ -170,46 +175,37 @@ def run_all(
             "fit: with `workers`, `residuals` must be a function of a module, or an object that "
             f"can be pickled: {error}"
         ) from error
-    return [*_remote(job, firsts, workers, report)]
+    ends = []
+    with closing(_remote(job, firsts, workers, deadline)) as remote:
+        for end in remote:
+            for trial in end.history:
+                report(trial)
+            ends.append(end)
+    return ends
 
 
 def _remote(
-    job: Job,
-    firsts: Sequence[FloatArray],
-    workers: int | Executor,
-    report: Callable[[Trial], None],
-) -> Iterator[End]:
-    from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
-
-    # Processes that are spawned inherit no thread or lock.
-    pool = (
-        ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
-        if isinstance(workers, int)
-        else workers
-    )
+    job: Job, firsts: Sequence[FloatArray], workers: int | Executor, deadline: float
+) -> Generator[End, None, None]:
+    work = partial(_work, job)
+    if not isinstance(workers, int):
+        yield from workers.map(work, enumerate(firsts))
+        return
+    pool = Pool("fit: `workers`", workers, deadline)
     try:
-        for future in [pool.submit(_work, job, k, first) for k, first in enumerate(firsts)]:
-            end = future.result()
-            for trial in end.history:
-                report(trial)
-            yield end
+        yield from pool.map(work, [*enumerate(firsts)])
     finally:
-        if isinstance(workers, int):
-            pool.shutdown(cancel_futures=True)
+        pool.close()
 
 
-def _work(job: Job, start: int, first: FloatArray) -> End:
+def _work(job: Job, start: tuple[int, FloatArray]) -> End:
     before = torch.get_num_threads()
     torch.set_num_threads(job.threads)
     try:
-        return run(job, start, first, _silent)
+        # The trials are reported by the caller when the start has ended.
+        return run(job, *start, lambda _: note_progress())
     finally:
         torch.set_num_threads(before)
-
-
-def _silent(trial: Trial) -> None:
-    """Report nothing: the caller reports when the start has ended."""
 
 
 def judge(job: Job, ends: Sequence[End], best: End, deviations: FloatArray) -> list[Start]:

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from processes import await_that, lives
 
 from diffcloth_torch import envs
-from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.errors import InvalidInput, WorkerError
 from diffcloth_torch.learn import Jobs, Processes, Ranks, RayActors, Trainer, TrainerOptions
 
 MAKE = functools.partial(envs.make, "FoldCloth", size=6, horizon=5, opens_at=-1.0, reach=0.06)
@@ -103,7 +104,7 @@ def test_what_a_process_that_dies_did_not_finish_is_made_again(tmp_path):
         items = [(tmp_path / "died", k) for k in range(4)]
         assert workers.map(die_once, items) == [0, 1, 2, 3]
         assert (tmp_path / "died").exists()
-        with pytest.raises(RuntimeError, match="terminated abruptly"):
+        with pytest.raises(WorkerError, match="Processes: piece 0 of 1 was given up after 4"):
             workers.map(die, [0])
     finally:
         workers.close()
@@ -131,15 +132,44 @@ def test_what_a_piece_raises_is_told_whatever_its_class():
         workers.close()
 
 
+ACTORS = """
+import sys
+from diffcloth_torch.learn import RayActors
+from test_workers import note_and_sleep
+RayActors(1).map(note_and_sleep, [sys.argv[1]])
+"""
+
+
+def note_and_sleep(path):
+    part = Path(f"{path}.part")
+    part.write_text(str(os.getpid()))
+    part.rename(path)
+    time.sleep(1000)
+
+
 @pytest.mark.filterwarnings("ignore")
 class TestRay:
+    @pytest.mark.slow
+    def test_actors_end_with_the_driver(self, ray, tmp_path):
+        script = tmp_path / "driver.py"
+        script.write_text(ACTORS)
+        file = tmp_path / "pid"
+        driver = subprocess.Popen(
+            [sys.executable, script, file], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        await_that(file.exists)
+        driver.kill()
+        driver.wait()
+        await_that(lambda: not lives(int(file.read_text())))
+
     @pytest.fixture(scope="class")
     def ray(self):
         with pytest.MonkeyPatch.context() as patch:
             # Before the import, or Ray's processes disagree about it: a cluster of this test alone.
             patch.setenv("RAY_AUTH_MODE", os.environ.get("RAY_AUTH_MODE", "disabled"))
             # Its processes import this file.
-            patch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+            for folder in Path(__file__).parents[:2]:
+                patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
             ray = pytest.importorskip("ray")
             yield ray
             ray.shutdown()
@@ -169,10 +199,20 @@ class TestRay:
     def test_who_dies_again_and_again_ends_it(self, ray):
         workers = RayActors(1)
         try:
-            with pytest.raises(ray.exceptions.RayActorError):
+            with pytest.raises(WorkerError, match="RayActors: piece 0 of 1 was given up after 4"):
                 workers.map(die, [0])
         finally:
             workers.close()
+
+    @pytest.mark.slow
+    def test_an_actor_that_stops_ends_it_at_the_deadline(self, ray):
+        workers = RayActors(1, deadline=600.0)
+        workers.map(str, [1])
+        workers._deadline = 1.0  # it has started
+        with pytest.raises(WorkerError, match="piece 1 of 2 did not end within the deadline of"):
+            workers.map(time.sleep, [0, 1000])
+        with pytest.raises(InvalidInput, match="have been closed"):
+            workers.map(str, [1])
 
     @pytest.mark.slow
     def test_ray_has_the_cores_that_actors_occupy(self, ray):
@@ -187,7 +227,7 @@ class TestRay:
 
 SCRIPT = """
 import hashlib, sys
-sys.path.insert(0, {folder!r})
+sys.path[:0] = {folders!r}
 import torch
 from test_workers import MAKE, InvalidInput, TrainerOptions, Trainer, fail, train
 from diffcloth_torch.learn import Ranks
@@ -226,7 +266,7 @@ def test_ranks_of_torchrun(tmp_path, here):
     import hashlib
 
     script = tmp_path / "job.py"
-    script.write_text(SCRIPT.format(folder=str(Path(__file__).parent)))
+    script.write_text(SCRIPT.format(folders=[str(f) for f in Path(__file__).parents[:2]]))
     result = subprocess.run(
         [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2",
          "--master-port", "0", "--standalone", str(script)],
@@ -238,6 +278,33 @@ def test_ranks_of_torchrun(tmp_path, here):
     assert result.stdout.count("all one refuses") == 2
     assert result.stdout.count("told ") == 2
     assert result.stdout.count("ranks ") == 2
+
+
+WAITING = """
+import os, sys, time
+from pathlib import Path
+from diffcloth_torch.learn import Ranks
+workers = Ranks()
+Path(sys.argv[1], f"{workers.rank}.part").write_text(str(os.getpid()))
+Path(sys.argv[1], f"{workers.rank}.part").rename(Path(sys.argv[1], str(workers.rank)))
+workers.map(time.sleep, [1000, 1000])
+"""
+
+
+@pytest.mark.slow
+def test_ranks_end_with_their_agent(tmp_path):
+    script = tmp_path / "job.py"
+    script.write_text(WAITING)
+    files = [tmp_path / "0", tmp_path / "1"]
+    agent = subprocess.Popen(
+        [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2",
+         "--master-port", "0", "--standalone", str(script), str(tmp_path)],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    await_that(lambda: all(file.exists() for file in files))
+    agent.kill()
+    agent.wait()
+    await_that(lambda: not any(lives(int(file.read_text())) for file in files))
 
 
 def test_ranks_need_a_job():
@@ -257,3 +324,8 @@ def test_what_cannot_be_sent_is_refused():
         Trainer(3, OPTIONS)
     with pytest.raises(InvalidInput, match="`count`"):
         Processes(0)
+    with pytest.raises(InvalidInput, match="`count` must be at most 4096"):
+        Processes(10**9)
+    for deadline in (0.0, 1e30):
+        with pytest.raises(InvalidInput, match="`deadline` must be between 0 and 1e"):
+            Processes(1, deadline=deadline)
