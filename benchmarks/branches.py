@@ -160,7 +160,7 @@ def record(simulator: dc.Simulator, scene: Scene, steps: int, kept: Path | None)
     """The states of a trajectory, from its regime on: of the file `kept`, or written to it."""
     start = simulator.initial_state()
     if kept is not None and kept.exists():
-        return [start.replace(**fields) for fields in torch.load(kept)]
+        return [start.replace(**fields) for fields in torch.load(kept, weights_only=True)]
     states = [in_regime(simulator, scene, 0)]
     while len(states) < steps:
         states.append(simulator.step(states[-1], scene.control(states[-1])))

@@ -288,7 +288,7 @@ def in_regime(
     """
     state = simulator.initial_state(batch or None)
     if kept is not None and kept.exists():
-        return state.replace(**torch.load(kept))
+        return state.replace(**torch.load(kept, weights_only=True))
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(state.positions.shape, generator=generator, dtype=torch.float64)
     speed = torch.tensor(scene.speed, dtype=torch.float64)

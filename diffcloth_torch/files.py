@@ -1,4 +1,5 @@
 """Files: only regular ones of a bounded size are read; new ones replace old ones as a whole."""
+"""Files: only regular ones are read; one that is replaced is replaced completely or not at all."""
 
 from __future__ import annotations
 
@@ -8,11 +9,26 @@ import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from diffcloth_torch.errors import InvalidInput
 
 __all__ = ["INTEGER", "NUMBER", "as_path", "read_regular_file", "replacing"]
+__all__ = [
+    "INTEGER",
+    "NUMBER",
+    "PART",
+    "as_path",
+    "open_regular_file",
+    "read_regular_file",
+    "replace_file",
+    "writing",
+]
+
+PART = ".part"
+"""End of the name of a file that is being written, and will replace another one."""
 
 INTEGER = re.compile(rb"[+-]?[0-9]+")
 """An integer in a text file. Python alone would also read 1_0 and digits of other scripts."""
@@ -30,17 +46,14 @@ def as_path(name: str, value: object) -> Path:
     return Path(value)
 
 
-def read_regular_file(path: Path, largest: int) -> bytes:
-    """Read a file whole.
+@contextmanager
+def open_regular_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a file to read.
 
     Reading a pipe or a device, also behind a link, could wait forever.
 
-    Args:
-        path: The file.
-        largest: Largest accepted size [bytes].
-
     Raises:
-        InvalidInput: If it is not a regular file, or larger.
+        InvalidInput: If it is not a regular file.
         OSError: If it does not exist or cannot be read.
     """
     try:
@@ -50,14 +63,28 @@ def read_regular_file(path: Path, largest: int) -> bytes:
     if regular:
         # The file at the path may have changed since: opening it must not wait either.
         with open(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb") as file:  # noqa: PTH123
-            status = os.fstat(file.fileno())
-            regular = stat.S_ISREG(status.st_mode)
-            if regular and status.st_size <= largest:
-                data = file.read(largest + 1)
-                if len(data) <= largest:
-                    return data
-    if not regular:
-        raise InvalidInput(f"{path}: must be a regular file, no folder, pipe or device")
+            if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                yield file
+                return
+    raise InvalidInput(f"{path}: must be a regular file, no folder, pipe or device")
+
+
+def read_regular_file(path: Path, largest: int) -> bytes:
+    """Read a file whole; see `open_regular_file`.
+
+    Args:
+        path: The file.
+        largest: Largest accepted size [bytes].
+
+    Raises:
+        InvalidInput: If it is not a regular file, or larger.
+        OSError: If it does not exist or cannot be read.
+    """
+    with open_regular_file(path) as file:
+        if os.fstat(file.fileno()).st_size <= largest:
+            data = file.read(largest + 1)
+            if len(data) <= largest:
+                return data
     raise InvalidInput(f"{path}: must be at most {largest >> 20} MiB")
 
 
@@ -76,3 +103,37 @@ def replacing(path: Path) -> Iterator[Path]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+def replace_file(path: Path) -> Iterator[Path]:
+    """Yield a path to write to, which replaces `path` when all is written.
+
+    If the block fails, the file at `path` stays as it is, and nothing else is left.
+
+    Raises:
+        OSError: If it cannot be written; the message is a sentence.
+    """
+    part = path.with_name(path.name + PART)
+    try:
+        with writing(path):
+            yield part
+            with part.open("rb+") as file:  # before the name, so that a crash keeps either file
+                os.fsync(file.fileno())
+            part.replace(path)
+    except BaseException:
+        with suppress(OSError):  # the first error is the one that counts
+            part.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Name a file or folder in what the disk refuses in a block that writes it.
+
+    Raises:
+        OSError: Of the class that the block raised; the message is a sentence.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, f"{path} cannot be written: {error.strerror}") from error

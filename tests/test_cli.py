@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import subprocess
 import sys
 import zipfile
@@ -15,6 +16,7 @@ import torch
 from click.testing import CliRunner
 
 import diffcloth_torch as dc
+from diffcloth_torch.checkpoint import write_checkpoint
 from diffcloth_torch.cli import main
 from diffcloth_torch.config.documents import read_document
 from diffcloth_torch.config.train_schema import TrainConfig
@@ -357,7 +359,7 @@ def test_a_finished_optimization_takes_more_iterations(call, tmp_path):
     ("arguments", "message"),
     [
         pytest.param(["--resume", "nowhere"], "must hold what `diffcloth optimize`", id="none"),
-        pytest.param(["--resume", "broken"], "is not what `diffcloth optimize` wrote", id="bytes"),
+        pytest.param(["--resume", "broken"], "is no complete checkpoint", id="bytes"),
         pytest.param(
             ["--resume", "good", "--set", "simulation.dt=1"],
             "the key must be in optimizer or output",
@@ -370,7 +372,7 @@ def test_what_cannot_be_resumed(call, tmp_path, arguments, message):
     (tmp_path / "broken/resume.pt").write_bytes(b"no such thing")
     (tmp_path / "good").mkdir()
     saved = {"config": {}, "source": "x.yaml", "start": {}, "found": None}
-    torch.save(saved, tmp_path / "good/resume.pt")
+    write_checkpoint(tmp_path / "good/resume.pt", "optimize", saved)
     result = call("optimize", *arguments)
     assert result.exit_code == 2
     assert message in one_sentence(result)
@@ -401,6 +403,85 @@ def test_an_interrupted_run_keeps_its_steps(call, tmp_path, monkeypatch):
     metrics = json.loads((tmp_path / "out/metrics.json").read_text())
     assert metrics["steps"] == 2
     assert metrics["error"] == "interrupted after step 2"
+
+
+# --- one process a folder ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("way", ["run", "optimize", "resume"])
+def test_a_folder_in_use_is_refused_with_its_holder(call, tmp_path, way):
+    arguments = [CONFIGS / "hit_cloth.yaml", *SMALL_HIT, "--out", "out", "--overwrite"]
+    if way == "resume":
+        assert call("optimize", *arguments).exit_code == 0
+    names = sorted(f.name for f in tmp_path.rglob("*"))
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLD, tmp_path / "out"], stdout=subprocess.PIPE, text=True
+    )
+    with holder:
+        assert holder.stdout.readline() == "held\n"
+        refused = call("optimize", "--resume", "out") if way == "resume" else call(way, *arguments)
+        assert refused.exit_code == 2
+        assert f"out is in use by process {holder.pid} on " in one_sentence(refused)
+        holder.kill()
+    # The lock ends with the process, and its file with the next one that uses the folder.
+    assert (tmp_path / "out/.lock").exists()
+    command = ["optimize", "--resume", "out"] if way == "resume" else [way, *arguments]
+    result = call(*command)
+    assert result.exit_code == 0, result.output
+    assert not (tmp_path / "out/.lock").exists()
+    assert not list(tmp_path.rglob("*.part"))
+    if way == "resume":
+        assert sorted(f.name for f in tmp_path.rglob("*")) == names
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from diffcloth_torch.lock import locked
+with locked("hold", Path(sys.argv[1])):
+    Path(sys.argv[1], "metrics.json.part").touch()  # as one that is killed while it writes
+    print("held", flush=True)
+    time.sleep(1000)
+"""
+
+
+@pytest.mark.parametrize("name", ["resume.pt", "metrics.json", "actions.npz", "events"])
+def test_something_in_the_place_of_results_is_refused(call, tmp_path, name):
+    (tmp_path / "out").mkdir()
+    if name == "events":
+        (tmp_path / "out/events").touch()
+    else:
+        (tmp_path / "out" / name).mkdir()
+    result = call("optimize", CONFIGS / "hit_cloth.yaml", "--out", "out", "--overwrite")
+    assert result.exit_code == 2
+    assert "move it away" in one_sentence(result)
+
+
+@pytest.mark.parametrize("out", ["file/out", "/proc/out", "file"])
+def test_a_folder_that_cannot_be_made_is_refused(call, tmp_path, out):
+    (tmp_path / "file").touch()
+    result = call("run", "sheet.yaml", "--out", out)
+    assert result.exit_code == 2
+    assert "Traceback" not in result.output
+    assert "cannot be written" in result.stderr or "is a file" in result.stderr
+
+
+def test_a_full_disk_ends_in_a_sentence_and_keeps_what_there_was(call, tmp_path):
+    arguments = [CONFIGS / "hit_cloth.yaml", *SMALL_HIT, "--set=output.viewers=[]"]
+    assert call("optimize", *arguments, "--out", "out").exit_code == 0
+    before = {f.name: f.read_bytes() for f in (tmp_path / "out").iterdir()}
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))  # bytes of a file
+    try:
+        more = call("optimize", "--resume", "out", "--set", "optimizer.iterations=3")
+        other = call("optimize", *arguments, "--out", "other")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    for result in (more, other):
+        assert result.exit_code == 2, result.output
+        assert "resume.pt cannot be written: File too large" in one_sentence(result)
+    assert {f.name: f.read_bytes() for f in (tmp_path / "out").iterdir()} == before
+    assert not list((tmp_path / "other").iterdir())
 
 
 # --- actions of another run ---------------------------------------------------------------------
@@ -501,7 +582,7 @@ def no_work(monkeypatch):
     monkeypatch.setattr(Simulator, "_next", fail)  # of rollouts
 
 
-@pytest.mark.parametrize("name", ["metrics.json", "actions.npz", "loss.png", "resume.part"])
+@pytest.mark.parametrize("name", ["metrics.json", "actions.npz", "loss.png", "resume.pt.part"])
 @pytest.mark.usefixtures("no_work")
 def test_a_folder_named_like_a_result_is_refused_before_the_work(call, tmp_path, name):
     (tmp_path / "out" / name).mkdir(parents=True)

@@ -1,5 +1,6 @@
 """Dependencies point one way: between the folders of csrc/, and between the modules in Python."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -139,6 +140,47 @@ def test_one_module_uses_undocumented_torch():
     package = ROOT / "diffcloth_torch"
     users = {p.relative_to(package) for p in package.rglob("*.py") if PRIVATE.search(p.read_text())}
     assert users == {Path("autograd/torch_private.py")}
+
+
+UNPICKLERS = {
+    # Read files: what a file holds must not run.
+    "diffcloth_torch/checkpoint.py": {"torch.load"},
+    "diffcloth_torch/sim/records/trajectory.py": {"torch.load"},
+    "benchmarks/branches.py": {"torch.load"},
+    "benchmarks/scenes.py": {"torch.load"},
+    # Read messages between a process and its own workers.
+    "diffcloth_torch/learn/rollouts.py": {"pickle.loads"},
+    "diffcloth_torch/processes.py": {"pickle.loads"},
+    "diffcloth_torch/worker.py": {"pickle.loads"},
+    "benchmarks/scaling.py": {"pickle.loads"},
+}
+
+
+def unpickled(tree):
+    """Calls of `torch.load` and of `pickle`, as (name, keywords)."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            name = ast.unparse(node.func)
+            is_numpy = name.endswith("np.load")
+            if re.fullmatch(r"(torch|pickle)\.(load|loads|Unpickler)", name) or is_numpy:
+                yield name, {k.arg: ast.unparse(k.value) for k in node.keywords}
+
+
+def test_no_file_is_unpickled_that_could_run_code():
+    found: dict[str, set[str]] = {}
+    for folder in ("diffcloth_torch", "benchmarks", "examples", "docs", "scripts"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for name, keywords in unpickled(ast.parse(path.read_text())):
+                place = str(path.relative_to(ROOT))
+                if name.endswith("np.load"):
+                    assert keywords.get("allow_pickle", "False") == "False", place
+                    continue
+                found.setdefault(place, set()).add(name)
+                if name == "torch.load":
+                    assert keywords.get("weights_only") == "True", place
+    assert found == UNPICKLERS
+    text = "torch.load(f, weights_only=False)"
+    assert list(unpickled(ast.parse(text))) == [("torch.load", {"weights_only": "False"})]
 
 
 def test_python_imports_point_down():

@@ -11,12 +11,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from diffcloth_torch.cli.results import (
-    check_folder,
-    read_resume,
+    clear,
+    results_folder,
+    resumed_folder,
     write_metrics,
     write_resume,
 )
-from diffcloth_torch.config.viewers import ANIMATION, open_fitted
+from diffcloth_torch.config.viewers import open_fitted
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.extras import from_extra
 from diffcloth_torch.optimize.fit import Fit, Trial, fit
@@ -47,14 +48,13 @@ def fit_configuration(
         raise InvalidInput(
             f"{config}: `task` must be identify to fit something, got {task.config.task!r}"
         )
-    out = check_folder(config, out, overwrite)
-    out.mkdir(parents=True, exist_ok=True)
-    for name in (_RESULT, _PAGE, ANIMATION):
-        (out / name).unlink(missing_ok=True)
-    for file in (out / _EVALUATIONS).glob("start_*.pt"):
-        file.unlink()
-    write_resume(out, task.config.model_dump(mode="json", exclude_unset=True), config)
-    return _run(task, out)
+    with results_folder(config, out, overwrite, "fit") as folder:
+        clear(folder)
+        for file in (folder / _EVALUATIONS).glob("start_*.pt"):
+            file.unlink()
+        document = task.config.model_dump(mode="json", exclude_unset=True)
+        write_resume(folder, "fit", document, config)
+        return _run(task, folder)
 
 
 def resume_fit(folder: Path) -> str:
@@ -64,12 +64,13 @@ def resume_fit(folder: Path) -> str:
         folder: Folder of its results.
 
     Raises:
-        InvalidInput: If the folder has no such results.
+        InvalidInput: If the folder has no such results, or another process uses it.
     """
-    document, source = read_resume(folder, "fit")
-    task = make_task(check_document(document, source), source)
-    assert isinstance(task, Identify)
-    return _run(task, folder)
+    with resumed_folder(folder, "fit") as kept:
+        task = make_task(check_document(kept["config"], kept["source"]), kept["source"])
+        if not isinstance(task, Identify):
+            raise InvalidInput(f"--resume: {folder} must hold a fit, got {task.config.task!r}")
+        return _run(task, folder)
 
 
 def _run(task: Identify, out: Path) -> str:

@@ -74,7 +74,10 @@ def _ending_in_a_sentence(command: C) -> C:
 def _end(error: Exception, code: int, debug: bool) -> None:
     if debug:
         raise error
-    click.echo(f"Error: {' '.join(str(error).split())}", err=True)
+    text = str(error)
+    if isinstance(error, OSError) and error.filename is None and error.strerror:
+        text = error.strerror  # without the number
+    click.echo(f"Error: {' '.join(text.split())}", err=True)
     sys.exit(code)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -11,27 +12,29 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
+from diffcloth_torch.checkpoint import check_like, check_optimizer, refusing_damage
 from diffcloth_torch.cli.results import (
     METRICS,
     RESUME,
     check_folder,
-    check_places,
     clear,
     read_actions,
-    replace_file,
-    resumed_from,
+    results_folder,
+    resumed_folder,
     step_records,
     values_used,
     write_metrics,
+    write_resume,
 )
 from diffcloth_torch.config.documents import set_values
 from diffcloth_torch.config.viewers import open_viewers
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.files import replace_file
 from diffcloth_torch.optimize.descent import Descent
 from diffcloth_torch.tasks.optimization import optimize as run_optimization
 from diffcloth_torch.tasks.optimization import position_gradients
 from diffcloth_torch.tasks.registry import TASKS, check_document, load_task, make_task
-from diffcloth_torch.tasks.task import Actions, OptimizableTask
+from diffcloth_torch.tasks.task import Actions, ConfiguredTask, OptimizableTask
 from diffcloth_torch.viewers.curves import draw_loss_curve, require_matplotlib
 
 __all__ = ["optimize", "resume"]
@@ -52,7 +55,7 @@ def optimize(
 
     Arguments and errors are those of `run`.
     """
-    out = check_folder(config, out, overwrite)
+    check_folder(config, out, overwrite, "optimize")
     task = load_task(config, assignments)
     if not isinstance(task, OptimizableTask):
         able = ", ".join(name for name, kind in TASKS.items() if issubclass(kind, OptimizableTask))
@@ -61,8 +64,9 @@ def optimize(
             f"`diffcloth run`; tasks that have are {able}"
         )
     start = read_actions(task, actions)
-    clear(out)
-    return _optimize(task, config, out, start, None)
+    with results_folder(config, out, overwrite, "optimize") as folder:
+        clear(folder)
+        return _optimize(task, config, folder, start, None)
 
 
 def resume(folder: Path, assignments: Iterable[str] = ()) -> str:
@@ -76,24 +80,54 @@ def resume(folder: Path, assignments: Iterable[str] = ()) -> str:
         assignments: "key=value" each, of the sections `optimizer` and `output`.
 
     Raises:
-        InvalidInput: If the folder has no such results, or an assignment changes another section.
+        InvalidInput: If the folder has no such results, another process uses it, or an assignment
+            changes another section.
     """
-    check_places(folder)
-    with resumed_from(folder, RESUME, "optimize") as file:
-        saved = torch.load(file, map_location=cpu.DEVICE, weights_only=True)
-        document, source = saved["config"], Path(saved["source"])
-        start = {name: tensor.requires_grad_() for name, tensor in saved["start"].items()}
-        record = saved["found"]
-        found = None if record is None else Descent.restore(record)
-    for assignment in assignments:
-        if assignment.partition(".")[0] not in _RESUMABLE:
-            raise InvalidInput(
-                f"--set with --resume: the key must be in {' or '.join(_RESUMABLE)}, "
-                f"got {assignment!r}"
-            )
-    task = make_task(check_document(set_values(document, assignments), source), source)
-    assert isinstance(task, OptimizableTask)
-    return _optimize(task, source, folder, start, found)
+    with resumed_folder(folder, "optimize") as kept:
+        source = kept["source"]
+        for assignment in assignments:
+            if assignment.partition(".")[0] not in _RESUMABLE:
+                raise InvalidInput(
+                    f"--set with --resume: the key must be in {' or '.join(_RESUMABLE)}, "
+                    f"got {assignment!r}"
+                )
+        task = make_task(check_document(set_values(kept["config"], assignments), source), source)
+        with refusing_damage("--resume", folder / RESUME):
+            start, found = _checked(task, kept)
+        assert isinstance(task, OptimizableTask)
+        return _optimize(task, source, folder, start, found)
+
+
+def _checked(task: ConfiguredTask, kept: dict[str, Any]) -> tuple[Actions, Descent | None]:
+    """The first actions and the results so far, as a file has them.
+
+    Raises:
+        InvalidInput: If they do not belong to the task.
+    """
+    example = {name: tensor.detach() for name, tensor in task.actions().items()}
+    check_like("the first actions", kept["start"], example)
+    start = {name: tensor.requires_grad_() for name, tensor in kept["start"].items()}
+    if kept["found"] is None:
+        return start, None
+    found = Descent.restore(kept["found"])
+    check_like("the next actions", found.next_variables, example)
+    check_like("the best rows", [found.best_rows, found.best_losses], [{}, cpu.zeros(0)])
+    # Whatever the momentum was, and will be.
+    momenta = torch.optim.SGD([t.clone() for t in example.values()], lr=0.0, momentum=0.9)
+    groups = momenta.state_dict()["param_groups"]
+    state = {
+        key: {name: value for name, value in entry.items() if value is not None}
+        for key, entry in found.optimizer["state"].items()
+    }
+    entries = {key: entry for key, entry in state.items() if entry}
+    check_optimizer("the optimizer", {"state": entries, "param_groups": groups}, momenta)
+    if len(found.best.states) != task.steps:
+        raise InvalidInput(f"there must be {task.steps} states, got {len(found.best.states)}")
+    for k, state_after in enumerate(found.best.states):
+        task.simulator.kinetic_energy(state_after)  # checks the state
+        if state_after.report is None or state_after.batch_size is not None:
+            raise InvalidInput(f"the state after step {k} must be one of a rollout")
+    return start, found
 
 
 def _optimize(
@@ -143,19 +177,24 @@ def _write_optimization(task: OptimizableTask, found: Descent, out: Path) -> Non
         **values_used(task),
     }
     write_metrics(out / METRICS, metrics)
-    torch.save({"best": found.best.variables, "initial": found.first.variables}, out / "actions.pt")
+    # torch reports a full disk as a RuntimeError where it writes the file itself.
+    archive = BytesIO()
+    torch.save({"best": found.best.variables, "initial": found.first.variables}, archive)
+    with replace_file(out / "actions.pt") as part:
+        part.write_bytes(archive.getbuffer())
     arrays: dict[str, Any] = {name: a.numpy() for name, a in found.best.variables.items()}
-    np.savez(out / "actions.npz", **arrays)
+    with replace_file(out / "actions.npz") as part, part.open("wb") as file:
+        np.savez(file, **arrays)
 
 
 def _write_resume(
     task: OptimizableTask, source: Path, start: Actions, found: Descent | None, out: Path
 ) -> None:
-    saved = {
-        "config": task.config.model_dump(mode="json"),
-        "source": str(source.resolve()),
-        "start": {name: tensor.detach() for name, tensor in start.items()},
-        "found": None if found is None else found.record(),
-    }
-    with replace_file(out / RESUME) as part:
-        torch.save(saved, part)
+    write_resume(
+        out,
+        "optimize",
+        task.config.model_dump(mode="json"),
+        source,
+        start={name: tensor.detach() for name, tensor in start.items()},
+        found=None if found is None else found.record(),
+    )

@@ -1,4 +1,4 @@
-"""Folders of results: checks before the work, files of actions, files to resume from, metrics."""
+"""Folders of results: a lock, checks before the work, actions, files to resume from, metrics."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ import torch
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from diffcloth_torch.checkpoint import read_checkpoint, refusing_damage, write_checkpoint
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.files import read_regular_file
+from diffcloth_torch.files import PART, as_path, read_regular_file, replace_file
+from diffcloth_torch.lock import LOCK, locked
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.statistics import finite_or_none, reports_of
 from diffcloth_torch.sim.records.state import State
@@ -26,12 +28,11 @@ __all__ = [
     "METRICS",
     "RESUME",
     "check_folder",
-    "check_places",
     "clear",
     "read_actions",
     "read_resume",
-    "replace_file",
-    "resumed_from",
+    "results_folder",
+    "resumed_folder",
     "step_records",
     "values_used",
     "write_metrics",
@@ -43,31 +44,69 @@ METRICS, RESUME = "metrics.json", "resume.pt"
 _FILES = (
     *(METRICS, RESUME, "actions.pt", "actions.npz", "loss.png"),
     *("animation.mp4", "animation.gif", "animation.png", "animation.html"),
-    *("metrics.part", "resume.part"),
+    *("fit.json", "fit.html", "train.json", "policy.pt"),
+    *("evaluation.mp4", "evaluation.gif", "evaluation.png", "evaluation.html"),
 )
-_FOLDERS = ("meshes", "animation_frames")
+_FOLDERS = ("meshes", "animation_frames", "evaluation_frames", "evaluations", "events")
 
-_RESUME_JSON = "resume.json"  # of fits and trainings
-_LARGEST_JSON = 1 << 20  # bytes of a configuration
+_RESUME_BEFORE = "resume.json"  # before 0.2.0
 _LARGEST_ACTIONS = 256 << 20  # bytes of a file: no run of this code writes a tenth
 
 
-def check_folder(config: Path, out: Path | None, overwrite: bool) -> Path:
-    """Name the folder for results, and refuse one that holds others unless `overwrite`."""
+def check_folder(config: Path, out: Path | None, overwrite: bool, command: str = "") -> Path:
+    """Name the folder for results, and refuse one that holds others unless `overwrite`.
+
+    Args:
+        config: The configuration, whose name is that of the folder by default.
+        out: The folder, or None.
+        overwrite: Whether it may hold other results.
+        command: The command that may go on with them, if one can.
+    """
     folder = Path("results") / config.stem if out is None else out
-    if folder.is_dir() and any(folder.iterdir()) and not overwrite:
-        going_on = f", `optimize --resume {folder}` goes on" if (folder / RESUME).exists() else ""
+    if folder.is_dir() and {file.name for file in folder.iterdir()} - {LOCK} and not overwrite:
+        goes_on = command and (folder / RESUME).exists()
+        going_on = f", `{command} --resume {folder}` goes on" if goes_on else ""
         raise InvalidInput(
             f"--out: {folder} holds results already: --overwrite replaces them{going_on}, and "
             "--out names another folder"
         )
-    check_places(folder)
+    _check_places(folder)
     return folder
 
 
-def check_places(folder: Path) -> None:
+@contextmanager
+def results_folder(
+    config: Path, out: Path | None, overwrite: bool, command: str = ""
+) -> Iterator[Path]:
+    """Yield the folder for results, locked; arguments are those of `check_folder`.
+
+    Raises:
+        InvalidInput: If another process uses the folder, or it holds other results.
+        OSError: If it cannot be written.
+    """
+    folder = check_folder(config, out, overwrite, command)
+    with locked("--out", folder):
+        check_folder(config, out, overwrite, command)
+        yield folder
+
+
+@contextmanager
+def resumed_folder(folder: Path, command: str) -> Iterator[dict[str, Any]]:
+    """Yield the content of a file of `write_resume`, while the folder is locked.
+
+    Raises:
+        InvalidInput: If another process uses the folder, or it has no such file.
+        OSError: If it cannot be written.
+    """
+    read_resume(folder, command)
+    with locked("--resume", folder):
+        _check_places(folder)
+        yield read_resume(folder, command)
+
+
+def _check_places(folder: Path) -> None:
     """Refuse, before the work, anything in the way of its results."""
-    for name in _FILES:
+    for name in (*_FILES, *(f"{name}{PART}" for name in _FILES)):
         if (folder / name).is_dir():
             raise InvalidInput(
                 f"{folder / name} is a folder, in the place of a file of results: move it away"
@@ -80,9 +119,8 @@ def check_places(folder: Path) -> None:
 
 
 def clear(folder: Path) -> None:
-    """Make the folder for results, without the files of an earlier run or optimization."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in _FILES:
+    """Remove the files of earlier results."""
+    for name in (*_FILES, _RESUME_BEFORE):
         (folder / name).unlink(missing_ok=True)
 
 
@@ -132,36 +170,40 @@ def _shapes(shapes: dict[str, list[int]]) -> str:
     return ", ".join(f"{name} {shape}" for name, shape in shapes.items()) or "nothing"
 
 
-@contextmanager
-def resumed_from(folder: Path, name: str, command: str) -> Iterator[Path]:
-    """Yield the file that `diffcloth command --resume` reads, and name it in what goes wrong.
+def write_resume(
+    folder: Path, command: str, document: dict[str, Any], source: Path, **content: Any
+) -> None:
+    """Write the file that `diffcloth command --resume` reads.
+
+    Args:
+        folder: Folder of the results.
+        command: The command.
+        document: The configuration.
+        source: File that it was read from.
+        content: Whatever else the command goes on with, in types that `torch.load` reads.
+    """
+    kept = {"config": document, "source": str(source.resolve()), **content}
+    write_checkpoint(folder / RESUME, command, kept)
+
+
+def read_resume(folder: Path, command: str) -> dict[str, Any]:
+    """Read a file of `write_resume`, whose `source` becomes a Path.
 
     Raises:
-        InvalidInput: If there is no such file, or the block fails to read its content.
+        InvalidInput: If there is no such file, or its content is damaged.
     """
-    file = folder / name
+    file = folder / RESUME
     if not file.is_file():
+        older = (folder / _RESUME_BEFORE).is_file()
+        why = f"; {_RESUME_BEFORE} is of diffcloth_torch before 0.2.0, which cannot be resumed" if older else ""
         raise InvalidInput(
-            f"--resume: {folder} must hold what `diffcloth {command}` wrote: no {file}"
+            f"--resume: {folder} must hold what `diffcloth {command}` wrote: no {file}{why}"
         )
-    try:
-        yield file
-    except (OSError, MemoryError):
-        raise
-    except Exception as error:  # any that parsers and unpicklers raise for other bytes
-        raise InvalidInput(f"--resume: {file} is not what `diffcloth {command}` wrote") from error
-
-
-def write_resume(folder: Path, document: dict[str, Any], source: Path) -> None:
-    """Write the configuration, and the file that it was read from, for `read_resume`."""
-    write_metrics(folder / _RESUME_JSON, {"config": document, "source": str(source.resolve())})
-
-
-def read_resume(folder: Path, command: str) -> tuple[dict[str, Any], Path]:
-    """Read the configuration of a fit or a training, and the file that it was read from."""
-    with resumed_from(folder, _RESUME_JSON, command) as file:
-        saved = json.loads(read_regular_file(file, _LARGEST_JSON))
-        return dict(saved["config"]), Path(saved["source"])
+    content = read_checkpoint("--resume", file, command)
+    with refusing_damage("--resume", file):
+        if not isinstance(content, dict) or not isinstance(content.get("config"), dict):
+            raise InvalidInput("its content must be a dict with a configuration")
+        return {**content, "source": as_path("the source", content["source"])}
 
 
 def write_metrics(path: Path, metrics: dict[str, Any]) -> None:
@@ -169,14 +211,6 @@ def write_metrics(path: Path, metrics: dict[str, Any]) -> None:
     text = json.dumps(metrics, indent=2, allow_nan=False) + "\n"
     with replace_file(path) as part:
         part.write_text(text, encoding="utf-8")
-
-
-@contextmanager
-def replace_file(path: Path) -> Iterator[Path]:
-    """Yield a path to write to, which replaces `path` when all is written."""
-    part = path.with_suffix(".part")
-    yield part
-    part.replace(path)
 
 
 def step_records(states: Sequence[State]) -> list[dict[str, Any]]:

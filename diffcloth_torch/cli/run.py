@@ -11,6 +11,7 @@ from diffcloth_torch.cli.results import (
     check_folder,
     clear,
     read_actions,
+    results_folder,
     step_records,
     values_used,
     write_metrics,
@@ -22,7 +23,7 @@ from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.records.trajectory import Trajectory, check_ending
 from diffcloth_torch.tasks.registry import load_task
 from diffcloth_torch.tasks.simulation import simulate
-from diffcloth_torch.tasks.task import ConfiguredTask
+from diffcloth_torch.tasks.task import Actions, ConfiguredTask
 
 __all__ = ["run"]
 
@@ -54,14 +55,20 @@ def run(
     out = check_folder(config, out, overwrite)
     if save is not None:
         _check_target(save, overwrite)
+    check_folder(config, out, overwrite)
     task = load_task(config, assignments)
     start_actions = read_actions(task, actions)
+    with results_folder(config, out, overwrite) as folder:
+        return _simulate(task, start_actions, config, folder)
+
+
+def _simulate(task: ConfiguredTask, actions: Actions, config: Path, out: Path) -> str:
     states: list[State] = []
     start = time.perf_counter()
     try:
         clear(out)
         with open_viewers(task.config, task.scene, out, task.goals()) as viewers:
-            for state in simulate(task, start_actions):
+            for state in simulate(task, actions):
                 viewers.show(state)
                 states.append(state)
             seconds = time.perf_counter() - start

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 from collections.abc import Iterable
@@ -14,11 +13,14 @@ from typing import Any
 from tqdm import tqdm
 
 from diffcloth_torch import envs
+from diffcloth_torch.checkpoint import check_like, refusing_damage
 from diffcloth_torch.cli.results import (
+    RESUME,
     check_folder,
+    clear,
     read_resume,
-    replace_file,
-    resumed_from,
+    results_folder,
+    resumed_folder,
     write_metrics,
     write_resume,
 )
@@ -40,7 +42,10 @@ __all__ = ["resume_training", "train"]
 # Files in a folder of results; TensorBoard reads those of a folder.
 _RESULT, _POLICY, _EVENTS = "train.json", "policy.pt", "events"
 _VIDEO = "evaluation"
+_EVALUATION = {"updates": 0, "steps": 0, "return": 0.0, "success": 0.0, "seconds": 0.0}
 _NOT_THERE = ("num_envs", "seed", "autoreset_mode")  # what a trainer decides
+
+_Workers = Processes | RayActors | Ranks | None
 
 
 def train(
@@ -55,17 +60,17 @@ def train(
     Arguments and errors are those of `run`.
     """
     section = _check(set_values(read_document(config), assignments), config)
-    job = _Job(section, config)
-    out = Path("results") / config.stem if out is None else out
-    if job.writes:
-        check_folder(config, out, overwrite)
-        out.mkdir(parents=True, exist_ok=True)
-        for file in (out / _RESULT, out / _POLICY, *out.glob(f"{_VIDEO}.*")):
-            file.unlink(missing_ok=True)
-        if (out / _EVENTS).is_dir():
-            shutil.rmtree(out / _EVENTS)
-        job.keep_configuration(out)
-    return job.run(out, [])
+    workers = _workers(section.workers)
+    if not _writes(workers):
+        return _Job(section, config, workers).run(check_folder(config, out, True), [])
+    check_folder(config, out, overwrite, "train")
+    job = _Job(section, config, workers)
+    with results_folder(config, out, overwrite, "train") as folder:
+        clear(folder)
+        if (folder / _EVENTS).is_dir():
+            shutil.rmtree(folder / _EVENTS)
+        job.keep(folder, [])
+        return job.run(folder, [])
 
 
 def resume_training(folder: Path) -> str:
@@ -75,19 +80,21 @@ def resume_training(folder: Path) -> str:
         folder: Folder of its results.
 
     Raises:
-        InvalidInput: If the folder has no such results.
+        InvalidInput: If the folder has no such results, or another process uses it.
     """
-    document, source = read_resume(folder, "train")
-    history: list[dict[str, Any]] = []
-    tried: list[dict[str, Any]] = []
-    if (folder / _RESULT).is_file():
-        with resumed_from(folder, _RESULT, "train") as file:
-            result = json.loads(file.read_text())
-            history, tried = result["evaluations"], result.get("tried", [])
-    job = _Job(_check(document, source), source, tried)
-    if (folder / _POLICY).is_file():
-        job.trainer.load(folder / _POLICY)
-    return job.run(folder, [e for e in history if e["updates"] <= job.trainer.updates])
+    kept = read_resume(folder, "train")
+    workers = _workers(_check(kept["config"], kept["source"]).workers)
+    if not _writes(workers):
+        return _resumed(folder, kept, workers)
+    with resumed_folder(folder, "train") as kept:
+        return _resumed(folder, kept, workers)
+
+
+def _resumed(folder: Path, kept: dict[str, Any], workers: _Workers) -> str:
+    job = _Job(_check(kept["config"], kept["source"]), kept["source"], workers)
+    with refusing_damage("--resume", folder / RESUME):
+        evaluations = job.restore(kept)
+    return job.run(folder, evaluations)
 
 
 def _check(document: dict[str, Any], source: Path) -> TrainConfig:
@@ -101,15 +108,13 @@ def _check(document: dict[str, Any], source: Path) -> TrainConfig:
 class _Job:
     """A training: its trainer, its workers, and what it has found so far."""
 
-    def __init__(
-        self, section: TrainConfig, source: Path, tried: list[dict[str, Any]] | None = None
-    ) -> None:
+    def __init__(self, section: TrainConfig, source: Path, workers: _Workers) -> None:
         self.section, self._source = section, source.resolve()
         self._options = _named(f"{source}: `trainer`", TrainerOptions, section.trainer)
-        self._workers = _workers(section.workers)
-        self.writes = not isinstance(self._workers, Ranks) or self._workers.rank == 0
+        self._workers = workers
+        self.writes = _writes(workers)
         self.trainer = self._make(self._options)
-        self._tried: list[dict[str, Any]] = tried or []
+        self._tried: list[dict[str, Any]] = []
 
     def _make(self, options: TrainerOptions) -> Trainer:
         section, env = self.section, self.section.environment
@@ -128,9 +133,42 @@ class _Job:
             threads=section.workers.threads,
         )
 
-    def keep_configuration(self, out: Path) -> None:
-        """Write the configuration that `--resume` begins with."""
-        write_resume(out, self.section.model_dump(mode="json", exclude_unset=True), self._source)
+    def keep(
+        self,
+        out: Path,
+        evaluations: list[dict[str, Any]],
+        trainer: dict[str, Any] | None = None,
+    ) -> None:
+        """Write the file that `--resume` reads.
+
+        Args:
+            out: Folder of the results.
+            evaluations: So far.
+            trainer: State of the trainer, None before its first evaluation.
+        """
+        document = self.section.model_dump(mode="json", exclude_unset=True)
+        found = {"evaluations": evaluations, "tried": self._tried, "trainer": trainer}
+        write_resume(out, "train", document, self._source, **found)
+
+    def restore(self, kept: dict[str, Any]) -> list[dict[str, Any]]:
+        """Go on with the content of a file of `keep`; returns the evaluations so far.
+
+        Raises:
+            InvalidInput: If it does not belong to this training.
+        """
+        for name, example in (("evaluations", _EVALUATION), ("tried", {"seed": 0, **_EVALUATION})):
+            for k, entry in enumerate(kept[name]):
+                check_like(f"`{name}[{k}]`", entry, example)
+        evaluations: list[dict[str, Any]] = kept["evaluations"]
+        if kept["trainer"] is not None:
+            updates = kept["trainer"]["counts"][1]
+            if not evaluations or evaluations[-1]["updates"] != updates:
+                raise InvalidInput(f"the last of `evaluations` must be after {updates} updates")
+            self.trainer.load_state_dict(kept["trainer"])
+        elif evaluations:
+            raise InvalidInput("`evaluations` must be empty where no trainer is kept")
+        self._tried = kept["tried"]
+        return evaluations
 
     def run(self, out: Path, evaluations: list[dict[str, Any]]) -> str:
         """Learn until the end, and write what was found."""
@@ -186,8 +224,6 @@ class _Job:
         trained = {**self.section.trainer, "seed": self.trainer.options.seed}
         self.section = self.section.model_copy(update={"trainer": trained, "tryout": None})
         if self.writes:
-            # What is resumed must be a training with this seed before there is its policy.
-            self.keep_configuration(out)
             self._write(out, evaluations)
         return states, evaluations
 
@@ -257,12 +293,11 @@ class _Job:
         return states, counts | {"return": value, "success": success}
 
     def _write(self, out: Path, evaluations: list[dict[str, Any]]) -> None:
-        # The policy last: `--resume` goes on from it, and what was found until then must be there.
         config = self.section.model_dump(mode="json")
         result = {"config": config, "evaluations": evaluations, "tried": self._tried}
         write_metrics(out / _RESULT, result)
-        with replace_file(out / _POLICY) as file:
-            self.trainer.save(file)
+        self.trainer.save(out / _POLICY)
+        self.keep(out, evaluations, self.trainer.state_dict())
 
     def _film(self, out: Path, states: list[State]) -> None:
         """Show the first episode of the last evaluation, or in the browser all of them."""
@@ -279,7 +314,11 @@ class _Job:
             show(scene, states, out / f"{_VIDEO}.html", camera=camera)
 
 
-def _workers(section: WorkersSection) -> Processes | RayActors | Ranks | None:
+def _writes(workers: _Workers) -> bool:
+    return not isinstance(workers, Ranks) or workers.rank == 0
+
+
+def _workers(section: WorkersSection) -> _Workers:
     deadline = section.deadline
     if section.kind == "processes":
         return Processes(section.count, deadline=deadline)

@@ -9,7 +9,15 @@ from pydantic import model_validator
 
 from diffcloth_torch.config.scene_schema import Selection
 from diffcloth_torch.config.schema import RunConfig
-from diffcloth_torch.config.section import Positive, Section, Vector3, require_one
+from diffcloth_torch.config.section import (
+    Count,
+    Positive,
+    Section,
+    Seed,
+    Updates,
+    Vector3,
+    require_one,
+)
 from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLINE
 
 __all__ = ["FitConfig", "FitSection", "SyntheticSection", "TrajectorySection", "VariableSection"]
@@ -38,7 +46,7 @@ class SyntheticSection(Section):
 
     values: dict[str, Numbers]
     changes: list[str] = []
-    seed: Annotated[int, Ge(0)] = 0
+    seed: Seed = 0
 
 
 class TrajectorySection(Section):
@@ -53,7 +61,7 @@ class TrajectorySection(Section):
     name: str
     changes: list[str] = []
     kind: Literal["markers", "outline"] = "markers"
-    steps: Annotated[list[Annotated[int, Ge(1)]], Len(1)] | None = None
+    steps: Annotated[list[Count], Len(1)] | None = None
     equilibrium: bool = False
     velocity: Vector3 | None = None
     markers: Selection | None = None
@@ -82,14 +90,14 @@ class FitSection(Section):
 
     variables: Annotated[dict[str, VariableSection], Len(1)]
     trajectories: Annotated[list[TrajectorySection], Len(1)]
-    starts: Annotated[int, Ge(1)] = 1
-    seed: Annotated[int, Ge(0)] = 0
+    starts: Annotated[int, Ge(1), Le(10**6)] = 1
+    seed: Seed = 0
     workers: Annotated[int, Ge(0), Le(LARGEST_WORKERS)] = 0
     deadline: Annotated[float, Gt(0), Lt(LONGEST_DEADLINE)] = DEADLINE
     method: Literal["least_squares", "L-BFGS-B"] = "least_squares"
     loss: Literal["linear", "soft_l1", "huber", "cauchy", "arctan"] = "linear"
     loss_scale: Positive = 1.0
-    max_evaluations: Annotated[int, Ge(1)] = 100
+    max_evaluations: Updates = 100
     tolerance: Positive = 1e-8
 
     @model_validator(mode="after")

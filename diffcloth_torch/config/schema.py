@@ -9,8 +9,10 @@ from pydantic import model_validator
 
 from diffcloth_torch.config.scene_schema import SceneSection
 from diffcloth_torch.config.section import (
+    Count,
     Positive,
     Section,
+    Updates,
     Vector3,
     limits,
 )
@@ -53,7 +55,7 @@ class ContactSection(Section):
 
     barrier_distance: Annotated[float, limits("barrier_distance")] | None = None
     barrier_stiffness: Annotated[float, limits("barrier_stiffness")] | None = None
-    friction_iterations: Annotated[int, Ge(1)] | None = None
+    friction_iterations: Count | None = None
     slip_velocity: Annotated[float, limits("slip_velocity")] | None = None
     self_contact: bool | None = None
 
@@ -62,7 +64,7 @@ class SolverSection(Section):
     """Options of the solver, as in `SolverOptions`."""
 
     tolerance: Positive | None = None
-    max_iterations: Annotated[int, Ge(1)] | None = None
+    max_iterations: Count | None = None
     max_seconds: Positive | None = None
     throw: bool | None = None
     metric: Metric | None = None
@@ -74,7 +76,7 @@ class SimulationSection(Section):
     """Time step [s], number of steps, scheme and options."""
 
     dt: Positive
-    steps: Annotated[int, Ge(1)]
+    steps: Count
     scheme: Scheme = SCHEMES[0]
     coupling: Coupling = COUPLINGS[0]
     integrator: Integrator = INTEGRATORS[0]
@@ -119,7 +121,7 @@ class OutputSection(Section):
     """Output of a run: a frame for each of the `viewers` after `every` so many steps."""
 
     viewers: list[Literal["record", "meshes", "web"]] = ["record", "meshes"]
-    every: Annotated[int, Ge(1)] = 1
+    every: Count = 1
     pictures: PictureSection = PictureSection()
 
 
@@ -133,14 +135,14 @@ class OptimizerSection(Section):
     smaller.
     """
 
-    iterations: Annotated[int, Ge(1)]
+    iterations: Updates
     learning_rates: dict[str, Annotated[float, Gt(0)]]
     momentum: Annotated[float, Ge(0), Lt(1)] = 0.0
     nesterov: bool = False
     restart: bool = False
     clip: Positive | None = None
-    failures: Annotated[int, Ge(0)] = 6
-    checkpoint_every: Annotated[int, Ge(1)] | None = None
+    failures: Annotated[int, Ge(0), Le(10**7)] = 6
+    checkpoint_every: Count | None = None
     stop_below: Positive | None = None
 
 

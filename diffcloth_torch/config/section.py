@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
-from annotated_types import Ge, Gt, Interval, Len
+from annotated_types import Ge, Gt, Interval, Le, Len
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from diffcloth_torch.model.quantities import PARAMETERS
@@ -16,17 +16,27 @@ from diffcloth_torch.model.quantities import PARAMETERS
 __all__ = [
     "Actuation",
     "Color",
+    "Count",
     "Lengths2",
     "Lengths3",
     "NonNegative",
     "Positive",
     "Section",
+    "Seed",
+    "Updates",
     "Vector3",
     "limits",
     "require_increasing",
     "require_one",
 ]
 
+Count = Annotated[int, Ge(1), Le(10**8)]
+"""A count of steps and the like: a day has fewer of the fastest steps."""
+
+Updates = Annotated[int, Ge(1), Le(10**7)]
+"""A count of updates or evaluations: a day has fewer of the fastest ones."""
+
+Seed = Annotated[int, Ge(0), Le(2**31 - 1)]
 Positive = Annotated[float, Gt(0)]
 NonNegative = Annotated[float, Ge(0)]
 Vector3 = Annotated[list[float], Len(3, 3)]

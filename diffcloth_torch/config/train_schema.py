@@ -7,12 +7,10 @@ from typing import Annotated, Any, Literal
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 
 from diffcloth_torch.config.schema import PictureSection
-from diffcloth_torch.config.section import Section
+from diffcloth_torch.config.section import Count, Section, Seed, Updates
 from diffcloth_torch.processes import DEADLINE, LARGEST_WORKERS, LONGEST_DEADLINE
 
 __all__ = ["EnvironmentSection", "TrainConfig", "TryoutSection", "WorkersSection"]
-
-Count = Annotated[int, Ge(1)]
 
 
 class EnvironmentSection(Section):
@@ -30,15 +28,15 @@ class WorkersSection(Section):
 
     kind: Literal["none", "processes", "ray", "ranks"] = "none"
     count: Annotated[int, Ge(1), Le(LARGEST_WORKERS)] = 1
-    threads: Count = 1
+    threads: Annotated[int, Ge(1), Le(LARGEST_WORKERS)] = 1
     deadline: Annotated[float, Gt(0), Lt(LONGEST_DEADLINE)] = DEADLINE
 
 
 class TryoutSection(Section):
     """Seeds that each learn for a few updates; the best of them goes on."""
 
-    seeds: Annotated[list[Annotated[int, Ge(0)]], MinLen(2)]
-    updates: Count
+    seeds: Annotated[list[Seed], MinLen(2)]
+    updates: Updates
 
 
 class TrainConfig(Section):
@@ -55,7 +53,7 @@ class TrainConfig(Section):
     trainer: dict[str, Any] = {}
     num_envs: Count = 4
     chunk: Count | None = None
-    updates: Count = 100
+    updates: Updates = 100
     evaluate_every: Count = 10
     episodes: Count = 8
     until_success: Annotated[float, Ge(0), Le(1)] | None = None

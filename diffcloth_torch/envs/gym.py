@@ -17,6 +17,7 @@ from diffcloth_torch import cpu
 from diffcloth_torch.checks import check_choice, check_count, check_shape, float_tensor
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.errors import InvalidInput, SimulationError
+from diffcloth_torch.memory import check_memory
 from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.records.controls import Parameters
 
@@ -86,6 +87,8 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         self.parameters: Parameters | None = None
         with torch.no_grad():
             size = _tried(task)
+            each = task.example().state.nbytes
+        check_memory(f"{owner}: `num_envs`", self.num_envs, each, "a state")
         self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (task.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)

@@ -14,6 +14,7 @@ __all__ = ["ALGORITHMS", "SCALES", "TrainerOptions"]
 ALGORITHMS = ("apg", "shac", "sapo")
 SCALES = ("number", "tensor")
 _LEAST_SHARE = 0.1
+_LARGEST_COUNT = 10**6  # of what each update repeats
 _LARGEST = 1e6  # above every sensible rate
 _POSITIVE = (
     "actor_rate", "plan_rate", "critic_rate", "gradient_norm", "deviation", "temperature",
@@ -99,7 +100,7 @@ class TrainerOptions:
         if not isinstance(self.feedback, bool):
             raise InvalidInput(f"TrainerOptions: `feedback` must be a bool, got {self.feedback!r}")
         for name in ("horizon", "critic_epochs", "critic_batches", "critics"):
-            check_count(f"TrainerOptions: `{name}`", getattr(self, name), 1)
+            check_count(f"TrainerOptions: `{name}`", getattr(self, name), 1, _LARGEST_COUNT)
         for name in ("critic_only", "decay_updates", "plan_knots", "seed"):
             check_count(f"TrainerOptions: `{name}`", getattr(self, name), 0)
         for name in ("discount", "trace", "target_rate"):

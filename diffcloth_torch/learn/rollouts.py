@@ -10,6 +10,7 @@ import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -21,6 +22,7 @@ from diffcloth_torch.envs.gym import ClothVectorEnv
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.learn.networks import Actor, Critics, Scale
 from diffcloth_torch.learn.options import TrainerOptions
+from diffcloth_torch.memory import check_memory
 
 __all__ = [
     "MakeEnv",
@@ -31,6 +33,8 @@ __all__ = [
     "roll_out_remotely",
     "threads_of_torch",
 ]
+
+_WEIGHT_BYTES = 16  # with its gradient and the moments of Adam
 
 MakeEnv = Callable[..., ClothVectorEnv]
 """A function that makes environments, as `dc.envs.make` does; called with `num_envs` by name."""
@@ -48,6 +52,7 @@ class Policy(torch.nn.Module):
         super().__init__()
         observations = env.task.observation(env.task.example()).shape[-1]
         self.observations = int(observations)
+        _check_size(self.observations, env.task.action_size, options)
         first = options.first_action or [0.0] * env.task.action_size
         self.actor = Actor(
             observations,
@@ -84,6 +89,18 @@ class Policy(torch.nn.Module):
         time = None if self._time is None else observation[:, self._time]
         actions, entropy = self.actor(self.scale(observation), noise, time)
         return actions, entropy
+
+
+def _check_size(observations: int, actions: int, options: TrainerOptions) -> None:
+    """Refuse networks that do not fit into memory, before they are made."""
+    sizes = [observations, *options.hidden]
+    inner = sum((before + 3) * after for before, after in pairwise(sizes))
+    critics = 2 * (options.critics if options.has_entropy else 1)  # and their slower copies
+    weights = (1 + critics) * (inner + (sizes[-1] + 1) * 2 * actions)
+    names = "TrainerOptions: the weights by `hidden` and `critics`"
+    check_memory(names, weights, _WEIGHT_BYTES, "a weight")
+    knots = "TrainerOptions: `plan_knots`"
+    check_memory(knots, options.plan_knots, actions * _WEIGHT_BYTES, "a knot")
 
 
 def _place_of_time(env: ClothVectorEnv) -> int:

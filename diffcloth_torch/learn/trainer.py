@@ -9,9 +9,10 @@ References:
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import pickle
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,15 @@ import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
+from diffcloth_torch.checkpoint import (
+    check_generator,
+    check_like,
+    check_optimizer,
+    check_structure,
+    read_checkpoint,
+    refusing_damage,
+    write_checkpoint,
+)
 from diffcloth_torch.checks import check_count, check_shape, refuse_threads
 from diffcloth_torch.envs.env import EnvState, Task
 from diffcloth_torch.envs.gym import begins_anew
@@ -38,9 +48,12 @@ from diffcloth_torch.learn.rollouts import (
     threads_of_torch,
 )
 from diffcloth_torch.learn.workers import Ranks, Workers
+from diffcloth_torch.memory import check_memory
 from diffcloth_torch.sim.records.state import State
 
 __all__ = ["Trainer"]
+
+_CHECKPOINT = "trainer"  # kind of its files
 
 
 class Trainer:
@@ -108,6 +121,10 @@ class Trainer:
         self._pickled = b"" if workers is None else _pickled(make_env)
         self._env = begins_anew("Trainer: `make_env`", make_env(num_envs=self._chunk))
         self._count = num_envs
+        each = self._env.task.example().state.nbytes
+        check_memory("Trainer: `num_envs`", num_envs, each, "a state")
+        horizon = self.options.horizon
+        check_memory("TrainerOptions: `horizon`", horizon, self._chunk * each, "a step")
         actions, first = self.task.action_size, self.options.first_action
         if first is not None and len(first) != actions:
             raise InvalidInput(
@@ -206,6 +223,8 @@ class Trainer:
         """
         check_count("Trainer.evaluate: `episodes`", episodes, 1)
         check_count("Trainer.evaluate: `seed`", seed, 0)
+        each = self.task.horizon * self.task.example().state.nbytes
+        check_memory("Trainer.evaluate: `episodes`", episodes, each, "an episode")
         env = self._make_env(num_envs=episodes)
         observation, _ = env.reset(seed=seed)
         total, running = (
@@ -223,69 +242,115 @@ class Trainer:
                 states.append(env.env_state.state)
         return float(total.mean()), float(success.float().mean()), states
 
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that a training goes on with, in types that `torch.load` reads."""
+        return {
+            "options": asdict(self.options),
+            "task": self._described,
+            "counts": [self.steps, self.updates],
+            "return": self._return.clone(),
+            "noise": self._noise.get_state(),
+            "policy": {name: t.clone() for name, t in self.policy.state_dict().items()},
+            "optimizers": [copy.deepcopy(o.state_dict()) for o in self._optimizers],
+            "places": [
+                ([e.state, e.tools, e.drawn, e.elapsed, e.failed], list(generators))
+                for e, generators in self._places
+            ],
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on with the state of another trainer, to the same bits.
+
+        Raises:
+            InvalidInput: If it is of another task, of other options, of environments in other
+                chunks, or has anything that `state_dict` does not return. The trainer is then as
+                before.
+        """
+        self._load("Trainer.load_state_dict: `state`", state)
+
+    def _load(self, owner: str, given: Any) -> None:
+        own = self.state_dict()
+        if not isinstance(given, Mapping) or given.keys() != own.keys():
+            raise InvalidInput(f"{owner} must have the keys {', '.join(own)}")
+        if given["task"] != own["task"]:
+            raise InvalidInput(f"{owner} is of {given['task']}, not of {own['task']}")
+        if given["options"] != own["options"]:
+            raise InvalidInput(f"{owner} was written with other options")
+        places = self._checked_places(owner, given["places"])
+        check_like(f"{owner}['counts']", given["counts"], own["counts"])
+        steps, updates = given["counts"]
+        if steps != updates * self.options.horizon * self._count:
+            raise InvalidInput(
+                f"{owner}['counts'] must be {self.options.horizon * self._count} steps for each "
+                f"update, got {steps} steps and {updates} updates"
+            )
+        check_like(f"{owner}['return']", given["return"], own["return"])
+        check_generator(f"{owner}['noise']", given["noise"])
+        check_like(f"{owner}['policy']", dict(given["policy"]), own["policy"])
+        check_like(f"{owner}['optimizers']", [None] * len(given["optimizers"]), [None] * 3)
+        for k, optimizer in enumerate(self._optimizers):
+            check_optimizer(f"{owner}['optimizers'][{k}]", given["optimizers"][k], optimizer)
+        # Everything is checked: from here on nothing may fail.
+        self.policy.load_state_dict(given["policy"])
+        for optimizer, kept in zip(self._optimizers, given["optimizers"], strict=True):
+            optimizer.load_state_dict(kept)
+        self.steps, self.updates = steps, updates
+        self._return = given["return"].clone()
+        self._noise.set_state(given["noise"])
+        self._places = places
+
+    def _checked_places(self, owner: str, given: Any) -> list[tuple[EnvState, list[Tensor]]]:
+        sizes = [len(generators) for _, generators in given]
+        if sizes != [self._chunk] * len(self._places):
+            raise InvalidInput(
+                f"{owner} has chunks of {sizes} environments, "
+                f"not {len(self._places)} of {self._chunk}"
+            )
+        places = []
+        for k, (parts, generators) in enumerate(given):
+            name = f"{owner}['places'][{k}]"
+            place = EnvState(*parts)
+            example, _ = self._places[k]
+            for part in ("tools", "drawn"):
+                check_structure(f"{name}: {part}", getattr(place, part), getattr(example, part))
+            check_like(f"{name}: elapsed", place.elapsed, example.elapsed)
+            check_like(f"{name}: failed", place.failed, example.failed)
+            if bool(((place.elapsed < 0) | (place.elapsed >= self.task.horizon)).any()):
+                raise InvalidInput(f"{name}: elapsed must be below {self.task.horizon}")
+            self.task.simulator.kinetic_energy(place.state)  # checks the state
+            # As an update does: the report must be of as many environments.
+            everywhere = cpu.ones(self._chunk, dtype=torch.bool)
+            EnvState.where(everywhere, place, example)
+            for i, generator in enumerate(generators):
+                check_generator(f"{name}: generator {i}", generator)
+            places.append((place, list(generators)))
+        return places
+
     def save(self, path: str | Path) -> None:
-        """Write all that goes on to a file; it loads with `weights_only`.
+        """Write `state_dict()` to a file, which replaces an older one completely or not at all.
 
         Raises:
             InvalidInput: If its folder does not exist.
+            OSError: If it cannot be written; an older file stays as it is.
         """
         path = as_path("Trainer.save: `path`", path)
         if not path.parent.is_dir():
             raise InvalidInput(f"Trainer.save: the folder of `path` must exist, got {str(path)!r}")
-        torch.save(
-            {
-                "options": asdict(self.options),
-                "task": self._described,
-                "counts": [self.steps, self.updates],
-                "return": self._return,
-                "noise": self._noise.get_state(),
-                "policy": self.policy.state_dict(),
-                "optimizers": [o.state_dict() for o in self._optimizers],
-                "places": [
-                    ([e.state, e.tools, e.drawn, e.elapsed, e.failed], generators)
-                    for e, generators in self._places
-                ],
-            },
-            path,
-        )
+        write_checkpoint(path, _CHECKPOINT, self.state_dict())
 
     def load(self, path: str | Path) -> None:
-        """Go on with what a file has, to the same bits.
+        """Go on with the content of a file of `save`, to the same bits.
 
         Raises:
-            InvalidInput: If it is of another task, of other options, or of environments in other
-                chunks, or no such file.
+            InvalidInput: If it is no such file, is damaged, or belongs to another training, see
+                `load_state_dict`. The trainer is then as before.
         """
         path = as_path("Trainer.load: `path`", path)
         if not path.is_file():
             raise InvalidInput(f"Trainer.load: `path` must be a file, got {str(path)!r}")
-        try:
-            kept: Any = torch.load(path, map_location=cpu.DEVICE, weights_only=True)
-        except (OSError, MemoryError):
-            raise
-        except Exception as error:  # whatever unpickling makes of bytes that are not its own
-            raise InvalidInput(f"Trainer.load: {path} must be a file of `Trainer.save`") from error
-        if not isinstance(kept, dict) or not {"task", "options", "places"} <= kept.keys():
-            raise InvalidInput(f"Trainer.load: {path} must be a file of `Trainer.save`")
-        if kept["task"] != self._described:
-            raise InvalidInput(
-                f"Trainer.load: {path} is of {kept['task']}, not of {self._described}"
-            )
-        if kept["options"] != asdict(self.options):
-            raise InvalidInput(f"Trainer.load: {path} was written with other options")
-        sizes = [len(generators) for _, generators in kept["places"]]
-        if sizes != [self._chunk] * len(self._places):
-            raise InvalidInput(
-                f"Trainer.load: {path} has chunks of {sizes} environments, "
-                f"not {len(self._places)} of {self._chunk}"
-            )
-        self.policy.load_state_dict(kept["policy"])
-        for optimizer, state in zip(self._optimizers, kept["optimizers"], strict=True):
-            optimizer.load_state_dict(state)
-        self.steps, self.updates = kept["counts"]
-        self._return = kept["return"]
-        self._noise.set_state(kept["noise"])
-        self._places = [(EnvState(*parts), generators) for parts, generators in kept["places"]]
+        kept = read_checkpoint("Trainer.load", path, _CHECKPOINT)
+        with refusing_damage("Trainer.load", path):
+            self._load("the trainer", kept)
 
     @property
     def _described(self) -> dict[str, Any]:

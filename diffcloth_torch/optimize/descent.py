@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
+from diffcloth_torch.checkpoint import check_generator, check_like, check_structure
 from diffcloth_torch.checks import POSITIVE, check_count, check_number
 from diffcloth_torch.errors import (
     InfeasibleMotion,
@@ -24,8 +25,10 @@ from diffcloth_torch.optimize.evaluation import (
     Loss,
     Simulate,
     Variables,
+    check_record,
     copies,
     evaluate,
+    restored,
 )
 from diffcloth_torch.optimize.progress import Progress
 from diffcloth_torch.optimize.rows import Rows
@@ -75,8 +78,25 @@ class Descent:
 
     @staticmethod
     def restore(record: Mapping[str, Any]) -> Descent:
-        """Make a Descent from its `record`."""
-        first, best = (Evaluation(**record[name]) for name in ("first", "best"))
+        """Make a Descent from its `record`.
+
+        Raises:
+            InvalidInput: If the record has anything else than `record` returns.
+        """
+        names = [field.name for field in fields(Descent)]
+        check_like("the record", dict.fromkeys(record), dict.fromkeys(names))
+        variables, losses = record["next_variables"], record["best_losses"]
+        check_structure("the next variables", variables, variables)
+        check_like("the next variables", variables, variables)
+        first, best = (restored(name, record[name], variables) for name in ("first", "best"))
+        _check_progress(record, best.loss)
+        check_generator("the random state", record["random_state"])
+        shapes = {name: variables[name] for name in record["best_rows"]}
+        check_like("the best rows", record["best_rows"], shapes)
+        # Infinite for environments without a loss.
+        check_structure("the record", {"losses": losses}, {"losses": cpu.zeros(len(losses))})
+        parts = {"state": None, "param_groups": None}
+        check_like("the optimizer", dict.fromkeys(record["optimizer"]), parts)
         return Descent(**{**record, "first": first, "best": best})
 
     def metrics(self) -> dict[str, Any]:
@@ -214,6 +234,19 @@ def descend(
             report(sofar)
     assert loop.found is not None  # at least one iteration
     return loop.found
+
+
+def _check_progress(record: Mapping[str, Any], best: float) -> None:
+    """Require the history, the failures and the seconds of a Descent."""
+    for k, entry in enumerate(record["history"]):
+        check_record(f"the history [{k}]", entry)
+    for k, failure in enumerate(record["failures"]):
+        check_like(f"the failures [{k}]", failure, {"iteration": 0, "error": ""})
+    if best not in [entry["loss"] for entry in record["history"]]:
+        raise InvalidInput("the history must have the best loss")
+    check_like("the seconds", record["seconds"], 0.0)
+    if record["seconds"] <= 0:
+        raise InvalidInput(f"the seconds must be positive, got {record['seconds']}")
 
 
 class _Loop:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from torch import Tensor
 
+from diffcloth_torch.checkpoint import check_like
 from diffcloth_torch.errors import (
     InfeasibleMotion,
     InvalidInput,
@@ -19,9 +20,18 @@ from diffcloth_torch.errors import (
 )
 from diffcloth_torch.operations import operation
 from diffcloth_torch.optimize.statistics import rollout_statistics
-from diffcloth_torch.sim.records.state import State
+from diffcloth_torch.sim.records.state import State, check_state
 
-__all__ = ["Evaluation", "Loss", "Simulate", "Variables", "copies", "evaluate"]
+__all__ = [
+    "Evaluation",
+    "Loss",
+    "Simulate",
+    "Variables",
+    "check_record",
+    "copies",
+    "evaluate",
+    "restored",
+]
 
 Variables = Mapping[str, Tensor]
 """Name -> leaf tensor that requires a gradient."""
@@ -32,6 +42,7 @@ Simulate = Callable[[Variables], Sequence[State]]
 Loss = Callable[[Sequence[State]], Tensor]
 """From states to a loss of shape [], or [B] with one for each environment."""
 
+_MAY_BE_UNKNOWN = ("minimum_distance", "cpu_seconds")
 _CONVERGED = "converged"
 _ERRORS: dict[str, type[SimulationError]] = {
     "infeasible_motion": InfeasibleMotion,
@@ -89,6 +100,47 @@ class Evaluation:
             **own,
             **self.statistics,
         }
+
+
+def restored(name: str, given: Mapping[str, Any], variables: Mapping[str, Tensor]) -> Evaluation:
+    """Make an evaluation from its fields, of a loop over variables like the given ones.
+
+    Raises:
+        InvalidInput: If it has other fields, or they do not fit; the message opens with the name.
+    """
+    names = [field.name for field in fields(Evaluation)]
+    check_like(name, dict.fromkeys(given), dict.fromkeys(names))
+    check_like(f"{name}: the variables", given["variables"], dict(variables))
+    for k, state in enumerate(given["states"]):
+        check_state(f"{name}: the state [{k}]", state)
+    evaluation = Evaluation(**given)
+    record = evaluation.record()
+    check_record(name, record)
+    check_like(f"{name}: the norms", record["gradient_norms"], dict.fromkeys(variables, 0.0))
+    return evaluation
+
+
+def check_record(name: str, given: Any) -> None:
+    """Require the numbers of a `record` of an evaluation.
+
+    Raises:
+        InvalidInput: If any is missing, or is none; the message opens with the name.
+    """
+    example = {"loss": 0.0, "forward_seconds": 0.0, "backward_seconds": 0.0, "gradient_norms": {}}
+    example |= rollout_statistics([]) | {"cpu_seconds": 0.0}
+    losses = given.get("environment_losses", [])
+    if losses:
+        example["environment_losses"] = []
+    check_like(name, dict.fromkeys(given), dict.fromkeys(example))
+    for key, like in example.items():
+        value = given[key]
+        if isinstance(like, dict):
+            check_like(f"{name}[{key!r}]", value, dict.fromkeys(value, 0.0))
+        elif isinstance(like, list):
+            known = [loss for loss in value if loss is not None]
+            check_like(f"{name}[{key!r}]", known, [0.0] * len(known))
+        elif value is not None or key not in _MAY_BE_UNKNOWN:
+            check_like(f"{name}[{key!r}]", value, 0.0 if like is None else like)
 
 
 def evaluate(

@@ -11,6 +11,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from diffcloth_torch.checks import (
 from diffcloth_torch.errors import InvalidInput, warn_caller
 from diffcloth_torch.extras import from_extra
 from diffcloth_torch.files import as_path
+from diffcloth_torch.lock import locked
 from diffcloth_torch.model.quantities import PARAMETERS
 from diffcloth_torch.optimize.fit_page import Page, write_page
 from diffcloth_torch.optimize.methods import METHODS, Method, Options
@@ -184,7 +186,8 @@ def fit(
             process that takes longer, or dies, is replaced, and its start computed again, up to
             three times. An executor has no deadline.
         resume: Folder that keeps all evaluations. A fit that was interrupted takes them from there,
-            and ends with the same bits. Residuals that differ where they began are refused.
+            and ends with the same bits. Residuals that differ where they began are refused, and
+            so is a folder that another process uses.
         progress: Called after each evaluation; of starts in processes, when they have ended.
 
     Returns:
@@ -220,7 +223,8 @@ def fit(
     )
     generator = np.random.default_rng(seed)
     firsts = [space.first] + [space.draw(generator) for _ in range(starts - 1)]
-    ends = run_all(job, firsts, workers, deadline, progress)
+    with nullcontext() if job.folder is None else locked("fit: `resume`", job.folder):
+        ends = run_all(job, firsts, workers, deadline, progress)
     best = min(ends, key=lambda end: end.cost)
     if best.failure is not None:
         raise next(end.failure for end in reversed(ends) if end.failure is not None)
@@ -335,10 +339,8 @@ def _folder(resume: str | Path | None) -> Path | None:
     if resume is None:
         return None
     folder = as_path("fit: `resume`", resume)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise InvalidInput(f"fit: `resume` must be a folder, got {str(folder)!r}") from error
+    if folder.exists() and not folder.is_dir():
+        raise InvalidInput(f"fit: `resume` must be a folder, got {str(folder)!r}")
     return folder
 
 

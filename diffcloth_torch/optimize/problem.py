@@ -16,6 +16,12 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from diffcloth_torch import cpu
+from diffcloth_torch.checkpoint import (
+    check_like,
+    read_checkpoint,
+    refusing_damage,
+    write_checkpoint,
+)
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.errors import InadmissibleMaterial, InvalidInput, SimulationError
 from diffcloth_torch.model.quantities import PARAMETERS
@@ -32,6 +38,8 @@ __all__ = [
     "parameters_of",
     "trajectories",
 ]
+
+_CHECKPOINT = "fit"  # kind of the files of evaluations
 
 Residuals = Callable[..., Tensor | Sequence[Tensor]]
 
@@ -86,20 +94,18 @@ class Memory:
         self._records: dict[tuple[str, int, bytes], dict[str, Any]] = {}
         if file is None or not file.exists():
             return
-        try:
-            saved = torch.load(file, map_location=cpu.DEVICE, weights_only=True)
-            problem, records = saved["problem"], saved["records"]
-            keys = [(r["kind"], r["stage"], _key(r["theta"])) for r in records]
-        except (OSError, MemoryError):
-            raise
-        except Exception as error:  # whatever unpickling makes of bytes that are not its own
-            raise InvalidInput(f"fit: `resume`: {file} is not what a fit wrote") from error
-        if problem != self._problem:
-            raise InvalidInput(
-                f"fit: `resume`: {file} belongs to other variables or options: {problem}; "
-                f"these are {self._problem}"
-            )
-        self._records = dict(zip(keys, records, strict=True))
+        owner = "fit: `resume`"
+        saved = read_checkpoint(owner, file, _CHECKPOINT)
+        with refusing_damage(owner, file):
+            check_like("the content", dict.fromkeys(saved), {"problem": None, "records": None})
+            found = {_checked_key(record): record for record in saved["records"]}
+            _check_sizes(found)
+            if saved["problem"] != self._problem:
+                raise InvalidInput(
+                    f"it belongs to other variables or options: {saved['problem']}; "
+                    f"these are {self._problem}"
+                )
+        self._records = found
 
     def recall(self, kind: str, stage: int, theta: FloatArray) -> dict[str, Any] | None:
         """Look up an evaluation of residuals or of their Jacobian."""
@@ -111,9 +117,8 @@ class Memory:
         record = {"kind": kind, "stage": stage, "theta": numbers, **found}
         self._records[kind, stage, theta.tobytes()] = record
         if self._file is not None:
-            part = self._file.with_suffix(".part")
-            torch.save({"problem": self._problem, "records": list(self._records.values())}, part)
-            part.replace(self._file)
+            content = {"problem": self._problem, "records": list(self._records.values())}
+            write_checkpoint(self._file, _CHECKPOINT, content)
         return record
 
 
@@ -350,5 +355,40 @@ def _text(failure: Failure) -> str:
     return f"{type(failure).__name__}: {failure}"
 
 
-def _key(theta: Tensor) -> bytes:
-    return bytes(theta.numpy().tobytes())
+_AXES = {"residuals": 1, "gradient": 1, "jacobian": 2}  # kind of a record -> axes of its numbers
+
+
+def _checked_key(record: Any) -> tuple[str, int, bytes]:
+    """The key of a record of a file.
+
+    Raises:
+        InvalidInput: If it is no record.
+    """
+    example: dict[str, Any] = {"kind": "", "stage": 0, "theta": None, "found": None}
+    if isinstance(record, dict) and record.get("kind") == "residuals":
+        example |= {"seconds": 0.0, "failure": ""}
+    plain = {n: None if isinstance(v, Tensor) else v for n, v in dict(record).items()}
+    check_like("a record", plain, example)
+    kind, theta, found = record["kind"], record["theta"], record["found"]
+    if kind not in _AXES:
+        raise InvalidInput(f"the kind of a record must be one of {', '.join(_AXES)}, got {kind!r}")
+    for name, numbers, axes in (("theta", theta, 1), ("found", found, _AXES[kind])):
+        if numbers.dim() != axes:
+            raise InvalidInput(f"`{name}` must have {axes} axes, got {numbers.dim()}")
+        check_like(f"`{name}`", numbers, cpu.zeros(*numbers.shape))
+    return kind, record["stage"], theta.numpy().tobytes()
+
+
+def _check_sizes(records: Mapping[tuple[str, int, bytes], Mapping[str, Any]]) -> None:
+    """Require one number of residuals, and of free numbers, in each stage."""
+    counts: dict[tuple[str, int], int] = {}
+    for (kind, stage, _), record in records.items():
+        sizes = {"free": len(record["theta"])}
+        if not record.get("failure"):
+            rows, *columns = record["found"].shape
+            sizes["free" if kind == "gradient" else "residuals"] = rows
+            if columns and columns[0] != len(record["theta"]):
+                raise InvalidInput("a Jacobian must have a column for each number of `theta`")
+        for name, size in sizes.items():
+            if counts.setdefault((name, stage), size) != size:
+                raise InvalidInput(f"stage {stage} must have one number of {name}")

@@ -17,6 +17,7 @@ from diffcloth_torch.config.scenes import (
     step_control,
 )
 from diffcloth_torch.config.schema import OptimizerSection, RunConfig
+from diffcloth_torch.memory import check_memory
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.records.controls import Control
 from diffcloth_torch.sim.records.state import State
@@ -47,7 +48,9 @@ class ConfiguredTask:
         self.config = config
         self.scene: Scene = build_scene(config, source)
         self.simulator: Simulator = build_simulator(self.scene, config.simulation)
-        self.steps = config.simulation.steps
+        each = self.simulator.initial_state().nbytes
+        name = f"{source}: `simulation.steps`"
+        self.steps = check_memory(name, config.simulation.steps, each, "a state")
         self._motions = prescribed_motions(config, self.scene, self.steps)
         self._wind = steady_wind(config)
 

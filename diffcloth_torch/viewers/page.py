@@ -18,6 +18,7 @@ import numpy as np
 from diffcloth_torch.checks import check_count
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.extras import from_extra
+from diffcloth_torch.viewers.guard import guarded_server, offline
 from diffcloth_torch.viewers.look import Camera
 from diffcloth_torch.viewers.motion import LAYERS, Motion
 
@@ -54,7 +55,7 @@ class Drawn(Protocol):
 class Page(ABC):
     """A page with a slider of the moments, play, speed, what colors the cloths and which arrows.
 
-    Its server listens on this machine alone unless told otherwise.
+    Its server listens on this machine alone unless told otherwise, and answers the page alone.
     """
 
     vectors: tuple[str, ...] = VECTORS
@@ -183,14 +184,14 @@ class Page(ABC):
             for k, wait in enumerate(np.diff([*times, times[-1]])):
                 drawing.draw(k, self._color, self._arrow_names)
                 recorder.insert_sleep(max(float(wait) / speed, 0.0))
-            page: str = recorder.as_html()
+            page = offline(recorder.as_html())
         finally:
             _stop(server)
         return page
 
     def _start(self, host: str) -> Any:
         with _silently():
-            return self._viser.ViserServer(host, self._port, verbose=False)
+            return guarded_server(self._viser, host, self._port)
 
     def _serving(self) -> Any:
         with self._lock:

@@ -400,13 +400,13 @@ def test_files_of_other_tasks_do_not_load(tmp_path):
         partial(envs.make, "DropCloth", size=6),
     ]
     for make in others:
-        with pytest.raises(InvalidInput, match=r"policy.pt is of .*'name': 'FoldCloth'"):
+        with pytest.raises(InvalidInput, match=r"policy.pt: the trainer is of .*'FoldCloth'"):
             Trainer(make, options).load(tmp_path / "policy.pt")
     torch.save({"policy": 3}, tmp_path / "other.pt")
-    with pytest.raises(InvalidInput, match=r"must be a file of `Trainer\.save`"):
+    with pytest.raises(InvalidInput, match=r"is no complete checkpoint: .* before 0\.2\.0"):
         Trainer(fold(), options).load(tmp_path / "other.pt")
     (tmp_path / "junk.pt").write_bytes(b"junk")
-    for name, message in (("junk.pt", "a file of `Trainer.save`"), ("none.pt", "must be a file")):
+    for name, message in (("junk.pt", "no complete checkpoint"), ("none.pt", "must be a file")):
         with pytest.raises(InvalidInput, match=message):
             Trainer(fold(), options).load(tmp_path / name)
     with pytest.raises(InvalidInput, match="the folder of `path` must exist"):

@@ -179,6 +179,11 @@ class State:
             )
         return self._surfaces
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the tensors [bytes], without the report."""
+        return sum(t.nbytes for t in vars(self).values() if isinstance(t, Tensor))
+
     def __getitem__(self, index: int | slice | Sequence[int] | Tensor) -> State:
         """Select one environment of a batch, without the batch axis, or several as a batch.
 

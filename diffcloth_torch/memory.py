@@ -1,0 +1,31 @@
+"""The memory of the machine, against which counts are checked before anything is allocated."""
+
+from __future__ import annotations
+
+import os
+
+from diffcloth_torch.errors import InvalidInput
+
+__all__ = ["check_memory"]
+
+
+def check_memory(name: str, count: int, each: int, of_what: str) -> int:
+    """Require a count of things that fit into the memory of the machine together.
+
+    Args:
+        name: Opens the message.
+        count: Their number.
+        each: Bytes of one of them, at least.
+        of_what: Of them, such as "a state".
+
+    Raises:
+        InvalidInput: If they do not fit.
+    """
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    most = memory // each
+    if count > most:
+        raise InvalidInput(
+            f"{name} must be at most {most}, as {of_what} takes {each} bytes and this machine has "
+            f"{memory >> 20} MiB, got {count}"
+        )
+    return count
