@@ -202,6 +202,7 @@ def _check_shape(name: str, given: Any, example: Tensor) -> None:
         or given.dtype != example.dtype
         or given.shape != example.shape
         or given.layout != example.layout
+        or not given.is_cpu
     ):
         _refuse(name, f"be a tensor {list(example.shape)} of {example.dtype}", given)
 
@@ -239,7 +240,11 @@ def check_optimizer(name: str, given: Any, optimizer: torch.optim.Optimizer) -> 
     for key, entry in given["state"].items():
         if key not in example["state"]:
             _refuse(f"{name}: the parameters", f"be {', '.join(map(str, example['state']))}", key)
-        check_like(f"{name}: of parameter {key}", entry, example["state"][key])
+        like = dict(example["state"][key])
+        steps = entry.get("step") if isinstance(entry, dict) else None
+        if isinstance(steps, Tensor) and steps.dtype in (torch.float32, torch.float64):
+            like["step"] = cpu.zeros((), dtype=steps.dtype)  # that of torch's default
+        check_like(f"{name}: of parameter {key}", entry, like)
 
 
 def _is_finite(number: float) -> bool:

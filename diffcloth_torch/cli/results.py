@@ -195,9 +195,13 @@ def read_resume(folder: Path, command: str) -> dict[str, Any]:
     file = folder / RESUME
     if not file.is_file():
         older = (folder / _RESUME_BEFORE).is_file()
-        why = f"; {_RESUME_BEFORE} is of diffcloth_torch before 0.2.0, which cannot be resumed" if older else ""
+        why = (
+            f"; {_RESUME_BEFORE} is of diffcloth_torch before 0.2.0, which cannot be resumed"
+            if older
+            else ""
+        )
         raise InvalidInput(
-            f"--resume: {folder} must hold what `diffcloth {command}` wrote: no {file}{why}"
+            f"--resume: {folder} must hold what `diffcloth {command}` wrote: no {file}{why if older else ''}"
         )
     content = read_checkpoint("--resume", file, command)
     with refusing_damage("--resume", file):

@@ -29,7 +29,7 @@ from diffcloth_torch.config.train_schema import TrainConfig, TryoutSection, Work
 from diffcloth_torch.config.validation import validate
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.learn.options import TrainerOptions
-from diffcloth_torch.learn.trainer import Trainer
+from diffcloth_torch.learn.trainer import Trainer, record_of, restore
 from diffcloth_torch.learn.workers import Processes, Ranks, RayActors
 from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.records.state import State
@@ -164,7 +164,7 @@ class _Job:
             updates = kept["trainer"]["counts"][1]
             if not evaluations or evaluations[-1]["updates"] != updates:
                 raise InvalidInput(f"the last of `evaluations` must be after {updates} updates")
-            self.trainer.load_state_dict(kept["trainer"])
+            restore(self.trainer, kept["trainer"])
         elif evaluations:
             raise InvalidInput("`evaluations` must be empty where no trainer is kept")
         self._tried = kept["tried"]
@@ -297,7 +297,7 @@ class _Job:
         result = {"config": config, "evaluations": evaluations, "tried": self._tried}
         write_metrics(out / _RESULT, result)
         self.trainer.save(out / _POLICY)
-        self.keep(out, evaluations, self.trainer.state_dict())
+        self.keep(out, evaluations, record_of(self.trainer))
 
     def _film(self, out: Path, states: list[State]) -> None:
         """Show the first episode of the last evaluation, or in the browser all of them."""

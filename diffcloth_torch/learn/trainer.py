@@ -51,7 +51,7 @@ from diffcloth_torch.learn.workers import Ranks, Workers
 from diffcloth_torch.memory import check_memory
 from diffcloth_torch.sim.records.state import State
 
-__all__ = ["Trainer"]
+__all__ = ["Trainer", "record_of", "restore"]
 
 _CHECKPOINT = "trainer"  # kind of its files
 
@@ -242,8 +242,7 @@ class Trainer:
                 states.append(env.env_state.state)
         return float(total.mean()), float(success.float().mean()), states
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that a training goes on with, in types that `torch.load` reads."""
+    def _record(self) -> dict[str, Any]:
         return {
             "options": asdict(self.options),
             "task": self._described,
@@ -258,18 +257,9 @@ class Trainer:
             ],
         }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on with the state of another trainer, to the same bits.
-
-        Raises:
-            InvalidInput: If it is of another task, of other options, of environments in other
-                chunks, or has anything that `state_dict` does not return. The trainer is then as
-                before.
-        """
-        self._load("Trainer.load_state_dict: `state`", state)
-
     def _load(self, owner: str, given: Any) -> None:
-        own = self.state_dict()
+        """Check a record completely, then go on with it."""
+        own = self._record()
         if not isinstance(given, Mapping) or given.keys() != own.keys():
             raise InvalidInput(f"{owner} must have the keys {', '.join(own)}")
         if given["task"] != own["task"]:
@@ -327,7 +317,9 @@ class Trainer:
         return places
 
     def save(self, path: str | Path) -> None:
-        """Write `state_dict()` to a file, which replaces an older one completely or not at all.
+        """Write all that goes on to a file, which replaces an older one completely or not at all.
+
+        The file loads with `weights_only`, too.
 
         Raises:
             InvalidInput: If its folder does not exist.
@@ -336,14 +328,14 @@ class Trainer:
         path = as_path("Trainer.save: `path`", path)
         if not path.parent.is_dir():
             raise InvalidInput(f"Trainer.save: the folder of `path` must exist, got {str(path)!r}")
-        write_checkpoint(path, _CHECKPOINT, self.state_dict())
+        write_checkpoint(path, _CHECKPOINT, self._record())
 
     def load(self, path: str | Path) -> None:
         """Go on with the content of a file of `save`, to the same bits.
 
         Raises:
-            InvalidInput: If it is no such file, is damaged, or belongs to another training, see
-                `load_state_dict`. The trainer is then as before.
+            InvalidInput: If it is no such file, is damaged, or is of another task, of other
+                options, or of environments in other chunks. The trainer is then as before.
         """
         path = as_path("Trainer.load: `path`", path)
         if not path.is_file():
@@ -480,6 +472,21 @@ class Trainer:
             "return": sum(returns) / len(returns),
             "success": sum(successes) / len(successes),
         }
+
+
+def record_of(trainer: Trainer) -> dict[str, Any]:
+    """Everything that a training goes on with, in types that `torch.load` reads."""
+    return trainer._record()
+
+
+def restore(trainer: Trainer, record: Any) -> None:
+    """Go on with the record of another trainer, to the same bits.
+
+    Raises:
+        InvalidInput: If it belongs to another training, or has anything that `record_of` does not
+            return. The trainer is then as before.
+    """
+    trainer._load("the trainer", record)
 
 
 class _Rows:

@@ -173,7 +173,7 @@ def test_an_interrupted_fit_goes_on_with_the_same_bits(tmp_path):
     with pytest.raises(dc.InvalidInput, match="belongs to other variables or options"):
         dc.fit(VARIABLES, residuals, loss="huber", resume=tmp_path)
     (tmp_path / "start_0.pt").write_bytes(b"something else")
-    with pytest.raises(dc.InvalidInput, match="is not what a fit wrote"):
+    with pytest.raises(dc.InvalidInput, match="is no complete checkpoint"):
         dc.fit(VARIABLES, residuals, resume=tmp_path)
 
 
