@@ -471,17 +471,23 @@ def test_a_full_disk_ends_in_a_sentence_and_keeps_what_there_was(call, tmp_path)
     assert call("optimize", *arguments, "--out", "out").exit_code == 0
     before = {f.name: f.read_bytes() for f in (tmp_path / "out").iterdir()}
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))  # bytes of a file
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))  # bytes of a file
     try:
         more = call("optimize", "--resume", "out", "--set", "optimizer.iterations=3")
         other = call("optimize", *arguments, "--out", "other")
+        page = call("run", *arguments, "--viewer", "web", "--out", "page")
+        mesh = call("run", *arguments, "--viewer", "meshes", "--out", "mesh")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     for result in (more, other):
         assert result.exit_code == 2, result.output
         assert "resume.pt cannot be written: File too large" in one_sentence(result)
+    for result, name in ((page, "page/animation.html"), (mesh, "mesh/meshes/frame_0000.obj")):
+        assert result.exit_code == 2, result.output
+        assert f"{name} cannot be written: File too large" in one_sentence(result)
     assert {f.name: f.read_bytes() for f in (tmp_path / "out").iterdir()} == before
     assert not list((tmp_path / "other").iterdir())
+    assert not list((tmp_path / "page").iterdir())
 
 
 # --- actions of another run ---------------------------------------------------------------------

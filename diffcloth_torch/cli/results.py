@@ -201,7 +201,7 @@ def read_resume(folder: Path, command: str) -> dict[str, Any]:
             else ""
         )
         raise InvalidInput(
-            f"--resume: {folder} must hold what `diffcloth {command}` wrote: no {file}{why if older else ''}"
+            f"--resume: {folder} must hold what `diffcloth {command}` wrote: no {file}{why}"
         )
     content = read_checkpoint("--resume", file, command)
     with refusing_damage("--resume", file):

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from diffcloth_torch.checks import FloatArray
 from diffcloth_torch.extras import from_extra
+from diffcloth_torch.files import replace_file
 from diffcloth_torch.optimize.compared import Comparison, noting
 from diffcloth_torch.optimize.problem import Residuals, Trial, trajectories
 from diffcloth_torch.optimize.starts import Start
@@ -82,7 +83,8 @@ def write_page(path: Path, page: Page) -> None:
         + "\n".join(parts)
         + "\n</body>\n</html>\n"
     )
-    path.write_text(text, encoding="utf-8")
+    with replace_file(path) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def _compare(page: Page, values: Mapping[str, Tensor]) -> list[Comparison]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from diffcloth_torch.extras import from_extra
+from diffcloth_torch.files import replace_file
 
 __all__ = ["draw_loss_curve", "require_matplotlib"]
 
@@ -50,4 +51,5 @@ def draw_loss_curve(path: Path, losses: Sequence[float], *, label: str = "loss")
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False)
-    figure.savefig(path)
+    with replace_file(path) as part:
+        figure.savefig(part, format=path.suffix[1:])

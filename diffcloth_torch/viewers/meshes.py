@@ -7,6 +7,7 @@ from types import TracebackType
 
 from torch import Tensor
 
+from diffcloth_torch.files import writing
 from diffcloth_torch.sim.records.state import State
 
 __all__ = ["MeshSequence"]
@@ -29,7 +30,9 @@ class MeshSequence:
 
     def show(self, state: State, gradient: Tensor | None = None) -> None:
         """Write one file of a state."""
-        state.export(self._folder / f"frame_{self._count:04d}.obj", bodies=True)
+        file = self._folder / f"frame_{self._count:04d}.obj"
+        with writing(file):
+            state.export(file, bodies=True)
         self._count += 1
 
     def __enter__(self) -> MeshSequence:

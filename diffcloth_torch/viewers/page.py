@@ -18,6 +18,7 @@ import numpy as np
 from diffcloth_torch.checks import check_count
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.extras import from_extra
+from diffcloth_torch.files import replace_file
 from diffcloth_torch.viewers.guard import guarded_server, offline
 from diffcloth_torch.viewers.look import Camera
 from diffcloth_torch.viewers.motion import LAYERS, Motion
@@ -141,7 +142,9 @@ class Page(ABC):
             path: File to write, in an existing folder; an existing file is replaced.
             speed: Speed of the motion, 1 in real time.
         """
-        Path(path).write_text(self._page(speed), encoding="utf-8")
+        page = self._page(speed)
+        with replace_file(Path(path)) as part:
+            part.write_text(page, encoding="utf-8")
 
     def _repr_html_(self) -> str:
         page = html.escape(self._page(1.0), quote=True)
