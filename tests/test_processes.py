@@ -183,7 +183,9 @@ def started(tmp_path, names):
     script = tmp_path / "main.py"
     script.write_text(textwrap.dedent(SCRIPT))
     with (tmp_path / "output").open("w") as output:
-        main = subprocess.Popen([sys.executable, script, tmp_path], stdout=output)
+        main = subprocess.Popen(
+            [sys.executable, script, tmp_path], stdout=output, stderr=subprocess.STDOUT
+        )
     await_that(lambda: all((tmp_path / name).exists() for name in names))
     return main, {name: int((tmp_path / name).read_text()) for name in names}
 
