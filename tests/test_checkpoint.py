@@ -269,6 +269,17 @@ class TestTrainer:
         write_checkpoint(file, "trainer", content)
         other.load(file)
 
+    @pytest.mark.parametrize("counts", [[5, 1], [4, 2], [-4, -1], [4.0, 1], [4]])
+    def test_steps_and_updates_must_fit(self, tmp_path, counts):
+        trainer = self.trainer()
+        trainer.update()
+        content = record_of(trainer)
+        assert content["counts"] == [4, 1]
+        write_checkpoint(tmp_path / "policy.pt", "trainer", content | {"counts": counts})
+        with pytest.raises(InvalidInput, match="counts"):
+            trainer.load(tmp_path / "policy.pt")
+        assert (trainer.steps, trainer.updates) == (4, 1)
+
 
 POINTS = torch.linspace(0, 1, 9, dtype=F64)
 
@@ -301,6 +312,24 @@ class TestFit:
         assert refused > 0.5 * count
         write_checkpoint(file, "fit", content)
         dc.fit(variables, residuals, resume=tmp_path)
+
+    @pytest.mark.parametrize(
+        ("kind", "rows", "message"),
+        [
+            ("residuals", slice(None, -1), "one number of residuals"),
+            ("jacobian", (slice(None, -1), slice(None)), "one number of residuals"),
+            ("jacobian", (slice(None), slice(None, -1)), "a column for each number"),
+        ],
+    )
+    def test_records_must_fit_each_other(self, tmp_path, kind, rows, message):
+        variables = {"slope": dc.Variable(1.0), "offset": dc.Variable(0.0, scale="linear")}
+        dc.fit(variables, residuals, resume=tmp_path)
+        content = read_checkpoint("test", tmp_path / "start_0.pt", "fit")
+        record = next(r for r in content["records"] if r["kind"] == kind)
+        record["found"] = record["found"][rows].clone()
+        write_checkpoint(tmp_path / "start_0.pt", "fit", content)
+        with pytest.raises(InvalidInput, match=message):
+            dc.fit(variables, residuals, resume=tmp_path)
 
 
 CONFIGURATIONS = {

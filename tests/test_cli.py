@@ -420,9 +420,9 @@ def test_a_folder_in_use_is_refused_with_its_holder(call, tmp_path, way):
     with holder:
         assert holder.stdout.readline() == "held\n"
         refused = call("optimize", "--resume", "out") if way == "resume" else call(way, *arguments)
-        assert refused.exit_code == 2
-        assert f"out is in use by process {holder.pid} on " in one_sentence(refused)
         holder.kill()
+    assert refused.exit_code == 2
+    assert f"out is in use by process {holder.pid} on " in one_sentence(refused)
     # The lock ends with the process, and its file with the next one that uses the folder.
     assert (tmp_path / "out/.lock").exists()
     command = ["optimize", "--resume", "out"] if way == "resume" else [way, *arguments]
