@@ -1,21 +1,17 @@
-"""Files: only regular ones of a bounded size are read; new ones replace old ones as a whole."""
 """Files: only regular ones are read; one that is replaced is replaced completely or not at all."""
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from diffcloth_torch.errors import InvalidInput
 
-__all__ = ["INTEGER", "NUMBER", "as_path", "read_regular_file", "replacing"]
 __all__ = [
     "INTEGER",
     "NUMBER",
@@ -89,29 +85,21 @@ def read_regular_file(path: Path, largest: int) -> bytes:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a path to write to, of the same ending, which replaces `path` when all is written.
-
-    Raises:
-        FileNotFoundError: If there is no folder for the file.
-    """
-    if not path.parent.is_dir():
-        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path.parent))
-    part = path.with_name(f"{path.stem}.part{path.suffix}")
-    try:
-        yield part
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-def replace_file(path: Path) -> Iterator[Path]:
+def replace_file(path: Path, *, keeps_ending: bool = False) -> Iterator[Path]:
     """Yield a path to write to, which replaces `path` when all is written.
 
     If the block fails, the file at `path` stays as it is, and nothing else is left.
 
+    Args:
+        path: The file.
+        keeps_ending: Whether the other path has the ending of `path`, for writers that choose a
+            format by it.
+
     Raises:
         OSError: If it cannot be written; the message is a sentence.
     """
-    part = path.with_name(path.name + PART)
+    name = f"{path.stem}{PART}{path.suffix}" if keeps_ending else path.name + PART
+    part = path.with_name(name)
     try:
         with writing(path):
             yield part

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from diffcloth_torch.animation.surfaces import Animation, MovingSurface
 from diffcloth_torch.checks import FloatArray
-from diffcloth_torch.files import replacing
+from diffcloth_torch.files import replace_file
 from diffcloth_torch.geometry.poses import poses_of_frames
 
 __all__ = ["write_gltf"]
@@ -47,7 +47,7 @@ def write_gltf(path: Path, animation: Animation) -> None:
         text = json.dumps(document).encode("utf-8")
         chunks = _chunk(b"JSON", text + b" " * (-len(text) % 4)) + _chunk(b"BIN\0", data)
         content = b"glTF" + np.array([2, 12 + len(chunks)], dtype="<u4").tobytes() + chunks
-    with replacing(path) as part:
+    with replace_file(path, keeps_ending=True) as part:
         part.write_bytes(content)
 
 

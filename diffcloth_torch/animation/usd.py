@@ -9,7 +9,7 @@ import numpy as np
 
 from diffcloth_torch.animation.surfaces import Animation, MovingSurface
 from diffcloth_torch.extras import from_extra
-from diffcloth_torch.files import replacing
+from diffcloth_torch.files import replace_file
 
 __all__ = ["write_usd"]
 
@@ -44,7 +44,7 @@ def write_usd(path: Path, animation: Animation) -> None:
     stage.SetDefaultPrim(root.GetPrim())
     for surface in animation.surfaces:
         _add(stage, geometry, surface, codes)
-    with replacing(path) as part:
+    with replace_file(path, keeps_ending=True) as part:
         if not stage.GetRootLayer().Export(str(part)):
             raise OSError(f"{path}: usd-core could not write the file")
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diffcloth_torch.animation.surfaces import Animation, MovingSurface
-from diffcloth_torch.files import replacing
+from diffcloth_torch.files import replace_file
 
 __all__ = ["write_pvd"]
 
@@ -49,7 +49,7 @@ def write_pvd(path: Path, animation: Animation) -> None:
             attributes = " ".join(f"{key}={quoteattr(value)}" for key, value in entry.items())
             lines.append(f"<DataSet {attributes}/>")
     lines += ["</Collection>", "</VTKFile>", ""]
-    with replacing(path) as part_file:
+    with replace_file(path, keeps_ending=True) as part_file:
         part_file.write_text("\n".join(lines), encoding="utf-8")
 
 

@@ -52,17 +52,18 @@ def run(
         SimulationError: If a step fails; earlier results are kept.
         KeyboardInterrupt: If the user ends the run; the message says what is kept.
     """
-    out = check_folder(config, out, overwrite)
+    check_folder(config, out, overwrite)
     if save is not None:
         _check_target(save, overwrite)
-    check_folder(config, out, overwrite)
     task = load_task(config, assignments)
     start_actions = read_actions(task, actions)
     with results_folder(config, out, overwrite) as folder:
-        return _simulate(task, start_actions, config, folder)
+        return _simulate(task, start_actions, config, folder, save)
 
 
-def _simulate(task: ConfiguredTask, actions: Actions, config: Path, out: Path) -> str:
+def _simulate(
+    task: ConfiguredTask, actions: Actions, config: Path, out: Path, save: Path | None
+) -> str:
     states: list[State] = []
     start = time.perf_counter()
     try:

@@ -17,7 +17,7 @@ from diffcloth_torch.animation.formats import ANIMATIONS
 from diffcloth_torch.animation.surfaces import Animation, MovingSurface
 from diffcloth_torch.autograd.torch_private import register_tree
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.files import as_path, replacing
+from diffcloth_torch.files import as_path, replace_file
 from diffcloth_torch.geometry.poses import poses_of_frames
 from diffcloth_torch.model.quantities import STATE, Fields
 from diffcloth_torch.sim.records.state import State, check_shapes, check_state
@@ -90,7 +90,7 @@ class Trajectory(list[State]):
         file = as_path("Trajectory.save: `path`", path)
         ending = check_ending("Trajectory.save: `path`", file)
         if ending == ".pt":
-            with replacing(file) as part:
+            with replace_file(file, keeps_ending=True) as part:
                 torch.save(list(self.detach()), part)
             return
         if not self:
@@ -99,7 +99,7 @@ class Trajectory(list[State]):
         check_shapes("Trajectory.save", "all states", places)
         if ending == ".npz":
             arrays = self._arrays()
-            with replacing(file) as part:
+            with replace_file(file, keeps_ending=True) as part:
                 np.savez(part, **arrays)  # type: ignore[arg-type]
             return
         animation = self._animation()
