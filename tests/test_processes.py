@@ -146,6 +146,7 @@ def test_close_ends_the_processes(tmp_path):
 # holds all connections open.
 SCRIPT = """
 import os, signal, sys, time
+from pathlib import Path
 from diffcloth_torch.processes import Pool
 
 def note(name):
