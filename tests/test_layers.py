@@ -153,6 +153,7 @@ UNPICKLERS = {
     "diffcloth_torch/processes.py": {"pickle.loads"},
     "diffcloth_torch/worker.py": {"pickle.loads"},
     "benchmarks/scaling.py": {"pickle.loads"},
+    "benchmarks/scripted_worker.py": {"pickle.loads"},
 }
 
 
