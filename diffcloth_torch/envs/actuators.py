@@ -39,9 +39,12 @@ class Actuator(ABC):
 
     Attributes:
         size: A, the length of an action.
+        vectors: Places in an action at which three numbers are the components of a vector, which
+            turns with the frame of the task.
     """
 
     size: int
+    vectors: tuple[int, ...] = ()
 
     @abstractmethod
     def act(
@@ -106,6 +109,7 @@ class Pickers(Actuator):
             raise InvalidInput(f"Pickers: `opens_at` must be in [-1, 1), got {opens_at}")
         self.count = check_count("Pickers: `count`", count, 1)
         self.size = 4 * count
+        self.vectors = tuple(range(0, self.size, 4))
         self.stride = check_number("Pickers: `stride`", stride, POSITIVE)
         self.reach = check_number("Pickers: `reach`", reach, NON_NEGATIVE)
         self.floor = check_number("Pickers: `floor`", floor, ANY_NUMBER)
@@ -195,6 +199,7 @@ class Velocities(Actuator):
         self._dt = check_number("Velocities: `dt`", dt, POSITIVE)
         self.speed = check_number("Velocities: `speed`", speed, NON_NEGATIVE)
         self.size = 3 * len(self._pins)
+        self.vectors = tuple(range(0, self.size, 3))
 
     def act(
         self, tools: Tools, state: State, actions: Tensor, substeps: int
@@ -225,6 +230,7 @@ class Forces(Actuator):
         self._groups = [list(group) for group in groups]
         self.steady, self.largest = steady, largest
         self.size = 3 * len(self._groups)
+        self.vectors = tuple(range(0, self.size, 3))
 
     def act(
         self, tools: Tools, state: State, actions: Tensor, substeps: int
@@ -245,6 +251,7 @@ class Twist(Actuator):
     """
 
     size = 6
+    vectors = (0, 3)
 
     def __init__(self, body: str, row: int, *, dt: float, speed: float, spin: float) -> None:
         """Choose the body, by its name and its row in `State.body_poses`."""
@@ -271,6 +278,7 @@ class Hand(Actuator):
     """
 
     size = 7
+    vectors = (0, 3)
 
     def __init__(
         self,

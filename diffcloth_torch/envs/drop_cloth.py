@@ -1,4 +1,4 @@
-"""Drop a hanging sheet so that it lies flat."""
+"""Drop a hanging sheet so that it lies flat at a place."""
 
 from __future__ import annotations
 
@@ -9,66 +9,80 @@ from torch import Tensor
 
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Tools
-from diffcloth_torch.envs.env import EnvState, lengths
-from diffcloth_torch.envs.sheets import HEIGHT, SIDE, SheetTask, follow, uniform
+from diffcloth_torch.envs.env import EnvState, graded, lengths
+from diffcloth_torch.envs.sheets import HEIGHT, SIDE, SheetTask, at, follow, uniform
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["DropCloth"]
 
 _CLOSE = 0.1  # of the side: mean distance to flat that succeeds
+_AWAY = 0.06  # how far the goal is from beside the lower edge, along both axes, at most [m]
 
 
 class DropCloth(SheetTask):
-    """A sheet that two pickers hold by the corners is to lie flat beside its lower edge.
+    """A sheet that two pickers hold by the corners is to lie flat at a goal beside its lower edge.
 
-    The reward of each transition is -(mean distance of the vertices from where they lie in the flat
-    sheet) [m]; after ClothDrop of SoftGym.
+    The start draws how high the sheet hangs, and the goal. With the mean distance d of the vertices
+    from where they lie in the flat sheet the reward is graded(d, side / 10, side / 2); after
+    ClothDrop of SoftGym.
     """
 
     name = "DropCloth"
+    steps = 68
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Also how high the lower edge is, 1 to 6 cm."""
-        return super().draw(generator) | {"height": uniform(generator, 1, 0.01, 0.06)[0]}
+        """Also how high the lower edge is, 1 to 6 cm, and where the goal is, within 6 cm."""
+        return super().draw(generator) | {
+            "height": uniform(generator, 1, 0.01, 0.06)[0],
+            "away": uniform(generator, 2, -_AWAY, _AWAY),
+        }
 
     def shape(self, drawn: dict[str, Tensor]) -> Tensor:
-        """Upright, with the rest shape's x as height; adds the flat sheet to what was drawn."""
-        flat = super().shape(drawn)
-        x, y, z = flat.unbind(dim=-1)
-        upright = torch.stack(
-            [torch.zeros_like(x), y, x + SIDE / 2 + drawn["height"][:, None] + HEIGHT], dim=-1
-        )
-        drawn["goal"] = self.posed(torch.stack([x + SIDE / 2, y, z], dim=-1), drawn)
-        return upright
+        """Upright, with the rest shape's x as height."""
+        x, y, _ = self.flat(len(drawn["turn"])).unbind(dim=-1)
+        height = x + SIDE / 2 + drawn["height"][:, None] + HEIGHT
+        return torch.stack([torch.zeros_like(x), y, height], dim=-1)
+
+    def started(self, state: State, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
+        """Also where the vertices are to lie, and the corners among them."""
+        x, y, z = self.flat(len(state)).unbind(dim=-1)
+        away = drawn["away"][:, None]
+        flat = torch.stack([x + SIDE / 2 + away[..., 0], y + away[..., 1], z], dim=-1)
+        drawn["flat"] = self.posed(flat, drawn)
+        drawn["goal"] = drawn["flat"][:, self._corners]
+        return super().started(state, drawn)
 
     def tools(self, positions: Tensor, drawn: Mapping[str, Tensor]) -> Tools:
         """Pickers that hold the upper corners."""
-        corners = self.beginnings()
-        held = cpu.tensor(corners, dtype=torch.int64).expand(len(positions), -1)
-        return self.pickers.start(positions[:, corners], held)
+        return self.pickers.start(at(positions, drawn["picked"]), drawn["picked"])
 
     def distance(self, env: EnvState) -> Tensor:
         """Mean distance from the flat sheet [m], [B]."""
-        away = env.state.positions - env.drawn["goal"]
-        return lengths(away).mean(dim=-1)
+        return lengths(env.state.positions - env.drawn["flat"]).mean(dim=-1)
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return -self.distance(env)
+        return graded(self.distance(env), _CLOSE * SIDE, 0.5 * SIDE)
 
     def success(self, env: EnvState) -> Tensor:
         """Whether the mean distance is below .1 of the side."""
         return self.distance(env) < _CLOSE * SIDE
 
     def scripted(self, env: EnvState) -> Tensor:
-        """Lower the sheet until it touches the table, lay it down about its edge, let go."""
-        start, goal = env.drawn["start"], env.drawn["goal"]
-        corners, edge = self.beginnings(), [self.vertex(0, 0), self.vertex(-1, 0)]
-        foot, out = start[:, edge], goal[:, corners] - goal[:, edge]
-        foot = torch.cat([foot[..., :2], torch.full_like(foot[..., 2:], HEIGHT)], dim=-1)
+        """Bring the lower edge over its place, lower it, lay the sheet down about it, let go."""
+        start, flat = env.drawn["start"], env.drawn["flat"]
+        picked = env.drawn["picked"]
+        edge = cpu.tensor([self.vertex(0, 0), self.vertex(-1, 0)], dtype=torch.int64)
+        foot, out = flat[:, edge], at(flat, picked) - flat[:, edge]
         up = cpu.tensor([0.0, 0.0, SIDE])
+        begin = at(start, picked)
+        high = torch.cat([foot[..., :2], begin[..., 2:]], dim=-1)
         # What has been laid down and what still hangs are together as long as the sheet.
         shares = [k / 6 for k in range(7)]
-        laid = [foot + share * out + (1 - share) * up for share in shares]
-        points = [*laid, laid[-1], laid[-1] + 0.1 * up]
-        times = [3, *(6 + 4 * k for k in range(6)), 30, 34]
-        return self.moves_to(env, *follow(env, times, points, [*[1.0] * 8, -1.0]))
+        laid = [foot + (share - 0.03 * (1 - share)) * out + (1.03 - share) * up for share in shares]
+        middle = 0.5 * (begin + high)
+        points = [begin, middle, middle, high, high, *laid, laid[-1], laid[-1] + 0.1 * up]
+        # The second half of the way begins half a period of the swinging sheet after the first one,
+        # which ends the swinging.
+        times = [0, 4, 11, 15, 17, *(26 + 4 * k for k in range(7)), 52, 56]
+        return self.moves_to(env, *follow(env, times, points, [*[1.0] * 13, -1.0]))

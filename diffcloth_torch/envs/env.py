@@ -6,36 +6,46 @@ on each other, and all but drawing a start are differentiable.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
-from diffcloth_torch.checks import check_count
+from diffcloth_torch.checks import check_choice, check_count
 from diffcloth_torch.envs.actuators import Actuator, Tools
+from diffcloth_torch.envs.frames import Frame, vectors_out_of
+from diffcloth_torch.envs.randomization import Randomization, Ranges
+from diffcloth_torch.envs.safety import SafetyStop
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.records.controls import Parameters
 from diffcloth_torch.sim.records.state import State, where
 from diffcloth_torch.sim.simulator import Simulator
 
-__all__ = ["EnvState", "Task", "lengths"]
+__all__ = ["FRAMES", "EnvState", "Task", "graded", "lengths"]
+
+FRAMES = ("task", "world")
 
 
 @dataclass(frozen=True, eq=False)
 class EnvState:
-    """What a batch of environments is at one time.
+    """The state of a batch of environments.
 
     Attributes:
-        state: Of the simulation.
-        tools: What the actuator keeps: positions of pickers and what they hold.
-        drawn: What was drawn for the start, and what follows from it, such as a goal.
+        state: State of the simulation.
+        tools: State of the actuator: positions of pickers and the vertices that they hold.
+        drawn: The random numbers of the start, and quantities that follow from it, such as a goal.
         elapsed: Transitions since the start, int64 [B].
-        failed: Whether the last transition failed, so that the state is where it ended, [B].
+        failed: Whether the simulation failed in the last transition, so that the state is the last
+            one that was reached, [B].
+        blocked: Whether a prescribed motion of the last transition was infeasible and was not made,
+            [B].
+        held: Number of transitions, up to the last one, in which the task was done, int64 [B].
     """
 
     state: State
@@ -43,6 +53,8 @@ class EnvState:
     drawn: dict[str, Tensor]
     elapsed: Tensor
     failed: Tensor
+    blocked: Tensor
+    held: Tensor
 
     def __len__(self) -> int:
         return len(self.elapsed)
@@ -62,46 +74,74 @@ class EnvState:
             where(mask, a.state, b.state),
             {name: choose(a.tools[name], b.tools[name]) for name in b.tools},
             {name: choose(a.drawn[name], b.drawn[name]) for name in b.drawn},
-            choose(a.elapsed, b.elapsed),
-            choose(a.failed, b.failed),
+            *(choose(getattr(a, name), getattr(b, name)) for name in _COUNTS),
         )
 
+    def rows(self, rows: Tensor) -> EnvState:
+        """Environments by their indices [n]."""
+        chosen = self._map(lambda t: t[rows], self.state[rows])
+        return replace(chosen, **{name: getattr(self, name)[rows] for name in _COUNTS})
+
     def _map(self, change: Callable[[Tensor], Tensor], state: State) -> EnvState:
-        return EnvState(
-            state,
-            {name: change(t) for name, t in self.tools.items()},
-            {name: change(t) for name, t in self.drawn.items()},
-            self.elapsed,
-            self.failed,
+        return replace(
+            self,
+            state=state,
+            tools={name: change(t) for name, t in self.tools.items()},
+            drawn={name: change(t) for name, t in self.drawn.items()},
         )
+
+
+_COUNTS = ("elapsed", "failed", "blocked", "held")
 
 
 class Task(ABC):
-    """What is to be done in a scene: where it starts, how tools act, and what counts.
+    """A task: the distribution of its starts, its tools, its reward and its success.
+
+    Rewards are at least `worst`, which a blocked motion costs; a simulation that fails costs it for
+    each transition that is left. So no failure has a larger return than an episode that goes on.
 
     Attributes:
         name: Its name in `make` and, with "diffcloth/" before and "-v0" behind, in gymnasium.
+        worst: The least reward of a transition.
+        holds: Transitions in which a task must be done, up to the last one, to succeed.
         simulator: The scene, shared by all environments.
         actuator: What actions move.
         horizon: Transitions after which an episode ends.
         substeps: Time steps of a transition.
+        frame: The axes of observations and actions: "task", fixed at the start of an episode, or
+            "world".
     """
 
     name: ClassVar[str]
+    worst: ClassVar[float] = -1.0
+    holds: ClassVar[int] = 5
 
     def __init__(
-        self, simulator: Simulator, actuator: Actuator, *, horizon: int, substeps: int
+        self,
+        simulator: Simulator,
+        actuator: Actuator,
+        *,
+        horizon: int,
+        substeps: int,
+        frame: str = "task",
+        randomize: Ranges = False,
     ) -> None:
         if not isinstance(getattr(self, "name", None), str):
             raise InvalidInput(f"{type(self).__name__}: a task must have a `name`")
+        owner = operation(self.name)
+        if not math.isfinite(self.worst):
+            raise InvalidInput(f"{owner}: `worst` must be finite, got {self.worst}")
         if simulator.solver.throw:
             raise InvalidInput(
-                f"{operation(self.name)}: `simulator` must have SolverOptions(throw=False): one "
+                f"{owner}: `simulator` must have SolverOptions(throw=False): one "
                 "environment that fails must not end the others"
             )
         self.simulator, self.actuator = simulator, actuator
-        self.horizon = check_count(f"{operation(self.name)}: `horizon`", horizon, 1)
-        self.substeps = check_count(f"{operation(self.name)}: `substeps`", substeps, 1)
+        self.horizon = check_count(f"{owner}: `horizon`", horizon, 1)
+        self.substeps = check_count(f"{owner}: `substeps`", substeps, 1)
+        self.frame = check_choice(f"{owner}: `frame`", frame, FRAMES)
+        self._randomization = Randomization(owner, simulator, randomize)
+        self._stop: SafetyStop | None = None
 
     @abstractmethod
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
@@ -120,11 +160,11 @@ class Task(ABC):
 
     @abstractmethod
     def reward(self, env: EnvState) -> Tensor:
-        """Reward [B] of having come to a state."""
+        """Reward [B] of having come to a state, at least `worst`."""
 
     @abstractmethod
     def success(self, env: EnvState) -> Tensor:
-        """Whether the task is done [B]."""
+        """Whether the task is done in a state [B]; it succeeds where this holds for `holds`."""
 
     def scripted(self, env: EnvState) -> Tensor:  # a task may have none
         """Actions [B, A] of a policy made by hand, which shows that the task can be done.
@@ -134,26 +174,39 @@ class Task(ABC):
         """
         raise InvalidInput(f"{self.name}: it has no scripted policy")
 
+    def frame_of(self, state: State, drawn: Mapping[str, Tensor]) -> Frame | None:
+        """The frame of the task at a start; None where it is the world."""
+        return None
+
     def terminal(self, env: EnvState) -> Tensor:
-        """Whether an episode ends before its horizon [B]: where a step failed."""
+        """Whether an episode ends before its horizon [B]: where the simulation failed."""
         return env.failed
+
+    def sample(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """Draw a start, and physical parameters where they are randomized."""
+        return self.draw(generator) | self._randomization.draw(generator)
 
     def initial(self, generator: torch.Generator, n: int) -> EnvState:
         """Starts of n environments, one drawn after the other."""
-        return self.start([self.draw(generator) for _ in range(n)])
+        return self.start([self.sample(generator) for _ in range(n)])
 
     def start(self, draws: list[dict[str, Tensor]]) -> EnvState:
         """Starts for what was drawn for each environment."""
         drawn = {name: torch.stack([d[name] for d in draws]) for name in draws[0]}
         with torch.no_grad():
             state, tools = self.place(drawn)
+            frame = self.frame_of(state, drawn) if self.frame == "task" else None
+        if frame is not None:
+            drawn |= frame
         count = len(draws)
         return EnvState(
             state,
             tools,
             drawn,
-            cpu.zeros(count, dtype=torch.int64),
-            cpu.zeros(count, dtype=torch.bool),
+            elapsed=cpu.zeros(count, dtype=torch.int64),
+            failed=cpu.zeros(count, dtype=torch.bool),
+            blocked=cpu.zeros(count, dtype=torch.bool),
+            held=cpu.zeros(count, dtype=torch.int64),
         )
 
     def transition(
@@ -161,28 +214,81 @@ class Task(ABC):
     ) -> EnvState:
         """The state after `substeps` time steps.
 
-        What failed stays at the last state that it reached, without a graph.
+        Where a prescribed motion is infeasible, it ends: the time step is taken again with
+        everything prescribed held, as are the ones that are left of the transition. Their
+        derivative by the action is zero; the derivatives by the state and by parameters are those
+        of the steps. An environment whose simulation fails stays at the last state that it reached,
+        without a graph.
 
         Args:
             env: The state before it.
-            actions: Between -1 and 1, others are clipped, float64 [B, A].
+            actions: Between -1 and 1, others are clipped, in the frame of the task, float64 [B, A].
             parameters: Of the simulation; None takes those of the scene.
         """
         state = env.state
         failed = torch.zeros_like(env.failed)
-        controls, tools = self.actuator.act(env.tools, state, actions.clamp(-1, 1), self.substeps)
+        parameters = self._randomization.parameters(env.drawn, parameters)
+        controls, tools = self.actuator.act(
+            env.tools, state, self.in_world(env, actions.clamp(-1, 1)), self.substeps
+        )
+        stopped = [False] * len(env)
         for control in controls:
-            state = self.simulator.step(state, control, parameters)
+            state = self._safety.step(state, control, parameters, stopped)
             failed = failed | failures(state)
             if bool(failed.any()):
                 state = where(failed, state.detach(), state)
-        if bool(failed.any()):
-            tools = {name: _cut(t, failed) for name, t in tools.items()}
-        return EnvState(state, tools, env.drawn, env.elapsed + 1, failed)
+        blocked = torch.zeros_like(env.blocked)
+        if any(stopped):
+            blocked = cpu.tensor(stopped, dtype=torch.bool)
+        cut = failed | blocked
+        if bool(cut.any()):
+            tools = {name: _cut(t, cut) for name, t in tools.items()}
+        after = EnvState(state, tools, env.drawn, env.elapsed + 1, failed, blocked, env.held)
+        with torch.no_grad():
+            done = self.success(after) & ~failed
+        return replace(after, held=(env.held + 1) * done)
+
+    def outcome(self, env: EnvState) -> Tensor:
+        """Reward [B] with the charges for failing.
+
+        A blocked motion costs `worst`; a failed simulation costs it for its transition and for each
+        that is left.
+        """
+        reward = self.reward(env)
+        if not bool((env.failed | env.blocked).any()):
+            return reward
+        left = (self.horizon - env.elapsed).clamp(min=0)
+        charge = self.worst * torch.where(env.failed, 1 + left, 1)
+        return torch.where(env.failed | env.blocked, charge.to(reward), reward)
+
+    def succeeded(self, env: EnvState) -> Tensor:
+        """Whether the task was done in each of the last `holds` transitions [B]."""
+        return env.held >= self.holds
 
     def observation(self, env: EnvState) -> Tensor:
         """What a policy sees, float64 [B, O]: all features, one behind the other."""
         return torch.cat(list(self.features(env).values()), dim=-1)
+
+    def in_world(self, env: EnvState, actions: Tensor) -> Tensor:
+        """Actions [B, A] in world axes."""
+        starts = self.actuator.vectors
+        if "frame_axes" not in env.drawn or not starts:
+            return actions
+        if self._vectors is None:
+            self._vectors = cpu.tensor(
+                [[s, s + 1, s + 2] for s in starts], dtype=torch.int64
+            ).flatten()
+        vectors = actions[:, self._vectors].reshape(len(actions), -1, 3)
+        turned = vectors_out_of(env.drawn, vectors).flatten(1)
+        return actions.index_copy(1, self._vectors, turned)
+
+    _vectors: Tensor | None = None
+
+    @property
+    def _safety(self) -> SafetyStop:
+        if self._stop is None or self._stop.simulator is not self.simulator:
+            self._stop = SafetyStop(self.simulator)
+        return self._stop
 
     @property
     def action_size(self) -> int:
@@ -201,6 +307,20 @@ class Task(ABC):
     def example(self) -> EnvState:
         """A start of one environment, which shows the shapes of everything."""
         return self.initial(cpu.generator().manual_seed(0), 1)
+
+
+def graded(distance: Tensor, tolerance: float, length: float) -> Tensor:
+    """Reward [B] between -1 and 1 that grows everywhere, and most where a task is nearly done.
+
+    It is s(4 (1 - d/t)) - tanh(d/l) with the logistic function s.
+
+    Args:
+        distance: d, from where the task is done [m], [B].
+        tolerance: t, the distance at which a task counts as done [m].
+        length: l, over which distances are told apart [m].
+    """
+    near = torch.sigmoid(4.0 - (4.0 / tolerance) * distance)
+    return near - torch.tanh(distance / length)
 
 
 def failures(state: State) -> Tensor:

@@ -1,72 +1,130 @@
-"""Fold a sheet in half, along an edge or along a diagonal."""
+"""Fold a sheet along a line, parallel to an edge or to a diagonal."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
-from diffcloth_torch.envs.env import EnvState, lengths
-from diffcloth_torch.envs.sheets import SIDE, SheetTask, arc, follow
+from diffcloth_torch.envs.actuators import Tools
+from diffcloth_torch.envs.env import EnvState, graded, lengths
+from diffcloth_torch.envs.sheets import SIDE, SheetTask, arc, at, follow
+from diffcloth_torch.sim.records.state import State
 
 __all__ = ["FoldCloth", "FoldClothDiagonal"]
 
-_DRIFT = 1.2  # weight of how far the kept half moves, as in SoftGym
+_DRIFT = 1.2  # weight of how far the kept part moves, as in SoftGym
+_CLOSE = 0.1  # in sides: see success()
 
 
 class FoldCloth(SheetTask):
-    """One half of a sheet is to lie on the other, which is to stay where it is.
+    """A part of a sheet is to lie on the rest of it, which is to stay where it is.
 
-    The reward of each transition is -(mean distance of paired vertices + 1.2 times the mean drift
-    of the kept half) [m], after ClothFold of SoftGym and fold_cloth of DaXBench.
+    The start draws which of two opposite edges moves, and the line of the fold: one of the rows of
+    vertices that leave between a fifth and a half of the sheet to be moved. A sheet folds along its
+    edges, so that this serves all sizes. The distance is d = mean distance of the moved material
+    from where it is to lie + 1.2 times the mean drift of the kept material, both by area, after
+    ClothFold of SoftGym and fold_cloth of DaXBench; the reward is graded(d, side / 10, side / 2).
     """
 
     name = "FoldCloth"
-    closes = (True, True)  # pickers that a fold needs
-    lift = 0.45  # how high they carry it, in sides
-    pace = 3  # transitions for an eighth of the way
-    close = 0.1  # in sides: see success()
+    steps = 45
+    closes: ClassVar[tuple[bool, bool]] = (True, True)  # pickers that a fold needs
+    lift: ClassVar[float] = 0.45  # height of the arc, in shares of its width
+    pace: ClassVar[int] = 3  # transitions for an eighth of the way
+
+    def lines(self) -> list[int]:
+        """Columns of vertices along which a sheet may be folded: half of it to four fifths stay."""
+        n = self.side
+        return [c for c in range(n - 1) if 0.5 <= c / (n - 1) <= 0.8]
+
+    def beyond(self, row: Tensor, column: Tensor, line: int) -> Tensor:
+        """How far vertices are beyond a line, in rows of vertices."""
+        return column - line
+
+    def mirror(self, row: Tensor, column: Tensor, line: int) -> tuple[Tensor, Tensor]:
+        """Row and column onto which vertices beyond a line are folded."""
+        return row, 2 * line - column
+
+    def corners(self) -> list[int]:
+        """Vertices near which the pickers begin."""
+        return [self.vertex(0, -1), self.vertex(-1, -1)]
 
     @cached_property
-    def _pairs(self) -> tuple[Tensor, Tensor]:
-        return self.pairs()
+    def _tables(self) -> dict[str, Tensor]:
+        """For both edges and all lines: partners of vertices, their areas, and picked vertices.
 
-    def pairs(self) -> tuple[Tensor, Tensor]:
-        """Vertices that move, and the ones on which they are to lie."""
-        rows = cpu.arange(self.side)[:, None]
-        columns = cpu.arange(self.side // 2)
-        kept = rows * self.side + columns
-        moved = rows * self.side + self.side - 1 - columns
-        return moved.flatten(), kept.flatten()
+        A sheet that is turned by half a turn has the same triangles: vertex i becomes N - 1 - i.
+        """
+        n, count = self.side, self.side**2
+        index = cpu.arange(count)
+        row, column = index // n, index % n
+        faces = cpu.as_tensor(self.simulator.scene.cloths[0].faces).long()
+        partners, areas, landing = [], [], []
+        for line in self.lines():
+            beyond = self.beyond(row, column, line)
+            there = self.mirror(row, column, line)
+            partner = torch.where(beyond > 0, there[0] * n + there[1], index)
+            moved, kept = (
+                _shares(faces, (side >= 0)[faces].all(dim=-1), count) for side in (beyond, -beyond)
+            )
+            partners.append(torch.stack([partner, (count - 1 - partner).flip(0)]))
+            areas.append(
+                torch.stack([torch.stack([moved, kept]), torch.stack([moved, kept]).flip(1)])
+            )
+            landing.append(partner[self.corners()])
+        picked = cpu.tensor(self.corners(), dtype=torch.int64)
+        landing_at = torch.stack(landing)
+        return {
+            "partner": torch.stack(partners, dim=1),  # [2, L, N]
+            "area": torch.stack(areas, dim=1),  # [2, L, 2, N]
+            "picked": torch.stack([picked, count - 1 - picked]),  # [2, P]
+            "landing": torch.stack([landing_at, count - 1 - landing_at]),  # [2, L, P]
+        }
 
-    def distances(self, env: EnvState) -> tuple[Tensor, Tensor]:
-        """Mean distance of the pairs, and mean drift of the kept half [m], [B] each."""
-        moved, kept = self._pairs
+    def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """Also the edge that moves, and the line of the fold."""
+        return super().draw(generator) | {
+            "edge": cpu.randint(2, (1,), generator=generator)[0],
+            "line": cpu.randint(len(self.lines()), (1,), generator=generator)[0],
+        }
+
+    def picked(self, drawn: Mapping[str, Tensor]) -> Tensor:
+        """See `SheetTask`."""
+        return self._tables["picked"][drawn["edge"]]
+
+    def started(self, state: State, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
+        """Also which material is to lie on which, and where the picked vertices are to lie."""
+        edge, line = drawn["edge"], drawn["line"]
+        drawn["partner"] = self._tables["partner"][edge, line]
+        drawn["area"] = self._tables["area"][edge, line]
+        drawn["goal"] = at(state.positions, self._tables["landing"][edge, line])
+        return super().started(state, drawn)
+
+    def distance(self, env: EnvState) -> Tensor:
+        """Of moved material from its goal, and 1.2 times the drift of kept material [m], [B]."""
         x = env.state.positions
-        drift = x[:, kept] - env.drawn["start"][:, kept]
-        return _mean_length(x[:, moved] - x[:, kept]), _mean_length(drift)
+        away = torch.stack([x - at(x, env.drawn["partner"]), x - env.drawn["start"]], dim=1)
+        apart, drift = (lengths(away) * env.drawn["area"]).sum(dim=-1).unbind(dim=1)
+        return apart + _DRIFT * drift
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        apart, drift = self.distances(env)
-        return -(apart + _DRIFT * drift)
+        return graded(self.distance(env), _CLOSE * SIDE, 0.5 * SIDE)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether the reward is above -`close` sides."""
-        return self.reward(env) > -self.close * SIDE
-
-    def ends(self) -> list[int]:
-        """Vertices onto which the pickers carry those that they begin at."""
-        return [self.vertex(0, 0), self.vertex(-1, 0)]
+        """Whether the distance is below a tenth of the side."""
+        return self.distance(env) < _CLOSE * SIDE
 
     def scripted(self, env: EnvState) -> Tensor:
         """Close on the corners, carry them over in an arc, put them down, let go."""
-        start = env.drawn["start"]
         low = cpu.tensor([0.0, 0.0, 0.016])
-        here, there = start[:, self.beginnings()], start[:, self.ends()] + low
-        carried = arc(here, there, self.lift * SIDE, 8)
+        here, there = at(env.drawn["start"], env.drawn["picked"]), env.drawn["goal"] + low
+        carried = arc(here, there, self.lift, 8)
         end = 5 + 8 * self.pace
         times = [4, *(5 + self.pace * k for k in range(1, 9)), end + 2, end + 6]
         points = [here, *carried, there, there + 4 * low]
@@ -80,38 +138,38 @@ class FoldCloth(SheetTask):
 
 
 class FoldClothDiagonal(FoldCloth):
-    """One triangle of a sheet is to lie on the other, along a diagonal.
+    """A triangle of a sheet is to lie on the rest of it.
 
-    One picker carries a corner to the opposite one; the other begins in the middle of the moved
-    half. Reward as in `FoldCloth`.
+    The start draws which of two opposite corners moves, and the line of the fold, parallel to the
+    diagonal between the others. One picker carries the corner; the other begins in the middle of
+    the moved triangle. Distance and reward as in `FoldCloth`.
     """
 
     name = "FoldClothDiagonal"
     closes = (True, False)
-    lift = 0.7
+    steps = 55
+    lift = 0.4
     pace = 4
-    close = 0.25  # corners beside the fold hang
 
-    def pairs(self) -> tuple[Tensor, Tensor]:
-        """Vertices that move, and the ones on which they are to lie."""
-        n = self.side
-        row, column = torch.meshgrid(cpu.arange(n), cpu.arange(n), indexing="ij")
-        moves = row + column > n - 1
-        moved = row[moves] * n + column[moves]
-        kept = (n - 1 - column[moves]) * n + n - 1 - row[moves]
-        return moved, kept
+    def lines(self) -> list[int]:
+        """Columns at which the line begins: up to a third of the side away from the diagonal."""
+        return [c for c in range(self.side - 2) if c / (self.side - 1) <= 0.34]
 
-    def beginnings(self) -> list[int]:
-        """Near the corner, and near a vertex half way to the middle."""
-        return [self.vertex(-1, -1), self.vertex(3 * self.side // 4, 3 * self.side // 4)]
+    def beyond(self, row: Tensor, column: Tensor, line: int) -> Tensor:
+        """See `FoldCloth`."""
+        return column - row - line
 
-    def ends(self) -> list[int]:
-        """The opposite corner, and the vertex that the other one should lie on."""
-        n = self.side
-        row = 3 * n // 4
-        return [self.vertex(0, 0), self.vertex(n - 1 - row, n - 1 - row)]
+    def mirror(self, row: Tensor, column: Tensor, line: int) -> tuple[Tensor, Tensor]:
+        """See `FoldCloth`."""
+        return column - line, row + line
+
+    def corners(self) -> list[int]:
+        """The corner, and a vertex half way to the middle."""
+        quarter = self.side // 4
+        return [self.vertex(0, -1), self.vertex(quarter, -1 - quarter)]
 
 
-def _mean_length(vectors: Tensor) -> Tensor:
-    """Mean length [B] of vectors [B, n, 3]; those that are zero have no gradient."""
-    return lengths(vectors).mean(dim=-1)
+def _shares(faces: Tensor, chosen: Tensor, count: int) -> Tensor:
+    """Shares of vertices [N] in the area of chosen faces, which are of the same size."""
+    corners = faces[chosen].flatten()
+    return cpu.zeros(count).index_add(0, corners, cpu.ones(len(corners))) / len(corners)

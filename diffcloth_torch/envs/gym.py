@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -25,6 +26,7 @@ __all__ = ["ClothVectorEnv"]
 
 _AUTORESETS = (AutoresetMode.SAME_STEP.value, AutoresetMode.DISABLED.value)
 _LARGEST_SEED = 2**64 - 1
+_FLAGS = ("success", "failed", "blocked", "elapsed")  # of an episode that ended
 _FLOAT = torch.float32  # at the border; float64 inside
 
 
@@ -33,14 +35,17 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
 
     Observations and rewards are float32 tensors [B, O] and [B]. They keep the graph of actions that
     need a gradient, through as many steps as have been taken since `clear_grad`; where nothing
-    needs one there is no graph. `info` has "success", "failed" and "elapsed", [B] each, and
-    "obs_before_reset", the observation at the end of the step.
+    needs one there is no graph. `info` has "success", "failed", "blocked" and "elapsed", [B] each,
+    and "obs_before_reset", the observation at the end of the step. Success is a task that was done
+    in the last `Task.holds` steps.
 
-    An episode ends at the horizon of the task (`truncated`), or where a step fails (`terminated`,
-    with `info["failed"]`; its reward is that of the last state that was reached, without a
-    gradient). With `AutoresetMode.SAME_STEP` a new episode then begins in the same step: the
-    observation is that of the new start, and `info["final_obs"]` that of the end, with its graph,
-    where `info["_final_obs"]` is true. With `AutoresetMode.DISABLED` it is begun by
+    A prescribed motion that is infeasible is blocked, as by a safety stop: `info["blocked"]`. Its
+    reward is `Task.worst`, and the derivative by the action is zero. An episode ends at the horizon
+    of the task (`truncated`), or where the simulation fails (`terminated`, with `info["failed"]`):
+    the reward is then `Task.worst` for this step and for each that is left, without a gradient.
+    With `AutoresetMode.SAME_STEP` a new episode begins in the step that ends one: the observation
+    is that of the new start, and `info["final_obs"]` that of the end, with its graph, where
+    `info["_final_obs"]` is true. With `AutoresetMode.DISABLED` it is begun by
     `reset(options={"reset_mask": ended})`.
 
     Environment i starts from numbers of its own, which depend on the seed and on i alone.
@@ -133,8 +138,8 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         """
         self._require_start("step")
         after = self.task.transition(self.env_state, self._actions(actions), self.parameters)
-        reward = self.task.reward(after)
-        _check_rewards(self.task, reward, after.failed)
+        reward = self.task.outcome(after)
+        _check_rewards(self.task, reward, after)
         observation = self._observe(after)
         terminated = self.task.terminal(after)
         truncated = (after.elapsed >= self.task.horizon) & ~terminated
@@ -143,7 +148,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         ended = terminated | truncated
         same_step = self.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
         if same_step and bool(ended.any()):
-            final = {name: info[name] for name in ("success", "failed", "elapsed")}
+            final = {name: info[name] for name in _FLAGS}
             info |= {"final_obs": observation, "_final_obs": ended}
             info |= {"final_info": final, "_final_info": ended}
             after = self._with_starts(after, ended)
@@ -218,7 +223,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _started(self, environments: Sequence[int]) -> EnvState:
         generators = self._generators or []
-        return self.task.start([self.task.draw(generators[i]) for i in environments])
+        return self.task.start([self.task.sample(generators[i]) for i in environments])
 
     def _with_starts(self, env: EnvState, mask: Tensor) -> EnvState:
         """New starts where the mask is true."""
@@ -229,22 +234,19 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         fresh = self._started(chosen)
         rows = cpu.zeros(self.num_envs, dtype=torch.int64)
         rows[chosen] = cpu.arange(len(chosen))
-        spread = EnvState(
-            fresh.state[rows],
-            {name: t[rows] for name, t in fresh.tools.items()},
-            {name: t[rows] for name, t in fresh.drawn.items()},
-            fresh.elapsed[rows],
-            fresh.failed[rows],
-        )
-        return EnvState.where(mask, spread, env)
+        return EnvState.where(mask, fresh.rows(rows), env)
 
     def _observe(self, env: EnvState) -> Tensor:
         return self.task.observation(env).to(_FLOAT)
 
     def _info(self, env: EnvState) -> dict[str, Any]:
-        with torch.no_grad():
-            success = self.task.success(env)
-        return {"success": success, "failed": env.failed, "elapsed": env.elapsed}
+        success = self.task.succeeded(env)
+        return {
+            "success": success,
+            "failed": env.failed,
+            "blocked": env.blocked,
+            "elapsed": env.elapsed,
+        }
 
     def _actions(self, given: Any) -> Tensor:
         actions = float_tensor("step: `actions`", given)
@@ -320,12 +322,15 @@ def _check(
         raise InvalidInput(f"{task.name}: `{name}` must give {words} {text}, got {got}")
 
 
-def _check_rewards(task: Task, reward: Tensor, failed: Tensor) -> None:
-    wrong = ~torch.isfinite(reward) & ~failed
+def _check_rewards(task: Task, reward: Tensor, env: EnvState) -> None:
+    """Require rewards of at least `worst`, but for those that charge the rest of an episode."""
+    ends = env.failed | task.terminal(env)
+    wrong = ~((reward >= task.worst) & (reward < math.inf)) & ~ends
     if bool(wrong.any()):
         row = int(wrong.nonzero()[0])
         raise SimulationError(
-            f"{task.name}: the reward of environment {row} is {float(reward[row].detach())}",
+            f"{task.name}: the reward of environment {row} is {float(reward[row].detach())}; it "
+            f"must be finite, and at least the `worst` of the task, {task.worst}",
             environments=wrong.nonzero()[:, 0].tolist(),
         )
 

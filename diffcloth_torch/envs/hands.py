@@ -2,163 +2,190 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
-from diffcloth_torch.checks import check_count
-from diffcloth_torch.envs.actuators import Hand, Tools
-from diffcloth_torch.envs.env import EnvState, Task, lengths
+from diffcloth_torch.envs.actuators import Actuator, Hand, Tools
+from diffcloth_torch.envs.built import DT, BuiltTask, key_rows, with_material
+from diffcloth_torch.envs.env import EnvState, graded, lengths
+from diffcloth_torch.envs.frames import Frame, points_in, pose_frame, poses_in, vectors_in
 from diffcloth_torch.envs.sheets import uniform
 from diffcloth_torch.geometry.rotation import (
+    quaternion_exp,
     quaternion_log,
     quaternion_multiply,
     rotate,
 )
-from diffcloth_torch.model.options import SolverOptions
+from diffcloth_torch.model.materials import Material
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.records.state import State
-from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.tasks.scenes import grid_changes, pose_of, scene_of
 
-__all__ = ["GraspCloth", "HandTask", "LiftCloth", "twist_to"]
+__all__ = ["LENGTH", "GraspCloth", "HandTask", "LiftCloth", "twist_to"]
 
-_DT = 0.02  # [s]
+LENGTH = 0.12  # of a side of the cloth [m]
 _JOINTS = ("gripper/left_finger_joint", "gripper/right_finger_joint")
 _CLOSING = 5  # transitions in which a scripted hand closes
 
 
-class HandTask(Task):
+class HandTask(BuiltTask):
     """A cloth lies on a table and over its edge, between the fingers of a gripper.
 
     Actions are the linear and angular velocity of the gripper's base and the effort of its fingers.
-    The start is drawn: where the gripper is, within 4 mm.
+    The start draws where the gripper is, within 4 mm. The frame of the task is the pose of the base
+    at the start.
 
     Attributes:
         center: Position of the cloth's center at the start [m], [3].
         target: Pose of the target of the task grasp_cloth, [7].
     """
 
-    obstacles: tuple[RigidBody, ...] = ()
+    steps = 40
+    obstacles: ClassVar[tuple[RigidBody, ...]] = ()
 
-    def __init__(self, *, size: int = 12, horizon: int = 40, substeps: int = 2) -> None:
-        """Build the scene.
-
-        Args:
-            size: Vertices along a side of the cloth, >= 4.
-            horizon: Transitions of an episode.
-            substeps: Time steps of a transition, of .02 s each.
-        """
-        check_count(f"{operation(self.name)}: `size`", size, 4)
-        scene, sections = scene_of("grasp_cloth", grid_changes("cloth", size))
-        simulator = Simulator(
-            Scene(scene.cloths, [*scene.bodies, *self.obstacles], scene.robots),
-            _DT,
-            solver=SolverOptions(throw=False),
-        )
-        hand = Hand("gripper", _JOINTS, dt=_DT)
-        super().__init__(simulator, hand, horizon=horizon, substeps=substeps)
-        self.hand = hand
-        self.center = cpu.tensor(sections["scene"]["cloths"][0]["pose"]["position"])  # of the cloth
+    def build(self, material: Material | None) -> tuple[Scene, Actuator]:
+        """See `BuiltTask`."""
+        scene, sections = scene_of("grasp_cloth", grid_changes("cloth", self.side))
+        self.hand = Hand("gripper", _JOINTS, dt=DT)
+        self.center = cpu.tensor(sections["scene"]["cloths"][0]["pose"]["position"])
         self.target = cpu.tensor(pose_of(sections["target"]["pose"]))
-        some = cpu.linspace(0, size - 1, 4).round().long()
-        self._rows = (some[:, None] * size + some).flatten()
+        self._rows = key_rows(self.side, self.sees)
+        corners = [0, self.side - 1, self.side * (self.side - 1), self.side**2 - 1]
+        self._corners = cpu.tensor(corners, dtype=torch.int64)
+        cloths = [with_material(cloth, material) for cloth in scene.cloths]
+        return Scene(cloths, [*scene.bodies, *self.obstacles], scene.robots), self.hand
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Where the gripper is, within 4 mm."""
         return {"shift": uniform(generator, 3, -0.004, 0.004)}
 
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
-        """See `Task`."""
+        """See `Task`. A subclass adds "goal" [B, g, 3]: points where the cloth is to be."""
         state = self.simulator.initial_state(len(drawn["shift"]))
         poses = state.base_poses.clone()
         poses[:, 0, :3] += drawn["shift"]
         drawn["start"], drawn["base"] = state.positions, poses[:, 0]
         return state.replace(base_poses=poses), {}
 
+    def frame_of(self, state: State, drawn: Mapping[str, Tensor]) -> Frame:
+        """See `Task`."""
+        return pose_frame(drawn["base"])
+
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Some vertices of the cloth, the hand and its joints."""
-        state = env.state
+        """Some vertices of the cloth, the hand and its joints, the corners at the start, the goal.
+
+        Lengths are in units of the side of the cloth.
+        """
+        state, rows, drawn = env.state, self._rows, env.drawn
+        positions = state.positions[:, rows]
+        start, goal = drawn["start"][:, self._corners], drawn["goal"]
+        sizes = [len(rows), 4, goal.shape[1]]
+        points = points_in(drawn, torch.cat([positions, start, goal], dim=1)) / LENGTH
+        placed = [part.flatten(1) for part in torch.split(points, sizes, dim=1)]
+        pairs = [state.velocities[:, rows], state.contact_forces[:, rows]]
+        velocities, forces = vectors_in(drawn, torch.cat(pairs, dim=1)).chunk(2, dim=1)
         return {
-            "positions": state.positions[:, self._rows].flatten(1),
-            "velocities": state.velocities[:, self._rows].flatten(1),
-            "contact_forces": state.contact_forces[:, self._rows].flatten(1),
-            "base": state.base_poses[:, 0],
+            "positions": placed[0],
+            "velocities": velocities.flatten(1),
+            "contact_forces": forces.flatten(1),
+            "base": poses_in(drawn, state.base_poses[:, 0]),
             "joint_positions": state.joint_positions,
             "joint_velocities": state.joint_velocities,
-            "time": env.elapsed.double()[:, None] / self.horizon,
+            "start": placed[1],
+            "goal": placed[2],
+            "time": self.observed(env.elapsed),
         }
 
-    def towards(self, env: EnvState, twist: Tensor) -> Tensor:
+    def towards(self, env: EnvState, twist: Tensor, closing: int = _CLOSING) -> Tensor:
         """Actions that close the fingers, and then move by a twist [B, 6] as far as they go."""
-        duration = self.substeps * _DT
-        moves = twist / (duration * self.hand.speeds)
+        duration = self.substeps * DT
+        moves = (twist / (duration * self.hand.speeds)).reshape(-1, 2, 3)
+        moves = vectors_in(env.drawn, moves).flatten(1)
         moves = moves / moves.abs().amax(dim=-1, keepdim=True).clamp(min=1)
-        moves = moves * (env.elapsed >= _CLOSING)[:, None]
+        moves = moves * (env.elapsed >= closing)[:, None]
         return torch.cat([moves, torch.ones_like(moves[:, :1])], dim=-1)
 
 
 class LiftCloth(HandTask):
     """A gripper lifts a cloth to a goal.
 
-    The reward of each transition is lifted (1 - tanh(d / s)) with the distance d of the cloth's
-    center from the goal and s = .1 m; "lifted" goes smoothly from 0 to 1 where the center is 3 cm
-    higher than at the start. After Lift-Cloth-Franka of Isaac Lab.
+    The start draws the goal, 5 to 13 cm above the table, within 4 cm. With the distance d of the
+    cloth's center from the goal the reward is graded(d, side / 6, side); after Lift-Cloth-Franka of
+    Isaac Lab.
     """
 
     name = "LiftCloth"
+    _CLOSE = LENGTH / 6
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Also the goal, 6 to 12 cm above the table."""
+        """Also the goal."""
         goal = cpu.tensor([-0.03, 0.0, float(self.center[2]) + 0.09])
-        return super().draw(generator) | {"goal": goal + uniform(generator, 3, -0.03, 0.03)}
+        return super().draw(generator) | {"goal": (goal + uniform(generator, 3, -0.04, 0.04))[None]}
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Also what the center of the cloth still has to go."""
-        return super().features(env) | {"to_goal": self._away(env)}
+        """Also the way that the center of the cloth has yet to go, in sides."""
+        away = vectors_in(env.drawn, self._away(env)[:, None])[:, 0] / LENGTH
+        return super().features(env) | {"to_goal": away}
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        height = env.state.positions[..., 2].mean(dim=-1) - self.center[2]
-        return torch.sigmoid((height - 0.03) / 0.005) * (1 - torch.tanh(self._distance(env) / 0.1))
+        return graded(self.distance(env), self._CLOSE, LENGTH)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether the center of the cloth is within 2 cm of the goal."""
-        return self._distance(env) < 0.02
+        """Whether the center of the cloth is within a sixth of its side of the goal."""
+        return self.distance(env) < self._CLOSE
 
     def scripted(self, env: EnvState) -> Tensor:
         """Close, then bring the center of the cloth to the goal."""
         twist = torch.cat([0.3 * self._away(env), cpu.zeros(len(env), 3)], dim=-1)
         return self.towards(env, twist)
 
-    def _away(self, env: EnvState) -> Tensor:
-        return env.drawn["goal"] - env.state.positions.mean(dim=1)
-
-    def _distance(self, env: EnvState) -> Tensor:
+    def distance(self, env: EnvState) -> Tensor:
+        """Distance of the cloth's center from the goal [m], [B]."""
         return lengths(self._away(env))
+
+    def _away(self, env: EnvState) -> Tensor:
+        return env.drawn["goal"][:, 0] - env.state.positions.mean(dim=1)
 
 
 class GraspCloth(HandTask):
     """A gripper brings a cloth upright into a target shape.
 
-    The reward of each transition is -(mean distance of the vertices from the target shape) [m]; the
-    task of the paper, section V.D.3.
+    The start draws the target: the cloth hangs from the edge that is held, at a place within 3 cm
+    along each axis, turned about the vertical by up to .3 rad. With the mean distance d of the
+    vertices from it the reward is graded(d, side / 8, side); the task of the paper, section V.D.3.
     """
 
     name = "GraspCloth"
+    steps = 50
+    _CLOSE = LENGTH / 8
+
+    def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """Also the target."""
+        return super().draw(generator) | {
+            "away": uniform(generator, 3, -0.03, 0.03),
+            "yaw": uniform(generator, 1, -0.3, 0.3)[0],
+        }
 
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
-        """Also the target: the cloth hanging from the edge that is held."""
+        """Also the target, its corners, and the pose of a hand that holds the cloth there."""
         state, tools = super().place(drawn)
-        at, turn = self.target[:3], self.target[3:]
-        drawn["target"] = rotate(turn, state.positions - self.center) + at
+        zero = torch.zeros_like(drawn["yaw"])
+        yaw = quaternion_exp(torch.stack([zero, zero, drawn["yaw"]], dim=-1))
+        turn = quaternion_multiply(yaw, self.target[3:].expand(len(yaw), -1))
+        place = self.target[:3] + drawn["away"]
         base = drawn["base"]
+        drawn["target"] = rotate(turn[:, None], state.positions - self.center) + place[:, None]
+        drawn["goal"] = drawn["target"][:, self._corners]
         drawn["target_base"] = torch.cat(
             [
-                rotate(turn, base[:, :3] - self.center) + at,
-                quaternion_multiply(turn.expand(len(base), -1), base[:, 3:]),
+                rotate(turn, base[:, :3] - self.center) + place,
+                quaternion_multiply(turn, base[:, 3:]),
             ],
             dim=-1,
         )
@@ -166,16 +193,15 @@ class GraspCloth(HandTask):
 
     def distance(self, env: EnvState) -> Tensor:
         """Mean distance from the target shape [m], [B]."""
-        away = env.state.positions - env.drawn["target"]
-        return lengths(away).mean(dim=-1)
+        return lengths(env.state.positions - env.drawn["target"]).mean(dim=-1)
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return -self.distance(env)
+        return graded(self.distance(env), self._CLOSE, LENGTH)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether the mean distance is below 1.5 cm."""
-        return self.distance(env) < 0.015
+        """Whether the mean distance is below an eighth of the side."""
+        return self.distance(env) < self._CLOSE
 
     def scripted(self, env: EnvState) -> Tensor:
         """Close, then move the hand as the cloth has to move."""

@@ -7,71 +7,92 @@ from torch import Tensor
 
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Tools
-from diffcloth_torch.envs.env import EnvState, lengths
-from diffcloth_torch.envs.hands import HandTask, twist_to
-from diffcloth_torch.envs.sheets import follow
+from diffcloth_torch.envs.env import EnvState, graded, lengths
+from diffcloth_torch.envs.frames import vectors_in
+from diffcloth_torch.envs.hands import LENGTH, HandTask, twist_to
+from diffcloth_torch.envs.sheets import follow, uniform
 from diffcloth_torch.geometry.rotation import quaternion_multiply
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.sim.records.state import State
 
 __all__ = ["HangCloth"]
 
-_PEG = cpu.tensor([0.3, 0.0, 0.2])  # between the pegs [m]
+_PEGS = cpu.tensor([0.3, 0.0, 0.2])  # mean place between the pegs [m]
+_ASIDE = 0.045  # of a peg from there, along y [m]
 _TIP = 0.075  # from the frame of the hand to between its fingers [m]
-_CLOSE = 0.06  # distance of a cloth that hangs [m]
+_FREE = 0.09  # distance of the nearest vertex from the frame of a hand that has let go [m]
+_CLOSE = LENGTH / 4
+_SECONDS = 0.2  # distance that a velocity is worth [s]
 
 
-def _peg(y: float) -> RigidBody:
+def _peg(name: str, y: float) -> RigidBody:
     """A short capsule across the way of the hand, which passes between two of them."""
-    x, _, z = _PEG.tolist()
+    x, _, z = _PEGS.tolist()
     across = [0.5**0.5, 0.5**0.5, 0, 0]
-    side = "left" if y > 0 else "right"
-    return RigidBody.capsule(0.01, 0.02, pose=[x, y, z, *across], friction=2.0, name=f"{side}_peg")
+    return RigidBody.capsule(
+        0.01, 0.02, pose=[x, y, z, *across], friction=2.0, name=name, motion="kinematic"
+    )
 
 
 class HangCloth(HandTask):
     """A gripper hangs a cloth over two pegs of rubber, and lets it go.
 
-    The reward of each transition is -(distance of the cloth's center from between the pegs) [m];
-    after the hanging tasks of GarmentLab. A cloth that is let go and stays there succeeds.
+    The start draws where the pegs are: within 4.5 cm along x, and 3 cm along y and z. The reward is
+    graded(d, side / 4, 2 sides), where d is the distance of the cloth's center from between the
+    pegs, and up to side / 4 for a hand that holds it, and .2 s times the speed of the cloth: a
+    cloth that is let go and stays there succeeds. After the hanging tasks of GarmentLab.
     """
 
     name = "HangCloth"
-    obstacles = (_peg(0.045), _peg(-0.045))
+    steps = 140
+    obstacles = (_peg("left_peg", _ASIDE), _peg("right_peg", -_ASIDE))
 
-    def __init__(self, *, size: int = 12, horizon: int = 115, substeps: int = 2) -> None:
-        """Build the scene: see `HandTask`."""
-        super().__init__(size=size, horizon=horizon, substeps=substeps)
+    def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """Also where the pegs are."""
+        spread = cpu.tensor([0.045, 0.03, 0.03])
+        return super().draw(generator) | {"away": spread * uniform(generator, 3, -1.0, 1.0)}
 
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
-        """Also the orientation of a hand that points down."""
+        """Also the pegs, and the orientation of a hand that points down."""
         state, tools = super().place(drawn)
+        poses = state.body_poses.clone()
+        names = self.simulator.scene.body_names
+        for peg in self.obstacles:
+            poses[:, names.index(peg.name), :3] += drawn["away"]
+        drawn["pegs"] = _PEGS + drawn["away"]
+        drawn["goal"] = drawn["pegs"][:, None]
         quarter = cpu.tensor([0.5**0.5, 0.0, 0.5**0.5, 0.0])
         base = drawn["base"]
         drawn["down"] = quaternion_multiply(quarter.expand(len(base), -1), base[:, 3:])
-        return state, tools
+        return state.replace(body_poses=poses), tools
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Also what the center of the cloth still has to go."""
-        return super().features(env) | {"to_pegs": self._away(env)}
+        """Also the way that the center of the cloth has yet to go, in sides."""
+        away = vectors_in(env.drawn, self._away(env)[:, None])[:, 0] / LENGTH
+        return super().features(env) | {"to_goal": away}
+
+    def amiss(self, env: EnvState) -> Tensor:
+        """Distance from where the cloth is to hang, with charges for holding and moving it [m]."""
+        state = env.state
+        hand = state.base_poses[:, :1, :3]
+        nearest = lengths(state.positions - hand).amin(dim=-1)
+        held = ((_FREE - nearest) / (_FREE - 0.5 * _TIP)).clamp(0, 1)
+        speed = lengths(state.velocities).mean(dim=-1)
+        return lengths(self._away(env)) + _CLOSE * held + _SECONDS * speed
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return -lengths(self._away(env))
+        return graded(self.amiss(env), _CLOSE, 2 * LENGTH)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether the cloth hangs near the pegs, at rest, and nothing else holds it."""
-        slow = env.state.velocities.square().sum(dim=-1).mean(dim=-1) < 0.05**2
-        hand = env.state.base_poses[:, 0, :3]
-        nearest = (env.state.positions - hand[:, None]).square().sum(dim=-1).amin(dim=-1)
-        return (self.reward(env) > -_CLOSE) & slow & (nearest > _TIP**2)
+        """Whether the cloth hangs on the pegs, at rest, and nothing else holds it."""
+        return self.amiss(env) < _CLOSE
 
     def scripted(self, env: EnvState) -> Tensor:
         """Close, lift and turn down, pass between the pegs, sink behind them, let go, rise."""
         steps, tips = zip(*_PATH, strict=True)
-        pegs = _PEG + cpu.tensor([0.0, 0.0, _TIP])
-        points = [(pegs + cpu.tensor(tip)) for tip in tips]
-        path = [p.expand(len(env), 1, 3) for p in points]
+        pegs = env.drawn["pegs"][:, None] + cpu.tensor([0.0, 0.0, _TIP])
+        path = [pegs + cpu.tensor(tip) for tip in tips]
         grasps = [1.0 if step <= _RELEASE else _AJAR for step in steps]
         wanted, grasp = follow(env, steps, path, grasps)
         target = torch.cat([wanted[:, 0], env.drawn["down"]], dim=-1)
@@ -79,24 +100,34 @@ class HangCloth(HandTask):
         rise = cpu.zeros(len(env), 6)
         rise[:, 2] = 0.02
         risen = (env.elapsed >= _RISEN)[:, None]
-        moves = self.towards(env, torch.where(risen, 0.5 * twist_to(base, target), rise))
-        return torch.cat([moves[:, :6], grasp], dim=-1)
+        moves = self.towards(
+            env, torch.where(risen, 0.5 * twist_to(base, target), rise), _ALIGNED + 5
+        )
+        # All cloths are held equally deep, and in the middle between the fingers.
+        edge = env.drawn["start"][:, self._corners[::2]].mean(dim=1) + cpu.tensor(_GRIP)
+        grip = torch.cat([edge - base[:, :3], cpu.zeros(len(env), 3)], dim=-1)
+        aligns = (env.elapsed < _ALIGNED)[:, None]
+        moves = torch.where(aligns, self.towards(env, grip, closing=0), moves)
+        return torch.cat([moves[:, :6], torch.where(aligns, 0.0, grasp)], dim=-1)
 
     def _away(self, env: EnvState) -> Tensor:
-        return _PEG - env.state.positions.mean(dim=1)
+        return env.drawn["goal"][:, 0] - env.state.positions.mean(dim=1)
 
 
 # Transitions, and where the tip of the hand should then be from between the pegs [m]. With the tip
 # 2.8 cm beyond them the middle of the cloth lies on the pegs.
 _PATH = (
-    (30, (-0.15, 0.0, 0.1)),
-    (44, (-0.05, 0.0, 0.06)),
-    (64, (0.018, 0.0, 0.04)),
-    (72, (0.028, 0.0, 0.005)),
-    (80, (0.028, 0.0, 0.005)),
-    (86, (0.028, 0.0, 0.005)),
-    (112, (0.028, 0.0, 0.12)),
+    (34, (-0.15, 0.0, 0.1)),
+    (48, (-0.05, 0.0, 0.06)),
+    (68, (0.018, 0.0, 0.04)),
+    (76, (0.028, 0.0, 0.005)),
+    (84, (0.028, 0.0, 0.005)),
+    (90, (0.028, 0.0, 0.005)),
+    (116, (0.028, 0.0, 0.12)),
 )
-_RELEASE = 80
+_RELEASE = 84
 _AJAR = 0.5  # effort with which fingers open by 1.7 cm each: further ones would push the cloth
-_RISEN = 12  # transitions after which the hand may turn: it has left the table
+_RISEN = 16  # transitions after which the hand may turn: it has left the table
+_ALIGNED = 4  # transitions in which the hand moves to where it closes
+_CLOSED = 9  # and after which it has closed
+_GRIP = (-0.058, 0.0, 0.0)  # of its base from the edge of the cloth [m]

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
-from diffcloth_torch.checks import check_count
-from diffcloth_torch.envs.actuators import Tools, Twist
-from diffcloth_torch.envs.env import EnvState, Task, lengths
+from diffcloth_torch.envs.actuators import Actuator, Tools, Twist
+from diffcloth_torch.envs.built import DT, BuiltTask, key_rows, with_material
+from diffcloth_torch.envs.env import EnvState, graded, lengths
 from diffcloth_torch.envs.sheets import follow, uniform
-from diffcloth_torch.geometry.poses import transform
-from diffcloth_torch.model.options import SolverOptions
-from diffcloth_torch.operations import operation
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.records.state import State
-from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.tasks.scenes import grid_changes, pose_of, scene_of
 
 __all__ = ["HitCloth"]
 
-_DT = 0.02  # [s]
-_CLOSE = 0.08  # mean distance to the target that succeeds [m]
+_LENGTH = 1.0  # of a side of the sheet [m]
+_CLOSE = 0.08 * _LENGTH  # mean distance to the target that succeeds
+_TARGETS = (50.0, 90.0)  # angles of the target from the hanging sheet [degrees]
+_UNDER = 0.025  # from the plane of the target to the center of the cuboid that bears it [m]
 
-# A path of the cuboid that succeeds: y, z [m] and angle [rad], every .1 s.
+# A path of the cuboid that swings the sheet up to 90 degrees: where its center is from where it
+# would bear a sheet at its angle, y and z [m], and the angle [rad], every .1 s.
 _PATH = (
     (0.053, 0.9, 0.22), (0.163, 0.924, 0.45), (0.265, 0.99, 0.67), (0.354, 1.08, 0.9),
     (0.425, 1.19, 1.12), (0.47, 1.3, 1.32), (0.491, 1.39, 1.46), (0.499, 1.44, 1.54),
@@ -30,73 +33,81 @@ _PATH = (
 )  # fmt: skip
 
 
-class HitCloth(Task):
+class HitCloth(BuiltTask):
     """A kinematic cuboid hits a hanging sheet, so that it lies flat on it, behind its pins.
 
-    The reward of each transition is -(mean distance of the vertices from the target) [m]; the task
-    of the paper, section V.D.1.
+    The start draws how far the cuboid is, and the angle by which the sheet is to be turned about
+    its pins, 50 to 90 degrees. With the mean distance d of the vertices from there the reward is
+    graded(d, .08 sides, .5 sides); the task of the paper, section V.D.1. The frame is the world.
     """
 
     name = "HitCloth"
+    steps = 36
 
-    def __init__(self, *, size: int = 12, horizon: int = 30, substeps: int = 2) -> None:
-        """Build the scene.
-
-        Args:
-            size: Vertices along a side of the sheet, >= 4.
-            horizon: Transitions of an episode.
-            substeps: Time steps of a transition, of .02 s each.
-        """
-        check_count(f"{operation(self.name)}: `size`", size, 4)
-        scene, sections = scene_of("hit_cloth", grid_changes("sheet", size))
-        simulator = Simulator(scene, _DT, solver=SolverOptions(throw=False))
-        actuator = Twist("cuboid", 0, dt=_DT, speed=1.5, spin=4.0)
-        super().__init__(simulator, actuator, horizon=horizon, substeps=substeps)
-        some = cpu.linspace(0, size - 1, 4).round().long()
-        self._rows = (some[:, None] * size + some).flatten()
-        target = transform(scene.cloths[0].rest_positions, pose_of(sections["target"]["pose"]))
-        self.target = cpu.tensor(target)
-        self._speeds = actuator.speeds
+    def build(self, material: Material | None) -> tuple[Scene, Actuator]:
+        """See `BuiltTask`."""
+        scene, sections = scene_of("hit_cloth", grid_changes("sheet", self.side))
+        sheet = with_material(scene.cloths[0], material)
+        self._rows = key_rows(self.side, self.sees)
+        self._pins = float(pose_of(sections["target"]["pose"])[2])  # their height [m]
+        rest = cpu.tensor(sheet.rest_positions)
+        self._across, self._down = rest[:, 0], _LENGTH / 2 - rest[:, 1]
+        self.actuator = Twist("cuboid", 0, dt=DT, speed=1.5, spin=4.0)
+        self._speeds = self.actuator.speeds
+        return Scene([sheet], scene.bodies), self.actuator
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """How far the cuboid is from the sheet, up to 4 cm more."""
-        return {"away": uniform(generator, 1, 0.0, 0.04)[0]}
+        """How far the cuboid is from the sheet, up to 4 cm more, and the angle of the target."""
+        low, high = (math.radians(degrees) for degrees in _TARGETS)
+        return {
+            "away": uniform(generator, 1, 0.0, 0.04)[0],
+            "angle": uniform(generator, 1, low, high)[0],
+        }
 
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
         """See `Task`."""
         state = self.simulator.initial_state(len(drawn["away"]))
         poses = state.body_poses.clone()
         poses[:, 0, 1] -= drawn["away"]
+        angle = drawn["angle"][:, None]
+        drawn["target"] = torch.stack(
+            [
+                self._across.expand(len(angle), -1),
+                self._down * angle.sin(),
+                self._pins - self._down * angle.cos(),
+            ],
+            dim=-1,
+        )
         return state.replace(body_poses=poses), {}
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Some vertices of the sheet, what they still have to go, and the cuboid."""
+        """Some vertices of the sheet, what they still have to go, the cuboid, and the angle."""
         positions = env.state.positions[:, self._rows]
         return {
             "positions": positions.flatten(1),
             "velocities": env.state.velocities[:, self._rows].flatten(1),
-            "to_target": (self.target[self._rows] - positions).flatten(1),
+            "to_target": (env.drawn["target"][:, self._rows] - positions).flatten(1),
             "cuboid": env.state.body_poses[:, 0],
-            "time": env.elapsed.double()[:, None] / self.horizon,
+            "goal": env.drawn["angle"][:, None],
+            "time": self.observed(env.elapsed),
         }
 
     def distance(self, env: EnvState) -> Tensor:
         """Mean distance from the target [m], [B]."""
-        away = env.state.positions - self.target
-        return lengths(away).mean(dim=-1)
+        return lengths(env.state.positions - env.drawn["target"]).mean(dim=-1)
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return -self.distance(env)
+        return graded(self.distance(env), _CLOSE, 0.5 * _LENGTH)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether the mean distance is below 8 cm."""
+        """Whether the mean distance is below .08 sides."""
         return self.distance(env) < _CLOSE
 
     def scripted(self, env: EnvState) -> Tensor:
-        """Swing the cuboid along a path made by hand."""
-        duration = self.substeps * _DT
-        path = cpu.tensor(_PATH).expand(len(env), -1, -1)
+        """Swing the cuboid along a path made by hand, up to the angle of the target."""
+        duration = self.substeps * DT
+        path = self._path(env.drawn["angle"])
         times = [0.1 * (k + 1) / duration for k in range(len(_PATH))]
         wanted, _ = follow(env, times, path[:, :, None].unbind(dim=1), [0.0] * len(_PATH))
         pose = env.state.body_poses[:, 0]
@@ -105,3 +116,18 @@ class HitCloth(Task):
         zero = torch.zeros_like(rates[:, 0])
         twist = torch.stack([zero, rates[:, 0], rates[:, 1], rates[:, 2], zero, zero], dim=-1)
         return (twist / self._speeds).clamp(-1, 1)
+
+    def _path(self, angle: Tensor) -> Tensor:
+        """Coordinates y and z, and angles [B, K, 3] of a path to an angle [B]."""
+        path = cpu.tensor(_PATH)
+        behind = path[:, :2] - self._bearing(path[:, 2])
+        angles = path[:, 2] * (angle / path[-1, 2])[:, None]
+        return torch.cat([self._bearing(angles) + behind, angles[..., None]], dim=-1)
+
+    def _bearing(self, angle: Tensor) -> Tensor:
+        """Center (y, z) [..., 2] of a cuboid that bears the middle of a sheet."""
+        sine, cosine = angle.sin(), angle.cos()
+        half = _LENGTH / 2
+        return torch.stack(
+            [half * sine - _UNDER * cosine, self._pins - half * cosine - _UNDER * sine], dim=-1
+        )

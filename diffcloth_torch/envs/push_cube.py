@@ -2,50 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
-from diffcloth_torch.checks import check_count
-from diffcloth_torch.envs.actuators import Tools, Velocities
-from diffcloth_torch.envs.env import EnvState, Task, lengths
+from diffcloth_torch.envs.actuators import Actuator, Tools, Velocities
+from diffcloth_torch.envs.built import DT, BuiltTask, with_material
+from diffcloth_torch.envs.env import EnvState, graded, lengths
+from diffcloth_torch.envs.frames import Frame, level_frame, points_in, poses_in, vectors_in
 from diffcloth_torch.envs.sheets import uniform
-from diffcloth_torch.model.options import SolverOptions
-from diffcloth_torch.operations import operation
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.scene import Scene
 from diffcloth_torch.sim.records.state import State
-from diffcloth_torch.sim.simulator import Simulator
 from diffcloth_torch.tasks.scenes import grid_changes, scene_of, sections_of
 
 __all__ = ["PushCube"]
 
 _GAP = 0.004  # below the cube, at least [m]
-_DT, _SPEED = 0.02, 0.4  # [s], [m/s] of the pins
-_BRAKING = 0.1  # time in which a scripted cube comes to rest [s]
-_CLOSE = 0.03  # distance to the target that succeeds [m]
+_SPEED = 0.4  # of the pins [m/s]
+_BRAKING = 0.15  # time in which a scripted cube comes to rest [s]
+_CLOSE = 0.03  # distance to the target that succeeds, a tenth of the sheet [m]
 
 
-class PushCube(Task):
+class PushCube(BuiltTask):
     """The two upper corners of a hanging sheet move, so that it pushes a cube to a target.
 
-    The reward of each transition is -(distance of the cube's center from the target) [m]; the task
-    of the paper, section V.D.2.
+    The start draws where the cube stands, within 2 cm, and its target, within 5 cm along both axes.
+    With the distance d of the cube's center from the target the reward is
+    graded(d, side / 10, side / 2); the task of the paper, section V.D.2. The frame of the task is
+    the cube at the start, with x to its target.
     """
 
     name = "PushCube"
+    steps = 60
 
-    def __init__(self, *, size: int = 12, horizon: int = 50, substeps: int = 2) -> None:
-        """Build the scene.
-
-        Args:
-            size: Vertices along a side of the sheet, >= 4.
-            horizon: Transitions of an episode.
-            substeps: Time steps of a transition, of .02 s each.
-        """
-        check_count(f"{operation(self.name)}: `size`", size, 4)
+    def build(self, material: Material | None) -> tuple[Scene, Actuator]:
+        """See `BuiltTask`."""
+        size = self.side
         section = sections_of("push_cube")["scene"]
-        self._side, self._cube = (section[k][0]["shape"]["size"] for k in ("cloths", "bodies"))
+        self._length, self._cube = (section[k][0]["shape"]["size"] for k in ("cloths", "bodies"))
         # Outside of the barrier, whose default is a tenth of an edge.
-        gap = max(_GAP, 0.1 * self._side / (size - 1))
+        gap = max(_GAP, 0.1 * self._length / (size - 1))
         scene, _ = scene_of(
             "push_cube",
             [
@@ -53,13 +52,13 @@ class PushCube(Task):
                 f"scene.bodies.cube.pose.position=[0, 0, {0.5 * self._cube + gap}]",
             ],
         )
-        sheet = scene.cloths[0]
-        simulator = Simulator(scene, _DT, solver=SolverOptions(throw=False))
+        sheet = with_material(scene.cloths[0], material)
         pins = {f"sheet/{name}": list(rows) for name, rows in sheet.pins.items()}
-        actuator = Velocities(pins, dt=_DT, speed=_SPEED)
-        super().__init__(simulator, actuator, horizon=horizon, substeps=substeps)
         self._pins = [row for rows in pins.values() for row in rows]
-        self._rows = cpu.linspace(0, size * size - 1, 16).round().long()
+        count = size * size
+        some = cpu.linspace(0, count - 1, 16).round().long()
+        self._rows = some if self.sees == "keypoints" else cpu.arange(count)
+        return Scene([sheet], scene.bodies), Velocities(pins, dt=DT, speed=_SPEED)
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Where the cube stands, within 2 cm, and its target, within 5 cm."""
@@ -73,43 +72,61 @@ class PushCube(Task):
         state = self.simulator.initial_state(len(drawn["cube"]))
         poses = state.body_poses.clone()
         poses[:, 0, :2] += drawn["cube"]
+        way = drawn["target"] - poses[:, 0, :2]
+        drawn["way"] = way / lengths(way)[:, None]
         return state.replace(body_poses=poses), {}
+
+    def frame_of(self, state: State, drawn: Mapping[str, Tensor]) -> Frame:
+        """See `Task`."""
+        return level_frame(state.body_poses[:, 0, :3], drawn["way"])
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
         """Pins, some vertices of the sheet, the cube and what it still has to go."""
-        state = env.state
+        state, rows, drawn = env.state, self._rows, env.drawn
+        away = torch.nn.functional.pad(self._away(env), (0, 1))[:, None]
+        points = [state.positions[:, self._pins], state.positions[:, rows]]
+        placed = points_in(drawn, torch.cat(points, dim=1))
+        pins, positions = torch.split(placed, [len(self._pins), len(rows)], dim=1)
+        twist = state.body_velocities[:, 0].reshape(-1, 2, 3)
+        vectors = vectors_in(drawn, torch.cat([state.velocities[:, rows], twist, away], dim=1))
+        velocities, twist, away = torch.split(vectors, [len(rows), 2, 1], dim=1)
         return {
-            "pins": state.positions[:, self._pins].flatten(1),
-            "positions": state.positions[:, self._rows].flatten(1),
-            "velocities": state.velocities[:, self._rows].flatten(1),
-            "cube": state.body_poses[:, 0],
-            "cube_velocities": state.body_velocities[:, 0],
-            "to_target": self._away(env),
-            "time": env.elapsed.double()[:, None] / self.horizon,
+            "pins": pins.flatten(1),
+            "positions": positions.flatten(1),
+            "velocities": velocities.flatten(1),
+            "cube": poses_in(drawn, state.body_poses[:, 0]),
+            "cube_velocities": twist.flatten(1),
+            "to_target": away[:, 0, :2],
+            "time": self.observed(env.elapsed),
         }
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return -lengths(self._away(env))
+        return graded(self.distance(env), _CLOSE, 0.5 * self._length)
 
     def success(self, env: EnvState) -> Tensor:
         """Whether the cube is within 3 cm of the target."""
-        return self.reward(env) > -_CLOSE
+        return self.distance(env) < _CLOSE
+
+    def distance(self, env: EnvState) -> Tensor:
+        """Distance of the cube from the target [m], [B]."""
+        return lengths(self._away(env))
 
     def scripted(self, env: EnvState) -> Tensor:
         """Push the cube with the sheet across the way to the target, and step back in time."""
-        away = self._away(env)
+        away, way = self._away(env), env.drawn["way"]
         cube, velocity = env.state.body_poses[:, 0, :2], env.state.body_velocities[:, 0, :2]
         distance = lengths(away)[:, None]
         to_target = away / distance.clamp(min=1e-3)
         ahead = away - _BRAKING * velocity
-        pushes = ((ahead * away).sum(dim=-1, keepdim=True) > 0) & (distance > 0.3 * _CLOSE)
-        middle = cube + torch.where(pushes, 0.04 * to_target, -self._cube * to_target)
-        across = 0.5 * self._side * torch.stack([to_target[:, 1], -to_target[:, 0]], dim=-1)
+        pushes = ((ahead * way).sum(dim=-1, keepdim=True) > 0) & (distance > 0.3 * _CLOSE)
+        to_target = torch.where(pushes, to_target, way)  # one that is passed is behind
+        middle = cube + torch.where(pushes, 0.04, -self._cube) * to_target
+        across = 0.5 * self._length * torch.stack([to_target[:, 1], -to_target[:, 0]], dim=-1)
         goals = torch.stack([middle - across, middle + across], dim=1)
         pins = env.state.positions[:, self._pins, :2]
-        moves = ((goals - pins) / (self.substeps * _DT * _SPEED)).clamp(-0.5, 0.5)
-        return torch.cat([moves, torch.zeros_like(moves[..., :1])], dim=-1).flatten(1)
+        moves = torch.nn.functional.pad(goals - pins, (0, 1)) / (self.substeps * DT * _SPEED)
+        return vectors_in(env.drawn, moves).clamp(-0.5, 0.5).flatten(1)
 
     def _away(self, env: EnvState) -> Tensor:
         return env.drawn["target"] - env.state.body_poses[:, 0, :2]

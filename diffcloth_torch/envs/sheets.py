@@ -4,31 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
-from diffcloth_torch.checks import check_choice, check_count
-from diffcloth_torch.envs.actuators import Pickers, Tools
-from diffcloth_torch.envs.env import EnvState, Task
+from diffcloth_torch.envs.actuators import Actuator, Pickers, Tools
+from diffcloth_torch.envs.built import BuiltTask, key_rows
+from diffcloth_torch.envs.env import EnvState
+from diffcloth_torch.envs.frames import Frame, level_frame, points_in, vectors_in
 from diffcloth_torch.model.cloth import Cloth
 from diffcloth_torch.model.materials import Material
-from diffcloth_torch.model.options import ContactOptions, SolverOptions
+from diffcloth_torch.model.options import ContactOptions
 from diffcloth_torch.model.rigid_body import RigidBody
 from diffcloth_torch.model.scene import Scene
-from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.records.state import State
-from diffcloth_torch.sim.simulator import Simulator
 
-__all__ = ["SheetTask", "arc", "follow", "uniform"]
+__all__ = ["HEIGHT", "SIDE", "SheetTask", "arc", "at", "follow", "uniform"]
 
-OBSERVATIONS = ("keypoints", "particles")
 SIDE = 0.3  # of the sheet [m]
 HEIGHT = 0.004  # at which it lies [m]
-_DT = 0.02  # [s]
-_KEY_POINTS = 4  # along a side
 _MATERIAL = Material(bending=1e-5, damping=1e-3, friction=0.5)
 
 
@@ -37,60 +34,59 @@ def uniform(generator: torch.Generator, size: int, low: float, high: float) -> T
     return low + (high - low) * cpu.rand(size, generator=generator)
 
 
-class SheetTask(Task):
+def at(positions: Tensor, vertices: Tensor) -> Tensor:
+    """Positions [B, n, 3] of vertices [B, n]."""
+    return positions.gather(1, vertices[..., None].expand(-1, -1, 3))
+
+
+class SheetTask(BuiltTask):
     """A square sheet of n x n vertices on a table, and two pickers.
 
     The start is drawn: where the sheet lies and how it is turned, and where pickers are. Subclasses
-    say how it is shaped, in `shape`, and which vertices the pickers begin at.
-
-    Attributes:
-        side: n.
-        key_points: Vertices that are observed.
+    say how it is shaped, in `shape`, and which vertices the pickers begin at. The frame of the task
+    is the center and the yaw of the sheet that lies flat as drawn.
     """
 
-    def __init__(
-        self,
-        *,
-        size: int = 12,
-        horizon: int = 50,
-        substeps: int = 2,
-        observation: str = "keypoints",
-        material: Material = _MATERIAL,
-        opens_at: float = 0.0,
-        reach: float = 0.03,
-    ) -> None:
-        """Build the scene.
+    steps = 50
+    beside: ClassVar[float] = 0.012  # how far beside a vertex a picker begins, at most [m]
+    above: ClassVar[tuple[float, float]] = (0.01, 0.02)  # and how far above it [m]
+
+    def __init__(self, *, opens_at: float = 0.0, reach: float = 0.03, **options: Any) -> None:
+        """Build the scene; see `BuiltTask` for the other options.
 
         Args:
-            size: Vertices along a side, >= 4.
-            horizon: Transitions of an episode.
-            substeps: Time steps of a transition, of .02 s each.
-            observation: "keypoints" for 4 x 4 vertices, or "particles" for all.
-            material: Of the sheet.
             opens_at: The largest grasp of an open picker: 0, or -1 for a soft grasp, whose gradient
                 is nowhere zero; see `Pickers`.
-            reach: Within which a picker closes on a vertex [m]; at .06 all begin within reach.
+            reach: Within which a picker closes on a vertex [m].
+            **options: As for `BuiltTask`.
         """
-        self.side = check_count(f"{operation(self.name)}: `size`", size, 4)
-        check_choice(f"{operation(self.name)}: `observation`", observation, OBSERVATIONS)
+        self._grasp = opens_at, reach
+        super().__init__(**options)
+        self.key_points = key_rows(self.side, self.sees)
+        self._corners = cpu.tensor(
+            [self.vertex(row, column) for row in (0, -1) for column in (0, -1)], dtype=torch.int64
+        )
+
+    def build(self, material: Material | None) -> tuple[Scene, Actuator]:
+        """See `BuiltTask`."""
+        material = _MATERIAL if material is None else material
         sheet = Cloth.grid(
-            (size, size), SIDE, name="sheet", pose=[0, 0, HEIGHT, 1, 0, 0, 0], material=material
+            (self.side, self.side),
+            SIDE,
+            name="sheet",
+            pose=[0, 0, HEIGHT, 1, 0, 0, 0],
+            material=material,
         )
-        pickers = Pickers(sheet, opens_at=opens_at, reach=reach)
+        opens_at, reach = self._grasp
+        self.pickers = Pickers(sheet, opens_at=opens_at, reach=reach)
         table = RigidBody.plane(4.0, friction=0.5, name="table")
-        simulator = Simulator(
-            Scene([sheet], [table], attachments=pickers.attachments),
-            _DT,
-            contact=ContactOptions(barrier_distance=HEIGHT),
-            solver=SolverOptions(throw=False),
-        )
-        super().__init__(simulator, pickers, horizon=horizon, substeps=substeps)
-        self.pickers = pickers
         self.rest = cpu.tensor(np.asarray(sheet.rest_positions))
-        some = cpu.linspace(0, size - 1, _KEY_POINTS).round().long()
-        rows = some if observation == "keypoints" else cpu.arange(size)
-        self.key_points = (rows[:, None] * size + rows).flatten()
-        self._share = float(np.mean(material.density)) * SIDE**2 * 9.81 / size**2
+        self._share = float(np.mean(material.density)) * SIDE**2 * 9.81 / self.side**2
+        return Scene([sheet], [table], attachments=self.pickers.attachments), self.pickers
+
+    def contact(self) -> ContactOptions:
+        """See `BuiltTask`."""
+        return ContactOptions(barrier_distance=HEIGHT)
 
     def vertex(self, row: int, column: int) -> int:
         """Index of a vertex; negative rows and columns count from the end."""
@@ -106,50 +102,85 @@ class SheetTask(Task):
 
     def shape(self, drawn: dict[str, Tensor]) -> Tensor:
         """Positions [B, N, 3] of the sheet before it is turned and moved: flat on the table."""
-        flat = self.rest + cpu.tensor([0.0, 0.0, HEIGHT])
-        return flat.expand(len(drawn["turn"]), -1, -1)
+        return self.flat(len(drawn["turn"]))
+
+    def flat(self, count: int) -> Tensor:
+        """Positions [B, N, 3] of the flat sheet before it is turned and moved."""
+        return (self.rest + cpu.tensor([0.0, 0.0, HEIGHT])).expand(count, -1, -1)
 
     def posed(self, points: Tensor, drawn: Mapping[str, Tensor]) -> Tensor:
         """Points [B, n, 3] turned about the vertical and moved as the sheet is."""
-        x, y, z = points.unbind(dim=-1)
+        return self.turned(points, drawn) + torch.nn.functional.pad(drawn["shift"], (0, 1))[:, None]
+
+    def turned(self, vectors: Tensor, drawn: Mapping[str, Tensor]) -> Tensor:
+        """Vectors [B, n, 3] turned about the vertical as the sheet is."""
+        x, y, z = vectors.unbind(dim=-1)
         c, s = drawn["turn"].cos()[:, None], drawn["turn"].sin()[:, None]
-        shift = drawn["shift"][:, None]
-        return torch.stack(
-            [c * x - s * y + shift[..., 0], s * x + c * y + shift[..., 1], z], dim=-1
-        )
+        return torch.stack([c * x - s * y, s * x + c * y, z], dim=-1)
 
     def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
         """The sheet as drawn, and pickers near the vertices that they begin at; see `Task`."""
         positions = self.posed(self.shape(drawn), drawn)
-        drawn["start"] = positions
         state = self.simulator.initial_state(len(positions)).replace(positions=positions)
-        return state, self.tools(positions, drawn)
+        return self.started(state, drawn)
+
+    def started(self, state: State, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
+        """Keep where the sheet begins and which vertices the pickers begin at; place the pickers.
+
+        A subclass adds "goal" [B, g, 3] to what was drawn: points where the sheet is to be.
+        """
+        drawn["start"] = state.positions
+        drawn["picked"] = self.picked(drawn)
+        return state, self.tools(state.positions, drawn)
+
+    def frame_of(self, state: State, drawn: Mapping[str, Tensor]) -> Frame:
+        """See `Task`."""
+        shift, turn = drawn["shift"], drawn["turn"]
+        origin = torch.cat([shift, torch.zeros_like(shift[:, :1])], dim=-1)
+        return level_frame(origin, torch.stack([turn.cos(), turn.sin()], dim=-1))
 
     def tools(self, positions: Tensor, drawn: Mapping[str, Tensor]) -> Tools:
-        """Open pickers up to 1.5 cm beside, and 1 to 3 cm above, the vertices of `beginnings`."""
-        off = drawn["pickers"] * cpu.tensor([0.015, 0.015, 0.01])
-        off = off + cpu.tensor([0.0, 0.0, 0.02])
-        return self.pickers.start(positions[:, self.beginnings()] + off)
+        """Open pickers beside and above the vertices at which they begin."""
+        low, high = self.above
+        off = drawn["pickers"] * cpu.tensor([self.beside, self.beside, 0.5 * (high - low)])
+        off = off + cpu.tensor([0.0, 0.0, 0.5 * (low + high)])
+        return self.pickers.start(at(positions, drawn["picked"]) + self.turned(off, drawn))
 
-    def beginnings(self) -> list[int]:
-        """Vertices near which the pickers begin: two corners of one edge."""
-        return [self.vertex(0, -1), self.vertex(-1, -1)]
+    def picked(self, drawn: Mapping[str, Tensor]) -> Tensor:
+        """Vertices [B, 2] at which the pickers begin: two corners of one edge."""
+        vertices = [self.vertex(0, -1), self.vertex(-1, -1)]
+        return cpu.tensor(vertices, dtype=torch.int64).expand(len(drawn["turn"]), -1)
 
     def features(self, env: EnvState) -> dict[str, Tensor]:
-        """Key points and pickers, in units of the side, of 1 m/s and of a vertex's weight."""
-        state, rows = env.state, self.key_points
+        """Key points and pickers, the corners at the start and the goal, in the frame of the task.
+
+        Lengths are in units of the side, velocities in m/s, forces in weights of a vertex.
+        """
+        state, rows, drawn = env.state, self.key_points, env.drawn
+        points = [state.positions[:, rows], env.tools["points"], drawn["start"][:, self._corners]]
+        sizes = [len(rows), self.pickers.count, 4]
+        if "goal" in drawn:
+            points.append(drawn["goal"])
+            sizes.append(drawn["goal"].shape[1])
+        placed = points_in(drawn, torch.cat(points, dim=1)) / SIDE
+        parts = [part.flatten(1) for part in torch.split(placed, sizes, dim=1)]
+        forces = state.contact_forces[:, rows] / self._share
+        vectors = vectors_in(drawn, torch.cat([state.velocities[:, rows], forces], dim=1))
+        velocities, forces = vectors.chunk(2, dim=1)
         return {
-            "positions": (state.positions[:, rows] / SIDE).flatten(1),
-            "velocities": state.velocities[:, rows].flatten(1),
-            "contact_forces": (state.contact_forces[:, rows] / self._share).flatten(1),
-            "pickers": (env.tools["points"] / SIDE).flatten(1),
+            "positions": parts[0],
+            "velocities": velocities.flatten(1),
+            "contact_forces": forces.flatten(1),
+            "pickers": parts[1],
             "grasp": env.tools["grasp"],
-            "time": env.elapsed.double()[:, None] / self.horizon,
+            "start": parts[2],
+            **({"goal": parts[3]} if "goal" in drawn else {}),
+            "time": self.observed(env.elapsed),
         }
 
     def moves_to(self, env: EnvState, points: Tensor, grasp: Tensor) -> Tensor:
         """Actions [B, A] that bring pickers as far towards points [B, P, 3] as they go."""
-        moves = (points - env.tools["points"]) / self.pickers.stride
+        moves = vectors_in(env.drawn, points - env.tools["points"]) / self.pickers.stride
         return torch.cat([moves.clamp(-1, 1), grasp[..., None]], dim=-1).flatten(1)
 
 
@@ -181,7 +212,10 @@ def follow(
 
 
 def arc(a: Tensor, b: Tensor, height: float, count: int) -> list[Tensor]:
-    """Points on half an ellipse from a to b above the line between them, without a itself."""
-    up = cpu.tensor([0.0, 0.0, height])
+    """Points on half an ellipse from a to b [B, P, 3], without a itself.
+
+    Its height above the line between them is a share of its width.
+    """
+    up = (b - a)[..., :2].square().sum(dim=-1, keepdim=True).sqrt() * cpu.tensor([0.0, 0.0, height])
     turns = [math.pi * k / count for k in range(1, count + 1)]
     return [a + 0.5 * (1 - math.cos(turn)) * (b - a) + math.sin(turn) * up for turn in turns]

@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from diffcloth_torch import cpu
 from diffcloth_torch.envs.actuators import Tools
-from diffcloth_torch.envs.env import EnvState, failures
-from diffcloth_torch.envs.sheets import HEIGHT, SIDE, SheetTask, follow, uniform
+from diffcloth_torch.envs.env import EnvState, failures, graded
+from diffcloth_torch.envs.sheets import HEIGHT, SIDE, SheetTask, at, follow, uniform
 from diffcloth_torch.errors import SimulationError
 from diffcloth_torch.sim.records.state import State
 
 __all__ = ["FlingCloth", "SpreadCloth", "covered_area"]
 
 _PLEATS = 1.5
+_STEEPNESS = (1.2, 1.5)  # of pleats: overhanging ones bury the edges [rad]
 _SETTLING = 15  # time steps before an episode begins
 _CELL = 0.02  # of the grid on which areas are counted [m]
 _EXTENT = 0.6  # of the grid: it reaches so far from the origin, along both axes [m]
-_WIDTH = 0.6  # of the kernel around a vertex, in distances of vertices
-_FILL = 1.5  # so that cells within a flat sheet count .97
-_JUDGED = 10  # transitions at the end of a fling
-_SPREAD = 0.9  # share of the area of a flat sheet that succeeds
+_WIDTH = 0.6  # of the kernel around a vertex, in distances of vertices or of cells
+_FILL = 0.54  # so that cells within a flat sheet count .97
+_BARE = 0.06  # share of the area of a flat sheet that may be missing
 
 
 def covered_area(positions: Tensor, spacing: float) -> Tensor:
@@ -36,24 +38,29 @@ def covered_area(positions: Tensor, spacing: float) -> Tensor:
         spacing: Their distances in the flat sheet [m].
     """
     centers = cpu.arange(-_EXTENT, _EXTENT, _CELL, dtype=torch.float64)
-    width = _WIDTH * spacing
+    width = _WIDTH * max(spacing, _CELL)
     x, y = (
         torch.exp(-0.5 * ((centers[:, None] - positions[:, None, :, axis]) / width) ** 2)
         for axis in (0, 1)
     )
     # Sums, no matrix product: that would round by the size of the batch.
     near = torch.stack([(row[:, None] * y).sum(dim=-1) for row in x.unbind(dim=1)], dim=1)
-    return _CELL**2 * (1 - torch.exp(-_FILL * near)).sum(dim=(-1, -2))
+    fill = _FILL * (spacing / width) ** 2
+    return _CELL**2 * (1 - torch.exp(-fill * near)).sum(dim=(-1, -2))
 
 
 class SpreadCloth(SheetTask):
     """A sheet that lies in pleats is to be spread flat.
 
-    The reward of each transition is (A - A0) / (Amax - A0) with the covered area A, that of the
-    start A0, and that of the flat sheet Amax; after ClothFlatten of SoftGym and unfold of DaXBench.
+    The start draws the pleats, and pickers begin up to 4 cm beside the edges along them. With the
+    covered area A and that of the flat sheet, Amax, the reward is graded(1 - A / Amax, .06, .5);
+    after ClothFlatten of SoftGym and unfold of DaXBench.
     """
 
     name = "SpreadCloth"
+    steps = 45
+    beside: ClassVar[float] = 0.04
+    above: ClassVar[tuple[float, float]] = (0.02, 0.05)
 
     @property
     def spacing(self) -> float:
@@ -61,9 +68,9 @@ class SpreadCloth(SheetTask):
         return SIDE / (self.side - 1)
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
-        """Also how steep the pleats are, up to 1.7 to 2 rad, and where they begin."""
+        """Also how steep the pleats are, and where they begin."""
         pleats = {
-            "steepness": uniform(generator, 1, 1.7, 2.0)[0],
+            "steepness": uniform(generator, 1, *_STEEPNESS)[0],
             "phase": uniform(generator, 1, 0.0, 2 * math.pi)[0],
         }
         return super().draw(generator) | pleats
@@ -81,14 +88,14 @@ class SpreadCloth(SheetTask):
         z = torch.nn.functional.pad((step * slope.sin()).cumsum(-1), (1, 0))[:, ::16]
         x = x - 0.5 * x[:, -1:]
         z = z - z.amin(dim=-1, keepdim=True) + HEIGHT
-        flat = super().shape(drawn)
+        flat = self.flat(len(x))
         return torch.stack([x.repeat(1, n), flat[..., 1], z.repeat(1, n)], dim=-1)
 
-    def place(self, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
-        """The sheet after it has come to lie; also the areas that rewards compare with."""
-        state, _ = super().place(drawn)
+    def started(self, state: State, drawn: dict[str, Tensor]) -> tuple[State, Tools]:
+        """The sheet after it has come to lie; also the area of the flat sheet, and its corners."""
+        parameters = self._randomization.parameters(drawn)
         for _ in range(_SETTLING):
-            state = self.simulator.step(state)
+            state = self.simulator.step(state, None, parameters)
             failed = failures(state)
             if bool(failed.any()):
                 environments = failed.nonzero()[:, 0].tolist()
@@ -97,28 +104,27 @@ class SpreadCloth(SheetTask):
                     environments=environments,
                 )
         state = state.replace(velocities=torch.zeros_like(state.velocities))
-        drawn["start"] = state.positions
-        flat = self.posed(SheetTask.shape(self, drawn), drawn)
-        drawn["least_area"] = covered_area(state.positions, self.spacing)
+        flat = self.posed(self.flat(len(state)), drawn)
         drawn["largest_area"] = covered_area(flat, self.spacing)
-        return state, self.tools(state.positions, drawn)
+        drawn["goal"] = flat[:, self._corners]
+        return super().started(state, drawn)
 
-    def spread(self, env: EnvState) -> Tensor:
-        """Covered share of the area of the flat sheet [B]."""
-        return covered_area(env.state.positions, self.spacing) / env.drawn["largest_area"]
+    def bare(self, env: EnvState) -> Tensor:
+        """Share of the area of the flat sheet that is not covered [B]."""
+        return 1 - covered_area(env.state.positions, self.spacing) / env.drawn["largest_area"]
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        least, largest = env.drawn["least_area"], env.drawn["largest_area"]
-        return (self.spread(env) * largest - least) / (largest - least)
+        return graded(self.bare(env), _BARE, 0.5)
 
     def success(self, env: EnvState) -> Tensor:
-        """Whether 90 % of the flat sheet's area are covered."""
-        return self.spread(env) > _SPREAD
+        """Whether 94 % of the flat sheet's area are covered."""
+        return self.bare(env) < _BARE
 
-    def beginnings(self) -> list[int]:
+    def picked(self, drawn: Mapping[str, Tensor]) -> Tensor:
         """The middles of the edges along the pleats."""
-        return [self.vertex(self.side // 2, 0), self.vertex(self.side // 2, -1)]
+        vertices = [self.vertex(self.side // 2, 0), self.vertex(self.side // 2, -1)]
+        return cpu.tensor(vertices, dtype=torch.int64).expand(len(drawn["turn"]), -1)
 
     def along(self, env: EnvState) -> Tensor:
         """The direction across the pleats, [B, 1, 3]."""
@@ -127,7 +133,7 @@ class SpreadCloth(SheetTask):
 
     def scripted(self, env: EnvState) -> Tensor:
         """Close on the edges, pull them apart, let go."""
-        here = env.drawn["start"][:, self.beginnings()]
+        here = at(env.drawn["start"], env.drawn["picked"])
         along = self.along(env) * cpu.tensor([[-0.5], [0.5]])
         apart = here.mean(dim=1, keepdim=True) + SIDE * along
         apart = torch.cat([apart[..., :2], torch.full_like(apart[..., 2:], 0.01)], dim=-1)
@@ -146,28 +152,43 @@ class SpreadCloth(SheetTask):
 class FlingCloth(SpreadCloth):
     """Two pickers lift a pleated sheet by one edge and spread it, by a fling or by laying it down.
 
-    The reward is that of `SpreadCloth` in the last ten transitions, and zero before: what counts is
-    the covered area after the fling, as in RGBench.
+    The start draws the pleats and which of two opposite edges the pickers begin at. With the share
+    of the area that is covered, as in `SpreadCloth`, and the mean height h of the sheet above the
+    table, the reward is graded(1 - A / Amax + h / side, .08, .5): the sheet must lie there. After
+    the fling of RGBench.
     """
 
     name = "FlingCloth"
+    steps = 80
+    _ALLOWED = 0.08
 
-    def __init__(self, *, horizon: int = 70, **options: object) -> None:
-        """Build the scene: see `SheetTask`."""
-        super().__init__(horizon=horizon, **options)  # type: ignore[arg-type]
+    def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """Also the edge that the pickers begin at."""
+        return super().draw(generator) | {"edge": cpu.randint(2, (1,), generator=generator)[0]}
+
+    def amiss(self, env: EnvState) -> Tensor:
+        """Share of the area that is not covered, and mean height in sides [B]."""
+        height = env.state.positions[..., 2].mean(dim=-1) - HEIGHT
+        return self.bare(env) + height.clamp(min=0) / SIDE
 
     def reward(self, env: EnvState) -> Tensor:
         """See the class."""
-        return super().reward(env) * (env.elapsed > self.horizon - _JUDGED)
+        return graded(self.amiss(env), self._ALLOWED, 0.5)
 
-    def beginnings(self) -> list[int]:
+    def success(self, env: EnvState) -> Tensor:
+        """Whether at most .08 of the area, or of the side in mean height, is missing."""
+        return self.amiss(env) < self._ALLOWED
+
+    def picked(self, drawn: Mapping[str, Tensor]) -> Tensor:
         """Two corners of an edge along the pleats."""
-        return [self.vertex(0, -1), self.vertex(-1, -1)]
+        vertices = cpu.tensor([self.vertex(0, -1), self.vertex(-1, -1)], dtype=torch.int64)
+        return torch.stack([vertices, self.side**2 - 1 - vertices])[drawn["edge"]]
 
     def scripted(self, env: EnvState) -> Tensor:
         """Close on the corners, lift the sheet until it hangs, and lay it down along a line."""
-        here = env.drawn["start"][:, self.beginnings()]
-        along = SIDE * self.along(env)
+        here = at(env.drawn["start"], env.drawn["picked"])
+        sign = (1 - 2 * env.drawn["edge"])[:, None, None]  # towards the edge that is held
+        along = sign * SIDE * self.along(env)
         foot = torch.cat([here[..., :2], torch.zeros_like(here[..., 2:])], dim=-1) - 0.9 * along
         up = cpu.tensor([0.0, 0.0, SIDE])
         # What has been laid down and what still hangs are together as long as the sheet.

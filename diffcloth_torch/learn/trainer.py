@@ -13,7 +13,7 @@ import copy
 import hashlib
 import pickle
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +54,7 @@ from diffcloth_torch.sim.records.state import State
 __all__ = ["Trainer", "record_of", "restore"]
 
 _CHECKPOINT = "trainer"  # kind of its files
+
 
 
 class Trainer:
@@ -252,7 +253,7 @@ class Trainer:
             "policy": {name: t.clone() for name, t in self.policy.state_dict().items()},
             "optimizers": [copy.deepcopy(o.state_dict()) for o in self._optimizers],
             "places": [
-                ([e.state, e.tools, e.drawn, e.elapsed, e.failed], list(generators))
+                ([getattr(e, field.name) for field in fields(e)], list(generators))
                 for e, generators in self._places
             ],
         }
@@ -303,8 +304,8 @@ class Trainer:
             example, _ = self._places[k]
             for part in ("tools", "drawn"):
                 check_structure(f"{name}: {part}", getattr(place, part), getattr(example, part))
-            check_like(f"{name}: elapsed", place.elapsed, example.elapsed)
-            check_like(f"{name}: failed", place.failed, example.failed)
+            for part in ("elapsed", "failed", "blocked", "held"):
+                check_like(f"{name}: {part}", getattr(place, part), getattr(example, part))
             if bool(((place.elapsed < 0) | (place.elapsed >= self.task.horizon)).any()):
                 raise InvalidInput(f"{name}: elapsed must be below {self.task.horizon}")
             self.task.simulator.kinetic_energy(place.state)  # checks the state
@@ -353,6 +354,7 @@ class Trainer:
             "name": task.name,
             "actions": task.action_size,
             "observations": sizes,
+            "frame": task.frame,
             "horizon": task.horizon,
             "substeps": task.substeps,
             "vertices": len(task.simulator.initial_state().positions),

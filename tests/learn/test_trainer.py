@@ -17,6 +17,7 @@ from diffcloth_torch import envs
 from diffcloth_torch.envs.actuators import Velocities
 from diffcloth_torch.envs.env import Task, lengths
 from diffcloth_torch.envs.fold_cloth import FoldCloth
+from diffcloth_torch.envs.sheets import at
 from diffcloth_torch.errors import InvalidInput, SimulationError
 from diffcloth_torch.learn import Trainer, TrainerOptions
 from diffcloth_torch.learn import rollouts as rollouts_module
@@ -480,12 +481,12 @@ def test_a_failed_environment_ends_its_episode_and_has_no_gradient(monkeypatch):
 
 
 class LiftCorner(FoldCloth):
-    """One corner is to be 10 cm above the table."""
+    """The corner at the first picker is to be 10 cm above the table."""
 
     name = "LiftCorner"
 
     def height(self, env):
-        return env.state.positions[:, self.vertex(0, -1), 2]
+        return at(env.state.positions, env.drawn["picked"])[:, 0, 2]
 
     def reward(self, env):
         return -(self.height(env) - 0.1).abs()
@@ -506,6 +507,7 @@ class CarryStrip(Task):
     """
 
     name = "CarryStrip"
+    worst = -10.0
     held = (0, 1)  # vertices
 
     def __init__(self):

@@ -1,0 +1,134 @@
+"""Tasks whose scenes are built from the options that all eleven tasks have."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+from torch import Tensor
+
+from diffcloth_torch import cpu
+from diffcloth_torch.checks import check_choice, check_count
+from diffcloth_torch.envs.actuators import Actuator
+from diffcloth_torch.envs.env import Task
+from diffcloth_torch.envs.randomization import Ranges
+from diffcloth_torch.model.cloth import Cloth
+from diffcloth_torch.model.materials import Material
+from diffcloth_torch.model.options import ContactOptions, SolverOptions
+from diffcloth_torch.model.scene import Scene
+from diffcloth_torch.operations import operation
+from diffcloth_torch.sim.simulator import Simulator
+
+__all__ = ["DT", "BuiltTask", "key_rows", "with_material"]
+
+DT = 0.02  # [s]
+OBSERVATIONS = ("keypoints", "particles")
+_KEY_POINTS = 4  # along a side
+
+
+class BuiltTask(Task):
+    """A task that builds its scene; subclasses define `build`.
+
+    Attributes:
+        side: Number of vertices along a side of a sheet.
+        sees: "keypoints" or "particles": the vertices that are observed.
+    """
+
+    steps: ClassVar[int]  # transitions of an episode, unless told otherwise
+
+    def __init__(
+        self,
+        *,
+        size: int = 12,
+        horizon: int | None = None,
+        substeps: int = 2,
+        observation: str = "keypoints",
+        material: Material | None = None,
+        contact: ContactOptions | None = None,
+        solver: SolverOptions | None = None,
+        frame: str = "task",
+        randomize: Ranges = False,
+    ) -> None:
+        """Build the scene.
+
+        Args:
+            size: Vertices along a side of a sheet, >= 4.
+            horizon: Transitions of an episode; by default a fifth more than the script needs.
+            substeps: Time steps of a transition, of .02 s each.
+            observation: "keypoints" for some vertices, or "particles" for all.
+            material: Of the cloths; None takes that of the task.
+            contact: Options of contact; None takes those of the task.
+            solver: Options of the solver; a step that fails never raises here.
+            frame: Axes of observations and actions: "task", fixed at the start of an episode, or
+                "world".
+            randomize: Whether to draw physical parameters at each start, or their ranges by name:
+                "stretch", "bending", "density", "friction", "drag", "mass".
+        """
+        owner = operation(self.name)
+        self.side = check_count(f"{owner}: `size`", size, 4)
+        self.sees = check_choice(f"{owner}: `observation`", observation, OBSERVATIONS)
+        for name, value, kind in (
+            ("material", material, Material),
+            ("contact", contact, ContactOptions),
+            ("solver", solver, SolverOptions),
+        ):
+            if value is not None and not isinstance(value, kind):
+                raise TypeError(
+                    f"{owner}: `{name}` must be {kind.__name__} or None, got {type(value).__name__}"
+                )
+        scene, actuator = self.build(material)
+        simulator = Simulator(
+            scene,
+            DT,
+            contact=self.contact() if contact is None else contact,
+            solver=replace(SolverOptions() if solver is None else solver, throw=False),
+        )
+        super().__init__(
+            simulator,
+            actuator,
+            horizon=self.steps if horizon is None else horizon,
+            substeps=substeps,
+            frame=frame,
+            randomize=randomize,
+        )
+
+    @abstractmethod
+    def build(self, material: Material | None) -> tuple[Scene, Actuator]:
+        """The scene, and what actions move."""
+
+    def contact(self) -> ContactOptions:
+        """Options of contact, unless others are given."""
+        return ContactOptions()
+
+    def observed(self, env_time: Tensor) -> Tensor:
+        """The share of the horizon that has passed, [B, 1]."""
+        return env_time.double()[:, None] / self.horizon
+
+
+def key_rows(size: int, observation: str) -> Tensor:
+    """Vertices of a square sheet that are observed: 4 x 4 of them, or all."""
+    if observation == "particles":
+        return cpu.arange(size * size)
+    some = cpu.linspace(0, size - 1, _KEY_POINTS).round().long()
+    return (some[:, None] * size + some).flatten()
+
+
+def with_material(cloth: Cloth, material: Material | None) -> Cloth:
+    """The cloth with another material, if there is one."""
+    if material is None:
+        return cloth
+    pins: Mapping[str, object] = dict(cloth.pins)
+    return Cloth(
+        cloth.vertices,
+        cloth.faces,
+        material=material,
+        pins=pins,
+        soft_pins=dict(cloth.soft_pins),
+        pin_stiffness=cloth.pin_stiffness,
+        rest_positions=cloth.rest_positions,
+        bending_model=cloth.bending_model,
+        name=cloth.name,
+        directions=cloth.directions if material.is_orthotropic else None,
+    )
