@@ -1,13 +1,15 @@
-"""Environments for learning: transitions a second, and what policies made by hand get."""
+"""Environments for learning: transitions a second, and returns of policies made by hand."""
 
 from __future__ import annotations
 
+import math
 import os
 import resource
 import sys
 import time
 from collections.abc import Callable, Sequence
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import click
@@ -17,7 +19,9 @@ from diffcloth_torch import envs
 from diffcloth_torch.sim.solve import step as core_step
 
 SIZES, BATCHES = (8, 12, 24), (1, 4, 8, 32)
-POLICIES = ("zero", "random", "scripted")
+POLICIES = ("zero", "random", "scripted", "replayed")
+_MARKS = "<!-- returns -->\n", "<!-- end of returns -->\n"  # of the table on a page
+_SEEDS = 1000, 2000  # of the episodes, and of the one that is replayed
 _WARM_UP = 4  # transitions: pickers close
 
 
@@ -30,7 +34,13 @@ _WARM_UP = 4  # transitions: pickers close
 @click.option("--threads", default=(1, 2), multiple=True, type=click.IntRange(1))
 @click.option("--steps", default=20, show_default=True, type=click.IntRange(1))
 @click.option("--returns", is_flag=True, help="What policies get instead.")
-@click.option("--episodes", default=8, show_default=True, help="Of each policy, for --returns.")
+@click.option("--episodes", default=64, show_default=True, help="Of each policy, for --returns.")
+@click.option("--size", default=7, show_default=True, help="Vertices a side, for --returns.")
+@click.option(
+    "--page",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Where to write the table of --returns, such as docs/environments.md.",
+)
 def main(
     tasks: Sequence[str],
     sizes: Sequence[int],
@@ -39,6 +49,8 @@ def main(
     steps: int,
     returns: bool,
     episodes: int,
+    size: int,
+    page: Path | None,
 ) -> None:
     """Environment steps a second, without and with gradients, under the scripted policy.
 
@@ -51,7 +63,7 @@ def main(
     wait for the last of them, and for other programs.
     """
     if returns:
-        print_returns(tasks or tuple(envs.TASKS), episodes)
+        print_returns(tasks or tuple(envs.TASKS), episodes, size, page)
         return
     print("environment steps a second; load of the machine", end=" ")
     print(f"{os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
@@ -132,40 +144,87 @@ def _script(env: envs.ClothVectorEnv, steps: int) -> tuple[list[torch.Tensor], e
     return script, start
 
 
-def print_returns(tasks: Sequence[str], episodes: int) -> None:
-    """What zero, random and scripted policies get in some tasks."""
-    print(f"Mean return of {episodes} episodes, and how many end in success, at size 12")
-    print(f"{'task':18}" + "".join(f"{policy:>18}" for policy in POLICIES))
+def print_returns(tasks: Sequence[str], episodes: int, size: int, page: Path | None = None) -> None:
+    """What zero, random, scripted and replayed policies get: mean return, and success in percent.
+
+    Intervals are those of Wilson, of 95 %. With a page the rows are written there, too: between the
+    lines that begin and end with `_MARKS`, where the row of a task replaces the former one.
+    """
+    print("| task | " + " | ".join(POLICIES) + " |")
+    print("|---" * (1 + len(POLICIES)) + "|")
     for name in tasks:
-        env = envs.make(name, episodes, autoreset_mode="Disabled")
-        line = f"{name:18}"
+        cells = []
+        env = envs.make(name, episodes, size=size, autoreset_mode="Disabled")
         for policy in POLICIES:
-            total, success = _episode(env, policy)
-            line += f"{total:10.2f} {success:3d}/{episodes:<3d}"
-        print(line)
+            total, success = _episodes(env, policy)
+            low, high = wilson(success, episodes)
+            shares = f"{success / episodes:.0%} ({low:.0%} to {high:.0%})"
+            cells.append(f"{total:.1f}, {shares.replace('%', ' %')}")
+        row = f"| `{name}` | " + " | ".join(cells) + " |"
+        print(row)
         sys.stdout.flush()
+        if page is not None:
+            page.write_text(with_row(page.read_text(), row))
 
 
-def _episode(env: envs.ClothVectorEnv, policy: str) -> tuple[float, int]:
-    env.reset(seed=100)
-    noise = torch.Generator().manual_seed(0)
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """The interval of Wilson for a share, 95 %."""
+    z = 1.959964
+    share = successes / count
+    middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
+    half = z / (1 + z**2 / count) * math.sqrt(share * (1 - share) / count + (z / (2 * count)) ** 2)
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def with_row(text: str, row: str) -> str:
+    """The text of a page with the row of a task in its table of returns."""
+    begin, end = _MARKS
+    before, _, rest = text.partition(begin)
+    table, _, after = rest.partition(end)
+    if not after:
+        raise ValueError(f"the page must have a table between {begin!r} and {end!r}")
+    task = row.split("|")[1]
+    rows = table.rstrip("\n").split("\n")
+    places = [k for k, each in enumerate(rows) if each.split("|")[1:2] == [task]]
+    rows[places[0] if places else len(rows) :] = [row, *(rows[places[0] + 1 :] if places else [])]
+    return begin.join([before, "\n".join(rows) + "\n" + end]) + after
+
+
+def _episodes(env: envs.ClothVectorEnv, policy: str) -> tuple[float, int]:
+    """Mean return, and number of episodes that succeed, of one episode each."""
     shape = (env.num_envs, env.task.action_size)
-    act: dict[str, Callable[[], torch.Tensor]] = {
-        "zero": lambda: torch.zeros(shape),
-        "random": lambda: 2 * torch.rand(shape, generator=noise) - 1,
-        "scripted": env.scripted_actions,
+    noise = torch.Generator().manual_seed(0)
+    if policy == "replayed":
+        one = envs.make(env.task.name, 1, size=env.task.side, autoreset_mode="Disabled")
+        script = _roll_out(one, lambda k: one.scripted_actions(), seed=_SEEDS[1])[2]
+    act: dict[str, Callable[[int], torch.Tensor]] = {
+        "zero": lambda k: torch.zeros(shape),
+        "random": lambda k: 2 * torch.rand(shape, generator=noise) - 1,
+        "scripted": lambda k: env.scripted_actions(),
+        "replayed": lambda k: script[k].expand(shape),
     }
+    total, success, _ = _roll_out(env, act[policy], seed=_SEEDS[0])
+    return float(total.mean()), int(success.sum())
+
+
+def _roll_out(
+    env: envs.ClothVectorEnv, act: Callable[[int], torch.Tensor], seed: int
+) -> tuple[torch.Tensor, torch.Tensor, list[torch.Tensor]]:
+    """Returns [B], successes [B] and actions of one episode of each environment."""
+    env.reset(seed=seed)
     total = torch.zeros(env.num_envs)
     success = torch.zeros(env.num_envs, dtype=torch.bool)
     running = ~success
-    for _ in range(env.task.horizon):
-        _, reward, terminated, truncated, info = env.step(act[policy]())
+    made = []
+    for k in range(env.task.horizon):
+        made.append(act(k))
+        _, reward, terminated, truncated, info = env.step(made[-1])
         total += torch.where(running, reward, 0.0)
         success = torch.where(running, info["success"], success)
         running = running & ~(terminated | truncated)
         if not bool(running.any()):
             break
-    return float(total.mean()), int(success.sum())
+    return total, success, made
 
 
 if __name__ == "__main__":

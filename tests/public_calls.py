@@ -198,6 +198,12 @@ class World:
         return env
 
     @cached_property
+    def single(self):
+        env = dc.envs.make_single("FoldCloth", size=5, horizon=3)
+        env.reset(seed=0)
+        return env
+
+    @cached_property
     def env_state(self):
         return self.env.task.initial(torch.Generator(device="cpu").manual_seed(1), 2)
 
@@ -426,10 +432,18 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "where": lambda w: call(dc.where, mask(), w.batch, w.state),
     "envs.Actuator": lambda w: call(type(w.env.task.actuator), w.cloth),
     "envs.Actuator.act": lambda w: acting(w, w.env.task.actuator),
+    "envs.ClothEnv": lambda w: call(dc.envs.ClothEnv, w.env.task),
+    "envs.ClothEnv.close": lambda w: call(w.single.close),
+    "envs.ClothEnv.render": lambda w: call(w.single.render),
+    "envs.ClothEnv.reset": lambda w: call(w.single.reset, seed=3),
+    "envs.ClothEnv.scripted_action": lambda w: call(w.single.scripted_action),
+    "envs.ClothEnv.step": lambda w: call(w.single.step, [0.1] * 8),
     "envs.ClothVectorEnv": lambda w: call(dc.envs.ClothVectorEnv, w.env.task, 2, seed=1),
     "envs.ClothVectorEnv.clear_grad": lambda w: call(begun(w).clear_grad),
     "envs.ClothVectorEnv.generator_states": lambda w: call(begun(w).generator_states),
     "envs.ClothVectorEnv.initialize_trajectory": lambda w: call(begun(w).initialize_trajectory),
+    "envs.ClothVectorEnv.close_extras": lambda w: call(w.env.close_extras),
+    "envs.ClothVectorEnv.render": lambda w: call(begun(w).render),
     "envs.ClothVectorEnv.reset": lambda w: call(
         w.env.reset, seed=3, options={"reset_mask": mask()}
     ),
@@ -440,6 +454,7 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "envs.ClothVectorEnv.step": lambda w: call(begun(w).step, [[0.1] * 8, [-0.1] * 8]),
     "envs.EnvState": lambda w: record(dc.envs.EnvState, w.env_state),
     "envs.EnvState.detach": lambda w: call(w.env_state.detach),
+    "envs.EnvState.rows": lambda w: call(w.env_state.rows, torch.tensor([1], device="cpu")),
     "envs.EnvState.where": lambda w: call(dc.envs.EnvState.where, mask(), w.env_state, w.env_state),
     "envs.Pickers": lambda w: call(dc.envs.Pickers, w.cloth, 2, stiffness=40.0),
     "envs.Pickers.act": lambda w: acting(w, w.env.task.actuator),
@@ -448,16 +463,23 @@ CALLS: dict[str, Callable[[World], Call]] = {
     "envs.Task.draw": lambda w: call(w.env.task.draw, torch.Generator("cpu").manual_seed(2)),
     "envs.Task.example": lambda w: call(w.env.task.example),
     "envs.Task.features": lambda w: call(w.env.task.features, w.env_state),
+    "envs.Task.frame_of": lambda w: call(
+        w.env.task.frame_of, w.env_state.state, dict(w.env_state.drawn)
+    ),
+    "envs.Task.in_world": lambda w: call(w.env.task.in_world, w.env_state, f64([[0.1] * 8] * 2)),
     "envs.Task.initial": lambda w: call(
         w.env.task.initial, torch.Generator("cpu").manual_seed(2), 2
     ),
     "envs.Task.observation": lambda w: call(w.env.task.observation, w.env_state),
+    "envs.Task.outcome": lambda w: call(w.env.task.outcome, w.env_state),
     "envs.Task.place": lambda w: call(w.env.task.place, dict(w.env_state.drawn)),
     "envs.Task.reward": lambda w: call(w.env.task.reward, w.env_state),
+    "envs.Task.sample": lambda w: call(w.env.task.sample, torch.Generator("cpu").manual_seed(2)),
     "envs.Task.scripted": lambda w: call(w.env.task.scripted, w.env_state),
     "envs.Task.start": lambda w: call(
         w.env.task.start, [w.env.task.draw(torch.Generator("cpu").manual_seed(2))]
     ),
+    "envs.Task.succeeded": lambda w: call(w.env.task.succeeded, w.env_state),
     "envs.Task.success": lambda w: call(w.env.task.success, w.env_state),
     "envs.Task.terminal": lambda w: call(w.env.task.terminal, w.env_state),
     "envs.Task.transition": lambda w: call(
@@ -472,6 +494,7 @@ CALLS: dict[str, Callable[[World], Call]] = {
         2,
     ),
     "envs.make": lambda w: call(dc.envs.make, "FoldCloth", 2, size=5),
+    "envs.make_single": lambda w: call(dc.envs.make_single, "FoldCloth", size=5),
     "fabrics.Measurement": lambda w: call(dc.fabrics.Measurement, *MEASURED),
     "fabrics.material": lambda w: call(dc.fabrics.material, next(iter(dc.fabrics.MEASUREMENTS))),
     "learn.Jobs": lambda w: call(dc.learn.Jobs, Inline()),

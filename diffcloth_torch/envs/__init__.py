@@ -6,7 +6,8 @@
 >>> observation, reward, terminated, truncated, info = env.step(actions)
 
 Importing this module also lets gymnasium find them:
-`gymnasium.make_vec("diffcloth/FoldCloth-v0", num_envs=8)`.
+`gymnasium.make("diffcloth/FoldCloth-v0")` is one environment with NumPy arrays, and
+`gymnasium.make_vec("diffcloth/FoldCloth-v0", num_envs=8)` several, with tensors.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from diffcloth_torch.operations import called
 
 try:
     from diffcloth_torch.envs.gym import ClothVectorEnv, register
+    from diffcloth_torch.envs.single import ClothEnv
 except ModuleNotFoundError as error:
     if error.name != "gymnasium":
         raise
@@ -40,12 +42,14 @@ except ModuleNotFoundError as error:
 __all__ = [
     "TASKS",
     "Actuator",
+    "ClothEnv",
     "ClothVectorEnv",
     "EnvState",
     "Pickers",
     "Task",
     "Velocities",
     "make",
+    "make_single",
 ]
 
 TASKS: dict[str, type[Task]] = {
@@ -66,7 +70,7 @@ TASKS: dict[str, type[Task]] = {
 }
 """Name -> task."""
 
-_OF_BATCH = ("seed", "autoreset_mode")
+_OF_BATCH = ("seed", "autoreset_mode", "render_mode")
 
 
 @called("make")
@@ -76,26 +80,49 @@ def make(task: str | Task, num_envs: int = 1, **options: Any) -> ClothVectorEnv:
     Args:
         task: One of `TASKS` by name, or a task of your own.
         num_envs: How many environments step together.
-        **options: `seed` and `autoreset_mode` as for `ClothVectorEnv`; the others go to the task,
-            where it is given by name.
+        **options: `seed`, `autoreset_mode` and `render_mode` as for `ClothVectorEnv`; the others go
+            to the task, where it is given by name: `size`, `horizon`, `substeps`, `observation`,
+            `material`, `contact`, `solver`, `frame`, `randomize`, and those of its own.
 
     Raises:
         InvalidInput: If a name or value is not accepted.
     """
     batch = {name: options.pop(name) for name in _OF_BATCH if name in options}
+    return ClothVectorEnv(_task("make", task, options, _OF_BATCH), num_envs, **batch)
+
+
+@called("make_single")
+def make_single(task: str | Task, *, render_mode: str | None = None, **options: Any) -> ClothEnv:
+    """Make one environment of a task with NumPy arrays, as `gymnasium.make` does.
+
+    Args:
+        task: One of `TASKS` by name, or a task of your own.
+        render_mode: "rgb_array" for pictures by `render`; None for none.
+        **options: Of the task, where it is given by name, as for `make`.
+
+    Raises:
+        InvalidInput: If a name or value is not accepted.
+    """
+    return ClothEnv(_task("make_single", task, options), render_mode=render_mode)
+
+
+def _task(
+    owner: str, task: str | Task, options: dict[str, Any], others: tuple[str, ...] = ()
+) -> Task:
+    """The task that is given, or the one of that name with options."""
     if isinstance(task, str):
-        check_choice("make: `task`", task, tuple(TASKS))
+        check_choice(f"{owner}: `task`", task, tuple(TASKS))
         accepted = _options(TASKS[task])
         for name in options:
-            check_choice(f"make: an option of {task}", name, (*accepted, *_OF_BATCH))
-        task, options = TASKS[task](**options), {}
+            check_choice(f"{owner}: an option of {task}", name, (*accepted, *others))
+        return TASKS[task](**options)
     given: Any = task
     if not isinstance(given, Task):
         kind = given.__name__ if isinstance(given, type) else type(given).__name__
-        raise TypeError(f"make: `task` must be a name or a Task, got {kind}")
+        raise TypeError(f"{owner}: `task` must be a name or a Task, got {kind}")
     if options:
-        raise InvalidInput(f"make: {', '.join(options)} cannot be given with a task of your own")
-    return ClothVectorEnv(task, num_envs, **batch)
+        raise InvalidInput(f"{owner}: {', '.join(options)} cannot be given with a task of your own")
+    return given
 
 
 def _options(task: type[Task]) -> list[str]:

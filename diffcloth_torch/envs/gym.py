@@ -12,6 +12,7 @@ import torch
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
 from torch import Tensor
 
 from diffcloth_torch import cpu
@@ -25,6 +26,8 @@ from diffcloth_torch.sim.records.controls import Parameters
 __all__ = ["ClothVectorEnv"]
 
 _AUTORESETS = (AutoresetMode.SAME_STEP.value, AutoresetMode.DISABLED.value)
+_RENDER_MODES = ("rgb_array",)
+_PICTURE = (480, 360)  # width and height [pixels]
 _LARGEST_SEED = 2**64 - 1
 _FLAGS = ("success", "failed", "blocked", "elapsed")  # of an episode that ended
 _FLOAT = torch.float32  # at the border; float64 inside
@@ -66,6 +69,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         *,
         seed: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        render_mode: str | None = None,
     ) -> None:
         """Prepare the environments; `reset` starts them.
 
@@ -74,6 +78,7 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
             num_envs: B, the number of environments.
             seed: Of the first `reset` that gives none.
             autoreset_mode: SAME_STEP or DISABLED.
+            render_mode: "rgb_array" for pictures by `render`, by the extra "viewer"; None for none.
 
         Raises:
             InvalidInput: If an argument is not accepted.
@@ -87,7 +92,13 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         if isinstance(autoreset_mode, AutoresetMode):
             autoreset_mode = autoreset_mode.value
         check_choice(f"{owner}: `autoreset_mode`", autoreset_mode, _AUTORESETS)
-        self.metadata = {"autoreset_mode": AutoresetMode(autoreset_mode), "render_modes": []}
+        self.render_mode = check_render_mode(owner, render_mode)
+        self.metadata = {
+            "autoreset_mode": AutoresetMode(autoreset_mode),
+            "render_modes": list(_RENDER_MODES),
+            "render_fps": round(1 / (task.simulator.dt * task.substeps)),
+        }
+        self._snapshots: Any = None
         self.task = task
         self.parameters: Parameters | None = None
         with torch.no_grad():
@@ -161,6 +172,33 @@ class ClothVectorEnv(VectorEnv[Any, Any, Any]):
         self._require_start("scripted_actions")
         with torch.no_grad():
             return self.task.scripted(self.env_state).to(_FLOAT)
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Pictures [height, width, 3] of the present state of each environment.
+
+        None without a render mode.
+
+        Raises:
+            InvalidInput: If nothing was reset, or pyvista is not installed.
+        """
+        if self.render_mode is None:
+            return None
+        self._require_start("render")
+        state = self.env_state.state.detach()
+        if self._snapshots is None:
+            # Drawing needs packages that environments without pictures do not.
+            from diffcloth_torch.viewers.look import Camera
+            from diffcloth_torch.viewers.snapshots import Snapshots
+
+            scene = self.task.simulator.scene
+            self._snapshots = Snapshots(scene, state[0], size=_PICTURE, camera=Camera())
+        return tuple(self._snapshots.image(state[i]) for i in range(self.num_envs))
+
+    def close_extras(self, **_: Any) -> None:
+        """Free the window of pictures."""
+        if self._snapshots is not None:
+            self._snapshots.close()
+            self._snapshots = None
 
     def clear_grad(self) -> None:
         """Cut the graph of the present state: gradients of later rewards end here."""
@@ -335,10 +373,18 @@ def _check_rewards(task: Task, reward: Tensor, env: EnvState) -> None:
         )
 
 
+def check_render_mode(owner: str, mode: str | None) -> str | None:
+    """Check a render mode."""
+    if mode is None:
+        return None
+    return check_choice(f"{owner}: `render_mode`", mode, _RENDER_MODES)
+
+
 def register(name: str) -> None:
-    """Let `gymnasium.make_vec("diffcloth/NAME-v0", num_envs=8)` find a task."""
+    """Let `gymnasium.make` and `make_vec` find a task as "diffcloth/NAME-v0"."""
     gymnasium.register(
         f"diffcloth/{name}-v0",
+        entry_point="diffcloth_torch.envs:make_single",
         vector_entry_point="diffcloth_torch.envs:make",
         kwargs={"task": name},
     )

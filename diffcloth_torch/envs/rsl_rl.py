@@ -53,6 +53,6 @@ class RslRlEnv:
             self._observation, reward, terminated, truncated, info = self.env.step(actions)
         extras = {
             "time_outs": truncated,
-            "log": {name: info[name].float().mean() for name in ("success", "failed")},
+            "log": {name: info[name].float().mean() for name in ("success", "failed", "blocked")},
         }
         return self.get_observations(), reward, (terminated | truncated).long(), extras

@@ -19,7 +19,6 @@ from diffcloth_torch.sim.records.state import State
 __all__ = ["FlingCloth", "SpreadCloth", "covered_area"]
 
 _PLEATS = 1.5
-_STEEPNESS = (1.2, 1.5)  # of pleats: overhanging ones bury the edges [rad]
 _SETTLING = 15  # time steps before an episode begins
 _CELL = 0.02  # of the grid on which areas are counted [m]
 _EXTENT = 0.6  # of the grid: it reaches so far from the origin, along both axes [m]
@@ -59,6 +58,7 @@ class SpreadCloth(SheetTask):
 
     name = "SpreadCloth"
     steps = 45
+    steepness: ClassVar[tuple[float, float]] = (1.2, 1.5)  # overhangs would bury the edges [rad]
     beside: ClassVar[float] = 0.04
     above: ClassVar[tuple[float, float]] = (0.02, 0.05)
 
@@ -70,7 +70,7 @@ class SpreadCloth(SheetTask):
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Also how steep the pleats are, and where they begin."""
         pleats = {
-            "steepness": uniform(generator, 1, *_STEEPNESS)[0],
+            "steepness": uniform(generator, 1, *self.steepness)[0],
             "phase": uniform(generator, 1, 0.0, 2 * math.pi)[0],
         }
         return super().draw(generator) | pleats
@@ -159,7 +159,8 @@ class FlingCloth(SpreadCloth):
     """
 
     name = "FlingCloth"
-    steps = 80
+    steps = 82
+    steepness = (1.6, 1.9)
     _ALLOWED = 0.08
 
     def draw(self, generator: torch.Generator) -> dict[str, Tensor]:
@@ -185,7 +186,7 @@ class FlingCloth(SpreadCloth):
         return torch.stack([vertices, self.side**2 - 1 - vertices])[drawn["edge"]]
 
     def scripted(self, env: EnvState) -> Tensor:
-        """Close on the corners, lift the sheet until it hangs, and lay it down along a line."""
+        """Close on the corners, lift the sheet, lay it down along a line, and pull it."""
         here = at(env.drawn["start"], env.drawn["picked"])
         sign = (1 - 2 * env.drawn["edge"])[:, None, None]  # towards the edge that is held
         along = sign * SIDE * self.along(env)
@@ -193,7 +194,9 @@ class FlingCloth(SpreadCloth):
         up = cpu.tensor([0.0, 0.0, SIDE])
         # What has been laid down and what still hangs are together as long as the sheet.
         laid = [foot + k / 6 * along + (1.02 - k / 6) * up for k in range(7)]
-        points = [here, here, *[foot + 1.15 * up] * 2, *laid, laid[-1], laid[-1] + 0.1 * up]
-        times = [4, 6, 24, 32, *(35 + 4 * k for k in range(7)), 61, 64]
+        # An edge that has turned under is pulled out by friction with the table.
+        end = laid[-1] + 0.3 * along
+        points = [here, here, *[foot + 1.15 * up] * 2, *laid, end, end, end + 0.1 * up]
+        times = [4, 6, 24, 30, *(33 + 4 * k for k in range(7)), 63, 65, 68]
         grasps = [-1.0, *[1.0] * (len(times) - 2), -1.0]
         return self.moves_to(env, *follow(env, times, points, grasps))

@@ -44,7 +44,7 @@ class StableBaselinesEnv(VecEnv):
         ended = terminated | truncated
         infos: list[dict[str, Any]] = []
         for i in range(self.num_envs):
-            one = {name: info[name][i].item() for name in ("success", "failed")}
+            one = {name: info[name][i].item() for name in ("success", "failed", "blocked")}
             one["TimeLimit.truncated"] = bool(truncated[i])
             if ended[i]:
                 one["terminal_observation"] = info["final_obs"][i].numpy()
@@ -52,7 +52,13 @@ class StableBaselinesEnv(VecEnv):
         return observation.numpy(), reward.numpy(), ended.numpy(), infos
 
     def close(self) -> None:
-        """Nothing is to be closed."""
+        """Free the window of pictures."""
+        self.env.close()
+
+    def get_images(self) -> list[NDArray[np.uint8] | None]:
+        """Pictures [height, width, 3] of all environments, for `VecVideoRecorder`."""
+        images = self.env.render()
+        return [None] * self.num_envs if images is None else list(images)
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """An attribute of the environments, the same for all."""

@@ -88,3 +88,56 @@ def test_what_rsl_rl_asks_for():
     # Runners may begin with episodes of random lengths.
     env.episode_length_buf = torch.tensor([1, 0])
     assert env.step(torch.zeros(2, env.num_actions))[2].tolist() == [1, 0]
+
+
+class TestFailures:
+    """Environment 1 fails in its first step: every adapter charges all that is left."""
+
+    @pytest.fixture
+    def failing(self, monkeypatch):
+        from diffcloth_torch.envs import env as module
+
+        def make(**options):
+            env = envs.make("FoldCloth", 2, size=SMALL, horizon=5, **options)
+            monkeypatch.setattr(module, "failures", lambda state: torch.tensor([False, True]))
+            return env
+
+        return make
+
+    CHARGE = 5 * envs.TASKS["FoldCloth"].worst
+
+    @pytest.mark.filterwarnings("ignore")
+    def test_torchrl(self, failing):
+        pytest.importorskip("torchrl")
+        from diffcloth_torch.envs.torchrl import TorchRLEnv
+
+        adapter = TorchRLEnv(failing(autoreset_mode="Disabled"))
+        start = adapter.reset()
+        after = adapter.step(start.set("action", torch.zeros(2, 8)))["next"]
+        assert float(after["reward"][1]) == self.CHARGE
+        assert after["terminated"].flatten().tolist() == [False, True]
+
+    @pytest.mark.filterwarnings("ignore")
+    def test_stable_baselines(self, failing):
+        pytest.importorskip("stable_baselines3")
+        from diffcloth_torch.envs.stable_baselines import StableBaselinesEnv
+
+        env = StableBaselinesEnv(failing())
+        env.reset()
+        _, reward, ended, infos = env.step(torch.zeros(2, 8).numpy())
+        assert float(reward[1]) == self.CHARGE
+        assert ended.tolist() == [False, True]
+        assert infos[1]["failed"]
+        assert not infos[1]["TimeLimit.truncated"]
+        assert infos[0]["blocked"] is False
+
+    def test_rsl_rl(self, failing):
+        pytest.importorskip("tensordict")
+        from diffcloth_torch.envs.rsl_rl import RslRlEnv
+
+        env = RslRlEnv(failing())
+        _, reward, ended, extras = env.step(torch.zeros(2, 8))
+        assert float(reward[1]) == self.CHARGE
+        assert ended.tolist() == [0, 1]
+        assert not extras["time_outs"].any()
+        assert float(extras["log"]["failed"]) == 0.5

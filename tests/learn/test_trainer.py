@@ -262,7 +262,8 @@ class TestTensorAdam:
         torch.testing.assert_close(
             moved["tensor"], -0.1 * gradient / gradient.square().mean().sqrt(), rtol=1e-3, atol=1e-5
         )
-        torch.testing.assert_close(moved["number"], -0.1 * gradient.sign(), rtol=0.01, atol=1e-4)
+        # Adam adds 1e-8 to the size of a gradient, of which the least ones are 1e-6.
+        torch.testing.assert_close(moved["number"], -0.1 * gradient.sign(), rtol=0.03, atol=1e-4)
 
 
 def test_lambda_returns_are_those_of_the_recursion():
@@ -478,6 +479,48 @@ def test_a_failed_environment_ends_its_episode_and_has_no_gradient(monkeypatch):
     log = trainer.update()
     assert log["failed"] == 0.5
     assert log["success"] == 0.0
+
+
+@pytest.mark.parametrize("algorithm", ["apg", "shac", "sapo"])
+def test_a_failure_costs_all_that_is_left(algorithm, monkeypatch):
+    """In evaluations, which tryouts compare, in rollouts, and in what critics learn."""
+    from diffcloth_torch.envs import env as module
+
+    worst, horizon = FoldCloth.worst, 6
+    options = TrainerOptions(algorithm, horizon=3, discount=1.0, temperature=1e-9)
+    trainer = Trainer(fold(horizon=horizon), options, num_envs=2)
+    calls = []
+
+    def failures(state):
+        calls.append(state)
+        return torch.tensor([False, len(calls) in (3, 4)])  # in the second step of the rollout
+
+    monkeypatch.setattr(module, "failures", failures)
+    (rollout,) = trainer._rollouts()
+    assert rollout.terminated[:, 1].tolist() == [False, True, False]
+    assert float(rollout.rewards[1, 1]) == worst * (horizon - 1)
+    assert bool((rollout.rewards[:, 0] > worst).all())
+    rows = _Rows([rollout])
+    values = torch.full_like(rows.rewards, 100.0)
+    goals = _lambda_returns(rows, rows.rewards, values, 1.0, 1.0)
+    assert float(goals[1, 1]) == worst * (horizon - 1)  # nothing follows a failure
+    assert float(goals[0, 1]) == pytest.approx(float(rollout.rewards[0, 1]) + worst * (horizon - 1))
+    monkeypatch.setattr(module, "failures", lambda state: torch.tensor([True, True]))
+    mean, success, _ = trainer.evaluate(2)
+    assert mean == worst * horizon
+    assert success == 0.0
+
+
+def test_a_policy_of_an_earlier_version_is_refused(tmp_path):
+    trainer = Trainer(fold(), TrainerOptions(horizon=3), num_envs=2)
+    trainer.save(tmp_path / "policy.pt")
+    kept = torch.load(tmp_path / "policy.pt", weights_only=True)
+    del kept["format"]
+    torch.save(kept, tmp_path / "old.pt")
+    with pytest.raises(
+        InvalidInput, match=r"old\.pt is of an earlier version, whose tasks had other"
+    ):
+        Trainer(fold(), TrainerOptions(horizon=3), num_envs=2).load(tmp_path / "old.pt")
 
 
 class LiftCorner(FoldCloth):
