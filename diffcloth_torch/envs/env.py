@@ -226,23 +226,22 @@ class Task(ABC):
             parameters: Of the simulation; None takes those of the scene.
         """
         state = env.state
-        failed = torch.zeros_like(env.failed)
+        failed = blocked = torch.zeros_like(env.failed)
         parameters = self._randomization.parameters(env.drawn, parameters)
         controls, tools = self.actuator.act(
             env.tools, state, self.in_world(env, actions.clamp(-1, 1)), self.substeps
         )
-        stopped = [False] * len(env)
+        stopped, fails = [False] * len(env), False
         for control in controls:
             state = self._safety.step(state, control, parameters, stopped)
             failed = failed | failures(state)
-            if bool(failed.any()):
+            fails = bool(failed.any())
+            if fails:
                 state = where(failed, state.detach(), state)
-        blocked = torch.zeros_like(env.blocked)
         if any(stopped):
             blocked = cpu.tensor(stopped, dtype=torch.bool)
-        cut = failed | blocked
-        if bool(cut.any()):
-            tools = {name: _cut(t, cut) for name, t in tools.items()}
+        if fails or any(stopped):
+            tools = {name: _cut(t, failed | blocked) for name, t in tools.items()}
         after = EnvState(state, tools, env.drawn, env.elapsed + 1, failed, blocked, env.held)
         with torch.no_grad():
             done = self.success(after) & ~failed

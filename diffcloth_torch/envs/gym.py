@@ -362,8 +362,10 @@ def _check(
 
 def _check_rewards(task: Task, reward: Tensor, env: EnvState) -> None:
     """Require rewards of at least `worst`, but for those that charge the rest of an episode."""
-    ends = env.failed | task.terminal(env)
-    wrong = ~((reward >= task.worst) & (reward < math.inf)) & ~ends
+    right = (reward >= task.worst) & (reward < math.inf)
+    if bool(right.all()):
+        return
+    wrong = ~(right | env.failed | task.terminal(env))
     if bool(wrong.any()):
         row = int(wrong.nonzero()[0])
         raise SimulationError(
