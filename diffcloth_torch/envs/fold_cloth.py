@@ -34,7 +34,6 @@ class FoldCloth(SheetTask):
     name = "FoldCloth"
     steps = 45
     closes: ClassVar[tuple[bool, bool]] = (True, True)  # pickers that a fold needs
-    lift: ClassVar[float] = 0.45  # height of the arc, in shares of its width
     pace: ClassVar[int] = 3  # transitions for an eighth of the way
 
     def lines(self) -> list[int]:
@@ -49,6 +48,10 @@ class FoldCloth(SheetTask):
     def mirror(self, row: Tensor, column: Tensor, line: int) -> tuple[Tensor, Tensor]:
         """Row and column onto which vertices beyond a line are folded."""
         return row, 2 * line - column
+
+    def lift(self) -> float:
+        """Height of the script's arc, in shares of its width."""
+        return 0.45
 
     def corners(self) -> list[int]:
         """Vertices near which the pickers begin."""
@@ -124,7 +127,7 @@ class FoldCloth(SheetTask):
         """Close on the corners, carry them over in an arc, put them down, let go."""
         low = cpu.tensor([0.0, 0.0, 0.016])
         here, there = at(env.drawn["start"], env.drawn["picked"]), env.drawn["goal"] + low
-        carried = arc(here, there, self.lift, 8)
+        carried = arc(here, there, self.lift(), 8)
         end = 5 + 8 * self.pace
         times = [4, *(5 + self.pace * k for k in range(1, 9)), end + 2, end + 6]
         points = [here, *carried, there, there + 4 * low]
@@ -148,7 +151,6 @@ class FoldClothDiagonal(FoldCloth):
     name = "FoldClothDiagonal"
     closes = (True, False)
     steps = 55
-    lift = 0.4
     pace = 4
 
     def lines(self) -> list[int]:
@@ -162,6 +164,10 @@ class FoldClothDiagonal(FoldCloth):
     def mirror(self, row: Tensor, column: Tensor, line: int) -> tuple[Tensor, Tensor]:
         """See `FoldCloth`."""
         return column - line, row + line
+
+    def lift(self) -> float:
+        """See `FoldCloth`; a finer sheet that is pulled taut drags the rest along."""
+        return 0.4 if self.side <= 16 else 0.3
 
     def corners(self) -> list[int]:
         """The corner, and a vertex half way to the middle."""
