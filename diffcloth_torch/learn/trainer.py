@@ -56,7 +56,6 @@ __all__ = ["Trainer", "record_of", "restore"]
 _CHECKPOINT = "trainer"  # kind of its files
 
 
-
 class Trainer:
     """Learns a policy for environments whose rewards have gradients.
 
