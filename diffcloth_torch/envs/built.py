@@ -48,6 +48,7 @@ class BuiltTask(Task):
         material: Material | None = None,
         contact: ContactOptions | None = None,
         solver: SolverOptions | None = None,
+        integrator: str = "implicit_euler",
         frame: str = "task",
         randomize: Ranges = False,
     ) -> None:
@@ -61,6 +62,7 @@ class BuiltTask(Task):
             material: Of the cloths; None takes that of the task.
             contact: Options of contact; None takes those of the task.
             solver: Options of the solver; a step that fails never raises here.
+            integrator: As for `Simulator`.
             frame: Axes of observations and actions: "task", fixed at the start of an episode, or
                 "world".
             randomize: Whether to draw physical parameters at each start, or their ranges by name:
@@ -84,6 +86,7 @@ class BuiltTask(Task):
             DT,
             contact=self.contact() if contact is None else contact,
             solver=replace(SolverOptions() if solver is None else solver, throw=False),
+            integrator=integrator,
         )
         super().__init__(
             simulator,

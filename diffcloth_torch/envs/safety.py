@@ -46,6 +46,7 @@ class SafetyStop:
             scheme=simulator.scheme,
             coupling=simulator.coupling,
             contact=simulator.contact,
+            integrator=simulator.integrator,
             solver=replace(options, max_iterations=most),
         )
 

@@ -399,3 +399,13 @@ def test_a_task_of_ones_own():
     env = envs.make(Lift(size=SMALL), 2)
     env.reset(seed=0)
     assert env.step(np.zeros((2, 8)))[1].tolist() == pytest.approx([4e-3] * 2, rel=0.1)
+
+
+def test_an_environment_takes_an_integrator():
+    env = dc.envs.make("FoldCloth", 2, size=6, integrator="second_order")
+    env.reset(seed=0)
+    with torch.no_grad():
+        *_, info = env.step(env.scripted_actions())
+    assert env.task.simulator.integrator == "second_order"
+    assert not info["blocked"].any()
+    assert not env.env_state.failed.any()
