@@ -199,15 +199,15 @@ def _robot(section: RobotSection, root: str, source: Path) -> Robot:
 
 
 def _robot_file(section: RobotSection, root: str, source: Path) -> tuple[Path, Path | None]:
-    """The file of a robot, and the folder of its meshes, None for that of the file."""
+    """The file of a robot, and the folder that its meshes must lie in; None for any place."""
     if section.model is not None:
         return robots.panda() if section.model == "panda" else (robots.GRIPPER, None)
     assert section.path is not None  # the schema requires one of the two
     path = resolve_path(source, root, section.path)
-    if section.mesh_root is None:
-        return path, None
-    folder = (source.resolve().parent / section.mesh_root).resolve()
     allowed = (source.resolve().parent / root).resolve()
+    if section.mesh_root is None:
+        return path, allowed
+    folder = (source.resolve().parent / section.mesh_root).resolve()
     if not folder.is_relative_to(allowed):
         raise InvalidInput(
             f"{source}: the folder {section.mesh_root!r} must lie under the root {str(allowed)!r}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -17,13 +17,17 @@ from diffcloth_torch.checks import (
     frozen,
 )
 from diffcloth_torch.errors import InvalidInput, warn_caller
-from diffcloth_torch.geometry.meshes import Indices, read_file_mesh
+from diffcloth_torch.geometry.meshes import FileMesh, Indices, read_file_mesh
 from diffcloth_torch.geometry.polygons import welded
 
 __all__ = ["LoadedMesh", "load_mesh"]
 
 # Usual sizes of cloths and bodies [m]: other ones are most often in another unit.
 _LONGEST, _SHORTEST = 10.0, 1e-3
+
+
+class _Read(Protocol):
+    def __call__(self, path: str | Path, name: str, *, triangulate: bool) -> FileMesh: ...
 
 
 class LoadedMesh(NamedTuple):
@@ -92,6 +96,7 @@ def load_mesh(
     triangulate: object,
     weld: object,
     instead: str,
+    read: _Read = read_file_mesh,
 ) -> LoadedMesh:
     """Read a mesh; warn if it is longer than 10 m or shorter than 1 mm.
 
@@ -102,10 +107,11 @@ def load_mesh(
         triangulate: Whether to cut polygons into triangles.
         weld: Distance [m] up to which vertices are merged; None merges none.
         instead: Remedy in the message about a scale that requires a gradient.
+        read: Reader of the file: `read_file_mesh` or `read_body_mesh`.
     """
     factor = check_number(f"{owner}: `scale`", scale, POSITIVE, instead=instead)
     cuts = check_bool(f"{owner}: `triangulate`", triangulate)
-    mesh = read_file_mesh(path, f"{owner}: `path`", triangulate=cuts)
+    mesh = read(path, f"{owner}: `path`", triangulate=cuts)
     vertices, faces = factor * mesh.vertices, mesh.faces
     kept = np.arange(len(vertices))
     if weld is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diffcloth_torch.checks import (
     SMALLEST,
@@ -20,7 +21,9 @@ from diffcloth_torch.errors import InvalidInput, warn_caller
 from diffcloth_torch.saved import saved
 
 __all__ = [
+    "BodySurface",
     "Surface",
+    "body_arrays",
     "check_areas",
     "check_manifold",
     "surface_arrays",
@@ -42,10 +45,62 @@ class Surface(NamedTuple):
 _FLATTEST_FACE = 1e-12
 
 
+class BodySurface(NamedTuple):
+    """Surface of a body, and its faces as a solid.
+
+    Attributes:
+        vertices: Positions [m], shape [n, 3].
+        faces: Triangles that contact takes, shape [f, 3].
+        solid: Triangles that enclose the body, where the mesh is closed, shape [s, 3]: those
+            without area close it, and so do two faces that face each other.
+    """
+
+    vertices: FloatArray
+    faces: IndexArray
+    solid: IndexArray
+
+
 def surface_arrays(
     owner: str, vertices: object, faces: object, *, instead: str
 ) -> tuple[FloatArray, IndexArray]:
     """Check vertices [n, 3] and triangles [f, 3]; returns read-only copies."""
+    points, triangles = _arrays(owner, vertices, faces, instead=instead)
+    _check_distinct(owner, triangles)
+    check_areas(owner, "vertices", points, triangles)
+    return frozen(points), frozen(triangles)
+
+
+def body_arrays(owner: str, vertices: object, faces: object, *, instead: str) -> BodySurface:
+    """Check vertices [n, 3] and triangles [f, 3] of a body; returns read-only copies.
+
+    Faces without area and all but one of those with the same vertices are dropped, with a warning
+    that counts them: they bear no contact, or that of another face.
+    """
+    points, triangles = _arrays(owner, vertices, faces, instead=instead)
+    _check_sides(owner, "vertices", points, triangles)
+    flat = _is_flat(points, triangles)
+    ordered = np.sort(triangles, axis=1)
+    doubled = _repeats(ordered) & ~flat
+    # In the direction of the face, from its smallest vertex on.
+    turned = np.take_along_axis(
+        triangles, (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1
+    )
+    is_line = (ordered[:, 0] == ordered[:, 1]) | (ordered[:, 1] == ordered[:, 2])
+    solid = triangles[~_repeats(turned) & ~is_line]
+    kept = triangles[~flat & ~doubled]
+    if len(kept) == 0:
+        check_areas(owner, "vertices", points, triangles)
+    if len(kept) < len(triangles):
+        warn_caller(
+            f"{owner}: dropped {len(triangles) - len(kept)} of {len(triangles)} faces: "
+            f"{int(flat.sum())} without area, {int(doubled.sum())} with the vertices of another"
+        )
+    return BodySurface(frozen(points), frozen(kept), frozen(solid))
+
+
+def _arrays(
+    owner: str, vertices: object, faces: object, *, instead: str
+) -> tuple[FloatArray, IndexArray]:
     points = float_array(f"{owner}: `vertices`", vertices, instead=instead)
     check_shape(f"{owner}: `vertices`", points.shape, [("n", 3)])
     check_finite(f"{owner}: `vertices`", points)
@@ -54,9 +109,14 @@ def surface_arrays(
     check_shape(f"{owner}: `faces`", triangles.shape, [("f", 3)], hint)
     if len(triangles) == 0:
         raise InvalidInput(f"{owner}: `faces` must hold at least one triangle")
-    _check_distinct(owner, triangles)
-    check_areas(owner, "vertices", points, triangles)
-    return frozen(points), frozen(triangles)
+    return points, triangles
+
+
+def _repeats(rows: IndexArray) -> NDArray[np.bool_]:
+    """Whether each row is equal to one before it, [n]."""
+    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    repeats: NDArray[np.bool_] = first[inverse.reshape(-1)] != np.arange(len(rows))
+    return repeats
 
 
 def warn_of_cuts(owner: str, vertices: FloatArray, faces: IndexArray) -> None:
@@ -102,9 +162,18 @@ def _check_distinct(owner: str, faces: IndexArray) -> None:
 
 def check_areas(owner: str, field: str, vertices: FloatArray, faces: IndexArray) -> None:
     """Refuse faces of zero area, and those whose area is lost in the range of float64."""
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    double_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    longest_sq = np.max([((q - p) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    _check_sides(owner, field, vertices, faces)
+    flat = np.flatnonzero(_is_flat(vertices, faces))
+    if flat.size:
+        face = int(flat[0])
+        raise InvalidInput(
+            f"{owner}: `faces` must have an area > 0 in `{field}`, got a face without area "
+            f"at [{face}], vertices {faces[face].tolist()}"
+        )
+
+
+def _check_sides(owner: str, field: str, vertices: FloatArray, faces: IndexArray) -> None:
+    longest_sq = _longest_sq(vertices, faces)
     tiny = np.flatnonzero((longest_sq > 0.0) & (longest_sq < SMALLEST**2))
     if tiny.size:
         face = int(tiny[0])
@@ -112,13 +181,20 @@ def check_areas(owner: str, field: str, vertices: FloatArray, faces: IndexArray)
             f"{owner}: `faces` must have sides of at least {SMALLEST:g} m in `{field}`, as powers "
             f"of them would vanish, got {np.sqrt(longest_sq[face]):g} at [{face}]"
         )
-    flat = np.flatnonzero(double_area <= _FLATTEST_FACE * longest_sq)
-    if flat.size:
-        face = int(flat[0])
-        raise InvalidInput(
-            f"{owner}: `faces` must have an area > 0 in `{field}`, got a face without area "
-            f"at [{face}], vertices {faces[face].tolist()}"
-        )
+
+
+def _longest_sq(vertices: FloatArray, faces: IndexArray) -> FloatArray:
+    corners = vertices[faces]
+    longest: FloatArray = ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=-1).max(axis=1)
+    return longest
+
+
+def _is_flat(vertices: FloatArray, faces: IndexArray) -> NDArray[np.bool_]:
+    """Which faces have no area."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    double_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    is_flat: NDArray[np.bool_] = double_area <= _FLATTEST_FACE * _longest_sq(vertices, faces)
+    return is_flat
 
 
 def check_manifold(owner: str, vertex_count: int, faces: IndexArray) -> None:

@@ -2,14 +2,14 @@
 
 OBJ and PLY have readers of our own: common loaders silently triangulate polygons, reorder faces and
 drop unreferenced vertices, so that a pin index refers to another vertex. STL files have no
-indices; corners that agree to the last bit are merged.
+indices; corners that agree to the last bit are merged. Meshes of rigid bodies may be COLLADA or
+glTF files, too.
 """
 
 from __future__ import annotations
 
-import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,8 +21,16 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import INTEGER, NUMBER, as_path, read_regular_file
 from diffcloth_torch.geometry.ply import read_ply, write_ply
 from diffcloth_torch.geometry.polygons import triangulated
+from diffcloth_torch.geometry.scene_files import SCENE_READERS, read_stl
 
-__all__ = ["FileMesh", "MeshPart", "read_file_mesh", "read_mesh", "write_mesh"]
+__all__ = [
+    "FileMesh",
+    "MeshPart",
+    "read_body_mesh",
+    "read_file_mesh",
+    "read_mesh",
+    "write_mesh",
+]
 
 # Far beyond what a step can take; a larger file is a mistake, refused before it fills the memory.
 _LARGEST_FILE = 1 << 30
@@ -45,6 +53,10 @@ class FileMesh(NamedTuple):
     vertices: FloatArray
     faces: Indices
     texture: FloatArray | None = None
+
+
+Reader = Callable[[Path, bytes, bool], FileMesh]
+"""A reader of a path, the content of the file, and whether to cut polygons into triangles."""
 
 
 def read_mesh(path: str | Path, name: str = "read_mesh: `path`") -> tuple[FloatArray, Indices]:
@@ -73,8 +85,39 @@ def read_file_mesh(path: str | Path, name: str, *, triangulate: bool = False) ->
         name: Opens messages about the path.
         triangulate: Whether to cut polygons into triangles instead of refusing them.
     """
+    return _read(path, name, _readers(), triangulate)
+
+
+def read_body_mesh(path: str | Path, name: str, *, triangulate: bool = True) -> FileMesh:
+    """Read the mesh of a rigid body.
+
+    Besides the files of `read_mesh`, .dae, .glb and .gltf files are read, all parts of which become
+    one mesh.
+
+    Args:
+        path: The file.
+        name: Opens messages about the path.
+        triangulate: Whether to cut polygons into triangles instead of refusing them.
+
+    Raises:
+        InvalidInput: As for `read_mesh`; if a polygon has no area or crosses itself; if polygons of
+            a .dae file are not to be cut; or if the file needs a package of the extra `robots` that
+            is not installed.
+        TypeError: If `path` is not a path.
+        OSError: If the file cannot be read.
+    """
+    readers = _readers() | dict.fromkeys(SCENE_READERS, _read_scene)
+    return _read(path, name, readers, triangulate)
+
+
+def _readers() -> dict[str, Reader]:
+    return {".obj": _read_obj, ".ply": _read_ply, ".stl": _read_stl}
+
+
+def _read(
+    path: str | Path, name: str, readers: Mapping[str, Reader], triangulate: bool
+) -> FileMesh:
     path = as_path(name, path)
-    readers = {".obj": _read_obj, ".ply": _read_ply, ".stl": _read_stl}
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise InvalidInput(f"{name} must end in {', '.join(readers)}, got {str(path)!r}")
@@ -227,26 +270,16 @@ def _shown(word: bytes) -> str:
 
 
 def _read_stl(path: Path, data: bytes, triangulate: bool) -> FileMesh:
-    from trimesh.exchange.stl import load_stl
+    return FileMesh(*read_stl(path, data))
 
-    if not data:
-        raise InvalidInput(f"{path}: the file is empty")
-    try:
-        soup = load_stl(io.BytesIO(data))
-        if "vertices" not in soup:
-            raise ValueError("it has neither the header of a binary file nor a solid of text")
-        corners = np.asarray(soup["vertices"], dtype=np.float64)[np.asarray(soup["faces"])]
-        points = corners.reshape(-1, 3)
-    except MemoryError:
-        raise
-    except Exception as error:
-        raise InvalidInput(f"{path}: not a readable STL file: {error}") from error
-    _, first, inverse = np.unique(points, axis=0, return_index=True, return_inverse=True)
-    # np.unique sorts; restore the order of first appearance in the file.
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return FileMesh(points[first[order]], rank[inverse.reshape(-1)].reshape(-1, 3))
+
+def _read_scene(path: Path, data: bytes, triangulate: bool) -> FileMesh:
+    suffix = path.suffix.lower()
+    if suffix == ".dae" and not triangulate:
+        raise InvalidInput(
+            f"{path}: polygons of .dae files are always cut into triangles: pass triangulate=True"
+        )
+    return FileMesh(*SCENE_READERS[suffix](path, data))
 
 
 def _write_obj(path: Path, parts: Sequence[MeshPart]) -> None:

@@ -235,11 +235,7 @@ class _Ascii:
                     entries = self._take(element, row, column.type, count)
                     if column.name in _CORNERS:  # other lists may be of any length
                         values.append(entries)
-        # Polygons may have different numbers of corners.
-        return {
-            name: np.array(values, dtype=object if _is_ragged(values) else None)
-            for name, values in columns.items()
-        }
+        return _columns(columns)
 
     def _take(self, element: _Element, row: int, kind: str, count: int) -> list[float]:
         words = self._words[self._at : self._at + count]
@@ -260,6 +256,14 @@ class _Ascii:
             f"{self._path}: {element.name} {row} must hold numbers of the types in the header, "
             f"got {got}"
         )
+
+
+def _columns(columns: dict[str, list[Any]]) -> Columns:
+    """Arrays of values; of lists where polygons have different numbers of corners."""
+    return {
+        name: np.array(values, dtype=object if _is_ragged(values) else None)
+        for name, values in columns.items()
+    }
 
 
 def _is_ragged(values: list[Any]) -> bool:
@@ -285,6 +289,34 @@ class _Binary:
         self._at = 0
 
     def read(self, element: _Element) -> Columns:
+        """Read rows; of different sizes only where they hold polygons."""
+        if element.name == "face" and self._triangulate:
+            return self._read_row_by_row(element)
+        return self._read_table(element)
+
+    def _read_row_by_row(self, element: _Element) -> Columns:
+        columns: dict[str, list[Any]] = {column.name: [] for column in element.properties}
+        for row in range(element.rows):
+            for column in element.properties:
+                count = 1
+                if column.count_type is not None:
+                    count = int(self._take(element, column.count_type, 1)[0])
+                    if count < 0:
+                        raise InvalidInput(f"{self._path}: face {row} has a list of length {count}")
+                    _check_polygon(self._path, element, column, row, count, self._triangulate)
+                entries = self._take(element, column.type, count)
+                if column.name in _CORNERS:
+                    columns[column.name].append(entries.tolist())
+        return _columns(columns)
+
+    def _take(self, element: _Element, kind: str, count: int) -> NDArray[Any]:
+        dtype = np.dtype(self._order + kind)
+        self._require(element, self._at + count * dtype.itemsize)
+        entries = np.frombuffer(self._body, dtype, count, self._at)
+        self._at += count * dtype.itemsize
+        return entries
+
+    def _read_table(self, element: _Element) -> Columns:
         """Read rows of equal size, which they are when each list is as long as in the first row."""
         if element.rows == 0 or not element.properties:
             return {p.name: np.empty(0) for p in element.properties}

@@ -21,7 +21,8 @@ def triangulated(path: str, vertices: FloatArray, polygons: Sequence[Sequence[in
     """Cut polygons into triangles, with ears of the shortest diagonals first.
 
     A quad is cut along its shorter diagonal, unless it has a corner that points inwards. Triangles
-    turn as their polygon, and stay in its order.
+    turn as their polygon, and stay in its order. A corner at the place of the one before gets a
+    triangle without area.
 
     Args:
         path: Opens messages.
@@ -51,6 +52,11 @@ def _ears(points: FloatArray) -> list[tuple[int, int, int]]:
     flat = _in_plane(points)
     left = list(range(len(points)))
     triangles = []
+    for corner in range(len(points)):
+        i = left.index(corner)
+        if (points[corner] == points[left[i - 1]]).all():
+            triangles.append((left[i - 1], corner, left[(i + 1) % len(left)]))
+            del left[i]
     while len(left) > 3:
         best: tuple[float, int] | None = None
         for i in range(len(left)):

@@ -13,7 +13,7 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.checks import FloatArray, check_finite, check_shape, float_array, texts
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.geometry.mesh_checks import Surface, surface_arrays
+from diffcloth_torch.geometry.mesh_checks import Surface, body_arrays
 from diffcloth_torch.model.mechanism import Mechanism
 from diffcloth_torch.model.urdf import Joint, Link, RobotDescription
 
@@ -69,15 +69,20 @@ def _joint_of_chain(mechanism: Mechanism, i: int, name: str) -> Any:
 
 
 def _joint_names(mechanism: Mechanism) -> list[str]:
-    """Name of the joint that carries each link; unique for moving joints, as files have no "/"."""
-    names = []
+    """Name of the joint that carries each link; unique for moving joints."""
+    names: list[str] = []
+    own = set(mechanism.joint_names)
     named: set[int] = set()
     for i, link in enumerate(mechanism.link_names):
         j, law = int(mechanism.dof[i]), (mechanism.multiplier[i], mechanism.constant[i])
         if j < 0:
             names.append(f"{link}_fixed")
         elif j in named or law != (1.0, 0.0):
-            names.append(f"{mechanism.joint_names[j]}/{link}")
+            name = f"{mechanism.joint_names[j]}/{link}"
+            while name in own:  # names in files may contain "/"
+                name += "/"
+            own.add(name)
+            names.append(name)
         else:
             names.append(mechanism.joint_names[j])
             named.add(j)
@@ -145,7 +150,8 @@ def link_surfaces(links: Sequence[str], given: Surfaces) -> list[Surface | None]
             surfaces.append(None)
             continue
         _check_length(owner, given[name], "(vertices, faces)", 2)
-        surfaces.append(Surface(*surface_arrays(owner, *given[name], instead=_DETACHED)))
+        surface = body_arrays(owner, *given[name], instead=_DETACHED)
+        surfaces.append(Surface(surface.vertices, surface.faces))
     return surfaces
 
 
@@ -254,9 +260,8 @@ def _check_length(label: str, given: Any, content: str, count: int) -> None:
 
 def _check_names(kind: str, names: Sequence[Any]) -> None:
     for name in names:
-        if not isinstance(name, str) or not name or "/" in name:
-            # Mimicking and fixed joints of a robot's own chain may have one.
-            raise InvalidInput(f"{_OWNER}: a {kind} must have a name without '/', got {name!r}")
+        if not isinstance(name, str) or not name:
+            raise InvalidInput(f"{_OWNER}: a {kind} must have a name, got {name!r}")
         if names.count(name) > 1:
             raise InvalidInput(
                 f"{_OWNER}: each {kind} must have a name of its own, got {name!r} twice"

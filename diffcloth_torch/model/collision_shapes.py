@@ -7,6 +7,7 @@ shape beside others becomes a link of its own, welded to the one that has it.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -18,8 +19,9 @@ from numpy.typing import NDArray
 from diffcloth_torch.checks import FloatArray, check_bool, check_finite, frozen, texts
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry import shapes
-from diffcloth_torch.geometry.mesh_checks import Surface, surface_arrays
-from diffcloth_torch.geometry.meshes import read_mesh
+from diffcloth_torch.geometry.mesh_checks import Surface, body_arrays, surface_arrays
+from diffcloth_torch.geometry.meshes import read_body_mesh
+from diffcloth_torch.model.refusals import Refusals
 from diffcloth_torch.model.round_bodies import ContactSurface, Primitive, round_surface
 from diffcloth_torch.model.urdf import Joint, Link, RobotDescription, Shape
 
@@ -111,6 +113,11 @@ def with_round_links(description: RobotDescription, smooth: object) -> RoundLink
         links.append(replace(link, shapes=others))
         for k, shape in found:
             part = _part(link.name, k, shape)
+            if part.name in names:
+                raise InvalidInput(
+                    f"{label} makes a link {part.name!r} of the round shape {k} of {link.name!r}, "
+                    "and so the file must have none of this name; rename it"
+                )
             skeletons[part.name] = _skeleton(shape)
             joints.append(_weld(link.name, part.name))
             further.append(part)
@@ -130,7 +137,7 @@ def _skeleton(shape: Shape) -> ContactSurface:
 
 
 def _part(link: str, k: int, shape: Shape) -> Link:
-    """A link for the round shape k of another one. No link of a file has a name with "/"."""
+    """A link for the round shape k of another one."""
     return Link(
         name=f"{link}/{k}",
         mass=0.0,
@@ -159,20 +166,28 @@ def _weld(parent: str, child: str) -> Joint:
 
 
 def link_surface(
-    link: Link, file: Path, mesh_root: Path, edge_length: float | None
+    link: Link,
+    file: Path,
+    mesh_root: Path | None,
+    edge_length: float | None,
+    refusals: Refusals,
 ) -> Surface | None:
     """Surface of all collision shapes of a link in its frame, or None without shapes.
 
     Args:
         link: The link.
         file: URDF file of the link.
-        mesh_root: Folder that mesh files must lie in.
+        mesh_root: As for `find_mesh`.
         edge_length: Longest edge of all shapes but meshes [m]; None lets the shape choose.
+        refusals: Gets the reasons against shapes, which are left out.
     """
-    if not link.shapes:
-        return None
     owner = f"{file}: <link name={link.name!r}> <collision>"
-    parts = [_placed(owner, shape, file, mesh_root, edge_length) for shape in link.shapes]
+    parts = []
+    for shape in link.shapes:
+        with refusals.collected():
+            parts.append(_placed(owner, shape, file, mesh_root, edge_length))
+    if not parts:
+        return None
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + start for part, start in zip(parts, starts, strict=False)]
     vertices = np.concatenate([part.vertices for part in parts])
@@ -180,23 +195,23 @@ def link_surface(
 
 
 def _placed(
-    owner: str, shape: Shape, file: Path, mesh_root: Path, edge_length: float | None
+    owner: str, shape: Shape, file: Path, mesh_root: Path | None, edge_length: float | None
 ) -> Surface:
-    if shape.kind == "mesh":
-        path = find_mesh(owner, shape.filename, file, mesh_root)
-        vertices, faces = read_mesh(path, f"{owner}: the mesh")
-        owner = str(path)
-        check_finite(f"{owner}: `vertices`", vertices)
-        scale = np.array(shape.size)
-        if not scale.all():
-            raise InvalidInput(f"{owner}: `scale` must be different from zero, got {shape.size}")
-        vertices = scale * vertices
-        if scale.prod() < 0:  # a mirror image, whose faces look inward
-            faces = faces[:, ::-1]
-    else:
+    if shape.kind != "mesh":
         vertices, faces = _generated(owner, shape, edge_length)
-    placed = _in_link(shape, vertices)
-    return Surface(*surface_arrays(owner, placed, faces, instead=_DETACHED))
+        placed = _in_link(shape, vertices)
+        return Surface(*surface_arrays(owner, placed, faces, instead=_DETACHED))
+    path = find_mesh(owner, shape.filename, file, mesh_root)
+    vertices, faces, _ = read_body_mesh(path, f"{owner}: the mesh")
+    owner = str(path)
+    check_finite(f"{owner}: `vertices`", vertices)
+    scale = np.array(shape.size)
+    if not scale.all():
+        raise InvalidInput(f"{owner}: `scale` must be different from zero, got {shape.size}")
+    if scale.prod() < 0:  # a mirror image, whose faces look inward
+        faces = faces[:, ::-1]
+    surface = body_arrays(owner, _in_link(shape, scale * vertices), faces, instead=_DETACHED)
+    return Surface(surface.vertices, surface.faces)
 
 
 def _in_link(shape: Shape, vertices: FloatArray) -> FloatArray:
@@ -249,45 +264,68 @@ def _longest_edge(vertices: FloatArray, faces: NDArray[np.int64]) -> float:
     return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max())
 
 
-def find_mesh(owner: str, filename: str, file: Path, mesh_root: Path) -> Path:
+def find_mesh(owner: str, filename: str, file: Path, mesh_root: Path | None) -> Path:
     """Path of a mesh file that a URDF file names.
 
-    "package://name/x" means x or name/x in `mesh_root`; any other path is relative to the file's
-    folder. Symbolic links are resolved before the path is checked to lie in `mesh_root`.
+    The first file of these counts. For "package://name/x" and "package:///name/x": x in a folder
+    "name" that is `mesh_root` or holds the URDF file, and name/x in `mesh_root` and in each folder
+    that holds the URDF file, the nearest one first; the package in a folder of ROS_PACKAGE_PATH, or
+    in "share" in a folder of AMENT_PREFIX_PATH; at last x in `mesh_root` and in each folder that
+    holds the URDF file. For a path: the path from the folder of the URDF file, from `mesh_root`,
+    and from each other folder that holds the URDF file.
 
     Args:
         owner: Opens the message.
         filename: As written in the file.
         file: URDF file that names it.
-        mesh_root: Folder that mesh files must lie in.
+        mesh_root: Folder that the mesh must lie in, symbolic links resolved, if it is not in a
+            folder of the environment variables; None accepts any place.
 
     Raises:
-        InvalidInput: If there is no such file in `mesh_root`.
+        InvalidInput: If there is no such file, or none where it may be.
     """
     scheme, separator, rest = filename.partition("://")
-    if not separator:
-        candidates = [file.parent / filename]
-    elif scheme == "package":
-        candidates = [mesh_root / rest.partition("/")[2], mesh_root / rest]
-    else:
+    if separator and scheme != "package":
         raise InvalidInput(
             f"{owner}: `filename` must be a path or start with package://, got {filename!r}"
         )
-    root = mesh_root.resolve()
+    folders = [*([] if mesh_root is None else [mesh_root]), *file.absolute().parents]
+    packages = _package_folders()
+    candidates = [folder / filename for folder in (file.parent, *folders)]
+    if separator:
+        name, _, inside = rest.lstrip("/").partition("/")
+        candidates = [
+            path
+            for folder in (*folders, *packages)
+            for path in (*([folder / inside] * (folder.name == name)), folder / name / inside)
+        ]
+        candidates += [folder / inside for folder in folders]
     try:
-        paths = [candidate.resolve() for candidate in candidates]
-        outside = [path for path in paths if not path.is_relative_to(root)]
-        found = [path for path in paths if path.is_file()]
+        found = [path.resolve() for path in candidates if path.is_file()]
+        roots = [folder.resolve() for folder in ([mesh_root] if mesh_root else []) + packages]
     except (OSError, RuntimeError) as error:  # names too long; links in circles
         raise InvalidInput(f"{owner}: `filename` {filename!r} cannot be found: {error}") from error
-    if outside:
-        raise InvalidInput(
-            f"{owner}: `filename` must stay inside `mesh_root`, {root}, got {filename!r}, "
-            f"which is {outside[0]}"
-        )
     if not found:
         raise InvalidInput(
-            f"{owner}: `filename` must be a file, got {filename!r}: there is no "
-            f"{' nor '.join(map(str, paths))}; `mesh_root` says where packages are"
+            f"{owner}: `filename` must be a file, got {filename!r}, which is not in {folders[0]}, "
+            "in the folders above the URDF file, or in the packages of ROS_PACKAGE_PATH and "
+            "AMENT_PREFIX_PATH; `mesh_root` says where packages are"
         )
-    return found[0]
+    if mesh_root is None:
+        return found[0]
+    for path in found:
+        if any(path.is_relative_to(root) for root in roots):
+            return path
+    raise InvalidInput(
+        f"{owner}: `filename` must stay inside `mesh_root`, {roots[0]}, got {filename!r}, "
+        f"which is {found[0]}"
+    )
+
+
+def _package_folders() -> list[Path]:
+    """Folders in which ROS finds packages, as its environment variables list them."""
+    ros, ament = (
+        [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
+        for variable in ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH")
+    )
+    return ros + [folder / "share" for folder in ament]

@@ -28,7 +28,8 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry import shapes
 from diffcloth_torch.geometry.loaded import load_mesh
 from diffcloth_torch.geometry.mass_properties import check_inertia, is_closed, mass_properties
-from diffcloth_torch.geometry.mesh_checks import surface_arrays, warn_of_cuts
+from diffcloth_torch.geometry.mesh_checks import body_arrays, warn_of_cuts
+from diffcloth_torch.geometry.meshes import read_body_mesh
 from diffcloth_torch.geometry.poses import pose_array
 from diffcloth_torch.model.cloth import plane_size
 from diffcloth_torch.model.quantities import check_parameter
@@ -124,7 +125,8 @@ class RigidBody:
         Args:
             vertices: Positions in the body frame [m], shape [v, 3].
             faces: Vertex indices of triangles, shape [g, 3]. Faces of a closed mesh must point
-                outward if it determines mass properties.
+                outward if it determines mass properties. Faces without area, and all but one of
+                those with the same vertices, are dropped with a warning.
             motion: "static", "kinematic" or "dynamic".
             pose: Initial pose [px, py, pz, qw, qx, qy, qz]; the identity by default.
             friction: Friction coefficient [-], >= 0.
@@ -148,14 +150,15 @@ class RigidBody:
                 or a dynamic body.
             TypeError: If an argument has a wrong type.
         """
-        self.vertices, self.faces = surface_arrays("RigidBody", vertices, faces, instead=_POSES)
+        surface = body_arrays("RigidBody", vertices, faces, instead=_POSES)
+        self.vertices, self.faces = surface.vertices, surface.faces
         warn_of_cuts("RigidBody", self.vertices, self.faces)
         self.motion = check_choice("RigidBody: `motion`", motion, MOTIONS)
         self.pose = frozen(pose_array("RigidBody: `pose`", pose, instead=_POSES))
         self.friction = check_parameter("RigidBody", "friction", friction)
         self.thickness = check_parameter("RigidBody", "thickness", thickness)
         given = {"density": density, "mass": mass, "center": center, "inertia": inertia}
-        self._set_mass_properties(given)
+        self._set_mass_properties(given, surface.solid)
         self.name = check_name("RigidBody: `name`", name)
         self._set_primitive(None, nodal_contact)
 
@@ -193,7 +196,7 @@ class RigidBody:
         body.smooth = is_smooth
         if is_smooth:
             given = {field: keywords.get(field) for field in _MASS_PROPERTIES}
-            body._set_mass_properties(given, round_solid(primitive))
+            body._set_mass_properties(given, body.faces, round_solid(primitive))
         if is_smooth and body.nodal_contact:
             raise InvalidInput(
                 "RigidBody: `smooth` must not be set with `nodal_contact`, which is with the "
@@ -209,7 +212,7 @@ class RigidBody:
         return round_surface(self.primitive)
 
     def _set_mass_properties(
-        self, given: Mapping[str, object], solid: MassProperties | None = None
+        self, given: Mapping[str, object], faces: IndexArray, solid: MassProperties | None = None
     ) -> None:
         """Take what is given; the rest is that of a solid, by default of the filled mesh."""
         density, mass, center, inertia = (given[field] for field in _MASS_PROPERTIES)
@@ -228,7 +231,7 @@ class RigidBody:
         # The mesh is asked only where it must be: it may be open.
         volume, middle, moments = 1.0, np.zeros(3), np.zeros((3, 3))
         if mass is None or center is None or inertia is None:
-            volume, middle, moments = self._filled_mesh() if solid is None else solid
+            volume, middle, moments = self._filled_mesh(faces) if solid is None else solid
         if mass is None:
             rho = check_number("RigidBody: `density`", density, POSITIVE, instead=_MASS)
             self.mass = rho * volume
@@ -244,14 +247,14 @@ class RigidBody:
         self.center = frozen(middle)
         self.inertia = frozen(check_inertia("RigidBody: `inertia`", moments))
 
-    def _filled_mesh(self) -> MassProperties:
+    def _filled_mesh(self, faces: IndexArray) -> MassProperties:
         """Volume, center and inertia for a density of one, of a mesh that must be closed."""
-        if not is_closed(self.faces):
+        if not is_closed(faces):
             raise InvalidInput(
                 "RigidBody: a dynamic body must have `mass`, `center` and `inertia` where its "
                 "mesh is not closed: some edge has no two faces of one orientation"
             )
-        volume, center, inertia = mass_properties(self.vertices, self.faces)
+        volume, center, inertia = mass_properties(self.vertices, faces)
         extent = float(np.ptp(self.vertices, axis=0).max())
         if not volume > _SMALLEST_VOLUME * extent**3:
             raise InvalidInput(
@@ -267,23 +270,31 @@ class RigidBody:
         path: str | Path,
         *,
         scale: float = 1.0,
-        triangulate: bool = False,
+        triangulate: bool = True,
         weld: float | None = None,
         **keywords: Any,
     ) -> RigidBody:
-        """Read an .obj, .ply or .stl file.
+        """Read an .obj, .ply, .stl, .dae, .glb or .gltf file.
 
         A mesh of more than 10 m or less than 1 mm gets a warning about `scale`.
 
         Args:
-            path: Mesh file; its coordinates are the body frame.
+            path: Mesh file; its coordinates are the body frame. Files in .dae need the extra
+                `robots`; their unit applies.
             scale: Meters per unit of the file, > 0.
-            triangulate: Whether to cut polygons into triangles instead of refusing them.
+            triangulate: Whether to cut polygons into triangles instead of refusing them. Files in
+                .dae are refused without it: their polygons are always cut.
             weld: Distance [m] up to which vertices are merged; None merges none.
             **keywords: As for `RigidBody`.
         """
         mesh = load_mesh(
-            "RigidBody.load", path, scale=scale, triangulate=triangulate, weld=weld, instead=_POSES
+            "RigidBody.load",
+            path,
+            scale=scale,
+            triangulate=triangulate,
+            weld=weld,
+            instead=_POSES,
+            read=read_body_mesh,
         )
         return cls(mesh.vertices, mesh.faces, **keywords)
 

@@ -42,9 +42,10 @@ from diffcloth_torch.model.chains import (
 from diffcloth_torch.model.collision_shapes import link_surface, with_round_links
 from diffcloth_torch.model.kinematics import link_frames, pose_frame
 from diffcloth_torch.model.mechanism import Mechanism
+from diffcloth_torch.model.refusals import Refusals
 from diffcloth_torch.model.robot_tree import JointBounds, joint_bounds, make_mechanism
 from diffcloth_torch.model.round_bodies import ContactSurface
-from diffcloth_torch.model.urdf import read_urdf
+from diffcloth_torch.model.urdf import describe_urdf
 from diffcloth_torch.saved import saved
 
 __all__ = ["ACTUATIONS", "BASES", "Robot"]
@@ -115,7 +116,7 @@ class Robot:
         base: str = "fixed",
         pose: object = None,
         joint_positions: object = None,
-        actuation: object = "pd",
+        actuation: object = None,
         stiffness: object = None,
         damping: object = None,
         effort_limits: object = None,
@@ -136,15 +137,19 @@ class Robot:
 
         Args:
             path: URDF file.
-            mesh_root: Folder that must contain all mesh files; "package://name/x" means x or name/x
-                in it. The folder of `path` by default.
+            mesh_root: Folder that must contain all mesh files which are not in the packages of
+                ROS_PACKAGE_PATH and AMENT_PREFIX_PATH; "package://name/x" means name/x or x in it.
+                By default these packages and the folders that hold the URDF file are searched, and
+                meshes may lie anywhere: give it for a file that you do not trust.
             base: "fixed", "kinematic" (the root link follows prescribed poses) or "floating".
             pose: Initial pose of the root link [px, py, pz, qw, qx, qy, qz]; the identity by
                 default.
             joint_positions: Initial joint positions [rad or m], within the limits; one value,
-                name -> value, or [J]. Zero by default.
+                name -> value, or [J]. By default each is the position within its limits that is
+                nearest to zero.
             actuation: "position" and "velocity" prescribe the motion of a joint; with "torque" and
-                "pd" the joint responds to forces. One mode, name -> mode, or J modes.
+                "pd" the joint responds to forces. One mode, name -> mode, or J modes. By default
+                "pd", but "position" for a joint whose limits leave it one position.
             stiffness: Stiffness of the drives of "pd" joints [N m/rad or N/m], >= 0; one value,
                 name -> value, or [J].
             damping: Damping of these drives [N m s/rad or N s/m], >= 0; as `stiffness`.
@@ -167,7 +172,8 @@ class Robot:
             name: Name in the scene.
 
         Raises:
-            InvalidInput: If the file or an argument is not accepted; see docs/robots.md.
+            InvalidInput: If the file or an argument is not accepted; the message has every reason
+                against the file. See docs/robots.md.
             TypeError: If an argument has a wrong type.
             OSError: If the file cannot be read.
         """
@@ -175,15 +181,24 @@ class Robot:
         check_choice("Robot.load: `base`", base, BASES)
         if edge_length is not None:
             edge_length = check_number("Robot.load: `edge_length`", edge_length, POSITIVE)
-        round_links = with_round_links(read_urdf(file), smooth)
+        root = None if mesh_root is None else as_path("Robot.load: `mesh_root`", mesh_root)
+        refusals = Refusals()
+        read = describe_urdf(file, refusals)
+        if refusals:  # no tree, but the meshes of the links that are accepted can be checked
+            for link in read.links:
+                link_surface(link, file, root, edge_length, refusals)
+            refusals.raise_any(f"{file}: ")
+        round_links = with_round_links(read, smooth)
         description = round_links.description
         names = [link.name for link in description.links]
         pairs = check_pairs("Robot: `ignore_contact`", ignore_contact, names)
         moving = [joint for joint in description.joints if joint.moves]
         modes = _modes("Robot.load", actuation, [joint.name for joint in moving])
-        mechanism = make_mechanism(file, description, base, modes)
-        root = file.parent if mesh_root is None else as_path("Robot.load: `mesh_root`", mesh_root)
-        surfaces = [link_surface(link, file, root, edge_length) for link in description.links]
+        mechanism = make_mechanism(file, description, base, modes, refusals)
+        surfaces = [
+            link_surface(link, file, root, edge_length, refusals) for link in description.links
+        ]
+        refusals.raise_any(f"{file}: ")
         return cls(
             mechanism,
             surfaces,
@@ -212,7 +227,7 @@ class Robot:
         inertials: Mapping[str, Sequence[Any]] | None = None,
         limits: Mapping[str, Sequence[float]] | None = None,
         base: str = "fixed",
-        actuation: object = "pd",
+        actuation: object = None,
         **options: Any,
     ) -> Robot:
         """Take a chain of pytorch-kinematics, and what it does not carry.
@@ -251,7 +266,10 @@ class Robot:
         check_choice(f"{label}: `base`", base, BASES)
         description = describe_chain(chain, inertials or {}, limits or {})
         moving = [joint.name for joint in description.joints if joint.moves]
-        mechanism = make_mechanism(label, description, base, _modes(label, actuation, moving))
+        refusals = Refusals()
+        modes = _modes(label, actuation, moving)
+        mechanism = make_mechanism(label, description, base, modes, refusals)
+        refusals.raise_any(f"{label}: ")
         links = [link.name for link in description.links]
         bounds = joint_bounds(description.joints)
         viscosity = np.zeros(len(moving))
@@ -283,7 +301,8 @@ class Robot:
         self.viscosity = frozen(viscosity)
         self.pose = frozen(pose_array("Robot: `pose`", pose, instead=_POSE))
         joints, links = self.joint_names, self.link_names
-        self.joint_positions = _named("joint_positions", joint_positions, joints, 0.0)
+        nearest = np.clip(0.0, mechanism.lower, mechanism.upper)
+        self.joint_positions = _named("joint_positions", joint_positions, joints, nearest)
         _check_limits(mechanism, self.joint_positions)
         driven = np.array([mode == "pd" for mode in mechanism.actuation], dtype=bool)
         self.stiffness = frozen(driven * _named("stiffness", stiffness, joints, 0.0, NON_NEGATIVE))
@@ -396,13 +415,17 @@ class Robot:
 
 
 def _named(
-    field: str, given: object, names: Sequence[str], default: float, accepted: Range = ANY_NUMBER
+    field: str,
+    given: object,
+    names: Sequence[str],
+    default: float | FloatArray,
+    accepted: Range = ANY_NUMBER,
 ) -> FloatArray:
     """One value for each name, from one for all, from name -> value, or from an array of them."""
     label = f"Robot: `{field}`"
     instead = f"differentiate with respect to {_DIFFERENTIABLE[field]}"
     if isinstance(given, Mapping):
-        values = np.full(len(names), default)
+        values = np.array(np.broadcast_to(default, len(names)))
         _check_known(field, given, names)
         for key, value in given.items():
             number = float_array(f"{label}[{key!r}]", value, instead=instead)
@@ -445,16 +468,20 @@ def _check_known(field: str, given: Iterable[object], names: Sequence[str]) -> N
             raise InvalidInput(f"Robot: `{field}` has the names {texts(names)}; got {key!r}")
 
 
-def _modes(owner: str, given: object, names: Sequence[str]) -> list[str]:
-    """Actuation of each joint, from one for all, from name -> mode, or from a list of them."""
+def _modes(owner: str, given: object, names: Sequence[str]) -> list[str | None]:
+    """Actuation of each joint, from one for all, from name -> mode, or from a list of them.
+
+    None lets the limits of a joint choose.
+    """
     label = f"{owner}: `actuation`"
-    if isinstance(given, str):
-        modes: list[object] = [given] * len(names)
+    modes: list[object]
+    if given is None or isinstance(given, str):
+        modes = [given] * len(names)
     elif isinstance(given, Mapping):
         unknown = [key for key in given if key not in names]
         if unknown:
             raise InvalidInput(f"{label} has the names {texts(names)}; got {unknown[0]!r}")
-        modes = [given.get(name, "pd") for name in names]
+        modes = [given.get(name) for name in names]
     elif isinstance(given, Sequence):
         check_shape(label, [len(given)], [(len(names),)])
         modes = list(given)
@@ -463,7 +490,7 @@ def _modes(owner: str, given: object, names: Sequence[str]) -> list[str]:
             f"{label} must be a word, a dict or a list of words, got {type(given).__name__}"
         )
     return [
-        check_choice(f"{label} of {name!r}", mode, ACTUATIONS)
+        None if mode is None else check_choice(f"{label} of {name!r}", mode, ACTUATIONS)
         for name, mode in zip(names, modes, strict=True)
     ]
 

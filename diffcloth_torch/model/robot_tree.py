@@ -12,13 +12,18 @@ from diffcloth_torch.checks import FloatArray, IndexArray
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.geometry.mass_properties import check_inertia
 from diffcloth_torch.model.mechanism import FORCED, Mechanism
+from diffcloth_torch.model.refusals import Refusals
 from diffcloth_torch.model.urdf import Joint, RobotDescription
 
-__all__ = ["JointBounds", "joint_bounds", "make_mechanism"]
+__all__ = ["JointBounds", "joint_bounds", "make_mechanism", "moves_by_forces"]
 
 
 def make_mechanism(
-    file: Path | str, description: RobotDescription, base: str, actuation: Sequence[str]
+    file: Path | str,
+    description: RobotDescription,
+    base: str,
+    actuation: Sequence[str | None],
+    refusals: Refusals,
 ) -> Mechanism:
     """Make the mechanism of a robot.
 
@@ -26,11 +31,10 @@ def make_mechanism(
         file: File of the robot, or the function that made it; opens messages.
         description: Contents of the file.
         base: "fixed", "kinematic" or "floating".
-        actuation: Actuation of the joints that move and do not mimic, in their order.
-
-    Raises:
-        InvalidInput: If limits leave a joint no position, or a part that is moved by forces has no
-            mass or an inertia that no body can have.
+        actuation: Actuation of the joints that move and do not mimic, in their order. None is "pd"
+            where the limits leave the joint a range, and "position" elsewhere.
+        refusals: Gets a reason where limits leave a joint no position, or where a part that is
+            moved by forces has no mass or an inertia that no body can have.
     """
     links, joints = description.links, description.joints
     carrier = {joint.child: joint for joint in joints}
@@ -44,7 +48,8 @@ def make_mechanism(
         parent.append(-1 if joint is None else index[joint.parent])
         moves = joint is not None and joint.type != "fixed"
         followed.append(_follow(joint, by_name, dof) if joint and moves else (-1, 1.0, 0.0))
-    lower, upper = _limits(file, joints, by_name, dof, actuation)
+    lower, upper = _limits(file, joints, by_name, dof, refusals)
+    modes = _modes(file, list(dof), lower, upper, actuation, refusals)
     mechanism = Mechanism(
         name=description.name,
         base=base,
@@ -59,12 +64,12 @@ def make_mechanism(
         joint_names=tuple(joint.name for joint in leaders),
         lower=lower,
         upper=upper,
-        actuation=tuple(actuation),
+        actuation=modes,
         mass=_stack([link.mass for link in links]),
         center=_stack([link.center for link in links]),
         inertia=_stack([(link.inertia + link.inertia.T) / 2 for link in links]),
     )
-    _check_masses(file, mechanism)
+    _check_masses(file, mechanism, refusals)
     return mechanism
 
 
@@ -98,7 +103,7 @@ def _limits(
     joints: Sequence[Joint],
     by_name: Mapping[str, Joint],
     dof: Mapping[str, int],
-    actuation: Sequence[str],
+    refusals: Refusals,
 ) -> tuple[FloatArray, FloatArray]:
     """Limits of the joints, narrowed by those of the joints that mimic them."""
     lower, upper = np.full(len(dof), -np.inf), np.full(len(dof), np.inf)
@@ -108,27 +113,46 @@ def _limits(
         j, multiplier, constant = _follow(joint, by_name, dof)
         limits = np.array([joint.lower, joint.upper])
         if multiplier == 0.0:
-            if not limits[0] <= constant <= limits[1]:
-                raise InvalidInput(
-                    f"{file}: <joint name={joint.name!r}> <mimic>: `offset` must be between its "
-                    f"limits {limits[0]:g} and {limits[1]:g}, got {constant:g}"
-                )
+            with refusals.collected():
+                if not limits[0] <= constant <= limits[1]:
+                    raise InvalidInput(
+                        f"{file}: <joint name={joint.name!r}> <mimic>: `offset` must be between "
+                        f"its limits {limits[0]:g} and {limits[1]:g}, got {constant:g}"
+                    )
             continue
         ends = np.sort((limits - constant) / multiplier)
         lower[j], upper[j] = max(lower[j], ends[0]), min(upper[j], ends[1])
     for name, j in dof.items():
-        where = f"{file}: <joint name={name!r}>"
-        if lower[j] > upper[j]:
-            raise InvalidInput(
-                f"{where}: its limits and those of the joints that mimic it must leave it a "
-                f"position, got none from {lower[j]:g} to {upper[j]:g}"
-            )
-        if lower[j] == upper[j] and actuation[j] in FORCED:
-            raise InvalidInput(
-                f"{where}: limits of a joint under {actuation[j]!r} must leave it a range, got "
-                f"{lower[j]:g} for both; make its type 'fixed', or prescribe its position"
-            )
+        with refusals.collected():
+            if lower[j] > upper[j]:
+                raise InvalidInput(
+                    f"{file}: <joint name={name!r}>: its limits and those of the joints that mimic "
+                    f"it must leave it a position, got none from {lower[j]:g} to {upper[j]:g}"
+                )
     return lower, upper
+
+
+def _modes(
+    file: Path | str,
+    names: Sequence[str],
+    lower: FloatArray,
+    upper: FloatArray,
+    actuation: Sequence[str | None],
+    refusals: Refusals,
+) -> tuple[str, ...]:
+    """Actuation of the joints, chosen where none is given."""
+    modes = []
+    for j, (name, mode) in enumerate(zip(names, actuation, strict=True)):
+        has_one_position = lower[j] == upper[j]
+        with refusals.collected():
+            if has_one_position and mode in FORCED:
+                raise InvalidInput(
+                    f"{file}: <joint name={name!r}>: limits of a joint under {mode!r} must leave "
+                    f"it a range, got {lower[j]:g} for both; make its type 'fixed', or prescribe "
+                    "its position"
+                )
+        modes.append(mode or ("position" if has_one_position else "pd"))
+    return tuple(modes)
 
 
 class JointBounds(NamedTuple):
@@ -172,26 +196,45 @@ def joint_bounds(joints: Sequence[Joint]) -> JointBounds:
     return JointBounds(efforts, velocities, friction)
 
 
-def _check_masses(file: Path | str, mechanism: Mechanism) -> None:
-    """Require a mass and an inertia of all links that are moved by forces.
+def _check_masses(file: Path | str, mechanism: Mechanism, refusals: Refusals) -> None:
+    """Require a mass and an inertia of all that is moved by forces.
 
-    Links connected by fixed joints are one body, so some of them may have no mass.
+    Links connected by fixed joints are one body, so some of them may have no mass, or be a point.
     """
     group = mechanism.rigid_group
-    for link in mechanism.order:
-        if not _moves_by_forces(mechanism, link):
+    for first in mechanism.order:
+        if group[first] != first or not moves_by_forces(mechanism, first):
             continue
-        where = f"{file}: <link name={mechanism.link_names[link]!r}> <inertial>"
-        if mechanism.mass[group == group[link]].sum() == 0.0:
-            raise InvalidInput(
-                f"{where}: `mass` must be > 0 for a link that moves by forces, or for one that a "
-                "fixed joint joins to it, got 0"
-            )
-        if mechanism.mass[link] > 0.0:
-            check_inertia(f"{where}: `inertia`", mechanism.inertia[link])
+        where = f"{file}: <link name={mechanism.link_names[first]!r}> <inertial>"
+        members = np.flatnonzero(group == first).tolist()
+        joined = " of the links that fixed joints join to it" if len(members) > 1 else ""
+        with refusals.collected():
+            if mechanism.mass[members].sum() == 0.0:
+                raise InvalidInput(
+                    f"{where}: `mass` must be > 0 for a link that moves by forces, or for one that "
+                    "a fixed joint joins to it, got 0"
+                )
+            check_inertia(f"{where}: `inertia`{joined}", _joint_inertia(mechanism, first, members))
 
 
-def _moves_by_forces(mechanism: Mechanism, link: int) -> bool:
+def _joint_inertia(mechanism: Mechanism, first: int, members: Sequence[int]) -> FloatArray:
+    """Inertia [3, 3] of links that fixed joints connect to the first: about their common center."""
+    frames = {first: np.eye(4)}
+    for link in mechanism.order:
+        if link in members and link not in frames:
+            frames[link] = frames[int(mechanism.parent[link])] @ mechanism.offset[link]
+    mass = mechanism.mass[members]
+    rotations = np.array([frames[link][:3, :3] for link in members])
+    offsets = np.array([frames[link][:3, 3] for link in members])
+    centers = np.einsum("lij,lj->li", rotations, mechanism.center[members]) + offsets
+    arms = centers - mass @ centers / mass.sum()
+    inertia = rotations @ mechanism.inertia[members] @ rotations.transpose(0, 2, 1)
+    spread = np.einsum("l,li,lj->ij", mass, arms, arms)
+    about: FloatArray = inertia.sum(axis=0) + np.trace(spread) * np.eye(3) - spread
+    return about
+
+
+def moves_by_forces(mechanism: Mechanism, link: int) -> bool:
     """Whether there is a floating base, or a torque or pd joint, between the world and a link."""
     while mechanism.parent[link] >= 0:
         j = mechanism.dof[link]

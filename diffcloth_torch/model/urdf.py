@@ -7,25 +7,29 @@ their defaults. The description is made from these alone, and must be a tree of 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree.ElementTree import Element, ParseError
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.sax import ContentHandler, SAXParseException
+from xml.sax.xmlreader import AttributesImpl
 
-import defusedxml.ElementTree
+import defusedxml.sax
 import numpy as np
 
 from diffcloth_torch.checks import FloatArray, texts
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import read_regular_file
+from diffcloth_torch.model.refusals import Refusals
 from diffcloth_torch.model.urdf_document import reduced
 
-__all__ = ["Joint", "Link", "RobotDescription", "Shape", "read_urdf"]
+__all__ = ["Joint", "Link", "RobotDescription", "Shape", "describe_urdf", "read_urdf"]
 
 # Robots with a thousand links have files of a few MB.
 _LARGEST_FILE = 16 * 2**20  # bytes
 
-_NAMED = ("link", "joint")
+_COUNTS = {2: "two", 3: "three"}
 
 # An axis shorter than this is taken for zero.
 _SHORTEST_AXIS = 1e-9
@@ -128,45 +132,85 @@ def read_urdf(path: Path) -> RobotDescription:
 
     Raises:
         InvalidInput: If the file is not safe or well-formed XML, an element or value is not
-            accepted, or its links do not form a tree. The message names the file and the element.
+            accepted, or its links do not form a tree. The message has every reason, with the file
+            and the element.
         OSError: If the file cannot be read.
     """
-    data = read_regular_file(path, _LARGEST_FILE)
+    refusals = Refusals()
+    description = describe_urdf(path, refusals)
+    refusals.raise_any(f"{path}: ")
+    return description
+
+
+def describe_urdf(path: Path, refusals: Refusals) -> RobotDescription:
+    """Describe the parts of a URDF file that are accepted.
+
+    Args:
+        path: The file.
+        refusals: Gets the reasons against the others. The links make a tree if it gets none.
+
+    Raises:
+        InvalidInput: If the file is not safe or well-formed XML, or describes no robot.
+        OSError: If the file cannot be read.
+    """
+    document = _parsed(path, read_regular_file(path, _LARGEST_FILE))
+    if document.tag != "robot":
+        raise InvalidInput(f"{path}: the root element must be <robot>, got <{document.tag}>")
+    if document.find("link") is None:
+        raise InvalidInput(f"{path}: a robot must have a <link>, got none")
+    robot = reduced(f"{path}: ", document, refusals)
+    file = str(path)
+    links = tuple(_link(link) for link in robot.iter("link"))
+    joints: list[Joint] = []
+    for joint in robot.iter("joint"):
+        with refusals.collected():
+            joints.append(_joint(file, joint))
+    for kind, named in (("link", links), ("joint", joints)):
+        _check_names(file, kind, [part.name for part in named], refusals)
+    if not refusals:
+        _check_tree(file, [link.name for link in links], joints, refusals)
+        _check_mimics(file, joints, refusals)
+    return RobotDescription(robot.get("name", ""), links, tuple(joints))
+
+
+class _Builder(ContentHandler):
+    """Builds a tree of elements; as in urdfdom, a prefix is a part of a name and needs no URI."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tree = TreeBuilder()
+
+    def startElement(self, name: str, attributes: AttributesImpl) -> None:
+        self.tree.start(name, dict(attributes))
+
+    def endElement(self, name: str) -> None:
+        self.tree.end(name)
+
+
+def _parsed(path: Path, data: bytes) -> Element:
+    builder = _Builder()
     try:
-        document = defusedxml.ElementTree.fromstring(data, forbid_dtd=True)
+        defusedxml.sax.parseString(data, builder, forbid_dtd=True)
     except defusedxml.DefusedXmlException as error:
         raise InvalidInput(
             f"{path}: a URDF file must have no DOCTYPE and no entities of its own: {error}"
         ) from error
-    except (ParseError, ValueError, LookupError) as error:  # the latter: encodings
+    except SAXParseException as error:
+        place = f"line {error.getLineNumber()}, column {error.getColumnNumber()}"
+        raise InvalidInput(f"{path}: not well-formed XML: {error.getMessage()}: {place}") from error
+    except (ValueError, LookupError) as error:  # encodings
         raise InvalidInput(f"{path}: not well-formed XML: {error}") from error
-    if document.tag != "robot":
-        raise InvalidInput(f"{path}: the root element must be <robot>, got <{document.tag}>")
-    robot = reduced(f"{path}: ", document)
-    file = str(path)
-    names = {kind: [found.attrib["name"] for found in robot.iter(kind)] for kind in _NAMED}
-    if not names["link"]:
-        raise InvalidInput(f"{file}: a robot must have a <link>, got none")
-    for kind in _NAMED:
-        _check_names(file, kind, names[kind])
-    links = tuple(_link(link) for link in robot.iter("link"))
-    joints = tuple(_joint(file, joint) for joint in robot.iter("joint"))
-    _check_tree(file, names["link"], joints)
-    _check_mimics(file, joints)
-    return RobotDescription(robot.attrib["name"], links, joints)
+    return builder.tree.close()
 
 
-def _check_names(file: str, kind: str, names: Sequence[str]) -> None:
-    seen = set()
-    for name in names:
-        if "/" in name:
-            raise InvalidInput(
-                f"{file}: a <{kind}> must have a name without '/', which stands between a robot "
-                f"and its {kind}s, got {name!r}"
-            )
-        if name in seen:
-            raise InvalidInput(f"{file}: two <{kind}> have the name {name!r}; it must be one")
-        seen.add(name)
+def _check_names(file: str, kind: str, names: Sequence[str], refusals: Refusals) -> None:
+    for name, count in Counter(names).items():
+        if count > 1:
+            with refusals.collected():
+                raise InvalidInput(
+                    f"{file}: {_COUNTS.get(count, count)} <{kind}> have the name {name!r}; "
+                    "it must be one"
+                )
 
 
 def _numbers(element: Element, attribute: str) -> FloatArray:
@@ -237,7 +281,8 @@ def _joint(file: str, joint: Element) -> Joint:
             f"got {length:g}"
         )
     lower, upper = -math.inf, math.inf
-    if kind not in ("fixed", "continuous"):
+    needs_limit = kind not in ("fixed", "continuous")
+    if needs_limit and not (limit is None and mimic is not None):
         if limit is None:
             raise InvalidInput(
                 f"{where} of type {kind!r} must have a <limit>; a joint that turns without "
@@ -248,10 +293,8 @@ def _joint(file: str, joint: Element) -> Joint:
             raise InvalidInput(
                 f"{where} <limit>: `lower` must not be above `upper`, got {lower:g} and {upper:g}"
             )
-    if mimic is not None and kind == "fixed":
-        raise InvalidInput(f"{where} of type 'fixed' must have no <mimic>: it does not move")
     follows = None
-    if mimic is not None:
+    if mimic is not None and kind != "fixed":
         follows = mimic.attrib["joint"], _number(mimic, "multiplier"), _number(mimic, "offset")
     parent, child = (joint.find(tag) for tag in ("parent", "child"))
     assert parent is not None  # the document has both
@@ -274,25 +317,38 @@ def _joint(file: str, joint: Element) -> Joint:
     )
 
 
-def _check_tree(file: str, links: Sequence[str], joints: Sequence[Joint]) -> None:
+def _check_tree(
+    file: str, links: Sequence[str], joints: Sequence[Joint], refusals: Refusals
+) -> None:
     """Require that the joints connect all links to one tree."""
+    before = len(refusals)
     holder: dict[str, str] = {}  # link -> the joint that carries it
     children: dict[str, list[str]] = {link: [] for link in links}
     for joint in joints:
-        for end, link in (("parent", joint.parent), ("child", joint.child)):
-            if link not in children:
+        with refusals.collected():
+            for end, link in (("parent", joint.parent), ("child", joint.child)):
+                if link not in children:
+                    raise InvalidInput(
+                        f"{file}: <joint name={joint.name!r}>: its {end} must be a <link> of the "
+                        f"file, got {link!r}"
+                    )
+            if joint.child in holder:
                 raise InvalidInput(
-                    f"{file}: <joint name={joint.name!r}>: its {end} must be a <link> of the file, "
-                    f"got {link!r}"
+                    f"{file}: <link name={joint.child!r}> must be the child of one joint, "
+                    f"got {holder[joint.child]!r} and {joint.name!r}"
                 )
-        if joint.child in holder:
-            raise InvalidInput(
-                f"{file}: <link name={joint.child!r}> must be the child of one joint, "
-                f"got {holder[joint.child]!r} and {joint.name!r}"
-            )
-        holder[joint.child] = joint.name
-        children[joint.parent].append(joint.child)
-    reached = [link for link in links if link not in holder]
+            holder[joint.child] = joint.name
+            children[joint.parent].append(joint.child)
+    if len(refusals) == before:
+        with refusals.collected():
+            _check_connected(file, links, children)
+
+
+def _check_connected(
+    file: str, links: Sequence[str], children: Mapping[str, Sequence[str]]
+) -> None:
+    carried = {child for of_link in children.values() for child in of_link}
+    reached = [link for link in links if link not in carried]
     if len(reached) > 1:
         raise InvalidInput(
             f"{file}: one <link> must be no child of a joint, the root; got {texts(reached)}"
@@ -307,22 +363,26 @@ def _check_tree(file: str, links: Sequence[str], joints: Sequence[Joint]) -> Non
         )
 
 
-def _check_mimics(file: str, joints: Sequence[Joint]) -> None:
+def _check_mimics(file: str, joints: Sequence[Joint], refusals: Refusals) -> None:
     """Require that every chain of mimicking joints ends at a joint that moves on its own."""
     by_name = {joint.name: joint for joint in joints}
     for joint in joints:
-        where = f"{file}: <joint name={joint.name!r}> <mimic>"
-        leader, followed = joint, {joint.name}
-        while leader.mimic is not None:
-            name = leader.mimic[0]
-            if name not in by_name or by_name[name].type == "fixed":
-                raise InvalidInput(
-                    f"{where}: `joint` must lead to a joint of the file that moves, got {name!r}"
-                )
-            if name in followed:
-                raise InvalidInput(
-                    f"{where}: `joint` must lead to a joint that does not mimic, got a cycle "
-                    f"through {name!r}"
-                )
-            followed.add(name)
-            leader = by_name[name]
+        with refusals.collected():
+            _check_mimic(f"{file}: <joint name={joint.name!r}> <mimic>", joint, by_name)
+
+
+def _check_mimic(where: str, joint: Joint, by_name: Mapping[str, Joint]) -> None:
+    leader, followed = joint, {joint.name}
+    while leader.mimic is not None:
+        name = leader.mimic[0]
+        if name not in by_name or by_name[name].type == "fixed":
+            raise InvalidInput(
+                f"{where}: `joint` must lead to a joint of the file that moves, got {name!r}"
+            )
+        if name in followed:
+            raise InvalidInput(
+                f"{where}: `joint` must lead to a joint that does not mimic, got a cycle "
+                f"through {name!r}"
+            )
+        followed.add(name)
+        leader = by_name[name]

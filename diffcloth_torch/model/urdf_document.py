@@ -10,6 +10,7 @@ import numpy as np
 
 from diffcloth_torch.checks import ANY_NUMBER, LARGEST, NON_NEGATIVE, Range, check_choice
 from diffcloth_torch.errors import InvalidInput
+from diffcloth_torch.model.refusals import Refusals
 
 __all__ = ["JOINT_TYPES", "SHAPES", "reduced"]
 
@@ -119,26 +120,48 @@ _ROBOT = _Element(
 
 
 def reduced(
-    file: str, node: Element, grammar: _Element = _ROBOT, above: Sequence[str] = ()
+    file: str,
+    node: Element,
+    refusals: Refusals,
+    grammar: _Element = _ROBOT,
+    above: Sequence[str] = (),
 ) -> Element:
-    """Copy and check what the grammar knows of an element; the rest is ignored."""
+    """Copy and check what the grammar knows of an element; the rest is ignored.
+
+    Args:
+        file: Opens messages.
+        node: The element.
+        refusals: Gets every reason against the element and what it holds.
+        grammar: Its grammar.
+        above: The elements that hold it.
+
+    Returns:
+        The copy, without those children that are not accepted.
+    """
     name = node.get("name")
     here = (*above, f"<{node.tag}>" if name is None else f"<{node.tag} name={name!r}>")
     where = file + " ".join(here[1:] or here)  # <robot> goes without saying
     copy = Element(node.tag)
     for key, attribute in grammar.attributes.items():
-        copy.set(key, _checked(f"{where}: `{key}`", node.get(key, attribute.default), attribute))
+        with refusals.collected():
+            text = node.get(key, attribute.default)
+            copy.set(key, _checked(f"{where}: `{key}`", text, attribute))
     found = [child for child in node if child.tag in grammar.children]
     for tag, rule in grammar.children.items():
         count = sum(child.tag == tag for child in found)
         if (count == 0 and rule.required) or (count > 1 and not rule.many):
-            raise InvalidInput(f"{where} must have one <{tag}>, got {count}")
+            with refusals.collected():
+                raise InvalidInput(f"{where} must have one <{tag}>, got {count}")
     for child in found:
-        copy.append(reduced(file, child, grammar.children[child.tag].element, here))
-    if grammar is _GEOMETRY and len(copy) != 1:
+        before = len(refusals)
+        part = reduced(file, child, refusals, grammar.children[child.tag].element, here)
+        if len(refusals) == before:
+            copy.append(part)
+    if grammar is _GEOMETRY and len(found) != 1:
         got = ", ".join(f"<{child.tag}>" for child in node) or "none"
         accepted = ", ".join(f"<{kind}>" for kind in SHAPES)
-        raise InvalidInput(f"{where} must hold one of {accepted}, got {got}")
+        with refusals.collected():
+            raise InvalidInput(f"{where} must hold one of {accepted}, got {got}")
     return copy
 
 

@@ -1,6 +1,7 @@
 """Mesh files, mesh checks and simple shapes: nothing is reordered, dropped or repaired."""
 
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 from public_data import public
 
 import diffcloth_torch as dc
-from diffcloth_torch.geometry.meshes import read_mesh, write_mesh
+from diffcloth_torch.geometry.meshes import read_body_mesh, read_mesh, write_mesh
 
 VERTICES = np.array([[0.1, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 1 / 3], [7, 8, 9]])
 FACES = np.array([[0, 1, 2], [2, 1, 3]])
@@ -271,6 +272,164 @@ def test_bodies_may_have_unreferenced_vertices_but_no_flat_faces():
     assert len(dc.RigidBody(VERTICES, FACES).vertices) == len(VERTICES)
     with pytest.raises(dc.InvalidInput, match="without area"):
         dc.RigidBody(np.zeros((3, 3)), [[0, 1, 2]])
+
+
+def test_useless_faces_of_a_body_are_dropped_with_a_warning():
+    """The rest is the body: its solid is closed by the faces that are dropped."""
+    box = dc.RigidBody.box(1.0)
+    # Face 0 becomes two, one of them on an edge, where a vertex more is.
+    a, b, c = box.faces[0].tolist()
+    middle = len(box.vertices)
+    vertices = np.concatenate([box.vertices, box.vertices[[a, b]].mean(axis=0)[None]])
+    split = [[a, middle, c], [middle, b, c]]
+    for extra, dropped in (
+        ([[a, b, middle]], "1 without area, 0 with"),
+        ([[a, b, middle], [2, 2, 3]], "2 without area, 0 with"),
+        ([[a, b, middle], [4, 1, 2], [2, 1, 4]], "1 without area, 1 with"),
+    ):
+        faces = [*split, *box.faces[1:].tolist(), *extra]
+        with pytest.warns(UserWarning, match=f"RigidBody: dropped . of .. faces: {dropped}"):
+            body = dc.RigidBody(vertices, faces, motion="dynamic", density=2.0)
+        assert body.mass == pytest.approx(2.0)
+    twice = np.concatenate([box.faces, box.faces[:3]])
+    with pytest.warns(UserWarning, match="dropped 3 of 15 faces: 0 without area, 3 with"):
+        body = dc.RigidBody(box.vertices, twice, motion="dynamic", density=2.0)
+    assert body.mass == pytest.approx(2.0)
+    np.testing.assert_array_equal(body.faces, box.faces)
+
+
+@pytest.mark.parametrize("suffix", [".obj", ".ply", ".binary.ply"])
+def test_polygons_of_bodies_are_cut(tmp_path, suffix):
+    """A quad, a triangle, a dart that is cut at its reflex corner, and a pentagon."""
+    points = [(0, 0), (1, 0), (1, 1), (0, 1), (4, 0), (5, 2), (4, 1), (3, 2), (2, 0.5)]
+    polygons = [[0, 1, 2, 3], [0, 2, 3], [5, 6, 7, 4], [0, 1, 8, 2, 3]]
+    vertices = np.array([(x, y, 0.0) for x, y in points])
+    path = tmp_path / f"a{suffix}"
+    header = "ply\nformat {} 1.0\nelement vertex 9\nproperty double x\nproperty double y\n"
+    header += "property double z\nelement face 4\nproperty list uchar int vertex_indices\n"
+    header += "property uchar red\nend_header\n"
+    if suffix == ".obj":
+        lines = [f"v {x} {y} {z}" for x, y, z in vertices]
+        lines += [" ".join(["f", *(str(i + 1) for i in polygon)]) for polygon in polygons]
+        path.write_text("\n".join(lines))
+    elif suffix == ".ply":
+        rows = [" ".join(map(str, row)) for row in vertices]
+        rows += [" ".join(map(str, [len(row), *row, 7])) for row in polygons]
+        path.write_text(header.format("ascii") + "\n".join(rows) + "\n")
+    else:
+        body = vertices.tobytes()
+        for row in polygons:
+            body += struct.pack(f"<B{len(row)}iB", len(row), *row, 7)
+        path.write_bytes(header.format("binary_little_endian").encode() + body)
+    with pytest.raises(dc.InvalidInput, match="must be a triangle, got 4 corners"):
+        read_mesh(path)
+    with pytest.raises(dc.InvalidInput, match="must be a triangle, got 4 corners"):
+        dc.RigidBody.load(path, triangulate=False)
+    found, faces, _ = read_body_mesh(path, "path")
+    np.testing.assert_array_equal(found, vertices)
+    assert faces.tolist() == [
+        *([3, 0, 1], [1, 2, 3], [0, 2, 3]),
+        *([4, 5, 6], [6, 7, 4]),
+        *([1, 8, 2], [3, 0, 1], [1, 2, 3]),
+    ]
+
+
+def test_a_polygon_whose_corners_see_few_others_is_cut(tmp_path):
+    path = tmp_path / "comb.obj"
+    x = [0, 6, 6, 5, 5, 4, 4, 3, 3, 2, 2, 1, 1, 0]
+    y = [0, 0, 3, 3, 1, 1, 3, 3, 1, 1, 3, 3, 1, 1]
+    lines = [f"v {a} {b} 0" for a, b in zip(x, y, strict=True)]
+    path.write_text("\n".join([*lines, "f " + " ".join(map(str, range(1, 15)))]))
+    body = dc.RigidBody.load(path)
+    assert len(body.faces) == 12
+    a, b, c = (body.vertices[body.faces[:, k]] for k in range(3))
+    areas = np.cross(b - a, c - a)[:, 2] / 2
+    assert (areas > 0).all()
+    assert areas.sum() == pytest.approx(6 + 3 * 2)
+
+
+def test_a_polygon_that_crosses_itself_is_refused(tmp_path):
+    path = tmp_path / "bow.obj"
+    path.write_text("v 0 0 0\nv 2 2 0\nv 2 0 0\nv 0 1 0\nf 1 2 3 4\n")
+    with pytest.raises(dc.InvalidInput, match=r"bow\.obj: face 0 must not cross itself"):
+        dc.RigidBody.load(path)
+
+
+def test_nodes_of_a_gltf_file_are_placed(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    scene = trimesh.Scene()
+    corner = trimesh.Trimesh(np.eye(3), [[0, 1, 2]], process=False)
+    frame = np.eye(4)
+    frame[:3, 3] = [1, 2, 3]
+    scene.add_geometry(corner)
+    scene.add_geometry(corner, transform=frame)
+    scene.export(tmp_path / "two.glb")
+    vertices, faces, _ = read_body_mesh(tmp_path / "two.glb", "path")
+    expected = np.concatenate([np.eye(3), np.eye(3) + np.array([1, 2, 3])])
+    found = {tuple(point) for point in vertices[faces].reshape(-1, 3)}
+    assert found == {tuple(point) for point in expected}
+
+
+COLLADA = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="{unit}"/><up_axis>Y_UP</up_axis></asset>
+<library_effects><effect id="e"><profile_COMMON><newparam sid="s"><sampler2D><source>none</source>
+</sampler2D></newparam></profile_COMMON></effect></library_effects>
+<library_geometries><geometry id="g"><mesh><source id="p"><float_array id="a" count="12">
+0 0 0 1 0 0 1 1 0 0 1 0</float_array><technique_common><accessor source="#a" count="4" stride="3">
+<param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/>
+</accessor></technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/>
+</vertices><polylist count="1"><input semantic="VERTEX" source="#{source}" offset="0"/>
+<vcount>4</vcount><p>0 1 2 3</p></polylist></mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="s"><node><scale>2 1 1</scale>
+<instance_geometry url="#g"/><instance_camera url="#none"/></node></visual_scene>
+</library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
+def test_the_unit_of_a_collada_file_applies_and_its_up_axis_does_not(tmp_path):
+    """Faults of what is beside the meshes do not matter: a texture and a camera are missing."""
+    pytest.importorskip("collada")
+    path = tmp_path / "a.dae"
+    for unit in (1.0, 0.001):
+        path.write_text(COLLADA.format(unit=unit, source="v"))
+        vertices, faces, _ = read_body_mesh(path, "path")
+        assert faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+        expected = unit * np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
+        np.testing.assert_allclose(vertices, expected, rtol=1e-15)
+    with pytest.raises(dc.InvalidInput, match=r"a\.dae: .* always cut .* pass triangulate=True"):
+        dc.RigidBody.load(path, triangulate=False)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "not well-formed XML: no element found"),
+        ("<COLLADA/>", "not a readable COLLADA file"),
+        (COLLADA.format(unit=1, source="none"), "not a readable COLLADA file"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><COLLADA/>', "no DOCTYPE and no entities"),
+    ],
+)
+def test_a_bad_collada_file_is_refused(tmp_path, content, message):
+    pytest.importorskip("collada")
+    path = tmp_path / "a.dae"
+    path.write_text(content)
+    with pytest.raises(dc.InvalidInput, match=f"a.dae: .*{message}"):
+        dc.RigidBody.load(path)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf"])
+def test_bytes_that_are_no_gltf_are_refused(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    for content in (b"", b"{}", b"glTF" + bytes(range(60)), bytes(range(256)) * 2):
+        path.write_bytes(content)
+        with pytest.raises(dc.InvalidInput, match=r"not a readable glTF|the mesh is empty"):
+            dc.RigidBody.load(path)
+
+
+def test_the_extra_is_named_where_pycollada_is_missing(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "collada", None)
+    (tmp_path / "a.dae").write_text("<COLLADA/>")
+    with pytest.raises(dc.InvalidInput, match=r"diffcloth-torch\[robots\]', or save the mesh as"):
+        dc.RigidBody.load(tmp_path / "a.dae")
 
 
 @pytest.mark.parametrize(

@@ -147,33 +147,81 @@ def test_corners_of_stl_files_are_merged(tmp_path):
     assert is_manifold(faces)
 
 
+@pytest.mark.parametrize("scheme", ["package://", "package:///"])
 @pytest.mark.parametrize(
-    "filename",
-    ["package://parts/meshes/part.obj", "package://other/meshes/part.obj", "meshes/part.obj"],
+    ("name", "folder", "mesh_root"),
+    [
+        pytest.param("parts/meshes/", "root/parts/meshes", "root", id="in the root"),
+        pytest.param("root/meshes/", "root/meshes", "root", id="the root itself"),
+        pytest.param("other/meshes/", "root/meshes", "root", id="the root by another name"),
+        pytest.param("parts/meshes/", "a/parts/meshes", None, id="beside the file"),
+        pytest.param("parts/meshes/", "parts/meshes", None, id="above the file"),
+        pytest.param("a/meshes/", "a/meshes", None, id="a folder above the file"),
+        pytest.param("other/meshes/", "a/meshes", None, id="a folder above by another name"),
+    ],
 )
-def test_packages_are_the_mesh_root_or_folders_in_it(tmp_path, filename):
-    # "parts" is a folder of the root; "other" is the root itself.
-    folder = "meshes" if "other" in filename or "://" not in filename else "parts/meshes"
+def test_packages_are_found(tmp_path, scheme, name, folder, mesh_root):
     mesh_file(tmp_path / folder)
-    geometry = f'<mesh filename="{filename}"/>'
-    assert len(surface(tmp_path, geometry).faces) == 4
-    assert len(surface(tmp_path, geometry, mesh_root=str(tmp_path)).faces) == 4
+    (tmp_path / "a" / "urdf").mkdir(parents=True, exist_ok=True)
+    (tmp_path / "root").mkdir(exist_ok=True)
+    root = None if mesh_root is None else str(tmp_path / mesh_root)
+    geometry = f'<mesh filename="{scheme}{name}part.obj"/>'
+    assert len(surface(tmp_path / "a" / "urdf", geometry, mesh_root=root).faces) == 4
 
 
-def test_paths_must_stay_inside_the_mesh_root(tmp_path):
+@pytest.mark.parametrize("variable", ["ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"])
+def test_packages_are_found_where_ros_finds_them(tmp_path, monkeypatch, variable):
+    inside = "share/parts/meshes" if "AMENT" in variable else "parts/meshes"
+    mesh_file(tmp_path / "ws" / inside)
+    folder = tmp_path / "a"
+    folder.mkdir()
+    geometry = '<mesh filename="package://parts/meshes/part.obj"/>'
+    with pytest.raises(dc.InvalidInput, match="ROS_PACKAGE_PATH and AMENT_PREFIX_PATH"):
+        surface(folder, geometry)
+    monkeypatch.setenv(variable, f"/nowhere::{tmp_path / 'ws'}")
+    assert len(surface(folder, geometry).faces) == 4
+    assert len(surface(folder, geometry, mesh_root=folder).faces) == 4  # it is a trusted folder
+
+
+def test_a_package_of_the_name_comes_before_other_folders(tmp_path):
+    """Two packages have a mesh of one name; the nearer one is not the one that is named."""
+    mesh_file(tmp_path / "mine" / "meshes")
+    mesh_file(tmp_path / "other" / "meshes", mesh=(TETRAHEDRON[0], TETRAHEDRON[1][:3]))
+    folder = tmp_path / "mine" / "urdf"
+    folder.mkdir()
+    for name, count in (("mine", 4), ("other", 3), ("renamed", 4)):
+        geometry = f'<mesh filename="package://{name}/meshes/part.obj"/>'
+        assert len(surface(folder, geometry).faces) == count
+
+
+@pytest.mark.parametrize(
+    "filename", ["meshes/part.obj", "../meshes/part.obj", "{}/meshes/part.obj"]
+)
+def test_paths_are_found_from_the_file_and_from_folders_above(tmp_path, filename):
+    mesh_file(tmp_path / "meshes")
+    folder = tmp_path / "urdf"
+    folder.mkdir()
+    geometry = f'<mesh filename="{filename.format(tmp_path)}"/>'
+    assert len(surface(folder, geometry).faces) == 4
+    assert len(surface(folder, geometry, mesh_root=tmp_path).faces) == 4
+
+
+def test_meshes_must_stay_inside_a_mesh_root_that_is_given(tmp_path):
     root = tmp_path / "robot"
     mesh_file(tmp_path)
     mesh_file(root / "inside")
     (root / "linked.obj").symlink_to(tmp_path / "part.obj")
     (root / "fine.obj").symlink_to(root / "inside" / "part.obj")
     (root / "ring.obj").symlink_to(root / "ring.obj")
-    assert len(surface(root, '<mesh filename="fine.obj"/>').faces) == 4
     absolute = root / "inside" / "part.obj"
-    assert len(surface(root, f'<mesh filename="{absolute}"/>').faces) == 4
-    outside = [tmp_path / "part.obj", "../part.obj", "linked.obj", "package://a/../../part.obj"]
+    for name in ("fine.obj", absolute):
+        assert len(surface(root, f'<mesh filename="{name}"/>', mesh_root=root).faces) == 4
+    outside = [tmp_path / "part.obj", "../part.obj", "linked.obj", "package://a/../part.obj"]
     for name in outside:
+        geometry = f'<mesh filename="{name}"/>'
         with pytest.raises(dc.InvalidInput, match="must stay inside `mesh_root`"):
-            surface(root, f'<mesh filename="{name}"/>')
+            surface(root, geometry, mesh_root=root)
+        assert len(surface(root, geometry).faces) == 4
     assert len(surface(root, '<mesh filename="../part.obj"/>', mesh_root=tmp_path).faces) == 4
     with pytest.raises(dc.InvalidInput, match="must stay inside"):
         surface(root, '<mesh filename="fine.obj"/>', mesh_root=root / "nowhere")
@@ -187,16 +235,47 @@ def test_paths_must_stay_inside_the_mesh_root(tmp_path):
             surface(root, f'<mesh filename="{name}"/>')
 
 
+def test_useless_faces_of_a_mesh_are_dropped_with_a_warning(tmp_path):
+    vertices, faces = TETRAHEDRON
+    more = np.concatenate([faces, [[2, 1, 0], [0, 1, 2], [1, 1, 2], [0, 1, 4]]])
+    mesh_file(tmp_path, mesh=(np.concatenate([vertices, [[0.5, 0, 0]]]), more))
+    message = r"part.obj: dropped 4 of 8 faces: 2 without area, 2 with the vertices of another"
+    with pytest.warns(UserWarning, match=message):
+        found = surface(tmp_path, '<mesh filename="part.obj"/>')
+    np.testing.assert_array_equal(found.faces, faces)
+
+
+def test_polygons_of_a_mesh_are_triangulated(tmp_path):
+    (tmp_path / "box.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1\n"
+        "f 4 3 2 1\nf 5 6 7 8\nf 1 2 6 5\nf 2 3 7 6\nf 3 4 8 7\nf 4 1 5 8\n"
+    )
+    vertices, faces = surface(tmp_path, '<mesh filename="box.obj"/>')
+    assert is_manifold(faces)
+    assert mass_properties(vertices, faces)[0] == pytest.approx(1)
+
+
+def test_collada_and_gltf_files_are_read(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    pytest.importorskip("collada")
+    mesh = trimesh.Trimesh(*TETRAHEDRON, process=False)
+    for name in ("part.dae", "part.glb"):
+        mesh.export(tmp_path / name)
+        vertices, faces = surface(tmp_path, f'<mesh filename="{name}" scale="2 2 2"/>')
+        assert len(vertices) == 4
+        assert mass_properties(vertices, faces)[0] == pytest.approx(8 / 6)
+
+
 def test_bad_meshes_are_refused_by_their_file(tmp_path):
     flat = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]), np.array([[0, 1, 2]])
     mesh_file(tmp_path, "flat.obj", flat)
     with pytest.raises(dc.InvalidInput, match=r"flat.obj: `faces` must have an area > 0"):
         surface(tmp_path, '<mesh filename="flat.obj"/>')
-    (tmp_path / "part.dae").write_text("<COLLADA/>")
+    (tmp_path / "part.fbx").write_text("")
     with pytest.raises(
-        dc.InvalidInput, match=r"the mesh must end in .obj, .ply, .stl, got .*part.dae"
+        dc.InvalidInput, match=r"end in .obj, .ply, .stl, .dae, .glb, .gltf, got .*part.fbx"
     ):
-        surface(tmp_path, '<mesh filename="part.dae"/>')
+        surface(tmp_path, '<mesh filename="part.fbx"/>')
     (tmp_path / "empty.obj").write_text("")
     with pytest.raises(dc.InvalidInput, match=r"empty.obj: the mesh is empty"):
         surface(tmp_path, '<mesh filename="empty.obj"/>')

@@ -331,10 +331,36 @@ def test_a_tool_frame_needs_no_mass_but_a_virtual_link_does(tmp_path):
 
 
 def test_a_joint_under_force_needs_a_range(tmp_path):
-    parts = two_links(limit='lower="0" upper="0"')
-    with pytest.raises(dc.InvalidInput, match="must leave it a range"):
-        load(tmp_path, *parts)
+    parts = two_links(limit='lower="0.5" upper="0.5"')
+    for actuation in ("pd", "torque", {"hinge": "pd"}):
+        with pytest.raises(dc.InvalidInput, match="must leave it a range"):
+            load(tmp_path, *parts, actuation=actuation)
     load(tmp_path, *parts, actuation="position")
+
+
+def test_a_joint_with_one_position_is_prescribed_unless_told(tmp_path):
+    held = joint("held", "arm", "tip", limit='lower="0.5" upper="0.5"')
+    for actuation in (None, {}, {"hinge": "pd"}):
+        robot = load(tmp_path, *two_links(), link("tip"), held, actuation=actuation)
+        assert robot.mechanism.actuation == ("pd", "position")
+        assert robot.joint_positions.tolist() == [0, 0.5]
+
+
+def test_links_that_fixed_joints_join_have_one_inertia(tmp_path):
+    """A point of mass is no body alone, but it may be a part of one."""
+    parts = [link("base", ""), joint("hinge", "base", "arm")]
+    point = '<inertial><mass value="1"/></inertial>'
+    weld = joint("weld", "arm", "tip", "fixed", '<origin xyz="0 0 1"/>')
+    load(tmp_path, *parts, link("arm"), link("tip", point), weld)
+    with pytest.raises(dc.InvalidInput, match=r"'arm'> <inertial>: `inertia` of the links that"):
+        load(tmp_path, *parts, link("arm", point), link("tip", point), weld)
+    rod = inertial(0.0, 1.0, 1.0)
+    # Two rods along x are a rod, unless the second one is turned.
+    turned = joint("weld", "arm", "tip", "fixed", '<origin xyz="0 0 0" rpy="0 0 1.5"/>')
+    load(tmp_path, *parts, link("arm", rod), link("tip", rod), turned)
+    straight = joint("weld", "arm", "tip", "fixed")
+    with pytest.raises(dc.InvalidInput, match="positive definite, got principal moments 0, 2, 2"):
+        load(tmp_path, *parts, link("arm", rod), link("tip", rod), straight)
 
 
 def test_dynamic_is_what_forces_move(tmp_path):
@@ -418,10 +444,18 @@ def test_a_bad_argument_is_refused(tmp_path, keywords, error, message):
         three_joints(tmp_path, **keywords)
 
 
-def test_zero_outside_the_limits_is_no_start(tmp_path):
-    with pytest.raises(dc.InvalidInput, match="'hinge' must be between its limits 1 and 2, got 0"):
-        load(tmp_path, *two_links(limit='lower="1" upper="2"'))
-    load(tmp_path, *two_links(limit='lower="1" upper="2"'), joint_positions={"hinge": 1})
+@pytest.mark.parametrize(
+    ("limits", "start"), [((1, 2), 1), ((-2, -1), -1), ((-1, 2), 0), ((0, 1), 0)]
+)
+def test_a_start_that_is_not_given_is_the_one_nearest_to_zero(tmp_path, limits, start):
+    parts = two_links(limit='lower="{}" upper="{}"'.format(*limits))
+    for given in (None, {}):
+        assert load(tmp_path, *parts, joint_positions=given).joint_positions.tolist() == [start]
+    assert load(tmp_path, *parts, joint_positions={"hinge": limits[1]}).joint_positions == limits[1]
+    beyond = limits[1] + 1
+    message = f"'hinge' must be between its limits {limits[0]} and {limits[1]}, got {beyond}"
+    with pytest.raises(dc.InvalidInput, match=message):
+        load(tmp_path, *parts, joint_positions=beyond)
 
 
 BOUNDS = ("effort_limits", "velocity_limits", "joint_friction")

@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
+import torch
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from robot_files import data, joint, link, load, robot, save, two_links
@@ -163,8 +164,84 @@ def test_a_chain_of_mimics_must_end(tmp_path):
     refused(tmp_path, robot(*parts, *ring), "'j'> <mimic>: `joint` must lead to .* through 'k'")
     weld = joint("k", "b", "c", "fixed")
     refused(tmp_path, robot(*parts[:3], ring[0], weld), "a joint of the file that moves, got 'k'")
-    held = joint("j", "a", "b", "fixed", mimic("j"))
-    refused(tmp_path, robot(*parts[:2], held), "'fixed' must have no <mimic>")
+
+
+def test_mimics_are_read_as_urdfdom_reads_them(tmp_path):
+    """A mimicking joint needs no limit of its own; a fixed joint mimics nothing."""
+    parts = [link(name) for name in "abcd"]
+    mimic = '<mimic joint="j" multiplier="2"/>'
+    joints = [
+        joint("j", "a", "b"),
+        joint("k", "b", "c", content=mimic, limit=""),
+        joint("l", "c", "d", "fixed", '<mimic joint="none"/>'),
+    ]
+    robot = load(tmp_path, *parts, *joints)
+    assert robot.joint_names == ("j",)
+    assert robot.mechanism.lower.tolist() == [-2]
+    assert robot.mechanism.kind == ("fixed", "revolute", "revolute", "fixed")
+
+
+def test_undeclared_prefixes_are_parts_of_names(tmp_path):
+    extra = '<drake:joint sensor:type="a"><drake:b/></drake:joint><sensor:link name="c"/>'
+    text = f'<robot name="r">{extra}{link("a", "<drake:inertial/>" + BOX)}</robot>'
+    assert dc.Robot.load(save(tmp_path, text)).link_names == ("a",)
+    declared = text.replace("<robot", '<robot xmlns="http://a" xmlns:drake="http://b"')
+    assert dc.Robot.load(save(tmp_path, declared)).link_names == ("a",)
+
+
+def test_names_may_contain_a_slash(tmp_path):
+    parts = [link("a/b", BOX), link("a"), joint("j/k", "a/b", "a"), link("a/b/c")]
+    mimic = joint("j", "a", "a/b/c", content='<mimic joint="j/k"/>')
+    robot = load(tmp_path, *parts, mimic, actuation="position", name="r")
+    assert robot.link_names == ("a/b", "a", "a/b/c")
+    assert robot.joint_names == ("j/k",)
+    scene = dc.Scene([dc.Cloth.grid(2, 2)], robots=[robot])
+    assert scene.surface_names == ("cloth0", "r/a/b")
+    assert len(robot.chain_positions(torch.zeros(1, dtype=torch.float64))) == 2
+
+
+# --- Every reason at once -------------------------------------------------------------------------
+
+
+def test_all_elements_and_meshes_are_in_one_message(tmp_path):
+    text = robot(
+        link("a", mass(-1) + shape('<sphere radius="0"/>') + shape('<cone radius="1"/>')),
+        link("b", shape('<mesh filename="none.obj"/>') + shape('<mesh filename="none.dae"/>')),
+        joint("j", "a", "b", kind="ball"),
+        joint("k", "a", "b", limit=""),
+    )
+    path = save(tmp_path, text)
+    with pytest.raises(dc.InvalidInput) as caught:
+        dc.Robot.load(path)
+    opening, *reasons = str(caught.value).split("\n")
+    expected = [
+        "- <link name='a'> <inertial> <mass>: `value` must be",
+        "- <link name='a'> <collision> <geometry> <sphere>: `radius` must be",
+        "- <link name='a'> <collision> <geometry> must hold one of",
+        "- <joint name='j'>: `type` must be one of",
+        "- <joint name='k'> of type 'revolute' must have a <limit>",
+        "- <link name='b'> <collision>: `filename` must be a file, got 'none.obj'",
+        "- <link name='b'> <collision>: `filename` must be a file, got 'none.dae'",
+    ]
+    assert opening == f"{path}: {len(expected)} reasons:"
+    for reason, beginning in zip(reasons, expected, strict=True):
+        assert reason.startswith(beginning)
+
+
+def test_all_faults_of_a_tree_are_in_one_message(tmp_path):
+    parts = [link(n) for n in "abc"]
+    ends = ["ax", "yb", "ac", "bc"]
+    joints = [joint(f"j{i}", *pair) for i, pair in enumerate(ends)]
+    message = r"(?s)3 reasons:.*got 'x'.*got 'y'.*got 'j2' and 'j3'"
+    refused(tmp_path, robot(*parts, *joints), message)
+
+
+def test_all_limits_and_masses_are_in_one_message(tmp_path):
+    held = joint("j", "a", "b", limit='lower="1" upper="1"')
+    parts = [link("a"), link("b", ""), link("c", ""), held, joint("k", "b", "c", "prismatic")]
+    message = r"(?s)3 reasons:.*<joint name='j'>.*<link name='b'> <iner.*<link name='c'> <iner"
+    with pytest.raises(dc.InvalidInput, match=message):
+        load(tmp_path, *parts, actuation="pd")
 
 
 # --- Trees ----------------------------------------------------------------------------------------
@@ -181,7 +258,6 @@ def test_a_chain_of_mimics_must_end(tmp_path):
             "two <joint> have the name 'j'",
             id="joints",
         ),
-        pytest.param([link("a/b")], "a name without '/'", id="slash"),
         pytest.param(
             [link("a"), joint("j", "a", "b")],
             "'j'>: its child must be a <link> of the file, got 'b'",
