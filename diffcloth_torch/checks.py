@@ -24,6 +24,7 @@ __all__ = [
     "LARGEST",
     "LARGEST_COUNT",
     "NON_NEGATIVE",
+    "OVERLAPPING",
     "POISSON",
     "POSITIVE",
     "SMALLEST",
@@ -35,6 +36,7 @@ __all__ = [
     "check_choice",
     "check_count",
     "check_finite",
+    "check_ignored_pairs",
     "check_name",
     "check_number",
     "check_pairs",
@@ -97,6 +99,9 @@ class Range(NamedTuple):
 # nor vanish. They are far outside every system of units.
 LARGEST = 1e30
 SMALLEST = 1e-30
+
+OVERLAPPING = "overlapping"
+"""In place of pairs of surfaces that do not collide: those that overlap at the start."""
 
 ANY_NUMBER = Range()
 POSITIVE = Range(0.0)
@@ -314,6 +319,15 @@ def check_pairs(name: str, value: Any, accepted: Sequence[str]) -> tuple[tuple[s
                 )
         pairs.append((pair[0], pair[1]))
     return tuple(pairs)
+
+
+def check_ignored_pairs(
+    name: str, value: Any, accepted: Sequence[str]
+) -> tuple[tuple[str, str], ...] | str:
+    """Require pairs of two different accepted names, or the word for those that overlap."""
+    if isinstance(value, str):
+        return check_choice(name, value, (OVERLAPPING,))
+    return check_pairs(name, value, accepted)
 
 
 def texts(names: Iterable[object]) -> str:

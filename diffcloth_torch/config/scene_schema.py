@@ -204,7 +204,7 @@ class RobotSection(Section):
     thickness: ForAll | None = None
     edge_length: Positive | None = None
     smooth: bool | dict[str, bool] = False
-    ignore_contact: list[Names] = []
+    ignore_contact: list[Names] | Literal["overlapping"] = []
     trajectory: list[PoseKeyframe] = []
     joint_trajectories: dict[str, Annotated[list[JointKeyframe], Len(1)]] = {}
     color: Color | None = None
@@ -292,7 +292,7 @@ class SceneSection(Section):
     bodies: list[BodySection] = []
     robots: list[RobotSection] = []
     attachments: list[AttachmentSection] = []
-    ignore_contact: list[Names] = []
+    ignore_contact: list[Names] | Literal["overlapping"] = []
 
     @model_validator(mode="after")
     def _check_cloths(self) -> SceneSection:

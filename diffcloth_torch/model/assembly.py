@@ -289,12 +289,15 @@ def _body_mechanism(name: str, body: RigidBody) -> Mechanism:
 def _ignored_pairs(scene: Scene) -> IndexArray:
     """Pairs of links of one robot that touch by construction, and pairs that the scene names.
 
-    And those of deforming bodies and what is prescribed, itself included: nothing gives way.
+    And those of deforming bodies and what is prescribed, itself included: nothing gives way. The
+    pairs that overlap are added where positions are known, in `sim/overlaps.py`.
     """
     index = {name: i for i, name in enumerate(scene.surface_names)}
-    named = list(scene.ignore_contact)
+    named = [] if isinstance(scene.ignore_contact, str) else list(scene.ignore_contact)
     for name, robot in zip(scene.robot_names, scene.robots, strict=True):
-        pairs = [*robot.mechanism.adjacent_links, *robot.ignore_contact]
+        pairs = list(robot.mechanism.adjacent_links)
+        if not isinstance(robot.ignore_contact, str):
+            pairs += robot.ignore_contact
         named += [(f"{name}/{a}", f"{name}/{b}") for a, b in pairs]
     deforming = scene.cloth_names[len(scene.cloths) - len(scene.deforming_bodies) :]
     named += [(a, b) for a in deforming for b in (*deforming, *_prescribed_surfaces(scene))]

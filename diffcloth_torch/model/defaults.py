@@ -24,6 +24,7 @@ __all__ = [
     "has_barrier",
     "has_contact",
     "scene_parameters",
+    "surface_thickness",
 ]
 
 # The barrier distance, as fractions of the median cloth edge and of the smallest distance between
@@ -79,7 +80,7 @@ def scene_parameters(scene: Scene, assembly: Assembly, contact: bool) -> dict[st
     if contact:
         friction = _surface_values(scene, "friction")
         values["friction"] = np.sqrt(friction[:, None] * friction)
-        values["thickness"] = _surface_values(scene, "thickness")
+        values["thickness"] = surface_thickness(scene)
     if len(assembly.soft_pins):
         values["pin_stiffness"] = _shortest([cloth.pin_stiffness for cloth in scene.cloths])
     if len(assembly.springs):
@@ -87,6 +88,11 @@ def scene_parameters(scene: Scene, assembly: Assembly, contact: bool) -> dict[st
     values["gravity"] = scene.gravity
     values |= _rigid_values(assembly)
     return {name: torch.from_numpy(np.array(value)) for name, value in values.items()}
+
+
+def surface_thickness(scene: Scene) -> FloatArray:
+    """Full thickness of every surface [m], shape [S]."""
+    return _surface_values(scene, "thickness")
 
 
 def _surface_values(scene: Scene, field: str) -> FloatArray:

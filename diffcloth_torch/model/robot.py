@@ -19,9 +19,9 @@ from diffcloth_torch.checks import (
     Range,
     check_choice,
     check_finite,
+    check_ignored_pairs,
     check_name,
     check_number,
-    check_pairs,
     check_range,
     check_shape,
     float_array,
@@ -87,7 +87,8 @@ class Robot:
         joint_friction: Their Coulomb friction [N m or N], shape [J].
         friction: Friction coefficient of each link's surface [-], shape [L].
         thickness: Full thickness of each link's surface [m], shape [L].
-        ignore_contact: Pairs of names of links that do not collide with each other.
+        ignore_contact: Pairs of names of links that do not collide with each other, or
+            "overlapping".
         name: Name in the scene; None lets the scene choose one.
     """
 
@@ -104,7 +105,7 @@ class Robot:
     joint_friction: FloatArray
     friction: FloatArray
     thickness: FloatArray
-    ignore_contact: tuple[tuple[str, str], ...]
+    ignore_contact: tuple[tuple[str, str], ...] | str
     name: str | None
 
     @classmethod
@@ -126,7 +127,7 @@ class Robot:
         thickness: object = 0.0,
         edge_length: float | None = None,
         smooth: object = False,
-        ignore_contact: Iterable[Sequence[str]] = (),
+        ignore_contact: Iterable[Sequence[str]] | str = (),
         name: str | None = None,
     ) -> Robot:
         """Read a URDF file.
@@ -167,8 +168,10 @@ class Robot:
                 all, or link -> True or False. A sphere beside other shapes of its link becomes a
                 link "link/k" of its own, the k-th shape of the link counted from 0, which is welded
                 to it, comes after those of the file and has what mappings say of the link.
-            ignore_contact: Pairs of names of links that do not collide with each other. Links
-                connected rigidly, or by a single moving joint, never collide.
+            ignore_contact: Pairs of names of links that do not collide with each other, or
+                "overlapping": the pairs that intersect, touch or are closer than their thickness in
+                the initial state of a scene. Links connected rigidly, or by a single moving joint,
+                never collide.
             name: Name in the scene.
 
         Raises:
@@ -191,7 +194,9 @@ class Robot:
         round_links = with_round_links(read, smooth)
         description = round_links.description
         names = [link.name for link in description.links]
-        pairs = check_pairs("Robot: `ignore_contact`", ignore_contact, names)
+        pairs = check_ignored_pairs("Robot: `ignore_contact`", ignore_contact, names)
+        if not isinstance(pairs, str):
+            pairs = tuple(round_links.pairs_with_parts(pairs))
         moving = [joint for joint in description.joints if joint.moves]
         modes = _modes("Robot.load", actuation, [joint.name for joint in moving])
         mechanism = make_mechanism(file, description, base, modes, refusals)
@@ -214,7 +219,7 @@ class Robot:
             joint_friction=joint_friction,
             friction=round_links.with_parts(friction),
             thickness=round_links.with_parts(thickness),
-            ignore_contact=round_links.pairs_with_parts(pairs),
+            ignore_contact=pairs,
             name=name,
         )
 
@@ -292,7 +297,7 @@ class Robot:
         joint_friction: object = None,
         friction: object = 0.4,
         thickness: object = 0.0,
-        ignore_contact: Iterable[Sequence[str]] = (),
+        ignore_contact: Iterable[Sequence[str]] | str = (),
         name: str | None = None,
     ) -> None:
         self.mechanism = mechanism
@@ -313,7 +318,7 @@ class Robot:
         self.joint_friction = _bounds("joint_friction", joint_friction, joints, friction_there)
         self.friction = _named("friction", friction, links, 0.4, NON_NEGATIVE)
         self.thickness = _named("thickness", thickness, links, 0.0, NON_NEGATIVE)
-        self.ignore_contact = check_pairs("Robot: `ignore_contact`", ignore_contact, links)
+        self.ignore_contact = check_ignored_pairs("Robot: `ignore_contact`", ignore_contact, links)
         self.name = check_name("Robot: `name`", name)
 
     @property

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from diffcloth_torch.checks import (
     FloatArray,
     check_finite,
-    check_pairs,
+    check_ignored_pairs,
     check_shape,
     float_array,
     frozen,
@@ -41,7 +41,8 @@ class Scene:
         robots: Robots.
         gravity: Acceleration [m/s^2], shape [3].
         air_density: Density of the air [kg/m^3], which cloths with drag feel.
-        ignore_contact: Pairs of names of surfaces that do not collide with each other.
+        ignore_contact: Pairs of names of surfaces that do not collide with each other, or
+            "overlapping".
         cloth_names: Names of the cloths; "cloth0", "cloth1" .. where none was given; and of the
             deforming bodies, "deforming0" .. likewise.
         body_names: Names of the bodies; "body0", "body1" .. where none was given.
@@ -57,7 +58,7 @@ class Scene:
     robots: tuple[Robot, ...]
     gravity: FloatArray
     air_density: float
-    ignore_contact: tuple[tuple[str, str], ...]
+    ignore_contact: tuple[tuple[str, str], ...] | str
     cloth_names: tuple[str, ...]
     body_names: tuple[str, ...]
     robot_names: tuple[str, ...]
@@ -73,7 +74,7 @@ class Scene:
         *,
         gravity: object = (0.0, 0.0, -9.81),
         air_density: float = _AIR_DENSITY,
-        ignore_contact: Iterable[Sequence[str]] = (),
+        ignore_contact: Iterable[Sequence[str]] | str = (),
         attachments: Iterable[Attachment] = (),
     ) -> None:
         """Check the arguments.
@@ -86,7 +87,9 @@ class Scene:
                 order.
             gravity: Acceleration [m/s^2], shape [3].
             air_density: Density of the air [kg/m^3], >= 0; by default that at 20 degrees Celsius.
-            ignore_contact: Pairs of names of surfaces that do not collide with each other.
+            ignore_contact: Pairs of names of surfaces that do not collide with each other, or
+                "overlapping": the pairs of bodies and links that intersect, touch or are closer
+                than their thickness in the initial state.
             attachments: Springs between points of the scene, or to targets.
 
         Raises:
@@ -128,7 +131,7 @@ class Scene:
         frozen(acceleration)
         self.gravity = acceleration
         self.air_density = check_parameter("Scene", "air_density", air_density)
-        self.ignore_contact = check_pairs(
+        self.ignore_contact = check_ignored_pairs(
             "Scene: `ignore_contact`", ignore_contact, self.surface_names
         )
         self.attachments = _instances("attachments", attachments, Attachment)

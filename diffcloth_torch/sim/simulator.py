@@ -34,6 +34,7 @@ from diffcloth_torch.sim.inputs.schemes import check_scheme
 from diffcloth_torch.sim.observables.observables import (
     Observables,
 )
+from diffcloth_torch.sim.overlaps import with_overlaps_ignored
 from diffcloth_torch.sim.records.controls import Control, Parameters
 from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.records.trajectory import Trajectory
@@ -126,7 +127,8 @@ class Simulator(Observables):
 
         Raises:
             IntersectingState: If surfaces of the scene intersect, touch, or are closer than their
-                thickness.
+                thickness; the message has all pairs, and the line that ignores contact between
+                those of bodies and links.
             InvalidInput: If a value is not accepted, the barrier is too wide for the meshes, or a
                 pd joint has no gains.
             TypeError: If an argument has a wrong type.
@@ -146,7 +148,8 @@ class Simulator(Observables):
         self.coupling = check_choice("Simulator: `coupling`", coupling, COUPLINGS)
         self.integrator = check_choice("Simulator: `integrator`", integrator, INTEGRATORS)
         abilities = ABILITIES[scheme]
-        self._assembly = assemble(scene, all_nodal=not abilities["barrier"])
+        assembly = assemble(scene, all_nodal=not abilities["barrier"])
+        self._assembly = with_overlaps_ignored(scene, assembly, initial_tensors(assembly))
         self._layout = Layout(self._assembly)
         check_gains(self._layout)
         check_scheme(self.scheme, self.coupling, self.integrator, scene, self._layout, solver)
@@ -186,7 +189,7 @@ class Simulator(Observables):
             distance = float(self._defaults["barrier_distance"])
             check_tolerance(solver.tolerance, distance, self.dt)
         if abilities["barrier"]:
-            check_start(self._engine, start._replace(parameters=self._border.defaults))
+            check_start(self._engine, scene, start._replace(parameters=self._border.defaults))
         if self.integrator == "second_order":
             remember(self, self._engine.surfaces)
 

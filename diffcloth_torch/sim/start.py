@@ -10,7 +10,7 @@ from torch import Tensor
 from diffcloth_torch import cpu
 from diffcloth_torch.autograd.core_function import failing_as
 from diffcloth_torch.autograd.transforms import outside_transforms, plain
-from diffcloth_torch.checks import POSITIVE, check_number
+from diffcloth_torch.checks import OVERLAPPING, POSITIVE, check_number
 from diffcloth_torch.dynamics.limits import slip_rates
 from diffcloth_torch.errors import (
     BarrierStartWarning,
@@ -27,6 +27,7 @@ from diffcloth_torch.operations import operation
 from diffcloth_torch.sim.inputs.border import Border, Given
 from diffcloth_torch.sim.inputs.layout import Layout
 from diffcloth_torch.sim.inputs.parameter_fields import default_fields
+from diffcloth_torch.sim.overlaps import overlapping_pairs
 from diffcloth_torch.sim.records.state import State
 from diffcloth_torch.sim.solve.cores import arrays_of
 from diffcloth_torch.sim.solve.engine import Engine
@@ -158,19 +159,33 @@ def check_tolerance(tolerance: float, distance: float, dt: float) -> None:
         )
 
 
-def check_start(engine: Engine, start: Given) -> None:
-    """Refuse surfaces that overlap.
+def check_start(engine: Engine, scene: Scene, start: Given) -> None:
+    """Refuse surfaces that overlap, with all pairs of them.
 
     Args:
         engine: Engine of the scene.
+        scene: The scene.
         start: The initial state, with a control that holds.
     """
     overlap = engine.core.find_overlap(arrays_of(engine.core_inputs(start, engine.predict(start))))
-    if overlap is not None:
-        raise IntersectingState(
-            f"Simulator: surfaces of the scene overlap: {overlap}; move them apart",
-            environments=(0,),
+    if overlap is None:
+        return
+    assembly = engine.assembly
+    pairs = overlapping_pairs(scene, assembly, initial_tensors(assembly))
+    names = assembly.surface_names
+    of_cloths = [(names[a], names[b]) for a, b in pairs if a < assembly.cloth_count]
+    rigid = [(names[a], names[b]) for a, b in pairs if a >= assembly.cloth_count]
+    text = f"Simulator: surfaces of the scene overlap: {overlap}; move them apart"
+    if of_cloths and len(pairs) > 1:
+        text += f"; {len(of_cloths)} pairs with a cloth overlap: {of_cloths}"
+    if rigid:
+        text += (
+            f"; {len(rigid)} pairs of bodies and links overlap: if they are meant to, give them to "
+            "the Scene, which then ignores contact between them, or give "
+            f'`ignore_contact="{OVERLAPPING}"` to the Scene or to Robot.load:\n'
+            f"ignore_contact={rigid}"
         )
+    raise IntersectingState(text, environments=(0,))
 
 
 class StartWatch:
