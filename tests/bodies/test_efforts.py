@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from coupled_scenes import COUPLINGS
+from public_robots import carrying, inside_its_limits, robot_file
 
 import diffcloth_torch as dc
 from diffcloth_torch.robots import GRIPPER
@@ -64,7 +65,7 @@ class Inverse:
         pin.framesForwardKinematics(self.model, self.data, end)
         external = [pin.Force.Zero() for _ in self.model.names]
         for frame, wrench in wrenches:
-            joint = self.model.frames[self.model.getFrameId(frame)].parentJoint
+            joint = self.model.frames[self.model.getFrameId(frame, pin.FrameType.BODY)].parentJoint
             external[joint] += self.data.oMi[joint].actInv(pin.Force(wrench))
         acceleration = (rates[1] - rates[0]) / h
         external = pin.StdVec_Force(external)
@@ -194,6 +195,20 @@ def test_a_held_pendulum_needs_its_weight(arm):
     assert abs(expected).min() > 0.5
 
 
+def contact_wrenches(sim, state):
+    """Pairs of a link and the wrench of contact on it, about the origin of the world."""
+    wrenches = []
+    for name, frame in sim.link_poses(state).items():
+        rows = sim.slices.get(name)
+        if rows is None:
+            continue
+        forces = state.body_forces[rows]
+        points = torch.from_numpy(sim._assembly.body_vertices[rows]) @ frame[:3, :3].T
+        torque = torch.linalg.cross(points + frame[:3, 3], forces).sum(0)
+        wrenches.append((name.partition("/")[2], torch.cat([forces.sum(0), torque]).numpy()))
+    return wrenches
+
+
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_contact_is_held_too(coupling):
     """A gripper on a moving base whose one finger is prescribed: it presses on cloth and box."""
@@ -208,15 +223,34 @@ def test_contact_is_held_too(coupling):
             heavier * inertia.mass, inertia.lever, heavier * inertia.inertia
         )
     end, gravity = states[-1], coupled_scenes.GRAVITY / heavier
-    frames, wrenches = sim.link_poses(end), []
-    for name, frame in frames.items():
-        rows = sim.slices[name]
-        forces = end.body_forces[rows]
-        points = torch.from_numpy(sim._assembly.body_vertices[rows]) @ frame[:3, :3].T
-        torque = torch.linalg.cross(points + frame[:3, 3], forces).sum(0)
-        wrenches.append((name.partition("/")[2], torch.cat([forces.sum(0), torque]).numpy()))
+    wrenches = contact_wrenches(sim, end)
     alone = inverse.efforts(states, coupled_scenes.DT, gravity)[0]
     expected = inverse.efforts(states, coupled_scenes.DT, gravity, wrenches)[0]
     assert abs(expected - alone) > 0.2
     # Up to what the time step leaves of the rest, and of the way over which contact acts.
     assert abs(float(end.joint_efforts[0]) - expected) < 0.02 * abs(expected - alone)
+
+
+@pytest.mark.filterwarnings(
+    "ignore:.*dropped .* faces", "ignore::diffcloth_torch.BarrierStartWarning"
+)
+@pytest.mark.parametrize(
+    "name", ["ur5_robot.urdf", "allegro_left_hand.urdf", "talos_left_arm.urdf"]
+)
+def test_a_public_robot_holds_what_lies_on_it(name):
+    """The sheet still falls, the robot holds still: its weight and contact, without motion."""
+    path = robot_file("example-robot-data", name)
+    robot, _ = inside_its_limits(path, actuation="position")
+    sim = carrying(robot)
+    state = sim.initial_state()
+    for _ in range(4):
+        state = sim.step(state)
+    inverse = Inverse(path, robot.joint_names)
+    efforts = [
+        inverse.efforts([state] * 3, sim.dt, sim.scene.gravity, wrenches)
+        for wrenches in ([], contact_wrenches(sim, state))
+    ]
+    # The share of a sheet of a gram, which has just landed, in the efforts that hold kilograms.
+    share = abs(efforts[1] - efforts[0]).max()
+    assert share > 1e-6
+    np.testing.assert_allclose(state.joint_efforts, efforts[1], rtol=0, atol=1e-5 * share)
