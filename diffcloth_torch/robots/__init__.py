@@ -24,7 +24,7 @@ def __dir__() -> list[str]:
 def panda() -> tuple[Path, Path]:
     """Find the Panda: its URDF file, and the `mesh_root` to load it with.
 
-    At zero its fourth joint is beyond its limit, and fingers and links overlap; this start does:
+    With all joints as near to zero as their limits allow, its fingers touch; this start is open:
 
     >>> path, root = dc.robots.panda()
     >>> start = {"panda_joint4": -1.5, "panda_joint6": 1.5, "panda_finger_joint1": 0.02}
