@@ -7,7 +7,7 @@ import numpy as np
 from diffcloth_torch.checks import FloatArray, IndexArray, check_finite, check_shape
 from diffcloth_torch.errors import InvalidInput
 
-__all__ = ["check_inertia", "is_closed", "mass_properties"]
+__all__ = ["check_inertia", "check_part_of_inertia", "is_closed", "mass_properties"]
 
 # Relative to the largest entry or moment: decimals that a file or a user has rounded.
 _ROUNDING = 1e-6
@@ -88,3 +88,13 @@ def check_inertia(name: str, inertia: FloatArray) -> FloatArray:
             f"as every body has, got {text} kg m^2"
         )
     return symmetric
+
+
+def check_part_of_inertia(name: str, inertia: FloatArray) -> None:
+    """Require a symmetric inertia [3, 3] that a part of a body can have, such as a point's."""
+    moments = np.linalg.eigvalsh(inertia)
+    if moments[0] < -_SMALLEST_MOMENT * abs(moments[2]):
+        text = ", ".join(f"{moment:g}" for moment in moments)
+        raise InvalidInput(
+            f"{name} must be positive semi-definite, got principal moments {text} kg m^2"
+        )

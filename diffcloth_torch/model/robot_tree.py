@@ -10,7 +10,7 @@ import numpy as np
 
 from diffcloth_torch.checks import FloatArray, IndexArray
 from diffcloth_torch.errors import InvalidInput
-from diffcloth_torch.geometry.mass_properties import check_inertia
+from diffcloth_torch.geometry.mass_properties import check_inertia, check_part_of_inertia
 from diffcloth_torch.model.mechanism import FORCED, Mechanism
 from diffcloth_torch.model.refusals import Refusals
 from diffcloth_torch.model.urdf import Joint, RobotDescription
@@ -207,7 +207,13 @@ def _check_masses(file: Path | str, mechanism: Mechanism, refusals: Refusals) ->
             continue
         where = f"{file}: <link name={mechanism.link_names[first]!r}> <inertial>"
         members = np.flatnonzero(group == first).tolist()
-        joined = " of the links that fixed joints join to it" if len(members) > 1 else ""
+        joined = " with that of the links that fixed joints join to it" if len(members) > 1 else ""
+        for link in members if joined else ():
+            with refusals.collected():
+                check_part_of_inertia(
+                    f"{file}: <link name={mechanism.link_names[link]!r}> <inertial>: `inertia`",
+                    mechanism.inertia[link],
+                )
         with refusals.collected():
             if mechanism.mass[members].sum() == 0.0:
                 raise InvalidInput(

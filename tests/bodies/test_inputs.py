@@ -404,3 +404,25 @@ def test_batched_parameters_have_one_axis_more(layout, defaults):
     assert fields["body_mass"].shape == (2, 3)
     assert fields["link_inertia"].shape[:2] == (2, 8)
     assert fields["gravity"].shape == (1, 3)
+
+
+def test_a_link_that_is_a_point_keeps_its_parameters(tmp_path):
+    """It has no inertia of its own, but the link that a fixed joint joins it to has."""
+    point = '<inertial><mass value="1"/></inertial>'
+    arm = point.replace("/></", '/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></')
+    parts = [f'<link name="{n}">{own}</link>' for n, own in (("base", ""), ("arm", arm))]
+    parts.append(f'<link name="tip">{point}</link>')
+    parts += [
+        f'<joint name="{a}{b}" type="{kind}"><parent link="{a}"/><child link="{b}"/></joint>'
+        for a, b, kind in (("base", "arm", "continuous"), ("arm", "tip", "fixed"))
+    ]
+    path = tmp_path / "arm.urdf"
+    path.write_text(f'<robot name="arm">{"".join(parts)}</robot>')
+    scene = dc.Scene([], robots=[dc.Robot.load(path, actuation="torque")])
+    simulator = dc.Simulator(scene, 0.01, contact=dc.ContactOptions(barrier_distance=1e-3))
+    given = simulator.parameters()
+    simulator.step(simulator.initial_state(), parameters=given)
+    for row, message in ((1, "positive definite"), (2, "positive semi-definite")):
+        wrong = given.replace(link_inertia=with_row(given.link_inertia, row, -torch.eye(3)))
+        with pytest.raises(dc.InvalidInput, match=message):
+            simulator.step(simulator.initial_state(), parameters=wrong)

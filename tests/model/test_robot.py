@@ -352,7 +352,9 @@ def test_links_that_fixed_joints_join_have_one_inertia(tmp_path):
     point = '<inertial><mass value="1"/></inertial>'
     weld = joint("weld", "arm", "tip", "fixed", '<origin xyz="0 0 1"/>')
     load(tmp_path, *parts, link("arm"), link("tip", point), weld)
-    with pytest.raises(dc.InvalidInput, match=r"'arm'> <inertial>: `inertia` of the links that"):
+    with pytest.raises(
+        dc.InvalidInput, match=r"'arm'> <inertial>: `inertia` with that of the links"
+    ):
         load(tmp_path, *parts, link("arm", point), link("tip", point), weld)
     rod = inertial(0.0, 1.0, 1.0)
     # Two rods along x are a rod, unless the second one is turned.
