@@ -8,6 +8,7 @@ import re
 import runpy
 import subprocess
 import sys
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import numpy as np
@@ -211,6 +212,23 @@ def test_plan_grasp(plan_grasp, capsys):
     losses = runpy.run_path(str(plan_grasp), run_name="__main__")["found"].metrics()["losses"]
     assert min(losses) < 0.5 * losses[0]
     assert capsys.readouterr().out.count("mm from the goal") == len(losses)
+
+
+@pytest.mark.filterwarnings("ignore:.*dropped .* faces")
+@pytest.mark.quick("allegro")
+@pytest.mark.parametrize("name", ["allegro", "panda", "ur5", "tiago", "talos"])
+def test_a_cloth_falls_on_public_robots(name):
+    names = runpy.run_path(str(ROOT / "examples/public_robots.py"))
+    assert name in names["ROBOTS"]
+    pose = names["ROBOTS"][name]
+    try:
+        names["find"](pose.file)
+    except PackageNotFoundError:
+        pytest.skip("the robots are in the extra `robots`")
+    _, states = names["simulate"](pose, cells=8)
+    moved = states[-1].joint_positions - states[0].joint_positions
+    assert moved.abs().max().item() == pytest.approx(max(pose.move.values()))
+    assert states[-1].report.contact_count > 0
 
 
 def test_drape_own_mesh(own_mesh, tmp_path):

@@ -10,7 +10,7 @@ import pytest
 
 import diffcloth_torch as dc
 from diffcloth_torch.config.documents import read_document
-from diffcloth_torch.geometry.meshes import read_mesh
+from diffcloth_torch.geometry.meshes import read_body_mesh, read_mesh
 from diffcloth_torch.model.urdf import read_urdf
 
 pytest.importorskip("hypothesis")
@@ -38,7 +38,26 @@ ASCII_STL = (
     b"endloop\nendfacet\nendsolid a\n"
 )
 YAML = b"task: drape\nscene:\n  cloths:\n  - &a {name: b, size: [1, 1e-3]}\n  - *a\n"
+DAE = b"""<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1"><asset/>
+<library_geometries><geometry id="g"><mesh><source id="p"><float_array id="a" count="9">
+0 0 0 1 0 0 0 1 0</float_array><technique_common><accessor source="#a" count="3" stride="3">
+<param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/>
+</accessor></technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/>
+</vertices><triangles count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p>
+</triangles></mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="s">
+<node><instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
+def glb():
+    trimesh = pytest.importorskip("trimesh")
+    corner = trimesh.Trimesh(CORNERS, [[0, 1, 2]], process=False)
+    return trimesh.Scene([corner]).export(file_type="glb")
+
+
 SEEDS = {
+    ".dae": [DAE],
+    ".glb": [glb()],
     ".obj": [OBJ],
     ".ply": [PLY, *BINARY_PLY],
     ".stl": [STL, ASCII_STL],
@@ -46,6 +65,7 @@ SEEDS = {
     ".urdf": [b'<?xml version="1.0"?><robot name="a"><link name="b"/></robot>'],
 }
 READERS = {".yaml": read_document, ".urdf": read_urdf}
+OF_BODIES = (".dae", ".glb")
 
 
 @contextmanager
@@ -65,6 +85,8 @@ def seconds(count):
 
 
 def read(path):
+    if path.suffix in OF_BODIES:
+        return read_body_mesh(path, "path")[:2]
     return READERS.get(path.suffix, read_mesh)(path)
 
 
@@ -94,6 +116,16 @@ def mutations(seeds, words):
 
 
 WORDS = {
+    ".dae": [
+        b"<p>0 1 9</p>",
+        b"nan ",
+        b"#v",
+        b"<node/>",
+        b"<polylist>",
+        b"</mesh>",
+        b"99999999999",
+    ],
+    ".glb": [b"glTF", b"JSON", b"BIN\0", b"5126", b"[", b"{", b"\xff\xff\xff\xff", b"nan"],
     ".obj": [b"v ", b"f 1 2 3\n", b"1_0", b"\xef\xbb\xbf", b"\xe2\x80\xa8", b"\0", b"#", b"\\\n"],
     ".ply": [
         b"element vertex 3\n",
@@ -116,6 +148,8 @@ WORDS = {
 
 @pytest.mark.parametrize("suffix", SEEDS)
 def test_any_bytes_are_read_or_refused(tmp_path, suffix):
+    if suffix == ".dae":
+        pytest.importorskip("collada")
     outcomes = {"read": 0, "refused": 0}
 
     @settings(

@@ -51,7 +51,7 @@ def fall_on(robot):
     simulator = under_a_cloth(robot)
     state, most = simulator.initial_state(), 0
     for _ in range(5):
-        state = simulator.step(state)
+        state = simulator.step(state, parameters=simulator.parameters())
         most = max(most, state.report.contact_count)
     return most
 

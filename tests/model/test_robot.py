@@ -356,6 +356,9 @@ def test_links_that_fixed_joints_join_have_one_inertia(tmp_path):
         dc.InvalidInput, match=r"'arm'> <inertial>: `inertia` with that of the links"
     ):
         load(tmp_path, *parts, link("arm", point), link("tip", point), weld)
+    beside = joint("weld2", "arm", "side", "fixed", '<origin xyz="1 0 0"/>')
+    points = [link(name, point) for name in ("arm", "tip", "side")]
+    load(tmp_path, *parts, *points, weld, beside)  # a triangle
     rod = inertial(0.0, 1.0, 1.0)
     # Two rods along x are a rod, unless the second one is turned.
     turned = joint("weld", "arm", "tip", "fixed", '<origin xyz="0 0 0" rpy="0 0 1.5"/>')

@@ -190,14 +190,16 @@ def test_undeclared_prefixes_are_parts_of_names(tmp_path):
 
 
 def test_names_may_contain_a_slash(tmp_path):
-    parts = [link("a/b", BOX), link("a"), joint("j/k", "a/b", "a"), link("a/b/c")]
-    mimic = joint("j", "a", "a/b/c", content='<mimic joint="j/k"/>')
-    robot = load(tmp_path, *parts, mimic, actuation="position", name="r")
-    assert robot.link_names == ("a/b", "a", "a/b/c")
-    assert robot.joint_names == ("j/k",)
+    links = [link("a/b", BOX), link("a"), link("c"), link("d")]
+    mimic = joint("j", "a", "c", content='<mimic joint="k"/>')
+    joints = [joint("k", "a/b", "a"), mimic, joint("k/c", "a", "d")]
+    robot = load(tmp_path, *links, *joints, actuation="position", name="r")
+    assert robot.link_names == ("a/b", "a", "c", "d")
+    assert robot.joint_names == ("k", "k/c")
     scene = dc.Scene([dc.Cloth.grid(2, 2)], robots=[robot])
     assert scene.surface_names == ("cloth0", "r/a/b")
-    assert len(robot.chain_positions(torch.zeros(1, dtype=torch.float64))) == 2
+    # In a chain the joint of c, which mimics k, has a name of its own.
+    assert len(robot.chain_positions(torch.zeros(2, dtype=torch.float64))) == 3
 
 
 # --- Every reason at once -------------------------------------------------------------------------
