@@ -1,5 +1,8 @@
 """Public robots as they are: which files load, and that a cloth falls on each that does."""
 
+from collections import defaultdict
+
+import numpy as np
 import pytest
 from public_robots import PACKAGES, robot_file, robot_files, under_a_cloth
 
@@ -67,6 +70,34 @@ def test_forces_move_a_public_robot_under_a_cloth():
     robot = load(robot_file(EXAMPLES, "ur5_gripper.urdf"), "default")
     assert robot.mechanism.is_dynamic
     assert fall_on(robot) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("package", "name"), QUICK)
+def test_meshes_are_where_pinocchio_places_them(package, name):
+    """Which files they are, their units, axes, scales and origins: the boxes of links agree."""
+    pin = pytest.importorskip("pinocchio", reason="Pinocchio is in the extra `test`")
+    path = robot_file(package, name)
+    robot = load(path, "position")
+    surfaces = dict(zip(robot.link_names, robot.surfaces, strict=True))
+    model = pin.buildModelFromUrdf(str(path))
+    folders = [str(folder) for folder in path.parents]
+    geometry = pin.buildGeomFromUrdf(model, str(path), pin.GeometryType.COLLISION, None, folders)
+    points, others = defaultdict(list), set()
+    for shape in geometry.geometryObjects:
+        frame = model.frames[shape.parentFrame]
+        if not hasattr(shape.geometry, "vertices"):
+            others.add(frame.name)  # boxes and the like, of which the tests of shapes know more
+            continue
+        in_link = (frame.placement.inverse() * shape.placement).homogeneous
+        vertices = np.array(shape.geometry.vertices())
+        points[frame.name].append(vertices @ in_link[:3, :3].T + in_link[:3, 3])
+    for link in points.keys() - others:
+        expected = np.concatenate(points[link])
+        found = surfaces[link].vertices[np.unique(surfaces[link].faces)]
+        size = np.abs(expected).max()
+        for corner in (np.min, np.max):  # Pinocchio may read meshes in single precision
+            np.testing.assert_allclose(corner(found, 0), corner(expected, 0), atol=1e-6 * size)
 
 
 def test_a_file_without_a_robot_is_refused():
