@@ -220,10 +220,10 @@ def _check_masses(file: Path | str, mechanism: Mechanism, refusals: Refusals) ->
                     f"{where}: `mass` must be > 0 for a link that moves by forces, or for one that "
                     "a fixed joint joins to it, got 0"
                 )
-            check_inertia(f"{where}: `inertia`{joined}", _joint_inertia(mechanism, first, members))
+            check_inertia(f"{where}: `inertia`{joined}", _common_inertia(mechanism, first, members))
 
 
-def _joint_inertia(mechanism: Mechanism, first: int, members: Sequence[int]) -> FloatArray:
+def _common_inertia(mechanism: Mechanism, first: int, members: Sequence[int]) -> FloatArray:
     """Inertia [3, 3] of links that fixed joints connect to the first: about their common center."""
     frames = {first: np.eye(4)}
     for link in mechanism.order:

@@ -177,13 +177,12 @@ def check_start(engine: Engine, scene: Scene, start: Given) -> None:
     rigid = [(names[a], names[b]) for a, b in pairs if a >= assembly.cloth_count]
     text = f"Simulator: surfaces of the scene overlap: {overlap}; move them apart"
     if of_cloths and len(pairs) > 1:
-        text += f"; {len(of_cloths)} pairs with a cloth overlap: {of_cloths}"
+        text += f"; all pairs with a cloth that overlap: {of_cloths}"
     if rigid:
         text += (
-            f"; {len(rigid)} pairs of bodies and links overlap: if they are meant to, give them to "
-            "the Scene, which then ignores contact between them, or give "
-            f'`ignore_contact="{OVERLAPPING}"` to the Scene or to Robot.load:\n'
-            f"ignore_contact={rigid}"
+            "; the Scene ignores contact between the bodies and links that overlap with "
+            f'`ignore_contact="{OVERLAPPING}"`, as Robot.load does for those of a robot, or with '
+            f"all pairs of them ({len(rigid)}):\nignore_contact={rigid}"
         )
     raise IntersectingState(text, environments=(0,))
 

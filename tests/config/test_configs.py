@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import types
 from pathlib import Path
 
@@ -398,6 +399,32 @@ def test_a_robot_is_read_from_a_file_under_the_root(write, tmp_path):
         load_task(write(MOVING), [changes[0], "scene.robots.left.path=../hand.urdf"])
     with pytest.raises(InvalidInput, match=r"the folder '\.\./' must lie under the root"):
         load_task(write(MOVING), [*changes, "scene.robots.left.mesh_root=../"])
+
+
+def test_meshes_of_a_robot_lie_under_the_root(write, tmp_path):
+    mesh = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
+    text = GRIPPER.read_text()
+    changes = ["scene.robots.left.model=null", "scene.robots.left.path=hand.urdf"]
+    for folder, name in ((tmp_path, "in.obj"), (tmp_path.parent, "out.obj")):
+        (folder / name).write_text(mesh)
+        path = f'<mesh filename="{folder / name}"/>'
+        (tmp_path / "hand.urdf").write_text(
+            re.sub("(<collision>.*?)<box [^>]*>", rf"\1{path}", text, count=1, flags=re.DOTALL)
+        )
+        if name == "in.obj":
+            robot = load_task(write(MOVING), changes).scene.robots[0]
+            assert [len(surface.faces) for surface in robot.surfaces] == [1, 12, 12]
+    with pytest.raises(InvalidInput, match="must stay inside `mesh_root`"):
+        load_task(write(MOVING), changes)
+
+
+def test_pairs_that_overlap_may_be_ignored_by_a_word(write):
+    word = "overlapping"
+    changes = [f"scene.ignore_contact={word}", f"scene.robots.left.ignore_contact={word}"]
+    scene = load_task(write(MOVING), changes).scene
+    assert scene.ignore_contact == scene.robots[0].ignore_contact == word
+    with pytest.raises(InvalidInput, match="ignore_contact"):
+        load_task(write(MOVING), ["scene.ignore_contact=touching"])
 
 
 # Those of `diffcloth train` have a schema of their own.
