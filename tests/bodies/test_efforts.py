@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from coupled_scenes import COUPLINGS
-from public_robots import carrying, inside_its_limits, robot_file
+from robot_packages import carrying, inside_its_limits, robot_file
 
 import diffcloth_torch as dc
 from diffcloth_torch.robots import GRIPPER

@@ -4,7 +4,7 @@ from collections import defaultdict
 
 import numpy as np
 import pytest
-from public_robots import PACKAGES, robot_file, robot_files, under_a_cloth
+from robot_packages import PACKAGES, robot_file, robot_files, under_a_cloth
 
 import diffcloth_torch as dc
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from differences import mismatch
-from public_robots import carrying, inside_its_limits, robot_file
+from robot_packages import carrying, inside_its_limits, robot_file
 
 import diffcloth_torch as dc
 
