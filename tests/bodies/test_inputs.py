@@ -422,6 +422,9 @@ def test_a_link_that_is_a_point_keeps_its_parameters(tmp_path):
     simulator = dc.Simulator(scene, 0.01, contact=dc.ContactOptions(barrier_distance=1e-3))
     given = simulator.parameters()
     simulator.step(simulator.initial_state(), parameters=given)
+    # The base is fixed to the world: its inertia moves nothing.
+    odd = given.replace(link_inertia=with_row(given.link_inertia, 0, -torch.eye(3)))
+    simulator.step(simulator.initial_state(), parameters=odd)
     for row, message in ((1, "positive definite"), (2, "positive semi-definite")):
         wrong = given.replace(link_inertia=with_row(given.link_inertia, row, -torch.eye(3)))
         with pytest.raises(dc.InvalidInput, match=message):

@@ -143,13 +143,14 @@ def _check_values(layout: Layout, name: str, values: FloatArray, default: FloatA
         _refuse_rows(layout, name, values == 0.0, "> 0", layout.permissions.massive)
     elif name in ("body_inertia", "link_inertia"):
         least, _, largest = np.moveaxis(np.linalg.eigvalsh(_symmetric(values)), -1, 0)
-        massive, dynamic = layout.permissions.massive, layout.permissions.dynamic
+        moved = layout.permissions.moved
+        massive = {owner: rows & moved[owner] for owner, rows in layout.permissions.massive.items()}
         # A link that fixed joints join to others may be a point or a rod in its file.
         was_definite = np.linalg.eigvalsh(_symmetric(default))[..., 0] > 0.0
         _refuse_rows(layout, name, (least <= 0.0) & was_definite, "positive definite", massive)
         # What has no mass in its file may be given some.
         wrong = least < -_ROUNDING * np.abs(largest)
-        _refuse_rows(layout, name, wrong, "positive semi-definite", dynamic)
+        _refuse_rows(layout, name, wrong, "positive semi-definite", moved)
 
 
 def _symmetric(values: FloatArray) -> FloatArray:

@@ -15,6 +15,7 @@ from diffcloth_torch.dynamics.limits import ZONE
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.model.assembly import Assembly
 from diffcloth_torch.model.mechanism import Mechanism
+from diffcloth_torch.model.robot_tree import moves_by_forces
 from diffcloth_torch.operations import label
 
 __all__ = ["Permissions"]
@@ -41,8 +42,8 @@ class Permissions:
         at_positions: Which joints have prescribed positions, shape [J].
         floating: Which robots have a floating base, shape [R].
         settable: Field of a control -> which joints it can set, shape [J].
-        dynamic: "body" or "link" -> which of them are dynamic, [K] or [L].
-        massive: "body" or "link" -> which of them are dynamic and have mass, [K] or [L].
+        moved: "body" or "link" -> which of them forces move, [K] or [L].
+        massive: "body" or "link" -> which of them are of something dynamic and have mass, likewise.
         lower: Lower limits [rad or m], shape [J].
         upper: Upper limits, likewise.
         farthest: Ends of the zones beyond the limits of joints under torque or pd, infinite for
@@ -70,7 +71,7 @@ class Permissions:
             field: np.array([mode in modes for mode in self.actuation], dtype=bool)
             for field, modes in _MODES.items()
         }
-        self.dynamic = {"body": _dynamic(bodies), "link": _dynamic(robots)}
+        self.moved = {"body": _moved(bodies), "link": _moved(robots)}
         self.massive = {"body": _massive(bodies), "link": _massive(robots)}
         self.lower = _joined([robot.lower for robot in robots])
         self.upper = _joined([robot.upper for robot in robots])
@@ -101,14 +102,14 @@ def _joined(arrays: Sequence[FloatArray]) -> FloatArray:
     return joined
 
 
-def _dynamic(mechanisms: Sequence[Mechanism]) -> NDArray[np.bool_]:
-    parts = [np.full(len(m.mass), m.is_dynamic) for m in mechanisms]
-    return np.concatenate([np.empty(0, dtype=bool), *parts])
+def _moved(mechanisms: Sequence[Mechanism]) -> NDArray[np.bool_]:
+    moved = [moves_by_forces(m, link) for m in mechanisms for link in range(m.link_count)]
+    return np.array(moved, dtype=bool)
 
 
 def _massive(mechanisms: Sequence[Mechanism]) -> NDArray[np.bool_]:
-    parts = [m.mass > 0.0 for m in mechanisms]
-    return np.concatenate([np.empty(0, dtype=bool), *parts]) & _dynamic(mechanisms)
+    parts = [(m.mass > 0.0) & m.is_dynamic for m in mechanisms]
+    return np.concatenate([np.empty(0, dtype=bool), *parts])
 
 
 def _unless(base: str, mechanisms: Sequence[Mechanism], why: Sequence[str]) -> list[str]:
