@@ -5,9 +5,10 @@ from __future__ import annotations
 import weakref
 from typing import Protocol
 
+from diffcloth_torch.autograd.guards import guarded
 from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.sim.records.controls import Control, Parameters
-from diffcloth_torch.sim.records.state import State
+from diffcloth_torch.sim.records.state import State, check_state
 from diffcloth_torch.sim.records.surfaces import Surfaces
 
 __all__ = ["at_half_step", "remember", "with_half_step_velocities"]
@@ -18,7 +19,7 @@ class Simulator(Protocol):
 
     integrator: str
 
-    def step(
+    def _step(
         self, state: State, control: Control | None, parameters: Parameters | None
     ) -> State: ...
 
@@ -34,6 +35,7 @@ def remember(simulator: Simulator, surfaces: Surfaces) -> None:
     _SIMULATORS[surfaces] = weakref.ref(simulator)
 
 
+@guarded
 def at_half_step(
     state: State,
     control: Control | None = None,
@@ -66,6 +68,7 @@ def at_half_step(
         InvalidInput: If the simulator is not known, or integrates by implicit Euler.
         SimulationError: As for `Simulator.step`.
     """
+    check_state("at_half_step: `state`", state)
     if simulator is None and state._surfaces is not None:
         known = _SIMULATORS.get(state._surfaces)
         simulator = None if known is None else known()
@@ -79,7 +82,7 @@ def at_half_step(
             "at_half_step: needs a simulator with integrator 'second_order', got "
             f"{simulator.integrator!r}, whose velocities have the time of the positions"
         )
-    return with_half_step_velocities(state, simulator.step(state, control, parameters))
+    return with_half_step_velocities(state, simulator._step(state, control, parameters))
 
 
 def with_half_step_velocities(state: State, after: State) -> State:

@@ -306,9 +306,10 @@ def test_a_start_is_deep_by_the_stiffness_of_its_own_pair():
         return sheet(4, height, density=2.0, stretch=20.0, bending=1e-7)
 
     def warns(height, *bodies):
+        cloth = soft(height)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            sim = simulator([soft(height)], [FLOOR, *bodies], dt=0.03, barrier_distance=4e-3)
+            sim = simulator([cloth], [FLOOR, *bodies], dt=0.03, barrier_distance=4e-3)
             sim.step(sim.initial_state())
         return [warning.category for warning in caught] == [dc.BarrierStartWarning]
 

@@ -190,6 +190,7 @@ def test_pins_driven_into_a_body_are_infeasible():
 # --- Public meshes -------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:Cloth.load. .* is 28 m long:UserWarning")
 def test_two_layers_thrown_at_each_other_stop():
     # The straight motion from t0 to t1 makes the layers pass through each other.
     before = dc.Cloth.load(public("pairs/thick-cloth_t0.ply"))

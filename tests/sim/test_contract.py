@@ -74,6 +74,8 @@ PUBLIC = {
     "Stage": "",
     "fit": "",
     "Variable": "",
+    "WorkerError": "",
+    "at_half_step": "",
     "residuals": "markers outline point_cloud",
     "envs": "make TASKS ClothVectorEnv Task",
     "fabrics": "MEASUREMENTS Measurement material",
