@@ -168,6 +168,8 @@ def hold():
         time.sleep(1e4)
 
 if __name__ == "__main__":
+    # A shell starts what it runs in the background with the interrupt ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     note("main")
     import threading
     pool = Pool("pool", 2, 1e4)
