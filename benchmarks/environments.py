@@ -145,9 +145,9 @@ def _script(env: envs.ClothVectorEnv, steps: int) -> tuple[list[torch.Tensor], e
 
 
 def print_returns(tasks: Sequence[str], episodes: int, size: int, page: Path | None = None) -> None:
-    """What zero, random, scripted and replayed policies get: mean return, and success in percent.
+    """Print mean returns and success rates [%] of zero, random, scripted and replayed policies.
 
-    Intervals are those of Wilson, of 95 %. With a page the rows are written there, too: between the
+    Intervals are Wilson's, at 95 %. With a page the rows are written there, too: between the
     lines that begin and end with `_MARKS`, where the row of a task replaces the former one.
     """
     print("| task | " + " | ".join(POLICIES) + " |")

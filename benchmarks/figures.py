@@ -208,7 +208,7 @@ def measure_forward_peers(newton: Path, mujoco: Path) -> Records:
 
 
 def measure_environments(release: str, folder: Path, quick: bool) -> Records:
-    """What `benchmarks.scripted` prints, and when."""
+    """Return the times that `benchmarks.scripted` measures, with the date."""
     rows, steps, turns = ((("FoldCloth", 7, 1),), 2, 1) if quick else (scripted.ROWS, 40, 3)
     return {
         "date": date.today().isoformat(),
@@ -443,8 +443,8 @@ def _release_text(rows: list[Records], release: str) -> str:
         parts.append(f"{size} x {size}: {', '.join(text)}")
     return (
         "Both take steps in turn, each on its own trajectory from the same start. A ratio is the "
-        f"time of {release} over that of this release. The geometric means of the ratios over the "
-        f"scenes, and their ranges, are {'; '.join(parts)}."
+        f"time of {release} over the time of this release. The geometric means of the ratios over "
+        f"the scenes, and their ranges, are {'; '.join(parts)}."
     )
 
 
@@ -472,7 +472,7 @@ options. {found["release"].capitalize()} and this release take the same recorded
 `python -m benchmarks.scripted` describes how. Measured on {found["date"]} ({found["processor"]}).
 Times are processor times of a time step, per environment, with the step's backward in
 `with gradients`; `python` is the part of `env.step` outside of the core. A ratio is the time of
-{found["release"]} over that of this release."""
+{found["release"]} over the time of this release."""
 
 
 def _environment_table(rows: list[Records]) -> str:

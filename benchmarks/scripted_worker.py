@@ -127,7 +127,7 @@ def timed_step(simulator: Any, state: Any, control: Any) -> dict[str, Any]:
 
 
 def with_certify(simulator: Any, certify: str) -> Any:
-    """The same simulator, certified otherwise."""
+    """Return a copy of a simulator with another value of `SolverOptions.certify`."""
     from dataclasses import replace
 
     return type(simulator)(

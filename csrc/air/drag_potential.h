@@ -28,7 +28,8 @@ struct Flow {
 ///
 ///   P(x) = h sum_f D_f(u_f),    u_f = 1/3 sum_p (x_p - x_n,p) / h - w,
 ///
-/// the sum over the corners p of a face. With given velocities v_n it is that of the mean velocity, of second order,
+/// the sum over the corners p of a face. With given velocities v_n, drag acts on the mean velocity of the step, and is
+/// of second order,
 ///
 ///   P(x) = 2 h sum_f D_f(u_f),    u_f = 1/3 sum_p ((x_p - x_n,p) / h + v_n,p) / 2 - w.
 ///

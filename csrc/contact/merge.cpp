@@ -108,8 +108,8 @@ Projection project(const CollisionMesh& mesh,
   return result;
 }
 
-/// Whether a point is above the inside of a triangle, farther than a range from all of its edges: nothing but the
-/// inside is then within that range.
+/// Return true if the projection of a point lies inside a triangle and the point is farther than `range` from all
+/// edges: within `range` there is then only the inside.
 bool is_far_inside(const Vec3& p, const Vec3& a, const Vec3& b, const Vec3& c, double range) {
   const Vec3 e0 = b - a;
   const Vec3 e1 = c - a;

@@ -159,7 +159,7 @@ DIFFCLOTH_INLINE void gather_at(const BendingBatch& batch,
   }
 }
 
-/// The shapes at both ends of a motion, whose change is that of differences.
+/// Shapes of the elements at both ends of a motion, and the change of Y, summed from displacements.
 struct BendingMotion {
   Shape start;
   Shape end;
@@ -519,7 +519,8 @@ DIFFCLOTH_INLINE void base_block(
   }
 }
 
-/// Of a vertex beyond the base triangle and each corner j of that: [m]x A_j in world axes. They add to zero.
+/// Hessian blocks [m]x A_j, in world axes, between an outer vertex and corner j of the base triangle. Their sum is
+/// zero.
 DIFFCLOTH_INLINE void outer_blocks(const Parts& parts,
                                    const BendingPoint& point,
                                    Block (&blocks)[3]) {

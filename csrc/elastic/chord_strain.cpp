@@ -8,7 +8,7 @@
 namespace diffcloth::elastic {
 namespace {
 
-/// q_0, the square of a strain: above those of smooth motion at common steps, below what is visible.
+/// q_0, a squared strain: larger than in smooth motion at common time steps, smaller than a visible strain.
 constexpr double kFree = 1e-4;
 
 /// phi and its derivatives.
@@ -137,7 +137,7 @@ void ChordStrain::add_hessian_product(const double* x, const double* z, double* 
   }
 }
 
-// phi = z . grad E = <stress, Z>: its derivatives by G and D are those of the stress, transposed.
+// phi = z . grad E = <stress, Z>: differentiate it by G and D, which transposes the derivative of the stress.
 void ChordStrain::accumulate(const double* x, const double* z) {
   const Wanted wanted = elastic_.wanted();
   Bar& bar = elastic_.bar();

@@ -34,10 +34,10 @@ class ConstantForm {
                std::span<const Springs> springs,
                const linalg::BlockPattern& pattern);
 
-  /// That of flat bending alone, which is its energy; the values stay the model's.
+  /// The form of flat bending alone, which is its energy; the values stay the model's.
   static ConstantForm of_flat_bending(const Model& model, const linalg::BlockPattern& pattern);
 
-  /// That of all bending without its damping, as if every element were flat.
+  /// The form of all bending without damping, as if every element were flat.
   static ConstantForm of_bending(const Model& model,
                                  const Slots& slots,
                                  const linalg::BlockPattern& pattern);
@@ -81,7 +81,7 @@ void add_constant_form_mixed(
 void add_constant_form_tangent(
     const Model& model, const double* u, const Bar& dot, const Changing& changing, double* y);
 
-/// The same two of ConstantForm::of_bending().
+/// Mixed derivative and tangent, as above, of ConstantForm::of_bending().
 void add_bending_form_mixed(
     const Model& model, const double* u, const double* z, bool with_rest, Bar& bar);
 void add_bending_form_tangent(

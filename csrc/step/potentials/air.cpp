@@ -23,7 +23,7 @@ double half_density(const Problem& p) {
   return density != nullptr ? 0.5 * *density : 0.0;
 }
 
-/// Whether drag takes the mean velocity: those of second-order steps are half a step before the positions.
+/// Drag of second-order steps acts on the mean velocity, as their velocities are half a step before the positions.
 bool takes_mean(const Problem& p) { return p.scene.given.integrator == Integrator::kSecondOrder; }
 
 bool wants_coefficients(const Gradients* wanted) {

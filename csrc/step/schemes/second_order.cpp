@@ -42,7 +42,7 @@ Array middle(const Problem& p) {
   return u;
 }
 
-/// Add the cotangents of vertices at the ends of prescribed points to those of the latter.
+/// Add cotangents of the positions at the end of the step to the cotangents of prescribed points.
 void add_to_ends(const Problem& p, Array bar, Cotangents& bars) {
   p.coordinates.gather(p.ends, bar);
   for (std::size_t a = 0; a < bar.size(); ++a) {
@@ -127,7 +127,7 @@ class Filter {
     soft_pins_.swap_cotangents(store);
   }
 
-  /// Pull the cotangents of its own inputs back; those of materials are with the potentials of the step.
+  /// Pull back the cotangents of the filter's inputs; potentials of the step hold the cotangents of materials.
   void pull_back(Cotangents& bars) const {
     for (std::size_t a = 0; a < p_.cloth_size; ++a) {
       bars.start[a] += inertia_.target_bar[a] + stretch_.start_bar[a];
@@ -228,7 +228,7 @@ class ShiftedStage {
     chords_.swap_cotangents(store);
   }
 
-  /// Pull the cotangent of the shift back to the start and to prescribed ends; returns that of y, of the rows.
+  /// Pull the cotangent of the shift back to the start and to prescribed ends. Returns the cotangent of y, by row.
   Array pull_back(Cotangents& bars) const {
     Array bar(shift_.size(), 0.0);
     for (const Shifted* potential : {&elastic_, &attachments_, &soft_pins_}) {
