@@ -3,14 +3,6 @@
 namespace diffcloth::elastic {
 namespace {
 
-void add_to_points(const Springs& springs, Index a, const Vec3& value, double* y) {
-  const auto points = springs.points(a);
-  const auto b = springs.coefficients(a);
-  for (std::size_t p = 0; p < points.size(); ++p) {
-    Eigen::Map<Vec3>(y + 3 * points[p]) += b[p] * value;
-  }
-}
-
 /// Change of P r along a change of the spring's extension e, for P = n n^T.
 Vec3 change_of_projected(const Vec3& e, const Vec3& change, const Vec3& r) {
   const double length = e.norm();

@@ -35,6 +35,8 @@ Vec3 times_hessian(const Vec3& d, double k, double rest, const Vec3& z) {
   return k * (along * n + pull(length, rest) * (z - along * n));
 }
 
+}  // namespace
+
 void add_to_points(const Springs& springs, Index a, const Vec3& value, double* y) {
   const auto points = springs.points(a);
   const auto b = springs.coefficients(a);
@@ -42,8 +44,6 @@ void add_to_points(const Springs& springs, Index a, const Vec3& value, double* y
     Eigen::Map<Vec3>(y + 3 * points[p]) += b[p] * value;
   }
 }
-
-}  // namespace
 
 Vec3 difference(const Springs& springs, Index a, const double* v) {
   const auto points = springs.points(a);

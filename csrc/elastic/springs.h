@@ -53,6 +53,9 @@ struct Springs {
 /// Sum of b_p v_p over the points of a spring, for rows v.
 Vec3 difference(const Springs& springs, Index a, const double* v);
 
+/// y_p += b_p value at the points of a spring: difference(), transposed.
+void add_to_points(const Springs& springs, Index a, const Vec3& value, double* y);
+
 /// d of a spring.
 Vec3 extension(const Springs& springs, Index a, const double* x);
 

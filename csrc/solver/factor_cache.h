@@ -22,6 +22,11 @@ struct KeptSolves {
 
   /// Add a certificate, or none where the cache has no room for it.
   void add(Certificate certificate);
+
+  /// Certificate k; none if it was not kept or is evicted.
+  Certificate certificate(std::size_t k) const {
+    return k < certificates.size() ? certificates[k] : Certificate{};
+  }
 };
 
 /// Kept solves of the steps that may still be differentiated, up to a number of bytes; the oldest are

@@ -12,11 +12,6 @@
 namespace diffcloth::step {
 namespace {
 
-/// The certificate of a step that has been taken; none if evicted.
-solver::Certificate certificate_of(const Taken& step) {
-  return step.kept.certificates.empty() ? solver::Certificate{} : step.kept.certificates.front();
-}
-
 solver::Objective objective(Problem& problem) {
   return problem.objective(problem.inertia, problem.cloth_potentials(),
                            problem.scene.elastic_patterns);
@@ -102,7 +97,7 @@ std::vector<double> ElasticStage::forward(const Forward& step, const Forces& for
 
 void ElasticStage::backward(const Backward& step, const std::vector<std::vector<double>>& g) const {
   const std::vector<double> x = problem_.predicted(step.tape["elastic"]);
-  const solver::Certificate certificate = certificate_of(step);
+  const solver::Certificate certificate = step.kept.certificate(0);
   const Turn::Exchange exchange = [&](std::size_t l) { step.losses[l].exchange(problem_); };
   if (nodes_.has_contacts()) {
     for (std::size_t l = 0; l < g.size(); ++l) {
@@ -118,7 +113,7 @@ void ElasticStage::backward(const Backward& step, const std::vector<std::vector<
 
 std::vector<std::vector<double>> ElasticStage::tangent(const Pushforward& step) const {
   const std::vector<double> x = problem_.predicted(step.tape["elastic"]);
-  const solver::Certificate certificate = certificate_of(step);
+  const solver::Certificate certificate = step.kept.certificate(0);
   const SetTangents set_tangents = [&](std::size_t l) {
     step.directions[l].push_forward(problem_);
   };

@@ -296,10 +296,6 @@ Array filtered(const Taken& step) {
   return y;
 }
 
-solver::Certificate certificate_of(const Taken& step) {
-  return step.kept.certificates.empty() ? solver::Certificate{} : step.kept.certificates.front();
-}
-
 }  // namespace
 
 std::vector<Field> SecondOrder::tape(const Scene& scene) const {
@@ -345,7 +341,7 @@ void SecondOrder::backward(const Backward& step) const {
   }
   const solver::Objective& f = filter.objective();
   f.stand_at(y.data());
-  pull_back_solve(step, f, y, certificate_of(step), g, false, {}, contact.exchange);
+  pull_back_solve(step, f, y, step.kept.certificate(0), g, false, {}, contact.exchange);
   for (std::size_t l = 0; l < g.size(); ++l) {
     const Turn turn(contact.exchange, l);
     filter.pull_back(step.losses[l]);
@@ -365,7 +361,7 @@ std::vector<Array> SecondOrder::tangent(const Pushforward& step) const {
   const solver::Objective& f = filter.objective();
   f.stand_at(y.data());
   const std::vector<Array> y_dot =
-      push_forward_solve(step, f, y, certificate_of(step), false, {}, [&](std::size_t l) {
+      push_forward_solve(step, f, y, step.kept.certificate(0), false, {}, [&](std::size_t l) {
         step.directions[l].push_forward(problem);
         filter.set_tangents(step.directions[l], ends_dot[l]);
       });

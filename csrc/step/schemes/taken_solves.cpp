@@ -45,9 +45,7 @@ void TakenSolves::stand(std::size_t k) {
   sum_.lag_kept(x_lag_, contacts_at(k, x_lag_));
   sum_.adopt(contacts_at(k + 1, x_));
   step_.problem.coordinates.stand_at(x_.data());
-  const std::size_t place = first_factor_ + k;
-  const auto& kept = step_.kept.certificates;
-  certificate_ = place < kept.size() ? kept[place] : solver::Certificate{};
+  certificate_ = step_.kept.certificate(first_factor_ + k);
   // The expected contacts are the same for all solves.
   if (!certificate_.factor && sum_.objective.expected.empty()) {
     sum_.expect_contacts_near(step_.problem.start);
