@@ -14,7 +14,14 @@ from diffcloth_torch.errors import InvalidInput
 from diffcloth_torch.files import read_regular_file
 from diffcloth_torch.operations import operation
 
-__all__ = ["Document", "check_plain_document", "read_document", "resolve_path", "set_values"]
+__all__ = [
+    "Document",
+    "check_plain_document",
+    "read_document",
+    "resolve_path",
+    "resolve_relative",
+    "set_values",
+]
 
 Document = dict[str, Any]
 
@@ -203,15 +210,26 @@ def _item(key: str, items: list[Any], part: str) -> int:
     )
 
 
+def resolve_relative(config: Path, given: str) -> Path:
+    """Resolve a path relative to its configuration, whether or not it exists.
+
+    Raises:
+        InvalidInput: If links lead in a circle.
+    """
+    try:
+        return (config.resolve().parent / given).resolve()
+    except (OSError, RuntimeError) as error:  # RuntimeError: a circle, before Python 3.13
+        raise InvalidInput(f"{config}: the path {given!r} cannot be resolved: {error}") from error
+
+
 def resolve_path(config: Path, root: str, given: str) -> Path:
     """Resolve a file name relative to its configuration, and require it to be under the root.
 
     Raises:
         InvalidInput: If it lies elsewhere or does not exist.
     """
-    folder = config.resolve().parent
-    allowed = (folder / root).resolve()
-    path = (folder / given).resolve()
+    allowed = resolve_relative(config, root)
+    path = resolve_relative(config, given)
     if not path.is_relative_to(allowed):
         raise InvalidInput(
             f"{config}: the file {given!r} must lie under the root {str(allowed)!r}; declare a "

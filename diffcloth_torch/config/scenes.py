@@ -14,7 +14,7 @@ from torch import Tensor
 from diffcloth_torch import cpu, fabrics, robots
 from diffcloth_torch.config import shapes
 from diffcloth_torch.config.attachments import attachment, attachment_motions
-from diffcloth_torch.config.documents import resolve_path
+from diffcloth_torch.config.documents import resolve_path, resolve_relative
 from diffcloth_torch.config.keyframes import moved, quaternion, select_vertices, values_at
 from diffcloth_torch.config.scene_schema import (
     BodySection,
@@ -204,10 +204,10 @@ def _robot_file(section: RobotSection, root: str, source: Path) -> tuple[Path, P
         return robots.panda() if section.model == "panda" else (robots.GRIPPER, None)
     assert section.path is not None  # the schema requires one of the two
     path = resolve_path(source, root, section.path)
-    allowed = (source.resolve().parent / root).resolve()
+    allowed = resolve_relative(source, root)
     if section.mesh_root is None:
         return path, allowed
-    folder = (source.resolve().parent / section.mesh_root).resolve()
+    folder = resolve_relative(source, section.mesh_root)
     if not folder.is_relative_to(allowed):
         raise InvalidInput(
             f"{source}: the folder {section.mesh_root!r} must lie under the root {str(allowed)!r}"

@@ -284,6 +284,14 @@ class TestRoot:
         with pytest.raises(InvalidInput, match="must lie under the root"):
             resolve_path(files / "project/configs/a.yaml", "..", "../meshes/link.obj")
 
+    @pytest.mark.parametrize(("root", "given"), [("..", "../meshes/a.obj"), ("a.obj", "m.obj")])
+    def test_links_in_a_circle_are_refused(self, files, root, given):
+        for folder in (files / "project/meshes", files / "project/configs"):
+            (folder / "a.obj").symlink_to(folder / "b.obj")
+            (folder / "b.obj").symlink_to(folder / "a.obj")
+        with pytest.raises(InvalidInput, match=r"a\.yaml: the path '.*a\.obj' cannot be resolved"):
+            resolve_path(files / "project/configs/a.yaml", root, given)
+
     def test_an_absolute_path_elsewhere_is_refused(self, files):
         with pytest.raises(InvalidInput, match="must lie under the root"):
             resolve_path(files / "project/configs/a.yaml", "..", str(files / "secret.obj"))
