@@ -12,6 +12,7 @@ import torch
 import diffcloth_torch as dc
 import diffcloth_torch.envs as envs
 from diffcloth_torch.envs.env import Task
+from diffcloth_torch.envs.spread_cloth import covered_area
 
 NAMES = tuple(envs.TASKS)
 SMALL = 6  # vertices along a side
@@ -409,3 +410,17 @@ def test_an_environment_takes_an_integrator():
     assert env.task.simulator.integrator == "second_order"
     assert not info["blocked"].any()
     assert not env.env_state.failed.any()
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_covered_area_of_two_patches_adds_only_where_they_lie_apart(axis):
+    line = 0.05 * torch.arange(4, dtype=torch.float64) - 0.1
+    x, y = torch.meshgrid(line, line, indexing="ij")
+    patch = torch.stack([x, y, torch.zeros_like(x)], dim=-1).reshape(1, -1, 3)
+    away = torch.zeros(3, dtype=torch.float64)
+    away[axis] = 0.4
+    one = covered_area(patch, 0.05)
+    apart = covered_area(torch.cat([patch, patch + away], dim=1), 0.05)
+    above = covered_area(torch.cat([patch, patch + torch.tensor([0.0, 0.0, 0.1])], dim=1), 0.05)
+    assert apart.item() == pytest.approx(2 * one.item(), rel=1e-3)
+    assert one.item() < above.item() < 1.3 * one.item()
