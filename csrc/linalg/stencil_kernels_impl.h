@@ -1,4 +1,4 @@
-// The arithmetic of AddStencil, written once over vectors of `kRows` doubles. Everything here is in an anonymous
+// Kernel of AddStencil, written once over vectors of `kRows` doubles. Everything here is in an anonymous
 // namespace, for the reason given in linalg/dense_kernels_impl.h.
 
 #pragma once
