@@ -24,7 +24,7 @@ struct RobotModel {
   double dt = 0.0;
   double largest = 0.0;        ///< value of a limit that means none
   bool is_at_rest = false;     ///< true if steps search for an equilibrium
-  bool bounds_weight = false;  ///< then: use a bound of the weight's stiffness
+  bool bounds_weight = false;  ///< with is_at_rest: use a bound of the weight's stiffness
 
   Index coordinate_count() const {
     return tree.joint_count + (base == Base::kFloating ? kRoot : 0);

@@ -60,13 +60,13 @@ class Linearized {
 
   /// Gradients by the variables, array by array, from cotangents of the outputs.
   ///
-  /// @param cotangents  [outputs]; null where zero
+  /// @param cotangents  [outputs]; null: zero
   /// @param gradients   [inputs]; null for constants
   void pull_back(std::span<const double* const> cotangents, std::span<double* const> gradients);
 
   /// Tangents of the outputs from tangents of the variables.
   ///
-  /// @param given     [inputs]; null where zero
+  /// @param given     [inputs]; null: zero
   /// @param tangents  [outputs]
   void push_forward(std::span<const double* const> given, std::span<double* const> tangents);
 

@@ -142,7 +142,7 @@ class BroadPhase {
             std::vector<Candidate>& out) const;
 
   /// Pairs within the sum of the two surfaces' reaches at x, and a few more: the result of find()
-  /// without motion, less the pairs that are near by their boxes alone.
+  /// without motion, minus most pairs that are near by their boxes alone.
   void find_at_rest(const double* x,
                     std::span<const double> reach,
                     Scratch& scratch,

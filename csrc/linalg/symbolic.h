@@ -49,7 +49,7 @@ struct Child {
 };
 
 /// Consecutive supernodes that one thread eliminates: a subtree, several whole trees, or a single
-/// supernode above subtrees. The last supernode is the root.
+/// supernode above subtrees. The last supernode is the root (of the last tree).
 struct Task {
   Index begin;  ///< its supernodes: Symbolic::supernodes[begin .. end - 1]
   Index end;
