@@ -19,7 +19,7 @@ struct Flow {
   const double* start = nullptr;       ///< [N, 3] x_n [m]
   Vec3 wind = Vec3::Zero();            ///< w [m/s]
   double h = 0.0;                      ///< time step [s]
-  const double* velocities = nullptr;  ///< [N, 3] v_n, for the mean velocity; null: end velocity only [m/s]
+  const double* velocities = nullptr;  ///< [N, 3] v_n, for the mean velocity, or null [m/s]
   /// Faces with a corner that is not a free vertex, if known: add_held_product() visits only these.
   const std::vector<Index>* held = nullptr;
 };

@@ -10,7 +10,7 @@ NB_MODULE(_core, m) {
   // suppress the warning.
   nb::set_leak_warnings(false);
   m.doc() = "C++ core of diffcloth_torch. The public interface is the Python package.";
-  diffcloth::linalg::chosen_level();  // the import fails if the environment variable names no supported level
+  diffcloth::linalg::chosen_level();  // import fails if the variable names no level
 
   diffcloth::bind::build_info(m);
   diffcloth::bind::dynamics(m);

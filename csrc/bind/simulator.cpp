@@ -22,7 +22,7 @@ nb::dict Simulator::forward(const nb::dict& inputs, bool tape, int threads) {
   const Outputs tapes(tape ? tape_ : std::vector<step::Field>(), {b}, "tape_", out);
   std::vector<step::Report> reports(b);
   KeptSteps kept{.tickets = decltype(KeptSteps::tickets)(b), .costs = std::vector<double>(b)};
-  const std::vector<double> expected = step_seconds_;  // copy, because another call may write during this one
+  const std::vector<double> expected = step_seconds_;  // another call may write meanwhile
   last_turns_ = for_environments(b, threads, expected, [&](Index i, const Checkpoint& checkpoint) {
     const auto e = static_cast<std::size_t>(i);
     solver::KeptSolves found;

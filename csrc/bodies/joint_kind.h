@@ -12,8 +12,8 @@ namespace diffcloth::bodies {
 /// from these two numbers: see bodies/link.h.
 struct JointKind {
   std::string_view name;  ///< name in Python, and type of the joint in URDF
-  double turn;   ///< angle per unit of the value; 0 or 1 if the value is an angle [rad]
-  double slide;  ///< shift per unit of the value [m/rad], or [-] if it is a length
+  double turn;            ///< angle per unit of the value; 0 or 1 if the value is an angle [rad]
+  double slide;           ///< shift per unit of the value [m/rad], or [-] if it is a length
 
   constexpr bool moves() const { return turn != 0.0 || slide != 0.0; }
 };

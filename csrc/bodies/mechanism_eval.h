@@ -17,7 +17,7 @@ struct Mechanisms::Eval {
   Mat34 frame;                               // S
   std::vector<Placed<double>> links;         // in the root's frame
   std::vector<Mat34> to_root;                // C_l, as matrices
-  std::vector<std::vector<Mat34>> by_joint;  // [link][k]: derivative of C_l by the k-th joint of its path
+  std::vector<std::vector<Mat34>> by_joint;  // [link][k]: dC_l by the k-th joint of its path
 };
 
 }  // namespace diffcloth::bodies

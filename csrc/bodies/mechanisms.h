@@ -15,8 +15,8 @@ namespace diffcloth::bodies {
 
 /// Description of mechanisms. Trees are the bodies of a scene, then its robots.
 struct MechanismsDescription {
-  std::vector<char> tree_free;  ///< [T] nonzero for dynamic roots: six coordinates, c and w
-  std::vector<Link> links;      ///< tree after tree, parents before their children
+  std::vector<char> tree_free;         ///< [T] nonzero for dynamic roots: six coordinates, c and w
+  std::vector<Link> links;             ///< tree after tree, parents before their children
   std::vector<Index> coordinate_tree;  ///< [n] tree after tree, coordinates of a free root first
   std::vector<char> prescribed;        ///< [n] nonzero if the value at the end of the step is given
   std::vector<char> held;              ///< [n] nonzero if dynamic, but prescribed in this solve

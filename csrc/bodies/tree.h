@@ -106,7 +106,7 @@ TreeRates<T> rates(const Tree& tree,
                    const std::vector<PlacedBody<T>>& placed,
                    const VectorX<T>& nu) {
   std::vector<Twist<T>> velocity(placed.size());
-  std::vector<Wrench<T>> momentum(placed.size());  // of all links that a link carries, including itself
+  std::vector<Wrench<T>> momentum(placed.size());  // of all links carried, including itself
   for (const Index l : tree.order) {
     const Link& link = tree.links[l];
     const PlacedBody<T>& p = placed[l];

@@ -9,7 +9,7 @@ struct BuildInfo {
   std::string compiler;    ///< Name and version.
   std::string build_type;  ///< CMake's: Release, Debug, ...
   std::string flags;       ///< Compiler flags.
-  std::string processor;   ///< Architecture, with "native" if the build may not run on other processors.
+  std::string processor;   ///< Architecture, with "native" if the build may not run elsewhere.
   std::string eigen;       ///< Version of Eigen's headers.
   std::string blas;        ///< BLAS used by CHOLMOD; "none" in a build without CHOLMOD.
 };

@@ -81,7 +81,7 @@ class Unused {
   void* take(std::size_t bytes) {
     const std::unique_lock lock(mutex_, std::try_to_lock);
     if (!lock) return nullptr;
-    for (std::size_t k = count_; k-- > 0;) {  // the last block returned is the most likely to be in the cache
+    for (std::size_t k = count_; k-- > 0;) {  // the latest is the likeliest to be cached
       if (blocks_[k].bytes == bytes) return remove(k).memory;
     }
     return nullptr;

@@ -78,7 +78,7 @@ std::vector<Travel> motions(const CollisionMesh& mesh, const double* from, const
       raise(motion.largest, u.squaredNorm());
       raise(motion.around_mean, (u - motion.mean).squaredNorm());
     }
-    motion.largest = std::sqrt(motion.largest);  // one root for the maximum, as roots keep the order
+    motion.largest = std::sqrt(motion.largest);  // one root for the maximum: roots keep the order
     motion.around_mean = std::sqrt(motion.around_mean);
     result[surface] = motion;
   }

@@ -100,14 +100,14 @@ class CandidateList {
   Kept wide_;
   Kept near_;
   bool has_parts_ = false;        // true if relative_search_ was started at the reference of wide_
-  std::size_t looked_at_ = 0;     // pairs of leaves visited by relative_search_ since wide_ was built
+  std::size_t looked_at_ = 0;     // pairs of leaves visited since wide_ was built
   std::vector<double> approach_;  // [surfaces^2] result of measure_approach()
-  std::vector<Vec3> mean_t0_;     // [surfaces] mean displacements since the reference, by measure_approach()
+  std::vector<Vec3> mean_t0_;     // [surfaces] mean displacements since the reference
   std::vector<Vec3> mean_t1_;
   std::vector<double> u_t0_;  // scratch of cull(): displacements since the reference
   std::vector<double> u_t1_;
   std::vector<double> deviation_;   // upper bound of each vertex's deviation from these means
-  std::vector<double> mean_apart_;  // [surfaces^2] upper bound of the difference of two of these means
+  std::vector<double> mean_apart_;  // [surfaces^2] upper bound of the difference of two means
   std::vector<Index> maybe_;
   Found found_;
   std::vector<double> with_skin_;  // [surfaces] scratch

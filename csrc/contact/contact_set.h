@@ -34,7 +34,7 @@ struct Contact {
   double coefficient;  ///< fraction of the area, or between bodies the area [m^2]; may be negative
   double weight;       ///< w: coefficient times area [m^2]
   double threshold;    ///< eps of the edge-edge mollifier [m^4]; 0: no mollifier
-  double xi;           ///< distance of touching: half the sum of the thicknesses, plus the radii [m]
+  double xi;           ///< touching distance: half the sum of the thicknesses, plus the radii [m]
   double kappa;        ///< barrier stiffness of the two surfaces [Pa]
   Closest closest;
   Barrier barrier;

@@ -59,7 +59,7 @@ struct FrictionTangent {
   int count;                  ///< number of points
   int part_count;             ///< one or two
   bool slides;                ///< true if the closest points slide
-  double beta[2][12];         ///< parameters of the closest points, by the corners of the lag configuration
+  double beta[2][12];         ///< derivatives of the closest points' parameters by the lag corners
   double c_beta[4][2];        ///< derivative of the corners' coefficients
   double t_beta[3][2];        ///< derivative of the gap
   double r_beta[3][2];        ///< derivative of the vector between both points, at x

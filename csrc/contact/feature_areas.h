@@ -20,7 +20,7 @@ namespace diffcloth::contact {
 /// A round body touches with an arbitrary point or line of its surface. As for a box, a sixth of its
 /// area is assigned to the ends of its skeleton, and a sixth to the segment between the ends.
 struct FeatureAreas {
-  std::vector<double> vertex;   ///< [vertices] [m^2]; 0 for vertices that do not bulge, and of cloths
+  std::vector<double> vertex;   ///< [vertices] [m^2]; 0 if a vertex does not bulge, and for cloths
   std::vector<double> edge;     ///< [edges] [m^2]; likewise
   std::vector<double> surface;  ///< [surfaces] total area of the faces [m^2]; 0 for cloths
 };

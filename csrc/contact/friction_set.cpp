@@ -635,7 +635,7 @@ void FrictionSet::add_mixed(
       const GapPart& part = k.parts[l];
       const Frame& frame = at.frames[l];
       Frame& change = changes[l] = Frame(k, part, z);
-      change.m = change.e1.cross(frame.e2) + frame.e1.cross(change.e2);  // replaces m of its own edges
+      change.m = change.e1.cross(frame.e2) + frame.e1.cross(change.e2);  // not of its own edges
       zeta = zeta - part.a[0] * change.e1 - part.a[1] * change.e2 - part.a[2] * change.m;
     }
     const double w_zeta = at.w.dot(zeta);

@@ -97,7 +97,8 @@ void visit_items(std::span<const Index> a,
 }  // namespace
 
 double approach_sq(const Candidate& pair, const double* u_t0, const double* u_t1) {
-  const int first = pair.kind == PairKind::kPointTriangle ? 1 : 2;  // first corner of the second primitive
+  const int first =
+      pair.kind == PairKind::kPointTriangle ? 1 : 2;  // corner of the second primitive
   double result = 0.0;
   for (const double* u : {u_t0, u_t1}) {
     const auto& v = pair.vertices;

@@ -154,7 +154,7 @@ std::optional<Vec3> find_pole(const std::vector<Vec3>& directions, const Vec3& g
 /// Edges and faces around a vertex.
 struct Star {
   std::vector<Vec3> directions;      ///< unit vectors along its edges
-  Vec3 normal = Vec3::Zero();        ///< sum of the unit normals of its faces, weighted by their angle
+  Vec3 normal = Vec3::Zero();        ///< sum of its faces' unit normals, weighted by angle
   double angle = 0.0;                ///< sum of the angles of its faces
   double lowest = std::numbers::pi;  ///< smallest dihedral angle of its edges
   bool solid = true;

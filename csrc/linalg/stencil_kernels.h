@@ -19,16 +19,15 @@ inline constexpr int kStencilPoints = 5;
 /// where `right` may be `left` times a core. Vectors have three numbers a point; vectors of five points
 /// are padded to sixteen.
 struct StencilTerms {
-  int count = 4;                ///< number of points: four or five
-  int terms = 0;                ///< number of outer products: at most three
-  const double* left[3] = {};   ///< [12] or [16]
-  const double* right[3] = {};  ///< likewise; without a core
-  const double* core =
-      nullptr;                ///< [3, 3], symmetric: right_k = sum_m core_km left_m; null: none
-  double along = 0.0;         ///< with four points only
-  const double* c = nullptr;  ///< [4]
-  const double* rest = nullptr;      ///< [12, 12], with four points; null: none
-  const double* turn = nullptr;      ///< [3]: cross product between both edges; null: none
+  int count = 4;                 ///< number of points: four or five
+  int terms = 0;                 ///< number of outer products: at most three
+  const double* left[3] = {};    ///< [12] or [16]
+  const double* right[3] = {};   ///< likewise; without a core
+  const double* core = nullptr;  ///< [3, 3], symmetric: right_k = sum_m core_km left_m; null: none
+  double along = 0.0;            ///< with four points only
+  const double* c = nullptr;     ///< [4]
+  const double* rest = nullptr;  ///< [12, 12], with four points; null: none
+  const double* turn = nullptr;  ///< [3]: cross product between both edges; null: none
   double sign[2][kStencilPoints]{};  ///< coefficient of each point in each edge
 };
 

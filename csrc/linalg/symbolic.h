@@ -80,7 +80,7 @@ struct Symbolic {
   std::size_t arena_size = 0;   ///< size of the largest task's arena
   std::size_t left_size = 0;    ///< size of all update matrices of task roots
   std::size_t passed_size = 0;  ///< size of the updates passed between tasks in a solve
-  std::size_t nonzeros = 0;     ///< entries of L, including zeros stored in supernodes, without padding
+  std::size_t nonzeros = 0;     ///< entries of L, with zeros stored in supernodes, without padding
   double flops = 0.0;           ///< operations of one factorization, for those nonzeros
   Index longest = 0;            ///< largest ld of a panel
 

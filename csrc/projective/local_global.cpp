@@ -111,8 +111,8 @@ class Iteration {
   Anderson anderson_;
   ConstantMatrix::Scratch scratch_;
   double residual_ = 0.0;
-  double change_ = -std::numeric_limits<double>::infinity();  // change of energy in the last step [J]
-  double noise_ = 0.0;                                        // bound of the change of energy due to rounding
+  double change_ = -std::numeric_limits<double>::infinity();  // change of energy, last step [J]
+  double noise_ = 0.0;  // bound of change_ due to rounding [J]
   double best_ = std::numeric_limits<double>::infinity();
   int age_ = 0;
   int idle_ = 0;
